@@ -40,7 +40,7 @@ SEEDS = Range(0, 2**31 - 1)
 FIRST_SEEDS = Range(0, 2 * 10**9)
 """Seeds that others follow."""
 THREADS = Range(1, 1024)
-TIMES = Range(-1e18, 1e18)
+TIMES = Range(-1e20, 1e20)
 """Seconds on a clock of any origin."""
 LENGTHS = Range(1e-6, 1e6)
 """Lengths that are not 0, and factors between units of length."""
@@ -56,7 +56,8 @@ STEPS = Range(1, 10**9)
 RAYS = Range(1, 2**31 - 1)
 LOSS_WEIGHTS = Range(0, 1e6)
 DIRECTIONS = Range(16, 1 << 20)
-SPP = Range(1, 1 << 20)
+SPP = Range(1, 1 << 24)
+"""Samples a pixel."""
 DECADES = Range(0, 30)
 """Powers of ten of a colour scale."""
 RATES = Range(1e-3, 1e5)

@@ -79,8 +79,7 @@ def check_observer(observer) -> None:
         viewpoint.require_center(observer, '"observer"')
         if not dr.all(dr.abs(dr.detach(viewpoint.center(observer))) <= FARTHEST, axis=None):
             raise NergError(
-                f'"observer" stands at a position with a coordinate that is not from {-FARTHEST:g} to {FARTHEST:g}; '
-                "correct its to_world"
+                f'"observer" stands at a position that is not finite, or beyond {FARTHEST:g}; correct its to_world'
             )
 
 

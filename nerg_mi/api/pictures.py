@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.jobs.reporter import SILENT, Reporter
+from nerg_mi.ranges import SEEDS, SPP, Range, check_number
 
 from .arrays import Floats, Labelled, points, same_for_all
 from .camera import Camera
@@ -164,10 +165,5 @@ def _has_alpha(film: Any) -> bool:
 
 
 def _check_counts(spp: int, seed: int) -> None:
-    from nerg_mi.rendering.scene_file import check_samples
-
-    for name, value in (("spp", spp), ("seed", seed)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-            raise NergError(f"{name} must be a whole number from 0 on, got {value!r}")
-    if spp:
-        check_samples(int(spp), "a picture")
+    check_number(spp, Range(0, SPP.high), "spp", whole=True)
+    check_number(seed, SEEDS, "seed", whole=True)

@@ -13,6 +13,8 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
+from nerg_mi.ranges import FARTHEST
+
 from .backend import namespace
 from .encoding.harmonics import encode_direction
 from .encoding.hashgrid import HashGridConfig
@@ -37,7 +39,7 @@ class BackgroundConfig:
     sh_degree: int = 4
 
     def __post_init__(self):
-        if not (np.isfinite(self.radius) and self.radius > 0):
+        if not 0 < self.radius <= FARTHEST:
             raise ValueError(f"the radius of a background must be positive and finite, got {self.radius}")
         if self.grid.dimensions != 2 or min(self.width, self.hidden) < 1:
             raise ValueError(f"a background needs a grid of 2 dimensions and sizes of at least 1, got {self}")

@@ -17,6 +17,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.ranges import VALUES
 
 from .backend import namespace
 from .background import Background
@@ -58,7 +59,7 @@ class RadianceConfig:
     def __post_init__(self):
         if min(self.width, self.density_hidden, self.color_hidden, self.geometry, self.sh_degree) < 1:
             raise ValueError(f"every size of a radiance field must be at least 1, got {self}")
-        if not (np.isfinite(self.density_scale) and self.density_scale > 0):
+        if self.density_scale not in VALUES:
             raise ValueError(f"density_scale must be positive and finite, got {self.density_scale}")
         if not isinstance(self.deferred, bool):
             raise ValueError(f"deferred must be true or false, got {self.deferred!r}")

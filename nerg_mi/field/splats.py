@@ -14,6 +14,7 @@ import numpy as np
 
 from nerg_mi.maths.harmonics import C0, DEGREES, rotated_harmonics
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.ranges import FARTHEST
 
 _LEAST_SCALE = 1e-9
 _LEAST_OPACITY = 1e-7
@@ -65,6 +66,9 @@ class Splats:
         for name in (*shapes, "harmonics"):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"some of the {name} of its Gaussians are not finite (a splat editor removes these)")
+        for name in ("centers", "scales"):
+            if not (np.abs(getattr(self, name)) <= FARTHEST).all():
+                raise ValueError(f"some of the {name} of its Gaussians are beyond {FARTHEST:g} units")
         length = np.linalg.norm(self.rotations.astype(np.float64), axis=1, keepdims=True)
         if not (length > 0).all():
             raise ValueError("some of its Gaussians have a rotation of length 0 (a splat editor removes these)")

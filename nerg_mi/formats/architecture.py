@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from nerg_mi.errors import NergError
 from nerg_mi.field.encoding.registry import config_type
 from nerg_mi.files.bounded import plain
+from nerg_mi.ranges import VALUES
 
 _MOST = {
     "width": 4096,
@@ -75,9 +76,10 @@ def check_sizes(about: object, what: str = "architecture", most: Mapping[str, in
 
 
 def number(about: object, name: str, what: str) -> float:
-    """The finite number ``name`` of the JSON object ``about``. Raises ``ValueError`` where it is none."""
+    """The number ``name`` of the JSON object ``about``. Raises ``ValueError`` where it is none, or single precision
+    cannot hold it."""
     value = about[name] if isinstance(about, dict) else None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= VALUES.high:
         raise ValueError(f'"{name}" of its {what} must be a finite number, not {_short(value)}')
     return value
 

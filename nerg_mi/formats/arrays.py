@@ -19,21 +19,25 @@ from nerg_mi.field.mlp import MLP
 
 from .architecture import check_sizes
 
+LARGEST = 1e6
+"""No weight is larger; products of a network's layers then stay in single precision."""
+
 
 def stored(parameters: Mapping[str, Any], half: bool) -> dict[str, np.ndarray]:
-    """The Dr.Jit arrays ``parameters`` for a file, in fp16 if ``half``. Raises `NergError` for what is not finite."""
+    """The Dr.Jit arrays ``parameters`` for a file, in fp16 if ``half``. Raises `NergError` for what is not finite, or
+    beyond `LARGEST`."""
     out = {}
     for name, value in parameters.items():
         value = value.numpy()
         with np.errstate(over="ignore"):  # what exceeds fp16 is refused below, by name
             out[name] = value.astype(np.float16 if half else np.float32)
-        if not np.all(np.isfinite(out[name])):
-            if np.all(np.isfinite(value)):
-                raise NergError(f'the weight array "{name}" exceeds what fp16 can hold; leave out --half')
+        if not np.all(np.abs(value) <= LARGEST):
             raise NergError(
-                f'the weight array "{name}" is not finite, so that the training has diverged; '
+                f'the weight array "{name}" is not finite, or beyond {LARGEST:g}, so that the training has diverged; '
                 "train with a lower learning rate"
             )
+        if not np.all(np.isfinite(out[name])):
+            raise NergError(f'the weight array "{name}" exceeds what fp16 can hold; leave out --half')
     return out
 
 
@@ -50,8 +54,9 @@ class StoredArrays:
         """The array ``name`` as it is stored."""
         return self._tensors[name]
 
-    def array(self, name: str, *shape: int | None) -> np.ndarray:
-        """The array ``name`` in fp32, aligned, where it is finite and has the ``shape`` (None: of any length)."""
+    def array(self, name: str, *shape: int | None, largest: float = LARGEST) -> np.ndarray:
+        """The array ``name`` in fp32, aligned, where it has the ``shape`` (None: of any length) and no value beyond
+        ``largest``."""
         found = self._tensors[name].shape
         if len(found) != len(shape) or any(want not in (None, have) for want, have in zip(shape, found)):
             needed = " x ".join("any" if n is None else str(n) for n in shape)
@@ -60,6 +65,8 @@ class StoredArrays:
             value = aligned(self._tensors[name])
         if not np.all(np.isfinite(value)):
             raise ValueError(f'the weight array "{name}" is not finite')
+        if np.abs(value).max(initial=0) > largest:
+            raise ValueError(f'the weight array "{name}" holds values beyond {largest:g}, as no training makes them')
         return value
 
     def grid(self, config: EncodingConfig, name: str = "grid") -> Encoding:

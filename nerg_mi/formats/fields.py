@@ -22,6 +22,7 @@ from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.field.refined import RefinedGrid
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.maths.contraction import box_of
+from nerg_mi.ranges import VALUES
 
 from .architecture import MEMBERS, building, check_occupancy, check_sizes, number
 from .arrays import StoredArrays, stored
@@ -147,6 +148,8 @@ def load_gaze(path: str | Path, ns: ModuleType) -> tuple[AnyGazeField, dict[str,
             raise ValueError(f"it has {len(about['members'])} members, and at most {MEMBERS} are read")
         field = build(about, box_of(meta["box"]), arrays)
         if "support" in meta:
-            field.support = RaySupport(arrays.array("support.cells", None, 5), meta["support"]["radius"])
+            field.support = RaySupport(
+                arrays.array("support.cells", None, 5, largest=VALUES.high), meta["support"]["radius"]
+            )
         field.basis = basis_of(meta["provenance"]) if isinstance(meta.get("provenance"), dict) else None
     return field, meta

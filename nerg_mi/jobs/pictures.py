@@ -25,7 +25,7 @@ from nerg_mi.rendering.long_renders import prepare_for
 from nerg_mi.rendering.pace import Pace
 from nerg_mi.rendering.picture_file import FORMATS, DisplayRows, picture_rows
 from nerg_mi.rendering.pictures import activate, load_scene
-from nerg_mi.rendering.scene_file import check_samples, files_of_scene
+from nerg_mi.rendering.scene_file import files_of_scene
 from nerg_mi.threads import set_thread_count
 
 from .options.pictures import PictureOptions
@@ -70,10 +70,6 @@ def asked_pictures(scene: Path, output: Path, options: PictureOptions) -> AskedP
     """What `render_file` would render. Raises `NergError` for options that contradict each other, and for files that
     cannot be read or written, before any work."""
     check_writable(output, *dict.fromkeys((*FORMATS, *OVERLAY_FORMATS)))
-    if not options.memory > 0:
-        raise NergError(f"the memory to render in is {options.memory} GB: give it more than 0")
-    if options.spp:
-        check_samples(options.spp, "the picture")
     if not scene.exists():
         raise NergError(f'there is no scene file "{scene}"')
     check_overlay(output, options)
@@ -249,7 +245,9 @@ def _picture(
 
 
 def sensor_of(path: Path, scene, index: int):
-    """The sensor of ``scene`` with this ``index``."""
+    """The sensor of ``scene`` with this ``index``. Raises `NergError` where there is none, or no integrator for it."""
+    if scene.integrator() is None:
+        raise NergError(f'the scene "{path}" has no integrator to render with; add one, as <integrator type="nerg"/>')
     count = len(scene.sensors())
     if not 0 <= index < count:
         raise NergError(f'"{path}" has {count} sensor(s) and number {index} was asked for: choose -s from 0 on')

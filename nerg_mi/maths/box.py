@@ -8,6 +8,8 @@ from typing import ClassVar
 import drjit as dr
 import numpy as np
 
+from nerg_mi.ranges import FARTHEST
+
 
 @dataclass(frozen=True)
 class Box:
@@ -31,8 +33,10 @@ class Box:
 
     def __post_init__(self):
         lower, upper = np.asarray(self.lower, float), np.asarray(self.upper, float)
-        if lower.shape != (3,) or upper.shape != (3,) or not np.all(np.isfinite(lower) & np.isfinite(upper)):
-            raise ValueError(f"a box needs two finite corners of 3 numbers, got {self.lower} and {self.upper}")
+        if lower.shape != (3,) or upper.shape != (3,) or not (np.abs([lower, upper]) <= FARTHEST).all():
+            raise ValueError(
+                f"a box needs two finite corners of 3 numbers within {FARTHEST:g}, got {self.lower} and {self.upper}"
+            )
         if not np.all(upper > lower):
             raise ValueError(f"the upper corner {self.upper} of a box must exceed its lower corner {self.lower}")
         farthest = max(np.abs(lower).max(), np.abs(upper).max())

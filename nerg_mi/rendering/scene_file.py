@@ -12,11 +12,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.parsers import expat
 
+import numpy as np
+
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import open_file, size_of
 from nerg_mi.files.image_header import check_image
 from nerg_mi.formats.meshes import READERS as MESHES
+from nerg_mi.maths.arrays import check_coordinates
 from nerg_mi.properties import resolved
+from nerg_mi.ranges import SPP, check_number
+from nerg_mi.transport.place import check_shape
 
 from .mesh_file import check_mesh, check_points, check_vol
 
@@ -32,9 +37,6 @@ each of them."""
 
 INCLUDES = 16
 """Files may be included so deep."""
-
-SAMPLES = 1 << 24
-"""So many samples a pixel at most."""
 
 PIXELS = 1 << 28
 """A picture may have so many pixels: 16384 x 16384."""
@@ -64,8 +66,14 @@ def files_of_scene(path: str | Path, defaults: Mapping[str, str] | None = None) 
 
 
 def check_scene(path: str | Path, scene) -> None:
-    """Look at what Mitsuba has made of the file: films and samplers. Raises `NergError`."""
+    """Look at what Mitsuba has made of the file: shapes, sensors, films and samplers. Raises `NergError`."""
+    for shape in scene.shapes():
+        check_shape(shape, f' of "{path}"', merged=True)
     for index, sensor in enumerate(scene.sensors()):
+        check_coordinates(
+            np.array(sensor.world_transform().matrix, float).reshape(4, 4)[:3, 3:].T,
+            f'the to_world of sensor {index} of "{path}"',
+        )
         film, count = sensor.film(), sensor.sampler().sample_count()
         width, height = map(int, film.crop_size())
         if not 0 < width * height <= PIXELS:
@@ -76,9 +84,8 @@ def check_scene(path: str | Path, scene) -> None:
 
 
 def check_samples(count: int, what: str) -> None:
-    """Raise `NergError` for no samples and for more than `SAMPLES`."""
-    if not 1 <= count <= SAMPLES:
-        raise NergError(f"{what} takes {count:,} samples a pixel: give it 1 to {SAMPLES:,}")
+    """Raise `NergError` for no samples a pixel and for too many."""
+    check_number(count, SPP, f"the number of samples a pixel of {what}", whole=True)
 
 
 class _Scene:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.arrays import check_coordinates
 from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f
 
 from .march.depth import DEPTHS, escape_distance, surface_depth
@@ -75,7 +76,7 @@ class Place:
 
     Positions and distances are the scene's. ``medium``: or None; ``scene``: the scene whose shapes are met, or None,
     which is what ``self.scene`` is for a scene without any. Holds nothing that a change of the medium's parameters or
-    of a shape would make wrong. Raises ``NergError`` for meshes that have no faces.
+    of a shape would make wrong. Raises ``NergError`` for shapes that `check_shape` refuses.
     """
 
     def __init__(self, medium: Medium | None, scene: mi.Scene | None = None):
@@ -83,9 +84,7 @@ class Place:
         shapes = [] if scene is None else scene.shapes()
         self.scene = scene if len(shapes) > 0 else None
         for shape in shapes:
-            if shape.is_mesh() and shape.face_count() == 0:
-                # Mitsuba 3.9.1 builds a scene of it, but cannot shade what it does not meet.
-                raise NergError(f'the mesh "{shape.id()}" has no faces; take it out of the scene')
+            check_shape(shape)
 
     @property
     def diagonal(self) -> float:
@@ -149,10 +148,25 @@ def as_place(subject: Medium | Place) -> Place:
     return subject if isinstance(subject, Place) else Place(subject)
 
 
+def check_shape(shape: mi.Shape, of: str = "", merged: bool = False) -> None:
+    """Raise `NergError` for a mesh without faces and for a shape that is not finite, or reaches beyond `FARTHEST`.
+
+    ``of``: what a message says of the scene that it is in. ``merged``: whether meshes that Mitsuba has merged, whose
+    boxes are unset, are looked at by their vertices, which are computed for it.
+    """
+    if shape.is_mesh() and shape.face_count() == 0:
+        # Mitsuba 3.9.1 builds a scene of it, but cannot shade what it does not meet.
+        raise NergError(f'the mesh "{shape.id()}"{of} has no faces; take it out of the scene')
+    if merged or shape.bbox().valid() or not shape.is_mesh():
+        name = f'shape "{shape.id()}"' if shape.id() else shape.class_name()
+        check_coordinates(np.array(corners_of(shape), float), f"the corners of the {name}{of}")
+
+
 def corners_of(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner of the bounding box of ``shape``, (3,) each, in scene units."""
     box = shape.bbox()
-    if box.valid():
+    # Boxes of NaN are not valid, either.
+    if box.valid() or not shape.is_mesh():
         return np.array(box.min), np.array(box.max)
     # Mitsuba 3.9.1 leaves the boxes of meshes that it has merged unset.
     import mitsuba as mi

@@ -138,10 +138,10 @@ def test09_progress_is_told(scene):
         ({"quantities": "gazes"}, '"aovs" does not know "gazes"'),
         ({"quantities": "kde"}, 'needs a "kde" volume'),
         ({"observers": (0, 1)}, "observers must have the shape"),
-        ({"spp": -1}, "spp must be a whole number from 0 on, got -1"),
+        ({"spp": -1}, "spp must lie in 0 .. 16777216, got -1"),
         ({"spp": 1.5}, "spp must be a whole number"),
         ({"seed": "one"}, "seed must be a whole number"),
-        ({"spp": 1 << 30}, "samples a pixel"),
+        ({"spp": 1 << 30}, "spp must lie in"),
         ({"camera": 3}, "camera 3 was asked for"),
     ],
 )

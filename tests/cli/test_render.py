@@ -204,5 +204,5 @@ def test11_one_piece_beyond_the_memory_is_said(rgb, scene, tmp_path, capsys):
 
 
 def test12_memory_of_nothing(scene, tmp_path, capsys):
-    assert nerg("render", scene, "-o", tmp_path / "a.exr", "--memory", 0) == 1
-    assert "give it more than 0" in capsys.readouterr().err
+    assert nerg("render", scene, "-o", tmp_path / "a.exr", "--memory", 0) == 2
+    assert "--memory" in capsys.readouterr().err

@@ -7,7 +7,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.mlp import MLP
-from nerg_mi.formats.arrays import StoredArrays, stored
+from nerg_mi.formats.arrays import LARGEST, StoredArrays, stored
 
 GRID = HashGridConfig(levels=1, log2_rows=3, base=1, finest=1)
 
@@ -25,6 +25,14 @@ def test_arrays_are_float32_of_the_shape_that_is_asked_for():
             arrays.array(name, size)
     with pytest.raises(KeyError, match="b"):
         arrays.array("b", 1)
+
+
+@pytest.mark.parametrize("value, largest", [(1e30, LARGEST), (-1.1e6, LARGEST), (81.0, 80.0)])
+def test_values_whose_products_single_precision_cannot_hold_are_refused(value, largest):
+    arrays = StoredArrays({"a": np.array([0.0, value])}, ns)
+    with pytest.raises(ValueError, match=f'"a" holds values beyond {largest:g}'.replace("+", ".")):
+        arrays.array("a", 2, largest=largest)
+    assert arrays.array("a", 2, largest=abs(value)).shape == (2,)
 
 
 def test_networks_and_encodings():
@@ -55,4 +63,6 @@ def test_what_is_stored_is_finite():
         stored(values, True)
     with pytest.raises(NergError, match='"a" is not finite.*diverged'):
         stored({"a": ns.Float([np.inf])}, False)
+    with pytest.raises(NergError, match='"a" is not finite, or beyond 1e.06.*diverged'):
+        stored({"a": ns.Float([-2e6])}, True)
     assert stored({"a": ns.TensorXf(np.ones((2, 2), np.float32))}, True)["a"].dtype == np.float16

@@ -11,6 +11,7 @@ from safetensors.numpy import save_file
 from nerg_mi.errors import NergError
 from nerg_mi.field.cascades import contracted_cascades
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
@@ -256,3 +257,20 @@ def test_a_place_without_an_end_that_makes_no_sense(tmp_path, change):
     rewrite(path, lambda _, m: change(m))
     with pytest.raises(NergError, match=path.name):
         load_radiance(path, ns)
+
+
+@pytest.mark.parametrize("value", [1e30, 81.0, 1e5])
+def test_a_blind_density_that_single_precision_cannot_hold_is_refused(tmp_path, value):
+    save_gaze(LogGazeField.random(LogGazeConfig(GRID, prior=4), BOX, ns), tmp_path / "g.safetensors", {})
+    load_gaze(tmp_path / "g.safetensors", ns)
+    rewrite(tmp_path / "g.safetensors", lambda tensors, meta: tensors["prior"].fill(value))
+    with pytest.raises(NergError, match='g.safetensors.*"prior" holds values beyond 80'):
+        load_gaze(tmp_path / "g.safetensors", ns)
+
+
+@pytest.mark.parametrize("far", [1.1e7, 1e30, 1e308])
+def test_a_box_beyond_all_places_is_refused(tmp_path, far):
+    save_gaze(gaze(), tmp_path / "g.safetensors", {})
+    rewrite(tmp_path / "g.safetensors", lambda tensors, meta: meta["box"].update(upper=[far, far, far]))
+    with pytest.raises(NergError, match="two finite corners of 3 numbers within"):
+        load_gaze(tmp_path / "g.safetensors", ns)

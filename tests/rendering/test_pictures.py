@@ -4,6 +4,7 @@ import pytest
 
 from nerg_mi import llvm
 from nerg_mi.errors import NergError, UnusableLLVM
+from nerg_mi.jobs.pictures import sensor_of
 from nerg_mi.rendering.pictures import activate, load_scene
 
 
@@ -59,3 +60,37 @@ def test_names_that_mitsuba_has_for_itself(rgb, tmp_path, name):
 def test_a_scene_that_is_not_there(tmp_path):
     with pytest.raises(NergError, match="there is no scene file"):
         load_scene(tmp_path / "s.xml")
+
+
+SCENE = '<scene version="3.0.0">{}</scene>'
+SCALED = '<shape type="{}"><transform name="to_world"><scale value="{}"/></transform></shape>'
+
+
+@pytest.mark.parametrize(
+    "inside, said",
+    [
+        *[(f'<shape type="sphere"><float name="radius" value="{r}"/></shape>', "Sphere") for r in ("nan", "inf", 1e38)],
+        *[(SCALED.format("cube", scale), "Mesh|Cube") for scale in ("nan", 1.1e7, -1e200)],
+        (SCALED.format("disk", "inf"), "corners of the Disk"),
+        (SCALED.format("cube", 1) + SCALED.format("cube", 1e9), "corners"),  # which Mitsuba makes one mesh of
+        (
+            '<sensor type="perspective"><transform name="to_world"><translate x="1e30"/></transform></sensor>',
+            "the to_world of sensor 0",
+        ),
+    ],
+)
+def test_shapes_and_sensors_beyond_all_places(rgb, tmp_path, inside, said):
+    (tmp_path / "s.xml").write_text(SCENE.format(inside))
+    with pytest.raises(NergError, match=f"({said}).* must have coordinates from"):
+        load_scene(tmp_path / "s.xml")
+
+
+def test_shapes_as_large_as_can_be_are_taken(rgb, tmp_path):
+    (tmp_path / "s.xml").write_text(SCENE.format(SCALED.format("cube", 9.9e6) + SCALED.format("sphere", 1e-6)))
+    assert len(load_scene(tmp_path / "s.xml").shapes()) == 2
+
+
+def test_a_picture_needs_an_integrator(rgb, tmp_path):
+    (tmp_path / "s.xml").write_text(SCENE.format('<sensor type="perspective"/>'))
+    with pytest.raises(NergError, match='s.xml" has no integrator to render with; add one'):
+        sensor_of(tmp_path / "s.xml", load_scene(tmp_path / "s.xml"), 0)

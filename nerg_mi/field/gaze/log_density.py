@@ -28,6 +28,7 @@ from nerg_mi.field.radiance import assign
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.elementary import sigmoid
+from nerg_mi.ranges import FARTHEST, LENGTHS
 
 from .basis import Basis
 from .product import VARIANTS
@@ -39,6 +40,8 @@ GEOMETRIES = ("surface", "none")
 ESCAPES = ("constant", "nearest")
 # Logits beyond this leave float32 as densities.
 _HIGHEST = 30.0
+# Logarithms of the blind density beyond this do so, too.
+_LARGEST_LOG = 80.0
 # A surface nearer than this share of the box counts as this far: the logarithm is an input of emit.
 _NEAREST = 1e-3
 # Of the blind density that is uniform, so that its logarithm is finite.
@@ -89,11 +92,11 @@ class LogGazeConfig:
         ):
             if value not in known:
                 raise ValueError(f'"{what}" of a gaze field must be one of {", ".join(known)}, got "{value}"')
-        if min(self.width, self.layers, self.sh_degree) < 1 or self.prior < 2 or not self.reach > 0:
+        if min(self.width, self.layers, self.sh_degree) < 1 or self.prior < 2 or self.reach not in LENGTHS:
             raise ValueError(f"every size of a gaze field must be positive, got {self}")
         if not 0 <= self.mix <= 1:
             raise ValueError(f"the share of the blind density must lie in [0, 1], got {self.mix}")
-        if np.shape(self.heads) != (2, 3) or not np.all(np.isfinite(self.heads)):
+        if np.shape(self.heads) != (2, 3) or not np.all(np.abs(self.heads) <= FARTHEST):
             raise ValueError(f"the box of heads needs two finite corners, got {self.heads}")
 
     @property
@@ -184,7 +187,7 @@ class LogGazeField:
             arrays.net("emit_net", config.emit_sizes),
             arrays.net("capture_net", config.capture_sizes),
             arrays.ns.Float(arrays.array("escaped", 1)),
-            arrays.ns.TensorXf(arrays.array("prior", config.prior, 2 * config.prior)),
+            arrays.ns.TensorXf(arrays.array("prior", config.prior, 2 * config.prior, largest=_LARGEST_LOG)),
         )
 
     def architecture(self) -> dict:

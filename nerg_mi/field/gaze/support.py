@@ -17,6 +17,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from nerg_mi.ranges import FARTHEST
+
 CELLS = 2
 """Cells along R."""
 REACH = 5.0
@@ -33,7 +35,7 @@ class RaySupport:
     def __init__(self, cells: np.ndarray, radius: float):
         self.cells, self.radius = np.ascontiguousarray(cells, np.float32).reshape(-1, 5), float(radius)
         self.reach = REACH * self.radius
-        if not np.all(np.isfinite(self.cells)) or not 0 < self.radius < np.inf:
+        if not np.all(np.isfinite(self.cells)) or not 0 < self.radius <= FARTHEST:
             raise ValueError(f"the support of a gaze field needs finite cells and a positive radius, got {self.radius}")
 
     @staticmethod

@@ -16,7 +16,6 @@ from nerg_mi.jobs.overlays import layers_of
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.rendering.asked import nerg_of
 from nerg_mi.rendering.pictures import activate, load_scene
-from nerg_mi.rendering.scene_file import check_samples
 
 from .kind import SceneOptions
 
@@ -59,8 +58,6 @@ class OpenScene:
 def open_scene(path: Path, options: SceneOptions, reporter: Reporter, parts: int = 1) -> Iterator[OpenScene]:
     """The scene file ``path``, of which ``parts`` pictures will be rendered within the block, which Ctrl-C ends. Raises
     `NergError` for what is none, or has another integrator than `nerg`."""
-    if options.spp:
-        check_samples(options.spp, "the picture")
     activate(options.mode)
     with Interruption() as stop:
 

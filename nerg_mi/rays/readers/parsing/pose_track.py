@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerg_mi.ranges import FARTHEST, TIMES
+
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack:
@@ -17,9 +19,10 @@ class PoseTrack:
 
     @classmethod
     def of_samples(cls, times: np.ndarray, vectors: np.ndarray, places: np.ndarray) -> PoseTrack | None:
-        """A track of samples in any order; those with something missing are left out, and of those at one time all but
-        the first. None where fewer than two are left."""
-        good = np.isfinite(times) & np.isfinite(vectors).all(axis=1) & np.isfinite(places).all(axis=1)
+        """A track of samples in any order; those with something missing, or beyond `FARTHEST`, are left out, and of
+        those at one time all but the first. None where fewer than two are left."""
+        within = lambda v: (np.abs(v) <= FARTHEST).all(axis=1)
+        good = (np.abs(times) <= TIMES.high) & within(vectors) & within(places)
         kept = np.flatnonzero(good)
         kept = kept[np.unique(times[kept], return_index=True)[1]]
         return cls(times[kept], vectors[kept], places[kept]) if len(kept) >= 2 else None

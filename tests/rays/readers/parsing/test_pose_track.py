@@ -1,6 +1,7 @@
 """Poses between samples."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.rays.readers.parsing.pose_track import PoseTrack
@@ -23,6 +24,16 @@ def test_between_samples():
 def test_gaps():
     track = PoseTrack.of_samples(np.array([0.0, 0.05, 1.0]), np.zeros((3, 3)), np.zeros((3, 3)))
     assert track.at(np.array([0.02, 0.14, 0.16, 0.5, 0.91]), 0.1)[2].tolist() == [False, False, True, True, False]
+
+
+@pytest.mark.parametrize("far", [1.1e7, -1e200, 1e308, np.inf])
+@pytest.mark.parametrize("of", ["times", "vectors", "places"])
+def test_samples_beyond_all_places_are_left_out(far, of):
+    samples = {"times": np.arange(4.0), "vectors": np.zeros((4, 3)), "places": np.zeros((4, 3))}
+    samples[of][2] = far * (1e14 if of == "times" and abs(far) < 1e100 else 1)
+    with np.errstate(over="raise"):
+        turn, place, lost = PoseTrack.of_samples(**samples).at(np.array([0.1, 2.0, 2.9]), 0.2)
+    assert np.isfinite(turn).all() and np.isfinite(place).all() and lost.tolist() == [False, True, False]
 
 
 def test_samples_in_any_order_with_something_missing():
