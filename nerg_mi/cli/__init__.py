@@ -12,14 +12,16 @@ import importlib
 import os
 import sys
 import traceback
-from typing import Annotated
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 from nerg_mi import __version__
 
-from .ending import INTERRUPTED, CtrlC, end_of, open_streams, quiet_ctrl_c
+from .ending import INTERRUPTED, CtrlC, end_of, open_streams, quiet_ctrl_c, shorten_values
 
 with quiet_ctrl_c():
     import typer
+    import typer.core
 
     from .completion import completed_command
 
@@ -49,6 +51,9 @@ COMMANDS = {
 """Name of each sub-command, which is also that of its module, and the line that `nerg --help` says about it."""
 
 
+# That of the parser, which typer does not name.
+_UsageError: Any = typer.BadParameter.__base__
+
 _DEBUG = ("--debug", "--traceback")
 
 
@@ -71,7 +76,7 @@ def main(arguments: list[str] | None = None) -> None:
         try:
             asked = completed_command(os.environ, COMMANDS) or next((a for a in arguments if a[:1] != "-"), None)
             try:
-                build_app(asked)(arguments, prog_name="nerg")
+                build_app(asked, arguments)(arguments, prog_name="nerg")
             finally:
                 sys.stdout.flush()
         except BaseException as error:
@@ -84,14 +89,25 @@ def main(arguments: list[str] | None = None) -> None:
             if debug:
                 traceback.print_exception(error)
             code, text = end_of(error)
-            print(f"nerg: {text}", file=sys.stderr)
+            print(f"nerg: {shorten_values(text, arguments)}", file=sys.stderr)
             sys.exit(code)
 
 
-def build_app(asked: str | None) -> typer.Typer:
-    """All commands, of which only the one `asked` for is more than its name and its line of help."""
+def build_app(asked: str | None, arguments: Sequence[str] = ()) -> typer.Typer:
+    """All commands, of which only the one `asked` for is more than its name and its line of help. Messages about a
+    wrong command line repeat the beginning of what is long among its `arguments`."""
+
+    class Commands(typer.core.TyperGroup):
+        def invoke(self, ctx: Any) -> Any:
+            try:
+                return super().invoke(ctx)
+            except _UsageError as error:
+                error.message = shorten_values(error.message, arguments)
+                raise
+
     app = typer.Typer(
         name="nerg",
+        cls=Commands,
         help="Neural radiance and gaze fields for Mitsuba 3.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,

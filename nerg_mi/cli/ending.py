@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,22 @@ INTERRUPTED = 130
 """Exit code of what was ended by Ctrl-C (128 and the signal's number, as a shell has it)."""
 
 
+ECHOED = 300
+"""Characters of a value on the command line that a message repeats."""
+
+
+def shorten_values(text: str, arguments: Iterable[str]) -> str:
+    """``text`` with the middle left out of what it repeats of ``arguments``, values and parts of lists, beyond
+    `ECHOED` characters."""
+    parts = {part for argument in arguments if len(argument) > ECHOED for part in _SEPARATORS.split(argument)}
+    values = {argument.partition("=")[2] for argument in arguments} | set(arguments) | parts
+    for value in sorted(values, key=len, reverse=True):
+        for spelt in (value, repr(value)[1:-1]):
+            if len(spelt) > ECHOED:
+                text = text.replace(spelt, f"{spelt[: ECHOED // 2]}...{spelt[-ECHOED // 6 :]}")
+    return text
+
+
 def end_of(error: Exception) -> tuple[int, str]:
     """Exit code of ``error``, and what is said about it."""
     if expected(error):
@@ -35,6 +52,9 @@ def end_of(error: Exception) -> tuple[int, str]:
         f"internal error ({type(error).__name__}{': ' + text if text else ''}): this is a fault of nerg_mi and not of "
         "your input; run again with --debug and report the traceback"
     )
+
+
+_SEPARATORS = re.compile(r"[=,;\s]")
 
 
 def open_streams() -> None:

@@ -7,12 +7,16 @@ from typing import Annotated
 
 import typer
 
+from nerg_mi.ranges import SECONDS, check_number
+
 from .progress import TerminalReporter
 
 
 def command(
     address: Annotated[str, typer.Argument(help="Of a dask scheduler: tcp://HOST:PORT or tls://HOST:PORT.")],
-    threads: Annotated[int, typer.Option("-t", "--threads", min=0, help="Worker threads; 0: one a core.")] = 0,
+    threads: Annotated[
+        int, typer.Option("-t", "--threads", min=0, max=1024, help="Worker threads; 0: one a core.")
+    ] = 0,
     wait: Annotated[float, typer.Option(help="Seconds to wait for a scheduler that is not there, or is gone.")] = 600.0,
     name: Annotated[
         str | None, typer.Option(help="What the scheduler calls this worker.  [default: its address]")
@@ -26,6 +30,7 @@ def command(
     from nerg_mi.tasks.dask_worker import serve_cluster
     from nerg_mi.threads import VARIABLE
 
+    check_number(wait, SECONDS, "--wait")
     if threads:
         os.environ[VARIABLE] = str(threads)
     with TerminalReporter() as reporter:

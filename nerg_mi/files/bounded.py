@@ -163,17 +163,22 @@ def read_json(path: str | os.PathLike, what: str = "file", most: int = JSON_BYTE
 
 def parse_json(raw: bytes | str, path: str | os.PathLike, what: str = "file") -> object:
     """The JSON document ``raw``, which stood in ``path``. `NergError` for what is none, is nested deeper than
-    `JSON_DEPTH` or holds more than `JSON_VALUES` values."""
+    `JSON_DEPTH` or holds more than `JSON_VALUES` values. Integers of hundreds of digits are floats."""
     with reading(path, what, "correct it, or make it anew"):
         if isinstance(raw, (bytes, bytearray)):
             raw = raw.decode(json.detect_encoding(raw))
         _check_json(raw, path, what)
         try:
-            return json.loads(raw)
+            return json.loads(raw, parse_int=_integer)
         except json.JSONDecodeError as error:
             raise NergError(
                 f'the {what} "{path}" is not valid JSON: {plain(error)}; correct it, or make it anew'
             ) from error
+
+
+def _integer(digits: str) -> int | float:
+    """An integer; one that no float can hold is infinite, which whoever reads it refuses."""
+    return int(digits) if len(digits) <= 300 else float(digits)
 
 
 # An unfinished string runs to the end, so that each character is looked at once.

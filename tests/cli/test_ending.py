@@ -8,7 +8,8 @@ import sys
 
 import pytest
 
-from nerg_mi.cli.ending import FAULT, INTERRUPTED, MENDABLE, CtrlC, end_of, open_streams
+from nerg_mi.cli import main
+from nerg_mi.cli.ending import FAULT, INTERRUPTED, MENDABLE, CtrlC, end_of, open_streams, shorten_values
 from nerg_mi.errors import NergError
 
 
@@ -76,3 +77,15 @@ import nerg_mi.cli
 """
     done = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (INTERRUPTED, "Interrupted.\n")
+
+
+@pytest.mark.parametrize("long", ["x" * 1500, "1 " * 750, "a" * 700 + "=" + "b" * 800, "it's " * 300, "z,9" * 500])
+def test_messages_repeat_the_ends_of_long_values(capsys, long):
+    with pytest.raises(SystemExit):
+        main(["bake", "a.ply", "-o", "b.ply", "--observer", f"x{long}"])
+    with pytest.raises(SystemExit):
+        main(["bake", "a.ply", "-o", "b.ply", f"--{long}"])
+    said = capsys.readouterr().err
+    assert said.count("...") >= 2 and max(map(len, said.splitlines())) < 800
+    assert shorten_values(f"got {long!r}; correct it", ["--up", long]).endswith("; correct it")
+    assert shorten_values("got red", ["--up=red"]) == "got red"

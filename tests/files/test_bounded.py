@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import zlib
@@ -11,6 +12,7 @@ import pytest
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files import bounded
 from nerg_mi.files.bounded import parse_json, plain, read_bytes, read_json, reading, size_of
+from nerg_mi.formats.regions import Region
 
 
 @pytest.mark.parametrize(
@@ -120,3 +122,11 @@ def test_limits_themselves_are_within(tmp_path, monkeypatch):
         with pytest.raises(NergError, match="more than the 100 values|nested 4 deep"):
             parse_json(beyond, "a.json")
     assert [bounded.is_count(v) for v in (0, (1 << 62) - 1, 1 << 62, -1, True, 1.0)] == [True, True, *[False] * 4]
+
+
+@pytest.mark.parametrize("digits", [309, 400, 5000])
+def test_integers_that_no_float_holds_are_infinite(digits):
+    found = parse_json(f"[{digits * '9'}, -{digits * '9'}, {'9' * 20}]", "a.json")
+    assert found == [math.inf, -math.inf, 10**20 - 1]
+    with pytest.raises(NergError, match="three numbers from -1e.07 to 1e.07"):
+        Region("shelf", (0, 0, 0), (1, 1, found[0]))

@@ -46,11 +46,7 @@ DEADLY = {
     "corner": (scene(shape("ply", "a.ply")), {"a.ply": mesh(999999999)}, "none of its 3 vertices"),
     "volume": (scene(GRID), {"a.vol": EMPTY_VOLUME}, "0 x 0 x 0 voxels"),
     "samples": (scene(spp="0"), {}, "must lie in 1 .. 16777216, got 0"),
-    "multijitter": (
-        scene(sampler="multijitter", spp="0"),
-        {},
-        "must lie in 1 .. 16777216, got 0",
-    ),
+    "multijitter": (scene(sampler="multijitter", spp="0"), {}, "must lie in 1 .. 16777216, got 0"),
     "film": (scene(width="2000000000", height="2000000000"), {}, "pixels"),
     "long film": (scene(width="2000000000", height="1"), {}, "pixels"),
 }
