@@ -56,8 +56,8 @@ class Region:
             )
         if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
             raise NergError(
-                f'the area "{plain(self.name, 40)}" needs a lower and an upper corner of three numbers, each '
-                "less in the lower one"
+                f'the area "{plain(self.name, 40)}" needs a lower and an upper corner of three numbers from '
+                f"{-FARTHEST:g} to {FARTHEST:g}, each less in the lower one"
             )
         check_name(self.name)
         if self.turn is not None:

@@ -102,7 +102,7 @@ def test_json_of_very_many_values_is_refused(tmp_path, monkeypatch):
         parse_json("[" + "{}," * 99 + "1]", "a.json")
 
 
-@pytest.mark.parametrize("raw", [b"", b"{", b"\xff\xfe\xfa", b'{"a": NaNN}', b'"' + b'\\"' * 50_000, b"1" * 5000])
+@pytest.mark.parametrize("raw", [b"", b"{", b"\xff\xfe\xfa", b'{"a": NaNN}', b'"' + b'\\"' * 50_000])
 def test_what_is_no_json_is_told_with_the_file(tmp_path, raw):
     (tmp_path / "a.json").write_bytes(raw)
     with pytest.raises(NergError, match=r"a\.json"):
