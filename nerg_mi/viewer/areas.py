@@ -127,7 +127,12 @@ class Areas:
         name = self._chosen.value
         lower, upper = middle - size / 2, middle + size / 2
         turn = next((r.turn for r in self.session.regions if r.name == name), None)
-        new = Region.of(name, lower, upper, turn)
+        try:
+            new = Region.of(name, lower, upper, turn)
+        except NergError:
+            # Nothing that a hand can drag: the gizmo goes back to where the area is.
+            self._choose()
+            return
         self.session.regions = [new if r.name == name else r for r in self.session.regions]
         self._show_all()
         self.page.count()

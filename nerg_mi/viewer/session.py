@@ -24,6 +24,7 @@ from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.overlays import basis_words
 from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.jobs.view import PlaceToView
+from nerg_mi.ranges import FARTHEST
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.transport.ceiling import Ceiling
 
@@ -142,10 +143,9 @@ class Session:
 
         Raises `NergError` for what is no position.
         """
-        with np.errstate(over="ignore"):
-            position = np.asarray(at, float)
-            finite = np.isfinite(position.astype(np.float32)).all()
-        if position.shape != (3,) or not finite or not (heading is None or np.isfinite(heading).all()):
+        position = np.asarray(at, float)
+        within = position.shape == (3,) and (np.abs(position) <= FARTHEST).all()
+        if not within or not (heading is None or np.isfinite(heading).all()):
             text = ", ".join(f"{v:g}" for v in position.ravel()[:3])
             raise NergError(f"an observer cannot stand at ({text}); give three numbers in scene units")
         with self.lock:

@@ -25,7 +25,9 @@ class StatisticsOptions(PartOptions):
         0.0, "Degrees by which a ray may miss what of a thing is in nobody's way.", within=Range(0, 20)
     )
     margin: float = option(
-        0.03, "Metres by which surfaces may lie in front of a thing, or behind a box, and yet be its own.", within=Range(0, 10**6)
+        0.03,
+        "Metres by which surfaces may lie in front of a thing, or behind a box, and yet be its own.",
+        within=Range(0, 10**6),
     )
     gap: float = option(1.0, "A ray stands for the time to the next, unless that is longer than this.", within=SECONDS)
     pause: float = option(60.0, "A longer pause of a person begins another sitting.", within=SECONDS)

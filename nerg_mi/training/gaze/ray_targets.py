@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.density.probes import Probes, place_probes
+from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry.places import GazePlace
@@ -48,9 +49,14 @@ def targets_of_probes(
     seed: int | tuple[int, ...] = 0,
 ) -> Targets:
     """Targets of ``probes`` in as many ``directions`` each; ``depth``: kind of depth that is the surface; ``seed``: of
-    the rotations."""
+    the rotations. Raises `NergError` where all kernels are so narrow that they vanish between the directions."""
     turned = rotated_sets(directions, len(probes), np.random.default_rng(seed))
     truth = probes.density(turned)
+    if not truth.any():
+        raise NergError(
+            f"the kernels of all rays vanish between {directions:,} directions; give a smaller --kappa, or more "
+            "--directions"
+        )
     return observe(
         place.points_from_rays(probes.positions), place.directions_from_rays(turned), truth, place, depth, needs
     )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.density.probes import place_probes
+from nerg_mi.errors import NergError
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.training.gaze.ray_targets import probes_of_rays, rotated_sets, targets_of_probes, targets_of_rays
 from nerg_mi.training.gaze.targets import TargetNeeds
@@ -44,6 +45,12 @@ def test_rays_are_aligned_with_the_field(rays, wall):
     inside = ~b.escaped
     p = b.positions[:, None] + b.directions * b.distance[..., None]
     assert inside.any() and np.abs(p[inside][:, 0] - 1.5).max() < 0.02
+
+
+def test_kernels_that_vanish_between_all_directions_are_refused(rays, wall):
+    probes = place_probes(rays, 0.5, count=2, min_rays=8, kappa_rule="fixed", kappa=1e8, seed=1)
+    with pytest.raises(NergError, match="vanish between 16 directions; give a smaller --kappa"):
+        targets_of_probes(probes, wall, 16)
 
 
 def test_probes_are_placed_as_the_settings_say(rays):

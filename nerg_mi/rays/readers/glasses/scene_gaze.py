@@ -53,7 +53,8 @@ class SceneOptions(Checked):
         recorded=False,
     )
     fps: float | None = option(
-        None, "Numbers count frames that ffmpeg's -vf fps=5 took, this many a second, not each frame of the video.",
+        None,
+        "Numbers count frames that ffmpeg's -vf fps=5 took, this many a second, not each frame of the video.",
         within=RATES,
     )
     place: Path | None = option(
