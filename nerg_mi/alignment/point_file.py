@@ -11,6 +11,7 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.npy import read_npy
 from nerg_mi.formats.meshes import READERS, read_mesh_file
 from nerg_mi.maths.coordinates import check_near_origin
+from nerg_mi.maths.arrays import check_coordinates
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
 
 SUFFIXES = (*READERS, ".csv", ".csv.gz", ".npy")
@@ -22,7 +23,7 @@ POINTS = 200_000
 
 def read_surface(path: Path, count: int = POINTS) -> np.ndarray:
     """At most ``count`` points (N, 3) on the surface in ``path``, in its own frame and units; drawn at random, with the
-    same result every time. Raises `NergError` for a file without finite points."""
+    same result every time. Raises `NergError` for a file without finite points, or with some beyond all places."""
     if not path.name.lower().endswith(SUFFIXES):
         raise NergError(f'"{path}" is no surface that is read; give a mesh or points in {", ".join(SUFFIXES)}')
     if not path.exists():
@@ -37,6 +38,7 @@ def read_surface(path: Path, count: int = POINTS) -> np.ndarray:
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise NergError(f'the surface "{path}" has no points; export it again')
+    check_coordinates(points, f'the points of "{path}"')
     check_near_origin(points, f'the surface "{path}"')
     rng = np.random.default_rng(0)
     return points if len(points) <= count else points[np.sort(rng.permutation(len(points))[:count])]

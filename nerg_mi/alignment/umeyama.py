@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.arrays import check_coordinates
 
 LINE = 0.01
 """Points lie on a line where their second extent is less than this share of the first."""
@@ -98,8 +99,8 @@ def check_points(source: np.ndarray, target: np.ndarray, what: str, *, upright: 
 
     ``what``: whose points they are, for the message ('the file "pairs.csv"').
     """
-    if not (np.isfinite(source).all() and np.isfinite(target).all()):
-        raise NergError(f"{what} has a coordinate that is not a finite number; correct it or leave its pair out")
+    for points, frame in ((source, "tracking"), (target, "place")):
+        check_coordinates(points, f"{what}: points in the frame of the {frame}")
     for points, frame in ((source, "tracking"), (target, "place")):
         why = _refused(points, upright)
         if why:

@@ -9,6 +9,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
+from .arrays import check_coordinates
 from .types import Array3f, Point3f, Vector3f
 
 
@@ -17,7 +18,7 @@ class Similarity:
 
     ``matrix``: (4, 4), local (the field's) to world (the scene's); the identity by default. ``scale``: length in the
     scene of one unit of the field. Raises ``NergError`` when it shears, mirrors or scales
-    unevenly: densities and directions would then have no single scale.
+    unevenly: densities and directions would then have no single scale; and for a translation beyond `FARTHEST`.
     """
 
     def __init__(self, matrix: np.ndarray | None = None):
@@ -34,6 +35,7 @@ class Similarity:
                 '"to_world" of a field must be a rotation, a uniform scale and a translation; bake any other '
                 "transform into the field's training data"
             )
+        check_coordinates(m[None, :3, 3], 'the translation of "to_world"')
         self.matrix, self.scale = m, float(scale)
         self.inverse = np.linalg.inv(m)
         self.identity = bool(np.array_equal(m, np.eye(4)))

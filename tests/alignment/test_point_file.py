@@ -62,3 +62,10 @@ def test_rows_that_do_not_match_the_header_are_refused(tmp_path):
     (tmp_path / "points.csv").write_text("x,y,z\n1,2,3\n1,2,3,4,5\n")
     with pytest.raises(NergError, match="line 3: 5 cells, the header has 3"):
         read_surface(tmp_path / "points.csv")
+
+
+@pytest.mark.parametrize("far", ["1.1e7", "-1e30", "1e308"])
+def test_points_beyond_all_places_are_refused(tmp_path, far):
+    (tmp_path / "a.csv").write_text(f"x,y,z\n0,0,0\n1,{far},0\n")
+    with pytest.raises(NergError, match="the points of .*a.csv.* must have coordinates from"):
+        read_surface(tmp_path / "a.csv")

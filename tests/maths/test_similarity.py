@@ -50,9 +50,11 @@ PROJECTIVE = np.eye(4)
 PROJECTIVE[3, 0] = 0.5
 MOVED_TO_NAN = np.eye(4)
 MOVED_TO_NAN[0, 3] = np.nan
+FAR_AWAY = np.eye(4)
+FAR_AWAY[1, 3] = -1.1e7
 
 
-@pytest.mark.parametrize("matrix", [SHEAR, UNEVEN, MIRROR, FLAT, NAN, PROJECTIVE, MOVED_TO_NAN])
+@pytest.mark.parametrize("matrix", [SHEAR, UNEVEN, MIRROR, FLAT, NAN, PROJECTIVE, MOVED_TO_NAN, FAR_AWAY])
 def test03_other_transforms_are_refused(matrix):
     with pytest.raises(ValueError, match='"to_world"'):
         Similarity(matrix)
