@@ -18,6 +18,7 @@ import nerg_mi.jobs.options
 import nerg_mi.rays.readers
 from nerg_mi.cli.options import takes
 from nerg_mi.errors import NergError
+from nerg_mi.jobs import tracking
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, Checked, Range, check_number, ranged
 from nerg_mi.training.gaze import settings as gaze_settings
 from nerg_mi.training.radiance import settings as radiance_settings
@@ -28,7 +29,7 @@ def _modules():
         yield package
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             yield importlib.import_module(module.name)
-    yield from (gaze_settings, radiance_settings)
+    yield from (gaze_settings, radiance_settings, tracking)
 
 
 KINDS = list(
@@ -97,7 +98,9 @@ def test_every_number_is_refused_beyond_its_range_and_nowhere_else(kind):
             assert said is None or (name in said and len(said) < 200)
 
 
-@pytest.mark.parametrize("kind", [k for k in KINDS if "help" in fields(k)[0].metadata], ids=lambda k: k.__name__)
+@pytest.mark.parametrize(
+    "kind", [k for k in KINDS if all("help" in f.metadata for f in fields(k))], ids=lambda k: k.__name__
+)
 def test_the_command_line_refuses_the_same(kind):
     app, made = typer.Typer(), []
 

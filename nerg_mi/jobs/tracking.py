@@ -15,6 +15,7 @@ from nerg_mi.figures import ray_figures, saving
 from nerg_mi.figures.provenance import files_among, provenance
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
+from nerg_mi.ranges import LENGTHS, Checked
 from nerg_mi.rays import splits
 from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays
@@ -27,6 +28,7 @@ from nerg_mi.rays.summary import RaysSummary, summarise
 
 from .datasets import dataset_cards, filter_dataset, import_dataset
 from .filtering import FilterSteps
+from .options import option
 from .options.rays import FilterOptions, ImportOptions, SplitOptions
 from .reporter import SILENT, Reporter
 
@@ -192,15 +194,18 @@ def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter 
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlotOptions:
+class PlotOptions(Checked):
     """What a floor plan shows. Raises `NergError` for an unknown word, or test rays beside densities."""
 
     kind: str = "density"  # "density": rays/m² with mean directions; "layout": each ray's place, with dimensions
-    cell: float | None = None  # density: edge of a cell, metres; None: a fiftieth of the plan
+    cell: float | None = option(
+        None, "density: edge of a cell, metres.  [default: a fiftieth of the plan]", within=LENGTHS
+    )
     test: Rays | FileName | None = None  # layout: test rays of a split, drawn beside
     output: FileName | None = None  # picture to write, .png or .svg; None: none
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.kind not in KINDS:
             raise NergError(f'--kind is "{self.kind}"; it is density or layout')
         if self.kind == "density" and self.test is not None:

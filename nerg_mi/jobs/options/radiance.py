@@ -50,7 +50,7 @@ class RadianceOptions(PhotoOptions):
     size: str = option("small", "Size of the field: small, medium or paper.")
     deferred: bool = option(False, "Ask the colour network once a ray, not at every sample: faster frames.")
     downscale: float | None = option(
-        None, "In place of a width: divide the pictures' size by this.", within=Range(0.001, 1000)
+        None, "In place of a width: divide the pictures' size by this.", within=Range(1, 1000)
     )
     minutes: float | None = option(None, "Train for this long. Default: 5.", within=MINUTES)
     steps: int | None = option(None, "Or: train for so many steps.", within=STEPS)
