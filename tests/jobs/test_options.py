@@ -13,6 +13,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.jobs import options
+from nerg_mi.jobs.options.statistics import StatisticsOptions
 
 MODULES = [importlib.import_module(f"{options.__name__}.{m.name}") for m in pkgutil.iter_modules(options.__path__)]
 # What has to be said where the defaults alone mean nothing.
@@ -49,3 +50,11 @@ def test_numbers():
     for text in ("", "1,,2", "a"):
         with pytest.raises(NergError, match="--box is numbers with commas between them"):
             options.parse_numbers(text, "--box")
+
+
+@pytest.mark.parametrize("text", ["1,2", "1,2,1.1e7", "nan,0,0", "1" + 400 * "0" + ",0,0", "x" * 1500])
+def test_points(text):
+    assert options.parse_point("1,-2,1e7", "--up") == (1.0, -2.0, 1e7)
+    for refused in (options.parse_point, lambda text, flag: StatisticsOptions(observers=(text,))):
+        with pytest.raises(NergError, match="--observer (is|must)"):
+            refused(text, "--observer")

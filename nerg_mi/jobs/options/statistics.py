@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nerg_mi.ranges import COORDINATES, SECONDS, SEEDS, THREADS, TIMES, Range
 
-from . import option, parse_numbers
+from . import option, parse_numbers, parse_point
 from .parts import PartOptions
 
 
@@ -70,6 +70,11 @@ class StatisticsOptions(PartOptions):
     mode: str | None = option(
         None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for text in self.observers:
+            parse_point(text, "--observer")
 
 
 def parse_window(text: str) -> tuple[str, float, float]:
