@@ -18,6 +18,7 @@ from nerg_mi.formats.splats.files import plugin_of_field
 from nerg_mi.registration import plugin_class
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.projection import clip_distances
+from nerg_mi.transport.place import check_shape
 
 from .arrays import Floats, listed, points
 from .camera import Camera
@@ -43,7 +44,7 @@ class Scene:
     ``mitsuba``: the scene itself, with which everything works that works with Mitsuba's scenes (``mi.traverse``,
     ``mi.render``, ...). ``path``: its file, where it is what that says. `make_scene` makes one of fields;
     ``Scene(scene)`` takes one that is loaded already, and ``Scene.load(path)`` a file. Raises `NergError` for a
-    scene with another integrator.
+    scene with another integrator, and for shapes that are not finite.
 
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
@@ -61,6 +62,8 @@ class Scene:
                 f'a scene needs the integrator "nerg", and this one has {have}; '
                 "make one around its shapes with make_scene(shapes=scene)"
             )
+        for shape in mitsuba.shapes():
+            check_shape(shape)
         self.mitsuba = mitsuba
         self.path: Path | None = None
 

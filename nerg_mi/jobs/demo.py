@@ -11,10 +11,11 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.evaluation.gaze.results import read_results
 from nerg_mi.figures import plots as figures
 from nerg_mi.figures.overlay import Heat, top_of
@@ -103,7 +104,11 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
             raise NergError(
                 f'"{scene}" has {len(seen.sensors())} sensor(s): give it a camera, the own view and a panorama'
             )
-        render = lambda of, index: render_channels(of, of.sensors()[index], spp, seed, lambda done, total: stop.check())
+
+        def render(of: Any, index: int) -> Channels:
+            with mitsuba_says():
+                return render_channels(of, of.sensors()[index], spp, seed, lambda done, total: stop.check())
+
         clock.start("camera")
         camera = render(seen, CAMERA)
         clock.start("own view")

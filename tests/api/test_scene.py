@@ -211,3 +211,9 @@ def test_a_camera_sees_a_scene_of_any_unit(rgb, scale):
     scene = nerg.make_scene(shapes=box, camera=camera)
     for number in (0, camera):
         assert nerg.render(scene, quantities=["opacity"], camera=number).opacity[..., 1:3, 2:4].min() == 1
+
+
+@pytest.mark.parametrize("radius", [float("nan"), 1e30, 1.1e7])
+def test_shapes_beyond_all_places_are_refused(rgb, radius):
+    with pytest.raises(nerg.NergError, match="corners of the shape .* must have coordinates from"):
+        nerg.make_scene(shapes={"type": "sphere", "radius": radius})

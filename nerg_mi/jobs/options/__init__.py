@@ -56,4 +56,4 @@ def parse_numbers(text: str, flag: str) -> tuple[float, ...]:
     try:
         return tuple(float(v) for v in (text.split(",") if "," in text or not text else text.split()))
     except ValueError:
-        raise NergError(f"{flag} is numbers with commas between them, got {text!r}") from None
+        raise NergError(f"{flag} is numbers with commas between them, got {plain(text, 60)!r}") from None
