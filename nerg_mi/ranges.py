@@ -85,7 +85,7 @@ def ranged(default: Any, within: Range) -> Any:
 
 
 class Checked:
-    """Base of dataclasses that check their numbers on construction, whoever makes them.
+    """Base of dataclasses that check their numbers on construction.
 
     A field with a `Range` in its metadata holds a number in it, or several of them; None where its type allows that.
     Raises `NergError` for others.
@@ -94,7 +94,8 @@ class Checked:
     def __post_init__(self) -> None:
         assert dataclasses.is_dataclass(self)
         for field in dataclasses.fields(self):
-            within, value, kind = field.metadata.get(RANGE), getattr(self, field.name), str(field.type)
+            within, kind = field.metadata.get(RANGE), str(field.type)
+            value: Any = getattr(self, field.name)
             if within is None or (value is None and "None" in kind):
                 continue
             several = "tuple" in kind

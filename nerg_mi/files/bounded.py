@@ -177,7 +177,7 @@ def parse_json(raw: bytes | str, path: str | os.PathLike, what: str = "file") ->
 
 
 def _integer(digits: str) -> int | float:
-    """An integer; one that no float can hold is infinite, which whoever reads it refuses."""
+    """An integer; infinite where no float can hold it, which every range refuses."""
     return int(digits) if len(digits) <= 300 else float(digits)
 
 

@@ -15,12 +15,10 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
 from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.encoding.registry import encoding_of
+from nerg_mi.field.gaze.protocol import LARGEST
 from nerg_mi.field.mlp import MLP
 
 from .architecture import check_sizes
-
-LARGEST = 1e6
-"""No weight is larger; products of a network's layers then stay in single precision."""
 
 
 def stored(parameters: Mapping[str, Any], half: bool) -> dict[str, np.ndarray]:

@@ -148,7 +148,7 @@ def as_place(subject: Medium | Place) -> Place:
     return subject if isinstance(subject, Place) else Place(subject)
 
 
-def check_shape(shape: mi.Shape, of: str = "", merged: bool = False) -> None:
+def check_shape(shape: Any, of: str = "", merged: bool = False) -> None:
     """Raise `NergError` for a mesh without faces and for a shape that is not finite, or reaches beyond `FARTHEST`.
 
     ``of``: what a message says of the scene that it is in. ``merged``: whether meshes that Mitsuba has merged, whose

@@ -82,14 +82,18 @@ class GazeFieldConfig(Protocol):
         ...
 
 
+LARGEST = 1e6
+"""No stored weight is larger; products of a network's layers then stay in single precision."""
+
+
 class Arrays(Protocol):
     """The arrays of a checkpoint, as a field's ``from_arrays`` asks for them. Every method raises ``ValueError`` for an
     array that is not finite or does not have the shape, ``KeyError`` for one that is missing."""
 
     ns: ModuleType
 
-    def array(self, name: str, *shape: int | None) -> np.ndarray:
-        """The float32 array ``name`` of that ``shape`` (None: of any length)."""
+    def array(self, name: str, *shape: int | None, largest: float = LARGEST) -> np.ndarray:
+        """The float32 array ``name`` of that ``shape`` (None: of any length), with no value beyond ``largest``."""
         ...
 
     def grid(self, config: EncodingConfig, name: str = "grid") -> Encoding:
