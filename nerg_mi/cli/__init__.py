@@ -12,7 +12,8 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 from nerg_mi import __version__
@@ -98,12 +99,13 @@ def build_app(asked: str | None, arguments: Sequence[str] = ()) -> typer.Typer:
     wrong command line repeat the beginning of what is long among its `arguments`."""
 
     class Commands(typer.core.TyperGroup):
+        def make_context(self, *args: Any, **kwargs: Any) -> Any:
+            with _shortened(arguments):
+                return super().make_context(*args, **kwargs)
+
         def invoke(self, ctx: Any) -> Any:
-            try:
+            with _shortened(arguments):
                 return super().invoke(ctx)
-            except _UsageError as error:
-                error.message = shorten_values(error.message, arguments)
-                raise
 
     app = typer.Typer(
         name="nerg",
@@ -124,6 +126,16 @@ def build_app(asked: str | None, arguments: Sequence[str] = ()) -> typer.Typer:
         else:
             app.command(name)(module.command)
     return app
+
+
+@contextmanager
+def _shortened(arguments: Sequence[str]) -> Iterator[None]:
+    """A block whose errors about the command line repeat the ends of long ``arguments``."""
+    try:
+        yield
+    except _UsageError as error:
+        error.message = shorten_values(error.message, arguments)
+        raise
 
 
 def _unasked() -> None:
