@@ -24,7 +24,7 @@ class PictureOptions(Checked):
     seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
     threads: int = option(0, "Worker threads; 0: one a core.", "-t", "--threads", within=Range(0, 1024))
     memory: float = option(
-        1.0, "GB that rendering may take; larger pictures are made in bands.", within=Range(1e-3, 10**6)
+        1.0, "GB that rendering may take; larger pictures are made in bands.", within=Range(1e-6, 10**6)
     )
     overlay: str | None = option(
         None, "Lay this over the colour, with its scale (.png, .svg, .mp4): gaze, kde, visibility, depth, support, ..."
