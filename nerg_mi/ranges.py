@@ -63,6 +63,8 @@ DECADES = Range(0, 30)
 RATES = Range(1e-3, 1e5)
 """Pictures, or samples, a second."""
 FIELDS_OF_VIEW = Range(1e-4, 179.9)
+ANGLES = Range(-90, 90)
+"""Degrees above and below the horizon."""
 TICKS = Range(1e-12, 1e12)
 """Seconds in a unit of time."""
 LEARNING_RATES = Range(0, 1)

@@ -10,8 +10,7 @@ from nerg_mi.capture.semidense import read_semidense
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.npy import read_npy
 from nerg_mi.formats.meshes import READERS, read_mesh_file
-from nerg_mi.maths.coordinates import check_near_origin
-from nerg_mi.maths.arrays import check_coordinates
+from nerg_mi.maths.coordinates import check_coordinates, check_near_origin
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
 
 SUFFIXES = (*READERS, ".csv", ".csv.gz", ".npy")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.arrays import check_coordinates
+from nerg_mi.maths.coordinates import check_coordinates
 
 LINE = 0.01
 """Points lie on a line where their second extent is less than this share of the first."""

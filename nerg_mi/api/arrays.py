@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.maths.arrays import check_coordinates
+from nerg_mi.maths.coordinates import check_coordinates
 
 Floats: TypeAlias = NDArray[np.float32]
 

@@ -12,9 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
-from nerg_mi.errors import NergError
-from nerg_mi.ranges import FARTHEST
-
 ALIGNMENT = 64
 """Bytes: the widest packet's."""
 
@@ -29,18 +26,6 @@ def vector_of(kind: Any, rows: ArrayLike, dtype: DTypeLike = np.float32) -> Any:
     import drjit as dr
 
     return kind(*map(dr.value_t(kind), _columns(np.asarray(rows), np.dtype(dtype))))
-
-
-def check_coordinates(points: np.ndarray, name: str) -> None:
-    """Raise `NergError`, which calls ``points`` (N, 3) by their ``name``, where a coordinate is no number or beyond
-    `FARTHEST`."""
-    within = np.abs(points) <= FARTHEST
-    if not within.all():
-        row = int(np.flatnonzero(~within.all(axis=1))[0])
-        raise NergError(
-            f"{name} must have coordinates from {-FARTHEST:g} to {FARTHEST:g}, and row {row} is "
-            f"{points[row].tolist()}; correct it, or move the origin nearer"
-        )
 
 
 def _columns(rows: np.ndarray, dtype: np.dtype) -> np.ndarray:

@@ -1,16 +1,29 @@
-"""Where coordinates are too far from their origin for single precision, in which Mitsuba computes."""
+"""Coordinates that are too far from their origin for single precision, in which Mitsuba computes."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import FARTHEST
 
 FAR = 20_000.0
 """Distance of the origin, in units, from which on places that are small beside it are refused: 2 mm are lost there."""
 
 _WIDTHS = 10
 _SAMPLE, _STRAY = 100_000, 0.01
+
+
+def check_coordinates(points: np.ndarray, name: str) -> None:
+    """Raise `NergError`, which calls ``points`` (N, 3) by their ``name``, where a coordinate is no number or beyond
+    `FARTHEST`."""
+    within = np.abs(points) <= FARTHEST
+    if not within.all():
+        row = int(np.flatnonzero(~within.all(axis=1))[0])
+        raise NergError(
+            f"{name} must have coordinates from {-FARTHEST:g} to {FARTHEST:g}, and row {row} is "
+            f"{points[row].tolist()}; correct it, or move the origin nearer"
+        )
 
 
 def check_near_origin(points: np.ndarray, what: str, to_file: np.ndarray | None = None) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
-from .arrays import check_coordinates
+from .coordinates import check_coordinates
 from .types import Array3f, Point3f, Vector3f
 
 

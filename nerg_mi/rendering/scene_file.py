@@ -18,7 +18,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import open_file, size_of
 from nerg_mi.files.image_header import check_image
 from nerg_mi.formats.meshes import READERS as MESHES
-from nerg_mi.maths.arrays import check_coordinates
+from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.properties import resolved
 from nerg_mi.ranges import SPP, check_number
 from nerg_mi.transport.place import check_shape

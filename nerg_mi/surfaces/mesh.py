@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.arrays import check_coordinates
+from nerg_mi.maths.coordinates import check_coordinates
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.arrays import check_coordinates
+from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f
 
 from .march.depth import DEPTHS, escape_distance, surface_depth

@@ -10,6 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
+from nerg_mi.ranges import ANGLES, Checked
 
 from .builder import RaysBuilder
 from .frames import UNITS, UPS, Frame
@@ -33,7 +34,7 @@ _NAMED = 12  # markers, in messages
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarkerOptions:
+class MarkerOptions(Checked):
     """Which markers are on a head, and what the file does not say of the laboratory."""
 
     keypoints: Places | None = option(
@@ -43,7 +44,7 @@ class MarkerOptions:
         parse=parse_keypoints,
         recorded=False,
     )
-    pitch: float = option(0.0, PITCH)
+    pitch: float = option(0.0, PITCH, within=ANGLES)
     units: str | None = option(None, "Unit of length: m, cm or mm.", shown="the file's", recorded=False)
     up: str | None = option(None, "Up axis: x, y, z, -x, -y or -z.", shown="the file's, or z", recorded=False)
 

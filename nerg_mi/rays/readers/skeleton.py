@@ -10,6 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
+from nerg_mi.ranges import ANGLES
 
 from .builder import RaysBuilder
 from .frames import UNITS, Frame
@@ -54,7 +55,7 @@ class SkeletonOptions(TickOption):
         parse=parse_keypoints,
         recorded=False,
     )
-    pitch: float = option(0.0, PITCH)
+    pitch: float = option(0.0, PITCH, within=ANGLES)
     units: str = option("m", "Unit of length: m, cm or mm.", recorded=False)
     up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", recorded=False)
     handedness: str = option("right", "Handedness: right or left.", flag="--hand", recorded=False)

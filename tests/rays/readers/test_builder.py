@@ -90,14 +90,14 @@ def test_builder_drops_with_an_account(tmp_path):
 @pytest.mark.parametrize("far", [1.1e9, -1e38, 1e200, 1e308])
 def test_points_beyond_all_places_are_accounted_for(far):
     """The bound is in metres, of what files have in centimetres."""
-    builder, points, d = RaysBuilder(Frame(units="cm")), np.full((3, 3), 9e8), np.tile([0.0, 0.0, 1.0], (3, 1))
+    builder, points, d = RaysBuilder(Frame(units="cm")), np.full((3, 3), 100.0), np.tile([0.0, 0.0, 1.0], (3, 1))
     hits = points.copy()
     points[1, 2], hits[2, 0] = far, far
     builder.add(np.arange(3.0), "ann", points, d, rows=np.arange(3), hit=hits)
     rays = builder.build()
     assert [(d["reason"], d["rows"]) for d in rays.metadata["dropped"]] == [("origin is beyond 1e+07 m", [[1, 1]])]
     assert np.isnan(rays.hit).all(axis=1).tolist() == [False, True]
-    assert rays.metadata["complaints"] == ["hit points beyond 1e+07 m are taken as unknown; check the unit of length"]
+    assert rays.metadata["missing"] == {"hit points beyond 1e+07 m": 1}
 
 
 def test_builder_with_nothing_left(tmp_path):
