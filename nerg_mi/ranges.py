@@ -100,10 +100,12 @@ class Checked:
             value: Any = getattr(self, field.name)
             if within is None or (value is None and "None" in kind):
                 continue
-            several = "tuple" in kind
-            if several and not isinstance(value, Iterable):
-                raise NergError(f"{_name(field)} must be several numbers, got {plain(repr(value), 60)}")
-            for number in value if several else (value,):
+            numbers = (value,)
+            if "tuple" in kind:
+                if not isinstance(value, Iterable):
+                    raise NergError(f"{_name(field)} must be several numbers, got {plain(repr(value), 60)}")
+                numbers = tuple(value)
+            for number in numbers:
                 check_number(number, within, _name(field), bool(re.search(r"\bint\b", kind)))
 
 

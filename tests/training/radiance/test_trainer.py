@@ -200,7 +200,7 @@ def test_features_that_no_ray_shapes_are_let_go(dataset):
         return float(dr.mean(dr.abs(trainer.optimiser["grid.table"]))[0])
 
     assert left(0.1) < 0.4 < left(0.0)
-    with pytest.raises(ValueError, match="must be 0 or more"):
+    with pytest.raises(ValueError, match="grid_decay must lie in"):
         settings(grid_decay=-1.0)
 
 
