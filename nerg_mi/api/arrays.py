@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.maths.coordinates import check_coordinates
+from nerg_mi.ranges import FARTHEST
 
 Floats: TypeAlias = NDArray[np.float32]
 
@@ -19,7 +20,11 @@ def points(values: ArrayLike, name: str) -> Floats:
     """``values`` as (N, 3) float32; one point (3,) is one row. Raises `NergError`, which calls it ``name``."""
     try:
         array = np.asarray(values, np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
+    except OverflowError as error:
+        raise NergError(
+            f"{name} must have coordinates from {-FARTHEST:g} to {FARTHEST:g}, and one is beyond"
+        ) from error
+    except (TypeError, ValueError) as error:
         raise NergError(f"{name} must be numbers x, y, z, or rows of them, got {plain(repr(values), 60)}") from error
     array = array[None] if array.shape == (3,) else array
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,9 @@ from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.formats.meshes import READERS
-from nerg_mi.formats.regions import LARGEST, Region
+from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.reporter import SILENT, Reporter
+from nerg_mi.ranges import FARTHEST, Range, check_number
 from nerg_mi.statistics.landing import MARGIN, Box
 from nerg_mi.statistics.shares import Shares, SumRule, gaze_shares
 
@@ -132,10 +132,8 @@ def attention(
 
     scene = Scene.of(scene)
     _check(scene)
-    if not (isinstance(margin, Real) and 0 <= margin < LARGEST):
-        raise NergError(f"margin must be a length from 0, in scene units, got {margin!r}")
-    if not (isinstance(tolerance, Real) and 0 < tolerance <= 1):
-        raise NergError(f"tolerance must be a share of the result, above 0 and at most 1, got {tolerance!r}")
+    check_number(margin, Range(0, FARTHEST), "margin")
+    check_number(tolerance, Range(1e-9, 1), "tolerance")
     if (region := _box(surface)) is not None:
         if divisions is not None or two_sided:
             raise NergError("divisions and two_sided are of meshes, and this is a box; leave them out, or give a mesh")

@@ -31,9 +31,6 @@ Quaternion = tuple[float, float, float, float]
 BEYOND_BOXES = ("mesh", "shape", "parts", "adt")
 """Keys of which an area has one that is no box."""
 
-LARGEST = 1e30
-"""A corner's coordinates are less than this."""
-
 _LETTERS = 80
 _EXAMPLE = '{"shelf": [[0, 0, 0], [1, 2, 3]]}'
 
@@ -49,15 +46,15 @@ class Region:
 
     def __post_init__(self) -> None:
         corners = np.array([self.lower, self.upper], float)
-        if corners.shape == (2, 3) and not (np.abs(corners) < LARGEST).all():
+        if corners.shape == (2, 3) and not (np.abs(corners) <= FARTHEST).all():
             raise NergError(
                 f'the area "{plain(self.name, 40)}" reaches to {np.abs(corners).max():g}; its corners must be finite, '
-                f"and less than {LARGEST:g}"
+                f"and at most {FARTHEST:g}"
             )
         if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
             raise NergError(
-                f'the area "{plain(self.name, 40)}" needs a lower and an upper corner of three numbers from '
-                f"{-FARTHEST:g} to {FARTHEST:g}, each less in the lower one"
+                f'the area "{plain(self.name, 40)}" needs a lower and an upper corner of three numbers, each '
+                "less in the lower one"
             )
         check_name(self.name)
         if self.turn is not None:

@@ -25,7 +25,7 @@ def test01_points_of_every_shape():
         ([(0, 0, 0), (0, np.nan, 0)], r"row 1 is \[0.0, nan, 0.0\]"),
         ([(0, 0, 0), (0, 0, 1.1e7)], "coordinates from -1e.07 to 1e.07, and row 1"),
         ((1e308, 0, 0), "row 0 is"),
-        ((10**400, 0, 0), "eyes must be numbers x, y, z"),
+        ((10**400, 0, 0), "eyes must have coordinates from"),
         ([(0, 0), (0, 0, 1)], "eyes must be numbers"),
     ],
 )

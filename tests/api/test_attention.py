@@ -131,7 +131,7 @@ def test07_errors_are_sentences(files, empty):
         with pytest.raises(nerg.NergError, match="divisions must be a whole number from 1"):
             nerg.attention(empty, box_dict(*np.array(BOX)), (0, 0, 0), divisions=wrong)
     for wrong in ({"margin": -1}, {"margin": "a"}, {"tolerance": 0}, {"tolerance": float("nan")}):
-        with pytest.raises(nerg.NergError, match=f"{next(iter(wrong))} must be a"):
+        with pytest.raises(nerg.NergError, match=f"{next(iter(wrong))} must"):
             nerg.attention(empty, BOX, (0, 0, 0), **wrong)
     with pytest.raises(nerg.NergError, match="divisions and two_sided are of meshes"):
         nerg.attention(empty, BOX, (0, 0, 0), divisions=2)
@@ -209,7 +209,7 @@ def test11_boxes_that_fill_space_share_out_all_of_the_gaze(files, eye):
     whole = nerg.attention(scene, [(2.0, 0.5, -0.5), (4.0, 3.0, 2.3)], eye, margin=0)
     parts = [nerg.attention(scene, [(2 + k, 0.5, -0.5), (3 + k, 3.0, 2.3)], eye, margin=0) for k in range(2)]
     assert sum(p.share[0] for p in parts) == pytest.approx(whole.share[0], abs=3 * float(whole.error[0]))
-    everything = nerg.attention(scene, [(-1e29,) * 3, (1e29,) * 3], eye)
+    everything = nerg.attention(scene, [(-1e7,) * 3, (1e7,) * 3], eye)
     assert everything.share[0] + everything.escaped[0] == pytest.approx(1, abs=1e-5)
 
 
@@ -227,10 +227,10 @@ def test12_small_things_are_seen(files):
 @pytest.mark.parametrize(
     ("box", "eye", "said"),
     [
-        ([(-1e30,) * 3, (1e30,) * 3], EYE, "reaches to 1e"),
-        ([(0, 0, 0), (10**400, 1, 1)], EYE, "the corners of a box must be finite in single precision"),
-        (BOX, (10**400, 0, 0), "observers must be finite in single precision"),
-        (BOX, (float("nan"), 0, 0), "observers must be finite in single precision"),
+        ([(-1e30,) * 3, (1e30,) * 3], EYE, "the corners of a box must have coordinates from"),
+        ([(0, 0, 0), (10**400, 1, 1)], EYE, "the corners of a box must have coordinates from"),
+        (BOX, (10**400, 0, 0), "observers must have coordinates from"),
+        (BOX, (float("nan"), 0, 0), "observers must have coordinates from"),
     ],
 )
 def test13_what_is_beyond_all_measure_is_told(empty, box, eye, said):

@@ -128,5 +128,5 @@ def test_limits_themselves_are_within(tmp_path, monkeypatch):
 def test_integers_that_no_float_holds_are_infinite(digits):
     found = parse_json(f"[{digits * '9'}, -{digits * '9'}, {'9' * 20}]", "a.json")
     assert found == [math.inf, -math.inf, 10**20 - 1]
-    with pytest.raises(NergError, match="three numbers from -1e.07 to 1e.07"):
+    with pytest.raises(NergError, match="reaches to inf; its corners must be finite, and at most 1e.07"):
         Region("shelf", (0, 0, 0), (1, 1, found[0]))
