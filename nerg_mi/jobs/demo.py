@@ -53,7 +53,7 @@ REPORT_POINTS = 60_000
 """Points of the report's 3D scene."""
 
 TRACKED = "shoppers.npz"
-"""Every tenth ray of the tracked gaze that the store's field was trained on."""
+"""A tenth of each visit of the tracked gaze that the store's field was trained on."""
 
 REPORT_EYES = 24
 """Places of people that the report looks from: few, since a demo must be quick."""

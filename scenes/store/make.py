@@ -13,7 +13,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 SAMPLED = 10
-"""One in so many of each shopper's rays is packed with the store."""
+"""One part in so many of each shopper's visit is packed with the store."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def make_field(job: Job) -> list[Path]:
 
 def make_rays(job: Job) -> list[Path]:
     """Rays of attention from the tracking data, as `nerg rays import --preset skeleton --tick 0.001` makes them, and
-    every tenth of them for the demo's report."""
+    a tenth of each visit for the demo's report."""
     import numpy as np
 
     from nerg_mi.rays.readers.registry import read_rays
@@ -76,7 +76,10 @@ def make_rays(job: Job) -> list[Path]:
     rays = read_rays("skeleton", tracking, SkeletonOptions(tick=1e-3))
     rays.save(path)
     sample = job.store / "shoppers.npz"
-    some = rays.select(np.sort(np.lexsort((rays.t, rays.person))[::SAMPLED]))
+    visits = [np.flatnonzero(rays.person == k) for k in range(len(rays.persons))]
+    # A run of each visit, from its begin for the first shopper to its end for the last.
+    starts = [int(k * (len(v) - len(v) // SAMPLED) / max(len(visits) - 1, 1)) for k, v in enumerate(visits)]
+    some = rays.select(np.sort(np.concatenate([v[s : s + len(v) // SAMPLED] for v, s in zip(visits, starts)])))
     some.with_step(step="sample", kept=len(some), of=len(rays)).save(sample)
     return [path, sample]
 
