@@ -143,12 +143,13 @@ def smoothing(args) -> list[dict]:
 
 
 def twin_surface(longest: float):
+    from nerg_mi.formats.meshes import read_mesh_file
     from nerg_mi.scenes import store
     from nerg_mi.surfaces.mesh import weld
-    from nerg_mi.surfaces.reading import read_mesh
     from nerg_mi.surfaces.refinement import refine
 
-    return refine(weld(*read_mesh(Path(store.__file__).parent / "twin.ply"))[0], longest)
+    twin = read_mesh_file(Path(store.__file__).parent / "twin.ply")
+    return refine(weld(twin.vertices, twin.faces)[0], longest)
 
 
 def shoppers(args):

@@ -10,6 +10,7 @@ directions, it is a bundle of rays, each of which ends at what it meets itself.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -35,8 +36,8 @@ def blurred(density: Callable[[Vector3f], Any], directions: Vector3f, sigma: flo
     found = 0.5 * density(directions)
     sin, cos = dr.sincos(mi.Float(2 * sigma))
     for k in range(RING):
-        turn = 2 * np.pi * k / RING
-        found += density(cos * directions + sin * (np.cos(turn) * side + np.sin(turn) * up)) / (2 * RING)
+        turn = 2 * math.pi * k / RING
+        found += density(cos * directions + sin * (math.cos(turn) * side + math.sin(turn) * up)) / (2 * RING)
     return found
 
 

@@ -15,7 +15,6 @@ from .test_eval import place  # noqa: F401  (fixture)
     [
         (["--resume"], "nothing to resume"),
         (["--steps", "5", "--minutes", "1"], "exactly one|either in steps or in minutes"),
-        (["--distortion-weight", "-1"], "0 or more"),
     ],
 )
 def test_wrong_options_are_told_in_a_sentence(given, said, tmp_path, capsys):
