@@ -30,9 +30,10 @@ SKIPPED = {"demo", "study", "ablate", "eval folds", "export torch-ngp"}
 KEPT_OPTIONS = set("-o --output --mode --variant --store --scheduler --help --threads --hosts --workers".split())
 """Options that are not varied: outputs, variants, and where work is done."""
 
-_FLOATS = "0 -0.0 -1 0.5 1 3 1e-30 1e-3 1e6 1e30 1e38 1e308 nan inf 1e400".split()
+# What is often allowed comes more than once, so that options meet beyond the checks of each.
+_FLOATS = [*4 * "0.1 0.5 1 2 10".split(), *"0 -0.0 -1 1e-30 1e-3 1e6 1e30 1e38 1e308 nan inf 1e400".split()]
 # Sizes that a user may ask for in earnest would take minutes; what is beyond them all must be refused.
-_INTEGERS = "-1 0 1 2 3 5 16 -2147483648 9223372036854775808 1e3".split()
+_INTEGERS = [*4 * "1 2 3 8 16".split(), *"-1 0 5 -2147483648 9223372036854775808 1e3".split()]
 _TEXTS = "|a|0,0,0|1,2,3|nan,0,0|1e30,0,0|1e308,0,0|-1,-1,-1|1,2|0.5|x=1|0:1|,|0,1,0,1,0,1|--|:|a:b:c".split("|")
 _FILES = ("rays.npz", "room.ply", "ball.xml", "areas.json", "gaze.safetensors", "day.csv", "photos", "no-such", "a.exr")
 

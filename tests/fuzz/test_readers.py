@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.fuzz import commands, semantic
 from tests.fuzz.cases import draw_cases, make_inputs
 from tests.fuzz.keeping import corpus, kept
 from tests.fuzz.readers import ALL, READERS
 from tests.fuzz.watch import BREACHES, Case, run_cases
 
-CASES = 2000
+CASES = 1500
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +59,18 @@ def test_the_contract_is_seen_to_be_broken(tmp_path):
     found = [r.outcome for _, r in run_cases(cases, inputs, names, "tests.fuzz.misbehaving")]
     # Each is called as what it does.
     assert found == [name.partition(":")[0] for name in names]
+
+
+@pytest.mark.slow
+def test_files_that_contradict_themselves_give_a_result_or_one_sentence(inputs):
+    """Also FIFOs, devices, folders and links in their place; ``tools/fuzz.py --kind semantic`` tries more."""
+    assert breaches(list(semantic.draw_cases(READERS, inputs, 600)), inputs) == []
+
+
+@pytest.mark.nightly
+def test_pairs_of_options_give_a_result_or_one_sentence(tmp_path):
+    lines = make_inputs(commands.READERS, tmp_path)
+    cases = list(commands.draw_cases(commands.READERS, lines, 80))
+    names = [r.name for r in commands.READERS]
+    found = [(case.data, report) for case, report in run_cases(cases, lines, names, commands.__name__)]
+    assert [(data, report) for data, report in found if report.outcome in BREACHES] == []
