@@ -57,13 +57,16 @@ def describe(volume: mi.Volume) -> tuple[VoxelCells, np.ndarray] | None:
 
     Mitsuba does not tell a volume's transform or interpolation, so both are found by asking for values and
     comparing them with the grid's: what does not match is treated as any other volume. Raises ``NergError`` for a
-    grid with values that are not finite.
+    grid with values that are not finite or with two channels, of which Mitsuba evaluates none.
     """
     import mitsuba as mi
 
     if volume.class_name() != "GridVolume":
         return None
     data = np.array(mi.traverse(volume)["data"], np.float32)
+    channels = data.size // max(int(np.prod(data.shape[:3])), 1)
+    if channels not in (1, 3):
+        raise NergError(f'the grid of "density" has {channels} channels; give one with a single channel')
     data = data.reshape(data.shape[:3] + (-1,))[..., 0]
     if not np.all(np.isfinite(data)):
         bad = np.argwhere(~np.isfinite(data))

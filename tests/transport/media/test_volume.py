@@ -92,6 +92,8 @@ def test06_voxels_that_are_not_finite_are_refused(rgb):
     data[2, 0, 1] = np.nan
     with pytest.raises(NergError, match=r"1 values that are not finite.*\(2, 0, 1\)"):
         VolumeMedium(grid(rgb, data))
+    with pytest.raises(NergError, match="2 channels"):
+        VolumeMedium(grid(rgb, np.ones((3, 2, 4, 2), np.float32)))
 
 
 def test07_its_coordinates_are_the_scenes(rgb):
