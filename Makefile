@@ -10,20 +10,19 @@
 #   make lint      format, style and import rules, all of which have to be right; nothing is changed
 #   make types     what a type checker finds
 #   make format    put right what of it can be put right by itself
-#   make docs      write what the pages say about the code: tables, pictures
+#   make docs      write what the pages say about the code: tables
 #   make manual    build the manual into out/manual/html (Python 3.11 or newer); any warning is an error
 #   make onecore   the tests that render, write pictures and train, on one core, where Dr.Jit has one thread
-#   make coverage  all tests, and which branches of the package they reach
+#   make coverage  all tests, and which lines and branches of the package they reach (into out/coverage/index.html too)
 #   make fuzz      damage what every reader reads, 20,000 times, and count what comes of it (some ten minutes)
-#   make mutants   judge the tests by 400 small mistakes in the source, resuming where it stopped (about an hour at first)
-#   make faults    kill commands at moments spread over their run, fill disks, forbid folders: nothing may be lost
+#   make faults    kill commands at moments spread over their run: nothing may be lost
 #   make soak      thousands of frames and steps: memory may not grow
 #   make bench     frames, stages, evaluations, growth and memory beside peers (under ten minutes); ARGS=--long for more
 #   make bench-gpu the same on a CUDA device, where there is one
-#   make packages  build the packages, install and try them with every Python that is here
+#   make packages  build the packages, install and try them with every Python that is here (nox)
 #
-# The last eight print tables; ARGS="--update docs/trust.md" puts them there, and of bench ARGS="--page docs/performance.md". Set-up is done once: the second run of any of
-# these only does its own work.
+# Set-up is done once: the second run of any of these only does its own work. `make fuzz`, `make faults` and `make bench` print
+# tables; ARGS="--update docs/trust.md" puts those of the first two there, ARGS="--page docs/performance.md" those of the third.
 
 PYTHON ?= python3
 ARGS ?=
@@ -34,12 +33,14 @@ PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_exr.py tests/files/test_png.py \
 	tests/test_interruption.py tests/renders
 
-.PHONY: demo test test-all check lint types format docs manual onecore coverage fuzz mutants faults soak packages bench bench-gpu setup
+.PHONY: demo test test-all check lint types format docs manual onecore coverage fuzz faults soak packages bench bench-gpu setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
 
-test test-all check onecore coverage fuzz mutants faults soak packages: EXTRAS = test
+test test-all check onecore coverage fuzz faults soak: EXTRAS = test
+
+packages: EXTRAS = dev
 
 test: setup
 	$(PYTEST) -m "not nightly" $(ARGS)
@@ -67,10 +68,10 @@ format: setup
 
 docs: setup
 	$(RUN) -m tools.generated
-	$(RUN) -m tools.architecture
 
 manual: setup
-	$(RUN) -m tools.site $(ARGS)
+	$(RUN) -m sphinx -b html -W --keep-going -q -E -c docs -d out/manual/doctrees . out/manual/html $(ARGS)
+	@echo wrote out/manual/html/docs/index.html
 
 check: setup
 	$(PYTEST) -q -m "not slow and not nightly" $(ARGS)
@@ -80,10 +81,20 @@ onecore: setup
 	else echo "One core is not tried: taskset (of util-linux) is not installed."; fi
 
 coverage: setup
-	$(RUN) -m tools.branches $(ARGS)
+	$(RUN) -m coverage erase
+	$(RUN) -m coverage run -m pytest -q $(ARGS)
+	$(RUN) -m coverage combine -q
+	$(RUN) -m coverage html -q
+	$(RUN) -m coverage report
 
-fuzz mutants faults soak packages: setup
+fuzz faults: setup
 	$(RUN) -m tools.$@ $(ARGS)
+
+soak: setup
+	NERG_SOAK=1 $(RUN) -m pytest -q -s tests/test_soak.py $(ARGS)
+
+packages: setup
+	$(RUN) -m nox $(ARGS)
 
 bench: setup
 	$(RUN) benchmarks/bench.py $(ARGS)

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before Dr.Jit and Mitsuba)
 from tools import command_pages, manual
-from tools.imports import ROOT
 from tools.page import table
 
+ROOT = Path(__file__).resolve().parents[1]
 PLUGINS = ("nerg", "nerf", "splats", "gazefield", "gazekde", "panorama")
 
 

@@ -14,8 +14,8 @@ from nerg_mi.training.gaze.log_density_model import log_gaze
 from nerg_mi.training.gaze.product_model import gaze_density
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from tests.field.encoding.dense import DenseConfig, DenseGrid
+from tests.tiny import ball_pose
 from tests.training.radiance.ball import BOX, ball, settings
-from tools.tiny import ball_pose
 
 register(DenseConfig, DenseGrid)
 CONFIG = RadianceConfig(DenseConfig(), width=16, color_hidden=1, density_scale=0.5)

@@ -14,7 +14,7 @@ from nerg_mi.field.radiance import RadianceConfig
 from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.settings import RadianceSettings
 from nerg_mi.training.radiance.trainer import RadianceTrainer
-from tools.tiny import ball_pose
+from tests.tiny import ball_pose
 
 BOX = Box((-1, -1, -1), (1, 1, 1))
 RADIUS = 0.6

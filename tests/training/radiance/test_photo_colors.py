@@ -9,7 +9,7 @@ import pytest
 
 from nerg_mi.training.radiance.photo_colors import PHOTOS, PhotoColors
 from nerg_mi.training.radiance.trainer import RadianceTrainer
-from tools.tiny import ball_pose
+from tests.tiny import ball_pose
 
 from .ball import BOX, TINY, ball, settings
 

@@ -12,7 +12,7 @@ from nerg_mi.training.radiance.held_out import measure
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.trace import trace_depth
-from tools.tiny import ball_pose
+from tests.tiny import ball_pose
 
 from .ball import BOX, LENS, RADIUS, TINY, ball, settings
 

@@ -1,5 +1,4 @@
-"""Places that are small enough to be worked on thousands of times: what the tools that try the package out begin
-with."""
+"""Places that are small enough to be worked on thousands of times."""
 
 from __future__ import annotations
 

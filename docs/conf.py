@@ -1,0 +1,82 @@
+"""Settings of Sphinx for the manual (`make manual`). Nothing here reaches for the network, and no page does.
+
+The source is the whole checkout, so that links between pages, notebooks and files are those that a code host follows.
+"""
+
+import re
+from pathlib import Path
+
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+
+from nerg_mi import __version__
+
+project = "nerg_mi"
+author = "The authors of nerg_mi"
+project_copyright = "the authors of nerg_mi, Apache-2.0"
+release = version = __version__
+
+extensions = ["myst_nb", "sphinx.ext.autodoc"]
+include_patterns = ["docs/*.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/*.ipynb"]
+root_doc = "docs/index"
+language = "en"
+# Two dashes begin an option.
+smartquotes = False
+
+# Pages are read as a code host reads them.
+myst_enable_extensions = ["dollarmath"]
+myst_fence_as_directive = ["math"]
+myst_heading_anchors = 4
+# A page may begin with a part of a notebook, whose headings are its own.
+suppress_warnings = ["myst.header"]
+nb_execution_mode = "off"
+highlight_language = "none"
+default_role = "literal"
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_class_signature = "mixed"
+autodoc_preserve_defaults = True
+python_maximum_signature_line_length = 80
+add_module_names = False
+toc_object_entries_show_parents = "hide"
+
+html_math_renderer = "mathml"
+html_theme = "furo"
+html_title = f"nerg_mi {release}"
+html_static_path = ["static"]
+html_css_files = ["manual.css"]
+html_copy_source = False
+html_show_sourcelink = False
+html_show_sphinx = False
+html_theme_options = {"navigation_with_keys": True}
+
+
+def add_contents(app, page, source):
+    """The contents, hidden: a tree for each heading of docs/index.md, of the pages that are listed below it."""
+    if page != root_doc:
+        return
+    for part in re.split(r"^## ", source[0], flags=re.M)[1:]:
+        title, _, body = part.partition("\n")
+        targets = re.findall(r"^- \[[^\]]*\]\(([^()#\s]+)", body, flags=re.M)
+        entries = [f"/{Path('docs', target)}".replace("/docs/../", "/").rsplit(".", 1)[0] for target in targets]
+        source[0] += "\n" + "\n".join(["```{toctree}", ":hidden:", f":caption: {title}", "", *entries, "```"]) + "\n"
+
+
+def add_inline(writer, node):
+    """A formula as MathML, which browsers draw without scripts."""
+    writer.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def add_displayed(writer, node):
+    """A formula on its own as MathML."""
+    writer.body.append(f'<div class="math-block">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
+def setup(app):
+    app.connect("source-read", add_contents)
+    app.add_html_math_renderer("mathml", (add_inline, None), (add_displayed, None))
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

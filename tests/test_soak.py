@@ -1,0 +1,179 @@
+"""Long use: memory stays flat over frames, training steps and changes of variant.
+
+`make soak` runs thousands of units of work; without NERG_SOAK=1 a thirtieth of them is done. A line is fitted to the
+resident memory between units after the first third, in which kernels are compiled and caches filled.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
+from tests import tiny
+from tests.conftest import ROOT
+
+SHORT = 1 if os.environ.get("NERG_SOAK") else 30
+
+
+def resident() -> float:
+    """Memory of this process that is in RAM, KiB, once what nothing refers to has gone back to the system."""
+    import drjit as dr
+
+    gc.collect()
+    dr.flush_malloc_cache()
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+        trim(0)
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1024
+
+
+def slope(unit: Callable[[int], object], count: int) -> float:
+    """KiB a unit by which memory grows over ``unit(k)`` for k in 0 .. ``count``."""
+    every = max(1, count // 120)
+    at, memory = [], []
+    for k in range(count):
+        unit(k)
+        if (k + 1) % every == 0:
+            at.append(k + 1)
+            # A thread that is about to end may still hold memory that nothing refers to.
+            memory.append(min(resident() for _ in range(3)))
+    warm = len(at) // 3
+    return float(np.polyfit(at[warm:], memory[warm:], 1)[0])
+
+
+def store(**values: str):
+    import mitsuba as mi
+
+    from nerg_mi.jobs.demo import store_scene
+
+    return mi.load_file(str(store_scene()), **({"width": "36", "height": "24"} | values))
+
+
+def frames() -> Callable[[int], None]:
+    """A frame of the store for an observer who walks up and down an aisle."""
+    import mitsuba as mi
+
+    scene = store()
+    params = mi.traverse(scene)
+
+    def frame(k: int) -> None:
+        eye = [4.4 + 0.3 * np.sin(0.1 * k), 2.8 + 0.5 * np.cos(0.07 * k), 1.6]
+        pose = mi.ScalarTransform4f().look_at(eye, [4.8, 4.4, 1.2], [0, 0, 1])
+        params["integrator.observer.to_world"] = pose
+        params.update()
+        assert np.isfinite(np.array(mi.render(scene, spp=1, seed=k))).all()
+
+    return frame
+
+
+def radiance_steps() -> Callable[[int], None]:
+    """A step of a tiny radiance training."""
+    import drjit as dr
+    import drjit.llvm.ad as ns
+
+    from nerg_mi.capture.cameras import Camera
+    from nerg_mi.capture.images import View
+    from nerg_mi.capture.intrinsics import Intrinsics
+    from nerg_mi.field.encoding.hashgrid import HashGridConfig
+    from nerg_mi.field.radiance import RadianceConfig
+    from nerg_mi.maths.box import Box
+    from nerg_mi.training.radiance.settings import RadianceSettings
+    from nerg_mi.training.radiance.trainer import RadianceTrainer
+
+    lens = Intrinsics(tiny.SIDE, tiny.SIDE, 30.0, 30.0, tiny.SIDE / 2, tiny.SIDE / 2)
+    rng, views = np.random.default_rng(0), []
+    for k in range(12):
+        center = rng.normal(size=3) * [1, 1, 0.5]
+        pose = tiny.ball_pose(2 * center / np.linalg.norm(center))
+        views.append(View(str(k), Camera(lens, pose), tiny.ball_photo(pose).astype(np.float32)))
+    config = RadianceConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=4, finest=16), width=16, color_hidden=1)
+    settings = RadianceSettings(steps=20_000, batch=2**10, resolution=16, march_step=1 / 32)
+    trainer = RadianceTrainer(views, Box(*tiny.CORNERS), config, settings, ns)
+
+    def step(k: int) -> None:
+        trainer.step()
+        # Whoever trains looks at the loss now and then; steps that nobody waits for would only queue up.
+        dr.eval(trainer.loss)
+        dr.sync_thread()
+
+    return step
+
+
+def gaze_steps() -> Callable[[int], None]:
+    """A step of a tiny gaze training."""
+    import drjit as dr
+    import drjit.llvm.ad as ns
+
+    from nerg_mi.field.encoding.hashgrid import HashGridConfig
+    from nerg_mi.field.gaze.product import GazeConfig
+    from nerg_mi.training.gaze.product import ProductTrainer
+    from nerg_mi.training.gaze.ray_targets import targets_of_rays
+    from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
+    from nerg_mi.training.geometry.places import place_of_nothing
+
+    rays = tiny.looks()
+    place = place_of_nothing(rays.origin)
+    probes = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, directions=64)
+    config = GazeConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=4)
+    settings = GazeSettings(steps=20_000, probes=4, directions=32, zones=0)
+    trainer = ProductTrainer(targets_of_rays(rays, place, probes), place.box, config, settings, ns)
+
+    def step(k: int) -> None:
+        trainer.step()
+        dr.sync_thread()
+
+    return step
+
+
+def variants() -> Callable[[int], None]:
+    """A change of variant, after which the store is loaded and rendered."""
+    import mitsuba as mi
+
+    def change(k: int) -> None:
+        mi.set_variant(("llvm_ad_mono", "llvm_ad_rgb")[k % 2])
+        assert np.isfinite(np.array(mi.render(store(width="12", height="8"), spp=1))).all()
+
+    return change
+
+
+PARTS = {"frames": frames, "radiance": radiance_steps, "gaze": gaze_steps, "variants": variants}
+
+# In a process of its own, since this one's memory is that of all tests before.
+_PROGRAM = """
+import json, sys
+import nerg_mi, mitsuba
+from tests import test_soak
+mitsuba.set_variant("llvm_ad_rgb")
+unit, hoard = test_soak.PARTS[sys.argv[1]](), []
+count, bound = int(sys.argv[2]), float(sys.argv[3])
+def leaking(k):
+    unit(k)
+    hoard.append(b"x" * round(4 * 1024 * bound))
+print("\\n" + json.dumps([test_soak.slope(unit, count), test_soak.slope(leaking, 12)]))
+"""
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "part, count, bound",
+    [("frames", 2000, 1.0), ("radiance", 10_000, 0.5), ("gaze", 10_000, 0.2), ("variants", 60, 200.0)],
+)
+def test_memory_stays_flat_and_a_leak_is_seen(part, count, bound):
+    """``count`` units of work keep ``bound`` (KiB a unit), which leaking four times as much exceeds."""
+    count, bound = max(30, count // SHORT), bound * (1 if SHORT == 1 else 100 if bound < 100 else 10)
+    command = [sys.executable, "-c", _PROGRAM, part, str(count), str(bound)]
+    done = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    sound, leaking = json.loads(done.stdout.splitlines()[-1])
+    print(f"{part}: {count} units, {sound:+.3f} KiB a unit (bound {bound:g})")
+    assert sound < bound and (SHORT == 1 or leaking == pytest.approx(4 * bound, rel=0.5))

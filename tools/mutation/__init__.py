@@ -1,1 +1,0 @@
-"""Mutants: small mistakes put into the source one at a time, to see whether the tests notice."""
