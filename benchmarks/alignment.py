@@ -35,7 +35,7 @@ from nerg_mi.alignment.tracking import Tracking
 from nerg_mi.alignment.umeyama import MIRROR, errors, move, scale_of
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
-from output import print_table, write_rows
+from timing import print_table, write_rows
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -1,12 +1,12 @@
-"""All that is said of speed, in one run: frames and their stages beside PyTorch, evaluations beside hand-written code,
-densities beside SciPy, volumes beside `volpath`, and how each cost grows.
+"""All that is said of speed, in one run: frames and their stages beside PyTorch, densities beside SciPy, volumes beside
+`volpath`, and how each cost grows.
 
     python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb] [--page docs/performance.md]
     [--out out/benchmarks/bench]
 
-Parts: ``frames``, ``stages``, ``density``, ``by_hand``, ``kde``, ``volume``, ``growth``, ``memory``; else all.
+Parts: ``frames``, ``stages``, ``kde``, ``volume``, ``growth``, ``memory``; else all.
 Works that are compared do the same, which is checked first, and take turns; figures are medians with their quartiles.
-Prints tables, writes them as CSV and two figures, and puts them into the page that is named. ``--long``: more runs,
+Prints tables, writes them as CSV and a figure, and puts them into the page that is named. ``--long``: more runs,
 larger sizes, and PyTorch at 1280 x 720. With a CUDA variant the parts without a peer are measured in wall-clock
 seconds; where there is no device it says so and ends.
 """
@@ -17,25 +17,116 @@ import argparse
 import os
 import platform
 import re
-import subprocess
 import sys
 from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+from collections.abc import Callable
 
 import cold_kernels  # noqa: F401
-import density_limit
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import torch_frames
-from growth_figures import growth_figure, roofline_figure
+from nerg_mi.density.kde.estimate import SphericalKde
 from nerg_mi.figures.saving import save
 from nerg_mi.jobs.demo import store_scene
 from nerg_mi.llvm import has_cuda
-from output import print_table, write_rows
-from timing import at_the_end, exponent, in_turns, median, spread
+from timing import at_the_end, exponent, in_turns, median, print_table, spread, write_rows
 
 import numpy as np
+
+Works = dict[str, Callable[[], np.ndarray]]
+
+
+def unit_vectors(count: int, seed: int) -> np.ndarray:
+    """Directions (count, 3), uniform over the sphere."""
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def kernel_densities(rays: int, directions: int, kappa: float = 200.0) -> tuple[Works, float]:
+    """A density of ``rays`` kernels in as many ``directions``, and the largest difference relative to the mean."""
+    import drjit as dr
+    from scipy.special import logsumexp
+
+    mu, x = unit_vectors(rays, 0), unit_vectors(directions, 1)
+    ours = SphericalKde(mu, np.array([0, rays]), kappa)
+    ns = ours.ns
+    where, probe = ns.Array3f(x.T.astype(np.float32)), dr.zeros(ns.UInt32, directions)
+    dr.eval(where, probe)
+    constant = np.log(kappa / (2 * np.pi * -np.expm1(-2 * kappa)) / rays)
+
+    def with_scipy() -> np.ndarray:
+        parts = [logsumexp(kappa * (part @ mu.T - 1), axis=1) for part in np.array_split(x, max(1, directions // 256))]
+        return np.exp(constant + np.concatenate(parts))
+
+    def with_nerg() -> np.ndarray:
+        return np.array(ours.density(probe, where))
+
+    known, got = with_scipy(), with_nerg()
+    return {"nerg": with_nerg, "SciPy": with_scipy}, float(np.max(np.abs(got - known)) / known.mean())
+
+
+def cloud(cells: int) -> np.ndarray:
+    """Densities (z, y, x, 1) of a cloud of balls in an otherwise empty grid, 0 to 6 a unit."""
+    at = (np.stack(np.meshgrid(*[np.arange(cells)] * 3, indexing="ij"), -1) + 0.5) / cells
+    value = np.zeros((cells,) * 3)
+    for center in np.random.default_rng(0).uniform(0.25, 0.75, (12, 3)):
+        value = np.maximum(value, 6.0 * np.clip(1.6 - np.linalg.norm(at - center, axis=-1) / 0.1, 0, 1))
+    return value[..., None].astype(np.float32)
+
+
+def transmittances(size: int, samples: int, cells: int = 64) -> tuple[Works, Callable[[np.ndarray], float], float]:
+    """How much passes a cloud that only absorbs: by `nerg` (its quadrature, one sample a pixel) and by `volpath`
+    (``samples`` a pixel, in a medium of albedo 0 before a white surrounding). The works give pictures (size, size); the
+    function their error (root of the mean square) against 16 samples a pixel with steps of a 16th, and the last number
+    how far the means of the two are apart."""
+    import mitsuba as mi
+
+    grid = {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid(cloud(cells)),
+        "raw": True,
+        "to_world": mi.ScalarTransform4f().translate(-1).scale(2),
+    }
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "component_format": "float32"}
+    view = mi.ScalarTransform4f().look_at([1.5, 1, -4], [0, 0, 0], [0, 1, 0])
+    sensor = {"type": "perspective", "fov": 35, "to_world": view, "film": film}
+    fine = 2 * 3**0.5 / 1024 / 16
+
+    def marched(**more):
+        integrator = {"type": "nerg", "density": grid, "aovs": "opacity", **more}
+        return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+
+    medium = {"type": "heterogeneous", "sigma_t": grid, "albedo": 0.0}
+    box = {"type": "cube", "bsdf": {"type": "null"}, "interior": medium}
+    traced = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "volpath", "max_depth": 64},
+            "sensor": sensor,
+            "box": box,
+            "sky": {"type": "constant"},
+        }
+    )
+    places = {"nerg": marched(), "exact": marched(step=fine)}
+
+    def passed(scene, spp: int, seed: int = 0) -> np.ndarray:
+        return 1 - np.array(mi.render(scene, spp=spp, seed=seed))[..., -1]
+
+    works = {
+        "nerg": lambda: passed(places["nerg"], 1),
+        f"volpath, {samples} samples": lambda: np.array(mi.render(traced, spp=samples))[..., 0],
+    }
+    truth = np.mean([passed(places["exact"], 4, seed) for seed in range(4)], axis=0)
+
+    def error(picture: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((picture - truth) ** 2)))
+
+    means = [float(work().mean()) for work in works.values()]
+    return works, error, abs(means[1] - means[0]) / means[0]
+
 
 STAGES = {
     "depth": {"radiance": "false", "aovs": "depth"},
@@ -85,9 +176,6 @@ def the_run(run: Run) -> None:
     flags = info.read_text() if info.exists() else ""
     vectors = next((v for k, v in {"avx512f": "AVX-512", "avx2": "AVX2"}.items() if k in flags), "")
     programs = [f"mitsuba {mi.__version__}", f"drjit {drjit.__version__}", f"numpy {np.__version__}"]
-    if (compiler := density_limit.compiler()) is not None:
-        said = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True).stdout
-        programs.append(said.split("\n")[0])
     rows = [
         ["processor", " ".join([name[1] if name else platform.processor() or platform.machine(), vectors]).strip()],
         ["threads", str(run.threads)],
@@ -193,49 +281,10 @@ def peer_stages(run: Run, width: int, height: int) -> dict[str, float]:
     return {name: 1e6 * median(wall for wall, _ in times) / len(o) for name, times in taken.items()}
 
 
-def density(run: Run) -> None:
-    if run.cuda:
-        print("The hand-written evaluation is of processors: nothing to compare with on a device.\n")
-        return
-    count = 1 << (20 if run.long else 18)
-    points = {
-        "of a frame": density_limit.marched_points(run.field, *torch_frames.camera_rays(320, 180), count),
-        "at random": density_limit.random_points(run.field, count),
-    }
-    work = density_limit.Work.of(run.field.config)
-    rows, found = density_limit.measure(run.field, points, 2 * run.runs, run.threads)
-    shown = density_limit.table(rows, found, work)
-    run.table("Evaluations of density", density_limit.HEAD, shown, "density")
-    if not found:
-        print("No C++ compiler was found (g++, clang++): no hand-written evaluation, and no roof.\n")
-        return
-    ceilings = density_limit.ceilings(found, work, run.threads)
-    run.table("The machine", density_limit.CEILINGS, ceilings, "machine")
-    reached = {f"{r['evaluation']}, points {r['points']}": r["gflops"] for r in rows}
-    roofs = {"table in order": found["table"] / 1e9, "memory in order": found["dram"] / 1e9}
-    roofs["8 bytes at random in the table"] = 8 * found["pairs"] / 1e9
-    run.figure(roofline_figure(found["flops"] / 1e9, roofs, work.flops / work.bytes, reached), "roofline")
-
-
-def by_hand(run: Run) -> None:
-    import frame_limit
-
-    if run.cuda or density_limit.compiler() is None:
-        print("A frame by hand is of processors, and needs a C++ compiler (g++, clang++): not measured.\n")
-        return
-    size = (1280, 720) if run.long else (640, 360)
-    rows = frame_limit.frame_table(*size, run.field, run.gaze, run.threads, run.runs)
-    run.table("A frame by hand", frame_limit.FRAME, rows, "by_hand")
-    rows = frame_limit.colour_table(*size, run.field, run.runs)
-    run.table("Ways to colour", frame_limit.COLOUR, rows, "colour")
-
-
 def kde(run: Run) -> None:
-    import peers
-
     rows = []
     for rays in (1000, 10_000, *((100_000,) if run.long else ())):
-        works, apart = peers.kernel_densities(rays, 1 << 13)
+        works, apart = kernel_densities(rays, 1 << 13)
         if not apart < 1e-4:
             raise SystemExit(f"the two do not give the same densities: {apart:.1e} apart")
         costs = {name: run.cost(times) for name, times in in_turns(works, run.runs).items()}
@@ -250,9 +299,7 @@ def kde(run: Run) -> None:
 
 
 def volume(run: Run) -> None:
-    import peers
-
-    works, error, apart = peers.transmittances(256, 64 if run.long else 16)
+    works, error, apart = transmittances(256, 64 if run.long else 16)
     if not apart < 0.01:
         raise SystemExit(f"the two do not render the same cloud: means are {apart:.1%} apart")
     errors = {name: error(work()) for name, work in works.items()}
@@ -301,7 +348,7 @@ def growth(run: Run) -> None:
     unit = "ms" if run.cuda else "CPU ms"
     head = ["cost", "against", f"{unit} by size", "exponent", "between the two largest", "aim"]
     run.table("Growth", head, rows, "growth")
-    run.figure(growth_figure(curves), "growth")
+    run.figure(sizes.growth_figure(curves), "growth")
 
 
 def memory(run: Run) -> None:
@@ -311,7 +358,7 @@ def memory(run: Run) -> None:
     run.table("Memory", frame_memory.HEAD, rows, "memory")
 
 
-PARTS = {part.__name__: part for part in (frames, stages, density, by_hand, kde, volume, growth, memory)}
+PARTS = {part.__name__: part for part in (frames, stages, kde, volume, growth, memory)}
 
 
 def main(argv=None) -> None:

@@ -37,7 +37,7 @@ HEAD = ("variant", "density", "colour", "us CPU", "times", "dB", "depth MAE mm",
 
 
 def main(argv=None) -> None:
-    from output import print_table, write_rows
+    from timing import print_table, write_rows
 
     import mitsuba as mi
 

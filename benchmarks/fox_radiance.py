@@ -43,7 +43,7 @@ def parse_settings(pairs: list[str]) -> dict:
 
 
 def main(argv=None) -> None:
-    from output import write_rows
+    from timing import write_rows
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=default_data())

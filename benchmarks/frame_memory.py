@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from output import print_table
+from timing import print_table
 
 SIZES = ((320, 180), (1280, 720), (1920, 1080))
 WAYS = ("mi.render", "nerg render")

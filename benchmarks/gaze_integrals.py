@@ -24,7 +24,7 @@ import numpy as np
 
 
 def main(argv=None) -> None:
-    from output import write_rows
+    from timing import write_rows
 
     import drjit as dr
     import mitsuba as mi

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import argparse
 
-from output import write_rows
-from place_rays import Make, asked_places, parse, place_parser, write_place
+from places import Make, asked_places, parse, place_parser, write_place
+from timing import write_rows
 
 
 def main(argv=None) -> None:

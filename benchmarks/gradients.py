@@ -2,7 +2,7 @@
 
     python benchmarks/gradients.py [--depth median] [--case NAME] [--update docs/gradients.md]
 
-One number moves each parameter along a fixed line (``gradients_cases.py``). Forward: derivatives of all pixels at once,
+One number moves each parameter along a fixed line. Forward: derivatives of all pixels at once,
 as ``mi.render`` gives them. Reverse: derivative of one weighted sum of the pixels of one quantity. Both against central
 differences of pictures at two distances, extrapolated (Richardson); reverse also against the weighted sum of the
 forward derivatives, which is the dot-product test and holds to rounding. Prints markdown; nothing passes or fails here.
@@ -13,13 +13,285 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from output import print_table
+from nerg_mi.field.backend import namespace
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.formats.fields import save_gaze, save_radiance
+from nerg_mi.maths.box import Box
+from timing import print_table
 
+import drjit as dr
 import numpy as np
+
+AOVS = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth"
+SIZE = 12
+GRID = HashGridConfig(levels=2, log2_rows=10, base=3, finest=5)
+BOX, AROUND = Box((-1, -1, -1), (1, 1, 1)), Box((-3.7, -3.7, -3.7), (3.7, 3.7, 3.7))
+
+
+@dataclass
+class Case:
+    """A parameter that moves. ``scene``: a key of ``SCENES``; ``keys``: of ``mi.traverse``, all moved together;
+    ``line``: value of a parameter at x from its ``(mi, key, base, x)``; ``h``: how far the differences reach."""
+
+    name: str
+    scene: str
+    keys: list[str]
+    line: Callable
+    h: float
+
+
+def write_fields(mi, folder: Path) -> None:
+    """A radiance field over the cube of side 2, a gaze field over a larger one, and an ensemble of that one with
+    another.
+
+    Features are positive, and each neuron's weights have one sign: some ReLUs pass and some block, and none changes
+    over while a parameter moves, so that differences are those of a smooth function.
+    """
+    ns = namespace(mi.variant())
+    rng = np.random.default_rng(0)
+    config = RadianceConfig(GRID, width=16, geometry=7, sh_degree=2, density_scale=0.4)
+    radiance = RadianceField.random(config, BOX, ns, 0, march_step=0.1)
+    gaze, other = (
+        GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2), AROUND, ns, seed) for seed in (1, 2)
+    )
+    for one in (radiance, gaze, other):
+        values = {"grid.table": ns.Float(rng.uniform(0.2, 1.8, len(one.grid.table)).astype(np.float32))}
+        for name, w in one.parameters().items():
+            if name == "grid.table":
+                continue
+            layer = rng.uniform(0.3, 1.7, w.shape) / w.shape[1]
+            last = name in ("density_net.1", "position_net.1", "color_net.2", "emit_head.0", "capture_head.0")
+            if not last:
+                layer[::3] *= -1
+            if name in ("color_net.0", "direction_net.0"):
+                # Harmonics of the direction have either sign: the features behind them outweigh them.
+                layer[:, 1:4] *= rng.choice([-1, 1], (len(w), 3)) * (5 if name == "direction_net.0" else 1)
+                layer[:, 4:] *= 2
+            elif name in ("color_net.2", "emit_head.0", "capture_head.0"):
+                layer = (0.1 if name == "color_net.2" else 0.4) * rng.normal(size=w.shape)
+                layer -= layer.mean(axis=1, keepdims=True)
+            values[name] = ns.TensorXf((1.5 * layer).astype(np.float32))
+        one.set_parameters(values)
+    save_radiance(radiance, folder / "field.safetensors", {})
+    save_gaze(gaze, folder / "gaze.safetensors", {})
+    save_gaze(GazeEnsemble([gaze, other]), folder / "ensemble.safetensors", {})
+
+
+# ----------------------------------------------------------------------------
+# Scenes
+# ----------------------------------------------------------------------------
+
+
+def look_at(mi, origin, target=(0, 0, 0)):
+    return mi.ScalarTransform4f().look_at(list(origin), list(target), [0, 1, 0])
+
+
+def camera(mi, origin=(0.3, 0.2, -3), fov=20, size=SIZE):
+    """One ray through the centre of every pixel, whatever the seed: mi.render gives a derivative another one."""
+    film = {"type": "hdrfilm", "width": size, "height": size, "component_format": "float32", "rfilter": {"type": "box"}}
+    return {
+        "type": "perspective",
+        "fov": fov,
+        "to_world": look_at(mi, origin),
+        "film": film,
+        "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
+    }
+
+
+def integrator(mi, folder, observer=(-2, 0.5, 2), **more):
+    eye = {} if observer is None else {"observer": {"type": "perspective", "to_world": look_at(mi, observer)}}
+    return {
+        "type": "nerg",
+        "gaze": {"type": "gazefield", "filename": str(folder / "gaze.safetensors")},
+        "aovs": AOVS,
+        "step": 0.1,
+        "stop": 1e-12,
+        "color_cutoff": 0.0,
+        "surface_opacity": 0.0,
+        "background": 0.3,
+        "falloff": 4.0,
+        "tolerance": 0.05,
+        **eye,
+        **more,
+    }
+
+
+def field_scene(mi, folder, **more):
+    """With the AOVs that only a field and an ensemble of gaze fields have."""
+    field = {"type": "nerf", "filename": str(folder / "field.safetensors")}
+    gaze = {"type": "gazefield", "filename": str(folder / "ensemble.safetensors")}
+    about = {"aovs": f"{AOVS},features,features_at,gaze_std", "field": field, "gaze": gaze, **more}
+    return {"integrator": integrator(mi, folder, **about), "sensor": camera(mi)}
+
+
+def constant_scene(mi, folder, **more):
+    place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
+    color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}
+    density = {"type": "constvolume", "value": 1.2, "to_world": place}
+    return {"integrator": integrator(mi, folder, density=density, color=color, **more), "sensor": camera(mi)}
+
+
+def grid_scene(mi, folder, **more):
+    rng = np.random.default_rng(2)
+    place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
+    volume = lambda data: {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid(data.astype(np.float32)),
+        "to_world": place,
+        "raw": True,
+    }
+    density, color = volume(0.1 + rng.exponential(1.2, (4, 5, 6))), volume(rng.uniform(0.1, 0.9, (4, 5, 6, 3)))
+    return {"integrator": integrator(mi, folder, density=density, color=color, **more), "sensor": camera(mi)}
+
+
+def shapes_scene(mi, folder, **more):
+    """A tilted slab that every ray of the camera meets, and a larger one between it and the observer: no silhouette is
+    seen."""
+    slab = lambda z, size, tilt: (
+        mi.ScalarTransform4f().translate([0, 0, z]).rotate([0.6, 1, 0], tilt).scale([size, size, 0.05])
+    )
+    paint = lambda *rgb: {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(rgb)}}
+    return {
+        "integrator": integrator(mi, folder, observer=(-0.9, 0.4, 2.8), **more),
+        "sensor": camera(mi),
+        "slab": {"type": "cube", "to_world": slab(-0.3, 0.8, 20), "bsdf": paint(0.8, 0.5, 0.2)},
+        "lid": {"type": "cube", "to_world": slab(1.5, 2.5, -15)},
+    }
+
+
+def ball_scene(mi, folder, **more):
+    paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}
+    return {
+        "integrator": integrator(mi, folder, observer=(-2, 0.5, -2.5), **more),
+        "sensor": camera(mi, fov=12),
+        "ball": {"type": "sphere", "radius": 0.8, "bsdf": paint},
+    }
+
+
+def both_scene(mi, folder, **more):
+    """A slab that light reaches through a haze."""
+    place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
+    color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.2, 0.3, 0.9]}}
+    return shapes_scene(
+        mi, folder, density={"type": "constvolume", "value": 0.25, "to_world": place}, color=color, **more
+    )
+
+
+def alone(make):
+    """The camera is the observer."""
+    return lambda mi, folder, **more: make(mi, folder, **more, observer=None)
+
+
+SCENES = {
+    "field": field_scene,
+    "constant": constant_scene,
+    "grid": grid_scene,
+    "shapes": shapes_scene,
+    "ball": ball_scene,
+    "both": both_scene,
+    "field, own camera": alone(field_scene),
+    "field, transmittance": lambda mi, folder, **more: field_scene(mi, folder, visibility="transmittance", **more),
+}
+
+
+# ----------------------------------------------------------------------------
+# What moves
+# ----------------------------------------------------------------------------
+
+
+def along(seed: int):
+    """Weights and voxels, all along one random line."""
+
+    def line(mi, key, base, x):
+        rng = np.random.default_rng([seed, *key.encode()])
+        direction = rng.normal(size=base.shape if hasattr(base, "shape") else dr.width(base)).astype(np.float32)
+        return base + type(base)(direction) * x
+
+    return line
+
+
+def number(scale=1.0):
+    return lambda mi, key, base, x: base + scale * x
+
+
+def color(mi, key, base, x):
+    return base + mi.Color3f(1, -0.5, 0.7) * x
+
+
+def walk(mi, key, base, x):
+    """A pose is moved."""
+    return mi.Transform4f().translate(mi.Vector3f(0.3 * x, x, -0.5 * x)) @ mi.Transform4f(base)
+
+
+def turn(mi, key, base, x):
+    """A pose is turned about an axis through the origin."""
+    return mi.Transform4f().rotate(mi.Vector3f(0.2, 1, 0.3), 20 * x) @ mi.Transform4f(base)
+
+
+def vertices(mi, key, base, x):
+    p = dr.unravel(mi.Point3f, mi.Float(base))
+    return dr.ravel(p + mi.Vector3f(0.3 * x, -0.2 * x, x) * (1 + 0.2 * p.x))
+
+
+def nets(prefix, *names):
+    return [f"integrator.{prefix}.{n}" for n in names]
+
+
+def cases() -> list[Case]:
+    density, paint = (
+        nets("field", "density_net.0", "density_net.1"),
+        nets("field", "color_net.0", "color_net.1", "color_net.2"),
+    )
+    heads = "position_net.0", "position_net.1", "direction_net.0", "direction_net.1", "emit_head.0", "capture_head.0"
+    both = lambda *names: [key for member in (0, 1) for key in nets(f"gaze.{member}", *names)]
+    return [
+        Case("field: hash table", "field", nets("field", "grid.table"), along(1), 2e-2),
+        Case("field: density network", "field", density, along(1), 2e-3),
+        Case("field: colour network", "field", paint, along(1), 2e-3),
+        Case("gaze: hash table", "constant", nets("gaze", "grid.table"), along(1), 2e-2),
+        Case("gaze: networks", "constant", nets("gaze", *heads), along(1), 1e-3),
+        Case("ensemble of gaze: hash tables", "field", both("grid.table"), along(1), 2e-2),
+        Case("ensemble of gaze: networks", "field", both(*heads), along(1), 1e-3),
+        Case("constvolume: density", "constant", ["integrator.density.value.value"], number(), 2e-2),
+        Case("constvolume: colour", "constant", ["integrator.color.value.value"], color, 2e-2),
+        Case("gridvolume: density", "grid", ["integrator.density.data"], along(1), 4e-3),
+        Case("gridvolume: colour", "grid", ["integrator.color.data"], along(1), 2e-2),
+        Case("falloff", "field", ["integrator.falloff"], number(), 4e-2),
+        Case("observer: position", "field", ["integrator.observer.to_world"], walk, 4e-3),
+        Case("... by transmittance", "field, transmittance", ["integrator.observer.to_world"], walk, 4e-3),
+        Case("... before shapes", "shapes", ["integrator.observer.to_world"], walk, 4e-3),
+        Case("camera: moved", "field", ["sensor.to_world"], walk, 4e-3),
+        Case("camera: turned", "field", ["sensor.to_world"], turn, 4e-3),
+        Case("camera that is the observer", "field, own camera", ["sensor.to_world"], walk, 4e-3),
+        Case("camera before shapes", "shapes", ["sensor.to_world"], walk, 4e-3),
+        Case("mesh: vertices", "shapes", ["slab.vertex_positions"], vertices, 4e-3),
+        Case("mesh: vertices of what hides it", "shapes", ["lid.vertex_positions"], vertices, 4e-3),
+        Case("mesh in a haze: vertices", "both", ["slab.vertex_positions"], vertices, 4e-3),
+        Case("sphere: to_world", "ball", ["ball.to_world"], walk, 4e-3),
+        Case("shape: colour", "shapes", ["slab.bsdf.reflectance.value"], color, 2e-2),
+    ]
+
+
+# Where derivatives miss what moves: (1), (2), ... stand below the table in docs/gradients.md.
+EXCLUDED = {
+    "shape: its silhouette": dict.fromkeys(
+        ("colour", "depth", "opacity", "position", "gaze", "emit", "capture", "visibility", "observer depth"),
+        "excluded (1)",
+    ),
+    "silhouette of what hides": dict.fromkeys(("gaze", "emit", "visibility", "observer depth"), "excluded (2)"),
+    "anything, falloff 0": dict.fromkeys(("gaze", "visibility"), "excluded (3)"),
+    "field and observer, map": dict.fromkeys(("visibility", "observer depth"), "excluded (4)"),
+    "shape lit by path": {"colour": "excluded (5)"},
+}
+
 
 QUANTITIES = {
     "colour": "RGB",
@@ -120,18 +392,16 @@ def norm(x) -> float:
 
 def errors(mi, only: str, depth: str):
     """The table of all cases, with surfaces at ``depth``."""
-    import gradients_cases as g
-
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        g.write_fields(mi, Path(folder))
-        for case in g.cases():
+        write_fields(mi, Path(folder))
+        for case in cases():
             if only not in case.name:
                 continue
-            scene = mi.load_dict({"type": "scene", **g.SCENES[case.scene](mi, Path(folder), depth=depth)})
+            scene = mi.load_dict({"type": "scene", **SCENES[case.scene](mi, Path(folder), depth=depth)})
             rows.append([case.name, *summary(measure(mi, scene, case))])
             print(rows[-1], file=sys.stderr, flush=True)
-    for name, reason in g.EXCLUDED.items():
+    for name, reason in EXCLUDED.items():
         if only in name:
             rows.append([name, *(reason.get(q, "") for q in QUANTITIES), "", "", ""])
     head = ["with respect to", *QUANTITIES, "reverse against forward", "differences", "left out"]

@@ -18,7 +18,7 @@ import nerg_mi
 import nerg_mi.scenes.store
 from nerg_mi.evaluation.study.operations import traced_operations
 from nerg_mi.files.tables import markdown_table
-from output import write_rows
+from timing import write_rows
 
 import mitsuba as mi
 

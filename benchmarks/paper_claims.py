@@ -15,9 +15,8 @@ from __future__ import annotations
 from dataclasses import fields
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from output import print_table, write_rows
-from place_rays import asked_places, parse, place_parser, write_place
-from places import interval
+from places import asked_places, interval, parse, place_parser, write_place
+from timing import print_table, write_rows
 
 import numpy as np
 

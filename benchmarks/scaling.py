@@ -20,7 +20,7 @@ import time
 from importlib.resources import files
 from pathlib import Path
 
-from output import write_rows
+from timing import write_rows
 
 import numpy as np
 

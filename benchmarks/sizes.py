@@ -5,18 +5,20 @@ Each is a `Growth`: works by their size, of the demo store where nothing else is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import nerg_mi as nerg
-from density_limit import ours, random_points
+from nerg_mi.figures.sheet import INK, new_page
 from nerg_mi.jobs.demo import store_scene
 from torch_frames import camera_rays
 
 import numpy as np
 
 OBSERVER = (4.4, 2.8, 1.6)
+_OURS, _SLOPE = "#1f5fa8", "#b9b9b9"
+_PANEL = (330, 250)
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,34 @@ def extent(long: bool) -> Growth:
     return Growth("depth of a hall of 0.1 m voxels, 320 x 180", "metres", "below 1", works)
 
 
+def random_points(field, count: int, seed: int = 0) -> np.ndarray:
+    """Places (3, count), uniform in the occupied cells that lie in the field's box."""
+    bits, rng = field.occupancy.bits, np.random.default_rng(seed)
+    side, n = field.box.side, bits.shape[0]
+    cells = np.argwhere(bits)[:, ::-1]
+    p = (cells[rng.integers(0, len(cells), 2 * count)] + rng.random((2 * count, 3))) * (side / n)
+    p += np.asarray(field.box.center) - side / 2
+    p = p[np.all((p > field.box.lower) & (p < field.box.upper), axis=1)]
+    return np.ascontiguousarray(np.resize(p, (count, 3)).T, np.float32)
+
+
+def density_work(field, p: np.ndarray):
+    """A function that evaluates the density of the field at ``p`` (3, N), and waits for it."""
+    import drjit as dr
+
+    ns = field.ns
+    points = ns.Array3f(*map(ns.Float, p))
+    dr.eval(points)
+
+    def evaluate():
+        out = field.density(points)
+        dr.eval(out)
+        dr.sync_thread()
+        return out
+
+    return evaluate
+
+
 def table(long: bool) -> Growth:
     """Density of random fields at the same points."""
     from nerg_mi.field.backend import namespace
@@ -113,7 +143,7 @@ def table(long: bool) -> Growth:
     for log2_rows in (12, 14, 16, 18, *((20, 22) if long else ())):
         grid = HashGridConfig(levels=8, log2_rows=log2_rows, base=32, finest=512)
         field = RadianceField.random(RadianceConfig(grid, width=32, color_hidden=1), store.box, ns)
-        works[2**log2_rows] = ours(field, p)
+        works[2**log2_rows] = density_work(field, p)
     return Growth("density at 131,072 points in no order", "rows a level", "below 1", works)
 
 
@@ -121,3 +151,42 @@ def growths(long: bool) -> Iterator[Growth]:
     """All of them; ``long``: larger sizes, too."""
     for make in (pixels, samples, observers, rays, extent, table):
         yield make(long)
+
+
+def _short(size: float) -> str:
+    """A size as the mark of an axis: 230k, 2.1M."""
+    for unit, letter in ((1e6, "M"), (1e3, "k")):
+        if size >= unit:
+            return f"{size / unit:.{1 if size < 10 * unit else 0}f}{letter}"
+    return f"{size:g}"
+
+
+def growth_figure(curves: Sequence[Mapping]):
+    """A panel for each of ``curves``: ``title``, ``axis``, ``sizes`` (n,), ``low``, ``middle`` and ``high`` (n,)
+    milliseconds, and the fitted ``exponent``; both axes logarithmic, with the slope of proportion in grey."""
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    columns = 3
+    rows = -(-len(curves) // columns)
+    figure = new_page(columns * _PANEL[0], rows * _PANEL[1])
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, curve in zip(panels, curves):
+        sizes, middle = (np.asarray(curve[k], float) for k in ("sizes", "middle"))
+        axes.plot(sizes, middle[-1] * sizes / sizes[-1], color=_SLOPE, linewidth=1, linestyle="--")
+        ends = [np.asarray(curve[k], float) for k in ("low", "high")]
+        axes.errorbar(sizes, middle, [middle - ends[0], ends[1] - middle], color=_OURS, marker="o", ms=3, lw=1.2)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xticks(sizes, [_short(n) for n in sizes])
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,g}"))
+        axes.minorticks_off()
+        axes.set_title(curve["title"], fontsize=8, color=INK)
+        axes.set_xlabel(curve["axis"], fontsize=7, color=INK)
+        axes.set_ylabel(curve.get("unit", "CPU ms"), fontsize=7, color=INK)
+        axes.tick_params(labelsize=6, colors=INK, length=2)
+        axes.text(0.04, 0.9, f"size^{curve['exponent']:.2f}", transform=axes.transAxes, fontsize=8, color=_OURS)
+    for axes in panels[len(curves) :]:
+        axes.set_visible(False)
+    figure.tight_layout()
+    return figure

@@ -174,7 +174,7 @@ def means(rows: list[dict], by: str) -> list[dict]:
 
 
 def main(argv=None) -> None:
-    from output import write_rows
+    from timing import write_rows
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--splats", type=Path, help="file of splats (default: made of the field)")

@@ -35,7 +35,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from nerg_mi.field.splats import Splats, harmonics_of, multiply_quaternions
 from nerg_mi.figures.tonemap import srgb
 from nerg_mi.registration import plugin_class
-from output import print_table
+from timing import print_table
 
 import drjit as dr
 import mitsuba as mi

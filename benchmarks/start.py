@@ -19,8 +19,7 @@ import time
 from pathlib import Path
 
 from nerg_mi.jobs.demo import store_scene
-from output import print_table, write_rows
-from timing import median, spread
+from timing import median, print_table, spread, write_rows
 
 COMMAND = [str(Path(sys.executable).with_name("nerg"))]
 VARIANT = 'import nerg_mi, mitsuba; mitsuba.set_variant("llvm_ad_rgb")'

@@ -38,7 +38,7 @@ def fresh_draws(law, count: int, kappa: float):
 
 
 def main(argv=None) -> None:
-    from output import write_rows
+    from timing import write_rows
 
     import mitsuba as mi
 

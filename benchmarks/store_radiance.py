@@ -26,7 +26,7 @@ VIEWS = Path(__file__).resolve().parents[1] / "scenes" / "store" / "build"
 
 
 def main(argv=None) -> None:
-    from output import write_rows
+    from timing import write_rows
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--views", type=Path, default=VIEWS)

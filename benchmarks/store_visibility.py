@@ -150,7 +150,7 @@ def table(rows: list[dict]) -> None:
 
 
 def main(argv=None) -> None:
-    from output import write_rows
+    from timing import write_rows
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--field", type=Path, help="checkpoint (default: that of the store)")

@@ -18,7 +18,7 @@ import argparse
 import os
 from pathlib import Path
 
-from output import write_rows
+from timing import write_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 SCORES = ("KLD", "CC", "SIM", "MAE", "NSS", "AUC", "sAUC", "bits", "loglik")

@@ -69,7 +69,7 @@ def score(field: Path, views: list, box, center, spp: int, pictures: Path) -> di
 
 
 def main(argv=None) -> None:
-    from output import print_table, write_rows
+    from timing import print_table, write_rows
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--views", type=Path, default=VIEWS)

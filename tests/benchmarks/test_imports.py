@@ -7,12 +7,14 @@ import ast
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib import import_module
+from importlib.util import find_spec
 
 import pytest
 
 from tests.conftest import ROOT
 
 SCRIPTS = sorted(p for folder in ("benchmarks", "examples", "tools") for p in (ROOT / folder).glob("*.py"))
+EXTRAS = {"torch", "pyarrow", "distributed", "importlinter", "nbformat", "jupyter_client", "nbclient"}
 OURS = {"nerg_mi", "tests", "tools", *(p.stem for p in (ROOT / "benchmarks").glob("*.py"))}
 
 
@@ -32,7 +34,9 @@ def imports(source: str) -> Iterator[tuple[str, str | None]]:
 def test_what_is_imported_is_there(rgb, monkeypatch, path):
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     for module, name in imports(path.read_text(encoding="utf-8")):
-        if module.split(".")[0] in OURS and not (name and hasattr(import_module(module), name)):
+        top = module.split(".")[0]
+        assert top in EXTRAS or find_spec(top), f"there is no {top}"
+        if top in OURS and not (name and hasattr(import_module(module), name)):
             import_module(f"{module}.{name}" if name else module)
 
 
