@@ -97,14 +97,6 @@ def test01_no_block_is_left_out():
     assert not [file for file in RUN_ELSEWHERE.values() if not (ROOT / file).is_file()]
 
 
-def test02_no_block_is_indented_but_in_a_fence():
-    for path in PAGES:
-        if path.name in ("README.md", "tracking.md"):
-            continue
-        prose = re.sub(r"^( *)```.*?^ *```", "", path.read_text("utf-8"), flags=re.M | re.S)
-        assert not re.findall(r"^\n {4}(?:nerg|python|make|pip|import|from) .*", prose, re.M), path.name
-
-
 def test03_every_line_of_a_shell_is_known():
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M)) | {"check", "test"}
     extras = set(re.findall(r"^(\w+) = \[", (ROOT / "pyproject.toml").read_text(), re.M))

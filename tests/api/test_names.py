@@ -56,13 +56,6 @@ def test05_types_are_known(name):
         assert all(p.annotation is not inspect.Parameter.empty for p in signature.parameters.values())
 
 
-@pytest.mark.parametrize("name", nerg.__all__)
-def test06_names_for_type_checkers_are_those(name):
-    source = inspect.getsource(nerg)
-    head = source[source.index("if TYPE_CHECKING:") : source.index("__version__")]
-    assert f" {name}" in head.replace(",", "").replace("(", "")
-
-
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
     """A folder of posed photos: the store, rendered from four places."""
