@@ -37,7 +37,7 @@ def test_colors_of_degree_0_are_the_same_from_everywhere():
 
 
 def test_quaternions_are_rotations():
-    a, b = Rotation.random(4, rng=RNG), Rotation.random(4, rng=RNG)
+    a, b = Rotation.random(4, random_state=RNG), Rotation.random(4, random_state=RNG)
     wxyz = lambda r: r.as_quat()[:, [3, 0, 1, 2]]
     assert np.allclose(matrices_of(wxyz(a)), a.as_matrix())
     assert np.allclose(matrices_of(multiply_quaternions(wxyz(a), wxyz(b))), (a * b).as_matrix())
@@ -45,7 +45,7 @@ def test_quaternions_are_rotations():
 
 def test_a_placed_place_is_the_same_place():
     splats = some()
-    turn = Rotation.random(rng=RNG).as_matrix()
+    turn = Rotation.random(random_state=RNG).as_matrix()
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 3 * turn, [1, 2, 3]
     placed = splats.placed(Similarity(matrix))

@@ -22,7 +22,7 @@ def test_they_are_orthonormal():
 def test_a_turned_function_is_turned():
     rng = np.random.default_rng(0)
     c, d = rng.normal(size=(5, 16, 3)), fibonacci_directions(100)
-    turn = Rotation.random(rng=rng).as_matrix()
+    turn = Rotation.random(random_state=rng).as_matrix()
     turned = rotated_harmonics(c, turn)
     at = lambda c, d: np.einsum("dk,nkc->ndc", harmonics(d, 3), c)
     assert np.abs(at(turned, d) - at(c, d @ turn)).max() < 1e-12

@@ -139,7 +139,7 @@ def test_shapes_hide_and_are_hidden(rgb, render):
 
 def test_a_turned_place_shows_its_colors_turned(rgb, render):
     splats = random_splats(25, degree=3, size=0.15)
-    turn = Rotation.random(rng=np.random.default_rng(4)).as_matrix()
+    turn = Rotation.random(random_state=np.random.default_rng(4)).as_matrix()
     matrix = np.eye(4)
     matrix[:3, :3] = 2 * turn
     to_world = rgb.ScalarTransform4f(matrix)

@@ -10,7 +10,7 @@ from tests.transport.media.splats.scenes import medium_of, rays, stack
 def test_a_placed_medium_meets_what_placed_splats_would(rgb):
     splats, (o, d) = random_splats(20, degree=2), rays(50)
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = 2.5 * Rotation.random(rng=np.random.default_rng(1)).as_matrix(), [1, 0, 2]
+    matrix[:3, :3], matrix[:3, 3] = 2.5 * Rotation.random(random_state=np.random.default_rng(1)).as_matrix(), [1, 0, 2]
     to_world = Similarity(matrix)
     placed, there = medium_of(splats, to_world), medium_of(splats.placed(to_world))
     assert np.isclose(placed.step, there.step, rtol=1e-5)
