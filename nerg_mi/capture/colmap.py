@@ -53,6 +53,8 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _MIN_TRACK, _MAX_ERROR = 3, 4.0
 # Characters of a line that is split into words; those of observations, which are longer, are skipped.
 _LONGEST = 1 << 20
+# Characters of a line that are read at once.
+_PIECE = 1 << 26
 # Bytes of a text file in which its comments state how many records it has.
 _HEADER = 1 << 12
 
@@ -295,7 +297,8 @@ def _lines(raw: bytes) -> Iterator[tuple[int, str]]:
     """Line numbers and lines; comments left out."""
     # Names of images may be in any encoding.
     text = io.TextIOWrapper(io.BytesIO(raw), encoding="utf-8", errors="surrogateescape")
-    for number, line in enumerate(text, 1):
+    # A file without line ends must not become one line of gigabytes.
+    for number, line in enumerate(iter(lambda: text.readline(_PIECE), ""), 1):
         if not line.startswith("#"):
             yield number, line.rstrip("\n")
 

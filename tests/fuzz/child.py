@@ -121,7 +121,7 @@ def _files(folder: Path) -> set:
 def attempt(reader, folder: Path, special: str = "") -> dict:
     """What comes of reading ``folder``: ``outcome`` is result, refusal, or one of the breaches of the contract.
 
-    A file of 2 GB (``special`` "sparse") may be refused for its size alone.
+    A file of 400 MB (``special`` "sparse") may be refused for its size alone.
     """
     global watched  # noqa: PLW0603 (an audit hook stays for good, and looks at this to know when it counts)
     from nerg_mi.errors import NergError
@@ -168,7 +168,7 @@ def place(file: Path, special: str, data: bytes) -> None:
             file.symlink_to(file.name)
         case "sparse":
             with file.open("wb") as out:
-                out.truncate(2 << 30)
+                out.truncate(400 << 20)
         case device:
             file.symlink_to(device)
 
