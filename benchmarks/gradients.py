@@ -24,7 +24,7 @@ from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from timing import print_table
 
 import drjit as dr

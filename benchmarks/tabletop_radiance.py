@@ -38,7 +38,7 @@ def score(field: Path, views: list, box, center, spp: int, pictures: Path) -> di
     from nerg_mi.evaluation.images import Renderer, ssim
     from nerg_mi.figures.tonemap import write_png
     from nerg_mi.files.atomic import make_folder
-    from nerg_mi.maths.psnr import decibels, psnr
+    from nerg_mi.maths.color import decibels, psnr
 
     make_folder(pictures)
     render, rows, parts = Renderer(field, spp), [], []

@@ -75,7 +75,7 @@ from nerg_mi.field.constant_weights import set_constant_weights
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.field.gaze.registry import kinds
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import boolean, expose_parameters, trained, transform, volume_of
 from nerg_mi.registration import register
 from nerg_mi.transport.observer.gaze import PlacedGaze

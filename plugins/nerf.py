@@ -69,7 +69,7 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.field.constant_weights import set_constant_weights
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import boolean, expose_parameters, number, trained, transform, volume_of
 from nerg_mi.ranges import VALUES, Range
 from nerg_mi.registration import register

@@ -72,7 +72,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.splats import Splats
 from nerg_mi.formats.splats.files import read_splats
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import choice, number, resolved, text, transform, volume_of
 from nerg_mi.ranges import Range
 from nerg_mi.registration import register

@@ -85,7 +85,7 @@ def radiance_steps() -> Callable[[int], None]:
     from nerg_mi.capture.intrinsics import Intrinsics
     from nerg_mi.field.encoding.hashgrid import HashGridConfig
     from nerg_mi.field.radiance import RadianceConfig
-    from nerg_mi.maths.box import Box
+    from nerg_mi.maths.geometry import Box
     from nerg_mi.training.radiance.settings import RadianceSettings
     from nerg_mi.training.radiance.trainer import RadianceTrainer
 

@@ -15,7 +15,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain, read_json
 from nerg_mi.files.tables import write_json
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 
 from .evidence import Fit
 from .umeyama import scale_of

@@ -303,7 +303,7 @@ def _volume(given: object, role: str, to_world: Any) -> Any:
 def _transform(matrix: ArrayLike) -> Any:
     import mitsuba as mi
 
-    from nerg_mi.maths.similarity import Similarity
+    from nerg_mi.maths.geometry import Similarity
 
     matrix = np.array(getattr(matrix, "matrix", matrix), np.float64)
     if matrix.shape != (4, 4):

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.contraction import AnyBox, ContractedBox
-from nerg_mi.maths.ray_box import box_interval
+from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, box_interval
 
 from . import lens
 from .cameras import Camera, pixel_directions, project

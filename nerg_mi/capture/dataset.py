@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.contraction import AnyBox, ContractedBox
+from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox
 
 from .bounds import Extent, depth_points, explain_wrong_depth, place_extent, unmatched
 from .images import View, load_usable

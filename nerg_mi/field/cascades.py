@@ -154,7 +154,7 @@ def levels_of(bound: float) -> int:
 def contracted_cascades(bits: np.ndarray, reach: float, ns: ModuleType, threshold: float) -> CascadeGrid:
     """Cascades that hold all that the cells ``bits`` of a contracted box's unit cube hold.
 
-    ``bits``: bool array (R, R, R), indexed [z, y, x], of the cube that `maths.contraction.ContractedBox` encodes
+    ``bits``: bool array (R, R, R), indexed [z, y, x], of the cube that `maths.geometry.ContractedBox` encodes
     positions in, R even; ``reach``: of the box. The cascades have R cells along each edge, the inner cube's R / 2 cells
     becoming R; each cell is on that meets one of ``bits``.
     """

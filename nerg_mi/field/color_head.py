@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import drjit as dr
 
-from nerg_mi.maths.elementary import sigmoid
+from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.types import Float
 
 # How near to 0 and 1 a diffuse colour is taken before its logit.

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.ranges import VALUES
 
 from .backend import namespace

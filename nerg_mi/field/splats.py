@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from nerg_mi.maths.harmonics import C0, DEGREES, rotated_harmonics
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.sphere import C0, DEGREES, rotated_harmonics
 from nerg_mi.ranges import FARTHEST
 
 _LEAST_SCALE = 1e-9
@@ -36,7 +36,7 @@ class Splats:
     rotations: np.ndarray
     # Share of light that is absorbed on a ray through the centre, (N,).
     opacities: np.ndarray
-    # Coefficients of real spherical harmonics (`maths.harmonics`), (N, K, 3) with K = 1, 4, 9 or 16: the colour seen
+    # Coefficients of real spherical harmonics (`maths.sphere`), (N, K, 3) with K = 1, 4, 9 or 16: the colour seen
     # along a unit direction d of the ray is max(0, 1/2 + sum_k c_k Y_k(d)), in the colour space of the training.
     harmonics: np.ndarray
     # Further columns of the file, (N,) each, by name.

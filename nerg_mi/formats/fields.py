@@ -21,7 +21,7 @@ from nerg_mi.field.occupancy import OccupancyGrid, unpacked
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.field.refined import RefinedGrid
 from nerg_mi.files.checksum import file_sha256
-from nerg_mi.maths.contraction import box_of
+from nerg_mi.maths.geometry import box_of
 from nerg_mi.ranges import VALUES
 
 from .architecture import MEMBERS, building, check_occupancy, check_sizes, number

@@ -26,7 +26,7 @@ from nerg_mi.figures.provenance import provenance
 from nerg_mi.figures.saving import save
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.checksum import file_sha256
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry import places
 from nerg_mi.training.geometry.places import GazePlace

@@ -20,7 +20,7 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.splats.files import read_splats
 from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.maths.color import decode_srgb
-from nerg_mi.maths.harmonics import C0
+from nerg_mi.maths.sphere import C0
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.population import Crowd, ray_seconds
 from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays

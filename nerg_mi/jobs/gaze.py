@@ -16,7 +16,7 @@ from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.files.atomic import check_writable, reserving
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays

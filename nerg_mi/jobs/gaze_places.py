@@ -13,8 +13,7 @@ from nerg_mi.alignment.check import check_alignment
 from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import is_field
-from nerg_mi.maths.contraction import AnyBox
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import AnyBox, Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry import places
 from nerg_mi.training.geometry.places import GazePlace

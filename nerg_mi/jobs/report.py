@@ -22,7 +22,7 @@ from nerg_mi.formats.areas.reading import read_areas
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.regions import Region
 from nerg_mi.interruption import Interruption
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.summary import summarise

@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures.overview import Frame, Seen
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.frames_file import write_frames
 from nerg_mi.rendering.pictures import load_scene

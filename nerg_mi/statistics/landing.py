@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from nerg_mi.formats.regions import Region
-from nerg_mi.maths.ray_box import box_interval
+from nerg_mi.maths.geometry import box_interval
 
 MARGIN = 0.03
 """In metres: of surfaces that are known as exactly as a radiance field has them."""

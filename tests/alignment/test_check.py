@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.alignment.check import Check, check_alignment
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.transport.media.volume import VolumeMedium
 from nerg_mi.transport.place import Place
 

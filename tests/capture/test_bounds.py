@@ -6,7 +6,7 @@ import pytest
 from nerg_mi.capture.bounds import place_extent, scene_box, unmatched
 from nerg_mi.capture.cameras import Camera
 from nerg_mi.capture.intrinsics import Intrinsics
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 LENS = Intrinsics(10, 10, 10.0, 10.0, 5.0, 5.0)
 

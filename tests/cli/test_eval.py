@@ -10,7 +10,7 @@ from nerg_mi.cli import main
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_radiance
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 
 @pytest.fixture

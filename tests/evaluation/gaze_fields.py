@@ -10,7 +10,7 @@ from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField, blind_table
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 
 KINDS = ("linear", "normalised", "default recipe", "ensemble")

@@ -8,7 +8,7 @@ import pytest
 
 from nerg_mi.evaluation import frame_time
 from nerg_mi.evaluation.frame_time import frame_timer
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.training.geometry.places import GazePlace, place_of_field, place_of_hits, place_of_scene
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.plugins import fields

@@ -14,7 +14,7 @@ from nerg_mi.evaluation.images import Renderer, depth_score, score_views, ssim
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_radiance
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 
 def noisy():

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.cascades import CascadeGrid, contracted_cascades
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.contraction import ContractedBox
+from nerg_mi.maths.geometry import Box, ContractedBox
 
 R = 4
 

@@ -15,7 +15,7 @@ from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.field.unrolled import evaluate
-from nerg_mi.maths.contraction import Box
+from nerg_mi.maths.geometry import Box
 
 GRID = HashGridConfig(levels=2, log2_rows=8, base=2, finest=8)
 BOX = Box((0, 0, 0), (1, 1, 1))

@@ -11,7 +11,7 @@ import pytest
 from nerg_mi.field import extraction
 from nerg_mi.field.extraction import Lattice, Sampler, crossings, opacity, surface_density
 from nerg_mi.field.occupancy import OccupancyGrid
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 
 class Ramp:

@@ -10,7 +10,7 @@ import pytest
 from nerg_mi.field.cascades import CascadeGrid
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.refinement import STEP_DEPTH, refine
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 BOX = Box((-1, -2, 0), (3, 2, 2))
 R = 16

@@ -3,9 +3,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.field.splats import Splats, from_trained, harmonics_of, logits_of, matrices_of, multiply_quaternions
-from nerg_mi.maths.harmonics import harmonics
-from nerg_mi.maths.similarity import Similarity
-from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.sphere import fibonacci_directions, harmonics
 
 RNG = np.random.default_rng(0)
 

@@ -8,7 +8,7 @@ from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.mlp import MLP
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from tests.field.test_mlp import evaluated_backwards
 
 RNG = np.random.default_rng(0)

@@ -15,7 +15,7 @@ def solid_cells() -> np.ndarray:
     """Cells (z, y, x), bool, that walls or furniture fill: 13 cm wide, on the unit cube of the store's box."""
     from nerg_mi.scenes.store import layout
 
-    from nerg_mi.maths.box import Box
+    from nerg_mi.maths.geometry import Box
 
     box = Box(*BOX)
     axis = (np.arange(CELLS) + 0.5) / CELLS
@@ -37,7 +37,7 @@ def write_standins(folder: Path) -> dict[str, str]:
     from nerg_mi.field.occupancy import OccupancyGrid
     from nerg_mi.field.radiance import RadianceConfig, RadianceField
     from nerg_mi.formats.fields import save_gaze, save_radiance
-    from nerg_mi.maths.box import Box
+    from nerg_mi.maths.geometry import Box
 
     ns, box = namespace(mi.variant()), Box(*BOX)
     grid = HashGridConfig(levels=4, log2_rows=12, base=4, finest=24)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.figures.overview import Frame, Judge, Seen, around_observer, of_place
-from nerg_mi.maths.ray_box import box_interval
+from nerg_mi.maths.geometry import box_interval
 from nerg_mi.maths.sphere import fibonacci_directions
 
 UP = np.array([0.0, 0, 1])

@@ -4,7 +4,7 @@ import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 CENTER, RADIUS = np.array([1.2, 1.0, 0.9]), 0.6
 

@@ -16,8 +16,7 @@ from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.contraction import ContractedBox
+from nerg_mi.maths.geometry import Box, ContractedBox
 
 GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
 BOX = Box((-1, 0, 2), (3, 2, 4))

@@ -12,7 +12,7 @@ import trimesh
 from nerg_mi.field.extraction import Lattice, surface_density
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.formats.surfaces import mesh, points, write_glb, write_ply
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from tests.formats.ball import CENTER, RADIUS, Ball
 
 

@@ -16,7 +16,7 @@ def _parts():
     from drjit.llvm import ad as ns
 
     from nerg_mi.field.encoding.hashgrid import HashGridConfig
-    from nerg_mi.maths.box import Box
+    from nerg_mi.maths.geometry import Box
 
     return ns, Box((-1, 0, 2), (3, 2, 4)), HashGridConfig(levels=2, log2_rows=3, base=2, finest=4)
 

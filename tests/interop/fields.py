@@ -6,7 +6,7 @@ import numpy as np
 from nerg_mi.field.background import Background, BackgroundConfig
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((-1, -1, -1), (1, 1, 1))

@@ -12,7 +12,7 @@ from nerg_mi.jobs import alignment, gaze_places
 from nerg_mi.jobs.alignment import align
 from nerg_mi.jobs.gaze_places import check_place
 from nerg_mi.jobs.options.alignment import AlignOptions
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.training.geometry.places import GazePlace
 from tests.alignment import rooms
 

@@ -14,7 +14,7 @@ from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.jobs.bake_splats import COLUMN, bake_splats
 from nerg_mi.jobs.baking import chunks
 from nerg_mi.jobs.options.bake import BakeOptions
-from nerg_mi.maths.harmonics import C0
+from nerg_mi.maths.sphere import C0
 from nerg_mi.rays.rays import Rays
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.jobs.recorder import Recorder

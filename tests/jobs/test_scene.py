@@ -18,8 +18,7 @@ from nerg_mi.jobs.options.place import PlaceOptions
 from nerg_mi.jobs.options.scene import SceneOptions
 from nerg_mi.jobs.pictures import render_file
 from nerg_mi.jobs.scene import write_scene
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.contraction import ContractedBox
+from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.channels import render_channels
 from nerg_mi.rendering.frames_file import read_frames

@@ -4,7 +4,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 BOX = Box((-1, 0, 2), (3, 2, 3))
 

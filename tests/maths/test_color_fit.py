@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.maths.color_fit import fit_colors, psnr_of_fitted_half
-from nerg_mi.maths.psnr import psnr
+from nerg_mi.maths.color import fit_colors, psnr, psnr_of_fitted_half
 
 A = np.array([[0.8, 0.05, 0.0], [0.0, 0.9, -0.04], [0.02, 0.0, 1.1]])
 B = np.array([0.05, -0.02, 0.01])

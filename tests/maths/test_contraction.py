@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.contraction import ContractedBox, box_of
+from nerg_mi.maths.geometry import Box, ContractedBox, box_of
 
 CORE = Box((-1.0, 2.0, -0.5), (3.0, 5.0, 1.5))
 

@@ -4,7 +4,7 @@ import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.maths.elementary import log1p, one_minus_exp, quotient, sigmoid
+from nerg_mi.maths.arrays import log1p, one_minus_exp, quotient, sigmoid
 
 EPS = np.finfo(np.float32).eps
 

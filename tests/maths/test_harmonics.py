@@ -3,8 +3,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.maths.harmonics import DEGREES, harmonics, rotated_harmonics
-from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.sphere import DEGREES, fibonacci_directions, harmonics, rotated_harmonics
 
 
 @pytest.mark.parametrize("degree", DEGREES.values())

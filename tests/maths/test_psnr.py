@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.maths.psnr import decibels, psnr
+from nerg_mi.maths.color import decibels, psnr
 
 
 def test_psnr():

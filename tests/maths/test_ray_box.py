@@ -4,7 +4,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.ray_box import box_interval, intersect_box
+from nerg_mi.maths.geometry import box_interval, intersect_box
 from tests.reference import march_numpy as reference
 
 LOWER, UPPER = (-1, 0, 2), (3, 2, 4)

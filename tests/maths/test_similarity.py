@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 
 
 def turn(scale=1.0, angle=40, move=(1, -2, 3)):

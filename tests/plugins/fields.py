@@ -7,7 +7,7 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((-1, -1, -1), (1, 1, 1))

@@ -8,8 +8,7 @@ import pytest
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_radiance
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.contraction import ContractedBox
+from nerg_mi.maths.geometry import Box, ContractedBox
 
 from .scenes import camera, channels, observer_at
 

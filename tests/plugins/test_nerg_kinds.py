@@ -12,7 +12,7 @@ from nerg_mi.evaluation.gaze.scores import gaze_field
 from nerg_mi.field.gaze import registry
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.place import Place
 
 from .scenes import camera, channels, named, observer_at

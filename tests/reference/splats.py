@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.maths.harmonics import harmonics
+from nerg_mi.maths.sphere import harmonics
 
 
 def peaks(splats, o, d, extent=3.0):

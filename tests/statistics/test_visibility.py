@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.regions import Region
-from nerg_mi.maths.ray_box import box_interval
+from nerg_mi.maths.geometry import box_interval
 from nerg_mi.statistics.landing import Box
 from nerg_mi.statistics.visibility import CellsInView, Targets, in_view, isovists, standing, unhidden
 

@@ -10,7 +10,7 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 ROOM = """<scene version="3.0.0">
     <integrator type="nerg" id="integrator">

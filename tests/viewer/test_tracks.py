@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.viewer.tracks import ALL, GAP, Tracks
 

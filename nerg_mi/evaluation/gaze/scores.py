@@ -10,7 +10,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.maths.arrays import vector_of
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
 from nerg_mi.transport.observer.gaze import ObservedGaze, PlacedGaze
 from nerg_mi.transport.observer.settings import ObserverSettings

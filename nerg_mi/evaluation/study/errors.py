@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.evaluation import saliency as metrics
-from nerg_mi.maths.psnr import decibels
+from nerg_mi.maths.color import decibels
 
 from .reference import Truth
 

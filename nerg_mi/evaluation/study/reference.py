@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerg_mi.maths.ray_box import box_interval
+from nerg_mi.maths.geometry import box_interval
 from nerg_mi.transport.observer.gaze import ObservedGaze
 
 from .scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene

@@ -16,7 +16,7 @@ import numpy as np
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.observer.gaze import PlacedGaze
 
 NUMPY = SimpleNamespace(select=np.where, exp=np.exp)

@@ -13,7 +13,7 @@ from typing import ClassVar
 import drjit as dr
 
 from nerg_mi.field.mlp import MLP
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 
 from .basis import Basis
 from .protocol import Arrays, GazeDensity

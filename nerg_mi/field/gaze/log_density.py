@@ -25,9 +25,8 @@ from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.encoding.registry import encoding_config, random_encoding
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign
-from nerg_mi.maths.arrays import vector_of
-from nerg_mi.maths.contraction import AnyBox
-from nerg_mi.maths.elementary import sigmoid
+from nerg_mi.maths.arrays import sigmoid, vector_of
+from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.ranges import FARTHEST, LENGTHS
 
 from .basis import Basis

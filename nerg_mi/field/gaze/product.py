@@ -24,8 +24,8 @@ from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.encoding.registry import encoding_config, random_encoding
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign
-from nerg_mi.maths.contraction import AnyBox
-from nerg_mi.maths.elementary import log1p, sigmoid
+from nerg_mi.maths.arrays import log1p, sigmoid
+from nerg_mi.maths.geometry import AnyBox
 
 from .basis import Basis
 from .protocol import Arrays

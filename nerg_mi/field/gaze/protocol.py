@@ -19,7 +19,7 @@ import numpy as np
 
 from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.mlp import MLP
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 
 from .basis import Basis

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TypeVar
 
 from nerg_mi.errors import plain
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 
 from .protocol import AnyGazeField, Arrays
 

@@ -20,7 +20,7 @@ from nerg_mi.field.encoding.protocol import Encoding
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.architecture import building, check_sizes
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 from .occupancy import bitfield, read_occupancy
 from .pickling import write_torch

@@ -14,7 +14,7 @@ from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.bounded import plain
 from nerg_mi.formats.architecture import building, check_sizes
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 from .fields import AS_TRAINED_BY_DEFAULT, Given, radiance_field
 from .state_dict import StateDict, decimals, grid, grid_config, open_checkpoint, origin, sh_degree

@@ -14,7 +14,7 @@ from nerg_mi.jobs.gaze_places import align_of_training
 from nerg_mi.jobs.options.bake import BakeOptions
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.maths.coordinates import check_coordinates
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.ranges import VALUES
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays

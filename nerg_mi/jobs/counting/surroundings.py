@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.jobs.gaze_places import align_of_training, place_of_training
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.statistics.shares import Look

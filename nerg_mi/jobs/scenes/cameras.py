@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.figures.overview import Frame, Judge, Seen, Shot, around_observer, of_place
-from nerg_mi.maths.contraction import box_of
+from nerg_mi.maths.geometry import box_of
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rendering.channels import render_channels
 from nerg_mi.rendering.scene_parts import Eye, ahead_level

@@ -14,7 +14,7 @@ from nerg_mi.formats.meshes import READERS
 from nerg_mi.formats.splats.files import is_splats, refuse_others
 from nerg_mi.jobs.gaze_places import align_of_training, file_of_training, place_key
 from nerg_mi.jobs.reporter import Reporter
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays
 

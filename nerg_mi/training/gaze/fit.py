@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.interruption import Interruption
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 
 from .plan import GazePlan
 from .state import GazeRunFile

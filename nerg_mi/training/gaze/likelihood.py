@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 
 from .batches import Batch
 from .log_density_model import log_gaze, used_parameters

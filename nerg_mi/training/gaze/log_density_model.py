@@ -12,7 +12,7 @@ from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.field.gaze.product import softplus
 from nerg_mi.field.mlp import MLP
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.training.radiance.model import stack
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from drjit.opt import AdamW
 
 from nerg_mi.field.gaze.protocol import GazeDensity
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 
 from .batches import Batch, TargetArrays
 from .losses import gaze_loss

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.ray_box import box_interval
+from nerg_mi.maths.geometry import Box, box_interval
 from nerg_mi.rays.rays import Rays
 
 from .hit_extent import HitExtent, hit_extent

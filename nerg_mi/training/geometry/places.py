@@ -17,9 +17,7 @@ from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.splats.files import READERS, is_splats, read_splats, refuse_others
 from nerg_mi.formats.volumes import write_volume
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.contraction import AnyBox
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import AnyBox, Box, Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.mesh_file import check_vol
 from nerg_mi.rendering.pictures import load_scene

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.maths.contraction import AnyBox
-from nerg_mi.maths.ray_box import box_interval
+from nerg_mi.maths.geometry import AnyBox, box_interval
 from nerg_mi.transport.observer.surroundings import nearest_depth
 from nerg_mi.transport.trace import trace_depth
 

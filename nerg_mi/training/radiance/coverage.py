@@ -8,7 +8,7 @@ import numpy as np
 
 from nerg_mi.capture.cameras import pixel_directions
 from nerg_mi.capture.images import View
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 from .preview import Preview
 

@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
 from nerg_mi.field.cascades import CascadeGrid, contracted_cascades
 from nerg_mi.field.occupancy import OccupancyGrid, grown
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f, UInt32
 
 _DECAY = 0.6

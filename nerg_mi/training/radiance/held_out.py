@@ -9,8 +9,7 @@ import numpy as np
 
 from nerg_mi.capture.images import View
 from nerg_mi.field.radiance import RadianceField
-from nerg_mi.maths.color_fit import psnr_of_fitted_half
-from nerg_mi.maths.psnr import psnr
+from nerg_mi.maths.color import psnr, psnr_of_fitted_half
 
 if TYPE_CHECKING:
     from .trainer import RadianceTrainer

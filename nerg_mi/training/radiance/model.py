@@ -9,7 +9,7 @@ from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceConfig, density_from_log
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 
 
 def stack(rows: list, ns):

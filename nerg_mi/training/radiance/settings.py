@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from nerg_mi.errors import NergError
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.ranges import LEARNING_RATES, LOSS_WEIGHTS, MINUTES, SEEDS, STEPS, Checked, Range, ranged
 
 # (levels, log2 rows, base and finest resolution, width, hidden layers of the colour net). "paper" has the paper's

@@ -20,7 +20,7 @@ from nerg_mi.field.backend import aligned
 from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.field.refinement import refine
-from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Float, UInt32
 from nerg_mi.training.common.step_clock import StepClock
 

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import drjit as dr
 
-from nerg_mi.maths.elementary import log1p
+from nerg_mi.maths.arrays import log1p
 from nerg_mi.maths.types import Bool, Float
 from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.protocol import Medium

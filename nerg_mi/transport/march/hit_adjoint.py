@@ -13,7 +13,7 @@ from typing import Any
 
 import drjit as dr
 
-from nerg_mi.maths.elementary import log1p
+from nerg_mi.maths.arrays import log1p
 from nerg_mi.maths.types import Bool, Color, Float, UInt32
 from nerg_mi.transport.media.hits import LastHit
 from nerg_mi.transport.media.local_ray import LocalRay

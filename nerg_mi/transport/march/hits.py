@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import drjit as dr
 
-from nerg_mi.maths.elementary import log1p
+from nerg_mi.maths.arrays import log1p
 from nerg_mi.maths.types import Bool, Float
 from nerg_mi.transport.media.hits import Hits, LastHit
 from nerg_mi.transport.media.local_ray import LocalRay

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import drjit as dr
 
-from nerg_mi.maths.elementary import one_minus_exp
+from nerg_mi.maths.arrays import one_minus_exp
 from nerg_mi.maths.types import Float
 
 # Below it the closed form cancels; the series is then exact to 1e-8.

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import drjit as dr
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.elementary import quotient
+from nerg_mi.maths.arrays import quotient
 from nerg_mi.maths.types import Bool, Color, Float
 from nerg_mi.transport.media.cells import VoxelCells
 from nerg_mi.transport.media.local_ray import LocalRay

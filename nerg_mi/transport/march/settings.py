@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from nerg_mi.maths.elementary import quotient
+from nerg_mi.maths.arrays import quotient
 from nerg_mi.maths.types import Bool, Color, Float
 from nerg_mi.transport.media.protocol import Medium
 

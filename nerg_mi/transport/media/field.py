@@ -8,8 +8,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.field.radiance import RadianceField
-from nerg_mi.maths.ray_box import intersect_box
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
 
 from .local_ray import LocalRay

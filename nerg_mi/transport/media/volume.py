@@ -10,7 +10,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.occupancy import OccupancyGrid
-from nerg_mi.maths.ray_box import intersect_box
+from nerg_mi.maths.geometry import intersect_box
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
 from nerg_mi.transport.fingerprint import Fingerprint
 from nerg_mi.transport.freezing import recording

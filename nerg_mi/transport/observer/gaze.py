@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.field.gaze.ensemble import mean, spread
 from nerg_mi.field.gaze.protocol import AnyGazeField, GazeDensity
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.transport.features import observed_features
 from nerg_mi.transport.fingerprint import Fingerprint

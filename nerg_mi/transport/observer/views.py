@@ -8,7 +8,7 @@ import drjit as dr
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.support import RaySupport
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Float, Point3f, Vector3f
 from nerg_mi.transport.freezing import recording
 

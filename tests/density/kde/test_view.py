@@ -8,7 +8,7 @@ import pytest
 
 from nerg_mi.density.kde.frame import WORTH
 from nerg_mi.density.kde.view import KdeView
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.transport.observer.cache import ObserverCache

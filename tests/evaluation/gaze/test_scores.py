@@ -9,8 +9,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze.scores import gaze_field, scores
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.geometry.places import place_of_field, place_of_scene
 from tests.evaluation.gaze_fields import KINDS, made, saved

@@ -8,7 +8,7 @@ import pytest
 from nerg_mi.evaluation.study import shapes as study_shapes
 from nerg_mi.evaluation.study.subject import open_subject
 from nerg_mi.jobs.study import StudyOptions, run_study
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.geometry.surfaces import box_exit
 from tests.evaluation.gaze_fields import KINDS, saved

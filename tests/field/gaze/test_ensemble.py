@@ -11,7 +11,7 @@ from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeField
 from nerg_mi.field.gaze.support import RaySupport
 from nerg_mi.formats.fields import load_gaze, save_gaze
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 
 from .test_log_density import SMALL, made
 

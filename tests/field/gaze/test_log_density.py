@@ -12,7 +12,7 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField, blind_table, look_up, table_directions
 from nerg_mi.formats.fields import load_gaze, save_gaze
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.vmf import log_normaliser
 

@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.product import ACTIVATIONS, VARIANTS, GazeConfig, GazeField, activate, softplus
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from tests.reference import fields_numpy as reference
 
 GRID = dict(levels=4, features=2, log2_rows=12, base=4, finest=32)

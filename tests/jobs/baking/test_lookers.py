@@ -6,7 +6,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.baking.lookers import check_values, find_crowd, read_path, tracked_rays
 from nerg_mi.jobs.options.bake import BakeOptions
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 from tests.jobs.recorder import Recorder
 

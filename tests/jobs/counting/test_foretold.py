@@ -10,7 +10,7 @@ from nerg_mi.jobs.counting.foretold import eyes_of_some, foretell, foretold_peop
 from nerg_mi.jobs.counting.surroundings import Surroundings
 from nerg_mi.jobs.counting.tracked import Eyes
 from nerg_mi.jobs.reporter import SILENT
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.statistics.landing import Box
 from nerg_mi.statistics.sums import ALL, Cell
 from tests.jobs.recorder import Recorder

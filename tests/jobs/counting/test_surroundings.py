@@ -8,7 +8,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.counting.surroundings import surroundings_of_files
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 
 from .place import first_box, people, write_place
 

@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.counting.surroundings import Surroundings
 from nerg_mi.jobs.counting.tracked import Counting, EyePicker, Window, ahead, blocks_of, count_block
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.landing import Box
 from nerg_mi.statistics.looks import LookRules

@@ -17,7 +17,7 @@ from nerg_mi.jobs.counting.surroundings import Surroundings
 from nerg_mi.jobs.counting.things import things_of
 from nerg_mi.jobs.counting.what_if import what_if_rows
 from nerg_mi.jobs.options.statistics import StatisticsOptions
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.statistics.looks import LookRules
 from nerg_mi.statistics.tables import Floor
 

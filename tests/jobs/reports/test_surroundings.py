@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.jobs.reports.surroundings import company, free_places, panorama_eyes, paths_of
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.report.stage import PATH_POINTS
 from nerg_mi.training.geometry.places import GazePlace

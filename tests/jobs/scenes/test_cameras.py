@@ -9,7 +9,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures.overview import Frame
 from nerg_mi.jobs.scenes.cameras import Probe, best_camera, best_photo, given_point, probe_values, turned_ahead, upright
 from nerg_mi.jobs.scenes.photos import PhotoCamera
-from nerg_mi.maths.ray_box import box_interval
+from nerg_mi.maths.geometry import box_interval
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.rendering.scene_parts import Attention, Eye, Lens, Place, SceneText
 from nerg_mi.rendering.scene_writer import element

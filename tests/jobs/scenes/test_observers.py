@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.scenes.observers import eye_of_person, support_of_rays, to_place, walk_of_person
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 
 # Half as large, turned by 90 degrees about z, moved.

@@ -8,7 +8,7 @@ import numpy as np
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.log_density import LogGazeConfig
 from nerg_mi.field.gaze.product import GazeConfig
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer
 from nerg_mi.training.gaze.plan import GazePlan

@@ -12,8 +12,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.basis import Basis
 from nerg_mi.formats.checkpoint import write_checkpoint
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.ensemble import blocks_of, resample, resample_views, train_ensemble
 from nerg_mi.training.gaze.state import StateSettings

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.training.gaze.plan import alignment
 from nerg_mi.training.gaze.state import StateSettings
 from nerg_mi.training.gaze.supervision import Supervision

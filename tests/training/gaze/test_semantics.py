@@ -13,7 +13,7 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.product import GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.product import ProductTrainer
 from nerg_mi.training.gaze.product_model import gaze_density

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.training.gaze.settings import GazeSettings
 from nerg_mi.training.gaze.splits import far_views, hold_out, split_validation, split_views
 from nerg_mi.training.gaze.supervision import Supervision

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.training.gaze.supervision import Supervision, digest_rays, digest_views
 from nerg_mi.training.geometry.places import GazePlace
 

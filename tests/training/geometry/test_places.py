@@ -12,8 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.splats import Splats, joined
 from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.formats.volumes import write_volume
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rendering.scene_file import files_of_scene
 from nerg_mi.training.geometry.places import (
     GazePlace,

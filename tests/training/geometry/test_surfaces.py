@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.geometry.places import NOWHERE, GazePlace
 from nerg_mi.training.geometry.surfaces import box_exit, surface_distances

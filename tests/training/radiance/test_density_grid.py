@@ -7,8 +7,7 @@ import pytest
 
 from nerg_mi.capture.cameras import Camera
 from nerg_mi.capture.intrinsics import Intrinsics
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.contraction import ContractedBox
+from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.training.radiance.density_grid import DensityGrid
 
 BOX = Box((-1, -1, -1), (1, 1, 1))

@@ -6,8 +6,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.color_fit import psnr_of_fitted_half
-from nerg_mi.maths.psnr import psnr
+from nerg_mi.maths.color import psnr, psnr_of_fitted_half
 from nerg_mi.training.radiance.held_out import HeldOutError, measure
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 

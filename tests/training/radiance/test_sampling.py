@@ -7,7 +7,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.training.radiance.sampling import StepTable, occupied_steps, rays_in_box, visible_samples
 
 BOX = Box((-1, -1, -1), (1, 1, 1))

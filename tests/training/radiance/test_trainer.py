@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.radiance import RadianceField
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.training.radiance.compositing import damp_near, ray_sum
 from nerg_mi.training.radiance.held_out import measure
 from nerg_mi.training.radiance.losses import color_loss, composite, depth_loss, feature_decay

@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.capture.cameras import pixel_directions
 from nerg_mi.capture.images import View
-from nerg_mi.maths.contraction import ContractedBox
+from nerg_mi.maths.geometry import ContractedBox
 from nerg_mi.training.radiance.held_out import measure
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from nerg_mi.transport.media.field import FieldMedium

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.study import settings as study
-from nerg_mi.maths.elementary import quotient
+from nerg_mi.maths.arrays import quotient
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.quadrature import linear_share
 from nerg_mi.transport.march.rules import RULES, Step

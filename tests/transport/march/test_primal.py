@@ -9,7 +9,7 @@ import pytest
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.field import FieldMedium

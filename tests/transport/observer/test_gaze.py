@@ -15,8 +15,7 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.log_density import LogGazeField
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.formats.volumes import write_volume
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.geometry.places import place_of_volume
 from nerg_mi.transport.march.settings import MarchSettings

@@ -6,7 +6,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 
 from nerg_mi.field.splats import Splats, harmonics_of
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from nerg_mi.transport.media.splats.medium import SplatMedium
 

@@ -2,7 +2,7 @@ import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.maths.harmonics import harmonics
+from nerg_mi.maths.sphere import harmonics
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from tests.formats.splats.writers import random_splats
 from tests.reference.splats import peaks

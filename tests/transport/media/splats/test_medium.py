@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.geometry import Similarity
 from tests.formats.splats.writers import random_splats
 from tests.transport.media.splats.scenes import medium_of, rays, stack
 

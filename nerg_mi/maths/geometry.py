@@ -1,0 +1,338 @@
+"""Boxes, bounded and contracted, the part of a ray inside one, and similarity transforms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import drjit as dr
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nerg_mi.errors import NergError
+from nerg_mi.ranges import FARTHEST
+
+from .coordinates import check_coordinates
+from .types import Array3f, Point3f, Vector3f
+
+# ---- The axis-aligned box in which a field lives, and its map to the unit cube ----
+
+
+@dataclass(frozen=True)
+class Box:
+    """``lower`` and ``upper`` corners, in the field's own units.
+
+    Points map to the unit cube by one uniform scale about the centre (grid cells
+    stay cubes), so the longest edge spans [0, 1] and the others a part of it.
+    ``bound``: the unit cube is [-bound, bound]³ instead, of which the box is a part, and the map is torch-ngp's
+    (p + bound) / (2 bound), rounded as there: in a fine hash grid the last bit of a coordinate can be seen.
+    """
+
+    # The three coordinates of either corner; any sequences of numbers become tuples.
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    # Half the edge of the unit cube, where that is not the box's longest.
+    bound: float | None = None
+
+    # Whether positions are contracted before they are encoded, and how far then (`geometry.ContractedBox`).
+    contracted: ClassVar[bool] = False
+    reach: ClassVar[float | None] = None
+
+    def __post_init__(self):
+        lower, upper = np.asarray(self.lower, float), np.asarray(self.upper, float)
+        if lower.shape != (3,) or upper.shape != (3,) or not (np.abs([lower, upper]) <= FARTHEST).all():
+            raise ValueError(
+                f"a box needs two finite corners of 3 numbers within {FARTHEST:g}, got {self.lower} and {self.upper}"
+            )
+        if not np.all(upper > lower):
+            raise ValueError(f"the upper corner {self.upper} of a box must exceed its lower corner {self.lower}")
+        farthest = max(np.abs(lower).max(), np.abs(upper).max())
+        if self.bound is not None and not (np.isfinite(self.bound) and farthest <= self.bound):
+            raise ValueError(f"a box of {self.lower} to {self.upper} does not lie within a bound of {self.bound}")
+        object.__setattr__(self, "lower", tuple(lower.tolist()))
+        object.__setattr__(self, "upper", tuple(upper.tolist()))
+
+    @property
+    def side(self) -> float:
+        """Length of the unit cube in the field's units: the longest edge, where no ``bound`` is given."""
+        return 2 * self.bound if self.bound is not None else max(u - l for l, u in zip(self.lower, self.upper))
+
+    @property
+    def cube_side(self) -> float:
+        """Length, in the field's units, of the cube that `to_cube` makes the unit cube."""
+        return self.side
+
+    @property
+    def core(self) -> Box:
+        """The part that is resolved best: all of it."""
+        return self
+
+    @property
+    def center(self) -> tuple[float, ...]:
+        """Centre of the unit cube."""
+        return (0.0, 0.0, 0.0) if self.bound is not None else tuple((l + u) / 2 for l, u in zip(self.lower, self.upper))
+
+    @property
+    def diagonal(self) -> float:
+        return float(np.linalg.norm(np.subtract(self.upper, self.lower)))
+
+    def to_unit(self, p):
+        """Unit-cube coordinates of ``p`` (Array3f or (N, 3) array)."""
+        if self.bound is not None:
+            return self._divided(p + self.bound, 2 * self.bound)
+        if dr.is_array_v(p):
+            return (p - type(p)(*self.center)) / self.side + 0.5
+        return (np.asarray(p) - np.asarray(self.center)) / self.side + 0.5
+
+    def from_unit(self, u):
+        """The points (Array3f) at ``u`` of the unit cube."""
+        return (u - 0.5) * self.side + type(u)(*self.center)
+
+    def to_cube(self, p):
+        """``p`` (Array3f) in a unit cube in which straight lines stay straight: as `to_unit` has it."""
+        return self.to_unit(p)
+
+    def distance_scale(self, p):
+        """How much larger cells of the unit cube are at ``p`` than in the core: they are all alike."""
+        return 1.0
+
+    def density_along(self, sigma, p):
+        """Density per unit of the field at ``p`` where it is ``sigma`` per unit as positions are encoded: the same."""
+        return sigma
+
+    @staticmethod
+    def _divided(x, divisor: float):
+        """``x / divisor``, correctly rounded: for Dr.Jit a division by a constant is a product with its reciprocal."""
+        if not dr.is_array_v(x):
+            return np.asarray(x) / np.asarray(x).dtype.type(divisor)
+        inverse = float(np.float32(1 / divisor))
+        quotient = x * inverse
+        if np.frexp(divisor)[0] == 0.5:
+            return quotient
+        return dr.fma(dr.fma(-quotient, divisor, x), inverse, quotient)
+
+    def contains(self, p):
+        """Mask of the points ``p`` (Array3f) inside the box."""
+        return dr.all((p >= type(p)(*self.lower)) & (p <= type(p)(*self.upper)))
+
+    def to_dict(self) -> dict:
+        corners = {"lower": list(self.lower), "upper": list(self.upper)}
+        return corners if self.bound is None else {**corners, "bound": self.bound}
+
+
+# ---- Contraction ----
+#
+# A place without an end: a cube at full resolution, and all around it, contracted, out to a far bound.
+#
+# The map is that of mip-NeRF 360 (Barron et al. 2022, equation 10) with the largest coordinate in the place of the
+# length: with x the position in half edges of the inner cube and m = max |x_k|,
+#
+#     contract(x) = x where m <= 1,   (2 - 1 / m) x / m elsewhere,
+#
+# which fills the cube [-2, 2]^3 as m grows without bound. Only where a field is *encoded* is anything contracted:
+# positions, distances and densities are those of the scene everywhere, and rays are straight.
+
+
+REACH = 64.0
+"""Half edges of the inner cube at which a place ends that knows no end: what lies farther away moves by less than a
+pixel as cameras within the cube walk about, and may as well stand there."""
+
+
+@dataclass(frozen=True)
+class ContractedBox:
+    """A cube around ``core``, whose edge is ``core``'s longest, and the ``reach`` times larger cube around that.
+
+    It answers what a `Box` answers. ``lower`` and ``upper`` bound everything that may be marched; ``side`` is the
+    length by which a scene is measured, the inner cube's edge. ``reach``: a power of two, at least 2. Raises
+    ``ValueError`` for another.
+    """
+
+    core: Box
+    reach: float = REACH
+
+    contracted: ClassVar[bool] = True
+    # The unit cube is not the box's own (`Box.bound`).
+    bound: ClassVar[float | None] = None
+
+    def __post_init__(self):
+        if not (2 <= self.reach <= 2**12 and np.frexp(self.reach)[0] == 0.5):
+            raise ValueError(f"the reach of a contracted box must be a power of two from 2 to 4096, got {self.reach}")
+        if self.core.bound is not None:
+            raise ValueError("a contracted box has a core that is bounded by its own corners")
+
+    @property
+    def side(self) -> float:
+        """Edge of the inner cube, in the field's units."""
+        return self.core.side
+
+    @property
+    def cube_side(self) -> float:
+        """Edge of the outer cube, in the field's units."""
+        return self.core.side * self.reach
+
+    @property
+    def center(self) -> tuple[float, ...]:
+        return self.core.center
+
+    @property
+    def lower(self) -> tuple[float, ...]:
+        return tuple(c - self.cube_side / 2 for c in self.center)
+
+    @property
+    def upper(self) -> tuple[float, ...]:
+        return tuple(c + self.cube_side / 2 for c in self.center)
+
+    @property
+    def diagonal(self) -> float:
+        """Of the outer cube."""
+        return 3**0.5 * self.cube_side
+
+    def _halves(self, p):
+        """``p`` (Array3f) in half edges of the inner cube from its centre, and the largest coordinate, at least 1."""
+        x = (p - type(p)(*self.center)) * (2 / self.side)
+        return x, dr.maximum(dr.maximum(dr.maximum(dr.abs(x.x), dr.abs(x.y)), dr.abs(x.z)), 1)
+
+    def to_unit(self, p):
+        """Where ``p`` (Array3f) is encoded, in the unit cube: the inner cube is its middle, half as wide."""
+        x, m = self._halves(p)
+        inverse = dr.rcp(m)
+        return x * ((2 - inverse) * inverse * 0.25) + 0.5
+
+    def from_unit(self, u):
+        """The points (Array3f) that are encoded at ``u``; those beyond the outer cube come to lie on its face."""
+        y = (u - 0.5) * 4
+        n = dr.maximum(dr.maximum(dr.maximum(dr.abs(y.x), dr.abs(y.y)), dr.abs(y.z)), 1)
+        scale = dr.rcp(n * dr.maximum(2 - n, 1 / self.reach))
+        return y * (scale * (0.5 * self.side)) + type(y)(*self.center)
+
+    def distance_scale(self, p):
+        """How many times farther than the inner cube's face ``p`` (Array3f) is from the centre; 1 within the cube."""
+        return self._halves(p)[1]
+
+    def density_along(self, sigma, p):
+        """Density per unit of the field at ``p`` (Array3f) where it is ``sigma`` per unit as positions are encoded, out
+        along the line from the centre: σ / m². A field without structure then absorbs no more outside than within."""
+        return sigma * dr.rcp(dr.square(self._halves(p)[1]))
+
+    def to_cube(self, p):
+        """``p`` (Array3f) in coordinates in which the outer cube is the unit cube: straight lines stay straight."""
+        return (p - type(p)(*self.center)) / self.cube_side + 0.5
+
+    def contains(self, p):
+        """Mask of the points ``p`` (Array3f) inside the outer cube."""
+        return dr.all((p >= type(p)(*self.lower)) & (p <= type(p)(*self.upper)))
+
+    def to_dict(self) -> dict:
+        return {**self.core.to_dict(), "reach": self.reach}
+
+
+AnyBox = Box | ContractedBox
+"""Where a field lives: both kinds answer the same."""
+
+
+def box_of(about: dict) -> AnyBox:
+    """The box whose ``to_dict`` made ``about``. Raises ``ValueError`` or ``TypeError`` for what is none."""
+    known = dict(about)
+    reach = known.pop("reach", None)
+    return Box(**known) if reach is None else ContractedBox(Box(**known), float(reach))
+
+
+# ---- Where a ray is inside an axis-aligned box (slab method) ----
+
+
+def intersect_box(o, d, lower, upper):
+    """Parameters ``(t_near, t_far)`` at which ``o + t d`` enters and leaves the box.
+
+    ``o``, ``d``: Array3f; ``lower``, ``upper``: sequences of 3 numbers, which kernels are compiled with, or of 3
+    Floats, which they read. The ray misses where ``t_near >= t_far``. ``t_near`` is not clamped to 0. A component of
+    ``d`` that is zero never divides: such a ray is inside that slab for all t or for none.
+    """
+    Float = type(o.x)
+    lower, upper = ([v if dr.is_array_v(v) else float(v) for v in corner] for corner in (lower, upper))
+    near, far = Float(-dr.inf), Float(dr.inf)
+    for oc, dc, lo, hi in zip((o.x, o.y, o.z), (d.x, d.y, d.z), lower, upper):
+        parallel = dc == 0
+        inverse = 1 / dr.select(parallel, 1, dc)
+        a, b = (lo - oc) * inverse, (hi - oc) * inverse
+        outside = parallel & ((oc < lo) | (oc > hi))
+        t_in = dr.select(parallel, -dr.inf, dr.minimum(a, b))
+        t_out = dr.select(parallel, dr.select(outside, -dr.inf, dr.inf), dr.maximum(a, b))
+        near, far = dr.maximum(near, t_in), dr.minimum(far, t_out)
+    return near, far
+
+
+def box_interval(o: ArrayLike, d: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """The same for NumPy rays: ``o``, ``d`` broadcast to (N, 3); ``t_near`` and ``t_far`` (N,), infinite where no
+    component of ``d`` leaves its slab."""
+    near, far = -np.inf, np.inf
+    # Axis by axis: NumPy's reductions over three numbers take several times as long.
+    for oc, dc, lo, hi in zip(*(np.moveaxis(np.asarray(v), -1, 0) for v in (o, d, lower, upper))):
+        still = dc == 0
+        along = np.where(still, 1, dc)
+        with np.errstate(over="ignore"):
+            a, b = (lo - oc) / along, (hi - oc) / along
+        outside = still & ((oc < lo) | (oc > hi))
+        near = np.maximum(near, np.where(still, -np.inf, np.minimum(a, b)))
+        far = np.minimum(far, np.where(still, np.where(outside, -np.inf, np.inf), np.maximum(a, b)))
+    return np.asarray(near), np.asarray(far)
+
+
+# ---- Similarity ----
+#
+# Rotations, uniform scales and translations: what places a field in a scene.
+
+
+class Similarity:
+    """A rotation, uniform scale and translation: a field's ``to_world``.
+
+    ``matrix``: (4, 4), local (the field's) to world (the scene's); the identity by default. ``scale``: length in the
+    scene of one unit of the field. Raises ``NergError`` when it shears, mirrors or scales
+    unevenly: densities and directions would then have no single scale; and for a translation beyond `FARTHEST`.
+    """
+
+    def __init__(self, matrix: np.ndarray | None = None):
+        m = np.eye(4) if matrix is None else np.asarray(matrix, float)
+        linear = m[:3, :3]
+        determinant = np.linalg.det(linear) if np.all(np.isfinite(m)) else np.nan
+        scale = abs(determinant) ** (1 / 3)
+        if not (
+            determinant > 0
+            and np.array_equal(m[3], [0, 0, 0, 1])
+            and np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)
+        ):
+            raise NergError(
+                '"to_world" of a field must be a rotation, a uniform scale and a translation; bake any other '
+                "transform into the field's training data"
+            )
+        check_coordinates(m[None, :3, 3], 'the translation of "to_world"')
+        self.matrix, self.scale = m, float(scale)
+        self.inverse = np.linalg.inv(m)
+        self.identity = bool(np.array_equal(m, np.eye(4)))
+
+    def point_to_local(self, p: Point3f) -> Point3f:
+        """A scene point in field coordinates."""
+        return p if self.identity else self._apply(self.inverse, p, 1)
+
+    def vector_to_local(self, v: Vector3f) -> Vector3f:
+        """A scene vector in field coordinates; a unit vector becomes 1 / scale long."""
+        return v if self.identity else self._apply(self.inverse, v, 0)
+
+    def direction_to_local(self, v: Vector3f) -> Vector3f:
+        """A unit scene direction as a unit field direction."""
+        return v if self.identity else self._apply(self.inverse * self.scale, v, 0)
+
+    def bounds(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner, (3,) each, of the scene's axis-aligned box around the field's box with the corners
+        ``lower`` and ``upper``."""
+        corners = np.array(
+            [[x, y, z, 1] for x in (lower[0], upper[0]) for y in (lower[1], upper[1]) for z in (lower[2], upper[2])]
+        )
+        p = (corners @ self.matrix.T)[:, :3]
+        return p.min(0), p.max(0)
+
+    @staticmethod
+    def _apply(m: np.ndarray, v: Array3f, w: float) -> Array3f:
+        """``m`` (4, 4) times ``v``, whose fourth coordinate is ``w``."""
+        rows = [dr.fma(a, v.x, dr.fma(b, v.y, dr.fma(c, v.z, w * e))) for a, b, c, e in m[:3].tolist()]
+        return type(v)(*rows)
