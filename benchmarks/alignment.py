@@ -25,14 +25,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.alignment.camera_poses import Cameras
-from nerg_mi.alignment.evidence import Evidence, Target
+from nerg_mi.alignment.constraints import Evidence, PlaceTraces, Target, read_surface, trace_place
 from nerg_mi.alignment.icp import Twin
-from nerg_mi.alignment.pairs import Pairs
-from nerg_mi.alignment.point_file import read_surface
-from nerg_mi.alignment.surface import PlaceTraces, trace_place
+from nerg_mi.alignment.points import Cameras, Pairs
+from nerg_mi.alignment.similarity import MIRROR, errors, move, scale_of
 from nerg_mi.alignment.tracking import Tracking
-from nerg_mi.alignment.umeyama import MIRROR, errors, move, scale_of
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from timing import print_table, write_rows

@@ -1,28 +1,242 @@
-"""Alignment from a twin: a mesh, or points on surfaces, in the tracking's frame, against the surface of the place.
-
-First all turns (and mirrors) on a lattice of rotations, judged by both distance fields at once, since a twin that
-shrinks onto a single spot of the place would lie on its surface too; then iterated closest points with scale (P. Besl,
-N. McKay, 1992; scale after T. Zinsser et al., 2005), in both directions for the same reason, trimmed of what only one
-of them has (D. Chetverikov et al., 2002); and at last steps on the place's distance field (`refine`).
-"""
+"""The similarity that agrees best with several scores near a start (iterative closest points among them), and how
+well it is determined."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 
-from .chart import ALL, upright_basis
-from .evidence import Fit, Progress, Target, angles, pair_covariance
-from .grid import DistanceGrid
-from .refine import refine
-from .scores import AtZero
-from .surface import PlaceSurface, surface_of_points, thinned
-from .umeyama import MIRROR, fit_similarity, move, scale_of
+from .constraints import (
+    DistanceGrid,
+    Fit,
+    PlaceSurface,
+    Progress,
+    Target,
+    angles,
+    pair_covariance,
+    surface_of_points,
+    thinned,
+)
+from .similarity import ALL, MIRROR, Chart, fit_similarity, move, scale_of, upright_basis
+
+# ---- Scores ----
+#
+# How well a similarity agrees with what tracking says about a place, each as residuals with their derivatives.
+#
+# People's heads are in free space; they are above the floor, by about the height of a person; gaze goes through free
+# space and ends on surfaces, at its hit points where these are known. Residuals are lengths in units of the tracking
+# (metres of people), so that a smaller place is no better than a larger one; their derivatives are with respect to the
+# numbers of a chart (`Chart`). Another score is another class with these methods.
+
+
+NEAR, FAR, STEPS = 0.3, 12.0, 32
+"""Gaze without a hit point ends between so many metres; at so many places along it a surface is looked for."""
+
+STANDS = 0.9, 2.05
+"""Metres above the floor between which a head is plausible: of somebody who sits, and of somebody tall."""
+
+
+class Score(Protocol):
+    """A property that a right alignment has."""
+
+    @property
+    def name(self) -> str:
+        """What it is about, in a few words."""
+        ...
+
+    @property
+    def scale(self) -> float:
+        """Residuals beyond this many metres count less and less: strays of the tracker, holes of the place."""
+        ...
+
+    @property
+    def group(self) -> np.ndarray:
+        """(N,) whose each residual is: those of a group are not independent of each other."""
+        ...
+
+    def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (N,) in metres, 0 where all is well, of the similarity ``chart.matrix(q)``, and their derivatives
+        (N, k) with respect to ``q``."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class AtZero:
+    """Points (N, 3) are where a distance of the place is 0: hit points on its surface (`PlaceSurface.distance`), heads
+    and what gaze passes in its free space (`PlaceSurface.blocked`)."""
+
+    grid: DistanceGrid
+    points: np.ndarray
+    group: np.ndarray
+    name: str
+    scale: float = 0.1
+
+    def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _of_grid(self.grid, self.points, chart, q)
+
+
+@dataclass(frozen=True, eq=False)
+class GazeEnds:
+    """Gaze from ``origins`` along unit ``directions`` (N, 3), whose hit points are not known, comes upon a surface."""
+
+    surface: PlaceSurface
+    origins: np.ndarray
+    directions: np.ndarray
+    group: np.ndarray
+    scale: float = 0.5
+    name: str = "gaze ends on surfaces"
+
+    def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        along = np.geomspace(NEAR, FAR, STEPS)
+        points = self.origins[:, None] + along[:, None] * self.directions[:, None]
+        distance = self.surface.distance.at(chart.moved(q, points.reshape(-1, 3))).reshape(len(points), STEPS)
+        # Between two places a ray may come nearer by half of the way from one to the other.
+        reach = 0.5 * np.gradient(along) * chart.scale(q)
+        nearest = np.argmin(distance - reach, axis=1)
+        each = np.arange(len(points))
+        # The derivative of a least value is that of the value that is least.
+        r, by = _of_grid(self.surface.distance, points[each, nearest], chart, q)
+        r = r - 0.5 * np.gradient(along)[nearest]
+        return np.maximum(r, 0), by * (r > 0)[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class HeadHeight:
+    """Heads (N, 3) are above the floor at the height ``floor`` of the place, z up, as people's are."""
+
+    floor: float
+    points: np.ndarray
+    group: np.ndarray
+    scale: float = 0.2
+    name: str = "heads above the floor"
+
+    def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        moved, s = chart.moved(q, self.points), chart.scale(q)
+        height = (moved[:, 2] - self.floor) / s
+        up = np.broadcast_to([0.0, 0.0, 1.0], moved.shape)
+        slope = chart.pulled(q, moved, up) / s - height[:, None] * chart.basis[6]
+        low, high = STANDS
+        sign = np.where(height < low, -1.0, np.where(height > high, 1.0, 0.0))
+        return np.maximum(np.maximum(low - height, height - high), 0), sign[:, None] * slope
+
+
+def _of_grid(grid: DistanceGrid, points: np.ndarray, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances in units of the tracking of ``points`` (N, 3) of its frame, and their derivatives."""
+    moved, s = chart.moved(q, points), chart.scale(q)
+    value, slope = grid.with_slope(moved)
+    return value / s, (chart.pulled(q, moved, slope) - value[:, None] * chart.basis[6]) / s
+
+
+# ---- Refine ----
+#
+# The similarity that agrees best with several scores, near one that is given, and how well it is determined.
+
+
+_FEW = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """``matrix`` (4, 4); ``cost``: the robust mean over all scores, 0 where all is well, below 1; ``covariance`` (7, 7)
+    of rotation vector, translation and logarithm of the scale about the chart's ``center``."""
+
+    matrix: np.ndarray
+    cost: float
+    covariance: np.ndarray
+    center: np.ndarray
+
+
+def refine(
+    scores: Sequence[Score], base: np.ndarray, center: np.ndarray, basis: np.ndarray, wide: float = 1.0, most: int = 60
+) -> Refined:
+    """Minimise the robust residuals of ``scores`` by Gauss-Newton steps in a trust region (SciPy's least_squares with a
+    Cauchy loss), from the similarity ``base`` (4, 4) on.
+
+    Each score has the same weight, however many residuals it has. ``center``, ``basis``: of the chart; ``wide``: factor
+    of the scores' own scales, larger for a first, coarse fit; ``most``: evaluations.
+    """
+    chart = Chart(base, center, basis)
+    weight = [1 / (wide * s.scale * np.sqrt(max(len(s.group), 1))) for s in scores]
+
+    def stacked(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        parts = [s.residuals(chart, q) for s in scores]
+        return (
+            np.concatenate([w * r for w, (r, _) in zip(weight, parts)]),
+            np.concatenate([w * by for w, (_, by) in zip(weight, parts)]),
+        )
+
+    # SciPy's loss is of each residual, of which those of a score count less the more there are of them.
+    counts = np.concatenate([np.full(len(s.group), len(s.group), float) for s in scores])
+
+    def weighed(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # log(1 + z) as a square, whose root has derivatives where z > 0: z = r^2 in units of a score's scale.
+        r, by = stacked(q)
+        z = r * r * counts
+        factor = np.sqrt(np.where(z > 1e-12, np.log1p(z) / np.maximum(z, 1e-300), 1.0))
+        slope = np.where(z > 1e-12, 1 / ((1 + z) * np.maximum(factor, 1e-150)), 1.0)
+        return r * factor, by * slope[:, None]
+
+    q = np.zeros(chart.size)
+    if len(counts):
+        last: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+
+        def at(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            key = q.tobytes()
+            if key not in last:
+                last.clear()
+                last[key] = weighed(q)
+            return last[key]
+
+        derivatives: Any = lambda q: at(q)[1]
+        q = least_squares(lambda q: at(q)[0], q, derivatives, x_scale="jac", max_nfev=most).x
+    r, by = stacked(q)
+    z = r * r * counts
+    group = np.concatenate([s.group for s in scores])
+    covariance = _sandwich(r, by, 1 / (1 + z), group)
+    return Refined(
+        chart.matrix(q), float(np.sum(np.log1p(z) / counts)), chart.basis @ covariance @ chart.basis.T, center
+    )
+
+
+def _sandwich(r: np.ndarray, by: np.ndarray, weight: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Covariance (k, k) of the parameters where residuals of a group may depend on each other: H^-1 (sum of g g') H^-1,
+    g the gradient of a group (K.-Y. Liang, S. Zeger: Longitudinal data analysis using generalized linear models,
+    1986)."""
+    hessian = (by * weight[:, None]).T @ by
+    gradient = by * (weight * r)[:, None]
+    _, where = np.unique(group, return_inverse=True)
+    where = where.reshape(-1)
+    sums = np.stack([np.bincount(where, g) for g in gradient.T], axis=1)
+    count = len(sums)
+    inverse = np.linalg.pinv(hessian, hermitian=True)
+    return inverse @ (sums.T @ sums) @ inverse * (count / max(count - 1, 1))
+
+
+def groups_of(person: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """(N,) numbers of groups that are taken for independent: people, or, of few people, ten seconds of each."""
+    if len(np.unique(person)) >= _FEW:
+        return person.astype(np.int64)
+    blocks = np.floor((t - t.min(initial=np.inf)) / 10).astype(np.int64) if len(t) else np.zeros(0, np.int64)
+    return person.astype(np.int64) * (int(blocks.max(initial=0)) + 1) + blocks
+
+
+# ---- Icp ----
+#
+# Alignment from a twin: a mesh, or points on surfaces, in the tracking's frame, against the surface of the place.
+#
+# First all turns (and mirrors) on a lattice of rotations, judged by both distance fields at once, since a twin that
+# shrinks onto a single spot of the place would lie on its surface too; then iterated closest points with scale (P.
+# Besl, N. McKay, 1992; scale after T. Zinsser et al., 2005), in both directions for the same reason, trimmed of what
+# only one of them has (D. Chetverikov et al., 2002); and at last steps on the place's distance field (`refine`).
+
 
 _TURNS, _COARSE, _FINE = 1000, 150, 2000
 _SCALES = np.exp(np.linspace(-0.25, 0.25, 5))

@@ -10,7 +10,7 @@ from .fields import FilePath
 from .options import options_of, rays_of
 
 if TYPE_CHECKING:
-    from nerg_mi.alignment.record import Alignment
+    from nerg_mi.alignment.check import Alignment
     from nerg_mi.jobs.options.alignment import AlignOptions
     from nerg_mi.rays.rays import Rays
 

@@ -8,17 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.alignment.camera_poses import read_cameras
-from nerg_mi.alignment.check import check_alignment
-from nerg_mi.alignment.evidence import Evidence, Fit, Target
-from nerg_mi.alignment.flips import DECLARED, compare_flips
+from nerg_mi.alignment.check import Alignment, check_alignment, read_similarity
+from nerg_mi.alignment.constraints import Evidence, Fit, Target, read_surface, trace_place
 from nerg_mi.alignment.icp import Twin
-from nerg_mi.alignment.pairs import read_pairs
-from nerg_mi.alignment.point_file import read_surface
-from nerg_mi.alignment.record import Alignment, read_similarity
-from nerg_mi.alignment.surface import trace_place
-from nerg_mi.alignment.tracking import Tracking
-from nerg_mi.alignment.umeyama import move
+from nerg_mi.alignment.points import read_cameras, read_pairs
+from nerg_mi.alignment.similarity import move
+from nerg_mi.alignment.tracking import DECLARED, Tracking, compare_flips
 from nerg_mi.capture.upright import turn_to_z
 from nerg_mi.errors import NergError
 from nerg_mi.figures.alignment_figures import alignment_figure

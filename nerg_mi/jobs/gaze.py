@@ -9,7 +9,7 @@ from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.alignment.record import read_similarity
+from nerg_mi.alignment.check import read_similarity
 from nerg_mi.capture.salience.views import SalienceSet, open_salience
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.protocol import AnyGazeField

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.alignment.record import read_similarity
+from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overview import Frame, Seen
 from nerg_mi.files.atomic import check_writable, write_text

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from nerg_mi.alignment.record import read_similarity
+from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.checkpoint import read_metadata

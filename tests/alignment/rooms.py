@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.alignment.surface import PlaceTraces
+from nerg_mi.alignment.constraints import PlaceTraces
 from nerg_mi.rays.rays import Rays
 
 BOXES = np.array([[(0.9, 0.7, 0), (1.7, 2.9, 1.2)], [(2.6, 0, 0), (4.0, 0.8, 2.0)]])

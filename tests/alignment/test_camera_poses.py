@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.alignment.camera_poses import Cameras, mean_rotation, read_cameras
-from nerg_mi.alignment.evidence import Target
-from nerg_mi.alignment.umeyama import MIRROR, errors, scale_of
+from nerg_mi.alignment.constraints import Target
+from nerg_mi.alignment.points import Cameras, mean_rotation, read_cameras
+from nerg_mi.alignment.similarity import MIRROR, errors, scale_of
 from nerg_mi.errors import NergError
 
 from .rooms import carried, similarity

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from nerg_mi.alignment.chart import ALL, Chart, right_jacobian, upright_basis
-from nerg_mi.alignment.umeyama import scale_of
+from nerg_mi.alignment.similarity import ALL, Chart, right_jacobian, scale_of, upright_basis
 
 from .rooms import carried, similarity
 

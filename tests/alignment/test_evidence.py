@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.chart import ALL
-from nerg_mi.alignment.evidence import Target, angles, pair_covariance
-from nerg_mi.alignment.umeyama import fit_similarity, scale_of
+from nerg_mi.alignment.constraints import Target, angles, pair_covariance
+from nerg_mi.alignment.similarity import ALL, fit_similarity, scale_of
 from nerg_mi.errors import NergError
 
 from .rooms import carried, similarity

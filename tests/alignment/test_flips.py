@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.flips import DECLARED, compare_flips
+from nerg_mi.alignment.tracking import DECLARED, compare_flips
 
 RNG = np.random.default_rng(3)
 POINTS = RNG.uniform([0, 0, 0], [6, 4, 2.5], (400, 3))

@@ -1,7 +1,7 @@
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from nerg_mi.alignment.grid import DistanceGrid
+from nerg_mi.alignment.constraints import DistanceGrid
 
 GRID = DistanceGrid(np.random.default_rng(0).random((6, 7, 5)), np.array([-1.0, 0, 2]), 0.5)
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.evidence import Target
+from nerg_mi.alignment.constraints import Target
 from nerg_mi.alignment.icp import Twin
-from nerg_mi.alignment.umeyama import MIRROR, errors
+from nerg_mi.alignment.similarity import MIRROR, errors
 from nerg_mi.errors import NergError
 
 from . import rooms

@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.evidence import Target
-from nerg_mi.alignment.pairs import Pairs, read_pairs
-from nerg_mi.alignment.umeyama import MIRROR, errors
+from nerg_mi.alignment.constraints import Target
+from nerg_mi.alignment.points import Pairs, read_pairs
+from nerg_mi.alignment.similarity import MIRROR, errors
 from nerg_mi.errors import NergError
 
 from .rooms import carried, similarity

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.alignment.point_file import read_surface
+from nerg_mi.alignment.constraints import read_surface
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 

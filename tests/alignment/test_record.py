@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.evidence import Fit
-from nerg_mi.alignment.record import Alignment, read_similarity
+from nerg_mi.alignment.check import Alignment, read_similarity
+from nerg_mi.alignment.constraints import Fit
 from nerg_mi.errors import NergError
 
 

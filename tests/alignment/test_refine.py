@@ -1,10 +1,8 @@
 import numpy as np
 
-from nerg_mi.alignment.chart import ALL
-from nerg_mi.alignment.refine import groups_of, refine
-from nerg_mi.alignment.scores import AtZero
-from nerg_mi.alignment.surface import surface_of_traces
-from nerg_mi.alignment.umeyama import errors
+from nerg_mi.alignment.constraints import surface_of_traces
+from nerg_mi.alignment.icp import AtZero, groups_of, refine
+from nerg_mi.alignment.similarity import ALL, errors
 
 from . import rooms
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.chart import ALL, Chart
-from nerg_mi.alignment.scores import AtZero, GazeEnds, HeadHeight
-from nerg_mi.alignment.surface import surface_of_traces
+from nerg_mi.alignment.constraints import surface_of_traces
+from nerg_mi.alignment.icp import AtZero, GazeEnds, HeadHeight
+from nerg_mi.alignment.similarity import ALL, Chart
 
 from . import rooms
 

@@ -1,7 +1,7 @@
 import numpy as np
 
-from nerg_mi.alignment.search import close, scale_range, search
-from nerg_mi.alignment.surface import surface_of_traces
+from nerg_mi.alignment.constraints import surface_of_traces
+from nerg_mi.alignment.tracking import close, scale_range, search
 
 from . import rooms
 

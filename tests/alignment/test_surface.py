@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.surface import PlaceTraces, surface_of_points, surface_of_traces, thinned, trace_place
+from nerg_mi.alignment.constraints import PlaceTraces, surface_of_points, surface_of_traces, thinned, trace_place
 from nerg_mi.errors import NergError
 
 from . import rooms
@@ -75,6 +75,8 @@ class _Nothing:
 
 
 def test_a_place_without_surfaces_is_refused(monkeypatch):
-    monkeypatch.setattr("nerg_mi.alignment.surface.trace_depth", lambda s, o, d: (np.zeros(len(o)), np.zeros(len(o))))
+    monkeypatch.setattr(
+        "nerg_mi.alignment.constraints.trace_depth", lambda s, o, d: (np.zeros(len(o)), np.zeros(len(o)))
+    )
     with pytest.raises(NergError, match="no surfaces that rays could meet"):
         trace_place(_Nothing(), np.zeros(3), np.ones(3), 1000)  # pyright: ignore[reportArgumentType] # traced by nothing

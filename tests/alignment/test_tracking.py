@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.evidence import Target
+from nerg_mi.alignment.constraints import Target
+from nerg_mi.alignment.similarity import MIRROR, errors
 from nerg_mi.alignment.tracking import Tracking
-from nerg_mi.alignment.umeyama import MIRROR, errors
 from nerg_mi.errors import NergError
 
 from . import rooms

@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.alignment.umeyama import (
+from nerg_mi.alignment.similarity import (
     MIRROR,
     check_points,
     errors,

@@ -173,8 +173,8 @@ def _make_pairs(folder: Path) -> None:
 
 def _pairs(name: str, kind: str) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.alignment.evidence import Target
-        from nerg_mi.alignment.pairs import read_pairs
+        from nerg_mi.alignment.constraints import Target
+        from nerg_mi.alignment.points import read_pairs
 
         read_pairs(folder / name).fit(Target(upright=False), lambda *_: None)
 
@@ -182,13 +182,13 @@ def _pairs(name: str, kind: str) -> Reader:
 
 
 def _make_alignment(folder: Path) -> None:
-    from nerg_mi.alignment.record import Alignment
+    from nerg_mi.alignment.check import Alignment
 
     Alignment(np.diag([2.0, 2, 2, 1]), {"kind": "pairs"}, {"count": 5}, None).save(folder / "alignment.json")
 
 
 def _read_alignment(folder: Path) -> None:
-    from nerg_mi.alignment.record import read_similarity
+    from nerg_mi.alignment.check import read_similarity
 
     read_similarity(folder / "alignment.json", "--align", "rays to field")
 
@@ -206,7 +206,7 @@ def _surface(name: str, *kinds: str) -> Reader:
             box.export(folder / name)
 
     def read(folder: Path) -> None:
-        from nerg_mi.alignment.point_file import read_surface
+        from nerg_mi.alignment.constraints import read_surface
 
         read_surface(folder / name, 500)
 

@@ -9,7 +9,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.record import read_similarity
+from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.gaze_places import make_place, place_of_training
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.record import read_similarity
+from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.tracking import (
     FilterOptions,

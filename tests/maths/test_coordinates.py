@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.point_file import read_surface
+from nerg_mi.alignment.constraints import read_surface
 from nerg_mi.capture.posed import Frame, settled
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns

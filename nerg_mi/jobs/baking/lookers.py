@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.alignment.record import read_similarity
+from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.figures.colors import find_colors
 from nerg_mi.formats.checkpoint import read_metadata

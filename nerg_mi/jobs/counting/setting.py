@@ -10,7 +10,7 @@ from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.alignment.record import read_similarity
+from nerg_mi.alignment.check import read_similarity
 from nerg_mi.formats.areas.kinds import Areas, Group
 from nerg_mi.formats.regions import read_regions
 from nerg_mi.jobs.options.statistics import StatisticsOptions, parse_window
