@@ -28,10 +28,10 @@ from collections.abc import Callable
 import cold_kernels  # noqa: F401
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import torch_frames
-from nerg_mi.density.kde.estimate import SphericalKde
 from nerg_mi.figures.saving import save
 from nerg_mi.jobs.demo import store_scene
 from nerg_mi.llvm import has_cuda
+from nerg_mi.probes.kde import SphericalKde
 from timing import at_the_end, exponent, in_turns, median, print_table, spread, write_rows
 
 import numpy as np

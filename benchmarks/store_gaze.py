@@ -27,7 +27,7 @@ DIRECTIONS = 2048
 
 def fresh_draws(law, count: int, kappa: float):
     """Baseline: kernel densities of ``count`` draws from ``law`` at each position itself."""
-    from nerg_mi.density.kde.estimate import SphericalKde
+    from nerg_mi.probes.kde import SphericalKde
 
     def evaluate(positions, directions):
         rng = np.random.default_rng(1)
@@ -43,12 +43,12 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.density.probes import place_probes
     from nerg_mi.evaluation.gaze import baselines
     from nerg_mi.evaluation.gaze.scores import EPS, gaze_field, print_scores, score_rows
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import load_gaze, load_radiance
     from nerg_mi.maths.sphere import fibonacci_directions
+    from nerg_mi.probes.probes import place_probes
     from nerg_mi.rays.rays import Rays
     from nerg_mi.rays.splits import purge
     from nerg_mi.scenes import store

@@ -4,7 +4,7 @@
 
 A box stands at the front edge of a shelf of the demo store. Synthetic shoppers pass; the gaze field says where they
 look. The expected share of their looks that lands on the box is an integral over the box's own points
-(``nerg_mi.density.received``), so that its derivative with respect to the box's position comes from automatic
+(``nerg_mi.probes.surface_attention``), so that its derivative with respect to the box's position comes from automatic
 differentiation through distance, direction, gaze networks and fall-off. The box climbs from several starts; a
 brute-force sweep along the whole shelf checks where it arrives, and central differences check its derivatives. Not
 differentiated: the moving edges of what else hides the box. What that leaves out is measured.
@@ -97,7 +97,7 @@ class Attention:
     """Expected attention of a stream of observers to a box on a shelf, and its derivative."""
 
     def __init__(self, shelf: Shelf, heads: np.ndarray, settings: Settings, falloff: float = 0.05):
-        from nerg_mi.density.received import patches
+        from nerg_mi.probes.surface_attention import patches
         from nerg_mi.scenes.store.attention_law import HERE
         from nerg_mi.transport.place import Place
 
@@ -115,7 +115,7 @@ class Attention:
         return self.gaze.evaluate(p_od, p_o, r_o, active)[0]
 
     def _each(self, at, density):
-        from nerg_mi.density.received import contributions
+        from nerg_mi.probes.surface_attention import contributions
 
         import mitsuba as mi
 
@@ -189,7 +189,7 @@ def uphill(values: np.ndarray, start: int, window: int = 2) -> int:
 def elevation(attention: Attention, at: float, spacing: float):
     """The shelf seen from the front with the box at ``at``: albedo (h, w, 3), attention (h, w) in 1/m², extent in
     metres."""
-    from nerg_mi.density.received import Patches, contributions
+    from nerg_mi.probes.surface_attention import Patches, contributions
     from nerg_mi.scenes.store.attention_law import HERE
     from nerg_mi.transport.place import Place
 

@@ -53,9 +53,9 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from nerg_mi.density.kde.view import KdeView
 from nerg_mi.field.backend import namespace
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.probes.kde_view import KdeView
 from nerg_mi.properties import integer, number, resolved, text, transform
 from nerg_mi.ranges import Range
 from nerg_mi.rays.rays import Rays

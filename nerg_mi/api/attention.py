@@ -2,7 +2,7 @@
 
 Of a box it is the share of the gaze whose first surface lies in it, summed over directions
 (`nerg_mi.statistics.shares`), as statistics, reports and the viewer have it. Of a mesh or a shape it is the share that
-ends on its own surface, in area form (`nerg_mi.density.received`), which also tells where on it.
+ends on its own surface, in area form (`nerg_mi.probes.surface_attention`), which also tells where on it.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def attention(
     """
     import drjit as dr
 
-    from nerg_mi.density.received import patches
+    from nerg_mi.probes.surface_attention import patches
 
     scene = Scene.of(scene)
     _check(scene)
@@ -200,7 +200,7 @@ def mesh_shares(
     import drjit as dr
     import mitsuba as mi
 
-    from nerg_mi.density.received import Patches, patches
+    from nerg_mi.probes.surface_attention import Patches, patches
 
     _check(scene)
     if not len(surfaces):
@@ -224,7 +224,7 @@ def _check(scene: Scene) -> None:
 
 def _density(scene: Scene, eye: Floats, pieces: Any, two_sided: bool) -> Floats:
     """Share of the gaze (K,) per area that ``pieces`` receive from the observer at ``eye`` (3,)."""
-    from nerg_mi.density.received import arriving
+    from nerg_mi.probes.surface_attention import arriving
 
     observer = ObserverOf(scene, eye)
     settings = observer.integrator.observer_settings

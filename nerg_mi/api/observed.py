@@ -30,7 +30,7 @@ class ObserverOf:
 
     def density(self, p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
         """Gaze (Float, 1/sr) along the unit direction ``r_o``, in which the observer, who is at ``p_o`` in all lanes,
-        sees the surface ``p_od``; as `nerg_mi.density.received` wants it."""
+        sees the surface ``p_od``; as `nerg_mi.probes.surface_attention` wants it."""
         if self.gaze is None:
             raise ValueError("a scene without a gaze field has no gaze")
         return self.gaze.evaluate(p_od, p_o, r_o, active)[0]

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerg_mi.density.regions import LEVELS, level_name
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze.evaluation import SCORES, SPLITS
 from nerg_mi.evaluation.gaze.folds import mean_rows, means
@@ -17,6 +16,7 @@ from nerg_mi.evaluation.gaze.uncertainty import rank_rows
 from nerg_mi.files.atomic import check_folder, write_text
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.probes.probes import LEVELS, level_name
 from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays

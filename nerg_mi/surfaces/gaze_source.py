@@ -6,10 +6,10 @@ An observer at p_o looks into the direction ω with the density g(ω), in 1/sr. 
 
 (Veach 1997, section 8.2.2.2), summed over pieces that are small as seen from p_o, each of which counts with its exact
 solid angle (`pieces`), with g at its centre, and with the share of it that is seen, for which it is cut where outlines
-pass (`outlines`). In a medium, or with a fall-off behind outlines, V is that of `nerg_mi.density.received.attended` at
-the centre. Over the sphere of the same observer directions (`sphere_rule`) tell what g adds up to and how much of it
-meets something else, or nothing. Both sums use other points, and what they lack of each other is the error that is
-told.
+pass (`outlines`). In a medium, or with a fall-off behind outlines, V is that of
+`nerg_mi.probes.surface_attention.attended` at the centre. Over the sphere of the same observer directions
+(`sphere_rule`) tell what g adds up to and how much of it meets something else, or nothing. Both sums use other points,
+and what they lack of each other is the error that is told.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.density.received import Density, attended
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.types import Point3f, Vector3f
+from nerg_mi.probes.surface_attention import Density, attended
 from nerg_mi.transport.observer.cache import ObserverCache
 from nerg_mi.transport.observer.gaze import PlacedGaze
 from nerg_mi.transport.observer.settings import ObserverSettings
@@ -56,7 +56,7 @@ class GazeSettings:
 @dataclass(frozen=True, eq=False)
 class Looker:
     """An observer at ``center`` (one lane): their ``density`` where they see a surface, as
-    `nerg_mi.density.received` wants it, and ``along`` directions, whatever is met there."""
+    `nerg_mi.probes.surface_attention` wants it, and ``along`` directions, whatever is met there."""
 
     center: Point3f
     density: Density

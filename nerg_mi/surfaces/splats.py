@@ -7,10 +7,10 @@ who looks with the density g(ω), in 1/sr, it receives
 
     g(ω) V(c, p_o) C(ω) / |c - p_o|²,    C(ω) = |Σ^{-1/2} ω| min σ,    ω = (c - p_o) / |c - p_o|,
 
-per area: the density of `nerg_mi.density.received` at the centre, with the area under which the Gaussian is seen, as a
-share of the largest under which it can be seen (C), in place of a cosine. V is the visibility of
-`nerg_mi.density.received.attended`, of a point that lies before the centre by the thickness of the Gaussian too. Such
-densities are colours: rendered in place of them, they mix by the light that reaches the eye.
+per area: the density of `nerg_mi.probes.surface_attention` at the centre, with the area under which the Gaussian is
+seen, as a share of the largest under which it can be seen (C), in place of a cosine. V is the visibility of
+`nerg_mi.probes.surface_attention.attended`, of a point that lies before the centre by the thickness of the Gaussian
+too. Such densities are colours: rendered in place of them, they mix by the light that reaches the eye.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from nerg_mi.density.received import attended
 from nerg_mi.field.splats import Splats, matrices_of
 from nerg_mi.maths.arrays import aligned, vector_of
+from nerg_mi.probes.surface_attention import attended
 from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.place import Place
 

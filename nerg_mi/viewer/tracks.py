@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerg_mi.density.probes import place_probes
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 
 VERTICES = 20_000

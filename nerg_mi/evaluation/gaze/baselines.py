@@ -2,7 +2,7 @@
 
 Each baseline is a function ``(positions (P, 3), directions) -> (P, D)`` of
 densities in 1/sr that integrate to one; ``directions`` is (D, 3) for all
-positions or (P, D, 3). All share the kernels of :mod:`nerg_mi.density.kde.estimate`.
+positions or (P, D, 3). All share the kernels of :mod:`nerg_mi.probes.kde`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.density.kde.estimate import Backend, SphericalKde
-from nerg_mi.density.probes import Probes, place_probes
+from nerg_mi.probes.kde import Backend, SphericalKde
+from nerg_mi.probes.probes import Probes, place_probes
 from nerg_mi.rays.rays import Rays
 
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -13,11 +13,11 @@ from functools import cached_property
 
 import numpy as np
 
-from nerg_mi.density.kde.estimate import SphericalKde
-from nerg_mi.density.probes import place_probes
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.probes.kde import SphericalKde
+from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.splits import purge, split_by_person
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.density.regions import LEVELS, level_name
 from nerg_mi.figures.colors import find_colors
 from nerg_mi.figures.provenance import Provenance
 from nerg_mi.figures.saving import save
@@ -15,6 +14,7 @@ from nerg_mi.figures.sheet import new_page
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid
+from nerg_mi.probes.probes import LEVELS, level_name
 
 from .baselines import Baseline
 from .evaluation import SCORES, GazeTest

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.density.regions import LEVELS, asked_level, level_name, region_levels
 from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.probes.probes import LEVELS, asked_level, level_name, region_levels
 
 from .evaluation import GazeTest
 from .scores import EPS
@@ -109,7 +109,7 @@ def calibration_rows(
     """A row a method: the share of the rays of ``test`` that lie in the smallest regions which are said to hold
     `LEVELS` of the gaze, with ``.low`` and ``.high`` where there are three persons. ``methods``: densities in the
     test's directions (P, D), and at its rays (P, K). ``calibrated``: by methods that have them, what its training found
-    are to be asked for (`density.regions.calibrated_levels`), which make a row "METHOD, calibrated"."""
+    are to be asked for (`probes.probes.calibrated_levels`), which make a row "METHOD, calibrated"."""
     rng, people = np.random.default_rng(seed), len(test.persons)
     draws = rng.multinomial(people, np.full(people, 1 / people), resamples if people >= 3 else 0)
     out = []

@@ -20,11 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.density.probes import Probes
-from nerg_mi.density.regions import calibrated_levels, region_levels
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.interruption import Interruption
+from nerg_mi.probes.probes import Probes, calibrated_levels, region_levels
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.splits import purge, split_by_position
 from nerg_mi.training.geometry.places import GazePlace
@@ -65,7 +64,7 @@ class MixChoice:
     kld: float | None = None
     kld_field: float | None = None
     kld_blind: float | None = None
-    # Shares that are to be asked for so that regions hold those of ``density.regions.LEVELS``, by their names.
+    # Shares that are to be asked for so that regions hold those of ``probes.probes.LEVELS``, by their names.
     regions: dict[str, float] | None = None
     # Of several variants (``variants.choose_variant``) the one that was chosen, and the KLD of each, with its share, in
     # the folds that all have.
@@ -232,7 +231,7 @@ def _bins(probes: Probes, place: GazePlace, directions: np.ndarray) -> np.ndarra
 
 
 def _regions(judgements: Sequence[_Judgement], mix: float) -> dict[str, float]:
-    """Shares to ask for so that regions hold `density.regions.LEVELS` of the looks in all folds, in which positions
+    """Shares to ask for so that regions hold `probes.probes.LEVELS` of the looks in all folds, in which positions
     count alike."""
     levels, weights = [], []
     for of in judgements:

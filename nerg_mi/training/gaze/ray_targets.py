@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.density.probes import Probes, place_probes
 from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.probes.probes import Probes, place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry.places import GazePlace
 

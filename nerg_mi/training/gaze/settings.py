@@ -38,7 +38,7 @@ class ProbeSettings(Checked):
     cap: int = ranged(1024, Range(1, 10**6))
     # Rays in a probe at least.
     min_rays: int = ranged(64, Range(1, 10**6))
-    # How a probe chooses the concentration of its rays' kernels (`density.probes.place_probes`).
+    # How a probe chooses the concentration of its rays' kernels (`probes.probes.place_probes`).
     kappa_rule: str = "fixed"
     # Concentration of the rule "fixed".
     kappa: float = ranged(50.0, KAPPAS)
@@ -46,13 +46,13 @@ class ProbeSettings(Checked):
     directions: int = ranged(1024, DIRECTIONS)
     # Kind of depth that is the surface (`transport.march.depth`).
     depth: str = "median"
-    # Where probes are placed (`density.placement`).
+    # Where probes are placed (`probes.probes`).
     placement: str = "data"
     # Distance between probes, of placements that have one.
     spacing: float | None = ranged(None, LENGTHS)
     # Whether directions are turned anew, and depths traced again, for every epoch.
     fresh: bool = False
-    # What a probe's rays count by (`density.probes.place_probes`).
+    # What a probe's rays count by (`probes.probes.place_probes`).
     weights: str = "equal"
     # Concentration of the kernels of the blind density, of fields that have one. Wide: such a field learns what it
     # lacks from many probes, but nothing takes back the peaks of a few people, which others do not share.

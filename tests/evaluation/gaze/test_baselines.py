@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from nerg_mi.density.probes import place_probes
 from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.evaluation.gaze import baselines
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
+from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 from tests.reference.kde import kde as reference
 

@@ -7,11 +7,11 @@ import itertools
 import numpy as np
 import pytest
 
-from nerg_mi.density.probes import place_probes
 from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.evaluation.gaze import evaluation
 from nerg_mi.evaluation.gaze.baselines import position_blind, uniform
 from nerg_mi.evaluation.gaze.report import markdown
+from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.splits import hold_out
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from nerg_mi.density.regions import LEVELS, calibrated_levels, level_name, region_levels
 from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.evaluation.gaze import evaluation, uncertainty
+from nerg_mi.probes.probes import LEVELS, calibrated_levels, level_name, region_levels
 
 from .test_evaluation import crowd
 

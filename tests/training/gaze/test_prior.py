@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.density.kde.estimate import SphericalKde
 from nerg_mi.field.backend import namespace
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.prior import elevation_density, prior_field
 

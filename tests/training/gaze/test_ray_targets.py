@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.density.probes import place_probes
 from nerg_mi.errors import NergError
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.probes.probes import place_probes
 from nerg_mi.training.gaze.ray_targets import probes_of_rays, rotated_sets, targets_of_probes, targets_of_rays
 from nerg_mi.training.gaze.targets import TargetNeeds
 

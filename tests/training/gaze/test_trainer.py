@@ -6,7 +6,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.density.probes import place_probes
+from nerg_mi.probes.probes import place_probes
 from nerg_mi.training.gaze.product import ProductTrainer
 from nerg_mi.training.gaze.ray_targets import targets_of_probes
 from nerg_mi.training.gaze.settings import GazeSettings

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerg_mi.density.probes import place_probes
+from nerg_mi.probes.probes import place_probes
 from tests.rays.readers.reading import dropped, read
 
 

@@ -31,6 +31,7 @@ from nerg_mi.transport.trace import default_settings
 if TYPE_CHECKING:
     import mitsuba as mi
 
+
 Density = Callable[[Point3f, Point3f, Vector3f, Bool], Float]
 """Of ``p_od``, ``p_o``, ``r_o`` and the active lanes: gaze in 1/sr of an observer at ``p_o`` along the unit direction
 ``r_o``, who sees the surface ``p_od`` there (``ObservedGaze.evaluate(...)[0]``, or anything else)."""

@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.density.bandwidth import (
-    kappa_grid,
-    leave_one_out_kappa,
-    leave_one_out_scores,
-    loo_kappas,
-    silverman_kappas,
-)
 from nerg_mi.maths import vmf
+from nerg_mi.probes.kde import kappa_grid, leave_one_out_kappa, leave_one_out_scores, loo_kappas, silverman_kappas
 
 
 def gazes(n, kappa=30.0, seed=0):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.density.placement import place_queries
+from nerg_mi.probes.probes import place_queries
 
 
 @pytest.fixture(scope="module")

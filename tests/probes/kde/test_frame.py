@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.density.kde.frame import directions_to, kde_frame, probe_at
 from nerg_mi.maths.sphere import uniform_directions
+from nerg_mi.probes.kde_view import directions_to, kde_frame, probe_at
 from nerg_mi.rays.index import RayIndex
 from nerg_mi.rays.rays import Rays
 from tests.reference.kde import kde as reference

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.density.received import Patches, contributions, patches, received
+from nerg_mi.probes.surface_attention import Patches, contributions, patches, received
 from nerg_mi.transport.panorama import pixel_solid_angles
 from nerg_mi.transport.place import Place
 from tests.plugins import fields

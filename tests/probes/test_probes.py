@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from nerg_mi.density.bandwidth import leave_one_out_kappa
-from nerg_mi.density.probes import person_weights, place_probes
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.probes.kde import leave_one_out_kappa
+from nerg_mi.probes.probes import person_weights, place_probes
 from nerg_mi.rays.rays import Rays
 
 

@@ -2,10 +2,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.density.kde.estimate import SphericalKde
-from nerg_mi.density.kde.table import SphericalKdeTable
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
+from nerg_mi.probes.kde import SphericalKde, SphericalKdeTable
 from tests.reference.kde import kde as reference
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.density.regions import LEVELS, asked_level, calibrated_levels, level_name, region_levels
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.probes.probes import LEVELS, asked_level, calibrated_levels, level_name, region_levels
 
 
 def test_regions_of_a_cap_hold_what_they_say():

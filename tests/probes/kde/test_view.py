@@ -6,10 +6,9 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.density.kde.frame import WORTH
-from nerg_mi.density.kde.view import KdeView
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
+from nerg_mi.probes.kde_view import WORTH, KdeView
 from nerg_mi.rays.rays import Rays
 from nerg_mi.transport.observer.cache import ObserverCache
 from nerg_mi.transport.observer.views import view_along

@@ -1,10 +1,17 @@
 import numpy as np
 import pytest
 
-from nerg_mi.density.bandwidth import kappa_grid, leave_one_out_scores
-from nerg_mi.density.measures import effective_persons, effective_rays, entropy, integral, sample
-from nerg_mi.density.probes import person_weights, place_probes
 from nerg_mi.maths import vmf
+from nerg_mi.probes.kde import kappa_grid, leave_one_out_scores
+from nerg_mi.probes.probes import (
+    effective_persons,
+    effective_rays,
+    entropy,
+    integral,
+    person_weights,
+    place_probes,
+    sample,
+)
 from nerg_mi.rays.rays import Rays
 
 

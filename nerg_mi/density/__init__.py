@@ -1,1 +1,0 @@
-"""From rays to densities over directions: probes, bandwidths, what a surface receives."""

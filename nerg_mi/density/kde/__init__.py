@@ -1,1 +1,0 @@
-"""Kernel densities on the sphere: exact, on a table, for a whole picture, and as an observer sees them."""
