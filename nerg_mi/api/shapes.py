@@ -16,7 +16,7 @@ from nerg_mi.formats.meshes import read_mesh_file
 def mesh_child(path: str | os.PathLike[str]) -> Any:
     """The mesh file ``path`` as a child of a Mitsuba scene, in grey and seen from both sides: a dict, or a mesh of what
     Mitsuba does not read. Raises `NergError` for a file that is missing or damaged."""
-    from nerg_mi.surfaces.target import mitsuba_mesh
+    from nerg_mi.surfaces.mesh import mitsuba_mesh
 
     mesh = read_mesh_file(path)
     grey = {"type": "twosided", "bsdf": {"type": "diffuse"}}

@@ -16,12 +16,9 @@ from nerg_mi.figures.overlay import Heat
 from nerg_mi.figures.provenance import provenance
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.gaze_source import GazeSettings
+from nerg_mi.surfaces.laplacian import Smoother, Sums, merge
 from nerg_mi.surfaces.mesh import Mesh
-from nerg_mi.surfaces.population import Crowd, ray_seconds
-from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
-from nerg_mi.surfaces.smoothing import Smoother
-from nerg_mi.surfaces.sums import Sums, merge
+from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays, ray_seconds
 
 from .backend import select_backend
 from .baking.asked import UNITS, cone_of, source_of

@@ -22,11 +22,9 @@ from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.sphere import C0
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.population import Crowd, ray_seconds
-from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
-from nerg_mi.surfaces.splat_areas import HIDDEN, splat_areas, whole_areas
-from nerg_mi.surfaces.splat_smoothing import SplatSmoother
-from nerg_mi.surfaces.sums import Sums, merge
+from nerg_mi.surfaces.laplacian import Sums, merge
+from nerg_mi.surfaces.sources import Crowd, RaySettings, TrackedRays, ray_seconds
+from nerg_mi.surfaces.splats import HIDDEN, SplatSmoother, splat_areas, whole_areas
 
 from .backend import select_backend
 from .baking.asked import UNITS, cone_of, source_of

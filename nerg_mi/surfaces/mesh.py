@@ -1,14 +1,27 @@
-"""Triangle meshes as attention is put on them: connected where they touch, and without faces that are none."""
+"""Triangle meshes as attention is put on them: read from scenes, connected, refined, unrolled into a texture, and
+cast at."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.arrays import aligned, vector_of
 from nerg_mi.maths.coordinates import check_coordinates
+from nerg_mi.transport.media.protocol import Medium
+from nerg_mi.transport.observer.settings import ObserverSettings
+from nerg_mi.transport.place import Place
+from nerg_mi.transport.trace import default_settings
+
+# ---- Mesh ----
+#
+# Triangle meshes as attention is put on them: connected where they touch, and without faces that are none.
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,3 +139,311 @@ def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     number = np.empty(len(rows), np.int64)
     number[order] = np.cumsum(new) - 1
     return order[new], number
+
+
+# ---- Shapes of Mitsuba scenes as triangles ----
+
+Triangles = tuple[np.ndarray, np.ndarray]
+"""Vertices (V, 3) float64 and faces (F, 3) int64."""
+
+
+def shape_triangles(shape: Any) -> Triangles | None:
+    """Those of a shape of a Mitsuba scene, in the scene; None of a shape that has none."""
+    if not shape.is_mesh():
+        return None
+    vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    return vertices, np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
+
+
+# ---- Triangles cut until none of their edges is longer than attention is to be resolved ----
+#
+# An edge that is too long is halved in all triangles that have it, so that no vertex comes to lie in the middle of an
+# edge of a neighbour: a surface stays as connected as it was. Triangles of one, two or three such edges become two,
+# three or four (Bank, Sherman, Weiser 1983, "red" and "green").
+
+
+MOST_REFINED_FACES = 8_000_000
+"""A refined mesh has so many faces at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """``mesh`` cut of another: ``parent`` (F,) the face of that which each face lies in, and ``place`` (F, 3, 3), of
+    each of its corners the barycentric coordinates there."""
+
+    mesh: Mesh
+    parent: np.ndarray
+    place: np.ndarray
+
+
+def refine(mesh: Mesh, longest: float) -> Refined:
+    """``mesh`` with edges of at most ``longest`` scene units. Raises `NergError` for more than `MOST_REFINED_FACES`
+    faces."""
+    vertices, faces = mesh.vertices, mesh.faces
+    parent, place = np.arange(len(faces)), np.broadcast_to(np.eye(3), (len(faces), 3, 3)).copy()
+    while True:
+        edges, of_face = _edges(faces)
+        ends = vertices[edges]
+        long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > longest
+        if not long.any():
+            return Refined(Mesh(vertices, faces), parent, place)
+        middle = np.full(len(edges), -1)
+        middle[long] = len(vertices) + np.arange(np.count_nonzero(long))
+        cut = middle[of_face]
+        if len(faces) + np.count_nonzero(cut >= 0) > MOST_REFINED_FACES:
+            raise NergError(
+                f"edges of at most {longest:.3g} scene units make more than {MOST_REFINED_FACES:,} faces; give a "
+                "larger --detail"
+            )
+        vertices = np.concatenate([vertices, 0.5 * (ends[long, 0] + ends[long, 1])])
+        faces, parent, place = _cut(vertices, faces, cut, parent, place)
+
+
+def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges (E, 2), and the number (F, 3) of that from each corner of a face to the next."""
+    pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    # One number a pair sorts in a tenth of the time that rows take.
+    count = int(faces.max()) + 1
+    key, number = np.unique(pairs[:, 0] * count + pairs[:, 1], return_inverse=True)
+    return np.stack([key // count, key % count], axis=1), number.reshape(-1, 3)
+
+
+def _cut(vertices, faces, cut, parent, place):
+    """Faces, parents and places after their edges were halved; ``cut`` (F, 3): the vertex in the middle of each edge,
+    -1 of those that stay."""
+    halves = 0.5 * (place + np.roll(place, -1, axis=1))
+    known = np.concatenate([faces, cut], axis=1)
+    where = np.concatenate([place, halves], axis=1)
+    out: list[tuple[np.ndarray, np.ndarray]] = []
+    marks = cut >= 0
+    number = marks.sum(axis=1)
+    # Corners 0, 1, 2, and 3, 4, 5 in the middle of the edges behind them.
+    out.append(_taken(np.flatnonzero(number == 0), ((0, 1, 2),)))
+    out.append(_taken(np.flatnonzero(number == 3), ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))))
+    for k in range(3):
+        a, b, c = k, (k + 1) % 3, (k + 2) % 3
+        only = np.flatnonzero((number == 1) & marks[:, k])
+        out.append(_taken(only, ((a, 3 + a, c), (3 + a, b, c))))
+        # The edge behind c stays, and the quadrangle beside it is cut along its shorter diagonal.
+        both = np.flatnonzero((number == 2) & ~marks[:, c])
+        corner = vertices[known[both]]
+        first = np.linalg.norm(corner[:, a] - corner[:, 3 + b], axis=1)
+        short = first <= np.linalg.norm(corner[:, 3 + a] - corner[:, c], axis=1)
+        out.append(_taken(both, ((3 + a, b, 3 + b),)))
+        out.append(_taken(both[short], ((a, 3 + a, 3 + b), (a, 3 + b, c))))
+        out.append(_taken(both[~short], ((a, 3 + a, c), (3 + a, 3 + b, c))))
+    rows, corners = (np.concatenate(part) for part in zip(*out))
+    order = np.argsort(rows, kind="stable")
+    rows, corners = rows[order], corners[order]
+    return known[rows[:, None], corners], parent[rows], where[rows[:, None], corners]
+
+
+def _taken(rows: np.ndarray, triangles) -> tuple[np.ndarray, np.ndarray]:
+    """Each of ``triangles``, three corners, for each of ``rows``."""
+    corners = np.tile(np.array(triangles), (len(rows), 1))
+    return np.repeat(rows, len(triangles)), corners
+
+
+# ---- A surface among all that may hide it, as rays are cast at it ----
+
+SURFACE_OPACITY = 0.5
+"""Opacity of a medium from which on a ray ends in it."""
+
+NEAR = 1e-5
+"""What a ray meets so near before a point, as a share of the distance, does not hide it: its own face, a neighbour."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Where N rays end: ``face`` (N,) of the surface, or -1; ``place`` (N, 3), barycentric coordinates on it;
+    ``elsewhere`` (N,) bool: at something else."""
+
+    face: np.ndarray
+    place: np.ndarray
+    elsewhere: np.ndarray
+
+
+class Target:
+    """``mesh``, which receives attention, ``others``, meshes that hide it, and a ``medium`` that both stand in, with
+    ``place``, in which all of it is traced.
+
+    ``settings``: of an observer's rays; by default those of the integrator ``nerg`` with nothing set, and ``falloff``
+    0, by which a point is either seen or not.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        others: list[tuple[np.ndarray, np.ndarray]] | None = None,
+        medium: Medium | None = None,
+        settings: ObserverSettings | None = None,
+        falloff: float = 0.0,
+    ):
+        import mitsuba as mi
+
+        self.mesh, self.falloff = mesh, falloff
+        self._shape = mitsuba_mesh(mesh.vertices, mesh.faces, "surface")
+        hiding = {f"other_{k}": mitsuba_mesh(v, f, f"other_{k}") for k, (v, f) in enumerate(others or ())}
+        scene: Any = mi.load_dict({"type": "scene", "surface": self._shape, **hiding}, optimize=False)
+        # What a scene is made of is given to it, and may come out as another object.
+        self._shape = next(shape for shape in scene.shapes() if shape.id() == "surface")
+        self.place = Place(medium, scene)
+        self.settings = settings or ObserverSettings(
+            march=default_settings(self.place), surface_opacity=SURFACE_OPACITY
+        )
+
+    @property
+    def sharp(self) -> bool:
+        """Whether what is met hides all that is behind it: shapes alone, without a medium, and without a fall-off."""
+        return self.place.medium is None and self.falloff == 0
+
+    def sees(self, eye: np.ndarray, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """Whether ``eye`` (3,) sees ``points`` (N, 3) of the surface, which lie in its ``faces`` (N,); of `sharp`
+        targets. A point is seen where the ray at it ends at its own face, however obliquely, or not before it."""
+        import mitsuba as mi
+
+        to = points - eye
+        distance = np.linalg.norm(to, axis=1)
+        d = vector_of(mi.Vector3f, to / np.where(distance > 0, distance, 1)[:, None])
+        o = mi.Point3f(np.asarray(eye, np.float64).tolist())
+        # A position that is a constant of the kernel would be compiled anew for every observer.
+        dr.make_opaque(o)
+        count = len(points)
+        with dr.suspend_grad():
+            view = self.place.trace(mi.Ray3f(o, d), dr.full(mi.Bool, True, count), self.settings.march)
+            assert view.cast is not None, "a target has shapes"
+            own = (view.cast.shape == mi.ShapePtr(self._shape)) & (
+                view.cast.prim_index == mi.UInt32(aligned(faces, np.uint32))
+            )
+            seen = ~view.hit | own | (view.distance >= mi.Float(aligned(distance * (1 - NEAR))))
+        return np.broadcast_to(np.array(seen).astype(bool), (count,)) & (distance > 0)
+
+    def ends(self, origins: np.ndarray, directions: np.ndarray) -> Ends:
+        """Where rays with ``origins`` (N, 3) and unit ``directions`` (N, 3) end."""
+        import mitsuba as mi
+
+        o, d = (vector_of(mi.Point3f, v) for v in (origins, directions))
+        count = len(origins)
+        with dr.suspend_grad():
+            view = self.place.trace(mi.Ray3f(o, mi.Vector3f(d)), dr.full(mi.Bool, True, count), self.settings.march)
+            assert view.cast is not None, "a target has shapes"
+            before = view.front >= self.settings.surface_opacity
+            on = view.hit & ~before & (view.cast.shape == mi.ShapePtr(self._shape))
+            uv, prim = view.cast.prim_uv, view.cast.prim_index
+            dr.eval(on, uv, prim, view.hit, before)
+        on_it = np.array(on).astype(bool)
+        met = np.broadcast_to(np.array(view.hit | before).astype(bool), (count,))
+        u, v = (np.array(c, np.float64) for c in (uv.x, uv.y))
+        place = np.stack([1 - u - v, u, v], axis=1)
+        face = np.where(on_it, np.array(prim).astype(np.int64), -1)
+        return Ends(face, np.where(on_it[:, None], place, 0.0), met & ~on_it)
+
+
+def mitsuba_mesh(vertices: np.ndarray, faces: np.ndarray, name: str, bsdf: Mapping[str, Any] | None = None) -> Any:
+    """Triangles as a Mitsuba mesh of the variant in use, with the id ``name`` and the ``bsdf`` of a dict."""
+    import mitsuba as mi
+
+    props = mi.Properties()
+    props.set_id(name)
+    if bsdf is not None:
+        props["bsdf"] = mi.load_dict(dict(bsdf))
+    mesh: Any = mi.Mesh(name, len(vertices), len(faces), props=props)
+    params: Any = mi.traverse(mesh)
+    params["vertex_positions"] = np.ravel(vertices).astype(np.float32)
+    params["faces"] = np.ravel(faces).astype(np.uint32)
+    params.update()
+    return mesh
+
+
+# ---- Charts ----
+#
+# A surface unrolled into a square, and values on it as a texture: charts by xatlas, an optional extra.
+
+
+GUTTER = 4
+"""Pixels by which colours go on beyond the border of a chart, for filters that look there."""
+
+MOST_CHART_FACES = 400_000
+"""A mesh of more triangles is not unrolled."""
+
+
+@dataclass(frozen=True, eq=False)
+class Charts:
+    """``vertex`` (W,): of which vertex of the mesh each corner on the square is; ``uv`` (W, 2), from 0 to 1, v down the
+    picture; ``faces`` (F, 3) of such corners, in the mesh's order."""
+
+    vertex: np.ndarray
+    uv: np.ndarray
+    faces: np.ndarray
+
+
+def unroller() -> Any:
+    """The package xatlas; `ImportError` with the remedy where it is not installed."""
+    try:
+        import xatlas
+    except ImportError:
+        raise ImportError('a texture needs xatlas, which is not installed: pip install "nerg-mi[bake]"') from None
+    return xatlas
+
+
+def unroll(mesh: Mesh, pixels: int) -> Charts:
+    """``mesh`` cut into charts that fill a square of ``pixels`` a side without overlaps. Needs xatlas; raises
+    `NergError` for meshes that are too large."""
+    xatlas = unroller()
+    if len(mesh.faces) > MOST_CHART_FACES:
+        raise NergError(
+            f"a mesh of {len(mesh.faces):,} triangles is not unrolled into a texture, but up to "
+            f"{MOST_CHART_FACES:,}; leave "
+            "out --texture for colours of vertices"
+        )
+    # In a unit in which nothing of it vanishes in single precision.
+    unit = (mesh.vertices - mesh.vertices.mean(axis=0)) / (mesh.diagonal or 1.0)
+    atlas, pack = xatlas.Atlas(), xatlas.PackOptions()
+    atlas.add_mesh(unit.astype(np.float32), mesh.faces.astype(np.uint32))
+    pack.padding, pack.resolution, pack.bruteForce = 2, pixels, False
+    # Of a resolution and no scale xatlas may need several squares; a scale is found with which one is enough.
+    texels = 0.8 * pixels / np.sqrt(float((mesh.area / (mesh.diagonal or 1.0) ** 2).sum()))
+    for _ in range(40):
+        pack.texels_per_unit = float(texels)
+        atlas.generate(xatlas.ChartOptions(), pack, False)
+        if atlas.atlas_count == 1 and max(atlas.width, atlas.height) <= pixels:
+            break
+        texels *= 0.85
+    else:
+        raise NergError(f"the surface does not fit on {pixels} x {pixels} pixels; give a larger --texture")
+    vertex, faces, uv = atlas[0]
+    # xatlas divides by its own size, which may be less than the square's.
+    size = np.array([atlas.width, atlas.height], np.float64)
+    return Charts(vertex.astype(np.int64), uv.astype(np.float64) * size / pixels, faces.astype(np.int64))
+
+
+def texture(charts: Charts, refined: Refined, values: np.ndarray, pixels: int) -> tuple[np.ndarray, np.ndarray]:
+    """``(values (pixels, pixels), known (pixels, pixels) bool)`` of ``values`` (V,) on the vertices of ``refined``, of
+    whose whole mesh ``charts`` are; linear in every triangle, and carried on over a gutter around charts."""
+    import drjit as dr
+    import mitsuba as mi
+    from scipy.ndimage import distance_transform_edt
+
+    corners = np.einsum("fij,fjk->fik", refined.place, charts.uv[charts.faces[refined.parent]])
+    flat = np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=2).reshape(-1, 3)
+    # A texel shows what lies under its centre, which is found as all else is: by a ray.
+    sheet = mitsuba_mesh(flat, np.arange(len(flat)).reshape(-1, 3), "charts")
+    scene: Any = mi.load_dict({"type": "scene", "charts": sheet})
+    center = (np.arange(pixels) + 0.5) / pixels
+    u, v = (c.ravel() for c in np.meshgrid(center, center))
+    above = mi.Point3f(np.stack([u, v, np.ones_like(u)]).astype(np.float32))
+    with dr.suspend_grad():
+        found = scene.ray_intersect_preliminary(mi.Ray3f(above, mi.Vector3f(0, 0, -1)), coherent=True)
+        hit, face = np.array(found.is_valid()).astype(bool), np.array(found.prim_index).astype(np.int64)
+        b, c = (np.array(x, np.float64) for x in (found.prim_uv.x, found.prim_uv.y))
+    face = np.where(hit, face, 0)
+    of_corners = values[refined.mesh.faces[face]]
+    out = np.where(hit, of_corners[:, 0] * (1 - b - c) + of_corners[:, 1] * b + of_corners[:, 2] * c, 0.0)
+    out, hit = out.reshape(pixels, pixels), hit.reshape(pixels, pixels)
+    if not hit.any():
+        raise NergError(f"no pixel of a texture of {pixels} x {pixels} shows the surface; give a larger --texture")
+    nearest = distance_transform_edt(~hit, return_indices=True)
+    assert nearest is not None, "both were asked for"
+    apart, near = nearest
+    out = out[near[0], near[1]]
+    return out, np.asarray(apart) <= GUTTER

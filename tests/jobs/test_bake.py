@@ -90,12 +90,12 @@ def test05_rays_do_not_look_from_elsewhere_and_one_person_has_no_halves(rgb, roo
 def test06_what_is_not_asked_for_is_not_made(rgb, room, monkeypatch):
     """No smoothing, no Laplacian; no texture, no xatlas."""
     from nerg_mi.jobs.baking import outputs
-    from nerg_mi.surfaces import smoothing
+    from nerg_mi.surfaces import laplacian
 
     def never(*given, **more):
         raise AssertionError("nobody asked for this")
 
-    monkeypatch.setattr(smoothing, "laplacian", never)
+    monkeypatch.setattr(laplacian, "laplacian", never)
     monkeypatch.setattr(outputs, "unroll", never)
     bake(room, [room.with_name("a.glb")], BakeOptions(detail=3.0, mode="llvm_ad_rgb"), rays=rays())
     with pytest.raises(AssertionError):

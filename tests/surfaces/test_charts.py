@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.surfaces import charts as module
-from nerg_mi.surfaces.charts import texture, unroll
-from nerg_mi.surfaces.refinement import refine
+from nerg_mi.surfaces import mesh as module
+from nerg_mi.surfaces.mesh import refine, texture, unroll
 from tests.surfaces.meshes import box, joined
 
 xatlas = pytest.importorskip("xatlas", reason="xatlas is not installed")
@@ -35,7 +34,7 @@ def test01_a_texture_has_at_each_point_what_the_surface_has(rgb, scale):
 
 def test02_what_does_not_fit(rgb, monkeypatch):
     mesh = joined(box((0, 0, 0), (1, 1, 1)))
-    monkeypatch.setattr(module, "MOST_FACES", 4)
+    monkeypatch.setattr(module, "MOST_CHART_FACES", 4)
     with pytest.raises(NergError, match="leave out --texture"):
         unroll(mesh, 64)
 

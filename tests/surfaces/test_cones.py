@@ -6,7 +6,7 @@ import pytest
 from scipy.special import eval_legendre
 
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.surfaces.cones import blurred, bundle
+from nerg_mi.surfaces.sources import blurred, bundle
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.surfaces.delaunay import delaunay, heron, twins
+from nerg_mi.surfaces.laplacian import delaunay, heron, twins
 from tests.surfaces.meshes import box, joined, plate
 
 

@@ -6,10 +6,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.surfaces.gaze_source import GazeSettings, gaze_sums, lookers_of_law
-from nerg_mi.surfaces.refinement import refine
-from nerg_mi.surfaces.sums import merge
-from nerg_mi.surfaces.target import Target
+from nerg_mi.surfaces.laplacian import merge
+from nerg_mi.surfaces.mesh import Target, refine
+from nerg_mi.surfaces.sources import GazeSettings, gaze_sums, lookers_of_law
 from tests.surfaces.meshes import box, joined, vmf
 
 ROOM = box((0, 0, 0), (4, 3, 2.5))
@@ -96,7 +95,7 @@ def test05_it_is_what_attention_says(rgb, tmp_path):
     thing = box((4.4, 4.65, 0.0), (4.9, 5.0, 1.45))
     expected = nerg.attention(scene, box_dict(*np.array([(4.4, 4.65, 0.0), (4.9, 5.0, 1.45)])), [eye], divisions=24)
     from nerg_mi.formats.meshes import read_mesh_file
-    from nerg_mi.surfaces.gaze_source import lookers_of_field
+    from nerg_mi.surfaces.sources import lookers_of_field
 
     read = read_mesh_file(here / "twin.ply")
     twin = read.vertices, read.faces

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from nerg_mi.surfaces.outlines import visible_pieces
-from nerg_mi.surfaces.pieces import pieces_of
-from nerg_mi.surfaces.target import Target
+from nerg_mi.surfaces.mesh import Target
+from nerg_mi.surfaces.sources import pieces_of, visible_pieces
 from tests.surfaces.meshes import joined
 
 FLOOR = (np.array([(-1.0, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]), np.array([(0, 1, 2), (0, 2, 3)]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.surfaces.pieces import pieces_of, solid_angles
+from nerg_mi.surfaces.sources import pieces_of, solid_angles
 from tests.surfaces.meshes import box, joined
 
 ROOM = joined(box((0, 0, 0), (1.0, 1.0, 1.0)))
@@ -45,6 +45,6 @@ def test04_an_observer_beyond_what_can_be_squared_ends(far):
 
 
 def test05_pieces_are_counted_before_they_are_cut(monkeypatch):
-    monkeypatch.setattr("nerg_mi.surfaces.pieces.MOST", 1000)
+    monkeypatch.setattr("nerg_mi.surfaces.sources.MOST_PIECES", 1000)
     with pytest.raises(NergError, match="sees the surfaces in more than 1,000 pieces of .* larger --angle"):
         pieces_of(ROOM, np.full(3, 0.5), 0.02)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.population import ray_seconds, ray_weights, thin
+from nerg_mi.surfaces.sources import ray_seconds, ray_weights, thin
 
 
 def rays(t, person):

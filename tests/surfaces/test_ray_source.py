@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays, ray_sums
-from nerg_mi.surfaces.sums import merge
-from nerg_mi.surfaces.target import Target
+from nerg_mi.surfaces.laplacian import merge
+from nerg_mi.surfaces.mesh import Target
+from nerg_mi.surfaces.sources import RaySettings, TrackedRays, ray_sums
 from tests.surfaces.meshes import box, joined, plate
 
 SIGMA = np.radians(1.5)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerg_mi.surfaces.reading import shape_triangles
+from nerg_mi.surfaces.mesh import shape_triangles
 
 
 def test01_shapes_of_scenes(rgb):

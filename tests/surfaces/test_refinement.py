@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.surfaces import refinement
-from nerg_mi.surfaces.refinement import refine
+from nerg_mi.surfaces import mesh
+from nerg_mi.surfaces.mesh import refine
 from tests.surfaces.meshes import box, joined, plate
 
 
@@ -36,6 +36,6 @@ def test02_what_is_fine_already_stays():
 
 
 def test03_too_many(monkeypatch):
-    monkeypatch.setattr(refinement, "MOST_FACES", 1000)
+    monkeypatch.setattr(mesh, "MOST_REFINED_FACES", 1000)
     with pytest.raises(NergError, match="larger --detail"):
         refine(joined(box((0, 0, 0), (1, 1, 1))), 0.01)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from nerg_mi.surfaces.laplacian import Smoother
 from nerg_mi.surfaces.mesh import Mesh, weld
-from nerg_mi.surfaces.smoothing import Smoother
 from tests.surfaces.meshes import box, joined, plate
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.surfaces.sphere_rule import sphere_rule
+from nerg_mi.surfaces.sources import sphere_rule
 
 MEAN = np.array([0.3, -0.5, 0.81]) / np.linalg.norm([0.3, -0.5, 0.81])
 

@@ -4,7 +4,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 
 from nerg_mi.field.splats import Splats
-from nerg_mi.surfaces.splat_hits import groups_of_hits
+from nerg_mi.surfaces.splats import groups_of_hits
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from tests.reference.splats import peaks
 from tests.transport.media.splats.scenes import rays, stack

@@ -6,11 +6,9 @@ import pytest
 
 from nerg_mi.field.splats import joined
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.surfaces.gaze_source import lookers_of_law
-from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
-from nerg_mi.surfaces.splat_areas import shortest_axes, splat_areas
-from nerg_mi.surfaces.splat_rays import gaze_and_escaped, splat_ray_sums
-from nerg_mi.surfaces.sums import merge
+from nerg_mi.surfaces.laplacian import merge
+from nerg_mi.surfaces.sources import RaySettings, TrackedRays, lookers_of_law
+from nerg_mi.surfaces.splats import gaze_and_escaped, shortest_axes, splat_areas, splat_ray_sums
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from tests.surfaces.meshes import vmf
 from tests.surfaces.test_splat_hits import shares, some

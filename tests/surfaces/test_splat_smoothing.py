@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.splats import Splats, joined
-from nerg_mi.surfaces.splat_areas import shortest_axes
-from nerg_mi.surfaces.splat_smoothing import SplatSmoother
+from nerg_mi.surfaces.splats import SplatSmoother, shortest_axes
 from tests.surfaces.walls import TURN_X, wall
 
 TOLERANCE = 0.002

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.field.splats import Splats, matrices_of
-from nerg_mi.surfaces.gaze_source import lookers_of_law
+from nerg_mi.surfaces.sources import lookers_of_law
 from nerg_mi.surfaces.splats import splat_densities
 from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.place import Place

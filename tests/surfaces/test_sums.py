@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerg_mi.surfaces.sums import Sums, deposit, merge
+from nerg_mi.surfaces.laplacian import Sums, deposit, merge
 
 
 def test01_a_deposit_is_divided_among_corners_and_keeps_its_sum():

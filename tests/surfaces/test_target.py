@@ -3,7 +3,7 @@
 import numpy as np
 
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.surfaces.target import Target
+from nerg_mi.surfaces.mesh import Target
 from nerg_mi.transport.media.volume import VolumeMedium
 from tests.surfaces.meshes import box, joined
 

@@ -22,13 +22,18 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.rendering.scene_file import files_of_scene
-from nerg_mi.surfaces.gaze_source import GazeSettings, MakeLooker, gaze_sums, lookers_of_field
-from nerg_mi.surfaces.mesh import Mesh
-from nerg_mi.surfaces.population import Crowd
-from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays, ray_sums
-from nerg_mi.surfaces.reading import Triangles
-from nerg_mi.surfaces.sums import Sums
-from nerg_mi.surfaces.target import Target
+from nerg_mi.surfaces.laplacian import Sums
+from nerg_mi.surfaces.mesh import Mesh, Target, Triangles
+from nerg_mi.surfaces.sources import (
+    Crowd,
+    GazeSettings,
+    MakeLooker,
+    RaySettings,
+    TrackedRays,
+    gaze_sums,
+    lookers_of_field,
+    ray_sums,
+)
 from nerg_mi.transport.observer.gaze import PlacedGaze
 
 OBSERVERS = 4

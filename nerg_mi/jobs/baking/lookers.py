@@ -19,8 +19,7 @@ from nerg_mi.ranges import VALUES
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
-from nerg_mi.surfaces.population import WEIGHTS, Crowd, ray_weights, thin
-from nerg_mi.surfaces.ray_source import TrackedRays
+from nerg_mi.surfaces.sources import WEIGHTS, Crowd, TrackedRays, ray_weights, thin
 
 POSITIONS = 1_000_000
 """A path has so many positions at most."""

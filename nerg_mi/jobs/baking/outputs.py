@@ -19,9 +19,7 @@ from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.gltf import Attribute, shown_unlit
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.maths.color import decode_srgb
-from nerg_mi.surfaces.charts import texture, unroll, unroller
-from nerg_mi.surfaces.mesh import Mesh
-from nerg_mi.surfaces.refinement import Refined
+from nerg_mi.surfaces.mesh import Mesh, Refined, texture, unroll, unroller
 
 from .receivers import Receivers
 

@@ -16,9 +16,7 @@ from nerg_mi.formats.splats.files import refuse_others
 from nerg_mi.formats.surfaces import mesh as mesh_of_field
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.surfaces.mesh import Mesh, weld
-from nerg_mi.surfaces.reading import Triangles, shape_triangles
-from nerg_mi.surfaces.refinement import Refined, refine
+from nerg_mi.surfaces.mesh import Mesh, Refined, Triangles, refine, shape_triangles, weld
 
 FACES = 100_000
 """Triangles that a surface is cut into when nothing is said."""

@@ -15,14 +15,10 @@ from nerg_mi.field.splats import Splats
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.splats.files import read_splats
-from nerg_mi.surfaces.gaze_source import MakeLooker, lookers_of_field
-from nerg_mi.surfaces.population import Crowd
-from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
-from nerg_mi.surfaces.splat_areas import shortest_axes
-from nerg_mi.surfaces.splat_rays import gaze_and_escaped, splat_ray_sums
-from nerg_mi.surfaces.splats import splat_densities
-from nerg_mi.surfaces.sums import Sums
-from nerg_mi.surfaces.target import SURFACE_OPACITY
+from nerg_mi.surfaces.laplacian import Sums
+from nerg_mi.surfaces.mesh import SURFACE_OPACITY
+from nerg_mi.surfaces.sources import Crowd, MakeLooker, RaySettings, TrackedRays, lookers_of_field
+from nerg_mi.surfaces.splats import gaze_and_escaped, shortest_axes, splat_densities, splat_ray_sums
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from nerg_mi.transport.media.splats.medium import SplatMedium
 from nerg_mi.transport.observer.gaze import PlacedGaze

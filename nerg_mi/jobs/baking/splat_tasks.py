@@ -9,8 +9,7 @@ from typing import Any
 
 from nerg_mi.jobs.backend import select_backend
 from nerg_mi.jobs.parts import Parts
-from nerg_mi.surfaces.population import Crowd
-from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
+from nerg_mi.surfaces.sources import Crowd, RaySettings, TrackedRays
 from nerg_mi.tasks.inputs import read_input
 from nerg_mi.tasks.task import Task
 from nerg_mi.threads import use_share

@@ -12,9 +12,8 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.jobs.parts import Parts
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.population import Crowd
-from nerg_mi.surfaces.ray_source import TrackedRays
-from nerg_mi.surfaces.sums import Sums
+from nerg_mi.surfaces.laplacian import Sums
+from nerg_mi.surfaces.sources import Crowd, TrackedRays
 from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.task import Task
 

@@ -15,12 +15,9 @@ from nerg_mi.files.npy import read_npy
 from nerg_mi.jobs.backend import select_backend
 from nerg_mi.jobs.parts import Parts
 from nerg_mi.rendering.scene_file import files_of_scene
-from nerg_mi.surfaces.gaze_source import GazeSettings
-from nerg_mi.surfaces.mesh import Mesh
-from nerg_mi.surfaces.population import Crowd
-from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
-from nerg_mi.surfaces.reading import Triangles
-from nerg_mi.surfaces.sums import Sums
+from nerg_mi.surfaces.laplacian import Sums
+from nerg_mi.surfaces.mesh import Mesh, Triangles
+from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays
 from nerg_mi.tasks.code import RENDERS, versions
 from nerg_mi.tasks.inputs import InputFile, name_of, read_input, read_inputs
 from nerg_mi.tasks.run import Output

@@ -27,7 +27,7 @@ from nerg_mi.formats.areas.kinds import Area, Areas, Group, SceneShape
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.regions import Entry, Region, check_name, is_number, parse_box
 from nerg_mi.ranges import COORDINATES
-from nerg_mi.surfaces.target import mitsuba_mesh
+from nerg_mi.surfaces.mesh import mitsuba_mesh
 
 from .things import scene_of, shape_named, shapes_of
 

@@ -21,7 +21,7 @@ from nerg_mi.maths.geometry import AnyBox, Box, Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.mesh_file import check_vol
 from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.surfaces.target import mitsuba_mesh
+from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from nerg_mi.transport.media.splats.medium import SplatMedium

@@ -11,10 +11,8 @@ from nerg_mi.scenes import store
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.baking import chunks
 from nerg_mi.jobs.baking.chunks import BakeScene, bake_chunk, parts_of
-from nerg_mi.surfaces.gaze_source import GazeSettings
-from nerg_mi.surfaces.population import Crowd
-from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
-from nerg_mi.surfaces.sums import merge
+from nerg_mi.surfaces.laplacian import merge
+from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays
 from tests.surfaces.meshes import box, joined
 
 ROOM = joined(box((0, 0, 0), (8, 6, 3)))

@@ -9,8 +9,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.jobs.baking.splat_chunks import SplatScene, splat_chunk, splat_place
-from nerg_mi.surfaces.population import Crowd
-from nerg_mi.surfaces.ray_source import RaySettings
+from nerg_mi.surfaces.sources import Crowd, RaySettings
 from tests.surfaces.test_splat_rays import falling
 from tests.surfaces.walls import wall
 

@@ -6,7 +6,7 @@ from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.jobs.baking import chunks, splat_tasks, tasks
 from nerg_mi.jobs.baking.splat_chunks import SplatScene, splat_chunk
 from nerg_mi.jobs.baking.summing import sums_in_one_go, sums_in_parts
-from nerg_mi.surfaces.ray_source import RaySettings
+from nerg_mi.surfaces.sources import RaySettings
 from nerg_mi.tasks.inputs import Checksums
 from nerg_mi.tasks.making import make_output
 from nerg_mi.tasks.run import Output

@@ -17,9 +17,7 @@ from nerg_mi.jobs.options.bake import BakeOptions
 from nerg_mi.jobs.options.parts import PartOptions
 from nerg_mi.jobs.parts import Parts
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.gaze_source import GazeSettings
-from nerg_mi.surfaces.population import Crowd
-from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
+from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays
 from nerg_mi.tasks.store import Store
 from tests.conftest import ROOT
 from tests.jobs.recorder import Recorder

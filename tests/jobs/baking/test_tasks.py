@@ -5,7 +5,7 @@ import shutil
 from nerg_mi.jobs.baking import tasks
 from nerg_mi.jobs.baking.chunks import BakeScene
 from nerg_mi.jobs.baking.summing import sums_in_one_go
-from nerg_mi.surfaces.gaze_source import GazeSettings
+from nerg_mi.surfaces.sources import GazeSettings
 from nerg_mi.tasks.inputs import Checksums
 from nerg_mi.tasks.making import make_output
 from nerg_mi.tasks.run import Output
