@@ -19,8 +19,7 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.statistics.estimates import adjusted
-from nerg_mi.statistics.measures import BY_NAME, MEASURES
-from nerg_mi.statistics.tables import COMPARED
+from nerg_mi.statistics.tables import BY_NAME, COMPARED, MEASURES
 from object_statistics import Walks, counting_of, made_store
 
 import numpy as np
@@ -61,8 +60,8 @@ def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     from nerg_mi.formats.regions import Region
     from nerg_mi.jobs.counting.things import things_of
     from nerg_mi.jobs.counting.tracked import count_block
-    from nerg_mi.statistics.measures import People
-    from nerg_mi.statistics.sums import ALL
+    from nerg_mi.statistics.tables import People
+    from nerg_mi.statistics.visits import ALL
 
     around, goods, _ = made_store()
     labels = []
@@ -101,7 +100,7 @@ def shares(people: tuple[int, ...]) -> None:
 
 
 def _share_intervals() -> dict:
-    from nerg_mi.statistics.proportions import mid_p
+    from nerg_mi.statistics.estimates import mid_p
 
     z = stats.norm.ppf(0.975)
     cut = lambda low, high: (np.maximum(low, 0), np.minimum(high, 1))
@@ -140,7 +139,7 @@ def _share_intervals() -> dict:
 
 def ratio_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     """Ends of the intervals (K,) of Σ x / Σ y in several ways."""
-    from nerg_mi.statistics.intervals import ratios
+    from nerg_mi.statistics.estimates import ratios
 
     n, count = (y > 0).sum(axis=0), len(x)
     m = x.sum(axis=0) / y.sum(axis=0)
@@ -235,12 +234,12 @@ def compare(population: Population, sets: int, people: tuple[int, ...], names: t
 
 def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     """Ends of the intervals (K,) with other factors of the error where few people decide a number."""
-    from nerg_mi.statistics import intervals
-    from nerg_mi.statistics.intervals import ratios
+    from nerg_mi.statistics import estimates
+    from nerg_mi.statistics.estimates import ratios
 
     kept = ratios(x, y, resamples=RESAMPLES, seed=seed)
-    value, _, people = intervals._linear(x, y)
-    apart = intervals._left_out(x, y, value, people)
+    value, _, people = estimates._linear(x, y)
+    apart = estimates._left_out(x, y, value, people)
     error, square = np.sqrt((apart**2).sum(axis=0)), apart**2
     c = (kept.high - value) / error
     few = (people <= len(x) / 2) & (np.where(y > 0, y, np.inf).min(axis=0) < y.max(axis=0))
@@ -259,8 +258,7 @@ def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
 
 
 def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
-    from nerg_mi.statistics.intervals import ratios
-    from nerg_mi.statistics.proportions import proportions
+    from nerg_mi.statistics.estimates import proportions, ratios
 
     print(f"\n| number {HEAD}")
     for n in people:
@@ -278,8 +276,7 @@ def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
 
 def differences(population: Population, sets: int, pairs: tuple[tuple[int, int], ...]) -> None:
     """How often two groups of one population are found to differ, p <= 0.05, and how often after the adjustment."""
-    from nerg_mi.statistics.intervals import ratio_differences
-    from nerg_mi.statistics.proportions import proportion_differences
+    from nerg_mi.statistics.estimates import proportion_differences, ratio_differences
 
     print("\n| people | number | p <= 0.05 | most of a thing | rare | most | a set has a false discovery |")
     print("| --- | --- | ---: | ---: | ---: | ---: | ---: |")

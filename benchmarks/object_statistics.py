@@ -36,8 +36,8 @@ def made_store():
 
 def counting_of(around, areas, things, seen: bool = True):
     from nerg_mi.jobs.counting.tracked import Counting
-    from nerg_mi.statistics.looks import LookRules
     from nerg_mi.statistics.visibility import CellsInView, Targets
+    from nerg_mi.statistics.visits import LookRules
 
     in_view = CellsInView(Targets.of(things, 48), around.depth, 0.1, 0.03) if seen else None
     members = list(areas.members().values())
@@ -98,10 +98,9 @@ def errors() -> None:
     from nerg_mi.jobs.reporter import SILENT
     from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.scenes.store import twin
-    from nerg_mi.statistics.landing import land
-    from nerg_mi.statistics.measures import People
-    from nerg_mi.statistics.sums import ALL
+    from nerg_mi.statistics.tables import People
     from nerg_mi.statistics.visibility import Targets
+    from nerg_mi.statistics.visits import ALL, land
 
     around, areas, things = made_store()
     walks = Walks(12, seed=5)

@@ -21,8 +21,8 @@ from nerg_mi.formats.meshes import READERS
 from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.reporter import SILENT, Reporter
 from nerg_mi.ranges import FARTHEST, Range, check_number
-from nerg_mi.statistics.landing import MARGIN, Box
 from nerg_mi.statistics.shares import Shares, SumRule, gaze_shares
+from nerg_mi.statistics.visits import MARGIN, Box
 
 from . import arrays
 from .arrays import Floats

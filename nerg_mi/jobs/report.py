@@ -37,8 +37,8 @@ from nerg_mi.report.page import page
 from nerg_mi.report.proxy import place_proxy, spread_out
 from nerg_mi.report.run import Picture, Run
 from nerg_mi.report.stage import Camera, Stage, pack
-from nerg_mi.statistics.landing import MARGIN, Box
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
+from nerg_mi.statistics.visits import MARGIN, Box
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.transport.observer.viewpoint import center
 from nerg_mi.transport.place import Place

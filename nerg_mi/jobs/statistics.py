@@ -17,11 +17,20 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.estimates import LEAST_PEOPLE
-from nerg_mi.statistics.measures import People
-from nerg_mi.statistics.persons import PersonRows
-from nerg_mi.statistics.sums import ALL, Cell, Sums, Total
-from nerg_mi.statistics.tables import FIELD, TRACKED, Floor, Row, difference_rows, duration_rows, move_rows, thing_rows
+from nerg_mi.statistics.tables import (
+    FIELD,
+    TRACKED,
+    Floor,
+    People,
+    PersonRows,
+    Row,
+    difference_rows,
+    duration_rows,
+    move_rows,
+    thing_rows,
+)
 from nerg_mi.statistics.visibility import Isovists, Targets
+from nerg_mi.statistics.visits import ALL, Cell, Sums, Total
 
 from .backend import select_backend
 from .counting.changes import read_changes

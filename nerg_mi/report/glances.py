@@ -12,8 +12,8 @@ import numpy as np
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.landing import Landed, Thing, land, regroup
 from nerg_mi.statistics.shares import Look
+from nerg_mi.statistics.visits import Landed, Thing, land, regroup
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
 from nerg_mi.transport.observer.gaze import PlacedGaze
@@ -112,7 +112,7 @@ def land_rays(
 ) -> tuple[Landed, np.ndarray]:
     """What up to ``most`` of the ``rays``, evenly chosen, are on of objects that consist of ``things`` by their
     numbers, ``members``, and whose each is (N,). Rays end at their own hit points, or else at what they meet in the
-    place. ``margin``: as of `landing.land`."""
+    place. ``margin``: as of `visits.land`."""
     some = rays if len(rays) <= most else rays.select(np.linspace(0, len(rays) - 1, most).round().astype(int))
     origins, directions = place.points_from_rays(some.origin), place.directions_from_rays(some.direction)
     met, hit = onlooker.meet(origins, directions)

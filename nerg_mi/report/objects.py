@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.evaluation.gaze.verdict import widening
-from nerg_mi.statistics.landing import Landed
 from nerg_mi.statistics.shares import Shares
+from nerg_mi.statistics.visits import Landed
 
 LEAST_PEOPLE = 3
 """Fewer people than these give no interval."""

@@ -22,7 +22,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions, numbers_in_cone
 from nerg_mi.transport.observer.integral import PARTS, POWER
 
-from .landing import Thing, land, regroup
+from .visits import Thing, land, regroup
 
 FIRST = 1 << 13
 """Directions over the sphere that are looked along first."""
@@ -90,7 +90,7 @@ def gaze_shares(
 ) -> Shares:
     """The shares of gaze that ``eyes`` (E, 3) give to areas, which consist of ``things`` by their numbers, ``members``.
 
-    ``look_from`` makes the look of an eye (3,); ``margin``: as of `landing.land`. ``on_eyes`` is told how many eyes are
+    ``look_from`` makes the look of an eye (3,); ``margin``: as of `visits.land`. ``on_eyes`` is told how many eyes are
     done, after some of them each time. Raises `NergError` where the gaze is not finite.
     """
     rule = rule or SumRule()

@@ -16,7 +16,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import LENGTHS, check_number
 
-from .landing import Thing
+from .visits import Thing
 
 Depth = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Of origins and unit directions (N, 3): distance to the first surface (N,), infinite where there is none."""

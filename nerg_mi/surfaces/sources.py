@@ -424,7 +424,7 @@ class TrackedRays:
 
 
 def ray_sums(target: Target, rays: TrackedRays, settings: RaySettings) -> Sums:
-    """What ``rays`` leave on ``target``: partial sums, which `sums.merge` adds up to those of more rays.
+    """What ``rays`` leave on ``target``: partial sums, which `visits.merge` adds up to those of more rays.
 
     The draws depend on the seed and on ``rays.first`` alone, so that parts that are cut alike give the same everywhere.
     """

@@ -10,8 +10,8 @@ from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.options.statistics import StatisticsOptions
 from nerg_mi.jobs.statistics import statistics
 from nerg_mi.report.glances import Onlooker
-from nerg_mi.statistics.landing import MARGIN, Box
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
+from nerg_mi.statistics.visits import MARGIN, Box
 from nerg_mi.training.geometry.places import GazePlace
 from tests.jobs.counting.place import SIGN, STAND, write_place
 

@@ -9,8 +9,8 @@ import pytest
 
 from nerg_mi.evaluation.gaze.verdict import widening
 from nerg_mi.report.objects import attention_on, mean_over_people
-from nerg_mi.statistics.landing import Landed
 from nerg_mi.statistics.shares import Shares
+from nerg_mi.statistics.visits import Landed
 
 
 def of_field(share, seen=None):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nerg_mi.statistics.intervals import ratio_differences, ratios
+from nerg_mi.statistics.estimates import ratio_differences, ratios
 
 ONES = np.ones
 

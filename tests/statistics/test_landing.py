@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.formats.regions import Region
-from nerg_mi.statistics.landing import Box, concatenate, cone, land, regroup, unite
+from nerg_mi.statistics.visits import Box, concatenate, cone, land, regroup, unite
 
 
 def box(name, lower, upper, turn=None):

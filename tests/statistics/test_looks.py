@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.statistics.looks import LookRules, looks_at, timeline
+from nerg_mi.statistics.visits import LookRules, looks_at, timeline
 
 
 def slow_weights(person, t, rules):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.statistics.measures import BY_NAME, MEASURES, People
+from nerg_mi.statistics.tables import BY_NAME, MEASURES, People
 
 # Three people, two things: Ada looks at the first alone, Bo at both, Cy at none and has no time.
 PEOPLE = People(

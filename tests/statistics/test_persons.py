@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from nerg_mi.statistics.persons import PersonRows
-from nerg_mi.statistics.sums import ALL, Cell, Sums
+from nerg_mi.statistics.tables import PersonRows
+from nerg_mi.statistics.visits import ALL, Cell, Sums
 
 
 def sums():

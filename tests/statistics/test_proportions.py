@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nerg_mi.statistics.proportions import mid_p, proportion_differences, proportions
+from nerg_mi.statistics.estimates import mid_p, proportion_differences, proportions
 
 P = np.linspace(0.001, 0.999, 999)
 

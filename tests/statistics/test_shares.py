@@ -8,8 +8,8 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.formats.regions import Region
 from nerg_mi.maths.sphere import fibonacci_directions, numbers_in_cone
-from nerg_mi.statistics.landing import Box, land
 from nerg_mi.statistics.shares import FIRST, SumRule, gaze_shares
+from nerg_mi.statistics.visits import Box, land
 
 LOW, HIGH = np.array([-2.0, -6.0, 0.0]), np.array([2.0, 6.0, 3.0])
 AHEAD = np.array([0.6, 0.8, 0.0])

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.landing import Landed
-from nerg_mi.statistics.looks import LookRules
-from nerg_mi.statistics.sums import ALL, BINS, Cell, Sums, merge, partial_sums
+from nerg_mi.statistics.visits import ALL, BINS, Cell, Landed, LookRules, Sums, merge, partial_sums
 
 from .test_looks import slow_looks, slow_weights
 

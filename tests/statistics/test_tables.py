@@ -5,9 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.statistics.measures import BY_NAME, People
-from nerg_mi.statistics.sums import ALL, BINS, Cell, Sums
-from nerg_mi.statistics.tables import TRACKED, Floor, difference_rows, duration_rows, move_rows, shown, thing_rows
+from nerg_mi.statistics.tables import (
+    BY_NAME,
+    TRACKED,
+    Floor,
+    People,
+    difference_rows,
+    duration_rows,
+    move_rows,
+    shown,
+    thing_rows,
+)
+from nerg_mi.statistics.visits import ALL, BINS, Cell, Sums
 
 A, B = Cell("cohort", "a"), Cell("cohort", "b")
 HOW = {"resamples": 299, "seed": 0}

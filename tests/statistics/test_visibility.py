@@ -8,8 +8,8 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.formats.regions import Region
 from nerg_mi.maths.geometry import box_interval
-from nerg_mi.statistics.landing import Box
 from nerg_mi.statistics.visibility import CellsInView, Targets, in_view, isovists, standing, unhidden
+from nerg_mi.statistics.visits import Box
 
 ROOM = np.array([[0.0, 0, 0], [6, 4, 3]])
 PILLAR = np.array([[2.0, 1.5, 0], [3, 2.5, 2.0]])

@@ -15,11 +15,10 @@ from zlib import crc32
 import numpy as np
 
 from nerg_mi.jobs.reporter import Reporter
-from nerg_mi.statistics.landing import Thing
-from nerg_mi.statistics.measures import People
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
-from nerg_mi.statistics.sums import Cell
+from nerg_mi.statistics.tables import People
 from nerg_mi.statistics.visibility import Targets, in_view, unhidden
+from nerg_mi.statistics.visits import Cell, Thing
 
 from .surroundings import Surroundings
 from .tracked import Eyes

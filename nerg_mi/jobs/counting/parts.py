@@ -20,7 +20,7 @@ from nerg_mi.rays.dataset.layout import HEAD, is_dataset
 from nerg_mi.rays.dataset.manifest import source_path
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene_file import files_of_scene
-from nerg_mi.statistics.sums import Sums
+from nerg_mi.statistics.visits import Sums
 from nerg_mi.tasks.code import RENDERS, versions
 from nerg_mi.tasks.inputs import Checksums, InputFile, name_of, read_inputs
 from nerg_mi.tasks.plan import Plan

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.statistics.sums import ALL
 from nerg_mi.statistics.tables import Row
 from nerg_mi.statistics.visibility import Isovists, standing
+from nerg_mi.statistics.visits import ALL
 
 from .surroundings import Surroundings
 from .tracked import Eyes

@@ -14,8 +14,8 @@ from nerg_mi.figures.statistics_figures import map_figure, moves_figure, things_
 from nerg_mi.files.atomic import write_text
 from nerg_mi.jobs.options.statistics import StatisticsOptions
 from nerg_mi.jobs.reporter import Reporter
-from nerg_mi.statistics.sums import Sums
 from nerg_mi.statistics.tables import Row
+from nerg_mi.statistics.visits import Sums
 
 from .writing import difference_columns, has_parquet, plain_columns, thing_columns, what_if_columns, write_rows
 

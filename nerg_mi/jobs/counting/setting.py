@@ -15,9 +15,8 @@ from nerg_mi.formats.areas.kinds import Areas, Group
 from nerg_mi.formats.regions import read_regions
 from nerg_mi.jobs.options.statistics import StatisticsOptions, parse_window
 from nerg_mi.jobs.reporter import SILENT, Reporter
-from nerg_mi.statistics.landing import Thing
-from nerg_mi.statistics.looks import LookRules
 from nerg_mi.statistics.visibility import CellsInView, Targets
+from nerg_mi.statistics.visits import LookRules, Thing
 
 from .changes import Changes, changed_areas, changed_scene
 from .cohorts import read_cohorts

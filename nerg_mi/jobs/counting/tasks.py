@@ -20,8 +20,7 @@ from nerg_mi.rays.dataset.dataset import RayDataset
 from nerg_mi.rays.dataset.layout import HEAD
 from nerg_mi.rays.dataset.manifest import read_head, read_source
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.looks import LookRules
-from nerg_mi.statistics.sums import Cell, Sums
+from nerg_mi.statistics.visits import Cell, LookRules, Sums
 from nerg_mi.tasks.inputs import InputFile
 from nerg_mi.tasks.task import canonical
 from nerg_mi.threads import use_share

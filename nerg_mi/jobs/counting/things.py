@@ -14,7 +14,7 @@ from nerg_mi.formats.areas.kinds import MeshPart, SceneShape
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.regions import Region
 from nerg_mi.maths.geometry import box_interval
-from nerg_mi.statistics.landing import Box, Thing
+from nerg_mi.statistics.visits import Box, Thing
 from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.transport.place import corners_of
 

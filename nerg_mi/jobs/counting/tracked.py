@@ -15,10 +15,21 @@ from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.merging import merge_rays
 from nerg_mi.rays.filters import time_order
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.landing import Landed, Thing, concatenate, cone, land, regroup, unite
-from nerg_mi.statistics.looks import LookRules
-from nerg_mi.statistics.sums import ALL, Cell, Sums, partial_sums
 from nerg_mi.statistics.visibility import CellsInView
+from nerg_mi.statistics.visits import (
+    ALL,
+    Cell,
+    Landed,
+    LookRules,
+    Sums,
+    Thing,
+    concatenate,
+    cone,
+    land,
+    partial_sums,
+    regroup,
+    unite,
+)
 
 from .surroundings import Surroundings
 
@@ -123,7 +134,7 @@ def ahead(rays: Rays) -> np.ndarray:
 
 def count_block(rays: Rays, counting: Counting) -> Sums:
     """The partial sums of a block of rays that holds sittings as a whole: a pure function of its arguments, whose
-    results `nerg_mi.statistics.sums.merge` adds up in the order of the blocks."""
+    results `nerg_mi.statistics.visits.merge` adds up in the order of the blocks."""
     landed = counting.land(rays)
     cells = counting.cells(rays, counting.around.points(rays.origin))
     return partial_sums(rays, landed, counting.names, cells, counting.rules, counting.visible(rays), counting.movable)

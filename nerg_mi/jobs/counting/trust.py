@@ -9,9 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from nerg_mi.jobs.reporter import Reporter
-from nerg_mi.statistics.measures import BY_NAME
-from nerg_mi.statistics.sums import Cell
-from nerg_mi.statistics.tables import FIELD, PLACES, Row
+from nerg_mi.statistics.tables import BY_NAME, FIELD, PLACES, Row
+from nerg_mi.statistics.visits import Cell
 
 from .foretold import Foretold, foretold_people
 from .tracked import Eyes

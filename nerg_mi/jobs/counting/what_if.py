@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.formats.areas.kinds import Areas
-from nerg_mi.statistics.estimates import adjusted
-from nerg_mi.statistics.intervals import ratio_differences
+from nerg_mi.statistics.estimates import adjusted, ratio_differences
 from nerg_mi.statistics.tables import FIELD, Floor, Row
 
 from .changes import read_changes

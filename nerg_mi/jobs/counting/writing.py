@@ -10,9 +10,7 @@ from typing import Any
 from nerg_mi.files.atomic import replacing, write_text
 from nerg_mi.files.tables import markdown_table, write_csv
 from nerg_mi.rays.io import pyarrow_modules
-from nerg_mi.statistics.measures import BY_NAME, MEASURES
-from nerg_mi.statistics.persons import PersonRows
-from nerg_mi.statistics.tables import FIELD, Row, shown
+from nerg_mi.statistics.tables import BY_NAME, FIELD, MEASURES, PersonRows, Row, shown
 
 MOST_LINES = 10_000
 """Rows of a table in Markdown: more are nobody's to read."""

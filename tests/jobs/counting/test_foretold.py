@@ -11,8 +11,7 @@ from nerg_mi.jobs.counting.surroundings import Surroundings
 from nerg_mi.jobs.counting.tracked import Eyes
 from nerg_mi.jobs.reporter import SILENT
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.statistics.landing import Box
-from nerg_mi.statistics.sums import ALL, Cell
+from nerg_mi.statistics.visits import ALL, Box, Cell
 from tests.jobs.recorder import Recorder
 
 

@@ -10,8 +10,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.counting.places import isovist_rows, look_around, places_of
 from nerg_mi.jobs.counting.surroundings import surroundings_of_files
-from nerg_mi.statistics.landing import Box
 from nerg_mi.statistics.visibility import Targets, isovists
+from nerg_mi.statistics.visits import Box
 
 from .place import SIGN, write_place
 

@@ -13,9 +13,7 @@ from nerg_mi.jobs.counting.surroundings import Surroundings
 from nerg_mi.jobs.counting.tracked import Counting, EyePicker, Window, ahead, blocks_of, count_block
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.landing import Box
-from nerg_mi.statistics.looks import LookRules
-from nerg_mi.statistics.sums import ALL, Cell, merge
+from nerg_mi.statistics.visits import ALL, Box, Cell, LookRules, merge
 
 from .place import SIGN, STAND, people
 

@@ -8,8 +8,8 @@ import pytest
 from nerg_mi.jobs.counting.foretold import Foretold
 from nerg_mi.jobs.counting.tracked import Eyes
 from nerg_mi.jobs.counting.trust import add_trust, support_of, tell_places, tell_support
-from nerg_mi.statistics.sums import ALL, Cell
 from nerg_mi.statistics.tables import PLACES
+from nerg_mi.statistics.visits import ALL, Cell
 from tests.jobs.recorder import Recorder
 
 ZONE = Cell("zone", "z")

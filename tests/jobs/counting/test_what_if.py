@@ -18,8 +18,8 @@ from nerg_mi.jobs.counting.things import things_of
 from nerg_mi.jobs.counting.what_if import what_if_rows
 from nerg_mi.jobs.options.statistics import StatisticsOptions
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.statistics.looks import LookRules
 from nerg_mi.statistics.tables import Floor
+from nerg_mi.statistics.visits import LookRules
 
 AREAS = Areas((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])))
 EYES = places_of(np.arange(15.0).reshape(5, 3))

@@ -8,9 +8,8 @@ import pytest
 
 from nerg_mi.figures.statistics_figures import things_figure
 from nerg_mi.jobs.counting import writing
-from nerg_mi.statistics.persons import PersonRows
-from nerg_mi.statistics.sums import ALL, Sums
-from nerg_mi.statistics.tables import PLACES
+from nerg_mi.statistics.tables import PLACES, PersonRows
+from nerg_mi.statistics.visits import ALL, Sums
 
 ROWS = [
     {"cell": "all", "value": "", "thing": "a|b", "n": 3, "x": 0.125},
