@@ -66,10 +66,10 @@ def main(argv=None) -> None:
     dr.set_thread_count(args.threads)
     from dataclasses import replace
 
-    from nerg_mi.capture.dataset import open_dataset
     from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
+    from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.training.radiance.held_out import measure
     from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
     from nerg_mi.training.radiance.trainer import RadianceTrainer

@@ -47,10 +47,10 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(args.threads)
     from fox_radiance import parse_settings, validation
-    from nerg_mi.capture.dataset import open_dataset
     from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
+    from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
     from nerg_mi.training.radiance.trainer import RadianceTrainer
     from nerg_mi.training.radiance.warm_up import warm_up

@@ -34,11 +34,11 @@ OFF = 0.1
 def score(field: Path, views: list, box, center, spp: int, pictures: Path) -> dict[str, float]:
     """Means over ``views`` of PSNR in dB and SSIM, and over all of their pixels: PSNR within and ``beyond`` the
     ``box``, and errors of depth near ``center`` and far."""
-    from nerg_mi.capture.cameras import pixel_directions
     from nerg_mi.evaluation.images import Renderer, ssim
     from nerg_mi.figures.tonemap import write_png
     from nerg_mi.files.atomic import make_folder
     from nerg_mi.maths.color import decibels, psnr
+    from nerg_mi.photos.cameras import pixel_directions
 
     make_folder(pictures)
     render, rows, parts = Renderer(field, spp), [], []
@@ -81,8 +81,8 @@ def main(argv=None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/tabletop_radiance"))
     args = parser.parse_args(argv)
 
-    from nerg_mi.capture.dataset import open_dataset
     from nerg_mi.jobs.radiance import RadianceOptions, train_radiance
+    from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.scenes.tabletop.photos import DEPTH_FILE
     from nerg_mi.scenes.tabletop.table import CENTRE
 

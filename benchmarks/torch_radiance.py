@@ -143,7 +143,7 @@ class TorchTrainer:
         self.optimiser = torch.optim.Adam(
             self.model.weights.values(), lr=self.s.learning_rate, betas=(0.9, 0.99), eps=1e-15
         )
-        from nerg_mi.capture.cameras import pixel_directions
+        from nerg_mi.photos.cameras import pixel_directions
 
         o, d, c = [], [], []
         for v in views:
@@ -302,10 +302,10 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(args.threads)
     torch.set_num_threads(args.threads)
-    from nerg_mi.capture.dataset import open_dataset
     from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
+    from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
     from nerg_mi.training.radiance.trainer import RadianceTrainer
 

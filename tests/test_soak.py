@@ -80,12 +80,11 @@ def radiance_steps() -> Callable[[int], None]:
     import drjit as dr
     import drjit.llvm.ad as ns
 
-    from nerg_mi.capture.cameras import Camera
-    from nerg_mi.capture.images import View
-    from nerg_mi.capture.intrinsics import Intrinsics
     from nerg_mi.field.encoding.hashgrid import HashGridConfig
     from nerg_mi.field.radiance import RadianceConfig
     from nerg_mi.maths.geometry import Box
+    from nerg_mi.photos.cameras import Camera, Intrinsics
+    from nerg_mi.photos.images import View
     from nerg_mi.training.radiance.settings import RadianceSettings
     from nerg_mi.training.radiance.trainer import RadianceTrainer
 

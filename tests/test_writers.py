@@ -44,7 +44,7 @@ EXCEPTIONS = {
     "nerg_mi/cli/ending.py:write": "is a standard stream",
     "nerg_mi/files/png.py": "encodes in memory",
     "nerg_mi/figures/saving.py:encode": "encodes in memory",
-    "nerg_mi/capture/structure/worker.py": "fills a folder that `replacing_folder` has named, in its own process",
+    "nerg_mi/photos/structure_worker.py": "fills a folder that `replacing_folder` has named, in its own process",
     "nerg_mi/tasks/child.py:main": "is the pipe to whoever asks",
     "nerg_mi/tasks/children.py:make": "is the pipe to the child",
     "nerg_mi/rays/readers/parsing/skeleton_file.py:_written": "is given the name that `replacing` has chosen",

@@ -12,12 +12,12 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, label
 
-from nerg_mi.capture.semidense import read_semidense
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.npy import read_npy
 from nerg_mi.formats.meshes import READERS, read_mesh_file
 from nerg_mi.maths.coordinates import check_coordinates, check_near_origin
 from nerg_mi.maths.sphere import uniform_directions
+from nerg_mi.photos.posed import read_semidense
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
 from nerg_mi.transport.media.protocol import Medium
 from nerg_mi.transport.place import Place

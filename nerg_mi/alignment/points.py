@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.capture.named_poses import find_source
-from nerg_mi.capture.posed import PosedImages
-from nerg_mi.capture.sources import read_posed
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.bounded import read_json, size_of
+from nerg_mi.photos.colmap import find_source
+from nerg_mi.photos.images import read_posed
+from nerg_mi.photos.posed import PosedImages
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
 
 from .constraints import Fit, Progress, Target, angles, pair_covariance

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.capture.cameras import Camera, pixel_directions, sensor_dict
-from nerg_mi.capture.images import View
-from nerg_mi.capture.undistort import pinhole, through_lens
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.figures.provenance import provenance
 from nerg_mi.figures.tonemap import srgb, write_png
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.maths.color import psnr, psnr_of_fitted_half
+from nerg_mi.photos.cameras import Camera, pixel_directions, sensor_dict
+from nerg_mi.photos.images import View, pinhole, through_lens
 
 # Wang et al. 2004: window of 11 x 11 pixels, a Gaussian of 1.5; constants for values in 0..1.
 _RADIUS, _SIGMA, _C1, _C2 = 5, 1.5, 0.01**2, 0.03**2

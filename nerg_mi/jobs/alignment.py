@@ -14,7 +14,6 @@ from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.points import read_cameras, read_pairs
 from nerg_mi.alignment.similarity import move
 from nerg_mi.alignment.tracking import DECLARED, Tracking, compare_flips
-from nerg_mi.capture.upright import turn_to_z
 from nerg_mi.errors import NergError
 from nerg_mi.figures.alignment_figures import alignment_figure
 from nerg_mi.figures.provenance import provenance
@@ -22,6 +21,7 @@ from nerg_mi.figures.saving import save
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.photos.colmap import turn_to_z
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry import places
 from nerg_mi.training.geometry.places import GazePlace

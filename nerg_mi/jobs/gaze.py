@@ -10,13 +10,13 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
-from nerg_mi.capture.salience.views import SalienceSet, open_salience
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.files.atomic import check_writable, reserving
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.photos.salience import SalienceSet, open_salience
 from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays

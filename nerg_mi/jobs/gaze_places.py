@@ -10,10 +10,10 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.alignment.check import check_alignment
-from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import is_field
 from nerg_mi.maths.geometry import AnyBox, Similarity
+from nerg_mi.photos.salience import SalienceView
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry import places
 from nerg_mi.training.geometry.places import GazePlace

@@ -8,18 +8,25 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.capture.colmap import read_colmap
-from nerg_mi.capture.posed import Unused, name_some
-from nerg_mi.capture.structure.photos import copy_photos, list_photos
-from nerg_mi.capture.structure.pictures import Folders, Picture
-from nerg_mi.capture.structure.reconstruction import Reconstruction, Settings, check_installed, reconstruct
-from nerg_mi.capture.structure.video import copy_frames
 from nerg_mi.errors import NergError
 from nerg_mi.figures.camera_figures import camera_figure
 from nerg_mi.figures.provenance import provenance
 from nerg_mi.figures.saving import save
 from nerg_mi.files.atomic import check_new_folder, make_folder, replacing_folder
 from nerg_mi.files.tables import write_json
+from nerg_mi.photos.colmap import read_colmap
+from nerg_mi.photos.posed import Unused, name_some
+from nerg_mi.photos.structure import (
+    Folders,
+    Picture,
+    Reconstruction,
+    Settings,
+    check_installed,
+    copy_photos,
+    list_photos,
+    reconstruct,
+)
+from nerg_mi.photos.video_frames import copy_frames
 
 from .options.poses import PoseOptions
 from .reporter import SILENT, Reporter

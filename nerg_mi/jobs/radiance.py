@@ -6,7 +6,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from nerg_mi.capture.dataset import Dataset, open_dataset
 from nerg_mi.errors import NergError, chosen
 from nerg_mi.evaluation.images import ViewScores, score_views
 from nerg_mi.field.radiance import RadianceField
@@ -14,6 +13,7 @@ from nerg_mi.files.atomic import check_folder, check_writable, reserving
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
+from nerg_mi.photos.dataset import Dataset, open_dataset
 from nerg_mi.training.radiance import run
 from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 

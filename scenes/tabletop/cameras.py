@@ -6,8 +6,7 @@ import numpy as np
 from nerg_mi.scenes.tabletop.layout import stream
 from nerg_mi.scenes.tabletop.table import CENTRE
 
-from nerg_mi.capture.cameras import Camera
-from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.photos.cameras import Camera, Intrinsics
 
 RINGS = ((1.08, 1.42, 0.14), (1.42, 1.62, 0.06), (1.68, 1.58, 0.16))
 """Of each ring: height of the camera, distance from the object's axis, and how far above the object's middle it aims;

@@ -17,11 +17,11 @@ import numpy as np
 from nerg_mi.scenes.store import twin
 from nerg_mi.scenes.tabletop.denoising import denoise
 
-from nerg_mi.capture.cameras import Camera, pixel_directions, sensor_dict
 from nerg_mi.files.atomic import replacing
 from nerg_mi.files.png import write_png
 from nerg_mi.files.tables import write_json
 from nerg_mi.maths.color import encode_srgb
+from nerg_mi.photos.cameras import Camera, pixel_directions, sensor_dict
 
 DEPTH_FILE = "transforms_depth.json"
 """The same photos, with their depth."""

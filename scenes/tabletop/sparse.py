@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from nerg_mi.scenes.tabletop.photos import Photo
 
-from nerg_mi.capture.cameras import Camera, project
 from nerg_mi.files.atomic import write_text
+from nerg_mi.photos.cameras import Camera, project
 
 CORNERS = 700
 """Corners of a photo at most, the strongest."""

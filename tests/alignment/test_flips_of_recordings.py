@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.alignment.tracking import DECLARED, compare_flips
-from nerg_mi.capture.semidense import read_semidense
+from nerg_mi.photos.posed import read_semidense
 from nerg_mi.rays.readers.registry import read_rays
 
 

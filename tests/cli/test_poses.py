@@ -14,7 +14,7 @@ from PIL import Image
 
 from nerg_mi.cli import main
 from nerg_mi.jobs import poses as job
-from tests.capture.structure import rendered
+from tests.photos.structure import rendered
 
 
 def nerg(capsys, *arguments) -> tuple[int, str, str]:
@@ -63,9 +63,9 @@ def test_what_stands_in_the_way_is_told_before_work(installed, photos, capsys, t
     ],
 )
 def test_errors_take_a_sentence(installed, arguments, words, photos, capsys, monkeypatch, tmp_path):
-    from nerg_mi.capture.structure import reconstruction
+    from nerg_mi.photos import structure
 
-    monkeypatch.setattr(reconstruction, "check_installed", lambda: None)
+    monkeypatch.setattr(structure, "check_installed", lambda: None)
     out = tmp_path / "capture"
     code, _, said = nerg(capsys, *[a.format(p=photos, t=tmp_path) for a in arguments], "-o", out)
     assert code == 1 and words in said and said.count("\n") == 1 and os.listdir(tmp_path) == ["photos"]

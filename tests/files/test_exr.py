@@ -124,7 +124,7 @@ def test_one_thread_is_enough(tmp_path):
     ],
 )
 def test_pictures_are_read_as_mitsuba_reads_them(rgb, tmp_path, names, kind):
-    from nerg_mi.capture.reading import open_bitmap
+    from nerg_mi.photos.images import open_bitmap
 
     values = np.random.default_rng(0).random((len(names.split()), 4, 3)).astype(kind)
     write_exr(tmp_path / "a.exr", dict(zip(names.split(), values)))

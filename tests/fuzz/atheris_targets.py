@@ -23,10 +23,8 @@ import atheris  # noqa: E402
 import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402, F401
 
-with atheris.instrument_imports(include=["nerg_mi.formats", "nerg_mi.capture", "zipfile", "gzip"]):
+with atheris.instrument_imports(include=["nerg_mi.formats", "nerg_mi.photos", "zipfile", "gzip"]):
     import nerg_mi  # noqa: F401
-    from nerg_mi.capture.colmap import read_colmap
-    from nerg_mi.capture.reading import read_image
     from nerg_mi.errors import NergError
     from nerg_mi.files.bounded import parse_json
     from nerg_mi.files.image_header import check_image
@@ -34,6 +32,8 @@ with atheris.instrument_imports(include=["nerg_mi.formats", "nerg_mi.capture", "
     from nerg_mi.formats.fields import load_radiance
     from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp
     from nerg_mi.formats.torch_ngp.unpickling import _Machine
+    from nerg_mi.photos.colmap import read_colmap
+    from nerg_mi.photos.images import read_image
 
 from tests.fuzz.cases import make_inputs  # noqa: E402
 from tests.fuzz.readers import READERS  # noqa: E402

@@ -61,7 +61,7 @@ def _make_transforms(folder: Path) -> None:
 
 
 def _read_dataset(folder: Path) -> object:
-    from nerg_mi.capture.dataset import open_dataset
+    from nerg_mi.photos.dataset import open_dataset
 
     coordinates = folder / "dataparser_transforms.json"
     return open_dataset(folder, coordinates=str(coordinates) if coordinates.is_file() else "file")
@@ -76,13 +76,13 @@ def _make_place(folder: Path) -> None:
 
 
 def _read_place(folder: Path) -> object:
-    from nerg_mi.capture.dataset import open_dataset
+    from nerg_mi.photos.dataset import open_dataset
 
     return [open_dataset(folder, holdout=0, scale=0.5, unbounded=given) for given in (None, True, False)]
 
 
 def _read_salience_set(folder: Path) -> object:
-    from nerg_mi.capture.salience.views import open_salience
+    from nerg_mi.photos.salience import open_salience
 
     return open_salience(folder, "spectral-residual")
 
@@ -146,10 +146,10 @@ def _picture(name: str):
 
 def _read_picture(name: str):
     def read(folder: Path) -> object:
-        from nerg_mi.capture.posed import DepthFile, MaskFile
-        from nerg_mi.capture.reading import read_depth, read_image, read_mask
-        from nerg_mi.capture.salience.views import read_salience
         from nerg_mi.errors import NergError
+        from nerg_mi.photos.images import read_depth, read_image, read_mask
+        from nerg_mi.photos.posed import DepthFile, MaskFile
+        from nerg_mi.photos.salience import read_salience
 
         path, out = folder / name, []
         ways = [
@@ -184,7 +184,7 @@ def _make_points(folder: Path) -> None:
 
 def _read_points(name: str):
     def read(folder: Path) -> object:
-        from nerg_mi.capture.semidense import read_semidense
+        from nerg_mi.photos.posed import read_semidense
 
         return read_semidense(folder / name)
 

@@ -42,8 +42,7 @@ def _make_photo(name: str):
 
 def _read_photo(name: str):
     def read(folder: Path) -> object:
-        from nerg_mi.capture.structure.photos import read_photo
-        from nerg_mi.capture.structure.pictures import encoded, shrunk, small_size
+        from nerg_mi.photos.structure import encoded, read_photo, shrunk, small_size
 
         photo = read_photo(folder / name)
         # What is done with it where it is turned, and in any case.
@@ -76,8 +75,8 @@ def _read_film(name: str):
     def read(folder: Path) -> object:
         from PIL import Image
 
-        from nerg_mi.capture.structure.pictures import encoded, shrunk, small_size
-        from nerg_mi.capture.structure.video import sharpest_frames
+        from nerg_mi.photos.structure import encoded, shrunk, small_size
+        from nerg_mi.photos.video_frames import sharpest_frames
 
         # By itself the decoder starts as many threads as there are cores.
         frames = [Image.fromarray(pixels) for _, pixels in sharpest_frames(folder / name, 3, threads=2)]

@@ -1,5 +1,5 @@
 """Photos made a capture: what is written, read again, told and warned of. COLMAP itself is tried in
-tests/capture/structure/test_worker.py; here a model that is known stands for what it finds."""
+tests/photos/structure/test_worker.py; here a model that is known stands for what it finds."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.capture.dataset import open_dataset
-from nerg_mi.capture.structure.reconstruction import Reconstruction
-from nerg_mi.capture.upright import Up
 from nerg_mi.errors import NergError
 from nerg_mi.jobs import poses as job
 from nerg_mi.jobs.options.poses import PoseOptions
 from nerg_mi.jobs.poses import STAGES, find_poses
-from tests.capture.structure import rendered
+from nerg_mi.photos.colmap import Up
+from nerg_mi.photos.dataset import open_dataset
+from nerg_mi.photos.structure import Reconstruction
+from tests.photos.structure import rendered
 
 from .recorder import Recorder
 

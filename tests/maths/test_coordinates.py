@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.alignment.constraints import read_surface
-from nerg_mi.capture.posed import Frame, settled
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats.files import read_splats
 from nerg_mi.maths.coordinates import check_near_origin
+from nerg_mi.photos.posed import Frame, settled
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import UNITY
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos

@@ -8,8 +8,8 @@ mi = pytest.importorskip("mitsuba")
 from nerg_mi.scenes.tabletop import cameras, denoising, layout, make, mesh, photos, sparse, stage, table  # noqa: E402
 from nerg_mi.scenes.tabletop import textures as t  # noqa: E402
 
-from nerg_mi.capture.cameras import pixel_directions, project  # noqa: E402
-from nerg_mi.capture.dataset import open_dataset  # noqa: E402
+from nerg_mi.photos.cameras import pixel_directions, project  # noqa: E402
+from nerg_mi.photos.dataset import open_dataset  # noqa: E402
 
 
 @pytest.fixture(scope="module")

@@ -65,8 +65,8 @@ def draw(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> Dr
 
 def _display(path: Path) -> np.ndarray:
     """The picture as it is shown (h, w, 3), in 0..1."""
-    from nerg_mi.capture.reading import read_image
     from nerg_mi.figures.tonemap import srgb
+    from nerg_mi.photos.images import read_image
     from nerg_mi.rendering.pictures import activate
 
     if path.suffix.lower() == EXR:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.capture.posed import Frame, PosedImages
-from nerg_mi.capture.reading import read_photo
-from nerg_mi.capture.sources import find_source, read_posed
 from nerg_mi.errors import NergError, plain
+from nerg_mi.photos.images import find_source, read_photo, read_posed
+from nerg_mi.photos.posed import Frame, PosedImages
 from nerg_mi.rendering.scene_parts import Eye, Lens
 
 

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.log_density import blind_table, table_directions
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.photos.salience import SalienceView
 from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.probes.probes import person_weights
 from nerg_mi.rays.rays import Rays

@@ -17,13 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.basis import basis_of
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.protocol import AnyGazeField, GazeDensity
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_gaze, save_gaze
+from nerg_mi.photos.salience import SalienceView
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.common.run_state import kept_unless, require_same
 from nerg_mi.training.geometry.places import GazePlace

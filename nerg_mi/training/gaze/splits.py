@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.errors import NergError
+from nerg_mi.photos.salience import SalienceView
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.splits import purge, split_by_person, split_by_position
 from nerg_mi.training.geometry.places import GazePlace

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerg_mi.capture.salience.views import SalienceView
+from nerg_mi.photos.salience import SalienceView
 from nerg_mi.training.geometry.places import GazePlace
 
 from .blind import blind_of_views

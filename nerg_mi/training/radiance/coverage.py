@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nerg_mi.capture.cameras import pixel_directions
-from nerg_mi.capture.images import View
 from nerg_mi.maths.geometry import Box
+from nerg_mi.photos.cameras import pixel_directions
+from nerg_mi.photos.images import View
 
 from .preview import Preview
 

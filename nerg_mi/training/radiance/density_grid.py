@@ -9,13 +9,13 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from nerg_mi.capture.cameras import Camera, view_tangents
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
 from nerg_mi.field.cascades import CascadeGrid, contracted_cascades
 from nerg_mi.field.occupancy import OccupancyGrid, grown
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f, UInt32
+from nerg_mi.photos.cameras import Camera, view_tangents
 
 _DECAY = 0.6
 # A share of the cells is refreshed at a time; the strides walk over all of them.

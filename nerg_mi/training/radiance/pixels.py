@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from nerg_mi.capture.images import View
 from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Array3f, Float, UInt32
+from nerg_mi.photos.images import View
 
 from .unproject import LensTable
 

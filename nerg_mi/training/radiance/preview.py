@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from nerg_mi.capture.cameras import pixel_directions
-from nerg_mi.capture.images import View
 from nerg_mi.field.color_head import mean_features
 from nerg_mi.field.radiance import RadianceField
+from nerg_mi.photos.cameras import pixel_directions
+from nerg_mi.photos.images import View
 from nerg_mi.transport.march.quadrature import mean_depth_share
 
 from .compositing import ray_sum

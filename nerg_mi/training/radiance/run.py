@@ -10,13 +10,13 @@ from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.capture.dataset import Dataset
-from nerg_mi.capture.images import View
 from nerg_mi.errors import NergError
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.figures.provenance import provenance
 from nerg_mi.files.png import write_png
 from nerg_mi.interruption import Interruption
+from nerg_mi.photos.dataset import Dataset
+from nerg_mi.photos.images import View
 from nerg_mi.training.common.run_state import kept_unless, load_run, save_run
 
 from .coverage import share_beyond

@@ -14,7 +14,6 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
-from nerg_mi.capture.images import View
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
 from nerg_mi.field.encoding.registry import encoding_of
@@ -22,6 +21,7 @@ from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.field.refinement import refine
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Float, UInt32
+from nerg_mi.photos.images import View
 from nerg_mi.training.common.step_clock import StepClock
 
 from .compositing import damp_near, weights

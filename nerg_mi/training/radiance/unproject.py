@@ -1,12 +1,11 @@
-"""Directions that lenses show, on the device: the float32 counterpart of `capture.lens.rays`."""
+"""Directions that lenses show, on the device: the float32 counterpart of `photos.cameras.rays`."""
 
 from __future__ import annotations
 
 import drjit as dr
 import numpy as np
 
-from nerg_mi.capture.intrinsics import Intrinsics
-from nerg_mi.capture.lens import fisheye_limit
+from nerg_mi.photos.cameras import Intrinsics, fisheye_limit
 
 # From the image's own coordinates, Newton's iteration reaches float32 in 3 to 5 steps at the corners of usual lenses.
 _STEPS = 8
@@ -47,7 +46,7 @@ class LensTable:
         return x, -y, -z
 
     def _pinhole(self, x0, y0, k):
-        """Newton's iteration on OpenCV's model, see `capture.lens.undistort`."""
+        """Newton's iteration on OpenCV's model, see `photos.cameras.undistort`."""
         k1, k2, p1, p2, k3, k4, k5, k6 = k
         x, y = x0, y0
         for _ in range(_STEPS):
@@ -68,7 +67,7 @@ class LensTable:
         return x, y, self.ns.Float(1)
 
     def _fisheye(self, x, y, k, end, most):
-        """Newton's iteration on the angle, kept within its rising part, see `capture.lens.rays`."""
+        """Newton's iteration on the angle, kept within its rising part, see `photos.cameras.rays`."""
         k1, k2, _, _, k3, k4, _, _ = k
         r = dr.sqrt(x * x + y * y)
         goal = dr.minimum(r, end)

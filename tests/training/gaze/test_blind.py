@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.gaze.log_density import look_up, table_directions
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.photos.salience import pixel_solid_angles
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.blind import blind_of_rays, blind_of_views
 from nerg_mi.training.geometry.places import GazePlace

@@ -8,8 +8,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.photos.salience import pixel_solid_angles
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer
 from nerg_mi.training.gaze.product import ProductTrainer
 from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings

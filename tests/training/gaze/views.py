@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.capture.cameras import Camera, pixel_directions
-from nerg_mi.capture.intrinsics import Intrinsics
-from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
-from nerg_mi.capture.salience.views import SalienceView
+from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.salience import SalienceView, pixel_solid_angles
 
 LENS = Intrinsics(24, 18, 14.0, 14.0, 12.0, 9.0, k1=-0.08)
 TARGET = np.array([1.9, 0.5, 1.6])

@@ -5,13 +5,12 @@ from __future__ import annotations
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.capture.cameras import Camera, pixel_directions
-from nerg_mi.capture.dataset import Dataset
-from nerg_mi.capture.images import View
-from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig
 from nerg_mi.maths.geometry import Box
+from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.dataset import Dataset
+from nerg_mi.photos.images import View
 from nerg_mi.training.radiance.settings import RadianceSettings
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from tests.tiny import ball_pose

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from nerg_mi.capture.cameras import Camera, pixel_directions
-from nerg_mi.capture.images import View
-from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.maths.geometry import Box
+from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.images import View
 from nerg_mi.training.radiance.coverage import share_beyond
 from nerg_mi.training.radiance.preview import Preview
 

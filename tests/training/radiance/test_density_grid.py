@@ -5,9 +5,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.capture.cameras import Camera
-from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.maths.geometry import Box, ContractedBox
+from nerg_mi.photos.cameras import Camera, Intrinsics
 from nerg_mi.training.radiance.density_grid import DensityGrid
 
 BOX = Box((-1, -1, -1), (1, 1, 1))

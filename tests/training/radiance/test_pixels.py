@@ -7,9 +7,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.capture.cameras import Camera, pixel_directions, pixel_grid
-from nerg_mi.capture.images import View
-from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions, pixel_grid
+from nerg_mi.photos.images import View
 from nerg_mi.training.radiance.pixels import PixelBank
 
 PLAIN = Intrinsics(24, 18, 20.0, 21.0, 11.0, 9.5)

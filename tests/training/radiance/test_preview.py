@@ -5,11 +5,10 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.capture.cameras import Camera, pixel_directions
-from nerg_mi.capture.images import View
-from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.field.radiance import RadianceConfig
 from nerg_mi.maths.geometry import Box
+from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.images import View
 from nerg_mi.training.radiance import preview
 from nerg_mi.training.radiance.preview import render_view
 from nerg_mi.training.radiance.sampling import StepTable

@@ -5,9 +5,9 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.capture.cameras import pixel_directions
-from nerg_mi.capture.images import View
 from nerg_mi.maths.geometry import ContractedBox
+from nerg_mi.photos.cameras import pixel_directions
+from nerg_mi.photos.images import View
 from nerg_mi.training.radiance.held_out import measure
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from nerg_mi.transport.media.field import FieldMedium

@@ -7,7 +7,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.photos.cameras import Intrinsics
 from nerg_mi.training.radiance.unproject import LensTable
 from tests.reference import opencv
 

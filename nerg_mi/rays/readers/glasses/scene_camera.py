@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerg_mi.capture.intrinsics import Intrinsics
-from nerg_mi.capture.lens import undistort_where
 from nerg_mi.errors import NergError
+from nerg_mi.photos.cameras import Intrinsics, undistort_where
 
 _COEFFICIENTS = 8  # k1 k2 p1 p2 k3 k4 k5 k6
 _LARGEST = 1e6  # of a calibration's numbers

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.capture.named_poses import NamedPoses, find_source, read_named_poses
-from nerg_mi.capture.upright import find_up
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
+from nerg_mi.photos.colmap import NamedPoses, find_source, find_up, read_named_poses
 from nerg_mi.ranges import LENGTHS, RATES, Checked, Range
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import Frame

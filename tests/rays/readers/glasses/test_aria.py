@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from nerg_mi.capture.semidense import read_semidense
+from nerg_mi.photos.posed import read_semidense
 from nerg_mi.rays.readers.glasses.aria_gaze import gaze_in_cpf, schema_of
 from tests.rays.readers.examples import ARIA_POSES, aria_pose, lines
 from tests.rays.readers.reading import dropped, read

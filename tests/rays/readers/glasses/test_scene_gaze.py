@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.capture.named_poses import read_named_poses
-from nerg_mi.capture.sources import read_split
 from nerg_mi.errors import NergError
+from nerg_mi.photos.colmap import read_named_poses
+from nerg_mi.photos.images import read_split
 from nerg_mi.rays.summary import summarise
-from tests.capture.test_named_poses import write_transforms
+from tests.photos.test_named_poses import write_transforms
 from tests.rays.readers.examples import EXAMPLES
 from tests.rays.readers.glasses.test_place_frame import write_place
 from tests.rays.readers.reading import read

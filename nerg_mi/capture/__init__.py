@@ -1,1 +1,0 @@
-"""What was recorded: posed image sets, cameras."""

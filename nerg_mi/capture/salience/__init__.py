@@ -1,1 +1,0 @@
-"""Salience images as densities over directions."""

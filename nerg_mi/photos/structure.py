@@ -1,0 +1,486 @@
+"""Structure from motion, as seen from outside: which photos can be used, which are compared, the process that
+reconstructs, and how far its poses are from others."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError, plain
+from nerg_mi.files.atomic import write_bytes, write_text
+from nerg_mi.files.bounded import read_bytes, reading
+from nerg_mi.files.image_header import check_image
+
+from .colmap import Up
+from .posed import Unused, inside
+
+# ---- How far poses are from others of the same pictures, whatever coordinates both are in ----
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """``rotation``: (N,) degrees; ``scatter``: (N,) degrees that are left without the turn that all cameras have in
+    common, in their own frames, as where one lens has another principal point; ``position``: (N,), as shares of the
+    extent of the reference's cameras, which is their largest distance from their mean; ``similarity``: (4, 4), from
+    the poses' coordinates to the reference's."""
+
+    rotation: np.ndarray
+    scatter: np.ndarray
+    position: np.ndarray
+    similarity: np.ndarray
+
+
+def fit_similarity(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """The similarity (4, 4) that takes ``points`` (N, 3) closest to ``targets`` (N, 3), by least squares.
+
+    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991. Raises
+    ``ValueError`` for less than three points, or points on a line, which leave it open.
+    """
+    if len(points) < 3 or points.shape != targets.shape:
+        raise ValueError(f"a similarity needs 3 pairs of points or more, got {len(points)} and {len(targets)}")
+    a, b = points - points.mean(axis=0), targets - targets.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    if s[1] <= 1e-9 * s[0]:
+        raise ValueError("the points lie on a line, around which anything can be turned")
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * sign) @ vt
+    scale = float(s @ sign / np.sum(a * a))
+    out = np.eye(4)
+    out[:3, :3] = scale * rotation
+    out[:3, 3] = targets.mean(axis=0) - scale * rotation @ points.mean(axis=0)
+    return out
+
+
+def pose_errors(found: np.ndarray, reference: np.ndarray) -> PoseErrors:
+    """Errors of the camera-to-world poses ``found`` (N, 4, 4) against ``reference`` (N, 4, 4), after the similarity
+    that fits their positions best."""
+    similarity = fit_similarity(found[:, :3, 3], reference[:, :3, 3])
+    scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
+    apart = np.swapaxes(reference[:, :3, :3], 1, 2) @ (similarity[:3, :3] / scale) @ found[:, :3, :3]
+    # The rotation nearest to their mean.
+    u, _, vt = np.linalg.svd(apart.mean(axis=0))
+    common = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    moved = found[:, :3, 3] @ similarity[:3, :3].T + similarity[:3, 3]
+    centers = reference[:, :3, 3]
+    extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    position = np.linalg.norm(moved - centers, axis=1) / extent
+    return PoseErrors(_degrees(apart), _degrees(apart @ common.T), position, similarity)
+
+
+def _degrees(rotations: np.ndarray) -> np.ndarray:
+    """Angles (N,) of ``rotations`` (N, 3, 3): by the sine of the half, which is exact where they are small."""
+    half = np.linalg.norm(rotations - np.eye(3), axis=(1, 2)) / np.sqrt(8)
+    return np.degrees(2 * np.arcsin(np.clip(half, 0, 1)))
+
+
+# ---- Which pictures are compared with which ----
+
+MATCHING = ("auto", "exhaustive", "sequential")
+
+EXHAUSTIVE = 100
+"""Of so many pictures, by default, each is compared with each: the work grows with their square."""
+
+# Neighbours, and after them steps of 16, 32, ...; and pictures, evenly over all, of which each is compared with each:
+# they find out where a walk comes back to.
+_NEIGHBOURS, _LANDMARKS = 10, 60
+
+
+def chosen_pairs(count: int, matching: str = "auto") -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, of ``count`` pictures in the order in which they were taken; sorted."""
+    if matching not in MATCHING:
+        raise NergError(f'matching must be {", ".join(MATCHING)}, got "{matching}"')
+    if matching == "exhaustive" or (matching == "auto" and count <= EXHAUSTIVE):
+        return list(combinations(range(count), 2))
+    steps = [*range(1, _NEIGHBOURS + 1), *(1 << k for k in range(4, 32) if 1 << k < count)]
+    near = {(i, i + step) for step in steps for i in range(count - step)}
+    landmarks = range(0, count, -(-count // _LANDMARKS))
+    return sorted(near | set(combinations(landmarks, 2)))
+
+
+# ---- Pictures ----
+#
+# Pictures as structure from motion takes them: upright copies for the capture, small ones to find features in.
+
+
+SIDE = 65_500
+"""Longest side of a picture in pixels: that of a JPEG file."""
+
+# As good as telephones write them; colours are not stored more coarsely than brightness.
+_JPEG = dict(format="JPEG", quality=95, subsampling=0)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of the capture. ``name``: its file in ``images/``; ``size``, ``small``: width and height of it and of
+    the copy that features are found in, in pixels; ``made_by``: what else pictures of one camera have in common (its
+    maker, model and focal length, as far as it is told); ``focal``: focal length in pixels of ``size``, None where it
+    is not known; ``seconds``: when a video showed it."""
+
+    name: str
+    size: tuple[int, int]
+    small: tuple[int, int]
+    made_by: tuple = ()
+    focal: float | None = None
+    seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Where copies go: ``images`` of the capture, and ``small``, whose files are called by `small_name`."""
+
+    images: Path
+    small: Path
+
+
+def small_name(index: int) -> str:
+    """File of the small copy of the so-many-th picture: no letter of its own name can be in the way of COLMAP."""
+    return f"{index:06d}.png"
+
+
+def small_size(size: tuple[int, int], longest: int) -> tuple[int, int]:
+    """``size`` with a longer side of at most ``longest`` pixels."""
+    factor = min(1.0, longest / max(size))
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+
+
+def encoded(image: Any, suffix: str) -> bytes:
+    """A Pillow image as the bytes of a PNG or JPEG file, by its ``suffix``."""
+    out = io.BytesIO()
+    _rgb(image).save(out, **(dict(format="PNG") if suffix.lower() == ".png" else _JPEG))
+    return out.getvalue()
+
+
+def _rgb(image: Any) -> Any:
+    # Pillow copies a picture that is RGB already.
+    return image if image.mode == "RGB" else image.convert("RGB")
+
+
+def shrunk(image: Any, size: tuple[int, int]) -> bytes:
+    """A Pillow image at ``size``, by averaging, as the bytes of a PNG file."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    small = _rgb(image)
+    if small.size != size:
+        small = small.resize(size, Image.Resampling.LANCZOS)
+    small.save(out, format="PNG", compress_level=1)
+    return out.getvalue()
+
+
+def cameras_of(pictures: Iterable[Picture], share: bool = True) -> list[int]:
+    """Number, from 0, of the camera of each picture: those of equal size, maker, model and focal length ``share`` one.
+
+    A telephone held upright and held across has two: each with its principal point at the centre of its pictures.
+    """
+    found: dict[object, int] = {}
+    return [
+        found.setdefault((p.size, p.made_by) if share else k, len(found) if share else k)
+        for k, p in enumerate(pictures)
+    ]
+
+
+# ---- Photos ----
+#
+# A folder of photos: which can be used, copied as they are to be looked at.
+
+
+SUFFIXES = (".jpg", ".jpeg", ".png")
+"""Of the files that are taken for photos, in small letters."""
+
+# Pictures that a camera writes and that are not read here: to be named, not passed over.
+_OTHERS = (".heic", ".heif", ".tif", ".tiff", ".webp", ".dng", ".raw", ".cr2", ".nef", ".arw", ".avif", ".exr", ".bmp")
+_ORIENTATION, _MAKE, _MODEL, _DETAILS = 0x0112, 0x010F, 0x0110, 0x8769
+_FOCAL, _FOCAL_AS_35 = 0x920A, 0xA405
+# The diagonal of the film of 36 x 24 mm, to which the equivalent focal length refers.
+_DIAGONAL_35 = 43.267
+# So many pixels a photo may have that its bytes do not warrant, and so many bytes: those of large panoramas.
+_PIXELS, _BYTES = 1 << 26, 1 << 28
+# EXIF orientation -> what makes it upright, as Pillow calls it.
+_TURNS = dict(
+    zip(range(2, 9), "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90".split())
+)
+# Modes of Pillow whose files other programs read as they are.
+_KEPT = ("L", "RGB", "RGBA", "I;16")
+
+
+def list_photos(folder: str | Path) -> tuple[list[Path], list[Unused]]:
+    """Photos directly in ``folder``, by name, and pictures of other kinds. `NergError` where there is no photo."""
+    folder = Path(folder)
+    with reading(folder, "folder of photos"):
+        files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    photos = [p for p in files if p.suffix.lower() in SUFFIXES]
+    others = [
+        Unused(p.name, "only JPEG and PNG photos are read; convert it") for p in files if p.suffix.lower() in _OTHERS
+    ]
+    if not photos:
+        if others:
+            raise NergError(
+                f'"{folder}" holds {len(others)} pictures such as "{plain(others[0].name)}" but no JPEG or PNG; '
+                "convert them"
+            )
+        below = folder / "images"
+        hint = f'; did you mean "{below}"?' if below.is_dir() else "; name the folder that holds them"
+        raise NergError(f'the folder "{folder}" holds no photos (.jpg, .jpeg or .png){hint}')
+    return photos, others
+
+
+def copy_photos(
+    photos: list[Path],
+    folders: Folders,
+    longest: int,
+    progress: Callable[[int, int], None],
+    allow_outside: bool = False,
+) -> tuple[list[Picture], list[Unused]]:
+    """Copy each of the ``photos`` to ``folders``, turned as its EXIF orientation says, and those that cannot be used.
+
+    A photo that stands upright as it is stored is copied byte for byte; another is stored anew, a JPEG at quality 95, a
+    PNG in 8 bits. ``longest``: side of the small copies in pixels. ``progress(done, of)`` is told after each.
+    ``allow_outside``: follow links that lead out of the photos' folder.
+    """
+    pictures: list[Picture] = []
+    unused: list[Unused] = []
+    seen: dict[str, str] = {}
+    for k, path in enumerate(photos):
+        try:
+            if not path.name.isprintable():
+                raise NergError("its name holds what is no character, which COLMAP cannot store; rename it")
+            pictures.append(_copied(path, folders, len(pictures), longest, seen, allow_outside))
+        except NergError as error:
+            unused.append(Unused(path.name, str(error)))
+        progress(k + 1, len(photos))
+    return pictures, unused
+
+
+def _copied(
+    path: Path, folders: Folders, index: int, longest: int, seen: dict[str, str], allow_outside: bool
+) -> Picture:
+    """``seen``: names of the photos before by their content, to which this one is added."""
+    photo = read_photo(path if allow_outside else inside(path.parent, path, "photo"))
+    image, name = photo.image, path.name
+    before = seen.setdefault(hashlib.sha256(photo.raw).hexdigest(), name)
+    if before != name:
+        raise NergError(f'it is the same file as "{before}"')
+    write_bytes(folders.images / name, photo.raw if photo.stays else encoded(image, path.suffix))
+    size = (image.width, image.height)
+    small = small_size(size, longest)
+    write_bytes(folders.small / small_name(index), shrunk(image, small))
+    focal = photo.as_35 / _DIAGONAL_35 * float((size[0] ** 2 + size[1] ** 2) ** 0.5) if photo.as_35 else None
+    return Picture(name, size, small, photo.made_by, focal)
+
+
+@dataclass(frozen=True)
+class Photo:
+    """``raw``: the bytes of the file; ``image``: of Pillow, as it is to be looked at; ``stays``: whether that
+    is how it is stored; ``made_by``: what its notes tell of its camera; ``as_35``: its focal length in terms of film of
+    36 x 24 mm."""
+
+    raw: bytes
+    image: Any
+    stays: bool
+    made_by: tuple = ()
+    as_35: float | None = None
+
+
+def read_photo(path: Path) -> Photo:
+    """The photo ``path``; `NergError` for what is none, is damaged, or claims more pixels than its bytes warrant."""
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.PngImagePlugin import PngImageFile
+
+    # Pillow takes four bytes a pixel, and as many again to turn it.
+    header = check_image(path, "photo", _PIXELS, _BYTES)
+    kind = header.kind
+    if max(header.size) > SIDE:
+        raise NergError(f'the photo "{path}" has a side of {max(header.size):,} pixels, more than {SIDE:,}; cut it')
+    if kind not in ("jpeg", "png"):
+        raise NergError(f'the photo "{path}" is of the kind "{kind}", whatever its name; convert it to JPEG or PNG')
+    raw = read_bytes(path, "photo", _BYTES)
+    with warnings.catch_warnings(), reading(path, "photo"):
+        # What is odd about its notes does not matter.
+        warnings.simplefilter("ignore")
+        # Not by Image.open, which has a limit of its own, below what telephones take by now.
+        image = (JpegImageFile if kind == "jpeg" else PngImageFile)(io.BytesIO(raw))
+        image.load()
+        orientation, made_by, as_35 = _notes(image)
+        turn = _TURNS.get(orientation)
+        upright = image if turn is None else image.transpose(_transpose(turn))
+    return Photo(raw, upright, turn is None and image.mode in _KEPT, made_by, as_35)
+
+
+def _notes(image: Any) -> tuple[int, tuple, float | None]:
+    """The EXIF orientation, what is told of the camera, and the focal length in terms of film of 36 x 24 mm."""
+    try:
+        notes = image.getexif()
+        details = notes.get_ifd(_DETAILS)
+        orientation = int(notes.get(_ORIENTATION, 1))
+        made_by = (*(str(notes.get(k, "")) for k in (_MAKE, _MODEL)), str(details.get(_FOCAL, "")))
+        as_35 = float(details.get(_FOCAL_AS_35, 0))
+    except Exception:  # Pillow raises many kinds on damaged notes, without which a photo is as good
+        return 1, (), None
+    return orientation, made_by, as_35 if 5 <= as_35 <= 2000 else None
+
+
+def _transpose(name: str) -> Any:
+    from PIL import Image
+
+    return Image.Transpose[name]
+
+
+# ---- Reconstruction ----
+#
+# Structure from motion, as seen from outside: starts the process of `worker`, listens, and reads what it found.
+
+
+LENSES = {"auto": None, "radial": "SIMPLE_RADIAL", "opencv": "OPENCV"}
+"""Names of lenses -> COLMAP's model that is refined; auto: by how many pictures a camera has."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """``lens``: one of `LENSES`; ``matching``: as `chosen_pairs` has it; ``share``: pictures share cameras; ``orient``:
+    turn the model so that up is +z; ``threads``: None for all."""
+
+    lens: str = "auto"
+    matching: str = "auto"
+    share: bool = True
+    orient: bool = True
+    seed: int = 0
+    threads: int | None = None
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """``parts``: names of the pictures of each model that was found, of which the first, the largest, is the one that
+    was kept; ``error``: its mean reprojection error in pixels of the small pictures; ``points``: how many it has;
+    ``up``: None where it was not asked for; ``lenses``: its cameras (JSON); ``to_world``: (N, 4, 4) OpenGL poses, in
+    the order of the first part; ``surface``, ``colors``: points (M, 3) that three pictures see, and their colours
+    (M, 3), uint8."""
+
+    parts: list[list[str]]
+    error: float
+    points: int
+    up: Up | None
+    lenses: list[dict]
+    to_world: np.ndarray
+    surface: np.ndarray
+    colors: np.ndarray
+
+
+def check_installed() -> None:
+    """Raise ``ImportError``, with the remedy, where pycolmap is not installed."""
+    if importlib.util.find_spec("pycolmap") is None:
+        raise ImportError('poses of photos need pycolmap, which is not installed: pip install "nerg-mi[poses]"')
+
+
+def reconstruct(
+    pictures: list[Picture], work: Path, settings: Settings, progress: Callable[[str, int, int], None]
+) -> Reconstruction | None:
+    """Find the poses of ``pictures``, whose small copies lie in ``work``/small; None where no three fit together.
+
+    The model is written to ``work``/sparse/0. ``progress(stage, done, of)``: stages are features, matching, mapping.
+    Raises `NergError` where COLMAP ends otherwise than by itself, ``ImportError`` where it is not installed.
+    """
+    check_installed()
+    if settings.lens not in LENSES:
+        raise NergError(f'lens must be {", ".join(LENSES)}, got "{settings.lens}"')
+    chosen_pairs(0, settings.matching)
+    write_text(work / "job.json", json.dumps(_job(pictures, settings)))
+    _run(work, settings.threads, progress)
+    with np.load(work / "result.npz", allow_pickle=False) as found:
+        result, arrays = json.loads(str(found["result"])), {k: found[k] for k in found.files if k != "result"}
+    if not result["parts"]:
+        return None
+    up = result.get("up")
+    return Reconstruction(
+        [[pictures[k].name for k in sorted(part)] for part in result["parts"]],
+        result["error"],
+        result["points"],
+        None if up is None else Up(np.array(up["direction"]), up["roll"], up["plane"], up["between"]),
+        result["lenses"],
+        arrays["to_world"],
+        arrays["points"],
+        arrays["colors"],
+    )
+
+
+def _job(pictures: list[Picture], settings: Settings) -> dict[str, Any]:
+    numbers = cameras_of(pictures, settings.share)
+    cameras = []
+    for number in range(max(numbers) + 1):
+        own = [p for p, n in zip(pictures, numbers) if n == number]
+        focal = [p.focal * p.small[0] / p.size[0] for p in own if p.focal is not None]
+        cameras.append(
+            {
+                "size": own[0].size,
+                "small": own[0].small,
+                "focal": float(np.median(focal)) if focal else None,
+                "pictures": len(own),
+            }
+        )
+    return {
+        "pictures": [{"name": p.name, "camera": n} for p, n in zip(pictures, numbers)],
+        "cameras": cameras,
+        "lens": LENSES[settings.lens],
+        "matching": settings.matching,
+        "orient": settings.orient,
+        "seed": settings.seed,
+        "threads": settings.threads or -1,
+    }
+
+
+def _run(work: Path, threads: int | None, progress: Callable[[str, int, int], None]) -> None:
+    """Run the process to its end; it ends with this block at the latest."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    if threads:
+        environment |= {name: str(threads) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+    command = [sys.executable, "-m", "nerg_mi.photos.structure_worker", str(work)]
+    with tempfile.TemporaryFile() as words:
+        # In a session of its own: Ctrl-C is for this process, which then ends the other.
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=words,
+            env=environment,
+            start_new_session=True,
+        )
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                progress(*json.loads(line))
+            code = process.wait()
+        finally:
+            process.kill()
+            process.wait()
+        if code:
+            words.seek(0)
+            raise NergError(_ended(code, words.read().decode("utf-8", "replace"), work))
+
+
+def _ended(code: int, words: str, work: Path) -> str:
+    """Why the process ended with ``code``, as far as it is known."""
+    if shutil.disk_usage(work).free < 1 << 20:
+        return f'COLMAP ended early, since the disk of "{work.parent.parent}" is full; free some space'
+    if code == -signal.SIGKILL:
+        return "COLMAP was ended from outside, probably for want of memory; give a smaller --size or fewer pictures"
+    lines = [line for line in words.splitlines() if line.strip()]
+    # A trace follows the sentence where a library aborts, and precedes it where Python raises.
+    said = next((line for line in lines if "Check failed" in line or "] " in line[:80]), lines[-1] if lines else "")
+    return (
+        f"COLMAP ended early, with code {code} ({plain(said, 200)}); try again with --threads 1, or with other photos"
+    )

@@ -1,0 +1,238 @@
+"""Frames of a video: the sharpest one of each of equally long stretches."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from math import isfinite
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import write_bytes
+from nerg_mi.files.bounded import reading, size_of
+from nerg_mi.files.movie_tables import check_movie
+
+from .structure import SIDE, SUFFIXES, Folders, Picture, encoded, shrunk, small_name, small_size
+
+FORMATS = ("mov", "matroska", "avi", "mpegts", "mpeg", "asf")
+"""Kinds of files, as FFmpeg calls them, that are taken for videos: of .mp4 and .mov; .mkv and .webm; .avi; .mts; .mpg;
+.wmv. Its others are pictures, sound and text, or lists of further files and addresses, which it would open."""
+
+CODECS = (
+    "h264 hevc vvc av1 libdav1d vp8 libvpx vp9 libvpx-vp9 mpeg4 msmpeg4v1 msmpeg4v2 msmpeg4 mpeg1video mpeg2video "
+    "mpegvideo h263 h263i h263p flv mjpeg wmv1 wmv2 wmv3 vc1 prores dnxhd cfhd dvvideo ffv1 rawvideo"
+).split()
+"""Decoders, as FFmpeg calls them, that may run: those of cameras, phones and converters, of its three hundred."""
+
+PIXELS = 8192 * 4320
+"""A frame may have so many: no camera films more, and a decoder holds many frames at a time."""
+
+# Sharpness is compared at this width: finer, it would be the noise of dark places. And at so many times it in height.
+_WIDTH, _TALLEST = 480, 4
+# So many packets may give no frame, and so many for each frame that was found: beyond, a video is destroyed.
+_LOST, _LOST_EACH = 1000, 4
+_REMEDY = "give a video such as .mp4 or .mov, or a folder of photos"
+
+
+def sharpness(gray: np.ndarray) -> float:
+    """Variance of the Laplacian of a picture (h, w): blur takes away what varies from pixel to pixel."""
+    g = np.asarray(gray, np.float32)
+    inner = g[1:-1, 1:-1]
+    return float(np.var(g[:-2, 1:-1] + g[2:, 1:-1] + g[1:-1, :-2] + g[1:-1, 2:] - 4 * inner))
+
+
+def copy_frames(
+    video: str | Path,
+    count: int,
+    folders: Folders,
+    longest: int,
+    threads: int | None,
+    progress: Callable[[int, int], None],
+) -> list[Picture]:
+    """Copy ``count`` frames of a video, at most, to ``folders``: as JPEG at quality 95, turned as it is to be shown.
+
+    ``longest``: side of the small copies in pixels; ``threads``: of the decoder, None for all; ``progress(done, of)``
+    is told as frames are chosen. Raises `NergError` for what is no video, and ``ImportError`` without PyAV.
+    """
+    from PIL import Image
+
+    pictures: list[Picture] = []
+    for seconds, pixels in sharpest_frames(video, count, threads):
+        image = Image.fromarray(pixels)
+        name = f"frame_{len(pictures) + 1:05d}.jpg"
+        write_bytes(folders.images / name, encoded(image, ".jpg"))
+        small = small_size(image.size, longest)
+        write_bytes(folders.small / small_name(len(pictures)), shrunk(image, small))
+        pictures.append(Picture(name, image.size, small, seconds=seconds))
+        progress(len(pictures), count)
+    return pictures
+
+
+def sharpest_frames(video: str | Path, count: int, threads: int | None = None) -> Iterator[tuple[float, np.ndarray]]:
+    """Seconds from the first frame on, and pixels (h, w, 3) uint8, sRGB, of the sharpest frame in each of ``count``
+    equally long stretches; a stretch without a frame has none."""
+    if Path(video).suffix.lower() in SUFFIXES:
+        raise NergError(f'"{video}" is a single photo; name the folder that holds it and others of the same place')
+    begin, end = _span(video)
+    with _opened(video) as (container, stream):
+        stream.thread_type = "AUTO"
+        if threads:
+            stream.codec_context.thread_count = threads
+        best: tuple[float, Any, float] | None = None
+        stretch = 0
+        for frame, seconds in _decoded(video, container, stream):
+            at = 0 if end <= begin else int(min(count - 1, (seconds - begin) / (end - begin) * count))
+            if best is not None and at > stretch:
+                yield best[2] - begin, _pixels(video, best[1])
+                best = None
+            stretch = max(stretch, at)
+            with _reading(video):
+                score = sharpness(_gray(frame))
+            if best is None or score > best[0]:
+                best = score, frame, seconds
+        if best is None:
+            raise NergError(
+                f'the video "{video}" has no frame that can be decoded, of {PIXELS:,} pixels at most; convert it to '
+                "H.264, or copy it again"
+            )
+        yield best[2] - begin, _pixels(video, best[1])
+
+
+def _pyav() -> Any:
+    try:
+        import av
+    except ImportError:
+        raise ImportError('frames of a video need PyAV, which is not installed: pip install "nerg-mi[poses]"') from None
+    return av
+
+
+@contextmanager
+def _reading(video: str | Path) -> Iterator[None]:
+    """A block in which FFmpeg reads ``video``: what it says, as one sentence, without its number of the error."""
+    av = _pyav()
+    with reading(video, "video", _REMEDY):
+        try:
+            yield
+        except av.FFmpegError as error:
+            said = error.strerror or "it is damaged"
+            # The formats of the list are no argument of the user's. For more than 2 GB at once FFmpeg does not ask.
+            said = {
+                errno.EINVAL: "it is no video of a kind that is read",
+                errno.ENOMEM: "it claims to be larger than there is memory for",
+            }.get(error.errno, said[:1].lower() + said[1:])
+            raise ValueError(said) from error
+
+
+def _nothing_else(url: str, flags: int, options: dict) -> Any:
+    raise ValueError("it refers to other files")
+
+
+class _Source:
+    """An open file for FFmpeg, without its name, which would take part in what it is taken for."""
+
+    def __init__(self, file: BinaryIO):
+        self.read, self.tell, self._file = file.read, file.tell, file
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """As `io.IOBase.seek`; below 0 for a place that there is not, which FFmpeg tries at times."""
+        try:
+            return self._file.seek(offset, whence)
+        except (OSError, ValueError, OverflowError):
+            return -errno.EINVAL
+
+
+@contextmanager
+def _opened(video: str | Path) -> Iterator[tuple[Any, Any]]:
+    """The container of ``video`` and its first stream of pictures.
+
+    FFmpeg is given the open file, since it takes names such as "12:30.mp4" for addresses; it may open nothing else.
+    """
+    size_of(video, "video")
+    av = _pyav()
+    with _reading(video):
+        check_movie(video)
+        file = open(video, "rb")
+    with file:
+        limits = {"max_pixels": str(PIXELS), "codec_whitelist": ",".join(CODECS)}
+        with _reading(video):
+            container = av.open(
+                _Source(file),
+                "r",
+                io_open=_nothing_else,
+                options=limits,
+                container_options={"format_whitelist": ",".join(FORMATS), "protocol_whitelist": "none"},
+                # Titles are written in many alphabets.
+                metadata_errors="replace",
+            )
+        with container:
+            if not container.streams.video:
+                raise NergError(f'"{video}" has no pictures, only sound; give a video, or a folder of photos')
+            stream = container.streams.video[0]
+            if stream.codec_context is None:
+                raise NergError(f'the video "{video}" is coded in a way that is not known; convert it to H.264')
+            _check_size(video, stream.codec_context.width, stream.codec_context.height)
+            stream.codec_context.options = limits
+            yield container, stream
+
+
+def _check_size(video: str | Path, width: int, height: int) -> None:
+    if width * height > PIXELS or max(width, height) > SIDE:
+        raise NergError(
+            f'the video "{video}" has {width:,} x {height:,} pixels, and at most {PIXELS:,} are read, a side of at '
+            f"most {SIDE:,}; make it smaller"
+        )
+
+
+def _span(video: str | Path) -> tuple[float, float]:
+    """Seconds at which the first and the last frame are shown, by the file's packets, undecoded."""
+    with _opened(video) as (container, stream):
+        first = last = None
+        with _reading(video):
+            for packet in container.demux(stream):
+                if packet.pts is not None:
+                    first = packet.pts if first is None else min(first, packet.pts)
+                    last = packet.pts if last is None else max(last, packet.pts)
+        if first is None or last is None or not stream.time_base:
+            raise NergError(f'the video "{video}" holds no frames with a time; copy it again')
+        return float(first * stream.time_base), float(last * stream.time_base)
+
+
+def _decoded(video: str | Path, container: Any, stream: Any) -> Iterator[tuple[Any, float]]:
+    """Frames that have a time, and that in seconds; packets that are damaged are passed over, as players do."""
+    av = _pyav()
+    packets = container.demux(stream)
+    lost = found = 0
+    while lost <= _LOST + _LOST_EACH * found:
+        with _reading(video):
+            packet = next(packets, None)
+        if packet is None:
+            return
+        try:
+            frames = packet.decode()
+        except av.FFmpegError:
+            frames = []
+        for frame in frames:
+            _check_size(video, frame.width, frame.height)
+            if frame.time is not None and isfinite(frame.time):
+                yield frame, frame.time
+        found += len(frames)
+        lost += not frames
+    raise NergError(f'most of the video "{video}" cannot be decoded; convert it to H.264, or copy it again')
+
+
+def _gray(frame: Any) -> np.ndarray:
+    """The frame in gray, at most `_WIDTH` wide and `_TALLEST` times as high."""
+    width = max(3, min(_WIDTH, frame.width))
+    height = min(max(3, round(frame.height * width / frame.width)), _TALLEST * _WIDTH)
+    return frame.to_ndarray(format="gray", width=width, height=height, interpolation="AREA")
+
+
+def _pixels(video: str | Path, frame: Any) -> np.ndarray:
+    """The frame (h, w, 3) as it is to be looked at."""
+    with _reading(video):
+        pixels = frame.to_ndarray(format="rgb24")
+        return np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90)))

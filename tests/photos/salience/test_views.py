@@ -1,0 +1,270 @@
+"""Salience images: what is read and refused, whose they are, and the densities they mean."""
+
+import json
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.exr import write_bitmap_exr
+from nerg_mi.photos.cameras import Intrinsics
+from nerg_mi.photos.salience import open_salience, pixel_solid_angles, read_salience
+
+LENSES = {
+    "pinhole": {"fl_x": 40.0, "fl_y": 40.0},
+    "barrel": {"fl_x": 40.0, "fl_y": 42.0, "cx": 30.0, "k1": -0.12, "k2": 0.02, "p1": 0.002},
+    "fisheye": {"fl_x": 30.0, "fl_y": 30.0, "k1": 0.02, "camera_model": "OPENCV_FISHEYE"},
+}
+
+
+def write(path, values):
+    import mitsuba as mi
+
+    if path.suffix == ".npy":
+        np.save(path, values)
+    elif path.suffix == ".exr":
+        write_bitmap_exr(path, mi.Bitmap(values))
+    else:
+        mi.Bitmap(values).write(str(path))
+    return path
+
+
+@pytest.fixture
+def posed(tmp_path):
+    """posed(names, **lens): a set of photos of 64 x 48 pixels, and the folder for their maps."""
+
+    def make(names=("a", "b"), size=(48, 64), **keys):
+        (tmp_path / "maps").mkdir()
+        frames = []
+        for k, name in enumerate(names):
+            write(tmp_path / f"{name}.png", np.full((*size, 3), 99, np.uint8))
+            pose = np.eye(4)
+            pose[:3, :3], pose[0, 3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], k
+            frames.append({"file_path": f"{name}.png", "transform_matrix": pose.tolist()})
+        data = {"w": size[1], "h": size[0], **(keys or LENSES["pinhole"]), "frames": frames}
+        (tmp_path / "transforms.json").write_text(json.dumps(data))
+        return tmp_path
+
+    return make
+
+
+# ------------------------------------------------------------------------
+#  Files
+# ------------------------------------------------------------------------
+
+
+def test_every_kind_of_file_says_the_same(tmp_path, rgb):
+    values = np.arange(12).reshape(3, 4) * 5
+    grey, byte = np.float32(values), values.astype(np.uint8)
+    kinds = {
+        "eight.png": byte,
+        "sixteen.png": values.astype(np.uint16),
+        "opaque.png": np.dstack([byte, byte, byte, 0 * byte + 255]),
+        "three.png": np.dstack([byte, byte, byte]),
+        "a.exr": grey,
+        "three.exr": np.dstack([grey, grey, grey]),
+        "a.npy": values / 60,
+        "whole.npy": values,
+        "column.npy": values[..., None],
+        "flags.npy": values > 20,
+    }
+    for name, array in kinds.items():
+        found = read_salience(write(tmp_path / name, array))
+        expected = (values > 20) if name == "flags.npy" else values
+        assert np.allclose(found / found.sum(), expected / expected.sum(), atol=1e-7), name
+
+
+@pytest.mark.parametrize(
+    "name, values, said",
+    [
+        ("a.png", np.zeros((4, 4), np.uint8), "zero everywhere"),
+        ("a.npy", np.full((4, 4), np.nan), "16 values that are not finite"),
+        ("a.exr", np.array([[1, np.inf]], np.float32), "1 values that are not finite"),
+        ("a.npy", np.array([[-1.0, 2]]), "log densities"),
+        ("a.png", np.random.default_rng(0).integers(0, 255, (4, 4, 3)).astype(np.uint8), "in colours"),
+        ("a.png", np.arange(1, 17, dtype=np.uint8).reshape(4, 4, 1) * np.ones(4, np.uint8), "partly transparent"),
+        ("a.npy", np.ones((2, 3, 4, 5)), "one number a pixel"),
+        ("a.npy", np.array([["x"]]), "one number a pixel"),
+    ],
+)
+def test_what_is_no_salience_is_refused_by_name(name, values, said, tmp_path, rgb):
+    path = write(tmp_path / name, values)
+    with pytest.raises(ValueError, match=said) as e:
+        read_salience(path)
+    assert str(path) in str(e.value)
+
+
+def test_broken_files_are_named(tmp_path, rgb):
+    for name in ("a.png", "a.exr", "a.npy"):
+        (tmp_path / name).write_bytes(b"nonsense")
+        with pytest.raises(ValueError, match=f"{name}.*cannot be read"):
+            read_salience(tmp_path / name)
+
+
+def test_maps_belong_to_frames_by_name(posed):
+    folder = posed(("a", "b", "c"))
+    write(folder / "maps" / "a.npy", np.ones((48, 64)))
+    write(folder / "maps" / "c.png", np.ones((24, 32), np.uint8))
+    write(folder / "maps" / "d.png", np.ones((24, 32), np.uint8))
+    found = open_salience(folder, folder / "maps")
+    assert (
+        [v.name for v in found.views] == ["a.png", "c.png"] and found.missing == ["b.png"] and found.stray == ["d.png"]
+    )
+    assert found.views[1].share.shape == (24, 32) and np.allclose(found.views[1].camera.center, [2, 0, 0])
+    assert found.about["used"] == 2 and found.about["missing"] == 1
+
+    write(folder / "maps" / "a.png", np.ones((48, 64), np.uint8))
+    with pytest.raises(ValueError, match='"a.npy" and "a.png"'):
+        open_salience(folder, folder / "maps")
+
+
+def test_a_map_of_another_shape_or_of_nobody_is_refused(posed):
+    folder = posed()
+    with pytest.raises(ValueError, match='no image in .* would be "a"'):
+        open_salience(folder, folder / "maps")
+    with pytest.raises(FileNotFoundError, match="spectral-residual"):
+        open_salience(folder, folder / "nothing")
+    write(folder / "maps" / "b.npy", np.ones((32, 32)))
+    with pytest.raises(ValueError, match="b.npy.* 32 x 32 .* 64 x 48"):
+        open_salience(folder, folder / "maps")
+    with pytest.raises(ValueError, match="per pixel or per steradian"):
+        open_salience(folder, folder / "maps", per="radian")
+
+
+def test_one_map_of_two_photos_is_refused(posed):
+    folder = posed(("one", "two"))
+    for k in ("one", "two"):
+        (folder / k).mkdir()
+        (folder / f"{k}.png").rename(folder / k / "a.png")
+    data = json.loads((folder / "transforms.json").read_text())
+    for frame, k in zip(data["frames"], ("one", "two")):
+        frame["file_path"] = f"{k}/a.png"
+    (folder / "transforms.json").write_text(json.dumps(data))
+    write(folder / "maps" / "a.npy", np.ones((48, 64)))
+    with pytest.raises(ValueError, match="could be of"):
+        open_salience(folder, folder / "maps")
+
+
+# ------------------------------------------------------------------------
+#  Densities
+# ------------------------------------------------------------------------
+
+
+def lens_of(keys):
+    named = {k: v for k, v in keys.items() if k[0] in "kp"}
+    return Intrinsics(
+        64, 48, keys["fl_x"], keys["fl_y"], keys.get("cx", 32.0), 24.0, **named, fisheye="camera_model" in keys
+    )
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_uniform_gaze_has_a_constant_density(name, posed):
+    """Whatever the lens: as an image of ones per steradian, and as one of solid angles per pixel."""
+    folder, solid = posed(("a",), **LENSES[name]), pixel_solid_angles(lens_of(LENSES[name]))
+    for per, image in (("steradian", np.ones((48, 64))), ("pixel", solid)):
+        write(folder / "maps" / "a.npy", image)
+        view = open_salience(folder, folder / "maps", per).views[0]
+        assert view.extent == pytest.approx(solid.sum(), rel=1e-6)
+        assert np.allclose(view.density, 1 / solid.sum(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_draws_stand_for_equal_areas(name, posed):
+    """The mean of any function over the draws is its integral over the picture; here of a lobe, by fine quadrature."""
+    folder = posed(("a",), **LENSES[name])
+    write(folder / "maps" / "a.npy", np.ones((12, 16)))
+    view = open_salience(folder, folder / "maps").views[0]
+    directions, which = view.draw(4096, np.random.default_rng(0))
+    assert np.allclose(np.linalg.norm(directions, axis=1), 1)
+    counts = np.bincount(which, minlength=192)
+    due = 4096 * (view.solid_angle / view.extent).ravel()
+    assert np.all(np.abs(counts - due) <= 1.01)
+    axis = np.array([-0.95, 0.2, -0.1]) / np.linalg.norm([-0.95, 0.2, -0.1])
+    lobe = lambda d: np.exp(8 * (d @ axis - 1))
+    fine = lens_of(LENSES[name]).resized(256, 192)
+    from nerg_mi.photos.cameras import pixel_directions
+
+    world = pixel_directions(fine) @ view.camera.to_world[:3, :3].T
+    expected = np.sum(lobe(world) * pixel_solid_angles(fine))
+    assert view.extent * lobe(directions).mean() == pytest.approx(expected, rel=0.01)
+
+
+def test_a_view_is_looked_up_where_it_looks(posed):
+    folder = posed(("a",), **LENSES["barrel"])
+    image = np.random.default_rng(3).uniform(0.1, 1, (48, 64))
+    write(folder / "maps" / "a.npy", image)
+    view = open_salience(folder, folder / "maps").views[0]
+    directions, which = view.draw(500, np.random.default_rng(1))
+    density, known = view.look_up(directions)
+    assert known.all() and np.allclose(density, view.density.ravel()[which], rtol=1e-5)
+    # The camera looks along -x.
+    assert not view.look_up(np.array([[1.0, 0, 0], [0, 1, 0]]))[1].any()
+
+
+def test_fewer_pixels_hold_the_same_gaze(posed):
+    folder = posed(("a",))
+    image = np.random.default_rng(3).uniform(0, 1, (48, 64))
+    write(folder / "maps" / "a.npy", image)
+    view = open_salience(folder, folder / "maps").views[0]
+    small = view.reduced(64 * 48 // 16)
+    assert small.share.shape == (12, 16)
+    assert np.allclose(small.share, view.share.reshape(12, 4, 16, 4).sum(axis=(1, 3)), rtol=1e-4)
+    assert np.allclose(small.solid_angle, pixel_solid_angles(small.camera.intrinsics), rtol=1e-5)
+    odd = view.reduced(200)
+    assert (
+        odd.share.size <= 200
+        and odd.extent == pytest.approx(view.extent, rel=1e-5)
+        and odd.share.sum() == pytest.approx(1)
+    )
+
+
+def test_masked_pixels_are_unknown(posed):
+    folder = posed(("a",))
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[:, :32] = 0
+    write(folder / "mask.png", mask)
+    data = json.loads((folder / "transforms.json").read_text())
+    data["frames"][0]["mask_path"] = "mask.png"
+    (folder / "transforms.json").write_text(json.dumps(data))
+    write(folder / "maps" / "a.npy", np.ones((24, 32)))
+    view = open_salience(folder, folder / "maps").views[0]
+    assert (
+        (view.solid_angle[:, :16] == 0).all()
+        and (view.solid_angle[:, 16:] > 0).all()
+        and (view.density[:, :16] == 0).all()
+    )
+    assert (view.draw(200, np.random.default_rng(0))[1] % 32 >= 16).all()
+    write(folder / "maps" / "a.npy", np.tile(np.arange(32) < 10, (24, 1)))
+    with pytest.raises(ValueError, match="a.npy.*mask"):
+        open_salience(folder, folder / "maps")
+
+
+def test_views_move_with_their_coordinates(posed):
+    folder = posed()
+    write(folder / "maps" / "b.npy", np.ones((48, 64)))
+    turn = np.diag([2.0, 2.0, 2.0, 1.0])
+    turn[:3, 3] = 1, 2, 3
+    view = open_salience(folder, folder / "maps", align=turn).views[0]
+    assert np.allclose(view.camera.center, [3, 2, 3]) and np.allclose(view.camera.axis, [-1, 0, 0])
+
+
+def test_a_model_makes_the_maps(posed, rgb):
+    folder = posed(("a",))
+    photo = np.random.default_rng(0).integers(90, 110, (48, 64, 3)).astype(np.uint8)
+    photo[20:28, 40:48] = 250
+    write(folder / "a.png", photo)
+    view = open_salience(folder, "spectral-residual").views[0]
+    y, x = np.unravel_index(np.argmax(view.share), view.share.shape)
+    assert 16 <= y < 32 and 36 <= x < 52
+    write(folder / "a.png", np.full((48, 64, 3), 90, np.uint8))
+    with pytest.raises(ValueError, match="a.png.*one colour"):
+        open_salience(folder, "spectral-residual")
+
+
+def test_maps_outside_of_their_folder_are_used_only_if_allowed(posed):
+    folder = posed(("a", "b"))
+    write(folder / "elsewhere.npy", np.ones((48, 64)))
+    (folder / "maps" / "a.npy").symlink_to(folder / "elsewhere.npy")
+    with pytest.raises(NergError, match="salience image .* outside of .*--allow-outside"):
+        open_salience(folder, folder / "maps")
+    assert len(open_salience(folder, folder / "maps", allow_outside=True).views) == 1

@@ -1,0 +1,239 @@
+"""Frames of a video that is made here: sharp ones among blurred ones, turned as they are to be shown."""
+
+from __future__ import annotations
+
+import builtins
+import socket
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from nerg_mi.errors import NergError
+from nerg_mi.photos import video_frames as module
+from nerg_mi.photos.structure import Folders
+from nerg_mi.photos.video_frames import copy_frames, sharpest_frames, sharpness
+
+SHARP = (3, 8, 11)
+
+
+def texture() -> np.ndarray:
+    return np.kron(np.random.default_rng(0).uniform(30, 220, (12, 16)), np.ones((4, 4)))
+
+
+@pytest.fixture(scope="module")
+def av():
+    return pytest.importorskip("av", reason='PyAV is not installed (pip install "nerg-mi[poses]")')
+
+
+@pytest.fixture
+def film(av, tmp_path) -> Path:
+    """15 frames of 64 x 48 pixels at 10 a second; all but those of `SHARP` are blurred, and each has its own grey."""
+    path = tmp_path / "film.mp4"
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 64, 48, "yuv420p", 4_000_000
+        for k in range(15):
+            gray = texture() if k in SHARP else gaussian_filter(texture(), 2)
+            frame = av.VideoFrame.from_ndarray(np.repeat(gray[..., None], 3, axis=2).astype(np.uint8), format="rgb24")
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode())
+    return path
+
+
+def test_blur_takes_sharpness():
+    assert sharpness(texture()) > 10 * sharpness(gaussian_filter(texture(), 2))
+    assert sharpness(np.full((5, 5), 7)) == 0
+
+
+def test_the_sharpest_of_each_stretch(film):
+    found = list(sharpest_frames(film, 3))
+    assert [round(10 * t) for t, _ in found] == list(SHARP)
+    for _, pixels in found:
+        assert pixels.shape == (48, 64, 3) and pixels.dtype == np.uint8
+        assert np.corrcoef(pixels[..., 1].ravel(), texture().ravel())[0, 1] > 0.97
+
+
+def test_more_stretches_than_frames(film):
+    times = [t for t, _ in sharpest_frames(film, 100, threads=1)]
+    assert len(times) == 15 and times == sorted(times)
+
+
+def test_frames_are_copied(film, tmp_path):
+    folders, steps = Folders(tmp_path / "images", tmp_path / "small"), []
+    pictures = copy_frames(film, 3, folders, 32, None, lambda *now: steps.append(now))
+    assert [p.name for p in pictures] == ["frame_00001.jpg", "frame_00002.jpg", "frame_00003.jpg"]
+    assert [p.small for p in pictures] == [(32, 24)] * 3 and steps == [(1, 3), (2, 3), (3, 3)]
+    assert [Image.open(folders.images / p.name).size for p in pictures] == [(64, 48)] * 3
+    assert len(list(folders.small.iterdir())) == 3 and pictures[1].seconds == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("rotation, corner", [(0, (0, 0)), (90, (1, 0)), (-90, (0, 1)), (180, (1, 1)), (-180, (1, 1))])
+def test_frames_are_turned_as_they_are_shown(rotation, corner, av):
+    """The display matrix says by how much a frame is turned, counterclockwise."""
+    pixels = np.zeros((4, 6, 3), np.uint8)
+    pixels[0, 0] = 255
+    frame = SimpleNamespace(to_ndarray=lambda format: pixels, rotation=rotation)
+    out = module._pixels("film.mp4", frame)
+    assert out.shape[:2] == ((6, 4) if abs(rotation) == 90 else (4, 6))
+    assert out[-1 * corner[0], -1 * corner[1], 0] == 255
+
+
+def test_what_is_no_video_is_told(av, tmp_path, film):
+    (tmp_path / "a.mp4").write_text("not a film")
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "one.jpg")
+    raw = film.read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(raw[: len(raw) // 2])
+    for name, said in (
+        ("a.mp4", "cannot be read.*give a video"),
+        ("one.jpg", "is a single photo; name the folder"),
+        ("cut.mp4", "cannot be read"),
+        ("nowhere.mp4", "there is no video"),
+    ):
+        with pytest.raises(NergError, match=said):
+            list(sharpest_frames(tmp_path / name, 3))
+
+
+def test_sound_alone_is_no_video(av, tmp_path):
+    with av.open(str(tmp_path / "a.mp4"), "w") as out:
+        stream = out.add_stream("aac", rate=8000)
+        stream.layout = "mono"
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 8000
+        out.mux([*stream.encode(frame), *stream.encode()])
+    with pytest.raises(NergError, match="only sound"):
+        list(sharpest_frames(tmp_path / "a.mp4", 3))
+
+
+def test_frames_may_not_be_too_large(film, monkeypatch):
+    monkeypatch.setattr(module, "PIXELS", 64 * 48 - 1)
+    with pytest.raises(NergError, match="no frame that can be decoded, of 3,071 pixels at most"):
+        list(sharpest_frames(film, 3))
+    with pytest.raises(NergError, match="64 x 48 pixels, and at most 3,071"):
+        module._check_size(film, 64, 48)
+    with pytest.raises(NergError, match="a side of at most 65,500"):
+        module._check_size(film, 65_501, 1)
+
+
+LISTS = {
+    "a.mp4": "ffconcat version 1.0\nfile 'film.mp4'\n",
+    "a.m3u8": "#EXTM3U\n#EXT-X-VERSION:3\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nfilm.ts\n#EXT-X-ENDLIST\n",
+    "b.m3u8": "#EXTM3U\n#EXT-X-VERSION:3\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nhttp://127.0.0.1:{port}/film.ts\n",
+    "a.sdp": "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nt=0 0\nm=video {port} RTP/AVP 96\n",
+}
+
+
+@pytest.mark.parametrize("name", LISTS)
+def test_nothing_but_the_file_is_opened(name, av, film, tmp_path):
+    """FFmpeg would follow lists to other files and addresses."""
+    with av.open(str(film)) as given, av.open(str(tmp_path / "film.ts"), "w") as out:
+        stream = out.add_stream_from_template(given.streams.video[0])
+        for packet in given.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                out.mux(packet)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0)
+        (tmp_path / name).write_text(LISTS[name].format(port=server.getsockname()[1]))
+        with pytest.raises(NergError, match="no video of a kind that is read|invalid data found"):
+            list(sharpest_frames(tmp_path / name, 3))
+        with pytest.raises(BlockingIOError):
+            server.accept()
+
+
+def test_what_a_file_refers_to_is_refused(film, tmp_path, monkeypatch):
+    """A second time: by whatever is opened."""
+    (tmp_path / "a.mp4").write_text(LISTS["a.mp4"])
+    monkeypatch.setattr(module, "FORMATS", (*module.FORMATS, "concat"))
+    with pytest.raises(NergError, match="cannot be read"):
+        list(sharpest_frames(tmp_path / "a.mp4", 3))
+
+
+@pytest.mark.parametrize("name", ["12:30.mp4", "http:film.mp4", "concat:a|b.mp4", "-.mp4"])
+def test_a_name_is_no_address(name, film, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    film.rename(name)
+    assert len(list(sharpest_frames(name, 3))) == 3
+
+
+def test_titles_need_not_be_utf8(av, film, tmp_path):
+    with av.open(str(film)) as given, av.open(str(tmp_path / "a.avi"), "w") as out:
+        out.metadata["title"] = "XXXXXXXX"
+        stream = out.add_stream_from_template(given.streams.video[0])
+        for packet in given.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                out.mux(packet)
+    raw = (tmp_path / "a.avi").read_bytes()
+    assert b"XXXXXXXX" in raw
+    (tmp_path / "a.avi").write_bytes(raw.replace(b"XXXXXXXX", b"caf\xe9\xff\xfe\x80 "))
+    assert len(list(sharpest_frames(tmp_path / "a.avi", 3))) == 3
+
+
+def test_unknown_codecs_are_told(film, tmp_path, av):
+    raw = film.read_bytes()
+    # Both what the track says, and what its description does.
+    (tmp_path / "a.mp4").write_bytes(raw.replace(b"mp4v", b"xyzw").replace(b"esds", b"free"))
+    with pytest.raises(NergError, match="is coded in a way that is not known"):
+        list(sharpest_frames(tmp_path / "a.mp4", 3))
+
+
+def test_tables_that_claim_too_much_are_told(film, tmp_path):
+    raw = bytearray(film.read_bytes())
+    at = raw.index(b"stsz") + 8
+    raw[at : at + 8] = (1).to_bytes(4, "big") + (30_000_000).to_bytes(4, "big")
+    (tmp_path / "a.mp4").write_bytes(raw)
+    with pytest.raises(NergError, match="cannot be read: it claims 30,000,000 samples in .*; give a video"):
+        list(sharpest_frames(tmp_path / "a.mp4", 3))
+
+
+def test_ffmpeg_prints_nothing(film, tmp_path, capfd):
+    raw = bytearray(film.read_bytes())
+    at = raw.index(b"mdat") + 60
+    raw[at : at + 500] = bytes(500)
+    (tmp_path / "b.mp4").write_bytes(raw)
+    list(sharpest_frames(tmp_path / "b.mp4", 3))
+    (tmp_path / "c.mp4").write_bytes(raw[: len(raw) // 2])
+    with pytest.raises(NergError, match="cannot be read: [a-z ]+; give a video"):
+        list(sharpest_frames(tmp_path / "c.mp4", 3))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_video_that_is_mostly_destroyed_is_told(film, monkeypatch):
+    monkeypatch.setattr(module, "_LOST", 2)
+    monkeypatch.setattr(module, "_LOST_EACH", -1)
+    with pytest.raises(NergError, match="most of the video .* cannot be decoded"):
+        list(sharpest_frames(film, 3))
+
+
+def test_frames_that_are_hardly_wide_are_compared():
+    frame = lambda w, h: SimpleNamespace(width=w, height=h, to_ndarray=lambda **given: given)
+    for size, found in (((1, 9), (3, 27)), ((2, 2), (3, 3)), ((3840, 2160), (480, 270)), ((64, 90_000), (64, 1920))):
+        given = module._gray(frame(*size))
+        assert (given["width"], given["height"]) == found
+
+
+def test_a_damaged_stretch_is_passed_over(film, tmp_path):
+    raw = bytearray(film.read_bytes())
+    at = raw.index(b"mdat") + 4
+    middle = at + (len(raw) - at) // 3
+    raw[middle : middle + 200] = bytes(200)
+    (tmp_path / "b.mp4").write_bytes(raw)
+    assert len(list(sharpest_frames(tmp_path / "b.mp4", 3))) == 3
+
+
+def test_without_pyav(tmp_path, monkeypatch):
+    original = builtins.__import__
+
+    def no_av(name, *given, **more):
+        if name == "av":
+            raise ImportError(name="av")
+        return original(name, *given, **more)
+
+    monkeypatch.setattr(builtins, "__import__", no_av)
+    (tmp_path / "a.mp4").write_bytes(b"film")
+    with pytest.raises(ImportError, match=r"PyAV, which is not installed: pip install \"nerg-mi\[poses\]\""):
+        list(sharpest_frames(tmp_path / "a.mp4", 3))

@@ -1,0 +1,95 @@
+"""Frames as files describe them: lenses, poses and changes of coordinates."""
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.photos.posed import Frame, drop_repeated, rigid_pose
+from nerg_mi.photos.transforms import read_transforms
+from tests.photos.written_sets import frame
+
+
+def test_shared_intrinsics_prefer_the_focal_length(write):
+    t = read_transforms(
+        write(
+            {
+                "w": 20.0,
+                "h": 10.0,
+                "fl_x": 30.0,
+                "camera_angle_x": 1.0,
+                "cx": 9.0,
+                "k1": 0.1,
+                "frames": [frame("b.png"), frame("a.png")],
+            }
+        )
+    )
+    assert [f.name for f in t.frames] == ["a.png", "b.png"]
+    i = t.frames[0].intrinsics(20, 10)
+    assert (i.fx, i.fy, i.cx, i.cy, i.distortion[:4]) == (30.0, 30.0, 9.0, 5.0, (0.1, 0, 0, 0))
+    half = t.frames[0].intrinsics(10, 5)
+    assert (half.fx, half.cx, half.width) == (15.0, 4.5, 10)
+
+
+def test_bad_intrinsics_name_the_frame(write):
+    t = read_transforms(write({"frames": [frame("a.png")]}))
+    with pytest.raises(ValueError, match="a.png.*focal length"):
+        t.frames[0].intrinsics(8, 8)
+    t = read_transforms(write({"w": 8, "h": 4, "fl_x": 3.0, "frames": [frame("a.png")]}))
+    with pytest.raises(ValueError, match="a.png.*8 x 8"):
+        t.frames[0].intrinsics(8, 8)
+
+
+def test_a_scale_within_a_pose_is_taken_out(write):
+    scaled = np.diag([2.0, 2, 2, 1])
+    scaled[:3, 3] = 5
+    f = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", transform_matrix=scaled.tolist())]})).frames[0]
+    assert np.allclose(f.to_world[:3, :3], np.eye(3)) and np.allclose(f.to_world[:3, 3], 5)
+
+
+def test_a_mirroring_change_of_coordinates_is_refused(write):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png")]}))
+    with pytest.raises(ValueError, match="mirroring"):
+        t.moved(np.diag([1.0, 1, -1, 1]))
+
+
+@pytest.mark.parametrize("keys", [{"fl_x": 1e-300}, {"fl_x": 1e300}, {"cx": 1e300}, {"cy": -1e9}, {"k2": 1e200}])
+def test_lenses_that_no_camera_has_are_refused(write, keys):
+    t = read_transforms(write({"fl_x": 30.0, **keys, "frames": [frame("a.png")]}))
+    with pytest.raises(NergError, match="a.png"):
+        t.frames[0].intrinsics(8, 8)
+
+
+def test_a_distortion_of_nothing_is_none(write):
+    t = read_transforms(write({"fl_x": 30.0, "k1": 1e-320, "k3": -1e-300, "frames": [frame("a.png")]}))
+    assert not t.frames[0].intrinsics(8, 8).is_distorted
+
+
+def test_the_nearest_rotation_is_what_a_rounded_pose_means():
+    turned = np.array([[0.0, -1.001, 0.0, 1], [1.0, 0.0, 0.0, 2], [0.0, 0.0, 1.0, 3]])
+    pose = rigid_pose(turned.tolist())
+    assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12) and np.allclose(pose[:3, 3], [1, 2, 3])
+    assert np.abs(pose[:3] - turned).max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    "matrix, reason",
+    [
+        ("x", "4 x 4 numbers"),
+        (np.diag([1.0, 1, -1, 1]), "mirrored"),
+        (np.diag([1.0, 1, 2, 1]), "sheared"),
+        (np.eye(4).T + np.eye(4, k=-3), "transposed"),
+        (np.full((4, 4), np.nan), "finite"),
+    ],
+)
+def test_what_is_no_pose(matrix, reason):
+    with pytest.raises(NergError, match=reason):
+        rigid_pose(matrix)
+
+
+def test_an_image_that_is_listed_again_counts_once(tmp_path):
+    (tmp_path / "a.png").touch()
+    (tmp_path / "b.png").symlink_to(tmp_path / "a.png")
+    first = Frame("a.png", tmp_path / "a.png", np.eye(4), {})
+    again = Frame("b.png", tmp_path / "b.png", np.diag([1.0, -1, -1, 1]), {})
+    kept, unused = drop_repeated([first, again])
+    assert kept == [first] and "another pose" in unused[0].reason

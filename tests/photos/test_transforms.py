@@ -1,0 +1,427 @@
+"""Reading transforms files: what is understood, what is listed, what is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.photos.posed import DepthFile, MaskFile
+from nerg_mi.photos.transforms import read_dataparser, read_frame_poses, read_transforms
+from tests.photos.written_sets import POSE, frame
+
+
+def test_intrinsics_of_a_frame_overrule_shared_ones(write):
+    t = read_transforms(write({"fl_x": 30.0, "k1": 0.1, "frames": [frame("a.png", fl_x=40.0, k1=0.0), frame("b.png")]}))
+    assert [f.intrinsics(8, 8).fx for f in t.frames] == [40.0, 30.0]
+    assert [f.intrinsics(8, 8).k1 for f in t.frames] == [0.0, 0.1]
+
+
+@pytest.mark.parametrize("keys", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_fisheyes_of_nerfstudio_and_instant_ngp(write, keys):
+    t = read_transforms(write({"fl_x": 3.0, "k1": 0.1, "k4": 0.01, **keys, "frames": [frame("a.png")]}))
+    i = t.frames[0].intrinsics(8, 8)
+    assert i.fisheye and (i.k1, i.k4) == (0.1, 0.01)
+
+
+def test_rational_lens_only_where_it_is_named(write):
+    content = {"fl_x": 3.0, "k4": 0.2, "frames": [frame("a.png")]}
+    with pytest.raises(ValueError, match="FULL_OPENCV"):
+        read_transforms(write(content))
+    assert read_transforms(write({**content, "camera_model": "FULL_OPENCV"})).frames[0].intrinsics(8, 8).k4 == 0.2
+
+
+def test_blender_style(write):
+    path = write(
+        {"camera_angle_x": np.pi / 2, "frames": [frame("./train/r_0")]}, ["train/r_0.png"], "transforms_train.json"
+    )
+    t = read_transforms(path)
+    assert t.frames[0].image.name == "r_0.png"
+    assert np.isclose(t.frames[0].intrinsics(800, 800).fx, 400)
+
+
+def test_scene_box(write):
+    content = {"fl_x": 1.0, "aabb": [[0, 0, 0], [1, 2, 3]], "frames": [frame("a.png")]}
+    assert np.array_equal(read_transforms(write(content)).aabb, [[0, 0, 0], [1, 2, 3]])
+
+
+def test_masks_of_nerfstudio_and_instant_ngp(write):
+    path = write(
+        {"fl_x": 1.0, "frames": [frame("a.png", mask_path="m/a.png"), frame("b.jpg"), frame("c.png")]},
+        ["a.png", "m/a.png", "b.jpg", "dynamic_mask_b.png", "c.png"],
+    )
+    folder = path.parent
+    assert [f.mask for f in read_transforms(path).frames] == [
+        MaskFile(folder / "m/a.png"),
+        MaskFile(folder / "dynamic_mask_b.png", hides=True),
+        None,
+    ]
+
+
+def test_units_and_kinds_of_depth(write):
+    images = ["a.png", "d.png", "d.npy", "d.exr"]
+
+    def depth(name, key="depth_file_path", **keys):
+        path = write({"fl_x": 1.0, **keys, "frames": [frame("a.png", **{key: name})]}, images)
+        return read_transforms(path).frames[0].depth
+
+    folder = write({}).parent
+    assert depth("d.png") == DepthFile(folder / "d.png", 1e-3, True)
+    assert depth("d.png", "depth_path", integer_depth_scale=0.01) == DepthFile(folder / "d.png", 0.01, True)
+    assert depth("d.png", depth_unit_scale_factor=0.5, applied_scale=2.0).unit == pytest.approx(1.0)
+    # As nerfstudio reads them: steps of a millimetre along the axis, whatever the kind of file; EXR as Record3D's.
+    assert depth("d.npy") == DepthFile(folder / "d.npy", 1e-3, True)
+    assert depth("d.npy", depth_unit_scale_factor=1.0) == DepthFile(folder / "d.npy", 1.0, True)
+    assert depth("d.npy", depth_unit_scale_factor=0.5, applied_scale=2.0).unit == pytest.approx(1.0)
+    assert depth("d.exr") == DepthFile(folder / "d.exr", 1.0, True)
+    assert depth("d.exr", applied_scale=2.0, is_euclidean_depth=True) == DepthFile(folder / "d.exr", 2.0, False)
+    assert depth("d.exr", depth_unit_scale_factor=1e-3).unit == 1e-3
+    assert depth("d.png", enable_depth_loading=False) is None
+
+
+def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
+    mirrored, sheared, transposed = np.diag([-1.0, 1, 1, 1]), np.eye(4), np.eye(4)
+    sheared[0, 1], transposed[3, :3] = 0.3, [1, 2, 3]
+    names = [f"{c}.png" for c in "abcdefghijk"]
+    path = write(
+        {
+            "fl_x": 1.0,
+            "frames": [
+                frame("a.png"),
+                frame("b.png", transform_matrix=mirrored.tolist()),
+                frame("c.png", transform_matrix=sheared.tolist()),
+                frame("d.png", transform_matrix=transposed.tolist()),
+                frame("e.png", transform_matrix=[[float("nan")] * 4] * 4),
+                frame("f.png", mask_path="none.png"),
+                frame("./a.png"),
+                frame("g.png", camera_model="EQUIRECTANGULAR"),
+                {"file_path": "h.png"},
+                {"transform_matrix": POSE},
+                frame("gone.png"),
+                frame("i.png", fl_x="wide"),
+                frame("j.png", transform_matrix=[[1, 2], [3]]),
+                frame("k.png", mask_path=5),
+            ],
+        },
+        names,
+    )
+    t = read_transforms(path)
+    # The name that sorts first of the two spellings of one file is the one kept.
+    assert [f.name for f in t.frames] == ["./a.png"]
+    reasons = {u.name: u.reason for u in t.unused}
+    for name, part in {
+        "b.png": "mirrored",
+        "c.png": "sheared",
+        "d.png": "transposed",
+        "e.png": "finite",
+        "f.png": "none.png",
+        "a.png": "twice",
+        "g.png": "EQUIRECTANGULAR",
+        "h.png": "transform_matrix",
+        "frame 9": "file_path",
+        "gone.png": "does not exist",
+        "i.png": "fl_x",
+        "j.png": "4 x 4",
+        "k.png": "mask_path",
+    }.items():
+        assert part in reasons.pop(name), name
+    assert not reasons
+
+
+def test_a_missing_depth_file_costs_the_depth_only(write):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", depth_file_path="d.npy")]}))
+    assert t.frames[0].depth is None and "a.png" in t.notes[0] and "d.npy" in t.notes[0]
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ({"frames": [frame("gone.png")], "fl_x": 1.0}, "gone.png.*does not exist"),
+        ({"fl_x": 1.0}, '"frames"'),
+        ({"fl_x": 1.0, "frames": []}, "no frames"),
+        ({"fl_x": 1.0, "frames": [{"transform_matrix": POSE}]}, "frame 0"),
+        ({"fl_x": 1.0, "aabb": [[0, 0, 0], [1, 0, 1]], "frames": [frame("a.png")]}, "aabb"),
+        ({"fl_x": 1.0, "aabb": "wide", "frames": [frame("a.png")]}, "aabb"),
+        ({"fl_x": 1.0, "applied_transform": [[1, 0], [2]], "frames": [frame("a.png")]}, "applied_transform"),
+        ({"fl_x": 1.0, "applied_scale": 0, "frames": [frame("a.png")]}, "applied_scale"),
+    ],
+)
+def test_bad_files_are_named(write, content, message):
+    with pytest.raises(ValueError, match=message):
+        read_transforms(write(content))
+
+
+def test_broken_json_is_named(tmp_path):
+    (tmp_path / "transforms.json").write_text("{")
+    with pytest.raises(ValueError, match="not valid JSON"):
+        read_transforms(tmp_path / "transforms.json")
+
+
+def test_original_coordinates_undo_what_was_applied(write):
+    """x_file = s (A x + t): a pose of the original goes there and comes back."""
+    turn, shift, s = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.array([1.0, 2, 3]), 2.5
+    pose = np.eye(4)
+    pose[:3, 3] = [4, 5, 6]
+    applied = np.eye(4)
+    applied[:3, :3], applied[:3, 3] = turn, s * (turn @ pose[:3, 3] + shift)
+    t = read_transforms(
+        write(
+            {
+                "fl_x": 1.0,
+                "applied_transform": np.column_stack([turn, shift]).tolist(),
+                "applied_scale": s,
+                "aabb": [[0, 0, 0], [1, 2, 3]],
+                "frames": [frame("a.png", transform_matrix=applied.tolist())],
+            }
+        )
+    )
+    back = t.moved(t.original)
+    assert np.allclose(back.frames[0].to_world, pose)
+    assert np.allclose(back.original, np.eye(4)) and np.allclose(back.to_file @ t.original, np.eye(4))
+    assert np.allclose(back.aabb[1] - back.aabb[0], np.array([2, 1, 3]) / s)
+
+
+def test_dataparser_transforms(tmp_path):
+    path = tmp_path / "dataparser_transforms.json"
+    path.write_text(json.dumps({"transform": [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]], "scale": 0.5}))
+    assert np.allclose(read_dataparser(path) @ [1, 1, 1, 1], [0, 1.5, 2, 1])
+    path.write_text(json.dumps({"transform": [[0, -1, 0, 1]], "scale": 0.5}))
+    with pytest.raises(ValueError, match="dataparser_transforms.json"):
+        read_dataparser(path)
+
+
+def test_nerfstudios_lists_of_files_split(write):
+    names = ["a.png", "b.png", "c.png", "d.png"]
+    t = read_transforms(
+        write(
+            {
+                "fl_x": 1.0,
+                "frames": [frame(n) for n in names],
+                "train_filenames": ["a.png", "./b.png"],
+                "test_filenames": ["d.png"],
+            },
+            names,
+        )
+    )
+    assert (t.held_out, t.spare) == (["d.png"], ["c.png"])
+
+
+def test_the_fox(recorded):
+    """Real photos: 17 of the 67 listed images do not exist."""
+    t = read_transforms(recorded("fox") / "transforms.json")
+    assert (len(t.frames), len(t.unused)) == (50, 17)
+    assert all(u.reason == "its image does not exist" for u in t.unused)
+    i = t.frames[0].intrinsics(1080, 1920)
+    assert (i.fx, i.fy, i.k2) == (1375.52, 1374.49, -0.0805099)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"file_path": "../out/x.png"},
+        {"mask_path": "../out/x.png"},
+        {"depth_file_path": "../out/x.png"},
+        {"file_path": "linked/x.png"},
+        {"mask_path": "linked/x.png"},
+        {"depth_path": "link.png"},
+    ],
+)
+def test_files_outside_of_the_folder_are_used_only_if_allowed(tmp_path, keys):
+    home, out = tmp_path / "set", tmp_path / "out"
+    home.mkdir()
+    out.mkdir()
+    for path in (home / "a.png", home / "b.png", out / "x.png"):
+        path.write_bytes(b"")
+    (home / "linked").symlink_to(out)
+    (home / "link.png").symlink_to(out / "x.png")
+    (home / "transforms.json").write_text(
+        json.dumps({"fl_x": 30.0, "frames": [frame("b.png"), {**frame("a.png"), **keys}]})
+    )
+    t = read_transforms(home / "transforms.json")
+    assert [f.name for f in t.frames] == ["b.png"]
+    assert "outside of the data set's folder" in t.unused[0].reason and "--allow-outside" in t.unused[0].reason
+    assert len(read_transforms(home / "transforms.json", allow_outside=True).frames) == 2
+
+
+def test_an_absolute_path_of_another_place_is_not_even_looked_for(tmp_path, write, monkeypatch):
+    path = write({"fl_x": 30.0, "frames": [frame("a.png"), frame("/etc/passwd"), frame("../../etc/hostname")]})
+    asked = []
+    monkeypatch.setattr("pathlib.Path.is_file", lambda self: asked.append(self) or True)
+    t = read_transforms(path)
+    assert len(t.unused) == 2 and not [p for p in asked if "etc" in str(p)]
+
+
+def test_links_within_the_folder_are_followed(tmp_path, write):
+    path = write({"fl_x": 30.0, "frames": [frame("here/a.png")]}, ("images/a.png",))
+    (tmp_path / "here").symlink_to(tmp_path / "images")
+    outer = tmp_path.with_name(tmp_path.name + "-link")
+    outer.symlink_to(tmp_path)
+    assert len(read_transforms(path).frames) == len(read_transforms(outer / "transforms.json").frames) == 1
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"transform_matrix": [[1e300, 0, 0, 0], [0, 1e300, 0, 0], [0, 0, 1e300, 0], [0, 0, 0, 1]]},
+        {"transform_matrix": [[10**400] * 4] * 4},
+        {"transform_matrix": [[1, 0, 0, 1e13], [0, 1, 0, 0], [0, 0, 1, 0]]},
+        {"fl_x": 10**400},
+        {"k1": [1]},
+        {"file_path": "a\0b"},
+        {"file_path": "x" * 5000},
+        {"camera_model": ["OPENCV"]},
+        {"mask_path": "y" * 5000},
+        {"depth_file_path": "a.png", "depth_unit_scale_factor": float("inf")},
+    ],
+)
+def test_numbers_and_names_that_nothing_can_hold_cost_their_frame(write, keys):
+    t = read_transforms(write({"fl_x": 30.0, "frames": [frame("b.png"), {**frame("a.png"), **keys}]}))
+    assert len(t.frames) == len(t.unused) == 1 and str(t.unused[0]).isprintable()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"applied_scale": 1e-320},
+        {"applied_scale": 10**400},
+        {"applied_transform": [[1e300] * 4] * 3},
+        {"aabb": [[10**400] * 3, [0, 0, 0]]},
+        {"aabb": [[-1e300] * 3, [1e300] * 3]},
+    ],
+)
+def test_numbers_of_the_file_are_bounded(write, content):
+    with pytest.raises(NergError, match="transforms.json"):
+        read_transforms(write({"fl_x": 30.0, **content, "frames": [frame("a.png")]}))
+
+
+def test_a_file_nested_deep_is_refused(tmp_path):
+    (tmp_path / "transforms.json").write_text('{"frames": ' + "[" * 200_000)
+    with pytest.raises(NergError, match="transforms.json.*nested"):
+        read_transforms(tmp_path / "transforms.json")
+
+
+@pytest.mark.parametrize("keys", [{"from_mitsuba": True}, {"from_mitsuba": 1}, {"normal_mts_args": "-D x=1"}])
+def test_cameras_of_mitsuba_are_turned(write, keys):
+    """They look along +z with x to the left; positions stay, as in instant-ngp's nerf_matrix_to_ngp."""
+    pose = np.array([[0.0, 0, 1, 3], [1, 0, 0, 4], [0, 1, 0, 5], [0, 0, 0, 1]])
+    path = write({"fl_x": 1.0, **keys, "frames": [frame("a.png", transform_matrix=pose.tolist())]})
+    expected = pose * [-1, 1, -1, 1]
+    assert np.allclose(read_transforms(path).frames[0].to_world, expected)
+    assert np.allclose(read_frame_poses(path)[1][0][1], expected)
+
+
+@pytest.mark.parametrize("keys", [{}, {"from_mitsuba": False}, {"from_mitsuba": None}, {"from_na": False}])
+def test_other_cameras_are_not(write, keys):
+    assert np.array_equal(
+        read_transforms(write({"fl_x": 1.0, **keys, "frames": [frame("a.png")]})).frames[0].to_world, np.eye(4)
+    )
+
+
+CHANGES = [
+    {"from_na": True},
+    {"camera_convention": "opencv"},
+    {"coordinate_system": "OPENCV"},
+    {"handedness": "left"},
+    {"is_w2c": True},
+    {"rolling_shutter": [0, 0, 1, 0]},
+    {"white_transparent": True},
+    {"skew": 0.1},
+    {"distortion": [0.1, 0]},
+    {"fisheye_crop_radius": 300},
+    {"latlong": True},
+]
+
+
+@pytest.mark.parametrize("keys", CHANGES, ids=lambda k: next(iter(k)))
+def test_an_unknown_key_that_changes_meaning_is_refused(write, keys):
+    """With the file's name where it stands for all frames, and costing the frame where it stands in one."""
+    key = next(iter(keys))
+    path = write({"fl_x": 1.0, **keys, "frames": [frame("a.png")]})
+    with pytest.raises(NergError, match=f'transforms.json.*"{key}"'):
+        read_transforms(path)
+    with pytest.raises(NergError, match=f'"{key}"'):
+        read_frame_poses(path)
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", **keys), frame("b.png")]}))
+    assert [f.name for f in t.frames] == ["b.png"] and f'"{key}"' in t.unused[0].reason
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {
+            "camera_convention": "OpenGL",
+            "is_w2c": False,
+            "rolling_shutter": [0, 0, 0, 0],
+            "skew": 0.0,
+            "depth_type": "z",
+        },
+        {"transform_matrix_start": POSE, "transform_matrix_end": POSE},
+        {"aabb_scale": 16, "scale": 0.3, "offset": [0, 0, 0], "sharpness": 9.0, "colmap_im_id": 7, "rotation": 0.1},
+    ],
+)
+def test_keys_that_change_nothing_are_read_over(write, keys):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", **keys)]}))
+    assert np.array_equal(t.frames[0].to_world, np.eye(4)) and "a.png" in t.frames[0].name
+
+
+def test_unknown_keys_of_depth_are_refused_where_there_is_depth(write):
+    content = {"fl_x": 1.0, "depth_scale": 4000, "frames": [frame("a.png", depth_file_path="b.png")]}
+    with pytest.raises(NergError, match='"depth_scale".*depth_unit_scale_factor'):
+        read_transforms(write(content))
+
+
+def test_keys_that_are_not_used_are_named_once(write):
+    frames = [frame(n, time=0.5, sharpness=3.0) for n in ("a.png", "b.png")]
+    t = read_transforms(write({"fl_x": 1.0, "aabb_scale": 4, "ply_file_path": "sparse_pc.ply", "frames": frames}))
+    assert t.notes == ["keys of transforms.json that are not used: ply_file_path, time"]
+
+
+@pytest.mark.parametrize("key", ["from_mitsuba", "is_fisheye", "is_equirectangular", "is_euclidean_depth"])
+def test_flags_are_true_or_false(write, key):
+    t = read_transforms(
+        write({"fl_x": 1.0, "frames": [frame("a.png", depth_path="a.png", **{key: "false"}), frame("b.png")]})
+    )
+    assert f'"{key}" must be true or false' in t.unused[0].reason
+
+
+def test_other_spellings_of_a_lens(write):
+    """instant-ngp's angles in degrees, nerfstudio's list of coefficients."""
+    i = read_transforms(write({"x_fov": 90.0, "frames": [frame("a.png")]})).frames[0].intrinsics(8, 8)
+    assert (i.fx, i.fy) == pytest.approx((4.0, 4.0))
+    keys = {"fl_x": 3.0, "k1": 9.0, "distortion_params": [0.1, 0.2, 0.3, 0, 0.5, 0.6]}
+    i = read_transforms(write({**keys, "frames": [frame("a.png")]})).frames[0].intrinsics(8, 8)
+    assert (i.k1, i.k2, i.k3, i.p1, i.p2) == (0.1, 0.2, 0.3, 0.5, 0.6)
+
+
+@pytest.mark.parametrize(
+    "listed, stored",
+    [
+        ("images\\a.png", "images/a.png"),
+        (".\\images\\a.png", "images/a.png"),
+        ("images/K\u00fcche.png", "images/Ku\u0308che.png"),
+        ("images/Ku\u0308che.png", "images/K\u00fcche.png"),
+        ("Images/A.PNG", "images/a.png"),
+        ("images/a.jpg", "images/a.JPG"),
+        ("IMAGES\\K\u00dcCHE", "images/Ku\u0308che.png"),
+    ],
+)
+def test_names_spelled_by_another_system_are_found(write, listed, stored):
+    """Of images, masks, depth files and lists of names."""
+    keys = {"mask_path": listed, "depth_file_path": listed} if Path(listed).suffix else {}
+    frames = [frame(listed, **keys), frame("b.png")]
+    t = read_transforms(write({"fl_x": 1.0, "frames": frames, "test_filenames": [stored]}, [stored, "b.png"]))
+    found = next(f for f in t.frames if f.name == listed)
+    assert found.image.samefile(found.image.parent / Path(stored).name) and found.image.name == Path(stored).name
+    if keys:
+        assert found.mask.path == found.depth.path == found.image and t.held_out == [listed]
+
+
+def test_names_that_two_files_fit_are_refused(write):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("A.png"), frame("b.png")]}, ["a.png", "a.PNG", "b.png"]))
+    assert "a.PNG, a.png" in t.unused[0].reason
+
+
+def test_backslashes_lead_nowhere_that_slashes_do_not(write):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png"), frame("..\\..\\etc\\hostname")]}))
+    assert "outside of the data set's folder" in t.unused[0].reason
