@@ -140,7 +140,7 @@ class Run:
     """What the parts have in common: the options, the variant's namespace, and the fields of the demo store."""
 
     def __init__(self, args: argparse.Namespace):
-        from nerg_mi.field.backend import namespace
+        from nerg_mi.fields.mlp import namespace
         from nerg_mi.formats.fields import load_gaze, load_radiance
 
         import mitsuba as mi

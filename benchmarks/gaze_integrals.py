@@ -30,7 +30,7 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.training.geometry.places import place_of_field, place_of_volume
     from nerg_mi.transport.observer.gaze import PlacedGaze

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.maths.geometry import Box
 from timing import print_table

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.field.radiance import density_from_log
+from nerg_mi.fields.radiance import density_from_log
 from nerg_mi.transport.march.depth import surface_depth
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.quadrature import absorbed_share, linear_crossing, linear_share, mean_depth_share

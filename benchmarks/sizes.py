@@ -130,9 +130,9 @@ def density_work(field, p: np.ndarray):
 
 def table(long: bool) -> Growth:
     """Density of random fields at the same points."""
-    from nerg_mi.field.backend import namespace
-    from nerg_mi.field.encoding.hashgrid import HashGridConfig
-    from nerg_mi.field.radiance import RadianceConfig, RadianceField
+    from nerg_mi.fields.encoding import HashGridConfig
+    from nerg_mi.fields.mlp import namespace
+    from nerg_mi.fields.radiance import RadianceConfig, RadianceField
     from nerg_mi.formats.fields import load_radiance
 
     import mitsuba as mi

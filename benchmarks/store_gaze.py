@@ -45,7 +45,7 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.evaluation.gaze import baselines
     from nerg_mi.evaluation.gaze.scores import EPS, gaze_field, print_scores, score_rows
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze, load_radiance
     from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.probes.probes import place_probes

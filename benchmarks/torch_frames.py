@@ -40,7 +40,7 @@ import numpy as np
 
 class Attention:
     """Gaze as a density that integrates to one over an observer's sphere, of the weights of a ``model`` (`TorchModel`):
-    `nerg_mi.field.gaze.log_density`."""
+    `nerg_mi.fields.gaze_log_density`."""
 
     def __init__(self, model):
         import torch
@@ -286,7 +286,7 @@ def main(argv=None) -> None:
     import torch
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
 
     dr.set_thread_count(args.threads)
     torch.set_num_threads(args.threads)

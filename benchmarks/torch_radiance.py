@@ -303,7 +303,7 @@ def main(argv=None) -> None:
     dr.set_thread_count(args.threads)
     torch.set_num_threads(args.threads)
     from nerg_mi.evaluation.images import score_views
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.training.radiance.settings import RadianceSettings, sized_config

@@ -53,7 +53,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from nerg_mi.field.backend import namespace
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.probes.kde_view import KdeView
 from nerg_mi.properties import integer, number, resolved, text, transform

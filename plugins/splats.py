@@ -69,8 +69,8 @@ from typing import Any
 import mitsuba as mi
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.splats import Splats
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.splats.files import read_splats
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import choice, number, resolved, text, transform, volume_of

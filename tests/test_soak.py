@@ -80,8 +80,8 @@ def radiance_steps() -> Callable[[int], None]:
     import drjit as dr
     import drjit.llvm.ad as ns
 
-    from nerg_mi.field.encoding.hashgrid import HashGridConfig
-    from nerg_mi.field.radiance import RadianceConfig
+    from nerg_mi.fields.encoding import HashGridConfig
+    from nerg_mi.fields.radiance import RadianceConfig
     from nerg_mi.maths.geometry import Box
     from nerg_mi.photos.cameras import Camera, Intrinsics
     from nerg_mi.photos.images import View
@@ -112,8 +112,8 @@ def gaze_steps() -> Callable[[int], None]:
     import drjit as dr
     import drjit.llvm.ad as ns
 
-    from nerg_mi.field.encoding.hashgrid import HashGridConfig
-    from nerg_mi.field.gaze.product import GazeConfig
+    from nerg_mi.fields.encoding import HashGridConfig
+    from nerg_mi.fields.gaze_product import GazeConfig
     from nerg_mi.training.gaze.product import ProductTrainer
     from nerg_mi.training.gaze.ray_targets import targets_of_rays
     from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings

@@ -89,8 +89,8 @@ def _shown(value: object) -> str:
 def registered() -> str:
     """What there is of each kind of which there are several, and where."""
     _choose_variant()
-    from nerg_mi.field.encoding import registry as encodings
-    from nerg_mi.field.gaze import registry as gaze_fields
+    from nerg_mi.fields import encoding as encodings
+    from nerg_mi.fields import gaze_base as gaze_fields
     from nerg_mi.rays.readers.registry import reader_names
     from nerg_mi.training.gaze.recipes import RECIPES
     from nerg_mi.transport.march.depth import DEPTHS
@@ -98,8 +98,8 @@ def registered() -> str:
 
     aovs = import_module("nerg_mi.plugins.nerg_aovs").AOVS
     rows = (
-        ("encoding of positions", "nerg_mi/field/encoding/protocol.py", encodings.kinds()),
-        ("gaze field", "nerg_mi/field/gaze/protocol.py", gaze_fields.kinds()),
+        ("encoding of positions", "nerg_mi/fields/encoding.py", encodings.kinds()),
+        ("gaze field", "nerg_mi/fields/gaze_base.py", gaze_fields.kinds()),
         ("quadrature rule", "nerg_mi/transport/march/rules.py", RULES.names()),
         ("depth", "nerg_mi/transport/march/depth.py", DEPTHS.names()),
         ("AOV", "plugins/nerg_aovs.py", aovs),

@@ -11,8 +11,8 @@ from .options import checkpoint_of, file_of, options_of, rays_of
 
 if TYPE_CHECKING:
     from nerg_mi.evaluation.images import ViewScores
-    from nerg_mi.field.gaze.protocol import AnyGazeField
-    from nerg_mi.field.radiance import RadianceField
+    from nerg_mi.fields.gaze_base import AnyGazeField
+    from nerg_mi.fields.radiance import RadianceField
     from nerg_mi.jobs.ablation import AblationResult
     from nerg_mi.jobs.evaluation import GazeEvaluation
     from nerg_mi.jobs.options.ablation import AblationOptions

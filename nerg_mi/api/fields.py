@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.protocol import AnyGazeField
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.formats.fields import load_gaze as read_gaze
 from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
 
@@ -29,7 +29,7 @@ Network = TypeVar("Network", RadianceField, AnyGazeField)
 class TrainedField(Generic[Network]):
     """A radiance field or a gaze field in memory.
 
-    ``network``: the field itself (`nerg_mi.field`), whose arrays belong to the variant that was active when it was
+    ``network``: the field itself (`nerg_mi.fields`), whose arrays belong to the variant that was active when it was
     made. ``provenance``: what it was trained on and with, as its file keeps it. ``name``: the file's, or what it is.
     ``path``: the checkpoint that holds it, None where there is none.
     """

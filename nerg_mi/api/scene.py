@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.field.splats import Splats
+from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.splats.files import plugin_of_field
 from nerg_mi.registration import plugin_class
 from nerg_mi.rendering.asked import is_nerg
@@ -30,8 +30,8 @@ from .variant import active_mitsuba
 if TYPE_CHECKING:
     import mitsuba as mi
 
-    from nerg_mi.field.gaze.protocol import AnyGazeField
-    from nerg_mi.field.radiance import RadianceField
+    from nerg_mi.fields.gaze_base import AnyGazeField
+    from nerg_mi.fields.radiance import RadianceField
     from nerg_mi.transport.place import Place
 
 COLOR = "color"
@@ -125,7 +125,7 @@ class Scene:
         """Write the weights of its trained fields into the kernels, for many pictures or rays of one scene: the same
         results to the bit in less time, after some seconds of compilation (the page on performance, "Weights as
         constants"). ``constant`` false takes it back."""
-        from nerg_mi.field.constant_weights import set_constant_weights
+        from nerg_mi.fields.constant_weights import set_constant_weights
         from nerg_mi.rendering.long_renders import fields_of
 
         for field in fields_of(self.integrator):

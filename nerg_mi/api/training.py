@@ -11,8 +11,8 @@ from .fields import FilePath, TrainedField
 from .options import file_of, options_of, rays_of
 
 if TYPE_CHECKING:
-    from nerg_mi.field.gaze.protocol import AnyGazeField
-    from nerg_mi.field.radiance import RadianceField
+    from nerg_mi.fields.gaze_base import AnyGazeField
+    from nerg_mi.fields.radiance import RadianceField
     from nerg_mi.jobs.options.gaze import GazeOptions
     from nerg_mi.jobs.radiance import RadianceOptions
     from nerg_mi.rays.rays import Rays

@@ -29,7 +29,7 @@ def active_mitsuba() -> ModuleType:
 
 
 def array_module() -> ModuleType:
-    """The Dr.Jit array types of the active variant (`nerg_mi.field.backend.namespace`)."""
-    from nerg_mi.field.backend import namespace
+    """The Dr.Jit array types of the active variant (`nerg_mi.fields.mlp.namespace`)."""
+    from nerg_mi.fields.mlp import namespace
 
     return namespace(active_mitsuba().variant())

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.encoding.registry import config_type
+from nerg_mi.fields.encoding import config_type
 from nerg_mi.files.bounded import plain
 from nerg_mi.ranges import VALUES
 

@@ -12,11 +12,9 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import aligned
-from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
-from nerg_mi.field.encoding.registry import encoding_of
-from nerg_mi.field.gaze.protocol import LARGEST
-from nerg_mi.field.mlp import MLP
+from nerg_mi.fields.encoding import Encoding, EncodingConfig, encoding_of
+from nerg_mi.fields.gaze_base import LARGEST
+from nerg_mi.fields.mlp import MLP, aligned
 
 from .architecture import check_sizes
 

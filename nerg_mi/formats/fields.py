@@ -1,6 +1,6 @@
 """Radiance and gaze fields in and out of checkpoint files.
 
-Which kinds of gaze fields there are is known to ``field.gaze.registry``.
+Which kinds of gaze fields there are is known to ``fields.gaze_base``.
 """
 
 from __future__ import annotations
@@ -11,15 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.field.cascades import CascadeGrid
-from nerg_mi.field.gaze.basis import basis_of
-from nerg_mi.field.gaze.protocol import AnyGazeField
-from nerg_mi.field.gaze.registry import build
-from nerg_mi.field.gaze.support import RaySupport
-from nerg_mi.field.occupancy import OccupancyGrid, unpacked
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.field.refined import RefinedGrid
+from nerg_mi.fields.gaze_base import AnyGazeField, RaySupport, basis_of, build
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpacked
+from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.maths.geometry import box_of
 from nerg_mi.ranges import VALUES
@@ -76,7 +70,7 @@ def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half
 
 
 def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict[str, Any]]:
-    """The field in ``path`` on backend ``ns`` (see ``field.backend.namespace``), and its metadata.
+    """The field in ``path`` on backend ``ns`` (see ``fields.mlp.namespace``), and its metadata.
 
     Raises `NergError` for a file that holds none.
     """

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.extraction import Lattice, Sampler, crossings, opacity, surface_density
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.extraction import Lattice, Sampler, crossings, opacity, surface_density
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.maths.color import decode_srgb, encode_srgb
 

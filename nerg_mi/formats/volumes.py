@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.field.extraction import Lattice, Sampler, surface_density
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.extraction import Lattice, Sampler, surface_density
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.maths.color import decode_srgb
 

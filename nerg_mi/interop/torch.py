@@ -28,10 +28,10 @@ except ImportError:
     ) from None
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import is_cuda
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
-from nerg_mi.field.gaze.protocol import AnyGazeField
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.mlp import is_cuda
+from nerg_mi.fields.radiance import RadianceField
 
 _FIXED = ("prior",)
 """Arrays that no training changes: parameters without gradients."""

@@ -13,7 +13,7 @@ def select_backend(mode: str | None, threads: int | None = None) -> ModuleType:
     ``mode``: None for the best that works here; ``threads``: of the CPU, None or 0 for all. Raises `NergError` for a
     variant that does not exist or does not work.
     """
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
     from nerg_mi.rendering.pictures import activate
 
     active = activate(mode)

@@ -12,7 +12,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.saliency import cc
-from nerg_mi.field.splats import Splats, harmonics_of
+from nerg_mi.fields.splats import Splats, harmonics_of
 from nerg_mi.figures.overlay import Heat, overlay, top_of
 from nerg_mi.figures.provenance import provenance
 from nerg_mi.files.atomic import check_writable

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.product import GazeField
-from nerg_mi.field.radiance import RadianceField
-from nerg_mi.field.refinement import refine
+from nerg_mi.fields.gaze_product import GazeField
+from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.refinement import refine
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.splats.ply import write_ply_splats

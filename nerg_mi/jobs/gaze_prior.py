@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.rays.dataset.opening import load_rays, rays_digest

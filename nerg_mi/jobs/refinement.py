@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.refined import RefinedGrid
-from nerg_mi.field.refinement import refine
+from nerg_mi.fields.occupancy import RefinedGrid
+from nerg_mi.fields.refinement import refine
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint

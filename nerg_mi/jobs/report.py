@@ -12,7 +12,7 @@ import numpy as np
 
 from nerg_mi.errors import mitsuba_says
 from nerg_mi.evaluation.gaze.results import GazeResults
-from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.provenance import Provenance
 from nerg_mi.figures.provenance import versions as programs
 from nerg_mi.files.atomic import check_writable, write_text

@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import namespace
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths import vmf
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.types import Array3f, Float, UInt32

@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.basis import Basis
+from nerg_mi.fields.gaze_base import Basis
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Float, Point3f, Vector3f
 from nerg_mi.rays.index import RayIndex

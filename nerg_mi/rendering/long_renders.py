@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from nerg_mi.field.constant_weights import set_constant_weights
-from nerg_mi.field.gaze.protocol import AnyGazeField
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.constant_weights import set_constant_weights
+from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.transport.media.field import FieldMedium
 
 from .asked import is_nerg

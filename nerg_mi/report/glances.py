@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.shares import Look

@@ -9,7 +9,7 @@ import drjit as dr
 import numpy as np
 from scipy import sparse
 
-from nerg_mi.field.splats import Splats, matrices_of
+from nerg_mi.fields.splats import Splats, matrices_of
 from nerg_mi.maths.arrays import aligned, vector_of
 from nerg_mi.probes.surface_attention import attended
 from nerg_mi.transport.march.settings import HITS_STOP

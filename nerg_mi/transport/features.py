@@ -12,8 +12,8 @@ from typing import Any
 
 import drjit as dr
 
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.color_head import mean_features
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.fields.radiance import mean_features
 from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f
 
 from .march.settings import MarchSettings
@@ -83,7 +83,7 @@ def observed_features(
     kind: str, place: Place, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool, settings: MarchSettings
 ) -> list[Float] | None:
     """Features of what an observer sees at ``p_od`` along unit ``r_o`` from ``p_o``, for a gaze field that wants such
-    of ``kind`` (``field.gaze.product.SEMANTICS``); None for one that wants none. ``settings``: of the march."""
+    of ``kind`` (``fields.gaze_product.SEMANTICS``); None for one that wants none. ``settings``: of the march."""
     import mitsuba as mi
 
     if kind == "snapshot":

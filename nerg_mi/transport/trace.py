@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.backend import namespace
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.types import Float, Point3f, Vector3f
 
 from .march.depth import DEPTHS

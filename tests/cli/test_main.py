@@ -105,8 +105,8 @@ def test06_traceback_on_request(monkeypatch, capsys, error, code, ask):
         (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"),
         (OSError("of nothing"), "OSError: of nothing"),
         (
-            ImportError("cannot import name 'x' from 'nerg_mi.field'", name="nerg_mi.field"),
-            "ImportError: cannot import name 'x' from 'nerg_mi.field'",
+            ImportError("cannot import name 'x' from 'nerg_mi.fields'", name="nerg_mi.fields"),
+            "ImportError: cannot import name 'x' from 'nerg_mi.fields'",
         ),
     ],
 )

@@ -12,7 +12,7 @@ from tests.plugins.fields import radiance
 def test_it_writes_and_tells(tmp_path):
     import drjit.llvm.ad as ns
 
-    from nerg_mi.field.occupancy import OccupancyGrid
+    from nerg_mi.fields.occupancy import OccupancyGrid
 
     occupancy = OccupancyGrid(np.ones((4, 4, 4), bool), ns, 0.1)
     radiance(tmp_path / "f.safetensors", density_scale=1e-2, occupancy=occupancy)

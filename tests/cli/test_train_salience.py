@@ -34,7 +34,7 @@ def run(*arguments):
 
 @pytest.mark.parametrize("recipe", ["default", "small"])
 def test_a_field_from_images(recipe, folder, capsys, rgb):
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze
 
     # A place, which small needs, is a scene of one wall.

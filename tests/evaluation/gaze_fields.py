@@ -5,10 +5,10 @@ from __future__ import annotations
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField, blind_table
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField, blind_table
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.images import Renderer, depth_score, score_views, ssim
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import Camera, Intrinsics

@@ -31,11 +31,11 @@ def write_standins(folder: Path) -> dict[str, str]:
     """Write a radiance and a gaze field into ``folder``; returns the scene's defaults that name them."""
     import mitsuba as mi
 
-    from nerg_mi.field.backend import namespace
-    from nerg_mi.field.encoding.hashgrid import HashGridConfig
-    from nerg_mi.field.gaze.product import GazeConfig, GazeField
-    from nerg_mi.field.occupancy import OccupancyGrid
-    from nerg_mi.field.radiance import RadianceConfig, RadianceField
+    from nerg_mi.fields.encoding import HashGridConfig
+    from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+    from nerg_mi.fields.mlp import namespace
+    from nerg_mi.fields.occupancy import OccupancyGrid
+    from nerg_mi.fields.radiance import RadianceConfig, RadianceField
     from nerg_mi.formats.fields import save_gaze, save_radiance
     from nerg_mi.maths.geometry import Box
 

@@ -9,12 +9,11 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.cascades import contracted_cascades
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.field.occupancy import OccupancyGrid
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.occupancy import OccupancyGrid, contracted_cascades
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
 from nerg_mi.maths.geometry import Box, ContractedBox
 
@@ -212,7 +211,7 @@ def test_arrays_must_have_the_shapes_of_the_architecture(tmp_path, name, shape):
 
 
 def test_cascades_that_float32_cannot_address_are_refused():
-    from nerg_mi.field.cascades import CascadeGrid
+    from nerg_mi.fields.occupancy import CascadeGrid
 
     with pytest.raises(ValueError, match="cells along an edge"):
         CascadeGrid(np.zeros((25, 2, 2, 2), bool), 2.0**24, ns, 0.0)

@@ -13,8 +13,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.cascades import CascadeGrid
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
 from nerg_mi.formats.checkpoint import FORMAT
 from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
 from nerg_mi.rays.rays import Rays

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.field.extraction import Lattice, surface_density
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.extraction import Lattice, surface_density
+from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.formats.surfaces import mesh, points, write_glb, write_ply
 from nerg_mi.maths.geometry import Box
 from tests.formats.ball import CENTER, RADIUS, Ball

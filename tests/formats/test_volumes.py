@@ -5,7 +5,7 @@ import math
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.extraction import Sampler
+from nerg_mi.fields.extraction import Sampler
 from nerg_mi.formats.volumes import density_and_color, write_volume
 from tests.formats.ball import Ball
 

@@ -15,17 +15,16 @@ _ABOUT = {"sha": 1, "width": 24}
 def _parts():
     from drjit.llvm import ad as ns
 
-    from nerg_mi.field.encoding.hashgrid import HashGridConfig
+    from nerg_mi.fields.encoding import HashGridConfig
     from nerg_mi.maths.geometry import Box
 
     return ns, Box((-1, 0, 2), (3, 2, 4)), HashGridConfig(levels=2, log2_rows=3, base=2, finest=4)
 
 
 def _make_radiance(folder: Path) -> None:
-    from nerg_mi.field.background import Background, BackgroundConfig
-    from nerg_mi.field.encoding.hashgrid import HashGridConfig
-    from nerg_mi.field.occupancy import OccupancyGrid
-    from nerg_mi.field.radiance import RadianceConfig, RadianceField
+    from nerg_mi.fields.encoding import HashGridConfig
+    from nerg_mi.fields.occupancy import OccupancyGrid
+    from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
     from nerg_mi.formats.fields import save_radiance
 
     ns, box, grid = _parts()
@@ -50,10 +49,10 @@ def _read_radiance(folder: Path) -> object:
 
 
 def _gaze(kind: str):
-    from nerg_mi.field.gaze.ensemble import GazeEnsemble
-    from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
-    from nerg_mi.field.gaze.product import GazeConfig, GazeField
-    from nerg_mi.field.gaze.support import RaySupport
+    from nerg_mi.fields.gaze_base import RaySupport
+    from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+    from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
+    from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 
     ns, box, grid = _parts()
     if kind == "product":

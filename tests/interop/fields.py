@@ -3,9 +3,8 @@
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.observer.gaze import PlacedGaze
@@ -76,7 +76,7 @@ def test01b_colours_of_features(torch, interop, deferred):
 
 def test02_gradients_of_a_restatement_in_torch(torch, interop):
     # The same networks in torch behind the same features, so that its autograd shares nothing with ours.
-    from nerg_mi.field.encoding.harmonics import encode_direction
+    from nerg_mi.fields.encoding import encode_direction
 
     field = radiance()
     module, (p, d) = interop.RadianceModule(field), rays(torch)

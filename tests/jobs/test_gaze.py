@@ -10,8 +10,8 @@ import pytest
 
 from nerg_mi.cli import main
 from nerg_mi.errors import NergError
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.log_density import LogGazeConfig
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig
 from nerg_mi.files.atomic import reserving
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.jobs.gaze import train_gaze

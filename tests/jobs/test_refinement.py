@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.cascades import CascadeGrid
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import is_field, load_radiance

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.jobs.gaze_places import make_place

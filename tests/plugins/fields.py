@@ -3,9 +3,9 @@
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.maths.geometry import Box
 

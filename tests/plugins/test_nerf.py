@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.occupancy import OccupancyGrid
 
 from . import fields
 from .scenes import camera, channels

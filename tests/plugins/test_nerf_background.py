@@ -4,8 +4,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.radiance import Background, BackgroundConfig
 from nerg_mi.formats.fields import load_radiance
 
 from . import fields

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.gaze.scores import gaze_field
-from nerg_mi.field.gaze import registry
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.fields import gaze_base
+from nerg_mi.fields.gaze_ensemble import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.place import Place
@@ -82,8 +82,8 @@ class LobeField:
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch):
-    monkeypatch.setattr(registry, "_KINDS", dict(registry._KINDS))
-    registry.register(LobeField)
+    monkeypatch.setattr(gaze_base, "_KINDS", dict(gaze_base._KINDS))
+    gaze_base.register(LobeField)
 
 
 def lobe(axis=(0.0, 0.0, 1.0), **more):
@@ -149,6 +149,6 @@ def test04_it_is_scored_like_any_other(rgb, tmp_path):
 def test05_without_it_the_checkpoint_is_refused(rgb, tmp_path):
     path = tmp_path / "g.safetensors"
     volume(path, lobe())
-    del registry._KINDS["lobe"]
+    del gaze_base._KINDS["lobe"]
     with pytest.raises(ValueError, match='of the kind "lobe", which this version does not know'):
         load_gaze(path, ns)

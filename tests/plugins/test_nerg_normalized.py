@@ -4,8 +4,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.place import Place

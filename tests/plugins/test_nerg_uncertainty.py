@@ -6,8 +6,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
-from nerg_mi.field.gaze.support import REACH, RaySupport
+from nerg_mi.fields.gaze_base import REACH, RaySupport
+from nerg_mi.fields.gaze_ensemble import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from tests.reference import fields_numpy
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.regions import Region
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions

@@ -3,7 +3,7 @@
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.field.splats import Splats, joined
+from nerg_mi.fields.splats import Splats, joined
 from nerg_mi.surfaces.splats import HIDDEN, shortest_axes, sides_of, splat_areas, whole_areas
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from tests.surfaces.walls import TURN_X, wall

@@ -3,7 +3,7 @@
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.field.splats import Splats
+from nerg_mi.fields.splats import Splats
 from nerg_mi.surfaces.splats import groups_of_hits
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from tests.reference.splats import peaks

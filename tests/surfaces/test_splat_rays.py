@@ -4,7 +4,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.splats import joined
+from nerg_mi.fields.splats import joined
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces.laplacian import merge
 from nerg_mi.surfaces.sources import RaySettings, TrackedRays, lookers_of_law

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.field.splats import Splats, joined
+from nerg_mi.fields.splats import Splats, joined
 from nerg_mi.surfaces.splats import SplatSmoother, shortest_axes
 from tests.surfaces.walls import TURN_X, wall
 

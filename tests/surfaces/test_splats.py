@@ -3,7 +3,7 @@
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.splats import Splats, matrices_of
+from nerg_mi.fields.splats import Splats, matrices_of
 from nerg_mi.surfaces.sources import lookers_of_law
 from nerg_mi.surfaces.splats import splat_densities
 from nerg_mi.transport.observer.settings import ObserverSettings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.field.splats import Splats
+from nerg_mi.fields.splats import Splats
 
 TURN_X = (0.0, 1.0, 0.0, 0.0)
 """By half a turn around x: what points along z points against it."""

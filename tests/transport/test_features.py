@@ -6,9 +6,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.color_head import mean_features
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.transport.features import FeaturePainter, color_painter, observed_features
 from nerg_mi.transport.march.march import march

@@ -6,9 +6,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.field import FieldMedium

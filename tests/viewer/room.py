@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import KDTree
 
 import nerg_mi as nerg
-from nerg_mi.field.splats import Splats
+from nerg_mi.fields.splats import Splats
 from nerg_mi.viewer.proxy import BATCH, LEVELS, bake, gather, ordered, thin, way_out
 
 

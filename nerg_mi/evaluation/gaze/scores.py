@@ -8,7 +8,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import saliency as metrics
-from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY

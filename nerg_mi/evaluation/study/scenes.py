@@ -13,9 +13,9 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.observer.gaze import PlacedGaze
 

@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 
-from nerg_mi.field.splats import Splats, harmonics_of
+from nerg_mi.fields.splats import Splats, harmonics_of
 from nerg_mi.files.bounded import read_bytes, reading
 
 BYTES = 4 << 30

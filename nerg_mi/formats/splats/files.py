@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.splats import Splats
+from nerg_mi.fields.splats import Splats
 from nerg_mi.maths.coordinates import check_near_origin
 
 from .antimatter import read_splat

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.field.splats import Splats, joined
+from nerg_mi.fields.splats import Splats, joined
 from nerg_mi.files.bounded import JSON_BYTES, open_file, read_bytes, reading
 from nerg_mi.formats.gltf import BYTES, accessor_values, instances, read_parts
 from nerg_mi.maths.geometry import Similarity

@@ -13,7 +13,7 @@ import re
 import numpy as np
 
 from nerg_mi.errors import plain
-from nerg_mi.field.splats import Splats, logits_of, opacities_of, scales_of
+from nerg_mi.fields.splats import Splats, logits_of, opacities_of, scales_of
 from nerg_mi.files.bounded import open_file, read_bytes, reading
 from nerg_mi.formats.ply import parse_ply, write_columns
 from nerg_mi.maths.sphere import DEGREES

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.field.splats import Splats, from_trained, logits_of
+from nerg_mi.fields.splats import Splats, from_trained, logits_of
 from nerg_mi.files.bounded import open_file, reading
 from nerg_mi.files.inflating import open_gzip
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.field.radiance import RadianceField
-from nerg_mi.field.splats import Splats, harmonics_of, quaternions_of
+from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.splats import Splats, harmonics_of, quaternions_of
 from nerg_mi.formats.surfaces import points
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.trace import trace_depth

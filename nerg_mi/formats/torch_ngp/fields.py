@@ -14,11 +14,9 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.encoding.protocol import Encoding
-from nerg_mi.field.mlp import MLP
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import Encoding, HashGridConfig
+from nerg_mi.fields.mlp import MLP
+from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.formats.architecture import building, check_sizes
 from nerg_mi.maths.geometry import Box
 

@@ -9,9 +9,9 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.field.mlp import MLP
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.mlp import MLP
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.bounded import plain
 from nerg_mi.formats.architecture import building, check_sizes
 from nerg_mi.maths.geometry import Box

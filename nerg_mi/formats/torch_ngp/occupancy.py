@@ -7,8 +7,7 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.cascades import CascadeGrid, levels_of
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, levels_of
 
 from .state_dict import StateDict
 

@@ -12,8 +12,8 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
-from nerg_mi.field.mlp import MLP
+from nerg_mi.fields.encoding import HashGrid, HashGridConfig
+from nerg_mi.fields.mlp import MLP
 
 from .unpickling import StoredTensor, read_torch
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import namespace
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rendering.asked import is_nerg

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.splats import Splats
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.fields.splats import Splats
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.splats.files import read_splats

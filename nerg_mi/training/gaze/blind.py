@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.log_density import blind_table, table_directions
+from nerg_mi.fields.gaze_log_density import blind_table, table_directions
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.probes.kde import SphericalKde
@@ -39,8 +39,8 @@ def check_kernels(rows: int, kappa: float) -> None:
 def blind_of_rays(
     rays: Rays, rows: int, place: GazePlace | None = None, seed: int = 0, weights: str = "equal", kappa: float = 10.0
 ) -> np.ndarray:
-    """``field.gaze.log_density.blind_table`` (rows, 2 rows) of where ``rays`` go, in the frame of ``place`` (None: that
-    of the rays). ``weights``: with ``person`` all people count alike, however many rays are theirs; ``kappa``:
+    """``fields.gaze_log_density.blind_table`` (rows, 2 rows) of where ``rays`` go, in the frame of ``place`` (None:
+    that of the rays). ``weights``: with ``person`` all people count alike, however many rays are theirs; ``kappa``:
     concentration of the kernel of each ray; see `check_kernels`."""
     check_kernels(rows, kappa)
     which = np.random.default_rng(seed).permutation(len(rays))[:_MOST_RAYS]
@@ -52,7 +52,7 @@ def blind_of_rays(
 
 
 def blind_of_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
-    """``field.gaze.log_density.blind_table`` (rows, 2 rows) of what is looked at wherever the camera stands, of which
+    """``fields.gaze_log_density.blind_table`` (rows, 2 rows) of what is looked at wherever the camera stands, of which
     each of ``views`` shows a part.
 
     The density b of greatest likelihood when view v sees b given its part, found by Hunter's (2004) iteration for

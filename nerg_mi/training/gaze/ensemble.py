@@ -18,9 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.basis import basis_of
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
-from nerg_mi.field.gaze.protocol import AnyGazeField, GazeDensity
+from nerg_mi.fields.gaze_base import AnyGazeField, GazeDensity, basis_of
+from nerg_mi.fields.gaze_ensemble import GazeEnsemble
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.photos.salience import SalienceView

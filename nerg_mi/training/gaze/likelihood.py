@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.maths.geometry import AnyBox
 
 from .batches import Batch

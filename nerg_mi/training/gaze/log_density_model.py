@@ -7,11 +7,10 @@ from typing import Any
 
 import drjit as dr
 
-from nerg_mi.field.encoding.protocol import Encoding
-from nerg_mi.field.encoding.registry import encoding_of
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
-from nerg_mi.field.gaze.product import softplus
-from nerg_mi.field.mlp import MLP
+from nerg_mi.fields.encoding import Encoding, encoding_of
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.gaze_product import softplus
+from nerg_mi.fields.mlp import MLP
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.training.radiance.model import stack
 

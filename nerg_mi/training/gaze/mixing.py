@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.interruption import Interruption
 from nerg_mi.probes.probes import Probes, calibrated_levels, region_levels
 from nerg_mi.rays.rays import Rays

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from nerg_mi.field.gaze.protocol import GazeFieldConfig
+from nerg_mi.fields.gaze_base import GazeFieldConfig
 from nerg_mi.training.geometry.places import GazePlace
 
 from .settings import GazeSettings, ProbeSettings

@@ -11,8 +11,8 @@ from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField, blind_table, table_directions
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField, blind_table, table_directions
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.vmf import log_normaliser

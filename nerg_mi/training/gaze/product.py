@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.gaze.product import GazeField
+from nerg_mi.fields.gaze_product import GazeField
 
 from .batches import Batch
 from .losses import gaze_loss

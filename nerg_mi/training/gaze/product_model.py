@@ -10,10 +10,9 @@ from typing import Any
 
 import drjit as dr
 
-from nerg_mi.field.encoding.harmonics import encode_direction
-from nerg_mi.field.encoding.registry import encoding_of
-from nerg_mi.field.gaze.product import GazeConfig, activate
-from nerg_mi.field.mlp import MLP
+from nerg_mi.fields.encoding import encode_direction, encoding_of
+from nerg_mi.fields.gaze_product import GazeConfig, activate
+from nerg_mi.fields.mlp import MLP
 from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.training.radiance.model import stack, unstack

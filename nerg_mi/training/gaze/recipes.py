@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypedDict
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.log_density import LogGazeConfig
-from nerg_mi.field.gaze.product import GazeConfig
-from nerg_mi.field.gaze.protocol import GazeFieldConfig
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_base import GazeFieldConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig
+from nerg_mi.fields.gaze_product import GazeConfig
 from nerg_mi.training.geometry.places import GazePlace
 
 from .likelihood import LikelihoodTrainer
@@ -31,13 +31,13 @@ class FieldChoices:
 
     # "emit", "capture" or "emit_capture"; "": one of `default_variants`.
     variant: str = ""
-    # Of the emit head (`field.gaze.product.ACTIVATIONS`); None: the recipe's.
+    # Of the emit head (`fields.gaze_product.ACTIVATIONS`); None: the recipe's.
     activation: str | None = None
     # Of the networks (`sizes.SIZES`); None: the recipe's.
     size: str | None = None
     # Whether the density is divided by its integral over the sphere.
     normalized: bool = False
-    # Features of a radiance field that emit is given (`field.gaze.product.SEMANTICS`); "": none.
+    # Features of a radiance field that emit is given (`fields.gaze_product.SEMANTICS`); "": none.
     semantic: str = ""
     # Whether emit has the field's own features besides.
     semantic_own: bool = False

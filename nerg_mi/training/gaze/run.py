@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.field.gaze.basis import basis_of
-from nerg_mi.field.gaze.protocol import GazeDensity
+from nerg_mi.fields.gaze_base import GazeDensity, basis_of
 from nerg_mi.training.common.run_state import kept_unless
 from nerg_mi.training.geometry.places import GazePlace
 

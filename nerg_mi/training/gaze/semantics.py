@@ -14,8 +14,8 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.product import GazeConfig
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.gaze_product import GazeConfig
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.transport.features import accumulated, snapshot
 from nerg_mi.transport.media.field import FieldMedium

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.product import GazeConfig
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_product import GazeConfig
 
 # (levels, log2 rows, base and finest resolution, width, geometry features). "paper" has the paper's sizes, 10.6 million
 # entries; "small" is what generalises to positions that nobody trained on, and stores in 0.4 MB as fp16.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerg_mi.field.gaze.support import RaySupport
+from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry.places import GazePlace

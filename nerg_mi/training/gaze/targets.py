@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.field.gaze.protocol import GazeFieldConfig
+from nerg_mi.fields.gaze_base import GazeFieldConfig
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.training.geometry.surfaces import surface_distances
 
@@ -23,7 +23,7 @@ from .semantics import semantic_features
 class TargetNeeds:
     """What a kind of gaze field is shown besides directions, densities and distances."""
 
-    # Features of a radiance field (`field.gaze.product.SEMANTICS`); "": none.
+    # Features of a radiance field (`fields.gaze_product.SEMANTICS`); "": none.
     semantic: str = ""
     # Whether directions that meet no surface end at the depth of those around them, not on the box.
     fill: bool = False
@@ -52,7 +52,7 @@ class Targets:
     escaped: np.ndarray
     # Features (P, D, F) of a radiance field, float16, for a gaze field that wants them.
     semantic: np.ndarray | None = None
-    # Table of the log of the density of all rays whatever their position (`field.gaze.log_density.blind_table`).
+    # Table of the log of the density of all rays whatever their position (`fields.gaze_log_density.blind_table`).
     blind: np.ndarray | None = None
     # The same observers in other directions, for the epoch that is given, where each epoch has its own.
     renew: Callable[[int], Targets] | None = None

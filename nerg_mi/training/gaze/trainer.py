@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 from drjit.opt import AdamW
 
-from nerg_mi.field.gaze.protocol import GazeDensity
+from nerg_mi.fields.gaze_base import GazeDensity
 from nerg_mi.maths.geometry import AnyBox
 
 from .batches import Batch, TargetArrays

@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.protocol import GazeFieldConfig
+from nerg_mi.fields.gaze_base import GazeFieldConfig
 from nerg_mi.training.geometry.places import GazePlace
 
 from .fit import GazeProgress, Listener

@@ -10,9 +10,8 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import aligned
-from nerg_mi.field.cascades import CascadeGrid, contracted_cascades
-from nerg_mi.field.occupancy import OccupancyGrid, grown
+from nerg_mi.fields.mlp import aligned
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, contracted_cascades, grown
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f, UInt32
 from nerg_mi.photos.cameras import Camera, view_tangents

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.maths.color import psnr, psnr_of_fitted_half
 from nerg_mi.photos.images import View
 

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import drjit as dr
 
-from nerg_mi.field.color_head import mean_features, network_color, network_inputs, point_features
-from nerg_mi.field.encoding.harmonics import encode_direction
-from nerg_mi.field.encoding.registry import encoding_of
-from nerg_mi.field.mlp import MLP
-from nerg_mi.field.radiance import RadianceConfig, density_from_log
+from nerg_mi.fields.encoding import encode_direction, encoding_of
+from nerg_mi.fields.mlp import MLP
+from nerg_mi.fields.radiance import (
+    RadianceConfig,
+    density_from_log,
+    mean_features,
+    network_color,
+    network_inputs,
+    point_features,
+)
 from nerg_mi.maths.geometry import AnyBox
 
 

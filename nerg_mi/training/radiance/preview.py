@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.color_head import mean_features
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceField, mean_features
 from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.images import View
 from nerg_mi.transport.march.quadrature import mean_depth_share

@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.figures.provenance import provenance
 from nerg_mi.files.png import write_png
 from nerg_mi.interruption import Interruption

@@ -14,7 +14,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import aligned, namespace
+from nerg_mi.fields.mlp import aligned, namespace
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.transport.march.quadrature import absorbed_share

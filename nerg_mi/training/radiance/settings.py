@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.radiance import RadianceConfig
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.radiance import RadianceConfig
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.ranges import LEARNING_RATES, LOSS_WEIGHTS, MINUTES, SEEDS, STEPS, Checked, Range, ranged
 

@@ -15,10 +15,10 @@ import numpy as np
 from drjit.opt import Adam
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import aligned
-from nerg_mi.field.encoding.registry import encoding_of
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.field.refinement import refine
+from nerg_mi.fields.encoding import encoding_of
+from nerg_mi.fields.mlp import aligned
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.refinement import refine
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Float, UInt32
 from nerg_mi.photos.images import View

@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.maths.types import Float
 
 from .local_ray import LocalRay

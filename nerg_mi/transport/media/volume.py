@@ -8,8 +8,8 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.maths.geometry import intersect_box
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
 from nerg_mi.transport.fingerprint import Fingerprint

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.gaze.ensemble import mean, spread
-from nerg_mi.field.gaze.protocol import AnyGazeField, GazeDensity
+from nerg_mi.fields.gaze_base import AnyGazeField, GazeDensity
+from nerg_mi.fields.gaze_ensemble import mean, spread
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.transport.features import observed_features

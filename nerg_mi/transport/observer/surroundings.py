@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.sphere import fibonacci_vectors, neighbourly_order
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f

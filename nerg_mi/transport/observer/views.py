@@ -7,7 +7,7 @@ from typing import Protocol
 import drjit as dr
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.support import RaySupport
+from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Float, Point3f, Vector3f
 from nerg_mi.transport.freezing import recording
@@ -52,7 +52,7 @@ def view_along(
 
 
 class SupportView:
-    """How many training rays started around an observer (``field.gaze.support``): one number each."""
+    """How many training rays started around an observer (``fields.gaze_base``): one number each."""
 
     occluded = False
 

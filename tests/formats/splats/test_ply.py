@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.splats import Splats
+from nerg_mi.fields.splats import Splats
 from nerg_mi.formats import ply as ply_tables
 from nerg_mi.formats.ply import parse_ply, write_columns
 from nerg_mi.formats.splats.ply import read_ply_splats, write_ply_splats

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.field.splats import Splats
+from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.gltf import pack_glb
 
 C0 = 0.28209479177387814

@@ -5,8 +5,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_radiance, save_radiance
 from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp, write_torch_ngp
 from nerg_mi.formats.torch_ngp.pickling import write_torch

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.cascades import CascadeGrid
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
 from nerg_mi.formats.torch_ngp.fields import read_torch_ngp
 from nerg_mi.formats.torch_ngp.occupancy import bitfield, morton_order
 from tests.formats.torch_ngp.test_fields import save

@@ -5,9 +5,9 @@ from __future__ import annotations
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.log_density import LogGazeConfig
-from nerg_mi.field.gaze.product import GazeConfig
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig
+from nerg_mi.fields.gaze_product import GazeConfig
 from nerg_mi.maths.geometry import Box
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer

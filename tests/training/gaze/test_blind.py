@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.gaze.log_density import look_up, table_directions
+from nerg_mi.fields.gaze_log_density import look_up, table_directions
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.photos.salience import pixel_solid_angles

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.basis import Basis
+from nerg_mi.fields.gaze_base import Basis
 from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays

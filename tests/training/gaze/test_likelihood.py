@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation import saliency as metrics
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.gaze.log_density import blind_table
+from nerg_mi.fields.gaze_log_density import blind_table
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer, log_mean_exp
 from nerg_mi.training.gaze.losses import KLD_EPS
 from nerg_mi.training.gaze.settings import LOSSES, GazeSettings
 from nerg_mi.training.gaze.targets import Targets
-from tests.field.gaze.test_log_density import BOX, SMALL, jit
+from tests.fields.gaze.test_log_density import BOX, SMALL, jit
 
 FAST = GazeSettings(
     steps=150,

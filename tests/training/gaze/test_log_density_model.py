@@ -8,9 +8,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.field.backend import namespace
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.training.gaze.log_density_model import log_gaze, used_parameters
-from tests.field.gaze.test_log_density import BOX, SMALL, jit, made, vectors
+from tests.fields.gaze.test_log_density import BOX, SMALL, jit, made, vectors
 
 
 @pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])

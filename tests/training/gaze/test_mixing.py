@@ -93,7 +93,7 @@ def test03_divergence_of_densities():
 def test04_a_field_counts_where_position_tells(law, kept, rgb):
     """Where all look at one point the field stays as it is; where each person has a way of their own, position tells
     nothing of others."""
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
 
     ns = namespace(rgb.Float(0))
     told = []
@@ -107,7 +107,7 @@ def test04_a_field_counts_where_position_tells(law, kept, rgb):
 
 
 def test05_of_a_training_and_of_an_ensemble(rgb):
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
 
     ns, rays = namespace(rgb.Float(0)), people(0.0)
     plan = plan_of(steps=20)

@@ -8,8 +8,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.gaze.product import GazeField
+from nerg_mi.fields.gaze_product import GazeField
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.training.gaze.product_model import gaze_density, used_parameters
 
 from .looks import BOX, SMALL

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.log_density import LogGazeConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer
 from nerg_mi.training.gaze.product import ProductTrainer
 from nerg_mi.training.gaze.recipes import DEFAULT, RECIPES, FieldChoices, Recipe, gaze_recipe, register

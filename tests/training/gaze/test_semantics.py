@@ -8,10 +8,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.product import GazeField
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_product import GazeField
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.maths.geometry import Box
 from nerg_mi.rays.rays import Rays

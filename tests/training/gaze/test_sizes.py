@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.training.gaze.sizes import sized_gaze_config
 
 from .looks import BOX

@@ -55,7 +55,7 @@ def test01_the_first_counts_unless_another_is_better_by_half_a_standard_error():
 def test02_what_foretells_those_who_are_held_out_is_trained(rgb):
     """A direction that all people share wherever they stand is in the blind density; one point that all look at, in
     the middle of a floor, needs emit where capture has one harmonic."""
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
 
     ns, told = namespace(rgb.Float(0)), []
     flat = replace(CAPTURE, sh_degree=1)
@@ -72,7 +72,7 @@ def test02_what_foretells_those_who_are_held_out_is_trained(rgb):
 
 
 def test03_nothing_is_chosen_without_folds_or_others(rgb):
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
 
     ns, supervision = namespace(rgb.Float(0)), Supervision(people(1.0, each=40))
     for plan in (two(mix_folds=0), replace(two(), alternatives=())):
@@ -83,7 +83,7 @@ def test03_nothing_is_chosen_without_folds_or_others(rgb):
 
 @pytest.mark.parametrize("members", [0, 2])
 def test04_a_run_that_goes_on_keeps_what_was_chosen(members, tmp_path, rgb, monkeypatch):
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
 
     ns, supervision = namespace(rgb.Float(0)), Supervision(people(1.0))
     path, plan, steps = tmp_path / "a.run", two(steps=8), []
@@ -120,7 +120,7 @@ def test04_a_run_that_goes_on_keeps_what_was_chosen(members, tmp_path, rgb, monk
 
 
 def test05_ctrl_c_while_folds_choose_says_that_nothing_was_kept(rgb):
-    from nerg_mi.field.backend import namespace
+    from nerg_mi.fields.mlp import namespace
 
     def stop(progress):
         if progress.stage.startswith("fold"):

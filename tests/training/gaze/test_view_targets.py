@@ -17,7 +17,7 @@ from nerg_mi.training.gaze.supervision import Supervision
 from nerg_mi.training.gaze.targets import TargetNeeds, Targets, concatenate
 from nerg_mi.training.gaze.view_targets import targets_of_views
 from nerg_mi.training.geometry.places import GazePlace
-from tests.field.gaze.test_log_density import BOX, SMALL
+from tests.fields.gaze.test_log_density import BOX, SMALL
 
 from .looks import SMALL as PLAIN
 from .looks import looking_at, train

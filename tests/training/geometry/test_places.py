@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.splats import Splats, joined
+from nerg_mi.fields.splats import Splats, joined
 from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.geometry import Box, Similarity

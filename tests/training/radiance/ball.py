@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.radiance import RadianceConfig
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.radiance import RadianceConfig
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
 from nerg_mi.photos.dataset import Dataset

@@ -7,7 +7,7 @@ import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.training.radiance.model import density, density_of, density_summand, ray_color, stack, unstack
 
 from .ball import BOX, TINY

@@ -5,7 +5,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.radiance import RadianceConfig
+from nerg_mi.fields.radiance import RadianceConfig
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
 from nerg_mi.photos.images import View

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.maths.geometry import ContractedBox
 from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 

@@ -7,7 +7,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.radiance import RadianceField
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.maths.geometry import Box
 from nerg_mi.training.radiance.compositing import damp_near, ray_sum
 from nerg_mi.training.radiance.held_out import measure

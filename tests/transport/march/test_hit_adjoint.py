@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.field.splats import matrices_of
+from nerg_mi.fields.splats import matrices_of
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.painting import ColorPainter

@@ -9,7 +9,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.quadrature import linear_crossing, linear_share
 from nerg_mi.transport.march.rules import RULES, boundaries, color_share
@@ -228,7 +228,7 @@ def test07_every_march_ends(kind):
     code = f"""
 import nerg_mi, numpy as np, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.local_ray import LocalRay

@@ -6,7 +6,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.march.stepping import advance, leap, step_length
 from nerg_mi.transport.media.cells import VoxelCells

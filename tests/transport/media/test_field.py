@@ -5,9 +5,9 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.occupancy import OccupancyGrid
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.occupancy import OccupancyGrid
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.settings import MarchSettings

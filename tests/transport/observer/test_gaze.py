@@ -10,10 +10,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from nerg_mi.field.backend import namespace
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.log_density import LogGazeField
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeField
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -25,7 +25,7 @@ from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.observer.sight import trace_sight
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
-from tests.field.gaze.test_log_density import BOX, SMALL
+from tests.fields.gaze.test_log_density import BOX, SMALL
 
 SETTINGS = ObserverSettings(march=MarchSettings(0.1))
 

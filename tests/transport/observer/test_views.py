@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.support import RaySupport
+from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.transport.observer.cache import ObserverCache
 from nerg_mi.transport.observer.views import SupportView, view_along

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.splats import Splats, matrices_of
+from nerg_mi.fields.splats import Splats, matrices_of
 from nerg_mi.maths.arrays import aligned
 from nerg_mi.maths.types import Bool, Color, Float, UInt32, Vector3f
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.field.splats import Splats, harmonics_of
+from nerg_mi.fields.splats import Splats, harmonics_of
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from nerg_mi.transport.media.splats.medium import SplatMedium

@@ -1,1 +1,0 @@
-"""What is at a point: encodings, radiance and gaze networks, occupancy. Knows no rays, files or scenes."""

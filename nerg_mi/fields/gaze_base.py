@@ -1,0 +1,349 @@
+"""What gaze fields have in common: the protocol, the registry of their kinds, the basis of lobes, and where
+training data supports them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, ClassVar, Protocol, TypeVar
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.errors import plain
+from nerg_mi.maths.geometry import AnyBox
+from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
+from nerg_mi.ranges import FARTHEST
+
+from .encoding import Encoding, EncodingConfig
+from .mlp import MLP
+
+# ---- Basis ----
+#
+# What a picture of gaze rests on: how many rays, of how many people.
+
+
+_MOST = 1 << 60
+
+
+@dataclass(frozen=True)
+class Basis:
+    """``rays`` of ``people`` (None: not known), and ``images`` of salience, that a gaze field learnt from, or of which
+    a density is made."""
+
+    rays: int
+    people: int | None = None
+    images: int = 0
+
+    def words(self) -> str:
+        """All of it in words, such as "81,751 rays of 80 people"; "" for nothing."""
+        rays = _count(self.rays, "ray", "rays")
+        if rays and self.people:
+            rays += " of " + _count(self.people, "person", "people")
+        return " and ".join(filter(None, [rays, _count(self.images, "salience image", "salience images")]))
+
+
+def basis_of(provenance: Mapping[str, Any]) -> Basis | None:
+    """That of a checkpoint's ``provenance``; None where it does not tell, as other programs' checkpoints do not."""
+    rays, people, images = (_number(provenance.get(name)) for name in ("rays", "people", "salience_views"))
+    return Basis(rays or 0, people or None, images or 0) if rays or images else None
+
+
+def _number(value: object) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < _MOST else None
+
+
+def _count(number: int, one: str, several: str) -> str:
+    return f"{number:,} {one if number == 1 else several}" if number else ""
+
+
+# ---- Support ----
+#
+# How much data a gaze field rests on around a position: where the rays that it learnt from started, in a few
+# kilobytes.
+#
+# Support at p is the sum over rays of Epanechnikov's kernel, Σ_i max(0, 1 - |o_i - p|² / (5R)²), R the radius of a
+# probe: a ray that started at p counts as one, a ray 5R away not at all. A field knows more than its probes: kernels of
+# R are zero wherever a field is asked for what it was not shown, where its error grows with the distance still. How
+# well those of 5 R rank the errors: docs/gaze-evaluation.md.
+#
+# Rays are kept as cells of R/2 with their number, mean origin and variance. The sum over a cell within reach follows
+# from these exactly. In one that the reach cuts, the squared distances are taken to be spread uniformly.
+
+
+CELLS = 2
+"""Cells along R."""
+REACH = 5.0
+"""Radii R from which a ray still counts."""
+
+# Cells that are looked at for the one with the greatest support.
+_DENSE = 64
+
+
+class RaySupport:
+    """``cells`` (n, 5): mean origin (3), number of rays, and their mean squared distance from that; ``radius``: R. Both
+    in one frame. ``reach``: how far away a ray still counts."""
+
+    def __init__(self, cells: np.ndarray, radius: float):
+        self.cells, self.radius = np.ascontiguousarray(cells, np.float32).reshape(-1, 5), float(radius)
+        self.reach = REACH * self.radius
+        if not np.all(np.isfinite(self.cells)) or not 0 < self.radius <= FARTHEST:
+            raise ValueError(f"the support of a gaze field needs finite cells and a positive radius, got {self.radius}")
+
+    @staticmethod
+    def of(origins: np.ndarray, radius: float) -> RaySupport:
+        """That of rays from ``origins`` (N, 3), for probes of ``radius``."""
+        origins = np.asarray(origins, np.float64).reshape(-1, 3)
+        lower = origins.min(axis=0)
+        index = np.floor((origins - lower) * (CELLS / radius)).astype(np.int64)
+        _, cell, count = np.unique(
+            np.ravel_multi_index(index.T, index.max(axis=0) + 1), return_inverse=True, return_counts=True
+        )
+        mean = np.stack([np.bincount(cell, weights=x) for x in origins.T], axis=1) / count[:, None]
+        apart = np.bincount(cell, weights=((origins - mean[cell]) ** 2).sum(axis=1)) / count
+        return RaySupport(np.concatenate([mean, count[:, None], apart[:, None]], axis=1), radius)
+
+    def at(self, p):
+        """Support at ``p`` (Array3f or Point3f of one lane), a Float of one lane: rays that count, without
+        derivatives."""
+        Float: Any = dr.float32_array_t(type(p.x))
+        p = dr.detach(p)
+        x, y, z, count, apart = (Float(np.ascontiguousarray(column)) for column in self.cells.T)
+        square = dr.square(x - p.x) + dr.square(y - p.y) + dr.square(z - p.z)
+        scale = 1 / self.reach**2
+        inside = 1 - (square + apart) * scale
+        # Half the width of a uniform law with the variance of |o - p|² in a cell whose rays spread alike in all
+        # directions.
+        reach = dr.sqrt(4 * square * apart) * scale + 1e-9
+        cut = dr.square(dr.maximum(inside + reach, 0)) / (4 * reach)
+        return dr.sum(count * dr.select(inside > reach, inside, cut))
+
+    def densest(self) -> np.ndarray:
+        """Where most rays started (3,) float64, by kernels of R: of the mean origins of the cells with most rays; of
+        equal ones the first."""
+        cells = self.cells.astype(np.float64)
+        best = cells[np.argsort(-cells[:, 3], kind="stable")[:_DENSE], :3]
+        square = ((best[:, None] - cells[None, :, :3]) ** 2).sum(axis=-1) + cells[:, 4]
+        return best[np.argmax((np.maximum(1 - square / self.radius**2, 0) * cells[:, 3]).sum(axis=1))]
+
+
+# ---- What every gaze field answers, whatever it is made of ----
+#
+# A gaze field is a density over the directions around an observer (1/sr): a product of two factors (``product``), a
+# normalised log density (``log_density``), or any other class that fulfils ``GazeDensity`` and is registered
+# (``registry``); or the mean of several of these (``ensemble``). Nothing outside of this package asks which of them it
+# has.
+#
+# Positions and directions are Dr.Jit 3-arrays of the field's backend, in the field's own frame and units; directions
+# are unit vectors, and ``r_o`` points from the observer to the surface. Densities do not change with scale.
+
+
+class GazeFieldConfig(Protocol):
+    """Sizes and conventions of a gaze field: a frozen dataclass that a checkpoint keeps as JSON."""
+
+    kind: ClassVar[str]
+    """The name under which a checkpoint knows the field's class."""
+
+    @property
+    def variant(self) -> str:
+        """``emit``, ``capture`` or ``emit_capture``: which of the two factors there are."""
+        ...
+
+    @property
+    def activation(self) -> str:
+        """What the network's output goes through to become a density; for people, not for code."""
+        ...
+
+    @property
+    def normalized(self) -> bool:
+        """Whether ``evaluate`` divides by the integral over the observer's sphere, which it then must be given."""
+        ...
+
+    @property
+    def semantic(self) -> str:
+        """Which features of a radiance field emit takes: ``accumulated``, ``snapshot`` or none ("")."""
+        ...
+
+    @property
+    def features(self) -> int:
+        """How many such features of a point; 0 without."""
+        ...
+
+    @property
+    def prior(self) -> int:
+        """Rows of the table of the density that does not depend on the position; 0 for a field that has none."""
+        ...
+
+    @property
+    def needs_surfaces(self) -> bool:
+        """Whether it matters where the observer's rays meet a surface."""
+        ...
+
+    @property
+    def fills_escaped(self) -> bool:
+        """Whether a direction in which no surface is met takes the depth of the nearest ones that do; otherwise it ends
+        on the field's box."""
+        ...
+
+    def conventions(self) -> tuple:
+        """What fields must have in common for their densities to be averaged."""
+        ...
+
+    def to_dict(self) -> dict:
+        """As JSON; with ``kind`` unless that is ``product``, which older checkpoints do not name."""
+        ...
+
+
+LARGEST = 1e6
+"""No stored weight is larger; products of a network's layers then stay in single precision."""
+
+
+class Arrays(Protocol):
+    """The arrays of a checkpoint, as a field's ``from_arrays`` asks for them. Every method raises ``ValueError`` for an
+    array that is not finite or does not have the shape, ``KeyError`` for one that is missing."""
+
+    ns: ModuleType
+
+    def array(self, name: str, *shape: int | None, largest: float = LARGEST) -> np.ndarray:
+        """The float32 array ``name`` of that ``shape`` (None: of any length), with no value beyond ``largest``."""
+        ...
+
+    def grid(self, config: EncodingConfig, name: str = "grid") -> Encoding:
+        """The encoding of ``config``."""
+        ...
+
+    def net(self, name: str, sizes: list[int], normalized: bool = False) -> MLP:
+        """The network whose layers have these ``sizes``; ``normalized``: with the gains and shifts of LayerNorm."""
+        ...
+
+    def member(self, index: int, about: dict) -> tuple[dict, Arrays]:
+        """The checked architecture and the arrays of the member ``index`` of an ensemble."""
+        ...
+
+
+class AnyGazeField(Protocol):
+    """A gaze field on one backend: one density or the mean of several, which are its ``members``."""
+
+    kind: ClassVar[str]
+    support: RaySupport | None
+    """How many rays it learnt from around a position, where that is known."""
+    basis: Basis | None
+    """How many rays and people it learnt from in all, where that is known."""
+
+    @property
+    def config(self) -> GazeFieldConfig:
+        """Sizes and conventions."""
+        ...
+
+    @property
+    def box(self) -> AnyBox:
+        """Where the field lives; positions outside of it are the encoding's to deal with."""
+        ...
+
+    @property
+    def ns(self) -> ModuleType:
+        """Array types of the field's backend (``fields.mlp.namespace``)."""
+        ...
+
+    @property
+    def members(self) -> Sequence[GazeDensity]:
+        """The densities whose mean it is; itself alone where it is one."""
+        ...
+
+    @property
+    def networks(self) -> int:
+        """Networks that one evaluation of gaze evaluates."""
+        ...
+
+    @property
+    def mlps(self) -> list[MLP]:
+        """All of its networks, those of all members."""
+        ...
+
+    def architecture(self) -> dict:
+        """What ``from_arrays`` needs besides the arrays (JSON)."""
+        ...
+
+    @classmethod
+    def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
+        """The field of ``architecture() == about`` with the ``arrays`` of a checkpoint."""
+        ...
+
+    def parameters(self) -> dict:
+        """Arrays that gaze depends on, by the names that checkpoints and ``mi.traverse`` give them."""
+        ...
+
+    def set_parameters(self, values: dict) -> None:
+        """Replace arrays by name (any subset of ``parameters()``)."""
+        ...
+
+    def pack(self) -> None:
+        """Refresh what the kernels read; call after any change of the weights."""
+        ...
+
+
+class GazeDensity(AnyGazeField, Protocol):
+    """A gaze field that is one density."""
+
+    def unnormalized(
+        self,
+        p_od: Point3f,
+        p_o: Point3f,
+        r_o: Vector3f,
+        active: Bool = True,
+        semantic: list[Float] | None = None,
+        escaped: Bool = False,
+    ) -> tuple[Float, Float]:
+        """``(emit, capture)``, whose product a normalised field divides by its integral. A variant that lacks a factor
+        has 1 in its place and does not evaluate it.
+
+        ``semantic``: ``config.features`` Floats where the configuration asks for them, else None; ``escaped``: mask of
+        directions in which no surface is met. Differentiable in the parameters, positions and directions.
+        """
+        ...
+
+    def evaluate(
+        self,
+        p_od: Point3f,
+        p_o: Point3f,
+        r_o: Vector3f,
+        active: Bool = True,
+        semantic: list[Float] | None = None,
+        integral: Float | None = None,
+        escaped: Bool = False,
+    ) -> tuple[Float, Float, Float]:
+        """``(gaze, emit, capture)`` in 1/sr of the observer at ``p_o`` attending ``p_od`` along ``r_o``.
+
+        ``integral``: of a normalised field over the sphere at ``p_o``, by which ``emit`` is divided (``ValueError``
+        without it); the others as for ``unnormalized``.
+        """
+        ...
+
+
+# ---- The kinds of gaze fields by the names that checkpoints give them ----
+
+Kind = TypeVar("Kind", bound=type[AnyGazeField])
+
+_KINDS: dict[str, type[AnyGazeField]] = {}
+
+
+def register(cls: Kind) -> Kind:
+    """Have checkpoints of the kind ``cls.kind`` read by the class ``cls`` (a decorator)."""
+    _KINDS[cls.kind] = cls
+    return cls
+
+
+def kinds() -> tuple[str, ...]:
+    """The names that are registered."""
+    return tuple(_KINDS)
+
+
+def build(about: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
+    """The gaze field that a checkpoint describes by ``about``, of its ``arrays``. Raises ``ValueError`` for a kind that
+    is not registered."""
+    # Checkpoints of the first version name no kind: there was one.
+    kind = about.get("kind", "product")
+    if kind not in _KINDS:
+        raise ValueError(f'it is a gaze field of the kind "{plain(kind, 40)}", which this version does not know')
+    return _KINDS[kind].from_arrays(about, box, arrays)

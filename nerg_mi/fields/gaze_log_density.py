@@ -1,0 +1,328 @@
+"""The gaze field as a log density that is normalised over the observer's sphere.
+
+gaze(p_o, r_o) = (1 - m) emit(p_od, -r_o, log |p_od - p_o|) * sigmoid(F_c(p_o, r_o)) * blind(r_o) / Z(p_o) + m
+blind(r_o)
+
+Z(p_o) is the integral of the product over all directions, so that gaze integrates to one whatever the weights are: a
+softmax over the sphere. ``blind`` is the density of where people look whatever their position; m its share. What the
+factors mean is as in :mod:`nerg_mi.fields.gaze_product`, but emit and capture have networks of their own: the one lives
+where the surfaces are, the other where people's heads were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from types import ModuleType
+from typing import ClassVar
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.maths.arrays import sigmoid, vector_of
+from nerg_mi.maths.geometry import AnyBox
+from nerg_mi.ranges import FARTHEST, LENGTHS
+
+from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, encoding_config, random_encoding
+from .gaze_base import Arrays, Basis, RaySupport, register
+from .gaze_product import VARIANTS
+from .mlp import MLP, namespace
+from .radiance import assign
+
+GEOMETRIES = ("surface", "none")
+ESCAPES = ("constant", "nearest")
+# Logits beyond this leave float32 as densities.
+_HIGHEST = 30.0
+# Logarithms of the blind density beyond this do so, too.
+_LARGEST_LOG = 80.0
+# A surface nearer than this share of the box counts as this far: the logarithm is an input of emit.
+_NEAREST = 1e-3
+# Of the blind density that is uniform, so that its logarithm is finite.
+_FLOOR = 1e-3
+
+
+@dataclass(frozen=True)
+class LogGazeConfig:
+    """Sizes and conventions."""
+
+    kind: ClassVar[str] = "log_density"
+    # Not to be chosen: what every gaze field answers (``gaze_base.GazeFieldConfig``).
+    activation = "log"
+    normalized = True
+    semantic = ""
+    features = 0
+
+    # Of emit, over the field's box; coarse levels generalise to positions where nobody stood.
+    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=3, log2_rows=14, base=2, finest=8))
+    # As in ``GazeConfig``.
+    variant: str = "emit_capture"
+    # Of both networks' hidden layers.
+    width: int = 64
+    # Hidden layers of both networks.
+    layers: int = 2
+    # Degrees of spherical harmonics of directions.
+    sh_degree: int = 4
+    # Corners of the box of observers that capture's encoding spans; positions beyond count as its nearest point.
+    heads: tuple = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    # The share m of the blind density.
+    mix: float = 0.0
+    # Rows of the blind density's latitude-longitude table.
+    prior: int = 64
+    # surface, or none where no geometry was known: p_od then is ``reach`` from p_o whatever is there.
+    geometry: str = "surface"
+    # What emit is where the observer meets no surface: a learnt constant, or (where the geometry has holes, as one made
+    # of hit points has) emit at the depth of the nearest directions that do.
+    escaped: str = "constant"
+    # Distance of p_od where no geometry was known, in the field's units.
+    reach: float = 2.0
+
+    def __post_init__(self):
+        object.__setattr__(self, "heads", tuple(tuple(float(x) for x in corner) for corner in self.heads))
+        for what, value, known in (
+            ("variant", self.variant, VARIANTS),
+            ("geometry", self.geometry, GEOMETRIES),
+            ("escaped", self.escaped, ESCAPES),
+        ):
+            if value not in known:
+                raise ValueError(f'"{what}" of a gaze field must be one of {", ".join(known)}, got "{value}"')
+        if min(self.width, self.layers, self.sh_degree) < 1 or self.prior < 2 or self.reach not in LENGTHS:
+            raise ValueError(f"every size of a gaze field must be positive, got {self}")
+        if not 0 <= self.mix <= 1:
+            raise ValueError(f"the share of the blind density must lie in [0, 1], got {self.mix}")
+        if np.shape(self.heads) != (2, 3) or not np.all(np.abs(self.heads) <= FARTHEST):
+            raise ValueError(f"the box of heads needs two finite corners, got {self.heads}")
+
+    @property
+    def needs_surfaces(self) -> bool:
+        """Whether it matters where the observer's rays meet a surface."""
+        return self.geometry != "none"
+
+    @property
+    def fills_escaped(self) -> bool:
+        """Whether what escapes takes the depth of the nearest directions that do not."""
+        return self.escaped == "nearest"
+
+    def conventions(self) -> tuple:
+        """What fields must have in common for their densities to be averaged."""
+        return self.kind, self.variant, self.geometry, self.escaped, self.reach
+
+    @property
+    def emit_sizes(self) -> list[int]:
+        return [self.grid.size + self.sh_degree**2 + 2, *[self.width] * self.layers, 1]
+
+    @property
+    def capture_sizes(self) -> list[int]:
+        return [9 + self.sh_degree**2 + 1, *[self.width] * self.layers, 1]
+
+    def to_dict(self) -> dict:
+        return {"kind": self.kind, **asdict(self), "grid": self.grid.to_dict()}
+
+    @staticmethod
+    def from_dict(d: dict) -> LogGazeConfig:
+        return LogGazeConfig(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": encoding_config(d["grid"])})
+
+
+@register
+class LogGazeField:
+    """A normalised gaze density. Positions are in the field's units inside ``box``; ``prior``: table (rows, 2 rows) of
+    the log of the blind density, rows from +z to -z, columns by azimuth, at texel centres."""
+
+    DRJIT_STRUCT: ClassVar[dict] = {"grid": None, "emit_net": None, "capture_net": None, "escaped": None, "prior": None}
+    _NETS = ("emit_net", "capture_net")
+    kind: ClassVar[str] = LogGazeConfig.kind
+
+    def __init__(
+        self, config: LogGazeConfig, box: AnyBox, grid: Encoding, emit_net: MLP, capture_net: MLP, escaped, prior
+    ):
+        grid.require(config.grid)
+        emit_net.require(config.emit_sizes, "emit_net")
+        capture_net.require(config.capture_sizes, "capture_net")
+        if tuple(prior.shape) != (config.prior, 2 * config.prior) or dr.width(escaped) != 1:
+            raise ValueError(
+                f"the blind density needs a table of {config.prior} x {2 * config.prior} and one escaped logit, "
+                f"got {tuple(prior.shape)} and {dr.width(escaped)}"
+            )
+        self.config, self.box, self.grid = config, box, grid
+        self.emit_net, self.capture_net, self.escaped, self.prior = emit_net, capture_net, escaped, prior
+        # How many rays it learnt from around a position, where that is known.
+        self.support: RaySupport | None = None
+        # How many rays and people it learnt from in all.
+        self.basis: Basis | None = None
+        self.pack()
+
+    @staticmethod
+    def random(
+        config: LogGazeConfig, box: AnyBox, ns: ModuleType, seed: int = 0, prior: np.ndarray | None = None
+    ) -> LogGazeField:
+        """An untrained field of backend ``ns``; equal seeds give equal weights. ``prior``: see ``blind_table``;
+        uniform."""
+        rng = np.random.default_rng(seed)
+        if prior is None:
+            prior = np.full((config.prior, 2 * config.prior), -np.log(4 * np.pi))
+        return LogGazeField(
+            config,
+            box,
+            random_encoding(config.grid, ns, rng),
+            MLP.random(config.emit_sizes, ns, rng),
+            MLP.random(config.capture_sizes, ns, rng),
+            ns.Float(0.0),
+            ns.TensorXf(np.asarray(prior, np.float32)),
+        )
+
+    @classmethod
+    def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> LogGazeField:
+        """The field of a checkpoint."""
+        config = LogGazeConfig.from_dict(about)
+        return cls(
+            config,
+            box,
+            arrays.grid(config.grid),
+            arrays.net("emit_net", config.emit_sizes),
+            arrays.net("capture_net", config.capture_sizes),
+            arrays.ns.Float(arrays.array("escaped", 1)),
+            arrays.ns.TensorXf(arrays.array("prior", config.prior, 2 * config.prior, largest=_LARGEST_LOG)),
+        )
+
+    def architecture(self) -> dict:
+        """What ``from_arrays`` needs besides the arrays."""
+        return self.config.to_dict()
+
+    @property
+    def members(self) -> list[LogGazeField]:
+        """The field alone."""
+        return [self]
+
+    @property
+    def networks(self) -> int:
+        """Networks that one evaluation of gaze evaluates: emit's, capture's, or both."""
+        return 2 if self.config.variant == "emit_capture" else 1
+
+    @property
+    def mlps(self) -> list[MLP]:
+        """All of its networks."""
+        return [getattr(self, name) for name in self._NETS]
+
+    def parameters(self) -> dict:
+        """Arrays by name, as checkpoints and ``mi.traverse`` spell them."""
+        out = {f"grid.{key}": value for key, value in self.grid.named().items()}
+        out |= {"escaped": self.escaped, "prior": self.prior}
+        for name in self._NETS:
+            out |= {f"{name}.{key}": value for key, value in getattr(self, name).named().items()}
+        return out
+
+    @property
+    def ns(self) -> ModuleType:
+        """Array types of the field's backend; see ``fields.mlp.namespace``."""
+        return namespace(self.escaped)
+
+    def set_parameters(self, values: dict) -> None:
+        """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
+        for name in ("escaped", "prior"):
+            if name in values:
+                setattr(self, name, values[name])
+        assign(self, {k: v for k, v in values.items() if k not in ("escaped", "prior")})
+        self.pack()
+
+    def pack(self) -> None:
+        """Refresh what the kernels read; call after any change of the weights."""
+        for name in ("grid", *self._NETS):
+            getattr(self, name).pack()
+
+    def emit_inputs(self, p_od, p_o, r_o, active=True) -> list:
+        """What emit's network is given (list of Floats): a bias, the log of the distance, the direction, the place."""
+        Float = type(p_od.x)
+        if self.config.geometry == "none":
+            p_od = p_o + r_o * self.config.reach
+        # The maximum before the logarithm: its derivative at zero would not be finite.
+        log_distance = 0.5 * dr.log(dr.maximum(dr.squared_norm(p_od - p_o), (_NEAREST * self.box.side) ** 2))
+        return [
+            Float(1),
+            log_distance,
+            *encode_direction(-r_o, self.config.sh_degree),
+            *self.grid(self.box.to_unit(p_od), active),
+        ]
+
+    def capture_position(self, p_o) -> list:
+        """What capture's network is given of the observer's position: coordinates in the box of heads and their first
+        waves."""
+        low, high = np.array(self.config.heads)
+        scale = 2 / max((high - low).max(), 1e-6)
+        u = [dr.clip((c - l) * scale - 1, -1, (h - l) * scale - 1) for c, l, h in zip(p_o, low.tolist(), high.tolist())]
+        return u + [f(c * (dr.pi / 2)) for f in (dr.sin, dr.cos) for c in u]
+
+    def capture_inputs(self, position: list, r_o) -> list:
+        """What capture's network is given, for ``capture_position`` and a direction."""
+        return [type(r_o.x)(1), *encode_direction(r_o, self.config.sh_degree), *position]
+
+    def log_blind(self, r_o):
+        """Log of the blind density (1/sr) in direction ``r_o``, interpolated in its table."""
+        return look_up(self.prior.array, self.config.prior, r_o)
+
+    def capture(self, p_o, r_o, active=True):
+        """sigmoid(F_c(p_o, r_o))."""
+        return sigmoid(self.capture_net(self.capture_inputs(self.capture_position(p_o), r_o))[0])
+
+    def unnormalized(self, p_od, p_o, r_o, active=True, semantic=None, escaped=False):
+        """``(emit * blind, capture)``: the product of both is what ``Z`` is the integral of. ``escaped``: mask of
+        directions in which no surface is met. There are no ``semantic`` features."""
+        c, one = self.config, type(p_od.x)(1)
+        logit = self.log_blind(r_o)
+        if c.variant != "capture":
+            emit = self.emit_net(self.emit_inputs(p_od, p_o, r_o, active))[0]
+            logit += emit if c.fills_escaped else dr.select(escaped, self.escaped, emit)
+        return dr.exp(dr.minimum(logit, _HIGHEST)), one if c.variant == "emit" else self.capture(p_o, r_o, active)
+
+    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
+        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr; ``escaped``
+        as for ``unnormalized``.
+
+        ``integral``: Z(p_o) (``transport.observer.gaze``); ``emit`` is divided by it and includes the blind
+        density, so that gaze = (1 - m) emit * capture + m blind. Raises ``ValueError`` without it.
+        """
+        if integral is None:
+            raise ValueError(
+                "this gaze field is normalised over the observer's sphere: evaluating it needs its integral there"
+            )
+        emit, capture = self.unnormalized(p_od, p_o, r_o, active, escaped=escaped)
+        emit = emit / integral
+        gaze = emit * capture
+        if self.config.mix:
+            gaze = (1 - self.config.mix) * gaze + self.config.mix * dr.exp(self.log_blind(r_o))
+        return gaze, emit, capture
+
+
+def look_up(table, rows: int, d):
+    """Bilinear value of a flat latitude-longitude ``table`` (rows x 2 rows, texel centres, +z first) in directions
+    ``d``."""
+    Float = type(d.x)
+    UInt32 = dr.uint32_array_t(Float)
+    step, columns = dr.pi / rows, 2 * rows
+    phi = dr.atan2(d.y, d.x)
+    x = dr.select(phi < 0, phi + dr.two_pi, phi) / step - 0.5
+    x = dr.select(x < 0, x + columns, x)
+    y = dr.clip(dr.atan2(dr.sqrt(d.x * d.x + d.y * d.y), d.z) / step - 0.5, 0, rows - 1)
+    i, j = dr.minimum(UInt32(x), columns - 1), dr.minimum(UInt32(y), rows - 2)
+    fx, fy = x - Float(i), y - Float(j)
+    k = dr.select(i + 1 < columns, i + 1, 0)
+    at = lambda column, row: dr.gather(Float, table, column + columns * row)
+    return dr.lerp(dr.lerp(at(i, j), at(k, j), fx), dr.lerp(at(i, j + 1), at(k, j + 1), fx), fy)
+
+
+def table_directions(rows: int) -> np.ndarray:
+    """Directions (2 rows², 3) of the texels that ``look_up`` interpolates."""
+    theta, phi = np.meshgrid(
+        (np.arange(rows) + 0.5) * np.pi / rows, (np.arange(2 * rows) + 0.5) * np.pi / rows, indexing="ij"
+    )
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
+
+
+def blind_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.ndarray) -> np.ndarray:
+    """Log table (rows, 2 rows) of a blind density given at ``table_directions(rows)``, 1/sr.
+
+    A thousandth of it is uniform. Scaled so that what ``look_up`` makes of it integrates to one over ``directions`` (N,
+    3), a fine set of equal area.
+    """
+    density = np.asarray(density, np.float64)
+    log = np.log((1 - _FLOOR) * density + _FLOOR / (4 * np.pi))
+    d = vector_of(ns.Array3f, directions)
+    found = np.asarray(dr.exp(look_up(ns.Float(log.astype(np.float32)), rows, d)), np.float64)
+    return (log - np.log(4 * np.pi * found.mean())).reshape(rows, 2 * rows).astype(np.float32)

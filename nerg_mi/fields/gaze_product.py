@@ -1,0 +1,298 @@
+"""The gaze field: how much a surface attracts, and how much an observer gives.
+
+Equation 1 of "Neural Radiance and Gaze Fields for Visual Attention Modeling in
+3D Environments": G(p_od, p_o) = F_e(p_od, -r_o) * sigmoid(F_c(p_o, r_o)), with
+r_o the unit direction from the observer p_o to the surface p_od that the
+observer sees. F_e and F_c share a trunk of the NeRF's shape (hash grid, two
+small networks) and differ in their last layer. G is a density over directions
+around the observer, in 1/sr.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from types import ModuleType
+from typing import ClassVar
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.maths.arrays import log1p, sigmoid
+from nerg_mi.maths.geometry import AnyBox
+
+from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, encoding_config, random_encoding
+from .gaze_base import Arrays, Basis, RaySupport, register
+from .mlp import MLP, namespace
+from .radiance import assign
+
+VARIANTS = ("emit", "capture", "emit_capture")
+ACTIVATIONS = ("softplus", "exp", "linear")
+TRUNKS = ("relu", "layernorm", "linear")
+SEMANTICS = ("", "accumulated", "snapshot")
+
+
+def softplus(x):
+    """log(1 + exp(x)) without overflow; the gradient is the sigmoid."""
+    # max(x, 0) + log(1 + exp(-|x|)), with a derivative of 1/2 at 0.
+    return 0.5 * (x + dr.abs(x)) + log1p(dr.exp(-dr.abs(x)))
+
+
+def activate(x, activation: str):
+    """The emit head's output, a density in 1/sr: non-negative unless ``activation`` is linear."""
+    if activation == "softplus":
+        return softplus(x)
+    if activation == "exp":
+        return dr.exp(dr.minimum(x, 30.0))
+    return x
+
+
+@dataclass(frozen=True)
+class GazeConfig:
+    """Variant, output activation and sizes. The defaults are the paper's (its NeRF's configuration).
+
+    With ``semantic`` emit is given the ``geometry`` features of a radiance field, ``accumulated`` along the observer's
+    ray by volume rendering or as a ``snapshot`` at p_od, in place of those of the field's own grid (the semantic
+    variants of the paper); with ``semantic_own`` too, the sum of both (its fine-tuned one). Capture has none.
+    """
+
+    kind: ClassVar[str] = "product"
+    # Not to be chosen: what every gaze field answers (``gaze_base.GazeFieldConfig``).
+    prior = 0
+    needs_surfaces = True
+    fills_escaped = False
+
+    # The encoding of positions, over the field's box.
+    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(finest=512))
+    # emit: of the surface alone; capture: of the observer alone, through a sigmoid; emit_capture: their product.
+    variant: str = "emit_capture"
+    # Of the emit head: softplus and exp give densities, linear is the paper's and may be negative.
+    activation: str = "softplus"
+    # Of the hidden layers.
+    width: int = 64
+    # Features that the position net hands to the direction net.
+    geometry: int = 15
+    # Degrees of spherical harmonics of directions.
+    sh_degree: int = 4
+    # Multiplies what emit returns: what the untrained field comes to, and what weight decay draws a field towards.
+    emit_scale: float = 1.0
+    # relu: a ReLU behind the direction net; layernorm: every layer's inputs normalised, biases, and a ReLU behind the
+    # position net too (what the paper's authors train by default); linear: a ReLU behind neither (their other choice).
+    trunk: str = "relu"
+    # Features of a radiance field that emit is given: accumulated, snapshot or none.
+    semantic: str = ""
+    # Added to the field's own features, in place of taking their place.
+    semantic_own: bool = False
+    # Divide by the integral over the observer's sphere, so that the density integrates to one whatever the weights are.
+    normalized: bool = False
+
+    def __post_init__(self):
+        if self.semantic not in SEMANTICS:
+            raise ValueError(
+                f"the semantics of a gaze field must be one of {', '.join(SEMANTICS[1:])} or none, "
+                f'got "{self.semantic}"'
+            )
+        if self.semantic and self.variant == "capture":
+            raise ValueError("a gaze field of the variant capture has no emit that semantic features could go to")
+        if self.semantic_own and not self.semantic:
+            raise ValueError("semantic_own adds a field's own features to semantic ones; say which those are")
+        if self.semantic and self.normalized:
+            raise ValueError(
+                "a gaze field with semantic features cannot be normalised over the sphere: their integral is not kept"
+            )
+        if self.trunk not in TRUNKS:
+            raise ValueError(f'the trunk of a gaze field must be one of {", ".join(TRUNKS)}, got "{self.trunk}"')
+        if not 0 < self.emit_scale < float("inf"):
+            raise ValueError(f"the scale of the emit head must be positive and finite, got {self.emit_scale}")
+        if self.variant not in VARIANTS:
+            raise ValueError(f'the gaze variant must be one of {", ".join(VARIANTS)}, got "{self.variant}"')
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(f'the activation must be one of {", ".join(ACTIVATIONS)}, got "{self.activation}"')
+        if min(self.width, self.geometry, self.sh_degree) < 1:
+            raise ValueError(f"every size of a gaze field must be at least 1, got {self}")
+
+    @property
+    def features(self) -> int:
+        """Features of a radiance field that emit is given; 0 without."""
+        return self.geometry if self.semantic else 0
+
+    def conventions(self) -> tuple:
+        """What fields must have in common for their densities to be averaged."""
+        return self.kind, self.variant, self.activation, self.normalized, self.semantic, self.geometry
+
+    @property
+    def position_sizes(self) -> list[int]:
+        return [self.grid.size, self.width, self.geometry]
+
+    @property
+    def direction_sizes(self) -> list[int]:
+        return [self.sh_degree**2 + self.geometry, self.width, self.width]
+
+    def to_dict(self) -> dict:
+        return {**asdict(self), "grid": self.grid.to_dict()}
+
+    @staticmethod
+    def from_dict(d: dict) -> GazeConfig:
+        named = {k: v for k, v in d.items() if k != "kind"}
+        return GazeConfig(**{**named, "grid": encoding_config(d["grid"])})
+
+
+@register
+class GazeField:
+    """Gaze density (1/sr) of an observer attending a surface.
+
+    Positions are in the field's units inside ``box`` (outside of it the grid's features are 0).
+    """
+
+    _NETS = ("position_net", "direction_net", "emit_head", "capture_head")
+    DRJIT_STRUCT: ClassVar[dict] = {"grid": None, **dict.fromkeys(_NETS)}
+    kind: ClassVar[str] = GazeConfig.kind
+
+    def __init__(
+        self,
+        config: GazeConfig,
+        box: AnyBox,
+        grid: Encoding,
+        position_net: MLP,
+        direction_net: MLP,
+        emit_head: MLP,
+        capture_head: MLP,
+    ):
+        grid.require(config.grid)
+        nets = (position_net, direction_net, emit_head, capture_head)
+        for net, (name, sizes) in zip(nets, self._sizes(config).items()):
+            net.require(sizes, name, self._is_normalized(config, name))
+        self.config, self.box, self.grid = config, box, grid
+        self.position_net, self.direction_net = position_net, direction_net
+        self.emit_head, self.capture_head = emit_head, capture_head
+        # How many rays it learnt from around a position, where that is known.
+        self.support: RaySupport | None = None
+        # How many rays and people it learnt from in all.
+        self.basis: Basis | None = None
+        self.pack()
+
+    @staticmethod
+    def _sizes(config: GazeConfig) -> dict[str, list[int]]:
+        """Sizes of the layers of each network."""
+        head = [config.width, 1]
+        return dict(zip(GazeField._NETS, (config.position_sizes, config.direction_sizes, head, head)))
+
+    @staticmethod
+    def _is_normalized(config: GazeConfig, name: str) -> bool:
+        return config.trunk == "layernorm" and not name.endswith("head")
+
+    @staticmethod
+    def random(config: GazeConfig, box: AnyBox, ns: ModuleType, seed: int = 0) -> GazeField:
+        """An untrained field of backend ``ns``; equal seeds give equal weights."""
+        rng = np.random.default_rng(seed)
+        grid = random_encoding(config.grid, ns, rng)
+        is_normalized = GazeField._is_normalized
+        nets = {
+            name: MLP.random(sizes, ns, rng, is_normalized(config, name))
+            for name, sizes in GazeField._sizes(config).items()
+        }
+        return GazeField(config, box, grid, **nets)
+
+    @classmethod
+    def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> GazeField:
+        """The field of a checkpoint."""
+        config = GazeConfig.from_dict(about)
+        nets = {
+            name: arrays.net(name, sizes, cls._is_normalized(config, name))
+            for name, sizes in cls._sizes(config).items()
+        }
+        return cls(config, box, arrays.grid(config.grid), **nets)
+
+    def architecture(self) -> dict:
+        """What ``from_arrays`` needs besides the arrays."""
+        return self.config.to_dict()
+
+    @property
+    def members(self) -> list[GazeField]:
+        """The field alone."""
+        return [self]
+
+    @property
+    def networks(self) -> int:
+        """Networks that one evaluation of gaze evaluates: emit's, capture's, or both."""
+        return 2 if self.config.variant == "emit_capture" else 1
+
+    @property
+    def mlps(self) -> list[MLP]:
+        """All of its networks."""
+        return [getattr(self, name) for name in self._NETS]
+
+    def parameters(self) -> dict:
+        """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
+        return {
+            f"{name}.{key}": value
+            for name in ("grid", *self._NETS)
+            for key, value in getattr(self, name).named().items()
+        }
+
+    @property
+    def ns(self) -> ModuleType:
+        """Array types of the field's backend; see ``fields.mlp.namespace``."""
+        return namespace(self.emit_head.weights[0])
+
+    def set_parameters(self, values: dict) -> None:
+        """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
+        assign(self, values)
+        self.pack()
+
+    def pack(self) -> None:
+        """Refresh what the kernels read; call after any change of the weights."""
+        for name in ("grid", *self._NETS):
+            getattr(self, name).pack()
+
+    def _trunk(self, p, d, active, semantic=None):
+        if semantic is not None and not self.config.semantic_own:
+            geometry = semantic
+        else:
+            geometry = self.position_net(self.grid(self.box.to_unit(p), active))
+            if self.config.trunk == "layernorm":
+                geometry = [dr.maximum(g, 0) for g in geometry]
+            if semantic is not None:
+                geometry = [g + s for g, s in zip(geometry, semantic)]
+        hidden = self.direction_net(encode_direction(d, self.config.sh_degree) + geometry)
+        return hidden if self.config.trunk == "linear" else [dr.maximum(h, 0) for h in hidden]
+
+    def emit(self, p_od, r_o, active=True, semantic=None):
+        """F_e(p_od, -r_o) after its activation, in 1/sr. ``r_o``: unit, from observer to surface. ``semantic``: list of
+        ``geometry`` features, for a field whose configuration asks for them."""
+        c = self.config
+        if (0 if semantic is None else len(semantic)) != c.features:
+            raise ValueError(
+                f"this gaze field takes {c.features or 'no'} semantic features, got "
+                f"{'none' if semantic is None else len(semantic)}"
+            )
+        return activate(self.emit_head(self._trunk(p_od, -r_o, active, semantic))[0], c.activation) * c.emit_scale
+
+    def capture(self, p_o, r_o, active=True):
+        """sigmoid(F_c(p_o, r_o)), the probability that what is emitted is perceived."""
+        return sigmoid(self.capture_head(self._trunk(p_o, r_o, active))[0])
+
+    def unnormalized(self, p_od, p_o, r_o, active=True, semantic=None, escaped=False):
+        """``(emit, capture)``, whose product a normalised field divides by its integral; ``escaped`` makes no
+        difference.
+
+        A variant that lacks a part has 1 in its place and does not evaluate it. ``semantic``: see ``emit``.
+        """
+        one = type(p_od.x)(1)
+        emit = one if self.config.variant == "capture" else self.emit(p_od, r_o, active, semantic)
+        return emit, one if self.config.variant == "emit" else self.capture(p_o, r_o, active)
+
+    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
+        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``; ``escaped`` makes
+        no difference.
+
+        ``semantic``: see ``emit``. ``integral``: of a normalised field over the sphere at ``p_o``
+        (``transport.observer.gaze``), by which ``emit`` is divided; ``ValueError`` without it.
+        """
+        emit, capture = self.unnormalized(p_od, p_o, r_o, active, semantic)
+        if self.config.normalized:
+            if integral is None:
+                raise ValueError(
+                    "this gaze field is normalised over the observer's sphere: evaluating it needs its integral there"
+                )
+            emit = emit / integral
+        return emit * capture, emit, capture

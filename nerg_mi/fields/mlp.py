@@ -1,0 +1,285 @@
+"""Multilayer perceptrons: by Dr.Jit's neural networks or unrolled with constant weights, and the backend of arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import ModuleType
+from typing import Any, ClassVar
+
+import drjit as dr
+import drjit.nn as nn
+import numpy as np
+
+from nerg_mi.errors import NergError
+
+# ---- The Dr.Jit array types of one backend ----
+#
+# A field belongs to one backend (LLVM or CUDA): its weights are arrays of that
+# backend. Nothing here depends on the Mitsuba variant in use, so that the code
+# survives a change of variant; the types derive from arguments.
+
+
+def namespace(source: str | dr.ArrayBase | type[dr.ArrayBase] | None) -> ModuleType:
+    """Module holding the differentiable array types of a backend.
+
+    ``source``: the name of a Mitsuba variant (``"llvm_ad_rgb"``; None, where none is active, is one that cannot be
+    used), ``"llvm"``, ``"cuda"``, or any JIT array or array type. Returns ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+    Raises ``NergError`` for scalar variants, which have no JIT arrays.
+    """
+    if source is None or isinstance(source, str):
+        name = source or "none"
+    else:
+        backend = dr.backend_v(source)
+        name = {dr.JitBackend.LLVM: "llvm", dr.JitBackend.CUDA: "cuda"}.get(backend, str(backend))
+    if name.startswith("llvm"):
+        import drjit.llvm.ad as ns
+    elif name.startswith("cuda"):
+        import drjit.cuda.ad as ns
+    else:
+        raise NergError(
+            f'fields need a JIT variant such as "llvm_ad_rgb" or "cuda_ad_rgb", not "{name}"; '
+            "select one with mi.set_variant()"
+        )
+    return ns
+
+
+def is_cuda(ns: ModuleType) -> bool:
+    """True when ``ns`` is the CUDA backend, where networks run in fp16."""
+    return ns.__name__.startswith("drjit.cuda")
+
+
+def aligned(array: np.ndarray, dtype: type = np.float32) -> np.ndarray:
+    """A copy of ``array``, of type ``dtype``, that begins at a multiple of 64 bytes.
+
+    Dr.Jit reads NumPy memory in place, and gathers several features in one load only from aligned memory. The alignment
+    is also part of a kernel: each combination of those of its inputs is compiled anew.
+    """
+    array = np.asarray(array, dtype)
+    memory = np.empty(array.nbytes + 64, np.uint8)
+    start = -memory.ctypes.data % 64
+    out = memory[start : start + array.nbytes].view(dtype).reshape(array.shape)
+    out[...] = array
+    return out
+
+
+# ---- A network whose weights are constants of the kernel that evaluates it ----
+#
+# Dr.Jit's cooperative vectors keep a layer's sums in memory while they read its weights, which on processors takes two
+# to three times as long as the products themselves. With the weights written into the kernel the sums stay in
+# registers. The products and their order are the same, and so are the results, to the bit. The price is compilation:
+# some seconds once for each kernel and each set of weights.
+
+
+_APART = 2048
+"""Products from which on a network becomes a function of its own within a kernel: compilers take more than
+proportionally long over long functions."""
+
+
+def evaluate(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
+    """Outputs (list of Floats) at ``x`` (list of Floats) of a ReLU network of ``layers``: weights [output][input]."""
+    if sum(len(layer) * len(layer[0]) for layer in layers) <= _APART:
+        return _unrolled(layers, x)
+    Float = type(x[0])
+    UInt32 = dr.uint32_array_t(Float)
+    which = UInt32(0)
+    # A function that is known to be the only one is inlined.
+    dr.make_opaque(which)
+    nothing = lambda *x: (Float(0),) * len(layers[-1])
+    return list(dr.switch(which, [lambda *x: tuple(_unrolled(layers, list(x))), nothing], *x))
+
+
+def _unrolled(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
+    for i, layer in enumerate(layers):
+        sums = []
+        for row in layer:
+            total = x[0] * row[0]
+            for value, weight in zip(x[1:], row[1:]):
+                total = dr.fma(value, weight, total)
+            sums.append(total if i + 1 == len(layers) else dr.maximum(total, 0))
+        x = sums
+    return x
+
+
+# ---- Small fully connected networks, evaluated inside kernels or as tensor products ----
+#
+# Two execution modes share one set of weights: cooperative vectors (one fused
+# kernel, best for rendering) and tensor products (``X @ W^T`` on whole batches,
+# whose weight gradient on the LLVM backend is several times cheaper than the
+# atomically accumulated outer products of cooperative vectors; best for training).
+
+
+# torch's LayerNorm (Ba et al. 2016) adds it to the variance.
+_NORM_EPSILON = 1e-5
+
+
+class MLP:
+    """ReLU network; the last layer is linear.
+
+    ``weights``: one TensorXf of shape (outputs, inputs) a layer, in fp32. On
+    CUDA the cooperative-vector path converts them to fp16, which the hardware's
+    matrix units require; on LLVM fp16 is slower than fp32 and is not used.
+
+    ``norms``: None, or for each layer ``{"gain", "shift", "bias"}``, TensorXf of shapes (inputs,), (inputs,)
+    and (outputs,): its inputs go through torch's LayerNorm (gain and shift included) first, and the bias is
+    added to what it returns. Raises ``ValueError`` for layers that do not fit together.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"weights": list, "norms": None, "_views": None, "buffer": None}
+
+    def __init__(self, weights: list, norms: list | None = None):
+        self.weights = list(weights)
+        self.norms: list[dict[str, Any]] | None = None if norms is None else [dict(n) for n in norms]
+        self._views: Any = None
+        # What the kernels read: the packed weights of all layers, attached to ``weights``.
+        self.buffer = None
+        # Whether they are constants of the kernels instead (``unrolled``), and these as numbers.
+        self.constant = False
+        self._constants: list[list[list[float]]] | None = None
+        for first, second in zip(self.weights, self.weights[1:]):
+            if first.shape[0] != second.shape[1]:
+                raise ValueError(
+                    f"layers of this network do not fit together: shapes {[w.shape for w in self.weights]}"
+                )
+        for w, norm in zip(self.weights, self.norms or []):
+            shapes = {k: tuple(v.shape) for k, v in norm.items()}
+            expected = {"gain": (w.shape[1],), "shift": (w.shape[1],), "bias": (w.shape[0],)}
+            if shapes != expected:
+                raise ValueError(f"a normalised layer of shape {w.shape} needs {expected}, got {shapes}")
+
+    @staticmethod
+    def random(sizes: list[int], ns: ModuleType, rng: np.random.Generator, normalized: bool = False) -> MLP:
+        """Kaiming-uniform weights (as torch's Linear) for layer ``sizes`` [inputs, ..., outputs]."""
+        weights, norms = [], []
+        for fan_in, fan_out in zip(sizes, sizes[1:]):
+            bound = 1 / np.sqrt(fan_in)
+            weights.append(ns.TensorXf(rng.uniform(-bound, bound, (fan_out, fan_in)).astype(np.float32)))
+            if normalized:
+                norms.append(
+                    {
+                        "gain": dr.ones(ns.TensorXf, (fan_in,)),
+                        "shift": dr.zeros(ns.TensorXf, (fan_in,)),
+                        "bias": ns.TensorXf(rng.uniform(-bound, bound, fan_out).astype(np.float32)),
+                    }
+                )
+        return MLP(weights, norms or None)
+
+    def require(self, sizes: list[int], name: str, normalized: bool = False) -> None:
+        """Raise ``ValueError`` unless the layers have ``sizes`` [inputs, ..., outputs] and are ``normalized`` or
+        not."""
+        shapes, expected = [tuple(w.shape) for w in self.weights], [(o, i) for i, o in zip(sizes, sizes[1:])]
+        if shapes != expected:
+            raise ValueError(f'"{name}" has layers of shapes {shapes} where its architecture needs {expected}')
+        if normalized != (self.norms is not None):
+            raise ValueError(
+                f'"{name}" {"lacks" if normalized else "has"} layer normalisation, unlike its architecture'
+            )
+
+    def named(self) -> dict:
+        """Arrays by name: ``"0"``, ``"1"``, ...: weights; ``"0.gain"``, ``"0.shift"``, ``"0.bias"`` of a normalised
+        layer."""
+        out = {}
+        for i, w in enumerate(self.weights):
+            out[str(i)] = w
+            if self.norms is not None:
+                out |= {f"{i}.{k}": v for k, v in self.norms[i].items()}
+        return out
+
+    def replace(self, name: str, value) -> None:
+        """Put ``value`` in the place of the array ``name``; ``pack`` makes it count."""
+        layer, _, part = name.partition(".")
+        if part and self.norms is not None:
+            self.norms[int(layer)][part] = value
+        else:
+            self.weights[int(layer)] = value
+
+    @property
+    def inputs(self) -> int:
+        """Numbers that the first layer takes."""
+        return self.weights[0].shape[1]
+
+    @property
+    def outputs(self) -> int:
+        """Numbers that the last layer returns."""
+        return self.weights[-1].shape[0]
+
+    def pack(self) -> None:
+        """Refresh what the kernels read after a change of ``weights``; gradients flow through."""
+        self._constants = None
+        ns = namespace(self.weights[0])
+        weights = self.weights
+        if self.norms is not None:
+            # Gain and shift are part of the next product: W (g x + s) + b = (W g) x + (W s + b).
+            folded = [_folded(w, norm) for w, norm in zip(weights, self.norms)]
+            weights = [array for pair in folded for array in pair]
+        weights = [ns.TensorXf16(w) if is_cuda(ns) else w for w in weights]
+        packed: Any = nn.pack(*weights, layout="training")
+        self._views = [packed] if len(weights) == 1 else list(packed)
+        self.buffer = self._views[0].buffer
+
+    def __call__(self, x: list) -> list:
+        """Outputs (list of Floats) at inputs ``x`` (list of Floats), as cooperative vectors."""
+        if self._views is None:
+            self.pack()
+        ns = namespace(self.weights[0])
+        half = is_cuda(ns)
+        # Cooperative vectors do not sum the derivatives of a lane that is shared by all the others.
+        width = max(dr.width(c) for c in x)
+        x = [c + dr.zeros(ns.Float, width) if dr.width(c) < width else c for c in x]
+        if self.constant and self._may_be_constant(x, ns):
+            if self._constants is None:
+                self._constants = [w.numpy().tolist() for w in self.weights]
+            return evaluate(self._constants, x)
+        if self.norms is not None:
+            return self._normalized(x, ns, half)
+        views: Any = self._views
+        v = nn.CoopVec(*([ns.Float16(c) for c in x] if half else x))
+        for i, view in enumerate(views):
+            v = nn.matvec(view, v)
+            if i + 1 < len(views):
+                v = dr.maximum(v, 0)
+        out = list(v)
+        return [ns.Float(c) for c in out] if half else out
+
+    def _may_be_constant(self, x: list, ns: ModuleType) -> bool:
+        """Whether nothing asks for the weights themselves: derivatives, a recording, a device's units, a norm."""
+        if is_cuda(ns) or self.norms is not None or dr.flag(dr.JitFlag.FreezingScope):
+            return False
+        return not dr.grad_enabled(self.weights, x)
+
+    def _normalized(self, x: list, ns: ModuleType, half: bool) -> list:
+        for i in range(len(self.weights)):
+            if i > 0:
+                x = [dr.maximum(c, 0) for c in x]
+            mean = sum(x) / len(x)
+            x = [c - mean for c in x]
+            scale = dr.rsqrt(sum(c * c for c in x) / len(x) + _NORM_EPSILON)
+            v = nn.CoopVec(*[ns.Float16(c * scale) if half else c * scale for c in x])
+            x = [ns.Float(c) if half else c for c in nn.matvec(self._views[2 * i], v, self._views[2 * i + 1])]
+        return x
+
+    def tensor(self, x: Any) -> Any:
+        """Outputs (N, outputs) at inputs ``x`` (N, inputs), both TensorXf, as tensor products.
+
+        Points by rows: the numbers of a point side by side are what Dr.Jit's products of matrices read quickest, by a
+        factor of up to two in the derivatives.
+        """
+        for i, w in enumerate(self.weights):
+            if self.norms is None:
+                x = _products(x, w)
+            else:
+                x = x - dr.reshape(type(x), dr.mean(x, axis=1), (-1, 1))
+                x = x * dr.reshape(type(x), dr.rsqrt(dr.mean(x * x, axis=1) + _NORM_EPSILON), (-1, 1))
+                w, bias = _folded(w, self.norms[i])
+                x = _products(x, w) + bias
+            if i + 1 < len(self.weights):
+                x = dr.maximum(x, 0)
+        return x
+
+
+def _products(x: Any, w: Any) -> Any:
+    return dr.matmul(x, w, Bt=True)
+
+
+def _folded(w, norm: dict[str, Any]) -> tuple:
+    """Weights and bias of a layer with the gain and shift of its inputs in them."""
+    return w * norm["gain"], norm["bias"] + dr.sum(w * norm["shift"], axis=1)

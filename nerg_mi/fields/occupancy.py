@@ -1,0 +1,435 @@
+"""Occupancy: grids over a box, refined ones, and cascades over a contracted place."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any, ClassVar
+
+import drjit as dr
+import numpy as np
+
+# ---- Occupancy ----
+#
+# Where a field may hold density: a bit a cell, and how far away the next one is.
+#
+# Marching skips a step only when its midpoint lies in an empty cell. The distance
+# to the nearest occupied cell (chessboard metric) lets a ray leap over many empty
+# cells with one look-up.
+
+
+_FAR = 255
+
+
+class OccupancyGrid:
+    """Grid over the unit cube, x varying fastest.
+
+    ``bits``: bool array, indexed [z, y, x] (a field's has equal edges, R). ``threshold``: the density (1/unit) below
+    which a cell counts as empty; it is the bound that skipping rests on and is recorded in checkpoints. Raises
+    ``ValueError`` for bits without three axes.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"distance": None}
+
+    def __init__(self, bits: np.ndarray, ns: ModuleType, threshold: float):
+        bits = np.asarray(bits, bool)
+        if bits.ndim != 3 or 0 in bits.shape:
+            raise ValueError(f"an occupancy grid has three axes of at least one cell, got shape {bits.shape}")
+        self.bits, self.threshold = bits, float(threshold)
+        self.cells = bits.shape[::-1]
+        self.distance = ns.UInt8(chessboard(bits).ravel())
+
+    @property
+    def coarse(self) -> OccupancyGrid:
+        """Itself: it refines no other grid (``occupancy.RefinedGrid.coarse``)."""
+        return self
+
+    @property
+    def resolution(self) -> int:
+        """Cells along an edge of a cubic grid."""
+        if len(set(self.cells)) != 1:
+            raise ValueError(f"a grid of {self.cells} cells has no single resolution; fields need a cubic one")
+        return self.cells[0]
+
+    @property
+    def fraction(self) -> float:
+        """Share of the cells that are occupied."""
+        return float(self.bits.mean())
+
+    def empty_cells(self, u, active=True):
+        """Distance in cells (UInt32) from the cell of ``u`` (unit cube) to an occupied one; 0: occupied.
+
+        Points outside of the cube are clamped to its nearest cell.
+        """
+        uint = dr.uint32_array_t(type(u.x))
+        c = [uint(dr.clip(x * n, 0, n - 1)) for x, n in zip((u.x, u.y, u.z), self.cells)]
+        index = c[0] + self.cells[0] * (c[1] + self.cells[1] * c[2])
+        return uint(dr.gather(type(self.distance), self.distance, index, active))
+
+    def packed(self) -> np.ndarray:
+        """The bits as bytes, (R^3 / 8,), x fastest, lowest bit first."""
+        return np.packbits(self.bits.ravel(), bitorder="little")
+
+    @staticmethod
+    def from_packed(data: np.ndarray, resolution: int, ns: ModuleType, threshold: float) -> OccupancyGrid:
+        """The cubic grid of ``resolution`` cells an edge whose ``packed`` bits are ``data`` (uint8); ``ValueError`` if
+        they are too few."""
+        return OccupancyGrid(unpacked(data, resolution), ns, threshold)
+
+
+def unpacked(data: np.ndarray, resolution: int) -> np.ndarray:
+    """The bits (R, R, R) of a cubic grid of ``resolution`` R whose ``packed`` form is ``data`` (uint8); ``ValueError``
+    if they are too few."""
+    if data.size * 8 < resolution**3:
+        raise ValueError(
+            f"an occupancy grid of resolution {resolution} needs {resolution**3 // 8} bytes, got {data.size}"
+        )
+    return np.unpackbits(data, bitorder="little")[: resolution**3].reshape((resolution,) * 3).astype(bool)
+
+
+def chessboard(bits: np.ndarray) -> np.ndarray:
+    """Chessboard distance in cells to the nearest occupied one, 0..255 (uint8, 0: occupied), of a bool array.
+
+    The occupied cells are grown by one layer at a time, 64 cells of a row in a word, and cells are counted for as long
+    as they are not reached: the count is kept as the planes of its binary digits, of which a step changes two in the
+    mean. Cells behind the end of a row are reached no sooner than through the row, and left out at last.
+    """
+    if not bits.any():
+        return np.full(bits.shape, _FAR, np.uint8)
+    *_, n = bits.shape
+    wide = np.zeros((*bits.shape[:-1], -(-n // 64) * 64), bool)
+    wide[..., :n] = True
+    inside = _words(wide)
+    wide[..., :n] = bits
+    reached, planes = _words(wide), []
+    for _ in range(_FAR):
+        carry = inside & ~reached
+        if not carry.any():
+            break
+        for k in range(8):
+            if k == len(planes):
+                planes.append(np.zeros_like(inside))
+            planes[k], carry = planes[k] ^ carry, planes[k] & carry
+            if not carry.any():
+                break
+        reached = _grown_words(reached)
+    distance = np.zeros(wide.shape, np.uint8)
+    for k, plane in enumerate(planes):
+        distance |= np.unpackbits(plane.view(np.uint8), axis=-1, bitorder="little") << np.uint8(k)
+    return np.ascontiguousarray(distance[..., :n])
+
+
+def _words(cells: np.ndarray) -> np.ndarray:
+    """Rows of ``cells`` (bool, a multiple of 64 in the last axis) as words, the lowest bit first."""
+    return np.packbits(cells, axis=-1, bitorder="little").view("<u8")
+
+
+def _grown_words(words: np.ndarray) -> np.ndarray:
+    """``grown`` of cells in words."""
+    one, last = np.uint64(1), np.uint64(63)
+    out = words | words << one | words >> one
+    out[..., 1:] |= words[..., :-1] >> last
+    out[..., :-1] |= words[..., 1:] << last
+    for axis in range(words.ndim - 1):
+        before = np.moveaxis(out, axis, 0)
+        out = out.copy()
+        moved = np.moveaxis(out, axis, 0)
+        moved[1:] |= before[:-1]
+        moved[:-1] |= before[1:]
+    return out
+
+
+def grown(cells: np.ndarray) -> np.ndarray:
+    """``cells`` (bool, three axes) and all that touch one of them, by a face, an edge or a corner."""
+    # An axis at a time: a tenth of the work of a dilation by the whole cube.
+    for axis in range(3):
+        before, grown = np.moveaxis(cells, axis, 0), cells.copy()
+        moved = np.moveaxis(grown, axis, 0)
+        moved[1:] |= before[:-1]
+        moved[:-1] |= before[1:]
+        cells = grown
+    return cells
+
+
+# ---- Occupancy in nested cubes about the origin, coarser outwards, as instant-ngp and torch-ngp keep it ----
+
+_MOST_PARTS = 64
+_MOST_CELLS = 1 << 24
+
+
+class CascadeGrid:
+    """Levels of R³ bits over the cubes [-b, b]³, b = min(2^l, ``bound``): a point belongs to the least that holds it.
+
+    ``bits``: bool array (levels, R, R, R), indexed [level, z, y, x]. Marching sees one grid of equal cells over
+    [-bound, bound]³, so fine that no cell of any level is divided; it is never stored. ``threshold``: as for
+    ``OccupancyGrid``.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"distance": None}
+
+    def __init__(self, bits: np.ndarray, bound: float, ns: ModuleType, threshold: float):
+        bits = np.asarray(bits, bool)
+        if bits.ndim != 4 or len(set(bits.shape[1:])) != 1 or bits.shape[1] % 2 or len(bits) != levels_of(bound):
+            raise ValueError(
+                f"cascades of a bound of {bound} are {levels_of(bound)} cubes with an even number of cells along each "
+                f"edge, got shape {bits.shape}"
+            )
+        self.bits, self.bound, self.threshold = bits, float(bound), float(threshold)
+        r = bits.shape[1]
+        self._halves = [min(2.0**level, self.bound) for level in range(len(bits))]
+        parts = [m for m in range(1, _MOST_PARTS + 1) if (self.bound * m).is_integer()]
+        if not parts:
+            raise ValueError(
+                f"the bound {bound} of cascades must be a whole number, or one of at most {_MOST_PARTS} parts"
+            )
+        # Cells of the common grid along a cell of each level.
+        self._ratios = [int(h * parts[0]) for h in self._halves]
+        self.cells = (r * self._ratios[-1],) * 3
+        if self.cells[0] > _MOST_CELLS:
+            raise ValueError(
+                f"cascades of {r} cells to a bound of {bound} need {self.cells[0]} equal cells along an edge, and "
+                f"float32 tells at most {_MOST_CELLS} apart"
+            )
+        self.distance = ns.UInt8(np.stack(self._distances()).ravel())
+
+    @property
+    def coarse(self) -> CascadeGrid:
+        """Itself: it refines no other grid (``occupancy.RefinedGrid.coarse``)."""
+        return self
+
+    @property
+    def resolution(self) -> int:
+        """Cells along an edge of each level."""
+        return self.bits.shape[1]
+
+    @property
+    def fraction(self) -> float:
+        """Share of the volume that is occupied."""
+        volume, inner = 0.0, 0.0
+        for level, half in enumerate(self._halves):
+            outside = self.bits[level] & ~self._within(level, inner)
+            volume += outside.sum() * (2 * half / self.resolution) ** 3
+            inner = half
+        return float(volume / (2 * self.bound) ** 3)
+
+    def _within(self, level: int, half: float) -> np.ndarray:
+        """Cells of ``level`` wholly inside of [-half, half]³."""
+        edges = np.linspace(-1, 1, self.resolution + 1) * self._halves[level]
+        inside = (edges[:-1] >= -half) & (edges[1:] <= half)
+        return inside[:, None, None] & inside[:, None] & inside
+
+    def _distances(self) -> list[np.ndarray]:
+        """For each level, chessboard distances in its own cells to what is occupied or beyond it; 0: occupied."""
+        out, finer, inner = [], None, 0.0
+        for level, bits in enumerate(self.bits):
+            full = bits & ~self._within(level, inner)
+            if finer is not None:
+                full |= self._coarsened(finer, level)
+            last = level + 1 == len(self.bits)
+            # What lies around a level is not known to be empty, except around the last.
+            padded = np.pad(full, 1, constant_values=not last)
+            reach = chessboard(padded)[1:-1, 1:-1, 1:-1]
+            out.append(np.where(bits, 0, np.maximum(reach, 1)).astype(np.uint8))
+            finer, inner = full, self._halves[level]
+        return out
+
+    def _coarsened(self, finer: np.ndarray, level: int) -> np.ndarray:
+        """Cells of ``level`` that overlap an occupied one of the level below."""
+        r, small, large = self.resolution, self._ratios[level - 1], self._ratios[level]
+        first = (np.arange(r) * small + r // 2 * (large - small)) // large
+        last = (np.arange(r) * small + small - 1 + r // 2 * (large - small)) // large
+        z, y, x = np.nonzero(finer)
+        out = np.zeros((r, r, r), bool)
+        for az in (first, last):
+            for ay in (first, last):
+                for ax in (first, last):
+                    out[az[z], ay[y], ax[x]] = True
+        return out
+
+    def empty_cells(self, u, active=True):
+        """Distance in cells of the common grid (UInt32) from that of ``u`` (unit cube) to an occupied one; 0: occupied.
+
+        Points outside of the cube are clamped to its nearest cell.
+        """
+        uint, r, n = dr.uint32_array_t(type(u.x)), self.resolution, self.cells[0]
+        # Whole numbers from here on, so that a point lies in the same cell for whoever asks.
+        cell = [uint(dr.clip(x * n, 0, n - 1)) for x in (u.x, u.y, u.z)]
+        # Twice the distance of the cell's middle from the centre.
+        away = [dr.abs(dr.int32_array_t(type(u.x))(c) * 2 + 1 - n) for c in cell]
+        far = dr.maximum(dr.maximum(away[0], away[1]), away[2])
+        last = self._ratios[-1]
+        ratio, level, inverse = uint(last), uint(len(self._ratios) - 1), type(u.x)(1 / last)
+        for k in range(len(self._ratios) - 2, -1, -1):
+            inside, part = far < r * self._ratios[k], self._ratios[k]
+            ratio, level = dr.select(inside, part, ratio), dr.select(inside, k, level)
+            inverse = dr.select(inside, 1 / part, inverse)
+        shift = (n - r * ratio) // 2
+        # Half a cell from the next whole number at least, which no rounding bridges.
+        c = [uint((type(u.x)(c - shift) + 0.5) * inverse) for c in cell]
+        index = c[0] + r * (c[1] + r * (c[2] + r * level))
+        k = uint(dr.gather(type(self.distance), self.distance, index, active))
+        return dr.select(k > 1, (k - 1) * ratio + 1, k)
+
+    def packed(self) -> np.ndarray:
+        """The bits as bytes, level by level, x fastest, lowest bit first; see ``from_packed``."""
+        return np.packbits(self.bits.ravel(), bitorder="little")
+
+    @staticmethod
+    def from_packed(data: np.ndarray, resolution: int, bound: float, ns: ModuleType, threshold: float) -> CascadeGrid:
+        """The cascades of ``resolution`` cells an edge whose ``packed`` bits are ``data`` (uint8); ``ValueError`` if
+        they are too few."""
+        count = levels_of(bound) * resolution**3
+        if data.size * 8 < count:
+            raise ValueError(
+                f"cascades of resolution {resolution} to a bound of {bound} need {count // 8} bytes, got {data.size}"
+            )
+        bits = np.unpackbits(data, bitorder="little")[:count].reshape(-1, *(resolution,) * 3)
+        return CascadeGrid(bits.astype(bool), bound, ns, threshold)
+
+
+def levels_of(bound: float) -> int:
+    """Number of cubes that torch-ngp keeps for a scene of [-bound, bound]³; ``ValueError`` for a bound below 1."""
+    if not (np.isfinite(bound) and bound >= 1):
+        raise ValueError(f"the bound of cascades must be at least 1, got {bound}")
+    return 1 + int(np.ceil(np.log2(bound)))
+
+
+def contracted_cascades(bits: np.ndarray, reach: float, ns: ModuleType, threshold: float) -> CascadeGrid:
+    """Cascades that hold all that the cells ``bits`` of a contracted box's unit cube hold.
+
+    ``bits``: bool array (R, R, R), indexed [z, y, x], of the cube that `maths.geometry.ContractedBox` encodes
+    positions in, R even; ``reach``: of the box. The cascades have R cells along each edge, the inner cube's R / 2 cells
+    becoming R; each cell is on that meets one of ``bits``.
+    """
+    r, levels = len(bits), levels_of(reach)
+    out = np.zeros((levels, r, r, r), bool)
+    if bits.any():
+        lower, upper = _preimages(bits, reach)
+        for level in range(levels):
+            # In cells of this level; what only touches a cell does not meet it.
+            scale, shift = r / 2.0 ** (level + 1), r / 2
+            first = np.floor(lower * scale + shift + 1e-4).astype(int)
+            last = np.ceil(upper * scale + shift - 1e-4).astype(int) - 1
+            meets = np.all((last >= 0) & (first < r), axis=1)
+            _mark(out[level], np.clip(first[meets], 0, r - 1), np.clip(last[meets], 0, r - 1))
+    return CascadeGrid(out, reach, ns, threshold)
+
+
+def _preimages(bits: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (N, 3), lower and upper corners in half edges of the inner cube, around what the cells ``bits`` encode."""
+    r = len(bits)
+    index = np.argwhere(bits)[:, ::-1]
+    low, high = 4 * index / r - 2, 4 * (index + 1) / r - 2
+    # Within a cell x = y g(n) for contracted y, n = max |y|, and g grows with n: its extremes bound every coordinate.
+    nearest = np.where((low < 0) & (high > 0), 0, np.minimum(np.abs(low), np.abs(high)))
+    farthest = np.maximum(np.abs(low), np.abs(high))
+
+    def growth(n: np.ndarray) -> np.ndarray:
+        n = np.clip(n, 1, 2 - 1 / reach)
+        return (1 / (n * (2 - n)))[:, None]
+
+    few, many = growth(nearest.max(axis=1)), growth(farthest.max(axis=1))
+    lower, upper = low * np.where(low < 0, many, few), high * np.where(high < 0, few, many)
+    return np.clip(lower, -reach, reach), np.clip(upper, -reach, reach)
+
+
+def _mark(cells: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
+    """Set the ``cells`` [z, y, x] of boxes of cells, from ``first`` (N, 3; x, y, z) to ``last``, both included."""
+    # Eight corners of each box, summed up along the axes: as much work for large boxes as for small ones.
+    count = np.zeros(np.add(cells.shape, 1), np.int32)
+    ends = (first, last + 1)
+    for corner in np.ndindex(2, 2, 2):
+        x, y, z = (ends[c][:, axis] for axis, c in enumerate(corner))
+        np.add.at(count, (z, y, x), 1 - 2 * (sum(corner) % 2))
+    for axis in range(3):
+        np.cumsum(count, axis=axis, out=count)
+    cells |= count[:-1, :-1, :-1] > 0
+
+
+# ---- Refined ----
+#
+# Where a field may hold density, in cells half as large: a byte for the eight parts of each occupied cell.
+#
+# The cells that training leaves on hold a wall and the air on both sides of it, and a ray pays for each step in them.
+# Of their parts those stay that were found to hold something (``refinement``). Distances are kept a cell, parts are
+# looked up in occupied cells only: two tables of a byte a cell, where a grid of parts would take eight.
+
+
+PARTS = 2
+"""Parts of a cell along each axis."""
+
+
+class RefinedGrid:
+    """``coarse_bits``: bool array (R, R, R), indexed [z, y, x], of a cubic ``OccupancyGrid`` of ``coarse_threshold``;
+    ``masks``: for each of its occupied cells, in that order, the bits of its parts (uint8, N), x fastest, lowest bit
+    first. ``threshold``: the density (1/unit) below which a part counts as empty, wherever it was looked at;
+    ``missed``: mean optical depth, along random lines through the field's box, of all that the cells hold and the parts
+    do not. Raises ``ValueError`` for what does not fit together.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"distance": None, "parts": None}
+
+    def __init__(
+        self,
+        coarse_bits: np.ndarray,
+        masks: np.ndarray,
+        ns: ModuleType,
+        threshold: float,
+        coarse_threshold: float,
+        missed: float,
+    ):
+        bits, masks = np.asarray(coarse_bits, bool), np.asarray(masks, np.uint8)
+        if bits.ndim != 3 or len(set(bits.shape)) != 1 or masks.shape != (bits.sum(),):
+            raise ValueError(
+                f"a refined grid needs a byte for each occupied cell of a cube, got {masks.shape} for "
+                f"{int(bits.sum())} of {bits.shape}"
+            )
+        self._ns, self.coarse_bits, self.masks = ns, bits, masks
+        self._coarse: OccupancyGrid | None = None
+        self.threshold, self.coarse_threshold, self.missed = float(threshold), float(coarse_threshold), float(missed)
+        self.cells = tuple(PARTS * n for n in bits.shape[::-1])
+        whole = np.zeros(bits.shape, np.uint8)
+        whole[bits] = masks
+        # Cells of which nothing is left are empty as any other.
+        self.distance, self.parts = ns.UInt8(chessboard(whole > 0).ravel()), ns.UInt8(whole.ravel())
+
+    @property
+    def coarse(self) -> OccupancyGrid:
+        """The grid that was refined, which holds all that this one holds: for weights that are no longer those that
+        were looked at, and for formats that know no parts."""
+        if self._coarse is None:
+            self._coarse = OccupancyGrid(self.coarse_bits, self._ns, self.coarse_threshold)
+        return self._coarse
+
+    @property
+    def bits(self) -> np.ndarray:
+        """A bit a part: bool array, indexed [z, y, x]."""
+        out = np.zeros(self.cells[::-1], bool)
+        z, y, x = np.nonzero(self.coarse_bits)
+        for part, (k, j, i) in enumerate(np.ndindex(PARTS, PARTS, PARTS)):
+            out[PARTS * z + k, PARTS * y + j, PARTS * x + i] = self.masks >> part & 1
+        return out
+
+    @property
+    def resolution(self) -> int:
+        """Parts along an edge."""
+        return self.cells[0]
+
+    @property
+    def fraction(self) -> float:
+        """Share of the parts that are occupied."""
+        return float(np.unpackbits(self.masks).sum() / np.prod(self.cells))
+
+    def empty_cells(self, u, active=True):
+        """Distance in parts (UInt32) from that of ``u`` (unit cube) to an occupied one, or less; 0: occupied.
+
+        Points outside of the cube are clamped to its nearest part.
+        """
+        uint, n = dr.uint32_array_t(type(u.x)), self.cells[0]
+        p = [uint(dr.clip(x * n, 0, n - 1)) for x in (u.x, u.y, u.z)]
+        x, y, z = (c >> 1 for c in p)
+        cell = x + (n // PARTS) * (y + (n // PARTS) * z)
+        away = uint(dr.gather(type(self.distance), self.distance, cell, active))
+        parts = uint(dr.gather(type(self.parts), self.parts, cell, active & (away == 0)))
+        part = (p[0] & 1) | ((p[1] & 1) << 1) | ((p[2] & 1) << 2)
+        # An occupied cell that is k away is at least 2 k - 1 parts away.
+        return dr.select(away > 0, PARTS * away - 1, 1 - ((parts >> part) & 1))

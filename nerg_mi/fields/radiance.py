@@ -1,0 +1,369 @@
+"""Radiance fields: density and colour networks, the head of colours, and the background."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from types import ModuleType
+from typing import Any, ClassVar
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.maths.arrays import sigmoid
+from nerg_mi.maths.geometry import AnyBox
+from nerg_mi.maths.types import Float
+from nerg_mi.ranges import FARTHEST, VALUES
+
+from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, encoding_config, random_encoding
+from .mlp import MLP, namespace
+from .occupancy import CascadeGrid, OccupancyGrid, RefinedGrid
+
+# ---- Background ----
+#
+# Colour behind everything, on a sphere around the scene: torch-ngp's background network.
+#
+# The ray's far intersection with the sphere, as two angles, goes through a small 2-D hash grid; its features
+# and the harmonics of the direction go through a small network to a colour (``NeRFNetwork.background`` there).
+
+
+@dataclass(frozen=True)
+class BackgroundConfig:
+    """Sizes of a background. The defaults are torch-ngp's. Raises ``ValueError`` for sizes that none has."""
+
+    # Of the sphere about the field's origin, in the field's units.
+    radius: float
+    # The encoding of the two angles.
+    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=4, dimensions=2))
+    # Neurons of every hidden layer.
+    width: int = 64
+    # Hidden layers.
+    hidden: int = 1
+    # Degree of the encoding of directions.
+    sh_degree: int = 4
+
+    def __post_init__(self):
+        if not 0 < self.radius <= FARTHEST:
+            raise ValueError(f"the radius of a background must be positive and finite, got {self.radius}")
+        if self.grid.dimensions != 2 or min(self.width, self.hidden) < 1:
+            raise ValueError(f"a background needs a grid of 2 dimensions and sizes of at least 1, got {self}")
+
+    @property
+    def sizes(self) -> list[int]:
+        """Sizes of the network's layers, [inputs, ..., 3]."""
+        return [self.sh_degree**2 + self.grid.size] + [self.width] * self.hidden + [3]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object that stands in a checkpoint."""
+        return {**asdict(self), "grid": self.grid.to_dict()}
+
+    @staticmethod
+    def from_dict(d: dict[str, Any]) -> BackgroundConfig:
+        """The configuration that ``to_dict`` made ``d`` of. Raises ``KeyError``, ``TypeError`` or ``ValueError``."""
+        return BackgroundConfig(**{**d, "grid": encoding_config(d["grid"])})
+
+
+class Background:
+    """Colour (0..1, in the colour space of its radiance field) that rays meet behind the field.
+
+    Raises ``ValueError`` for parts that are not those of ``config``.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"grid": None, "net": None}
+
+    def __init__(self, config: BackgroundConfig, grid: Encoding, net: MLP):
+        grid.require(config.grid)
+        net.require(config.sizes, "background_net")
+        self.config, self.grid, self.net = config, grid, net
+
+    @staticmethod
+    def random(config: BackgroundConfig, ns: ModuleType, seed: int = 0) -> Background:
+        """An untrained background; equal seeds give equal weights."""
+        rng = np.random.default_rng(seed)
+        return Background(config, random_encoding(config.grid, ns, rng), MLP.random(config.sizes, ns, rng))
+
+    def coordinates(self, o, d) -> list:
+        """[2 θ / π - 1, φ / π] where the ray ``o + t d`` (unit ``d``) leaves the sphere; θ from +y, φ from +x to +z."""
+        b = dr.dot(o, d)
+        # A ray that misses the sphere takes the point of it nearest to its own nearest point.
+        inside = dr.maximum(b * b - dr.squared_norm(o) + self.config.radius**2, 0)
+        p = o + d * (dr.sqrt(inside) - b)
+        theta = dr.atan2(dr.sqrt(p.x * p.x + p.z * p.z), p.y)
+        return [2 / dr.pi * theta - 1, dr.atan2(p.z, p.x) / dr.pi]
+
+    def __call__(self, o, d):
+        """Colour (Array3f like ``d``) of rays from ``o`` along unit ``d``, in the field's own coordinates."""
+        ns = namespace(d)
+        square = ns.Array2f(*[dr.clip(0.5 * c + 0.5, 0, 1) for c in self.coordinates(o, d)])
+        # torch-ngp puts the direction first.
+        rgb = self.net(encode_direction(d, self.config.sh_degree) + self.grid(square))
+        return type(d)(*[dr.fma(0.5, dr.tanh(0.5 * c), 0.5) for c in rgb])
+
+
+# ---- What the colour network of a radiance field is asked with, and how its answer becomes a colour ----
+#
+# At every sample of a ray, c(g, d) = sigmoid(color_net(Y(d), g)). A deferred field asks once a ray:
+#
+#     C = α c(ḡ, d),   ḡ = Σ_i w_i g_i / α,   α = Σ_i w_i,   c(g, d) = sigmoid(l + color_net(Y(d), l, g_4..))
+#
+# with l = logit(g_1..3) and w_i the weights of volume rendering, after Hedman et al. 2021 ("Baking Neural Radiance
+# Fields for Real-Time View Synthesis", section 3): the first three features are a diffuse colour in 0..1, which
+# composites as any colour does, and to which the network adds what depends on the direction. There colours are added,
+# here their logits, so that the sum stays in 0..1.
+
+
+# How near to 0 and 1 a diffuse colour is taken before its logit.
+_MARGIN = 1e-3
+
+
+def point_features(outputs: list[Float], deferred: bool) -> list[Float]:
+    """Features of points, of the ``outputs`` of the density net behind the log density: of a deferred field the first
+    three become its diffuse colour, in 0..1."""
+    return [*(sigmoid(x) for x in outputs[:3]), *outputs[3:]] if deferred else outputs
+
+
+def mean_features(sums: list[Float], opacity: Float) -> list[Float]:
+    """Features Σ w g / α of rays of ``opacity`` α that composited ``sums`` Σ w g; 0 where nothing absorbs."""
+    # Its square, which derivatives have, stays finite.
+    per = 1 / dr.maximum(opacity, 1e-12)
+    return [s * per for s in sums]
+
+
+def network_inputs(features: list[Float], deferred: bool) -> list[Float]:
+    """What the colour net is given, behind the direction, for ``features``."""
+    if not deferred:
+        return features
+    # Not clipped, which would hold black and white fast.
+    inside = [dr.fma(1 - 2 * _MARGIN, f, _MARGIN) for f in features[:3]]
+    return [*(dr.log(x / (1 - x)) for x in inside), *features[3:]]
+
+
+def network_color(outputs: list[Float], inputs: list[Float], deferred: bool) -> list[Float]:
+    """Colour (3 Floats in 0..1) of the colour net's ``outputs`` for its ``inputs`` (`network_inputs`)."""
+    return [sigmoid(c + x) for c, x in zip(outputs, inputs)] if deferred else [sigmoid(c) for c in outputs]
+
+
+# ---- Radiance ----
+#
+# The radiance field: density and view-dependent colour at a point.
+#
+#     (h, g) = density_net(encoding(p)),   σ(p) = density_scale · exp(h),   c(p, d) = sigmoid(color_net(Y(d), g))
+#
+# with Y the spherical harmonics of the direction: NeRF (Mildenhall et al. 2020, section 3) in the architecture of
+# instant-ngp (Müller et al. 2022, section 5.4) as torch-ngp and the paper use it. The colour network is asked at every
+# sample of a ray, or once a ray of a deferred field: see ``color_head``.
+
+
+# exp(30) is 1e13 per unit: opaque at any scale, and far from the overflow of fp32 (exp(88)).
+_MAX_LOG_DENSITY = 30.0
+
+
+@dataclass(frozen=True)
+class RadianceConfig:
+    """Sizes of the networks. The defaults are the paper's. Raises ``ValueError`` for sizes that no field has."""
+
+    # The encoding of positions.
+    grid: EncodingConfig = field(default_factory=HashGridConfig)
+    # Neurons of every hidden layer.
+    width: int = 64
+    # Hidden layers of the density net.
+    density_hidden: int = 1
+    # Hidden layers of the colour net.
+    color_hidden: int = 2
+    # Features handed from the density net to the colour net.
+    geometry: int = 15
+    # Degree of the encoding of directions, which has sh_degree**2 numbers.
+    sh_degree: int = 4
+    # Density, in 1/unit, where the density net returns 0.
+    density_scale: float = 1.0
+    # Whether the colour net is asked once a ray, with the features composited along it, of which three are a colour.
+    deferred: bool = False
+
+    def __post_init__(self):
+        if min(self.width, self.density_hidden, self.color_hidden, self.geometry, self.sh_degree) < 1:
+            raise ValueError(f"every size of a radiance field must be at least 1, got {self}")
+        if self.density_scale not in VALUES:
+            raise ValueError(f"density_scale must be positive and finite, got {self.density_scale}")
+        if not isinstance(self.deferred, bool):
+            raise ValueError(f"deferred must be true or false, got {self.deferred!r}")
+        if self.deferred and self.geometry < 3:
+            raise ValueError(
+                f"a deferred field needs at least 3 geometry features, its diffuse colour; got {self.geometry}"
+            )
+
+    @property
+    def density_sizes(self) -> list[int]:
+        """Sizes of the density net's layers, [inputs, ..., outputs]: the first output is the log density."""
+        return [self.grid.size] + [self.width] * self.density_hidden + [1 + self.geometry]
+
+    @property
+    def color_sizes(self) -> list[int]:
+        """Sizes of the colour net's layers, [inputs, ..., 3]."""
+        return [self.sh_degree**2 + self.geometry] + [self.width] * self.color_hidden + [3]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object that stands in a checkpoint. Where colour is not deferred it says nothing of it, so that
+        releases that know no deferred fields read it."""
+        out = {**asdict(self), "grid": self.grid.to_dict()}
+        if not self.deferred:
+            del out["deferred"]
+        return out
+
+    @staticmethod
+    def from_dict(d: dict[str, Any]) -> RadianceConfig:
+        """The configuration that ``to_dict`` made ``d`` of. Raises ``KeyError``, ``TypeError`` or ``ValueError``."""
+        return RadianceConfig(**{**d, "grid": encoding_config(d["grid"])})
+
+
+def assign(field, values: dict) -> None:
+    """Replace parameters of a field by name, each by one of the same shape. Raises ``ValueError`` for others."""
+    known = field.parameters()
+    for name, value in values.items():
+        if name not in known:
+            raise ValueError(f'this field has no parameter "{name}"; it has {", ".join(known)}')
+        if value.shape != known[name].shape:
+            raise ValueError(f'"{name}" has shape {known[name].shape}, and cannot become one of {value.shape}')
+    for name, value in values.items():
+        owner, part = name.split(".", 1)
+        getattr(field, owner).replace(part, value)
+
+
+def density_from_log(h, scale: float):
+    """Density from the density net's first output, clamped well before fp32 overflows."""
+    return scale * dr.exp(dr.minimum(h, _MAX_LOG_DENSITY))
+
+
+class RadianceField:
+    """Density (1/unit) and colour at points of ``box``.
+
+    ``color_space``: ``"srgb"`` or ``"linear"``, the space in which samples are composited because the field was trained
+    in it. ``occupancy``: where density may exceed its threshold; None marches the whole box. ``march_step``: step
+    length, in units, that the field was trained with, and ``march_growth`` the share of their distance that steps were
+    at least, where the box is contracted. ``background``: colour behind the field where it was trained with
+    one: what a ray shows in ``color_space`` is then C + (1 - α) background(o, d). Raises ``ValueError`` for parts that
+    are not those of ``config``.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {
+        "grid": None,
+        "density_net": None,
+        "color_net": None,
+        "_head": None,
+        "occupancy": None,
+        "background": None,
+    }
+
+    def __init__(
+        self,
+        config: RadianceConfig,
+        box: AnyBox,
+        grid: Encoding,
+        density_net: MLP,
+        color_net: MLP,
+        occupancy: OccupancyGrid | RefinedGrid | CascadeGrid | None = None,
+        color_space: str = "srgb",
+        march_step: float | None = None,
+        background: Background | None = None,
+        march_growth: float = 0.0,
+    ):
+        if color_space not in ("srgb", "linear"):
+            raise ValueError(f'color_space must be "srgb" or "linear", got "{color_space}"')
+        grid.require(config.grid)
+        density_net.require(config.density_sizes, "density_net")
+        color_net.require(config.color_sizes, "color_net")
+        self.config, self.box, self.color_space = config, box, color_space
+        self.grid, self.density_net, self.color_net = grid, density_net, color_net
+        self.march_step, self.background = march_step, background
+        self.march_growth = march_growth
+        self.occupancy: OccupancyGrid | RefinedGrid | CascadeGrid | None = None
+        self.pack()
+        self.occupancy = occupancy
+
+    @staticmethod
+    def random(config: RadianceConfig, box: AnyBox, ns: ModuleType, seed: int = 0, **kwargs) -> RadianceField:
+        """An untrained field of backend ``ns``; equal seeds give equal weights."""
+        rng = np.random.default_rng(seed)
+        return RadianceField(
+            config,
+            box,
+            random_encoding(config.grid, ns, rng),
+            MLP.random(config.density_sizes, ns, rng),
+            MLP.random(config.color_sizes, ns, rng),
+            **kwargs,
+        )
+
+    def parameters(self) -> dict:
+        """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
+        owners = ["grid", "density_net", "color_net"]
+        if self.background is not None:
+            owners += ["background_grid", "background_net"]
+        return {f"{name}.{key}": value for name in owners for key, value in getattr(self, name).named().items()}
+
+    @property
+    def mlps(self) -> list[MLP]:
+        """All of its networks."""
+        nets = [self.density_net, self._head, self.color_net]
+        return nets if self.background is None else [*nets, self.background.net]
+
+    @property
+    def ns(self) -> ModuleType:
+        """Array types of the field's backend; see ``fields.mlp.namespace``."""
+        return namespace(self.density_net.weights[0])
+
+    @property
+    def background_grid(self) -> Encoding | None:
+        """The encoding of the background, under the name that its parameters have."""
+        return self.background.grid if self.background is not None else None
+
+    @property
+    def background_net(self) -> MLP | None:
+        """The network of the background, under the name that its parameters have."""
+        return self.background.net if self.background is not None else None
+
+    def set_parameters(self, values: dict) -> None:
+        """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
+        assign(self, values)
+        self.pack()
+
+    def pack(self) -> None:
+        """Refresh what the kernels read; call after any change of the weights.
+
+        A refined occupancy becomes the one that it refines: it holds for the weights that it was made of."""
+        if self.occupancy is not None:
+            self.occupancy = self.occupancy.coarse
+        for part in (self.grid, self.density_net, self.color_net):
+            part.pack()
+        # Depth passes need one output of the last layer, not 1 + geometry of them.
+        last = self.density_net.weights[-1]
+        self._head = MLP(self.density_net.weights[:-1] + [last[0:1, :]])
+        self._head.constant = self.density_net.constant
+        self._head.pack()
+        if self.background is not None:
+            self.background.grid.pack()
+            self.background.net.pack()
+
+    def kernel_parameters(self) -> list:
+        """The arrays that evaluations read: the encoding's and the packed networks, attached to ``parameters()``."""
+        return [*self.grid.kernel_parameters(), self.density_net.buffer, self.color_net.buffer, self._head.buffer]
+
+    def density(self, p, active=True):
+        """Density in 1/unit at ``p`` (Array3f, the field's units); 0 outside of the box."""
+        inside = active & self.box.contains(p)
+        h = self._head(self.grid(self.box.to_unit(p), inside))
+        return dr.select(inside, self._density(h[0], p), 0)
+
+    def _density(self, h, p):
+        """Density (1/unit) at ``p`` where the density net's first output is ``h``."""
+        return self.box.density_along(density_from_log(h, self.config.density_scale), p)
+
+    def density_features(self, p, active=True):
+        """Density (1/unit) at ``p`` and the ``geometry`` features (list of Floats) that ``color`` needs."""
+        inside = active & self.box.contains(p)
+        h = self.density_net(self.grid(self.box.to_unit(p), inside))
+        return dr.select(inside, self._density(h[0], p), 0), point_features(h[1:], self.config.deferred)
+
+    def color(self, features: list, d):
+        """Colour (Array3f in ``color_space``, 0..1) of a point with ``features``, seen along unit ``d``; of a deferred
+        field also that of an opaque ray along ``d`` with these features on average (``radiance.mean_features``)."""
+        given = network_inputs(features, self.config.deferred)
+        rgb = self.color_net(encode_direction(d, self.config.sh_degree) + given)
+        return type(d)(*network_color(rgb, given, self.config.deferred))

@@ -1,0 +1,206 @@
+"""The radiance field against its NumPy version, and its handling of parameters."""
+
+from dataclasses import replace
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.fields.encoding import HashGrid, HashGridConfig, encode_direction
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField, density_from_log
+from nerg_mi.maths.geometry import Box
+from tests.reference import fields_numpy as reference
+
+GRID = dict(levels=4, features=2, log2_rows=12, base=4, finest=32)
+CONFIG = RadianceConfig(grid=HashGridConfig(**GRID), width=16, geometry=7, density_scale=2.5)
+BOX = Box((-1, 0, 2), (3, 2, 4))
+
+
+def make(seed=0, config=CONFIG, **kwargs):
+    field = RadianceField.random(config, BOX, ns, seed, **kwargs)
+    # Features of order one, or every output would be that of zero input.
+    rng = np.random.default_rng(seed)
+    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    return field
+
+
+def arrays(field):
+    return {k: v.numpy() for k, v in field.parameters().items()}
+
+
+def points(n=60):
+    rng = np.random.default_rng(5)
+    p = rng.uniform(np.array(BOX.lower) - 0.3, np.array(BOX.upper) + 0.3, (n, 3)).astype(np.float32)
+    d = rng.normal(size=(n, 3))
+    return p, d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def test01_equals_numpy():
+    field, (p, d) = make(), points()
+    sigma, features = field.density_features(ns.Array3f(p.T))
+    rgb = np.array(field.color(features, ns.Array3f(d.T))).T
+    s, c = reference.radiance(p, d, arrays(field), GRID, BOX.lower, BOX.upper, scale=2.5)
+    outside = s == 0
+    assert 5 < outside.sum() < 55
+    assert np.allclose(sigma.numpy(), s, rtol=2e-5) and np.all(sigma.numpy()[outside] == 0)
+    assert np.allclose(rgb[~outside], c[~outside], atol=2e-6)
+
+
+def test02_density_head_equals_the_full_net():
+    field, (p, _) = make(), points()
+    assert np.allclose(
+        field.density(ns.Array3f(p.T)).numpy(), field.density_features(ns.Array3f(p.T))[0].numpy(), rtol=1e-6
+    )
+
+
+def test03_the_mask_is_honoured():
+    field = make()
+    p = ns.Array3f(ns.Float([1, 1]), 1, 3)
+    active = ns.Bool([True, False])
+    for sigma in (field.density(p, active), field.density_features(p, active)[0]):
+        assert sigma.numpy()[0] > 0 and sigma.numpy()[1] == 0
+
+
+def test04_density_is_clamped_before_it_overflows():
+    h = np.array([0, -100, 29, 31, 1e30])
+    x = ns.Float(h)
+    dr.enable_grad(x)
+    sigma = density_from_log(x, 2.5)
+    expected = 2.5 * np.exp(np.minimum(h, 30))
+    assert np.allclose(sigma.numpy(), expected, rtol=1e-5, atol=1e-30)
+    dr.backward(dr.sum(sigma))
+    assert np.allclose(dr.grad(x).numpy(), np.where(h < 30, expected, 0), rtol=1e-5)
+
+
+def test06_set_parameters_changes_every_output():
+    field, (p, d) = make(), points(20)
+    x = ns.Array3f(p.T)
+
+    def outputs():
+        sigma, features = field.density_features(x)
+        return field.density(x).numpy(), sigma.numpy(), np.array(field.color(features, ns.Array3f(d.T)))
+
+    before = outputs()
+    values = {k: type(v)(v) * 1.5 for k, v in field.parameters().items() if k.startswith("density_net")}
+    field.set_parameters(values)
+    after = outputs()
+    assert all(not np.allclose(a, b) for a, b in zip(before, after))
+    s, c = reference.radiance(p, d, arrays(field), GRID, BOX.lower, BOX.upper, scale=2.5)
+    assert np.allclose(after[0], s, rtol=2e-5) and np.allclose(after[1], s, rtol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "name", ["grid", "density_net.2", "density_net", "density_net.x", "emit_head.0", "density_net.-1"]
+)
+def test07_unknown_parameters_are_named(name):
+    field = make()
+    with pytest.raises(ValueError, match=f'no parameter "{name}"; it has grid.table, density_net.0'):
+        field.set_parameters({name: field.density_net.weights[0]})
+
+
+@pytest.mark.parametrize("name", ["grid.table", "density_net.0", "density_net.1", "color_net.0", "color_net.2"])
+def test08_gradients_reach_every_parameter(name):
+    # Central differences in float64 NumPy
+    field, (p, d) = make(), points(12)
+    p = np.clip(p, np.array(BOX.lower) + 0.1, np.array(BOX.upper) - 0.1)
+    w = type(field.parameters()[name])(field.parameters()[name])
+    dr.enable_grad(w)
+    field.set_parameters({name: w})
+    sigma, features = field.density_features(ns.Array3f(p.T))
+    rgb = field.color(features, ns.Array3f(d.T))
+    dr.backward(dr.sum(sigma + field.density(ns.Array3f(p.T)) + rgb.x + 2 * rgb.y + 3 * rgb.z))
+    gradient = dr.grad(w).numpy().ravel()
+    values = {k: v.astype(np.float64) for k, v in arrays(field).items()}
+
+    def loss(i, h):
+        moved = dict(values)
+        moved[name] = values[name].copy()
+        moved[name].flat[i] += h
+        s, c = reference.radiance(p, d, moved, GRID, BOX.lower, BOX.upper, scale=2.5)
+        return (2 * s + c @ [1, 2, 3]).sum()
+
+    for i in np.argsort(-np.abs(gradient))[[0, 3, 20]]:
+        difference = (loss(i, 1e-5) - loss(i, -1e-5)) / 2e-5
+        assert np.isclose(gradient[i], difference, rtol=2e-3, atol=1e-4)
+
+
+def test09_equal_seeds_give_equal_fields():
+    a, b, c = (arrays(RadianceField.random(CONFIG, BOX, ns, s)) for s in (1, 1, 2))
+    assert all(np.array_equal(a[k], b[k]) for k in a) and not np.array_equal(a["grid.table"], c["grid.table"])
+    assert list(a) == ["grid.table", "density_net.0", "density_net.1", "color_net.0", "color_net.1", "color_net.2"]
+
+
+def test10_defaults_are_the_papers():
+    config = RadianceConfig()
+    assert config.density_sizes == [32, 64, 16] and config.color_sizes == [31, 64, 64, 3]
+    assert sum(a * b for s in (config.density_sizes, config.color_sizes) for a, b in zip(s, s[1:])) == 3072 + 6272
+    assert RadianceConfig.from_dict(CONFIG.to_dict()) == CONFIG
+
+
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (dict(width=0), "at least 1"),
+        (dict(density_hidden=0), "at least 1"),
+        (dict(density_scale=0), "density_scale"),
+        (dict(density_scale=float("nan")), "density_scale"),
+        (dict(density_scale=float("inf")), "density_scale"),
+    ],
+)
+def test11_wrong_sizes(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        RadianceConfig(**wrong)
+
+
+def test12_wrong_color_space():
+    with pytest.raises(ValueError, match='"srgb" or "linear", got "aces"'):
+        make(color_space="aces")
+
+
+def test13_a_table_of_another_length_is_refused():
+    # Gathers beyond the end of a table would read foreign memory.
+    field = make()
+    with pytest.raises(ValueError, match="grid.table"):
+        field.set_parameters({"grid.table": dr.zeros(ns.Float, 8)})
+
+
+def test14_a_matrix_of_another_shape_is_refused():
+    field = make()
+    with pytest.raises(ValueError, match="density_net.0"):
+        field.set_parameters({"density_net.0": dr.zeros(ns.TensorXf, (3, 3))})
+
+
+def test15_networks_that_do_not_fit_the_grid_are_refused():
+    a, b = make(), make(config=RadianceConfig(grid=HashGridConfig(**{**GRID, "levels": 3}), width=16, geometry=7))
+    with pytest.raises(ValueError):
+        RadianceField(CONFIG, BOX, a.grid, b.density_net, a.color_net)
+
+
+def test16_the_grid_belongs_to_one_configuration():
+    grid = HashGrid.random(HashGridConfig(**GRID), ns, np.random.default_rng(0))
+    assert grid.config == CONFIG.grid and make().config.grid == CONFIG.grid
+
+
+def test17_a_deferred_field():
+    """Its features and its colours are those of ``color_head``; a file of another field says nothing of it."""
+    config = replace(CONFIG, deferred=True)
+    field, plain, (p, d) = make(config=config), make(), points()
+    sigma, features = field.density_features(ns.Array3f(p.T))
+    same, raw = plain.density_features(ns.Array3f(p.T))
+    assert np.array_equal(sigma.numpy(), same.numpy())
+    g = np.stack([f.numpy() for f in raw])
+    expected = np.concatenate([reference.sigmoid(g[:3]), g[3:]])
+    assert np.allclose(np.stack([f.numpy() for f in features]), expected, atol=1e-6)
+    inside = 1e-3 + (1 - 2e-3) * expected[:3]
+    given = np.concatenate([np.log(inside / (1 - inside)), expected[3:]])
+    outputs = np.array(plain.color_net([*encode_direction(ns.Array3f(d.T), config.sh_degree), *map(ns.Float, given)]))
+    found = np.array(field.color(features, ns.Array3f(d.T)))
+    assert np.allclose(found, reference.sigmoid(outputs + given[:3]), atol=1e-5)
+    assert RadianceConfig.from_dict(config.to_dict()) == config and "deferred" not in CONFIG.to_dict()
+
+
+@pytest.mark.parametrize("change, words", [({"deferred": 1}, "true or false"), ({"geometry": 2}, "at least 3")])
+def test18_deferred_fields_that_cannot_be(change, words):
+    with pytest.raises(ValueError, match=words):
+        RadianceConfig(**{"deferred": True, **change})
