@@ -56,10 +56,10 @@ class Population:
 
 
 def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    from nerg_mi.aoi.measured import count_block
+    from nerg_mi.aoi.scene import things_of
     from nerg_mi.formats.areas.kinds import Areas
     from nerg_mi.formats.regions import Region
-    from nerg_mi.jobs.counting.things import things_of
-    from nerg_mi.jobs.counting.tracked import count_block
     from nerg_mi.statistics.tables import People
     from nerg_mi.statistics.visits import ALL
 

@@ -23,9 +23,8 @@ def made_store():
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.aoi.scene import shapes_of, surroundings_of_scene, things_of
     from nerg_mi.formats.areas.reading import read_areas
-    from nerg_mi.jobs.counting.surroundings import surroundings_of_scene
-    from nerg_mi.jobs.counting.things import shapes_of, things_of
     from nerg_mi.jobs.demo import store_scene
 
     folder = store_scene().parent
@@ -35,7 +34,7 @@ def made_store():
 
 
 def counting_of(around, areas, things, seen: bool = True):
-    from nerg_mi.jobs.counting.tracked import Counting
+    from nerg_mi.aoi.measured import Counting
     from nerg_mi.statistics.visibility import CellsInView, Targets
     from nerg_mi.statistics.visits import LookRules
 
@@ -93,8 +92,8 @@ class Walks:
 
 
 def errors() -> None:
-    from nerg_mi.jobs.counting.foretold import foretell
-    from nerg_mi.jobs.counting.tracked import Eyes, count_block
+    from nerg_mi.aoi.measured import Eyes, count_block
+    from nerg_mi.aoi.predicted import foretell
     from nerg_mi.jobs.reporter import SILENT
     from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.scenes.store import twin

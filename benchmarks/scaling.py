@@ -34,7 +34,7 @@ def room(folder: Path, observers: int, count: int) -> None:
     from nerg_mi.formats.ply import write_columns
     from nerg_mi.rays.rays import Rays
 
-    from tests.jobs.counting.place import write_place
+    from tests.aoi.place import write_place
     from tests.surfaces.meshes import box
 
     vertices, faces = box((0, 0, 0), (8, 6, 3))
@@ -67,7 +67,7 @@ def bake(folder: Path, name: str, detail: float, **more) -> tuple[int, bytes]:
 
 def count(folder: Path, name: str, **more) -> tuple[int, bytes]:
     """Rays and the bytes of the table."""
-    from nerg_mi.jobs.options.statistics import StatisticsOptions
+    from nerg_mi.aoi.options import StatisticsOptions
     from nerg_mi.jobs.statistics import statistics as stats
 
     options = StatisticsOptions(areas=folder / "areas.json", resamples=199, names=True, mode="llvm_ad_rgb", **more)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import typer
 
+import nerg_mi.aoi
 import nerg_mi.jobs.drawing
 import nerg_mi.jobs.options
 import nerg_mi.rays.readers
@@ -25,7 +26,7 @@ from nerg_mi.training.radiance import settings as radiance_settings
 
 
 def _modules():
-    for package in (nerg_mi.jobs.options, nerg_mi.jobs.drawing, nerg_mi.rays.readers):
+    for package in (nerg_mi.aoi, nerg_mi.jobs.options, nerg_mi.jobs.drawing, nerg_mi.rays.readers):
         yield package
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             yield importlib.import_module(module.name)

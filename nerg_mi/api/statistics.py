@@ -28,7 +28,7 @@ def stats(
 
     ``files``: rays (in memory, or their file, or a dataset), a scene, a gaze field, a radiance field, in any order.
     ``areas``: a JSON file of boxes, meshes, shapes and groups (docs/statistics.md). ``output``: folder for the tables.
-    ``options``: those of `nerg stats` (`nerg_mi.jobs.options.statistics.StatisticsOptions`). Gives a
+    ``options``: those of `nerg stats` (`nerg_mi.aoi.options.StatisticsOptions`). Gives a
     `nerg_mi.jobs.statistics.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
 
     >>> import json, nerg_mi as nerg
@@ -40,7 +40,7 @@ def stats(
     >>> row["thing"], round(row["share"], 3), row["reach"], row["distance"]
     ('shelf', 0.667, 1.0, 2.0)
     """
-    from nerg_mi.jobs.options.statistics import StatisticsOptions
+    from nerg_mi.aoi.options import StatisticsOptions
     from nerg_mi.jobs.statistics import statistics
 
     given = [files] if isinstance(files, (str, os.PathLike, Rays)) else list(files)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from nerg_mi.jobs.options.statistics import StatisticsOptions
+from nerg_mi.aoi.options import StatisticsOptions
 
 from .options import takes
 from .progress import TerminalReporter

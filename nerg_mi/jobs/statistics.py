@@ -9,6 +9,25 @@ from types import ModuleType
 
 import numpy as np
 
+from nerg_mi.aoi.measured import Counting, EyePicker, Eyes, blocks_of, cohort_names, count_block, ray_count
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.output import write_results
+from nerg_mi.aoi.parts import CountingParts
+from nerg_mi.aoi.predicted import (
+    Foretold,
+    Setting,
+    add_trust,
+    eyes_of_some,
+    foretold_people,
+    isovist_rows,
+    look_around,
+    places_of,
+    setting_of,
+    tell_places,
+    tell_support,
+    what_if_rows,
+)
+from nerg_mi.aoi.scene import read_changes
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder, make_folder
 from nerg_mi.formats.areas.kinds import Areas
@@ -33,17 +52,7 @@ from nerg_mi.statistics.visibility import Isovists, Targets
 from nerg_mi.statistics.visits import ALL, Cell, Sums, Total
 
 from .backend import select_backend
-from .counting.changes import read_changes
-from .counting.foretold import Foretold, eyes_of_some, foretold_people
-from .counting.parts import CountingParts
-from .counting.places import isovist_rows, look_around, places_of
-from .counting.results import write_results
-from .counting.setting import Setting, setting_of
-from .counting.tracked import Counting, EyePicker, Eyes, blocks_of, cohort_names, count_block, ray_count
-from .counting.trust import add_trust, tell_places, tell_support
-from .counting.what_if import what_if_rows
 from .options import parse_point
-from .options.statistics import StatisticsOptions
 from .parts import Parts
 from .reporter import SILENT, Reporter
 from .scenes.files import kind_of_file

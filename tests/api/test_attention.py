@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
+from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.api.attention import box_shares
 from nerg_mi.api.shapes import box_dict
 from nerg_mi.formats.regions import Region
-from nerg_mi.jobs.options.statistics import StatisticsOptions
 from nerg_mi.jobs.statistics import statistics
 from nerg_mi.report.glances import Onlooker
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, Box
 from nerg_mi.training.geometry.places import GazePlace
-from tests.jobs.counting.place import SIGN, STAND, write_place
+from tests.aoi.place import SIGN, STAND, write_place
 
 BOX = [(-0.2, 1.8, -0.1), (0.2, 2.2, 0.1)]
 EYE = (1.2, 2.2, 1.5)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.aoi.output import has_parquet
 from nerg_mi.files.exr import write_exr
 from nerg_mi.formats.ply import write_columns
-from nerg_mi.jobs.counting.writing import has_parquet
 from nerg_mi.rays.rays import Rays
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.figures.standins import write_standins

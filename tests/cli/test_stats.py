@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import nerg_mi.cli
-from tests.jobs.counting.place import people, write_place
+from tests.aoi.place import people, write_place
 
 
 def nerg(capsys, *arguments):

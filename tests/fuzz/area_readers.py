@@ -55,9 +55,9 @@ def _make_changes(folder: Path) -> None:
 
 
 def _read_changes(folder: Path) -> object:
+    from nerg_mi.aoi.scene import changed_areas, read_changes
     from nerg_mi.formats.areas.kinds import Areas
     from nerg_mi.formats.regions import Region
-    from nerg_mi.jobs.counting.changes import changed_areas, read_changes
 
     return changed_areas(Areas((Region.of("shelf", [0, 0, 0], [1, 1, 1]),)), read_changes(folder / "changes.json"))
 
@@ -67,7 +67,7 @@ def _make_cohorts(folder: Path) -> None:
 
 
 def _read_cohorts(folder: Path) -> object:
-    from nerg_mi.jobs.counting.cohorts import read_cohorts
+    from nerg_mi.aoi.scene import read_cohorts
 
     return read_cohorts(folder / "cohorts.csv")
 

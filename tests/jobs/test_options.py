@@ -11,11 +11,12 @@ from typing import get_type_hints
 
 import pytest
 
+from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.errors import NergError
 from nerg_mi.jobs import options
-from nerg_mi.jobs.options.statistics import StatisticsOptions
 
 MODULES = [importlib.import_module(f"{options.__name__}.{m.name}") for m in pkgutil.iter_modules(options.__path__)]
+MODULES.append(importlib.import_module(StatisticsOptions.__module__))
 # What has to be said where the defaults alone mean nothing.
 SAID = {"FilterOptions": {"thin": 1.0}, "SplitOptions": {"zones": 3}}
 KINDS = [k for m in MODULES for k in vars(m).values() if is_dataclass(k) and k.__module__ == m.__name__]

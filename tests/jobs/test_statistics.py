@@ -8,12 +8,12 @@ import json
 import numpy as np
 import pytest
 
+from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.errors import NergError
-from nerg_mi.jobs.options.statistics import StatisticsOptions
 from nerg_mi.jobs.statistics import statistics
 from nerg_mi.rays.rays import Rays
+from tests.aoi.place import first_box, people, write_place
 
-from .counting.place import first_box, people, write_place
 from .recorder import Recorder
 
 FAST = {"resamples": 199, "eyes": 12, "directions": 512, "samples": 12, "mode": "llvm_ad_rgb"}

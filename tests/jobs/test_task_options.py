@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.parts import OF_COUNTS, OF_FIELDS
 from nerg_mi.jobs import folds
 from nerg_mi.jobs.ablation_tasks import _OF_TRAINING
-from nerg_mi.jobs.counting.tasks import OF_COUNTS, OF_FIELDS
 from nerg_mi.jobs.film_tasks import OF_PICTURES
 from nerg_mi.jobs.options import other_fields
 from nerg_mi.jobs.options.folds import FoldOptions
 from nerg_mi.jobs.options.parts import FilmOptions, PartOptions
-from nerg_mi.jobs.options.statistics import StatisticsOptions
 
 STORE = ("store", "scheduler", "threads")
 # Inputs of the parts, by their bytes.

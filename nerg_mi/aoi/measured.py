@@ -31,7 +31,7 @@ from nerg_mi.statistics.visits import (
     unite,
 )
 
-from .surroundings import Surroundings
+from .scene import Surroundings
 
 BLOCK = 1 << 17
 """About so many rays are looked at at once."""

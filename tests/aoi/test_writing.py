@@ -6,8 +6,8 @@ import csv
 
 import pytest
 
+from nerg_mi.aoi import output
 from nerg_mi.figures.statistics_figures import things_figure
-from nerg_mi.jobs.counting import writing
 from nerg_mi.statistics.tables import PLACES, PersonRows
 from nerg_mi.statistics.visits import ALL, Sums
 
@@ -18,7 +18,7 @@ ROWS = [
 
 
 def test01_all_kinds(tmp_path):
-    files = writing.write_rows(tmp_path, "t", ROWS, *writing.plain_columns(ROWS, ()))
+    files = output.write_rows(tmp_path, "t", ROWS, *output.plain_columns(ROWS, ()))
     with files[0].open() as file:
         rows = list(csv.DictReader(file))
     assert rows[0]["x"] == "0.125" and rows[1]["n"] == "" and rows[0]["thing"] == "a|b"
@@ -28,22 +28,22 @@ def test01_all_kinds(tmp_path):
 
 
 def test02_without_pyarrow(tmp_path, monkeypatch):
-    monkeypatch.setattr(writing, "find_spec", lambda name: None)
-    files = writing.write_rows(tmp_path, "t", ROWS, *writing.plain_columns(ROWS, ()))
+    monkeypatch.setattr(output, "find_spec", lambda name: None)
+    files = output.write_rows(tmp_path, "t", ROWS, *output.plain_columns(ROWS, ()))
     assert [f.suffix for f in files] == [".csv", ".md"]
 
 
 def test03_things_show_what_is_known():
     row = {"cell": "cohort", "value": "x", "thing": "a", "source": "tracked", "people": None, "share": 0.5}
-    head, cells = writing.thing_columns([row])
+    head, cells = output.thing_columns([row])
     assert head == ["cell", "thing", "source", "people", "share of time"]
-    assert cells(row) == ["cohort x", "a", "tracked", "", "50.0 %"] and writing.cell_name({"cell": "all"}) == "all"
+    assert cells(row) == ["cohort x", "a", "tracked", "", "50.0 %"] and output.cell_name({"cell": "all"}) == "all"
 
 
 def test04_what_a_field_foretells_with_its_spread_and_support():
     row = {"cell": "all", "value": "", "thing": "a", "source": "field", "people": 5, "share": 0.5, "share_low": 0.4}
     row |= {"share_high": 0.6, "share_spread": 0.021, "support": 1234.0}
-    head, cells = writing.thing_columns([row, row | {"source": "tracked"}])
+    head, cells = output.thing_columns([row, row | {"source": "tracked"}])
     assert head[-1] == "support [rays]"
     assert cells(row)[-2:] == ["50.0 % [40.0, 60.0] ± 2.1", "1,234"]
     assert (
@@ -57,7 +57,7 @@ def test06_reach_from_few_places_is_marked_in_table_and_picture():
     row |= {"dwell": 2.0, "support": 9.0}
     for places, low in ((2.56, True), (PLACES - 0.01, True), (PLACES, False), (None, False)):
         one = row | {"places": places}
-        texts = writing.thing_columns([one])[1](one)
+        texts = output.thing_columns([one])[1](one)
         said = [text for text in texts if "too low" in str(text)]
         assert said == ([f"45.0 % (too low: {places:.1f} places a person)"] if low else [])
         share, reach, dwell = things_figure([one]).axes
@@ -70,20 +70,20 @@ def test05_what_a_change_does():
     row |= {"low": -0.3, "high": -0.2, "p": 0.0005, "p_adjusted": 0.001, "difference_spread": None, "support": None}
     new = row | {"thing": "b", "measure": "visible", "before": None, "difference": None, "low": None, "p": None}
     rows = [row | {"source": "field"}, new | {"source": "field", "p_adjusted": None, "support": 12.5}]
-    head, cells = writing.what_if_columns(rows)
+    head, cells = output.what_if_columns(rows)
     assert head[3:6] == ["before [%]", "after [%]", "difference [points]"] and len(head) == len(cells(rows[0])) == 9
     told = ["50.00", "25.00", "-25.00 [-30.00, -20.00]", "0.0005", "0.001", "not in the checkpoint"]
     assert cells(rows[0]) == ["a", "share of gaze", 5, *told]
     assert cells(rows[1]) == ["b", "visible share", 5, "", "25.00", "", "", "", "12.5"]
     spread = [r | {"difference_spread": 0.01} for r in rows]
-    head, cells = writing.what_if_columns(spread)
+    head, cells = output.what_if_columns(spread)
     assert head[6] == "± members" and cells(spread[0])[6] == "1.00"
 
 
 def test06_differences_in_their_units():
     row = {"cell": "zone", "first": "front", "second": "back", "thing": "a", "measure": "share", "difference": -0.06}
     row |= {"low": -0.08, "high": -0.04, "p": 0.001, "p_adjusted": 0.0014, "found": True}
-    head, cells = writing.difference_columns([row])
+    head, cells = output.difference_columns([row])
     told = ["zone", "front", "back", "a", "share of time", "-6.00 points [-8.00, -4.00]", "0.001", "0.0014", "yes"]
     assert head[5] == "second - first" and cells(row) == told
     blank = row | {"measure": "dwell", "difference": 1.5, "low": None, "p": None, "p_adjusted": None, "found": False}
@@ -95,9 +95,9 @@ def test07_many_people_are_written_in_parts(tmp_path, monkeypatch):
     # The first part of the file knows no first look.
     sums.looks[3:], sums.first_sum[3:], sums.first_count[3:] = 1, 2.5, 1
     rows = PersonRows(sums, {f"p{k}": f"p{k}" for k in range(5)}, False)
-    monkeypatch.setattr(writing, "_PART", 3)
-    monkeypatch.setattr(writing, "MOST_LINES", 4)
-    files = writing.write_rows(tmp_path, "people", rows, *writing.plain_columns(rows))
+    monkeypatch.setattr(output, "_PART", 3)
+    monkeypatch.setattr(output, "MOST_LINES", 4)
+    files = output.write_rows(tmp_path, "people", rows, *output.plain_columns(rows))
     with files[0].open() as file:
         told = list(csv.DictReader(file))
     assert len(told) == 10 and told[0]["first_look"] == "" and told[9]["first_look"] == "2.5"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from nerg_mi.jobs.counting.results import write_results
-from nerg_mi.jobs.options.statistics import StatisticsOptions
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.output import write_results
 from nerg_mi.jobs.statistics import StatisticsResult
 from tests.jobs.recorder import Recorder
 

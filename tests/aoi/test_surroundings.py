@@ -6,8 +6,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.aoi.scene import surroundings_of_files
 from nerg_mi.errors import NergError
-from nerg_mi.jobs.counting.surroundings import surroundings_of_files
 from nerg_mi.maths.geometry import Similarity
 
 from .place import first_box, people, write_place

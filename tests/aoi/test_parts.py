@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nerg_mi.aoi import measured
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.parts import _place_beside
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.jobs.counting import tracked
-from nerg_mi.jobs.counting.parts import _place_beside
-from nerg_mi.jobs.options.statistics import StatisticsOptions
 from nerg_mi.jobs.statistics import statistics
 from nerg_mi.jobs.store_account import account_for_store
 from tests.conftest import ROOT
@@ -29,7 +29,7 @@ FAST = {"resamples": 199, "eyes": 40, "directions": 128, "samples": 6, "names": 
 def engine(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     # Blocks of about a person each.
-    monkeypatch.setattr(tracked.blocks_of, "__defaults__", (100,))
+    monkeypatch.setattr(measured.blocks_of, "__defaults__", (100,))
 
 
 @pytest.fixture

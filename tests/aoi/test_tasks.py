@@ -4,8 +4,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from nerg_mi.jobs.counting.tasks import OF_COUNTS, described, foretell_part, read_foretold, read_sums, write_sums
-from nerg_mi.jobs.options.statistics import StatisticsOptions
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.parts import OF_COUNTS, described, foretell_part, read_foretold, read_sums, write_sums
 from nerg_mi.statistics.visits import ALL, Cell, Sums
 from nerg_mi.tasks.inputs import read_input
 

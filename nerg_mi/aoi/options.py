@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from nerg_mi.jobs.options import option, parse_numbers, parse_point
+from nerg_mi.jobs.options.parts import PartOptions
 from nerg_mi.ranges import COORDINATES, SECONDS, SEEDS, THREADS, TIMES, Range
-
-from . import option, parse_numbers, parse_point
-from .parts import PartOptions
 
 
 @dataclass(frozen=True, kw_only=True)

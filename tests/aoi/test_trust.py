@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.jobs.counting.foretold import Foretold
-from nerg_mi.jobs.counting.tracked import Eyes
-from nerg_mi.jobs.counting.trust import add_trust, support_of, tell_places, tell_support
+from nerg_mi.aoi.measured import Eyes
+from nerg_mi.aoi.predicted import Foretold, add_trust, support_of, tell_places, tell_support
 from nerg_mi.statistics.tables import PLACES
 from nerg_mi.statistics.visits import ALL, Cell
 from tests.jobs.recorder import Recorder

@@ -8,15 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.predicted import Foretold, Setting, places_of, what_if_rows
+from nerg_mi.aoi.scene import Surroundings, things_of
 from nerg_mi.formats.areas.kinds import Areas
 from nerg_mi.formats.regions import Region
-from nerg_mi.jobs.counting.foretold import Foretold
-from nerg_mi.jobs.counting.places import places_of
-from nerg_mi.jobs.counting.setting import Setting
-from nerg_mi.jobs.counting.surroundings import Surroundings
-from nerg_mi.jobs.counting.things import things_of
-from nerg_mi.jobs.counting.what_if import what_if_rows
-from nerg_mi.jobs.options.statistics import StatisticsOptions
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.statistics.tables import Floor
 from nerg_mi.statistics.visits import LookRules

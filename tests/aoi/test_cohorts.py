@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from nerg_mi.aoi.scene import read_cohorts
 from nerg_mi.errors import NergError
 from nerg_mi.files.tables import write_csv
-from nerg_mi.jobs.counting.cohorts import read_cohorts
 
 
 def test01_read(tmp_path):

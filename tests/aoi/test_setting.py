@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.predicted import setting_of
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.areas.reading import read_areas
-from nerg_mi.jobs.counting.setting import setting_of
-from nerg_mi.jobs.options.statistics import StatisticsOptions
 
 from .place import write_place
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nerg_mi.aoi.scene import scene_of, shape_named, shapes_of, thing_of_shape, things_of
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas.kinds import MeshPart, SceneShape
 from nerg_mi.formats.regions import Region
-from nerg_mi.jobs.counting.things import scene_of, shape_named, shapes_of, thing_of_shape, things_of
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.surfaces.mesh import mitsuba_mesh
 

@@ -1,0 +1,409 @@
+"""What a gaze field predicts of areas: for people where they stood, for places where nobody was tracked, after a
+change, and how far it is to be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+from zlib import crc32
+
+import numpy as np
+
+from nerg_mi.alignment.check import read_similarity
+from nerg_mi.errors import NergError
+from nerg_mi.formats.areas.kinds import Areas, Group
+from nerg_mi.formats.regions import read_regions
+from nerg_mi.jobs.reporter import SILENT, Reporter
+from nerg_mi.statistics.estimates import adjusted, ratio_differences
+from nerg_mi.statistics.shares import ROUGH, gaze_shares
+from nerg_mi.statistics.tables import BY_NAME, FIELD, PLACES, Floor, People, Row
+from nerg_mi.statistics.visibility import CellsInView, Isovists, Targets, in_view, standing, unhidden
+from nerg_mi.statistics.visits import ALL, Cell, LookRules, Thing
+
+from .measured import Counting, Eyes, Window
+from .options import StatisticsOptions, parse_window
+from .scene import (
+    Changes,
+    Surroundings,
+    changed_areas,
+    changed_scene,
+    read_changes,
+    read_cohorts,
+    shapes_of,
+    surroundings_of_files,
+    things_of,
+)
+
+# ---- Foretold ----
+#
+# What a gaze field foretells of people who stand where they stood: the same numbers as those that are counted, as far
+# as a field tells them.
+#
+# A field knows how gaze is shared out at a moment, and nothing of its course: there are no looks, returns or first
+# looks in it. The probability that somebody looked at all follows if glances, one every so many seconds, are
+# independent of each other: 1 - Π (1 - s_i) over their time, s_i the share at glance i.
+
+
+@dataclass(frozen=True, eq=False)
+class Foretold:
+    """Of E eyes and A areas: ``share`` (E, A) of the gaze, ``distance`` (E, A) its mean in metres, times the share,
+    ``visible`` (E, A) bool, ``support`` (E,) rays that the field learnt from there, NaN where it does not say;
+    ``members`` (M, E, A): the share by each member of an ensemble, by one field the same share again."""
+
+    share: np.ndarray
+    distance: np.ndarray
+    visible: np.ndarray
+    support: np.ndarray
+    members: np.ndarray
+
+
+def eyes_of_some(eyes: Eyes, most: int, reporter: Reporter) -> Eyes:
+    """Those of at most ``most`` people, who are the same whatever the order in which they came: those whose names have
+    the least checksums."""
+    people = sorted(set(eyes.person), key=lambda name: (crc32(name.encode("utf-8", "surrogatepass")), name))
+    if len(people) <= most:
+        return eyes
+    reporter.message(f"the field is asked of {most:,} of {len(people):,} people; --eyes {len(people)} asks of all")
+    chosen = set(people[:most])
+    rows = [k for k, person in enumerate(eyes.person) if person in chosen]
+    person, cells = tuple(eyes.person[k] for k in rows), tuple(eyes.cells[k] for k in rows)
+    return Eyes(eyes.positions[rows], eyes.ahead[rows], person, cells)
+
+
+def foretell(
+    around: Surroundings,
+    eyes: Eyes,
+    things: Sequence[Thing],
+    members: Sequence[tuple[int, ...]],
+    margin: float,
+    view: float,
+    samples: int,
+    directions: int,
+    reporter: Reporter,
+) -> Foretold:
+    """What the gaze field of ``around`` says of each of the ``eyes``, whose shares over the sphere add up to one, in
+    so many ``directions`` around each or, where a thing is small, more."""
+    E = len(eyes.positions)
+    told = lambda done: reporter.progress(done / E, f"the field: place {done} of {E}")
+    found = gaze_shares(
+        around.look_from, eyes.positions, things, members, margin, replace(ROUGH, first=directions), told
+    )
+    targets = Targets.of(things, samples)
+    seen = in_view(targets, eyes.positions, eyes.ahead, unhidden(targets, eyes.positions, around.depth, margin), view)
+    visible = np.stack([seen[:, list(of)].any(axis=1) for of in members], axis=1)
+    support = np.array([around.support(p) for p in eyes.positions])
+    return Foretold(found.share, found.distance / around.scale, visible, support, found.members)
+
+
+def foretold_people(
+    foretold: Foretold, eyes: Eyes, cell: Cell, times: dict[str, float], glance: float
+) -> People | None:
+    """The people of a cell by the field; ``times``: for how long each was there, in seconds; ``glance``: seconds that
+    one takes. None where no eye is of the cell."""
+    rows = [k for k, cells in enumerate(eyes.cells) if cell in cells and eyes.person[k] in times]
+    names = sorted({eyes.person[k] for k in rows})
+    if not names:
+        return None
+    place = {name: k for k, name in enumerate(names)}
+    who = np.array([place[eyes.person[k]] for k in rows])
+    count = np.bincount(who, minlength=len(names)).astype(float)
+
+    def mean(v: np.ndarray) -> np.ndarray:
+        total = np.zeros((len(names), v.shape[1]))
+        np.add.at(total, who, v[rows].astype(float))
+        return total / count[:, None]
+
+    time = np.array([times[name] for name in names])
+    share = mean(foretold.share)
+    missed = mean(-np.log1p(-np.minimum(foretold.share, 1 - 1e-12)))
+    reached = -np.expm1(-missed * (time / glance)[:, None])
+    seconds = time[:, None]
+    distance, visible = mean(foretold.distance) * seconds, mean(foretold.visible) * seconds
+    return People(tuple(names), time, share * seconds, distance, visible, reached)
+
+
+# ---- Places ----
+#
+# Places on the floor where nobody was tracked: where one can stand, and what is seen from there.
+
+
+def look_around(around: Surroundings, height: float, step: float, floor: float) -> np.ndarray:
+    """Places (G, 3) at eye height where one can stand. Raises `NergError` where there are none."""
+    lower, upper = around.bounds()
+    found = standing(lower, upper, step * around.scale, height * around.scale, around.depth, floor)
+    if not len(found):
+        raise NergError(
+            f"nobody can stand anywhere: there is no floor at {floor:g} (--floor) below eyes at {height:g} (--height)"
+        )
+    return found
+
+
+def places_of(positions: np.ndarray) -> Eyes:
+    """Somebody at each of ``positions`` (M, 3), who may turn round."""
+    names = tuple(f"observer {k + 1:0{len(str(len(positions)))}d}" for k in range(len(positions)))
+    return Eyes(positions, np.tile([1.0, 0, 0], (len(positions), 1)), names, (frozenset([ALL]),) * len(positions))
+
+
+def isovist_rows(found: Isovists, names: Sequence[str], members: Sequence[tuple[int, ...]]) -> list[Row]:
+    """A row for each place; of each area the share of its points that are seen from there."""
+    rows = []
+    for k, (x, y, z) in enumerate(found.points.tolist()):
+        row: Row = {"x": x, "y": y, "z": z}
+        row |= {n: float(getattr(found, n)[k]) for n in ("area", "perimeter", "nearest", "farthest", "radius")}
+        rows.append(row | {f"sees {n}": float(found.seen[k, list(of)].mean()) for n, of in zip(names, members)})
+    return rows
+
+
+# ---- Setting ----
+#
+# What a count needs besides rays, from files and options: the same in whatever process it is made.
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """``areas`` in what is ``around`` people, and the ``things`` that they consist of; ``options`` of how it is
+    counted, with their ``rules`` of looks and ``windows`` of time."""
+
+    around: Surroundings
+    areas: Areas
+    things: Sequence[Thing]
+    options: StatisticsOptions
+    rules: LookRules
+    windows: Sequence[Window]
+
+    @cached_property
+    def members(self) -> list[tuple[int, ...]]:
+        """Of each area the numbers of its things."""
+        return list(self.areas.members().values())
+
+    @property
+    def margin(self) -> float:
+        """In units of the place."""
+        return self.options.margin * self.around.scale
+
+    def counting(self, hits: bool, cohorts: tuple[str, ...]) -> Counting:
+        """How rays are counted which end at their ``hits``, or not, and have these ``cohorts`` where no table does."""
+        o = self.options
+        in_view = None
+        if o.seen:
+            targets = Targets.of(self.things, o.samples)
+            in_view = CellsInView(targets, self._depth_or_things, o.cell * self.around.scale, self.margin)
+        leaves = [k for k, area in enumerate(self.areas.areas) if not isinstance(area, Group)]
+        table = {} if o.cohorts is None else read_cohorts(o.cohorts)
+        return Counting(
+            self.around,
+            self.things,
+            self.areas.names,
+            self.members,
+            leaves,
+            self.rules,
+            self.margin,
+            o.tolerance,
+            hits,
+            o.view,
+            in_view,
+            self.windows,
+            [] if o.zones is None else read_regions(o.zones),
+            table,
+            tuple(sorted(set(table.values()))) if table else cohorts,
+        )
+
+    def changed(self, changes: Changes) -> Setting:
+        """The same after ``changes`` of shapes and areas. Raises `NergError` for those that cannot be made."""
+        areas, around, shapes = changed_areas(self.areas, changes), self.around, shapes_of(self.around.scene)
+        if changes.of_shapes:
+            scene, shapes = changed_scene(around.scene, changes)
+            around = around.within(scene)
+        return replace(self, around=around, areas=areas, things=things_of(areas.things, shapes))
+
+    def foretold(self, eyes: Eyes, view: float, reporter: Reporter = SILENT) -> Foretold:
+        """What the field says of the gaze of ``eyes`` that see so many degrees (``view``)."""
+        o = self.options
+        return foretell(
+            self.around, eyes, self.things, self.members, self.margin, view, o.samples, o.directions, reporter
+        )
+
+    def _depth_or_things(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """How far is seen: to the surfaces of the place, or, where none is known, to the nearest thing."""
+        if self.around.place is not None:
+            return self.around.depth(o, d)
+        reach = np.full(len(o), np.inf)
+        for thing in self.things:
+            near, far = thing.interval(o, d)
+            met = (near >= 0) & (np.isfinite(near) if thing.open else near < far)
+            reach = np.where(met, np.minimum(reach, near), reach)
+        return reach
+
+
+def setting_of(
+    scene: Path | None, field: Path | None, gaze: Path | None, areas: Areas, options: StatisticsOptions, ns: ModuleType
+) -> Setting:
+    """The setting of these files. Raises `NergError`; what is plainly wrong is told before anything is loaded."""
+    rules = LookRules(options.gap, options.pause, options.merge, options.least)
+    windows = [Window(*parse_window(text)) for text in options.windows]
+    align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
+    around = surroundings_of_files(scene, field, gaze, align, ns)
+    return Setting(around, areas, things_of(areas.things, shapes_of(around.scene)), options, rules, windows)
+
+
+# ---- Trust ----
+#
+# How far what a field foretells is to be trusted: the spread of an ensemble's members, and how many rays it learnt
+# from around the eyes.
+
+
+SPREAD = ("share", "dwell", "reach")
+"""Numbers whose spread over members is told."""
+
+
+def add_trust(
+    rows: Sequence[Row], foretold: Foretold, eyes: Eyes, times: Mapping[Cell, dict[str, float]], glance: float
+) -> None:
+    """Give ``rows`` of the table of things ``support``, the median over the eyes of their cell, ``places``, the eyes of
+    the cell for each of its people, and ``share_spread``, ``dwell_spread`` and ``reach_spread``, the standard
+    deviations over the members of an ensemble; None for what was counted, is blank, or is not known."""
+    found: dict[tuple[str, str], tuple[float | None, float | None, dict[str, np.ndarray]]] = {}
+    areas: dict[str, int] = {}
+    for cell in times:
+        mine = np.array([cell in cells for cells in eyes.cells], bool)
+        people = {person for person, own in zip(eyes.person, mine.tolist()) if own}
+        places = float(mine.sum()) / len(people) if people else None
+        spreads = _spreads(foretold, eyes, cell, times, glance)
+        found[cell.dimension, cell.value] = support_of(foretold, mine), places, spreads
+    for row in rows:
+        place = areas.setdefault(row["thing"], len(areas))
+        support, places, spreads = found[row["cell"], row["value"]]
+        told = row["source"] == FIELD
+        for name in SPREAD:
+            known = told and name in spreads and row[name] is not None
+            row[f"{name}_spread"] = float(spreads[name][place]) if known else None
+        row["support"] = support if told and row["people"] is not None else None
+        row["places"] = places if told and row["people"] is not None else None
+
+
+def support_of(foretold: Foretold, mine: np.ndarray | None = None) -> float | None:
+    """Rays that the field learnt from around an eye, at the median of all, or of ``mine`` (E,); None where the
+    checkpoint keeps none."""
+    some = foretold.support if mine is None else foretold.support[mine]
+    some = some[np.isfinite(some)]
+    return float(np.median(some)) if len(some) else None
+
+
+def tell_support(foretold: Foretold, reporter: Reporter) -> None:
+    """Say what is missing where nobody can tell how much data the numbers of a field rest on."""
+    if support_of(foretold) is None:
+        reporter.message(
+            "the gaze field's checkpoint keeps no support, so that the tables cannot say where it learnt from nobody; "
+            "nerg train gaze with the rays makes one that does"
+        )
+
+
+def tell_places(eyes: Eyes, reporter: Reporter) -> None:
+    """Say so where a field is asked from too few places a person for their reach: who looks at a thing only where it is
+    near is taken for somebody who does not, unless one of their places is there."""
+    people = len(set(eyes.person))
+    if people and len(eyes.person) < PLACES * people:
+        reporter.message(
+            f"the field is asked from {len(eyes.person) / people:.1f} places a person, by which reach comes out too "
+            f"low; --eyes {PLACES * people} asks from {PLACES}"
+        )
+
+
+def _spreads(
+    foretold: Foretold, eyes: Eyes, cell: Cell, times: Mapping[Cell, dict[str, float]], glance: float
+) -> dict[str, np.ndarray]:
+    if len(foretold.members) < 2:
+        return {}
+    values: dict[str, list[np.ndarray]] = {name: [] for name in SPREAD}
+    for share in foretold.members:
+        people = foretold_people(replace(foretold, share=share), eyes, cell, times[cell], glance)
+        for name in SPREAD:
+            pair = None if people is None else BY_NAME[name].pair(people)
+            if pair is None:
+                return {}
+            with np.errstate(divide="ignore", invalid="ignore"):
+                values[name].append(pair[0].sum(axis=0) / pair[1].sum(axis=0))
+    return {name: np.std(found, axis=0, ddof=1) for name, found in values.items()}
+
+
+# ---- The table of what a change would do, by the field ----
+
+Foretell = Callable[[Setting, Eyes], Foretold]
+
+
+def what_if_rows(
+    path: Path,
+    setting: Setting,
+    eyes: Eyes,
+    before: Foretold,
+    foretell: Foretell,
+    floor: Floor,
+    resamples: int,
+    seed: int,
+) -> list[Row]:
+    """Of each area and measure (``share`` of gaze, ``visible`` share of people's time) what the field says ``before``
+    and ``after`` the changes in the file ``path``, the ``difference`` with its interval over people and, of an
+    ensemble's shares, its ``difference_spread`` over the members, and the ``support``: rays that the field learnt from
+    around an eye, at the median after the changes. ``foretell`` is asked what the field says in the changed setting of
+    the observers that there are then. Raises `NergError`."""
+    changes = read_changes(path)
+    there = setting.changed(changes)
+    areas, after_areas = setting.areas, there.areas
+    others = eyes
+    if changes.observers is not None:
+        others = places_of(changes.observers)
+    if changes.shift is not None:
+        others = replace(others, positions=others.positions + changes.shift)
+    after = foretell(there, others)
+    # People who are the same before and after are compared with themselves.
+    names = sorted({*eyes.person, *others.person})
+    support = support_of(after)
+    rows: list[Row] = []
+    for name in dict.fromkeys((*areas.names, *after_areas.names)):
+        for measure in ("share", "visible"):
+            old = _of(eyes, names, getattr(before, measure), areas, name)
+            new = _of(others, names, getattr(after, measure), after_areas, name)
+            row = _row(name, measure, old, new, floor, resamples, seed)
+            row["difference_spread"] = None
+            if measure == "share" and row["difference"] is not None and len(after.members) > 1:
+                apart = [
+                    _mean(_of(others, names, to, after_areas, name)) - _mean(_of(eyes, names, at, areas, name))
+                    for at, to in zip(before.members, after.members)
+                ]
+                row["difference_spread"] = float(np.std(apart, ddof=1))
+            rows.append(row | {"support": support, "source": FIELD})
+    corrected = adjusted(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
+    for row, p in zip(rows, corrected):
+        row["p_adjusted"] = float(p) if np.isfinite(p) else None
+    return rows
+
+
+def _of(eyes: Eyes, names: list[str], values: np.ndarray, areas: Areas, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of an area's ``values`` (E, A) over the eyes of each person, and who has any, (P, 1) each."""
+    total, count = np.zeros((len(names), 1)), np.zeros((len(names), 1))
+    if name in areas.names:
+        place = {n: k for k, n in enumerate(names)}
+        who = np.array([place[p] for p in eyes.person])
+        np.add.at(total[:, 0], who, values[:, areas.names.index(name)].astype(float))
+        np.add.at(count[:, 0], who, 1.0)
+    return total / np.maximum(count, 1), (count > 0).astype(float)
+
+
+def _mean(pair: tuple[np.ndarray, np.ndarray]) -> float:
+    return float(pair[0].sum() / pair[1].sum())
+
+
+def _row(name: str, measure: str, old, new, floor: Floor, resamples: int, seed: int) -> Row:
+    mean = lambda pair: _mean(pair) if pair[1].sum() else None
+    people = int(min(old[1].sum() or new[1].sum(), new[1].sum() or old[1].sum()))
+    told = floor.passes(people)
+    row: Row = {"thing": name, "measure": measure, "people": people if told else None}
+    row |= {"before": mean(old) if told else None, "after": mean(new) if told else None}
+    both = bool(old[1].sum() and new[1].sum())
+    found = ratio_differences(old, new, resamples=resamples, seed=seed) if both and told else None
+    number = lambda v: float(v[0]) if np.isfinite(v[0]) else None
+    keys = {"difference": "value", "low": "low", "high": "high", "p": "p"}
+    return row | {k: None if found is None else number(getattr(found, v)) for k, v in keys.items()}
