@@ -45,8 +45,8 @@ def video_frames(
     container: Any = None
     stream: Any = None
     with replacing(path) as temporary:
-        # Without the name and version of the writing library, files stay equal.
-        flags = {"movflags": "+faststart", "fflags": "+bitexact"}
+        # Without the name and version of the writing library, and its estimate of the bit rate, files stay equal.
+        flags = {"movflags": "+faststart", "fflags": "+bitexact", "write_btrt": "0"}
         container = av.open(str(temporary), "w", format="mp4", options=flags)
 
         def write(frame: np.ndarray) -> None:
