@@ -107,6 +107,7 @@ def test04_wrong_sizes_are_a_sentence(tmp_path, capsys):
     assert "at least 12 pixels" in capsys.readouterr().err
 
 
+@pytest.mark.nightly
 def test05_the_store_itself(rgb, tmp_path):
     """Committed checkpoints: the shelf hides what lies behind it, and gaze is what occlusion leaves of it."""
     missing = [f for f in demo.CHECKPOINTS.values() if not (demo.store_scene().parent / f).is_file()]

@@ -39,6 +39,7 @@ class Uniform:
         return np.full((len(positions), len(directions)), 1 / (4 * np.pi))
 
 
+@pytest.mark.nightly
 def test_rows_are_made_once(tmp_path, monkeypatch):
     """With two variants, for the time that compiling takes; the trainers know all of them."""
     found = ablate(crowd(3000), tmp_path, OPTIONS)

@@ -158,6 +158,7 @@ def test_without_a_place(tmp_path):
     assert "No objects are named, for nothing is known of the place." in text and "sphere" in result.run.pictures
 
 
+@pytest.mark.nightly
 def test_pictures_that_are_there_are_not_rendered_again(run, tmp_path, monkeypatch):
     from nerg_mi.jobs import report
 

@@ -118,6 +118,7 @@ def test_a_place_alone_is_shown_from_where_it_can_be_seen(rgb, folder, tmp_path)
     assert f"wrote {result.path}" in told.messages and any("best overview" in line for line in told.messages)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind, scale", [("mesh", 1e-4), ("mesh", 1e6), ("hits", 1e-4), ("hits", 3e4)])
 def test_places_of_any_unit(rgb, tmp_path, kind, scale):
     import mitsuba as mi

@@ -92,6 +92,7 @@ def test05_a_place_of_a_dataset(rgb, tmp_path):
         assert place.rays is not None and len(place.rays) == len(rays) and place.made
 
 
+@pytest.mark.nightly
 def test06_several_gaze_fields_are_variants(rgb, tmp_path):
     store = demo.store_scene()
     run, told = tmp_path / "run", Recorder()

@@ -103,6 +103,7 @@ def test02_gaze_weights_learn_from_whole_views(task):
     assert task.error() < 0.5 * before, (before, task.error())
 
 
+@pytest.mark.nightly
 def test03_gaze_weights_learn_from_batches_of_rays(task):
     """Random pixels of all cameras a step, their targets in the loader's colours."""
     before = task.error()

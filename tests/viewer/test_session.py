@@ -172,6 +172,7 @@ def test03_layers_have_ranges_of_their_own(session_of, room):
     assert float(np.ravel(np.array(session.scene.integrator.falloff))[0]) == pytest.approx(0.25)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test04_shares_are_those_of_the_library(session_of, store):
     session = session_of(store, observer=(4.6, 3.0, 1.6))

@@ -64,6 +64,7 @@ def equal(one, other):
     )
 
 
+@pytest.mark.nightly
 def test_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again(tmp_path):
     scene = BakeScene(ROOM, gaze=GAZE, of_gaze=GazeSettings(angle=0.5, directions=1024), of_rays=RAYS)
     groups = [crowd(3), rays(500)]

@@ -27,6 +27,7 @@ def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
     assert loaded.color_space == "srgb" and loaded.march_step == pytest.approx(2 / 64)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_learns_without_depth(dataset):
     _, provenance = train_field(dataset, TINY, settings(), ns, depth=False)
