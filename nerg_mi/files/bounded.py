@@ -158,12 +158,17 @@ def read_bytes(path: str | os.PathLike, what: str = "file", most: int | None = N
 
 def read_json(path: str | os.PathLike, what: str = "file", most: int = JSON_BYTES) -> object:
     """The JSON document ``path``. `NergError` for what is none, is larger than ``most`` bytes or is nested too deep."""
-    return parse_json(read_bytes(path, what, most), path, what)
+    return parse_json(read_bytes(path, what, most), path, what, most)
 
 
-def parse_json(raw: bytes | str, path: str | os.PathLike, what: str = "file") -> object:
+def parse_json(raw: bytes | str, path: str | os.PathLike, what: str = "file", most: int = JSON_BYTES) -> object:
     """The JSON document ``raw``, which stood in ``path``. `NergError` for what is none, is nested deeper than
     `JSON_DEPTH` or holds more than `JSON_VALUES` values. Integers of hundreds of digits are floats."""
+    if len(raw) > most:
+        raise NergError(
+            f'the {what} "{path}" holds a JSON document of {len(raw):,} bytes, more than the {most:,} that are read; '
+            "give a smaller one"
+        )
     with reading(path, what, "correct it, or make it anew"):
         if isinstance(raw, (bytes, bytearray)):
             raw = raw.decode(json.detect_encoding(raw))

@@ -130,3 +130,8 @@ def test_integers_that_no_float_holds_are_infinite(digits):
     assert found == [math.inf, -math.inf, 10**20 - 1]
     with pytest.raises(NergError, match="reaches to inf; its corners must be finite, and at most 1e.07"):
         Region("shelf", (0, 0, 0), (1, 1, found[0]))
+
+
+def test_documents_within_other_files_have_the_same_limit():
+    with pytest.raises(NergError, match="12 bytes, more than the 11"):
+        parse_json(b'{"a": [1,2]}', "a.glb", most=11)
