@@ -33,11 +33,10 @@ def main(argv=None) -> None:
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.training.geometry.places import place_of_field, place_of_volume
-    from nerg_mi.transport.observer.gaze import PlacedGaze
-    from nerg_mi.transport.observer.settings import DIRECTIONS as COUNT
-    from nerg_mi.transport.observer.settings import ObserverSettings
-    from nerg_mi.transport.place import Place
-    from nerg_mi.transport.trace import default_settings
+    from nerg_mi.transport.geometry import Place, default_settings
+    from nerg_mi.transport.observer import DIRECTIONS as COUNT
+    from nerg_mi.transport.observer import ObserverSettings
+    from nerg_mi.transport.observer_gaze import PlacedGaze
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("gaze", type=Path)

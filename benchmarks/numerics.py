@@ -17,13 +17,12 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.fields.radiance import density_from_log
-from nerg_mi.transport.march.depth import surface_depth
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.quadrature import absorbed_share, linear_crossing, linear_share, mean_depth_share
-from nerg_mi.transport.march.rules import RULES
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.local_ray import LocalRay
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.depth import surface_depth
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import LocalRay
+from nerg_mi.transport.quadrature import RULES, absorbed_share, linear_crossing, linear_share, mean_depth_share
+from nerg_mi.transport.volume_medium import VolumeMedium
 from timing import print_table
 
 import drjit as dr

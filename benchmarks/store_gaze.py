@@ -53,7 +53,7 @@ def main(argv=None) -> None:
     from nerg_mi.rays.splits import purge
     from nerg_mi.scenes import store
     from nerg_mi.scenes.store.attention_law import AttentionLaw
-    from nerg_mi.transport.media.field import FieldMedium
+    from nerg_mi.transport.field_medium import FieldMedium
 
     here = Path(store.__file__).resolve().parent
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

@@ -99,7 +99,7 @@ class Attention:
     def __init__(self, shelf: Shelf, heads: np.ndarray, settings: Settings, falloff: float = 0.05):
         from nerg_mi.probes.surface_attention import patches
         from nerg_mi.scenes.store.attention_law import HERE
-        from nerg_mi.transport.place import Place
+        from nerg_mi.transport.geometry import Place
 
         import mitsuba as mi
 
@@ -191,7 +191,7 @@ def elevation(attention: Attention, at: float, spacing: float):
     metres."""
     from nerg_mi.probes.surface_attention import Patches, contributions
     from nerg_mi.scenes.store.attention_law import HERE
-    from nerg_mi.transport.place import Place
+    from nerg_mi.transport.geometry import Place
 
     import drjit as dr
     import mitsuba as mi

@@ -77,7 +77,7 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import boolean, expose_parameters, trained, transform, volume_of
 from nerg_mi.registration import register
-from nerg_mi.transport.observer.gaze import PlacedGaze
+from nerg_mi.transport.observer_gaze import PlacedGaze
 
 
 class GazeFieldVolume(mi.Volume):

@@ -73,7 +73,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import boolean, expose_parameters, number, trained, transform, volume_of
 from nerg_mi.ranges import VALUES, Range
 from nerg_mi.registration import register
-from nerg_mi.transport.media.field import FieldMedium
+from nerg_mi.transport.field_medium import FieldMedium
 
 
 class NerfVolume(mi.Volume):

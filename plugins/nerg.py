@@ -214,10 +214,10 @@ from nerg_mi.maths.types import Bool, UInt32
 from nerg_mi.properties import boolean, number, text
 from nerg_mi.ranges import VALUES, Range
 from nerg_mi.registration import register
-from nerg_mi.transport.freezing import no_collection, recording
-from nerg_mi.transport.observer import viewpoint
-from nerg_mi.transport.observer.cache import ObserverCache
-from nerg_mi.transport.shading import Shading
+from nerg_mi.transport import observer
+from nerg_mi.transport.geometry import Shading
+from nerg_mi.transport.jit import no_collection, recording
+from nerg_mi.transport.observer import ObserverCache
 
 from . import nerg_aovs, nerg_properties
 from .nerg_asked import Asked
@@ -285,8 +285,8 @@ class NergIntegrator(mi.SamplingIntegrator):
     def render_forward(self, scene, params, sensor, seed: UInt32 = 0, spp=0):
         # Mitsuba 3.9.1 ends the process instead, also with its own integrators: a batch calls its cameras through a
         # table of all sensors, the observer among them.
-        eyes = viewpoint.centers([sensor]) + ([] if self.observer is None else [viewpoint.center(self.observer)])
-        if viewpoint.is_batch(sensor) and any(dr.grad_enabled(c) for c in eyes):
+        eyes = observer.centers([sensor]) + ([] if self.observer is None else [observer.center(self.observer)])
+        if observer.is_batch(sensor) and any(dr.grad_enabled(c) for c in eyes):
             raise NergError(
                 'a "batch" of cameras has no forward derivatives with respect to the pose of an observer or a camera; '
                 "render its cameras one by one, or use reverse mode (dr.backward)"

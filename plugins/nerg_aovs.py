@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.features import snapshot
+from nerg_mi.transport.field_medium import snapshot
 
 from .nerg_pixel import Pixel
 

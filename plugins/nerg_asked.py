@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 
-from nerg_mi.transport.observer import viewpoint
-from nerg_mi.transport.observer.cache import ObserverCache
+from nerg_mi.transport import observer
+from nerg_mi.transport.observer import ObserverCache
 
 from . import nerg_aovs, nerg_properties
 from .nerg_pixel import Pixel
@@ -83,7 +83,7 @@ class Watcher:
 
     def pixel(self, pixel: AskedPixel) -> AskedPixel:
         """The same rays, for this observer."""
-        aligned = viewpoint.same_center(pixel.sensors, self.p_o)
+        aligned = observer.same_center(pixel.sensors, self.p_o)
         return self._watched(pixel, aligned)
 
     def own_pixel(self, pixel: AskedPixel) -> AskedPixel:

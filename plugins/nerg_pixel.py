@@ -10,18 +10,18 @@ import drjit as dr
 import mitsuba as mi
 
 from nerg_mi.maths.color import composite_to_linear
-from nerg_mi.transport.features import FeaturePainter, color_painter
-from nerg_mi.transport.observer import viewpoint
-from nerg_mi.transport.observer.gaze import ObservedGaze
-from nerg_mi.transport.observer.sight import Sight, trace_sight
-from nerg_mi.transport.observer.views import view_along
-from nerg_mi.transport.place import Place
+from nerg_mi.transport import observer
+from nerg_mi.transport.field_medium import FeaturePainter, color_painter
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.observer import view_along
+from nerg_mi.transport.observer_gaze import ObservedGaze
+from nerg_mi.transport.occlusion import Sight, trace_sight
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from nerg_mi.transport.march.settings import MarchResult
-    from nerg_mi.transport.media.painting import Painter
+    from nerg_mi.transport.march_primal import MarchResult
+    from nerg_mi.transport.medium import Painter
 
 
 @dataclass(frozen=True)
@@ -130,25 +130,25 @@ class Pixel:
     def observers(self) -> list:
         """Where the observer stands, or each of those who take the picture (Point3f of one lane)."""
         if self.nerg.observer is None:
-            return viewpoint.centers(self.sensors)
+            return observer.centers(self.sensors)
         return [self.p_o]
 
     @cached_property
     def p_o(self):
         """The observer of this ray."""
         if self.nerg.observer is None:
-            return viewpoint.center_of_ray(self.sensors, self.camera_ray)
-        return viewpoint.center(self.nerg.observer)
+            return observer.center_of_ray(self.sensors, self.camera_ray)
+        return observer.center(self.nerg.observer)
 
     @cached_property
     def aligned(self) -> bool:
         """Whether the observer stands where the camera does, and so sees what it sees."""
-        return self.nerg.observer is None or viewpoint.same_center(self.sensors, self.p_o)
+        return self.nerg.observer is None or observer.same_center(self.sensors, self.p_o)
 
     @cached_property
     def distance_and_direction(self) -> tuple:
         """From the observer to the surface."""
-        return viewpoint.distance_and_direction(self.p_o, self.p_d)
+        return observer.distance_and_direction(self.p_o, self.p_d)
 
     @property
     def r_o(self):

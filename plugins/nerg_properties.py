@@ -10,16 +10,14 @@ import mitsuba as mi
 from nerg_mi.errors import NergError
 from nerg_mi.properties import boolean, choice, color, integer, number, vector
 from nerg_mi.ranges import COORDINATES, FARTHEST, VALUES, Range
-from nerg_mi.transport.ceiling import Ceiling
-from nerg_mi.transport.march.depth import DEPTHS
-from nerg_mi.transport.march.rules import RULES, boundaries
-from nerg_mi.transport.march.settings import MarchSettings, default_growth, default_step, default_stop
-from nerg_mi.transport.media.protocol import Medium
-from nerg_mi.transport.media.volume import KnownEmpty, VolumeMedium
-from nerg_mi.transport.observer import viewpoint
-from nerg_mi.transport.observer.gaze import PlacedGaze
-from nerg_mi.transport.observer.settings import VISIBILITIES, ObserverSettings
-from nerg_mi.transport.observer.views import ObserverView, SupportView
+from nerg_mi.transport.depth import DEPTHS
+from nerg_mi.transport.geometry import Ceiling
+from nerg_mi.transport.march_primal import MarchSettings, default_growth, default_step, default_stop
+from nerg_mi.transport.medium import Medium
+from nerg_mi.transport.observer import VISIBILITIES, ObserverSettings, ObserverView, SupportView, center, require_center
+from nerg_mi.transport.observer_gaze import PlacedGaze
+from nerg_mi.transport.quadrature import RULES, boundaries
+from nerg_mi.transport.volume_medium import KnownEmpty, VolumeMedium
 
 TEXTS = {
     "ceiling": "Height above which a place is left out of what cameras see from above it, so that a roof hides no "
@@ -76,8 +74,8 @@ def _nested(props):
 def check_observer(observer) -> None:
     """Raise ``NergError`` for an observer (a sensor, or None) who stands nowhere, or too far away."""
     if observer is not None:
-        viewpoint.require_center(observer, '"observer"')
-        if not dr.all(dr.abs(dr.detach(viewpoint.center(observer))) <= FARTHEST, axis=None):
+        require_center(observer, '"observer"')
+        if not dr.all(dr.abs(dr.detach(center(observer))) <= FARTHEST, axis=None):
             raise NergError(
                 f'"observer" stands at a position that is not finite, or beyond {FARTHEST:g}; correct its to_world'
             )
@@ -178,7 +176,7 @@ def describe(nerg) -> str:
     """The integrator ``nerg`` with all its parameters, for people."""
     body = {k: str(v).replace("\n", "\n  ") for k, v in nerg.children.items() if k not in ("observer", "integrator")}
     if nerg.observer is not None:
-        body["observer"] = viewpoint.center(nerg.observer)
+        body["observer"] = center(nerg.observer)
     march, seen = nerg.settings, nerg.observer_settings
     body |= {
         "occlusion": nerg.occlusion,

@@ -38,7 +38,7 @@ lie *at* the poles, where ``envmap`` has them. What a sample of these two rows d
 pole, on the opposite meridian.
 
 The solid angle of a pixel is :math:`2\pi/W\,(\cos\theta_0 - \cos\theta_1)` between the borders of its row, clipped to
-the sphere; the sum is :math:`4\pi`. ``nerg_mi.transport.panorama.pixel_solid_angles(W, H)`` gives it without a variant,
+the sphere; the sum is :math:`4\pi`. ``nerg_mi.transport.geometry.pixel_solid_angles(W, H)`` gives it without a variant,
 and the method ``pixel_solid_angles()`` of the sensor for the crop window of its film.
 
 Things that it does not do: it has no near and far clipping plane, no aperture, and does not take part in light tracing
@@ -77,7 +77,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.registration import register
-from nerg_mi.transport.panorama import pixel_solid_angles
+from nerg_mi.transport.geometry import pixel_solid_angles
 
 POLE = 1e-4
 """Least angle in radian between a ray and the panorama's axis."""

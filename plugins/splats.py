@@ -76,9 +76,8 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import choice, number, resolved, text, transform, volume_of
 from nerg_mi.ranges import Range
 from nerg_mi.registration import register
-from nerg_mi.transport.freezing import recording
-from nerg_mi.transport.media.splats.arrays import SplatArrays
-from nerg_mi.transport.media.splats.medium import SplatMedium
+from nerg_mi.transport.jit import recording
+from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 
 
 class SplatsVolume(mi.Volume):

@@ -12,7 +12,7 @@ import typer
 
 import nerg_mi.cli
 from nerg_mi.evaluation.study import settings as study_settings
-from nerg_mi.transport.march.settings import MarchSettings
+from nerg_mi.transport.march_primal import MarchSettings
 from tests.conftest import ROOT
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -93,15 +93,15 @@ def registered() -> str:
     from nerg_mi.fields import gaze_base as gaze_fields
     from nerg_mi.rays.readers.registry import reader_names
     from nerg_mi.training.gaze.recipes import RECIPES
-    from nerg_mi.transport.march.depth import DEPTHS
-    from nerg_mi.transport.march.rules import RULES
+    from nerg_mi.transport.depth import DEPTHS
+    from nerg_mi.transport.quadrature import RULES
 
     aovs = import_module("nerg_mi.plugins.nerg_aovs").AOVS
     rows = (
         ("encoding of positions", "nerg_mi/fields/encoding.py", encodings.kinds()),
         ("gaze field", "nerg_mi/fields/gaze_base.py", gaze_fields.kinds()),
-        ("quadrature rule", "nerg_mi/transport/march/rules.py", RULES.names()),
-        ("depth", "nerg_mi/transport/march/depth.py", DEPTHS.names()),
+        ("quadrature rule", "nerg_mi/transport/quadrature.py", RULES.names()),
+        ("depth", "nerg_mi/transport/depth.py", DEPTHS.names()),
         ("AOV", "plugins/nerg_aovs.py", aovs),
         ("tracking reader", "nerg_mi/rays/readers/protocol.py", reader_names()),
         ("gaze recipe", "nerg_mi/training/gaze/recipes.py", RECIPES),

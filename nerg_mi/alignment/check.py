@@ -16,9 +16,8 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.checks.mirror import hit_shares, mirror_warning
 from nerg_mi.rays.rays import Rays
-from nerg_mi.transport.media.protocol import Medium
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.geometry import Place, trace_depth
+from nerg_mi.transport.medium import Medium
 
 from .constraints import Fit
 from .similarity import move, scale_of

@@ -32,11 +32,9 @@ from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.training.geometry import places
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
-from nerg_mi.transport.observer.gaze import PlacedGaze
-from nerg_mi.transport.observer.looking import look_from
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.place import Place, corners_of
-from nerg_mi.transport.trace import default_settings, trace_depth
+from nerg_mi.transport.geometry import Place, corners_of, default_settings, trace_depth
+from nerg_mi.transport.observer import ObserverSettings
+from nerg_mi.transport.observer_gaze import PlacedGaze, look_from
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -139,7 +137,7 @@ class Surroundings:
 def surroundings_of_scene(path: Path, gaze: Path | None, align: Similarity | None, ns: ModuleType) -> Surroundings:
     """A scene's shapes, and the field and gaze of its integrator where that is a ``nerg``; ``gaze``: another gaze field
     in their stead. Raises `NergError` for a scene with neither shapes nor a field."""
-    from nerg_mi.transport.observer.viewpoint import center
+    from nerg_mi.transport.observer import center
 
     scene = load_scene(path, merge=False)
     integrator: Any = scene.integrator()

@@ -173,7 +173,7 @@ def box_shares(
 ) -> Shares:
     """The shares of ``observers`` (M, 3) on N boxes, which may be turned, all of them at once, (M, N), as finely as
     the ``rule`` says; arguments and errors as of `attention`."""
-    from nerg_mi.transport.observer.looking import look_from
+    from nerg_mi.transport.observer_gaze import look_from
 
     _check(scene)
     i, place, count = scene.integrator, scene.place, len(observers)

@@ -40,8 +40,8 @@ class ObserverOf:
         import drjit as dr
         import mitsuba as mi
 
-        from nerg_mi.transport.observer.sight import trace_sight
-        from nerg_mi.transport.observer.viewpoint import distance_and_direction
+        from nerg_mi.transport.observer import distance_and_direction
+        from nerg_mi.transport.occlusion import trace_sight
 
         i = self.integrator
         distance, r_o = distance_and_direction(self.center, p)

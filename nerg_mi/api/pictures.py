@@ -79,15 +79,15 @@ def render(
 
 def _observers(scene: Scene, sensor: Any, given: ArrayLike | None, needed: bool) -> Floats:
     """Positions (M, 3) of the observers of a picture; ``needed``: whether it depends on them."""
-    from nerg_mi.transport.observer import viewpoint
+    from nerg_mi.transport import observer
 
     if given is not None:
         return points(given, "observers")
     if scene.observer is not None:
         return scene.observer[None]
     if needed:
-        viewpoint.require_center(sensor, "the camera")
-    return np.array(viewpoint.center(sensor), np.float32).reshape(1, 3)
+        observer.require_center(sensor, "the camera")
+    return np.array(observer.center(sensor), np.float32).reshape(1, 3)
 
 
 class _Layers:

@@ -18,7 +18,7 @@ from nerg_mi.formats.splats.files import plugin_of_field
 from nerg_mi.registration import plugin_class
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.projection import clip_distances
-from nerg_mi.transport.place import check_shape
+from nerg_mi.transport.geometry import check_shape
 
 from .arrays import Floats, listed, points
 from .camera import Camera
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from nerg_mi.fields.gaze_base import AnyGazeField
     from nerg_mi.fields.radiance import RadianceField
-    from nerg_mi.transport.place import Place
+    from nerg_mi.transport.geometry import Place
 
 COLOR = "color"
 """The quantity that is no AOV: linear colour."""
@@ -104,7 +104,7 @@ class Scene:
     @property
     def place(self) -> Place:
         """What rays of this scene meet: its field or volumes, and its shapes."""
-        from nerg_mi.transport.place import Place
+        from nerg_mi.transport.geometry import Place
 
         return Place(self.integrator.medium, self.mitsuba)
 
@@ -116,7 +116,7 @@ class Scene:
     @property
     def observer(self) -> Floats | None:
         """Position (3,) of the scene's own observer; None where the camera is the observer."""
-        from nerg_mi.transport.observer.viewpoint import center
+        from nerg_mi.transport.observer import center
 
         sensor = self.integrator.observer
         return None if sensor is None else np.ravel(np.array(center(sensor), np.float32))

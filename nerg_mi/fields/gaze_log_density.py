@@ -275,7 +275,7 @@ class LogGazeField:
         """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr; ``escaped``
         as for ``unnormalized``.
 
-        ``integral``: Z(p_o) (``transport.observer.gaze``); ``emit`` is divided by it and includes the blind
+        ``integral``: Z(p_o) (``transport.observer_gaze``); ``emit`` is divided by it and includes the blind
         density, so that gaze = (1 - m) emit * capture + m blind. Raises ``ValueError`` without it.
         """
         if integral is None:

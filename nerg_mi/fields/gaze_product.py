@@ -286,7 +286,7 @@ class GazeField:
         no difference.
 
         ``semantic``: see ``emit``. ``integral``: of a normalised field over the sphere at ``p_o``
-        (``transport.observer.gaze``), by which ``emit`` is divided; ``ValueError`` without it.
+        (``transport.observer_gaze``), by which ``emit`` is divided; ``ValueError`` without it.
         """
         emit, capture = self.unnormalized(p_od, p_o, r_o, active, semantic)
         if self.config.normalized:

@@ -4,7 +4,7 @@ Many candidates are looked through at a few hundred pixels each, by depths alone
 surfaces and not the void, nothing right before the lens, near things and far ones, and, where there is an observer,
 as much as can be of what gets their attention. All positions are scene units, arrays of float64; depths come from a
 function ``trace(origins (N, 3), directions (N, 3)) -> (depth (N,), opacity (N,))`` such as that of
-`nerg_mi.transport.trace.trace_depth` with a place.
+`nerg_mi.transport.geometry.trace_depth` with a place.
 """
 
 from __future__ import annotations

@@ -82,7 +82,7 @@ def resample(panorama: Any, projection: Projection, width: int) -> tuple[np.ndar
     wide and half as high: the nearest pixel's value at each, and where the map is (width // 2, width), bool.
 
     Columns of a panorama are cells around its front, its first and last row lie at the poles
-    (`nerg_mi.transport.panorama`).
+    (`nerg_mi.transport.geometry`).
     """
     panorama = np.asarray(panorama)
     rows, columns = panorama.shape[:2]

@@ -205,7 +205,7 @@ class GazeModule(_FieldModule):
     ) -> torch.Tensor:
         """The integral over the sphere (one number) of one observer, who is ``p_o`` in every row, from N directions
         ``r_o`` of equal area that lead to ``p_od``. Of the integrator's many directions it is the integrator's
-        (``transport.observer.surroundings``)."""
+        (``transport.observer_gaze``)."""
         return 4 * torch.pi * self.unnormalized(p_od, p_o, r_o, escaped).mean()
 
     def _extra(self, count: int, integral, escaped) -> torch.Tensor:

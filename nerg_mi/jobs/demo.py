@@ -31,8 +31,8 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.channels import Channels, render_channels
 from nerg_mi.rendering.pictures import activate, load_scene
 from nerg_mi.rendering.projection import pixel_of
-from nerg_mi.transport.observer.viewpoint import center
-from nerg_mi.transport.panorama import pixel_solid_angles
+from nerg_mi.transport.geometry import pixel_solid_angles
+from nerg_mi.transport.observer import center
 
 from .bake import bake
 from .options.bake import BakeOptions

@@ -18,7 +18,7 @@ from nerg_mi.files.atomic import write_bytes
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.asked import is_nerg, render_asked
 from nerg_mi.rendering.projection import pixel_of
-from nerg_mi.transport.observer.viewpoint import center
+from nerg_mi.transport.observer import center
 
 from .options.pictures import PictureOptions
 

@@ -40,8 +40,8 @@ from nerg_mi.report.stage import Camera, Stage, pack
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, Box
 from nerg_mi.training.geometry.places import GazePlace
-from nerg_mi.transport.observer.viewpoint import center
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.observer import center
 
 from .backend import select_backend
 from .options.report import ReportOptions

@@ -6,7 +6,7 @@ surface S is the integral of g over the directions in which S is seen. Over the 
     A = ∫_S g V(y, p_o) max(0, -n · ω) / |y - p_o|² dA,    ω = (y - p_o) / |y - p_o|,
 
 with the change of variables dω = |cos θ| dA / d² (Veach 1997, section 8.2.2.2, "three-point form"), n the normal at y,
-and V the visibility of ``transport.observer.sight``. Unlike pixels, the points move with the surface: A has derivatives
+and V the visibility of ``transport.occlusion``. Unlike pixels, the points move with the surface: A has derivatives
 with respect to where the surface is, without any edge of its own that would have to be sampled. The moving edges of
 what *else* hides it are not seen by derivatives; the fall-off behind them is.
 """
@@ -22,11 +22,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.observer.sight import trace_sight
-from nerg_mi.transport.observer.viewpoint import distance_and_direction
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import default_settings
+from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.observer import ObserverSettings, distance_and_direction
+from nerg_mi.transport.occlusion import trace_sight
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.observer import viewpoint
+from nerg_mi.transport.observer import center
 
 from .bands import render_bands, why_whole
 from .channels import Channels, channels_of
@@ -26,7 +26,7 @@ class AskedLayer:
         observer = integrator.observer
         self._watcher = None
         if observer is not None and self._asked.own:
-            eye = np.ravel(np.array(viewpoint.center(observer), np.float32))
+            eye = np.ravel(np.array(center(observer), np.float32))
             self._watcher = self._asked.watcher(eye, True)
         self._order = [*self._asked.shared, *self._asked.own]
         self.names = [self._asked.channels(self._order)]

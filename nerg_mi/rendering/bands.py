@@ -53,7 +53,7 @@ def why_whole(scene, sensor) -> str | None:
     """Why a picture of ``sensor`` can only be rendered in one piece; None where it can be divided."""
     import mitsuba as mi
 
-    from nerg_mi.transport.observer.viewpoint import is_batch
+    from nerg_mi.transport.observer import is_batch
 
     integrator, film = scene.integrator(), sensor.film()
     if str(mi.variant()).startswith("scalar") or mi.is_spectral or mi.is_polarized:

@@ -7,7 +7,7 @@ from typing import Any
 from nerg_mi.fields.constant_weights import set_constant_weights
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.radiance import RadianceField
-from nerg_mi.transport.media.field import FieldMedium
+from nerg_mi.transport.field_medium import FieldMedium
 
 from .asked import is_nerg
 

@@ -21,7 +21,7 @@ from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.properties import resolved
 from nerg_mi.ranges import SPP, check_number
-from nerg_mi.transport.place import check_shape
+from nerg_mi.transport.geometry import check_shape
 
 from .mesh_file import check_mesh, check_points, check_vol
 

@@ -16,11 +16,9 @@ from nerg_mi.statistics.shares import Look
 from nerg_mi.statistics.visits import Landed, Thing, land, regroup
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
-from nerg_mi.transport.observer.gaze import PlacedGaze
-from nerg_mi.transport.observer.looking import look_from
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import default_settings, trace_depth
+from nerg_mi.transport.geometry import Place, default_settings, trace_depth
+from nerg_mi.transport.observer import ObserverSettings
+from nerg_mi.transport.observer_gaze import PlacedGaze, look_from
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
 # Directions of the integral of a normalised field: shares are divided by their own sum.

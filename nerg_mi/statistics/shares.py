@@ -6,7 +6,7 @@ many as its error asks for: of a finer spiral only those are looked along that c
 take no more than large ones, and things that ask for the same spiral share its directions. What a sum is a share of is
 summed in the same way over the whole sphere, with what escapes and meets no surface.
 
-Errors are those of the integral over an observer's sphere (`nerg_mi.transport.observer.integral`): told from the
+Errors are those of the integral over an observer's sphere (`nerg_mi.transport.observer_gaze`): told from the
 scatter of sums over every eighth direction.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions, numbers_in_cone
-from nerg_mi.transport.observer.integral import PARTS, POWER
+from nerg_mi.transport.observer_gaze import PARTS, POWER
 
 from .visits import Thing, land, regroup
 

@@ -14,10 +14,9 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths.arrays import aligned, vector_of
 from nerg_mi.maths.coordinates import check_coordinates
-from nerg_mi.transport.media.protocol import Medium
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import default_settings
+from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.medium import Medium
+from nerg_mi.transport.observer import ObserverSettings
 
 # ---- Mesh ----
 #

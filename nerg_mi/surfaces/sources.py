@@ -18,10 +18,9 @@ from nerg_mi.maths.types import Point3f, Vector3f
 from nerg_mi.probes.surface_attention import Density, attended
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.sessions import find_sessions
-from nerg_mi.transport.observer.cache import ObserverCache
-from nerg_mi.transport.observer.gaze import PlacedGaze
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.observer import ObserverCache, ObserverSettings
+from nerg_mi.transport.observer_gaze import PlacedGaze
 
 from .laplacian import Sums, deposit, merge
 from .mesh import Mesh, Target

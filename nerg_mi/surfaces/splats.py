@@ -12,13 +12,11 @@ from scipy import sparse
 from nerg_mi.fields.splats import Splats, matrices_of
 from nerg_mi.maths.arrays import aligned, vector_of
 from nerg_mi.probes.surface_attention import attended
-from nerg_mi.transport.march.settings import HITS_STOP
-from nerg_mi.transport.media.hits import LastHit
-from nerg_mi.transport.media.local_ray import LocalRay
-from nerg_mi.transport.media.splats.arrays import MOST_ABSORBED, SplatArrays
-from nerg_mi.transport.media.splats.nearest import SplatHits
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.march_primal import HITS_STOP
+from nerg_mi.transport.medium import LastHit, LocalRay
+from nerg_mi.transport.observer import ObserverSettings
+from nerg_mi.transport.splat_medium import MOST_ABSORBED, SplatArrays, SplatHits
 
 from .laplacian import Sums
 from .sources import (
@@ -38,7 +36,8 @@ from .sources import (
 # The Gaussians that rays meet, hit by hit, as arrays of NumPy: sums of them are the same to the bit each time.
 #
 # A kernel that added to the Gaussians itself would add in whatever order its threads arrive. So it only finds hits,
-# some at a time, as the march does (`nerg_mi.transport.march.hits`), and the light that is left is followed in float64.
+# some at a time, as the march does (`nerg_mi.transport.march_primal`), and the light that is left is followed in
+# float64.
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,1 +1,1 @@
-"""What a ray sees of any density: quadrature, marching, depth, visibility. Pure maths."""
+"""Light and gaze along rays: media, the march through them and its adjoint, the observer and what hides from them."""

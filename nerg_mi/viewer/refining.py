@@ -15,7 +15,7 @@ import numpy as np
 
 from nerg_mi.api.queries import trace
 from nerg_mi.api.scene import Scene
-from nerg_mi.transport.ceiling import Ceiling
+from nerg_mi.transport.geometry import Ceiling
 
 from .view import View
 

@@ -26,7 +26,7 @@ from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.jobs.view import PlaceToView
 from nerg_mi.ranges import FARTHEST
 from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.transport.ceiling import Ceiling
+from nerg_mi.transport.geometry import Ceiling
 
 from . import layers
 from .layers import Layer, Scale, Shade

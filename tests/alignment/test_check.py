@@ -6,8 +6,8 @@ import pytest
 
 from nerg_mi.alignment.check import Check, check_alignment
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 from . import rooms
 

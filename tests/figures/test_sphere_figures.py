@@ -9,7 +9,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat
 from nerg_mi.figures.saving import encode
 from nerg_mi.figures.sphere_figures import sphere_figure
-from nerg_mi.transport.panorama import pixel_directions
+from nerg_mi.transport.geometry import pixel_directions
 
 HEIGHT, WIDTH = 90, 180
 BLACK, NOBODY = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))

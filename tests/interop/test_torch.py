@@ -13,11 +13,10 @@ from nerg_mi.fields.gaze_ensemble import GazeEnsemble
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.observer.gaze import PlacedGaze
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.observer.surroundings import trace_surroundings
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.observer import ObserverSettings
+from nerg_mi.transport.observer_gaze import PlacedGaze, trace_surroundings
 
 from .fields import BOX, GRID, RNG, radiance, rays, varied
 

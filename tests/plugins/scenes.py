@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.observer import ObserverSettings
 
 SIZE = 12
 

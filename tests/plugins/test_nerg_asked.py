@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
 
 from . import fields
 
@@ -115,14 +115,14 @@ def test07_nothing_to_see(rgb, ray):
 
 def test08_integrals_of_several_observers_are_kept(rgb, files, tmp_path, ray, monkeypatch):
     """Two observers asked for in turns: each has an integral of their own, which is found once."""
-    from nerg_mi.transport.observer import gaze
+    from nerg_mi.transport import observer_gaze
 
     fields.gaze(tmp_path / "gaze.safetensors", normalized=True)
     volumes = {"field": {"type": "nerf", "filename": str(files / "field.safetensors")}}
     volumes["gaze"] = {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")}
     scene = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg", **volumes}})
-    found, integrate = [], gaze.integrate
-    monkeypatch.setattr(gaze, "integrate", lambda *a: found.append(1) or integrate(*a))
+    found, integrate = [], observer_gaze.integrate
+    monkeypatch.setattr(observer_gaze, "integrate", lambda *a: found.append(1) or integrate(*a))
     values = []
     for _ in range(2):
         asked = scene.integrator().asked(["gaze"], False)

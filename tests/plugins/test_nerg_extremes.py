@@ -7,7 +7,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.rules import RULES
+from nerg_mi.transport.quadrature import RULES
 from tests.reference import march_numpy as reference
 
 from .scenes import GAZE, camera, channels, constant, look_at, observer_at, render, with_gaze

@@ -142,19 +142,19 @@ def test08_training(rgb, files, key):
 
 def test09_garbage_waits_until_a_recording_is_over(rgb, files):
     """Dr.Jit ends the process where NumPy's memory is freed in the middle of a recording."""
-    from nerg_mi.transport import freezing
+    from nerg_mi.transport import jit
 
     seen = []
 
     def look(scene):
-        with freezing.no_collection():
+        with jit.no_collection():
             seen.append(gc.isenabled())
         return rgb.render(scene, spp=1)
 
-    assert not freezing.recording()
+    assert not jit.recording()
     dr.freeze(look)(scene_of(rgb, files))
     assert seen == [False] and gc.isenabled()
-    with freezing.no_collection():
+    with jit.no_collection():
         assert gc.isenabled()
 
 

@@ -13,7 +13,7 @@ from nerg_mi.fields import gaze_base
 from nerg_mi.fields.gaze_ensemble import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.maths.geometry import Box
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
 
 from .scenes import camera, channels, named, observer_at
 from .test_nerg_normalized import around, room

@@ -8,7 +8,7 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
 
 from . import fields
 from .scenes import camera, channels, observed, observer_at

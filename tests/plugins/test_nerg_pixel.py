@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
 
 from .scenes import camera, named, observer_at, with_gaze
 

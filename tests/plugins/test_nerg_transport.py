@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.rules import RULES
+from nerg_mi.transport.quadrature import RULES
 
 from .scenes import camera, channels, constant, render, straight
 

@@ -6,8 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.media import volume
-from nerg_mi.transport.observer import viewpoint
+from nerg_mi.transport import observer, volume_medium
 
 from .scenes import camera, channels, observer_at, wall, with_field
 
@@ -35,8 +34,8 @@ def seen(mi, scene) -> np.ndarray:
 @pytest.fixture
 def reads(monkeypatch):
     """One entry for each time that the voxels of a grid are read."""
-    count, describe = [], volume.describe
-    monkeypatch.setattr(volume, "describe", lambda volume: (count.append(volume), describe(volume))[1])
+    count, describe = [], volume_medium.describe
+    monkeypatch.setattr(volume_medium, "describe", lambda volume: (count.append(volume), describe(volume))[1])
     return count
 
 
@@ -65,7 +64,7 @@ def test01b_an_observer_who_moves_is_no_constant_of_the_kernel(rgb, of):
     name = "integrator.observer.to_world" if of == "scene" else "observer.to_world"
     params[name] = rgb.Transform4f().translate([0.2, 0, -0.8])
     params.update()
-    center = viewpoint.center(scene.integrator().observer)
+    center = observer.center(scene.integrator().observer)
     assert np.allclose(np.ravel(np.array(center)), [0.2, 0, -0.8])
     assert scene.integrator().observer.world_transform().matrix[0, 3].state == dr.VarState.Evaluated
 

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.panorama import pixel_directions, pixel_solid_angles
+from nerg_mi.transport.geometry import pixel_directions, pixel_solid_angles
 
 WIDTH, HEIGHT = 12, 7
 

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.probes.surface_attention import Patches, contributions, patches, received
-from nerg_mi.transport.panorama import pixel_solid_angles
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place, pixel_solid_angles
 from tests.plugins import fields
 
 

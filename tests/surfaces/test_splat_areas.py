@@ -5,7 +5,7 @@ import numpy as np
 
 from nerg_mi.fields.splats import Splats, joined
 from nerg_mi.surfaces.splats import HIDDEN, shortest_axes, sides_of, splat_areas, whole_areas
-from nerg_mi.transport.media.splats.arrays import SplatArrays
+from nerg_mi.transport.splat_medium import SplatArrays
 from tests.surfaces.walls import TURN_X, wall
 
 

@@ -5,7 +5,7 @@ import numpy as np
 
 from nerg_mi.fields.splats import Splats
 from nerg_mi.surfaces.splats import groups_of_hits
-from nerg_mi.transport.media.splats.arrays import SplatArrays
+from nerg_mi.transport.splat_medium import SplatArrays
 from tests.reference.splats import peaks
 from tests.transport.media.splats.scenes import rays, stack
 

@@ -9,7 +9,7 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces.laplacian import merge
 from nerg_mi.surfaces.sources import RaySettings, TrackedRays, lookers_of_law
 from nerg_mi.surfaces.splats import gaze_and_escaped, shortest_axes, splat_areas, splat_ray_sums
-from nerg_mi.transport.media.splats.arrays import SplatArrays
+from nerg_mi.transport.splat_medium import SplatArrays
 from tests.surfaces.meshes import vmf
 from tests.surfaces.test_splat_hits import shares, some
 from tests.surfaces.walls import TURN_X, wall

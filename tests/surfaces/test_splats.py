@@ -6,9 +6,8 @@ import numpy as np
 from nerg_mi.fields.splats import Splats, matrices_of
 from nerg_mi.surfaces.sources import lookers_of_law
 from nerg_mi.surfaces.splats import splat_densities
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import default_settings
+from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.observer import ObserverSettings
 from tests.reference import splats as reference
 from tests.surfaces.meshes import vmf
 from tests.transport.media.splats.scenes import medium_of, stack

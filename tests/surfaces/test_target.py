@@ -4,7 +4,7 @@ import numpy as np
 
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces.mesh import Target
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.surfaces.meshes import box, joined
 
 

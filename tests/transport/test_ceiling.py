@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.ceiling import Ceiling
+from nerg_mi.transport.geometry import Ceiling
 
 
 def ray(mi, origins, directions, kind="RayDifferential3f"):

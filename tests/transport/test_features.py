@@ -9,12 +9,11 @@ import pytest
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
 from nerg_mi.maths.geometry import Box, Similarity
-from nerg_mi.transport.features import FeaturePainter, color_painter, observed_features
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.media.painting import ColorPainter
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.field_medium import FeaturePainter, FieldMedium, color_painter, observed_features
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import ColorPainter
 
 O, D = np.array([0.1, -0.2, -3.0]), np.array([0.0, 0.1, 1.0]) / np.hypot(0.1, 1)
 

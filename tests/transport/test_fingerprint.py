@@ -5,8 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from nerg_mi.transport.fingerprint import Fingerprint, of_shapes
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.jit import Fingerprint, of_shapes
 
 
 def test01_equal_as_long_as_nothing_is_assigned(rgb):

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import drjit as dr
 
-from nerg_mi.transport.freezing import no_collection, recording
+from nerg_mi.transport.jit import no_collection, recording
 
 
 def test01_it_is_known_while_a_function_is_recorded(rgb):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.panorama import direction_pixels, pixel_directions, pixel_solid_angles
+from nerg_mi.transport.geometry import direction_pixels, pixel_directions, pixel_solid_angles
 
 SIZES = [(1, 2), (2, 3), (16, 8), (33, 17), (256, 128)]
 

@@ -4,9 +4,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 SETTINGS = MarchSettings(0.01)
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.shading import Shading
+from nerg_mi.transport.geometry import Place, Shading
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 BACKGROUND = 0.125
 SAMPLES = 1 << 14

@@ -10,10 +10,10 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box, Similarity
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.trace import default_settings, trace_depth
+from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.geometry import default_settings, trace_depth
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 
 @pytest.fixture

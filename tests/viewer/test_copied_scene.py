@@ -7,7 +7,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
-from nerg_mi.transport.ceiling import Ceiling
+from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.viewer import copied_scene
 from nerg_mi.viewer.copied_scene import Shown
 from nerg_mi.viewer.refining import Pace, refine

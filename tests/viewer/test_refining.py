@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.transport.ceiling import Ceiling
+from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.viewer.refining import DIRECTIONS, SIZES, Pace, refine, rough_integrals
 from nerg_mi.viewer.view import View
 

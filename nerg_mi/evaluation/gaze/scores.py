@@ -12,10 +12,9 @@ from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
-from nerg_mi.transport.observer.gaze import ObservedGaze, PlacedGaze
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import default_settings
+from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.observer import ObserverSettings
+from nerg_mi.transport.observer_gaze import ObservedGaze, PlacedGaze
 
 # Of the uniform density: what a density of zero counts as in KLD. A truth that is a kernel density has
 # long empty stretches where nothing should hinge on how empty exactly.

@@ -19,10 +19,10 @@ from typing import Any
 import drjit as dr
 
 from nerg_mi.maths.color import composite_to_linear
-from nerg_mi.transport.features import color_painter
-from nerg_mi.transport.observer import viewpoint
-from nerg_mi.transport.observer.visibility import visibility
-from nerg_mi.transport.place import Place
+from nerg_mi.transport import observer
+from nerg_mi.transport.field_medium import color_painter
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.observer import visibility
 
 STEPS = 1024
 DT_GAMMA = 1 / 128
@@ -96,7 +96,7 @@ def _integrator_class(variant: str):
         def _look(self, p_d, surface, out, gaze):
             """Visibility, gaze and their count into ``out``; returns the density evaluations made."""
             like = self._like
-            p_o = viewpoint.center(self._sensor if like.observer is None else like.observer)
+            p_o = observer.center(self._sensor if like.observer is None else like.observer)
             distance = dr.norm(p_d - p_o)
             r_o = (p_d - p_o) / (distance + 1e-6)
             local = like.medium.local(p_o, r_o)
@@ -123,7 +123,7 @@ def _whole_cells(occupancy: Any) -> Any:
 def march(medium, ray, t0, t1, active, painter, *, steps, shortest, longest, dt_gamma):
     """``(opacity, depth, sum of what samples contribute, samples)`` of ``ray`` (`LocalRay`) between ``t0`` and ``t1``.
 
-    ``painter``: what samples contribute (``media.painting.Painter``), or None for a density-only pass.
+    ``painter``: what samples contribute (``medium.Painter``), or None for a density-only pass.
     """
     Float = type(ray.t_near)
     grid = _whole_cells(medium.occupancy)

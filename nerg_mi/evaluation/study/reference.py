@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.maths.geometry import box_interval
-from nerg_mi.transport.observer.gaze import ObservedGaze
+from nerg_mi.transport.observer_gaze import ObservedGaze
 
 from .scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene
 

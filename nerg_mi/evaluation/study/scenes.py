@@ -17,7 +17,7 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Box
-from nerg_mi.transport.observer.gaze import PlacedGaze
+from nerg_mi.transport.observer_gaze import PlacedGaze
 
 NUMPY = SimpleNamespace(select=np.where, exp=np.exp)
 """The functions that densities use, as Dr.Jit names them."""

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from nerg_mi.transport.march.depth import DEPTHS
-from nerg_mi.transport.march.rules import RULES
+from nerg_mi.transport.depth import DEPTHS
+from nerg_mi.transport.quadrature import RULES
 
 from . import splats
 from .paper import DT_GAMMA, STEPS, as_in_the_paper

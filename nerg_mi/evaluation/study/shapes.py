@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.observer.gaze import ObservedGaze
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.observer_gaze import ObservedGaze
 
 from .reference import Truth, evaluate_gaze, towards
 

@@ -16,9 +16,9 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.types import UInt32
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.transport.observer.sight import EXACT
-from nerg_mi.transport.observer.viewpoint import center
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.observer import center
+from nerg_mi.transport.occlusion import EXACT
 
 from . import reference as study_reference
 from . import scenes as study_scenes

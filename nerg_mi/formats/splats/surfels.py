@@ -11,8 +11,8 @@ import numpy as np
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats, harmonics_of, quaternions_of
 from nerg_mi.formats.surfaces import points
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.geometry import trace_depth
 
 WIDTH = 0.7
 """Standard deviation along the surface, in distances to the nearest neighbours: one more widely smears colours, one

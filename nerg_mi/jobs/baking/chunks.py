@@ -34,7 +34,7 @@ from nerg_mi.surfaces.sources import (
     lookers_of_field,
     ray_sums,
 )
-from nerg_mi.transport.observer.gaze import PlacedGaze
+from nerg_mi.transport.observer_gaze import PlacedGaze
 
 OBSERVERS = 4
 """Observers of a part."""

@@ -19,12 +19,10 @@ from nerg_mi.surfaces.laplacian import Sums
 from nerg_mi.surfaces.mesh import SURFACE_OPACITY
 from nerg_mi.surfaces.sources import Crowd, MakeLooker, RaySettings, TrackedRays, lookers_of_field
 from nerg_mi.surfaces.splats import gaze_and_escaped, shortest_axes, splat_densities, splat_ray_sums
-from nerg_mi.transport.media.splats.arrays import SplatArrays
-from nerg_mi.transport.media.splats.medium import SplatMedium
-from nerg_mi.transport.observer.gaze import PlacedGaze
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import default_settings
+from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.observer import ObserverSettings
+from nerg_mi.transport.observer_gaze import PlacedGaze
+from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from nerg_mi.figures.sphere_figures import sphere_figure
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import Range
-from nerg_mi.transport.panorama import pixel_solid_angles
+from nerg_mi.transport.geometry import pixel_solid_angles
 
 from .kind import Drawing, Kind, SceneOptions, need_scale
 

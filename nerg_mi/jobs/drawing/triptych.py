@@ -30,7 +30,7 @@ class TriptychOptions(SceneOptions):
 
 def draw(files: Sequence[Path], options: TriptychOptions, reporter: Reporter) -> Drawing:
     """Three pictures with one scale; the scene file needs an observer who is not the camera."""
-    from nerg_mi.transport.observer.viewpoint import center
+    from nerg_mi.transport.observer import center
 
     from .scene import open_scene
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.figures.floor_figures import Walls
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.geometry import Place, trace_depth
 
 CELLS = 360
 """Cells along the longer side of a plan."""

@@ -14,9 +14,7 @@ from nerg_mi.maths.geometry import box_of
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rendering.channels import render_channels
 from nerg_mi.rendering.scene_parts import Eye, ahead_level
-from nerg_mi.transport.panorama import pixel_directions, pixel_solid_angles
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.geometry import Place, pixel_directions, pixel_solid_angles, trace_depth
 
 from .photos import PhotoCamera
 

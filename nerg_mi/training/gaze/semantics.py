@@ -17,10 +17,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_product import GazeConfig
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.training.geometry.places import GazePlace
-from nerg_mi.transport.features import accumulated, snapshot
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import default_settings
+from nerg_mi.transport.field_medium import FieldMedium, accumulated, snapshot
+from nerg_mi.transport.geometry import Place, default_settings
 
 BATCH = 1 << 18
 """Rays whose features are computed in one launch."""

@@ -44,7 +44,7 @@ class ProbeSettings(Checked):
     kappa: float = ranged(50.0, KAPPAS)
     # Directions of equal area of each probe, turned at random and fixed, so that depths are traced once.
     directions: int = ranged(1024, DIRECTIONS)
-    # Kind of depth that is the surface (`transport.march.depth`).
+    # Kind of depth that is the surface (`transport.depth`).
     depth: str = "median"
     # Where probes are placed (`probes.probes`).
     placement: str = "data"

@@ -22,11 +22,10 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.mesh_file import check_vol
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.surfaces.mesh import mitsuba_mesh
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.media.splats.arrays import SplatArrays
-from nerg_mi.transport.media.splats.medium import SplatMedium
-from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 from .hit_extent import hit_extent
 from .hit_geometry import volume_dict, voxelise_hits
@@ -43,7 +42,7 @@ _STRAY, _AROUND = 0.002, 0.02
 class GazePlace:
     """Where people looked around, and how their frame lies in it."""
 
-    # What depths are traced in, in the field's frame (`transport.trace.trace_depth`); None where nothing is known.
+    # What depths are traced in, in the field's frame (`transport.geometry.trace_depth`); None where nothing is known.
     medium: FieldMedium | VolumeMedium | SplatMedium | Place | None
     # Where a gaze field lives, in that frame.
     box: AnyBox

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.maths.geometry import AnyBox, box_interval
-from nerg_mi.transport.observer.surroundings import nearest_depth
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.geometry import trace_depth
+from nerg_mi.transport.observer_gaze import nearest_depth
 
 from .places import NOWHERE, GazePlace
 
@@ -20,7 +20,7 @@ def surface_distances(
     """Distances (P, D) from ``positions`` (P, 3) along unit ``directions`` (P, D, 3) to the surface that each meets,
     float32, and which meet none, (P, D) bool; all in the frame and units of the place.
 
-    ``depth``: kind of depth that is the surface (``transport.march.depth``). Without any geometry everything is
+    ``depth``: kind of depth that is the surface (``transport.depth``). Without any geometry everything is
     ``NOWHERE`` away and nothing counts as escaped. A direction that meets no surface ends where it leaves the place's
     box (or after the box's diagonal, where it never enters): it still needs a p_od at which the field is evaluated.
     With ``fill`` it ends at the depth of the directions of its position nearest to it that do meet one: where the

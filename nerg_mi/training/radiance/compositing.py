@@ -16,7 +16,7 @@ from typing import Any
 import drjit as dr
 
 from nerg_mi.maths.types import Float
-from nerg_mi.transport.march.quadrature import absorbed_share
+from nerg_mi.transport.quadrature import absorbed_share
 
 # A denser step changes nothing (exp(-60) is 0 in fp32), but would drown the running sum of the other rays.
 _MAX_TAU = 60.0

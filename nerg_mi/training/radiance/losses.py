@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 
 from nerg_mi.maths.types import Float
-from nerg_mi.transport.march.quadrature import mean_depth_share
+from nerg_mi.transport.quadrature import mean_depth_share
 
 from .compositing import ray_sum, weights
 from .pixels import PixelBatch

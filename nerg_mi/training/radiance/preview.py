@@ -10,7 +10,7 @@ import numpy as np
 from nerg_mi.fields.radiance import RadianceField, mean_features
 from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.images import View
-from nerg_mi.transport.march.quadrature import mean_depth_share
+from nerg_mi.transport.quadrature import mean_depth_share
 
 from .compositing import ray_sum
 from .losses import composite

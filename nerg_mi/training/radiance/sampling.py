@@ -17,7 +17,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import aligned, namespace
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f, Float, UInt32
-from nerg_mi.transport.march.quadrature import absorbed_share
+from nerg_mi.transport.quadrature import absorbed_share
 
 from .compositing import Segments, Thinned
 
@@ -26,7 +26,7 @@ class StepTable:
     """Edges t_0 < t_1 < ... from ``near`` to ``far``, in scene units.
 
     A step is ``step`` long, or ``growth`` times its distance where that is longer: pixels widen with
-    distance, and so may steps. The rule is scale-free, as ``transport.march.stepping`` has it.
+    distance, and so may steps. The rule is scale-free, as ``transport.march_primal`` has it.
     """
 
     def __init__(self, ns, near: float, far: float, step: float, growth: float):

@@ -14,7 +14,7 @@ from nerg_mi.evaluation.study import paper as study_paper
 from nerg_mi.evaluation.study import scenes as study_scenes
 from nerg_mi.evaluation.study.subject import open_subject
 from nerg_mi.fields.occupancy import OccupancyGrid
-from nerg_mi.transport.media.local_ray import LocalRay
+from nerg_mi.transport.medium import LocalRay
 from tests.plugins import fields
 from tests.plugins.scenes import camera
 from tests.reference import march_numpy

@@ -9,7 +9,7 @@ from nerg_mi.cli import main
 from nerg_mi.evaluation.study import shapes as study_shapes
 from nerg_mi.evaluation.study import subject as study_subject
 from nerg_mi.jobs.demo import store_scene
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
 
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg">

@@ -6,10 +6,9 @@ import pytest
 
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.splats.surfels import splats_of_field
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.media.splats.arrays import SplatArrays
-from nerg_mi.transport.media.splats.medium import SplatMedium
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.geometry import trace_depth
+from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 from tests.conftest import ROOT
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.drawing.draw import draw
-from nerg_mi.transport.panorama import pixel_directions
+from nerg_mi.transport.geometry import pixel_directions
 
 from .scenes import MODE, write_scene
 

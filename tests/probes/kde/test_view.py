@@ -10,8 +10,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
 from nerg_mi.probes.kde_view import WORTH, KdeView
 from nerg_mi.rays.rays import Rays
-from nerg_mi.transport.observer.cache import ObserverCache
-from nerg_mi.transport.observer.views import view_along
+from nerg_mi.transport.observer import ObserverCache, view_along
 from tests.reference.kde import kde as reference
 
 COUNT, KAPPA = 40, 15.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.training.geometry.places import GazePlace
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 from .looks import BOX, looking_at
 

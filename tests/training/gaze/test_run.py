@@ -13,7 +13,7 @@ from nerg_mi.training.gaze.supervision import Supervision
 from nerg_mi.training.gaze.targets import TargetNeeds
 from nerg_mi.training.geometry.hit_geometry import voxelise_hits
 from nerg_mi.training.geometry.places import GazePlace
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 from .looks import LIKELIHOOD, LOG, NOWHERE, PROBES, PRODUCT, RAYS, SMALL, looking_at, planned, train
 from .views import around

@@ -23,8 +23,8 @@ from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
 from nerg_mi.training.gaze.sizes import sized_gaze_config
 from nerg_mi.training.gaze.targets import TargetNeeds
 from nerg_mi.training.geometry.places import GazePlace, place_of_field
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.trace import default_settings
+from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.geometry import default_settings
 
 BOX = Box((-2, -2, 0), (2, 2, 3))
 PROBES = ProbeSettings(radius=0.5, count=12, cap=64, min_rays=8, kappa=20.0, directions=64)
@@ -114,7 +114,7 @@ def test03_snapshots_and_accumulations(rgb, radiance):
     uniform = namespace("llvm").Float(np.full(len(radiance.grid.table), 0.3, np.float32))
     radiance.set_parameters({"grid.table": uniform})
     medium = FieldMedium(radiance)
-    from nerg_mi.transport.trace import trace_depth
+    from nerg_mi.transport.geometry import trace_depth
 
     _, opacity = trace_depth(medium, o, d)
     here = semantic_features(place_of(radiance), o, d, t, "snapshot").astype(float)

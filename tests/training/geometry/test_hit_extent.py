@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.training.geometry.hit_extent import PAD, VOXEL, HitExtent, hit_extent
 from nerg_mi.training.geometry.hit_geometry import voxelise_hits
 from nerg_mi.training.geometry.places import place_of_hits
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.geometry import trace_depth
 from tests.reference.office import ROOM, looks_out, office
 
 # A box around everything would be a hundred times as large.

@@ -12,8 +12,8 @@ from nerg_mi.formats.volumes import write_volume
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry.hit_extent import HitExtent
 from nerg_mi.training.geometry.hit_geometry import volume_dict, voxelise_hits
-from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.geometry import trace_depth
+from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.training.gaze.looks import looking_at
 
 

@@ -21,7 +21,7 @@ from nerg_mi.training.geometry.places import (
     place_of_scene,
     place_of_volume,
 )
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.geometry import trace_depth
 from tests.formats.splats.writers import random_splats
 
 

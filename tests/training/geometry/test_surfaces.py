@@ -9,7 +9,7 @@ from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.geometry.places import NOWHERE, GazePlace
 from nerg_mi.training.geometry.surfaces import box_exit, surface_distances
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 BOX = Box((-2, -2, 0), (2, 2, 3))
 

@@ -10,8 +10,8 @@ from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.images import View
 from nerg_mi.training.radiance.held_out import measure
 from nerg_mi.training.radiance.trainer import RadianceTrainer
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.geometry import trace_depth
 from tests.tiny import ball_pose
 
 from .ball import BOX, LENS, RADIUS, TINY, ball, settings

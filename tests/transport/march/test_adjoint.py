@@ -9,12 +9,10 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march import march as front
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.primal import march_primal
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.local_ray import LocalRay
-from nerg_mi.transport.media.painting import ColorPainter
+from nerg_mi.transport import march as front
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings, march_primal
+from nerg_mi.transport.medium import ColorPainter, LocalRay
 
 
 def scene_of(mi, size, step, quadrature="constant"):

@@ -5,9 +5,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.depth import DEPTHS, Expected
-from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.trace import trace_depth
+from nerg_mi.transport.depth import DEPTHS, Expected
+from nerg_mi.transport.geometry import trace_depth
+from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.plugins.scenes import channels, constant, straight
 
 

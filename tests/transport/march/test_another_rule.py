@@ -10,11 +10,10 @@ import pytest
 
 from nerg_mi.evaluation.study import settings as study
 from nerg_mi.maths.arrays import quotient
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.quadrature import linear_share
-from nerg_mi.transport.march.rules import RULES, Step
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.local_ray import LocalRay
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import LocalRay
+from nerg_mi.transport.quadrature import RULES, Step, linear_share
 from tests.plugins.scenes import camera, channels, constant, named, render
 
 

@@ -6,10 +6,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.depth import DEPTHS, escape_distance, surface_depth
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.depth import DEPTHS, escape_distance, surface_depth
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.reference import march_numpy as reference
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields.splats import matrices_of
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.painting import ColorPainter
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import ColorPainter
 from tests.formats.splats.writers import random_splats
 from tests.reference.splats import peaks, trace
 from tests.transport.media.splats.scenes import medium_of, rays, stack

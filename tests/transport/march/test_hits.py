@@ -4,11 +4,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.depth import escape_distance, surface_depth
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.occlusion import Occlusion
-from nerg_mi.transport.march.settings import HITS_STOP, MarchSettings, default_stop
-from nerg_mi.transport.media.painting import ColorPainter
+from nerg_mi.transport.depth import escape_distance, surface_depth
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import HITS_STOP, MarchSettings, Occlusion, default_stop
+from nerg_mi.transport.medium import ColorPainter
 from tests.formats.splats.writers import random_splats
 from tests.reference.splats import trace
 from tests.transport.media.splats.scenes import medium_of, rays, stack

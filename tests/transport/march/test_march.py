@@ -4,10 +4,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march import march as front
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.painting import ColorPainter
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport import march as front
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import ColorPainter
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 from .test_primal import grid, slab
 

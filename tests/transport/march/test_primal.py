@@ -10,11 +10,11 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.media.painting import ColorPainter
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import ColorPainter
+from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.reference import march_numpy as reference
 
 DIAGONAL = 3**0.5

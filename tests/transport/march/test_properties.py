@@ -9,12 +9,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nerg_mi.transport.march.depth import DEPTHS, surface_depth
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.local_ray import LocalRay
-from nerg_mi.transport.media.painting import ColorPainter
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.depth import DEPTHS, surface_depth
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import ColorPainter, LocalRay
+from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.reference import march_numpy as reference
 
 PIECES = 8

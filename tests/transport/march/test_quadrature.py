@@ -7,7 +7,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.quadrature import absorbed_share, linear_share, mean_depth_share
+from nerg_mi.transport.quadrature import absorbed_share, linear_share, mean_depth_share
 
 TAU = np.logspace(-8, 8, 1601).astype(np.float32)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.march.registry import Registry
+from nerg_mi.transport.quadrature import Registry
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields.occupancy import OccupancyGrid
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.quadrature import linear_crossing, linear_share
-from nerg_mi.transport.march.rules import RULES, boundaries, color_share
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.cells import VoxelCells
-from nerg_mi.transport.media.local_ray import LocalRay
-from nerg_mi.transport.media.painting import ColorPainter
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import ColorPainter, LocalRay, VoxelCells
+from nerg_mi.transport.quadrature import RULES, boundaries, color_share, linear_crossing, linear_share
+from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.reference import march_numpy as reference
 
 
@@ -229,10 +226,10 @@ def test07_every_march_ends(kind):
 import nerg_mi, numpy as np, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 from nerg_mi.fields.occupancy import OccupancyGrid
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.local_ray import LocalRay
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import LocalRay
+from nerg_mi.transport.volume_medium import VolumeMedium
 data = np.full((64, 64, 64), 1.5, np.float32)
 data[::2] = 0.5
 medium = VolumeMedium(mi.load_dict({{"type": "gridvolume", "grid": mi.VolumeGrid(data)}}))

@@ -8,7 +8,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.settings import MarchResult, MarchSettings, default_step
+from nerg_mi.transport.march_primal import MarchResult, MarchSettings, default_step
 
 
 @pytest.mark.parametrize("stop, depth", [(0.0, math.inf), (1.0, 0.0), (1e-4, -math.log(1e-4))])

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields.occupancy import OccupancyGrid
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.march.stepping import advance, leap, step_length
-from nerg_mi.transport.media.cells import VoxelCells
+from nerg_mi.transport.march_primal import MarchSettings, advance, leap, step_length
+from nerg_mi.transport.medium import VoxelCells
 
 from .test_primal import grid
 

@@ -5,7 +5,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.transport.media.cells import bound
+from nerg_mi.transport.medium import bound
 
 
 @pytest.mark.parametrize("filter_type", ["nearest", "trilinear"])

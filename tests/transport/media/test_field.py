@@ -9,10 +9,10 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box, Similarity
-from nerg_mi.transport.march.march import march
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.media.painting import ColorPainter
+from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import ColorPainter
 from tests.maths.test_similarity import turn
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.transport.media.painting import ColorPainter
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.medium import ColorPainter
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 
 @pytest.mark.parametrize("kind", ["Color3f", "Spectrum", "Vector3f"])

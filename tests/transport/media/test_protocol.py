@@ -7,10 +7,9 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.transport.media.field import FieldMedium
-from nerg_mi.transport.media.local_ray import LocalRay
-from nerg_mi.transport.media.protocol import MAX_DENSITY, Medium, bounded
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.field_medium import FieldMedium
+from nerg_mi.transport.medium import MAX_DENSITY, LocalRay, Medium, bounded
+from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.transport.media.splats.scenes import medium_of, stack
 
 from .test_field import field

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.media.volume import KnownEmpty, VolumeMedium
+from nerg_mi.transport.volume_medium import KnownEmpty, VolumeMedium
 
 
 def test01_a_volume_without_extent_is_refused(rgb):
@@ -67,7 +67,7 @@ def test04_nothing_is_skipped_while_derivatives_of_it_are_tracked(rgb):
 
 
 def test05_refreshing_reads_voxels_that_have_changed_and_no_others(rgb, monkeypatch):
-    from nerg_mi.transport.media import volume as module
+    from nerg_mi.transport import volume_medium as module
 
     volume, read = grid(rgb, corner()), []
     describe = module.describe

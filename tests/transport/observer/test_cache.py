@@ -4,10 +4,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.fingerprint import Fingerprint
-from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.observer.cache import Known, ObserverCache, fingerprint_of
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.jit import Fingerprint
+from nerg_mi.transport.observer import Known, ObserverCache, fingerprint_of
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 
 @pytest.fixture

@@ -4,10 +4,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.observer.depth_map import ObserverMap
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.observer import ObserverSettings
+from nerg_mi.transport.occlusion import ObserverMap
 
 HEIGHT = 32
 SETTINGS = ObserverSettings(march=MarchSettings(0.1), depth="expected", map_height=HEIGHT)

@@ -18,13 +18,11 @@ from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.geometry.places import place_of_volume
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.observer.cache import ObserverCache
-from nerg_mi.transport.observer.gaze import PlacedGaze
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.observer.sight import trace_sight
-from nerg_mi.transport.place import Place
-from nerg_mi.transport.trace import default_settings
+from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.observer import ObserverCache, ObserverSettings
+from nerg_mi.transport.observer_gaze import PlacedGaze
+from nerg_mi.transport.occlusion import trace_sight
 from tests.fields.gaze.test_log_density import BOX, SMALL
 
 SETTINGS = ObserverSettings(march=MarchSettings(0.1))

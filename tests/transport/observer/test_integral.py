@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.transport.observer.integral import FEWEST, FIRST, USUAL, integrate
+from nerg_mi.transport.observer_gaze import FEWEST, FIRST, USUAL, integrate
 
 MOST = 1 << 17
 

@@ -4,8 +4,8 @@ from dataclasses import fields, replace
 
 import pytest
 
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.observer.settings import ObserverSettings
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.observer import ObserverSettings
 
 SETTINGS = ObserverSettings(march=MarchSettings(0.1))
 OTHERS = {

@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.observer.cache import ObserverCache
-from nerg_mi.transport.observer.settings import ObserverSettings
-from nerg_mi.transport.observer.sight import trace_sight
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.observer import ObserverCache, ObserverSettings
+from nerg_mi.transport.occlusion import trace_sight
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 STEP = 0.01
 

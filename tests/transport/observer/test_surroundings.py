@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.transport.observer.surroundings import nearest_depth
+from nerg_mi.transport.observer_gaze import nearest_depth
 
 
 @pytest.mark.parametrize("count", [1, 5, 8, 40])

@@ -4,8 +4,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.observer import viewpoint
-from nerg_mi.transport.observer.cache import Known
+from nerg_mi.transport import observer
+from nerg_mi.transport.observer import Known
 
 
 def camera(mi, origin, target=(0, 0, 0), kind="perspective", **kwargs):
@@ -29,9 +29,9 @@ def test01_center_is_not_the_near_plane(rgb, kind):
     extra = {"aperture_radius": 0.1, "focus_distance": 3.0} if kind == "thinlens" else {}
     extra |= {} if kind == "panorama" else {"near_clip": 1.0}
     sensor = rgb.load_dict(camera(rgb, [1, 2, 3], kind=kind, **extra))
-    assert np.allclose(np.array(viewpoint.center(sensor)).ravel(), [1, 2, 3], atol=1e-6)
-    viewpoint.require_center(sensor, "x")
-    got = np.array(viewpoint.center_of_ray([sensor], rays_of(rgb, sensor)))
+    assert np.allclose(np.array(observer.center(sensor)).ravel(), [1, 2, 3], atol=1e-6)
+    observer.require_center(sensor, "x")
+    got = np.array(observer.center_of_ray([sensor], rays_of(rgb, sensor)))
     assert np.allclose(got.reshape(3, -1).T, [1, 2, 3], atol=1e-6)
 
 
@@ -45,9 +45,9 @@ def test02_sensors_without_a_center(rgb, kind):
             {"type": kind, "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}}
         )
     with pytest.raises(ValueError, match='the camera is a .* no centre .* explicit "observer"'):
-        viewpoint.require_center(sensor, "the camera")
+        observer.require_center(sensor, "the camera")
     with pytest.raises(ValueError, match="no centre"):
-        viewpoint.center_of_ray([sensor], rays_of(rgb, rgb.load_dict(camera(rgb, [0, 0, 1]))))
+        observer.center_of_ray([sensor], rays_of(rgb, rgb.load_dict(camera(rgb, [0, 0, 1]))))
 
 
 def batch(mi, *cameras):
@@ -60,7 +60,7 @@ def test03_rays_of_a_batch_find_their_camera(rgb, near):
     origins = [[0, 0, 3], [0.5, 0, 3], [-3, 1, 0], [0, 0, -3]]
     sensor = batch(rgb, *(camera(rgb, o, near_clip=near) for o in origins))
     ray = rays_of(rgb, sensor, 200)
-    got = np.array(viewpoint.center_of_ray([sensor], ray)).T
+    got = np.array(observer.center_of_ray([sensor], ray)).T
     # The ray's own camera: its line passes through exactly one of the centres.
     o, d = np.array(ray.o).T, np.array(ray.d).T
     v = o[:, None] - np.array(origins)
@@ -72,17 +72,17 @@ def test03_rays_of_a_batch_find_their_camera(rgb, near):
 def test04_same_center(rgb):
     a, b = rgb.load_dict(camera(rgb, [1, 2, 3], near_clip=1.0)), rgb.load_dict(camera(rgb, [1, 2, 3.001]))
     turned = rgb.load_dict(camera(rgb, [1, 2, 3], target=(5, 0, 1), fov=70))
-    assert viewpoint.same_center([a], viewpoint.center(turned)) and not viewpoint.same_center([a], viewpoint.center(b))
-    assert not viewpoint.same_center([a, b], viewpoint.center(a)) and not viewpoint.same_center([], viewpoint.center(a))
+    assert observer.same_center([a], observer.center(turned)) and not observer.same_center([a], observer.center(b))
+    assert not observer.same_center([a, b], observer.center(a)) and not observer.same_center([], observer.center(a))
     ortho = rgb.load_dict({"type": "orthographic"})
-    assert not viewpoint.same_center([ortho], viewpoint.center(ortho))
-    assert viewpoint.same_center([batch(rgb, camera(rgb, [1, 2, 3]), camera(rgb, [1, 2, 3]))], viewpoint.center(a))
+    assert not observer.same_center([ortho], observer.center(ortho))
+    assert observer.same_center([batch(rgb, camera(rgb, [1, 2, 3]), camera(rgb, [1, 2, 3]))], observer.center(a))
 
 
 def test05_no_sensor(rgb):
     ray = rays_of(rgb, rgb.load_dict(camera(rgb, [0, 0, 1])))
     with pytest.raises(ValueError, match='give the integrator an "observer"'):
-        viewpoint.center_of_ray([], ray)
+        observer.center_of_ray([], ray)
 
 
 def test06_center_is_attached_to_the_placement(rgb):
@@ -92,7 +92,7 @@ def test06_center_is_attached_to_the_placement(rgb):
     dr.enable_grad(x)
     params["to_world"] = rgb.Transform4f().translate([x, 2 * x, 0]) @ rgb.Transform4f(params["to_world"])
     params.update()
-    c = viewpoint.center(sensor)
+    c = observer.center(sensor)
     dr.backward(c.x + c.y)
     assert np.isclose(dr.grad(x).numpy()[0], 3)
 
@@ -103,7 +103,7 @@ def test_cameras_on_one_line_are_told_apart_by_where_their_rays_start(rgb, near)
     sensor = batch(rgb, camera(rgb, [0, 0, 3], near_clip=near), camera(rgb, [0, 0, 1], [0, 0, -1], near_clip=near))
     for z in (3, 1):
         ray = rgb.Ray3f(rgb.Point3f(0, 0, z - near), rgb.Vector3f(0, 0, -1))
-        assert np.allclose(np.array(viewpoint.center_of_ray([sensor], ray)).ravel(), [0, 0, z], atol=1e-5)
+        assert np.allclose(np.array(observer.center_of_ray([sensor], ray)).ravel(), [0, 0, z], atol=1e-5)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
@@ -112,5 +112,5 @@ def test_each_lane_has_what_belongs_to_the_nearest(rgb, count):
     centers, p = rng.normal(size=(count, 3)), rng.normal(size=(60, 3))
     known = [Known(rgb.Point3f(*map(float, c)), rgb.Float(k)) for k, c in enumerate(centers)]
     lanes = rgb.Point3f(np.ascontiguousarray(p.T, np.float32))
-    found = viewpoint.select_nearest(known, lanes, lambda value: value).numpy()
+    found = observer.select_nearest(known, lanes, lambda value: value).numpy()
     assert np.array_equal(np.broadcast_to(found, 60), np.linalg.norm(p[:, None] - centers, axis=2).argmin(axis=1))

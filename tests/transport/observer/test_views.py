@@ -7,8 +7,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.transport.observer.cache import ObserverCache
-from nerg_mi.transport.observer.views import SupportView, view_along
+from nerg_mi.transport.observer import ObserverCache, SupportView, view_along
 
 
 class Counting:

@@ -5,7 +5,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.transport.observer.visibility import visibility
+from nerg_mi.transport.observer import visibility
 
 
 def seen(d_expected, d_met, falloff, tolerance=0.0):

@@ -7,8 +7,7 @@ import numpy as np
 
 from nerg_mi.fields.splats import Splats, harmonics_of
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.transport.media.splats.arrays import SplatArrays
-from nerg_mi.transport.media.splats.medium import SplatMedium
+from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 
 
 def medium_of(splats: Splats, to_world: Similarity | None = None) -> SplatMedium:

@@ -3,7 +3,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 
 from nerg_mi.maths.sphere import harmonics
-from nerg_mi.transport.media.splats.arrays import SplatArrays
+from nerg_mi.transport.splat_medium import SplatArrays
 from tests.formats.splats.writers import random_splats
 from tests.reference.splats import peaks
 from tests.transport.media.splats.scenes import rays

@@ -1,8 +1,8 @@
 import drjit as dr
 import numpy as np
 
-from nerg_mi.transport.media.hits import LastHit
-from nerg_mi.transport.media.splats.nearest import AT_ONCE
+from nerg_mi.transport.medium import LastHit
+from nerg_mi.transport.splat_medium import AT_ONCE
 from tests.formats.splats.writers import random_splats
 from tests.reference.splats import peaks
 from tests.transport.media.splats.scenes import medium_of, rays, stack

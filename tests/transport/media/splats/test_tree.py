@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.transport.media.splats.tree import build_tree
+from nerg_mi.transport.splat_medium import build_tree
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 1000])

@@ -1,8 +1,4 @@
-"""What an observer, who may stand elsewhere than the camera, sees of a point.
-
-The paper's second depth pass: the observer's ray towards the camera's surface p_d is marched for its own depth d_o, and
-compared with the distance d_o* (see ``visibility``).
-"""
+"""What hides a surface from an observer: maps of depth around them, and the sight along one segment."""
 
 from __future__ import annotations
 
@@ -10,17 +6,116 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f
-from nerg_mi.transport.march.depth import DEPTHS
-from nerg_mi.transport.march.occlusion import Occlusion
-from nerg_mi.transport.place import Place, View
+from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f
 
-from .cache import ObserverCache, fingerprint_of
-from .depth_map import ObserverMap
-from .gaze import ObservedGaze
-from .settings import ObserverSettings
-from .viewpoint import distance_and_direction
-from .visibility import visibility
+from .depth import DEPTHS
+from .geometry import Place, View
+from .march_primal import Occlusion
+from .observer import ObserverCache, ObserverSettings, distance_and_direction, fingerprint_of, visibility
+from .observer_gaze import ObservedGaze
+
+# ---- What an observer meets in every direction, marched once and looked up ever after ----
+#
+# A latitude-longitude map of depth, and of gaze, around the observer. A point is compared with the four nearest entries
+# and the results are interpolated (percentage-closer filtering, Reeves et al. 1987), not the depths themselves, which
+# would float between surfaces.
+
+
+class ObserverMap:
+    """Depths (scene units, infinite where nothing is met) around ``center`` (one lane), ``2 height`` x
+    ``height`` entries.
+
+    Detached: no derivative passes through the map. Rows run from +z to -z, columns from azimuth 0 on, entries at pixel
+    centres.
+    """
+
+    def __init__(self, place: Place, center: Point3f, settings: ObserverSettings):
+        import mitsuba as mi
+
+        self.height, self.width, self.center = settings.map_height, 2 * settings.map_height, center
+        self._float, self._uint, self._vector = mi.Float, mi.UInt32, mi.Vector3f
+        with dr.suspend_grad():
+            everywhere = dr.full(mi.Bool, True, self.width * self.height)
+            view = place.trace(mi.Ray3f(self.center, self._directions()), everywhere, settings.march)
+            met = view.meets(settings.surface_opacity)
+            self.depth = dr.select(met, view.depth(settings.depth, met), dr.inf)
+            dr.eval(self.depth)
+
+    def gaze_table(self, gaze: ObservedGaze) -> Float:
+        """The density of ``gaze`` (an entry each) where a surface is met, 0 elsewhere."""
+        with dr.suspend_grad():
+            r_o = self._directions()
+            met = dr.isfinite(self.depth)
+            p_od = self.center + r_o * dr.select(met, self.depth, 0)
+            table = dr.select(met, gaze.evaluate(p_od, self.center, r_o, met)[0], 0)
+            dr.eval(table)
+        return table
+
+    @property
+    def spacing(self) -> float:
+        """Angle between neighbouring entries, in radian."""
+        return dr.pi / self.height
+
+    def _directions(self) -> Vector3f:
+        index = dr.arange(self._uint, self.width * self.height)
+        Float = self._float
+        phi = (Float(index % self.width) + 0.5) * self.spacing
+        theta = (Float(index // self.width) + 0.5) * self.spacing
+        sin_theta, cos_theta = dr.sincos(theta)
+        sin_phi, cos_phi = dr.sincos(phi)
+        return self._vector(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta)
+
+    def look_up(
+        self, r_o: Vector3f, distance: Float, falloff: Float, tolerance: Float, active: Bool
+    ) -> tuple[Float, Float]:
+        """``(nearest depth, visibility)`` of points at ``distance`` along unit ``r_o`` from the centre."""
+        Float = type(distance)
+        seen, nearest, best = Float(0), Float(dr.inf), Float(-1)
+        for entry, weight in self._entries(r_o, distance):
+            depth = dr.gather(Float, self.depth, entry, active)
+            seen += weight * visibility(distance, depth, falloff, tolerance)
+            closer = weight > best
+            nearest, best = dr.select(closer, depth, nearest), dr.select(closer, weight, best)
+        return nearest, seen
+
+    def gaze_along(
+        self, table: Float, r_o: Vector3f, distance: Float, falloff: Float, slack: Float, active: Bool
+    ) -> Float:
+        """Density of a ``gaze_table`` at the surface that is met along unit ``r_o`` for points at ``distance``.
+
+        Negative where the map does not know it: an entry that looks past the point, by more than ``slack``, sees
+        another surface."""
+        Float = type(distance)
+        total, share = Float(0), Float(0)
+        for entry, weight in self._entries(r_o, distance):
+            depth = dr.gather(Float, self.depth, entry, active)
+            weight *= visibility(distance, depth, falloff, slack)
+            weight = dr.select(depth < distance + slack, weight, 0)
+            total += weight * dr.gather(Float, table, entry, active)
+            share += weight
+        return dr.select(share > 0, total / dr.select(share > 0, share, 1), -1)
+
+    def _entries(self, r_o, distance):
+        """The four entries around the direction ``r_o``, and their bilinear weights."""
+        Float, UInt32 = type(distance), self._uint
+        r_o = dr.detach(r_o)
+        theta = dr.atan2(dr.sqrt(r_o.x * r_o.x + r_o.y * r_o.y), r_o.z)
+        x = dr.atan2(r_o.y, r_o.x) / self.spacing - 0.5
+        y = dr.clip(theta / self.spacing - 0.5, 0, self.height - 1)
+        x = dr.select(x < 0, x + self.width, x)
+        i, j = UInt32(x), dr.minimum(UInt32(y), self.height - 1)
+        fx, fy = x - Float(i), y - Float(j)
+        for dj in (0, 1):
+            for di in (0, 1):
+                row, column = dr.minimum(j + dj, self.height - 1), (i + di) % self.width
+                yield column + self.width * row, (fx if di else 1 - fx) * (fy if dj else 1 - fy)
+
+
+# ---- What an observer, who may stand elsewhere than the camera, sees of a point ----
+#
+# The paper's second depth pass: the observer's ray towards the camera's surface p_d is marched for its own depth d_o,
+# and compared with the distance d_o* (see ``visibility``).
+
 
 # An entry of a map sees the same surface as a point if it lies at most this many times the point's lift behind it.
 _PAST = 4

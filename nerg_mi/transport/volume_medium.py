@@ -1,4 +1,4 @@
-"""Any Mitsuba volumes as a medium that is marched."""
+"""A grid of densities as a medium."""
 
 from __future__ import annotations
 
@@ -12,19 +12,16 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.maths.geometry import intersect_box
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
-from nerg_mi.transport.fingerprint import Fingerprint
-from nerg_mi.transport.freezing import recording
 
-from .cells import VoxelCells, bound, describe
-from .local_ray import LocalRay
-from .protocol import bounded
+from .jit import Fingerprint, recording
+from .medium import LocalRay, VoxelCells, bound, bounded, describe
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
 
 class VolumeMedium:
-    """Any Mitsuba volume as density (1/scene unit), optionally with a second one as colour: a ``protocol.Medium`` in
+    """Any Mitsuba volume as density (1/scene unit), optionally with a second one as colour: a ``medium.Medium`` in
     the scene's own coordinates.
 
     Outside of the density volume's ``bbox()`` there is vacuum. Empty voxels of an axis-aligned

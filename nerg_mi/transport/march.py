@@ -1,20 +1,4 @@
-"""Derivatives of a march, by marching again.
-
-In the manner of path replay (Vicini et al. 2021): nothing is stored along the ray.
-The primal's sums are known, so a second march that repeats its steps knows, at
-step i, both what lies in front and what lies behind it. With T_i the
-transmittance before the step, and M and C the weighted sums of distances and
-colours, the derivative of the outputs with respect to the step's own optical
-depth dτ_i, mean distance m_i (from t0 on) and colour c_i is that of
-
-    f_i = δτ dτ_i + T_i (1 - e^{-dτ_i}) (δM m_i + δC c_i) - dτ_i (δM M_{>i} + δC C_{>i}) + δh h_i
-
-where δ are the adjoints, M_{>i} the part of M behind the step, and h_i the step's
-part in the distance at which an optical depth is reached. Nothing is divided by a
-transmittance, which may be zero.
-
-Steps keep their lengths and move with the ray's entry t0; the last one ends at t1.
-"""
+"""The march through a medium as one differentiable operation: its adjoint, and that of hits."""
 
 from __future__ import annotations
 
@@ -24,16 +8,30 @@ from typing import Any
 
 import drjit as dr
 
-from nerg_mi.maths.types import Bool, Color, Float
-from nerg_mi.transport.media.local_ray import LocalRay
-from nerg_mi.transport.media.painting import Painter
-from nerg_mi.transport.media.protocol import Medium
+from nerg_mi.maths.arrays import log1p
+from nerg_mi.maths.types import Bool, Color, Float, UInt32
 
-from .primal import add, limits, march_primal
-from .quadrature import absorbed_share
-from .rules import RULES, boundaries
-from .settings import MarchResult, MarchSettings
-from .stepping import advance
+from .march_primal import MarchResult, MarchSettings, Occlusion, add, advance, limits, march_hits, march_primal
+from .medium import LastHit, LocalRay, Medium, Painter
+from .quadrature import RULES, absorbed_share, boundaries
+
+# ---- Derivatives of a march, by marching again ----
+#
+# In the manner of path replay (Vicini et al. 2021): nothing is stored along the ray.
+# The primal's sums are known, so a second march that repeats its steps knows, at
+# step i, both what lies in front and what lies behind it. With T_i the
+# transmittance before the step, and M and C the weighted sums of distances and
+# colours, the derivative of the outputs with respect to the step's own optical
+# depth dτ_i, mean distance m_i (from t0 on) and colour c_i is that of
+#
+#     f_i = δτ dτ_i + T_i (1 - e^{-dτ_i}) (δM m_i + δC c_i) - dτ_i (δM M_{>i} + δC C_{>i}) + δh h_i
+#
+# where δ are the adjoints, M_{>i} the part of M behind the step, and h_i the step's
+# part in the distance at which an optical depth is reached. Nothing is divided by a
+# transmittance, which may be zero.
+#
+# Steps keep their lengths and move with the ray's entry t0; the last one ends at t1.
+
 
 _INPUTS = ("o", "d", "w", "t0", "t1")
 
@@ -257,3 +255,164 @@ class March(dr.CustomOp):
 
     def name(self):
         return "march"
+
+
+# ---- Derivatives of a march from hit to hit, by finding the hits again ----
+#
+# The sums are those of ``adjoint``, with a hit's optical depth, its distance and its colour for a step's: nothing is
+# stored along the ray, however many hits there are. Which hits there are, and their order, carry no derivatives: one
+# that moves past another, or to where it is cut off, changes the sums by a jump that is not seen.
+
+
+@dataclass
+class _HitState:
+    """Where a repeated march is: the hit to come, and the sums in front of it."""
+
+    active: Bool
+    index: UInt32
+    tau: Float
+    moment: Float
+    lost: tuple[Float, Float]
+    color: Color | None
+
+
+class HitMarch(March):
+    """``march_hits`` as one node of the graph."""
+
+    def _primal(self) -> MarchResult:
+        medium, active, settings, _, color, count, until, _ = self.fixed
+        t0, t1 = self.inputs[3:]
+        return march_hits(medium, medium.hits, LocalRay(*self.inputs), t0, t1, active, settings, color, count, until)
+
+    def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], active: Bool, extra: Any) -> Any:
+        medium, _, settings, _, color, _, until, _ = self.fixed
+        ray, (t0, t1) = LocalRay(*(dr.detach(x) for x in self.inputs)), self.inputs[3:]
+        Float = type(t0)
+        UInt32 = dr.uint32_array_t(Float)
+        end = limits(Float, settings, until)[1]
+
+        def take(state, t, index, extra):
+            """The first of the hits; the others move up."""
+            state, extra = body(replace(state, index=index[0]), extra)
+            t, index = t[1:] + [Float(dr.inf)], index[1:] + [UInt32(0)]
+            return replace(state, active=state.active & (t[0] < dr.inf)), t, index, extra
+
+        def group(active, last, state, extra):
+            found = medium.hits.nearest(ray, last, t1, dr.exp(-state.tau), dr.exp(-end), active)
+            farthest = LastHit(found.t[-1], found.index[-1])
+            state = replace(state, active=active & (found.t[0] < dr.inf))
+            state, _, _, extra = dr.while_loop(
+                (state, found.t, found.index, extra), lambda state, *_: state.active, take, label="hits again"
+            )
+            return active & (farthest.t < dr.inf) & (state.tau < end), farthest, state, extra
+
+        nothing = None if color is None else color.zero()
+        state = _HitState(active, UInt32(0), Float(0), Float(0), (Float(0), Float(0)), nothing)
+        first = LastHit(dr.fma(dr.abs(t0), -(2.0**-22), t0 - 1e-37), UInt32(0))
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
+            out = dr.while_loop((active, first, state, extra), lambda active, *_: active, group, label="hits adjoint")
+        return out[3]
+
+    def _replay(self, leaves: list[Any], state: Any) -> tuple[Replayed, Any]:
+        medium, _, settings, _, color, _, until, _ = self.fixed
+        o, d, w, t0, t1 = leaves
+        goal, end = limits(type(t0), settings, until)
+        active, tau = state.active, state.tau
+        t, absorbed = medium.hits.again(LocalRay(o, d, w, t0, t1), state.index, active)
+        dtau, mean = dr.select(active, -log1p(-absorbed), 0), t - t0
+        transmittance = dr.exp(-tau)
+        weight = dr.select(active, transmittance * dr.detach(absorbed), 0)
+        moment, lost_moment = add(state.moment, state.lost[1], weight * dr.detach(mean))
+        after, lost_tau = add(tau, state.lost[0], dr.detach(dtau))
+        total, painted = state.color, None
+        if color is not None:
+            lit = active & (weight > 0)
+            painted = dr.select(lit, color.paint(medium, [state.index], o + d * t, w, lit), 0)
+            total = total + weight * dr.detach(painted)
+        before = active & (after < goal)
+        crosses = active & ~before & (tau < goal)
+        replayed = Replayed(active, dtau, mean, painted, transmittance, before, crosses, t)
+        lost = lost_tau, lost_moment
+        return replayed, _HitState(active & (after < end), state.index, after, moment, lost, total)
+
+
+# ---- March ----
+#
+# Volume rendering along rays: the march through a medium, with derivatives where any are tracked.
+#
+# Chooses between the plain march (``primal``) and the one that can be differentiated by marching again (``adjoint``),
+# and lets steps be coarse in front of all matter.
+
+
+# Optical depth that counts as a first trace of matter.
+_TRACE = 1e-3
+
+
+def march(
+    medium: Medium,
+    ray: LocalRay,
+    t0: Float,
+    t1: Float,
+    active: Bool,
+    settings: MarchSettings,
+    *,
+    offset: Float | None = None,
+    color: Painter | None = None,
+    count: bool = False,
+    until: Float | None = None,
+    fine_from: Float | None = None,
+    occlusion: Occlusion | None = None,
+) -> MarchResult:
+    """March ``ray`` from the distance ``t0`` to ``t1``, both in scene units and finite where there is matter.
+
+    ``offset`` in [0, 1]: length of the first step as a share of a full one (jitter; None: a full step). ``color``: what
+    samples contribute to the result's ``color``; None for a density-only pass. ``until``: optical depth at which to
+    end, for a march that only looks for that crossing. ``count``: count evaluations. ``fine_from``: distance up to
+    which steps are coarse. ``occlusion``: end as soon as its answer is known, unless derivatives are tracked, and say
+    so in ``known``. Differentiable, in forward and in reverse mode, in the ray, ``t0``, ``t1``, ``until`` and
+    the medium's parameters. Raises ``NergError`` for a quadrature rule that is not known, or that the medium does not
+    suit.
+    """
+    Float = type(ray.t_near)
+    active = dr.mask_t(Float)(active) & (t0 < t1)
+    arguments = (Float(t0), Float(t1), active, settings, offset, color, count, until, fine_from)
+    if medium.hits is not None:
+        if attached(medium, ray, t0, t1):
+            result = differentiable_march(HitMarch, medium, ray, *arguments)
+        else:
+            result = march_hits(medium, medium.hits, ray, *arguments[:4], color, count, until, occlusion)
+    elif attached(medium, ray, t0, t1):
+        result = differentiable_march(March, medium, ray, *arguments)
+    else:
+        result = march_primal(medium, ray, *arguments, occlusion)
+    result.origin = arguments[0]
+    if until is not None and dr.grad_enabled(until):
+        crossed = dr.isfinite(result.half)
+        result.half = dr.select(crossed, dr.fma(result.half_slope, until - dr.detach(until), result.half), result.half)
+    return result
+
+
+def fine_start(
+    medium: Medium, ray: LocalRay, t0: Float, t1: Float, active: Bool, settings: MarchSettings
+) -> tuple[Float, Float]:
+    """Distance from which matter must be marched finely, and the density evaluations that finding it took.
+
+    A coarse density-only march looks for the first trace of matter. What is thinner than a coarse step may be missed.
+    """
+    scout = replace(settings, step=settings.step * settings.coarse, coarse=1.0, quadrature="constant")
+    with dr.suspend_grad():
+        found = march(medium, ray, t0, t1, active, scout, until=_TRACE, count=True)
+        return dr.select(dr.isfinite(found.half), found.enter - scout.step, dr.inf), found.density_evals
+
+
+def scouted_march(
+    medium: Medium, ray: LocalRay, t0: Float, t1: Float, active: Bool, settings: MarchSettings, **options: Any
+) -> MarchResult:
+    """``march`` with coarse steps in front of all matter, where ``settings.coarse`` asks for them."""
+    if settings.coarse <= 1 or medium.hits is not None:
+        return march(medium, ray, t0, t1, active, settings, **options)
+    fine_from, scouted = fine_start(medium, ray, t0, t1, active, settings)
+    result = march(medium, ray, t0, t1, active, settings, fine_from=fine_from, **options)
+    if result.density_evals is not None:
+        result.density_evals = result.density_evals + scouted
+    return result

@@ -1,8 +1,4 @@
-"""Which distance along a ray is "the surface": expected, median or refined depth.
-
-A kind of depth is one object of the protocol ``Depth``, registered in ``DEPTHS``: the integrator's parameter ``depth``,
-its manual and the study offer whatever stands there.
-"""
+"""Kinds of depth: what a ray's optical depth makes of where it ends."""
 
 from __future__ import annotations
 
@@ -13,15 +9,11 @@ import drjit as dr
 
 from nerg_mi.maths.arrays import log1p
 from nerg_mi.maths.types import Bool, Float
-from nerg_mi.transport.media.local_ray import LocalRay
-from nerg_mi.transport.media.protocol import Medium
 
 from .march import march
-from .primal import LOG2
-from .registry import Registry
-from .rules import RULES
-from .settings import MarchResult, MarchSettings
-from .stepping import step_length
+from .march_primal import LOG2, MarchResult, MarchSettings, step_length
+from .medium import LocalRay, Medium
+from .quadrature import RULES, Registry
 
 # Most that a surface is moved towards the camera for being soft, as a share of its depth.
 _SOFTEST = 1 / 64

@@ -1,14 +1,21 @@
-"""Whether arrays are still those that something was made of: told by identity, without reading them."""
+"""Dr.Jit's side of rendering: fingerprints of scenes and fields, and frozen functions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import gc
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 
 if TYPE_CHECKING:
     import mitsuba as mi
+
+
+# ---- Fingerprint ----
+#
+# Whether arrays are still those that something was made of: told by identity, without reading them.
 
 
 class Fingerprint(list):
@@ -24,7 +31,7 @@ class Fingerprint(list):
 
 
 class HasShapes(Protocol):
-    """A ``place.Place``, of which only the shapes count here."""
+    """A ``geometry.Place``, of which only the shapes count here."""
 
     scene: mi.Scene | None
 
@@ -51,3 +58,32 @@ def _groups(mi: Any, scene: Any) -> list[Any]:
     if any(shape.class_name() == "Instance" for shape in scene.shapes()):
         scene.traverse(Collect())
     return found
+
+
+# ---- Freezing ----
+#
+# What to mind while ``dr.freeze`` records a function: it will be replayed with other values, and nothing is decided by
+# them.
+
+
+def recording() -> bool:
+    """Whether a frozen function is being recorded: values cannot be read then."""
+    return dr.flag(dr.JitFlag.FreezingScope)
+
+
+@contextmanager
+def no_collection() -> Iterator[None]:
+    """Keep Python's garbage while a function is recorded: Dr.Jit 1.5 ends the process where an array that lies in
+    NumPy's memory is freed."""
+    paused = recording() and gc.isenabled()
+    if paused:
+        gc.disable()
+    try:
+        yield
+    finally:
+        if paused:
+            if gc.get_freeze_count() == 0:
+                # Counts as if everything had just been looked at; otherwise the next object made would collect it all.
+                gc.freeze()
+                gc.unfreeze()
+            gc.enable()

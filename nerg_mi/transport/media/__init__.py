@@ -1,1 +1,0 @@
-"""What is marched: a trained field or Mitsuba volumes, with their cells, and what their samples contribute."""

@@ -1,1 +1,0 @@
-"""Gaussian splats as a medium: what rays meet of them, nearest first."""
