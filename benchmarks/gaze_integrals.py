@@ -32,7 +32,7 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze
-    from nerg_mi.training.geometry.places import place_of_field, place_of_volume
+    from nerg_mi.train.geometry import place_of_field, place_of_volume
     from nerg_mi.transport.geometry import Place, default_settings
     from nerg_mi.transport.observer import DIRECTIONS as COUNT
     from nerg_mi.transport.observer import ObserverSettings

@@ -51,9 +51,9 @@ def main(argv=None) -> None:
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.photos.dataset import open_dataset
-    from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
-    from nerg_mi.training.radiance.trainer import RadianceTrainer
-    from nerg_mi.training.radiance.warm_up import warm_up
+    from nerg_mi.train.radiance_run import warm_up
+    from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
+    from nerg_mi.train.radiance_trainer import RadianceTrainer
 
     if not args.views.exists():
         raise SystemExit(

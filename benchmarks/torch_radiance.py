@@ -131,7 +131,7 @@ def harmonics(d):
 
 
 class TorchTrainer:
-    """The scheme of ``nerg_mi.training``, in eager PyTorch. ``ours``: a trainer that has made no step, to start as it
+    """The scheme of ``nerg_mi.train``, in eager PyTorch. ``ours``: a trainer that has made no step, to start as it
     does."""
 
     def __init__(self, ours, views):
@@ -260,7 +260,7 @@ class TorchTrainer:
 
 def same_model(trainer, peer) -> float:
     """Largest relative difference of densities, and of colours, at random points."""
-    from nerg_mi.training.radiance.model import density_summand
+    from nerg_mi.train.radiance_losses import density_summand
 
     import drjit as dr
     import torch
@@ -306,8 +306,8 @@ def main(argv=None) -> None:
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.photos.dataset import open_dataset
-    from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
-    from nerg_mi.training.radiance.trainer import RadianceTrainer
+    from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
+    from nerg_mi.train.radiance_trainer import RadianceTrainer
 
     ns = namespace("llvm_ad_rgb")
     data = open_dataset(args.data, None, args.width)

@@ -21,8 +21,7 @@ from nerg_mi.cli.options import takes
 from nerg_mi.errors import NergError
 from nerg_mi.jobs import tracking
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, Checked, Range, check_number, ranged
-from nerg_mi.training.gaze import settings as gaze_settings
-from nerg_mi.training.radiance import settings as radiance_settings
+from nerg_mi.train import gaze_settings, radiance_settings
 
 
 def _modules():

@@ -85,8 +85,8 @@ def radiance_steps() -> Callable[[int], None]:
     from nerg_mi.maths.geometry import Box
     from nerg_mi.photos.cameras import Camera, Intrinsics
     from nerg_mi.photos.images import View
-    from nerg_mi.training.radiance.settings import RadianceSettings
-    from nerg_mi.training.radiance.trainer import RadianceTrainer
+    from nerg_mi.train.radiance_settings import RadianceSettings
+    from nerg_mi.train.radiance_trainer import RadianceTrainer
 
     lens = Intrinsics(tiny.SIDE, tiny.SIDE, 30.0, 30.0, tiny.SIDE / 2, tiny.SIDE / 2)
     rng, views = np.random.default_rng(0), []
@@ -114,10 +114,10 @@ def gaze_steps() -> Callable[[int], None]:
 
     from nerg_mi.fields.encoding import HashGridConfig
     from nerg_mi.fields.gaze_product import GazeConfig
-    from nerg_mi.training.gaze.product import ProductTrainer
-    from nerg_mi.training.gaze.ray_targets import targets_of_rays
-    from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
-    from nerg_mi.training.geometry.places import place_of_nothing
+    from nerg_mi.train.gaze_data import targets_of_rays
+    from nerg_mi.train.gaze_product import ProductTrainer
+    from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
+    from nerg_mi.train.geometry import place_of_nothing
 
     rays = tiny.looks()
     place = place_of_nothing(rays.origin)

@@ -50,7 +50,7 @@ def checks() -> str:
 
 def recipes() -> str:
     """What each gaze recipe sets: its field, length, losses and probes."""
-    from nerg_mi.training.gaze.recipes import RECIPES, FieldChoices
+    from nerg_mi.train.gaze_recipes import RECIPES, FieldChoices
 
     found = list(RECIPES.values())
     rows = [("what it is", *(recipe.summary for recipe in found))]
@@ -92,7 +92,7 @@ def registered() -> str:
     from nerg_mi.fields import encoding as encodings
     from nerg_mi.fields import gaze_base as gaze_fields
     from nerg_mi.rays.readers.registry import reader_names
-    from nerg_mi.training.gaze.recipes import RECIPES
+    from nerg_mi.train.gaze_recipes import RECIPES
     from nerg_mi.transport.depth import DEPTHS
     from nerg_mi.transport.quadrature import RULES
 
@@ -104,7 +104,7 @@ def registered() -> str:
         ("depth", "nerg_mi/transport/depth.py", DEPTHS.names()),
         ("AOV", "plugins/nerg_aovs.py", aovs),
         ("tracking reader", "nerg_mi/rays/readers/protocol.py", reader_names()),
-        ("gaze recipe", "nerg_mi/training/gaze/recipes.py", RECIPES),
+        ("gaze recipe", "nerg_mi/train/gaze_recipes.py", RECIPES),
     )
     cells = [(what, f"`{file}`", ", ".join(f"`{name}`" for name in names)) for what, file, names in rows]
     return table(("what", "protocol, or table", "there are"), cells)

@@ -29,9 +29,9 @@ from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.statistics.shares import Look
 from nerg_mi.statistics.visits import Box, Thing
 from nerg_mi.surfaces.mesh import mitsuba_mesh
-from nerg_mi.training.geometry import places
-from nerg_mi.training.geometry.places import GazePlace
-from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
+from nerg_mi.train import geometry
+from nerg_mi.train.gaze_data import SURFACE_OPACITY
+from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place, corners_of, default_settings, trace_depth
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import PlacedGaze, look_from
@@ -171,7 +171,7 @@ def surroundings_of_files(
         made = place_of_training(gaze, about.get("provenance", about), network.box, options, ns)
         return _of_place(made, PlacedGaze(network), align or made.align)
     if field is not None:
-        return _of_place(places.place_of_field(field, ns), None, align or Similarity())
+        return _of_place(geometry.place_of_field(field, ns), None, align or Similarity())
     return Surroundings(None, None, align or Similarity())
 
 

@@ -20,7 +20,7 @@ from nerg_mi.figures.sheet import new_page
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.rays.rays import Rays
-from nerg_mi.training.gaze.recipes import gaze_recipe
+from nerg_mi.train.gaze_recipes import gaze_recipe
 
 from .gaze.baselines import Baseline
 from .gaze.evaluation import GazeTest, make_test, map_scores
@@ -51,7 +51,7 @@ class Variant:
 
     # What it is called in tables.
     name: str
-    # Of `training.gaze.recipes`.
+    # Of `train.gaze_recipes`.
     recipe: str
     # Factors: "emit", "capture" or "emit_capture".
     gaze: str = "emit_capture"
@@ -63,7 +63,7 @@ class Variant:
     begin: bool = False
     # and stays so.
     frozen: bool = False
-    # What it is trained on (`training.gaze.settings.LOSSES`); "": the recipe's.
+    # What it is trained on (`train.gaze_settings.LOSSES`); "": the recipe's.
     loss: str = ""
 
     def file_name(self, seed: int) -> str:

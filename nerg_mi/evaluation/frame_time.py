@@ -10,8 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import mitsuba_says
 from nerg_mi.formats.splats.files import plugin_of_field
-from nerg_mi.training.geometry.hit_geometry import volume_dict
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train.geometry import GazePlace, volume_dict
 from nerg_mi.transport.geometry import Place
 
 

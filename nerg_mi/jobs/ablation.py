@@ -19,8 +19,8 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.splats.files import is_splats
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.training.gaze.recipes import gaze_recipe
-from nerg_mi.training.gaze.supervision import digest_rays
+from nerg_mi.train.gaze_data import digest_rays
+from nerg_mi.train.gaze_recipes import gaze_recipe
 
 from .ablation_bench import Bench, bench_of, law_of, plan_of, train_variant
 from .ablation_tasks import rows_in_parts

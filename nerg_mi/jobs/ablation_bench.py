@@ -18,11 +18,10 @@ from nerg_mi.evaluation.gaze.evaluation import GazeTest, held_out_rays
 from nerg_mi.evaluation.gaze.scores import gaze_field
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.rays.rays import Rays
-from nerg_mi.training.gaze.plan import GazePlan
-from nerg_mi.training.gaze.recipes import gaze_recipe
-from nerg_mi.training.gaze.splits import hold_out
-from nerg_mi.training.gaze.supervision import Supervision
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train.gaze_data import Supervision, hold_out
+from nerg_mi.train.gaze_recipes import gaze_recipe
+from nerg_mi.train.gaze_trainer import GazePlan
+from nerg_mi.train.geometry import GazePlace
 
 from .gaze import train_planned
 from .gaze_places import check_place, make_place

@@ -23,8 +23,8 @@ from nerg_mi.files.checksum import file_sha256
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.photos.colmap import turn_to_z
 from nerg_mi.rays.rays import Rays
-from nerg_mi.training.geometry import places
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train import geometry
+from nerg_mi.train.geometry import GazePlace
 
 from .backend import select_backend
 from .options import parse_point
@@ -147,9 +147,9 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazeP
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.02, "tracing the place")
     place = (
-        places.place_of_field(options.field, ns)
+        geometry.place_of_field(options.field, ns)
         if options.field is not None
-        else places.place_of_scene(_path(options.scene))
+        else geometry.place_of_scene(_path(options.scene))
     )
     assert place.medium is not None
     core = place.box.core

@@ -21,7 +21,7 @@ from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rays.dataset.opening import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train.geometry import GazePlace
 
 from .backend import select_backend
 from .gaze_places import check_place, place_of_training

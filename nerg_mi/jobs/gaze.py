@@ -20,16 +20,13 @@ from nerg_mi.photos.salience import SalienceSet, open_salience
 from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
-from nerg_mi.training.gaze import run
-from nerg_mi.training.gaze.ensemble import train_ensemble
-from nerg_mi.training.gaze.fit import GazeProgress
-from nerg_mi.training.gaze.mixing import mixes
-from nerg_mi.training.gaze.plan import GazePlan
-from nerg_mi.training.gaze.settings import ProbeSettings
-from nerg_mi.training.gaze.splits import far_views, hold_out
-from nerg_mi.training.gaze.state import StateSettings
-from nerg_mi.training.gaze.supervision import Supervision
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train import gaze_run
+from nerg_mi.train.gaze_data import Supervision, far_views, hold_out
+from nerg_mi.train.gaze_ensemble import train_ensemble
+from nerg_mi.train.gaze_folds import mixes
+from nerg_mi.train.gaze_settings import ProbeSettings
+from nerg_mi.train.gaze_trainer import GazePlan, GazeProgress, StateSettings
+from nerg_mi.train.geometry import GazePlace
 
 from .backend import select_backend
 from .gaze_places import check_place, make_place
@@ -139,7 +136,7 @@ def train_planned(
     write = None
     if output is not None:
         write = lambda field, provenance: save_gaze(field, output, {**state.about, **provenance}, half)
-    train = partial(train_ensemble, ensemble) if ensemble else run.train_gaze
+    train = partial(train_ensemble, ensemble) if ensemble else gaze_run.train_gaze
     tell = lambda progress: reporter.progress(progress.done, _progress(progress))
     field, provenance = train(supervision, place, plan, ns, state=state, tell=tell, write=write)
     return GazeResult(field, {**state.about, **provenance}, output, provenance["interrupted"])

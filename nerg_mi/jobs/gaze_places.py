@@ -15,8 +15,8 @@ from nerg_mi.formats.fields import is_field
 from nerg_mi.maths.geometry import AnyBox, Similarity
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.rays.rays import Rays
-from nerg_mi.training.geometry import places
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train import geometry
+from nerg_mi.train.geometry import GazePlace
 
 from .options.evaluation import GazeEvaluationOptions
 from .options.place import PlaceOptions
@@ -50,20 +50,20 @@ def make_place(
     """
     kind = place_kind(options)
     if options.field is not None:
-        place = places.place_of_field(Path(options.field), ns)
+        place = geometry.place_of_field(Path(options.field), ns)
         for note in place.notes:
             reporter.message(f"of {options.field}: {note}")
         return place
     if options.scene is not None:
-        return places.place_of_scene(Path(options.scene))
+        return geometry.place_of_scene(Path(options.scene))
     if kind == "none":
         origins = [v.camera.center[None] for v in views] + ([] if rays is None else [rays.origin])
-        return places.place_of_nothing(np.concatenate(origins))
+        return geometry.place_of_nothing(np.concatenate(origins))
     if rays is None or volume is None:
         raise NergError(
             "a place of hit points is made of rays and written beside the gaze field: give both, or a field"
         )
-    place = places.place_of_hits(rays, volume, voxel)
+    place = geometry.place_of_hits(rays, volume, voxel)
     made = place.about["geometry_file"]
     reporter.message(
         f"wrote {volume}: {' x '.join(map(str, made['shape']))} voxels of {made['voxel']:.3g} m, "
@@ -89,9 +89,9 @@ def place_of_training(
     if provenance.get("geometry") == "none":
         return GazePlace(None, box, "none", align=align)
     makers: dict[str, tuple[Path | None, str, Callable[[Path], GazePlace]]] = {
-        "field_file": (options.field, "--field", lambda path: places.place_of_field(path, ns)),
-        "scene_file": (options.scene, "--scene", places.place_of_scene),
-        "geometry_file": (options.geometry, "--geometry", places.place_of_volume),
+        "field_file": (options.field, "--field", lambda path: geometry.place_of_field(path, ns)),
+        "scene_file": (options.scene, "--scene", geometry.place_of_scene),
+        "geometry_file": (options.geometry, "--geometry", geometry.place_of_volume),
     }
     key = place_key(gaze, provenance)
     given, name, make = makers[key]

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from nerg_mi.errors import NergError, chosen
-from nerg_mi.training.gaze.blind import check_kernels
-from nerg_mi.training.gaze.plan import GazePlan
-from nerg_mi.training.gaze.recipes import FieldChoices, Recipe, gaze_recipe
-from nerg_mi.training.gaze.settings import ProbeSettings
-from nerg_mi.training.gaze.targets import TargetNeeds
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train.gaze_data import TargetNeeds, check_kernels
+from nerg_mi.train.gaze_recipes import FieldChoices, Recipe, gaze_recipe
+from nerg_mi.train.gaze_settings import ProbeSettings
+from nerg_mi.train.gaze_trainer import GazePlan
+from nerg_mi.train.geometry import GazePlace
 
 from .gaze_places import place_kind
 from .options.gaze import GazeOptions

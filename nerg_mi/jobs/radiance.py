@@ -14,8 +14,8 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.photos.dataset import Dataset, open_dataset
-from nerg_mi.training.radiance import run
-from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+from nerg_mi.train import radiance_run
+from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
 
 from .backend import select_backend
 from .options.radiance import RadianceOptions, RadianceScoreOptions
@@ -74,7 +74,7 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
     reporter.progress(0.0, "reading photos")
     data = _open(photos, options)
     _tell_about(data, reporter)
-    field, provenance = run.train_field(
+    field, provenance = radiance_run.train_field(
         data,
         sized_config(options.size, data.box, options.deferred),
         settings,
@@ -136,7 +136,7 @@ def _tell_about(data: Dataset, reporter: Reporter) -> None:
     )
 
 
-def _progress(now: run.Progress) -> str:
+def _progress(now: radiance_run.Progress) -> str:
     left = now.seconds * (1 - now.done) / max(now.done, 1e-6)
     error = f", held out {now.psnr:.2f} dB" if now.psnr is not None else ""
     return f"{left:.0f} s left, step {now.steps}{error}"

@@ -39,7 +39,7 @@ from nerg_mi.report.run import Picture, Run
 from nerg_mi.report.stage import Camera, Stage, pack
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, Box
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import center
 

@@ -20,7 +20,7 @@ from nerg_mi.rendering.frames_file import write_frames
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.rendering.scene_parts import Attention, Eye, Lens, SceneText, default_name, relative_name
 from nerg_mi.rendering.scene_writer import numbers, value_of
-from nerg_mi.training.geometry.places import place_of_hits
+from nerg_mi.train.geometry import place_of_hits
 
 from .backend import select_backend
 from .options.scene import SceneOptions

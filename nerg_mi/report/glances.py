@@ -14,8 +14,8 @@ from nerg_mi.maths.arrays import vector_of
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.shares import Look
 from nerg_mi.statistics.visits import Landed, Thing, land, regroup
-from nerg_mi.training.geometry.places import GazePlace
-from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
+from nerg_mi.train.gaze_data import SURFACE_OPACITY
+from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place, default_settings, trace_depth
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import PlacedGaze, look_from

@@ -12,7 +12,7 @@ from nerg_mi.jobs.statistics import statistics
 from nerg_mi.report.glances import Onlooker
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, Box
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train.geometry import GazePlace
 from tests.aoi.place import SIGN, STAND, write_place
 
 BOX = [(-0.2, 1.8, -0.1), (0.2, 2.2, 0.1)]

@@ -14,7 +14,7 @@ from nerg_mi.formats.fields import load_gaze, load_radiance
 from nerg_mi.jobs import gaze
 from nerg_mi.jobs.options.gaze import GazeOptions
 from tests.plugins import fields as radiance_fields
-from tests.training.gaze.looks import looking_at
+from tests.train.gaze.looks import looking_at
 
 ASKED = {
     "field": "place.safetensors",

@@ -9,10 +9,10 @@ import pytest
 from nerg_mi.evaluation import frame_time
 from nerg_mi.evaluation.frame_time import frame_timer
 from nerg_mi.maths.geometry import Box
-from nerg_mi.training.geometry.places import GazePlace, place_of_field, place_of_hits, place_of_scene
+from nerg_mi.train.geometry import GazePlace, place_of_field, place_of_hits, place_of_scene
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.plugins import fields
-from tests.training.gaze.looks import looking_at
+from tests.train.gaze.looks import looking_at
 
 from .gaze_fields import saved
 

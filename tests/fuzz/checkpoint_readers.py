@@ -99,7 +99,7 @@ def _trainer():
     """What of a trainer its state consists of."""
     import mitsuba as mi
 
-    from nerg_mi.training.common.step_clock import StepClock
+    from nerg_mi.train.checkpointing import StepClock
 
     ns = _parts()[0]
     optimiser = mi.ad.Adam(lr=0.1)
@@ -125,26 +125,26 @@ def _trainer():
 
 
 def _make_radiance_run(folder: Path) -> None:
-    from nerg_mi.training.common.run_state import save_run
+    from nerg_mi.train.checkpointing import save_run
 
     save_run(_trainer(), folder / "field.run", _ABOUT, [{"psnr": 20.0}])
 
 
 def _read_radiance_run(folder: Path) -> object:
-    from nerg_mi.training.common.run_state import load_run
+    from nerg_mi.train.checkpointing import load_run
 
     return load_run(_trainer(), folder / "field.run", _ABOUT)
 
 
 def _make_gaze_run(folder: Path) -> None:
-    from nerg_mi.training.gaze.state import GazeRunFile
+    from nerg_mi.train.gaze_trainer import GazeRunFile
 
     trainer = _trainer()
     GazeRunFile(folder / "gaze.run", _ABOUT).keep("fit", trainer, {"best": 1.5}, trainer.averaged, now=True)
 
 
 def _read_gaze_run(folder: Path) -> object:
-    from nerg_mi.training.gaze.state import GazeRunFile
+    from nerg_mi.train.gaze_trainer import GazeRunFile
 
     file = GazeRunFile(folder / "gaze.run", _ABOUT, resume=True)
     return file.restore("fit", _trainer())

@@ -15,7 +15,7 @@ from tests.jobs.test_ablation import OPTIONS
 def test_a_semantic_variant_is_planned_with_the_features_of_the_place(tmp_path):
     import drjit.llvm.ad as ns
 
-    from nerg_mi.training.geometry.places import place_of_field
+    from nerg_mi.train.geometry import place_of_field
     from tests.plugins import fields
 
     fields.radiance(tmp_path / "field.safetensors")

@@ -13,7 +13,7 @@ from nerg_mi.jobs.alignment import align
 from nerg_mi.jobs.gaze_places import check_place
 from nerg_mi.jobs.options.alignment import AlignOptions
 from nerg_mi.maths.geometry import Box
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train.geometry import GazePlace
 from tests.alignment import rooms
 
 from .recorder import Recorder

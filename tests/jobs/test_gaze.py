@@ -17,12 +17,12 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.jobs.gaze import train_gaze
 from nerg_mi.jobs.options.gaze import GazeOptions
 from nerg_mi.jobs.radiance import train_radiance
-from nerg_mi.training.gaze import recipes
-from nerg_mi.training.gaze.likelihood import LikelihoodTrainer
-from nerg_mi.training.gaze.recipes import Recipe, register
-from nerg_mi.training.geometry.places import place_of_scene
-from nerg_mi.training.geometry.surfaces import surface_distances
-from tests.training.gaze.looks import RAYS, looking_at
+from nerg_mi.train import gaze_recipes
+from nerg_mi.train.gaze_data import surface_distances
+from nerg_mi.train.gaze_log_density import LikelihoodTrainer
+from nerg_mi.train.gaze_recipes import Recipe, register
+from nerg_mi.train.geometry import place_of_scene
+from tests.train.gaze.looks import RAYS, looking_at
 
 QUICK = GazeOptions(geometry="none", radius=0.5, probes=6, min_rays=8, steps=3, directions=64, zones=0)
 WALL = """<scene version="3.0.0"><shape type="rectangle"><transform name="to_world">
@@ -147,13 +147,13 @@ def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, mo
     from nerg_mi.jobs.ablation import ablate
     from nerg_mi.jobs.options.ablation import AblationOptions
 
-    monkeypatch.setattr(recipes, "RECIPES", dict(recipes.RECIPES))
+    monkeypatch.setattr(gaze_recipes, "RECIPES", dict(gaze_recipes.RECIPES))
     grid = HashGridConfig(levels=2, log2_rows=8, base=2, finest=4)
     register(
         Recipe(
             name="coarse",
             summary="a log density on two levels",
-            config=lambda c: LogGazeConfig(grid, c.variant, width=8, **recipes.surroundings(c.place)),
+            config=lambda c: LogGazeConfig(grid, c.variant, width=8, **gaze_recipes.surroundings(c.place)),
             trainer=LikelihoodTrainer,
             losses=("likelihood",),
             settings={"steps": 3, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 4, "directions": 32},
@@ -238,7 +238,7 @@ def test_an_interrupted_job_returns_what_there_is_or_says_how_to_go_on(rays, tmp
 
 
 def test_the_command_goes_on(tmp_path, monkeypatch, capsys):
-    from nerg_mi.training.gaze.trainer import GazeTrainer
+    from nerg_mi.train.gaze_trainer import GazeTrainer
 
     RAYS.save(tmp_path / "rays.npz")
     out = tmp_path / "gaze.safetensors"
@@ -266,7 +266,7 @@ def test_the_command_goes_on(tmp_path, monkeypatch, capsys):
 
 
 def test_an_ensemble_is_one_option(tmp_path):
-    from tests.training.gaze.test_ensemble import crowd
+    from tests.train.gaze.test_ensemble import crowd
 
     out = tmp_path / "gaze.safetensors"
     options = replace(QUICK, steps=2, zones=1, ensemble=2, half=True)

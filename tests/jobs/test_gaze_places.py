@@ -15,8 +15,8 @@ from nerg_mi.jobs.gaze_places import make_place, place_of_training
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
 from nerg_mi.jobs.options.place import PlaceOptions
 from tests.plugins import fields
-from tests.training.gaze.looks import BOX, looking_at
-from tests.training.gaze.views import around
+from tests.train.gaze.looks import BOX, looking_at
+from tests.train.gaze.views import around
 
 WALL = '<scene version="3.0.0"><shape type="cube"/></scene>'
 

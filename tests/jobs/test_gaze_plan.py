@@ -10,8 +10,8 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.gaze_plan import check_plan, plan_gaze
 from nerg_mi.jobs.options.gaze import GazeOptions
-from nerg_mi.training.geometry.places import GazePlace
-from tests.training.gaze.looks import BOX
+from nerg_mi.train.geometry import GazePlace
+from tests.train.gaze.looks import BOX
 
 HITS = GazeOptions(geometry="hits")
 FIELD = GazeOptions(field=Path("field.safetensors"), recipe="small")

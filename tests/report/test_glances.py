@@ -16,7 +16,7 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.report.glances import Onlooker, eyes_of, land_rays
 from nerg_mi.statistics.visits import Box as Solid
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place
 from tests.evaluation.gaze.test_evaluation import crowd
 

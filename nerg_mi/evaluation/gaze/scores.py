@@ -11,7 +11,7 @@ from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
+from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.transport.geometry import Place, default_settings
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import ObservedGaze, PlacedGaze

@@ -10,7 +10,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.report.glances import Onlooker
 from nerg_mi.report.proxy import spread_out
 from nerg_mi.report.stage import PATH_POINTS
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train.geometry import GazePlace
 
 PANORAMAS = 8
 """Panoramas that the 3D scene is made of."""

@@ -17,8 +17,7 @@ from nerg_mi.rendering.mesh_file import check_vol, write_mesh
 from nerg_mi.rendering.nested_scene import nested_place
 from nerg_mi.rendering.scene_parts import Place, relative_name
 from nerg_mi.rendering.scene_writer import Comment, Node, element, prop, value_of
-from nerg_mi.training.geometry.hit_shading import shade_hits
-from nerg_mi.training.geometry.places import NOWHERE
+from nerg_mi.train.geometry import NOWHERE, shade_hits
 
 from .files import GivenFiles
 
@@ -164,7 +163,7 @@ def _hits(path: Path, output: Path, words: str) -> WrittenPlace:
     write_volume(colors, color, lower, end)
 
     def make(folder: Path, lamps: dict[str, float]) -> Place:
-        # As `training.geometry.hit_geometry.volume_dict` has it: interpolation would bring every surface nearer.
+        # As `train.geometry.volume_dict` has it: interpolation would bring every surface nearer.
         nearest, box = prop("string", "filter_type", "nearest"), prop("boolean", "use_grid_bbox", "true")
         density = element(
             "volume", prop("string", "filename", "$density"), box, nearest, name="density", type="gridvolume"

@@ -13,7 +13,7 @@ from nerg_mi.evaluation.gaze.baselines import position_blind, uniform
 from nerg_mi.evaluation.gaze.report import markdown
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
-from nerg_mi.training.gaze.splits import hold_out
+from nerg_mi.train.gaze_data import hold_out
 
 
 def crowd(n=3000, people=4, seed=0):

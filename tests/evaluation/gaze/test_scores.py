@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze.scores import gaze_field, scores
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.training.geometry.places import place_of_field, place_of_scene
+from nerg_mi.train.geometry import place_of_field, place_of_scene
 from tests.evaluation.gaze_fields import KINDS, made, saved
 from tests.plugins import fields
 from tests.plugins.scenes import channels

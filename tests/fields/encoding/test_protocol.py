@@ -10,12 +10,12 @@ from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
-from nerg_mi.training.gaze.log_density_model import log_gaze
-from nerg_mi.training.gaze.product_model import gaze_density
-from nerg_mi.training.radiance.trainer import RadianceTrainer
+from nerg_mi.train.gaze_log_density import log_gaze
+from nerg_mi.train.gaze_product import gaze_density
+from nerg_mi.train.radiance_trainer import RadianceTrainer
 from tests.fields.encoding.dense import DenseConfig, DenseGrid
 from tests.tiny import ball_pose
-from tests.training.radiance.ball import BOX, ball, settings
+from tests.train.radiance.ball import BOX, ball, settings
 
 register(DenseConfig, DenseGrid)
 CONFIG = RadianceConfig(DenseConfig(), width=16, color_hidden=1, density_scale=0.5)

@@ -11,7 +11,7 @@ from nerg_mi.jobs.reports.surroundings import company, free_places, panorama_eye
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.report.stage import PATH_POINTS
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.train.geometry import GazePlace
 
 BOX = Box((0.0, 0.0, 0.0), (8.0, 6.0, 3.0))
 PLACE = GazePlace(None, BOX, "none")

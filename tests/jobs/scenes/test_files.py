@@ -13,7 +13,7 @@ from nerg_mi.jobs.scenes.files import kind_of_file, recognise
 from nerg_mi.jobs.scenes.places import place_of_files
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene_writer import document
-from nerg_mi.training.geometry.places import file_identity
+from nerg_mi.train.geometry import file_identity
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.jobs.recorder import Recorder
 

@@ -17,7 +17,7 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.training.geometry.places import place_of_volume
+from nerg_mi.train.geometry import place_of_volume
 from nerg_mi.transport.geometry import Place, default_settings
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings

@@ -1,0 +1,1 @@
+"""Training of radiance and gaze fields: data, losses, trainers and recipes."""

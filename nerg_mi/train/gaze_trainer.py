@@ -1,0 +1,478 @@
+"""The loop that trains a gaze field: its plan, its state and the fit."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import drjit as dr
+import numpy as np
+from drjit.opt import AdamW
+
+from nerg_mi.errors import NergError, plain
+from nerg_mi.fields.gaze_base import GazeDensity, GazeFieldConfig
+from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
+from nerg_mi.interruption import Interruption
+from nerg_mi.maths.geometry import AnyBox
+
+from .checkpointing import count_of, optimiser_state, require_same, require_shape, restore_optimiser, restoring
+from .gaze_data import Batch, Supervision, TargetArrays, Targets
+from .gaze_settings import GazeSettings, ProbeSettings, gaze_loss
+from .geometry import GazePlace
+
+# ---- Trainer ----
+#
+# Training a gaze field on targets (NeRG, Section 4.3): what every kind of field's training has in common.
+
+
+# Samples of one launch of a validation.
+_CHUNK = 1 << 16
+
+
+class Scores(NamedTuple):
+    """Means over probes: ``loss`` as trained, ``kld`` (nats), ``cc``, ``mae`` (1/sr), ``integral`` over the sphere."""
+
+    loss: float
+    kld: float
+    cc: float
+    mae: float
+    integral: float
+
+
+class GazeTrainer(ABC):
+    """One run: state, ``step()``, ``measure()``, and ``field()`` for what it has come to.
+
+    ``targets``: what to learn from; ``box``: where the field lives, in the same frame; ``config``: of the field;
+    ``schedule``: steps that the learning rate's schedule spans, where that is not ``settings``' own length;
+    ``initial``: arrays to begin with in place of random ones, which with ``settings.frozen`` stay as they are. Equal
+    seeds draw equal batches; sums over threads are not ordered, so that weights agree between runs to rounding (and bit
+    for bit only with one thread).
+
+    A kind of field has a class of its own, which says what its weights are and what moves them.
+    """
+
+    def __init__(
+        self,
+        targets: Targets,
+        box: AnyBox,
+        config: Any,
+        settings: GazeSettings,
+        ns: ModuleType,
+        schedule: int | None = None,
+        initial: dict | None = None,
+    ):
+        # A field's class knows its configuration's, and so does its trainer.
+        self.config: Any = config
+        self.settings, self.box, self.ns = settings, box, ns
+        self.rng = np.random.default_rng(settings.seed)
+        self._schedule, self._targets = schedule, targets
+        self.learn_from(targets, 0)
+        self.initial: Any = self.untrained()
+        if initial:
+            self.initial.set_parameters(initial)
+        self.constant = dict(initial or {}) if settings.frozen else {}
+        trained = {k: v for k, v in self.trainable(self.initial.parameters()).items() if k not in self.constant}
+        self.optimiser = AdamW(
+            settings.learning_rate, trained, beta_2=0.99, epsilon=1e-15, weight_decay=settings.weight_decay
+        )
+        self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.optimiser.items()}
+        self.steps, self.loss = 0, None
+        self._started = time.perf_counter()
+
+    @abstractmethod
+    def untrained(self) -> GazeDensity:
+        """The field with its random weights."""
+
+    @abstractmethod
+    def trainable(self, parameters: dict) -> dict:
+        """Those of a field's ``parameters`` that are trained."""
+
+    @abstractmethod
+    def backward(self) -> None:
+        """Draw a batch, and leave the gradients of its loss in the weights."""
+
+    @abstractmethod
+    def density(self, batch: Batch, parameters: dict) -> Any:
+        """Density (Float, 1/sr) of the field with ``parameters`` in the directions of ``batch``, for a validation."""
+
+    @abstractmethod
+    def judge(self, kld: float, cc: float, mae: float, off: float) -> float:
+        """What a validation is judged by, from its means over probes; ``off``: squared error of the integral."""
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the run, without that between an interruption and its resumption."""
+        return time.perf_counter() - self._started
+
+    @property
+    def progress(self) -> float:
+        """Share of the schedule that is done, 0..1."""
+        steps, minutes = self._schedule or self.settings.steps, self.settings.minutes
+        if not steps and minutes is not None:
+            return min(1.0, self.seconds / (60 * minutes))
+        return min(1.0, self.steps / (steps or 1))
+
+    def restore(self, steps: int, seconds: float, random: dict) -> None:
+        """Go on from stored numbers; see ``state``."""
+        self.steps, self._started = steps, time.perf_counter() - seconds
+        self.rng.bit_generator.state = random
+
+    def learn_from(self, targets: Targets, epoch: int) -> None:
+        """Take ``targets``, which are those of ``epoch``, in place of the ones before."""
+        self.data, self._epoch = TargetArrays(targets, self.ns), epoch
+
+    def current(self) -> dict:
+        """All arrays, as they are while training."""
+        return {**self.constant, **dict(self.optimiser.items())}
+
+    def step(self) -> None:
+        """Draw probes and directions, and move the weights once."""
+        if self._targets.renew is not None:
+            epoch = self.steps * min(self.settings.probes, self.data.count) // self.data.count
+            if epoch != self._epoch:
+                self.learn_from(self._targets.renew(epoch), epoch)
+        self.backward()
+        self.optimiser.set_learning_rate(self.settings.rate(self.progress))
+        self.optimiser.step()
+        self.steps += 1
+        # A short memory at first: the start of a run is not worth remembering.
+        decay = min(self.settings.average, (1 + self.steps) / (10 + self.steps))
+        for k, old in self.averaged.items():
+            self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * dr.opaque(self.ns.Float, 1 - decay)
+        dr.eval(self.averaged)
+        # Steps are only queued otherwise: their time would count as none, and a run of minutes would go on long after
+        # them.
+        dr.sync_thread()
+
+    def measure(self, targets: Targets, weights: dict | None = None) -> Scores:
+        """Scores of the averaged weights (or of ``weights``) on other targets, all of their directions."""
+        rows = []
+        with dr.suspend_grad():
+            for batch in self.batches(targets):
+                density = self.density(batch, {**self.constant, **(weights or self.averaged)})
+                parts = gaze_loss(density, batch.truth, targets.truth.shape[1])
+                integral = batch.integral(density)
+                means = parts.kld, parts.cc, parts.mae, dr.mean(integral), dr.mean(dr.square(1 - integral))
+                rows.append((dr.width(batch.extent), *(float(v[0]) for v in means)))
+        rows = np.array(rows)
+        kld, cc, mae, integral, off = rows[:, 0] @ rows[:, 1:] / rows[:, 0].sum()
+        return Scores(self.judge(kld, cc, mae, off), kld, cc, mae, integral)
+
+    def batches(self, targets: Targets) -> Iterator[Batch]:
+        """All of ``targets`` in all of their directions, some observers at a time."""
+        data = TargetArrays(targets, self.ns)
+        block, every = max(1, _CHUNK // data.directions), np.arange(data.directions)[None]
+        for a in range(0, data.count, block):
+            observers = np.arange(a, min(a + block, data.count))
+            yield data.batch(observers, np.broadcast_to(every, (len(observers), data.directions)))
+
+    def weights(self) -> dict:
+        """A copy of the averaged weights."""
+        return {k: type(v)(v) for k, v in self.averaged.items()}
+
+    def field(self, weights: dict | None = None) -> GazeDensity:
+        """The field with the averaged weights (or ``weights``)."""
+        out = self.untrained()
+        out.set_parameters({**self.constant, **(weights or self.weights())})
+        return out
+
+
+# ---- State ----
+#
+# The whole state of a gaze training in a file: of both of its fits, and of what validation has found so far.
+
+
+KIND = "gaze run"
+STAGES = ("fit", "refit")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateSettings:
+    """Whether a run can be gone on with, and from where."""
+
+    # File that holds the whole state of the run; None: none is kept.
+    path: Path | None = None
+    # Go on from the state in that file; probes and depths are made again.
+    resume: bool = False
+    # Seconds between two states; it is also written when the run is interrupted.
+    every: float = 60.0
+    # What else a run must agree on to be gone on with (JSON), such as the files of its place.
+    about: dict = field(default_factory=dict)
+
+
+def kept_identity(state: StateSettings) -> dict | None:
+    """What the run that ``state`` goes on with has been started as (`GazePlan.identity`); None where it starts anew.
+    Raises `NergError` where nothing was kept, and for a damaged file."""
+    if not state.resume:
+        return None
+    path = _kept_file(state.path)
+    with restoring(path):
+        about = read_checkpoint(path, KIND)[1]["about"]
+        if not isinstance(about, dict):
+            raise TypeError("it does not say what it was started as")
+    return about
+
+
+def _kept_file(path: Path | None) -> Path:
+    if path is None or not path.is_file():
+        raise NergError(f'there is nothing to resume: "{path}" does not exist; leave out --resume to start')
+    return path
+
+
+class GazeRunFile:
+    """State of one training, kept in ``path`` (None: not at all) every ``every`` seconds.
+
+    ``about``: what a run must agree on to go on (JSON). With ``resume`` the state is read at once: `NergError` where
+    there is none, or one of another run. ``stage``: that of the state, ``fit`` or ``refit``, None without one;
+    ``seconds``: that were spent before this process.
+    """
+
+    def __init__(self, path: Path | None, about: dict, every: float = 60.0, resume: bool = False):
+        self.path, self.about, self.every = path, about, every
+        self.stage, self.found, self.seconds, self._tensors = None, {}, 0.0, {}
+        self._started = self._kept = time.perf_counter()
+        if resume:
+            path = _kept_file(path)
+            self._tensors, self._meta = read_checkpoint(path, KIND)
+            with restoring(path):
+                require_same(path, self._meta["about"], about)
+                self.stage, self.found = self._meta["stage"], self._meta["found"]
+                self.seconds = count_of(self._meta, "spent")
+                if self.stage not in STAGES or not isinstance(self.found, dict):
+                    raise ValueError(f'its "stage" is {plain(self.stage, 40)} and not one of {", ".join(STAGES)}')
+
+    @property
+    def spent(self) -> float:
+        """Wall time of the run in seconds, without that between an interruption and its resumption."""
+        return self.seconds + time.perf_counter() - self._started
+
+    def restore(self, stage: str, trainer: GazeTrainer) -> dict:
+        """Set ``trainer`` to the state of ``stage``, where that is what was read; returns the weights that ``keep`` was
+        given."""
+        if self.path is None or stage != self.stage or "random" not in self._meta:
+            return {}
+        with restoring(self.path):
+            restore_optimiser(trainer, self._tensors, self._meta["taken"])
+            steps, seconds = (count_of(self._meta, name) for name in ("steps", "seconds"))
+            trainer.restore(int(steps), seconds, self._meta["random"])
+            best = {k: v for k, v in trainer.averaged.items() if f"best.{k}" in self._tensors}
+            for k, v in best.items():
+                require_shape(self._tensors, f"best.{k}", v)
+            return {k: type(v)(self._tensors[f"best.{k}"]) for k, v in best.items()}
+
+    def keep(self, stage: str, trainer: GazeTrainer | None, found: dict, weights: dict, now: bool = False) -> None:
+        """Write the state, atomically, when it is time (or ``now``). ``trainer``: None between two fits; ``found``:
+        what validation has come to (JSON); ``weights``: the best ones so far."""
+        if self.path is None or not (now or time.perf_counter() - self._kept > self.every):
+            return
+        tensors, meta = {f"best.{k}": v.numpy() for k, v in weights.items()}, {}
+        if trainer is not None:
+            state, taken = optimiser_state(trainer)
+            tensors |= state
+            meta = {
+                "taken": taken,
+                "steps": trainer.steps,
+                "seconds": trainer.seconds,
+                "random": trainer.rng.bit_generator.state,
+            }
+        write_checkpoint(
+            self.path, KIND, tensors, {"about": self.about, "stage": stage, "found": found, "spent": self.spent, **meta}
+        )
+        self._kept = time.perf_counter()
+
+
+# ---- Plan ----
+#
+# How one gaze field is trained: its architecture, the settings, and the trainer of its kind.
+
+
+@dataclass(frozen=True, kw_only=True)
+class GazePlan:
+    """All that decides a training but for what it learns from and where."""
+
+    # Architecture of the field.
+    config: GazeFieldConfig
+    # Others that folds may choose in its place (`gaze_folds.choose_variant`).
+    alternatives: tuple[GazeFieldConfig, ...] = ()
+    # How weights are moved, and for how long.
+    settings: GazeSettings
+    # How rays become probes.
+    probes: ProbeSettings
+    # Moves the weights of a field of this kind.
+    trainer: type[GazeTrainer]
+    # Arrays to begin with in place of random ones, by name (`gaze_data.initial_weights`); None: random ones.
+    initial: dict[str, Any] | None = None
+
+    def with_settings(self, **changes: Any) -> GazePlan:
+        """The same with other ``settings``."""
+        return replace(self, settings=replace(self.settings, **changes))
+
+    def identity(self, supervision: Supervision, place: GazePlace, state: StateSettings) -> dict:
+        """What a run must agree on to be gone on with (JSON): of two runs that differ in any of it, neither goes on
+        with the other's state."""
+        return {
+            **state.about,
+            **supervision.digest(),
+            "settings": self.settings.to_dict(),
+            "probes": self.probes.to_dict(),
+            "architecture": self.config.to_dict(),
+            "box": place.box.to_dict(),
+            "align": alignment(place),
+        }
+
+
+def alignment(place: GazePlace) -> list[list[float]] | None:
+    """The similarity from the rays' frame to that of ``place``, as JSON; None where they are one."""
+    return None if place.align.identity else place.align.matrix.tolist()
+
+
+# ---- Fit ----
+#
+# The two fits of a training: one that a validation watches, and a second one on everything, as long as was best.
+
+
+@dataclass(frozen=True)
+class GazeProgress:
+    """State of a run."""
+
+    # "probes", "fit" or "refit"; of an ensemble with the member before it.
+    stage: str
+    # Share of the stage that is done, 0..1; of an ensemble, of all members.
+    done: float
+    # Steps taken.
+    steps: int
+    # Wall time of the fit.
+    seconds: float
+    # The last validation; None before the first.
+    scores: Scores | None
+
+
+Listener = Callable[[GazeProgress], object]
+"""Is told how a run goes; may raise `KeyboardInterrupt` to end it."""
+
+
+@dataclass
+class Fit:
+    """What a fit has come to."""
+
+    # The `GazeTrainer`; None: of an earlier process, which kept no more than what was found.
+    trainer: Any = None
+    # The best weights.
+    weights: dict = field(default_factory=dict)
+    # After how many steps they were.
+    best_step: int = 0
+    # Steps that the schedule spans.
+    schedule: int = 0
+    # Of the best weights.
+    scores: Scores | None = None
+    # Every validation (JSON).
+    history: list[dict] = field(default_factory=list)
+    # Whether it ended by Ctrl-C.
+    interrupted: bool = False
+    # Looks without an improvement.
+    since: int = 0
+    # Which look is due.
+    next_look: int = 0
+
+    def found(self) -> dict:
+        """What a resumed run needs to know besides arrays (JSON)."""
+        scores = None if self.scores is None else [float(v) for v in self.scores]
+        return {
+            **{k: getattr(self, k) for k in ("best_step", "schedule", "history", "since", "next_look")},
+            "scores": scores,
+        }
+
+    @staticmethod
+    def of(found: dict, trainer: GazeTrainer | None = None, weights: dict | None = None) -> Fit:
+        """The fit of which ``found`` was kept."""
+        scores = found.get("scores")
+        return Fit(trainer, weights or {}, **{**found, "scores": None if scores is None else Scores(*scores)})
+
+
+def fit_watched(
+    targets: Targets,
+    watched: Targets | None,
+    box: AnyBox,
+    plan: GazePlan,
+    ns: ModuleType,
+    share: float,
+    file: GazeRunFile,
+    tell: Listener,
+) -> Fit:
+    """Train until the schedule ends, or validation on ``watched`` has not improved for ``patience`` looks. ``share``:
+    of the minutes."""
+    settings = plan.settings
+    if settings.minutes is not None:
+        settings = replace(settings, minutes=settings.minutes * share)
+    trainer = plan.trainer(targets, box, plan.config, settings, ns, initial=plan.initial)
+    out = Fit.of(file.found, trainer, file.restore("fit", trainer))
+    out.schedule = settings.steps or 0
+    looks, recent = np.arange(1, settings.looks + 1) / settings.looks, out.scores
+    with Interruption() as stop:
+        while (
+            trainer.progress < 1 and not out.interrupted and not (settings.patience and out.since >= settings.patience)
+        ):
+            trainer.step()
+            if watched is not None and trainer.progress >= looks[out.next_look]:
+                out.next_look = min(int(np.searchsorted(looks, trainer.progress, "right")), len(looks) - 1)
+                recent = trainer.measure(watched)
+                out.history.append({"steps": trainer.steps, **rounded(recent)})
+                out.since += 1
+                if out.scores is None or np.isnan(out.scores.loss) or recent.loss < out.scores.loss:
+                    out.weights, out.best_step, out.scores, out.since = trainer.weights(), trainer.steps, recent, 0
+            file.keep("fit", trainer, out.found(), out.weights)
+            out.interrupted = _stopped(
+                stop, tell, GazeProgress("fit", trainer.progress, trainer.steps, trainer.seconds, recent)
+            )
+    if out.interrupted:
+        file.keep("fit", trainer, out.found(), out.weights, now=True)
+    if watched is not None and out.scores is None and trainer.steps:
+        out.scores, out.best_step, out.weights = trainer.measure(watched), trainer.steps, trainer.weights()
+    if not out.weights:
+        out.weights, out.best_step = trainer.weights(), trainer.steps
+    if settings.minutes is not None:
+        # What the clock's schedule came to in steps, so that a second fit can follow the same one.
+        out.schedule = max(trainer.steps, round(trainer.steps / max(trainer.progress, 1e-6)))
+    return out
+
+
+def fit_again(
+    targets: Targets, first: Fit, box: AnyBox, plan: GazePlan, ns: ModuleType, file: GazeRunFile, tell: Listener
+) -> Fit:
+    """Train for as many steps as were best in the ``first`` fit, along the same schedule."""
+    settings = replace(plan.settings, steps=first.best_step, minutes=None)
+    trainer = plan.trainer(targets, box, plan.config, settings, ns, first.schedule, plan.initial)
+    file.restore("refit", trainer)
+    interrupted = False
+    with Interruption() as stop:
+        while trainer.steps < first.best_step and not interrupted:
+            trainer.step()
+            file.keep("refit", trainer, first.found(), {})
+            done = trainer.steps / first.best_step
+            interrupted = _stopped(
+                stop, tell, GazeProgress("refit", done, trainer.steps, trainer.seconds, first.scores)
+            )
+    if interrupted:
+        file.keep("refit", trainer, first.found(), {}, now=True)
+    return Fit(trainer, trainer.weights(), trainer.steps, first.schedule, first.scores, [], interrupted)
+
+
+def _stopped(stop: Interruption, tell: Listener, progress: GazeProgress) -> bool:
+    """Tell ``progress``; whether there was a Ctrl-C. Heard only here: within a step, weights and random numbers are of
+    different steps."""
+    try:
+        tell(progress)
+        stop.check()
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+def rounded(scores: Scores) -> dict[str, float]:
+    """``scores`` by name, with five digits (JSON)."""
+    return {k: round(float(v), 5) for k, v in scores._asdict().items()}

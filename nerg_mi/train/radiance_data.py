@@ -1,0 +1,242 @@
+"""Pixels of photographs and depth as training data of radiance fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.maths.types import Array3f, Float, UInt32
+from nerg_mi.photos.cameras import Intrinsics, fisheye_limit
+from nerg_mi.photos.images import View
+
+# ---- Unproject ----
+#
+# Directions that lenses show, on the device: the float32 counterpart of `photos.cameras.rays`.
+
+
+# From the image's own coordinates, Newton's iteration reaches float32 in 3 to 5 steps at the corners of usual lenses.
+_STEPS = 8
+_ROUNDING = 1e-5
+
+
+class LensTable:
+    """The lenses of some frames; only what they need is computed.
+
+    A row has the half-pixel offset and inverse focal length of both axes, then the eight coefficients and, for
+    fisheyes, the image radius where they end (0: no fisheye).
+    """
+
+    def __init__(self, ns, lenses: list[Intrinsics]):
+        self.ns = ns
+        self.fisheye = [i.fisheye for i in lenses]
+        plain = [i for i in lenses if not i.fisheye]
+        self.distorted = any(any(i.distortion) for i in plain)
+        self.rational = any(i.k4 or i.k5 or i.k6 for i in plain)
+        rows = [[0.5 - i.cx, 0.5 - i.cy, 1 / i.fx, 1 / i.fy, *i.distortion, *_end(i)] for i in lenses]
+        self._columns = [ns.Float(c) for c in np.array(rows, np.float32).T]
+
+    def directions(self, frame, column, row):
+        """Directions (3 Floats, OpenGL camera frame, of any length) of the pixels ``column``, ``row`` of ``frame``
+        (UInt32)."""
+        ns = self.ns
+        get = lambda k: dr.gather(ns.Float, self._columns[k], frame)
+        x, y = (ns.Float(column) + get(0)) * get(2), (ns.Float(row) + get(1)) * get(3)
+        z = ns.Float(1)
+        if self.distorted or any(self.fisheye):
+            k = [get(4 + n) for n in range(8)]
+            out = self._pinhole(x, y, k) if self.distorted else (x, y, z)
+            if any(self.fisheye):
+                end, angle = get(12), get(13)
+                bent = self._fisheye(x, y, k, end, angle)
+                out = bent if all(self.fisheye) else tuple(dr.select(end > 0, b, a) for a, b in zip(out, bent))
+            x, y, z = out
+        return x, -y, -z
+
+    def _pinhole(self, x0, y0, k):
+        """Newton's iteration on OpenCV's model, see `photos.cameras.undistort`."""
+        k1, k2, p1, p2, k3, k4, k5, k6 = k
+        x, y = x0, y0
+        for _ in range(_STEPS):
+            r2 = x * x + y * y
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+            if self.rational:
+                under = dr.rcp(1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+                radial *= under
+                slope = (slope - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) * under
+            ex = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) - x0
+            ey = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y - y0
+            a = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+            b = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+            d = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+            inverse = dr.rcp(a * d - b * b)
+            x, y = x - (d * ex - b * ey) * inverse, y - (a * ey - b * ex) * inverse
+        return x, y, self.ns.Float(1)
+
+    def _fisheye(self, x, y, k, end, most):
+        """Newton's iteration on the angle, kept within its rising part, see `photos.cameras.rays`."""
+        k1, k2, _, _, k3, k4, _, _ = k
+        r = dr.sqrt(x * x + y * y)
+        goal = dr.minimum(r, end)
+        low, high, theta = self.ns.Float(0), most, dr.minimum(goal, most)
+        for _ in range(3 * _STEPS):
+            t = theta * theta
+            excess = theta * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4)))) - goal
+            slope = 1 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + t * 9 * k4)))
+            low, high = dr.select(excess > 0, low, theta), dr.select(excess > 0, theta, high)
+            step = theta - excess / slope
+            # Where the polynomial flattens Newton's step may leave the bracket, by more than rounding: halve it
+            # instead.
+            theta = dr.select((step > low - _ROUNDING) & (step < high + _ROUNDING), step, 0.5 * (low + high))
+        sine, cosine = dr.sincos(theta)
+        across = dr.select(r > 1e-7, sine / dr.maximum(r, 1e-7), 1)
+        return x * across, y * across, cosine
+
+
+def _end(lens: Intrinsics) -> tuple[float, float]:
+    """Image radius and angle where a fisheye ends."""
+    if not lens.fisheye:
+        return 0.0, 0.0
+    angle, radius = fisheye_limit(lens)
+    return radius, angle
+
+
+# ---- All training pixels as device arrays, and batches of their rays ----
+
+# A pixel's place in its colours is 32 bits, four channels each.
+_MOST = 2**30
+_DEPTH_STEPS = 65535
+
+
+@dataclass
+class PixelBatch:
+    """Rays of chosen pixels: ``o``, ``d`` (Array3f, world, d of unit length), ``rgb`` (Array3f, sRGB, straight),
+    ``alpha`` (Float or None), ``depth`` (Float, scene units, 0 where unknown; None without any)."""
+
+    o: Array3f
+    d: Array3f
+    rgb: Array3f
+    alpha: Float | None
+    depth: Float | None
+    frame: UInt32
+
+
+class PixelBank:
+    """Pixels of ``views`` that their masks leave in; which of them are drawn is the caller's business.
+
+    A pixel takes 3 bytes (8-bit pictures) or 6 (others), a third more with alpha, 2 with depth, and 4 with masks; its
+    ray is computed from its camera when it is drawn. Depth keeps 1/65535 of its picture's largest.
+    """
+
+    def __init__(self, ns, views: list[View]):
+        self.ns = ns
+        counts = [v.pixels.shape[0] * v.pixels.shape[1] for v in views]
+        used = [n if v.mask is None else int(np.count_nonzero(v.mask)) for n, v in zip(counts, views)]
+        self.size = sum(used)
+        if sum(counts) >= _MOST:
+            raise NergError(f"{sum(counts)} training pixels are too many; load the pictures at a smaller width")
+        self.centers = np.array([v.camera.center for v in views])
+        self._ends = ns.UInt32(np.cumsum(counts).astype(np.uint32))
+        self._starts = ns.UInt32(np.cumsum([0, *counts[:-1]]).astype(np.uint32))
+        self._widths = ns.UInt32(np.array([v.pixels.shape[1] for v in views], np.uint32))
+        self._lenses = LensTable(ns, [v.camera.intrinsics for v in views])
+        self._pose = ns.Float(np.concatenate([v.camera.to_world[:3].ravel() for v in views]).astype(np.float32))
+        self._frames = len(views)
+        self._where = None
+        if any(v.mask is not None for v in views):
+            starts = np.cumsum([0, *counts[:-1]])
+            self._where = ns.UInt32(
+                np.concatenate(
+                    [(start + np.flatnonzero(_mask(v).ravel())).astype(np.uint32) for start, v in zip(starts, views)]
+                )
+            )
+        self._store_colors(views, used)
+        self._store_depth(views, used)
+
+    def _store_colors(self, views: list[View], used: list[int]) -> None:
+        self._channels = 4 if any(v.has_alpha for v in views) else 3
+        bytes_ = all(v.pixels.dtype == np.uint8 for v in views)
+        table = np.empty((self.size, self._channels), np.uint8 if bytes_ else np.float16)
+        at = 0
+        for view, n in zip(views, used):
+            pixels = view.pixels if bytes_ else view.color
+            if view.mask is not None:
+                pixels = pixels[view.mask]
+            c = pixels.shape[-1]
+            table[at : at + n, :c] = pixels.reshape(-1, c)
+            table[at : at + n, c:] = 255 if bytes_ else 1
+            at += n
+        self._color_type = self.ns.UInt8 if bytes_ else self.ns.Float16
+        self._color_unit = 1 / 255 if bytes_ else 1.0
+        self._colors = self._color_type(table.ravel())
+
+    def _store_depth(self, views: list[View], used: list[int]) -> None:
+        self._depth, self.depth_everywhere = None, False
+        self.has_depth = any(v.depth is not None for v in views)
+        if not self.has_depth:
+            return
+        table, unit, at = np.zeros(self.size, "<u2"), np.zeros(len(views), np.float32), 0
+        for k, (view, n) in enumerate(zip(views, used)):
+            if view.depth is not None:
+                depth = view.depth.ravel() if view.mask is None else view.depth[view.mask]
+                unit[k] = max(float(depth.max(initial=0)), 1e-30) / _DEPTH_STEPS
+                # What is known must not round to unknown.
+                table[at : at + n] = np.where(depth > 0, np.clip(np.round(depth / unit[k]), 1, _DEPTH_STEPS), 0)
+            at += n
+        self.depth_everywhere = np.count_nonzero(table) >= 0.999 * self.size
+        self._depth, self._depth_unit = self.ns.UInt8(table.view(np.uint8)), self.ns.Float(unit)
+
+    @property
+    def bytes_per_pixel(self) -> float:
+        """Device memory of what is kept for each pixel."""
+        kept = [self._colors, *(a for a in (self._where, self._depth) if a is not None)]
+        return sum(dr.width(a) * dr.itemsize_v(a) for a in kept) / self.size
+
+    def batch(self, index) -> PixelBatch:
+        """Rays and colours of the pixels at ``index`` (UInt32)."""
+        ns = self.ns
+        frame, column, row = self._locate(index)
+        x, y, z = self._lenses.directions(frame, column, row)
+        m = [dr.gather(ns.Float, self._pose, frame * 12 + k) for k in range(12)]
+        d = dr.normalize(ns.Array3f(*[m[4 * r] * x + m[4 * r + 1] * y + m[4 * r + 2] * z for r in range(3)]))
+        o = ns.Array3f(m[3], m[7], m[11])
+        color = [
+            ns.Float(dr.gather(self._color_type, self._colors, index * self._channels + k)) * self._color_unit
+            for k in range(self._channels)
+        ]
+        rgb, alpha = ns.Array3f(*color[:3]), color[3] if self._channels == 4 else None
+        depth = None
+        if self._depth is not None:
+            low, high = (ns.Float(dr.gather(ns.UInt8, self._depth, index * 2 + k)) for k in range(2))
+            depth = (low + 256 * high) * dr.gather(ns.Float, self._depth_unit, frame)
+        dr.eval(o, d, rgb, alpha, depth, frame)
+        return PixelBatch(o, d, rgb, alpha, depth, frame)
+
+    def _locate(self, index):
+        """Frame, column and row (UInt32) of the pixels at ``index``."""
+        ns = self.ns
+        pixel = index if self._where is None else dr.gather(ns.UInt32, self._where, index)
+        frame = ns.UInt32(0)
+        if self._frames > 1:
+            frame = dr.binary_search(0, self._frames - 1, lambda k: dr.gather(ns.UInt32, self._ends, k) <= pixel)
+        offset = pixel - dr.gather(ns.UInt32, self._starts, frame)
+        # The unused lanes of a vector gather 0, and a division of integers by it kills the process.
+        width = dr.maximum(dr.gather(ns.UInt32, self._widths, frame), 1)
+        row = offset // width
+        return frame, offset - row * width, row
+
+    def surface_points(self, chunk: int = 2**20):
+        """The points (Array3f, world) that the pixels with depth see, ``chunk`` pixels at a time."""
+        for first in range(0, self.size, chunk):
+            index = dr.arange(self.ns.UInt32, min(chunk, self.size - first)) + dr.opaque(self.ns.UInt32, first)
+            pixels = self.batch(index)
+            if pixels.depth is not None:
+                known: UInt32 = dr.compress(pixels.depth > 0)
+                yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, known)
+
+
+def _mask(view: View) -> np.ndarray:
+    return np.ones(view.shape, bool) if view.mask is None else view.mask

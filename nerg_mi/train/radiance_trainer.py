@@ -1,0 +1,422 @@
+"""The loop that trains a radiance field, and its previews."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+from drjit.opt import Adam
+
+from nerg_mi.errors import NergError
+from nerg_mi.fields.encoding import encoding_of
+from nerg_mi.fields.mlp import aligned
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
+from nerg_mi.fields.refinement import refine
+from nerg_mi.maths.geometry import AnyBox
+from nerg_mi.maths.types import Float, UInt32
+from nerg_mi.photos.cameras import pixel_directions
+from nerg_mi.photos.images import View
+from nerg_mi.transport.quadrature import mean_depth_share
+
+from .checkpointing import StepClock
+from .radiance_data import PixelBank
+from .radiance_grid import DensityGrid, Settling
+from .radiance_losses import (
+    PHOTOS,
+    PhotoColors,
+    color_loss,
+    composite,
+    density,
+    density_of,
+    density_summand,
+    depth_loss,
+    distortion_loss,
+    feature_decay,
+    ray_color,
+)
+from .radiance_sampling import StepTable, Thinning, damp_near, ray_sum, rays_in_box, visible_samples, weights
+from .radiance_settings import RadianceSettings, adapted_rays, affordable_rays, refined
+
+# ---- Pictures of a field by the trainer's own marcher, for the error that is watched while it trains ----
+
+# Candidates (rays times steps) in flight at once.
+_CHUNK = 2**22
+
+
+@dataclass
+class Preview:
+    """``color`` (h, w, 3) sRGB before the background, ``opacity`` (h, w), ``depth`` (h, w): expected distance in
+    scene units, 0 where nothing absorbs; of every ``every``-th pixel of a view, from ``every // 2`` on."""
+
+    color: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+
+
+def render_view(
+    field: RadianceField,
+    occupied,
+    table: StepTable,
+    view: View,
+    near: float,
+    background: float = 0.0,
+    every: int = 1,
+    stop: float = 1e-3,
+) -> Preview:
+    """March every ``every``-th pixel of ``view`` through ``field``.
+
+    ``occupied``: mask of points (Array3f, mask) in cells that may hold density; ``near``: where rays start, scene
+    units.
+    """
+    ns = field.ns
+    d = pixel_directions(view.camera.intrinsics)[every // 2 :: every, every // 2 :: every]
+    shape = d.shape[:2]
+    d = (d.reshape(-1, 3) @ view.camera.to_world[:3, :3].T).astype(np.float32)
+    parts = []
+    size = max(1, _CHUNK // table.steps)
+    with dr.suspend_grad():
+        for first in range(0, len(d), size):
+            parts.append(_march(field, occupied, table, view.camera.center, d[first : first + size], near, stop, ns))
+    color, opacity, moment = (np.concatenate([p[k] for p in parts]) for k in range(3))
+    color = color + (1 - opacity[:, None]) * background
+    depth = np.where(opacity > 0, moment / np.where(opacity > 0, opacity, 1), 0)
+    return Preview(color.reshape(*shape, 3), opacity.reshape(shape), depth.reshape(shape))
+
+
+def _march(field, occupied, table, center, d, near: float, stop: float, ns):
+    count = len(d)
+    direction = ns.Array3f(d.T)
+    origin = ns.Array3f(*[ns.Float(np.full(count, c, np.float32)) for c in center])
+    rays = rays_in_box(origin, direction, field.box, near)
+    offset = ns.Float(np.full(count, 0.5, np.float32))
+    samples, _ = visible_samples(rays, table, offset, occupied, field.density, stop)
+    if samples is None:
+        return np.zeros((count, 3)), np.zeros(count), np.zeros(count)
+    sigma, features = field.density_features(samples.p)
+    deferred = field.config.deferred
+    parts = features if deferred else list(field.color(features, dr.gather(ns.Array3f, direction, samples.ray)))
+    weight, tau, sums, opacity = composite(sigma, parts, samples)
+    color = [opacity * c for c in field.color(mean_features(sums, opacity), direction)] if deferred else sums
+    moment = ray_sum(weight * (samples.t + samples.length * mean_depth_share(tau)), samples.segments)
+    return np.stack([c.numpy() for c in color], axis=1), opacity.numpy(), moment.numpy()
+
+
+# ---- Training a radiance field on posed pictures ----
+#
+# instant-ngp's training (Müller et al. 2022) in Dr.Jit, arranged for the CPU backend: rays march a grid of occupied
+# cells with true steps; a density-only pass drops what lies behind opaque surfaces, and lets one in many stand for
+# samples that hardly absorb; what remains is packed into batches of constant size, the number of rays adapting;
+# networks run as tensor products.
+
+
+# The average is taken of every fourth step.
+_AVERAGE_EVERY = 4
+# Training rays that decide, at the end, which cells matter, and their samples at most: in fog each ray has hundreds.
+_LOOKS, _LOOK_RAYS, _LOOK_SAMPLES = 64, 2**12, 2**25
+# Steps of rays that the marching kernel goes through, in batches: they cost a fiftieth of a sample of the density pass.
+_CANDIDATES = 128
+# Rays whose depth loss exceeds this are drawn again; so many are kept.
+_WRONG, _HARD = 0.3, 2**14
+
+
+class RadianceTrainer:
+    """One run: state, ``step()``, and ``field()`` for what it has come to.
+
+    ``views``: the training pictures; ``box``: where density may be, in their coordinates; ``depth``: supervise with
+    the views' depth. Equal seeds draw equal rays; sums over threads are not ordered, so that weights agree
+    between runs to rounding (and bit for bit only with one thread).
+    """
+
+    def __init__(
+        self, views: list[View], box: AnyBox, config: RadianceConfig, settings: RadianceSettings, ns, depth: bool = True
+    ):
+        if not views:
+            raise NergError("there are no pictures to train on")
+        self.config, self.settings, self.box, self.ns = config, settings, box, ns
+        self.rng, self.clock = np.random.default_rng(settings.seed), StepClock()
+        self.pixels = PixelBank(ns, views)
+        self.use_depth = depth and self.pixels.has_depth
+        self.live = RadianceField.random(config, box, ns, settings.seed)
+        # One photo has nothing to differ from.
+        self.photos = PhotoColors(ns, len(views)) if settings.photo_colors and len(views) > 1 else None
+        start = self.live.parameters() | ({} if self.photos is None else {PHOTOS: self.photos.start()})
+        self.optimiser = Adam(settings.learning_rate, start, beta_2=0.99, epsilon=1e-15)
+        self.averaged = {k: type(v)(dr.detach(v)) for k, v in start.items()}
+        self.march_step = settings.march_step * box.side
+        self.grid = DensityGrid(
+            ns,
+            box,
+            settings.resolution,
+            self.march_step,
+            [v.camera for v in views],
+            settings.min_views,
+            near=settings.near * box.side,
+            growth=settings.growth,
+        )
+        # With exact depth everywhere the free space is known from the start, and there is no fog to clear.
+        self.carved = self.use_depth and self.pixels.depth_everywhere
+        if self.carved:
+            self.grid.carve(self.pixels.surface_points())
+        self.grid.update(self.density, self.rng, everywhere=True)
+        self._tables: dict[int, StepTable] = {}
+        self.settling = Settling(self.grid)
+        self.hard = np.zeros(0, np.uint32)
+        self.steps, self.rays, self.loss, self.samples = 0, 256, 0.0, 0
+        # Of the marching: how many times coarser than `march_step`, and samples a ray of the last density-only pass.
+        self.stride, self.looked = 1 if self.carved else max(settings.strides, default=1), 0.0
+        self.start()
+
+    def start(self) -> None:
+        """Start the clock of the run."""
+        self._started = time.perf_counter()
+
+    def restore(self, seconds: float, hard: np.ndarray, **numbers) -> None:
+        """Go on from stored numbers (of the attributes of these names); see ``run_state``."""
+        self.hard = hard
+        for name, value in numbers.items():
+            setattr(self, name, value)
+        self._started = time.perf_counter() - seconds
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the run, without that between an interruption and its resumption."""
+        return time.perf_counter() - self._started
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, 0..1."""
+        s = self.settings
+        return min(1.0, self.steps / s.steps if s.steps is not None else self.seconds / (60 * s.minutes))
+
+    def table(self, stride: int = 1) -> StepTable:
+        """Step edges ``stride`` times as coarse as the finest."""
+        if stride not in self._tables:
+            s, side = self.settings, self.box.side
+            self._tables[stride] = StepTable(
+                self.ns, s.near * side, self._far(), stride * self.march_step, stride * s.growth
+            )
+        return self._tables[stride]
+
+    def _far(self) -> float:
+        """The farthest that a training camera can be from a point of the box."""
+        corners = np.array(
+            [[b[i] for i, b in zip(k, zip(self.box.lower, self.box.upper))] for k in np.ndindex(2, 2, 2)]
+        )
+        return float(max(np.linalg.norm(corners - c, axis=1).max() for c in self.pixels.centers))
+
+    def density(self, p, active):
+        """Current density at world points, without gradient."""
+        self.clock.count(dr.width(p))
+        with dr.suspend_grad():
+            return self.live.density(p, active)
+
+    def _look(self, p, active):
+        """Density at ``p`` for the choice of samples, and the grid's features, which need no second look-up."""
+        self.clock.count(dr.width(p))
+        now = {k: dr.detach(v) for k, v in self._parameters().items()}
+        features = encoding_of(self.config.grid, now).evaluated(self.box.to_unit(p), active)
+        return density_of(self.config, self.box, now, p, features), features
+
+    def _parameters(self) -> dict:
+        """The weights of the field, with their derivatives."""
+        return {k: self.optimiser[k] for k in self.live.parameters()}
+
+    def step(self) -> None:
+        """Draw rays, march, composite, and move the weights once."""
+        with self.clock:
+            self._step()
+
+    def _step(self) -> None:
+        s, ns, most = self.settings, self.ns, self.settings.most_looked
+        self._keep_grid()
+        self._refine()
+        table = self.table(self.stride)
+        self.rays = affordable_rays(self.rays, self.looked, table.steps, most, _CANDIDATES * s.batch)
+        index = self._draw()
+        pixels = self.pixels.batch(ns.UInt32(aligned(index, np.uint32)))
+        rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
+        offset = ns.Float(aligned(self.rng.random(self.rays, np.float32)))
+        thinning = Thinning(s.thin_sure, s.thin_least, int(self.rng.integers(2**63))) if s.thin_least < 1 else None
+        samples, covered = visible_samples(
+            rays, table, offset, self.grid.occupied, self._look, s.stop, s.batch, thinning, most, with_features=True
+        )
+        self.steps += 1
+        if samples is None:
+            self.rays = adapted_rays(self.rays, 0, 0, s.batch, most)
+            return
+        background = ns.Array3f(*[ns.Float(aligned(self.rng.random(self.rays, np.float32))) for _ in range(3)])
+        misplaced = self._descend(samples, pixels, background, covered, self.stride)
+        if misplaced is not None:
+            self._remember(index[:covered], misplaced)
+        self.looked = samples.looked
+        self.rays = adapted_rays(self.rays, samples.count / covered, self.looked, s.batch, most)
+
+    def _keep_grid(self) -> None:
+        """Look over a part of the density grid if it is time to, and find a piece of what rendering will visit."""
+        s = self.settings
+        settling = self.progress >= s.settle and not self.settling.done
+        due = self.steps % s.grid_every == 0 and self.steps > 0
+        if settling or due:
+            self.update_live()
+        if settling:
+            self.settle()
+        if due:
+            self.grid.update(self.density, self.rng)
+
+    def update_live(self) -> None:
+        """Have ``live`` hold the weights of this step."""
+        self.live.set_parameters({k: dr.detach(v) for k, v in self._parameters().items()})
+
+    def settle(self) -> None:
+        """Find a piece of what rendering will visit, by the weights that ``live`` holds."""
+        with dr.suspend_grad():
+            self.settling.advance(self.density, self._lit_by_a_few, self.settings.seed)
+
+    def _refine(self) -> None:
+        """March finer if it is time to and what is cleared allows it."""
+        s = self.settings
+        waits = self.progress < 2 * s.stride_share
+        stride = refined(self.stride, s.strides, s.stride(self.progress), self.looked, s.most_looked, waits)
+        self.looked, self.stride = self.looked * self.stride / stride, stride
+
+    def _draw(self) -> np.ndarray:
+        """Indices of the pixels of a batch: at random, a share of them from those whose depth was wrong before."""
+        index = self.rng.integers(0, self.pixels.size, self.rays, np.uint32)
+        if self.hard.size and self.progress > self.settings.hold:
+            again = int(self.settings.replay * self.rays)
+            index[:again] = self.hard[self.rng.integers(0, self.hard.size, again)]
+            # In mixed order, because the last rays of a batch may not fit into it.
+            self.rng.shuffle(index)
+        return index
+
+    def _remember(self, index: np.ndarray, misplaced: Float) -> None:
+        """Keep the pixels of this batch whose depth was wrong, in place of the oldest kept."""
+        wrong = misplaced.numpy()[: len(index)] > _WRONG
+        self.hard = np.concatenate([self.hard, index[wrong]])[-_HARD:]
+
+    def _descend(self, samples, pixels, background, covered: int, stride: int) -> Float | None:
+        """Move the weights once; returns how wrong the depth of each ray was, None where that is not asked for."""
+        s, ns, misplaced = self.settings, self.ns, None
+        d = dr.gather(ns.Array3f, pixels.d, samples.ray)
+        parameters = self._parameters()
+        sigma, parts = density_summand(self.config, self.box, parameters, samples.p, d, ns, samples.features)
+        if s.reach > 0:
+            # Never 0, and never left out: that would compile other kernels in the middle of the run.
+            reach = max(s.damped_within(self.progress), 1e-6) * self.box.side
+            sigma, *parts = damp_near([sigma, *parts], samples.t, dr.opaque(ns.Float, reach))
+        # Now: each sum along the rays would evaluate the networks again.
+        dr.eval(sigma, parts)
+        self.clock.count(s.batch)
+        weight, tau, sums, opacity = composite(sigma, parts, samples)
+        color = ray_color(self.config, parameters, sums, opacity, pixels.d, ns)
+        total = 0
+        if self.photos is not None:
+            changes = self.photos.changes(self.optimiser[PHOTOS])
+            color = self.photos.apply(changes, color, opacity, pixels.frame)
+            total = s.photo_decay * self.photos.decay(changes)
+        loss = color_loss(color, opacity, pixels, background, s.huber)
+        if self.use_depth:
+            # In units of the step at hand: while marching is coarse, no more can be asked for.
+            unit, margin = dr.opaque(ns.Float, stride * self.march_step), s.depth_margin * self.march_step
+            if self.box.contracted:
+                step = dr.maximum(s.growth * pixels.depth, self.march_step)
+                unit, margin = step * stride, step * s.depth_margin
+            placed = depth_loss(weight, tau, samples, pixels.depth, margin, unit)
+            # Places first, colours later: once surfaces stand, colour has more to say.
+            loss += dr.opaque(ns.Float, s.depth_weight * s.final_depth**self.progress) * placed
+            misplaced = dr.detach(placed)
+        if s.distortion_weight > 0:
+            loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
+        complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
+        loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
+        total += loss + self._clear(parameters)
+        for name, value in parameters.items():
+            if name.startswith("grid."):
+                total = total + s.grid_decay * feature_decay(value.array if dr.is_tensor_v(value) else value)
+        dr.backward(total)
+        self.optimiser.set_learning_rate(s.rate(self.progress))
+        self.optimiser.step()
+        self.loss, self.samples = loss, samples.count
+        if self.steps % _AVERAGE_EVERY == 0:
+            # A short memory at first: the start of a run is not worth remembering.
+            decay = min(s.average, (1 + self.steps) / (10 + self.steps)) ** _AVERAGE_EVERY
+            # As a literal it would compile a kernel each time.
+            part = dr.opaque(ns.Float, 1 - decay)
+            for k, old in self.averaged.items():
+                self.averaged[k] = type(old)(old + (dr.detach(self.optimiser[k]) - old) * part)
+            dr.eval(self.averaged)
+        return misplaced
+
+    def _clear(self, parameters: dict):
+        """Penalty on density in cells that are not sampled.
+
+        Nothing else would hold them to what they are taken for, empty, and hashing fills them with the echoes of
+        surfaces elsewhere. The logarithm pulls at fog and at echoes alike.
+        """
+        s = self.settings
+        p = self.grid.empty_points(s.batch // 16, self.rng)
+        if p is None or s.empty_weight == 0:
+            return 0
+        self.clock.count(dr.width(p))
+        sigma, cell = density(self.config, self.box, parameters, p, self.ns), self.grid.cell_at(p)
+        return s.empty_weight * dr.mean(dr.log(1 + sigma * cell))
+
+    def _lit(self, density, occupied):
+        """Points (Array3f) of the samples that give a training ray more than a thousandth of its light."""
+        rng, looked = np.random.default_rng(self.settings.seed), 0
+        for _ in range(min(_LOOKS, -(-self.pixels.size // _LOOK_RAYS))):
+            samples, p = self._lit_points(density, occupied, rng, _LOOK_RAYS)
+            if samples is not None:
+                looked += samples.looked * _LOOK_RAYS
+                yield p
+            if looked > _LOOK_SAMPLES:
+                break
+
+    def _lit_by_a_few(self, density, occupied, rng: np.random.Generator):
+        """Such points, or None, of as many rays as a step may take."""
+        most = self.settings.most_looked
+        looked, candidates = self.looked * self.stride, _CANDIDATES * self.settings.batch
+        rays = affordable_rays(_LOOK_RAYS, looked, self.table().steps, most, candidates)
+        return self._lit_points(density, occupied, rng, rays, most)[1]
+
+    def _lit_points(self, density, occupied, rng: np.random.Generator, count: int, most: int | None = None) -> tuple:
+        s, ns = self.settings, self.ns
+        pixels = self.pixels.batch(ns.UInt32(aligned(rng.integers(0, self.pixels.size, count, np.uint32), np.uint32)))
+        rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
+        offset = ns.Float(aligned(rng.random(count, np.float32)))
+        samples, _ = visible_samples(rays, self.table(), offset, occupied, density, s.stop, most=most)
+        if samples is None:
+            return None, None
+        weight = weights(density(samples.p, True) * samples.length, samples.segments)
+        seen: UInt32 = dr.compress(weight > 1e-3)
+        return samples, dr.gather(ns.Array3f, samples.p, seen)
+
+    def pixels_within(self, views: list[View], samples: int) -> int:
+        """The ``every`` of `render` with which ``views`` take about so many ``samples``, by those of the last step's
+        rays."""
+        rays = sum(v.pixels.shape[0] * v.pixels.shape[1] for v in views)
+        return max(1, int(np.ceil((rays * max(self.looked * self.stride, 1) / samples) ** 0.5)))
+
+    def render(self, view: View, every: int = 1, field: RadianceField | None = None) -> Preview:
+        """Every ``every``-th pixel of ``view`` by the trainer's own marcher.
+
+        Of ``field``, by its own occupancy; without one, of the averaged weights so far.
+        """
+        field, occupied = field or self.field(bound=False), self.grid.occupied
+        bound = field.occupancy
+        if bound is not None:
+            occupied = lambda p, active: active & (bound.empty_cells(self.box.to_cube(p), active) == 0)
+        return render_view(field, occupied, self.table(), view, self.settings.near * self.box.side, every=every)
+
+    def field(self, bound: bool = True) -> RadianceField:
+        """The field with averaged weights. ``bound``: with the occupancy that rendering may rest on."""
+        growth = self.settings.growth if self.box.contracted else 0.0
+        out = RadianceField.random(self.config, self.box, self.ns, 0, march_step=self.march_step, march_growth=growth)
+        out.set_parameters({k: type(v)(v) for k, v in self.averaged.items() if k != PHOTOS})
+        if bound:
+            with dr.suspend_grad():
+                out.occupancy = self.grid.bound(out.density, np.random.default_rng(self.settings.seed), self._lit)
+            out.occupancy = refine(out) or out.occupancy
+        return out

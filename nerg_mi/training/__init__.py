@@ -1,1 +1,0 @@
-"""Optimisation of radiance and gaze fields."""

@@ -1,1 +1,0 @@
-"""Training a gaze field on rays and on salience images."""

@@ -1,1 +1,0 @@
-"""Training a radiance field on posed photos."""

@@ -1,0 +1,207 @@
+"""Ensembles: what is resampled, members by themselves, going on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.fields.gaze_base import Basis
+from nerg_mi.formats.checkpoint import write_checkpoint
+from nerg_mi.maths.geometry import Box, Similarity
+from nerg_mi.rays.rays import Rays
+from nerg_mi.train.gaze_data import Supervision
+from nerg_mi.train.gaze_ensemble import blocks_of, resample, resample_views, train_ensemble
+from nerg_mi.train.gaze_trainer import StateSettings
+
+from .looks import LIKELIHOOD, LOG, NOWHERE, PROBES, looking_at, planned, train
+from .views import around
+
+PLACE = replace(LOG, geometry="none")
+SHORT = replace(LIKELIHOOD, steps=4, zones=0)
+MOVED = replace(NOWHERE, align=Similarity([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
+
+
+def crowd(people=6, n=1200, seconds=100.0):
+    """Rays of several people, interleaved, with times of their own."""
+    rays = looking_at((1.5, 0, 1.2), n, spread=2.0)
+    who = np.arange(n) % people
+    t = np.sort(np.random.default_rng(1).uniform(0, seconds, n)) + 1000 * who
+    return Rays(t, who, tuple("abcdefgh"[:people]), rays.origin, rays.direction, np.ones(n))
+
+
+def together(members=3, rays=None, *, place=NOWHERE, config=PLACE, settings=SHORT, probes=PROBES, **options):
+    tell, write = options.pop("tell", None), options.pop("write", None)
+    return train_ensemble(
+        members,
+        Supervision(rays or crowd()),
+        place,
+        planned(config, settings, probes),
+        ns,
+        state=StateSettings(**options),
+        tell=tell,
+        write=write,
+    )
+
+
+def arrays(field):
+    return {k: np.array(v) for k, v in field.parameters().items()}
+
+
+def test_people_are_blocks_and_else_stretches_of_their_time():
+    rays = crowd()
+    block, kind = blocks_of(rays)
+    assert kind == "people" and np.array_equal(block, rays.person)
+    few = crowd(people=2)
+    block, kind = blocks_of(few)
+    assert kind == "blocks of 30 s" and block.max() + 1 == 8
+    for b in range(8):
+        assert len(set(few.person[block == b])) == 1 and np.ptp(few.t[block == b]) < 30
+    with pytest.raises(ValueError, match="2 stretches of 30 s of 1 people are too few"):
+        blocks_of(crowd(people=1, seconds=40.0))
+
+
+def test_a_resample_holds_whole_people_as_often_as_they_were_drawn():
+    rays, times = crowd(), []
+    for seed in range(300):
+        drawn = resample(rays, seed)
+        # One who is drawn twice is two people, of 200 rays each, who are told apart by their names.
+        each = np.bincount(drawn.person, minlength=len(drawn.persons))
+        assert set(each) <= {0, 200} and drawn.persons[:6] == rays.persons
+        counts = np.bincount(drawn.person % 6, minlength=6) / 200
+        assert np.array_equal(counts, counts.round()) and counts.sum() == 6
+        times.append(counts)
+    # Multinomial with six trials and probabilities of a sixth: mean 1, variance 5/6, and one in three is left out.
+    times = np.array(times)
+    assert np.abs(times.mean(axis=0) - 1).max() < 0.2 and times.var() == pytest.approx(5 / 6, rel=0.1)
+    assert (times == 0).mean() == pytest.approx((5 / 6) ** 6, abs=0.03)
+
+
+def test_members_are_trainings_of_resamples(threads):
+    threads(1)
+    rays = crowd()
+    ensemble, about = together(3, rays)
+    for k, member in enumerate(ensemble.members):
+        own = Supervision(resample(rays, (SHORT.seed, k)))
+        alone, _ = train(NOWHERE, replace(SHORT, seed=100 * k), PLACE, supervision=own)
+        for name, value in arrays(alone).items():
+            np.testing.assert_array_equal(arrays(member)[name], value, err_msg=name)
+    assert about["ensemble"] == {"members": 3, "resampled": "people", "seeds": [0, 100, 200]} and about["steps"] == 12
+    # Of all rays, not of a resample.
+    assert ensemble.support.cells[:, 3].sum() == len(rays) == about["rays"] and ensemble.support.radius == PROBES.radius
+    assert ensemble.basis == Basis(len(rays), len(rays.persons)) and about["people"] == len(rays.persons)
+
+
+def test_an_interrupted_ensemble_goes_on(threads, tmp_path):
+    """In the second member: the first is not trained again, and all come out as if nothing had happened."""
+    threads(1)
+    path, seen = tmp_path / "a.run", []
+
+    def stop(state):
+        seen.append(state.stage)
+        if state.stage == "2/3 fit" and state.steps == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="interrupted while training member 2 of 3; go on with --resume"):
+        together(path=path, tell=stop)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.member0.safetensors", "a.run"]
+    with pytest.raises(NergError, match="started with other probes"):
+        together(path=path, resume=True, probes=replace(PROBES, kappa=9.0))
+    seen.clear()
+    written = []
+    shares = []
+    got, about = together(
+        path=path,
+        resume=True,
+        tell=lambda s: (seen.append(s.stage), shares.append(s.done)),
+        write=lambda *_: written.append(sorted(p.name for p in tmp_path.iterdir())),
+    )
+    assert set(seen) == {"2/3 probes", "2/3 fit", "3/3 probes", "3/3 fit"} and seen.count("2/3 fit") == 2
+    # Each member is a third of what is done, the first of them from before.
+    assert shares == sorted(shares) and shares[-1] == pytest.approx(1)
+    assert all(int(stage[0]) - 1 - 1e-9 <= 3 * share <= int(stage[0]) + 1e-9 for stage, share in zip(seen, shares))
+    assert (
+        written == [[f"a.member{k}.safetensors" for k in range(3)]]
+        and not list(tmp_path.iterdir())
+        and about["steps"] == 12
+    )
+    expected = arrays(together()[0])
+    for name, value in arrays(got).items():
+        np.testing.assert_array_equal(value, expected[name], err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"config": replace(PLACE, width=8)}, "architecture"),
+        ({"config": replace(PLACE, variant="emit")}, "architecture"),
+        ({"place": replace(NOWHERE, box=Box((-3, -3, 0), (3, 3, 3)))}, "box"),
+        ({"rays": crowd(people=7)}, "rays"),
+        ({"settings": replace(SHORT, steps=5)}, "settings"),
+        ({"place": MOVED}, "align"),
+    ],
+)
+def test_members_of_another_run_are_refused(tmp_path, change, said):
+    """Finished members count as members only of the run that they are of: of another architecture they would be
+    averaged with it."""
+    path = tmp_path / "a.run"
+
+    def stop(state):
+        if state.stage == "2/2 fit":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        together(2, path=path, tell=stop)
+    assert (tmp_path / "a.member0.safetensors").is_file()
+    with pytest.raises(NergError, match=f"a.member0.safetensors.*started with other .*{said}"):
+        together(2, **change, path=path, resume=True)
+    assert (tmp_path / "a.member0.safetensors").is_file()
+
+
+def test_an_ensemble_that_cannot_be_written_is_kept(threads, tmp_path):
+    """Refused at the end: the next start trains no member again; nor does one that was killed before it removed a
+    state."""
+    threads(1)
+    path, stages = tmp_path / "a.run", []
+
+    def refuse(field, about):
+        raise NergError("a weight does not fit into fp16; leave out --half")
+
+    with pytest.raises(NergError, match="fp16.*--resume writes it"):
+        together(path=path, write=refuse)
+    members = sorted(p.name for p in tmp_path.iterdir())
+    assert members == [f"a.member{k}.safetensors" for k in range(3)]
+    write_checkpoint(path, "gaze run", {"x": np.zeros(1)}, {"about": {"member": [1, 3]}})
+    _, about = together(path=path, resume=True, tell=lambda s: stages.append(s.stage), write=lambda *_: None)
+    assert not stages and about["steps"] == 12 and not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_resampled_is_refused():
+    for members, said, options in (
+        (1, "at least two members", {}),
+        (2, "who would predict themselves", {"probes": replace(PROBES, kappa_rule="loo")}),
+    ):
+        with pytest.raises(ValueError, match=said):
+            together(members, **options)
+    with pytest.raises(NergError, match="4 salience images are too few to resample"):
+        train_ensemble(2, Supervision(None, around(4)), NOWHERE, planned(PLACE, SHORT), ns)
+    with pytest.raises(NergError, match="nothing to resume"):
+        together(path=Path("nowhere.run"), resume=True)
+
+
+def test_views_are_resampled_one_by_one():
+    views = around(12)
+    drawn = resample_views(views, (0, 1))
+    assert len(drawn) == 12 and 5 <= len(set(drawn)) < 12 and set(drawn) <= set(views)
+    assert drawn == resample_views(views, (0, 1)) != resample_views(views, (0, 2))
+    plan = planned(PLACE, replace(SHORT, mix_folds=3))
+    field, about = train_ensemble(2, Supervision(None, views), NOWHERE, plan, ns)
+    assert about["ensemble"]["resampled"] == "views" and about["salience_views"] == 12 and about["rays"] == 0
+    assert field.support is None and "mix" not in about
+    assert not np.array_equal(arrays(field)["0.capture_net.0"], arrays(field)["1.capture_net.0"])
+    _, about = train_ensemble(2, Supervision(crowd(), views), NOWHERE, planned(PLACE, SHORT), ns)
+    assert about["ensemble"]["resampled"] == "people and views" and about["people"] == 6
