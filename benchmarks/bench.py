@@ -28,7 +28,7 @@ from collections.abc import Callable
 import cold_kernels  # noqa: F401
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import torch_frames
-from nerg_mi.figures.saving import save
+from nerg_mi.figures.style import save
 from nerg_mi.jobs.demo import store_scene
 from nerg_mi.llvm import has_cuda
 from nerg_mi.probes.kde import SphericalKde

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import nerg_mi as nerg
-from nerg_mi.figures.sheet import INK, new_page
+from nerg_mi.figures.style import INK, new_page
 from nerg_mi.jobs.demo import store_scene
 from torch_frames import camera_rays
 

@@ -139,7 +139,7 @@ def times(scene: Path, files: dict, runs: int) -> list[dict]:
 
 def picture(path: Path, scenes: dict[str, tuple[Path, dict]]) -> None:
     """Field, splats and shapes, one below the other."""
-    from nerg_mi.figures.tonemap import srgb, write_png
+    from nerg_mi.figures.overlay import srgb, write_png
 
     rows, brightest = [], None
     for scene, files in scenes.values():

@@ -33,7 +33,7 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from nerg_mi.fields.splats import Splats, harmonics_of, multiply_quaternions
-from nerg_mi.figures.tonemap import srgb
+from nerg_mi.figures.overlay import srgb
 from nerg_mi.registration import plugin_class
 from timing import print_table
 

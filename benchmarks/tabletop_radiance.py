@@ -35,7 +35,7 @@ def score(field: Path, views: list, box, center, spp: int, pictures: Path) -> di
     """Means over ``views`` of PSNR in dB and SSIM, and over all of their pixels: PSNR within and ``beyond`` the
     ``box``, and errors of depth near ``center`` and far."""
     from nerg_mi.evaluation.images import Renderer, ssim
-    from nerg_mi.figures.tonemap import write_png
+    from nerg_mi.figures.overlay import write_png
     from nerg_mi.files.atomic import make_folder
     from nerg_mi.maths.color import decibels, psnr
     from nerg_mi.photos.cameras import pixel_directions

@@ -28,7 +28,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import cold_kernels  # noqa: F401
 import nerg_mi as nerg
-from nerg_mi.figures.tonemap import srgb
+from nerg_mi.figures.overlay import srgb
 from nerg_mi.formats.fields import load_gaze, load_radiance
 from nerg_mi.jobs.demo import store_scene
 from nerg_mi.maths.sphere import fibonacci_directions

@@ -321,7 +321,7 @@ def main(argv=None) -> dict:
     print(f"  all pairs of observer and patch               {100 * off[0]:6.2f} %")
     print(f"  without pairs that an edge passes ({100 * checks[:, 5].mean():.2f} %)   {100 * off[1]:6.2f} %")
 
-    from nerg_mi.figures.saving import save
+    from nerg_mi.figures.style import save
 
     save(figure(attention, (at, values), paths, checks, settings), args.out)
     print(f"wrote {args.out}")

@@ -305,7 +305,7 @@ def main(argv=None) -> dict:
         f"(first guesses: median {np.median(off[:, 0]):.1f} cm); {np.sum(off[:, 1] < 10)} of {len(off)} within 10 cm"
     )
 
-    from nerg_mi.figures.saving import save
+    from nerg_mi.figures.style import save
 
     save(figure(shown, truths, searches), args.out)
     print(f"wrote {args.out}")

@@ -43,7 +43,7 @@ EXCEPTIONS = {
     "nerg_mi/formats/torch_ngp/pickling.py": "puts a pickle together in memory before it opens the file",
     "nerg_mi/cli/ending.py:write": "is a standard stream",
     "nerg_mi/files/png.py": "encodes in memory",
-    "nerg_mi/figures/saving.py:encode": "encodes in memory",
+    "nerg_mi/figures/style.py:encode": "encodes in memory",
     "nerg_mi/photos/structure_worker.py": "fills a folder that `replacing_folder` has named, in its own process",
     "nerg_mi/tasks/child.py:main": "is the pipe to whoever asks",
     "nerg_mi/tasks/children.py:make": "is the pipe to the child",

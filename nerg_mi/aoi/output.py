@@ -10,9 +10,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from nerg_mi.figures.provenance import provenance
-from nerg_mi.figures.saving import save
-from nerg_mi.figures.statistics_figures import map_figure, moves_figure, things_figure
+from nerg_mi.figures.statistics import map_figure, moves_figure, things_figure
+from nerg_mi.figures.style import provenance, save
 from nerg_mi.files.atomic import replacing, write_text
 from nerg_mi.files.tables import markdown_table, write_csv
 from nerg_mi.jobs.reporter import Reporter

@@ -14,9 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.figures.provenance import Provenance
-from nerg_mi.figures.saving import save
-from nerg_mi.figures.sheet import new_page
+from nerg_mi.figures.style import Provenance, new_page, save
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.rays.rays import Rays

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.figures.provenance import provenance
-from nerg_mi.figures.tonemap import srgb, write_png
+from nerg_mi.figures.overlay import srgb, write_png
+from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.maths.color import psnr, psnr_of_fitted_half
 from nerg_mi.photos.cameras import Camera, pixel_directions, sensor_dict

@@ -1,22 +1,56 @@
-"""Attention over colour: a heat map that stays readable on a picture, with a scale that can be read off.
-
-Values are densities in 1/sr. Colours come from one of matplotlib's perceptually uniform maps; the heat grows more
-opaque with the value, over a picture that is dimmed and greyed, so that goods stay recognisable and their colours are
-not mistaken for heat. Where there is no surface nothing is coloured, and what is not known can be hatched.
-"""
+"""Gaze over a picture, plots, and the overlays that commands draw."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.files import png
+from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import DECADES
 
-from .colors import color_values, find_colors
-from .hatching import hatch
-from .tonemap import LUMINANCE, srgb
+from .style import SMALL, Sheet, color_values, find_colors, hatch
+
+# ---- From linear radiance to the bytes of a picture ----
+#
+# The sRGB transfer function of IEC 61966-2-1; nothing is scaled or compressed, so that equal radiance has equal bytes
+# in every picture. What is brighter than white is clipped.
+
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Weights of linear sRGB for the luminance (Rec. 709)."""
+
+
+def srgb(linear) -> np.ndarray:
+    """sRGB values in 0..1 (float64) of linear ones of any shape; clipped to 0..1, NaN becomes 0."""
+    x = np.clip(np.nan_to_num(np.asarray(linear, np.float64), nan=0.0), 0.0, 1.0)
+    return encode_srgb(x)
+
+
+def to_bytes(display) -> np.ndarray:
+    """Display values in 0..1 as uint8, rounded to the nearest."""
+    return (np.clip(display, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def write_png(path, display, text: dict[str, str] | None = None) -> None:
+    """Write display values (h, w, 3) in 0..1 as an 8-bit PNG. ``text``: what its header says (tEXt chunks)."""
+    import mitsuba as mi
+
+    png.write_png(path, mi.Bitmap(to_bytes(display)), text)
+
+
+# ---- Overlay ----
+#
+# Attention over colour: a heat map that stays readable on a picture, with a scale that can be read off.
+#
+# Values are densities in 1/sr. Colours come from one of matplotlib's perceptually uniform maps; the heat grows more
+# opaque with the value, over a picture that is dimmed and greyed, so that goods stay recognisable and their colours are
+# not mistaken for heat. Where there is no surface nothing is coloured, and what is not known can be hatched.
+
 
 MOST_DECADES = float(DECADES.high)
 
@@ -26,7 +60,7 @@ class Heat:
     """How values become colour.
 
     ``top``: the value, in 1/sr, at the upper end of the scale, which starts at 0; ``colors``: one of
-    `colors.SEQUENTIAL`; ``opacity``: of the hottest pixel; ``ramp``: share of the scale over which opacity rises from
+    `style.SEQUENTIAL`; ``opacity``: of the hottest pixel; ``ramp``: share of the scale over which opacity rises from
     0; ``dim``: brightness of the picture below; ``grey``: how much of its colour is taken away. ``decades``: 0 for a
     linear scale, else a logarithmic one that starts so many powers of ten below ``top``. Raises NergError for what
     cannot be shown.
@@ -109,3 +143,272 @@ def scale_strip(heat: Heat, steps: int = 256) -> np.ndarray:
     share = np.linspace(0.0, 1.0, steps)
     values = heat.top * (10.0 ** (heat.decades * (share - 1.0)) if heat.decades else share)
     return overlay(np.full((1, steps, 3), 0.2), values[None], heat)[0]
+
+
+# ---- Plots ----
+#
+# Figures with scales and labels: depth, gaze, visibility, differences and the paper's occlusion figure.
+#
+# Each function takes arrays as the integrator gives them (rows from the top) and returns a matplotlib ``Figure``, see
+# `sheet`; `style.save` writes it.
+
+
+HIDDEN = np.array([0.16, 0.20, 0.42])
+"""Tint (display sRGB) of what the observer cannot see."""
+
+GAZE = "gaze density [1/sr]"
+
+_STEPS = 256
+
+
+def depth_limits(depth, mask) -> tuple[float, float]:
+    """The ends of a scale for ``depth`` (h, w) where ``mask`` (h, w) is true, but for the outermost half percents."""
+    depth = np.asarray(depth, np.float64)
+    some = np.asarray(mask, bool) & np.isfinite(depth)
+    low, high = (float(v) for v in np.percentile(depth[some], (0.5, 99.5))) if some.any() else (0.0, 1.0)
+    return low, max(high, low + 1e-6)
+
+
+def depth_figure(
+    depth,
+    mask,
+    title: str = "Depth",
+    unit: str = "m",
+    limits: tuple[float, float] | None = None,
+    colors: str = "viridis_r",
+):
+    """``depth`` (h, w) in scene units, with a colour bar; hatched where ``mask`` (h, w) says that nothing is met.
+    ``limits``: ends of the scale, by default those of `depth_limits`."""
+    depth = np.asarray(depth, np.float64)
+    some = np.asarray(mask, bool) & np.isfinite(depth)
+    low, high = limits or depth_limits(depth, mask)
+    shown = color_values(colors, np.where(some, (depth - low) / (high - low), 0.0))
+    sheet = Sheet([_hatched(shown, ~some)], [title], scale=True)
+    inside = depth[some]
+    above, below = bool(np.any(inside > high)), bool(np.any(inside < low))
+    strip = color_values(colors, np.linspace(0, 1, _STEPS))
+    label = f"distance from the camera [{unit}]"
+    sheet.bar(strip, low, high, label, above=above, below=below, unknown=not some.all())
+    return sheet.page
+
+
+def gaze_figure(
+    color, gaze, mask, heat: Heat, title: str = "Gaze", label: str = GAZE, marker=None, unknown=None, note: str = ""
+) -> Any:
+    """``gaze`` (h, w) in 1/sr over the linear picture ``color`` (h, w, 3), with its scale, which ``label`` explains.
+    ``marker``: pixel (x, y) at which the observer stands; ``unknown`` (h, w) bool: where it is hatched, since nothing
+    is known there; ``note``: what it rests on."""
+    sheet = Sheet([overlay(color, gaze, heat, mask, unknown)], [title], scale=True, note=note)
+    if marker is not None:
+        mark_observer(sheet, 0, marker)
+    add_scale(sheet, heat, label, [(gaze, mask)], unknown is not None and bool(np.any(unknown)))
+    return sheet.page
+
+
+def visibility_figure(color, visibility, mask, title: str = "Visible to the observer"):
+    """``visibility`` (h, w): 1 in the colours of the picture, 0 in a dark blue; hatched where ``mask`` is false."""
+    v = np.clip(np.asarray(visibility, np.float64), 0, 1)[..., None]
+    luminance = srgb(np.clip(color, 0, 1) @ LUMINANCE)[..., None]
+    hidden = HIDDEN * (0.35 + 0.9 * luminance)
+    unknown = ~np.asarray(mask, bool)
+    sheet = Sheet([_hatched(hidden + v * (srgb(color) - hidden), unknown)], [title], scale=True)
+    grey = np.linspace(0, 1, _STEPS)[:, None]
+    strip = HIDDEN * 0.8 + grey * (0.85 - HIDDEN * 0.8)
+    sheet.bar(strip, 0.0, 1.0, "0 hidden, 1 visible", unknown=bool(unknown.any()))
+    return sheet.page
+
+
+def difference_figure(
+    first,
+    second,
+    mask=None,
+    title: str = "Difference",
+    label: str = "difference",
+    limit=None,
+    colors: str = "RdBu_r",
+    note: str = "",
+):
+    """``first`` less ``second``, (h, w) each, in the colours of a diverging map whose middle is 0; hatched where
+    ``mask`` (h, w) is false, or one of both is no number. ``limit``: both ends of the scale, by default that which 99.5
+    percent of the pixels stay within; ``note``: what they rest on."""
+    less = np.asarray(first, np.float64) - np.asarray(second, np.float64)
+    some = np.isfinite(less) if mask is None else np.isfinite(less) & np.asarray(mask, bool)
+    size = np.abs(less[some])
+    limit = float(limit or (np.percentile(size, 99.5) if size.size else 0.0) or (size.max() if size.size else 0.0) or 1)
+    shown = color_values(colors, np.where(some, 0.5 + 0.5 * less / limit, 0.5), diverging=True)
+    sheet = Sheet([_hatched(shown, ~some)], [title], scale=True, note=note)
+    strip = color_values(colors, np.linspace(0, 1, _STEPS), diverging=True)
+    over = dict(above=bool(np.any(less[some] > limit)), below=bool(np.any(less[some] < -limit)))
+    sheet.bar(strip, -limit, limit, label, unknown=not some.all(), **over)
+    return sheet.page
+
+
+def occlusion_figure(own, moved_without, moved_with, heat: Heat, marker=None, hatched: bool = False, note: str = ""):
+    """The paper's occlusion figure: three pictures with one scale.
+
+    ``own``, ``moved_without``, ``moved_with``: tuples (color (h, w, 3) linear, gaze (h, w) in 1/sr, mask (h, w)): what
+    the observer sees; another camera, gaze without occlusion; the same with it. ``marker``: pixel (x, y) at which the
+    observer stands in the two pictures of the other camera. ``hatched``: hatch where there is no surface;
+    ``note``: what it rests on.
+    """
+    parts = (own, moved_without, moved_with)
+    void = [~np.asarray(m, bool) if hatched else None for _, _, m in parts]
+    pictures = [overlay(c, g, heat, m, u) for (c, g, m), u in zip(parts, void)]
+    titles = ["The observer's own view", "Another camera, without occlusion", "The same with occlusion"]
+    sheet = Sheet(pictures, titles, scale=True, note=note)
+    if marker is not None:
+        for panel in (1, 2):
+            mark_observer(sheet, panel, marker)
+    add_scale(sheet, heat, GAZE, [(g, m) for _, g, m in parts], any(u is not None and u.any() for u in void))
+    return sheet.page
+
+
+def add_scale(sheet: Sheet, heat: Heat, label: str, values, unknown: bool = False) -> None:
+    """The scale of ``heat`` on a ``sheet``; ``values``: pairs (values, mask) of all pictures that it explains."""
+    above = any(float(np.max(v, where=np.asarray(m, bool), initial=0.0)) > heat.top for v, m in values)
+    sheet.bar(scale_strip(heat), heat.low, heat.top, label, above=above, log=heat.decades > 0, unknown=unknown)
+
+
+def mark_observer(sheet: Sheet, panel: int, at: tuple[float, float]) -> None:
+    """Show in a picture of ``sheet`` that the observer stands at the pixel ``at`` (x, y)."""
+    axes, unit = sheet.panels[panel], sheet.unit
+    dot = dict(markerfacecolor="#35c2ff", markeredgecolor="white", markeredgewidth=1.2 * unit)
+    axes.plot(*at, marker="o", markersize=6 * unit, **dot)
+    height, width = sheet.images[panel].get_array().shape[:2]
+    # Towards the middle, so that it stays within the picture.
+    left, low = at[0] > 0.6 * width, at[1] < 0.15 * height
+    axes.annotate(
+        "observer",
+        at,
+        ((-6 if left else 6) * unit, (-6 if low else 5) * unit),
+        textcoords="offset points",
+        ha="right" if left else "left",
+        va="top" if low else "bottom",
+        fontsize=SMALL * unit,
+        color="white",
+        bbox=dict(boxstyle="round,pad=0.15", facecolor="black", alpha=0.45, linewidth=0),
+    )
+
+
+def _hatched(shown, unknown) -> np.ndarray:
+    """``shown`` (h, w, 3), hatched over a middle grey where ``unknown`` (h, w)."""
+    return hatch(np.where(np.asarray(unknown)[..., None], 0.5, shown), unknown) if np.any(unknown) else shown
+
+
+# ---- Overlays ----
+#
+# What can be laid over a picture: a table of quantities, how each is drawn, and which scale several pictures share.
+#
+# One more is one more entry. Values are the AOVs of the integrator `nerg`, (h, w) each.
+
+
+Limits = tuple[float, float] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """A picture and what lies over it: linear ``color`` (h, w, 3), ``values`` (h, w), ``mask`` (h, w) bool where there
+    is a surface; ``marker``: pixel (x, y) of the observer, or None; ``supported``: whether anything was recorded around
+    the observer, so that their gaze is known; ``basis``: rays and people that it rests on, in words, "" where that is
+    not known."""
+
+    color: np.ndarray
+    values: np.ndarray
+    mask: np.ndarray
+    marker: tuple[float, float] | None = None
+    supported: bool = True
+    basis: str = ""
+
+
+@dataclass(frozen=True)
+class Style:
+    """How an overlay is drawn: the ``colors`` of its scale (None: those usual for it), over how many ``decades`` that
+    is logarithmic (0: linear), whether what is not known is hatched (``hatched``), and the ``title`` (None: the usual
+    one)."""
+
+    colors: str | None = None
+    decades: float = 0.0
+    hatched: bool = True
+    title: str | None = None
+
+
+USUAL = Style()
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """``name`` of the AOV; ``summary`` for people; ``limits(layers)``: ends of the scale of one picture, None where it
+    shows nothing of it; ``draw(layers, limits, style)``: a figure; ``scaled``: whether it needs a scale; ``low``: the
+    lower end of every scale, or None where it depends on the pictures; ``of_gaze``: whether it is known only where rays
+    were recorded; ``rests_on``: "gaze" or "kde", the part of the scene that was made of rays."""
+
+    name: str
+    summary: str
+    limits: Callable[[Layers], Limits]
+    draw: Callable[..., Any]
+    scaled: bool = True
+    low: float | None = 0.0
+    of_gaze: bool = False
+    rests_on: str | None = None
+
+
+def _heat(name: str, summary: str, title: str, label: str, of_gaze: bool = False, rests_on: str = "gaze") -> Overlay:
+    def limits(of: Layers) -> Limits:
+        return (0.0, top_of(of.values, of.mask)) if np.any(of.values[of.mask] > 0) else None
+
+    def draw(of: Layers, limits: Limits, style: Style = USUAL) -> Any:
+        heat = Heat(1.0 if limits is None else limits[1], decades=style.decades)
+        heat = heat if style.colors is None else replace(heat, colors=style.colors)
+        shown = style.title or (title if of.supported or not of_gaze else f"{title}: nobody recorded around here")
+        unknown = unknown_of(of, of_gaze) if style.hatched else None
+        return gaze_figure(of.color, of.values, of.mask, heat, shown, label, of.marker, unknown, of.basis)
+
+    return Overlay(name, summary, limits, draw, of_gaze=of_gaze, rests_on=rests_on)
+
+
+def unknown_of(layers: Layers, of_gaze: bool) -> np.ndarray:
+    """Where nothing is known (h, w), bool: where there is no surface, and everywhere for gaze without support."""
+    void = ~np.asarray(layers.mask, bool)
+    return void if layers.supported or not of_gaze else np.ones_like(void)
+
+
+def _draw_visibility(of: Layers, limits: Limits, style: Style = USUAL) -> Any:
+    return visibility_figure(of.color, of.values, of.mask, style.title or "Visible to the observer")
+
+
+def _draw_depth(of: Layers, limits: Limits, style: Style = USUAL) -> Any:
+    colors = style.colors or "viridis_r"
+    return depth_figure(of.values, of.mask, style.title or "Depth", "scene units", limits, colors)
+
+
+OVERLAYS = {
+    overlay.name: overlay
+    for overlay in (
+        _heat("gaze", "how much the observer attends to what is seen", "Gaze", GAZE, of_gaze=True),
+        _heat("kde", "where tracked people looked", "Where people looked", "tracked gaze [1/sr]", rests_on="kde"),
+        _heat("gaze_std", "how sure that is", "Uncertainty of gaze", "standard deviation of gaze [1/sr]", of_gaze=True),
+        _heat("emit", "how much surfaces attract", "What surfaces attract", "emitted attention"),
+        _heat("capture", "how much the observer gives", "What the observer gives", "captured attention"),
+        _heat("support", "how many rays the gaze rests on", "Support", "training rays around the observer"),
+        Overlay("visibility", "what the observer sees", lambda of: None, _draw_visibility, scaled=False),
+        Overlay(
+            "depth", "distance from the camera", lambda of: depth_limits(of.values, of.mask), _draw_depth, low=None
+        ),
+    )
+}
+
+
+def find_overlay(name: str) -> Overlay:
+    """The overlay ``name``. Raises `NergError` for one that is not known."""
+    if name not in OVERLAYS:
+        raise NergError(f'there is no overlay "{name}"; there are {", ".join(OVERLAYS)}')
+    return OVERLAYS[name]
+
+
+def shared_limits(each: Sequence[Limits], top: float | None) -> Limits:
+    """Ends of one scale for all pictures, of the ends of ``each``, with the upper end ``top`` where one is given."""
+    known = [limits for limits in each if limits is not None]
+    if top is not None:
+        low = min((limits[0] for limits in known), default=0.0)
+        return min(low, 0.0) if low >= top else low, top
+    return (min(limits[0] for limits in known), max(limits[1] for limits in known)) if known else None

@@ -1,11 +1,4 @@
-"""Where a camera should stand so that a place, or what somebody in it looks at, can be seen well.
-
-Many candidates are looked through at a few hundred pixels each, by depths alone, and the best is taken: it sees
-surfaces and not the void, nothing right before the lens, near things and far ones, and, where there is an observer,
-as much as can be of what gets their attention. All positions are scene units, arrays of float64; depths come from a
-function ``trace(origins (N, 3), directions (N, 3)) -> (depth (N,), opacity (N,))`` such as that of
-`nerg_mi.transport.geometry.trace_depth` with a place.
-"""
+"""One picture of a dataset: where people were, where they looked, and when."""
 
 from __future__ import annotations
 

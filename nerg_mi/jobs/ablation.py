@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
 from nerg_mi.evaluation.ablation import Variant
 from nerg_mi.evaluation.frame_time import frame_timer
-from nerg_mi.figures.provenance import files_among, provenance
+from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_json

@@ -15,9 +15,8 @@ from nerg_mi.alignment.points import read_cameras, read_pairs
 from nerg_mi.alignment.similarity import move
 from nerg_mi.alignment.tracking import DECLARED, Tracking, compare_flips
 from nerg_mi.errors import NergError
-from nerg_mi.figures.alignment_figures import alignment_figure
-from nerg_mi.figures.provenance import provenance
-from nerg_mi.figures.saving import save
+from nerg_mi.figures.maps import alignment_figure
+from nerg_mi.figures.style import provenance, save
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.maths.geometry import Similarity

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerg_mi.evaluation.saliency import cc
 from nerg_mi.figures.overlay import Heat
-from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import Smoother, Sums, merge

@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation.saliency import cc
 from nerg_mi.fields.splats import Splats, harmonics_of
 from nerg_mi.figures.overlay import Heat, overlay, top_of
-from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.splats.files import read_splats

@@ -17,12 +17,10 @@ import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.evaluation.gaze.results import read_results
-from nerg_mi.figures import plots as figures
-from nerg_mi.figures.overlay import Heat, top_of
-from nerg_mi.figures.provenance import Provenance, provenance
-from nerg_mi.figures.saving import save
-from nerg_mi.figures.sphere_figures import sphere_figure
-from nerg_mi.figures.tonemap import srgb, write_png
+from nerg_mi.figures import overlay as figures
+from nerg_mi.figures.overlay import Heat, srgb, top_of, write_png
+from nerg_mi.figures.sphere import sphere_figure
+from nerg_mi.figures.style import Provenance, provenance, save
 from nerg_mi.files.atomic import check_folder, write_bytes
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.files.exr import write_bitmap_exr

@@ -15,7 +15,7 @@ from nerg_mi.evaluation.gaze.report import side_by_side, write_report
 from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
 from nerg_mi.evaluation.gaze.uncertainty import calibration_rows, position_rows, rank_rows
 from nerg_mi.fields.gaze_base import AnyGazeField
-from nerg_mi.figures.provenance import files_among, provenance
+from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze

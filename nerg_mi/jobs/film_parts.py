@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.figures.overlays import find_overlay, shared_limits
+from nerg_mi.figures.overlay import find_overlay, shared_limits
 from nerg_mi.files.atomic import replacing
 from nerg_mi.files.video import video_frames
 from nerg_mi.rendering.pictures import activate

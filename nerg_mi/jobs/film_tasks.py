@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlays import find_overlay
-from nerg_mi.figures.saving import save
+from nerg_mi.figures.overlay import find_overlay
+from nerg_mi.figures.style import save
 from nerg_mi.files.atomic import replacing
 from nerg_mi.files.npy import read_npy
 from nerg_mi.interruption import Interruption

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.figures import saving
-from nerg_mi.figures.colors import find_colors
-from nerg_mi.figures.overlays import Layers, Limits, Overlay, Style, find_overlay, shared_limits
+from nerg_mi.figures import style
+from nerg_mi.figures.overlay import Layers, Limits, Overlay, Style, find_overlay, shared_limits
+from nerg_mi.figures.style import find_colors
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.asked import is_nerg, render_asked
@@ -36,7 +36,7 @@ class Picture:
     whole: str | None = None
 
 
-OVERLAY_FORMATS = (*saving.FORMATS, ".mp4")
+OVERLAY_FORMATS = (*style.FORMATS, ".mp4")
 
 OnStrip = Callable[[int, int], None]
 """Is told how many samples are done, and of how many."""

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.figures.provenance import Provenance, provenance
-from nerg_mi.figures.saving import rasterize, save
+from nerg_mi.figures.style import Provenance, provenance, rasterize, save
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.video import check_video, video_frames
 from nerg_mi.interruption import Interruption
@@ -94,7 +93,7 @@ def render_file(
     it; the scene's list of AOVs need not have it. With ``options.frames`` there is a picture for each line of that
     file, with a number added to its name, or one video where that ends in .mp4; one scale serves all overlays, for
     which all are rendered before the first is drawn, unless ``options.top`` gives it. Each file says in its header what
-    it was made of (`nerg_mi.figures.provenance`).
+    it was made of (`nerg_mi.figures.style`).
 
     A picture that needs more than ``options.memory`` is rendered in bands of rows, as large as fit beside what the
     scene itself takes. Its pixels do not depend on that where the film has a box filter; with wider filters they differ

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.camera_figures import camera_figure
-from nerg_mi.figures.provenance import provenance
-from nerg_mi.figures.saving import save
+from nerg_mi.figures.maps import camera_figure
+from nerg_mi.figures.style import provenance, save
 from nerg_mi.files.atomic import check_new_folder, make_folder, replacing_folder
 from nerg_mi.files.tables import write_json
 from nerg_mi.photos.colmap import read_colmap

@@ -13,8 +13,8 @@ import numpy as np
 from nerg_mi.errors import mitsuba_says
 from nerg_mi.evaluation.gaze.results import GazeResults
 from nerg_mi.fields.gaze_base import AnyGazeField
-from nerg_mi.figures.provenance import Provenance
-from nerg_mi.figures.provenance import versions as programs
+from nerg_mi.figures.style import Provenance
+from nerg_mi.figures.style import versions as programs
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.areas.kinds import Areas

@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation.study import errors, measure, plots, tables
 from nerg_mi.evaluation.study.settings import Setting, settings
 from nerg_mi.evaluation.study.subject import Subject, open_subject
-from nerg_mi.figures.provenance import Provenance, files_among, provenance
+from nerg_mi.figures.style import Provenance, files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.rendering.pictures import activate
 from nerg_mi.rendering.scene_file import files_of_scene

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures import ray_figures, saving
-from nerg_mi.figures.provenance import files_among, provenance
+from nerg_mi.figures import maps, style
+from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
 from nerg_mi.ranges import LENGTHS, Checked
@@ -216,16 +216,16 @@ def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions(), repor
     """The floor plan of rays, or of a file of them, as a figure of matplotlib."""
     reporter.progress(0.0, "drawing rays")
     if options.output is not None:
-        check_writable(options.output, *saving.FORMATS)
+        check_writable(options.output, *style.FORMATS)
     if options.kind == "density":
-        figure = ray_figures.floor_plan(_load(rays), options.cell)
+        figure = maps.floor_plan(_load(rays), options.cell)
     else:
         test = None if options.test is None else _load(options.test)
         where = {} if test is None else splits.position_of_split(test)
-        figure = ray_figures.layout_figure(_load(rays), test, where.get("test_centres"), where.get("radius"))
+        figure = maps.layout_figure(_load(rays), test, where.get("test_centres"), where.get("radius"))
     if options.output is not None:
         about = provenance("nerg rays plot", files_among(rays, options.test), None, options)
-        saving.save(figure, options.output, about)
+        style.save(figure, options.output, about)
     return figure
 
 

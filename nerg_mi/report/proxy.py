@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.figures.tonemap import srgb, to_bytes
+from nerg_mi.figures.overlay import srgb, to_bytes
 from nerg_mi.rendering.channels import render_channels
 
 GazeAt = Callable[[np.ndarray, np.ndarray, float], np.ndarray]

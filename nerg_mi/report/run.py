@@ -65,7 +65,7 @@ class Run:
     settings: Mapping[str, str] = field(default_factory=dict)
     # Rays and people that the gaze rests on, in words, "" where that is not known.
     basis: str = ""
-    # Where all of this comes from (`figures.provenance`), as JSON.
+    # Where all of this comes from (`figures.style`), as JSON.
     made: str = ""
     # ``objects`` of the observer alone, where one was named; of people otherwise.
     observed_objects: tuple[ObjectAttention, ...] = ()

@@ -15,7 +15,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
-from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.style import provenance
 from nerg_mi.files.png import write_png
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.color import psnr, psnr_of_fitted_half

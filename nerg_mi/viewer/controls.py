@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, sentence
-from nerg_mi.figures.provenance import Provenance, provenance
+from nerg_mi.figures.style import Provenance, provenance
 from nerg_mi.files.png import encode_png
 from nerg_mi.rendering.scene_file import files_of_scene
 

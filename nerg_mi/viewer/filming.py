@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from nerg_mi.figures.overlays import OVERLAYS
+from nerg_mi.figures.overlay import OVERLAYS
 from nerg_mi.jobs.options.pictures import PictureOptions
 from nerg_mi.jobs.pictures import render_file
 

@@ -9,10 +9,9 @@ import numpy as np
 
 from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.errors import NergError
-from nerg_mi.figures.colors import SEQUENTIAL as MAPS
-from nerg_mi.figures.hatching import hatch
-from nerg_mi.figures.overlay import Heat, overlay, top_of
-from nerg_mi.figures.tonemap import srgb, to_bytes
+from nerg_mi.figures.overlay import Heat, overlay, srgb, to_bytes, top_of
+from nerg_mi.figures.style import SEQUENTIAL as MAPS
+from nerg_mi.figures.style import hatch
 
 
 @dataclass(frozen=True)

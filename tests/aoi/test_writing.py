@@ -7,7 +7,7 @@ import csv
 import pytest
 
 from nerg_mi.aoi import output
-from nerg_mi.figures.statistics_figures import things_figure
+from nerg_mi.figures.statistics import things_figure
 from nerg_mi.statistics.tables import PLACES, PersonRows
 from nerg_mi.statistics.visits import ALL, Sums
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.figures.alignment_figures import alignment_figure
+from nerg_mi.figures.maps import alignment_figure
 
 
 @pytest.mark.parametrize("place", [None, np.random.default_rng(0).uniform(0, 4, (500, 3))])

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.figures.camera_figures import camera_figure
-from nerg_mi.figures.saving import save
+from nerg_mi.figures.maps import camera_figure
+from nerg_mi.figures.style import save
 
 
 def poses() -> np.ndarray:

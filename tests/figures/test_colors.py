@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.colors import DIVERGING, SEQUENTIAL, color_values, find_colors
+from nerg_mi.figures.style import DIVERGING, SEQUENTIAL, color_values, find_colors
 
 
 def lightness(colors):

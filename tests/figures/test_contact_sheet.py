@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.figures.contact_sheet import contact_sheet, shrink
 from nerg_mi.figures.overlay import Heat
+from nerg_mi.figures.sheets import contact_sheet, shrink
 
 RNG = np.random.default_rng(0)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PatchCollection
 
-from nerg_mi.figures.floor_figures import PEOPLE, Sight, Walk, Walls, floor_figure
-from nerg_mi.figures.saving import encode
+from nerg_mi.figures.maps import PEOPLE, Sight, Walk, Walls, floor_figure
+from nerg_mi.figures.style import encode
 
 LOW, HIGH = np.array([0.0, 0.0]), np.array([4.0, 3.0])
 

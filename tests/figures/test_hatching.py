@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.figures.colors import SEQUENTIAL, color_values
-from nerg_mi.figures.hatching import hatch, lines, swatch
+from nerg_mi.figures.style import SEQUENTIAL, color_values, hatch, lines, swatch
 
 SHOWN = np.random.default_rng(0).random((40, 60, 3))
 UNKNOWN = np.zeros((40, 60), bool)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlays import OVERLAYS, Layers, find_overlay, shared_limits
-from nerg_mi.figures.saving import save
+from nerg_mi.figures.overlay import OVERLAYS, Layers, find_overlay, shared_limits
+from nerg_mi.figures.style import save
 
 X, Y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 16))
 LAYERS = Layers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))

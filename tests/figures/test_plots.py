@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from nerg_mi.figures import plots as figures
+from nerg_mi.figures import overlay as figures
 from nerg_mi.figures.overlay import Heat, overlay
-from nerg_mi.figures.saving import save
+from nerg_mi.figures.style import save
 
 RNG = np.random.default_rng(0)
 COLOR, GAZE = RNG.random((24, 36, 3)), RNG.random((24, 36))

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.projections import PROJECTIONS, find_projection, resample
+from nerg_mi.figures.sphere import PROJECTIONS, find_projection, resample
 
 RNG = np.random.default_rng(0)
 LONGITUDE, LATITUDE = RNG.uniform(-np.pi, np.pi, 200), np.arcsin(RNG.uniform(-1, 1, 200))

@@ -12,7 +12,7 @@ import pytest
 
 import nerg_mi
 from nerg_mi.errors import NergError
-from nerg_mi.figures.provenance import files_among, provenance
+from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.jobs.options.bake import BakeOptions
 from nerg_mi.jobs.options.pictures import PictureOptions
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.figures.ray_figures import floor_plan, layout_figure
-from nerg_mi.figures.sheet import DPI
+from nerg_mi.figures.maps import floor_plan, layout_figure
+from nerg_mi.figures.style import DPI
 from nerg_mi.rays.rays import Rays
 
 

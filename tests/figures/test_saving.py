@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import Heat, overlay
-from nerg_mi.figures.plots import gaze_figure
-from nerg_mi.figures.provenance import Provenance
-from nerg_mi.figures.saving import encode, rasterize, save
+from nerg_mi.figures.overlay import Heat, gaze_figure, overlay
+from nerg_mi.figures.style import Provenance, encode, rasterize, save
 
 RNG = np.random.default_rng(3)
 COLOR, GAZE = RNG.random((160, 200, 3)), RNG.random((160, 200))

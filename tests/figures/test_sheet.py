@@ -7,10 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from nerg_mi.figures.overlay import Heat, scale_strip
-from nerg_mi.figures.plots import gaze_figure
-from nerg_mi.figures.saving import rasterize
-from nerg_mi.figures.sheet import Sheet, even, wrap
+from nerg_mi.figures.overlay import Heat, gaze_figure, scale_strip
+from nerg_mi.figures.style import Sheet, even, rasterize, wrap
 
 SIZES = [(320, 480), (60, 1200), (500, 60), (16, 24), (1, 1), (900, 1600), (3, 400)]
 

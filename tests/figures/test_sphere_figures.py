@@ -7,8 +7,8 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat
-from nerg_mi.figures.saving import encode
-from nerg_mi.figures.sphere_figures import sphere_figure
+from nerg_mi.figures.sphere import sphere_figure
+from nerg_mi.figures.style import encode
 from nerg_mi.transport.geometry import pixel_directions
 
 HEIGHT, WIDTH = 90, 180

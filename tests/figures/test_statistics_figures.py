@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.figures.saving import rasterize
-from nerg_mi.figures.statistics_figures import map_figure, moves_figure, things_figure
+from nerg_mi.figures.statistics import map_figure, moves_figure, things_figure
+from nerg_mi.figures.style import rasterize
 
 
 def row(thing, source, share):

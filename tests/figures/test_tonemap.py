@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerg_mi.figures.tonemap import srgb, to_bytes, write_png
+from nerg_mi.figures.overlay import srgb, to_bytes, write_png
 
 
 def test01_srgb_against_known_values():

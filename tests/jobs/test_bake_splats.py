@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.colors import color_values
+from nerg_mi.figures.style import color_values
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.splats.files import read_splats
 from nerg_mi.formats.splats.ply import write_ply_splats

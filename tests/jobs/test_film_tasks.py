@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlays import find_overlay
+from nerg_mi.figures.overlay import find_overlay
 from nerg_mi.jobs.film_tasks import OF_PICTURES, draw_layers, make_layers, make_picture
 from nerg_mi.jobs.options.pictures import PictureOptions
 from nerg_mi.jobs.pictures import render_file

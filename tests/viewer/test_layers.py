@@ -7,9 +7,8 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
-from nerg_mi.figures.hatching import LINE, lines
-from nerg_mi.figures.overlay import Heat, overlay
-from nerg_mi.figures.tonemap import to_bytes
+from nerg_mi.figures.overlay import Heat, overlay, to_bytes
+from nerg_mi.figures.style import LINE, lines
 from nerg_mi.rendering.scene_gaze import with_gaze
 from nerg_mi.viewer import layers
 from nerg_mi.viewer.layers import LAYERS, Scale

@@ -7,10 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.figures.colors import find_colors
-from nerg_mi.figures.provenance import Provenance
-from nerg_mi.figures.saving import save
-from nerg_mi.figures.sheet import new_page
+from nerg_mi.figures.style import Provenance, find_colors, new_page, save
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.figures.provenance import Provenance
-from nerg_mi.figures.saving import save
-from nerg_mi.figures.sheet import new_page
+from nerg_mi.figures.style import Provenance, new_page, save
 
 from .settings import PAPER
 from .tables import comparable

@@ -8,7 +8,7 @@ import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
-from nerg_mi.figures.colors import find_colors
+from nerg_mi.figures.style import find_colors
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.jobs.gaze_places import align_of_training
 from nerg_mi.jobs.options.bake import BakeOptions

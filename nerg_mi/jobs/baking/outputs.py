@@ -12,7 +12,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat, overlay
-from nerg_mi.figures.provenance import Provenance
+from nerg_mi.figures.style import Provenance
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.png import encode_png
 from nerg_mi.files.tables import write_csv, write_json

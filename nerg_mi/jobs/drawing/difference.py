@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.colors import find_colors
-from nerg_mi.figures.plots import difference_figure
+from nerg_mi.figures.overlay import difference_figure
+from nerg_mi.figures.style import find_colors
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import VALUES, Checked

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.figures.provenance import provenance
-from nerg_mi.figures.saving import FORMATS, save
+from nerg_mi.figures.style import FORMATS, provenance, save
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.jobs.reporter import SILENT, Reporter
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.floor_figures import Sight, Walk, floor_figure
+from nerg_mi.figures.maps import Sight, Walk, floor_figure
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import COORDINATES, Checked, Range

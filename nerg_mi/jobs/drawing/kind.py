@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.colors import find_colors
-from nerg_mi.figures.overlays import Overlay, Style
+from nerg_mi.figures.overlay import Overlay, Style
+from nerg_mi.figures.style import find_colors
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import DECADES, SEEDS, SPP, VALUES, Checked, Range

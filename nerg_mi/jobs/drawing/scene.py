@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlays import Layers, Overlay
+from nerg_mi.figures.overlay import Layers, Overlay
 from nerg_mi.interruption import Interruption
 from nerg_mi.jobs.overlays import layers_of
 from nerg_mi.jobs.reporter import Reporter

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.figures.contact_sheet import contact_sheet, shrink
 from nerg_mi.figures.overlay import Heat, overlay, top_of
+from nerg_mi.figures.sheets import contact_sheet, shrink
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import Range
@@ -65,7 +65,7 @@ def draw(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> Dr
 
 def _display(path: Path) -> np.ndarray:
     """The picture as it is shown (h, w, 3), in 0..1."""
-    from nerg_mi.figures.tonemap import srgb
+    from nerg_mi.figures.overlay import srgb
     from nerg_mi.photos.images import read_image
     from nerg_mi.rendering.pictures import activate
 

@@ -8,10 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.figures.overlay import Heat
-from nerg_mi.figures.overlays import find_overlay, shared_limits, unknown_of
-from nerg_mi.figures.projections import find_projection
-from nerg_mi.figures.sphere_figures import sphere_figure
+from nerg_mi.figures.overlay import Heat, find_overlay, shared_limits, unknown_of
+from nerg_mi.figures.sphere import find_projection, sphere_figure
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import Range

@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import Heat
-from nerg_mi.figures.overlays import find_overlay, shared_limits
-from nerg_mi.figures.plots import occlusion_figure
+from nerg_mi.figures.overlay import Heat, find_overlay, occlusion_figure, shared_limits
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import Range

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.figures.floor_figures import Walls
+from nerg_mi.figures.maps import Walls
 from nerg_mi.transport.geometry import Place, trace_depth
 
 CELLS = 360

@@ -8,13 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.figures import plots, ray_figures
-from nerg_mi.figures.overlay import Heat, top_of
-from nerg_mi.figures.overlays import Layers, unknown_of
-from nerg_mi.figures.provenance import Provenance
-from nerg_mi.figures.saving import encode
-from nerg_mi.figures.sphere_figures import sphere_figure
-from nerg_mi.figures.tonemap import srgb, to_bytes
+from nerg_mi.figures import maps, overlay
+from nerg_mi.figures.overlay import Heat, Layers, srgb, to_bytes, top_of, unknown_of
+from nerg_mi.figures.sphere import sphere_figure
+from nerg_mi.figures.style import Provenance, encode
 from nerg_mi.files.png import encode_png
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.channels import Channels
@@ -62,7 +59,7 @@ def pictures_of_views(views: Views, top: float | None, place_known: bool, about:
     def draw(name: str, title: str) -> bytes:
         of = views.layers(name)
         arrays = of.color, of.values, of.mask
-        drawn = plots.gaze_figure(*arrays, heat, title, marker=of.marker, unknown=hatched(of), note=of.basis)
+        drawn = overlay.gaze_figure(*arrays, heat, title, marker=of.marker, unknown=hatched(of), note=of.basis)
         return encode(drawn, ".png", text)
 
     if place_known:
@@ -92,7 +89,7 @@ def _spread(of: Layers, text: Mapping[str, str]) -> Picture:
     heat = Heat(top_of(of.values, of.mask), colors="viridis")
     label = "standard deviation of the gaze [1/sr]"
     arrays = of.color, of.values, of.mask
-    drawn = plots.gaze_figure(
+    drawn = overlay.gaze_figure(
         *arrays, heat, "Where the fields disagree", label, unknown=unknown_of(of, True), note=of.basis
     )
     return Picture(
@@ -104,13 +101,13 @@ def _spread(of: Layers, text: Mapping[str, str]) -> Picture:
 
 def pictures_of_rays(rays: Rays, test: Mapping[str, Any] | None, about: Provenance) -> dict[str, Picture]:
     """Plans of the floor. ``test``: what was held out of the training; ``about``: what the header of each says."""
-    plan = encode(ray_figures.floor_plan(rays), ".png", about.text())
+    plan = encode(maps.floor_plan(rays), ".png", about.text())
     held_out = {}
     words = "Each ray's place."
     if test and test.get("centres"):
         held_out = {"centres": np.array(test["centres"], float), "radius": float(test.get("radius", 0.25))}
         words += " Circles: positions that were held out of the training."
-    layout = encode(ray_figures.layout_figure(rays, title="Rays", **held_out), ".png", about.text())
+    layout = encode(maps.layout_figure(rays, title="Rays", **held_out), ".png", about.text())
     return {
         "plan": Picture(plan, "Plan of how densely the floor is walked.", "How densely the floor is walked."),
         "layout": Picture(layout, "Plan of the places of all rays.", words),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.colors import color_values
+from nerg_mi.figures.style import color_values
 from nerg_mi.files.exr import write_exr
 from nerg_mi.jobs.drawing.draw import draw
 

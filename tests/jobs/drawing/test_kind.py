@@ -3,7 +3,7 @@
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlays import Style, find_overlay
+from nerg_mi.figures.overlay import Style, find_overlay
 from nerg_mi.jobs.drawing.kind import ScaleOptions, need_scale
 
 

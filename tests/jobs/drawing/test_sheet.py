@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import top_of
-from nerg_mi.figures.tonemap import srgb, write_png
+from nerg_mi.figures.overlay import srgb, top_of, write_png
 from nerg_mi.jobs.drawing.draw import draw
 
 from .test_files import COLOR, GAZE, OPACITY, write

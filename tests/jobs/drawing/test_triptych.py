@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlays import find_overlay
+from nerg_mi.figures.overlay import find_overlay
 from nerg_mi.jobs.drawing import scene as scenes
 from nerg_mi.jobs.drawing.draw import draw
 from nerg_mi.jobs.drawing.kind import SceneOptions

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.style import provenance
 from nerg_mi.jobs.reports.pictures import Views, gaze_top, pictures_of_rays, pictures_of_views
 from tests.evaluation.gaze.test_evaluation import crowd
 

@@ -1,4 +1,4 @@
-"""Several pictures on one page."""
+"""Contact sheets of several pictures."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from .overlay import Heat
-from .plots import add_scale
-from .sheet import Sheet
+from .overlay import Heat, add_scale
+from .style import Sheet
 
 
 def contact_sheet(

@@ -1,7 +1,4 @@
-"""Numbers of attention as pictures: bars with intervals for things, a matrix of moves, a map of what is seen.
-
-Each returns a matplotlib ``Figure``; `saving.save` writes it. Rows are those of the tables, as dicts.
-"""
+"""Figures of statistics: shares of areas with their intervals."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ import numpy as np
 
 from nerg_mi.statistics.tables import is_too_low
 
-from .sheet import INK, new_page
+from .style import INK, new_page
 
 MOST = 40
 """So many things are drawn, those of the greatest share."""

@@ -1,0 +1,494 @@
+"""Figures of a place from above and of rays in it: alignment, cameras, floors, rays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+
+from .style import INK, PAPER, SMALL, TITLE, new_page, wrap
+
+# ---- Alignment figures ----
+#
+# How tracking lies in a place, before and after it is aligned: from above and from the side.
+
+
+_PLACE, _HITS, _HEADS, _WANTED = "#b9b4aa", "#d9730d", "#2b6cb0", "#1c7c3c"
+_MOST = 20_000  # points drawn of a kind; more of them only hide each other
+_SIDE = 420
+
+
+def alignment_figure(
+    place: np.ndarray | None,
+    points: np.ndarray,
+    heads: np.ndarray | None,
+    matrix: np.ndarray,
+    targets: np.ndarray | None = None,
+    title: str = "Alignment",
+    cut: float | None = None,
+):
+    """``points`` (N, 3) and ``heads`` (M, 3) of the tracking as they are and by ``matrix`` (4, 4), over points (K, 3)
+    of the ``place`` and the ``targets`` (N, 3) that they belong to; all z up.
+
+    ``cut``: height above which the place is left out of the plans from above, so that no ceiling hides it.
+    """
+    figure = new_page(2 * _SIDE, 2 * _SIDE + 60)
+    moved = lambda p: p @ matrix[:3, :3].T + matrix[:3, 3]
+    rows = ((points, heads, "before"), (moved(points), None if heads is None else moved(heads), "after"))
+    for line, (p, h, when) in zip(figure.subplots(2, 2), rows):
+        for axes, (a, b), view in zip(line, ((0, 1), (0, 2)), ("from above", "from the side")):
+            shown = place
+            if shown is not None and cut is not None and b == 1:
+                shown = shown[shown[:, 2] < cut]
+            _dots(axes, shown, (a, b), _PLACE, 1.2, "the place")
+            _dots(axes, targets, (a, b), _WANTED, 30, "where they belong", "+")
+            _dots(axes, p, (a, b), _HITS, 2 if len(p) > 100 else 14, "hit points" if h is not None else "points")
+            _dots(axes, h, (a, b), _HEADS, 2, "heads")
+            _frame(axes, [v for v in (shown, targets, p, h) if v is not None and len(v)], (a, b))
+            axes.set_title(f"{when}, {view}", fontsize=9, color=INK, loc="left")
+            axes.set_xlabel("xyz"[a], fontsize=7, color=INK, labelpad=1)
+            axes.set_ylabel("xyz"[b], fontsize=7, color=INK, labelpad=1)
+            axes.tick_params(labelsize=7, colors=INK, length=2)
+    figure.axes[0].legend(fontsize=7, frameon=False, markerscale=5, loc="upper right")
+    figure.suptitle(title, fontsize=10, color=INK)
+    figure.tight_layout()
+    return figure
+
+
+def _dots(axes, points: np.ndarray | None, at: tuple[int, int], color: str, size: float, name: str, mark=".") -> None:
+    if points is None or not len(points):
+        return
+    some = points[np.random.default_rng(0).permutation(len(points))[:_MOST]]
+    edge = 0 if mark == "." else 1
+    x, y = some[:, at].T
+    axes.scatter(x, y, s=size, c=color, marker=mark, linewidths=edge, label=name, rasterized=True)
+
+
+def _frame(axes, parts: Sequence[np.ndarray], at: tuple[int, int]) -> None:
+    """Axes of equal scale that hold all parts but for their strays."""
+    low = np.min([np.percentile(p[:, at], 1, axis=0) for p in parts], axis=0)
+    high = np.max([np.percentile(p[:, at], 99, axis=0) for p in parts], axis=0)
+    edge = 0.06 * max(float(np.max(high - low)), 1e-9)
+    axes.set_xlim(low[0] - edge, high[0] + edge)
+    axes.set_ylim(low[1] - edge, high[1] + edge)
+    axes.set_aspect("equal", adjustable="box")
+
+
+# ---- Camera figures ----
+#
+# Where pictures were taken: cameras and points of a place, from above and from the side.
+
+
+_CAMERA, _PATH = "#c0392b", "#e2a49c"
+_MOST_POINTS = 40_000  # drawn; more of them only hide each other
+_CAMERA_FIGURES_SIDE = 520  # pixels of each of the two plans
+
+
+def camera_figure(to_world: np.ndarray, points: np.ndarray, colors: np.ndarray, title: str):
+    """OpenGL camera-to-world poses (N, 4, 4), as wedges that open to where they look, and ``points`` (M, 3) in their
+    ``colors`` (M, 3), uint8: x and y from above, x and z from the side, +z up. Lengths are in units of the poses.
+
+    Points far beyond the others are left out of the plans.
+    """
+    figure = new_page(2 * _CAMERA_FIGURES_SIDE, _CAMERA_FIGURES_SIDE + 50)
+    centers = to_world[:, :3, 3]
+    low, high = _bounds(centers, points)
+    size = 0.04 * float(np.max(high - low)) or 1.0
+    near = np.all((points >= low) & (points <= high), axis=1)
+    points, colors = points[near], colors[near]
+    if len(points) > _MOST_POINTS:
+        some = np.random.default_rng(0).choice(len(points), _MOST_POINTS, replace=False)
+        points, colors = points[some], colors[some]
+    for axes, (a, b), name in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side")):
+        axes.scatter(points[:, a], points[:, b], s=1.5, c=colors / 255.0, linewidths=0, rasterized=True)
+        axes.plot(centers[:, a], centers[:, b], color=_PATH, linewidth=0.6)
+        for pose in to_world:
+            wedge = (np.array([[0, 0, 0], [-0.6, 0, -1], [0.6, 0, -1], [0, 0, 0]]) * size) @ pose[:3, :3].T + pose[
+                :3, 3
+            ]
+            axes.plot(wedge[:, a], wedge[:, b], color=_CAMERA, linewidth=0.8)
+        axes.set_aspect("equal")
+        axes.set_title(name, fontsize=9, color=INK)
+        axes.set_xlabel("xyz"[a], fontsize=8, color=INK)
+        axes.set_ylabel("xyz"[b], fontsize=8, color=INK)
+        axes.set_xlim(low[a] - size, high[a] + size)
+        axes.set_ylim(low[b] - size, high[b] + size)
+        axes.tick_params(labelsize=7, colors=INK, length=2)
+    figure.suptitle(title, fontsize=10, color=INK)
+    figure.tight_layout()
+    return figure
+
+
+def _bounds(centers: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners that hold all cameras, and the points but for those far off."""
+    low, high = centers.min(axis=0), centers.max(axis=0)
+    if len(points):
+        lower, upper = np.quantile(points, [0.05, 0.95], axis=0)
+        low, high = np.minimum(low, lower - 0.1 * (upper - lower)), np.maximum(high, upper + 0.1 * (upper - lower))
+    return low, high
+
+
+# ---- Floor figures ----
+#
+# The floor plan of a place: what stands there, where people walked, what they looked at and what they could see.
+#
+# Axes are in metres, x to the right and y up, z the height; +z is up.
+
+
+PEOPLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#332288")
+"""Colours of people, which can be told apart with any kind of colour blindness (Okabe and Ito; Tol), and in grey by
+their lightness as far as eight can."""
+
+_FLOOR_FIGURES_SIDE = 720  # pixels of the plan's longer side
+_LEFT, _FOOT, _RIGHT = 56, 50, 16
+_GREYS = (0.94, 0.62)  # of the lowest and of the highest things below the cut
+_CUT = 0.25
+_NAMED = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Walls:
+    """A place cut at a height. ``low``, ``high`` (2,): corners of the grid on the floor; ``height`` (ny, nx): that of
+    what is met below the cut, NaN where nothing is; ``cut`` (ny, nx), bool: where the cut goes through something. Rows
+    from the least y on. ``level``: the height of the cut."""
+
+    low: np.ndarray
+    high: np.ndarray
+    height: np.ndarray
+    cut: np.ndarray
+    level: float
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """Where a person was: ``places`` (N, 2) in the order of time, ``breaks`` (N,) bool where a new walk begins."""
+
+    name: str
+    places: np.ndarray
+    breaks: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """``origins`` (N, 2), and unit ``directions`` (N, 2) or ``ends`` (N, 2) on the floor, of the people numbered
+    ``person`` (N,)."""
+
+    origins: np.ndarray
+    ends: np.ndarray
+    person: np.ndarray
+
+
+def floor_figure(
+    low: np.ndarray,
+    high: np.ndarray,
+    walls: Walls | None = None,
+    walks: list[Walk] | None = None,
+    rays: Sight | None = None,
+    fields: Sight | None = None,
+    fov: float = 60.0,
+    title: str = "Floor plan",
+) -> Any:
+    """The plan between the corners ``low`` and ``high`` (2,), metres.
+
+    ``walks``: paths, a colour a person; ``rays``: lines from eyes to what was looked at; ``fields``: fields of view
+    ``fov`` degrees wide, as wedges that end where the sight does. Each kind is explained by a legend.
+    """
+    size = np.asarray(high, float) - low
+    pixels = np.maximum(size / size.max() * _FLOOR_FIGURES_SIDE, 200)
+    names = _legend_entries(walls, walks or [], rays, fields, fov)
+    columns = max(int(pixels[0] // 190), 1)
+    head = 30 + 17 * -(-len(names) // columns)
+    width, height = _LEFT + pixels[0] + _RIGHT, _FOOT + pixels[1] + head
+    page = new_page(width, height)
+    axes = page.add_axes((_LEFT / width, _FOOT / height, pixels[0] / width, pixels[1] / height))
+    if walls is not None:
+        extent = (walls.low[0], walls.high[0], walls.low[1], walls.high[1])
+        axes.imshow(_plan(walls), origin="lower", extent=extent, interpolation="nearest", zorder=0)
+    if fields is not None:
+        _draw_fields(axes, fields, fov)
+    if rays is not None:
+        _draw_rays(axes, rays)
+    for k, walk in enumerate(walks or []):
+        starts = walk.places[walk.breaks]
+        axes.plot(*_with_gaps(walk).T, color=color_of(k), linewidth=1.4, zorder=4, solid_joinstyle="round")
+        axes.plot(
+            *starts.T, "o", color=color_of(k), markersize=3.5, markeredgecolor=PAPER, markeredgewidth=0.6, zorder=5
+        )
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x [m]", fontsize=SMALL, color=INK)
+    axes.set_ylabel("y [m]", fontsize=SMALL, color=INK)
+    axes.tick_params(labelsize=SMALL, colors=INK, length=2)
+    for spine in axes.spines.values():
+        spine.set_linewidth(0.5)
+    page.text(_LEFT / width, 1 - 8 / height, wrap(title, pixels[0], TITLE), fontsize=TITLE, color=INK, va="top")
+    if names:
+        handles = [axes.plot([], [], label=name, **how)[0] for name, how in names]
+        where = dict(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.3, columnspacing=1.4)
+        axes.legend(handles=handles, fontsize=SMALL, frameon=False, ncols=columns, handletextpad=0.5, **where)
+    return page
+
+
+def color_of(person: int) -> str:
+    """The colour of the person with this number; those beyond the last colour begin anew."""
+    return PEOPLE[person % len(PEOPLE)]
+
+
+def _with_gaps(walk: Walk) -> np.ndarray:
+    """The places of a walk with a NaN before each at which a new one begins."""
+    return np.insert(walk.places.astype(float), np.flatnonzero(walk.breaks), np.nan, axis=0)
+
+
+def _plan(walls: Walls) -> np.ndarray:
+    """Greys (ny, nx, 3): the higher the darker, white where nothing is met, and darkest where the cut goes through."""
+    share = np.clip(np.nan_to_num(walls.height) / walls.level, 0.0, 1.0)
+    grey = _GREYS[0] + share * (_GREYS[1] - _GREYS[0])
+    grey = np.where(np.isnan(walls.height), 1.0, grey)
+    return np.repeat(np.where(walls.cut, _CUT, grey)[..., None], 3, axis=-1)
+
+
+def _draw_rays(axes: Any, rays: Sight) -> None:
+    from matplotlib.collections import LineCollection
+
+    lines = np.stack([rays.origins, rays.ends], axis=1)
+    colors = [color_of(k) for k in rays.person]
+    axes.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.6, alpha=0.45, zorder=3))
+    axes.scatter(*rays.ends.T, s=5, c=colors, linewidths=0, zorder=3.5)
+
+
+def _draw_fields(axes: Any, fields: Sight, fov: float) -> None:
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Wedge
+
+    along = fields.ends - fields.origins
+    angle, reach = np.degrees(np.arctan2(along[:, 1], along[:, 0])), np.linalg.norm(along, axis=1)
+    wedges = [Wedge(tuple(o), r, a - fov / 2, a + fov / 2) for o, r, a in zip(fields.origins, reach, angle)]
+    colors = [color_of(k) for k in fields.person]
+    axes.add_collection(
+        PatchCollection(wedges, facecolor=colors, edgecolor=colors, alpha=0.22, linewidth=0.7, zorder=2)
+    )
+
+
+def _legend_entries(
+    walls: Walls | None, walks: list[Walk], rays: Sight | None, fields: Sight | None, fov: float
+) -> list[tuple[str, dict[str, Any]]]:
+    square = dict(linestyle="none", marker="s", markersize=6)
+    found: list[tuple[str, dict[str, Any]]] = []
+    if walls is not None:
+        found.append((f"cut at {walls.level:g} m", {**square, "color": str(_CUT)}))
+        found.append(("lower things", {**square, "color": str(_GREYS[1])}))
+        if np.isnan(walls.height[~walls.cut]).any():
+            edge = dict(color=PAPER, markeredgecolor="0.6", markeredgewidth=0.6)
+            found.append(("nothing below", {**square, **edge}))
+    for k, walk in enumerate(walks[:_NAMED]):
+        found.append(
+            (walk.name if len(walk.name) <= 22 else walk.name[:21] + "…", dict(color=color_of(k), linewidth=1.4))
+        )
+    if len(walks) > _NAMED:
+        found.append((f"and {len(walks) - _NAMED} more people", dict(color="none")))
+    if rays is not None:
+        found.append(("to what was looked at", dict(color="0.4", linewidth=0.8, marker="o", markersize=2.5)))
+    if fields is not None:
+        found.append((f"field of view, {fov:g}°", {**square, "color": "0.75"}))
+    return found
+
+
+# ---- Ray figures ----
+#
+# Rays from above: how densely a floor is walked, and the layout with every ray's place.
+#
+# Both return a matplotlib ``Figure`` with axes in metres, x to the right and y up; ``figures.save`` writes it. pyplot
+# stays out of it.
+
+
+_POINTS, _SURFACES = "#2b6cb0", "#b9b4aa"
+_RAY_FIGURES_MOST_POINTS = 60_000  # drawn; more of them only hide each other
+_MOST_CELLS = 4_000_000
+_RAY_FIGURES_SIDE = 640  # pixels of the plan's longer side
+
+
+def floor_plan(rays, cell: float | None = None, title: str = "Where people stood"):
+    """Density of the rays' origins on the floor, in rays/m², on a logarithmic scale; cells without a ray stay white,
+    as the scale says.
+
+    ``cell``: edge of a cell in metres (default: a fiftieth of the plan's shorter side, 5 cm at least). Short lines show
+    where the people of a coarser cell look on average; the longer, the more they agree. Raises `NergError` for no rays,
+    and for cells that are no length or too many.
+    """
+    from matplotlib.colors import LogNorm
+
+    xy = rays.origin[:, :2]
+    low, high = _box(xy)
+    size = high - low
+    cell = max(0.05, round(float(size.min()) / 50, 2)) if cell is None else cell
+    if not 0 < cell < np.inf:
+        raise NergError(f"the edge of a cell is a positive length in metres, got {cell:g} (--cell)")
+    if not np.prod(size / cell + 1) <= _MOST_CELLS:
+        raise NergError(
+            f"a plan of {size[0]:.4g} x {size[1]:.4g} m has more than {_MOST_CELLS:,} cells of {cell:g} m; name "
+            "larger ones (--cell)"
+        )
+    edges = [np.arange(a, b + cell, cell) for a, b in zip(low, high)]
+    counts, *_ = np.histogram2d(xy[:, 0], xy[:, 1], edges)
+    density = np.ma.masked_equal(counts.T / cell**2, 0)
+    figure, axes = _sheet(low, high, f"{title}: {_of(rays)}", bar=True)
+    top = float(density.max())
+    bottom = max(float(density.min()), top * 1e-4)
+    image = axes.pcolormesh(
+        *edges, density, cmap="viridis", norm=LogNorm(bottom, max(top, bottom * 1.01)), rasterized=True
+    )
+    _arrows(axes, rays, low, high)
+    bar = figure.colorbar(image, cax=figure.axes[1])
+    bar.set_label(f"rays/m² in cells of {cell:g} m; white: no ray", fontsize=7, color=INK)
+    bar.ax.tick_params(labelsize=7, colors=INK, length=2)
+    return figure
+
+
+def layout_figure(rays, test=None, centres=None, radius: float | None = None, title: str = "Layout"):
+    """The paper's layout figure: a point for every ray's place (blue) within the place and its dimensions in metres.
+
+    The place is drawn as what was looked at: hit points between knee and reach (0.3 to 2 m above the floor), in grey.
+    ``test``: rays held out, in orange. ``centres`` (T, 3) with ``radius``: test positions, as circles.
+    """
+    points = [rays.origin[:, :2]] + ([] if test is None else [test.origin[:, :2]])
+    walls = _walls([rays] if test is None else [rays, test])
+    low, high = _box(np.concatenate([*points, *([] if walls is None else [walls])]))
+    figure, axes = _sheet(low, high, f"{title}: {_of(rays, test)}", pad=0.13)
+    if walls is not None:
+        axes.plot(*_some(walls).T, ",", color=_SURFACES, rasterized=True, zorder=1)
+    for xy, color in zip(points, (_POINTS, "#d9730d")):
+        size = 3.5 - 0.5 * np.log10(max(len(xy), 10))  # few points are drawn larger
+        axes.plot(
+            *_some(xy).T, ".", markersize=max(size, 1.1), markeredgewidth=0, color=color, rasterized=True, zorder=2
+        )
+    if centres is not None and radius is not None:
+        from matplotlib.collections import PatchCollection
+        from matplotlib.patches import Circle
+
+        circles = [Circle(c, radius) for c in np.asarray(centres)[:, :2]]
+        axes.add_collection(PatchCollection(circles, facecolor="#d9730d", edgecolor="none", alpha=0.02, zorder=1.5))
+    first, last = _box(np.concatenate(points), margin=0.0)
+    _dimension(axes, first, last)
+    names = [(_POINTS, "rays" if test is None else "training rays")]
+    names += ([] if test is None else [("#d9730d", "test rays")]) + (
+        [] if walls is None else [(_SURFACES, "what was looked at")]
+    )
+    handles = [axes.plot([], [], "s", markersize=5, color=color, label=name)[0] for color, name in names]
+    axes.legend(
+        handles=handles,
+        fontsize=7,
+        frameon=False,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=3,
+        borderaxespad=0.2,
+        handletextpad=0.1,
+    )
+    return figure
+
+
+def _walls(sets) -> np.ndarray | None:
+    hits = [r.hit[np.isfinite(r.hit).all(axis=1)] for r in sets if r.hit is not None]
+    found = [h[(h[:, 2] > 0.3) & (h[:, 2] < 2.0), :2] for h in hits]
+    found = [f for f in found if len(f)]
+    if not found:
+        return None
+    walls = np.concatenate(found)
+    # A glance through a gap ends tens of metres away.
+    low, high = np.percentile(walls, [1, 99], axis=0)
+    return walls[((walls >= low) & (walls <= high)).all(axis=1)]
+
+
+def _box(xy: np.ndarray, margin: float = 0.03) -> tuple[np.ndarray, np.ndarray]:
+    if not len(xy):
+        raise NergError("there are no rays to draw; select fewer away")
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    edge = np.maximum(margin * (high - low).max(), 0.05 if margin else 0.0)
+    return low - edge, high + edge
+
+
+def _some(xy: np.ndarray) -> np.ndarray:
+    return (
+        xy
+        if len(xy) <= _RAY_FIGURES_MOST_POINTS
+        else xy[np.random.default_rng(0).choice(len(xy), _RAY_FIGURES_MOST_POINTS, replace=False)]
+    )
+
+
+def _of(rays, test=None) -> str:
+    people = np.unique(
+        np.concatenate([np.asarray(rays.persons)[np.unique(r.person)] for r in (rays, test) if r is not None])
+    ).size
+    count = f"{len(rays):,} rays" if test is None else f"{len(rays):,} + {len(test):,} rays"
+    return f"{count} of {people} {'person' if people == 1 else 'people'}"
+
+
+def _arrows(axes, rays, low, high) -> None:
+    step = float((high - low).max()) / 24
+    at = np.floor((rays.origin[:, :2] - low) / step).astype(int)
+    width = int(np.ceil((high - low)[0] / step)) + 1
+    _, cell, count = np.unique(at[:, 1] * width + at[:, 0], return_inverse=True, return_counts=True)
+    mean = lambda v: np.stack([np.bincount(cell, weights=c) for c in v.T], axis=1) / count[:, None]
+    place, level = mean(rays.origin[:, :2]), mean(rays.direction[:, :2])
+    enough = count >= max(20, len(rays) * 1e-4)
+    place, level = place[enough], level[enough]
+    axes.quiver(
+        *place.T,
+        *(level.T * step),
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        width=0.0028,
+        color="white",
+        edgecolor=INK,
+        linewidth=0.4,
+        headwidth=4,
+        headlength=4,
+        headaxislength=3.5,
+        zorder=3,
+    )
+
+
+def _dimension(axes, low, high) -> None:
+    """Lines along two sides that say how far the rays reach."""
+    x0, x1 = axes.get_xlim()
+    y0, y1 = axes.get_ylim()
+    line = dict(
+        arrowprops=dict(arrowstyle="|-|, widthA=0.25, widthB=0.25", color=INK, linewidth=0.8, shrinkA=0, shrinkB=0)
+    )
+    y, x = y0 + 0.045 * (y1 - y0), x1 - 0.045 * (x1 - x0)
+    axes.annotate("", (low[0], y), (high[0], y), **line)
+    axes.annotate("", (x, low[1]), (x, high[1]), **line)
+    text = dict(fontsize=7, color=INK, ha="center", va="center", bbox=dict(facecolor=PAPER, edgecolor="none", pad=1))
+    axes.text(0.5 * (low[0] + high[0]), y, f"{high[0] - low[0]:.2f} m", **text)
+    axes.text(x, 0.5 * (low[1] + high[1]), f"{high[1] - low[1]:.2f} m", rotation=90, **text)
+
+
+def _sheet(low, high, title: str, bar: bool = False, pad: float = 0.0):
+    """A figure with axes in metres, of equal scale: so large that the plan's longer side has a fixed number of
+    pixels. ``bar``: the figure's second axes are those of a colour bar."""
+    # Room for the lines of dimension, outside of what they measure.
+    room = pad * (high - low).max()
+    low, high = low - (0, room), high + (room, 0)
+    size = np.maximum((high - low) / (high - low).max() * _RAY_FIGURES_SIDE, 160)
+    left, foot, head, right = 48, 40, 46, 96 if bar else 14
+    width, height = left + size[0] + right, foot + size[1] + head
+    figure = new_page(width, height)
+    axes = figure.add_axes((left / width, foot / height, size[0] / width, size[1] / height))
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x [m]", fontsize=7, color=INK)
+    axes.set_ylabel("y [m]", fontsize=7, color=INK)
+    axes.tick_params(labelsize=7, colors=INK, length=2)
+    for spine in axes.spines.values():
+        spine.set_linewidth(0.5)
+    axes.set_title(title, fontsize=9, color=INK, loc="left", pad=19 if not bar else 6)
+    if bar:
+        figure.add_axes(((left + size[0] + 12) / width, foot / height, 12 / width, size[1] / height))
+    return figure, axes
