@@ -29,7 +29,7 @@ def command(
     The page is served to this machine alone, until Ctrl-C; nothing is fetched from anywhere else. At another --host its
     address has a token.
     """
-    from nerg_mi.viewer import serving
+    from nerg_mi.viewer import serve
 
     with TerminalReporter() as reporter:
-        serving.view_files(files, options, reporter)
+        serve.view_files(files, options, reporter)

@@ -1,4 +1,4 @@
-"""What can be shown, and how its values become colour: in pictures and on points alike."""
+"""Layers that the viewer shows."""
 
 from __future__ import annotations
 

@@ -1,18 +1,18 @@
-"""What is viewed, whoever looks: the scene, its observer, the layer that is shown, and the tasks that compute them.
-
-All of Mitsuba and Dr.Jit is used on the thread of the `Worker`. What is found is told to a `Listener`, on that thread.
-"""
+"""A session of the viewer: its state, the worker that renders, tracks of people, and sharing."""
 
 from __future__ import annotations
 
+import itertools
 import threading
-from collections.abc import Callable, Hashable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from nerg_mi.api.attention import box_shares, mesh_shares
 from nerg_mi.api.queries import trace
 from nerg_mi.api.scene import Scene
 from nerg_mi.api.variant import active_mitsuba
@@ -24,19 +24,304 @@ from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.overlays import basis_words
 from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.jobs.view import PlaceToView
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.probes.probes import place_probes
 from nerg_mi.ranges import FARTHEST
+from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.statistics.shares import ROUGH
 from nerg_mi.transport.geometry import Ceiling
 
 from . import layers
 from .layers import Layer, Scale, Shade
-from .listener import Listener
-from .proxy import Points, Proxy, bake, gather, way_out
-from .refining import SIZES, Pace, Picture, filled, refine
-from .sharing import shares_in_steps
-from .tracks import Tracks
-from .view import View, ahead_of, heading_of
-from .worker import Worker
+from .points import (
+    SIZES,
+    Pace,
+    Picture,
+    Points,
+    Proxy,
+    View,
+    ahead_of,
+    bake,
+    filled,
+    gather,
+    heading_of,
+    refine,
+    rough_integrals,
+    way_out,
+)
+
+# ---- What a session tells of what it finds ----
+
+
+class Listener(Protocol):
+    """Whoever shows what a session finds."""
+
+    def on_proxy(self) -> None:
+        """There are points, or more of them."""
+        ...
+
+    def on_baked(self) -> None:
+        """The points have the gaze of the observer."""
+        ...
+
+    def on_shares(self) -> None:
+        """The shares of attention are those of the observer."""
+        ...
+
+    def on_range(self) -> None:
+        """The automatic range of the layer that is shown is another one."""
+        ...
+
+    def on_error(self, error: BaseException) -> None:
+        """A task has failed."""
+        ...
+
+
+# ---- Shares of attention of named areas and shapes, in steps between which other work is done ----
+
+FACES = 1 << 17
+"""Faces of shapes whose shares are counted in one step, but for a shape that has more."""
+
+
+def shares_in_steps(
+    scene: Scene, at: np.ndarray, regions: Sequence[Region], shapes: Sequence[str]
+) -> Iterator[dict[str, float]]:
+    """The share of the observer at ``at`` (3,) of each of ``regions``, together, then of the meshes whose ids are
+    ``shapes``, so many at a time as a step can count."""
+    if regions:
+        boxes = box_shares(scene, regions, np.asarray(at, np.float32)[None], rule=ROUGH).share[0]
+        yield dict(zip([region.name for region in regions], boxes.tolist()))
+    for names in shape_groups(scene, shapes):
+        with rough_integrals(scene):
+            meshes = mesh_shares(scene, names, at, divisions=1, two_sided=True)
+        yield dict(zip(names, meshes.tolist()))
+
+
+def shape_groups(scene: Scene, shapes: Sequence[str]) -> Iterator[list[str]]:
+    """The ids ``shapes`` in groups of `FACES` faces at most, but for a shape that has more by itself."""
+    faces = {shape.id(): shape.face_count() for shape in scene.mitsuba.shapes() if shape.is_mesh()}
+    group: list[str] = []
+    for name in shapes:
+        if group and sum(faces[n] for n in [*group, name]) > FACES:
+            yield group
+            group = []
+        group.append(name)
+    if group:
+        yield group
+
+
+# ---- Tracks ----
+#
+# People of the rays: their paths, and where they are at a moment.
+
+
+VERTICES = 20_000
+"""Points of all paths together, at most: what a browser draws without effort."""
+
+GAP = 1.0
+"""Seconds without a ray that end a path, and that a person is still shown after the last one."""
+
+RAYS = 1 << 11
+"""Rays that are drawn at most."""
+
+PROBES = 512
+"""Probes that are drawn at most."""
+
+ALL = "everybody"
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """``person``, their eye ``at`` (3,) and ``ahead`` (3,), a unit vector, both in the place."""
+
+    person: str
+    at: np.ndarray
+    ahead: np.ndarray
+
+
+class Tracks:
+    """Rays in the place: ``align`` leads there from their own frame."""
+
+    def __init__(self, rays: Rays, align: Similarity):
+        order = np.lexsort((rays.t, rays.person))
+        self._rays = rays.select(order)
+        matrix = self._matrix = np.asarray(align.matrix, float)
+        turn = matrix[:3, :3] / align.scale
+        self.at = self._rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
+        self.ahead = self._rays.direction @ turn.T
+
+    @property
+    def times(self) -> tuple[float, float]:
+        """When the first ray and the last one are, in seconds."""
+        return (float(self._rays.t.min()), float(self._rays.t.max())) if len(self._rays) else (0.0, 0.0)
+
+    @property
+    def groups(self) -> list[str]:
+        """Everybody, and the cohorts."""
+        return [ALL, *self._rays.cohorts]
+
+    @property
+    def people(self) -> list[str]:
+        """Names of those who have rays."""
+        return [self._rays.persons[k] for k in np.unique(self._rays.person)]
+
+    def segments(self, group: str = ALL) -> tuple[np.ndarray, np.ndarray]:
+        """Line segments (S, 2, 3) of the paths of a cohort, and the person's number (S,) of each."""
+        rows = np.flatnonzero(self._of(group))
+        rows = rows[:: max(len(rows) // VERTICES, 1)]
+        person, t = self._rays.person[rows], self._rays.t[rows]
+        step = max(np.median(np.diff(t)) if len(t) > 1 else 0.0, 0.0)
+        if len(rows) < 2:
+            return np.zeros((0, 2, 3), np.float32), person[:0]
+        joined = (np.diff(person) == 0) & (np.diff(t) <= max(GAP, 4 * step))
+        pairs = np.stack([self.at[rows[:-1]], self.at[rows[1:]]], axis=1)[joined]
+        return pairs.astype(np.float32), person[:-1][joined]
+
+    def at_time(self, time: float, group: str = ALL) -> list[Pose]:
+        """Where those of a cohort are whose nearest ray is within `GAP` of ``time``."""
+        near = np.flatnonzero(self._of(group) & (np.abs(self._rays.t - time) <= GAP))
+        found = []
+        for person in np.unique(self._rays.person[near]):
+            own = near[self._rays.person[near] == person]
+            k = own[np.argmin(np.abs(self._rays.t[own] - time))]
+            found.append(Pose(self._rays.persons[person], self.at[k], self.ahead[k]))
+        return found
+
+    def sample(self, group: str = ALL, most: int = RAYS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Eyes (K, 3) and unit directions (K, 3) of ``most`` rays of a cohort at most, evenly through each person's
+        time, and the person's number (K,)."""
+        rows = np.flatnonzero(self._of(group))
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)] if len(rows) else rows
+        return self.at[rows], self.ahead[rows], self._rays.person[rows]
+
+    def probes(self, group: str = ALL) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (P, 3) in the place of the probes that a density of a cohort's rays would have by default, and how
+        many rays each holds (P,). Raises `NergError` where nobody stayed long enough for one."""
+        rows = np.flatnonzero(self._of(group))
+        found = place_probes(self._rays.select(rows), count=PROBES)
+        turn, shift = self._matrix[:3, :3], self._matrix[:3, 3]
+        return found.positions @ turn.T + shift, found.counts
+
+    def _of(self, group: str) -> np.ndarray:
+        if group == ALL or self._rays.cohort is None:
+            return np.ones(len(self._rays), bool)
+        return self._rays.cohort == self._rays.cohorts.index(group)
+
+
+# ---- One thread that does all rendering, in small steps, the most urgent first ----
+#
+# Dr.Jit is used from one thread at a time. A task is a generator: each of its steps is short, between two of them
+# another task may be more urgent, and whoever submits one under a name that is taken replaces the other, whose further
+# steps are then never made. That is how a picture is cancelled when the view moves.
+
+
+Result = TypeVar("Result")
+Task = Generator[Any, None, None] | Iterator[Any]
+
+
+class Worker:
+    """A thread that runs tasks; ``on_error(error)`` is told of exceptions that tasks raise, which end them alone."""
+
+    def __init__(self, on_error: Callable[[BaseException], None]):
+        self._on_error = on_error
+        self._tasks: dict[Hashable, tuple[int, int, Task]] = {}
+        self._changed = threading.Condition()
+        self._turn = itertools.count()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="nerg-view-render", daemon=True)
+        self._thread.start()
+
+    def submit(self, name: Hashable, urgency: int, task: Task) -> None:
+        """Run ``task`` from now on, in place of one of the same ``name``; smaller ``urgency`` first, tasks of one
+        urgency in turns."""
+        with self._changed:
+            if not self._stopped:
+                self._tasks[name] = urgency, next(self._turn), task
+                self._changed.notify_all()
+
+    def cancel(self, name: Hashable) -> None:
+        """Make no further step of the task ``name``, if there is one."""
+        with self._changed:
+            self._tasks.pop(name, None)
+            self._changed.notify_all()
+
+    def call(self, function: Callable[[], Result]) -> Future[Result]:
+        """Call ``function`` on the thread, before any task; its result or its exception is the future's."""
+        future: Future[Result] = Future()
+
+        def steps() -> Iterator[None]:
+            try:
+                future.set_result(function())
+            except BaseException as error:
+                future.set_exception(error)
+            yield
+
+        self.submit(object(), -1, steps())
+        return future
+
+    @property
+    def names(self) -> list[Hashable]:
+        """The tasks that are not done yet."""
+        with self._changed:
+            return list(self._tasks)
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is left to do."""
+        with self._changed:
+            return not self._tasks
+
+    def wait_idle(self, timeout: float) -> bool:
+        """Wait until nothing is left to do, ``timeout`` seconds at most; whether it is so."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._tasks, timeout)
+
+    def stop(self, timeout: float = 30.0) -> None:
+        """End the thread after the step that it is in."""
+        with self._changed:
+            self._stopped = True
+            self._tasks.clear()
+            self._changed.notify_all()
+        self._thread.join(timeout)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._stopped or self._tasks)
+                if self._stopped:
+                    return
+                name = min(self._tasks, key=lambda n: self._tasks[n][:2])
+                entry = self._tasks[name]
+            over = self._step(entry[2])
+            with self._changed:
+                # It may have been replaced in the meantime.
+                if self._tasks.get(name) is entry:
+                    if over:
+                        del self._tasks[name]
+                    else:
+                        self._tasks[name] = entry[0], next(self._turn), entry[2]
+                self._changed.notify_all()
+
+    def _step(self, task: Task) -> bool:
+        """Make a step of ``task``: whether it was the last."""
+        try:
+            next(task)
+        except StopIteration:
+            return True
+        except BaseException as error:
+            self._on_error(error)
+            return True
+        return False
+
+
+# ---- Session ----
+#
+# What is viewed, whoever looks: the scene, its observer, the layer that is shown, and the tasks that compute them.
+#
+# All of Mitsuba and Dr.Jit is used on the thread of the `Worker`. What is found is told to a `Listener`, on that
+# thread.
+
 
 URGENCY = 1
 """Of tasks that take turns: the first picture is coarse, and nobody waits long for numbers."""

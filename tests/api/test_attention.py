@@ -239,7 +239,7 @@ def test13_what_is_beyond_all_measure_is_told(empty, box, eye, said):
 
 
 def test14_statistics_viewer_and_report_say_the_same(room):
-    from nerg_mi.viewer.sharing import shares_in_steps
+    from nerg_mi.viewer.session import shares_in_steps
 
     path, scene = room
     regions = [Region.of("the sign", *SIGN), Region.of("corner", (4.5, 2.5, 0), (6.1, 4.1, 3.1), 20)]

@@ -14,10 +14,10 @@ def nerg(*arguments):
 
 
 def test01_options_come_through(monkeypatch, tmp_path):
-    from nerg_mi.viewer import serving
+    from nerg_mi.viewer import serve
 
     given = []
-    monkeypatch.setattr(serving, "view_files", lambda files, options, reporter: given.append((files, options)))
+    monkeypatch.setattr(serve, "view_files", lambda files, options, reporter: given.append((files, options)))
     line = ["view", "a.xml", "b.npz", "--port", 0, "--observer=1,2,3", "--host", "::1", "--name", "lab", "--width", 320]
     assert nerg(*line) == 0
     ((files, options),) = given

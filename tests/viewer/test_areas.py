@@ -7,8 +7,8 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.regions import Region
-from nerg_mi.viewer.areas import box_around, edges
-from nerg_mi.viewer.view import View
+from nerg_mi.viewer.controls import box_around, edges
+from nerg_mi.viewer.points import View
 
 
 def test01_around_the_foremost():

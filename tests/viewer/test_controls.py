@@ -11,10 +11,10 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.viewer.controls import Inset, png_bytes, table
-from nerg_mi.viewer.copied_scene import copied_view
 from nerg_mi.viewer.layers import LAYERS, STALE, Shade
-from nerg_mi.viewer.view import View
-from nerg_mi.viewer.worker import Worker
+from nerg_mi.viewer.points import View
+from nerg_mi.viewer.scene import copied_view
+from nerg_mi.viewer.session import Worker
 
 
 def test01_the_largest_share_first():

@@ -8,10 +8,8 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.transport.geometry import Ceiling
-from nerg_mi.viewer import copied_scene
-from nerg_mi.viewer.copied_scene import Shown
-from nerg_mi.viewer.refining import Pace, refine
-from nerg_mi.viewer.view import View
+from nerg_mi.viewer.points import Pace, View, refine
+from nerg_mi.viewer.scene import Shown, copied
 
 VIEW = View.of((6.9, 3.0, 2.0), (4.8, 4.2, 1.0), (0, 0, 1), 0.9, 1.5)
 EYE = np.array([4.6, 3.1, 1.6])
@@ -22,7 +20,7 @@ def test01_pictures_are_alike(store, tmp_path):
     shown = Shown(VIEW, EYE, ("depth", "opacity", "gaze"), 96, 16, 0.05)
     path = tmp_path / "elsewhere" / "view.xml"
     path.parent.mkdir()
-    path.write_text(copied_scene.copied(store, shown))
+    path.write_text(copied(store, shown))
     copy = nerg.Scene.load(path)
     rendered = nerg.render(copy, quantities=["color", "gaze", "depth"])
     assert np.allclose(copy.observer, EYE) and rendered.color.shape == (1, 64, 96, 3)
@@ -41,7 +39,7 @@ def test01_pictures_are_alike(store, tmp_path):
 
 def test02_the_settings_are_those_that_were_viewed(store, tmp_path):
     path = tmp_path / "view.xml"
-    path.write_text(copied_scene.copied(store, Shown(VIEW, EYE, ("depth",), 48, 3, 0.25)))
+    path.write_text(copied(store, Shown(VIEW, EYE, ("depth",), 48, 3, 0.25)))
     scene = nerg.Scene.load(path, view_camera="1, 2, 1.5", view_observer="2, 2, 1.7")
     assert float(np.ravel(np.array(scene.integrator.falloff))[0]) == pytest.approx(0.25)
     assert scene.sensor(0).sampler().sample_count() == 3 and len(scene.mitsuba.sensors()) == 4
@@ -51,7 +49,7 @@ def test02_the_settings_are_those_that_were_viewed(store, tmp_path):
 
 def test03_shapes_and_no_observer(room, tmp_path):
     path = tmp_path / "view.xml"
-    path.write_text(copied_scene.copied(room, Shown(VIEW, None, ("depth", "visibility"), 48, 1, 0.0)))
+    path.write_text(copied(room, Shown(VIEW, None, ("depth", "visibility"), 48, 1, 0.0)))
     scene = nerg.Scene.load(path)
     assert len(scene.mitsuba.shapes()) == 2 and np.allclose(scene.observer, [0, 0, 0.5])
 
@@ -60,7 +58,7 @@ def test03_shapes_and_no_observer(room, tmp_path):
 def test04_what_is_cut_off_from_above(room, tmp_path, up):
     view, up = View.of((1.5, 0, 5), (1.5, 0.01, 0), (0, 0, 1), 0.3, 1.0), np.array(up, float)
     path = tmp_path / "view.xml"
-    path.write_text(copied_scene.copied(room, Shown(view, None, ("depth",), 32, 1, 0.0, (0.5, up))))
+    path.write_text(copied(room, Shown(view, None, ("depth",), 32, 1, 0.0, (0.5, up))))
     rendered = nerg.render(nerg.Scene.load(path), quantities=["depth"]).depth[0]
     steps = refine(nerg.Scene.load(room), view, None, ["depth"], 32, 1, Pace(), ceiling=Ceiling(0.5, up))
     viewed = [p for p in steps if p is not None][-1].values["depth"]
@@ -69,7 +67,7 @@ def test04_what_is_cut_off_from_above(room, tmp_path, up):
     assert (np.abs(rendered - viewed) < 0.03).mean() > 0.8 and rendered[16, 16] == pytest.approx(5, abs=0.02)
     # A copy of the copy that cuts nothing off shows the top again.
     again = tmp_path / "again.xml"
-    again.write_text(copied_scene.copied(path, Shown(view, None, ("depth",), 32, 1, 0.0)))
+    again.write_text(copied(path, Shown(view, None, ("depth",), 32, 1, 0.0)))
     assert nerg.render(nerg.Scene.load(again), quantities=["depth"]).depth[0, 16, 16] == pytest.approx(4, abs=0.02)
 
 
@@ -77,4 +75,4 @@ def test05_without_an_integrator_there_is_nothing_to_copy(tmp_path, rgb):
     path = tmp_path / "a.xml"
     path.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
     with pytest.raises(NergError, match="0 integrators"):
-        copied_scene.copied(path, Shown(VIEW, None, ("depth",), 48, 1, 0.0))
+        copied(path, Shown(VIEW, None, ("depth",), 48, 1, 0.0))

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerg_mi.viewer.copied_scene import copied
-from nerg_mi.viewer.filming import Film, even, film_options, shown_of_flight
-from nerg_mi.viewer.flights import flight, frames_csv
+from nerg_mi.viewer.flights import Film, even, film_options, flight, frames_csv, shown_of_flight
 from nerg_mi.viewer.layers import LAYERS, Scale
-from nerg_mi.viewer.view import View
-from nerg_mi.viewer.worker import Worker
+from nerg_mi.viewer.points import View
+from nerg_mi.viewer.scene import copied
+from nerg_mi.viewer.session import Worker
 
 HOME = View.of((-2, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
 

@@ -8,7 +8,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.frames_file import read_frames
 from nerg_mi.viewer.flights import flight, frames_csv
-from nerg_mi.viewer.view import View
+from nerg_mi.viewer.points import View
 
 
 def view(x, ahead=(0, 1, 0)):

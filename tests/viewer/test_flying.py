@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from nerg_mi.jobs.options.view import ViewOptions
-from nerg_mi.viewer.flying import Flying
-from nerg_mi.viewer.serving import viewer
-from nerg_mi.viewer.view import View
+from nerg_mi.viewer.flights import Flying
+from nerg_mi.viewer.points import View
+from nerg_mi.viewer.serve import viewer
 from tests.viewer.browser import require
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from nerg_mi.viewer.guard import CLIENTS, Guard, is_loopback, new_token
+from nerg_mi.viewer.server import CLIENTS, Guard, is_loopback, new_token
 
 LOCAL = Guard("127.0.0.1")
 

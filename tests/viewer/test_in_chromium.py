@@ -13,8 +13,8 @@ import pytest
 
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.viewer.layers import LAYERS
-from nerg_mi.viewer.serving import viewer
-from nerg_mi.viewer.view import View
+from nerg_mi.viewer.points import View
+from nerg_mi.viewer.serve import viewer
 from tests.viewer.browser import chromium, require
 
 pytestmark = pytest.mark.slow

@@ -6,8 +6,8 @@ import inspect
 
 import pytest
 
-from nerg_mi.viewer.listener import Listener
 from nerg_mi.viewer.page import Page
+from nerg_mi.viewer.session import Listener
 
 TOLD = [name for name in vars(Listener) if name.startswith("on_")]
 

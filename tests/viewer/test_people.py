@@ -8,8 +8,8 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.viewer.page import Page
-from nerg_mi.viewer.people import People, color_of
-from nerg_mi.viewer.serving import viewer
+from nerg_mi.viewer.scene import People, color_of
+from nerg_mi.viewer.serve import viewer
 from tests.viewer.browser import require
 
 

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 import nerg_mi as nerg
 from nerg_mi.fields.splats import Splats
-from nerg_mi.viewer.proxy import BATCH, LEVELS, bake, gather, ordered, thin, way_out
+from nerg_mi.viewer.points import BATCH, LEVELS, bake, gather, ordered, thin, way_out
 
 
 def last(steps):

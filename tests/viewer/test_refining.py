@@ -9,8 +9,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.transport.geometry import Ceiling
-from nerg_mi.viewer.refining import DIRECTIONS, SIZES, Pace, refine, rough_integrals
-from nerg_mi.viewer.view import View
+from nerg_mi.viewer.points import DIRECTIONS, SIZES, Pace, View, refine, rough_integrals
 
 QUANTITIES = ["color", "depth", "opacity", "visibility"]
 
@@ -41,7 +40,7 @@ def test02_equal_seeds_give_equal_pictures_whatever_the_bands(room_scene):
 
 
 def test03_a_picture_that_is_left_off_is_not_gone_on_with(room_scene, monkeypatch):
-    import nerg_mi.viewer.refining as module
+    import nerg_mi.viewer.points as module
 
     traced = []
     original = module.trace

@@ -8,8 +8,7 @@ import socket
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.viewer.guard import MESSAGE_BYTES, Guard
-from nerg_mi.viewer.server import start_server
+from nerg_mi.viewer.server import MESSAGE_BYTES, Guard, start_server
 from tests.viewer.browser import require
 
 OPEN = {

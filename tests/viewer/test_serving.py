@@ -11,8 +11,8 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.options.view import ViewOptions
-from nerg_mi.viewer import serving
-from nerg_mi.viewer.serving import view_files, viewer
+from nerg_mi.viewer import serve
+from nerg_mi.viewer.serve import view_files, viewer
 from tests.jobs.recorder import Recorder
 from tests.viewer.browser import require
 
@@ -63,7 +63,7 @@ def test04_until_ctrl_c(room, monkeypatch):
     def interrupted():
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(serving, "_wait", interrupted)
+    monkeypatch.setattr(serve, "_wait", interrupted)
     view_files([room], ViewOptions(port=0), told)
     assert any(text.startswith("open http://127.0.0.1:") for text in told.messages)
     assert told.messages[-1] == "the viewer has ended"

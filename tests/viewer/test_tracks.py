@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.viewer.tracks import ALL, GAP, Tracks
+from nerg_mi.viewer.session import ALL, GAP, Tracks
 
 SAME = Similarity(np.eye(4))
 

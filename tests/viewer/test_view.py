@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.viewer.view import View, heading_of
+from nerg_mi.viewer.points import View, heading_of
 
 
 def test01_the_frame_of_a_page():

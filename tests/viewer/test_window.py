@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from nerg_mi.viewer.proxy import LEVELS
-from nerg_mi.viewer.window import Window
+from nerg_mi.viewer.page import Window
+from nerg_mi.viewer.points import LEVELS
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from nerg_mi.viewer.worker import Worker
+from nerg_mi.viewer.session import Worker
 
 
 @pytest.fixture

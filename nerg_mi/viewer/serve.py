@@ -1,4 +1,4 @@
-"""From files to a page that is served."""
+"""What the viewer serves, and for how long."""
 
 from __future__ import annotations
 
@@ -14,13 +14,11 @@ from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.reporter import SILENT, Reporter
 from nerg_mi.jobs.view import place_to_view
 
-from .areas import Areas
-from .controls import Controls
-from .flying import Flying
-from .guard import Guard, is_loopback, new_token
+from .controls import Areas, Controls
+from .flights import Flying
 from .page import Page
-from .people import People
-from .server import require_viser, start_server
+from .scene import People
+from .server import Guard, is_loopback, new_token, require_viser, start_server
 from .session import Session
 
 
