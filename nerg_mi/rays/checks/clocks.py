@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .figures import Figures, group_medians, name_some
-from .protocol import Check
+from .protocol import check
 
 _GAP = 5.0  # seconds without a ray after which it is asked whether the head went on meanwhile
 _BACK = 1.0  # seconds; less is a row in the wrong place
@@ -21,7 +21,11 @@ _FEW = 0.02  # share of a person's windows
 _EPOCH = 1e8  # seconds, three years, between times on one clock
 
 
-def _check_clocks(figures: Figures) -> list[str]:
+@check(
+    "times that go back or leap while the head goes on as before, recordings under one name that overlap or are there "
+    "twice, people whose clock counts in another unit or from another moment (`--tick`, `--person-from`, `--clock`)"
+)
+def check_clocks(figures: Figures) -> list[str]:
     if figures.step is None or np.isnan(figures.step):
         return []  # no two times, which another check tells
     return [
@@ -172,11 +176,3 @@ def _check_epochs(figures: Figures) -> list[str]:
         f"the clock of {names} counts from another moment than that of others: split by time for each person by itself "
         "(--clock person)"
     ]
-
-
-CHECK = Check(
-    "clocks",
-    "times that go back or leap while the head goes on as before, recordings under one name that overlap or are there "
-    "twice, people whose clock counts in another unit or from another moment (`--tick`, `--person-from`, `--clock`)",
-    _check_clocks,
-)

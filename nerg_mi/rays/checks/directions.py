@@ -14,7 +14,7 @@ import numpy as np
 from nerg_mi.rays.rays import Rays
 
 from .figures import ENOUGH, MOST, Figures, name_some, to_source
-from .protocol import Check
+from .protocol import check
 from .walking import find_against_walking
 
 _OFF = 5.0, 10.0  # degrees between direction and hit point: of half of the rays, and of some
@@ -24,7 +24,11 @@ _FEW = 20  # hit points from which on they are asked
 _STEEP = 50.0  # degrees up or down
 
 
-def _check_directions(figures: Figures) -> list[str]:
+@check(
+    "directions that miss the hit points, with the signs that would mend them; where there are none, directions away "
+    "from where people walk, and steep gaze (`--hand`, `--forward`)"
+)
+def check_directions(figures: Figures) -> list[str]:
     """The frame of the directions: by the hit points or, where these tell nothing, by steep gaze and by walking."""
     return _check_hits(figures.rays) or [*_check_elevation(figures.rays), *find_against_walking(figures)]
 
@@ -74,11 +78,3 @@ def _check_elevation(rays: Rays) -> list[str]:
         f"half of the rays look more than {abs(median):.0f} degrees {'up' if median > 0 else 'down'}: "
         "check the axes of the directions, or which way is forward"
     ]
-
-
-CHECK = Check(
-    "directions",
-    "directions that miss the hit points, with the signs that would mend them; where there are none, directions away "
-    "from where people walk, and steep gaze (`--hand`, `--forward`)",
-    _check_directions,
-)

@@ -7,7 +7,7 @@ import numpy as np
 from nerg_mi.rays.readers.frames import UNITS
 
 from .figures import Figures, name_some
-from .protocol import Check
+from .protocol import check
 
 USUAL = 0.063
 """Metres between the eyes of adults, on average; 95 % of them lie between 0.055 and 0.071 (Dodgson 2004)."""
@@ -17,7 +17,11 @@ _SEVERAL = 5
 _LIKE = 1.25  # factor up to which a unit fits
 
 
-def _check_eyes(figures: Figures) -> list[str]:
+@check(
+    "eyes nearer to each other or farther apart than people's, where both are recorded (`--units`, or the scale of the "
+    "recorder's scene)"
+)
+def check_eyes(figures: Figures) -> list[str]:
     rays = figures.rays
     there = {rays.persons[p] for p in np.flatnonzero(np.bincount(rays.person))}
     found = {name: d for name, d in rays.metadata.get("eye_distance", {}).items() if name in there}
@@ -36,11 +40,3 @@ def _check_eyes(figures: Figures) -> list[str]:
     else:
         remedy = f"a unit of the file's lengths is about {size:.2g} m: scale its positions by that"
     return [f"the eyes{whose} are {1e3 * distance:.3g} mm apart, where people have {1e3 * USUAL:.0f}; {remedy}"]
-
-
-CHECK = Check(
-    "eyes",
-    "eyes nearer to each other or farther apart than people's, where both are recorded (`--units`, or the scale of the "
-    "recorder's scene)",
-    _check_eyes,
-)

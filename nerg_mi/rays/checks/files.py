@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from .figures import Figures
-from .protocol import Check
+from .protocol import check
 
 
-def _complaints(figures: Figures) -> list[str]:
+@check("what the reader of the files found wrong with them, as it read them")
+def check_files(figures: Figures) -> list[str]:
     return list(figures.rays.metadata.get("complaints", []))
-
-
-CHECK = Check("files", "what the reader of the files found wrong with them, as it read them", _complaints)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .figures import Figures, name_some
-from .protocol import Check
+from .protocol import check
 
 _ROWS, _FEW = 1000, 100  # rays of a recording that are looked at, and that it needs
 _SESSIONS = 1000
@@ -32,15 +32,19 @@ class _Stays:
     cells: list[np.ndarray]  # of the floor, (C, 2) whole numbers each
 
 
-def _check_frames(figures: Figures) -> list[str]:
+@check(
+    "people or recordings whose heads are higher or lower than people's, far from all others, or, with axes negated or "
+    "exchanged, where others walk (import them apart, `nerg align`)"
+)
+def check_frames(figures: Figures) -> list[str]:
     stays = _find_stays(figures)
     if len(stays.name) < 2:
         return []
     out, told = [], np.zeros(len(stays.name), bool)
-    for check in (_check_heights, _check_boxes, _check_floors):
-        if check is _check_heights and not figures.floor_known:
+    for find_odd in (_check_heights, _check_boxes, _check_floors):
+        if find_odd is _check_heights and not figures.floor_known:
             continue
-        found, odd = check(stays, told)
+        found, odd = find_odd(stays, told)
         out += found
         told |= odd
     return out
@@ -152,11 +156,3 @@ def _check_floors(stays: _Stays, told: np.ndarray) -> tuple[list[str], np.ndarra
 
 def _flipped(cells: np.ndarray, a: int, b: int, sign_a: int, sign_b: int) -> list[np.ndarray]:
     return [cells[:, i] if sign > 0 else -1 - cells[:, i] for i, sign in ((a, sign_a), (b, sign_b))]
-
-
-CHECK = Check(
-    "frames",
-    "people or recordings whose heads are higher or lower than people's, far from all others, or, with axes negated or "
-    "exchanged, where others walk (import them apart, `nerg align`)",
-    _check_frames,
-)

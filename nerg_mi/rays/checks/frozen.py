@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from .figures import Figures, name_some
-from .protocol import Check
+from .protocol import check
 
 _SHARE, _SECONDS = 0.01, 10.0  # of a person's rays: less is a moment without the eyes
 
 
-def _check_frozen(figures: Figures) -> list[str]:
+@check(
+    "gaze that does not turn for a second or more, in the world or against the head, while the head moves "
+    "(`nerg rays filter`)"
+)
+def check_frozen(figures: Figures) -> list[str]:
     rays = figures.rays
     frozen = figures.frozen
     if not frozen.any() or not figures.step:
@@ -29,11 +33,3 @@ def _check_frozen(figures: Figures) -> list[str]:
         f"the gaze of {name_some(names)} stands still for seconds while the head moves, as if the tracker had lost the "
         f"eyes or wrote the head's direction in their place; {remedy}"
     ]
-
-
-CHECK = Check(
-    "frozen",
-    "gaze that does not turn for a second or more, in the world or against the head, while the head moves "
-    "(`nerg rays filter`)",
-    _check_frozen,
-)

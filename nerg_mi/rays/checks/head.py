@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 
 from .figures import MOST, Figures, name_some, to_source
-from .protocol import Check
+from .protocol import check
 
 _COSINE = 0.5  # of 60 degrees
 _SHARE, _FEW = 0.02, 20  # of a person's rays; in 44 recordings that are right it is 0
@@ -18,7 +18,12 @@ _ENOUGH = 200  # rays of a person
 _BLOCK = 1 << 18
 
 
-def _check_head(figures: Figures) -> list[str]:
+@check(
+    "directions more than 60 degrees from where the head points; whether they stay about one direction of the world "
+    "(gaze in the head's frame taken for that in the world), about another axis of the head (`--forward`), or would be "
+    "right with an axis negated (`--hand`); gaze that goes against the head, or does not follow it"
+)
+def check_head(figures: Figures) -> list[str]:
     rays = figures.rays
     if rays.head is None:
         return []
@@ -125,12 +130,3 @@ def head_frames(head: np.ndarray) -> np.ndarray:
     right = np.cross(head, (0.0, 0.0, 1.0))
     right /= np.maximum(np.linalg.norm(right, axis=1, keepdims=True), 1e-9)
     return np.stack([head, right, np.cross(right, head)], axis=1)
-
-
-CHECK = Check(
-    "head",
-    "directions more than 60 degrees from where the head points; whether they stay about one direction of the world "
-    "(gaze in the head's frame taken for that in the world), about another axis of the head (`--forward`), or would be "
-    "right with an axis negated (`--hand`); gaze that goes against the head, or does not follow it",
-    _check_head,
-)

@@ -10,7 +10,7 @@ import numpy as np
 
 from .figures import Figures, name_some
 from .head import EXCHANGES, head_frames
-from .protocol import Check
+from .protocol import check
 
 _LAG = 0.08  # seconds between two directions that are compared; a fixation takes 0.2 and more
 _TURNS = 20.0, 200.0  # degrees a second of heads that are looked at
@@ -19,7 +19,8 @@ _FEW = 300
 _MOST = 1 << 18, 1 << 10  # rays looked at in runs of so many
 
 
-def _check_holding(figures: Figures) -> list[str]:
+@check("gaze that turns with the head where eyes turn against it: left and right, or up and down, exchanged")
+def check_holding(figures: Figures) -> list[str]:
     rays = figures.rays
     if rays.head is None or figures.selected:
         return []
@@ -79,10 +80,3 @@ def _turned(figures: Figures, heads: np.ndarray) -> tuple[np.ndarray, np.ndarray
         before, after = (np.einsum("nij,ni->nj", f, v * signs) for f, v in zip(frames, own))
         turned.append(np.linalg.norm(after - before, axis=1))
     return np.array(turned), person[first]
-
-
-CHECK = Check(
-    "holding",
-    "gaze that turns with the head where eyes turn against it: left and right, or up and down, exchanged",
-    _check_holding,
-)

@@ -10,12 +10,16 @@ import numpy as np
 from nerg_mi.rays.rays import Rays
 
 from .figures import ENOUGH, MOST, Figures, to_source
-from .protocol import Check
+from .protocol import check
 
 _HEADS = 0.4, 2.3  # metres over the floor between which the median of all heads is
 
 
-def _check_lengths(figures: Figures) -> list[str]:
+@check(
+    "heights and extents that heads do not have, and the axis of the file along which they have them (`--units`, "
+    "`--up`)"
+)
+def check_lengths(figures: Figures) -> list[str]:
     """Units of length and the up axis, by the heights and the extent of the origins."""
     extent, median, out = figures.extent, figures.height[1], []
     if 100 <= median <= 230:
@@ -53,11 +57,3 @@ def _standing_axis(rays: Rays) -> str | None:
     like_heads[np.argmax(np.abs(to_source(rays)[:, 2]))] = False
     (found,) = np.nonzero(like_heads)
     return None if len(found) != 1 else ("-" if mid[found[0]] < 0 else "") + "xyz"[found[0]]
-
-
-CHECK = Check(
-    "lengths",
-    "heights and extents that heads do not have, and the axis of the file along which they have them (`--units`, "
-    "`--up`)",
-    _check_lengths,
-)

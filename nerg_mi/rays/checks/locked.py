@@ -6,14 +6,15 @@ import numpy as np
 
 from .figures import MOST, Figures, group_medians, name_some
 from .head import head_frames
-from .protocol import Check
+from .protocol import check
 
 _STILL = 4.0  # degrees from its mean direction in the head, by the median; 44 people who look about have 7 and more
 _TURNED = 0.25  # of heads, whose mean directions are shorter by that than one: they look about in a cone of 40 degrees
 _ENOUGH = 500  # rays of a person
 
 
-def _check_locked(figures: Figures) -> list[str]:
+@check("gaze that stays at one place in the head while the head looks about (`nerg rays filter`)")
+def check_locked(figures: Figures) -> list[str]:
     rays = figures.rays
     if rays.head is None:
         return []
@@ -37,8 +38,3 @@ def _check_locked(figures: Figures) -> list[str]:
         f"{_STILL:g} degrees, as if it were the head's direction: were the eyes tracked? Leave them out "
         "(nerg rays filter --without-person)"
     ]
-
-
-CHECK = Check(
-    "locked", "gaze that stays at one place in the head while the head looks about (`nerg rays filter`)", _check_locked
-)

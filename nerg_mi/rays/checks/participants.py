@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from .figures import ENOUGH, Figures
-from .protocol import Check
+from .protocol import check
 
 _FEW = 2  # rays of a participant, by the median
 
 
-def _check_participants(figures: Figures) -> list[str]:
+@check("participants of one or two rays each: a column that counts rows, taken for participants (`person` in `--map`)")
+def check_participants(figures: Figures) -> list[str]:
     rays = np.bincount(figures.rays.person)
     rays = rays[rays > 0]
     if figures.selected or len(rays) < ENOUGH or np.median(rays) > _FEW:
@@ -19,10 +20,3 @@ def _check_participants(figures: Figures) -> list[str]:
         f"{len(rays):,} participants have {len(figures.rays):,} rays together: does their column count rows? (leave "
         "person out of --map, so that each file is a participant)"
     ]
-
-
-CHECK = Check(
-    "participants",
-    "participants of one or two rays each: a column that counts rows, taken for participants (`person` in `--map`)",
-    _check_participants,
-)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from . import clocks, directions, eyes, files, frames, frozen, head, holding, lengths, locked, participants, times
+from .direction_checks import DIRECTION_CHECKS
 from .figures import Figures
-from .protocol import Check
+from .recording_checks import RECORDING_CHECKS
 
-CHECKS: tuple[Check, ...] = tuple(
-    module.CHECK
-    for module in (files, participants, lengths, eyes, times, clocks, frozen, locked, head, holding, directions, frames)
-)
+CHECKS = (*RECORDING_CHECKS, *DIRECTION_CHECKS)
 """What is looked for, in the order of the card."""
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from .figures import Figures
-from .protocol import Check
+from .protocol import check
 
 _USUAL = 5.0, 2100.0  # rays a second of devices that there are
 
 
-def _check_times(figures: Figures) -> list[str]:
+@check("speeds that nobody walks, rates of rays that no device has, times that never change (`--tick`, `--map t=`)")
+def check_times(figures: Figures) -> list[str]:
     """The unit and the column of time, by the speeds of the origins and the rate of rays."""
     speed, step, out = figures.speed, figures.step, []
     if speed > 5:
@@ -34,10 +35,3 @@ def _check_times(figures: Figures) -> list[str]:
             remedy = f"were a unit of the file's time {unit:g} s, it would be {rate:.3g} a second (--tick {unit:g})"
         out.append(f"a ray comes every {step:.3g} s; {remedy}")
     return out
-
-
-CHECK = Check(
-    "times",
-    "speeds that nobody walks, rates of rays that no device has, times that never change (`--tick`, `--map t=`)",
-    _check_times,
-)
