@@ -9,7 +9,7 @@ from nerg_mi.report.run import Run
 from .protocol import Section
 
 
-def body(run: Run) -> Html:
+def _show_data(run: Run) -> Html:
     """The sanity card of the rays."""
     assert run.rays is not None and run.summary is not None
     lines = card_lines(run.rays, run.summary)
@@ -22,7 +22,7 @@ def body(run: Run) -> Html:
     return markup([paragraph(words), pairs(lines)])
 
 
-def absent(run: Run) -> str | None:
+def _explain_absent_data(run: Run) -> str | None:
     if run.rays is not None:
         return None
     trained = run.provenance.get("rays")
@@ -30,4 +30,4 @@ def absent(run: Run) -> str | None:
     return f"The rays are not at hand, so that nothing is shown of who was recorded{count}."
 
 
-SECTION = Section("data", "The data", body, absent)
+DATA = Section("data", "The data", _show_data, _explain_absent_data)

@@ -8,7 +8,7 @@ from nerg_mi.report.run import Run
 from .protocol import Section
 
 
-def body(run: Run) -> Html:
+def _show_gaze(run: Run) -> Html:
     """The overview, and the observer's own view and sphere."""
     shown = lambda names: [
         figure(image(p.png, p.alt), p.caption) for p in (run.pictures.get(n) for n in names) if p is not None
@@ -21,10 +21,10 @@ def body(run: Run) -> Html:
     return markup([paragraph(words), *shown(["gaze"]), element("div", shown(["own", "sphere"]), class_="side")])
 
 
-def absent(run: Run) -> str | None:
+def _explain_absent_gaze(run: Run) -> str | None:
     if {"gaze", "own", "sphere"} & set(run.pictures):
         return None
     return "There are no pictures of the gaze, for it is nowhere above zero around the observer."
 
 
-SECTION = Section("gaze", "The gaze", body, absent)
+GAZE = Section("gaze", "The gaze", _show_gaze, _explain_absent_gaze)

@@ -7,7 +7,7 @@ from nerg_mi.report.run import Run
 
 from .protocol import Section
 
-LIMITS = (
+_LIMITS = (
     "A head is not a gaze: eyes turn away from where a head points. A field from heads says where heads point, and "
     "shares of small things are then too even.",
     "Places are static: what was moved, restocked or stood in the way on other days is as it was when the place was "
@@ -20,9 +20,9 @@ LIMITS = (
 )
 
 
-def body(run: Run) -> Html:
+def _show_limits(run: Run) -> Html:
     """A list."""
-    return element("ul", [element("li", text) for text in LIMITS])
+    return element("ul", [element("li", text) for text in _LIMITS])
 
 
-SECTION = Section("limits", "Limits", body)
+LIMITS = Section("limits", "Limits", _show_limits)

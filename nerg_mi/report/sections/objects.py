@@ -14,7 +14,7 @@ from .protocol import Section
 _DRAWN = 24
 
 
-def body(run: Run) -> Html:
+def _show_objects(run: Run) -> Html:
     """A table and a chart, the most attended first."""
     order = sorted(run.objects, key=lambda o: (-o.field.mean, o.name))
     shown = [o for o in order if not _hidden(o, run.least)]
@@ -78,7 +78,7 @@ def _words(run: Run, recorded: bool) -> str:
     )
 
 
-def absent(run: Run) -> str | None:
+def _explain_absent_objects(run: Run) -> str | None:
     if run.objects:
         return None
     if run.kind == "none":
@@ -86,4 +86,4 @@ def absent(run: Run) -> str | None:
     return "No objects are named: --objects FILE.json gives their boxes."
 
 
-SECTION = Section("objects", "Named objects", body, absent)
+OBJECTS = Section("objects", "Named objects", _show_objects, _explain_absent_objects)

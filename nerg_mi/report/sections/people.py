@@ -8,7 +8,7 @@ from nerg_mi.report.run import Run
 from .protocol import Section
 
 
-def body(run: Run) -> Html:
+def _show_people(run: Run) -> Html:
     """Plans of the floor."""
     shown = [run.pictures[name] for name in ("plan", "layout") if name in run.pictures]
     sides = [figure(image(p.png, p.alt), p.caption) for p in shown]
@@ -30,8 +30,8 @@ def _company(run: Run) -> list[str]:
     ]
 
 
-def absent(run: Run) -> str | None:
+def _explain_absent_people(run: Run) -> str | None:
     return None if run.rays is not None else "The rays are not at hand, so that it is not known where people were."
 
 
-SECTION = Section("people", "Where people were", body, absent)
+PEOPLE = Section("people", "Where people were", _show_people, _explain_absent_people)

@@ -8,7 +8,7 @@ from nerg_mi.report.run import Run
 from .protocol import Section
 
 
-def body(run: Run) -> Html:
+def _show_place(run: Run) -> Html:
     """What it is and what it looks like."""
     shown = [paragraph(run.place), pairs(_facts(run))]
     picture = run.pictures.get("color")
@@ -34,4 +34,4 @@ def _facts(run: Run) -> list[tuple[str, str]]:
     return facts
 
 
-SECTION = Section("place", "The place", body)
+PLACE = Section("place", "The place", _show_place)

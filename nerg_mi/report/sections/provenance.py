@@ -8,7 +8,7 @@ from nerg_mi.report.run import Run
 from .protocol import Section
 
 
-def body(run: Run) -> Html:
+def _show_provenance(run: Run) -> Html:
     """Files with their checksums, and versions of programs."""
     shown = [
         table(["", "file", "SHA-256"], [[role, name, element("code", digest)] for role, name, digest in run.inputs])
@@ -24,4 +24,4 @@ def body(run: Run) -> Html:
     return markup(shown)
 
 
-SECTION = Section("provenance", "Provenance", body)
+PROVENANCE = Section("provenance", "Provenance", _show_provenance)

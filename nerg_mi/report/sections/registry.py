@@ -1,23 +1,32 @@
-"""The sections, in the order in which they are shown. Another one is a file beside these, named here."""
+"""The sections, in the order in which they are shown. Another one is defined beside these and named here."""
 
 from __future__ import annotations
 
-from . import data, gaze, limits, objects, people, place, provenance, scores, settings, stage, uncertainty, verdict
+from .data import DATA
+from .gaze import GAZE
+from .limits import LIMITS
+from .objects import OBJECTS
+from .people import PEOPLE
+from .place import PLACE
+from .protocol import Section
+from .provenance import PROVENANCE
+from .scores import SCORES
+from .settings import SETTINGS
+from .stage import STAGE
+from .uncertainty import UNCERTAINTY
+from .verdict import VERDICT
 
-SECTIONS = tuple(
-    module.SECTION
-    for module in (
-        verdict,
-        place,
-        data,
-        people,
-        gaze,
-        stage,
-        objects,
-        scores,
-        uncertainty,
-        settings,
-        limits,
-        provenance,
-    )
+SECTIONS: tuple[Section, ...] = (
+    VERDICT,
+    PLACE,
+    DATA,
+    PEOPLE,
+    GAZE,
+    STAGE,
+    OBJECTS,
+    SCORES,
+    UNCERTAINTY,
+    SETTINGS,
+    LIMITS,
+    PROVENANCE,
 )

@@ -20,7 +20,7 @@ COLUMNS = {"bits": "log score, bits", "CC": "CC", "KLD": "KLD, nats", "NSS": "NS
 _PANELS = ("bits", "CC", "KLD")
 
 
-def body(run: Run) -> Html:
+def _show_scores(run: Run) -> Html:
     """A part for each split."""
     parts = [
         paragraph(
@@ -102,10 +102,10 @@ def _known(value: Any) -> bool:
     return isinstance(value, (int, float)) and math.isfinite(value)
 
 
-def absent(run: Run) -> str | None:
+def _explain_absent_scores(run: Run) -> str | None:
     if run.results:
         return None
     return "No evaluation is at hand: give the folder that nerg eval gaze wrote, or the rays with --evaluate."
 
 
-SECTION = Section("scores", "Evaluation", body, absent)
+SCORES = Section("scores", "Evaluation", _show_scores, _explain_absent_scores)

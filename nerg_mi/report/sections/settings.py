@@ -23,7 +23,7 @@ _ABOUT = {
 """Entries of the provenance that are numbers or words, and their names."""
 
 
-def body(run: Run) -> Html:
+def _show_settings(run: Run) -> Html:
     """Tables of settings. What names people, such as who was held out, is counted and not shown."""
     about = run.provenance
     facts = [(words, _shown(about[key])) for key, words in _ABOUT.items() if key in about]
@@ -75,4 +75,4 @@ def _shown(value: object) -> str:
     return str(value)[:200]
 
 
-SECTION = Section("settings", "Settings", body)
+SETTINGS = Section("settings", "Settings", _show_settings)

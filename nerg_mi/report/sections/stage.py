@@ -8,7 +8,7 @@ from nerg_mi.report.run import Run
 from .protocol import Section
 
 
-def body(run: Run) -> Html:
+def _show_stage(run: Run) -> Html:
     """The viewer with its data, and the picture that stands for it without scripts and without WebGL. On paper all of
     it is left out, for the picture is in the section before."""
     assert run.stage is not None
@@ -43,8 +43,8 @@ def body(run: Run) -> Html:
     return markup([paragraph(words), element("div", controls, canvas, picture, data)])
 
 
-def absent(run: Run) -> str | None:
+def _explain_absent_stage(run: Run) -> str | None:
     return None if run.stage is not None else "There is no 3D scene, for nothing is known of the place's surfaces."
 
 
-SECTION = Section("stage", "In 3D", body, absent)
+STAGE = Section("stage", "In 3D", _show_stage, _explain_absent_stage)

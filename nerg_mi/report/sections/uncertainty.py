@@ -8,7 +8,7 @@ from nerg_mi.report.run import Run
 from .protocol import Section
 
 
-def body(run: Run) -> Html:
+def _show_uncertainty(run: Run) -> Html:
     """Of the scores, of the field, and of single places."""
     members = len(run.gaze.get("architecture", {}).get("members", ()))
     shown = [
@@ -40,4 +40,4 @@ def body(run: Run) -> Html:
     return markup(shown)
 
 
-SECTION = Section("uncertainty", "Uncertainty", body)
+UNCERTAINTY = Section("uncertainty", "Uncertainty", _show_uncertainty)

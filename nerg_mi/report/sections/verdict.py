@@ -9,7 +9,7 @@ from nerg_mi.report.run import Run
 from .protocol import Section
 
 
-def body(run: Run) -> Html:
+def _show_verdict(run: Run) -> Html:
     """A sentence for each evaluation, and what it rests on."""
     shown = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}") for _, verdict in run.verdicts]
     results = run.results[0]
@@ -31,7 +31,7 @@ def body(run: Run) -> Html:
     return markup([*shown, paragraph(basis, way, kind="note"), *(paragraph(d, kind="note") for d in run.doubts)])
 
 
-def absent(run: Run) -> str | None:
+def _explain_absent_verdict(run: Run) -> str | None:
     if run.results:
         return None
     held_out = "test" in run.provenance
@@ -44,4 +44,4 @@ def absent(run: Run) -> str | None:
     )
 
 
-SECTION = Section("verdict", "Verdict", body, absent)
+VERDICT = Section("verdict", "Verdict", _show_verdict, _explain_absent_verdict)
