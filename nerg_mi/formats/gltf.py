@@ -14,7 +14,7 @@ import numpy as np
 from nerg_mi.errors import plain
 from nerg_mi.files.bounded import is_count, parse_json, reading
 
-BYTES = 1 << 30
+GLTF_BYTES = 1 << 30
 """A file may have so many bytes."""
 
 DEPTH = 64

@@ -17,8 +17,7 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.bounded import read_bytes, reading, size_of
 from nerg_mi.maths.coordinates import check_near_origin
 
-from .gltf import BYTES as GLTF_BYTES
-from .gltf import parse_glb
+from .gltf import GLTF_BYTES, parse_glb
 from .ply import PlyTable, parse_numbers, parse_ply
 
 BYTES = 64 << 30

@@ -21,7 +21,7 @@ from nerg_mi.formats.regions import MOST, Region
 
 BOXES, POSES, NAMES = "3d_bounding_box.csv", "scene_objects.csv", "instances.json"
 
-BYTES = 256 << 20
+TABLE_BYTES = 256 << 20
 """A table may have so many bytes."""
 
 _THIN = 1e-3  # metres: a box that is thinner is made so thick
@@ -86,7 +86,7 @@ def _box(name: str, sides: np.ndarray, place: np.ndarray) -> Region:
 
 def _rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
     """Numbers of the rows without a time, by object."""
-    raw = read_bytes(path, "table of objects", BYTES)
+    raw = read_bytes(path, "table of objects", TABLE_BYTES)
     found: dict[str, np.ndarray] = {}
     moving: set[str] = set()
     with reading(path, "table of objects", "download it again", also=(csv.Error,)):

@@ -9,7 +9,7 @@ import numpy as np
 from nerg_mi.fields.splats import Splats, harmonics_of
 from nerg_mi.files.bounded import read_bytes, reading
 
-BYTES = 4 << 30
+SPLAT_BYTES = 4 << 30
 """A file may have so many bytes."""
 
 _ROW = np.dtype([("center", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
@@ -17,7 +17,7 @@ _ROW = np.dtype([("center", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), 
 
 def read_splat(path: str | os.PathLike) -> Splats:
     """The Gaussian splats in ``path``; `NergError` for what cannot be such a file."""
-    raw = read_bytes(path, "splat file", BYTES)
+    raw = read_bytes(path, "splat file", SPLAT_BYTES)
     with reading(path, "splat file", "export it again"):
         if len(raw) % _ROW.itemsize:
             raise ValueError(f"its {len(raw):,} bytes are no multiple of {_ROW.itemsize}")

@@ -18,7 +18,7 @@ from nerg_mi.files.bounded import open_file, read_bytes, reading
 from nerg_mi.formats.ply import parse_ply, write_columns
 from nerg_mi.maths.sphere import DEGREES
 
-BYTES = 8 << 30
+PLY_BYTES = 8 << 30
 """A file may have so many bytes."""
 
 HEADER_BYTES = 64 << 10
@@ -43,7 +43,7 @@ def has_splats(path: str | os.PathLike) -> bool:
 
 def read_ply_splats(path: str | os.PathLike) -> Splats:
     """The Gaussian splats in the PLY file ``path``; `NergError` for another kind of file, and for a damaged one."""
-    raw = read_bytes(path, "splat file", BYTES)
+    raw = read_bytes(path, "splat file", PLY_BYTES)
     with reading(path, "splat file", "export it again as a 3DGS .ply"):
         tables = parse_ply(np.frombuffer(raw, np.uint8)).tables
         first = next(iter(tables), "")
