@@ -13,7 +13,6 @@ defined: maps that are constant or zero give a number, not NaN.
 from __future__ import annotations
 
 import numpy as np
-from scipy.integrate import trapezoid
 
 # Of a map's mean: far below any density that matters, far above underflow.
 EPS = 1e-20
@@ -81,6 +80,8 @@ def auc_judd(
     above the threshold; false alarms: the share of the map that is. ``fixated`` (..., D) bool leaves pixels out of the
     latter, as the original does on a picture; rays are no pixels, and leave out nothing.
     """
+    from scipy.integrate import trapezoid
+
     w = _shares(density, density, weights)
     density, at_gaze = np.asarray(density, np.float64), np.asarray(at_gaze, np.float64)
     shape = np.broadcast_shapes(density.shape[:-1], at_gaze.shape[:-1])

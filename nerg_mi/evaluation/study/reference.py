@@ -169,7 +169,7 @@ class Truth:
     convergence: dict
 
 
-def truth(
+def compute_truth(
     scene: AnalyticScene,
     gaze: ObservedGaze | None,
     o,

@@ -233,7 +233,7 @@ def volumes(scene: AnalyticScene, resolution: int = 0) -> dict:
     return {"density": density, "color": made.color(), "gaze": made.gaze()}
 
 
-def sensor(origin, target, fov: float, width: int, height: int) -> dict:
+def make_sensor(origin, target, fov: float, width: int, height: int) -> dict:
     """A perspective camera with a box filter and float32 channels, z up."""
     import mitsuba as mi
 

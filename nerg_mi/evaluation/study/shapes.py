@@ -65,7 +65,7 @@ def observed_gaze(subject, p_o: np.ndarray) -> ObservedGaze:
     return integrator.gaze.at([mi.Point3f(*p_o.tolist())], place, integrator.observer_settings)
 
 
-def truth(subject, seed: int, visibility: str, color: np.ndarray) -> Truth:
+def compute_truth_of_shapes(subject, seed: int, visibility: str, color: np.ndarray) -> Truth:
     """The reference of ``nerg``'s channels for shapes alone, as its manual page defines them.
 
     ``color``: (N, 3), what the colours of the picture tend to.

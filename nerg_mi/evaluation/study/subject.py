@@ -20,13 +20,12 @@ from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import center
 from nerg_mi.transport.occlusion import EXACT
 
-from . import reference as study_reference
-from . import scenes as study_scenes
-from . import shapes as study_shapes
-from . import splats as study_splats
 from .errors import errors
 from .parameters import parameters
-from .reference import Truth
+from .reference import Truth, compute_truth, first_solid, towards
+from .scenes import SCENES, AnalyticScene, make_sensor, volumes
+from .shapes import COLOR_SPP, compute_truth_of_shapes, first_hit, triangles
+from .splats import LIMITS, SOURCE, cut_off
 
 KINDS = ("auto", "analytic", "file")
 AOVS = "depth,opacity,visibility,gaze"
@@ -70,12 +69,12 @@ def open_subject(
     """
     if kind not in KINDS:
         raise NergError(f'there is no kind of scene "{kind}": choose one of {", ".join(KINDS)}')
-    if kind == "analytic" or (kind == "auto" and scene in study_scenes.SCENES):
-        if scene not in study_scenes.SCENES:
-            raise NergError(f'there is no analytic scene "{scene}": choose one of {", ".join(study_scenes.SCENES)}')
-        return AnalyticSubject(study_scenes.SCENES[scene], width, height)
+    if kind == "analytic" or (kind == "auto" and scene in SCENES):
+        if scene not in SCENES:
+            raise NergError(f'there is no analytic scene "{scene}": choose one of {", ".join(SCENES)}')
+        return AnalyticSubject(SCENES[scene], width, height)
     if not Path(scene).exists():
-        names = ", ".join(study_scenes.SCENES)
+        names = ", ".join(SCENES)
         raise NergError(f'there is no scene file "{scene}", and no analytic scene of that name; those are {names}')
     return load_subject(Path(scene), width, height, defaults or {}, surfaces)
 
@@ -116,7 +115,7 @@ class Subject:
 
         if resolution:
             raise NergError(f'"{self.name}" has no grids of other resolutions; only analytic scenes do')
-        return mi.load_dict({"type": "nerg", **study_splats.cut_off({**self.base, **params})})
+        return mi.load_dict({"type": "nerg", **cut_off({**self.base, **params})})
 
     def aovs(self) -> str:
         return AOVS if self.has_gaze else AOVS.replace(",gaze", "")
@@ -183,17 +182,17 @@ class Subject:
 
 
 class AnalyticSubject(Subject):
-    """A scene of `study_scenes`."""
+    """An analytic scene."""
 
     resampled = True
 
-    def __init__(self, scene: study_scenes.AnalyticScene, width: int, height: int):
+    def __init__(self, scene: AnalyticScene, width: int, height: int):
         import mitsuba as mi
 
         self.analytic, self.name, self.opaque = scene, scene.name, scene.opaque
-        self._volumes = study_scenes.volumes(scene)
-        observer = study_scenes.sensor(scene.observer, (0.5, 0.5, 0.5), 40, 1, 1)
-        sensor = mi.load_dict(study_scenes.sensor(scene.camera, scene.target, scene.fov, width, height))
+        self._volumes = volumes(scene)
+        observer = make_sensor(scene.observer, (0.5, 0.5, 0.5), 40, 1, 1)
+        sensor = mi.load_dict(make_sensor(scene.camera, scene.target, scene.fov, width, height))
         self.size = (width, height)
         base = {**self._volumes, "observer": observer, "falloff": FALLOFF, "aovs": AOVS}
         self._set_up(mi.load_dict({"type": "scene", "sensor": sensor}), sensor, base)
@@ -201,7 +200,7 @@ class AnalyticSubject(Subject):
     def integrator(self, params: Mapping = {}, resolution: int = 0):
         import mitsuba as mi
 
-        grid = {"density": study_scenes.volumes(self.analytic, resolution)["density"]} if resolution else {}
+        grid = {"density": volumes(self.analytic, resolution)["density"]} if resolution else {}
         return mi.load_dict({"type": "nerg", **self.base, **grid, **params})
 
     def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
@@ -209,7 +208,7 @@ class AnalyticSubject(Subject):
 
         o, d = self.rays(seed)
         made, p_o = self.integrator(), mi.Point3f(*self.analytic.observer)
-        return study_reference.truth(
+        return compute_truth(
             self.analytic,
             made.gaze.at([p_o], Place(made.medium), made.observer_settings),
             o,
@@ -225,12 +224,12 @@ class AnalyticSubject(Subject):
         if not self.opaque:
             return None
         o, d = self.rays(seed)
-        t = study_reference.first_solid(self.analytic, o, d)
+        t = first_solid(self.analytic, o, d)
         hit = np.isfinite(t)
         eye = np.asarray(self.analytic.observer, float)
-        towards = o + d * np.where(hit, t, 0)[:, None] - eye
-        distance = np.linalg.norm(towards, axis=-1)
-        met = study_reference.first_solid(self.analytic, np.broadcast_to(eye, o.shape), towards / distance[:, None])
+        offset = o + d * np.where(hit, t, 0)[:, None] - eye
+        distance = np.linalg.norm(offset, axis=-1)
+        met = first_solid(self.analytic, np.broadcast_to(eye, o.shape), offset / distance[:, None])
         # Both distances lead to the same point, but for rounding.
         return t, hit & (met > distance - 1e-6)
 
@@ -260,13 +259,13 @@ class FileSubject(Subject):
     def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
         """A render with steps `FINER` times shorter, or with Gaussians cut off far out, and how far one with steps
         twice as long, or Gaussians cut off nearer, is from it."""
-        limits = study_splats.LIMITS if self.hits else [{"step": self.step / n} for n in (FINER, FINER // 2)]
+        limits = LIMITS if self.hits else [{"step": self.step / n} for n in (FINER, FINER // 2)]
         kinds = {**_CONVERGED, "depth": depth, "visibility": visibility, "radiance": True}
         fine, half = (self.channels(self.integrator({**kinds, **limit}), 1, seed) for limit in limits)
         known = Truth(
             **{n: fine[n] for n in ("color", "opacity", "depth", "visibility")},
             gaze=fine.get("gaze", np.zeros(len(fine["depth"]))),
-            source=study_splats.SOURCE if self.hits else f"render with steps of {self.step / FINER:.3g} units",
+            source=SOURCE if self.hits else f"render with steps of {self.step / FINER:.3g} units",
             convergence={},
         )
         return replace(known, convergence=errors(half, known))
@@ -289,7 +288,7 @@ class ShapesSubject(FileSubject):
     marched = False
 
     def __init__(self, path: Path, loaded, width: int, height: int):
-        self.corners = study_shapes.triangles(loaded)
+        self.corners = triangles(loaded)
         self._hits: dict = {}
         self._color = None
         super().__init__(path, loaded, width, height)
@@ -303,20 +302,20 @@ class ShapesSubject(FileSubject):
     def first_hits(self, seed: int) -> np.ndarray:
         """Distances (N,) to the shapes along the rays of ``seed``; inf on a miss."""
         if seed not in self._hits:
-            self._hits[seed] = study_shapes.first_hit(self.corners, *self.rays(seed))
+            self._hits[seed] = first_hit(self.corners, *self.rays(seed))
         return self._hits[seed]
 
     def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
         if self._color is None:
-            self._color = self.channels(self.integrator({"aovs": ""}), study_shapes.COLOR_SPP, seed + 1)["color"]
-        return study_shapes.truth(self, seed, visibility, self._color)
+            self._color = self.channels(self.integrator({"aovs": ""}), COLOR_SPP, seed + 1)["color"]
+        return compute_truth_of_shapes(self, seed, visibility, self._color)
 
     def exact(self, seed: int):
         o, d = self.rays(seed)
         t = self.first_hits(seed)
         hit = np.isfinite(t)
-        distance, r_o = study_reference.towards(self.eye(), o + d * np.where(hit, t, 0)[:, None])
-        met = study_shapes.first_hit(self.corners, np.broadcast_to(self.eye(), o.shape), r_o)
+        distance, r_o = towards(self.eye(), o + d * np.where(hit, t, 0)[:, None])
+        met = first_hit(self.corners, np.broadcast_to(self.eye(), o.shape), r_o)
         # Both distances lead to the same point, but for rounding.
         return t, hit & (met > distance - 1e-6)
 

@@ -71,7 +71,7 @@ def test_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_depth
     seen = study_reference.trace(subject.analytic, o, d)
     thick = np.isfinite(t) & (seen.tau > 12)
     for kind in ("expected", "median"):
-        known = study_reference.truth(
+        known = study_reference.compute_truth(
             subject.analytic,
             None,
             o,
@@ -89,7 +89,7 @@ def test_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_depth
 def test_what_is_no_surface_is_not_visible(visibility):
     scene = study_scenes.SCENES["ramp"]
     o, d = rays(scene, 64)
-    known = study_reference.truth(
+    known = study_reference.compute_truth(
         scene, None, o, d, depth="expected", visibility=visibility, falloff=0.1, tolerance=1e-3, surface_opacity=0.9
     )
     thin = known.opacity < 0.9
