@@ -30,13 +30,25 @@ from nerg_mi.rendering.channels import Channels, render_channels
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.rendering.projection import pixel_of
 from nerg_mi.rendering.scene_parts import default_name
-from nerg_mi.report.glances import Eyes, Onlooker, eyes_of, land_rays
-from nerg_mi.report.names import Labels, rays_without_names, results_without_names
-from nerg_mi.report.objects import ObjectAttention, attention_on
-from nerg_mi.report.page import page
-from nerg_mi.report.proxy import place_proxy, spread_out
-from nerg_mi.report.run import Picture, Run
-from nerg_mi.report.stage import Camera, Stage, pack
+from nerg_mi.report.data import (
+    Camera,
+    Eyes,
+    Labels,
+    ObjectAttention,
+    Onlooker,
+    Picture,
+    Run,
+    Stage,
+    attention_on,
+    eyes_of,
+    land_rays,
+    pack,
+    place_proxy,
+    rays_without_names,
+    results_without_names,
+    spread_out,
+)
+from nerg_mi.report.sections import page
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, Box
 from nerg_mi.train.geometry import GazePlace

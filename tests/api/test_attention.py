@@ -9,7 +9,7 @@ from nerg_mi.api.attention import box_shares
 from nerg_mi.api.shapes import box_dict
 from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.statistics import statistics
-from nerg_mi.report.glances import Onlooker
+from nerg_mi.report.data import Onlooker
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, Box
 from nerg_mi.train.geometry import GazePlace

@@ -26,8 +26,8 @@ def _make_results(folder: Path) -> None:
 
 def _read_results(folder: Path) -> None:
     from nerg_mi.evaluation.gaze.results import read_results
-    from nerg_mi.report.page import page
-    from nerg_mi.report.run import Run
+    from nerg_mi.report.data import Run
+    from nerg_mi.report.sections import page
 
     found = read_results(folder / "gaze.json")
     page(Run("Gaze", {}, "A place.", "none", results=(found,)))

@@ -9,10 +9,7 @@ import numpy as np
 from nerg_mi.evaluation.gaze.results import GazeResults
 from nerg_mi.formats.regions import Region
 from nerg_mi.rays.summary import summarise
-from nerg_mi.report.objects import ObjectAttention, Share
-from nerg_mi.report.proxy import Proxy
-from nerg_mi.report.run import Picture, Run
-from nerg_mi.report.stage import Camera, Stage, pack
+from nerg_mi.report.data import Camera, ObjectAttention, Picture, Proxy, Run, Share, Stage, pack
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.evaluation.gaze.test_verdict import scored
 

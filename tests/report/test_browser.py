@@ -14,7 +14,7 @@ import time
 
 import pytest
 
-from nerg_mi.report.page import page
+from nerg_mi.report.sections import page
 from tests.report.made import HOSTILE, bare, whole
 
 REQUIRED = os.environ.get("NERG_REQUIRE_BROWSER", "0") not in ("", "0")

@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from nerg_mi.report.charts import Point, interval_chart, nice_ticks
+from nerg_mi.report.html import Point, interval_chart, nice_ticks
 from tests.report.made import HOSTILE
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -14,7 +14,7 @@ from nerg_mi.formats.regions import Region
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.report.glances import Onlooker, eyes_of, land_rays
+from nerg_mi.report.data import Onlooker, eyes_of, land_rays
 from nerg_mi.statistics.visits import Box as Solid
 from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place

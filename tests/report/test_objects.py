@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.gaze.verdict import widening
-from nerg_mi.report.objects import attention_on, mean_over_people
+from nerg_mi.report.data import attention_on, mean_over_people
 from nerg_mi.statistics.shares import Shares
 from nerg_mi.statistics.visits import Landed
 

@@ -8,8 +8,7 @@ import re
 
 import pytest
 
-from nerg_mi.report.page import page
-from nerg_mi.report.sections.registry import SECTIONS
+from nerg_mi.report.sections import SECTIONS, page
 from tests.report.made import HOSTILE, bare, packed_scene, whole
 from tests.report.test_html import Parsed
 

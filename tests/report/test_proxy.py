@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.api.scene import make_scene
-from nerg_mi.report.proxy import place_proxy, smooth_normals, spread_out, surface_normals, thin
+from nerg_mi.report.data import place_proxy, smooth_normals, spread_out, surface_normals, thin
 
 LOW, HIGH = np.array([-2.0, -3.0, 0.0]), np.array([2.0, 3.0, 3.0])
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.formats.regions import Region
-from nerg_mi.report.stage import pack
+from nerg_mi.report.data import pack
 from tests.report.made import stage
 
 

@@ -15,7 +15,7 @@ from nerg_mi.figures.style import Provenance, encode
 from nerg_mi.files.png import encode_png
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.channels import Channels
-from nerg_mi.report.run import Picture
+from nerg_mi.report.data import Picture
 
 
 @dataclass(frozen=True, eq=False)

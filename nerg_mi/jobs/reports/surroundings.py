@@ -7,9 +7,7 @@ import numpy as np
 
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.report.glances import Onlooker
-from nerg_mi.report.proxy import spread_out
-from nerg_mi.report.stage import PATH_POINTS
+from nerg_mi.report.data import PATH_POINTS, Onlooker, spread_out
 from nerg_mi.train.geometry import GazePlace
 
 PANORAMAS = 8

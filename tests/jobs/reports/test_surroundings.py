@@ -10,7 +10,7 @@ import pytest
 from nerg_mi.jobs.reports.surroundings import company, free_places, panorama_eyes, paths_of
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.report.stage import PATH_POINTS
+from nerg_mi.report.data import PATH_POINTS
 from nerg_mi.train.geometry import GazePlace
 
 BOX = Box((0.0, 0.0, 0.0), (8.0, 6.0, 3.0))

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from nerg_mi.report.sections.registry import SECTIONS
-from nerg_mi.report.sections.settings import SETTINGS
+from nerg_mi.report.sections import SECTIONS, SETTINGS
 from tests.report.made import HOSTILE, bare, whole
 from tests.report.test_html import Parsed
 
