@@ -42,7 +42,7 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.evaluation.study.subject import load_subject
+    from nerg_mi.evaluation.study_subject import load_subject
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path)

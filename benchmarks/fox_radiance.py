@@ -66,7 +66,7 @@ def main(argv=None) -> None:
     dr.set_thread_count(args.threads)
     from dataclasses import replace
 
-    from nerg_mi.evaluation.images import score_views
+    from nerg_mi.evaluation.metrics import score_views
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.photos.dataset import open_dataset

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import nerg_mi
 import nerg_mi.scenes.store
-from nerg_mi.evaluation.study.operations import traced_operations
+from nerg_mi.evaluation.study import traced_operations
 from nerg_mi.files.tables import markdown_table
 from timing import write_rows
 

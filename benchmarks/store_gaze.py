@@ -43,8 +43,15 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.evaluation.gaze import baselines
-    from nerg_mi.evaluation.gaze.scores import EPS, gaze_field, print_scores, score_rows
+    from nerg_mi.evaluation.gaze import (
+        EPS,
+        gaze_field,
+        nearest_probes,
+        nearest_rays,
+        position_blind,
+        print_scores,
+        score_rows,
+    )
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze, load_radiance
     from nerg_mi.maths.sphere import fibonacci_directions
@@ -80,7 +87,7 @@ def main(argv=None) -> None:
     narrow = probe_settings["kappa"]
     methods = {
         "gaze field": gaze_field(gaze, medium, kind=probe_settings["depth"]),
-        "position-blind, kappa 50": baselines.position_blind(train, kappa=50),
+        "position-blind, kappa 50": position_blind(train, kappa=50),
     }
     for kappa in (narrow, args.wide):
         probes = place_probes(
@@ -93,10 +100,8 @@ def main(argv=None) -> None:
             kappa=kappa,
             seed=0,
         )
-        methods |= {
-            f"{k} nearest probe{'s' * (k > 1)}, kappa {kappa:g}": baselines.nearest_probes(probes, k) for k in (1, 16)
-        }
-        methods[f"4,096 nearest rays, kappa {kappa:g}"] = baselines.nearest_rays(train, 4096, kappa=kappa)
+        methods |= {f"{k} nearest probe{'s' * (k > 1)}, kappa {kappa:g}": nearest_probes(probes, k) for k in (1, 16)}
+        methods[f"4,096 nearest rays, kappa {kappa:g}"] = nearest_rays(train, 4096, kappa=kappa)
     methods[f"law, seen by {probe_settings['cap']:,} rays, kappa {narrow:g}"] = fresh_draws(
         law, probe_settings["cap"], narrow
     )

@@ -34,7 +34,7 @@ OFF = 0.1
 def score(field: Path, views: list, box, center, spp: int, pictures: Path) -> dict[str, float]:
     """Means over ``views`` of PSNR in dB and SSIM, and over all of their pixels: PSNR within and ``beyond`` the
     ``box``, and errors of depth near ``center`` and far."""
-    from nerg_mi.evaluation.images import Renderer, ssim
+    from nerg_mi.evaluation.metrics import Renderer, ssim
     from nerg_mi.figures.overlay import write_png
     from nerg_mi.files.atomic import make_folder
     from nerg_mi.maths.color import decibels, psnr

@@ -302,7 +302,7 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(args.threads)
     torch.set_num_threads(args.threads)
-    from nerg_mi.evaluation.images import score_views
+    from nerg_mi.evaluation.metrics import score_views
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.photos.dataset import open_dataset

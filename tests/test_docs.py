@@ -11,7 +11,7 @@ import pytest
 import typer
 
 import nerg_mi.cli
-from nerg_mi.evaluation.study import settings as study_settings
+from nerg_mi.evaluation import study as study_settings
 from nerg_mi.transport.march_primal import MarchSettings
 from tests.conftest import ROOT
 

@@ -10,7 +10,7 @@ from .fields import FilePath, TrainedField
 from .options import checkpoint_of, file_of, options_of, rays_of
 
 if TYPE_CHECKING:
-    from nerg_mi.evaluation.images import ViewScores
+    from nerg_mi.evaluation.metrics import ViewScores
     from nerg_mi.fields.gaze_base import AnyGazeField
     from nerg_mi.fields.radiance import RadianceField
     from nerg_mi.jobs.ablation import AblationResult

@@ -24,8 +24,7 @@ def eval_folds(
 
     Each fold is kept when it is done, and the same command goes on where it ended.
     """
-    from nerg_mi.evaluation.gaze.evaluation import SCORES
-    from nerg_mi.evaluation.gaze.scores import print_scores
+    from nerg_mi.evaluation.gaze import SCORES, print_scores
     from nerg_mi.jobs.folds import evaluate_folds
 
     with TerminalReporter() as reporter:

@@ -25,8 +25,7 @@ def eval_gaze(
     ] = None,
 ) -> None:
     """Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the people."""
-    from nerg_mi.evaluation.gaze.evaluation import SCORES
-    from nerg_mi.evaluation.gaze.scores import print_scores
+    from nerg_mi.evaluation.gaze import SCORES, print_scores
     from nerg_mi.jobs.evaluation import evaluate_gaze
 
     with TerminalReporter() as reporter:

@@ -1,1 +1,1 @@
-"""Metrics, baselines and measured error."""
+"""How good a field is: scores against held-out data, baselines, folds, ablation, and error against run time."""

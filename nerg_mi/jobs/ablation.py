@@ -10,8 +10,7 @@ from pathlib import Path
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
-from nerg_mi.evaluation.ablation import Variant
-from nerg_mi.evaluation.frame_time import frame_timer
+from nerg_mi.evaluation.ablation import Variant, frame_timer
 from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.bounded import read_json

@@ -13,9 +13,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
 from nerg_mi.evaluation.ablation import Variant
-from nerg_mi.evaluation.gaze.baselines import Baseline
-from nerg_mi.evaluation.gaze.evaluation import GazeTest, held_out_rays
-from nerg_mi.evaluation.gaze.scores import gaze_field
+from nerg_mi.evaluation.gaze import Baseline, GazeTest, gaze_field, held_out_rays
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import Supervision, hold_out

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.evaluation.saliency import cc
+from nerg_mi.evaluation.metrics import cc
 from nerg_mi.figures.overlay import Heat
 from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import check_writable

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.saliency import cc
+from nerg_mi.evaluation.metrics import cc
 from nerg_mi.fields.splats import Splats, harmonics_of
 from nerg_mi.figures.overlay import Heat, overlay, top_of
 from nerg_mi.figures.style import provenance

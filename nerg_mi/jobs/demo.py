@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.evaluation.gaze.results import read_results
+from nerg_mi.evaluation.gaze_report import read_results
 from nerg_mi.figures import overlay as figures
 from nerg_mi.figures.overlay import Heat, srgb, top_of, write_png
 from nerg_mi.figures.sphere import sphere_figure

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.gaze import evaluation
-from nerg_mi.evaluation.gaze.baselines import Baseline, Remembered, standard_baselines
-from nerg_mi.evaluation.gaze.report import side_by_side, write_report
-from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
-from nerg_mi.evaluation.gaze.uncertainty import calibration_rows, position_rows, rank_rows
+from nerg_mi.evaluation import gaze as evaluation
+from nerg_mi.evaluation.gaze import EPS, Baseline, Remembered, gaze_field, standard_baselines
+from nerg_mi.evaluation.gaze_report import side_by_side, write_report
+from nerg_mi.evaluation.uncertainty import calibration_rows, position_rows, rank_rows
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_folder
@@ -41,7 +40,7 @@ _CALIBRATED = ("gaze field", _BLIND, "4,096 nearest rays")
 class GazeEvaluation:
     """What a gaze field scored."""
 
-    # A row a method, the gaze field's first; scores by `evaluation.SCORES`, intervals with ".low" and ".high".
+    # A row a method, the gaze field's first; scores by `gaze.SCORES`, intervals with ".low" and ".high".
     rows: list[dict]
     # A row a method and person.
     persons: list[dict]

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.gaze.evaluation import SCORES, SPLITS
-from nerg_mi.evaluation.gaze.folds import mean_rows, means
-from nerg_mi.evaluation.gaze.report import markdown, uncertainty_text
-from nerg_mi.evaluation.gaze.uncertainty import rank_rows
+from nerg_mi.evaluation.folds import mean_rows, means
+from nerg_mi.evaluation.gaze import SCORES, SPLITS
+from nerg_mi.evaluation.gaze_report import markdown, uncertainty_text
+from nerg_mi.evaluation.uncertainty import rank_rows
 from nerg_mi.files.atomic import check_folder, write_text
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_csv, write_json
@@ -47,7 +47,7 @@ _SCORING = ("kappa", "directions", "min_rays", "mode")
 
 @dataclass(frozen=True)
 class FoldResult:
-    """``rows``: a row a split and method, means over folds (`evaluation.gaze.folds.mean_rows`); ``each``: a row a fold,
+    """``rows``: a row a split and method, means over folds (`evaluation.folds.mean_rows`); ``each``: a row a fold,
     split and method; ``fields``: the checkpoint of each fold, where the store keeps it; ``files`` written;
     ``by_position``: a row a fold, split and position; ``uncertainty``: how well a signal ranks the errors of all folds'
     positions, in each split and in all of them ("anywhere"); ``calibration``: a row a split and method, means over

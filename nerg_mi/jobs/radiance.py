@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from nerg_mi.errors import NergError, chosen
-from nerg_mi.evaluation.images import ViewScores, score_views
+from nerg_mi.evaluation.metrics import ViewScores, score_views
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import check_folder, check_writable, reserving
 from nerg_mi.files.tables import write_json

@@ -11,7 +11,7 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.errors import mitsuba_says
-from nerg_mi.evaluation.gaze.results import GazeResults
+from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.style import Provenance
 from nerg_mi.figures.style import versions as programs

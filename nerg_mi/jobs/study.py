@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.study import errors, measure, plots, tables
-from nerg_mi.evaluation.study.settings import Setting, settings
-from nerg_mi.evaluation.study.subject import Subject, open_subject
+from nerg_mi.evaluation import study, study_tables, study_truth
+from nerg_mi.evaluation.study import Setting, settings
+from nerg_mi.evaluation.study_subject import Subject, open_subject
 from nerg_mi.figures.style import Provenance, files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.rendering.pictures import activate
@@ -57,7 +57,7 @@ def run_study(
     reporter.progress(0.0, "open")
     subject = open_subject(str(scene), options.scene_kind, width, height, options.defaults, twin_beside)
     rows = _chosen(settings(subject, options.quick), wanted, options.only)
-    repeats, samples = (1, 16) if options.quick else (options.repeats, measure.PIXEL_SPP)
+    repeats, samples = (1, 16) if options.quick else (options.repeats, study.PIXEL_SPP)
     timed_by: list[dict] = []
     done = 0
 
@@ -71,10 +71,10 @@ def run_study(
         numbers = (repeats, samples)
         table, scaling, timed_by = measured_in_parts(subject, scene, out, rows, numbers, mode, options, reporter)
     else:
-        table = measure.measure(subject, rows, repeats, samples, step)
-        scaling = measure.scaling(subject, min(repeats, 3), options.quick, step)
-    tables.mark_fronts(table)
-    known = subject.truth(measure.SEED, "expected", "depth")
+        table = study.measure(subject, rows, repeats, samples, step)
+        scaling = study.scaling(subject, min(repeats, 3), options.quick, step)
+    study_tables.mark_fronts(table)
+    known = subject.truth(study.SEED, "expected", "depth")
     report = {
         "scene": subject.name,
         "variant": mode,
@@ -84,21 +84,21 @@ def run_study(
         "tolerance": subject.tolerance,
         "reference": known.source,
         "reference_change_when_step_halved": known.convergence,
-        "precision": measure.precision(),
-        "gaze_kld_eps": errors.KLD_EPS,
+        "precision": study.precision(),
+        "gaze_kld_eps": study_truth.KLD_EPS,
         "repeats": repeats,
         "threads": timed_by[0]["threads"] if timed_by else dr.thread_count(),
         "timed_by": timed_by,
         "peak_mb": "what Dr.Jit allocated at most during a first render, in MiB, beyond scene and field",
         "seconds_of_study": time.perf_counter() - begin,
         "versions": versions(mode),
-        "against_paper": tables.against_paper(table),
+        "against_paper": study_tables.against_paper(table),
         "rows": table,
         "scaling": scaling,
     }
     sources = files_of_scene(scene, options.defaults) if files_among(scene) else []
-    files = _write(out, subject, report, provenance("nerg study", sources, measure.SEED, options))
-    for line in tables.summary(report):
+    files = _write(out, subject, report, provenance("nerg study", sources, study.SEED, options))
+    for line in study_tables.summary(report):
         reporter.message(line)
     for path in files:
         reporter.message(f"wrote {path}")
@@ -124,9 +124,9 @@ def _chosen(all_settings: list[Setting], wanted: re.Pattern, only: str) -> list[
 
 
 def _write(out: Path, subject: Subject, report: dict, about: Provenance) -> list[Path]:
-    files = tables.write_tables(out, report)
+    files = study_tables.write_tables(out, report)
     width, height = report["size"]
     title = f"{subject.name}, {width} x {height}, {report['variant']}"
-    plots.plot_errors(out / "errors.png", report["rows"], f"Error against time: {title}", about)
-    plots.plot_scaling(out / "scaling.png", report["scaling"], f"Cost of the default: {title}", about)
+    study_tables.plot_errors(out / "errors.png", report["rows"], f"Error against time: {title}", about)
+    study_tables.plot_scaling(out / "scaling.png", report["scaling"], f"Cost of the default: {title}", about)
     return [*files, out / "errors.png", out / "scaling.png"]

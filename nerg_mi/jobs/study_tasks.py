@@ -12,9 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from nerg_mi.evaluation.study import measure
-from nerg_mi.evaluation.study.settings import Setting, settings
-from nerg_mi.evaluation.study.subject import ExactSurfaces, FileSubject, Subject, open_subject
+from nerg_mi.evaluation import study
+from nerg_mi.evaluation.study import Setting, settings
+from nerg_mi.evaluation.study_subject import ExactSurfaces, FileSubject, Subject, open_subject
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.rendering.scene_file import files_of_scene
@@ -48,7 +48,7 @@ def measured_in_parts(
     options: StudyOptions,
     reporter: Reporter,
 ) -> tuple[list[dict], list[dict], list[dict]]:
-    """What `measure.measure` finds of ``rows`` (the default first) and `measure.scaling`, in parts; and who timed what:
+    """What `study.measure` finds of ``rows`` (the default first) and `study.scaling`, in parts; and who timed what:
     of each process its ``processor``, ``threads``, ``rows`` and, of the default there, the least and most ``seconds``.
 
     Rows say in ``timed_by`` which process it was, counted from 1, and have ``default_seconds`` and
@@ -85,12 +85,10 @@ def measure_part(parameters: Mapping[str, Any], inputs: Mapping[str, Path], outp
     use_share()
     subject, quick, repeats = _subject(parameters, inputs), parameters["quick"], parameters["repeats"]
     if parameters["settings"] is None:
-        rows = measure.scaling(subject, min(repeats, 3), quick)
+        rows = study.scaling(subject, min(repeats, 3), quick)
     else:
         every = settings(subject, quick)
-        rows = measure.measure(
-            subject, [every[k] for k in (0, *parameters["settings"])], repeats, parameters["samples"]
-        )
+        rows = study.measure(subject, [every[k] for k in (0, *parameters["settings"])], repeats, parameters["samples"])
     timed_by = {"process": _PROCESS, "processor": processor(), "threads": dr.thread_count()}
     write_json(output, {"rows": rows, "timed_by": timed_by})
 

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.evaluation.gaze.results import GazeResults
-from nerg_mi.evaluation.gaze.verdict import Verdict, judge, widening
+from nerg_mi.evaluation.gaze_report import GazeResults, Verdict, judge, widening
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.overlay import srgb, to_bytes
 from nerg_mi.formats.regions import Region
@@ -212,7 +211,7 @@ def results_without_names(found: GazeResults, labels: Labels) -> GazeResults:
 # How much attention named objects have: by the field, and by the rays; of people, each of whom counts alike.
 #
 # Intervals are of 95 %, of the mean over people: Student's t with n - 1 degrees of freedom, which for means is what the
-# bootstrap over people comes to with many resamples, widened for few (`nerg_mi.evaluation.gaze.verdict.widening`).
+# bootstrap over people comes to with many resamples, widened for few (`nerg_mi.evaluation.gaze_report.widening`).
 
 
 LEAST_PEOPLE = 3

@@ -11,8 +11,7 @@ from importlib.resources import files
 from typing import Any
 
 from nerg_mi import __version__
-from nerg_mi.evaluation.gaze.results import GazeResults
-from nerg_mi.evaluation.gaze.verdict import BLIND, HALF, WORDS, Comparison, Verdict
+from nerg_mi.evaluation.gaze_report import BLIND, HALF, WORDS, Comparison, GazeResults, Verdict
 from nerg_mi.rays.card import WARNING, card_lines
 
 from .data import ObjectAttention, Run, Share

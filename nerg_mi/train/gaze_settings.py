@@ -31,7 +31,7 @@ from nerg_mi.ranges import (
 # Densities are flat arrays, probe after probe with the same D directions each
 # (P * D values, 1/sr): value p * D + d is probe p in direction d. Sums over a
 # probe are weighted by solid angle. Definitions as in
-# :mod:`nerg_mi.evaluation.saliency`; NeRG, Section 4.3 (whose text adds the
+# :mod:`nerg_mi.evaluation.metrics`; NeRG, Section 4.3 (whose text adds the
 # correlation itself; it is 1 - CC that is minimised).
 
 

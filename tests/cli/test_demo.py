@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.evaluation.gaze.results import read_results
-from nerg_mi.evaluation.gaze.verdict import judge
+from nerg_mi.evaluation.gaze_report import judge, read_results
 from nerg_mi.jobs import demo
 from nerg_mi.rendering.channels import render_channels
 from tests.cli.test_render import NERG, interrupt

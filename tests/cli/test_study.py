@@ -6,7 +6,7 @@ import json
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.evaluation.study.measure import COLUMNS
+from nerg_mi.evaluation.study import COLUMNS
 
 
 @pytest.mark.nightly

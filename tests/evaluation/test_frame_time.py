@@ -6,8 +6,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation import frame_time
-from nerg_mi.evaluation.frame_time import frame_timer
+from nerg_mi.evaluation import ablation
+from nerg_mi.evaluation.ablation import frame_timer
 from nerg_mi.maths.geometry import Box
 from nerg_mi.train.geometry import GazePlace, place_of_field, place_of_hits, place_of_scene
 from tests.formats.splats.writers import random_splats, write_inria
@@ -25,7 +25,7 @@ ROOM = '<scene version="3.0.0"><shape type="cube"><boolean name="flip_normals" v
 def clock(monkeypatch):
     """A clock by which the k-th frame takes k seconds."""
     ticks = iter([t for k in range(1, 20) for t in (100 * k, 101 * k)])
-    monkeypatch.setattr(frame_time.time, "perf_counter", lambda: next(ticks))
+    monkeypatch.setattr(ablation.time, "perf_counter", lambda: next(ticks))
 
 
 def made(kind, folder):

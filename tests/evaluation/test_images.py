@@ -7,7 +7,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.images import Renderer, depth_score, score_views, ssim
+from nerg_mi.evaluation.metrics import Renderer, depth_score, score_views, ssim
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_radiance

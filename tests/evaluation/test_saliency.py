@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.evaluation import metrics
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions, latlong_grid
 

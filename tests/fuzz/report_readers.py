@@ -9,7 +9,7 @@ from tests.fuzz.describe import Reader
 
 
 def _make_results(folder: Path) -> None:
-    from nerg_mi.evaluation.gaze.report import write_report
+    from nerg_mi.evaluation.gaze_report import write_report
     from tests.evaluation.gaze.test_verdict import scored
 
     person = {"method": "gaze field", "person": "Ada", "rays": 9, "bits": 0.1, "CC": 0.5, "KLD": 0.2}
@@ -25,7 +25,7 @@ def _make_results(folder: Path) -> None:
 
 
 def _read_results(folder: Path) -> None:
-    from nerg_mi.evaluation.gaze.results import read_results
+    from nerg_mi.evaluation.gaze_report import read_results
     from nerg_mi.report.data import Run
     from nerg_mi.report.sections import page
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.gaze.evaluation import SCORES
+from nerg_mi.evaluation.gaze import SCORES
 from nerg_mi.jobs.evaluation import evaluate_gaze
 from nerg_mi.jobs.gaze import train_gaze
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.gaze.report import write_report
+from nerg_mi.evaluation.gaze_report import write_report
 from nerg_mi.jobs.gaze import train_gaze
 from nerg_mi.jobs.options.gaze import GazeOptions
 from nerg_mi.jobs.options.report import ReportOptions

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from nerg_mi.evaluation.study import measure
-from nerg_mi.evaluation.study.settings import settings
-from nerg_mi.evaluation.study.subject import open_subject
+from nerg_mi.evaluation import study
+from nerg_mi.evaluation.study import settings
+from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.jobs import study_tasks
 from nerg_mi.jobs.study import StudyOptions, run_study
 from nerg_mi.jobs.study_tasks import measure_part, twin_beside
@@ -58,5 +58,5 @@ def test_a_scene_file_is_measured_with_its_twin_where_a_worker_has_laid_them(rgb
     inputs = {f"at/{name}.xml": tmp_path / f"{name}.xml" for name in ("scene", "twin")}
     measure_part(given | {"settings": [number]}, inputs, tmp_path / "rows.json")
     found = json.loads((tmp_path / "rows.json").read_text())
-    here = {"rows": measure.measure(subject, [every[0], every[number]], 1, 16), "scaling": []}
+    here = {"rows": study.measure(subject, [every[0], every[number]], 1, 16), "scaling": []}
     assert errors(found | {"scaling": []}) == errors(here) and found["rows"][1]["surface_mae"] > 0

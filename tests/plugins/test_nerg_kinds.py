@@ -8,7 +8,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.gaze.scores import gaze_field
+from nerg_mi.evaluation.gaze import gaze_field
 from nerg_mi.fields import gaze_base
 from nerg_mi.fields.gaze_ensemble import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study.operations import traced_operations
+from nerg_mi.evaluation.study import traced_operations
 
 from . import fields
 from .scenes import camera, channels, look_at, observer_at, straight, with_field, with_gaze

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study.operations import traced_operations
+from nerg_mi.evaluation.study import traced_operations
 
 from .scenes import camera, channels, constant, named, observed, observer_at, render, with_gaze
 

@@ -163,7 +163,7 @@ def test_samples_of_the_option_are_bounded(tmp_path):
 
 
 def test_the_other_ways_in_are_guarded(tmp_path):
-    from nerg_mi.evaluation.study import subject as study_subject
+    from nerg_mi.evaluation import study_subject
     from nerg_mi.jobs.demo import DemoOptions, make_demo
     from nerg_mi.train.geometry import place_of_scene
     from tests.figures.standins import write_standins

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from nerg_mi.evaluation.gaze.results import GazeResults
+from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.formats.regions import Region
 from nerg_mi.rays.summary import summarise
 from nerg_mi.report.data import Camera, ObjectAttention, Picture, Proxy, Run, Share, Stage, pack

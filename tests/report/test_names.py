@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerg_mi.evaluation.gaze.results import GazeResults
+from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.report.data import Labels, rays_without_names, results_without_names
 from tests.evaluation.gaze.test_evaluation import crowd
 

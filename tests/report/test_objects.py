@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.gaze.verdict import widening
+from nerg_mi.evaluation.gaze_report import widening
 from nerg_mi.report.data import attention_on, mean_over_people
 from nerg_mi.statistics.shares import Shares
 from nerg_mi.statistics.visits import Landed

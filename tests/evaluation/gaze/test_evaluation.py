@@ -7,10 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation import saliency as metrics
-from nerg_mi.evaluation.gaze import evaluation
-from nerg_mi.evaluation.gaze.baselines import position_blind, uniform
-from nerg_mi.evaluation.gaze.report import markdown
+from nerg_mi.evaluation import gaze, metrics
+from nerg_mi.evaluation.gaze import position_blind, uniform
+from nerg_mi.evaluation.gaze_report import markdown
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import hold_out
@@ -41,9 +40,7 @@ def rays():
 
 @pytest.fixture(scope="module")
 def test_set(rays):
-    return evaluation.make_test(
-        rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, 512, min_rays=20
-    )
+    return gaze.make_test(rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, 512, min_rays=20)
 
 
 def test_truth_is_the_probes(rays, test_set):
@@ -56,7 +53,7 @@ def test_truth_is_the_probes(rays, test_set):
 
 
 def test_scores_of_the_truth_and_of_nothing(test_set):
-    rows = evaluation.evaluate_gaze(
+    rows = gaze.evaluate_gaze(
         test_set,
         {"truth": lambda p, d: test_set.truth if d.ndim == 2 else np.ones(d.shape[:2]), "uniform": uniform()},
         uniform(),
@@ -87,32 +84,32 @@ def test_other_rays_are_of_positions_farther_than_two_radii_where_there_are_any(
     """A to C stand in a row; B is within 2R of A, C of none."""
     centres = np.array([[-0.5, 0, 1.6], [-0.5, 1, 1.6], [-0.5, 4, 1.6]])
     of = lambda a: {tuple(v) for v in a.reshape(-1, 3)}
-    found = evaluation.make_test(rays, centres, 0.6, 20.0, 64, min_rays=20)
+    found = gaze.make_test(rays, centres, 0.6, 20.0, 64, min_rays=20)
     (a, b, c), others = map(of, found.at), [of(o) for o in found.others]
     assert a.isdisjoint(c) and b.isdisjoint(c)
     assert others[0] <= c and others[1] <= c and others[2] <= a | b and others[2] & a and others[2] & b
     # Where all are nearer, any other one, and its own where it is alone.
-    found = evaluation.make_test(rays, centres[:2], 0.6, 20.0, 64, min_rays=20)
+    found = gaze.make_test(rays, centres[:2], 0.6, 20.0, 64, min_rays=20)
     a, b = map(of, found.at)
     assert of(found.others[0]) <= b and of(found.others[1]) <= a
-    found = evaluation.make_test(rays, centres[:1], 0.6, 20.0, 64, min_rays=20)
+    found = gaze.make_test(rays, centres[:1], 0.6, 20.0, 64, min_rays=20)
     assert np.array_equal(found.others, found.at)
 
 
-def by_hand(persons: int) -> evaluation.GazeTest:
+def by_hand(persons: int) -> gaze.GazeTest:
     """One position and sixteen directions, of which each person sees one of their own; the rays are of them in turn."""
     d = np.eye(16, 3)
     parts = 16 / (4 * np.pi) * np.eye(16)[None, :persons]
     who = np.arange(4 * persons)[None] % persons
     at, counts, names = np.zeros((1, 4 * persons, 3)), np.full((1, persons), 4.0), tuple("abcdefgh"[:persons])
-    return evaluation.GazeTest(np.zeros((1, 3)), d, parts.mean(axis=1), parts, counts, names, at, who, at)
+    return gaze.GazeTest(np.zeros((1, 3)), d, parts.mean(axis=1), parts, counts, names, at, who, at)
 
 
 def test_intervals_are_a_bootstrap_over_persons():
     """Of three persons all 27 draws can be made: the error of what one of them sees is the share of the others."""
     test = by_hand(3)
     sees = lambda k: lambda p, d: test.parts[:, k] if d.ndim == 2 else np.ones(d.shape[:2])
-    row, _ = evaluation.evaluate_gaze(test, {"first": sees(0), "second": sees(1)}, uniform(), resamples=1000)
+    row, _ = gaze.evaluate_gaze(test, {"first": sees(0), "second": sees(1)}, uniform(), resamples=1000)
     draws = list(itertools.product(range(3), repeat=3))
     mae = [2 * (1 - draw.count(0) / 3) / (4 * np.pi) for draw in draws]
     assert row["MAE"] == pytest.approx(np.mean(mae))
@@ -126,14 +123,14 @@ def test_intervals_are_a_bootstrap_over_persons():
 
 @pytest.mark.parametrize("persons, known", [(2, False), (3, True), (4, True)])
 def test_fewer_than_three_persons_have_no_interval(persons, known):
-    for row in evaluation.evaluate_gaze(by_hand(persons), {"a": uniform(), "b": uniform()}, uniform(), resamples=5):
-        assert all((f"{k}.low" in row) == known and (f"{k}.high" in row) == known for k in evaluation.SCORES)
+    for row in gaze.evaluate_gaze(by_hand(persons), {"a": uniform(), "b": uniform()}, uniform(), resamples=5):
+        assert all((f"{k}.low" in row) == known and (f"{k}.high" in row) == known for k in gaze.SCORES)
 
 
 def test_ray_scores_by_hand():
     maps = np.array([[0.0, 1.0, 2.0, 5.0]]) / (4 * np.pi * 2)
     at, others = maps[:, [3, 1]], maps[:, [0, 0, 1, 3]]
-    scores = evaluation.ray_scores(maps, at, others, np.zeros((1, 2)))
+    scores = gaze.ray_scores(maps, at, others, np.zeros((1, 2)))
     np.testing.assert_allclose(scores["AUC"], [[3.5 / 4, 1.5 / 4]])
     np.testing.assert_allclose(scores["sAUC"], [[3.5 / 4, 2.5 / 4]])
     np.testing.assert_allclose(scores["loglik"], np.log(at), rtol=1e-6)
@@ -144,7 +141,7 @@ def test_ray_scores_by_hand():
 
 def test_persons_are_scored_each_by_their_own(rays, test_set):
     blind = position_blind(rays, kappa=50)
-    rows = evaluation.person_rows(test_set, {"blind": blind}, blind, min_rays=10)
+    rows = gaze.person_rows(test_set, {"blind": blind}, blind, min_rays=10)
     assert [r["person"] for r in rows] == list(test_set.persons) and sum(
         r["rays"] for r in rows
     ) == test_set.counts.sum()
@@ -155,22 +152,22 @@ def test_persons_are_scored_each_by_their_own(rays, test_set):
 
 def test_nothing_is_on_both_sides(rays):
     _, account = hold_out(rays, 0.3, zones=2, positions=8, min_rays=8, people=0.5)
-    for split in evaluation.SPLITS:
-        train, scored, centres = evaluation.held_out_rays(rays, account, split)
+    for split in gaze.SPLITS:
+        train, scored, centres = gaze.held_out_rays(rays, account, split)
         named = lambda r: {rays.persons[i] for i in np.unique(r.person)}
         assert named(train).isdisjoint(account["people"])
         assert named(scored) == (named(train) if split == "pos" else set(account["people"]))
         assert np.linalg.norm(train.origin[:, None] - np.array(account["centres"])[None], axis=2).min() > 0.6
     _, without = hold_out(rays, 0.3, zones=2, positions=8, min_rays=8)
     with pytest.raises(ValueError, match="--test-people"):
-        evaluation.held_out_rays(rays, without, "both")
+        gaze.held_out_rays(rays, without, "both")
     with pytest.raises(ValueError, match="both, pos, people"):
-        evaluation.held_out_rays(rays, account, "time")
+        gaze.held_out_rays(rays, account, "time")
 
 
 def test_positions_without_rays_are_refused(rays):
     with pytest.raises(ValueError, match="lower min_rays"):
-        evaluation.make_test(rays, np.array([[40.0, 0, 0]]), 0.5)
+        gaze.make_test(rays, np.array([[40.0, 0, 0]]), 0.5)
 
 
 def test_markdown_has_intervals_and_gaps():
@@ -185,16 +182,16 @@ def test_markdown_has_intervals_and_gaps():
 
 
 def test_halves_of_the_people_are_compared_where_both_were(rays, test_set):
-    row = evaluation.split_half(
+    row = gaze.split_half(
         rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, uniform(), min_rays=20
     )
     assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0
     nobody = np.array([[40.0, 0, 0]])
-    assert evaluation.split_half(rays, nobody, 0.6, 20.0, uniform(), min_rays=20) is None
-    two = evaluation.split_half(rays.select(rays.person < 2), test_set.centres, 0.6, 20.0, uniform(), min_rays=20)
+    assert gaze.split_half(rays, nobody, 0.6, 20.0, uniform(), min_rays=20) is None
+    two = gaze.split_half(rays.select(rays.person < 2), test_set.centres, 0.6, 20.0, uniform(), min_rays=20)
     assert two is not None and two["KLD"] > 0
     alone = rays.select(rays.person == 0)
-    assert evaluation.split_half(alone, test_set.centres, 0.6, 20.0, uniform(), min_rays=20) is None
+    assert gaze.split_half(alone, test_set.centres, 0.6, 20.0, uniform(), min_rays=20) is None
     with pytest.raises(ValueError, match="kappa is negative"):
         # What is wrong is said, and not taken for "nobody was there".
-        evaluation.split_half(rays, test_set.centres, 0.6, -1.0, uniform(), min_rays=20)
+        gaze.split_half(rays, test_set.centres, 0.6, -1.0, uniform(), min_rays=20)

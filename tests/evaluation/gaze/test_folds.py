@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nerg_mi.evaluation.gaze.folds import mean_rows
+from nerg_mi.evaluation.folds import mean_rows
 
 
 def fold(ours, bar, half=None):

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.gaze import report as gaze_report
-from nerg_mi.evaluation.gaze.report import markdown, side_by_side, write_report
+from nerg_mi.evaluation import gaze_report
+from nerg_mi.evaluation.gaze_report import markdown, side_by_side, write_report
 from nerg_mi.maths.sphere import fibonacci_directions
 
 ROWS = [

@@ -7,8 +7,7 @@ import json
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.gaze.report import write_report
-from nerg_mi.evaluation.gaze.results import read_results
+from nerg_mi.evaluation.gaze_report import read_results, write_report
 
 ROWS = [{"method": "gaze field", "bits": 0.5, "KLD": float("nan")}, {"method": "uniform", "bits": 0.0, "KLD": 1.0}]
 PERSONS = [{"method": "gaze field", "person": "Ada", "rays": 4, "bits": 0.1}]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.gaze.scores import gaze_field, scores
+from nerg_mi.evaluation.gaze import gaze_field, scores
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.train.geometry import place_of_field, place_of_scene

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from nerg_mi.evaluation import saliency as metrics
-from nerg_mi.evaluation.gaze import evaluation, uncertainty
+from nerg_mi.evaluation import gaze, metrics, uncertainty
 from nerg_mi.probes.probes import LEVELS, calibrated_levels, level_name, region_levels
 
 from .test_evaluation import crowd
@@ -23,7 +22,7 @@ def row(support, error, group, **more):
 def asked():
     """A test of four people, and what is asked of it: a map, and the uniform one."""
     centres = np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [-0.5, -3, 1.6]])
-    test = evaluation.make_test(crowd(), centres, 0.6, 20.0, 256, min_rays=20)
+    test = gaze.make_test(crowd(), centres, 0.6, 20.0, 256, min_rays=20)
     return test, test.truth[::-1], np.full_like(test.truth, 1 / (4 * np.pi))
 
 
@@ -57,12 +56,12 @@ def test_positions_tell_their_errors(asked):
     assert [r["KLD"] for r in rows] == pytest.approx(expected.tolist()) and "spread" not in rows[0]
     # Half of these four, who look at different heights, tells less of the other half than all tell of themselves.
     assert all(0 < r["half"] < r["blind"] and r["excess"] == r["KLD"] - r["half"] for r in rows)
-    alone = evaluation.make_test(crowd(people=1), test.centres, 0.6, 20.0, 256, min_rays=20)
+    alone = gaze.make_test(crowd(people=1), test.centres, 0.6, 20.0, 256, min_rays=20)
     assert "half" not in uncertainty.position_rows(alone, maps, uniform)[0]
 
 
 def test_halves_that_look_alike_agree():
-    test = evaluation.make_test(crowd(20_000), np.array([[-0.5, 0, 1.6]]), 0.6, 20.0, 256, cap=4096)
+    test = gaze.make_test(crowd(20_000), np.array([[-0.5, 0, 1.6]]), 0.6, 20.0, 256, cap=4096)
     apart = uncertainty.half_errors(test, np.zeros_like(test.truth))
     alike = type(test)(**{**vars(test), "parts": np.repeat(test.truth[:, None], 4, axis=1)})
     assert uncertainty.half_errors(alike, np.zeros_like(test.truth)) == pytest.approx(-np.log(1), abs=1e-6)

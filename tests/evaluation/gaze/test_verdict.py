@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.gaze.verdict import BETTER, UNDECIDED, WORSE, Comparison, Lead, judge, lead_of, widening
+from nerg_mi.evaluation.gaze_report import BETTER, UNDECIDED, WORSE, Comparison, Lead, judge, lead_of, widening
 
 
 def row(method, bits, cc, kld, reach=0.05, gap=None):

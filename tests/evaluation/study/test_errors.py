@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from nerg_mi.evaluation.study import reference as study_reference
-from nerg_mi.evaluation.study.errors import errors
+from nerg_mi.evaluation import study_truth as study_reference
+from nerg_mi.evaluation.study_truth import errors
 
 
 def test_errors_of_known_pictures():

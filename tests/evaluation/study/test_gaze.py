@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study import shapes as study_shapes
-from nerg_mi.evaluation.study.subject import open_subject
+from nerg_mi.evaluation import study_truth as study_shapes
+from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.jobs.study import StudyOptions, run_study
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -92,7 +92,7 @@ def test03_the_study_of_a_default_recipe(rgb, tmp_path, shapes):
 @pytest.mark.parametrize("kind", ["default recipe", "ensemble"])
 def test04_the_papers_marching_is_divided_by_the_same_integral(rgb, tmp_path, kind):
     """In an opaque box both rules meet the same surfaces; what they say of them is then the same density."""
-    from nerg_mi.evaluation.study.paper import as_in_the_paper
+    from nerg_mi.evaluation.study import as_in_the_paper
 
     subject = open_subject(str(scene(tmp_path, kind, False)), "auto", 24, 16)
     made = subject.integrator({"aovs": "depth,opacity,gaze,visibility,gaze_evals", "depth": "expected"})

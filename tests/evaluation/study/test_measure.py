@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study import measure as study_measure
-from nerg_mi.evaluation.study.settings import Setting
-from nerg_mi.evaluation.study.subject import open_subject
+from nerg_mi.evaluation import study as study_measure
+from nerg_mi.evaluation.study import Setting
+from nerg_mi.evaluation.study_subject import open_subject
 
 
 class Recorded:

@@ -3,7 +3,7 @@
 import drjit as dr
 import drjit.llvm.ad as ns
 
-from nerg_mi.evaluation.study.operations import traced_operations
+from nerg_mi.evaluation.study import traced_operations
 
 
 def test_more_work_has_more_operations_and_more_lanes_have_not():

@@ -10,9 +10,9 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study import paper as study_paper
-from nerg_mi.evaluation.study import scenes as study_scenes
-from nerg_mi.evaluation.study.subject import open_subject
+from nerg_mi.evaluation import study as study_paper
+from nerg_mi.evaluation import study_scenes
+from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.transport.medium import LocalRay
 from tests.plugins import fields

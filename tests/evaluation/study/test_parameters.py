@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 
-from nerg_mi.evaluation.study.parameters import parameters
+from nerg_mi.evaluation.study_subject import parameters
 
 NONE_OF_A_STUDY = {"aovs", "ceiling", "up"}
 

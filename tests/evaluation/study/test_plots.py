@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
 
-from nerg_mi.evaluation.study import plots as study_plots
+from nerg_mi.evaluation import study_tables as study_plots
 
 
 @pytest.fixture

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study import reference as study_reference
-from nerg_mi.evaluation.study import scenes as study_scenes
-from nerg_mi.evaluation.study.errors import errors
-from nerg_mi.evaluation.study.subject import open_subject
+from nerg_mi.evaluation import study_scenes
+from nerg_mi.evaluation import study_truth as study_reference
+from nerg_mi.evaluation.study_subject import open_subject
+from nerg_mi.evaluation.study_truth import errors
 from tests.reference import march_numpy
 
 NAMES = list(study_scenes.SCENES)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerg_mi.evaluation.study import scenes as study_scenes
+from nerg_mi.evaluation import study_scenes
 
 
 def test_volumes_fill_the_unit_cube(rgb):

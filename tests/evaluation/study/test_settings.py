@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study.settings import RESOLUTIONS, STEP_COUNTS, settings
-from nerg_mi.evaluation.study.subject import open_subject
+from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, settings
+from nerg_mi.evaluation.study_subject import open_subject
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.evaluation.study import shapes as study_shapes
-from nerg_mi.evaluation.study import subject as study_subject
+from nerg_mi.evaluation import study_subject
+from nerg_mi.evaluation import study_truth as study_shapes
 from nerg_mi.jobs.demo import store_scene
 from nerg_mi.transport.geometry import Place
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study import splats
-from nerg_mi.evaluation.study.measure import measure
-from nerg_mi.evaluation.study.parameters import extent
-from nerg_mi.evaluation.study.settings import settings
-from nerg_mi.evaluation.study.subject import open_subject
+from nerg_mi.evaluation import study_truth
+from nerg_mi.evaluation.study import measure, settings
+from nerg_mi.evaluation.study_subject import extent, open_subject
 from nerg_mi.formats.splats.ply import write_ply_splats
 from tests.formats.splats.writers import random_splats
 
@@ -32,7 +30,7 @@ def test_a_field_is_cut_off_elsewhere_and_else_the_same(subject):
     assert extent(first) == 3 and extent(other) == 5
     assert np.allclose(other.medium.to_world.matrix, first.medium.to_world.matrix, atol=1e-6)
     assert other.medium.color_space == "linear" and other.medium.arrays.count == 30
-    assert splats.cut_off({"stop": 0.5}) == {"stop": 0.5}
+    assert study_truth.cut_off({"stop": 0.5}) == {"stop": 0.5}
 
 
 @pytest.mark.nightly

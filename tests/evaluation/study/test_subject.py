@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study import scenes as study_scenes
-from nerg_mi.evaluation.study.subject import open_subject
+from nerg_mi.evaluation import study_scenes
+from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.jobs.study_tasks import twin_beside
 from tests.reference import march_numpy
 

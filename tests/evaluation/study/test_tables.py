@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from nerg_mi.evaluation.study import tables as study_tables
+from nerg_mi.evaluation import study_tables
 
 
 def test_pareto():

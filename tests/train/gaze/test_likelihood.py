@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.evaluation import metrics
 from nerg_mi.fields.gaze_log_density import blind_table
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import fibonacci_directions

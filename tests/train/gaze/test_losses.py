@@ -3,7 +3,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.evaluation import metrics
 from nerg_mi.maths.sphere import latlong_grid
 from nerg_mi.train.gaze_settings import CODE, KLD_EPS, PAPER, gaze_loss
 

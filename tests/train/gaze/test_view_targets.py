@@ -101,7 +101,7 @@ def test_a_law_is_learnt_from_views_alone_and_holds_around():
     views = Supervision(None, around(90))
     field, about = train(PLACE, settings, config, replace(PROBES, radius=0.1), views)
     assert about["rays"] == 0 and about["salience_views"] == 90 and about["validation"]["views_held_out"] >= 10
-    from nerg_mi.evaluation.gaze.scores import gaze_field
+    from nerg_mi.evaluation.gaze import gaze_field
 
     rng, d = np.random.default_rng(5), fibonacci_directions(1024)
     positions = rng.uniform((-0.9, -0.9, 1.45), (0.9, 0.9, 1.75), (8, 3))

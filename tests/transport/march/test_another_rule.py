@@ -8,7 +8,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study import settings as study
+from nerg_mi.evaluation import study
 from nerg_mi.maths.arrays import quotient
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings

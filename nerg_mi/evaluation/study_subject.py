@@ -1,8 +1,4 @@
-"""What is studied: a scene of which integrators with any parameters can be made, its rays, and its truth.
-
-Three kinds: analytic scenes and scenes of shapes, with float64 references, and scene files with a field, whose
-reference is a render with much smaller steps.
-"""
+"""What a study measures: a scene at many settings, rendered and compared with its true values."""
 
 from __future__ import annotations
 
@@ -20,12 +16,52 @@ from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import center
 from nerg_mi.transport.occlusion import EXACT
 
-from .errors import errors
-from .parameters import parameters
-from .reference import Truth, compute_truth, first_solid, towards
-from .scenes import SCENES, AnalyticScene, make_sensor, volumes
-from .shapes import COLOR_SPP, compute_truth_of_shapes, first_hit, triangles
-from .splats import LIMITS, SOURCE, cut_off
+from .study_scenes import SCENES, AnalyticScene, make_sensor, volumes
+from .study_truth import (
+    COLOR_SPP,
+    LIMITS,
+    SOURCE,
+    Truth,
+    compute_truth,
+    compute_truth_of_shapes,
+    cut_off,
+    errors,
+    first_hit,
+    first_solid,
+    towards,
+    triangles,
+)
+
+# ---- The settings of an integrator, read back so that another one can be made of them ----
+
+
+def parameters(integrator) -> dict:
+    """The parameters of an integrator of type ``nerg``, read back by the names of its manual page."""
+    names = ("occlusion", "radiance", "jitter")
+    march = ("step", "dt_gamma", "stop", "color_cutoff", "quadrature", "coarse", "refined")
+    out = {n: getattr(integrator, n) for n in names} | {n: getattr(integrator.settings, n) for n in march}
+    observer = integrator.observer_settings
+    seen = ("depth", "surface_opacity", "visibility", "tolerance", "map_height", "directions", "integral_tolerance")
+    return out | {
+        "falloff": float(integrator.falloff[0]),
+        **{n: getattr(observer, n) for n in seen},
+        "background": np.array(integrator.background, float).ravel().tolist(),
+    }
+
+
+def extent(integrator) -> float | None:
+    """Where the Gaussians of its field are cut off, in standard deviations; None where its field is none of these."""
+    medium = integrator.medium
+    return None if medium is None or medium.hits is None else medium.arrays.extent
+
+
+# ---- Subject ----
+#
+# What is studied: a scene of which integrators with any parameters can be made, its rays, and its truth.
+#
+# Three kinds: analytic scenes and scenes of shapes, with float64 references, and scene files with a field, whose
+# reference is a render with much smaller steps.
+
 
 KINDS = ("auto", "analytic", "file")
 AOVS = "depth,opacity,visibility,gaze"

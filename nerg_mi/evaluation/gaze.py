@@ -1,28 +1,302 @@
-"""A gaze field at positions, and of people, that it was not trained on, beside what needs no field.
-
-Truth at a test position is the kernel density of the rays within R of it. Maps are compared over directions of equal
-area, rays one by one as they are. What is uncertain is which people came: intervals are a bootstrap over persons, who
-are drawn whole, with all of their rays (Efron & Tibshirani 1993).
-"""
+"""Scores of a gaze field at held-out positions, and the baselines that it is compared with."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.maths.arrays import vector_of
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.kde import SphericalKde
-from nerg_mi.probes.probes import place_probes
+from nerg_mi.probes.kde import Backend, SphericalKde
+from nerg_mi.probes.probes import Probes, place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.splits import purge, split_by_person
+from nerg_mi.train.gaze_data import SURFACE_OPACITY
+from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.observer import ObserverSettings
+from nerg_mi.transport.observer_gaze import ObservedGaze, PlacedGaze
 
-from .baselines import Baseline
-from .scores import EPS
+from . import metrics
+
+# ---- Baselines ----
+#
+# What a gaze field must beat: densities without a field.
+#
+# Each baseline is a function ``(positions (P, 3), directions) -> (P, D)`` of
+# densities in 1/sr that integrate to one; ``directions`` is (D, 3) for all
+# positions or (P, D, 3). All share the kernels of :mod:`nerg_mi.probes.kde`.
+
+
+Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Densities (P, D), 1/sr, of positions (P, 3) in directions (D, 3) or (P, D, 3)."""
+
+UNIFORM = 1.0 / (4.0 * np.pi)  # 1/sr
+# Points in a leaf of a KD-tree, which decides the order of those that are equally far, and so the last bits of sums.
+_LEAF = 16
+
+
+class Remembered:
+    """A function of positions and directions that is not asked twice for the same two arrays: its answers are kept, and
+    cannot be written to. Neither may the arrays change."""
+
+    def __init__(self, method: Baseline):
+        self._method = method
+        self._answers: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def __call__(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        for p, d, answer in self._answers:
+            if p is positions and d is directions:
+                return answer
+        answer = np.asarray(self._method(positions, directions))
+        answer.setflags(write=False)
+        self._answers.append((positions, directions, answer))
+        return answer
+
+
+def uniform() -> Baseline:
+    """The density that knows nothing: 1/(4π) everywhere."""
+
+    def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        return np.full((len(np.atleast_2d(positions)), np.shape(directions)[-2]), UNIFORM)
+
+    return evaluate
+
+
+def position_blind(rays: Rays, *, kappa: float = 50.0, backend: Backend = None) -> Baseline:
+    """One density for all positions: the KDE of all training rays, with ``kappa``
+    (what people look at wherever they stand)."""
+    # Runs of rays are separate mixtures averaged in float64: one sum of 10^5
+    # terms in float32 would lose digits, and a lane alone would take it all.
+    runs = np.array_split(np.arange(len(rays)), max(1, len(rays) // 4096))
+    offsets = np.concatenate([[0], np.cumsum([len(r) for r in runs])])
+    kde = SphericalKde(rays.direction, offsets, kappa, backend=backend)
+    share = np.diff(offsets) / len(rays)
+
+    def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        P = len(np.atleast_2d(positions))
+        directions = np.asarray(directions)
+        density = share @ kde.evaluate(directions.reshape(-1, 3)).astype(np.float64)
+        return np.broadcast_to(density, (P, len(density))) if directions.ndim == 2 else density.reshape(P, -1)
+
+    return evaluate
+
+
+def nearest_probes(probes: Probes, k: int = 16, *, backend: Backend = None) -> Baseline:
+    """Mean density of the ``k`` training probes nearest to a position; k = 1 is
+    the nearest probe. Fewer where there are fewer probes."""
+    from scipy.spatial import KDTree
+
+    tree = KDTree(probes.positions, leafsize=_LEAF)
+    k = min(k, len(probes))
+    rays = [np.arange(a, b) for a, b in zip(probes.offsets[:-1], probes.offsets[1:])]
+
+    def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        found = _nearest(tree, np.atleast_2d(positions), k)
+        # The probes used, once each when the directions are common to all.
+        if np.ndim(directions) == 2:
+            used, back = np.unique(found, return_inverse=True)
+            density = _some(probes, rays, used, backend).evaluate(directions)
+            return _mean_rows(density, back.reshape(found.shape))
+        density = [
+            _some(probes, rays, near, backend).evaluate(d).mean(axis=0, dtype=np.float64)
+            for near, d in zip(found, directions)
+        ]
+        return np.stack(density)
+
+    return evaluate
+
+
+def nearest_rays(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: Backend = None) -> Baseline:
+    """KDE of the ``k`` training rays whose origins are nearest to a position: a
+    probe without a radius, hard to beat where rays are many."""
+    from scipy.spatial import KDTree
+
+    tree = KDTree(rays.origin, leafsize=_LEAF)
+    k = min(k, len(rays))
+
+    def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        positions, directions = np.atleast_2d(positions), np.asarray(directions)
+        out = []
+        for start in range(0, len(positions), 64):  # 64 x 4,096 rays at a time
+            found = _nearest(tree, positions[start : start + 64], k)
+            kde = SphericalKde(rays.direction[found.ravel()], np.arange(len(found) + 1) * k, kappa, backend=backend)
+            out.append(kde.evaluate(directions if directions.ndim == 2 else directions[start : start + 64]))
+        return np.concatenate(out)
+
+    return evaluate
+
+
+def standard_baselines(
+    rays: Rays, radius: float, kappa: float = 20.0, blind_kappa: float = 50.0, seed: int = 0, count: int = 2048
+) -> tuple[Baseline, dict[str, Baseline]]:
+    """``(blind, baselines)``: the density that information is counted from, and by name all that a gaze field is shown
+    beside: uniform, position-blind, nearest probes and nearest rays of the training ``rays``, with kernels of
+    ``kappa``."""
+    probes = place_probes(
+        rays, radius, count=count, min_rays=min(64, len(rays)), kappa_rule="fixed", kappa=kappa, seed=seed
+    )
+    blind = position_blind(rays, kappa=blind_kappa)
+    return blind, {
+        "uniform": uniform(),
+        "position-blind": position_blind(rays, kappa=kappa),
+        f"position-blind, kappa {blind_kappa:g}": blind,
+        "nearest probe": nearest_probes(probes, 1),
+        "16 nearest probes": nearest_probes(probes, 16),
+        "4,096 nearest rays": nearest_rays(rays, 4096, kappa=kappa),
+    }
+
+
+def _nearest(tree: Any, positions: np.ndarray, k: int) -> np.ndarray:
+    """Indices (P, k) of the ``k`` points of a KD-tree that are nearest to each of ``positions`` (P, 3)."""
+    return tree.query(positions, k=np.arange(1, k + 1))[1]
+
+
+def _some(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: Backend) -> SphericalKde:
+    """The densities of the probes ``which`` of ``probes``, whose rays are at ``rays``."""
+    runs = [rays[p] for p in which]
+    offsets = np.concatenate([[0], np.cumsum([len(r) for r in runs])])
+    flat = np.concatenate(runs)
+    weights = None if probes.weights is None else probes.weights[flat]
+    return SphericalKde(probes.directions[flat], offsets, probes.kappa[which], weights, backend)
+
+
+def _mean_rows(density: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Mean (P, D) of the ``rows`` (P, k) of ``density`` (n, D)."""
+    return np.stack([density[r].mean(axis=0, dtype=np.float64) for r in rows])
+
+
+# ---- Scores ----
+#
+# A trained gaze field beside its baselines: densities over the sphere at positions, and a table of scores.
+
+
+# Of the uniform density: what a density of zero counts as in KLD. A truth that is a kernel density has
+# long empty stretches where nothing should hinge on how empty exactly.
+EPS = 1e-6
+
+
+class FieldDensity:
+    """A gaze field in a place, as a function as those of `baselines` are; see `gaze_field`."""
+
+    def __init__(
+        self,
+        field: AnyGazeField,
+        place: Place,
+        align: Similarity,
+        settings: ObserverSettings,
+        on_position: Callable[[int], None] | None,
+    ):
+        self._gaze, self._place, self._align, self._settings = PlacedGaze(field), place, align, settings
+        self._on_position = on_position
+        self._observed: dict[bytes, ObservedGaze] = {}
+
+    def __call__(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Densities (P, D) of positions (P, 3) in unit directions (D, 3) or (P, D, 3)."""
+        return self.members(positions, directions).mean(axis=0)
+
+    def members(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """The same of each member of an ensemble (M, P, D); of one field, that alone."""
+        align = self._align
+        positions = np.atleast_2d(np.asarray(positions, np.float64)) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
+        directions = np.asarray(directions, np.float64) @ (align.matrix[:3, :3] / align.scale).T
+        directions = np.broadcast_to(directions, (len(positions), *directions.shape[-2:]))
+        return np.stack([self._of(p, d) for p, d in zip(positions, directions)], axis=1)
+
+    def _of(self, position: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Densities (M, D) of one observer (3,), both in the field's frame."""
+        import mitsuba as mi
+
+        p_o, key = mi.Point3f(*position.tolist()), position.tobytes()
+        new = key not in self._observed
+        if new:
+            self._observed[key] = self._gaze.at([p_o], self._place, self._settings)
+        r_o = vector_of(mi.Vector3f, directions)
+        density = np.stack([np.array(m) for m in self._observed[key].members_along(p_o, r_o)])
+        if new and self._on_position is not None:
+            self._on_position(len(self._observed))
+        return density
+
+
+def gaze_field(
+    field: AnyGazeField,
+    medium,
+    align: Similarity | None = None,
+    kind: str = "median",
+    on_position: Callable[[int], None] | None = None,
+) -> FieldDensity:
+    """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr of the
+    positions' units.
+
+    What the integrator ``nerg`` shows on surfaces for an observer there, by the same functions: its depths, its
+    integral of a normalised field, its mean of an ensemble. Where no surface is met the field is what it was trained to
+    be there.
+
+    ``medium``: what the observer's depth is traced in, in the field's frame (a medium or a ``Place``; None for a field
+    that knows no geometry); ``align``: similarity from the frame of the positions to the field's; directions (D, 3) for
+    all positions or (P, D, 3), unit. The integrals of positions are kept: neither the field nor its place may change.
+    ``on_position`` is told how many positions are known, after each new one. Raises `NergError` for a field that needs
+    surfaces where there is no place.
+    """
+    if medium is None and field.config.needs_surfaces:
+        raise NergError(
+            "this gaze field was trained among surfaces, and there is no place that has any: give it the field, the "
+            "scene or the geometry"
+        )
+    place = medium if isinstance(medium, Place) else Place(medium)
+    settings = ObserverSettings(march=default_settings(place), depth=kind, surface_opacity=SURFACE_OPACITY)
+    return FieldDensity(field, place, align or Similarity(), settings, on_position)
+
+
+def scores(truth: np.ndarray, prediction: np.ndarray, eps: float = EPS) -> dict[str, float]:
+    """Means over positions of KLD (nats, both normalised over the sphere), CC, SIM, MAE (1/sr) and the prediction's
+    integral.
+
+    ``truth``, ``prediction``: (P, D) in 1/sr, directions of equal area; ``eps`` as in ``metrics.kld``. MAE and the
+    integral are of the prediction as it is, not normalised.
+    """
+    return {
+        "KLD": float(metrics.kld(truth, prediction, eps=eps).mean()),
+        "CC": float(metrics.cc(truth, prediction).mean()),
+        "SIM": float(metrics.sim(truth, prediction).mean()),
+        "MAE": float(metrics.mae(truth, prediction).mean()),
+        "integral": float(4 * np.pi * np.mean(prediction)),
+    }
+
+
+def score_rows(
+    truth: np.ndarray, positions: np.ndarray, directions: np.ndarray, methods: dict[str, Callable]
+) -> list[dict]:
+    """One row of ``scores`` for each of ``methods`` (name: density function), in order; ``method`` holds the name."""
+    return [{"method": name, **scores(truth, density(positions, directions))} for name, density in methods.items()]
+
+
+def print_scores(rows: list[dict], title: str) -> None:
+    """Print ``rows`` as a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    out = Table(title=title, title_justify="left")
+    for k in rows[0]:
+        out.add_column(k, justify="left" if isinstance(rows[0][k], str) else "right")
+    for row in rows:
+        out.add_row(*(v if isinstance(v, str) else f"{v:.4f}" if k == "MAE" else f"{v:.3f}" for k, v in row.items()))
+    # A width of its own: a table in a file or a pipe must not be folded.
+    Console(width=120).print(out)
+
+
+# ---- A gaze field at positions, and of people, that it was not trained on, beside what needs no field ----
+#
+# Truth at a test position is the kernel density of the rays within R of it. Maps are compared over directions of equal
+# area, rays one by one as they are. What is uncertain is which people came: intervals are a bootstrap over persons, who
+# are drawn whole, with all of their rays (Efron & Tibshirani 1993).
+
 
 SPLITS = ("both", "pos", "people")
 """What may be new to a field: positions and people, positions, or people."""

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .evaluation import SCORES
+from .gaze import SCORES
 
 SPLIT_HALF = "split half"
 """A reference and no method: what half of the people tell of the other half."""

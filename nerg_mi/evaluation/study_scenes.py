@@ -1,8 +1,4 @@
-"""Scenes whose pictures are known in closed form: densities for NumPy float64 and for Mitsuba alike.
-
-One function states a density; the reference evaluates it in float64, the marcher through a Mitsuba volume in single
-precision. Colours are affine in position, so that a picture's colour follows from opacity and first moment.
-"""
+"""Analytic scenes of a study, and their volumes and sensors."""
 
 from __future__ import annotations
 

@@ -1,10 +1,4 @@
-"""Whether what tells how sure a gaze field is foretells how far it is off, and whether its regions hold the looks that
-they should.
-
-The error of a position is the KLD of the density of the people who are scored there. Some of it is theirs, who are few:
-what half of them tells of the other half is taken off where both halves have rays enough. Positions of one zone are
-neighbours and are drawn together in a bootstrap; calibration draws persons, as all scores do.
-"""
+"""Whether a gaze field knows where it is wrong: its spread and its support against its errors."""
 
 from __future__ import annotations
 
@@ -13,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.probes.probes import LEVELS, asked_level, level_name, region_levels
 
-from .evaluation import GazeTest
-from .scores import EPS
+from . import metrics
+from .gaze import EPS, GazeTest
 
 SIGNALS = {"support": True, "spread": False}
 """What tells how sure a field is, by its name in a row of `position_rows`, and whether more of it is surer."""

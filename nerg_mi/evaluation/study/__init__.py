@@ -1,1 +1,0 @@
-"""Error against run time: scenes whose truth is known, at many settings."""

@@ -1,0 +1,424 @@
+"""True values of a study's scenes: of media in closed form, of shapes and of splats, and errors against them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.maths.color import decibels
+from nerg_mi.maths.geometry import box_interval
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.observer_gaze import ObservedGaze
+
+from . import metrics
+from .study_scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene
+
+# ---- Reference ----
+#
+# What a ray sees of an analytic scene, in float64: closed forms, and Gauss-Legendre where there is none.
+#
+# Independent of ``transport``: nothing is stepped. Opacity α = 1 - exp(-τ); the first moment ∫ t σ T dt; the median,
+# where the optical depth reaches -log(1 - α/2). Between breaks of constant density σ a piece of length δ and optical
+# depth x = σδ absorbs 1 - e^{-x} at the mean distance 1/σ - δ/expm1(x) into it. Smooth profiles have τ in closed form
+# and a moment by composite Gauss-Legendre quadrature (32 panels of 16 nodes: the integrands are analytic, so it is
+# exact to rounding).
+
+
+PANELS, NODES = 32, 16
+SOLID = 1.0
+"""Density (1/unit) that counts as a solid in a scene of hard surfaces; the vacuum between has 1e-4."""
+FUZZ = 1 / 64
+"""Most that a surface is moved towards the camera for being soft, as a share of its depth."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Along rays (N,): optical depth, first moment ∫ t σ T dt, the median's distance (0 where nothing absorbs), and the
+    mean free path 1/σ where T = 1/2 (0 where that is not reached)."""
+
+    tau: np.ndarray
+    moment: np.ndarray
+    median: np.ndarray
+    free_path: np.ndarray
+
+    @property
+    def opacity(self) -> np.ndarray:
+        return -np.expm1(-self.tau)
+
+    @property
+    def expected(self) -> np.ndarray:
+        """Mean distance of absorption, 0 where nothing absorbs."""
+        some = self.opacity > 0
+        return np.where(some, self.moment / np.where(some, self.opacity, 1), 0)
+
+    def depth(self, kind: str) -> np.ndarray:
+        """Of the kinds that the integrator knows; the refined depth is the median, found better."""
+        return self.expected if kind == "expected" else self.median
+
+    def color(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """Linear radiance (N, 3) of the scenes' affine colour, black behind."""
+        place = o * self.opacity[:, None] + d * self.moment[:, None]
+        return COLOR_BASE * self.opacity[:, None] + place @ COLOR_SLOPE.T
+
+
+def box_distances(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where float64 rays (N, 3) enter and leave the unit cube, from the origin on; equal on a miss."""
+    near, far = box_interval(o, d, np.zeros(3), np.ones(3))
+    near = np.maximum(near, 0)
+    miss = ~(near < far)
+    return np.where(miss, 0, near), np.where(miss, 0, far)
+
+
+def trace(scene: AnalyticScene, o: np.ndarray, d: np.ndarray, end: np.ndarray | None = None) -> Seen:
+    """What float64 rays ``o + t d`` (N, 3) see of ``scene``, up to the distances ``end`` (N,)."""
+    near, far = box_distances(o, d)
+    if end is not None:
+        far = np.clip(far, near, np.maximum(end, near))
+    return (_pieces if scene.optical_depth is None else _profile)(scene, o, d, near, far)
+
+
+def first_solid(scene: AnalyticScene, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Distance (N,) at which float64 rays meet the solid of a scene that is constant between breaks: matter denser than
+    `SOLID`; inf on a miss."""
+    start, length, sigma = _intervals(scene, o, d, *box_distances(o, d))
+    solid = (sigma > SOLID) & (length > 0)
+    return np.where(solid.any(-1), start[np.arange(len(o)), np.argmax(solid, -1)], np.inf)
+
+
+def _intervals(scene, o, d, near, far):
+    """Starts, lengths and densities (N, K) of the pieces between breaks."""
+    t = np.concatenate([near[:, None], scene.breaks(o, d), far[:, None]], -1)
+    t = np.sort(np.clip(t, near[:, None], far[:, None]), -1)
+    start, length = t[:, :-1], np.diff(t, axis=-1)
+    p = o[:, None] + d[:, None] * (start + length / 2)[..., None]
+    return start, length, scene.density(p[..., 0], p[..., 1], p[..., 2], NUMPY)
+
+
+def _pieces(scene, o, d, near, far) -> Seen:
+    start, length, sigma = _intervals(scene, o, d, near, far)
+    tau = sigma * length
+    before = np.cumsum(tau, -1) - tau
+    share = mean_share(tau)
+    moment = (np.exp(-before) * -np.expm1(-tau) * (start + length * share)).sum(-1)
+    total = tau.sum(-1)
+
+    row = np.arange(len(o))
+
+    def crossing(goal):
+        """Distance, and length per optical depth there, at which the optical depths ``goal`` are reached."""
+        i = np.argmax((before + tau >= goal[:, None]) & (tau > 0), -1)
+        slope = length[row, i] / np.where(tau[row, i] > 0, tau[row, i], 1)
+        return start[row, i] + slope * (goal - before[row, i]), slope
+
+    median = crossing(_half_of_opacity(total))[0]
+    free_path = crossing(np.full(len(o), np.log(2)))[1]
+    return Seen(total, moment, np.where(total > 0, median, 0), np.where(total >= np.log(2), free_path, 0))
+
+
+def _half_of_opacity(tau: np.ndarray) -> np.ndarray:
+    """Optical depth at which half of the opacity of ``tau`` is reached."""
+    return -np.log1p(0.5 * np.expm1(-tau))
+
+
+def mean_share(x: np.ndarray) -> np.ndarray:
+    """1/x - 1/expm1(x), with its series where that cancels."""
+    small = x < 1e-2
+    y = np.clip(np.where(small, 1, x), None, 700)
+    large = 1 / np.where(small, 1, x) - 1 / np.expm1(y)
+    return np.where(small, 0.5 - x / 12 + x**3 / 720, large)
+
+
+def _profile(scene, o, d, near, far) -> Seen:
+    x, w = np.polynomial.legendre.leggauss(NODES)
+    edges = (np.arange(PANELS)[:, None] + 0.5 + 0.5 * x) / PANELS
+    length = far - near
+    moment = np.zeros(len(o))
+    for share, weight in zip(edges.ravel(), np.tile(w, PANELS)):
+        t = near + length * share
+        p = o + d * t[:, None]
+        sigma = scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY)
+        moment += weight * t * sigma * np.exp(-scene.optical_depth(o, d, near, t))
+    moment *= length / (2 * PANELS)
+    total = np.where(length > 0, scene.optical_depth(o, d, near, far), 0)
+
+    def crossing(goal):
+        low, high = near.copy(), far.copy()
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            short = scene.optical_depth(o, d, near, middle) < goal
+            low, high = np.where(short, middle, low), np.where(short, high, middle)
+        return high
+
+    p = o + d * crossing(np.log(2))[:, None]
+    reached = total >= np.log(2)
+    sigma = np.where(reached, scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY), 1)
+    return Seen(
+        total, moment, np.where(total > 0, crossing(_half_of_opacity(total)), 0), np.where(reached, 1 / sigma, 0)
+    )
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A reference picture, a row a ray or pixel: ``color`` (N, 3) linear, the others (N,); ``gaze`` is 0 throughout
+    without a gaze field.
+
+    ``source``: what it is; ``convergence``: how much it changed when its step was halved, by name of error (empty for
+    closed forms).
+    """
+
+    color: np.ndarray
+    opacity: np.ndarray
+    depth: np.ndarray
+    visibility: np.ndarray
+    gaze: np.ndarray
+    source: str
+    convergence: dict
+
+
+def compute_truth(
+    scene: AnalyticScene,
+    gaze: ObservedGaze | None,
+    o,
+    d,
+    *,
+    depth: str,
+    visibility: str,
+    falloff: float,
+    tolerance: float,
+    surface_opacity: float,
+) -> Truth:
+    """The reference of ``nerg``'s channels for rays (N, 3), as its manual page defines them.
+
+    ``gaze``: for the scene's observer (a single-precision network, evaluated at float64 positions), or None.
+    """
+    seen = trace(scene, o, d)
+    t = seen.depth(depth)
+    surface = seen.opacity >= surface_opacity
+    p_d = o + d * t[:, None]
+    p_o = np.asarray(scene.observer, float)
+    # The point looked for lies in front of the surface, by the tolerance and by how far light goes into it: one mean
+    # free path to the expected depth of thick matter, ln 2 of it to the median.
+    paths = 1 if depth == "expected" else np.log(2)
+    in_front = tolerance + np.minimum(paths * seen.free_path, t * FUZZ)
+    distance, r_o = towards(p_o, p_d - d * in_front[:, None])
+    start = np.broadcast_to(p_o, o.shape)
+    p_od = p_d
+    if visibility == "transmittance":
+        share = np.exp(-trace(scene, start, r_o, distance).tau)
+    else:
+        met = trace(scene, start, r_o)
+        d_o = np.where(met.opacity >= surface_opacity, met.depth(depth), np.inf)
+        excess = distance - d_o - tolerance
+        share = 1 - (np.clip(excess / falloff, 0, 1) if falloff > 0 else (excess > 0))
+        blocked = excess > 0
+        p_od = np.where(blocked[:, None], p_o + r_o * np.where(blocked, d_o, 0)[:, None], p_d)
+    share = np.where(surface, share, 0)
+    density = np.zeros(len(o)) if gaze is None else evaluate_gaze(gaze, p_od, p_o, towards(p_o, p_d)[1]) * share
+    return Truth(seen.color(o, d), seen.opacity, t, share, density, "float64 closed form", {})
+
+
+def towards(p_o, p):
+    """Distance (N,) and unit direction (N, 3) from ``p_o`` to ``p``."""
+    v = p - p_o
+    distance = np.linalg.norm(v, axis=-1)
+    return distance, v / np.where(distance > 0, distance, 1)[:, None]
+
+
+def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
+    """Gaze density (N,) in 1/sr at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``, one of the observers of
+    ``gaze``."""
+    import mitsuba as mi
+
+    def points(kind, v):
+        return kind(np.ascontiguousarray(np.broadcast_to(v, p_od.shape).T, np.float32))
+
+    return np.array(
+        gaze.evaluate(points(mi.Point3f, p_od), points(mi.Point3f, p_o), points(mi.Vector3f, r_o), True)[0], float
+    )
+
+
+# ---- Errors ----
+#
+# How far a picture is from the truth: the errors that a study reports.
+
+
+SURFACE = 0.5
+"""Opacity from which on a ray meets a surface."""
+TRACE = 1e-3
+"""Opacity from which on a depth is compared."""
+KLD_EPS = 1e-6
+"""Of the mean: what a gaze of zero costs where the truth is not zero is bounded by it (13.8 nats)."""
+
+NAMES = (
+    "color_rmse",
+    "color_psnr",
+    "opacity_mae",
+    "depth_mae",
+    "depth_p99",
+    "visibility_mae",
+    "visibility_wrong",
+    "gaze_mae",
+    "gaze_kld",
+    "surface_mae",
+    "surface_p99",
+)
+
+
+def errors(
+    seen: dict[str, np.ndarray], known: Truth, exact: tuple[np.ndarray, np.ndarray] | None = None
+) -> dict[str, float]:
+    """Errors of the channels ``seen`` (N,), colour (N, 3), by name; what was not rendered is left out.
+
+    ``color_rmse``: linear radiance, over pixels and channels; ``color_psnr``: -20 log10 of it in dB; ``depth_mae``,
+    ``depth_p99``: mean and 99th percentile of |depth - truth| in scene units, over rays of opacity >= `TRACE`, a ray
+    that met nothing counting with its depth of 0; ``visibility_mae``, ``gaze_mae`` (1/sr): over pixels that truly show
+    a surface; ``gaze_kld``: nats, of both pictures as densities over those pixels. With ``exact`` distances and
+    visibilities: ``surface_mae``, ``surface_p99``: |depth - exact| over exact hits; ``visibility_wrong``: share of
+    these pixels that are shown (above 1/2) and hidden, or the reverse.
+    """
+    out = {}
+    if "color" in seen and np.any(seen["color"]):
+        out["color_rmse"] = float(np.sqrt(np.mean((seen["color"] - known.color) ** 2)))
+        out["color_psnr"] = decibels(out["color_rmse"] ** 2, 1e-24)
+    if "opacity" in seen:
+        out["opacity_mae"] = float(np.mean(np.abs(seen["opacity"] - known.opacity)))
+    traced = known.opacity >= TRACE
+    if "depth" in seen and traced.any():
+        off = np.abs(seen["depth"] - known.depth)[traced]
+        out["depth_mae"], out["depth_p99"] = float(off.mean()), float(np.percentile(off, 99))
+    surface = known.opacity >= SURFACE
+    if "visibility" in seen and surface.any():
+        out["visibility_mae"] = float(np.mean(np.abs(seen["visibility"] - known.visibility)[surface]))
+    if "gaze" in seen and np.any(known.gaze[surface] > 0):
+        out["gaze_mae"] = float(np.mean(np.abs(seen["gaze"] - known.gaze)[surface]))
+        out["gaze_kld"] = float(metrics.kld(known.gaze[surface], seen["gaze"][surface], eps=KLD_EPS))
+    if exact is not None:
+        distance, visible = exact
+        hit = np.isfinite(distance)
+        if "depth" in seen:
+            off = np.abs(seen["depth"] - np.where(hit, distance, 0))[hit]
+            out["surface_mae"], out["surface_p99"] = float(off.mean()), float(np.percentile(off, 99))
+        if "visibility" in seen:
+            out["visibility_wrong"] = float(np.mean(((seen["visibility"] > 0.5) != visible)[hit]))
+    return out
+
+
+# ---- Shapes ----
+#
+# A scene of shapes alone as the subject of a study: its truth is float64 ray casts at their triangles.
+
+
+# Rays tested against all triangles at once.
+CHUNK = 64
+# The mean of so many samples a pixel is the colour that pictures are compared with.
+COLOR_SPP = 256
+
+
+def triangles(scene) -> np.ndarray:
+    """Corners (N, 3, 3), float64, of all shapes of a Mitsuba scene. Raises NergError for a shape that is no mesh."""
+    import mitsuba as mi
+
+    found = []
+    for shape in scene.shapes():
+        if not shape.is_mesh():
+            raise NergError(
+                f"a study of shapes needs meshes, and this scene has a {shape.class_name()}: give it as triangles"
+            )
+        params = mi.traverse(shape)
+        corners = np.array(params["vertex_positions"], float).reshape(-1, 3)
+        found.append(corners[np.array(params["faces"], int).reshape(-1, 3)])
+    return np.concatenate(found)
+
+
+def first_hit(corners: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Distance (N,) at which rays ``o + t d`` (N, 3), t > 0, first meet one of the triangles (M, 3, 3); inf on a miss.
+
+    Möller and Trumbore 1997, in float64. Edges count as inside to rounding, so that no ray slips between neighbours.
+    """
+    a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    out = np.empty(len(o))
+    for begin in range(0, len(o), CHUNK):
+        origin, way = o[begin : begin + CHUNK, None], d[begin : begin + CHUNK, None]
+        p = np.cross(way, v)
+        det = (p * u).sum(-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            s = origin - a
+            first = (s * p).sum(-1) / det
+            q = np.cross(s, u)
+            second = (q * way).sum(-1) / det
+            t = (q * v).sum(-1) / det
+            hit = (first >= -1e-12) & (second >= -1e-12) & (first + second <= 1 + 1e-12) & (t > 0) & (det != 0)
+        out[begin : begin + CHUNK] = np.where(hit, t, np.inf).min(-1)
+    return out
+
+
+def observed_gaze(subject, p_o: np.ndarray) -> ObservedGaze:
+    """The gaze field of ``subject`` for the observer at ``p_o`` (3,)."""
+    import mitsuba as mi
+
+    # The integral is the integrator's own, of all directions: over ray casts, which are exact to single precision, and
+    # tested against ``first_hit``.
+    integrator = subject.integrator({"integral_tolerance": 0.0})
+    place = Place(None, subject.scene)
+    return integrator.gaze.at([mi.Point3f(*p_o.tolist())], place, integrator.observer_settings)
+
+
+def compute_truth_of_shapes(subject, seed: int, visibility: str, color: np.ndarray) -> Truth:
+    """The reference of ``nerg``'s channels for shapes alone, as its manual page defines them.
+
+    ``color``: (N, 3), what the colours of the picture tend to.
+    """
+    o, d = subject.rays(seed)
+    t = subject.first_hits(seed)
+    hit = np.isfinite(t)
+    depth = np.where(hit, t, 0)
+    p_d, p_o = o + d * depth[:, None], subject.eye()
+    distance, r_o = towards(p_o, p_d - d * subject.tolerance)
+    met = first_hit(subject.corners, np.broadcast_to(p_o, o.shape), r_o)
+    p_od = p_d
+    if visibility == "transmittance":
+        share = (met >= distance).astype(float)
+    else:
+        falloff = float(subject.base["falloff"])
+        excess = distance - met - subject.tolerance
+        share = 1 - (np.clip(excess / falloff, 0, 1) if falloff > 0 else (excess > 0))
+        blocked = excess > 0
+        p_od = np.where(blocked[:, None], p_o + r_o * np.where(blocked, met, 0)[:, None], p_d)
+    share = np.where(hit, share, 0)
+    gaze = np.zeros(len(o))
+    if subject.has_gaze:
+        gaze = evaluate_gaze(observed_gaze(subject, p_o), p_od, p_o, towards(p_o, p_d)[1]) * share
+    source = f"float64 ray casts; colour the mean of {COLOR_SPP} samples a pixel"
+    return Truth(color, hit.astype(float), depth, share, gaze, source, {})
+
+
+# ---- Splats ----
+#
+# What can be set of Gaussian splats: they are not marched, but cut off, each at so many standard deviations, and rays
+# end where little light is left.
+
+
+EXTENTS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
+STOPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+LIMITS = ({"extent": 8.0}, {"extent": 6.0})
+"""Where Gaussians are cut off in a reference, and in one that tells how good it is."""
+SOURCE = f"render of Gaussians cut off at {LIMITS[0]['extent']:g} standard deviations"
+
+
+def cut_off(params: Mapping) -> dict:
+    """``params`` of an integrator without ``extent``, where Gaussians of its field are cut off: if it is there, the
+    field is another one that is cut off there."""
+    import mitsuba as mi
+
+    found = dict(params)
+    extent = found.pop("extent", None)
+    if extent is not None:
+        field = found["field"]
+        medium = field.medium()
+        to_world = mi.ScalarTransform4f(medium.to_world.matrix.tolist())
+        splats = {"type": "splats", "filename": field.filename, "color_space": medium.color_space}
+        found["field"] = mi.load_dict(splats | {"to_world": to_world, "extent": extent})
+    return found
