@@ -18,7 +18,8 @@ from nerg_mi.evaluation.study_subject import ExactSurfaces, FileSubject, Subject
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.rendering.scene_file import files_of_scene
-from nerg_mi.tasks.code import RENDERS, processor, versions
+from nerg_mi.tasks.code import RENDERS, processor
+from nerg_mi.tasks.code import versions as code_versions
 from nerg_mi.tasks.inputs import name_of, read_inputs
 from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.task import Task, canonical
@@ -70,7 +71,7 @@ def measured_in_parts(
     for of_part in (*(chosen[k : k + ROWS] for k in range(0, len(chosen), ROWS)), None):
         label = "cost against size" if of_part is None else f"{len(of_part)} settings from number {of_part[0]}"
         part = given | {"settings": of_part}
-        tasks.append(Task(f"{__name__}:measure_part", part, inputs, ".json", versions(*RENDERS), label))
+        tasks.append(Task(f"{__name__}:measure_part", part, inputs, ".json", code_versions(*RENDERS), label))
     plan = Plan(f"nerg study {out.absolute()}", tasks)
     return _joined([read_json(made.path, "part of a study") for made in Parts(options, out, reporter).run(plan)])
 

@@ -26,7 +26,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.registry import read_rays
 from nerg_mi.rays.summary import RaysSummary, summarise
 
-from .datasets import dataset_cards, filter_dataset, import_dataset
+from .datasets import FileName, dataset_cards, filter_dataset, import_dataset
 from .filtering import FilterSteps
 from .options import option
 from .options.rays import FilterOptions, ImportOptions, SplitOptions
@@ -35,7 +35,6 @@ from .reporter import SILENT, Reporter
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FileName = str | os.PathLike
 KINDS = ("density", "layout")
 
 

@@ -28,7 +28,7 @@ class DifferenceOptions(Checked):
     cmap: str = option("RdBu_r", "Colour map: RdBu_r, PuOr_r, BrBG_r, PRGn_r.")
 
 
-def draw(files: Sequence[Path], options: DifferenceOptions, reporter: Reporter) -> Drawing:
+def _draw_difference(files: Sequence[Path], options: DifferenceOptions, reporter: Reporter) -> Drawing:
     """The first of two files less the second."""
     find_colors(options.cmap, diverging=True)
     if options.top is not None and not (np.isfinite(options.top) and options.top > 0):
@@ -48,6 +48,11 @@ def draw(files: Sequence[Path], options: DifferenceOptions, reporter: Reporter) 
     return Drawing(figure, list(files))
 
 
-KIND = Kind(
-    "difference", "A quantity of one picture less that of another.", "two pictures (.exr)", 2, DifferenceOptions, draw
+DIFFERENCE_KIND = Kind(
+    "difference",
+    "A quantity of one picture less that of another.",
+    "two pictures (.exr)",
+    2,
+    DifferenceOptions,
+    _draw_difference,
 )

@@ -43,7 +43,7 @@ class FloorOptions(Checked):
     )
 
 
-def draw(files: Sequence[Path], options: FloorOptions, reporter: Reporter) -> Drawing:
+def _draw_floor(files: Sequence[Path], options: FloorOptions, reporter: Reporter) -> Drawing:
     """The plan of the rays of a file, over the place of ``options.scene`` where there is one."""
     (path,) = files
     rays = _of_people(load_rays(path), options.people)
@@ -151,4 +151,6 @@ def _ahead(rays: Rays, some: np.ndarray) -> np.ndarray:
     return rays.origin[some, :2] + _REACH * rays.direction[some, :2]
 
 
-KIND = Kind("floor", "The floor plan of rays in their place.", "file of rays (.npz)", 1, FloorOptions, draw)
+FLOOR_KIND = Kind(
+    "floor", "The floor plan of rays in their place.", "file of rays (.npz)", 1, FloorOptions, _draw_floor
+)

@@ -1,13 +1,14 @@
-"""The kinds of figures. One more is one more module, and its name here."""
+"""The kinds of figures. One more is a `Kind` in the list of its file."""
 
 from __future__ import annotations
 
 from nerg_mi.errors import NergError
 
-from . import difference, floor, sheet, sphere, surface, triptych
+from .file_kinds import FILE_KINDS
 from .kind import Kind
+from .scene_kinds import SCENE_KINDS
 
-KINDS: dict[str, Kind] = {kind.KIND.name: kind.KIND for kind in (sphere, triptych, floor, sheet, difference, surface)}
+KINDS: dict[str, Kind] = {kind.name: kind for kind in (*SCENE_KINDS, *FILE_KINDS)}
 
 
 def find_kind(name: str) -> Kind:

@@ -31,7 +31,7 @@ class SheetOptions(ScaleOptions):
     width: int = option(480, "Pixels that a picture is wide at most; larger ones are shrunk.", within=Range(16, 4096))
 
 
-def draw(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> Drawing:
+def _draw_sheet(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> Drawing:
     """The pictures of ``files``, named by their files."""
     style, pictures, heat = options.style(), [], None
     names = [path.stem for path in files]
@@ -83,6 +83,11 @@ def _display(path: Path) -> np.ndarray:
     return shown[..., :3]
 
 
-KIND = Kind(
-    "sheet", "Several pictures on one page, with one scale.", "pictures (.png, .jpg, .exr)", 400, SheetOptions, draw
+SHEET_KIND = Kind(
+    "sheet",
+    "Several pictures on one page, with one scale.",
+    "pictures (.png, .jpg, .exr)",
+    400,
+    SheetOptions,
+    _draw_sheet,
 )

@@ -29,7 +29,7 @@ class SphereOptions(SceneOptions):
     width: int = option(800, "Width of the map in pixels; it is half as high.", within=Range(64, 5792))
 
 
-def draw(files: Sequence[Path], options: SphereOptions, reporter: Reporter) -> Drawing:
+def _draw_sphere(files: Sequence[Path], options: SphereOptions, reporter: Reporter) -> Drawing:
     """The sphere of the observer of the scene file, or of its camera where it has none, turned to where they look."""
     import mitsuba as mi
 
@@ -62,4 +62,6 @@ def draw(files: Sequence[Path], options: SphereOptions, reporter: Reporter) -> D
     return Drawing(figure, [path], options.seed)
 
 
-KIND = Kind("sphere", "The gaze of an observer over all directions.", "scene file (.xml)", 1, SphereOptions, draw)
+SPHERE_KIND = Kind(
+    "sphere", "The gaze of an observer over all directions.", "scene file (.xml)", 1, SphereOptions, _draw_sphere
+)

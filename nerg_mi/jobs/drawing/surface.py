@@ -69,7 +69,7 @@ class BakedSurface:
     made_of: tuple[str, ...]
 
 
-def draw(files: Sequence[Path], options: SurfaceOptions, reporter: Reporter) -> Drawing:
+def _draw_surface(files: Sequence[Path], options: SurfaceOptions, reporter: Reporter) -> Drawing:
     """The picture of the surface that `nerg bake` has written."""
     style = options.style()
     (path,) = files
@@ -184,4 +184,6 @@ def _unit(vector: np.ndarray | None, otherwise: np.ndarray | None, name: str) ->
     return vector / length
 
 
-KIND = Kind("surface", "Gaze on a mesh, with its scale.", "a baked surface (.ply)", 1, SurfaceOptions, draw)
+SURFACE_KIND = Kind(
+    "surface", "Gaze on a mesh, with its scale.", "a baked surface (.ply)", 1, SurfaceOptions, _draw_surface
+)

@@ -26,7 +26,7 @@ class TriptychOptions(SceneOptions):
     sensor: int = option(0, "The other camera, counted from 0.", "-s", "--sensor", within=Range(0, 65535))
 
 
-def draw(files: Sequence[Path], options: TriptychOptions, reporter: Reporter) -> Drawing:
+def _draw_triptych(files: Sequence[Path], options: TriptychOptions, reporter: Reporter) -> Drawing:
     """Three pictures with one scale; the scene file needs an observer who is not the camera."""
     from nerg_mi.transport.observer import center
 
@@ -82,4 +82,6 @@ def _own_camera(observer: Any, camera: Any) -> Any:
     return mi.load_dict(own)
 
 
-KIND = Kind("triptych", "Occlusion: three views of a gaze.", "scene file (.xml)", 1, TriptychOptions, draw)
+TRIPTYCH_KIND = Kind(
+    "triptych", "Occlusion: three views of a gaze.", "scene file (.xml)", 1, TriptychOptions, _draw_triptych
+)
