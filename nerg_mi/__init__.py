@@ -42,26 +42,26 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _WHERE = {
-    "Camera": "api.camera",
-    "NergError": "errors",
-    "Rays": "rays.rays",
-    "Scene": "api.scene",
-    "ablate": "api.evaluation",
-    "align": "api.alignment",
-    "attention": "api.attention",
-    "evaluate_gaze": "api.evaluation",
-    "evaluate_radiance": "api.evaluation",
-    "import_rays": "api.tracking",
-    "load_field": "api.fields",
-    "load_gaze": "api.fields",
-    "load_rays": "api.fields",
-    "make_scene": "api.scene",
-    "observe": "api.queries",
-    "render": "api.pictures",
-    "study": "api.evaluation",
-    "trace": "api.queries",
-    "train_gaze": "api.training",
-    "train_radiance": "api.training",
+    "Camera": "nerg_mi.api.camera",
+    "NergError": "nerg_mi.errors",
+    "Rays": "nerg_mi.rays.rays",
+    "Scene": "nerg_mi.api.scene",
+    "ablate": "nerg_mi.api.evaluation",
+    "align": "nerg_mi.api.alignment",
+    "attention": "nerg_mi.api.attention",
+    "evaluate_gaze": "nerg_mi.api.evaluation",
+    "evaluate_radiance": "nerg_mi.api.evaluation",
+    "import_rays": "nerg_mi.api.tracking",
+    "load_field": "nerg_mi.api.fields",
+    "load_gaze": "nerg_mi.api.fields",
+    "load_rays": "nerg_mi.api.fields",
+    "make_scene": "nerg_mi.api.scene",
+    "observe": "nerg_mi.api.queries",
+    "render": "nerg_mi.api.pictures",
+    "study": "nerg_mi.api.evaluation",
+    "trace": "nerg_mi.api.queries",
+    "train_gaze": "nerg_mi.api.training",
+    "train_radiance": "nerg_mi.api.training",
 }
 """The public names, and the module of each."""
 
@@ -97,7 +97,7 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f'module "{__name__}" has no attribute "{name}"', name=name, obj=sys.modules[__name__])
     from importlib import import_module
 
-    value = getattr(import_module(f".{_WHERE[name]}", __name__), name)
+    value = getattr(import_module(_WHERE[name]), name)
     globals()[name] = value
     return value
 
