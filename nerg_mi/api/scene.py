@@ -128,8 +128,8 @@ class Scene:
         from nerg_mi.fields.constant_weights import set_constant_weights
         from nerg_mi.rendering.long_renders import fields_of
 
-        for field in fields_of(self.integrator):
-            set_constant_weights(field, constant)
+        for trained in fields_of(self.integrator):
+            set_constant_weights(trained, constant)
 
     @property
     def default_quantities(self) -> tuple[str, ...]:

@@ -207,9 +207,9 @@ def _check(paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
     for path in paths:
         check_writable(path, *SUFFIXES)
     check_values(options)
-    for field in fields(options):
-        if field.name in _OF_TRIANGLES and getattr(options, field.name) != field.default:
-            name = {"shapes": "shape"}.get(field.name, field.name)
+    for entry in fields(options):
+        if entry.name in _OF_TRIANGLES and getattr(options, entry.name) != entry.default:
+            name = {"shapes": "shape"}.get(entry.name, entry.name)
             raise NergError(f"--{name} is of surfaces with triangles; leave it out for Gaussian splats")
     source = source_of(options, rays)
     if source == "field" and options.gaze is None:

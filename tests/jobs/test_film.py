@@ -107,7 +107,8 @@ def test_files_of_the_scene_are_the_same_wherever_it_lies(scene, tmp_path):
 def test_one_picture_needs_nothing_of_it(scene, tmp_path):
     """Neither the engine nor dask is loaded where no parts are asked for."""
     code = (
-        "import sys\nfrom nerg_mi.jobs.film import render_film\nfrom nerg_mi.jobs.options.parts import FilmOptions\n"
+        "import sys\nfrom nerg_mi.jobs.film import render_film\n"
+        "from nerg_mi.jobs.options.parts import FilmOptions\n"
         f"render_film({str(scene)!r}, {str(tmp_path / 'a.png')!r}, FilmOptions(mode='llvm_ad_rgb'))\n"
         "print([m for m in sys.modules if m.startswith(('nerg_mi.tasks', 'distributed', 'dask'))])"
     )
