@@ -14,18 +14,18 @@ import pytest
 import typer
 
 import nerg_mi.aoi
-import nerg_mi.jobs.drawing
 import nerg_mi.jobs.options
 import nerg_mi.rays.readers
 from nerg_mi.cli.options import takes
 from nerg_mi.errors import NergError
 from nerg_mi.jobs import tracking
+from nerg_mi.jobs.drawing.registry import KINDS as FIGURES
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, Checked, Range, check_number, ranged
 from nerg_mi.train import gaze_settings, radiance_settings
 
 
 def _modules():
-    for package in (nerg_mi.aoi, nerg_mi.jobs.options, nerg_mi.jobs.drawing, nerg_mi.rays.readers):
+    for package in (nerg_mi.aoi, nerg_mi.jobs.options, nerg_mi.rays.readers):
         yield package
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             yield importlib.import_module(module.name)
@@ -35,8 +35,10 @@ def _modules():
 KINDS = list(
     dict.fromkeys(
         kind
-        for module in _modules()
-        for kind in vars(module).values()
+        for kind in (
+            *(kind for module in _modules() for kind in vars(module).values()),
+            *(figure.options for figure in FIGURES.values()),
+        )
         if isinstance(kind, type)
         and is_dataclass(kind)
         and (issubclass(kind, Checked) or any(RANGE in f.metadata for f in fields(kind)))
