@@ -31,12 +31,14 @@ def test01_derivatives_are_paid_for_where_any_are_tracked(rgb, taken):
     settings, medium, z = MarchSettings(0.01), slab(rgb, 2, 1), rgb.Float(0)
     through(rgb, medium, settings, z)
     assert taken == ["march_primal"]
+    taken.clear()
     dr.enable_grad(z)
     attached = through(rgb, medium, settings, z)
-    assert taken[1:] == ["differentiable_march"] and dr.grad_enabled(attached.expected_depth)
+    assert taken[0] == "differentiable_march" and dr.grad_enabled(attached.expected_depth)
+    taken.clear()
     with dr.suspend_grad():
         through(rgb, medium, settings, z)
-    assert taken[2:] == ["march_primal"]
+    assert taken == ["march_primal"]
 
 
 def test02_both_marches_find_the_same(rgb):
