@@ -86,6 +86,25 @@ def ranged(default: Any, within: Range) -> Any:
     return dataclasses.field(default=default, metadata={RANGE: within})
 
 
+def setting(default: Any, help: str, *names: str, within: Range | None = None, option: str = "") -> Any:
+    """A field of a dataclass of settings, a `Checked` one, that is an option of what uses these settings, too.
+
+    Parameters
+    ----------
+    default
+        Its value where none is set.
+    help
+        What it means, in one line.
+    names
+        How the command line spells it, where that is not ``--`` and the option's name.
+    within
+        The range of its numbers.
+    option
+        The option's name, where that is not the field's.
+    """
+    return dataclasses.field(default=default, metadata={RANGE: within, "help": help, "names": names, "option": option})
+
+
 class Checked:
     """Base of dataclasses that check their numbers on construction.
 

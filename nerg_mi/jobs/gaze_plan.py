@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from nerg_mi.errors import NergError, chosen
 from nerg_mi.train.gaze_data import TargetNeeds, check_kernels
 from nerg_mi.train.gaze_recipes import FieldChoices, Recipe, gaze_recipe
-from nerg_mi.train.gaze_settings import ProbeSettings
+from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan
 from nerg_mi.train.geometry import GazePlace
 
 from .gaze_places import place_kind
+from .options import chosen_settings
 from .options.gaze import GazeOptions
 
 
@@ -25,8 +23,8 @@ def plan_gaze(options: GazeOptions, place: GazePlace, views_alone: bool = False)
         return gaze_recipe(options.recipe).plan(
             place,
             _choices(options, place.kind, views_alone),
-            settings=_settings(options),
-            probes=_probes(options),
+            settings=chosen_settings(options, GazeSettings),
+            probes=chosen_settings(options, ProbeSettings),
             begin=options.begin == "field",
             views_alone=views_alone,
         )
@@ -39,8 +37,8 @@ def check_plan(options: GazeOptions, views_alone: bool = False) -> ProbeSettings
     _check(options, recipe, views_alone)
     with chosen(_named(options)):
         config = recipe.architectures(_choices(options, place_kind(options), views_alone))[0]
-    recipe.gaze_settings(_settings(options), views_alone)
-    probes = recipe.probe_settings(_probes(options))
+    recipe.gaze_settings(chosen_settings(options, GazeSettings), views_alone)
+    probes = recipe.probe_settings(chosen_settings(options, ProbeSettings))
     if rows := TargetNeeds.of(config).blind_rows:
         check_kernels(rows, probes.mix_kappa)
     return probes
@@ -109,41 +107,3 @@ def _choices(options: GazeOptions, kind: str, views_alone: bool) -> FieldChoices
         semantic_own=options.semantic_own,
         place=kind,
     )
-
-
-def _settings(options: GazeOptions) -> Mapping[str, Any]:
-    """Keywords of `GazeSettings` that are given."""
-    return _given(
-        minutes=options.minutes,
-        steps=options.steps,
-        seed=options.seed,
-        loss=options.loss,
-        zones=options.zones,
-        refit=options.refit,
-        mix_folds=options.mix_folds,
-        frozen=options.freeze,
-        learning_rate=options.learning_rate,
-        weight_decay=options.weight_decay,
-        integral=options.integral,
-    )
-
-
-def _probes(options: GazeOptions) -> Mapping[str, Any]:
-    """Keywords of `ProbeSettings` that are given."""
-    return _given(
-        radius=options.radius,
-        count=options.probes,
-        placement=options.placement,
-        cap=options.cap,
-        min_rays=options.min_rays,
-        kappa_rule=options.kappa_rule,
-        kappa=options.kappa,
-        mix_kappa=options.mix_kappa,
-        weights=options.weights,
-        directions=options.directions,
-        fresh=options.fresh or None,
-    )
-
-
-def _given(**options: Any) -> Mapping[str, Any]:
-    return {k: v for k, v in options.items() if v is not None}

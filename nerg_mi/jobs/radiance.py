@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError, chosen
@@ -18,6 +18,7 @@ from nerg_mi.train import radiance_run
 from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
 
 from .backend import select_backend
+from .options import chosen_settings
 from .options.radiance import RadianceOptions, RadianceScoreOptions
 from .reporter import SILENT, Reporter
 
@@ -95,15 +96,8 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
 
 
 def _settings(options: RadianceOptions) -> RadianceSettings:
-    minutes = 5.0 if options.minutes is None and options.steps is None else options.minutes
-    given = RadianceSettings(
-        steps=options.steps,
-        minutes=minutes,
-        seed=options.seed,
-        distortion_weight=options.distortion_weight,
-        photo_colors=options.photo_colors,
-    )
-    return given if options.depth_weight is None else replace(given, depth_weight=options.depth_weight)
+    given = chosen_settings(options, RadianceSettings)
+    return RadianceSettings(**given if {"minutes", "steps"} & given.keys() else given | {"minutes": 5.0})
 
 
 def _open(photos: str | Path, options: RadianceOptions) -> Dataset:

@@ -24,6 +24,7 @@ from nerg_mi.ranges import (
     Checked,
     Range,
     ranged,
+    setting,
 )
 
 # ---- Losses between predicted and true gaze densities of probes, in Dr.Jit ----
@@ -172,33 +173,28 @@ LOSSES = {"paper": PAPER, "code": CODE, "likelihood": {"kld": 1.0, "cc": 0.0, "m
 class ProbeSettings(Checked):
     """How rays become probes, and probes targets; lengths in metres, in the rays' frame."""
 
-    # Radius R of a probe.
-    radius: float = ranged(0.25, LENGTHS)
-    # Probes at most.
-    count: int = ranged(2048, Range(1, 10**6))
-    # Rays in a probe at most, the nearest.
-    cap: int = ranged(1024, Range(1, 10**6))
-    # Rays in a probe at least.
-    min_rays: int = ranged(64, Range(1, 10**6))
-    # How a probe chooses the concentration of its rays' kernels (`probes.probes.place_probes`).
-    kappa_rule: str = "fixed"
-    # Concentration of the rule "fixed".
-    kappa: float = ranged(50.0, KAPPAS)
-    # Directions of equal area of each probe, turned at random and fixed, so that depths are traced once.
-    directions: int = ranged(1024, DIRECTIONS)
+    radius: float = setting(0.25, "Radius R of a probe in metres.", within=LENGTHS)
+    count: int = setting(2048, "Number of probes at most.", within=Range(1, 10**6), option="probes")
+    cap: int = setting(1024, "Rays in a probe at most, the nearest.", within=Range(1, 10**6))
+    min_rays: int = setting(64, "Rays in a probe at least.", within=Range(1, 10**6))
+    kappa_rule: str = setting("fixed", "Concentration of a ray's kernel: fixed, silverman or loo.")
+    kappa: float = setting(50.0, "That of the rule fixed.", within=KAPPAS)
+    # Of equal area, turned at random and fixed, so that depths are traced once.
+    directions: int = setting(1024, "Directions of a probe.", within=DIRECTIONS)
     # Kind of depth that is the surface (`transport.depth`).
     depth: str = "median"
-    # Where probes are placed (`probes.probes`).
-    placement: str = "data"
+    placement: str = setting("data", "Of probes: data, grid, random or blue.")
     # Distance between probes, of placements that have one.
     spacing: float | None = ranged(None, LENGTHS)
-    # Whether directions are turned anew, and depths traced again, for every epoch.
-    fresh: bool = False
-    # What a probe's rays count by (`probes.probes.place_probes`).
-    weights: str = "equal"
-    # Concentration of the kernels of the blind density, of fields that have one. Wide: such a field learns what it
-    # lacks from many probes, but nothing takes back the peaks of a few people, which others do not share.
-    mix_kappa: float = ranged(10.0, KAPPAS)
+    fresh: bool = setting(False, "Draw the directions again for every epoch, not once a probe.", "--fresh-directions")
+    weights: str = setting(
+        "equal", "Of a probe's rays: equal, distance (1 - d/R), or person (all people of a probe count alike)."
+    )
+    # Wide: such a field learns what it lacks from many probes, but nothing takes back the peaks of a few people, which
+    # others do not share.
+    mix_kappa: float = setting(
+        10.0, "Concentration of the kernels of that blind density, which default also begins with.", within=KAPPAS
+    )
 
     def to_dict(self) -> dict:
         """As JSON, for the provenance."""
@@ -207,50 +203,48 @@ class ProbeSettings(Checked):
 
 @dataclass(frozen=True)
 class GazeSettings(Checked):
-    """How weights are moved, for how long, and what a validation watches. Of ``steps`` and ``minutes`` one is given."""
+    """How weights are moved, for how long, and what a validation watches. Of ``steps`` and ``minutes`` one is set."""
 
-    # Steps of the run.
-    steps: int | None = ranged(None, STEPS)
-    # Or its length in minutes.
-    minutes: float | None = ranged(None, MINUTES)
-    # Of probes, directions, weights, batches and the validation's split.
-    seed: int = ranged(0, SEEDS)
-    # "paper" (KLD + (1 - CC) + MAE), "code" (MAE + 0.1 (1 - CC), as published) or "likelihood", of a log density.
-    loss: str = "paper"
-    # Weight of the squared error of a probe's integral, which KLD and CC do not see; MAE alone pulls it to the median.
-    integral: float = ranged(1.0, LOSS_WEIGHTS)
+    steps: int | None = setting(None, "Or: train for so many steps.", within=STEPS)
+    minutes: float | None = setting(None, "Train for this long, both fits together.", within=MINUTES)
+    seed: int = setting(0, "Seed of probes, directions, weights, batches and splits.", within=SEEDS)
+    # "likelihood" is that of a log density.
+    loss: str = setting("paper", "Of small and paper. paper: KLD + (1 - CC) + MAE; code: MAE + 0.1 (1 - CC).")
+    # KLD and CC do not see the integral; MAE alone pulls it to the median.
+    integral: float = setting(1.0, "Weight of the squared error of the integral over the sphere.", within=LOSS_WEIGHTS)
     # Probes of a step, drawn at random.
     probes: int = ranged(16, Range(1, 10**6))
     # Directions of each, drawn at random.
     directions: int = ranged(256, Range(1, 1 << 20))
     # Rays of each, drawn from its density, for the likelihood.
     rays: int = ranged(64, Range(1, 10**6))
-    # Learning rate at the start.
-    learning_rate: float = ranged(1e-2, LEARNING_RATES)
+    learning_rate: float = setting(1e-2, "Learning rate at the start.", within=LEARNING_RATES)
     # What it comes to at the end, a share of that at the start; it decays exponentially.
     final_rate: float = ranged(0.03, Range(0, 1))
     # Share of the run for which the rate is held before it decays.
     hold: float = ranged(0.3, Range(0, 0.999))
-    # Decoupled (AdamW): share of the weights a step, a unit of learning rate.
-    weight_decay: float = ranged(0.3, WEIGHT_DECAYS)
+    # AdamW: share of the weights a step, a unit of learning rate.
+    weight_decay: float = setting(0.3, "Decoupled weight decay.", within=WEIGHT_DECAYS)
     # Decay a step of the averaged weights, which are the result.
     average: float = ranged(0.98, Range(0, 1))
     # How often in a run the validation is looked at.
     looks: int = ranged(20, Range(1, 10**6))
     # Looks without an improvement after which the run ends; 0: it never ends early.
     patience: int = ranged(6, Range(0, 10**6))
-    # Groups of positions that the validation watches; 0: there is none.
-    zones: int = ranged(3, Range(0, 1000))
+    zones: int = setting(
+        3, "Zones of positions watched as validation, whose best weights count; 0: none.", within=Range(0, 1000)
+    )
     # Probes in all of them.
     watched: int = ranged(60, Range(1, 10**6))
     # Rays that each of these has at least; None: as many as those of the training.
     watched_rays: int | None = ranged(None, Range(1, 10**6))
-    # Whether to train again on everything, the validation's part too, for as many steps as were best.
-    refit: bool = True
-    # Folds of people and positions that choose a log density's share of the blind density; 0: it is the architecture's.
-    mix_folds: int = ranged(0, Range(0, 1000))
-    # Whether weights that were given to begin with stay as they are.
-    frozen: bool = False
+    refit: bool = setting(True, "Train again on all rays once the best number of steps is known.")
+    mix_folds: int = setting(
+        0,
+        "Folds of people and positions that choose how much of the blind density default mixes in; 0: a twentieth.",
+        within=Range(0, 1000),
+    )
+    frozen: bool = setting(False, "Do not train the weights that --begin field gives.", option="freeze")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -8,7 +8,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.radiance import RadianceConfig
 from nerg_mi.maths.geometry import AnyBox
-from nerg_mi.ranges import LEARNING_RATES, LOSS_WEIGHTS, MINUTES, SEEDS, STEPS, Checked, Range, ranged
+from nerg_mi.ranges import LEARNING_RATES, LOSS_WEIGHTS, MINUTES, SEEDS, STEPS, Checked, Range, ranged, setting
 
 # ---- How much one step of a radiance training takes on, from what the last one found ----
 #
@@ -88,12 +88,9 @@ class RadianceSettings(Checked):
     """Controls of a training run; lengths are shares of the scene box's side. Exactly one of ``steps`` and ``minutes``
     says how long it takes."""
 
-    # How many steps.
-    steps: int | None = ranged(None, STEPS)
-    # Or: how many minutes.
-    minutes: float | None = ranged(None, MINUTES)
-    # Of the weights, rays and jitter.
-    seed: int = ranged(0, SEEDS)
+    minutes: float | None = setting(None, "Train for this long. Default: 5.", within=MINUTES)
+    steps: int | None = setting(None, "Or: train for so many steps.", within=STEPS)
+    seed: int = setting(0, "Seed of the weights, rays and jitter.", within=SEEDS)
     # Samples a step. Not a power of two: arrays that many bytes apart share their place in the caches, which costs a
     # factor of two.
     batch: int = ranged(2**14 + 240, Range(1, 1 << 26))
@@ -144,20 +141,19 @@ class RadianceSettings(Checked):
     # Weight of the mean square of the hash grid's features, which lets go of what few rays have shaped (Barron et al.
     # 2023, Zip-NeRF, there level by level).
     grid_decay: float = ranged(0.1, LOSS_WEIGHTS)
-    # Whether each photo has an exposure and a white balance of its own.
-    photo_colors: bool = True
+    photo_colors: bool = setting(True, "Learn the exposure and white balance of each photo.")
     # Weight of the squares of how far they are from the average, the mean over the photos.
     photo_decay: float = ranged(0.01, LOSS_WEIGHTS)
-    # Weight of the depth terms where depth is known.
-    depth_weight: float = ranged(0.02, LOSS_WEIGHTS)
+    depth_weight: float = setting(0.02, "Weight of the depth's loss, where depth is known.", within=LOSS_WEIGHTS)
     # What ``depth_weight`` falls to, times itself.
     final_depth: float = ranged(0.25, Range(0, 1e6))
     # Distance from the true surface, in march steps, within which a ray's weight should lie.
     depth_margin: float = ranged(1.5, Range(0, 1e6))
     # Share of the rays drawn from those whose depth was wrong.
     replay: float = ranged(0.25, Range(0, 1))
-    # Weight of the loss that draws a ray's weight together (mip-NeRF 360); 0: none.
-    distortion_weight: float = ranged(0.0, LOSS_WEIGHTS)
+    distortion_weight: float = setting(
+        0.0, "Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.", within=LOSS_WEIGHTS
+    )
 
     def __post_init__(self):
         super().__post_init__()

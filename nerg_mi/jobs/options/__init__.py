@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import field, fields
-from typing import Any
+from typing import Any, TypeVar
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.ranges import COORDINATES, FLAG, RANGE, Range, check_number
@@ -31,6 +31,47 @@ def option(
     """
     about = {"help": help, "names": names, "parse": parse, "more": more}
     return field(default=default, metadata={**about, RANGE: within, FLAG: names[-1] if names else ""})
+
+
+Class = TypeVar("Class", bound=type)
+
+
+def exposes(*kinds: type, default: str = "") -> Callable[[Class], Class]:
+    """Decorator of a class, under ``dataclass``: gives it an option for each `nerg_mi.ranges.setting` of ``kinds``.
+
+    Parameters
+    ----------
+    kinds
+        Dataclasses of settings, for which `chosen_settings` reads the options again. A field that the class declares
+        itself stays as it is.
+    default
+        Ends the help of options that are None until they are set, where something else decides. Without it an option
+        has the default of its setting.
+    """
+
+    def decorate(kind: Class) -> Class:
+        for setting in (f for settings in kinds for f in fields(settings) if "help" in f.metadata):
+            about, name, hint = setting.metadata, setting.metadata["option"] or setting.name, str(setting.type)
+            if name in kind.__annotations__:
+                continue
+            names, value = about["names"], setting.default
+            if default:
+                value, hint = None, f"{hint.removesuffix(' | None')} | None"
+                if "bool" in hint:
+                    flag = (names[-1] if names else f"--{name.replace('_', '-')}").removeprefix("--")
+                    names = (f"--{flag}/--no-{flag}",)
+            kind.__annotations__[name] = hint
+            setattr(kind, name, option(value, f"{about['help']} {default}".rstrip(), *names, within=about[RANGE]))
+        return kind
+
+    return decorate
+
+
+def chosen_settings(options: Any, kind: type) -> dict[str, Any]:
+    """Keywords of the settings ``kind``, for those of its exposed fields that are set in ``options``."""
+    exposed = {f.name: f.metadata["option"] or f.name for f in fields(kind) if "help" in f.metadata}
+    values = {name: getattr(options, option) for name, option in exposed.items()}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def other_fields(kind: type, *names: str) -> tuple[str, ...]:

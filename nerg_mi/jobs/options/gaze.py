@@ -4,31 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from nerg_mi.ranges import (
-    DIRECTIONS,
-    KAPPAS,
-    LEARNING_RATES,
-    LENGTHS,
-    LOSS_WEIGHTS,
-    MINUTES,
-    RAYS,
-    SECONDS,
-    SEEDS,
-    STEPS,
-    TEST_SHARES,
-    THREADS,
-    WEIGHT_DECAYS,
-    Range,
-)
+from nerg_mi.ranges import LENGTHS, RAYS, SECONDS, SEEDS, TEST_SHARES, THREADS, Range
+from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 
-from . import option
+from . import exposes, option
 from .place import PlaceOptions
 
 
 @dataclass(frozen=True, kw_only=True)
+@exposes(ProbeSettings, GazeSettings, default="Default: the recipe's.")
 class GazeOptions(PlaceOptions):
     """How a gaze field is trained; what is None is the recipe's. Lengths are metres, in the rays' frame."""
+
+    if TYPE_CHECKING:
+        # Options that are settings, too.
+        def __getattr__(self, name: str) -> Any: ...
 
     views: Path | None = option(None, "Posed photos (folder or transforms file) with salience.")
     salience: str | None = option(
@@ -51,21 +43,9 @@ class GazeOptions(PlaceOptions):
         None, "How the rays lie in the place: what nerg align writes, or JSON with the 4x4 similarity. Default: alike."
     )
     force: bool = option(False, "Train even where no gaze meets a surface of the place.")
-    radius: float | None = option(None, "Radius R of a probe in metres.", within=LENGTHS)
     most: int = option(
         10_000_000, "Rays of a dataset at most; of more, a sample by --seed in which each is as likely.", within=RAYS
     )
-    probes: int | None = option(None, "Number of probes at most.", within=Range(1, 10**6))
-    placement: str | None = option(None, "Of probes: data, grid, random or blue.")
-    cap: int | None = option(None, "Rays in a probe at most, the nearest.", within=Range(1, 10**6))
-    min_rays: int | None = option(None, "Rays in a probe at least.", within=Range(1, 10**6))
-    kappa_rule: str | None = option(None, "Concentration of a ray's kernel: fixed, silverman or loo.")
-    kappa: float | None = option(None, "That of the rule fixed.", within=KAPPAS)
-    weights: str | None = option(
-        None, "Of a probe's rays: equal, distance (1 - d/R), or person (all people of a probe count alike)."
-    )
-    directions: int | None = option(None, "Directions of a probe.", within=DIRECTIONS)
-    fresh: bool = option(False, "Draw the directions anew for every epoch, not once a probe.", "--fresh-directions")
     variant: str | None = option(
         None, "emit, capture or emit_capture. Default: emit_capture; without any geometry folds choose it or capture."
     )
@@ -77,30 +57,6 @@ class GazeOptions(PlaceOptions):
     )
     semantic_own: bool = option(False, "Besides the gaze field's own, not in their place.")
     begin: str = option("random", "Weights of the trunk to begin with: random, or those of the radiance field (field).")
-    freeze: bool = option(False, "Do not train the weights that --begin field gives.")
-    loss: str | None = option(None, "Of small and paper. paper: KLD + (1 - CC) + MAE; code: MAE + 0.1 (1 - CC).")
-    integral: float | None = option(None, "Weight of the error of the integral over the sphere.", within=LOSS_WEIGHTS)
-    minutes: float | None = option(None, "Train for this long, both fits together.", within=MINUTES)
-    steps: int | None = option(None, "Or: train for so many steps. Default: the recipe's.", within=STEPS)
-    learning_rate: float | None = option(None, "Learning rate at the start.", within=LEARNING_RATES)
-    weight_decay: float | None = option(None, "Decoupled weight decay.", within=WEIGHT_DECAYS)
-    zones: int | None = option(
-        None,
-        "Zones of positions watched as validation, whose best weights count; 0: none. Default: the recipe's.",
-        within=Range(0, 1000),
-    )
-    mix_folds: int | None = option(
-        None,
-        "Folds of people and positions that choose how much of the blind density default mixes in; 0: a twentieth. "
-        "Default: the recipe's.",
-        within=Range(0, 1000),
-    )
-    mix_kappa: float | None = option(
-        None,
-        "Concentration of the kernels of that blind density, which default also begins with. Default: the recipe's.",
-        within=KAPPAS,
-    )
-    refit: bool = option(True, "Train again on all rays once the best number of steps is known.")
     test_zones: int = option(
         0, "Zones of test positions that are left out of everything; 0: none.", within=Range(0, 1000)
     )

@@ -4,22 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from nerg_mi.ranges import (
-    COORDINATES,
-    LENGTHS,
-    LOSS_WEIGHTS,
-    MINUTES,
-    SECONDS,
-    SEEDS,
-    SPP,
-    STEPS,
-    THREADS,
-    Checked,
-    Range,
-)
+from nerg_mi.ranges import COORDINATES, LENGTHS, SECONDS, SPP, THREADS, Checked, Range
+from nerg_mi.train.radiance_settings import RadianceSettings
 
-from . import option, parse_numbers
+from . import exposes, option, parse_numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,16 +34,19 @@ class PhotoOptions(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
+@exposes(RadianceSettings)
 class RadianceOptions(PhotoOptions):
     """How a radiance field is trained."""
+
+    if TYPE_CHECKING:
+        # Options that are settings, too.
+        def __getattr__(self, name: str) -> Any: ...
 
     size: str = option("small", "Size of the field: small, medium or paper.")
     deferred: bool = option(False, "Ask the colour network once a ray, not at every sample: faster frames.")
     downscale: float | None = option(
         None, "In place of a width: divide the pictures' size by this.", within=Range(1, 1000)
     )
-    minutes: float | None = option(None, "Train for this long. Default: 5.", within=MINUTES)
-    steps: int | None = option(None, "Or: train for so many steps.", within=STEPS)
     aabb: tuple[float, ...] | None = option(
         None,
         "Bounds of what is seen: x0,y0,z0,x1,y1,z1, in the coordinates of the field.",
@@ -65,14 +58,8 @@ class RadianceOptions(PhotoOptions):
         "Whether anything is to be seen beyond those bounds. Default: as the points tell, and no without any.",
         "--unbounded/--bounded",
     )
-    seed: int = option(0, "Seed of the weights, rays and jitter.", within=SEEDS)
     threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
     half: bool = option(False, "Store the weights in fp16.")
-    depth_weight: float | None = option(None, "Weight of the depth's loss.", within=LOSS_WEIGHTS)
-    distortion_weight: float = option(
-        0.0, "Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.", within=LOSS_WEIGHTS
-    )
-    photo_colors: bool = option(True, "Learn the exposure and white balance of each photo.")
     resume: bool = option(False, "Go on with the interrupted run of this output.")
     save_every: float = option(
         60.0, "Seconds between two states for --resume; 0: only one, when it ends early.", within=SECONDS
