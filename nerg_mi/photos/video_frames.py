@@ -5,9 +5,9 @@ from __future__ import annotations
 import errno
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from math import isfinite
+from fractions import Fraction
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -38,6 +38,15 @@ _LOST, _LOST_EACH = 1000, 4
 _REMEDY = "give a video such as .mp4 or .mov, or a folder of photos"
 
 
+class SharpFrame(NamedTuple):
+    """A frame of a video: its number in the order in which frames are shown, from 1, the seconds since the first one,
+    and its pixels (h, w, 3), uint8, sRGB."""
+
+    number: int
+    seconds: float
+    pixels: np.ndarray
+
+
 def sharpness(gray: np.ndarray) -> float:
     """Variance of the Laplacian of a picture (h, w): blur takes away what varies from pixel to pixel."""
     g = np.asarray(gray, np.float32)
@@ -55,51 +64,55 @@ def copy_frames(
 ) -> list[Picture]:
     """Copy ``count`` frames of a video, at most, to ``folders``: as JPEG at quality 95, turned as it is to be shown.
 
+    Each is named by its number among all frames of the video, as ``nerg rays import --frames "frame_{frame1}"`` counts.
     ``longest``: side of the small copies in pixels; ``threads``: of the decoder, None for all; ``progress(done, of)``
     is told as frames are chosen. Raises `NergError` for what is no video, and ``ImportError`` without PyAV.
     """
     from PIL import Image
 
     pictures: list[Picture] = []
-    for seconds, pixels in sharpest_frames(video, count, threads):
-        image = Image.fromarray(pixels)
-        name = f"frame_{len(pictures) + 1:05d}.jpg"
+    for frame in sharpest_frames(video, count, threads):
+        image = Image.fromarray(frame.pixels)
+        name = f"frame_{frame.number:06d}.jpg"
         write_bytes(folders.images / name, encoded(image, ".jpg"))
         small = small_size(image.size, longest)
         write_bytes(folders.small / small_name(len(pictures)), shrunk(image, small))
-        pictures.append(Picture(name, image.size, small, seconds=seconds))
+        pictures.append(Picture(name, image.size, small, seconds=frame.seconds))
         progress(len(pictures), count)
     return pictures
 
 
-def sharpest_frames(video: str | Path, count: int, threads: int | None = None) -> Iterator[tuple[float, np.ndarray]]:
-    """Seconds from the first frame on, and pixels (h, w, 3) uint8, sRGB, of the sharpest frame in each of ``count``
-    equally long stretches; a stretch without a frame has none."""
+def sharpest_frames(video: str | Path, count: int, threads: int | None = None) -> Iterator[SharpFrame]:
+    """The sharpest frame in each of ``count`` equally long stretches; a stretch without a frame has none."""
     if Path(video).suffix.lower() in SUFFIXES:
         raise NergError(f'"{video}" is a single photo; name the folder that holds it and others of the same place')
-    begin, end = _span(video)
+    ticks, tick = _frame_ticks(video)
+    begin, span = int(ticks[0]), int(ticks[-1] - ticks[0])
+    as_shown = lambda frame: SharpFrame(
+        int(np.searchsorted(ticks, frame.pts)) + 1, float((frame.pts - begin) * tick), _pixels(video, frame)
+    )
     with _opened(video) as (container, stream):
         stream.thread_type = "AUTO"
         if threads:
             stream.codec_context.thread_count = threads
-        best: tuple[float, Any, float] | None = None
+        best: tuple[float, Any] | None = None
         stretch = 0
-        for frame, seconds in _decoded(video, container, stream):
-            at = 0 if end <= begin else int(min(count - 1, (seconds - begin) / (end - begin) * count))
+        for frame in _decoded(video, container, stream):
+            at = min(count - 1, (frame.pts - begin) * count // span) if span else 0
             if best is not None and at > stretch:
-                yield best[2] - begin, _pixels(video, best[1])
+                yield as_shown(best[1])
                 best = None
             stretch = max(stretch, at)
             with _reading(video):
                 score = sharpness(_gray(frame))
             if best is None or score > best[0]:
-                best = score, frame, seconds
+                best = score, frame
         if best is None:
             raise NergError(
                 f'the video "{video}" has no frame that can be decoded, of {PIXELS:,} pixels at most; convert it to '
                 "H.264, or copy it again"
             )
-        yield best[2] - begin, _pixels(video, best[1])
+        yield as_shown(best[1])
 
 
 def _pyav() -> Any:
@@ -187,22 +200,18 @@ def _check_size(video: str | Path, width: int, height: int) -> None:
         )
 
 
-def _span(video: str | Path) -> tuple[float, float]:
-    """Seconds at which the first and the last frame are shown, by the file's packets, undecoded."""
+def _frame_ticks(video: str | Path) -> tuple[np.ndarray, Fraction]:
+    """When each frame is shown (F,) int64, sorted, by the file's packets, undecoded; and the seconds of a tick."""
     with _opened(video) as (container, stream):
-        first = last = None
         with _reading(video):
-            for packet in container.demux(stream):
-                if packet.pts is not None:
-                    first = packet.pts if first is None else min(first, packet.pts)
-                    last = packet.pts if last is None else max(last, packet.pts)
-        if first is None or last is None or not stream.time_base:
+            ticks = {p.pts for p in container.demux(stream) if p.pts is not None and not p.is_discard}
+        if not ticks or not stream.time_base:
             raise NergError(f'the video "{video}" holds no frames with a time; copy it again')
-        return float(first * stream.time_base), float(last * stream.time_base)
+        return np.array(sorted(ticks), np.int64), stream.time_base
 
 
-def _decoded(video: str | Path, container: Any, stream: Any) -> Iterator[tuple[Any, float]]:
-    """Frames that have a time, and that in seconds; packets that are damaged are passed over, as players do."""
+def _decoded(video: str | Path, container: Any, stream: Any) -> Iterator[Any]:
+    """Frames that have a time, in ticks of the ``stream``; packets that are damaged are passed over, as players do."""
     av = _pyav()
     packets = container.demux(stream)
     lost = found = 0
@@ -217,8 +226,8 @@ def _decoded(video: str | Path, container: Any, stream: Any) -> Iterator[tuple[A
             frames = []
         for frame in frames:
             _check_size(video, frame.width, frame.height)
-            if frame.time is not None and isfinite(frame.time):
-                yield frame, frame.time
+            if frame.pts is not None and frame.time_base == stream.time_base:
+                yield frame
         found += len(frames)
         lost += not frames
     raise NergError(f'most of the video "{video}" cannot be decoded; convert it to H.264, or copy it again')

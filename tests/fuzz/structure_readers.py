@@ -79,7 +79,7 @@ def _read_film(name: str):
         from nerg_mi.photos.video_frames import sharpest_frames
 
         # By itself the decoder starts as many threads as there are cores.
-        frames = [Image.fromarray(pixels) for _, pixels in sharpest_frames(folder / name, 3, threads=2)]
+        frames = [Image.fromarray(frame.pixels) for frame in sharpest_frames(folder / name, 3, threads=2)]
         return [(encoded(f, ".jpg"), shrunk(f, small_size(f.size, 24))) for f in frames]
 
     return read

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import socket
+from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -51,24 +52,41 @@ def test_blur_takes_sharpness():
 
 def test_the_sharpest_of_each_stretch(film):
     found = list(sharpest_frames(film, 3))
-    assert [round(10 * t) for t, _ in found] == list(SHARP)
-    for _, pixels in found:
+    assert [round(10 * frame.seconds) for frame in found] == list(SHARP)
+    for *_, pixels in found:
         assert pixels.shape == (48, 64, 3) and pixels.dtype == np.uint8
         assert np.corrcoef(pixels[..., 1].ravel(), texture().ravel())[0, 1] > 0.97
 
 
 def test_more_stretches_than_frames(film):
-    times = [t for t, _ in sharpest_frames(film, 100, threads=1)]
+    times = [frame.seconds for frame in sharpest_frames(film, 100, threads=1)]
     assert len(times) == 15 and times == sorted(times)
 
 
 def test_frames_are_copied(film, tmp_path):
     folders, steps = Folders(tmp_path / "images", tmp_path / "small"), []
     pictures = copy_frames(film, 3, folders, 32, None, lambda *now: steps.append(now))
-    assert [p.name for p in pictures] == ["frame_00001.jpg", "frame_00002.jpg", "frame_00003.jpg"]
+    assert [p.name for p in pictures] == [f"frame_{k + 1:06d}.jpg" for k in SHARP]
     assert [p.small for p in pictures] == [(32, 24)] * 3 and steps == [(1, 3), (2, 3), (3, 3)]
     assert [Image.open(folders.images / p.name).size for p in pictures] == [(64, 48)] * 3
     assert len(list(folders.small.iterdir())) == 3 and pictures[1].seconds == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("name, codec", [("a.mkv", "mpeg4"), ("a.ts", "mpeg2video"), ("a.mp4", "mpeg4")])
+@pytest.mark.parametrize("times", [range(6), [0, 1, 2, 5, 6, 9], [4, 7, 8, 9, 11, 12]])
+def test_frames_are_numbered_as_they_are_shown(av, tmp_path, name, codec, times):
+    """With frames that come in another order, frames that were lost and a first one that is late."""
+    with av.open(str(tmp_path / name), "w") as out:
+        stream = out.add_stream(codec, rate=25, options={"bf": "2"})
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 64, 48, "yuv420p", 4_000_000
+        for k, time in enumerate(times):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 30 + 30 * k, np.uint8), format="rgb24")
+            frame.pts, frame.time_base = time, Fraction(1, 25)
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode())
+    frames = list(sharpest_frames(tmp_path / name, 1000, threads=1))
+    assert [f.number for f in frames] == [round(f.pixels.mean() / 30) for f in frames] == list(range(1, 7))
+    assert np.allclose([f.seconds for f in frames], (np.array(times) - times[0]) / 25, atol=2e-3)
 
 
 @pytest.mark.parametrize("rotation, corner", [(0, (0, 0)), (90, (1, 0)), (-90, (0, 1)), (180, (1, 1)), (-180, (1, 1))])
