@@ -33,6 +33,8 @@ def card_lines(rays: Rays, summary: RaysSummary) -> list[tuple[str, str]]:
         lines.append(("missing", f"{count:,} {what}"))
     if rays.metadata.get("decimal") == ",":
         lines.append(("numbers", "commas are taken for decimal signs"))
+    if rays.metadata.get("passes_midnight"):
+        lines.append(("times", "of day without a date, which go on past midnight"))
     unused = rays.metadata.get("unused_columns", [])
     if unused:
         more = f" and {len(unused) - _PERSONS} more" if len(unused) > _PERSONS else ""

@@ -116,8 +116,7 @@ class RaysBuilder:
         used = {*numbers, *texts, *also_used}
         there = table_columns(path) if header is None else header
         self.note_unused(name for name in there if name and name not in used)
-        commas = lambda: self.note(decimal=",")
-        how = {"first_line": first_line, "clocks": clocks, "on_commas": commas}
+        how = {"first_line": first_line, "clocks": clocks, "on_note": self.note}
         return iterate_table(path, numbers, texts, header, self.on_bad, **how)
 
     def note_unused(self, columns: Iterable[str]) -> None:

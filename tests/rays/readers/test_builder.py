@@ -248,6 +248,17 @@ def test_decimal_commas_are_named(tmp_path):
         assert {"numbers"} & set(dict(card_lines(rays, summarise(rays)))) == expected
 
 
+def test_times_past_midnight_are_named(tmp_path):
+    (tmp_path / "a.csv").write_text("t,x\n23:59:59,1\n0:00:01,1\n")
+    builder = RaysBuilder()
+    builder.source(tmp_path / "a.csv")
+    (block,) = builder.read_table(tmp_path / "a.csv", ["t", "x"], clocks={"t": 1.0})
+    assert block.numbers[:, 0].tolist() == [86399, 86401]
+    add(builder, 2)
+    rays = builder.build()
+    assert "past midnight" in dict(card_lines(rays, summarise(rays)))["times"]
+
+
 def test_unused_columns_are_named_once(tmp_path):
     builder = RaysBuilder()
     for name in ("a.csv", "b.csv"):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import datetime
 import re
+from collections.abc import Callable
+
+import numpy as np
 
 _CLOCK = re.compile(
     r"(?:(\d{4})[-/](\d\d)[-/](\d\d)(?:T| +))?(\d\d?):(\d\d):(\d\d)(?:[.,](\d+))? ?(Z|([+-])(\d\d):?(\d\d))?"
@@ -33,3 +36,36 @@ def clock_seconds(text: str) -> tuple[float, bool] | None:
     except ValueError:
         return None
     return 86400.0 * days + seconds, True
+
+
+_DAY = 86400.0
+_PAUSE = 3600.0  # seconds between two times of one recording, at most, of which one is before midnight
+
+
+class DayCounter:
+    """Lets times of day without a date go on past midnight, block by block of one column.
+
+    Midnight lies between two times of which the second is earlier, and within an hour of the first on the next day.
+    Other steps back lead from one recording to another, as in a table of several participants, and steps forth of more
+    than half a day to the day before. ``tick``: seconds of a unit; ``on_note(passes_midnight=True)`` is called where a
+    block has times of another day.
+    """
+
+    def __init__(self, tick: float, on_note: Callable[..., None] | None = None) -> None:
+        self.tick, self._on_note = tick, on_note
+        self._last, self._day = np.nan, 0
+
+    def unwrap(self, times: np.ndarray) -> np.ndarray:
+        """Units since the first midnight, (n,), of units since the last one; NaN stays."""
+        valid = np.isfinite(times)
+        if not valid.any():
+            return times
+        steps = self.tick * np.diff(times[valid], prepend=self._last)
+        days = self._day + np.cumsum((steps < _PAUSE - _DAY).astype(int) - (steps > _DAY / 2))
+        days -= np.minimum(np.minimum.accumulate(days), 0)
+        self._last, self._day = times[valid][-1], int(days[-1])
+        if days.any() and self._on_note is not None:
+            self._on_note(passes_midnight=True)
+        out = times.copy()
+        out[valid] += days * (_DAY / self.tick)
+        return out

@@ -17,7 +17,7 @@ from nerg_mi.files.inflating import inflated_limit
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
 from nerg_mi.rays.io import pyarrow_modules
 
-from .clock_times import clock_seconds
+from .clock_times import DayCounter, clock_seconds
 
 BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
 
@@ -67,7 +67,7 @@ def iterate_table(
     *,
     first_line: int = 1,
     clocks: Mapping[str, float] | None = None,
-    on_commas: Callable[[], None] | None = None,
+    on_note: Callable[..., None] | None = None,
 ) -> Iterator[TableBlock]:
     """Yield named columns of a table in blocks of at most ``BLOCK`` rows.
 
@@ -83,8 +83,10 @@ def iterate_table(
     clocks
         Those of ``numbers`` whose cells may be times such as ``2024-05-01T12:00:00`` or ``12:00:00.25``
         (`clock_seconds`), with the seconds of the unit in which they are returned, and in which plain numbers count.
-    on_commas
-        Called once where commas are taken for decimal signs.
+        Times of day without a date go on past midnight (`DayCounter`).
+    on_note
+        Called with ``decimal=","`` where commas are taken for decimal signs, and with ``passes_midnight=True`` where
+        times of day do.
 
     Raises
     ------
@@ -94,9 +96,10 @@ def iterate_table(
         naming the line. Where pyarrow is installed it converts the cells, to the same numbers.
     """
     if str(path).lower().endswith(".parquet"):
-        yield from _iterate_parquet(path, numbers, texts, clocks or {})
+        yield from _iterate_parquet(path, numbers, texts, clocks or {}, on_note)
         return
     count, layout, convert = 0, None, None
+    days: dict[int, DayCounter] = {}
     for raw in line_blocks(path, "table", BLOCK):
         skip = max(0, first_line - 1 - count)
         raw, count = raw[skip:], count + min(skip, len(raw))
@@ -113,10 +116,14 @@ def iterate_table(
             if convert is None:
                 layout = _with_spelling(layout, rows, clocks or {})
                 convert = _fast_reader(layout) or (lambda rows: None)
-                if on_commas is not None and layout.decimal == ",":
-                    on_commas()
+                if on_note is not None and layout.decimal == ",":
+                    on_note(decimal=",")
+                days = {k: DayCounter(tick, on_note) for k, (tick, dated) in layout.clocks.items() if not dated}
             values = convert(rows)
             block = TableBlock(*values, lines) if values else _convert(path, rows, lines, layout, on_bad)
+            for k, counter in days.items():
+                column = block.numbers[:, layout.number_at.index(k)]
+                column[:] = counter.unwrap(column)
             if len(block.lines):
                 yield block
     if layout is None and header is None:
@@ -405,10 +412,15 @@ def _parquet(path: str | os.PathLike) -> Any:
 
 
 def _iterate_parquet(
-    path: str | os.PathLike, numbers: Sequence[str], texts: Sequence[str], clocks: Mapping[str, float]
+    path: str | os.PathLike,
+    numbers: Sequence[str],
+    texts: Sequence[str],
+    clocks: Mapping[str, float],
+    on_note: Callable[..., None] | None,
 ) -> Iterator[TableBlock]:
     import pyarrow as pa
 
+    days = {name: DayCounter(tick, on_note) for name, tick in clocks.items()}
     with _parquet(path) as table:
         names = table.schema_arrow.names
         check_columns(path, [*numbers, *texts], names)
@@ -422,7 +434,7 @@ def _iterate_parquet(
                     return
                 n = batch.num_rows
                 column = {c: batch.column(batch.schema.get_field_index(c)) for c in wanted}
-                values = [_as_numbers(path, c, column[c], clocks.get(c)) for c in numbers]
+                values = [_as_numbers(path, c, column[c], days.get(c)) for c in numbers]
                 words = [_as_texts(path, c, column[c]) for c in texts]
             yield TableBlock(
                 np.stack(values, axis=1) if values else np.empty((n, 0)),
@@ -442,14 +454,16 @@ def _as_texts(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:
     return np.array(words, dtype=str)
 
 
-def _as_numbers(path: str | os.PathLike, name: str, column: Any, tick: float | None) -> np.ndarray:
-    """A column as (n,) float64; one of times in units of ``tick`` seconds."""
+def _as_numbers(path: str | os.PathLike, name: str, column: Any, days: DayCounter | None) -> np.ndarray:
+    """A column as (n,) float64; one of times, for which there are ``days``, in their unit."""
+    tick = None if days is None else days.tick
     try:
         values = column.to_numpy(zero_copy_only=False)
         if tick is not None and values.dtype == object:
             cells = ["" if cell is None else str(cell) for cell in column.to_pylist()]
             dated = next((time[1] for cell in cells if (time := clock_seconds(cell))), False)
             values = _clock_column(cells, tick, dated)
+            values = values if dated or values is None else days.unwrap(values)
         elif values.dtype.kind == "M" and tick is not None:
             since = values.astype("datetime64[ns]").astype(np.int64) * (1e-9 / tick)
             values = np.where(np.isnat(values), np.nan, since)

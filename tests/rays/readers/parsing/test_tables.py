@@ -299,6 +299,34 @@ def test_times_that_nothing_orders_are_refused(tmp_path, cells):
         list(iterate_table(tmp_path / "t.csv", ["t", "a"], clocks={"t": 1.0}))
 
 
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("block", [2, 100])
+@pytest.mark.parametrize(
+    "cells, hours",
+    [
+        (
+            ["23:30:00", "23:59:59", "", "00:00:01", "11:00:00", "22:30:00", "23:45:00", "0:30:00"],
+            [23.5, 24, 24, 35, 46.5, 47.75, 48.5],
+        ),
+        (["23:59:59", "00:00:01", "23:59:59.5", "00:00:02"], [24, 24, 24, 24]),  # rows that are not quite sorted
+        (["23:30:00", "00:10:00", "22:30:00", "23:50:00", "00:20:00"], [23.5, 24.1667, 22.5, 23.8333, 24.3333]),
+        (["10:00:00", "20:00:00", "06:00:00", "20:00:00"], [10, 20, 6, 20]),  # another recording of the same day
+        (["2024-05-01T23:59:59", "2024-05-02T00:00:01"], [24 * 19845, 24 * 19845]),
+    ],
+    ids=["two nights", "unsorted", "two recordings over midnight", "two recordings", "dated"],
+)
+def test_times_of_day_go_on_past_midnight(tmp_path, monkeypatch, cells, hours, block, fast):
+    if not fast:
+        monkeypatch.setattr(ray_tables, "_fast_reader", lambda layout: None)
+    monkeypatch.setattr(ray_tables, "BLOCK", block)
+    (tmp_path / "t.csv").write_text("a,t\n" + "".join(f"1,{cell}\n" for cell in cells))
+    notes = {}
+    blocks = iterate_table(tmp_path / "t.csv", ["a", "t"], clocks={"t": 1e-3}, on_note=notes.update)
+    t = np.concatenate([b.numbers[:, 1] for b in blocks])
+    assert np.allclose(t[np.isfinite(t)] / 3.6e6, hours, rtol=0, atol=1e-3)
+    assert notes == ({} if max(hours) < 23.9 or "T" in cells[0] else {"passes_midnight": True})
+
+
 def test_times_of_parquet(tmp_path):
     pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     texts = ["2024-05-01T12:00:00", "2024-05-01T12:00:00.5"]
@@ -308,3 +336,6 @@ def test_times_of_parquet(tmp_path):
         assert np.allclose(block.numbers[:, 0], [2 * 1714564800, 2 * 1714564800 + 1])
         with pytest.raises(NergError, match="'t' .* holds no numbers"):
             read(tmp_path / "t.parquet", ["t"])
+    pq.write_table(pa.table({"t": ["23:59:59", None, "00:00:01"]}), tmp_path / "t.parquet")
+    (block,) = iterate_table(tmp_path / "t.parquet", ["t"], clocks={"t": 0.5})
+    assert np.allclose(block.numbers[:, 0], [2 * 86399, np.nan, 2 * 86401], equal_nan=True)
