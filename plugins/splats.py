@@ -91,9 +91,9 @@ class SplatsVolume(mi.Volume):
         self.filename = "" if splats is not None else resolved(text(props, "filename"))
         super().__init__(props)
         self.splats = splats if splats is not None else read_splats(self.filename)
-        for guess in self.splats.guesses:
+        for note in (*self.splats.guesses, *self.splats.notes):
             log: Any = mi.Log  # of which the stubs know nothing
-            log(mi.LogLevel.Warn, f"{self.filename}: {guess}")
+            log(mi.LogLevel.Warn, f"{self.filename}: {note}")
         self.color_space = self.splats.color_space if color_space == "file" else color_space
         self.arrays = SplatArrays(self.splats, namespace(mi.Float), extent)
 

@@ -89,9 +89,10 @@ POINTS = 200_000
 """Points that are taken of a mesh, evenly by area, or of a larger cloud."""
 
 
-def read_surface(path: Path, count: int = POINTS) -> np.ndarray:
+def read_surface(path: Path, count: int = POINTS, on_note: Callable[[str], None] | None = None) -> np.ndarray:
     """At most ``count`` points (N, 3) on the surface in ``path``, in its own frame and units; drawn at random, with the
-    same result every time. Raises `NergError` for a file without finite points, or with some beyond all places."""
+    same result every time. ``on_note`` is called with sentences on what of the file is not used. Raises `NergError` for
+    a file without finite points, or with some beyond all places."""
     if not path.name.lower().endswith(SUFFIXES):
         raise NergError(f'"{path}" is no surface that is read; give a mesh or points in {", ".join(SUFFIXES)}')
     if not path.exists():
@@ -103,6 +104,8 @@ def read_surface(path: Path, count: int = POINTS) -> np.ndarray:
     else:
         mesh = read_mesh_file(path, points=True)
         points = _sampled(mesh.vertices, mesh.faces, count)
+        for note in mesh.notes if on_note is not None else ():
+            on_note(f"of {path}: {note}")
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise NergError(f'the surface "{path}" has no points; export it again')

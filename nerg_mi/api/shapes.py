@@ -14,15 +14,26 @@ from nerg_mi.formats.meshes import read_mesh_file
 
 
 def mesh_child(path: str | os.PathLike[str]) -> Any:
-    """The mesh file ``path`` as a child of a Mitsuba scene, in grey and seen from both sides: a dict, or a mesh of what
-    Mitsuba does not read. Raises `NergError` for a file that is missing or damaged."""
+    """The mesh file ``path`` as a child of a Mitsuba scene, in its colours or in grey, and seen from both sides: a
+    dict, or a mesh of what Mitsuba does not show as it is. What of the file is not used goes to Mitsuba's log. Raises
+    `NergError` for a file that is missing or damaged."""
+    import mitsuba as mi
+
     from nerg_mi.surfaces.mesh import mitsuba_mesh
 
     mesh = read_mesh_file(path)
-    grey = {"type": "twosided", "bsdf": {"type": "diffuse"}}
-    if mesh.unreadable:
-        return mitsuba_mesh(mesh.vertices, mesh.faces, Path(path).stem, grey)
-    return {"type": Path(path).suffix.lower()[1:], "filename": str(path), "bsdf": grey}
+    log: Any = mi.Log  # of which the stubs know nothing
+    for note in mesh.notes:
+        log(mi.LogLevel.Warn, f"{path}: {note}")
+    name, colors = ("face_color", mesh.face_colors) if mesh.colors is None else ("vertex_color", mesh.colors)
+    tint = {} if colors is None else {"reflectance": {"type": "mesh_attribute", "name": name}}
+    bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", **tint}}
+    if mesh.is_plain:
+        return {"type": Path(path).suffix.lower()[1:], "filename": str(path), "bsdf": bsdf}
+    shown = mitsuba_mesh(mesh.vertices, mesh.faces, Path(path).stem, bsdf)
+    if colors is not None:
+        shown.add_attribute(name, 3, colors.astype(np.float32).ravel())
+    return shown
 
 
 def box_dict(lower: np.ndarray, upper: np.ndarray, turn: np.ndarray | None = None) -> dict:

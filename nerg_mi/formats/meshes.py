@@ -15,6 +15,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.bounded import read_bytes, reading, size_of
+from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.coordinates import check_near_origin
 
 from .gltf import GLTF_BYTES, parse_glb
@@ -31,7 +32,7 @@ GREY = 0.5
 
 _BLOCK = 1 << 24
 _CENTER, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
-_COLORS = (("red", "green", "blue", "alpha"), ("r", "g", "b", "a"))
+_COLORS = (("red", "green", "blue", "alpha"), ("r", "g", "b", "a"), ("color_0", "color_1", "color_2", "color_3"))
 _CORNERS = ("vertex_index", "vertex_indices")
 _OBJ_USED = {b"v", b"vn", b"f", b"g", b"o", b"s"}
 _OBJ_LINE = 1000
@@ -43,10 +44,10 @@ class MeshFile:
     """Triangles of a file, in its own frame and units (of glTF turned, so that z is up).
 
     ``vertices`` (V, 3) float64, ``faces`` (F, 3) int64; ``polygons`` (F,): of which face of the file each is a part;
-    ``normals`` (V, 3), ``colors`` (V, 3), ``face_colors`` (F, 3) in 0..1, or None; ``color_scale``: what the file's own
-    numbers of colours are multiplied by. ``notes``: sentences on what is not used, or was guessed. ``unreadable``: why
-    Mitsuba does not read the file as it is, or ""; ``hides_colors``: whether it does without its colours, of
-    which an alpha makes what no texture of Mitsuba shows.
+    ``normals`` (V, 3), ``colors`` (V, 3), ``face_colors`` (F, 3), linear in 0..1, or None. ``notes``: sentences on what
+    is not used, or was guessed. ``unreadable``: why Mitsuba does not read the file as it is, or ""; ``hides_colors``:
+    whether it does without its colours, of which an alpha makes what no texture of Mitsuba shows; ``encodes_colors``:
+    whether they are sRGB values in the file, which Mitsuba takes for linear ones.
     """
 
     vertices: np.ndarray
@@ -55,15 +56,15 @@ class MeshFile:
     normals: np.ndarray | None = None
     colors: np.ndarray | None = None
     face_colors: np.ndarray | None = None
-    color_scale: float = 1.0
     notes: tuple[str, ...] = ()
     unreadable: str = ""
     hides_colors: bool = False
+    encodes_colors: bool = False
 
     @property
     def is_plain(self) -> bool:
         """Whether Mitsuba shows the file as it is."""
-        return not (self.unreadable or self.hides_colors)
+        return not (self.unreadable or self.hides_colors or self.encodes_colors)
 
 
 def read_mesh_file(path: str | os.PathLike, points: bool = False, suffix: str | None = None) -> MeshFile:
@@ -104,13 +105,19 @@ def _split(counts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.stack([corners[first], corners[first + k + 1], corners[first + k + 2]], axis=1), polygons
 
 
-def _unit_colors(columns: Sequence[np.ndarray], kind: np.dtype) -> tuple[np.ndarray, float]:
-    """Colours in 0..1, and what they were multiplied by: whole numbers of a type reach up to its largest."""
+def _linear_colors(columns: Sequence[np.ndarray], kind: np.dtype) -> tuple[np.ndarray, bool]:
+    """Linear colours in 0..1 of the ``columns`` of a PLY file, and whether these are sRGB values.
+
+    Whole numbers, which reach up to the largest of their type, are those of pictures: cameras, scanners and modelling
+    programs write them so. Floats up to 1 are linear, as renderers write them.
+    """
     values = np.stack(columns, axis=-1).astype(np.float64)
     if not np.isfinite(values).all():
         raise ValueError("some of its colours are not finite")
-    top = np.iinfo(kind).max if kind.kind in "iu" else 255 if values.size and values.max() > 1 else 1
-    return np.clip(values / top, 0, 1), 1 / top
+    if kind.kind == "f" and not (values.size and values.max() > 1):
+        return np.clip(values, 0, 1), False
+    top = np.iinfo(kind).max if kind.kind in "iu" else 255
+    return decode_srgb(np.clip(values / top, 0, 1)), True
 
 
 def _read_ply(path: str | os.PathLike) -> MeshFile:
@@ -129,11 +136,12 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
         raise ValueError(f'its vertices have no property "{missing[0]}"')
     take = lambda table, names: [table.columns[name]() for name in names]
     vertices = np.stack(take(vertex, _CENTER), axis=1).astype(np.float64) if vertex.count else np.zeros((0, 3))
-    used, notes, scales, tints_of = {"vertex": {*_CENTER, *_NORMAL}, "face": {names}}, [], {}, {}
+    used, notes, encodes, tints_of = {"vertex": {*_CENTER, *_NORMAL}, "face": {names}}, [], False, {}
     for name, table in (("vertex", vertex), ("face", face)):
         tints = next((c for c in _COLORS if all(n in table.columns for n in c[:3])), None)
         if tints:
-            tints_of[name], scales[name] = _unit_colors(take(table, tints[:3]), table.kinds[tints[0]])
+            tints_of[name], encoded = _linear_colors(take(table, tints[:3]), table.kinds[tints[0]])
+            encodes |= encoded
             used[name] |= set(tints[:3])
     normals = None
     if all(name in vertex.columns for name in _NORMAL):
@@ -161,7 +169,7 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
     elif len(face.lists) > 1 or any(t.lists for n, t in ply.tables.items() if n != "face"):
         # Each of them is taken for three values.
         unreadable = "it has other lists than the corners of its faces"
-    hides_colors = any({"alpha", "a"} & set(ply.tables[name].columns) for name in tints_of)
+    hides_colors = any({"alpha", "a", "color_3"} & set(ply.tables[name].columns) for name in tints_of)
     return MeshFile(
         vertices,
         faces,
@@ -169,10 +177,10 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
         normals,
         tints_of.get("vertex"),
         tints_of["face"][polygons] if "face" in tints_of else None,
-        scales.get("vertex", scales.get("face", 1.0)),
         tuple(notes),
         unreadable,
         hides_colors,
+        encodes,
     )
 
 
@@ -291,13 +299,16 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
             obj.read(lines)
     obj.read([rest])
     faces, polygons = _split(np.array(obj.counts, np.int64), np.concatenate([*obj.corners, np.zeros(0, np.int64)]))
-    notes, colors, scale = [], None, 1.0
+    notes, colors = [], None
     # After the coordinates a weight, a colour, or both.
     tints = {k: words[-3:] if len(words) == 4 else words[:3] for k, words in obj.rest.items() if len(words) >= 3}
     if tints:
         values = parse_numbers(b" ".join(word for words in tints.values() for word in words)).reshape(-1, 3)
         colors = np.full((obj.count, 3), GREY)
-        colors[list(tints)], scale = _unit_colors(list(values.T), values.dtype)
+        if not np.isfinite(values).all():
+            raise ValueError("some of its colours are not finite")
+        # sRGB values of 0 to 1, or to 255.
+        colors[list(tints)] = decode_srgb(np.clip(values / (255 if values.max() > 1 else 1), 0, 1))
         if len(tints) < obj.count:
             notes.append(f"{obj.count - len(tints):,} of its vertices have no colour, and are grey")
     if any(len(words) < 3 for words in obj.rest.values()):
@@ -307,16 +318,7 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
         notes.append(f"statements that are not used: {plain(names)}")
     vertices = np.concatenate(obj.vertices)
     return MeshFile(
-        vertices,
-        faces,
-        polygons,
-        None,
-        colors,
-        None,
-        scale,
-        tuple(notes),
-        obj.unreadable,
-        hides_colors=colors is not None,
+        vertices, faces, polygons, None, colors, None, tuple(notes), obj.unreadable, hides_colors=colors is not None
     )
 
 

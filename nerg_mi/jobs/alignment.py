@@ -60,7 +60,7 @@ def align(
         check_writable(output.with_suffix(".png"))
     reporter.progress(0.0, "reading")
     data = rays if rays is None or isinstance(rays, Rays) else Rays.load(rays)
-    evidence = _evidence(options, data)
+    evidence = _evidence(options, data, reporter)
     place, target = _target(options, evidence.kind, reporter)
     fit = evidence.fit(target, reporter.progress)
     if options.refine and data is not None:
@@ -90,7 +90,7 @@ def align(
     return AlignResult(found, written)
 
 
-def _evidence(options: AlignOptions, rays: Rays | None) -> Evidence:
+def _evidence(options: AlignOptions, rays: Rays | None, reporter: Reporter) -> Evidence:
     """What is given as evidence. Raises `NergError` for more than one kind, or none."""
     given = [name for name in ("pairs", "twin", "cameras") if getattr(options, name) is not None]
     if len(given) > 1 or (given and options.start is not None):
@@ -102,7 +102,7 @@ def _evidence(options: AlignOptions, rays: Rays | None) -> Evidence:
         raise NergError("--refine needs the tracking: give a rays file")
     makers: dict[str, Callable[[Path], Evidence]] = {
         "pairs": read_pairs,
-        "twin": lambda path: Twin(read_surface(path), f'the twin "{path}"'),
+        "twin": lambda path: Twin(read_surface(path, on_note=reporter.message), f'the twin "{path}"'),
         "cameras": lambda path: read_cameras(path, _path(options.place_cameras)),
     }
     if given:
@@ -142,7 +142,7 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazeP
             )
         return None, Target(**common)
     if options.surface is not None:
-        return None, Target(points=read_surface(options.surface), **common)
+        return None, Target(points=read_surface(options.surface, on_note=reporter.message), **common)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.02, "tracing the place")
     place = (
@@ -150,6 +150,8 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazeP
         if options.field is not None
         else geometry.place_of_scene(_path(options.scene))
     )
+    for note in place.notes:
+        reporter.message(f"of {options.field or options.scene}: {note}")
     assert place.medium is not None
     core = place.box.core
     traces = trace_place(place.medium, np.array(core.lower), np.array(core.upper), seed=options.seed)

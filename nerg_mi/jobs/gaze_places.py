@@ -49,13 +49,12 @@ def make_place(
     Raises `NergError` for a file that cannot be used, and for rays without hits.
     """
     kind = place_kind(options)
-    if options.field is not None:
-        place = geometry.place_of_field(Path(options.field), ns)
+    if options.field is not None or options.scene is not None:
+        path = Path(options.field or options.scene or "")
+        place = geometry.place_of_field(path, ns) if options.field is not None else geometry.place_of_scene(path)
         for note in place.notes:
-            reporter.message(f"of {options.field}: {note}")
+            reporter.message(f"of {path}: {note}")
         return place
-    if options.scene is not None:
-        return geometry.place_of_scene(Path(options.scene))
     if kind == "none":
         origins = [v.camera.center[None] for v in views] + ([] if rays is None else [rays.origin])
         return geometry.place_of_nothing(np.concatenate(origins))

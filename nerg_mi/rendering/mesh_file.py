@@ -40,7 +40,7 @@ def check_points(path: str | os.PathLike) -> None:
 
 def write_mesh(path: str | os.PathLike, mesh: MeshFile) -> None:
     """Write ``mesh`` as a PLY file that Mitsuba shows: triangles, with the attributes ``vertex_color`` or
-    ``face_color`` in 0..1 where there are colours."""
+    ``face_color``, linear in 0..1, where there are colours."""
     columns = dict(zip("xyz", mesh.vertices.T))
     if mesh.normals is not None:
         columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.T))

@@ -373,7 +373,7 @@ def place_of_scene(path: Path) -> GazePlace:
 
     Raises `NergError` for a scene with neither.
     """
-    scene = _scene_of_mesh(path) if path.suffix.lower() in MESHES else load_scene(path)
+    scene, notes = _scene_of_mesh(path) if path.suffix.lower() in MESHES else (load_scene(path), ())
     place = Place(getattr(scene.integrator(), "medium", None), scene)
     bounds = place.bounds()
     if bounds is None:
@@ -384,17 +384,19 @@ def place_of_scene(path: Path) -> GazePlace:
     lower, upper = bounds
     # A plane has no thickness, and a field needs some.
     pad = 0.01 * max(upper - lower)
-    return GazePlace(place, Box(tuple(lower - pad), tuple(upper + pad)), "scene", {"scene_file": file_identity(path)})
+    box, about = Box(tuple(lower - pad), tuple(upper + pad)), {"scene_file": file_identity(path)}
+    return GazePlace(place, box, "scene", about, notes=notes)
 
 
-def _scene_of_mesh(path: Path) -> Any:
+def _scene_of_mesh(path: Path) -> tuple[Any, tuple[str, ...]]:
+    """A scene of the mesh in ``path``, and sentences on what of the file is not used."""
     import mitsuba as mi
 
     if path.suffix.lower() in READERS and is_splats(path):
         raise NergError(f'"{path}" holds Gaussian splats, which are a field: give it by --field')
     mesh = read_mesh_file(path)
     with mitsuba_says():
-        return mi.load_dict({"type": "scene", "mesh": mitsuba_mesh(mesh.vertices, mesh.faces, "mesh")})
+        return mi.load_dict({"type": "scene", "mesh": mitsuba_mesh(mesh.vertices, mesh.faces, "mesh")}), mesh.notes
 
 
 def place_of_hits(rays: Rays, path: Path, voxel: float | None = None) -> GazePlace:

@@ -25,6 +25,26 @@ def test02_a_scene_gives_its_shapes_and_lights(rgb):
     assert len(again.emitters()) == 3 and len(again.shapes()) == 1
 
 
+PLY = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+property {0} red
+property {0} green
+property {0} blue
+property float quality
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0 {1}
+1 0 0 {1}
+0 1 0 {1}
+3 0 1 2
+"""
+
+
 def test03_a_box_reaches_from_corner_to_corner(rgb):
     box = rgb.load_dict(box_dict(np.array((1.0, 2, 3)), np.array((2.0, 5, 4)))).bbox()
     assert np.allclose(np.ravel(box.min), (1, 2, 3)) and np.allclose(np.ravel(box.max), (2, 5, 4))
@@ -44,3 +64,23 @@ def test04_files_are_looked_at_first(rgb, tmp_path):
     (tmp_path / "empty.obj").write_text("v 0 0 0\n")
     with pytest.raises(NergError, match="empty.obj"):
         mesh_child(tmp_path / "empty.obj")
+
+
+@pytest.mark.parametrize(
+    "name, text, said",
+    [
+        ("a.obj", "mtllib a.mtl\nv 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\nf 1 2 3\n", "mtllib"),
+        ("a.ply", PLY.format("uchar", "255 0 0 7"), "quality"),
+        ("a.ply", PLY.format("float", "1 0 0 7"), "quality"),
+    ],
+)
+def test_colours_of_files_are_shown_and_the_rest_is_named(rgb, monkeypatch, tmp_path, name, text, said):
+    (tmp_path / name).write_text(text)
+    notes = []
+    monkeypatch.setattr(rgb, "Log", lambda level, note: notes.append(note))
+    child = mesh_child(tmp_path / name)
+    shape = child if isinstance(child, rgb.Mesh) else rgb.load_dict(child)
+    (note,) = notes
+    assert said in note and str(tmp_path / name) in note
+    si = rgb.load_dict({"type": "scene", "a": shape}).ray_intersect(rgb.Ray3f((0.2, 0.2, 1), (0, 0, -1)))
+    assert np.allclose(np.ravel(si.bsdf().eval_diffuse_reflectance(si)), (1, 0, 0), atol=1e-4)

@@ -66,12 +66,17 @@ def test_polygons_become_triangles(tmp_path, order, faces, triangles, polygons):
     assert ("split" in "".join(mesh.notes)) == (not mesh.is_plain)
 
 
+FIFTH = ((0.2 + 0.055) / 1.055) ** 2.4
+"""Of the light, for a fifth in sRGB."""
+
+
 @pytest.mark.parametrize("order", ["", "<"])
 @pytest.mark.parametrize(
     "kind, values, expected",
     [
-        ("uchar", (51, 0, 255), (0.2, 0, 1)),
-        ("ushort", (65535, 0, 13107), (1, 0, 0.2)),
+        ("uchar", (51, 0, 255), (FIFTH, 0, 1)),
+        ("ushort", (65535, 0, 13107), (1, 0, FIFTH)),
+        ("float", (51, 0, 255), (FIFTH, 0, 1)),
         ("float", (0.25, 0.5, 1), (0.25, 0.5, 1)),
     ],
 )
@@ -81,15 +86,16 @@ def test_colours_of_vertices(tmp_path, order, kind, values, expected, alpha):
     rows = [(*corner, *values, *((values[0],) if alpha else ())) for corner in CORNERS]
     (tmp_path / "a.ply").write_bytes(ply(order, XYZ | dict.fromkeys(names, kind), LIST, rows, [((0, 1, 2),)]))
     mesh = read_mesh_file(tmp_path / "a.ply")
-    assert np.allclose(mesh.colors, expected) and np.isclose(mesh.color_scale * values[2], expected[2])
-    assert mesh.is_plain != alpha and (mesh.notes == (("columns of vertex that are not used: alpha",) if alpha else ()))
+    assert np.allclose(mesh.colors, expected) and mesh.encodes_colors == (FIFTH in expected)
+    assert mesh.is_plain == (not alpha and FIFTH not in expected)
+    assert mesh.notes == (("columns of vertex that are not used: alpha",) if alpha else ())
 
 
 def test_colours_of_faces_go_with_their_triangles(tmp_path):
     tints = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
     faces = [((1, 4, 2), 255, 0, 0), ((0, 1, 2, 3), 0, 255, 51)]
     (tmp_path / "a.ply").write_bytes(ply("<", XYZ, LIST + tints, CORNERS, faces))
-    assert np.allclose(read_mesh_file(tmp_path / "a.ply").face_colors, [(1, 0, 0), (0, 1, 0.2), (0, 1, 0.2)])
+    assert np.allclose(read_mesh_file(tmp_path / "a.ply").face_colors, [(1, 0, 0), (0, 1, FIFTH), (0, 1, FIFTH)])
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 0), (float("nan"), 0, 1)])
@@ -131,9 +137,9 @@ def test_continued_lines_across_blocks(tmp_path, monkeypatch, lines):
 
 
 def test_colours_of_an_obj(tmp_path):
-    (tmp_path / "a.obj").write_text("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0 1 0 0.2 0.4\nf 1 2 3")
+    (tmp_path / "a.obj").write_text("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0 1 0 0.2 1\nf 1 2 3")
     mesh = read_mesh_file(tmp_path / "a.obj")
-    assert np.allclose(mesh.colors, [(1, 0, 0), (0.5, 0.5, 0.5), (0, 0.2, 0.4)]) and mesh.hides_colors
+    assert np.allclose(mesh.colors, [(1, 0, 0), (0.5, 0.5, 0.5), (0, FIFTH, 1)]) and mesh.hides_colors
     assert mesh.notes == ("1 of its vertices have no colour, and are grey",)
 
 

@@ -104,3 +104,16 @@ def test_gaze_that_meets_nothing_is_refused_and_doubts_are_told_with_the_next_co
         bare = replace(nowhere, kind=kind, medium=None if kind == "none" else nowhere.medium)
         check_place(bare, RAYS, "", False, reporter)
     assert len(reporter.warnings) == 2
+
+
+@pytest.mark.parametrize("option", ["surface", "scene", "twin"])
+def test_what_of_a_mesh_is_not_used_is_named(tmp_path, option):
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
+    options, reporter = AlignOptions(**{option: tmp_path / "a.obj"}), Recorder()
+    if option == "twin":
+        alignment._evidence(options, None, reporter)
+    else:
+        alignment._target(options, "tracking", reporter)
+    assert [m for m in reporter.messages if "mtllib" in m] == [
+        f"of {tmp_path / 'a.obj'}: statements that are not used: mtllib"
+    ]

@@ -127,10 +127,8 @@ def _mesh_color(mesh: MeshFile) -> Node:
     """The mesh's own colours, or grey."""
     if mesh.colors is None and mesh.face_colors is None:
         return prop("rgb", "reflectance", GREY)
-    # What is written has colours in 0..1.
-    scale = [prop("float", "scale", f"{mesh.color_scale:.7g}")] if mesh.is_plain and mesh.color_scale != 1 else []
     name = "face_color" if mesh.colors is None else "vertex_color"
-    return element("texture", prop("string", "name", name), *scale, name="reflectance", type="mesh_attribute")
+    return element("texture", prop("string", "name", name), name="reflectance", type="mesh_attribute")
 
 
 def _lamps(lamps: dict[str, float]) -> list[Node]:

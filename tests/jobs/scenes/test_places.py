@@ -9,6 +9,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.jobs.scenes.files import GivenFiles
 from nerg_mi.jobs.scenes.places import colors_of, place_of_files
+from nerg_mi.maths.color import encode_srgb
 from nerg_mi.rendering.scene_writer import document
 from tests.formats.splats.writers import random_splats, write_inria
 
@@ -39,19 +40,19 @@ def text_of(folder, path, kind, lamps=None):
 
 
 @pytest.mark.parametrize(
-    "kind, values, said",
+    "names, values, said",
     [
-        (None, "", 'name="reflectance" value="0.5"'),
-        ("float", "0.2 0.4 0.6", 'value="vertex_color"'),
-        ("uchar", "51 102 153", 'name="scale" value="0.003921569"'),
+        ("", "", 'name="reflectance" value="0.5"'),
+        ("rgb", "0.2 0.4 0.6", 'value="vertex_color"'),
+        (("color_0", "color_1", "color_2"), "0.2 0.4 0.6", 'value="vertex_color"'),
     ],
+    ids=["grey", "rgb", "of Mitsuba"],
 )
-def test_colours_of_a_mesh(rgb, tmp_path, kind, values, said):
-    names = ("r", "g", "b")
-    colors = "\n".join(f"property {kind} {name}" for name in names) if kind else "comment grey"
+def test_colours_of_a_mesh(rgb, tmp_path, names, values, said):
+    colors = "\n".join(f"property float {name}" for name in names) or "comment grey"
     (tmp_path / "a.ply").write_text(PLY.format(colors=colors, a=values))
     place, text = text_of(tmp_path, tmp_path / "a.ply", "mesh")
-    assert said in text and ('name="scale"' in text) == (kind == "uchar")
+    assert said in text
     assert place.files == {"place": "a.ply"} and text.count('<emitter type="point">') == 2
     assert 'value="$eye"' in text and 'value="$camera"' in text
 
@@ -72,19 +73,21 @@ def test_colours_of_a_mesh(rgb, tmp_path, kind, values, said):
                 "3 0 1 2", "4 0 1 2 0"
             ),
         ),
+        ("a.ply", PLY.format(colors="property uchar red\nproperty uchar green\nproperty uchar blue", a="51 102 153")),
         ("a.obj", "".join(f"v {p} 0.2 0.4 0.6\n" for p in ("0 0 0", "1 0 0", "0 1 0")) + "f -3 -2 -1"),
         ("a.obj", "".join(f"v {p} 51 102 153\n" for p in ("0 0 0", "1 0 0", "0 1 0")) + "f 1 2 \\\n3"),
     ],
-    ids=["RGBA", "quads", "negative", "continued"],
+    ids=["RGBA", "quads", "RGB", "negative", "continued"],
 )
 def test_a_mesh_that_mitsuba_does_not_show_is_written_again(rgb, tmp_path, name, text):
     (tmp_path / name).write_text(text)
     written = place_of_files(given(tmp_path / name, "mesh"), tmp_path / "out.xml")
     place, xml = text_of(tmp_path, tmp_path / name, "mesh")
     assert written.files == (tmp_path / "out.mesh.ply",) and place.files == {"place": "out.mesh.ply"}
-    assert '"vertex_color"' in xml and 'name="scale"' not in xml and 'type="ply"' in xml
+    assert '"vertex_color"' in xml and 'type="ply"' in xml
     params = rgb.traverse(rgb.load_dict({"type": "ply", "filename": str(tmp_path / "out.mesh.ply")}))
-    assert np.allclose(np.array(params["vertex_color"]).reshape(-1, 3), (0.2, 0.4, 0.6))
+    shown = np.array(params["vertex_color"]).reshape(-1, 3)
+    assert np.allclose(encode_srgb(shown), (0.2, 0.4, 0.6), atol=1e-6)
     assert np.array(params["faces"])[:3].tolist() == [0, 1, 2]
 
 
