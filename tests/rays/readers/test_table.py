@@ -266,6 +266,23 @@ def test_fill_values_in_the_heads_frame(tmp_path, heads):
     assert dropped(rays) == {"direction is the fill value -1, -1, -1": [[5, 6]], "direction is zero": [[9, 9]]}
 
 
+@pytest.mark.parametrize(
+    "columns, rows, kept",
+    [
+        ("xyzw=a,b,c,d", [(0, 0, 0, 1), (-1, -1, -1, -1), (0, 0, 0, 0), (-9999,) * 4, (1, 1, 1, 1)], 2),
+        ("ypr=a,b,c", [(0, 0, 0), (-9999,) * 3, (-1, -1, -1), (999, 999, 999), (-32768,) * 3], 2),
+        ("azel=a,b", [(0, 0), (-1, -1), (-9999, -9999), (999, 999), (3.402823e38,) * 2], 2),
+        ("yawpitch=a,b", [(0, 0), (-9999, -9999), (-999, -999), (99999, 99999), (20, 20)], 2),
+        ("direction=a,b,c", [(0, 0, 1), (3.402823e38,) * 3, (-32768,) * 3, (-1, -1, -1), (1, 2, 3)], 2),
+    ],
+)
+def test_fill_values_of_poses_and_angles(tmp_path, columns, rows, kept):
+    names = "x,y,z," + columns.split("=")[1]
+    path = write(tmp_path / "t.csv", names, [(1, 2, 1.6, *row) for row in rows])
+    rays = read_table(path, f"origin=x,y,z {columns}")
+    assert len(rays) == kept and sum(d["count"] for d in rays.metadata["dropped"]) == 3
+
+
 def test_columns_of_validity_of_a_map(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("x,y,z,a,b,c,isValid\n" + "".join(f"{k},0,1.6,1,0,0,{k % 2}\n" for k in range(10)))

@@ -1,18 +1,31 @@
-"""Vectors whose three components are one fill value, as 0, 0, 0 or -1, -1, -1 where a program had nothing to write."""
+"""Vectors whose components are all one fill value, as 0, 0, 0 or -1, -1, -1 where a program had nothing to write."""
 
 from __future__ import annotations
 
 import numpy as np
 
-_FILLS = np.array([0.0, -1.0, *(sign * 10.0**k - sign for k in range(2, 6) for sign in (1, -1))])
+_FILLS = np.array(
+    [
+        *(0.0, -1.0, *(sign * 10.0**k - sign for k in range(2, 7) for sign in (1, -1))),
+        *(limit for bits in (16, 32) for limit in (-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1, 2.0**bits - 1)),
+    ]
+)
+_LIMIT = 1e30  # of floats that are lengths or directions; a fill beyond is the largest of its type, however rounded
 _APART = 0.1  # metres between a fill value and the nearest place of a person who was never there
 _AIMED = np.cos(np.radians(2.0))  # of a ray that points at its hit point
 
 
 def fill_values(v: np.ndarray) -> np.ndarray:
-    """The fill value of vectors (n, 3), (n,); NaN of those that are none."""
-    same = (v[:, 0] == v[:, 1]) & (v[:, 1] == v[:, 2]) & np.isin(v[:, 0], _FILLS)
-    return np.where(same, v[:, 0], np.nan)
+    """The fill value of vectors (n, C), (n,); NaN of those that are none."""
+    first = v[:, 0]
+    is_fill = np.isin(first, _FILLS) | (np.isfinite(first) & (np.abs(first) > _LIMIT))
+    return np.where((v == v[:, :1]).all(axis=1) & is_fill, first, np.nan)
+
+
+def is_filled_angles(angles: np.ndarray) -> np.ndarray:
+    """Whether angles (n, C) of a head or of gaze, in degrees or radians, are one fill value, (n,) bool; 0 and -1 may be
+    true."""
+    return np.abs(fill_values(angles)) > 90
 
 
 def is_aimed(origin: np.ndarray, direction: np.ndarray, hit: np.ndarray) -> np.ndarray:

@@ -10,6 +10,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
+from .fill_values import fill_values, is_filled_angles
+
 AXES = {f"{sign}{axis}": s * np.eye(3)[i] for i, axis in enumerate("xyz") for sign, s in (("", 1.0), ("-", -1.0))}
 """Unit vectors by name: x, -x, y, -y, z, -z."""
 
@@ -33,14 +35,16 @@ def default_forward(up: str, handedness: str) -> str:
 
 def rotations_from_quaternions(q: np.ndarray, order: str = "xyzw") -> np.ndarray:
     """Rotation matrices (N, 3, 3) of quaternions (N, 4) in ``order`` xyzw or wxyz; they need not be unit. NaN where one
-    is not finite or zero."""
+    is not finite, zero or a fill value."""
     q = np.asarray(q, dtype=np.float64)
     if order not in ("xyzw", "wxyz") or q.ndim != 2 or q.shape[1] != 4:
         raise ValueError(f'quaternions {q.shape} in order "{order}": expected (N, 4), xyzw or wxyz')
-    length = np.linalg.norm(q, axis=1)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(q, axis=1)
+    good = np.isfinite(length) & (length > 1e-12) & np.isnan(fill_values(q))
     if order == "wxyz":
         q = np.roll(q, -1, axis=1)
-    return _where(np.isfinite(length) & (length > 1e-12), q, lambda rotation, q: rotation.from_quat(q))
+    return _where(good, q, lambda rotation, q: rotation.from_quat(q))
 
 
 def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bool = True) -> np.ndarray:
@@ -57,8 +61,8 @@ def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bo
         raise NergError(f"the up axis and the forward axis are both {up}; say where heads look with forward")
     (side,) = set("xyz") - {up, forward}
     sequence = (up + side + forward).upper()[: angles.shape[1]]
-    known = np.asarray(np.isfinite(angles).all(axis=1))
-    return _where(known, angles, lambda rotation, a: rotation.from_euler(sequence, a, degrees=degrees))
+    good = np.isfinite(angles).all(axis=1) & ~is_filled_angles(angles)
+    return _where(good, angles, lambda rotation, a: rotation.from_euler(sequence, a, degrees=degrees))
 
 
 def directions_from_azimuths(
@@ -75,7 +79,8 @@ def directions_from_azimuths(
         raise NergError(f"the up axis and the forward axis are both {up[-1]}; say where heads look with forward")
     ahead, top = axis(forward, "forward"), axis(up, "up")
     right = np.cross(ahead, top) if handedness == "right" else np.cross(top, ahead)
-    a, e = (np.radians(angles) if degrees else np.asarray(angles, np.float64)).T
+    angles = np.where(is_filled_angles(angles)[:, None], np.nan, angles)
+    a, e = (np.radians(angles) if degrees else angles).T
     part = lambda weight, vector: weight[:, None] * vector
     return part(np.cos(e) * np.cos(a), ahead) + part(np.cos(e) * np.sin(a), right) + part(np.sin(e), top)
 

@@ -15,8 +15,11 @@ from .column_finder import column_words
 # Of the gaze as a whole, as one word: isvalid, gazevalidity, combinedgazestatus. Those of one eye are none.
 _OF_GAZE = re.compile(
     r"(is|has|was)?(gaze|eyes?|combined|tracking|tracker|ray|data|sample)*(is|has|was)?"
-    r"(valid(ity)?|status|tracked|trackingstate)(flag|code)?"
+    r"(valid(ity)?|status|tracked|trackingstate)(flag|code)?|(is|has)?valid(gaze|eyes?|data|sample)|"
+    r"(is)?(gaze|eye)trackingenabledandvalid"
 )
+# Words of names that may say so, too.
+_MAY_BE = {"detected", "available", "found", "lost", "missing", "dropout", "blink", "blinking", "worn", "tracked"}
 _VALID = ("valid", "true", "tracked", "tracking", "ok", "yes")
 _INVALID = (
     *("invalid", "false", "lost", "untracked", "nottracked", "nottracking", "notvalid", "no", "none", "limited"),
@@ -33,7 +36,7 @@ def is_validity(column: str) -> bool:
 
 def looks_like_validity(column: str) -> bool:
     """Whether a name may be that of a validity of any kind, such as ``left_eye_validity``."""
-    return "valid" in column.lower() or is_validity(column)
+    return "valid" in column.lower() or is_validity(column) or not _MAY_BE.isdisjoint(column_words(column).split("_"))
 
 
 def valid_values(column: str, values: Iterable[str]) -> list[str] | None:
@@ -44,7 +47,7 @@ def valid_values(column: str, values: Iterable[str]) -> list[str] | None:
     device's. The status of the gaze with codes to 2 is Varjo's: 0 invalid, 1 being calibrated, 2 valid.
     """
     words = {value: re.sub(r"[^a-z0-9.]", "", value.lower()) for value in values}
-    codes = {value: float(word) for value, word in words.items() if re.fullmatch(r"\d{1,9}(\.0*)?", word)}
+    codes = {value: float(value) for value in words if re.fullmatch(r"\s*[+-]?\d{1,9}(\.0*)?\s*", value)}
     name = column_words(column).replace("_", "")
     is_status = name.endswith(("status", "state", "code"))
     if is_status and "gaze" in name and 2 in codes.values() and set(codes.values()) <= _VARJO:

@@ -1,6 +1,7 @@
 """Fill values in place of vectors."""
 
 import numpy as np
+import pytest
 
 from nerg_mi.rays.readers.parsing.fill_values import FilledOrigins, fill_values, is_aimed
 
@@ -8,6 +9,19 @@ from nerg_mi.rays.readers.parsing.fill_values import FilledOrigins, fill_values,
 def test_values():
     v = np.array([[0, 0, -0.0], [-1, -1, -1], [9999, 9999, 9999], [-99, -99, -99], [0.5, 0.5, 0.5], [0, 0, 1e-9]])
     assert np.array_equal(fill_values(v), [0, -1, 9999, -99, np.nan, np.nan], equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    "fill", [-32768, 32767, 65535, -2147483648, 4294967295, 999999, -999999, 3.402823e38, -3.4028235e38]
+)
+def test_limits_of_types_are_fill_values(fill):
+    v = np.array([[fill] * 3, [fill, fill, 0], [1, 1, 1]], float)
+    assert np.array_equal(fill_values(v), [fill, np.nan, np.nan], equal_nan=True)
+    assert np.array_equal(fill_values(v[:, :2]), [fill, fill, np.nan], equal_nan=True)
+
+
+def test_infinity_is_no_fill_value():
+    assert np.isnan(fill_values(np.full((2, 3), [np.inf, np.inf, np.inf]))).all()
 
 
 def test_rays_that_point_at_their_hits():

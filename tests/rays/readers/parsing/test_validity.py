@@ -17,20 +17,22 @@ from nerg_mi.rays.readers.parsing.validity import (
 @pytest.mark.parametrize(
     "name",
     "isValid IsGazeValid GazeValidity gaze_is_valid valid Status GazeStatus gaze_status tracking_state "
-    "combinedGazeValid eye_tracked gazeRay.isValid validity_flag".split(),
+    "combinedGazeValid eye_tracked gazeRay.isValid validity_flag IsEyeTrackingEnabledAndValid HasValidGaze".split(),
 )
 def test_names_of_validity(name):
     assert is_validity(name) and looks_like_validity(name)
 
 
 @pytest.mark.parametrize(
-    "name", "left_valid RightEyeValidity left_eye_data_validata_bit_mask calibration_is_valid".split()
+    "name",
+    "left_valid RightEyeValidity left_eye_data_validata_bit_mask calibration_is_valid "
+    "blink eye_detected GazeAvailable gaze.lost left_tracked".split(),
 )
 def test_names_of_another_validity(name):
     assert not is_validity(name) and looks_like_validity(name)
 
 
-@pytest.mark.parametrize("name", "state trial_status time statusbar gaze_dir_x".split())
+@pytest.mark.parametrize("name", "state trial_status time statusbar gaze_dir_x blinks_per_minute".split())
 def test_names_of_none(name):
     assert not is_validity(name) and not looks_like_validity(name)
 
@@ -47,6 +49,8 @@ def test_names_of_none(name):
         ("GazeStatus", ["2.0", "0.0"], ["2.0"]),
         ("gaze_status", ["0", "1"], None),  # calibrating, or true
         ("status", ["0", "1", "2"], None),  # of no device that is named
+        ("isValid", ["1", "-1"], None),
+        ("isValid", ["+1", " 0"], ["+1"]),
         ("valid", ["0", "1", "4"], None),  # of some trackers 0 is the best
         ("status", ["good", "valid"], None),
     ],
