@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, plain
 from nerg_mi.rays.readers.parsing import poses
 from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder, is_counter
 from nerg_mi.rays.readers.parsing.column_map import ColumnMap
@@ -223,7 +223,11 @@ def _find_time(out: Proposal, sample: TableSample, roles: Roles) -> tuple[str | 
     """The column of the time, and its seconds."""
     name = next((c for c in (*roles.times, *sorted(sample.clocks)) if c in sample.numbers), None)
     if name is None:
-        out.open.append("the time: no column is called so; without t= rows are numbered, and --tick is the time of one")
+        why = "no column is called so"
+        if unread := next((c for c in roles.times if c in sample.columns), None):
+            cell = plain(next(iter(sample.texts(unread)), ""), 40)
+            why = f"{unread!r} holds {cell!r}, which is read neither as a number nor as 2024-05-01T12:00:00.25"
+        out.open.append(f"the time: {why}; without t= rows are numbered, and --tick is the time of one")
         return None, None
     if name in sample.clocks:
         out.sure.append(f"{name!r} holds times of day, or dates with them (in UTC where no offset is written)")
@@ -292,12 +296,12 @@ def _pose_evidence(
         forward = rows.find_forward(turns, where, seconds, up, rows.UNITS[settings["metre"]])
         if forward:
             out.guessed.append(f"heads look along their {forward}: that is where they walk to")
-    unity = up is not None and up.endswith("y") and forward != "-z"
+    unity = up == "y" and forward != "-z"
     unreal = up is not None and up.endswith("z") and settings["metre"] == "cm"
     hand = "left" if unity or unreal else "right"
     if up:
         out.options["--hand"] = hand
-        which = "as most worlds with that axis up are"
+        which = "as cameras' frames are" if up == "-y" else "as most worlds with that axis up are"
         if hand == "left":
             which = "as Unity's worlds with y up are" if unity else "as Unreal's worlds (z up, in centimetres) are"
         out.guessed.append(

@@ -183,6 +183,46 @@ def test_unreal_is_left_handed(tmp_path, monkeypatch):
     assert np.allclose(rays.origin, WALK.eye, atol=1e-5) and np.allclose(rays.direction, WALK.gaze, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "to, hand",
+    [
+        (lambda v: v[:, [0, 2, 1]], "left"),  # Unity
+        (lambda v: v[:, [0, 2, 1]] * [1, -1, 1], "right"),  # OpenCV, Kinect
+        (lambda v: v * [1, -1, 1] * 100, "left"),  # Unreal
+        (lambda v: 1000 * v, "right"),  # Vicon
+        (lambda v: v[:, [2, 0, 1]], "right"),
+    ],
+    ids=["y", "-y", "z cm", "z mm", "x"],
+)
+def test_hands_of_worlds(tmp_path, to, hand):
+    eye, gaze = to(WALK.eye), to(WALK.gaze)
+    (tmp_path / "log.csv").write_text(alike(eye, gaze / np.linalg.norm(gaze, axis=1, keepdims=True)))
+    proposal = propose_import(tmp_path / "log.csv")
+    assert proposal.options["--hand"] == hand
+    assert any(f"{hand}-handed" in sentence for sentence in proposal.guessed)
+
+
+@pytest.mark.parametrize("name, cell", [("time", "12:00"), ("timestamp", "5/1/2024 12:00:00"), ("utc", "noon")])
+def test_times_that_are_not_read_are_named(tmp_path, name, cell):
+    eye, gaze, _ = frame(WALK, "y left")
+    table = {name: [cell] * N, **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
+    (tmp_path / "log.csv").write_text(csv(**table))
+    (sentence,) = (s for s in propose_import(tmp_path / "log.csv").open if "the time" in s)
+    assert f"{name!r} holds {cell!r}" in sentence
+
+
+@pytest.mark.parametrize(
+    "ids",
+    [np.arange(N), [f"u{k:05d}" for k in range(N)], [f"{k / 90:.3f}" for k in range(N)], np.arange(N)[::-1]],
+    ids=["counter", "words", "times", "backwards"],
+)
+@pytest.mark.parametrize("name", ["subject", "user_id"])
+def test_what_differs_in_each_row_is_no_participant(tmp_path, name, ids):
+    (tmp_path / "log.csv").write_text(alike(*frame(WALK, "y left")[:2], **{name: ids}))
+    proposal = propose_import(tmp_path / "log.csv")
+    assert proposal.columns.person is None and any(f"{name!r} has another value" in s for s in proposal.open)
+
+
 @pytest.mark.parametrize("form", ["2024-05-01T12:00:{:08.5f}", "12:00:{:08.5f}", "2024/05/01 12:00:{:08.5f}Z"])
 def test_times_as_text(tmp_path, monkeypatch, form):
     eye, gaze, _ = frame(WALK, "y left")

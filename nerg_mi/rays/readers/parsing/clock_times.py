@@ -9,8 +9,13 @@ from collections.abc import Callable
 import numpy as np
 
 _CLOCK = re.compile(
-    r"(?:(\d{4})[-/](\d\d)[-/](\d\d)(?:T| +))?(\d\d?):(\d\d):(\d\d)(?:[.,](\d+))? ?(Z|([+-])(\d\d):?(\d\d))?"
+    r"(?:(?:(?P<year>\d{4})[-/](?P<month>\d\d)[-/](?P<day>\d\d)|"
+    r"(?P<day_>\d\d)\.(?P<month_>\d\d)\.(?P<year_>\d{4}))(?:T|,? +))?"
+    r"(?P<hour>\d\d?):(?P<minute>\d\d):(?P<second>\d\d)(?:[.,](?P<fraction>\d+))?"
+    r"(?: ?(?P<half>[AaPp])\.?[Mm]\.?)? ?(?P<zone>Z|(?P<sign>[+-])(?P<zone_hour>\d\d):?(?P<zone_minute>\d\d))?"
 )
+# ISO 8601's basic format; its time alone would be a number.
+_BASIC = re.compile(r"(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)(?=\D|$)")
 _EPOCH = datetime.date(1970, 1, 1).toordinal()
 
 
@@ -18,17 +23,24 @@ def clock_seconds(text: str) -> tuple[float, bool] | None:
     """Seconds of a time such as ``2024-05-01T12:00:00.25+02:00`` or ``12:00:00.25``, and whether it has a date.
 
     With a date they count from 1970 in UTC, as which a time without an offset is taken; else from midnight. None for
-    any other text. The year stands first and hours count to 24, so that no order has to be guessed.
+    any other text. Dates are year-month-day or day.month.year, and hours count to 24 or have AM or PM, so that no order
+    has to be guessed.
     """
-    match = _CLOCK.fullmatch(text.strip()[:64])
+    match = _CLOCK.fullmatch(_BASIC.sub(r"\1-\2-\3T\4:\5:\6", text.strip()[:64]))
     if match is None:
         return None
-    year, month, day, hour, minute, second, fraction, zone, sign, zone_hour, zone_minute = match.groups()
-    if int(hour) > 23 or int(minute) > 59 or int(second) > 60:
+    hour, minute, second = int(match["hour"]), int(match["minute"]), int(match["second"])
+    if match["half"]:
+        if not 1 <= hour <= 12:
+            return None
+        hour = hour % 12 + 12 * (match["half"] in "Pp")
+    if hour > 23 or minute > 59 or second > 60:
         return None
-    seconds = 3600.0 * int(hour) + 60 * int(minute) + int(second) + (float(f"0.{fraction}") if fraction else 0.0)
-    if zone and sign:
-        seconds -= (1 if sign == "+" else -1) * (3600 * int(zone_hour) + 60 * int(zone_minute))
+    seconds = 3600.0 * hour + 60 * minute + second + (float(f"0.{match['fraction']}") if match["fraction"] else 0.0)
+    if match["sign"]:
+        offset = 3600 * int(match["zone_hour"]) + 60 * int(match["zone_minute"])
+        seconds -= offset if match["sign"] == "+" else -offset
+    year, month, day = (match[name] or match[f"{name}_"] for name in ("year", "month", "day"))
     if year is None:
         return seconds, False
     try:
