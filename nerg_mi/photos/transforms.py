@@ -69,18 +69,24 @@ _DEPTH_MEANING = "depth.*(unit|scale|factor|type|near|far|min|max|offset)"
 # Patterns of other keys, whatever program writes them, that change what pictures and poses mean -> the remedy. They do
 # no harm with a value that is off (false, 0) or says what is read here.
 _CHANGES_MEANING = {
-    "^from_|convention|handed|^coord|^pose_(type|format)|w2c|world_to_cam|^is_(opencv|colmap)|^opencv$": (
+    "^from_|convention|handed|^coord|^(pose|transform)_(type|format)|w2c|world_to_cam|^is_(opencv|colmap)|^opencv$|"
+    "^extrinsic|^flip|^mirror": (
         "its poses follow another convention; write OpenGL's camera-to-world poses (x right, y up, z back) without it"
     ),
     "^rolling_shutter|^transform_matrix_(start|end)$": (
         "its cameras move while a picture is taken; write the pose of the middle row without it"
     ),
+    "^(color|colour)_?space$|^gamma$|^is_linear$": "its colours are encoded otherwise; store pictures in sRGB",
+    "mask.*inver|inver.*mask": "its masks mean the opposite; write masks that are white where pictures are used",
     "_transparent$|^fix_premult$": "a colour stands for nothing; store alpha in the pictures and remove it",
     "^(skew|xi|omega|b[12]|shift_[xy]|p[3-9]|s[1-4]|k([7-9]|1[0-9])|tau_[xy])$|^distortion(?!_model)|crop_radius|"
-    "^(latlong|equirectangular|orthographic|projection)$": "its lens is not supported; undistort the pictures",
+    "^(latlong|equirectangular|orthographic|projection|lens|(lens|camera)_type|distortion_model)$": (
+        "its lens is not supported; undistort the pictures"
+    ),
     _DEPTH_MEANING: 'it says what depth means; write "depth_unit_scale_factor" (in metres), "is_euclidean_depth"',
 }
-_SAME_MEANING = {"opengl", "nerfstudio", "nerf", "blender", "c2w", "camera_to_world", "right", "perspective"}
+_SAME_MEANING = {"opengl", "nerfstudio", "nerf", "blender", "c2w", "camera_to_world", "cam2world", "right"}
+_SAME_MEANING |= {"perspective", "pinhole", "srgb"}
 
 
 def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImages:

@@ -330,6 +330,13 @@ CHANGES = [
     {"distortion": [0.1, 0]},
     {"fisheye_crop_radius": 300},
     {"latlong": True},
+    {"transform_type": "w2c"},
+    {"flip_y": True},
+    {"camera_type": "fisheye"},
+    {"distortion_model": "OPENCV_FISHEYE"},
+    {"color_space": "linear"},
+    {"is_linear": True},
+    {"invert_mask": True},
 ]
 
 
@@ -356,6 +363,8 @@ def test_an_unknown_key_that_changes_meaning_is_refused(write, keys):
             "skew": 0.0,
             "depth_type": "z",
         },
+        {"transform_type": "c2w", "flip_y": False, "camera_type": "perspective", "color_space": "sRGB"},
+        {"is_linear": False, "invert_mask": False, "distortion_model": "PINHOLE", "mirror": None},
         {"transform_matrix_start": POSE, "transform_matrix_end": POSE},
         {"aabb_scale": 16, "scale": 0.3, "offset": [0, 0, 0], "sharpness": 9.0, "colmap_im_id": 7, "rotation": 0.1},
     ],
