@@ -108,15 +108,17 @@ def _split(counts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _linear_colors(columns: Sequence[np.ndarray], kind: np.dtype) -> tuple[np.ndarray, bool]:
     """Linear colours in 0..1 of the ``columns`` of a PLY file, and whether these are sRGB values.
 
-    Whole numbers, which reach up to the largest of their type, are those of pictures: cameras, scanners and modelling
-    programs write them so. Floats up to 1 are linear, as renderers write them.
+    Whole numbers, of 8 bits if none is larger, else of 16 or as many as their type has, are those of pictures: cameras,
+    scanners and modelling programs write them so. Floats up to 1 are linear, as renderers write them.
     """
     values = np.stack(columns, axis=-1).astype(np.float64)
     if not np.isfinite(values).all():
         raise ValueError("some of its colours are not finite")
-    if kind.kind == "f" and not (values.size and values.max() > 1):
+    most = values.max(initial=0)
+    if kind.kind == "f" and most <= 1:
         return np.clip(values, 0, 1), False
-    top = np.iinfo(kind).max if kind.kind in "iu" else 255
+    limits = [255, 65535, np.iinfo(kind).max] if kind.kind in "iu" and kind.itemsize > 1 else [255]
+    top = next((limit for limit in limits if most <= limit), limits[-1])
     return decode_srgb(np.clip(values / top, 0, 1)), True
 
 
@@ -300,8 +302,17 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
     obj.read([rest])
     faces, polygons = _split(np.array(obj.counts, np.int64), np.concatenate([*obj.corners, np.zeros(0, np.int64)]))
     notes, colors = [], None
-    # After the coordinates a weight, a colour, or both.
-    tints = {k: words[-3:] if len(words) == 4 else words[:3] for k, words in obj.rest.items() if len(words) >= 3}
+    # After the coordinates a weight, a colour, or both; or, as some programs write, a colour and an alpha.
+    firsts = parse_numbers(b" ".join(words[0] for words in obj.rest.values() if len(words) == 4))
+    has_weights = bool((firsts == 1).all())
+    tints = {
+        k: words[1:] if len(words) == 4 and has_weights else words[:3]
+        for k, words in obj.rest.items()
+        if len(words) >= 3
+    }
+    if len(firsts):
+        what = "the first is taken for a weight" if has_weights else "the last is taken for an alpha, and not used"
+        notes.append(f"of four numbers after the coordinates of its vertices {what}")
     if tints:
         values = parse_numbers(b" ".join(word for words in tints.values() for word in words)).reshape(-1, 3)
         colors = np.full((obj.count, 3), GREY)

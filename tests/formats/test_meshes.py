@@ -68,6 +68,7 @@ def test_polygons_become_triangles(tmp_path, order, faces, triangles, polygons):
 
 FIFTH = ((0.2 + 0.055) / 1.055) ** 2.4
 """Of the light, for a fifth in sRGB."""
+DARK = 1 / 255 / 12.92, 2 / 255 / 12.92
 
 
 @pytest.mark.parametrize("order", ["", "<"])
@@ -76,6 +77,7 @@ FIFTH = ((0.2 + 0.055) / 1.055) ** 2.4
     [
         ("uchar", (51, 0, 255), (FIFTH, 0, 1)),
         ("ushort", (65535, 0, 13107), (1, 0, FIFTH)),
+        ("ushort", (51, 0, 255), (FIFTH, 0, 1)),
         ("float", (51, 0, 255), (FIFTH, 0, 1)),
         ("float", (0.25, 0.5, 1), (0.25, 0.5, 1)),
     ],
@@ -140,7 +142,37 @@ def test_colours_of_an_obj(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0 1 0 0.2 1\nf 1 2 3")
     mesh = read_mesh_file(tmp_path / "a.obj")
     assert np.allclose(mesh.colors, [(1, 0, 0), (0.5, 0.5, 0.5), (0, FIFTH, 1)]) and mesh.hides_colors
-    assert mesh.notes == ("1 of its vertices have no colour, and are grey",)
+    assert mesh.notes == (
+        "of four numbers after the coordinates of its vertices the first is taken for a weight",
+        "1 of its vertices have no colour, and are grey",
+    )
+
+
+@pytest.mark.parametrize(
+    "rests, colors, said",
+    [
+        (["1 0 0 1", "0 1 0 1"], [(1, 0, 0), (0, 1, 0)], "the last is taken for an alpha"),
+        (["255 0 0 255", "0 255 51 255"], [(1, 0, 0), (0, 1, FIFTH)], "the last is taken for an alpha"),
+        (["1 0 0.2 1", "1 1 0 1"], [(0, FIFTH, 1), (1, 0, 1)], "the first is taken for a weight"),
+        (["255 0 0", "0 255 51"], [(1, 0, 0), (0, 1, FIFTH)], ""),
+    ],
+)
+def test_numbers_after_the_coordinates_of_an_obj(tmp_path, rests, colors, said):
+    rows = "".join(f"v {k} {k * k} 0 {rests[k % 2]}\n" for k in range(4))
+    (tmp_path / "a.obj").write_text(rows + "f 1 2 3 4")
+    mesh = read_mesh_file(tmp_path / "a.obj")
+    assert np.allclose(mesh.colors[:2], colors) and said in "".join(mesh.notes) and bool(mesh.notes) == bool(said)
+
+
+@pytest.mark.parametrize("kind", ["int", "uint", "short", "ushort"])
+@pytest.mark.parametrize("values, expected", [((51, 0, 255), (FIFTH, 0, 1)), ((0, 1, 2), (0, *DARK))])
+def test_bytes_in_wider_numbers_are_colours_of_8_bits(tmp_path, kind, values, expected):
+    tints = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
+    faces = "3 0 1 2 " + " ".join(map(str, values))
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {a}\n" for a in "xyz")
+    rows = "0 0 0\n1 0 0\n0 1 0\n"
+    (tmp_path / "a.ply").write_text(f"{head}element face 1\n{LIST}{tints}end_header\n{rows}{faces}\n")
+    assert np.allclose(read_mesh_file(tmp_path / "a.ply").face_colors, [expected])
 
 
 @pytest.mark.parametrize(

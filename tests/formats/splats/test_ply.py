@@ -136,15 +136,29 @@ def test_what_trainings_write_is_not_taken_for_anything_else(tmp_path, change):
     assert equal(read, splats) and not read.guesses
 
 
-def test_the_3d_filter_widens_and_keeps_the_mass(tmp_path):
-    splats, widths = random_splats(50, 2), np.linspace(0, 0.5, 50, dtype=np.float32)
-    write_columns_of(tmp_path / "a.ply", splats, filter_3D=widths)
+@pytest.mark.parametrize(
+    "degree, change",
+    [(2, {}), (0, {"nx": np.ones(50)}), (1, {"label": np.ones(50)}), (3, {"lengths": True}), (0, {"shares": True})],
+    ids=["degree 2", "normals", "further columns", "lengths", "opacities as they are"],
+)
+def test_the_3d_filter_widens_and_keeps_the_mass(tmp_path, degree, change):
+    """Of what trainings write, and of activated values."""
+    splats = random_splats(100, degree, size=0.02)
+    widths, change = np.linspace(0, 0.05, 100, dtype=np.float32), dict(change)
+    columns = {name: np.resize(values, 100) for name, values in change.items() if values is not True}
+    if "lengths" in change:
+        columns |= {f"scale_{i}": splats.scales[:, i] for i in range(3)}
+    if "shares" in change:
+        columns["opacity"] = splats.opacities
+    write_columns_of(tmp_path / "a.ply", splats, filter_3D=widths, **columns)
     read = read_ply_splats(tmp_path / "a.ply")
     assert np.allclose(read.scales**2 - splats.scales**2, widths[:, None] ** 2, atol=1e-5)
     assert np.allclose(read.opacities * read.scales.prod(axis=1), splats.opacities * splats.scales.prod(axis=1))
+    assert len(read.guesses) == len({"lengths", "shares"} & change.keys())
     # What is written again has the filter in it, and not twice.
     write_ply_splats(tmp_path / "b.ply", read)
-    assert equal(read_ply_splats(tmp_path / "b.ply"), read, 1e-5) and not read.extra and not read.notes
+    again = read_ply_splats(tmp_path / "b.ply")
+    assert equal(again, read, 1e-5) and set(again.extra) == {"label"} & change.keys()
 
 
 def test_columns_that_are_not_used_are_named(tmp_path):
