@@ -33,6 +33,8 @@ NAMED_RUNS = 500_000
 
 _UNUSED = 256  # columns that are not used and kept by name
 
+_NO_NAMES = {"nan", "none", "null", "n/a", "<na>"}  # what programs write where there is no name
+
 _EYES = "eye_distance"  # a column while files are read; of the rays, one number a person in the metadata
 
 
@@ -364,7 +366,8 @@ class _Names:
         names = np.asarray(names, dtype=str)
         # Rows of one person mostly follow each other: names are looked up where they change.
         starts = np.flatnonzero(np.r_[True, names[1:] != names[:-1]][:n])
-        codes = np.array([self.code(name.strip()) for name in names[starts].tolist()], dtype=np.int32)
+        stripped = (name.strip() for name in names[starts].tolist())
+        codes = np.array([self.code("" if s.lower() in _NO_NAMES else s) for s in stripped], dtype=np.int32)
         return np.repeat(codes, np.diff(np.r_[starts, n]))
 
     def sorted(self, codes: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:

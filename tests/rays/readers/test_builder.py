@@ -248,6 +248,16 @@ def test_decimal_commas_are_named(tmp_path):
         assert {"numbers"} & set(dict(card_lines(rays, summarise(rays)))) == expected
 
 
+@pytest.mark.parametrize("word", ["", "NaN", " nan ", "None", "null", "N/A", "<NA>"])
+def test_words_for_no_name_are_no_participant(word):
+    builder = RaysBuilder()
+    v = np.ones((3, 3))
+    builder.add(np.arange(3.0), ["ann", word, "nana"], v, v, rows=np.arange(3), cohort=[word, "a", "b"])
+    rays = builder.build()
+    assert rays.persons == ("ann", "nana") and rays.cohorts == ("unknown", "b")
+    assert [d["reason"] for d in rays.metadata["dropped"]] == ["person is missing"]
+
+
 def test_times_past_midnight_are_named(tmp_path):
     (tmp_path / "a.csv").write_text("t,x\n23:59:59,1\n0:00:01,1\n")
     builder = RaysBuilder()

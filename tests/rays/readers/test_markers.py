@@ -65,21 +65,22 @@ def test_heads_in_all_directions(tmp_path, names, keypoints, centre, unused, uni
 
 @pytest.mark.parametrize("up", ["+Y", "-Y"])
 def test_people_axes_and_markers_that_were_not_seen(tmp_path, up):
-    """Two people in one file whose y points up; a marker that was lost, and one at exactly zero."""
+    """Two people in one file whose y points up; markers that were lost, at exactly zero and at a fill value."""
     turn, place = turned()
     names = ["LFHD", "RFHD", "LBHD", "RBHD"]
     ann = positions(names, turn, place)
     bo = positions(names, turn.inv(), place + 1)
     ann[3, 1], bo[5, 2] = np.nan, 0
     both = np.concatenate([ann, bo], axis=1)
-    upright = np.stack([both[..., 0], both[..., 2], -both[..., 1]], axis=-1)
+    upright = 1000 * np.stack([both[..., 0], both[..., 2], -both[..., 1]], axis=-1)
+    upright[7, 6] = -9999
     labels = [f"{person}:{name}" for person in ("Ann", "Bo") for name in names]
-    write_c3d(tmp_path / "trial.c3d", labels, 1000 * upright, up=up, rate=50)
+    write_c3d(tmp_path / "trial.c3d", labels, upright, up=up, rate=50)
     rays = read("c3d", tmp_path / "trial.c3d")
     assert rays.persons == ("Ann", "Bo") and rays.metadata["source_frame"]["up"] == "y"
-    assert dropped(rays) == {"a keypoint of the head is missing": [[4, 4], [6, 6]]}
+    assert dropped(rays) == {"a keypoint of the head is missing": [[4, 4], [6, 6], [8, 8]]}
     mine = rays.person == 1
-    there = np.arange(12) != 5
+    there = ~np.isin(np.arange(12), [5, 7])
     assert np.abs(rays.direction[mine] - turn.inv().apply([1, 0, 0])[there]).max() < 1e-5
     assert np.allclose(rays.t[mine], np.arange(12)[there] / 50)
 

@@ -105,6 +105,17 @@ def test_keypoints_that_were_not_seen(tmp_path, name, sure):
     assert dropped(read("skeleton", path)) == {"a keypoint of the head is missing": [[4, 5]]}
 
 
+@pytest.mark.parametrize("fill", [-1, -9999, -32768, 3.402823e38])
+def test_keypoints_that_are_fill_values(tmp_path, fill):
+    keypoints, turn, _ = bodies_of("coco17")
+    keypoints[3, 0], keypoints[4, 4], keypoints[5, 12] = fill, fill, fill
+    path = tmp_path / "day.csv"
+    write_skeleton(path, ["ann"] * 20, np.arange(20), keypoints)
+    rays = read("skeleton", path)
+    assert dropped(rays) == {"a keypoint of the head is missing": [[4, 5]]}
+    assert np.abs(rays.direction - turn.apply(FORWARD)[np.isin(np.arange(20), rays.t)]).max() < 3e-5
+
+
 def test_bodies_that_are_in_no_place(tmp_path):
     keypoints, _, _ = bodies_of("mediapipe33")
     path = tmp_path / "day.csv"

@@ -92,7 +92,7 @@ def _ray(found: np.ndarray, eyes: int) -> tuple[np.ndarray, np.ndarray]:
     looks = np.stack([turn @ poses.axis("z", "forward") for turn in turns[:eyes]], axis=1)
     places = found[:, :eyes, :3].copy()
     # Of two eyes, one at a fill value was lost; both are left to the builder, which knows the other rows.
-    filled = np.isfinite(np.stack([fill_values(places[:, k]) for k in range(eyes)], axis=1))
+    filled = np.isfinite(fill_values(places))
     places[filled & ~filled.all(axis=1, keepdims=True)] = np.nan
     origin, direction = places.mean(axis=1), looks.mean(axis=1)
     if found.shape[1] > eyes:

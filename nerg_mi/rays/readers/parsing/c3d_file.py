@@ -14,6 +14,8 @@ import numpy as np
 
 from nerg_mi.files.bounded import reading, size_of
 
+from .fill_values import fill_values
+
 _BLOCK = 1 << 13  # frames that are read at a time
 # What c3d raises of a damaged file besides: it asserts, and uses parameters and variables that are not there.
 _DAMAGED = (AssertionError, AttributeError, TypeError, ZeroDivisionError, UnboundLocalError)
@@ -72,7 +74,7 @@ def iterate_markers(path: Path, wanted: Sequence[int]) -> Iterator[tuple[np.ndar
 
 def _positions(block: list[np.ndarray]) -> np.ndarray:
     points = np.stack(block).astype(np.float64)
-    unseen = (points[:, :, 3] < 0) | (points[:, :, :3] == 0).all(axis=2)
+    unseen = (points[:, :, 3] < 0) | np.isfinite(fill_values(points[:, :, :3]))
     return np.where(unseen[:, :, None], np.nan, points[:, :, :3])
 
 

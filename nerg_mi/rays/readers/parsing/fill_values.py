@@ -16,10 +16,10 @@ _AIMED = np.cos(np.radians(2.0))  # of a ray that points at its hit point
 
 
 def fill_values(v: np.ndarray) -> np.ndarray:
-    """The fill value of vectors (n, C), (n,); NaN of those that are none."""
-    first = v[:, 0]
+    """The fill value of vectors (..., C), (...); NaN of those that are none."""
+    first = v[..., 0]
     is_fill = np.isin(first, _FILLS) | (np.isfinite(first) & (np.abs(first) > _LIMIT))
-    return np.where((v == v[:, :1]).all(axis=1) & is_fill, first, np.nan)
+    return np.where((v == v[..., :1]).all(axis=-1) & is_fill, first, np.nan)
 
 
 def is_filled_angles(angles: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 The tracking format of the NeRG paper (Section 5.1): a person's id, an integer
 time or frame number, and keypoints (there 22) of three coordinates each, or of
 three and a confidence. A keypoint that was not seen is ``nan``, lies at exactly
-0, 0, 0, or has no confidence. What the keypoints mean is the business of
+0, 0, 0 or another fill value, or has no confidence. What the keypoints mean is the business of
 :mod:`nerg_mi.rays.readers.parsing.bodies`.
 """
 
@@ -25,6 +25,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import replacing
 from nerg_mi.files.bounded import plain
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
+
+from .fill_values import fill_values
 
 KEYPOINTS = 22
 _SNIFFED = 1000  # lines, of which the first one that is whole says how many numbers there are
@@ -203,7 +205,7 @@ def _rows(
     values[:, columns] = found
     values = values.reshape(len(ids), *layout)
     points, confidence = values[:, :, :3], values[:, :, 3] if layout.width == 4 else np.ones(values.shape[:2])
-    points[(points == 0).all(axis=2) | ~(confidence > 0)] = np.nan
+    points[np.isfinite(fill_values(points)) | ~(confidence > 0)] = np.nan
     return SkeletonRows(
         np.array(ids, dtype=str), np.array(times, dtype=np.int64), points, np.array(lines, dtype=np.int64), confidence
     )
