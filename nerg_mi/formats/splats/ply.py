@@ -32,6 +32,8 @@ _THIN = 1e-3
 # From so many Gaussians on the range of a column is evidence.
 _SOME = 64
 _NEIGHBOR, _SAMPLE = 4, 2000
+# No training has such a logit: at half of it float32 is 1.
+_OPAQUE = 32
 
 
 def has_splats(path: str | os.PathLike) -> bool:
@@ -90,6 +92,9 @@ def _activated(
     # As logits, all opacities of a training would lie between 0.5 and 0.73.
     if len(opacities) >= _SOME and 0 <= opacities.min() < opacities.max() <= 1:
         guesses.append("its opacities are taken as they are, since all lie in 0..1: logits reach further")
+    elif len(opacities) >= _SOME and opacities.min() >= 0 and _OPAQUE < opacities.max() <= 255:
+        guesses.append("its opacities are taken for 255ths: as logits they would all be opaque or half so")
+        opacities = opacities / np.float32(255)
     else:
         opacities = opacities_of(opacities)
     return scales, opacities, tuple(guesses)

@@ -119,6 +119,15 @@ def test_shares_in_place_of_logits_are_recognised(tmp_path, low, high):
     assert equal(read, splats) and "logits" in read.guesses[0]
 
 
+@pytest.mark.parametrize("low, high", [(0, 255), (10, 200), (0, 40)])
+def test_bytes_in_place_of_logits_are_recognised(tmp_path, low, high):
+    stored = np.linspace(low, high, 100).round().astype(np.float32)
+    splats = replace(random_splats(100, 1), opacities=stored / np.float32(255))
+    write_columns_of(tmp_path / "a.ply", splats, opacity=stored)
+    read = read_ply_splats(tmp_path / "a.ply")
+    assert equal(read, splats) and "255ths" in read.guesses[0]
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -126,8 +135,9 @@ def test_shares_in_place_of_logits_are_recognised(tmp_path, low, high):
         lambda s: replace(s, scales=np.full_like(s.scales, 1.05), centers=20 * s.centers),
         lambda s: replace(s, opacities=np.full_like(s.opacities, 0.6)),
         lambda s: replace(s, opacities=np.geomspace(0.005, 0.7, len(s)).astype(np.float32)),
+        lambda s: replace(s, opacities=1 / (1 + np.exp(-np.linspace(0.1, 12, len(s)))).astype(np.float32)),
     ],
-    ids=["millimetres", "large and alike", "of one opacity", "faint"],
+    ids=["millimetres", "large and alike", "of one opacity", "faint", "pruned"],
 )
 def test_what_trainings_write_is_not_taken_for_anything_else(tmp_path, change):
     splats = change(random_splats(300, 0))
