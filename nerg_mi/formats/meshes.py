@@ -10,6 +10,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,11 +32,14 @@ GREY = 0.5
 """What has no colour."""
 
 _BLOCK = 1 << 24
+_FLAT = 1e-6  # of a polygon's area: a triangle of its fan that is turned over by more makes it concave
+_CORNERS_TRIED, _AT_ONCE = 64, 1 << 20
 _CENTER, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 _COLORS = (("red", "green", "blue", "alpha"), ("r", "g", "b", "a"), ("color_0", "color_1", "color_2", "color_3"))
 _CORNERS = ("vertex_index", "vertex_indices")
 _OBJ_USED = {b"v", b"vn", b"f", b"g", b"o", b"s"}
 _OBJ_LINE = 1000
+_BEYOND = "{:,} of its faces are concave, and have triangles that reach beyond them: triangulate it where it was made"
 _BAD_NORMALS = "some of its normals are 0 or not finite"
 
 
@@ -92,17 +96,59 @@ def read_mesh_file(path: str | os.PathLike, points: bool = False, suffix: str | 
     return mesh
 
 
-def _split(counts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Polygons with ``counts`` (P,) of ``corners``, one after another, as triangles (F, 3), and whose each is (F,)."""
+class _Triangles(NamedTuple):
+    """``faces`` (F, 3) of polygons, and of which polygon each is a part (F,); how many polygons are concave, and of how
+    many of these triangles reach beyond them."""
+
+    faces: np.ndarray
+    polygons: np.ndarray
+    concave: int = 0
+    beyond: int = 0
+
+
+def _split(counts: np.ndarray, corners: np.ndarray, vertices: np.ndarray) -> _Triangles:
+    """Polygons with ``counts`` (P,) of ``corners``, one after another, of the ``vertices`` (V, 3), as fans."""
     if len(counts) and counts.min() < 3:
         raise ValueError(f"face {int(np.argmin(counts)) + 1:,} has fewer than three corners")
     if not len(counts) or counts.max() == 3:
-        return corners.reshape(-1, 3), np.arange(len(counts))
+        return _Triangles(corners.reshape(-1, 3), np.arange(len(counts)))
+    starts, concave, beyond = np.cumsum(counts) - counts, 0, 0
+    # Faces with corners that are none of the vertices are refused later.
+    is_valid = 0 <= corners.min() <= corners.max() < len(vertices)
+    for count in np.unique(counts[counts > 3]).tolist() if is_valid else ():
+        places = starts[counts == count]
+        for block in np.array_split(places, 1 + len(places) * count // _AT_ONCE):
+            at = block[:, None] + np.arange(count)
+            corners[at], turned, left = _turn_concave(corners[at], vertices)
+            concave, beyond = concave + turned + left, beyond + left
     pieces = counts - 2
     polygons = np.repeat(np.arange(len(counts)), pieces)
-    first = np.repeat(np.cumsum(counts) - counts, pieces)
+    first = np.repeat(starts, pieces)
     k = np.arange(len(polygons)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    return np.stack([corners[first], corners[first + k + 1], corners[first + k + 2]], axis=1), polygons
+    faces = np.stack([corners[first], corners[first + k + 1], corners[first + k + 2]], axis=1)
+    return _Triangles(faces, polygons, concave, beyond)
+
+
+def _turn_concave(index: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, int, int]:
+    """Polygons (P, N) with the corners of concave ones from one on that sees all others; how many these are, and how
+    many have no such corner, or too many of them to look for it."""
+
+    def is_flipped(index: np.ndarray) -> np.ndarray:
+        p = vertices[index]
+        normals = np.cross(p[:, 1:-1] - p[:, :1], p[:, 2:] - p[:, :1])
+        whole = normals.sum(axis=1, keepdims=True)
+        return ((normals * whole).sum(axis=2) < -_FLAT * (whole**2).sum(axis=2)).any(axis=1)
+
+    (left,) = np.nonzero(is_flipped(index))
+    concave = len(left)
+    for k in range(1, min(index.shape[1], _CORNERS_TRIED, 1 + _AT_ONCE // index.shape[1])):
+        if not len(left):
+            break
+        rolled = np.roll(index[left], -k, axis=1)
+        is_good = ~is_flipped(rolled)
+        index[left[is_good]] = rolled[is_good]
+        left = left[~is_good]
+    return index, concave - len(left), len(left)
 
 
 def _linear_colors(columns: Sequence[np.ndarray], kind: np.dtype) -> tuple[np.ndarray, bool]:
@@ -132,12 +178,12 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
     counts, corners = face.lists[names]() if names else (np.zeros(0, np.int64), np.zeros(0))
     if corners.dtype.kind == "f" and not ((corners == np.floor(corners)) & np.isfinite(corners)).all():
         raise ValueError("the corners of its faces are no whole numbers")
-    faces, polygons = _split(counts, corners.astype(np.int64))
     missing = [name for name in _CENTER if vertex.count and name not in vertex.columns]
     if missing:
         raise ValueError(f'its vertices have no property "{missing[0]}"')
     take = lambda table, names: [table.columns[name]() for name in names]
     vertices = np.stack(take(vertex, _CENTER), axis=1).astype(np.float64) if vertex.count else np.zeros((0, 3))
+    faces, polygons, _, beyond = _split(counts, corners.astype(np.int64), vertices)
     used, notes, encodes, tints_of = {"vertex": {*_CENTER, *_NORMAL}, "face": {names}}, [], False, {}
     for name, table in (("vertex", vertex), ("face", face)):
         tints = next((c for c in _COLORS if all(n in table.columns for n in c[:3])), None)
@@ -160,6 +206,8 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
     uneven = int((counts != 3).sum())
     if uneven:
         notes.append(f"{uneven:,} faces of more than three corners are split into triangles")
+    if beyond:
+        notes.append(_BEYOND.format(beyond))
     unreadable = ""
     if uneven:
         unreadable = "it has faces of more than three corners"
@@ -300,7 +348,10 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
                 lines = whole
             obj.read(lines)
     obj.read([rest])
-    faces, polygons = _split(np.array(obj.counts, np.int64), np.concatenate([*obj.corners, np.zeros(0, np.int64)]))
+    vertices, corners = np.concatenate(obj.vertices), np.concatenate([*obj.corners, np.zeros(0, np.int64)])
+    faces, polygons, concave, beyond = _split(np.array(obj.counts, np.int64), corners, vertices)
+    if concave:
+        obj.unreadable = "it has concave faces"
     notes, colors = [], None
     # After the coordinates a weight, a colour, or both; or, as some programs write, a colour and an alpha.
     firsts = parse_numbers(b" ".join(words[0] for words in obj.rest.values() if len(words) == 4))
@@ -327,7 +378,8 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
     if obj.other:
         names = ", ".join(name.decode("latin-1") for name in obj.other)
         notes.append(f"statements that are not used: {plain(names)}")
-    vertices = np.concatenate(obj.vertices)
+    if beyond:
+        notes.append(_BEYOND.format(beyond))
     return MeshFile(
         vertices, faces, polygons, None, colors, None, tuple(notes), obj.unreadable, hides_colors=colors is not None
     )

@@ -131,6 +131,38 @@ def test_legal_obj(tmp_path, text):
     assert ("usemtl" in "".join(mesh.notes)) == ("usemtl" in text)
 
 
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("suffix", [".obj", ".ply"])
+@pytest.mark.parametrize(
+    "outline, area, beyond",
+    [
+        ([(0, 0), (2, 2), (4, 0), (2, 4)], 4, False),  # an arrow
+        ([(0, 0), (4, 0), (4, 1), (1, 1), (1, 3), (0, 3)], 6, False),  # an L
+        ([(1, 1), (1, 3), (0, 3), (0, 0), (4, 0), (4, 1)], 6, False),
+        ([(0, 0), (4, 0), (4, 3), (3, 3), (3, 1), (1, 1), (1, 3), (0, 3)], 8, True),  # a U
+        ([(0, 0), (2, 0), (2, 2), (1, 2), (0, 2)], 4, False),
+    ],
+)
+def test_concave_polygons_are_covered(tmp_path, outline, area, beyond, suffix, order):
+    outline = outline[::order]
+    rows, n = [(*p, 1.5) for p in outline], len(outline)
+    if suffix == ".obj":
+        text = "".join(f"v {x} {y} {z}\n" for x, y, z in rows) + "f " + " ".join(map(str, range(1, n + 1)))
+        (tmp_path / "a.obj").write_text(text)
+    else:
+        (tmp_path / "a.ply").write_bytes(ply("<", XYZ, LIST, rows, [(tuple(range(n)),)]))
+    mesh = read_mesh_file(tmp_path / f"a{suffix}")
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a) / 2
+    assert np.isclose(normals[:, 2].sum(), order * area) and len(mesh.faces) == n - 2
+    assert np.isclose(np.abs(normals[:, 2]).sum(), area) == (not beyond)
+    assert ("reach beyond" in "".join(mesh.notes)) == beyond
+    # Mitsuba takes fans from the first corner on.
+    x, y = (np.array(outline) - outline[0])[1:].T
+    fan = order * (x[:-1] * y[1:] - x[1:] * y[:-1])
+    assert suffix == ".ply" or bool(mesh.unreadable) == (fan.min() < 0)
+
+
 @pytest.mark.parametrize("lines", [1, 3])
 def test_continued_lines_across_blocks(tmp_path, monkeypatch, lines):
     monkeypatch.setattr("nerg_mi.formats.meshes._BLOCK", 12 * lines)
