@@ -89,7 +89,7 @@ POINTS = 200_000
 """Points that are taken of a mesh, evenly by area, or of a larger cloud."""
 
 
-def read_surface(path: Path, count: int = POINTS, on_note: Callable[[str], None] | None = None) -> np.ndarray:
+def read_surface(path: Path, count: int = POINTS, on_note: Callable[[str], None] = lambda note: None) -> np.ndarray:
     """At most ``count`` points (N, 3) on the surface in ``path``, in its own frame and units; drawn at random, with the
     same result every time. ``on_note`` is called with sentences on what of the file is not used. Raises `NergError` for
     a file without finite points, or with some beyond all places."""
@@ -104,7 +104,7 @@ def read_surface(path: Path, count: int = POINTS, on_note: Callable[[str], None]
     else:
         mesh = read_mesh_file(path, points=True)
         points = _sampled(mesh.vertices, mesh.faces, count)
-        for note in mesh.notes if on_note is not None else ():
+        for note in mesh.notes:
             on_note(f"of {path}: {note}")
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):

@@ -456,16 +456,15 @@ def _as_texts(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:
 
 def _as_numbers(path: str | os.PathLike, name: str, column: Any, days: DayCounter | None) -> np.ndarray:
     """A column as (n,) float64; one of times, for which there are ``days``, in their unit."""
-    tick = None if days is None else days.tick
     try:
         values = column.to_numpy(zero_copy_only=False)
-        if tick is not None and values.dtype == object:
+        if days is not None and values.dtype == object:
             cells = ["" if cell is None else str(cell) for cell in column.to_pylist()]
             dated = next((time[1] for cell in cells if (time := clock_seconds(cell))), False)
-            values = _clock_column(cells, tick, dated)
+            values = _clock_column(cells, days.tick, dated)
             values = values if dated or values is None else days.unwrap(values)
-        elif values.dtype.kind == "M" and tick is not None:
-            since = values.astype("datetime64[ns]").astype(np.int64) * (1e-9 / tick)
+        elif days is not None and values.dtype.kind == "M":
+            since = values.astype("datetime64[ns]").astype(np.int64) * (1e-9 / days.tick)
             values = np.where(np.isnat(values), np.nan, since)
         if values is None or values.dtype.kind == "M":
             raise TypeError("no numbers")
