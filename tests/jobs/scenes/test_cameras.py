@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overview import Frame
+from nerg_mi.figures.overview import Frame, Seen
 from nerg_mi.jobs.scenes.cameras import Probe, best_camera, best_photo, given_point, probe_values, turned_ahead, upright
 from nerg_mi.jobs.scenes.photos import PhotoCamera
 from nerg_mi.maths.geometry import box_interval
@@ -38,6 +38,15 @@ def test_what_is_met_around(probe):
     turned = turned_ahead(EYE, seen)
     np.testing.assert_allclose(turned.origin, EYE.origin)
     assert np.abs(turned.target).max() == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("depths, length", [((0, 0), 1), ((0, 4), 4), ((3, 5), 3)], ids=["within", "beside", "before"])
+def test_observers_within_matter_are_turned_ahead(depths, length):
+    """They meet it at once; what they are turned to still lies before them, at a distance of what is met elsewhere."""
+    directions = np.array([[0.6, 0.8, 0], *[[0, 0, 1.0]] * 3])
+    depth = np.array([depths[0], *[depths[1]] * 3], float)
+    seen = Seen(EYE.origin, directions, depth, np.ones(4, bool), np.array([9.0, 0, 0, 0]), np.ones(4))
+    np.testing.assert_allclose(turned_ahead(EYE, seen).target, EYE.origin + length * directions[0])
 
 
 def test_points_and_ups():
