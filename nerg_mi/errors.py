@@ -6,6 +6,8 @@ import errno
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
 
 
 class NergError(ValueError):
@@ -77,8 +79,8 @@ _MENDABLE = (
 
 
 @contextmanager
-def mitsuba_says() -> Iterator[None]:
-    """A block whose `RuntimeError`s are Mitsuba's, about a scene, as `NergError`.
+def mitsuba_says(file: str | PathLike[str] | None = None) -> Iterator[None]:
+    """A block whose `RuntimeError`s are Mitsuba's, about a scene or about ``file``, as `NergError` that names it.
 
     It makes one of whatever a plugin's constructor raises, with the traceback as text. Where that ends in an exception
     that only a mistake of the program raises (a `TypeError`, say), the error is left as it is.
@@ -90,8 +92,11 @@ def mitsuba_says() -> Iterator[None]:
         kind = _raised(trace).partition(":")[0].strip().rpartition(".")[2] if marker else None
         if kind is not None and kind not in _MENDABLE:
             raise
-        # Mitsuba quotes the files that it cannot read.
-        raise NergError(plain(sentence(error), 1000)) from error
+        # Mitsuba quotes most files that it cannot read, but none whose content it gets as arrays.
+        said = sentence(error)
+        if file is not None and Path(file).name not in said:
+            said = f'"{file}" cannot be used by Mitsuba: {said}'
+        raise NergError(plain(said, 1000)) from error
     except UnicodeDecodeError as error:
         # And what it quotes may be no text.
         raise NergError(

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+import nerg_mi as nerg
 from nerg_mi import errors
 from nerg_mi.errors import NergError
+from nerg_mi.evaluation.ablation import frame_timer
+from nerg_mi.evaluation.metrics import Renderer
+from nerg_mi.formats.volumes import write_volume
+from nerg_mi.photos.cameras import Camera, Intrinsics
+from nerg_mi.train.geometry import place_of_scene, place_of_volume
 
 TRACE = """While loading "a.xml" (line 3): could not instantiate plugin of type "nerg":
 Traceback (most recent call last):
@@ -73,6 +80,64 @@ def test_a_mistake_in_a_plugin_is_none_of_the_scene():
         with errors.mitsuba_says():
             raise RuntimeError(TRACE.format(error="TypeError"))
     assert not isinstance(said.value, NergError)
+
+
+def _mesh(folder):
+    (folder / "file.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    return lambda: place_of_scene(folder / "file.obj")
+
+
+def _volume(folder):
+    write_volume(folder / "file.vol", np.ones((2, 2, 2), np.float32), (0, 0, 0), (1, 1, 1))
+    return lambda: place_of_volume(folder / "file.vol")
+
+
+def _timer(folder):
+    render = frame_timer(_volume(folder)(), np.zeros((1, 3)), folder)
+    return lambda: render(folder / "file.safetensors")
+
+
+def _camera_of_photo(folder):
+    renderer = Renderer.__new__(Renderer)
+    renderer.spp = 1
+    return lambda: renderer(Camera(Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.5), np.eye(4)))
+
+
+def _camera_of_scene(folder):
+    scene = nerg.make_scene(shapes={"type": "cube"})
+    return lambda: scene.sensor(nerg.Camera((0, -3, 0), (0, 0, 0)))
+
+
+@pytest.mark.parametrize(
+    "prepare, names_file",
+    [
+        (_mesh, True),
+        (_volume, True),
+        (_timer, True),
+        (lambda folder: lambda: Renderer(folder / "file.safetensors"), True),
+        (_camera_of_photo, False),
+        (_camera_of_scene, False),
+        (lambda folder: lambda: nerg.make_scene(shapes={"type": "cube"}), False),
+    ],
+)
+def test_what_mitsuba_refuses_of_a_file_or_camera_is_the_users(rgb, tmp_path, monkeypatch, prepare, names_file):
+    def refuse(*_, **__):
+        raise RuntimeError("[plugin.cpp:7] it has no sides")
+
+    load = prepare(tmp_path)
+    monkeypatch.setattr(rgb, "load_dict", refuse)
+    with pytest.raises(NergError, match="it has no sides$") as said:
+        load()
+    assert (str(tmp_path / "file.") in str(said.value)) is names_file
+
+
+@pytest.mark.parametrize("load", [_timer, lambda folder: lambda: Renderer(folder / "file.safetensors")])
+@pytest.mark.parametrize("content", [None, b"", b"\x08\0\0\0\0\0\0\0{}      "], ids=["missing", "empty", "other"])
+def test_checkpoints_that_cannot_be_rendered_are_named(rgb, tmp_path, load, content):
+    if content is not None:
+        (tmp_path / "file.safetensors").write_bytes(content)
+    with pytest.raises(NergError, match=r"file\.safetensors"):
+        load(tmp_path)()
 
 
 @pytest.mark.parametrize(

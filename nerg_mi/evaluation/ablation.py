@@ -243,7 +243,7 @@ def frame_timer(
     def render(checkpoint: Path) -> float:
         integrator = {"type": "nerg", "aovs": "gaze", "radiance": False, **_medium(place, folder)}
         integrator["gaze"] = {"type": "gazefield", "filename": str(checkpoint)}
-        with mitsuba_says():
+        with mitsuba_says(checkpoint):
             scene = mi.load_dict({"type": "scene", "integrator": integrator, **_shapes(place)})
         times = []
         for eye, angle in [(eyes[0], angles[0]), *zip(eyes, angles)]:

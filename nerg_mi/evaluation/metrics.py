@@ -102,7 +102,7 @@ class Renderer:
 
         self.spp = spp
         integrator = {"type": "nerg", "field": {"type": "nerf", "filename": str(field)}, "aovs": "depth,opacity"}
-        with mitsuba_says():
+        with mitsuba_says(field):
             self.scene = mi.load_dict({"type": "scene", "integrator": integrator})
 
     def __call__(self, camera: Camera, seed: int = 0) -> Rendered:

@@ -395,7 +395,7 @@ def _scene_of_mesh(path: Path) -> tuple[Any, tuple[str, ...]]:
     if path.suffix.lower() in READERS and is_splats(path):
         raise NergError(f'"{path}" holds Gaussian splats, which are a field: give it by --field')
     mesh = read_mesh_file(path)
-    with mitsuba_says():
+    with mitsuba_says(path):
         return mi.load_dict({"type": "scene", "mesh": mitsuba_mesh(mesh.vertices, mesh.faces, "mesh")}), mesh.notes
 
 
@@ -425,7 +425,7 @@ def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
     # Mitsuba makes some box of any six numbers.
     if not (np.isfinite(box).all() and (box[:3] < box[3:]).all()):
         raise NergError(f'the place of hit points "{path}" has no box with a lower and an upper corner; make it anew')
-    with mitsuba_says():
+    with mitsuba_says(path):
         medium = VolumeMedium(mi.load_dict(volume_dict(path)))
     lower, upper = medium.bounds()
     return GazePlace(
