@@ -61,7 +61,10 @@ def test_read_back(av, tmp_path, fps, rate):
 def test_equal_frames_are_equal_files(av, tmp_path):
     for k in "ab":
         write(tmp_path / f"{k}.mp4", text={"Comment": "x"})
-    assert (tmp_path / "a.mp4").read_bytes() == (tmp_path / "b.mp4").read_bytes()
+    data = (tmp_path / "a.mp4").read_bytes()
+    assert data == (tmp_path / "b.mp4").read_bytes()
+    # The box of the estimated bit rate, which depends on how the encoder's threads were scheduled.
+    assert b"btrt" not in data and b"mdat" in data
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
+from nerg_mi.photos import colmap
 from nerg_mi.photos.colmap import model_files, read_colmap, read_image_poses
 
 # COLMAP's camera models: number, name, parameters.
@@ -242,6 +243,15 @@ def test_observations_may_stand_on_a_long_line_and_nothing_else(tmp_path):
     assert len(read_colmap(tmp_path, tmp_path / "images").frames) == 1
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 40 30 " + "1 " * 700_000)
     with pytest.raises(NergError, match="line 1 .*cameras.txt.* characters"):
+        read_colmap(tmp_path, tmp_path / "images")
+
+
+def test_a_file_without_line_ends_is_read_in_pieces(tmp_path, monkeypatch):
+    (tmp_path / "images").mkdir()
+    write_txt(tmp_path, ["a.png"])
+    monkeypatch.setattr(colmap, "_PIECE", 1 << 21)
+    (tmp_path / "cameras.txt").write_bytes(bytes(1 << 23))
+    with pytest.raises(NergError, match="line 1 .*cameras.txt.* has 2,097,152 characters"):
         read_colmap(tmp_path, tmp_path / "images")
 
 
