@@ -7,9 +7,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import trimesh
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.jobs.gaze_places import make_place
@@ -19,10 +21,12 @@ from nerg_mi.jobs.options.scene import SceneOptions
 from nerg_mi.jobs.pictures import render_file
 from nerg_mi.jobs.scene import write_scene
 from nerg_mi.maths.geometry import Box, ContractedBox
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.channels import render_channels
 from nerg_mi.rendering.frames_file import read_frames
 from nerg_mi.rendering.pictures import load_scene
+from tests.formats.splats.writers import write_inria
 from tests.jobs.recorder import Recorder
 from tests.pictures import mitsuba_bitmap
 from tests.plugins import fields
@@ -118,18 +122,33 @@ def test_a_place_alone_is_shown_from_where_it_can_be_seen(rgb, folder, tmp_path)
     assert f"wrote {result.path}" in told.messages and any("best overview" in line for line in told.messages)
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("kind, scale", [("mesh", 1e-4), ("mesh", 1e6), ("hits", 1e-4), ("hits", 3e4)])
-def test_places_of_any_unit(rgb, tmp_path, kind, scale):
-    import mitsuba as mi
-
+def written_place(folder, kind, scale):
+    """A room of 6 x 4 x 3 metres, or a cloud in it, in units of 1/scale metres: its file, and its upper corner."""
     corner = np.array([3, 2, 1.5]) * scale
-    path = tmp_path / ("a.ply" if kind == "mesh" else "a.vol")
+    path = folder / ("place" + {"hits": ".vol", "scene": ".xml", "field": ".safetensors"}.get(kind, ".ply"))
     if kind == "mesh":
-        mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale(corner.tolist())}).write_ply(str(path))
-    else:
+        trimesh.creation.box(2 * corner).export(path)
+    elif kind == "hits":
         walls = np.pad(np.zeros((10, 14, 18), np.float32), 1, constant_values=50 / scale)
         write_volume(path, walls, -corner, corner)
+    elif kind == "scene":
+        size = '<transform name="to_world"><scale value="{}, {}, {}"/></transform>'.format(*corner)
+        path.write_text(f'<scene version="3.0.0"><shape type="cube">{size}</shape></scene>')
+    elif kind == "field":
+        config = RadianceConfig(fields.GRID, width=16, geometry=3, sh_degree=2, density_scale=6 / scale)
+        box = Box(tuple(-corner), tuple(corner))
+        save_radiance(RadianceField.random(config, box, _ns(), march_step=0.1 * scale), path, {})
+    else:
+        n, centers = 2000, fibonacci_directions(2000) * corner
+        write_inria(path, Splats(centers, [[0.1 * scale] * 3] * n, [[1, 0, 0, 0]] * n, [0.99] * n, np.ones((n, 1, 3))))
+    return path, corner
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("scale", [1e-4, 1e6])
+@pytest.mark.parametrize("kind", ["mesh", "scene", "field", "splats", "hits"])
+def test_places_of_any_unit(rgb, tmp_path, kind, scale):
+    path, corner = written_place(tmp_path, kind, scale)
     told, eye = Recorder(), tuple(0.1 * corner)
     result = write_scene([path], tmp_path / "a.xml", SceneOptions(observer=eye, mode=MODE), told)
     for sensor in (0, 1):
@@ -138,7 +157,7 @@ def test_places_of_any_unit(rgb, tmp_path, kind, scale):
     # Own eyes see all that is visible, whatever the unit; and near what is seen gaze fades within the place.
     assert found.aovs["visibility"][found.mask].min() == 1
     assert 1e-4 * np.linalg.norm(corner) < float(defaults(result.path)["falloff"]) < 0.1 * np.linalg.norm(corner)
-    assert any("light leaks" in line for line in told.warnings) == (kind == "mesh" and scale < 1)
+    assert any("light leaks" in line for line in told.warnings) == (kind in ("mesh", "scene") and scale < 1)
 
 
 def test_a_picture_that_would_be_empty_is_refused(rgb, folder, tmp_path):
