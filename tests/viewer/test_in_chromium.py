@@ -227,6 +227,8 @@ def test05c_nobody_is_left_in_a_shelf(running, driver):
     until(lambda: window.note, 30)
     refined(running, window)
     assert np.linalg.norm(window.view.origin - shelf) > 0.2 and "stands before it now" in window.status.content
+    # Who was put somewhere is dragged from there.
+    running.page.place_observer(session.observer + (0, 0, 0.5))
     before = session.observer.copy()
     running.page._observer.position = tuple(shelf)
     running.page._dragged("end")
