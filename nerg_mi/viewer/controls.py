@@ -65,6 +65,11 @@ class Inset:
         self._handle.label = self._title
 
 
+def slider_end(value: float) -> float:
+    """The upper end of a slider from 0 on which ``value`` lies: a power of ten, at least three times as large."""
+    return 10.0 ** math.ceil(math.log10(3 * value)) if value > 0 else 1.0
+
+
 class Controls:
     """The panel of a `Page`."""
 
@@ -99,7 +104,7 @@ class Controls:
         automatic = gui.add_checkbox("Automatic range", True)
         ends = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)
         # As Mitsuba has it, in single precision, it would be written with all its digits.
-        top = 10.0 ** math.ceil(math.log10(3 * session.falloff)) if session.falloff > 0 else 1.0
+        top = slider_end(session.falloff)
         falloff = gui.add_slider("Fall-off", 0.0, top, 0.01 * top, float(f"{session.falloff:.4g}"))
 
         def change(event: Any) -> None:

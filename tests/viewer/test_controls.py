@@ -10,7 +10,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
-from nerg_mi.viewer.controls import Inset, png_bytes, table
+from nerg_mi.viewer.controls import Inset, png_bytes, slider_end, table
 from nerg_mi.viewer.layers import LAYERS, STALE, Shade
 from nerg_mi.viewer.points import View
 from nerg_mi.viewer.scene import copied_view
@@ -46,6 +46,11 @@ def test01_a_small_picture_is_greyed_while_another_is_made():
     assert np.array_equal(shown[0].image, grey), "not twice"
     inset.show(red)
     assert np.array_equal(shown[0].image, red) and shown[0].label == "Own view"
+
+
+@pytest.mark.parametrize("value, end", [(0, 1), (0.05, 1), (0.4, 10), (40, 1000), (300, 1000), (2e-5, 1e-4)])
+def test01_a_slider_holds_its_value_in_any_unit(value, end):
+    assert slider_end(value) == pytest.approx(end)
 
 
 def test02_a_scene_of_what_is_shown(store, tmp_path):
