@@ -118,6 +118,7 @@ def _camera_of_scene(folder):
         (_camera_of_photo, False),
         (_camera_of_scene, False),
         (lambda folder: lambda: nerg.make_scene(shapes={"type": "cube"}), False),
+        (lambda folder: lambda: nerg.make_scene(shapes={"type": "scene", "box": {"type": "cube"}}), False),
     ],
 )
 def test_what_mitsuba_refuses_of_a_file_or_camera_is_the_users(rgb, tmp_path, monkeypatch, prepare, names_file):
