@@ -94,6 +94,10 @@ class Rendered:
     mask: np.ndarray
 
 
+# Samples that are rendered at once: the memory for those of a whole picture may not be there.
+_LAUNCH = 1 << 26
+
+
 class Renderer:
     """Renders the field in a checkpoint as the cameras of a data set see it. Needs a Mitsuba variant."""
 
@@ -124,7 +128,13 @@ class Renderer:
         dr.make_opaque(pose)
         params["to_world"] = pose
         params.update()
-        out = np.array(mi.render(self.scene, sensor=sensor, spp=self.spp, seed=mi.UInt32(seed)), np.float64)
+        each = max(_LAUNCH // (source.intrinsics.width * source.intrinsics.height), 1)
+        out = np.zeros(())
+        for first in range(0, self.spp, each):
+            count = min(each, self.spp - first)
+            with mitsuba_says():
+                part = mi.render(self.scene, sensor=sensor, spp=count, seed=mi.UInt32(seed + first))
+            out = out + np.array(part, np.float64) * (count / self.spp)
         opacity = np.clip(out[..., 4], 0, 1)
         some = np.maximum(opacity, 1e-6)[..., None]
         color = opacity[..., None] * srgb(out[..., :3] / some)

@@ -7,6 +7,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.evaluation import metrics
 from nerg_mi.evaluation.metrics import Renderer, depth_score, score_views, ssim
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
@@ -80,6 +81,24 @@ def test_rendered_through_mitsuba_it_is_the_closed_form(fog):
     assert np.allclose(seen.opacity[middle], alpha, atol=2e-3)
     assert np.allclose(seen.color[middle], 0.5 * alpha, atol=2e-3)
     assert np.allclose(seen.depth[middle], 2 - np.log(1 - alpha / 2) / 1.5, atol=0.005)
+
+
+def test_many_samples_are_rendered_a_part_at_a_time(fog, rgb, monkeypatch):
+    """As many as an option takes, which no memory holds at once."""
+    render, parts = rgb.render, []
+
+    def render_part(*args, spp, **more):
+        parts.append(spp)
+        return render(*args, spp=spp, **more)
+
+    monkeypatch.setattr(rgb, "render", render_part)
+    monkeypatch.setattr(metrics, "_LAUNCH", 4 * 16 * 12 + 5)
+    seen = Renderer(fog, 9)(camera())
+    assert parts == [4, 4, 1]
+    assert np.allclose(seen.opacity[5:7, 7:9], 1 - np.exp(-3), atol=2e-3)
+    monkeypatch.setattr(metrics, "_LAUNCH", 1)
+    Renderer(fog, 2)(camera())
+    assert parts[3:] == [1, 1]
 
 
 def test_a_distorted_camera_is_followed(fog):
