@@ -28,6 +28,14 @@ def test_matrices_lose_their_scale_and_others_are_none():
     assert np.allclose(R[:3], turn[:3]) and np.isnan(R[3]).all() and np.array_equal(place.ravel(), np.arange(12.0))
 
 
+@pytest.mark.parametrize("mirror", [-np.eye(3), np.diag([-1.0, 1, 1]), np.diag([1.0, 1, -2]), np.eye(3)[[1, 0, 2]]])
+def test_mirrored_matrices_are_no_rotations(mirror):
+    turn = Rotation.from_quat(np.random.default_rng(1).normal(size=(4, 4))).as_matrix()
+    turn[2] = turn[2] @ mirror
+    R, _ = poses.rotations_from_matrices(np.concatenate([turn, np.ones((4, 3, 1))], axis=2).reshape(4, 12))
+    assert np.isnan(R[2]).all() and np.allclose(R[[0, 1, 3]], turn[[0, 1, 3]])
+
+
 def test_vectors_are_each_turned_by_their_own():
     turn = Rotation.from_quat(np.random.default_rng(2).normal(size=(5, 4)))
     v = np.random.default_rng(3).normal(size=(5, 3))
