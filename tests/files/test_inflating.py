@@ -125,11 +125,15 @@ def test_limits_themselves_are_within(tmp_path, monkeypatch):
         assert stream.read() == bytes(1000)
     with open_gzip(path, most=999) as stream, pytest.raises(NergError, match="inflates to more than 999"):
         stream.read()
-    archive = _zip(tmp_path / "a.zip", a=b"1")
+    archive = _zip(tmp_path / "a.zip", a=b"1", b=b"23")
+    with open_zip(archive, most=3) as found:
+        assert found.read("b") == b"23"
+    with pytest.raises(NergError, match="inflates to more than 2 bytes"), open_zip(archive, most=2):
+        pass
     listed = inflating._directory_bytes(archive, archive.stat().st_size)
     monkeypatch.setattr(inflating, "DIRECTORY_BYTES", listed)
     with open_zip(archive) as found:
-        assert found.namelist() == ["a"]
+        assert found.namelist() == ["a", "b"]
     monkeypatch.setattr(inflating, "DIRECTORY_BYTES", listed - 1)
     with pytest.raises(NergError, match="fewer members"), open_zip(archive):
         pass

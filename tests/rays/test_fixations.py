@@ -154,3 +154,9 @@ def test_a_fixation_has_the_mean_head():
 def test_a_pause_as_long_as_it_may_be(find):
     still = gaze([0] * 9, dt=0.125)
     assert (find(still, gap=0.125) == 0).all() and (find(still, gap=0.12) == -1).all()
+
+
+@pytest.mark.parametrize("find", [ivt, idt])
+def test_a_fixation_as_short_as_it_may_be(find):
+    still = gaze([0] * 3, dt=0.125)
+    assert (find(still, least=0.25, gap=0.2) == 0).all() and (find(still, least=0.251, gap=0.2) == -1).all()
