@@ -159,7 +159,9 @@ def test_distances_and_times_on_the_bounds():
     n = len(origin)
     rays = Rays(np.arange(n) * 1.0, np.zeros(n), ("ann",), origin, np.tile([1.0, 0, 0], (n, 1)), np.ones(n))
     # Of all places the first alone has so many rays within R.
-    split = split_by_position(rays, 0.5, zones=1, test_probes=1, min_rays=73, min_train=1)
+    split = split_by_position(rays, 0.5, zones=1, test_probes=1, min_rays=73, min_train=9)
+    with pytest.raises(ValueError, match="9 rays are left to train on"):
+        split_by_position(rays, 0.5, zones=1, test_probes=1, min_rays=73, min_train=10)
     assert split.test.tolist() == [True] * 74 + [False] * 10 and split.train.tolist() == [False] * 75 + [True] * 9
     assert purge(rays, np.zeros((1, 3)), 1.0).tolist() == split.train.tolist()
     some = rays.select(np.arange(11))
