@@ -16,6 +16,8 @@ from nerg_mi.maths.color import decode_srgb
 
 # Optical depth of a voxel at most, and the opacity from which on it has a colour.
 _DEEPEST, _FAINT = 5.0, 1e-3
+# Voxels whose colour is looked for at a time.
+_BLOCK = 1 << 18
 
 
 def write_volume(path: str | Path, data: np.ndarray, lower, upper) -> None:
@@ -48,21 +50,38 @@ def density_and_color(field: RadianceField, resolution: int = 256, color: bool =
     if not color:
         return density, None, lower, upper
     out = np.zeros((*density.shape, 3), np.float32)
-    z, y, x = np.nonzero(alpha > _FAINT)
-    if len(z) == 0:
+    filled = np.flatnonzero(alpha > _FAINT)
+    if len(filled) == 0:
         return density, out, lower, upper
-    slope = np.stack([-np.gradient(alpha, axis=axis)[z, y, x] for axis in (2, 1, 0)], 1)
-    normals = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-6)
-    p = _to_the_surface(sampler, lattice, lattice.points(np.stack([x, y, z], 1)), normals)
-    # Where density is even there is no normal, and any direction will do.
-    normals[np.linalg.norm(normals, axis=1) < 0.5] = [0, 0, 1]
-    c = sampler.diffuse(p, normals)
-    if field.color_space == "srgb":
-        c = decode_srgb(c)
-    out[z, y, x] = c
-    found: Any = distance_transform_edt(alpha <= _FAINT, return_indices=True)
-    away, nearest = found
-    return density, np.where((away < 2.5)[..., None], out[tuple(nearest)], 0), lower, upper
+    for start in range(0, len(filled), _BLOCK):
+        at = np.stack(np.unravel_index(filled[start : start + _BLOCK], alpha.shape), 1)
+        normals = -_slope(alpha, at)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+        p = _to_the_surface(sampler, lattice, lattice.points(at[:, ::-1]), normals)
+        # Where density is even there is no normal, and any direction will do.
+        normals[np.linalg.norm(normals, axis=1) < 0.5] = [0, 0, 1]
+        c = sampler.diffuse(p, normals)
+        out[tuple(at.T)] = decode_srgb(c) if field.color_space == "srgb" else c
+    del filled
+    nearest: Any = distance_transform_edt(alpha <= _FAINT, return_distances=False, return_indices=True)
+    y, x = np.ogrid[: alpha.shape[1], : alpha.shape[2]]
+    for z, layer in enumerate(out):
+        squared = (nearest[0, z] - z) ** 2 + (nearest[1, z] - y) ** 2 + (nearest[2, z] - x) ** 2
+        near = (squared > 0) & (squared < 2.5**2)
+        layer[near] = out[tuple(nearest[:, z][:, near])]
+    return density, out, lower, upper
+
+
+def _slope(values: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Central differences (N, 3), along x, y and z, of a grid (z, y, x) at the voxels ``at`` (N, 3) of it; one-sided on
+    its faces."""
+    slopes = []
+    for axis in (2, 1, 0):
+        before, after = at.copy(), at.copy()
+        before[:, axis] = np.maximum(at[:, axis] - 1, 0)
+        after[:, axis] = np.minimum(at[:, axis] + 1, values.shape[axis] - 1)
+        slopes.append((values[tuple(after.T)] - values[tuple(before.T)]) / (after - before)[:, axis])
+    return np.stack(slopes, 1)
 
 
 def _to_the_surface(sampler: Sampler, lattice: Lattice, p: np.ndarray, normals: np.ndarray) -> np.ndarray:

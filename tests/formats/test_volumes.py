@@ -1,11 +1,13 @@
 """Voxels of a field: what they hold, and that Mitsuba shows them where they belong."""
 
 import math
+import tracemalloc
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.fields.extraction import Sampler
+from nerg_mi.formats import volumes
 from nerg_mi.formats.volumes import density_and_color, write_volume
 from tests.formats.ball import Ball
 
@@ -36,6 +38,23 @@ def test_voxels_render_as_the_field(rgb, tmp_path):
         it.p = rgb.Point3f(*((np.array([6, 9, 8]) + 0.5) * cell).tolist())
         got = np.ravel(volume.eval_1(it) if name == "d" else volume.eval_3(it))
         assert np.allclose(got, data[8, 9, 6], rtol=1e-4)
+
+
+def test_a_full_field_takes_a_few_bytes_a_voxel(monkeypatch):
+    """Every voxel of it has a colour: they are looked for in blocks, as if all at once."""
+    fog = Ball()
+    fog.density = lambda p, active=True: dr.select(active, 1 + p.x, 0)
+    whole = density_and_color(fog, 48, samples=1)
+    monkeypatch.setattr(volumes, "_BLOCK", 1000)
+    tracemalloc.start()
+    try:
+        blocks = density_and_color(fog, 48, samples=1)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert all(np.array_equal(a, b) for a, b in zip(whole, blocks)) and blocks[1].min() > 0
+    # Of them 16 are the result's own, and 12 tell which surface is nearest.
+    assert peak < 60 * blocks[0].size
 
 
 def test_an_empty_field_has_no_colour():
