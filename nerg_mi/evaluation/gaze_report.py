@@ -78,11 +78,8 @@ def write_report(
     write_text(files[0], f"{text}## Each person\n\n{each}")
     for path, table in zip((*files[1:3], files[4]), (rows, persons, positions)):
         write_csv(path, table)
-    clean = lambda table: [
-        {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()} for r in table
-    ]
     of_all = {"methods": rows, "persons": persons, "uncertainty": ranks, "calibration": regions}
-    write_json(files[3], {**about, **{k: clean(v) for k, v in of_all.items()}}, allow_nan=False)
+    write_json(files[3], {**about, **of_all})
     return files
 
 

@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.figures.overlay import srgb, write_png
 from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import make_folder
-from nerg_mi.maths.color import psnr, psnr_of_fitted_half
+from nerg_mi.maths.color import mean_score, psnr, psnr_of_fitted_half
 from nerg_mi.photos.cameras import Camera, pixel_directions, sensor_dict
 from nerg_mi.photos.images import View, pinhole, through_lens
 
@@ -158,11 +158,11 @@ class ViewScores:
     height: int
     # Rays a pixel.
     spp: int
-    # Of each view, in dB.
+    # Of each view, in dB; NaN of one that its mask leaves nothing of.
     psnr: list[float]
-    # Of each view.
+    # Of each view; NaN of one that holds no window of 11 x 11 pixels.
     ssim: list[float]
-    # Of the right half of each view in dB, its colours fitted on the left half.
+    # Of the right half of each view in dB, its colours fitted on the left half; NaN where it has no pixel.
     psnr_fitted: list[float]
     # Means over the views with true depth; None where there are none.
     depth: DepthScore | None
@@ -170,17 +170,17 @@ class ViewScores:
     @property
     def psnr_mean(self) -> float:
         """The mean over the views, in dB."""
-        return float(np.mean(self.psnr))
+        return mean_score(self.psnr)
 
     @property
     def psnr_fitted_mean(self) -> float:
         """The mean over the views whose colours could be fitted, in dB."""
-        return float(np.nanmean(self.psnr_fitted))
+        return mean_score(self.psnr_fitted)
 
     @property
     def ssim_mean(self) -> float:
-        """The mean over the views."""
-        return float(np.mean(self.ssim))
+        """The mean over the views that have one."""
+        return mean_score(self.ssim)
 
     def to_dict(self) -> dict:
         """For JSON: the fields and the means; without ``depth`` where it is None."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -71,7 +72,20 @@ def _markdown_cell(text: str) -> str:
     return _MARKUP.sub(lambda match: match[0] if match[1] else f"{match[2]}\\{match[3]}", text)
 
 
-def write_json(path: str | os.PathLike, value: Any, allow_nan: bool = True) -> None:
-    """Write ``value`` as JSON, indented, with a line end. ``allow_nan``: whether NaN may be in it, which JSON does not
-    know."""
-    write_text(path, json.dumps(value, indent=1, allow_nan=allow_nan) + "\n")
+def write_json(path: str | os.PathLike, value: Any, allow_nan: bool | None = None) -> None:
+    """Write ``value`` as JSON, indented, with a line end.
+
+    NaN and infinities, which JSON does not know, become null. ``allow_nan``: True leaves them as they are, for files
+    that only this program reads; with False they are a ``ValueError``.
+    """
+    value = _with_null(value) if allow_nan is None else value
+    write_text(path, json.dumps(value, indent=1, allow_nan=bool(allow_nan)) + "\n")
+
+
+def _with_null(value: Any) -> Any:
+    """``value`` with None in place of each number that is not finite."""
+    if isinstance(value, Mapping):
+        return {key: _with_null(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with_null(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

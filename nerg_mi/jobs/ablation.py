@@ -115,7 +115,7 @@ def _row(variant: Variant, seed: int, bench: Bench) -> dict:
 def _keep(row: dict, variant: Variant, seed: int, bench: Bench) -> None:
     """Write ``row`` beside its checkpoint."""
     path = (bench.folder / variant.file_name(seed)).with_suffix(".json")
-    write_json(path, {"row": row, "same": _identity(variant, seed, bench)})
+    write_json(path, {"row": row, "same": _identity(variant, seed, bench)}, allow_nan=True)
 
 
 def _identity(variant: Variant, seed: int, bench: Bench) -> dict:

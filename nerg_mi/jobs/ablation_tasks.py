@@ -84,4 +84,4 @@ def train_part(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output
     bench = _last[key][0]
     known = ablation.all_variants(options.field is not None, [parameters["recipe"]])
     variant = next(v for v in known if v.name == parameters["variant"])
-    write_json(output / _ROW, train_variant(variant, parameters["seed"], output / _FIELD, bench))
+    write_json(output / _ROW, train_variant(variant, parameters["seed"], output / _FIELD, bench), allow_nan=True)

@@ -139,7 +139,7 @@ def train_and_score(parameters: Mapping[str, Any], inputs: Mapping[str, Path], o
         scored = evaluate_gaze(gaze, files["rays"], None, scoring)
         found[split] = {"rows": scored.rows, "positions": scored.positions, "people": scored.people}
         found[split] |= {"by_position": scored.by_position, "calibration": scored.calibration}
-    write_json(output / SCORED, found)
+    write_json(output / SCORED, found, allow_nan=True)
 
 
 def _splits(text: str) -> list[str]:

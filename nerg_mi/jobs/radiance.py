@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +39,7 @@ class RadianceResult:
 
     @property
     def psnr(self) -> float | None:
-        """Mean PSNR in dB on the held-out views; None where none are held out."""
+        """Mean PSNR in dB on the held-out views; None where none are held out, or masks leave nothing of them."""
         held_out = self.provenance.get("psnr_held_out")
         return None if held_out is None else held_out["mean"]
 
@@ -142,9 +143,8 @@ def _tell_result(result: RadianceResult, reporter: Reporter) -> None:
     reporter.message(f"{about['steps']} steps in {about['seconds']:.0f} s{speed}")
     if result.psnr is not None:
         fitted = about["psnr_held_out"]["mean_fitted"]
-        reporter.message(
-            f"held-out PSNR: {result.psnr:.2f} dB; of right halves, colours fitted on left ones: {fitted:.2f} dB"
-        )
+        halves = "" if fitted is None else f"; of right halves, colours fitted on left ones: {fitted:.2f} dB"
+        reporter.message(f"held-out PSNR: {result.psnr:.2f} dB{halves}")
     if about.get("photo_stops", 0) >= _STOPS:
         reporter.message(f"the photos' exposures differ by {about['photo_stops']:.2f} stops (standard deviation)")
     if "beyond_box" in about:
@@ -191,7 +191,9 @@ def evaluate_radiance(
     done = 0
 
     def row(name: str, psnr: float, ssim: float) -> None:
-        reporter.message(f"{name[-32:]:32s} {psnr:8.2f} {ssim:7.4f}")
+        similarity = "-" if math.isnan(ssim) else f"{ssim:.4f}"
+        likeness = "-" if math.isnan(psnr) else f"{psnr:.2f}"
+        reporter.message(f"{name[-32:]:32s} {likeness:>8s} {similarity:>7s}")
 
     def scored(name: str, psnr: float, ssim: float) -> None:
         nonlocal done
@@ -202,7 +204,13 @@ def evaluate_radiance(
     reporter.message(f"{'view':32s} {'PSNR dB':>8s} {'SSIM':>7s}")
     scores = score_views(field, views, options.spp, pictures, scored)
     row("mean", scores.psnr_mean, scores.ssim_mean)
-    reporter.message(f"PSNR of right halves, their colours fitted on left ones: {scores.psnr_fitted_mean:.2f} dB")
+    if not math.isnan(scores.psnr_fitted_mean):
+        reporter.message(f"PSNR of right halves, their colours fitted on left ones: {scores.psnr_fitted_mean:.2f} dB")
+    if any(map(math.isnan, scores.ssim)):
+        reporter.warn(
+            f"views of {scores.width} x {scores.height} pixels hold no whole window of 11 x 11, which SSIM needs; give "
+            "a larger --width"
+        )
     if scores.depth is not None:
         d = scores.depth
         reporter.message(

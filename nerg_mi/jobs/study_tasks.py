@@ -91,7 +91,7 @@ def measure_part(parameters: Mapping[str, Any], inputs: Mapping[str, Path], outp
         every = settings(subject, quick)
         rows = study.measure(subject, [every[k] for k in (0, *parameters["settings"])], repeats, parameters["samples"])
     timed_by = {"process": _PROCESS, "processor": processor(), "threads": dr.thread_count()}
-    write_json(output, {"rows": rows, "timed_by": timed_by})
+    write_json(output, {"rows": rows, "timed_by": timed_by}, allow_nan=True)
 
 
 def _subject(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> Subject:

@@ -3,6 +3,8 @@ whatever their exposure and white balance."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -75,6 +77,12 @@ def psnr(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None)
     if mask is not None:
         error = error[mask]
     return decibels(float(np.mean(error))) if error.size else float("nan")
+
+
+def mean_score(scores: Sequence[float]) -> float:
+    """The mean of those that are not NaN; NaN if there is none."""
+    known = [score for score in scores if not math.isnan(score)]
+    return float(np.mean(known)) if known else math.nan
 
 
 # ---- How alike two pictures are, whatever exposure and white balance they were taken with ----

@@ -241,7 +241,7 @@ def _facts(run: Run) -> list[tuple[str, str]]:
     if "training_frames" in about:
         facts.append(("photos", f"{about['training_frames']} that it was trained on"))
     held = about.get("psnr_held_out")
-    if isinstance(held, dict) and "mean" in held:
+    if isinstance(held, dict) and held.get("mean") is not None:
         facts.append(("likeness", f"{held['mean']:.1f} dB PSNR on {len(held.get('views', ()))} photos held out"))
     shape = (run.provenance.get("geometry_file") or {}).get("shape")
     if shape:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.figures.style import provenance
 from nerg_mi.files.png import write_png
 from nerg_mi.interruption import Interruption
-from nerg_mi.maths.color import psnr, psnr_of_fitted_half
+from nerg_mi.maths.color import mean_score, psnr, psnr_of_fitted_half
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.dataset import Dataset
@@ -51,18 +52,18 @@ def share_beyond(views: list[View], render: Callable[[View], Preview], core: Box
 @dataclass(frozen=True)
 class HeldOutError:
     """In dB, one of each view: ``psnr`` before black; ``fitted`` of right halves, their colours fitted on left
-    halves (`psnr_of_fitted_half`)."""
+    halves (`psnr_of_fitted_half`). NaN where no pixel counts, of all views in their means."""
 
     psnr: list[float]
     fitted: list[float]
 
     @property
     def mean(self) -> float:
-        return float(np.nanmean(self.psnr))
+        return mean_score(self.psnr)
 
     @property
     def mean_fitted(self) -> float:
-        return float(np.nanmean(self.fitted))
+        return mean_score(self.fitted)
 
 
 def measure(
@@ -256,7 +257,8 @@ def train_field(
             trainer.step()
             if looks and trainer.progress >= looks[0] and trainer.steps >= looked + LOOK_GAP:
                 looks, looked = [x for x in looks if x > trainer.progress], trainer.steps
-                last = _look(trainer, watched, history)
+                _look(trainer, watched, history)
+                last = history[-1]["psnr"] if history else None
                 if preview is not None:
                     write_preview(trainer, watched[0], preview)
             if state is not None and trainer.seconds - saved > save_every:
@@ -314,10 +316,10 @@ def _result(
         every = trainer.pixels_within(dataset.held_out, _FINAL_SAMPLES)
         error = measure(trainer, dataset.held_out, every, field)
         provenance["psnr_held_out"] = {
-            "mean": round(error.mean, 3),
-            "mean_fitted": round(error.mean_fitted, 3),
+            "mean": _rounded(error.mean),
+            "mean_fitted": _rounded(error.mean_fitted),
             "every_pixel": every,
-            "views": {v.name: round(p, 3) for v, p in zip(dataset.held_out, error.psnr)},
+            "views": {v.name: _rounded(p) for v, p in zip(dataset.held_out, error.psnr)},
         }
         _look(trainer, watched, history, field)
         if field.box.contracted:
@@ -330,12 +332,19 @@ def _result(
     return field, provenance
 
 
-def _look(trainer: RadianceTrainer, watched: list[View], history: list, field: RadianceField | None = None) -> float:
-    """The error on the ``watched`` views, added to ``history``: every so many pixels, as many as take little time."""
+def _rounded(decibels: float) -> float | None:
+    """For the checkpoint: None where no pixel counted."""
+    return None if math.isnan(decibels) else round(decibels, 3)
+
+
+def _look(trainer: RadianceTrainer, watched: list[View], history: list, field: RadianceField | None = None) -> None:
+    """Add the error on the ``watched`` views, if any of their pixels counts, to ``history``: every so many pixels, as
+    many as take little time."""
     every, seconds = trainer.pixels_within(watched, _LOOK_SAMPLES), trainer.seconds
     psnr = measure(trainer, watched, every, field).mean
-    history.append({"steps": trainer.steps, "seconds": round(seconds, 1), "psnr": round(psnr, 2), "every_pixel": every})
-    return psnr
+    if not math.isnan(psnr):
+        row = {"steps": trainer.steps, "seconds": round(seconds, 1), "psnr": round(psnr, 2), "every_pixel": every}
+        history.append(row)
 
 
 def write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:

@@ -5,6 +5,7 @@ import json
 import math
 import os
 
+import numpy as np
 import pytest
 
 from nerg_mi.files.tables import markdown_table, with_formula, write_csv, write_json
@@ -28,11 +29,15 @@ def test_a_table_that_cannot_be_made_leaves_the_old_one(tmp_path):
         with pytest.raises(ValueError):
             write(tmp_path / name)
         assert (tmp_path / name).read_bytes() == b"old"
-    write_json(tmp_path / "a.json", {"a": [1, math.nan]})
-    assert math.isnan(json.loads((tmp_path / "a.json").read_text())["a"][1]) and sorted(os.listdir(tmp_path)) == [
-        "a.csv",
-        "a.json",
-    ]
+    assert sorted(os.listdir(tmp_path)) == ["a.csv", "a.json"]
+
+
+def test_json_has_null_for_what_is_no_number(tmp_path):
+    value = {"a": [1, math.nan], "b": {"c": (np.float64("inf"), "nan")}}
+    write_json(tmp_path / "a.json", value)
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": [1, None], "b": {"c": [None, "nan"]}}
+    write_json(tmp_path / "a.json", value, allow_nan=True)
+    assert math.isnan(json.loads((tmp_path / "a.json").read_text())["a"][1])
 
 
 FORMULAS = ["=1+1", "+cmd|' /C calc'!A0", "-A1", "@SUM(A1)", "\t=1", "\r=1", "-1-2", "'=1", "''+a", "\uff1d1"]

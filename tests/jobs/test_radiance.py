@@ -1,5 +1,7 @@
 """Radiance fields by jobs: what a notebook gets, and what it is told."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -66,6 +68,17 @@ def test_scores_without_any_file(place):  # noqa: F811
     assert scores.psnr_mean == pytest.approx(np.mean(scores.psnr)) and scores.depth is None and scores.spp == 4
     assert len(told.messages) == len(scores.views) + 3 and told.messages[-2].startswith("mean")
     assert told.messages[-1].endswith(f"{np.mean(scores.psnr_fitted):.2f} dB")
+
+
+def test_views_too_small_for_a_score_have_none(place, tmp_path):  # noqa: F811
+    """One pixel has no right half to fit colours for, and no window of structural similarity."""
+    told, out, table = Recorder(), tmp_path / "f.safetensors", tmp_path / "s.json"
+    result = train_radiance(place, out, RadianceOptions(steps=2, holdout=3, width=1), told)
+    assert result.provenance["psnr_held_out"]["mean_fitted"] is None and np.isfinite(result.psnr)
+    evaluate_radiance(out, place, RadianceScoreOptions(holdout=3, width=1, spp=1, json_file=table), told)
+    scores = json.loads(table.read_text())
+    assert scores["ssim"] == scores["psnr_fitted"] == [None] and scores["psnr_mean"] > 0
+    assert not any("nan" in text for text in told.messages) and "11 x 11" in told.warnings[-1]
 
 
 def test_views_that_were_trained_on_are_no_held_out_views(place):  # noqa: F811

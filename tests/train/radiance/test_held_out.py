@@ -45,3 +45,4 @@ def test_both_errors_are_those_of_the_rendered_view(dataset):
 def test_views_of_which_nothing_counts_are_left_out_of_the_mean():
     error = HeldOutError([20.0, float("nan"), 22.0], [float("nan"), 25.0, 27.0])
     assert error.mean == 21 and error.mean_fitted == 26
+    assert np.isnan(HeldOutError([20.0], [float("nan")]).mean_fitted)
