@@ -17,7 +17,12 @@ def command(
     threads: Annotated[
         int, typer.Option("-t", "--threads", min=0, max=1024, help="Worker threads; 0: one a core.")
     ] = 0,
-    wait: Annotated[float, typer.Option(help="Seconds to wait for a scheduler that is not there, or is gone.")] = 600.0,
+    wait: Annotated[
+        float,
+        typer.Option(
+            min=SECONDS.low, max=SECONDS.high, help="Seconds to wait for a scheduler that is not there, or is gone."
+        ),
+    ] = 600.0,
     name: Annotated[
         str | None, typer.Option(help="What the scheduler calls this worker.  [default: its address]")
     ] = None,

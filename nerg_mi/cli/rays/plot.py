@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from nerg_mi.cli.progress import TerminalReporter
+from nerg_mi.ranges import LENGTHS
 
 from .arguments import RaysFile
 
@@ -19,7 +20,12 @@ def command(
         str, typer.Option(help="density: rays/m² with mean directions; layout: each ray's place, with dimensions.")
     ] = "density",
     cell: Annotated[
-        float | None, typer.Option(help="density: edge of a cell, metres.  [default: a fiftieth of the plan]")
+        float | None,
+        typer.Option(
+            min=LENGTHS.low,
+            max=LENGTHS.high,
+            help="density: edge of a cell, metres.  [default: a fiftieth of the plan]",
+        ),
     ] = None,
     test: Annotated[Path | None, typer.Option(help="layout: the test rays of a split, drawn beside.")] = None,
 ) -> None:
