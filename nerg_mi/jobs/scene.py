@@ -95,6 +95,7 @@ def write_scene(
     reporter.progress(0.1, "placing the observer")
     theirs = rays if options.person is None else found.of_person(options.person)
     observer, walk, about = _observer(given, theirs, align, ns, options, reporter)
+    observer = None if observer is None else upright(observer, up)
     tracked = given.gaze is not None or given.rays is not None
     scene = _Draft(given, place, align, up, observer, tracked)
     with tempfile.TemporaryDirectory() as folder:
@@ -111,7 +112,7 @@ def write_scene(
         if seen is not None and observer is not None and not seen.met.any() and given.kind != "none":
             reporter.warn("the observer meets no surface at all; give --observer another place, or check the alignment")
         if observer is not None and seen is not None and walk is None and options.person is None:
-            observer = turned_ahead(observer, seen)
+            observer = upright(turned_ahead(observer, seen), up)
             scene = replace(scene, observer=observer)
         reporter.progress(0.5, "looking for the best overview")
         camera, lens, chosen = _camera(scene, probe, seen, options, reporter)

@@ -232,6 +232,14 @@ def test_rays_alone_show_where_people_looked(rgb, folder, tmp_path, geometry):
     assert sphere.aovs["kde"][3:5, 7:9].min() > 10 * max(sphere.aovs["kde"][:, 0].max(), 1e-6)
 
 
+def test_an_observer_who_looks_along_up(rgb, folder, tmp_path):
+    """Until they are turned to the gaze, and then as well: up is where all of it goes."""
+    options = SceneOptions(geometry="none", up=(1.0, 0.0, 0.0), mode=MODE)
+    result = write_scene([folder / "rays.npz"], tmp_path / "a.xml", options)
+    ahead = result.observer.target - result.observer.origin
+    assert ahead[0] / np.linalg.norm(ahead) > 0.97 and shown(result.path, 1)[0] is not None
+
+
 def test_rays_in_another_frame_than_the_place(rgb, folder, tmp_path):
     matrix = np.array([[0, 0, 2, 0.5], [2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 0, 1]], float)
     align = tmp_path / "align.json"

@@ -121,7 +121,7 @@ def turned_ahead(eye: Eye, seen: Seen) -> Eye:
     at = int(np.argmax(seen.directions @ towards))
     # An observer within matter meets it at once, and a direction needs a length.
     away = seen.depth[at] if seen.met[at] and seen.depth[at] > 0 else seen.usual or 1.0
-    return replace(eye, target=eye.origin + away * towards)
+    return replace(eye, target=eye.origin + away * towards, up=None)
 
 
 def best_camera(probe: Probe, seen: Seen | None, frame: Frame, field_box: dict | None) -> Shot | None:
@@ -157,12 +157,19 @@ def given_point(values: tuple[float, ...] | None, option: str) -> np.ndarray | N
     return np.array(values, float)
 
 
+# Share of a coordinate that is some thousand times what single precision resolves of it.
+_APART = 1e-4
+
+
 def upright(eye: Eye, up: np.ndarray) -> Eye:
-    """``eye`` with an up of its own where it looks straight up or down, along ``up``. Raises `NergError` for one that
-    looks at where it is."""
+    """``eye`` with an up of its own where it looks straight up or down, along ``up``, and with a target so far ahead
+    that single precision tells it from the origin. Raises `NergError` for one that looks at where it is."""
     ahead = np.subtract(eye.target, eye.origin)
     if not np.any(np.abs(ahead) > 1e-9 * (1 + np.abs(eye.origin))):
         raise NergError("a camera cannot look at the point at which it stands; give --to another one")
+    nearest = _APART * float(np.abs(eye.origin).max())
+    if np.linalg.norm(ahead) < nearest:
+        eye = replace(eye, target=eye.origin + ahead * (nearest / np.linalg.norm(ahead)))
     if eye.up is None and np.linalg.norm(np.cross(ahead, up)) < 1e-3 * np.linalg.norm(ahead) * np.linalg.norm(up):
         return replace(eye, up=ahead_level(eye, up))
     return eye

@@ -57,6 +57,8 @@ def test_points_and_ups():
     assert upright(EYE, up) is EYE
     down = upright(Eye(np.zeros(3), np.array([0, 0, -2.0])), up)
     assert abs(down.up @ up) < 1e-9
+    far = upright(Eye(np.array([-1e7, 0, 1e7]), np.array([-1e7, 1.0, 1e7])), up)
+    assert np.allclose(np.float32(far.target) - np.float32(far.origin), [0, 1000, 0])
     with pytest.raises(NergError, match="cannot look at the point"):
         upright(Eye(np.ones(3), np.ones(3)), up)
 
