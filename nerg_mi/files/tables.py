@@ -14,8 +14,8 @@ from .atomic import replacing, write_text
 
 
 def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
-    """Write ``rows`` as CSV with a line of names first; what a row lacks stays empty, and text that a spreadsheet would
-    run as a formula gets an apostrophe before it (`without_formula`).
+    """Write ``rows`` as CSV with a line of names first; what a row lacks, and NaN, stays empty, and text that a
+    spreadsheet would run as a formula gets an apostrophe before it (`without_formula`).
 
     ``columns``: default, all keys in the order in which they appear; where they are given, rows are taken one by one.
     Raises ``ValueError`` for a row with others.
@@ -26,7 +26,8 @@ def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], column
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, restval="")
         csv.writer(file).writerow(map(without_formula, columns))
-        writer.writerows({key: without_formula(value) for key, value in row.items()} for row in rows)
+        # NaN alone is no equal of itself.
+        writer.writerows({k: without_formula(v) for k, v in row.items() if v == v} for row in rows)
 
 
 # Also the wide forms that spreadsheets take for the same in some languages.

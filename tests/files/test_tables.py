@@ -16,7 +16,7 @@ def test_rows_come_back_and_what_they_lack_is_empty(tmp_path):
     write_csv(path, [{"a": 1, "b": 'é, "x"'}, {"a": 2.5, "c": "2\n3"}])
     with path.open(encoding="utf-8", newline="") as file:
         assert list(csv.DictReader(file)) == [{"a": "1", "b": 'é, "x"', "c": ""}, {"a": "2.5", "b": "", "c": "2\n3"}]
-    write_csv(path, [{"a": 1}], ("b", "a"))
+    write_csv(path, [{"a": 1, "b": math.nan}], ("b", "a"))
     assert path.read_bytes() == b"b,a\r\n,1\r\n"
 
 
