@@ -26,7 +26,7 @@ class SphereOptions(SceneOptions):
         0, "Where no observer is: whose place it is, counted from 0.", "-s", "--sensor", within=Range(0, 65535)
     )
     projection: str = option("mollweide", "Projection: mollweide (equal areas) or equirectangular.")
-    width: int = option(800, "Width of the map in pixels; it is half as high.", within=Range(64, 5792))
+    width: int = option(800, "Width of the map in pixels; it is half as high.", within=Range(64, 2896))
 
 
 def _draw_sphere(files: Sequence[Path], options: SphereOptions, reporter: Reporter) -> Drawing:

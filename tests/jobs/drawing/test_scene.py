@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.drawing.kind import SceneOptions
 from nerg_mi.jobs.drawing.scene import film, open_scene, upright_pose
+from nerg_mi.jobs.drawing.sphere import SphereOptions
+from nerg_mi.ranges import RANGE
 from tests.cli.test_render import SCENE
 from tests.jobs.recorder import Recorder
 
@@ -38,8 +42,11 @@ def test_straight_down_there_is_some_heading(rgb):
 
 def test_a_film_that_is_too_large():
     assert film(30, 20)["rfilter"] == {"type": "box"}
-    with pytest.raises(NergError, match="100,000 x 50,000 pixels is too large"):
-        film(100_000, 50_000)
+    with pytest.raises(NergError, match="4,096 x 2,048 pixels is too large"):
+        film(4096, 2048)
+    # What the widest sphere needs, a gigabyte to draw, is allowed.
+    (width,) = (f.metadata[RANGE].high for f in fields(SphereOptions) if f.name == "width")
+    assert film(width, width // 2)["width"] == width
 
 
 def test_another_integrator_is_refused(tmp_path):
