@@ -12,19 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from typer.core import TyperOption
 
 import nerg_mi.aoi
 import nerg_mi.jobs.options
 import nerg_mi.rays.readers
-from nerg_mi.cli import worker
+from nerg_mi.cli import COMMANDS, build_app
 from nerg_mi.cli.options import takes
 from nerg_mi.errors import NergError
 from nerg_mi.jobs import tracking
 from nerg_mi.jobs.drawing.registry import KINDS as FIGURES
-from nerg_mi.jobs.options.rays import ImportOptions
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, Checked, Range, check_number, ranged
+from nerg_mi.rays.readers.registry import shared_options
 from nerg_mi.train import gaze_settings, radiance_settings
-from tools.command_pages import commands
 
 
 def _modules():
@@ -124,29 +124,20 @@ def test_the_command_line_refuses_the_same(kind):
     assert not made
 
 
-# Options without limits in the parser: what checks them in its place.
-CHECKED_LATER = {
-    ("nerg worker", "--wait"): lambda value: worker.command("tcp://127.0.0.1:1", wait=value),
-    ("nerg rays plot", "--cell"): lambda value: tracking.PlotOptions(cell=value),
-    ("nerg rays import", "--workers"): lambda value: ImportOptions(place_name="a", workers=value),
-}
+def _options(command):
+    for below in getattr(command, "commands", {}).values():
+        yield from _options(below)
+    yield from (p for p in command.params if isinstance(p, TyperOption))
 
 
-def test_every_number_of_the_command_line_has_limits():
-    """In its parser, in the options of a reader of rays, or where it is checked later."""
-    readers = [kind for kind in KINDS if kind.__module__.startswith("nerg_mi.rays.readers")]
-    without = {
-        (command, option.opts[-1])
-        for command, parser, _ in commands()
-        for option in parser.params
-        if option.type_descriptor.annotation in (int, float) and None in (option.min, option.max)
-    }
-    flags = {f.metadata[FLAG] or "--" + f.name.replace("_", "-") for kind in readers for f in _numbers(kind)}
-    assert without - {("nerg rays import", flag) for flag in flags} == set(CHECKED_LATER)
-    for (_, flag), check in CHECKED_LATER.items():
-        for wrong in (math.nan, math.inf, 1e10, -1.0):
-            with pytest.raises(NergError, match=f"{flag} must"):
-                check(wrong)
+def test_every_number_of_the_command_line_shows_its_range():
+    """Also where a command declares an option itself; those of readers of rays are checked by them."""
+    apps = [typer.main.get_command(build_app(name)) for name in COMMANDS]
+    of_readers = {option.name for option in shared_options()}
+    numbers = [p for app in apps for p in _options(app) if p.type_descriptor.annotation in (int, float)]
+    numbers = [p for p in numbers if p.name not in of_readers]
+    limits = {(p.name, (i := p.type_descriptor.parameter_info).min, i.max) for p in numbers}
+    assert len(limits) > 80 and [limit for limit in limits if None in limit] == []
 
 
 def test_several_numbers_are_checked_one_by_one():

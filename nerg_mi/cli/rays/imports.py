@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import THREADS
 from nerg_mi.rays.readers.registry import SharedOption, preset_names, shared_options
 
 from .arguments import Output, print_card
@@ -61,7 +62,9 @@ def _own_options(
     workers: Annotated[
         int | None,
         typer.Option(
-            help="Of a dataset: processes that import files beside each other.  [default: a core each]", min=1
+            help="Of a dataset: processes that import files beside each other.  [default: a core each]",
+            min=THREADS.low,
+            max=THREADS.high,
         ),
     ] = None,
     skip_bad_lines: Annotated[
