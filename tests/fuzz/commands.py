@@ -1,8 +1,9 @@
 """Command lines with pairs of options and values that one seldom tries together; each must end with a result or one
 sentence.
 
-To the fuzzer a line is a file of JSON (its words). Inputs are those of `tests.cli.outputs`, so small that a command
-takes about a second.
+Most values are allowed by the option's own check, since it is beyond those checks that options meet. To the fuzzer a
+line is a file of JSON (its words). Inputs are those of `tests.cli.outputs`, so small that a command takes about a
+second.
 """
 
 from __future__ import annotations
@@ -11,31 +12,65 @@ import contextlib
 import functools
 import io
 import json
+import re
 import shutil
+import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, get_args, get_origin
 
 import numpy as np
 from typer.core import TyperOption
 
+from nerg_mi.ranges import COORDINATES, TIMES
+from nerg_mi.train.gaze_recipes import RECIPES
 from tests.cli import outputs
 from tests.fuzz.describe import Reader
 from tests.fuzz.watch import Case
 
-SKIPPED = {"demo", "study", "ablate", "eval folds", "export torch-ngp"}
+SKIPPED = {"demo", "study", "ablate", "eval folds", "export torch-ngp", "refine"}
 """Commands that take many seconds at any setting, or have no options."""
 
-KEPT_OPTIONS = set("-o --output --mode --variant --store --scheduler --help --threads --hosts --workers".split())
+FIXED = set("-o --output --mode --variant --store --scheduler --help --threads --hosts --workers".split())
 """Options that are not varied: outputs, variants, and where work is done."""
 
-# What is often allowed comes more than once, so that options meet beyond the checks of each.
-_FLOATS = [*4 * "0.1 0.5 1 2 10".split(), *"0 -0.0 -1 1e-30 1e-3 1e6 1e30 1e38 1e308 nan inf 1e400".split()]
-# Sizes that a user may ask for in earnest would take minutes; what is beyond them all must be refused.
-_INTEGERS = [*4 * "1 2 3 8 16".split(), *"-1 0 5 -2147483648 9223372036854775808 1e3".split()]
-_TEXTS = "|a|0,0,0|1,2,3|nan,0,0|1e30,0,0|1e308,0,0|-1,-1,-1|1,2|0.5|x=1|0:1|,|0,1,0,1,0,1|--|:|a:b:c".split("|")
-_FILES = ("rays.npz", "room.ply", "ball.xml", "areas.json", "gaze.safetensors", "day.csv", "photos", "no-such", "a.exr")
+_WORK = "steps minutes spp resamples resolution samples directions probes ensemble width height texture pictures angle"
+_WORK += " observers eyes points detail cell step voxel count views rays downscale scale cone positions fps bundle gaze"
+WORK = {"--" + name for name in _WORK.split()}
+"""Options whose value is an amount of work: any in their range may be meant in earnest, and take hours. A line with one
+is interrupted after `PATIENCE` seconds of the processor, and must end then; others must be done within `LIMIT`."""
+
+PATIENCE, LIMIT = 4.0, 20.0
+
+_FILES = dict(field="field.safetensors", gaze="gaze.safetensors", scene="ball.xml", surface="room.ply", rays="rays.npz")
+_FILES |= dict(areas="areas.json", pairs="pairs.csv", frames="frames.csv", photos="photos", views="photos")
+_FILES |= dict(align="align.json", align_views="align.json", geometry="gaze.vol", test="rays.npz")
+"""Parameter of a command -> an input of the kind that it reads."""
+_WRITTEN = {("import", "gaze"), ("export volume", "color"), ("eval radiance", "json_file")}
+
+_REFUSED = {
+    int: "-1 -2147483648 9223372036854775808 1e3 0.5 nan".split(),
+    float: "-1 -0.0 1e-320 1e38 1e308 nan inf 1e400 x".split(),
+    str: "|a|nan,0,0|1e30,0,0|1e308,0,0|1,2|0:1|,|--|:|a:b:c|no such word".split("|"),
+    Path: ["{i}/" + name for name in ("rays.npz", "day.csv", "room.ply", "a.exr", "photos", "no-such", "")],
+}
+"""Type of an option -> values of which most are refused."""
+
+_TEXTS = dict(define=("level=0.5", "spp=1"), source=("field", "rays"), geometry=("hits", "none"), photo=("0", "3.png"))
+_TEXTS |= dict(person=("a", "b"), people=("a", "a,b"), persons=("a", "b"), without_persons=("a", "b"))
+_TEXTS |= dict(
+    recipe=RECIPES, salience=("spectral-residual",), semantic=("accumulated", "snapshot"), windows=("w=0:1",)
+)
+_TEXTS |= dict(observers=("0,0,1.6", "1,1,1.6"), begin=("random", "field"))
+"""Parameter of a command -> values that its help does not enumerate."""
+_POINTS = ("0.5,1.2,1.6", f"{COORDINATES.low},0,{COORDINATES.high}", "1e-7,0,0", "-2,-2,-2", "0,0,1")
+_SPANS = ("0,2", "0,0", f"{TIMES.low},{TIMES.high}", "1.5,1.5000001")
+_BOXES = {"x0,x1": "-2,2,-2,2,-1,3", "x0,y0": "-2,-2,-1,2,2,3"}
+# How a help text enumerates choices: "data, grid or blue", "all (one clock), or person", "both: ...; pos: ...".
+_WORD = r"[A-Za-z][\w-]*(?: \([^)]*\))?"
+_ROW = re.compile(rf"\b{_WORD}(?:, {_WORD})*,? or {_WORD}|\b{_WORD}(?:, {_WORD}){{2,}}")
+_ENTRY = re.compile(r"(?<!\S)([a-z]+): ")
+_NO_NUMBER = re.compile(r"(?<![\w.\-/])[-+]?(?:nan|inf|infinity)(?![\w\-])", re.IGNORECASE)
 
 
 @functools.lru_cache
@@ -52,52 +87,93 @@ def _inputs() -> Path:
     )
     with contextlib.suppress(SystemExit):
         nerg_mi.cli.main([*line.split(), *"--directions 64 --zones 0 --min-rays 8 --test-zones 1".split()])
+    (folder / "align.json").write_text(json.dumps(np.eye(4).tolist()))
     return folder
 
 
 def _reader(name: str, case: outputs.Case) -> Reader:
+    words = [*case.name.split(), *case.line.split("'")[0].split()]
+
     def make(folder: Path) -> None:
         shutil.copytree(_inputs(), folder, dirs_exist_ok=True)
-        (folder / "line.json").write_text(json.dumps([*case.name.split(), *case.line.split("'")[0].split()]))
+        (folder / "line.json").write_text(json.dumps(words))
 
     def read(folder: Path) -> None:
-        run(folder, json.loads((folder / "line.json").read_text()))
+        line = json.loads((folder / "line.json").read_text())
+        run(folder, line, is_work=not WORK.isdisjoint(line[len(words) :]))
 
     return Reader(name, make, {"line.json": ()}, read, is_command=True)
 
 
-def run(folder: Path, words: list[str]) -> None:
-    """Run the command line ``words`` on the inputs in ``folder``.
+def run(folder: Path, words: list[str], is_work: bool = False) -> None:
+    """Run the command line ``words`` on the inputs in ``folder``; ``is_work``: a long time of it was asked for.
 
-    Raises `NergError` with its sentence where it refuses, ``RuntimeError`` where it ends with an internal error.
+    Raises `NergError` with its sentence where it refuses, ``RuntimeError`` where it ends with an internal error, takes
+    too long, or is done without a result.
     """
     import nerg_mi.cli
+    from nerg_mi.cli.ending import FAULT, INTERRUPTED
     from nerg_mi.errors import NergError
 
-    output, said = tempfile.mkdtemp(prefix="nerg-out-"), io.StringIO()
+    output, printed, said = Path(tempfile.mkdtemp(prefix="nerg-out-")), io.StringIO(), io.StringIO()
+    # It is ignored in what a shell runs in the background.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGPROF, lambda *_: signal.raise_signal(signal.SIGINT))
+    signal.setitimer(signal.ITIMER_PROF, PATIENCE if is_work else LIMIT)
     try:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(said):
-            nerg_mi.cli.main([word.replace("{i}", str(folder)).replace("{o}", output) for word in words])
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
+            nerg_mi.cli.main([word.replace("{i}", str(folder)).replace("{o}", str(output)) for word in words])
     except SystemExit as end:
         last = " ".join(said.getvalue().split())[-900:]
-        if end.code == 70:
+        if end.code == FAULT or "Traceback" in said.getvalue():
             raise RuntimeError(last) from None
-        if end.code:
+        if end.code == INTERRUPTED and not is_work:
+            raise RuntimeError(f"not done in {LIMIT:g} s of the processor: {last}") from None
+        if end.code and end.code != INTERRUPTED:
             raise NergError(last) from None
+        if not end.code:
+            check_outputs(output, printed.getvalue())
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
         shutil.rmtree(output)
 
 
+def check_outputs(folder: Path, printed: str) -> None:
+    """Raise ``RuntimeError`` where a command that was done ``printed``, or wrote into ``folder``, nothing, or no number
+    where one is due."""
+    import mitsuba as mi
+    from safetensors.numpy import load_file
+
+    from nerg_mi.rays.rays import Rays
+
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    wrong = [path.name for path in files if not path.stat().st_size]
+    for path in set(files) - {folder / name for name in wrong}:
+        arrays = []
+        if path.suffix == ".safetensors":
+            arrays = list(load_file(path).values())
+        elif path.suffix in (".exr", ".png"):
+            arrays = [np.array(mi.Bitmap(str(path)))]
+        elif path.suffix == ".npz":
+            arrays = [Rays.load(path).origin]
+        elif path.suffix in (".csv", ".json", ".md", ".xml", ".svg") and _NO_NUMBER.search(path.read_text()):
+            wrong.append(path.name)
+        if arrays and not (sum(a.size for a in arrays) and all(np.isfinite(a.astype(float)).all() for a in arrays)):
+            wrong.append(path.name)
+    if wrong or not files or _NO_NUMBER.search(printed):
+        raise RuntimeError(f"done, but there is no number in {wrong or len(files)} of its files: {printed[-400:]}")
+
+
 def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) -> Iterator[Case]:
-    """``count`` lines, as many for each command, each with one to three options more."""
+    """``count`` lines, as many for each command, each with two or three options more, of those that there are."""
     for k, reader in enumerate(readers):
         words = json.loads((inputs / reader.name / "line.json").read_text())
         rng = np.random.default_rng([start, k])
-        options = _options(words)
+        command, options = reader.name.rpartition(" ")[0], _options(words)
         for _ in range(count * (k + 1) // len(readers) - count * k // len(readers)):
             more: list[str] = []
-            for option in rng.choice(len(options), min(len(options), int(rng.integers(1, 4))), replace=False):
-                more += _drawn(options[option], rng)
+            for option in rng.choice(len(options), min(len(options), int(rng.integers(2, 4))), replace=False):
+                more += _drawn(options[option], command, rng)
             yield Case(reader.name, "line.json", json.dumps([*words, *more]).encode())
 
 
@@ -110,22 +186,43 @@ def _options(words: list[str]) -> list[TyperOption]:
     command = typer.main.get_command(build_app(words[0]))
     for word in words:
         command = getattr(command, "commands", {}).get(word, command)
-    return [p for p in command.params if isinstance(p, TyperOption) and KEPT_OPTIONS.isdisjoint(p.opts)]
+    return [p for p in command.params if isinstance(p, TyperOption) and FIXED.isdisjoint(p.opts)]
 
 
-def _drawn(option: TyperOption, rng: np.random.Generator) -> list[str]:
+def _drawn(option: TyperOption, command: str, rng: np.random.Generator) -> list[str]:
     """``option`` with a value, as words of a command line."""
     if option.is_flag:
         return [str(rng.choice([*option.opts, *option.secondary_opts]))]
     kind = option.type_descriptor.annotation
-    choices = get_args(kind) if get_origin(kind) is Literal else ()
-    if choices and rng.random() < 0.8:
-        values = choices
-    elif kind is Path:
-        values = ["{i}/" + name for name in _FILES]
+    if (command, option.name) in _WRITTEN:
+        values = ["{o}/" + option.name + (".vol" if option.name == "color" else "")]
+    elif rng.random() < 0.1:
+        values = _REFUSED.get(kind, _REFUSED[str])
     else:
-        values = {int: _INTEGERS, float: _FLOATS}.get(kind, _TEXTS)
+        values = _allowed(option)
     return [option.opts[0], *(str(rng.choice(values)) for _ in range(max(option.nargs, 1)))]
+
+
+def _allowed(option: TyperOption) -> list[str]:
+    """Values in the range of ``option``: its ends, what is next to them, and usual ones; or its choices."""
+    kind = option.type_descriptor.annotation
+    if kind is Path:
+        return ["{i}/" + _FILES.get(option.name, "rays.npz")]
+    if kind in (int, float):
+        limits = option.type_descriptor.parameter_info
+        low, high = kind(limits.min), kind(limits.max)
+        next_to = (low + 1, high - 1) if kind is int else np.nextafter((low, high), (high, low)).tolist()
+        usual = [v for v in (option.default, 0, 0.1, 0.5, 1, 2, 3, 8, 16) if v is not None and low <= v <= high]
+        return [str(v) for v in (*usual, *usual, low, *next_to, high) if kind(v) == v]
+    about = re.sub(r"\[.*?\]", "", option.help or "")
+    if "A,B" in about:
+        return [*_SPANS]
+    if coordinates := re.search(r"\b[a-z]\d?(?:,[a-z]\d?){2,}", about):
+        return [_BOXES.get(coordinates[0][:5], "")] if coordinates[0].count(",") > 2 else [*_POINTS]
+    rows = ", ".join(_ROW.findall(re.sub(r" \([^)]*\)", "", about)))
+    entries = _ENTRY.findall(about)
+    words = re.split(r",? or |, ", rows) if rows and len(entries) < 2 else entries
+    return [*_TEXTS.get(option.name, words or ("a",)), *([option.default] if option.default else [])]
 
 
 def _all() -> list[Reader]:
