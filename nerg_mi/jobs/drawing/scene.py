@@ -19,8 +19,8 @@ from nerg_mi.rendering.pictures import activate, load_scene
 
 from .kind import SceneOptions
 
-MOST_PIXELS = 1 << 22
-"""A figure is drawn in one piece, in double precision: some 200 bytes a pixel, which is 1 GB of so many."""
+MOST_PIXELS = 1 << 23
+"""A figure is drawn in one piece, in double precision, some 200 bytes a pixel; a film of 3,840 x 2,160 is allowed."""
 
 
 class OpenScene:

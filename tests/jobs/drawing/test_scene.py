@@ -42,8 +42,8 @@ def test_straight_down_there_is_some_heading(rgb):
 
 def test_a_film_that_is_too_large():
     assert film(30, 20)["rfilter"] == {"type": "box"}
-    with pytest.raises(NergError, match="4,096 x 2,048 pixels is too large"):
-        film(4096, 2048)
+    with pytest.raises(NergError, match="4,096 x 4,096 pixels is too large"):
+        film(4096, 4096)
     # What the widest sphere needs, a gigabyte to draw, is allowed.
     (width,) = (f.metadata[RANGE].high for f in fields(SphereOptions) if f.name == "width")
     assert film(width, width // 2)["width"] == width
