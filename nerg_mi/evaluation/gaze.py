@@ -363,6 +363,10 @@ def held_out_rays(rays: Rays, account: dict, split: str = "both", seed: int = 0)
     return train, rays.select(unseen if split == "both" else ~unseen), centres
 
 
+# Memory of an evaluation at most: maps of each person in single precision, and of a dozen methods in double.
+_BYTES_A_METHOD, _MOST_BYTES = 100, 2e9
+
+
 def make_test(
     rays: Rays,
     centres: np.ndarray,
@@ -389,6 +393,11 @@ def make_test(
     person = rays.person[probes.indices]
     present = np.unique(person)
     P, N = len(probes), len(present)
+    if (size := P * directions * (4 * N + _BYTES_A_METHOD)) > _MOST_BYTES:
+        raise NergError(
+            f"maps of {directions:,} directions at {P} positions, of {N} persons, take {size / 1e9:.0f} GB; ask for "
+            "fewer --directions, of which some thousand tell maps apart as well"
+        )
     parts, counts = np.zeros((P, N, directions), np.float32), np.zeros((P, N))
     probe = np.repeat(np.arange(P), probes.counts)
     # Runs of one person at one position are mixtures of their own.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from nerg_mi.errors import NergError
 from nerg_mi.maths.arrays import vector_of
 
 from .radiance import RadianceField
@@ -21,6 +22,10 @@ _BATCH = 1 << 21
 _BISECTIONS = 8
 # Tilted directions beside the head-on one that a surface's colour is the mean of.
 _TILTED = 4
+
+
+# Densities of a lattice are held in single precision, all at once.
+_MOST_CELLS = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,11 @@ class Lattice:
         edges = np.subtract(core.upper, core.lower)
         step = float(edges.max() / resolution)
         shape = np.maximum(np.ceil(edges / step - 1e-6).astype(int), 2)
+        if (cells := math.prod(shape.tolist())) > _MOST_CELLS:
+            raise NergError(
+                f"a lattice of {' x '.join(map(str, shape))} cells takes {4 * cells / 1e9:.0f} GB; ask for a lower "
+                "--resolution"
+            )
         # What the last cells overhang is shared by both sides.
         lower = (np.add(core.upper, core.lower) - shape * step) / 2
         return Lattice(tuple(lower.tolist()), step, tuple(shape.tolist()))

@@ -8,6 +8,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.fields import extraction
 from nerg_mi.fields.extraction import Lattice, Sampler, crossings, opacity, surface_density
 from nerg_mi.fields.occupancy import OccupancyGrid
@@ -45,6 +46,8 @@ def test_a_lattice_fills_the_box_evenly():
     assert Lattice.over(SimpleNamespace(box=Box((0, 0, 0), (1, 1, 0.01))), 2).shape == (2, 2, 2)
     with pytest.raises(ValueError, match="at least 2 cells"):
         Lattice.over(Ramp(), 1)
+    with pytest.raises(NergError, match="--resolution"):
+        Lattice.over(SimpleNamespace(box=Box((0, 0, 0), (1, 1, 1))), 2048)
     assert -math.expm1(-surface_density(lattice) * 0.4) == pytest.approx(0.5)
     assert np.allclose(opacity(np.array([0, surface_density(lattice), 1e9]), lattice), [0, 0.5, 1])
 

@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, metrics
 from nerg_mi.evaluation.gaze import position_blind, uniform
 from nerg_mi.evaluation.gaze_report import markdown
@@ -168,6 +169,12 @@ def test_nothing_is_on_both_sides(rays):
 def test_positions_without_rays_are_refused(rays):
     with pytest.raises(ValueError, match="lower min_rays"):
         gaze.make_test(rays, np.array([[40.0, 0, 0]]), 0.5)
+
+
+def test_maps_that_no_memory_holds_are_refused(rays, monkeypatch):
+    monkeypatch.setattr(gaze, "_MOST_BYTES", 1e5)
+    with pytest.raises(NergError, match="--directions"):
+        gaze.make_test(rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6]]), 0.6, 20.0, 512, min_rays=20)
 
 
 def test_markdown_has_intervals_and_gaps():
