@@ -1,9 +1,9 @@
 """The command `nerg`: finds the sub-command, runs it, and tells an expected error in one sentence.
 
-Each sub-command is a file of this folder that defines either a function `command` (its parameters are the options, its
-docstring the help) or `app`, a `typer.Typer` with sub-commands of its own, and a line in `COMMANDS`. Only the module of
-the command that was asked for is imported, so that `nerg --help` answers at once; for the same reason these modules
-import Mitsuba, NumPy and the like inside their functions.
+A sub-command NAME is a line in `COMMANDS` and either a function `NAME_command` (its parameters are the options, its
+docstring the help) or `NAME_app`, a `typer.Typer` with sub-commands of its own, in the module NAME. Only that module is
+imported, so that `nerg --help` answers at once; for the same reason these modules import Mitsuba, NumPy and the like
+inside their functions.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Annotated, Any
 
@@ -120,12 +120,18 @@ def build_app(asked: str | None, arguments: Sequence[str] = ()) -> typer.Typer:
         if name != asked:
             app.command(name, help=line)(_unasked)
             continue
-        module = importlib.import_module(f"{__name__}.{name}")
-        if hasattr(module, "app"):
-            app.add_typer(module.app, name=name, help=line)
+        command = load_command(name)
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name, help=line)
         else:
-            app.command(name)(module.command)
+            app.command(name)(command)
     return app
+
+
+def load_command(name: str) -> Callable[..., None] | typer.Typer:
+    """The function that is the sub-command ``name``, or the app of its sub-commands."""
+    module = vars(importlib.import_module(f"{__name__}.{name}"))
+    return module[f"{name}_app"] if f"{name}_app" in module else module[f"{name}_command"]
 
 
 @contextmanager

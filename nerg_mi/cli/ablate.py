@@ -14,7 +14,7 @@ from .progress import TerminalReporter
 
 
 @takes(AblationOptions)
-def command(
+def ablate_command(
     rays: Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet), as nerg rays import writes it.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for checkpoints, table and plot.")],
     options: AblationOptions,

@@ -14,7 +14,7 @@ from .progress import TerminalReporter
 
 
 @takes(AlignOptions)
-def command(
+def align_command(
     output: Annotated[
         Path,
         typer.Option("-o", "--output", help="Alignment to write (.json), which --align takes; beside it a picture."),

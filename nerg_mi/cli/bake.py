@@ -14,7 +14,7 @@ from .progress import TerminalReporter
 
 
 @takes(BakeOptions)
-def command(
+def bake_command(
     surface: Annotated[
         Path,
         typer.Argument(

@@ -18,7 +18,7 @@ from .progress import TerminalReporter
 
 
 @takes(DemoOptions, "scene", "defaults")
-def command(
+def demo_command(
     options: DemoOptions,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write into; it is made.")] = Path("out/demo"),
     define: Defines = None,

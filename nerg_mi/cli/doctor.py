@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 
-def command() -> None:
+def doctor_command() -> None:
     """Say what works on this machine, and how to mend what does not.
 
     Ends with exit code 0 if some compiled variant of Mitsuba works, else with 1.

@@ -15,7 +15,7 @@ from .defines import Defines, parse_defines
 from .options import takes
 from .progress import TerminalReporter
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode=None)
+draw_app = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode=None)
 
 
 def make_command(kind: Kind) -> Callable[..., None]:
@@ -50,4 +50,4 @@ def _draw(kind: Kind, files: Path | list[Path], output: Path, options: Any) -> N
 
 
 for _kind in KINDS.values():
-    app.command(_kind.name)(make_command(_kind))
+    draw_app.command(_kind.name)(make_command(_kind))

@@ -16,12 +16,12 @@ from .mode import OldMode, mode_of
 from .options import takes
 from .progress import TerminalReporter
 
-app = typer.Typer(no_args_is_help=True, help="Score trained fields.")
-app.command("gaze")(eval_gaze)
-app.command("folds")(eval_folds)
+eval_app = typer.Typer(no_args_is_help=True, help="Score trained fields.")
+eval_app.command("gaze")(eval_gaze)
+eval_app.command("folds")(eval_folds)
 
 
-@app.command("radiance")
+@eval_app.command("radiance")
 @takes(RadianceScoreOptions)
 def eval_radiance(
     field: Annotated[Path, typer.Argument(help="Checkpoint of a radiance field (.safetensors).")],

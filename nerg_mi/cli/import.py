@@ -17,7 +17,7 @@ from .progress import TerminalReporter
 
 
 @takes(ImportOptions)
-def command(
+def import_command(
     file: Annotated[Path, typer.Argument(help="Checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors.")],
     options: ImportOptions,
     output: Annotated[

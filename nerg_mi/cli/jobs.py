@@ -10,7 +10,7 @@ import typer
 from .progress import TerminalReporter
 
 
-def command(
+def jobs_command(
     folder: Annotated[Path, typer.Argument(help="Store of a job: what was given as --store, or OUTPUT.tasks.")],
     remove_stale: Annotated[
         bool, typer.Option("--remove-stale", help="Take out what no job asks for any more, and what is left over.")

@@ -14,7 +14,7 @@ from .progress import TerminalReporter
 
 
 @takes(PoseOptions)
-def command(
+def poses_command(
     pictures: Annotated[Path, typer.Argument(metavar="PHOTOS|VIDEO", help="Folder of photos (JPEG, PNG), or a video.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to make: a capture with poses.")],
     options: PoseOptions,

@@ -14,7 +14,7 @@ from .progress import TerminalReporter
 
 
 @takes(RefineOptions)
-def command(
+def refine_command(
     field: Annotated[Path, typer.Argument(help="Radiance field (.safetensors).")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Radiance field to write (.safetensors).")],
     options: RefineOptions,

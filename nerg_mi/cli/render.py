@@ -16,7 +16,7 @@ from .progress import TerminalReporter
 
 
 @takes(FilmOptions, "defaults")
-def command(
+def render_command(
     scene: Annotated[Path, typer.Argument(help="Mitsuba scene file (.xml).")],
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Picture to write: .exr (all channels), .png; .svg, .mp4.")

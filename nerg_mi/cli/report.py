@@ -14,7 +14,7 @@ from .progress import TerminalReporter
 
 
 @takes(ReportOptions)
-def command(
+def report_command(
     files: Annotated[
         list[Path],
         typer.Argument(

@@ -14,7 +14,7 @@ from .progress import TerminalReporter
 
 
 @takes(SceneOptions)
-def command(
+def scene_command(
     files: Annotated[
         list[Path],
         typer.Argument(

@@ -14,7 +14,7 @@ from .progress import TerminalReporter
 
 
 @takes(StatisticsOptions)
-def command(
+def stats_command(
     files: Annotated[
         list[Path], typer.Argument(help="Rays or a dataset, a scene, a gaze field, a place; in any order.")
     ],

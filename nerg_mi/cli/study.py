@@ -16,7 +16,7 @@ from .progress import TerminalReporter
 
 
 @takes(StudyOptions, "defaults")
-def command(
+def study_command(
     scene: Annotated[str, typer.Argument(help="Scene file (.xml), or slab, sphere, sheets, fog or ramp.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write into; it is made.")],
     options: StudyOptions,

@@ -16,12 +16,12 @@ from .progress import TerminalReporter
 from .train_gaze import train_gaze
 from .train_prior import train_prior
 
-app = typer.Typer(no_args_is_help=True, help="Train fields from recordings.")
-app.command("gaze")(train_gaze)
-app.command("prior")(train_prior)
+train_app = typer.Typer(no_args_is_help=True, help="Train fields from recordings.")
+train_app.command("gaze")(train_gaze)
+train_app.command("prior")(train_prior)
 
 
-@app.command("radiance")
+@train_app.command("radiance")
 @takes(RadianceOptions)
 def train_radiance(
     dataset: Annotated[Path, typer.Argument(help="Folder of posed photos, its transforms.json, or a COLMAP model.")],

@@ -14,7 +14,7 @@ from .progress import TerminalReporter
 
 
 @takes(ViewOptions)
-def command(
+def view_command(
     files: Annotated[
         list[Path],
         typer.Argument(

@@ -12,7 +12,7 @@ from nerg_mi.ranges import SECONDS, check_number
 from .progress import TerminalReporter
 
 
-def command(
+def worker_command(
     address: Annotated[str, typer.Argument(help="Of a dask scheduler: tcp://HOST:PORT or tls://HOST:PORT.")],
     threads: Annotated[
         int, typer.Option("-t", "--threads", min=0, max=1024, help="Worker threads; 0: one a core.")

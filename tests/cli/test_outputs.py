@@ -3,7 +3,6 @@ nor Ctrl-C loses anything."""
 
 from __future__ import annotations
 
-import importlib
 import os
 import pkgutil
 import resource
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
+import typer
 
 import nerg_mi.cli
 
@@ -172,11 +172,11 @@ def commands() -> dict:
     """Every command of `nerg`, a function, by its whole name."""
     out = {}
     for name in nerg_mi.cli.COMMANDS:
-        module = importlib.import_module(f"nerg_mi.cli.{name}")
-        if hasattr(module, "app"):
-            out |= {f"{name} {c.name}": c.callback for c in module.app.registered_commands}
+        command = nerg_mi.cli.load_command(name)
+        if isinstance(command, typer.Typer):
+            out |= {f"{name} {c.name}": c.callback for c in command.registered_commands}
         else:
-            out[name] = module.command
+            out[name] = command
     return out
 
 

@@ -13,7 +13,7 @@ from .arguments import Output, RaysFile
 
 
 @takes(FilterOptions, "output")
-def command(rays: RaysFile, output: Output, options: FilterOptions) -> None:
+def rays_filter_command(rays: RaysFile, output: Output, options: FilterOptions) -> None:
     """Keep some rays: conditions first, then fixations, then thinning of those who stand still."""
     from nerg_mi.cli.progress import TerminalReporter
     from nerg_mi.jobs.tracking import filter_rays

@@ -10,7 +10,7 @@ import typer
 from nerg_mi.cli.progress import TerminalReporter
 
 
-def command(
+def rays_guess_command(
     files: Annotated[
         list[Path], typer.Argument(help="Unknown tracking files, folders of them, or folders of recordings.")
     ],

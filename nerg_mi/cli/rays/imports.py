@@ -15,10 +15,10 @@ from nerg_mi.rays.readers.registry import SharedOption, preset_names, shared_opt
 
 from .arguments import Output, print_card
 
-HELP = "Convert tracking files to rays: right-handed, z up, metres, seconds."
+IMPORT_HELP = "Convert tracking files to rays: right-handed, z up, metres, seconds."
 
 
-def make_command() -> Callable[..., None]:
+def make_import_command() -> Callable[..., None]:
     """The command with the options of all readers that are registered now."""
     options = shared_options()
 

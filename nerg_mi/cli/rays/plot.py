@@ -13,7 +13,7 @@ from nerg_mi.ranges import LENGTHS
 from .arguments import RaysFile
 
 
-def command(
+def rays_plot_command(
     rays: RaysFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write (.png or .svg).")],
     kind: Annotated[

@@ -7,7 +7,7 @@ from nerg_mi.cli.progress import TerminalReporter
 from .arguments import RaysFile, print_card
 
 
-def command(rays: RaysFile) -> None:
+def rays_show_command(rays: RaysFile) -> None:
     """The sanity card: rays, persons, duration, rate, what was dropped, extent, eye height.
 
     Of a dataset one for each place; of very many rays some figures are of a sample, as it says.

@@ -15,7 +15,7 @@ from .arguments import RaysFile
 
 
 @takes(SplitOptions, "train_output", "test_output")
-def command(
+def rays_split_command(
     rays: RaysFile,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Rays file; -train and -test are put before its ending.")
