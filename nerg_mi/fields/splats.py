@@ -18,6 +18,7 @@ from nerg_mi.ranges import FARTHEST
 
 _LEAST_SCALE = 1e-9
 _LEAST_OPACITY = 1e-7
+_BLOCK = 1 << 14  # Gaussians that are normalised at once
 
 
 @dataclass(frozen=True)
@@ -69,12 +70,10 @@ class Splats:
         for name in ("centers", "scales"):
             if not (np.abs(getattr(self, name)) <= FARTHEST).all():
                 raise ValueError(f"some of the {name} of its Gaussians are beyond {FARTHEST:g} units")
-        length = np.linalg.norm(self.rotations.astype(np.float64), axis=1, keepdims=True)
-        if not (length > 0).all():
-            raise ValueError("some of its Gaussians have a rotation of length 0 (a splat editor removes these)")
-        object.__setattr__(self, "rotations", (self.rotations / length).astype(np.float32))
+        object.__setattr__(self, "rotations", _normalized(self.rotations))
         object.__setattr__(self, "opacities", np.clip(self.opacities, 0, 1))
-        object.__setattr__(self, "scales", np.maximum(self.scales, np.float32(_LEAST_SCALE)))
+        if self.scales.min() < _LEAST_SCALE:
+            object.__setattr__(self, "scales", np.maximum(self.scales, np.float32(_LEAST_SCALE)))
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -98,6 +97,19 @@ class Splats:
     def axes(self) -> np.ndarray:
         """Rotation matrices (N, 3, 3), float64: columns are the Gaussians' own axes."""
         return matrices_of(self.rotations)
+
+
+def _normalized(rotations: np.ndarray) -> np.ndarray:
+    """Quaternions (N, 4) of length 1. Raises `ValueError` where one has the length 0."""
+    unit = np.empty_like(rotations)
+    # In blocks: in double precision all of them would take more memory than the Gaussians.
+    for at in range(0, len(unit), _BLOCK):
+        block = rotations[at : at + _BLOCK].astype(np.float64)
+        length = np.linalg.norm(block, axis=1, keepdims=True)
+        if not (length > 0).all():
+            raise ValueError("some of its Gaussians have a rotation of length 0 (a splat editor removes these)")
+        unit[at : at + _BLOCK] = block / length
+    return unit
 
 
 def joined(parts: Sequence[Splats]) -> Splats:

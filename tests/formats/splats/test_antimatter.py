@@ -1,3 +1,5 @@
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -27,3 +29,13 @@ def test_what_is_no_such_file_is_refused(tmp_path):
     (tmp_path / "a.splat").write_bytes(b"")
     with pytest.raises(NergError, match="no Gaussians"):
         read_splat(tmp_path / "a.splat")
+
+
+def test_memory_is_a_small_multiple_of_the_file(tmp_path):
+    rows = np.ones((1 << 19, 32), np.uint8)
+    rows[:, :24] = np.full(6, 0.5, "<f4").view(np.uint8)
+    (tmp_path / "a.splat").write_bytes(rows.tobytes())
+    tracemalloc.start()
+    assert len(read_splat(tmp_path / "a.splat")) == len(rows)
+    assert tracemalloc.get_traced_memory()[1] < 2.7 * rows.nbytes
+    tracemalloc.stop()
