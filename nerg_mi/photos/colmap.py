@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import io
+import itertools
 import re
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, plain, sentence
-from nerg_mi.files.bounded import read_bytes, size_of
+from nerg_mi.files.bounded import open_file, size_of
+from nerg_mi.files.checksum import file_sha256
 
 from .posed import FARTHEST, FileFinder, Frame, MaskFile, PosedImages, Unused, name_some, settled
 from .transforms import read_frame_poses
@@ -25,6 +29,15 @@ from .transforms import read_frame_poses
 # The layout of both is COLMAP's (src/colmap/scene/reconstruction_io): little-endian; world-to-camera poses as a
 # quaternion (w, x, y, z) and a translation; cameras look along +z with y down; the first pixel's centre is (0.5, 0.5).
 
+
+BYTES = 8 << 30
+"""A file of a model may have so many bytes: ``images.bin`` of some 30,000 photos, most of it observations."""
+
+IMAGES = 1 << 18
+"""A model may have so many images, and as many cameras."""
+
+POINTS = 12_000_000
+"""And so many points."""
 
 # COLMAP's numbers of its camera models, and how many parameters each has.
 _MODELS = {
@@ -62,6 +75,10 @@ _LONGEST = 1 << 20
 _PIECE = 1 << 26
 # Bytes of a text file in which its comments state how many records it has.
 _HEADER = 1 << 12
+# Bytes of the name of an image, with the zero after it.
+_NAME = 1 << 12
+# Points that are judged at once.
+_BLOCK = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -116,10 +133,10 @@ def read_colmap(
     when no frame can be used.
     """
     folder, images = Path(folder), Path(images)
-    files, raw = _open(folder)
+    files = _require_model(folder)
     binary = files["cameras"].suffix == ".bin"
-    cameras = (_cameras_bin if binary else _cameras_txt)(files["cameras"], raw["cameras"])
-    poses = (_images_bin if binary else _images_txt)(files["images"], raw["images"])
+    cameras = (_cameras_bin if binary else _cameras_txt)(files["cameras"])
+    poses = (_images_bin if binary else _images_txt)(files["images"])
     frames, unused = [], []
     limit = None if allow_outside else images.parent
     finder, mask_finder = FileFinder(images, limit), None if masks is None else FileFinder(Path(masks), limit)
@@ -134,12 +151,10 @@ def read_colmap(
             unused.append(Unused(name, sentence(e)))
     frames, unused = settled(files["images"], frames, unused)
     counts, points = {"cameras": len(cameras), "images": len(poses)}, None
-    digest = _digest(raw)
     if "points3D" in files:
-        raw["points3D"] = read_bytes(files["points3D"], "COLMAP file")
-        table = (_points_bin if binary else _points_txt)(files["points3D"], raw["points3D"])
-        counts["points3D"], points = len(table), _trusted(table)
-    notes = [] if binary else [n for k, c in counts.items() for n in _count_notes(files[k], raw[k], c)]
+        counts["points3D"], points = _trusted((_points_bin if binary else _points_txt)(files["points3D"]))
+    notes = [] if binary else [n for k, c in counts.items() for n in _count_notes(files[k], c)]
+    digest = _digest(files)
     folders = frozenset([images, *(p for p in images.rglob("*") if p.is_dir())])
     return PosedImages(
         files["images"], frames, unused, None, digest, notes, points, images.parent, folders, frozenset(listed)
@@ -150,9 +165,8 @@ def count_images(folder: Path) -> int:
     """Number of images of the model in ``folder``, as a binary file states it."""
     path = _require_model(folder)["images"]
     if path.suffix == ".txt":
-        return len(_images_txt(path, read_bytes(path, "COLMAP file")))
-    size_of(path, "COLMAP file")
-    with open(path, "rb") as file:
+        return len(_images_txt(path))
+    with _open(path) as file:
         return int.from_bytes(file.read(8), "little")
 
 
@@ -163,15 +177,15 @@ def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.
 
     `NergError` names file and record for what cannot be parsed.
     """
-    files, raw = _open(Path(folder))
+    files = _require_model(Path(folder))
     path, found = files["images"], []
-    for name, _, q, t in (_images_bin if path.suffix == ".bin" else _images_txt)(path, raw["images"]):
+    for name, _, q, t in (_images_bin if path.suffix == ".bin" else _images_txt)(path):
         try:
             found.append((name, _to_world(q, t)))
         except NergError as error:
             raise NergError(f'image "{plain(name)}" of "{path}": {error}; copy the model again') from error
-    notes = _count_notes(path, raw["images"], len(found)) if path.suffix == ".txt" else []
-    return path, _digest(raw), found, notes
+    notes = _count_notes(path, len(found)) if path.suffix == ".txt" else []
+    return path, _digest(files), found, notes
 
 
 def _require_model(folder: Path) -> dict[str, Path]:
@@ -181,15 +195,17 @@ def _require_model(folder: Path) -> dict[str, Path]:
     return files
 
 
-def _open(folder: Path) -> tuple[dict[str, Path], dict[str, bytes]]:
-    """Files of the model in ``folder``, and the bytes of its cameras and images; `MissingFile` where there is none."""
-    files = _require_model(folder)
-    # Both are digested as well, and images.bin may have gigabytes of observations.
-    return files, {name: read_bytes(files[name], "COLMAP file") for name in ("cameras", "images")}
+@contextmanager
+def _open(path: Path) -> Iterator[BinaryIO]:
+    """A file of a model; what it holds is read in pieces, since observations may be gigabytes."""
+    with open_file(path, "COLMAP file", most=BYTES) as file:
+        yield file
 
 
-def _digest(raw: dict[str, bytes]) -> str:
-    return hashlib.sha256(b"".join(hashlib.sha256(raw[name]).digest() for name in ("cameras", "images"))).hexdigest()
+def _digest(files: dict[str, Path]) -> str:
+    """Of the files of cameras and images. Both are read to their ends: to be computed after they were parsed."""
+    digests = (bytes.fromhex(file_sha256(files[name])) for name in ("cameras", "images"))
+    return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
 def _frame(name: str, camera: _Camera | None, number: int, q, t, image: Path, masks: FileFinder | None) -> Frame:
@@ -220,117 +236,145 @@ def _to_world(q, t) -> np.ndarray:
     return out @ _FLIP
 
 
-class _Reader:
-    """Little-endian records of a file; an end that comes too early is told with its place."""
+_Point = tuple[float, float, float, float, int]
+"""Position, reprojection error and length of the track of a point."""
 
-    def __init__(self, path: Path, data: bytes):
-        self.path, self.data, self.at = path, data, 0
+
+class _Reader:
+    """Little-endian records of an open file; an end that comes too early is told with its place."""
+
+    def __init__(self, path: Path, file: BinaryIO):
+        self.path, self.file, self.at, self.size = path, file, 0, size_of(path, "COLMAP file")
+
+    def count(self, most: int, what: str) -> int:
+        """The number of records, which begins the file."""
+        count = self.take("Q", "its header")[0]
+        _check_count(self.path, count, most, what)
+        return count
 
     def take(self, form: str, what: str) -> tuple:
         size = struct.calcsize("<" + form)
         self.need(size, what)
-        out = struct.unpack_from("<" + form, self.data, self.at)
         self.at += size
-        return out
+        return struct.unpack("<" + form, self.file.read(size))
 
     def need(self, size: int, what: str) -> None:
-        if self.at + size > len(self.data):
+        if self.at + size > self.size:
             raise NergError(
-                f'"{self.path}" ends in the middle of {what} (byte {self.at} of {len(self.data)}); copy it again'
+                f'"{self.path}" ends in the middle of {what} (byte {self.at} of {self.size}); copy it again'
             )
 
     def skip(self, size: int, what: str) -> None:
         self.need(size, what)
         self.at += size
+        self.file.seek(self.at)
 
     def end(self, count: int) -> None:
         """`NergError` where anything follows the ``count`` records that the header states."""
-        if self.at < len(self.data):
+        if self.at < self.size:
             raise NergError(
-                f'"{self.path}" has {len(self.data) - self.at:,} more bytes than the {count:,} records that its header '
+                f'"{self.path}" has {self.size - self.at:,} more bytes than the {count:,} records that its header '
                 "states; copy it again"
             )
 
     def name(self, what: str) -> str:
-        end = self.data.find(b"\0", self.at)
+        raw = self.file.read(_NAME)
+        end = raw.find(b"\0")
+        if end < 0 and len(raw) == _NAME:
+            raise NergError(f'the name of {what} of "{self.path}" has more than {_NAME - 1:,} bytes; copy it again')
         if end < 0:
             raise NergError(f'"{self.path}" ends in the middle of the name of {what}; copy it again')
-        out, self.at = self.data[self.at : end], end + 1
-        return out.decode("utf-8", errors="surrogateescape")
+        self.skip(end + 1, what)
+        return raw[:end].decode("utf-8", errors="surrogateescape")
 
 
-def _cameras_bin(path: Path, raw: bytes) -> dict[int, _Camera]:
-    r, out = _Reader(path, raw), {}
-    for k in range(r.take("Q", "its header")[0]):
-        number, model, width, height = r.take("iiQQ", f"camera record {k + 1}")
-        if model not in _MODELS:
-            raise NergError(
-                f'camera {number} of "{path}" has the unknown model number {model}, so that the file cannot be '
-                'read on; convert it with "colmap model_converter --output_type TXT"'
-            )
-        name, count = _MODELS[model]
-        out[number] = _Camera(name, width, height, r.take(f"{count}d", f"camera record {k + 1}"))
-    r.end(len(out))
+def _check_count(path: Path, count: int, most: int, what: str) -> None:
+    if count > most:
+        raise NergError(f'"{path}" has {count:,} {what}, more than the {most:,} that are read; give a smaller model')
+
+
+def _cameras_bin(path: Path) -> dict[int, _Camera]:
+    out = {}
+    with _open(path) as file:
+        r = _Reader(path, file)
+        for k in range(r.count(IMAGES, "cameras")):
+            number, model, width, height = r.take("iiQQ", f"camera record {k + 1}")
+            if model not in _MODELS:
+                raise NergError(
+                    f'camera {number} of "{path}" has the unknown model number {model}, so that the file cannot be '
+                    'read on; convert it with "colmap model_converter --output_type TXT"'
+                )
+            name, count = _MODELS[model]
+            out[number] = _Camera(name, width, height, r.take(f"{count}d", f"camera record {k + 1}"))
+        r.end(len(out))
     return out
 
 
-def _images_bin(path: Path, raw: bytes) -> list[tuple]:
-    r, out = _Reader(path, raw), []
-    for k in range(r.take("Q", "its header")[0]):
-        what = f"image record {k + 1}"
-        values = r.take("i7di", what)
-        name = r.name(what)
-        # Per observation: x, y as doubles and the number of its point.
-        r.skip(24 * r.take("Q", what)[0], what)
-        out.append((name, values[8], values[1:5], values[5:8]))
-    r.end(len(out))
+def _images_bin(path: Path) -> list[tuple]:
+    out = []
+    with _open(path) as file:
+        r = _Reader(path, file)
+        for k in range(r.count(IMAGES, "images")):
+            what = f"image record {k + 1}"
+            values = r.take("i7di", what)
+            name = r.name(what)
+            # Per observation: x, y as doubles and the number of its point.
+            r.skip(24 * r.take("Q", what)[0], what)
+            out.append((name, values[8], values[1:5], values[5:8]))
+        r.end(len(out))
     return out
 
 
-def _points_bin(path: Path, raw: bytes) -> np.ndarray:
-    r, out = _Reader(path, raw), []
-    for k in range(r.take("Q", "its header")[0]):
-        what = f"point record {k + 1}"
-        values = r.take("Q3d3BdQ", what)
-        r.skip(8 * values[8], what)
-        out.append((*values[1:4], values[7], values[8]))
-    r.end(len(out))
-    return _point_table(out)
+def _points_bin(path: Path) -> Iterator[_Point]:
+    with _open(path) as file:
+        r = _Reader(path, file)
+        count = r.count(POINTS, "points")
+        for k in range(count):
+            what = f"point record {k + 1}"
+            values = r.take("Q3d3BdQ", what)
+            r.skip(8 * values[8], what)
+            yield *values[1:4], values[7], values[8]
+        r.end(count)
 
 
-def _lines(raw: bytes) -> Iterator[tuple[int, str]]:
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Line numbers and lines; comments left out."""
-    # Names of images may be in any encoding.
-    text = io.TextIOWrapper(io.BytesIO(raw), encoding="utf-8", errors="surrogateescape")
-    # A file without line ends must not become one line of gigabytes.
-    for number, line in enumerate(iter(lambda: text.readline(_PIECE), ""), 1):
-        if not line.startswith("#"):
-            yield number, line.rstrip("\n")
+    with _open(path) as file:
+        # Names of images may be in any encoding.
+        text = io.TextIOWrapper(file, encoding="utf-8", errors="surrogateescape")
+        # A file without line ends must not become one line of gigabytes.
+        for number, line in enumerate(iter(lambda: text.readline(_PIECE), ""), 1):
+            if not line.startswith("#"):
+                yield number, line.rstrip("\n")
 
 
-def _rows(path: Path, raw: bytes) -> Iterator[tuple[int, list[str]]]:
-    """Numbers and words of the lines that are not empty."""
-    for number, line in _lines(raw):
+def _rows(path: Path, most: int, what: str) -> Iterator[tuple[int, list[str]]]:
+    """Numbers and words of the lines that are not empty, of which there may be ``most``."""
+    count = 0
+    for number, line in _lines(path):
         if len(line) > _LONGEST:
             raise NergError(
                 f'line {number} of "{path}" has {len(line):,} characters, and at most {_LONGEST:,} are read; '
                 "is it a COLMAP file?"
             )
         if line.strip():
+            count += 1
+            _check_count(path, count, most, what)
             yield number, line.split()
 
 
-def _count_notes(path: Path, raw: bytes, count: int) -> list[str]:
+def _count_notes(path: Path, count: int) -> list[str]:
     """A sentence, where the header of a text file states another number than the ``count`` of its records."""
-    stated = re.search(rb"^#\s*Number of [a-z]+: *(\d+)", raw[:_HEADER], re.MULTILINE)
+    with _open(path) as file:
+        stated = re.search(rb"^#\s*Number of [a-z]+: *(\d+)", file.read(_HEADER), re.MULTILINE)
     if stated is None or int(stated[1]) == count:
         return []
     return [f'"{path}" has {count:,} records, but its header states {int(stated[1]):,}; copy it again if it was cut']
 
 
-def _cameras_txt(path: Path, raw: bytes) -> dict[int, _Camera]:
+def _cameras_txt(path: Path) -> dict[int, _Camera]:
     out = {}
-    for number, words in _rows(path, raw):
+    for number, words in _rows(path, IMAGES, "cameras"):
         try:
             out[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
         except (ValueError, IndexError) as e:
@@ -338,9 +382,9 @@ def _cameras_txt(path: Path, raw: bytes) -> dict[int, _Camera]:
     return out
 
 
-def _images_txt(path: Path, raw: bytes) -> list[tuple]:
+def _images_txt(path: Path) -> list[tuple]:
     out, after_image = [], False
-    for number, line in _lines(raw):
+    for number, line in _lines(path):
         words = line[:_LONGEST].split()
         # The line after an image's lists its observations; it may be empty, and some writers leave it out.
         if not words or (after_image and (len(line) > _LONGEST or _are_observations(words))):
@@ -353,6 +397,7 @@ def _images_txt(path: Path, raw: bytes) -> list[tuple]:
                 raise ValueError
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"') from e
+        _check_count(path, len(out), IMAGES, "images")
         after_image = True
     return out
 
@@ -365,24 +410,23 @@ def _are_observations(words: list[str]) -> bool:
         return False
 
 
-def _points_txt(path: Path, raw: bytes) -> np.ndarray:
-    out = []
-    for number, words in _rows(path, raw):
+def _points_txt(path: Path) -> Iterator[_Point]:
+    for number, words in _rows(path, POINTS, "points"):
         try:
-            out.append((*map(float, words[1:4]), float(words[7]), (len(words) - 8) // 2))
+            yield float(words[1]), float(words[2]), float(words[3]), float(words[7]), (len(words) - 8) // 2
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "POINT3D_ID X Y Z R G B ERROR TRACK"') from e
-    return _point_table(out)
 
 
-def _point_table(rows: list[tuple]) -> np.ndarray:
-    """Position, reprojection error and length of the track of each point (N, 5)."""
-    return np.array(rows, np.float64).reshape(-1, 5)
-
-
-def _trusted(table: np.ndarray) -> np.ndarray:
-    good = np.all(np.abs(table) <= FARTHEST, axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
-    return table[good, :3]
+def _trusted(points: Iterator[_Point]) -> tuple[int, np.ndarray]:
+    """How many ``points`` there are, and the positions (N, 3) of those that are evidence of a surface."""
+    count, trusted = 0, [np.empty((0, 3))]
+    while block := list(itertools.islice(points, _BLOCK)):
+        table = np.array(block, np.float64)
+        good = np.all(np.abs(table) <= FARTHEST, axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
+        trusted.append(table[good, :3])
+        count += len(block)
+    return count, np.concatenate(trusted)
 
 
 # ---- Named poses ----

@@ -1,6 +1,8 @@
 """COLMAP models, built byte by byte and line by line here: cameras, poses, points, and what cannot be read."""
 
+import hashlib
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -320,4 +322,40 @@ def test_a_binary_file_with_more_than_its_header_states_is_refused(tmp_path, nam
     raw = path.read_bytes()
     path.write_bytes(struct.pack("<Q", struct.unpack("<Q", raw[:8])[0] - 1) + raw[8:])
     with pytest.raises(NergError, match=f"{name}.bin.* more bytes than the"):
+        read_colmap(tmp_path, tmp_path)
+
+
+def test_gigabytes_of_observations_are_skipped(tmp_path, monkeypatch):
+    write_bin(tmp_path, NAMES)
+    expected = read_image_poses(tmp_path)
+    files = [(tmp_path / f"{name}.bin").read_bytes() for name in ("cameras", "images")]
+    assert expected[1] == hashlib.sha256(b"".join(hashlib.sha256(file).digest() for file in files)).hexdigest()
+    many, (first, rest) = 1 << 27, (files[1][: 73 + len(NAMES[0])], files[1][81 + len(NAMES[0]) :])
+    with (tmp_path / "images.bin").open("wb") as out:
+        out.write(first + struct.pack("<Q", many))
+        out.seek(24 * many, 1)
+        out.write(rest)
+    monkeypatch.setattr(colmap, "file_sha256", lambda path: "")
+    tracemalloc.start()
+    listed = read_image_poses(tmp_path)[2]
+    assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()
+    assert [name for name, _ in listed] == NAMES
+    assert np.array_equal([p for _, p in listed], [p for _, p in expected[2]])
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("write", [write_bin, write_txt])
+def test_more_than_is_read_is_refused_before_it_is_read(tmp_path, monkeypatch, write, name):
+    (tmp_path / NAMES[0]).parent.mkdir()
+    (tmp_path / NAMES[0]).write_bytes(b"")
+    monkeypatch.setattr(colmap, "file_sha256", lambda path: pytest.fail("it was read to its end"))
+    write(tmp_path, NAMES[:1], {} if name == "images" else {1: CAMERAS[1]})
+    with monkeypatch.context() as limits, pytest.raises(NergError, match=f"{name}.* more than the 0 that are read"):
+        limits.setattr(colmap, "POINTS" if name == "points3D" else "IMAGES", 0)
+        read_colmap(tmp_path, tmp_path)
+    path = next(tmp_path.glob(f"{name}.*"))
+    with path.open("r+b") as out:
+        out.truncate(64 << 30)
+    with pytest.raises(NergError, match=f"{name}.* has 68,719,476,736 bytes, more than"):
         read_colmap(tmp_path, tmp_path)
