@@ -85,6 +85,7 @@ class RaysBuilder:
         self._kept: list[int] = []
         self._persons, self._cohorts = _Names(), _Names()
         self._sources: list[dict[str, Any]] = []
+        self._path = Path()  # of the present source
         self._dropped: list[dict[str, Any]] = []
         self._rows_read = self._runs = 0
         self._unused: dict[str, None] = {}
@@ -152,6 +153,8 @@ class RaysBuilder:
         if bad:
             self._drop("the line is cut off, has cells too many, or holds one that is no number", np.array(self._bad))
             self._rows_read += bad
+        if self._sources and "sha256" not in self._sources[-1]:
+            self._sources[-1]["sha256"] = file_sha256(self._path)
         self._lines, self._bad, self._first_bad = 0, [], ""
         for code, count in self._filled.undecided.items():
             self.complain(
@@ -161,11 +164,14 @@ class RaysBuilder:
         self._filled = FilledOrigins(float(np.cbrt(abs(np.linalg.det(self._transform[:3, :3])))))
 
     def source(self, path: Path, name: str | None = None) -> None:
-        """Begin a file; only its name (or another one, where files share theirs) is recorded, with its checksum."""
+        """Begin a file; only its name (or another one, where files share theirs) is recorded, with its checksum.
+
+        The checksum is computed at the file's end: what is not of the format is refused before gigabytes are read."""
         self._end_source()
         if self._on_source is not None:
             self._on_source(name or path.name)
-        self._sources.append({"file": name or path.name, "sha256": file_sha256(path)})
+        self._path = path
+        self._sources.append({"file": name or path.name})
 
     def add(
         self,

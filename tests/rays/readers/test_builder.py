@@ -56,6 +56,22 @@ def test_bad_lines_are_bounded_by_file(tmp_path):
     assert RaysBuilder().on_bad is None
 
 
+def test_checksums_are_computed_at_the_end_of_a_file(tmp_path, monkeypatch):
+    """What is refused while it is read was not read to its end before."""
+    summed = []
+    monkeypatch.setattr(builder_module, "file_sha256", lambda path: summed.append(path.name) or f"of {path.name}")
+    builder = RaysBuilder()
+    for name in "ab":
+        (tmp_path / name).write_text("x")
+    builder.source(tmp_path / "a", "ann/a")
+    add(builder, 3)
+    assert summed == []
+    builder.source(tmp_path / "b")
+    assert summed == ["a"]
+    add(builder, 3)
+    assert builder.build().metadata["sources"] == [{"file": "ann/a", "sha256": "of a"}, {"file": "b", "sha256": "of b"}]
+
+
 def test_a_file_of_another_kind_ends_early(tmp_path):
     (tmp_path / "a").write_text("x")
     builder = RaysBuilder(skip_bad_lines=True)
