@@ -77,18 +77,52 @@ def _import_source(task: Task) -> Outcome:
     marks, recipe = Marks(task.recipe.key), task.recipe
     # Before it is read: what changes meanwhile is then found by the next import.
     stamp = marks.stamp(task.path)
-    id = marks.source(task.path, task.mark)
     before, generation = task.known or ("", -1)
-    found = _whole_source(task.folder, id, task.head)
-    generation += id != before
-    if found is not None:
-        about = replace(found, where=task.where, stamp=stamp, generation=generation)
+    try:
+        writer, rest, names = _write_parts(task, marks)
+    except _Unchanged as unchanged:
+        found = unchanged.source
+        about = replace(found, where=task.where, stamp=stamp, generation=generation + (found.id != before))
         if about != found:
             write_source(task.folder, about)
-        return Outcome(task.path, id, found.rays, unchanged=True)
-    writer = SourceWriter(task.folder, id, task.head.buckets)
+        return Outcome(task.path, found.id, found.rays, unchanged=True)
+    generation += writer.source != before
+    metadata, name = rest.metadata, task.path.name
+    if recipe.key is not None:
+        metadata, name = _without_names(rest, names, recipe, name)
+    source = writer.finish(metadata, file=name, where=task.where, stamp=stamp, recipe=task.mark, generation=generation)
+    return Outcome(task.path, source.id, source.rays)
+
+
+class _Unchanged(Exception):
+    """Ends the import of content that was imported in the same way before, as ``source``."""
+
+    def __init__(self, source: Source) -> None:
+        super().__init__(source.id)
+        self.source = source
+
+
+def _begin(task: Task, marks: Marks) -> SourceWriter:
+    """The writer of the source's parts, by its id, for which all of it is read. Raises `_Unchanged`."""
+    id = marks.source(task.path, task.mark)
+    found = _whole_source(task.folder, id, task.head)
+    if found is not None:
+        raise _Unchanged(found)
+    return SourceWriter(task.folder, id, task.head.buckets)
+
+
+def _write_parts(task: Task, marks: Marks) -> tuple[SourceWriter, Rays, tuple[str, ...]]:
+    """Write the rays of a source, but for the account.
+
+    Returns the writer, the last rays, with the metadata of all, and the names of the people. Raises `_Unchanged`.
+    """
+    recipe = task.recipe
+    # What was imported before is likely unchanged. Something new may be no recording: first rays are read from it.
+    writer = None if task.known is None else _begin(task, marks)
 
     def take(rays: Rays) -> None:
+        nonlocal writer
+        writer = writer or _begin(task, marks)
         writer.add(rays if recipe.key is None else pseudonymise(rays, recipe.key), recipe.place, recipe.day)
         names.update(rays.persons)
         # Of somebody who is in several blocks, that of the first.
@@ -99,11 +133,8 @@ def _import_source(task: Task) -> Outcome:
     rest = read_rays(recipe.reader, task.path, recipe.settings, skip_bad_lines=recipe.skip_bad_lines, on_rays=take)
     take(rest)
     rest = replace(rest, metadata={**rest.metadata, **({"eye_distance": eyes} if eyes else {})})
-    metadata, name = rest.metadata, task.path.name
-    if recipe.key is not None:
-        metadata, name = _without_names(rest, tuple(sorted(names)), recipe, name)
-    source = writer.finish(metadata, file=name, where=task.where, stamp=stamp, recipe=task.mark, generation=generation)
-    return Outcome(task.path, id, source.rays)
+    assert writer is not None
+    return writer, rest, tuple(sorted(names))
 
 
 def _without_names(rest: Rays, names: tuple[str, ...], recipe: Recipe, name: str) -> tuple[dict[str, Any], str]:

@@ -30,7 +30,7 @@ class SourceWriter:
     """
 
     def __init__(self, folder: Path, source: str, buckets: int) -> None:
-        self._folder, self._source, self._buckets = folder, source, buckets
+        self._folder, self.source, self._buckets = folder, source, buckets
         self._parts: list[Part] = []
         self._persons: Counter[str] = Counter()
         self._cohorts: Counter[str] = Counter()
@@ -102,7 +102,7 @@ class SourceWriter:
             "cohorts": rays.cohort is not None,
             "heads": rays.head is not None and bool(np.isfinite(rays.head[rows]).any()),
         }
-        path = self._folder / Part(**about).path(self._source)
+        path = self._folder / Part(**about).path(self.source)
         table = table_of(rays, rows)
         floats = {name: "BYTE_STREAM_SPLIT" for name in table.schema.names if name not in _WORDS}
         with replacing(path) as temporary:
@@ -128,7 +128,7 @@ class SourceWriter:
         metadata = {k: v for k, v in metadata.items() if k not in ("persons", "cohorts")}
         metadata["dropped"] = [_shortened(entry) for entry in metadata.get("dropped", [])]
         source = Source(
-            id=self._source,
+            id=self.source,
             persons=dict(sorted(self._persons.items())),
             cohorts=dict(sorted(self._cohorts.items())),
             parts=self._parts,

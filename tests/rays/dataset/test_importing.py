@@ -97,3 +97,25 @@ def test_a_source_without_a_ray_has_an_account(tmp_path):
 def test_what_can_be_mended_is_told(tmp_path):
     write_head(tmp_path / "a.rays", HEAD)
     assert "absent.csv" in (import_source(task(tmp_path / "a.rays", tmp_path / "absent.csv")).error or "")
+
+
+def test_what_is_no_recording_is_refused_before_all_of_it_is_read(tmp_path, monkeypatch):
+    folder, path = tmp_path / "a.rays", tmp_path / "a.csv"
+    write_head(folder, HEAD)
+    monkeypatch.setattr(Marks, "source", lambda *_: pytest.fail("it was read to its end"))
+    with path.open("wb") as out:
+        out.truncate(64 << 30)
+    assert "characters that are read" in (import_source(task(folder, path)).error or "")
+
+
+def test_a_copy_of_an_imported_source_is_known_by_its_first_rays(tmp_path, monkeypatch):
+    monkeypatch.setattr("nerg_mi.rays.readers.parsing.tables.BLOCK", 50)
+    monkeypatch.setattr("nerg_mi.rays.readers.builder.STREAMED", 120)
+    path, folder = write_source(tmp_path / "a.csv", people=5), tmp_path / "a.rays"
+    write_head(folder, HEAD)
+    first = import_source(task(folder, path))
+    (tmp_path / "b").mkdir()
+    copy = write_source(tmp_path / "b" / "a.csv", people=5)
+    monkeypatch.setattr("nerg_mi.rays.dataset.importing.SourceWriter", lambda *_: pytest.fail("it was written again"))
+    again = import_source(task(folder, copy))
+    assert again.unchanged and again.source == first.source and len(read_sources(folder, HEAD)) == 1
