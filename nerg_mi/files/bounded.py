@@ -9,6 +9,7 @@ from __future__ import annotations
 import gzip
 import json
 import lzma
+import mmap
 import os
 import pickle
 import re
@@ -150,10 +151,20 @@ def open_file(
         yield file
 
 
-def read_bytes(path: str | os.PathLike, what: str = "file", most: int | None = None) -> bytes:
-    """The bytes of the ordinary file ``path``, at most ``most``; see `size_of`."""
+def read_bytes(path: str | os.PathLike, what: str, most: int) -> bytes:
+    """The bytes of the ordinary file ``path``, at most ``most``; see `size_of`. All of them are held: read what may be
+    larger than its reader can hold by `open_file`."""
     with open_file(path, what, most=most) as file:
         return file.read()
+
+
+def map_bytes(path: str | os.PathLike, what: str, most: int, start: bytes, remedy: str = _REMEDY) -> memoryview:
+    """The bytes of the ordinary file ``path``, at most ``most``, each read when it is used: what is not used takes no
+    memory. `NergError` for a file that does not begin with ``start``; see `open_file`."""
+    with open_file(path, what, remedy, most) as file:
+        if file.read(len(start)) != start:
+            raise ValueError(f'it does not begin with "{plain(start.decode("latin-1"))}", as such a file does')
+        return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
 
 def read_json(path: str | os.PathLike, what: str = "file", most: int = JSON_BYTES) -> object:
@@ -161,7 +172,9 @@ def read_json(path: str | os.PathLike, what: str = "file", most: int = JSON_BYTE
     return parse_json(read_bytes(path, what, most), path, what, most)
 
 
-def parse_json(raw: bytes | str, path: str | os.PathLike, what: str = "file", most: int = JSON_BYTES) -> object:
+def parse_json(
+    raw: bytes | memoryview | str, path: str | os.PathLike, what: str = "file", most: int = JSON_BYTES
+) -> object:
     """The JSON document ``raw``, which stood in ``path``. `NergError` for what is none, is nested deeper than
     `JSON_DEPTH` or holds more than `JSON_VALUES` values. Integers of hundreds of digits are floats."""
     if len(raw) > most:
@@ -170,7 +183,8 @@ def parse_json(raw: bytes | str, path: str | os.PathLike, what: str = "file", mo
             "give a smaller one"
         )
     with reading(path, what, "correct it, or make it anew"):
-        if isinstance(raw, (bytes, bytearray)):
+        if not isinstance(raw, str):
+            raw = bytes(raw)
             raw = raw.decode(json.detect_encoding(raw))
         _check_json(raw, path, what)
         try:

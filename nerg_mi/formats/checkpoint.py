@@ -21,6 +21,9 @@ from nerg_mi.files.bounded import open_file, parse_json, plain, reading
 FORMAT = 1
 """The version of the files, raised when an earlier version of this package could misread them."""
 
+CHECKPOINT_BYTES = 16 << 30
+"""A checkpoint may have so many bytes."""
+
 HEADER_BYTES = 16 << 20
 """The header, which names every array and holds the metadata, may have so many bytes."""
 
@@ -72,8 +75,9 @@ def _read(path: str | Path, contents: Callable[[Any], _Contents]) -> _Contents:
 
 
 def _check_header(path: Path) -> None:
-    with open_file(path, "checkpoint") as file:
+    with open_file(path, "checkpoint", most=CHECKPOINT_BYTES) as file:
         size, header = os.fstat(file.fileno()).st_size, int.from_bytes(file.read(8), "little")
+        start = file.read(1)
     if size < 8 or header > size - 8:
         if path.suffix.lower() != ".safetensors":
             raise NergError(f'"{path}" is no checkpoint of a field; name one (.safetensors), as "nerg train" makes it')
@@ -83,6 +87,8 @@ def _check_header(path: Path) -> None:
         )
     if header > HEADER_BYTES:
         raise NergError(f'the header of "{path}" has {header:,} bytes, more than the {HEADER_BYTES:,} that are read')
+    if start != b"{":
+        raise NergError(f'"{path}" is not a readable safetensors file: its header is no JSON object; copy it again')
 
 
 def _contents(f, path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:

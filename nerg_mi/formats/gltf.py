@@ -14,6 +14,9 @@ import numpy as np
 from nerg_mi.errors import plain
 from nerg_mi.files.bounded import is_count, parse_json, reading
 
+GLTF_MAGIC = b"glTF"
+"""A file begins with these bytes."""
+
 GLTF_BYTES = 1 << 30
 """A file may have so many bytes."""
 
@@ -26,7 +29,7 @@ INSTANCES = 100_000
 TRIANGLES = 20_000_000
 """So many triangles may be in all of them."""
 
-_MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
+_JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _INDICES = {5121: "u1", 5123: "<u2", 5125: "<u4"}
 _FLOATS = {5126: "<f4"}
 _SHARES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}
@@ -106,7 +109,7 @@ def pack_glb(document: dict[str, Any], data: bytes) -> tuple[bytes, ...]:
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
-    head = struct.pack("<III", _MAGIC, 2, 28 + len(text) + len(data))
+    head = struct.pack("<4sII", GLTF_MAGIC, 2, 28 + len(text) + len(data))
     return head, struct.pack("<II", len(text), _JSON), text, struct.pack("<II", len(data), _BINARY), data
 
 
@@ -121,7 +124,7 @@ class GltfTriangles:
     notes: tuple[str, ...] = ()
 
 
-def parse_glb(raw: bytes, path: str | os.PathLike) -> GltfTriangles:
+def parse_glb(raw: bytes | memoryview, path: str | os.PathLike) -> GltfTriangles:
     """The triangles in the bytes ``raw`` of the file ``path``.
 
     Raises `NergError` for what is damaged, compressed, quantised without saying so or beyond this module's limits,
@@ -182,7 +185,9 @@ def _unused(document: dict[str, Any], primitives: list[dict[str, Any]]) -> tuple
     return (f"parts that are not used: {plain(', '.join(parts))}",) if parts else ()
 
 
-def _vertex_colors(document: dict[str, Any], data: bytes, attributes: dict[str, Any], count: int) -> np.ndarray | None:
+def _vertex_colors(
+    document: dict[str, Any], data: bytes | memoryview, attributes: dict[str, Any], count: int
+) -> np.ndarray | None:
     if "COLOR_0" not in attributes:
         return None
     shape = document["accessors"][_index(attributes["COLOR_0"])]["type"]
@@ -194,10 +199,12 @@ def _vertex_colors(document: dict[str, Any], data: bytes, attributes: dict[str, 
     return np.clip(colors, 0, 1)
 
 
-def read_parts(raw: bytes, path: str | os.PathLike, what: str = "mesh") -> tuple[dict[str, Any], bytes]:
+def read_parts(
+    raw: bytes | memoryview, path: str | os.PathLike, what: str = "mesh"
+) -> tuple[dict[str, Any], bytes | memoryview]:
     """The document and the binary chunk of the bytes ``raw`` of the file ``path``, a kind of file called ``what``."""
-    magic, version, _ = struct.unpack_from("<III", raw)
-    if magic != _MAGIC or version != 2:
+    magic, version, _ = struct.unpack_from("<4sII", raw)
+    if magic != GLTF_MAGIC or version != 2:
         raise ValueError("it is no binary glTF of version 2")
     at, document, data = 12, None, b""
     while at + 8 <= len(raw):
@@ -255,7 +262,12 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 
 
 def _triangles(
-    document: dict[str, Any], data: bytes, position: object, indices: object, mode: int, kinds: Mapping[int, str]
+    document: dict[str, Any],
+    data: bytes | memoryview,
+    position: object,
+    indices: object,
+    mode: int,
+    kinds: Mapping[int, str],
 ) -> tuple[np.ndarray, np.ndarray]:
     corners = accessor_values(document, data, position, "VEC3", kinds).astype(np.float64)
     if indices is None:
@@ -289,7 +301,7 @@ _CORNERS_OF = {_TRIANGLES: _separate, 5: _strip, 6: _fan}
 
 
 def accessor_values(
-    document: dict[str, Any], data: bytes, number: object, shape: str, kinds: Mapping[int, str] = _FLOATS
+    document: dict[str, Any], data: bytes | memoryview, number: object, shape: str, kinds: Mapping[int, str] = _FLOATS
 ) -> np.ndarray:
     """An accessor's values (N, components), as far as the bytes that are there hold them. ``kinds``: NumPy's type of
     each component type that is read. Integers that stand for 0 to 1, or for -1 to 1, become floats."""

@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import read_bytes, reading, size_of
+from nerg_mi.files.bounded import map_bytes, reading, size_of
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.coordinates import check_near_origin
 
-from .gltf import GLTF_BYTES, parse_glb
-from .ply import PlyTable, parse_numbers, parse_ply
+from .gltf import GLTF_BYTES, GLTF_MAGIC, parse_glb
+from .ply import PLY_MAGIC, PlyTable, parse_numbers, parse_ply
 
 BYTES = 64 << 30
 """A file may have so many bytes."""
@@ -31,7 +31,7 @@ TEXT_BYTES = 1 << 30
 GREY = 0.5
 """What has no colour."""
 
-_BLOCK = 1 << 24
+_BLOCK = 1 << 24  # bytes of text that are read at once, and of its longest line
 _FLAT = 1e-6  # of a polygon's area: a triangle of its fan that is turned over by more makes it concave
 _CORNERS_TRIED, _AT_ONCE = 64, 1 << 20
 _CENTER, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -169,8 +169,7 @@ def _linear_colors(columns: Sequence[np.ndarray], kind: np.dtype) -> tuple[np.nd
 
 
 def _read_ply(path: str | os.PathLike) -> MeshFile:
-    size = size_of(path, "mesh", BYTES)
-    ply = parse_ply(np.memmap(path, np.uint8, mode="r") if size else np.zeros(0, np.uint8))
+    ply = parse_ply(np.frombuffer(map_bytes(path, "mesh", BYTES, PLY_MAGIC, "export it again"), np.uint8))
     vertex, face = (ply.tables.get(name, PlyTable(0)) for name in ("vertex", "face"))
     names = next((names for names in _CORNERS if names in face.lists), None)
     if face.count and names is None:
@@ -331,23 +330,28 @@ def _parts(tokens: list[bytes]) -> list[np.ndarray]:
 
 def _read_obj(path: str | os.PathLike) -> MeshFile:
     size_of(path, "mesh", TEXT_BYTES)
-    obj, rest = _Obj(), b""
+    obj, rest, end, ended = _Obj(), bytearray(), b"", False
     with open(path, "rb") as file:
-        while block := file.readlines(_BLOCK):
-            lines = [line.rstrip() for line in block]
+        while not ended:
+            block = file.read(_BLOCK)
+            ended = not block
+            *lines, end = (end + (block or b"\n")).split(b"\n")
+            lines = [line.rstrip() for line in lines]
             if rest or any(line.endswith(b"\\") for line in lines):
                 obj.unreadable = "it has lines that go on after a \\"
                 whole: list[bytes] = []
                 for line in lines:
                     rest += line
                     if rest.endswith(b"\\"):
-                        rest = rest[:-1] + b" "
+                        rest[-1:] = b" "
                     else:
-                        whole.append(rest)
-                        rest = b""
+                        whole.append(bytes(rest))
+                        rest.clear()
                 lines = whole
+            if max(len(end), len(rest)) > _BLOCK:
+                raise ValueError(f"it has a line of more than the {_BLOCK:,} bytes that are read")
             obj.read(lines)
-    obj.read([rest])
+    obj.read([bytes(rest)])
     vertices, corners = np.concatenate(obj.vertices), np.concatenate([*obj.corners, np.zeros(0, np.int64)])
     faces, polygons, concave, beyond = _split(np.array(obj.counts, np.int64), corners, vertices)
     if concave:
@@ -386,7 +390,7 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
 
 
 def _read_glb(path: str | os.PathLike) -> MeshFile:
-    triangles = parse_glb(read_bytes(path, "mesh", GLTF_BYTES), path)
+    triangles = parse_glb(map_bytes(path, "mesh", GLTF_BYTES, GLTF_MAGIC, "export it again"), path)
     # Its y is up.
     vertices = np.stack([triangles.vertices[:, 0], -triangles.vertices[:, 2], triangles.vertices[:, 1]], axis=1)
     faces = triangles.faces

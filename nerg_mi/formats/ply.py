@@ -18,6 +18,9 @@ import numpy as np
 
 from nerg_mi.files.atomic import write_bytes
 
+PLY_MAGIC = b"ply"
+"""A file begins with these bytes."""
+
 HEADER_BYTES = 1 << 20
 """The header of a file may be so long."""
 
@@ -67,7 +70,7 @@ def parse_ply(raw: np.ndarray) -> Ply:
     """
     head = bytes(raw[:HEADER_BYTES])
     end = re.search(rb"(?:^|\n)end_header[ \t]*\r?\n", head)
-    if not head.startswith(b"ply") or end is None:
+    if not head.startswith(PLY_MAGIC) or end is None:
         raise ValueError("it has no header of a PLY file")
     order, elements, comments = _elements(head[: end.start()].decode("latin-1"))
     source: _Bytes | _Words = _Bytes(raw[end.end() :], order) if order else _Words(raw[end.end() :])

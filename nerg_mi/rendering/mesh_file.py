@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import open_file, reading, size_of
-from nerg_mi.formats.meshes import MeshFile, read_mesh_file
-from nerg_mi.formats.ply import parse_ply, write_columns
+from nerg_mi.files.bounded import map_bytes, open_file, reading
+from nerg_mi.formats.meshes import BYTES, MeshFile, read_mesh_file
+from nerg_mi.formats.ply import PLY_MAGIC, parse_ply, write_columns
 
 
 def check_mesh(path: str | os.PathLike, kind: str, colored: bool = False) -> None:
@@ -31,9 +31,9 @@ def check_mesh(path: str | os.PathLike, kind: str, colored: bool = False) -> Non
 
 def check_points(path: str | os.PathLike) -> None:
     """Raise `NergError` for a PLY file that holds less than its header says, or no vertices."""
-    size = size_of(path, "PLY file")
+    raw = map_bytes(path, "PLY file", BYTES, PLY_MAGIC, "export it again")
     with reading(path, "PLY file", "export it again"):
-        tables = parse_ply(np.memmap(path, np.uint8, mode="r") if size else np.zeros(0, np.uint8)).tables
+        tables = parse_ply(np.frombuffer(raw, np.uint8)).tables
         if "vertex" not in tables or not tables["vertex"].count:
             raise ValueError("it has no vertices")
 

@@ -11,7 +11,7 @@ import pytest
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files import bounded
-from nerg_mi.files.bounded import parse_json, plain, read_bytes, read_json, reading, size_of
+from nerg_mi.files.bounded import map_bytes, parse_json, plain, read_bytes, read_json, reading, size_of
 from nerg_mi.formats.regions import Region
 
 
@@ -58,23 +58,35 @@ def test_the_safetensors_library_is_known_by_name(tmp_path):
 def test_a_missing_file_is_both_kinds_of_error(tmp_path):
     for kind in (MissingFile, FileNotFoundError, NergError):
         with pytest.raises(kind, match=r'there is no checkpoint ".*a\.bin"'):
-            read_bytes(tmp_path / "a.bin", "checkpoint")
+            read_bytes(tmp_path / "a.bin", "checkpoint", 9)
 
 
 def test_only_ordinary_files_of_bounded_size_are_read(tmp_path):
     (tmp_path / "a").write_bytes(b"12345")
-    assert read_bytes(tmp_path / "a", most=5) == b"12345" and size_of(tmp_path / "a") == 5
+    assert read_bytes(tmp_path / "a", "file", 5) == b"12345" and size_of(tmp_path / "a") == 5
     with pytest.raises(NergError, match="5 bytes, more than the 4"):
-        read_bytes(tmp_path / "a", most=4)
+        read_bytes(tmp_path / "a", "file", 4)
     with pytest.raises(NergError, match="is a folder"):
-        read_bytes(tmp_path)
+        read_bytes(tmp_path, "file", 9)
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(NergError, match="is a pipe"):
-        read_bytes(tmp_path / "pipe")
+        read_bytes(tmp_path / "pipe", "file", 9)
     with pytest.raises(NergError, match="is a device"):
-        read_bytes("/dev/zero")
+        read_bytes("/dev/zero", "file", 9)
     with pytest.raises(NergError):
-        read_bytes("a\0b")
+        read_bytes("a\0b", "file", 9)
+
+
+def test_mapped_files_begin_as_they_should(tmp_path):
+    (tmp_path / "a").write_bytes(b"ply 345")
+    assert bytes(map_bytes(tmp_path / "a", "mesh", 7, b"ply")) == b"ply 345"
+    with pytest.raises(NergError, match="7 bytes, more than the 6"):
+        map_bytes(tmp_path / "a", "mesh", 6, b"ply")
+    with (tmp_path / "a").open("wb") as out:
+        for size in (0, 64 << 30):
+            out.truncate(size)
+            with pytest.raises(NergError, match='does not begin with "ply".*; export it again'):
+                map_bytes(tmp_path / "a", "mesh", 1 << 40, b"ply", "export it again")
 
 
 def test_json_is_read_as_before(tmp_path):

@@ -144,6 +144,15 @@ def test_a_header_of_many_megabytes_is_not_read(tmp_path):
         read_checkpoint(tmp_path / "f.safetensors", "radiance")
 
 
+@pytest.mark.parametrize("size", [3 << 30, 64 << 30])
+def test_what_is_no_checkpoint_is_refused_before_it_is_mapped(tmp_path, monkeypatch, size):
+    with (tmp_path / "f.safetensors").open("wb") as out:
+        out.truncate(size)
+    monkeypatch.setattr("safetensors.safe_open", lambda *_, **__: pytest.fail("it was mapped"))
+    with pytest.raises(NergError, match="f.safetensors.* (no JSON object|more than the 17,179,869,184 that are read)"):
+        read_checkpoint(tmp_path / "f.safetensors", "radiance")
+
+
 def test_metadata_nested_deep_are_refused(tmp_path):
     from safetensors.numpy import save_file
 

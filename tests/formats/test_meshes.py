@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.formats import meshes
 from nerg_mi.formats.gltf import pack_glb, shown_unlit
 from nerg_mi.formats.meshes import read_mesh_file
 from tests.surfaces.meshes import box
@@ -325,3 +327,31 @@ def test_other_units_are_read(tmp_path, scale, offset):
     rows = "".join(f"v {x} {y} {z}\n" for x, y, z in scale * V + offset)
     (tmp_path / "a.obj").write_text(rows + "f 1 2 3\n")
     assert np.allclose(read_mesh_file(tmp_path / "a.obj").vertices, scale * V + offset)
+
+
+def test_a_line_of_gigabytes_is_refused_in_bounded_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(meshes, "_BLOCK", 1 << 20)
+    with (tmp_path / "a.obj").open("wb") as out:
+        out.truncate(meshes.TEXT_BYTES)
+    tracemalloc.start()
+    with pytest.raises(NergError, match="a.obj.* line of more than"):
+        read_mesh_file(tmp_path / "a.obj")
+    assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    tracemalloc.stop()
+    (tmp_path / "a.obj").write_bytes(b"v 0 0 \\\n" * (1 << 18))
+    with pytest.raises(NergError, match="a.obj.* line of more than"):
+        read_mesh_file(tmp_path / "a.obj")
+
+
+def test_what_of_a_gltf_is_not_used_takes_no_memory(tmp_path):
+    corners = [("POSITION", np.eye(3, dtype="<f4"), False)]
+    raw, spare = b"".join(shown_unlit(corners, np.array([[0, 1, 2]]))), 512 << 20
+    at = 20 + struct.unpack_from("<I", raw, 12)[0]
+    length = struct.unpack_from("<I", raw, at)[0]
+    with (tmp_path / "a.glb").open("wb") as out:
+        out.write(raw[:at] + struct.pack("<I", length + spare) + raw[at + 4 :])
+        out.truncate(len(raw) + spare)
+    tracemalloc.start()
+    assert len(read_mesh_file(tmp_path / "a.glb").faces) == 1
+    assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    tracemalloc.stop()

@@ -117,15 +117,15 @@ def _make_glb(folder: Path) -> None:
 
 
 def _read_glb(folder: Path) -> object:
-    from nerg_mi.files.bounded import read_bytes
+    from nerg_mi.files.bounded import JSON_BYTES, read_bytes
     from nerg_mi.formats.gltf import parse_glb
     from nerg_mi.formats.meshes import read_mesh_file
 
-    whole, text = read_bytes(folder / "a.glb"), read_bytes(folder / "document.json")
+    text = read_bytes(folder / "document.json", "document", JSON_BYTES)
     data = np.array(_CORNERS, "<f4").tobytes() + np.array([0, 1, 2], "<u4").tobytes()
     head = struct.pack("<IIIII", 0x46546C67, 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
     made = head + text + struct.pack("<II", len(data), 0x004E4942) + data
-    return parse_glb(made, folder / "b.glb"), read_mesh_file(folder / "a.glb"), len(whole)
+    return parse_glb(made, folder / "b.glb"), read_mesh_file(folder / "a.glb")
 
 
 def _make_path(folder: Path) -> None:

@@ -86,10 +86,11 @@ def _make_metadata(folder: Path) -> None:
 def _read_metadata(folder: Path) -> None:
     from dataclasses import replace
 
-    from nerg_mi.files.bounded import read_bytes
+    from nerg_mi.files.bounded import JSON_BYTES, read_bytes
     from nerg_mi.rays.metadata import read_metadata
 
-    about = read_metadata(read_bytes(folder / "metadata.json"), folder / "metadata.json")
+    raw = read_bytes(folder / "metadata.json", "rays file", JSON_BYTES)
+    about = read_metadata(raw, folder / "metadata.json")
     persons, cohorts = about.pop("persons"), about.pop("cohorts", [])
     _shown(replace(_rays(), metadata=about, persons=persons, cohorts=cohorts))
 

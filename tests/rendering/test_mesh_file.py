@@ -63,7 +63,7 @@ def test_whole_meshes_pass_here_and_in_mitsuba(rgb, tmp_path, data):
         (ply(4, 1, CORNERS + bytes(12) + face(0, 1, 2, 3)), "three corners"),
         (ply(3, 1, TEXT + b"4 0 1 2 1\n", "ascii"), "three corners"),
         (b"ply\n", "no header"),
-        (b"", "no header"),
+        (b"", "does not begin"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex\nend_header\n", "a.ply"),
         (b"ply\nformat odd 1.0\nend_header\n", "a.ply"),
     ],

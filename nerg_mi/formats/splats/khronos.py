@@ -10,8 +10,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.fields.splats import Splats, joined
-from nerg_mi.files.bounded import JSON_BYTES, open_file, read_bytes, reading
-from nerg_mi.formats.gltf import GLTF_BYTES, accessor_values, instances, read_parts
+from nerg_mi.files.bounded import JSON_BYTES, map_bytes, open_file, reading
+from nerg_mi.formats.gltf import GLTF_BYTES, GLTF_MAGIC, accessor_values, instances, read_parts
 from nerg_mi.maths.geometry import Similarity
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -35,7 +35,7 @@ def read_gltf_splats(path: str | os.PathLike) -> Splats:
     Raises `NergError` for a damaged file, for one without splats or with compressed ones, for nodes that scale
     unevenly, for splats that are not all of one degree of harmonics, and for values beyond what the extension says.
     """
-    raw = read_bytes(path, "splat file", GLTF_BYTES)
+    raw = map_bytes(path, "splat file", GLTF_BYTES, GLTF_MAGIC, "export it again")
     with reading(path, "splat file", "export it again", also=(TypeError, AttributeError)):
         document, data = read_parts(raw, path, "splat file")
         found = []

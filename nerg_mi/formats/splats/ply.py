@@ -14,8 +14,8 @@ import numpy as np
 
 from nerg_mi.errors import plain
 from nerg_mi.fields.splats import Splats, logits_of, opacities_of, scales_of
-from nerg_mi.files.bounded import open_file, read_bytes, reading
-from nerg_mi.formats.ply import parse_ply, write_columns
+from nerg_mi.files.bounded import map_bytes, open_file, reading
+from nerg_mi.formats.ply import PLY_MAGIC, parse_ply, write_columns
 from nerg_mi.maths.sphere import DEGREES
 
 PLY_BYTES = 8 << 30
@@ -45,8 +45,9 @@ def has_splats(path: str | os.PathLike) -> bool:
 
 def read_ply_splats(path: str | os.PathLike) -> Splats:
     """The Gaussian splats in the PLY file ``path``; `NergError` for another kind of file, and for a damaged one."""
-    raw = read_bytes(path, "splat file", PLY_BYTES)
-    with reading(path, "splat file", "export it again as a 3DGS .ply"):
+    remedy = "export it again as a 3DGS .ply"
+    raw = map_bytes(path, "splat file", PLY_BYTES, PLY_MAGIC, remedy)
+    with reading(path, "splat file", remedy):
         tables = parse_ply(np.frombuffer(raw, np.uint8)).tables
         first = next(iter(tables), "")
         if first != "vertex":
