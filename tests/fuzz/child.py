@@ -167,7 +167,7 @@ def place(file: Path, special: str, data: bytes) -> None:
             file.symlink_to(file.name)
         case "sparse":
             with file.open("wb") as out:
-                out.truncate(400 << 20)
+                out.truncate(64 << 30)
         case device:
             file.symlink_to(device)
 
