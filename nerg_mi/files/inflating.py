@@ -6,11 +6,11 @@ case, for an array of zeros is no attack.
 
 from __future__ import annotations
 
-import gzip
 import io
 import os
 import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO, Any
@@ -29,6 +29,9 @@ DIRECTORY_BYTES = 8 << 20
 """A zip archive's list of members may have so many bytes: some 100,000 members."""
 
 _CHUNK = 1 << 20
+_GZIP = 16 + zlib.MAX_WBITS
+# Bytes of a gzip file without any that come out: its header with names, and zeros that fill up a tape's block.
+_IDLE = 1 << 24
 # The most that one byte of a deflate stream can stand for, rounded up.
 _DEFLATE = 1100
 
@@ -58,6 +61,44 @@ class _Bounded(io.RawIOBase):
         return len(data)
 
 
+class _Members(io.RawIOBase):
+    """What the members of the open gzip ``file`` inflate to, one after the other (RFC 1952); zeros may follow each.
+
+    Python's own reader takes zeros and the names of members byte by byte, gigabytes of them as well.
+    """
+
+    def __init__(self, file):
+        self._file, self._input, self._ended, self._idle = file, b"", False, 0
+        self._inflater = zlib.decompressobj(_GZIP)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer) -> int:
+        while True:
+            if not self._input and not self._ended:
+                self._input = self._file.read(_CHUNK)
+                self._ended = not self._input
+                self._idle += len(self._input)
+            if self._idle > _IDLE:
+                raise ValueError(f"it has {_IDLE:,} bytes and more that nothing comes out of")
+            if self._inflater.eof:
+                self._input = self._input.lstrip(b"\0")
+                if not self._input:
+                    if self._ended:
+                        return 0
+                    continue
+                self._inflater = zlib.decompressobj(_GZIP)
+            data = self._inflater.decompress(self._input, len(buffer))
+            self._input = self._inflater.unused_data if self._inflater.eof else self._inflater.unconsumed_tail
+            if data:
+                self._idle = 0
+                buffer[: len(data)] = data
+                return len(data)
+            if self._ended and not self._inflater.eof:
+                raise EOFError
+
+
 def _too_large(path, what: str, most: int) -> NergError:
     return NergError(
         f'the {what} "{path}" inflates to more than {most:,} bytes, which its size does not warrant; '
@@ -71,9 +112,9 @@ def open_gzip(path: str | os.PathLike, what: str = "file", most: int | None = No
     or more than ``most`` bytes (default: `inflated_limit`) come out."""
     most = inflated_limit(size_of(path, what)) if most is None else most
     with reading(path, what):
-        stream = gzip.open(path, "rb")
-    with stream:
-        yield io.BufferedReader(_Bounded(stream, most, path, what), _CHUNK)
+        file = open(path, "rb")
+    with file:
+        yield io.BufferedReader(_Bounded(_Members(file), most, path, what), _CHUNK)
 
 
 @contextmanager

@@ -137,3 +137,22 @@ def test_limits_themselves_are_within(tmp_path, monkeypatch):
     monkeypatch.setattr(inflating, "DIRECTORY_BYTES", listed - 1)
     with pytest.raises(NergError, match="fewer members"), open_zip(archive):
         pass
+
+
+def test_what_nothing_comes_out_of_is_bounded(tmp_path, monkeypatch):
+    """Zeros may follow each member, and names may be long; not for gigabytes."""
+    path, member = tmp_path / "a.gz", gzip.compress(b"1")
+    for idle in (0, 1, 5000):
+        path.write_bytes(member + bytes(idle) + member + bytes(idle))
+        with open_gzip(path) as stream:
+            assert stream.read() == b"11"
+    named = member[:3] + b"\x08" + member[4:10] + b"n" * (1 << 26)
+    for start in (member, named):
+        with path.open("wb") as out:
+            out.write(start)
+            out.truncate(64 << 30)
+        with open_gzip(path) as stream, pytest.raises(NergError, match="a.gz.*16,777,216 bytes and more"):
+            stream.read()
+    path.write_bytes(member + b"and more")
+    with open_gzip(path) as stream, pytest.raises(NergError, match="a.gz"):
+        stream.read()

@@ -167,6 +167,7 @@ def place(file: Path, special: str, data: bytes) -> None:
             file.symlink_to(file.name)
         case "sparse":
             with file.open("wb") as out:
+                out.write(data)
                 out.truncate(64 << 30)
         case device:
             file.symlink_to(device)

@@ -46,7 +46,8 @@ def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) 
         rng = np.random.default_rng([start, zlib.crc32(f"{reader.name} {target}".encode())])
         for _ in range(count * (k + 1) // len(targets) - count * k // len(targets)):
             if rng.random() < SPECIAL_FRACTION:
-                yield Case(reader.name, target, b"", str(rng.choice(SPECIAL)))
+                special = str(rng.choice(SPECIAL))
+                yield Case(reader.name, target, data if special == "sparse" and rng.random() < 0.5 else b"", special)
             else:
                 yield Case(reader.name, target, change(data, rng))
 

@@ -25,7 +25,8 @@ SPECIAL = ("fifo", "/dev/zero", "/dev/null", "folder", "missing", "loop", "spars
 
 @dataclass(frozen=True)
 class Case:
-    """``data``: the bytes of the file ``target`` of the reader ``reader``, or ``special``: one of `SPECIAL` instead."""
+    """``data``: the bytes of the file ``target`` of the reader ``reader``, or ``special``: one of `SPECIAL` instead, of
+    which "sparse" begins with ``data`` and goes on with zeros."""
 
     reader: str
     target: str
