@@ -22,6 +22,12 @@ WARRANTED = 16
 """So many times its file's bytes a picture may take in any case, in pixels as in bytes: photos of 200 million pixels
 and large environment maps are no attack, where a small file that claims as much is one."""
 
+BYTES = 4 << 30
+"""A file may have so many bytes."""
+
+JPEG_BYTES = 1 << 29
+"""And so many as JPEG, which is read whole: a photo of 200 million pixels has a fifth of them."""
+
 SCANS = 100
 """A progressive JPEG may run over its pixels so many times; encoders make ten."""
 
@@ -40,7 +46,7 @@ class ImageHeader:
 
 
 def check_image(
-    path: str | os.PathLike, what: str = "image", most: int = PIXELS, most_bytes: int | None = None
+    path: str | os.PathLike, what: str = "image", most: int = PIXELS, most_bytes: int = BYTES
 ) -> ImageHeader:
     """The header of the picture ``path``; `NergError` where it is damaged, beyond ``most`` pixels of three bytes and
     beyond `WARRANTED` times its file, or where the file has more than ``most_bytes``."""
@@ -92,6 +98,8 @@ def _png(start: bytes) -> ImageHeader:
 
 
 def _jpeg(file, length: int) -> ImageHeader:
+    if length > JPEG_BYTES:
+        raise ValueError(f"it has {length:,} bytes, more than the {JPEG_BYTES:,} of JPEG that are read")
     file.seek(0)
     data = file.read()
     at = 2

@@ -28,6 +28,9 @@ CODECS = (
 ).split()
 """Decoders, as FFmpeg calls them, that may run: those of cameras, phones and converters, of its three hundred."""
 
+BYTES = 16 << 30
+"""A file may have so many bytes: FFmpeg looks through all of those that it does not understand."""
+
 PIXELS = 8192 * 4320
 """A frame may have so many: no camera films more, and a decoder holds many frames at a time."""
 
@@ -164,7 +167,7 @@ def _opened(video: str | Path) -> Iterator[tuple[Any, Any]]:
 
     FFmpeg is given the open file, since it takes names such as "12:30.mp4" for addresses; it may open nothing else.
     """
-    size_of(video, "video")
+    size_of(video, "video", BYTES)
     av = _pyav()
     with _reading(video):
         check_movie(video)

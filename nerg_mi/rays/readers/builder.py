@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import size_of
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.files.line_blocks import OnBadLine
 from nerg_mi.maths.coordinates import check_near_origin
@@ -24,6 +25,9 @@ from .parsing.validity import looks_like_validity
 
 BAD_LINES = 0.01
 """Share of a file's lines that may be left out since they cannot be read."""
+
+SOURCE_BYTES = 16 << 30
+"""A file may have so many bytes, for its checksum takes a second for each of some 10^9."""
 
 STREAMED = 1 << 20
 """So many rays are kept at a time where somebody takes them as they come."""
@@ -168,6 +172,7 @@ class RaysBuilder:
 
         The checksum is computed at the file's end: what is not of the format is refused before gigabytes are read."""
         self._end_source()
+        size_of(path, "tracking file", SOURCE_BYTES)
         if self._on_source is not None:
             self._on_source(name or path.name)
         self._path = path

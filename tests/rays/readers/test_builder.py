@@ -69,6 +69,10 @@ def test_checksums_are_computed_at_the_end_of_a_file(tmp_path, monkeypatch):
     builder.source(tmp_path / "b")
     assert summed == ["a"]
     add(builder, 3)
+    with (tmp_path / "c").open("wb") as out:
+        out.truncate(64 << 30)
+    with pytest.raises(NergError, match='c" has 68,719,476,736 bytes, more than the 17,179,869,184 that are read'):
+        builder.source(tmp_path / "c")
     assert builder.build().metadata["sources"] == [{"file": "ann/a", "sha256": "of a"}, {"file": "b", "sha256": "of b"}]
 
 
