@@ -55,7 +55,9 @@ def read_gltf_splats(path: str | os.PathLike) -> Splats:
         return joined(found)
 
 
-def _splats(document: dict[str, Any], data: bytes, attributes: dict[str, Any], extension: dict[str, Any]) -> Splats:
+def _splats(
+    document: dict[str, Any], data: bytes | memoryview, attributes: dict[str, Any], extension: dict[str, Any]
+) -> Splats:
     take = lambda name, shape: accessor_values(document, data, attributes[name], shape)
     own = lambda name, shape: take(f"{EXTENSION}:{name}", shape)
     harmonics = []

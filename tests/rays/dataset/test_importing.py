@@ -104,7 +104,7 @@ def test_what_is_no_recording_is_refused_before_all_of_it_is_read(tmp_path, monk
     write_head(folder, HEAD)
     monkeypatch.setattr(Marks, "source", lambda *_: pytest.fail("it was read to its end"))
     with path.open("wb") as out:
-        out.truncate(64 << 30)
+        out.truncate(3 << 30)
     assert "characters that are read" in (import_source(task(folder, path)).error or "")
 
 
