@@ -203,7 +203,9 @@ supported.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -220,8 +222,7 @@ from nerg_mi.transport.jit import no_collection, recording
 from nerg_mi.transport.observer import ObserverCache
 
 from . import nerg_aovs, nerg_properties
-from .nerg_asked import Asked
-from .nerg_pixel import Pixel
+from .nerg_pixel import RenderContext
 
 __doc__ = nerg_properties.complete(__doc__ or "").replace("{aovs}", nerg_aovs.manual())
 
@@ -273,7 +274,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     @contextmanager
     def seen_by(self, sensor, scene):
         """While this is open the rays that ``sample`` is given come from ``sensor``."""
-        self.check_place(scene)
+        self.context().check_place(scene)
         if 0 in sensor.film().crop_size():
             raise NergError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")
         self._sensors = [sensor]
@@ -294,18 +295,39 @@ class NergIntegrator(mi.SamplingIntegrator):
         return super().render_forward(scene, params, sensor, seed, spp)
 
     def sample(self, scene, sampler, ray, medium=None, active: Bool = True):
-        if self._sensors is None:
-            self.check_place(scene)
-        active = mi.Bool(active)
-        offset = sampler.next_1d(active) if self.jitter else None
-        pixel = Pixel(self, scene, self._sensors or scene.sensors(), ray, active, offset)
-        aovs = nerg_aovs.compute(self.aovs, pixel)
-        L, shown, nested = pixel.radiance(scene, sampler, medium)
-        return dr.select(active, L, 0), shown, aovs + nested
+        camera = self.context().trace(scene, self._sensors or scene.sensors(), sampler, ray, mi.Bool(active))
+        aovs = camera.for_observer().channels(self.aovs)
+        L, shown, nested = camera.radiance(scene, sampler, medium)
+        return dr.select(camera.active, L, 0), shown, aovs + nested
 
-    def asked(self, aovs, radiance: bool) -> Asked:
-        """This integrator asked for other AOVs, and for colour or not."""
-        return Asked(self, aovs, radiance)
+    def context(self) -> RenderContext:
+        """What its pictures are computed with."""
+        return RenderContext(
+            aovs=self.aovs,
+            demands=self.demands,
+            views=self.views,
+            radiance=self.radiance,
+            medium=self.medium,
+            gaze=self.gaze,
+            shading=self.shading,
+            observer=self.observer,
+            cache=self.cache,
+            occlusion=self.occlusion,
+            falloff=self.falloff,
+            settings=self.settings,
+            observer_settings=self.observer_settings,
+            ceiling=self.ceiling,
+            background=self.background,
+            hide_emitters=self.hide_emitters,
+            jitter=self.jitter,
+        )
+
+    def for_aovs(self, aovs: Sequence[str], radiance: bool) -> RenderContext:
+        """The same for other AOVs, with colour or without. Raises ``NergError`` for those that it cannot compute."""
+        names = nerg_aovs.read_aovs(",".join(aovs), self)
+        views = nerg_properties.views_of(names, self.children, self.gaze)
+        demands = nerg_aovs.demands_of(names)
+        return replace(self.context(), aovs=names, demands=demands, views=views, radiance=radiance)
 
     @property
     def children(self):
@@ -336,10 +358,6 @@ class NergIntegrator(mi.SamplingIntegrator):
         nerg_properties.check_observer(self.observer)
         if not dr.all(self.falloff >= 0):
             raise NergError(f'"falloff" must not be negative, got {self.falloff}')
-
-    def check_place(self, scene):
-        if self.medium is None and len(scene.shapes()) == 0:
-            raise NergError('there is nothing to render: give "nerg" a "field" or a "density", or the scene shapes')
 
     def to_string(self):
         return nerg_properties.describe(self)

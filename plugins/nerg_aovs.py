@@ -4,9 +4,9 @@ manual follow. One more AOV is one more entry."""
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +14,10 @@ import mitsuba as mi
 from nerg_mi.errors import NergError
 from nerg_mi.transport.field_medium import snapshot
 
-from .nerg_pixel import Pixel
+if TYPE_CHECKING:
+    from nerg_mi.transport.medium import Medium
+
+    from .nerg_pixel import CameraView, Pixel
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,8 @@ class Aov:
     channels: str | None = "Y"
     # What it is, for the manual.
     summary: str
-    # A Float for each channel.
-    compute: Callable[[Pixel], list]
+    # A Float for each channel, of a ``CameraView``, or of a ``Pixel`` where it is ``of_observer``.
+    compute: Callable[[Any], list]
     # Whether it depends on where the observer is: what does not is computed once for several of them.
     of_observer: bool = False
     # In the order in which they are checked.
@@ -62,16 +65,16 @@ class Aov:
 _GAZE, _FACTORS, _COUNTS = frozenset({"gaze"}), frozenset({"gaze", "factors"}), frozenset({"counts"})
 
 
-def _features_at(p: Pixel) -> list:
-    return snapshot(p.nerg.medium, p.p_d, p.surface & (p.depth < p.view.distance))
+def _features_at(p: CameraView) -> list:
+    return snapshot(cast("Medium", p.context.medium), p.p_d, p.surface & (p.depth < p.view.distance))
 
 
-def _color_evaluations(p: Pixel) -> list:
-    march = p.view.march
-    if not p.lit or march is None:
+def _color_evaluations(p: CameraView) -> list:
+    march, medium = p.view.march, p.context.medium
+    if not p.lit or march is None or medium is None:
         return [mi.Float(0)]
     once = dr.select(p.active & (p.view.front > 0), mi.Float(1), 0)
-    return [once if p.nerg.medium.deferred else march.color_evals]
+    return [once if medium.deferred else march.color_evals]
 
 
 AOVS: dict[str, Aov] = {
@@ -141,14 +144,14 @@ AOVS: dict[str, Aov] = {
         Aov(
             name="visibility",
             summary="1 visible to the observer .. 0 hidden",
-            compute=lambda p: [dr.select(p.surface, p.sight.visibility, 0)],
+            compute=lambda p: [dr.select(p.camera.surface, p.sight.visibility, 0)],
             of_observer=True,
         ),
         Aov(
             name="observer_depth",
             channels="T",
             summary=":math:`d_o`; the distance to the surface where no occlusion is computed",
-            compute=lambda p: [dr.select(p.surface, p.sight.depth, 0)],
+            compute=lambda p: [dr.select(p.camera.surface, p.sight.depth, 0)],
             of_observer=True,
             demands=frozenset({"observer_depth"}),
         ),
@@ -217,10 +220,11 @@ def channel_names(names: Iterable[str], medium) -> list[str]:
     return [f"{name}.{channel}" for name in names for channel in AOVS[name].channels_of(medium)]
 
 
-def compute(names: list[str], pixel: Pixel) -> list:
+def compute(names: Sequence[str], pixel: Pixel) -> list:
     """All channels of these AOVs, in their order."""
     # Evaluations are counted when all else has made its own.
-    found = {name: AOVS[name].compute(pixel) for name in sorted(names, key=lambda n: "counts" in AOVS[n].demands)}
+    order = sorted((AOVS[name] for name in names), key=lambda aov: "counts" in aov.demands)
+    found = {aov.name: aov.compute(pixel if aov.of_observer else pixel.camera) for aov in order}
     return [channel for name in names for channel in found[name]]
 
 

@@ -16,7 +16,7 @@ from nerg_mi.ranges import SEEDS, SPP, Range, check_number
 from .arrays import Floats, Labelled, points, same_for_all
 from .camera import Camera
 from .fields import FilePath
-from .scene import COLOR, Scene, asked_integrator, asked_quantities
+from .scene import COLOR, Scene, asked_quantities, context_for
 from .variant import active_mitsuba
 
 if TYPE_CHECKING:
@@ -70,9 +70,9 @@ def render(
     sensor = scene.sensor(camera)
     _check_counts(spp, seed)
     with mitsuba_says():
-        integrator = asked_integrator(scene, asked)
-        eyes = _observers(scene, sensor, observers, bool(integrator.own))
-        layers = _Layers(integrator, sensor, asked, eyes)
+        context = context_for(scene, asked)
+        eyes = _observers(scene, sensor, observers, bool(context.own))
+        layers = _Layers(context, sensor, asked, eyes)
         values = _render(scene, sensor, layers, int(spp), int(seed), reporter)
     return Pictures({name: values[name] for name in asked}, AXES, eyes)
 
@@ -94,23 +94,23 @@ class _Layers:
     """What `nerg_mi.rendering.bands.render_bands` renders: first what all observers have in common, then, for each of
     them, what does not."""
 
-    def __init__(self, integrator: Any, sensor: Any, asked: Sequence[str], eyes: Floats):
+    def __init__(self, context: Any, sensor: Any, asked: Sequence[str], eyes: Floats):
         self.sensor, self.color, self.observers = sensor, COLOR in asked, len(eyes)
-        self.integrator = integrator
-        self.shared, self.own = integrator.shared, integrator.own
-        self.watchers = [self.integrator.watcher(eye, len(eyes) == 1) for eye in eyes] if self.own else []
-        shared, own = (self.integrator.channels(names) for names in (self.shared, self.own))
-        self.names, self.count = [shared, *(own for _ in self.watchers)], len(shared) + len(own)
+        self.context = context
+        self.shared, self.own = context.shared, context.own
+        self.lookers = [context.observer_at(eye, len(eyes) == 1) for eye in eyes] if self.own else []
+        shared, own = (context.channels(names) for names in (self.shared, self.own))
+        self.names, self.count = [shared, *(own for _ in self.lookers)], len(shared) + len(own)
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterator[tuple]:
-        pixel = self.integrator.pixel(scene, [self.sensor], sampler, ray, active)
-        shared = pixel.channels(self.shared)
-        radiance, shown, _ = pixel.radiance(scene, sampler, medium)
-        if self.watchers:
-            pixel.settle(radiance, shown, shared)
+        camera = self.context.trace(scene, [self.sensor], sampler, ray, active)
+        shared = camera.channels(self.shared)
+        radiance, shown, _ = camera.radiance(scene, sampler, medium)
+        if self.lookers:
+            camera.settle(radiance, shown, shared)
         yield radiance, shown, shared
-        for watcher in self.watchers:
-            yield 0, shown, watcher.pixel(pixel).channels(self.own)
+        for looker in self.lookers:
+            yield 0, shown, camera.for_observer(looker).channels(self.own)
 
     def split(self, layer: int, pixels: Floats) -> dict[str, Floats]:
         """The channels (height, width, C) of a layer by quantity."""

@@ -17,7 +17,7 @@ from . import arrays
 from .arrays import Floats, Labelled, same_for_all
 from .fields import FilePath
 from .observed import ObserverOf
-from .scene import COLOR, Scene, asked_integrator, asked_quantities
+from .scene import COLOR, Scene, asked_quantities, context_for
 from .variant import active_mitsuba
 
 BATCH = 1 << 18
@@ -86,13 +86,13 @@ class _Tracer:
 
     def __init__(self, scene: Scene, asked: Sequence[str], seed: int, reporter: Reporter):
         self.scene, self.asked, self.seed, self.reporter = scene, asked, seed, reporter
-        self.integrator = asked_integrator(scene, asked)
-        self.shared, self.own = self.integrator.shared, self.integrator.own
+        self.context = context_for(scene, asked)
+        self.shared, self.own = self.context.shared, self.context.own
 
     def of_observers(self, o: Floats, d: Floats, eyes: Floats) -> dict[str, Floats]:
         """Quantities (M, N, ...) of rays as observers at ``eyes`` (M, 3) have them."""
-        watchers = [self.integrator.watcher(eye, len(eyes) == 1) for eye in eyes] if self.own else []
-        parts = [self._part(o, d, a, lambda pixel: (w.pixel(pixel) for w in watchers)) for a in _starts(o)]
+        observers = [self.context.observer_at(eye, len(eyes) == 1) for eye in eyes] if self.own else []
+        parts = [self._part(o, d, a, lambda camera: map(camera.for_observer, observers)) for a in _starts(o)]
         values = {}
         for name in self.asked:
             value = np.concatenate([part[name] for part in parts], axis=-1 if name in self.own else 0)
@@ -102,12 +102,12 @@ class _Tracer:
     def of_origins(self, o: Floats, d: Floats) -> dict[str, Floats]:
         """Quantities (N, ...) of rays as whoever stands at their origins has them."""
         if not self.own:
-            parts = [self._part(o, d, a, lambda pixel: ()) for a in _starts(o)]
+            parts = [self._part(o, d, a, lambda camera: ()) for a in _starts(o)]
             return {name: np.concatenate([part[name] for part in parts]) for name in self.asked}
-        gaze = self.integrator.gaze
-        if self.integrator.views or (gaze is not None and gaze.field.config.normalized):
+        gaze = self.context.gaze
+        if self.context.views or (gaze is not None and gaze.field.config.normalized):
             return self._of_each_origin(o, d)
-        parts = [self._part(o, d, a, lambda pixel: (pixel.for_origins(),)) for a in _starts(o)]
+        parts = [self._part(o, d, a, lambda camera: (camera.for_origins(),)) for a in _starts(o)]
         first = lambda name, value: value[0] if name in self.own else value
         return {name: np.concatenate([first(name, part[name]) for part in parts]) for name in self.asked}
 
@@ -118,9 +118,9 @@ class _Tracer:
         groups = np.split(order, np.cumsum(np.bincount(of_ray.ravel()))[:-1])
         parts = []
         for number, (origin, rows) in enumerate(zip(origins, groups), 1):
-            watcher = self.integrator.watcher(origin)
+            who = self.context.observer_at(origin)
             for a in _starts(rows):
-                part = self._part(o[rows], d[rows], a, lambda pixel, w=watcher: (w.own_pixel(pixel),))
+                part = self._part(o[rows], d[rows], a, lambda camera, who=who: (camera.for_observer(who, True),))
                 parts.append({name: v[0] if name in self.own else v for name, v in part.items()})
             self.reporter.progress(number / len(origins), f"origin {number:,} of {len(origins):,}")
         back = np.argsort(order)
@@ -136,12 +136,12 @@ class _Tracer:
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(self.seed + first, len(o))
         with dr.suspend_grad():
-            pixel = self.integrator.pixel(self.scene.mitsuba, [], sampler, ray, mi.Bool(True))
-            shared = pixel.channels(self.shared)
-            color = pixel.radiance(self.scene.mitsuba, sampler, None)[0]
-            pixel.settle(color, shared)
+            camera = self.context.trace(self.scene.mitsuba, [], sampler, ray, mi.Bool(True))
+            shared = camera.channels(self.shared)
+            color = camera.radiance(self.scene.mitsuba, sampler, None)[0]
+            camera.settle(color, shared)
             each = []
-            for mine in observed(pixel) if self.own else ():
+            for mine in observed(camera) if self.own else ():
                 channels = mine.channels(self.own)
                 dr.eval(channels)
                 each.append(self._named(self.own, channels, len(o)))
@@ -153,7 +153,7 @@ class _Tracer:
     def _named(self, names: Sequence[str], channels: Sequence[Any], count: int) -> dict[str, Floats]:
         """Channels as arrays (N,), or (N, C) where a quantity has several, by quantity."""
         columns: dict[str, list[Floats]] = {}
-        for name, value in zip(self.integrator.channels(names), channels):
+        for name, value in zip(self.context.channels(names), channels):
             columns.setdefault(name.rpartition(".")[0], []).append(_lanes(value, count))
         return {name: c[0] if len(c) == 1 else np.stack(c, axis=-1) for name, c in columns.items()}
 

@@ -261,12 +261,12 @@ def _observer_sensor(position: ArrayLike) -> dict:
     return {"type": "perspective", "to_world": place, "film": {"type": "hdrfilm", "width": 1, "height": 1}}
 
 
-def asked_integrator(scene: Scene, quantities: Sequence[str]) -> Any:
-    """The scene's integrator asked for ``quantities``; its ``own`` depend on the observer, its ``shared`` do not.
+def context_for(scene: Scene, quantities: Sequence[str]) -> Any:
+    """What ``quantities`` of the scene are computed with; the ``own`` depend on the observer, the ``shared`` do not.
 
     Raises `NergError` for those that it cannot compute.
     """
-    return scene.integrator.asked([name for name in quantities if name != COLOR], COLOR in quantities)
+    return scene.integrator.for_aovs([name for name in quantities if name != COLOR], COLOR in quantities)
 
 
 def asked_quantities(scene: Scene, names: object, known: tuple[str, ...] | None = None) -> tuple[str, ...]:

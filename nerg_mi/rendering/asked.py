@@ -6,10 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from nerg_mi.errors import NergError
-from nerg_mi.transport.observer import center
 
 from .bands import render_bands, why_whole
 from .channels import Channels, channels_of
@@ -22,23 +19,14 @@ class AskedLayer:
     """
 
     def __init__(self, integrator: Any, sensor: Any, names_asked: Sequence[str]):
-        self._sensor, self._asked = sensor, integrator.asked(names_asked, True)
-        observer = integrator.observer
-        self._watcher = None
-        if observer is not None and self._asked.own:
-            eye = np.ravel(np.array(center(observer), np.float32))
-            self._watcher = self._asked.watcher(eye, True)
-        self._order = [*self._asked.shared, *self._asked.own]
-        self.names = [self._asked.channels(self._order)]
+        self._sensor, self._context = sensor, integrator.for_aovs(names_asked, True)
+        self.names = [self._context.channels(self._context.aovs)]
         self.count = len(self.names[0])
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterable[tuple]:
-        pixel = self._asked.pixel(scene, [self._sensor], sampler, ray, active)
-        if self._watcher is None:
-            channels = pixel.channels(self._order)
-        else:
-            channels = pixel.channels(self._asked.shared) + self._watcher.pixel(pixel).channels(self._asked.own)
-        radiance, shown, _ = pixel.radiance(scene, sampler, medium)
+        camera = self._context.trace(scene, [self._sensor], sampler, ray, active)
+        channels = camera.for_observer().channels(self._context.aovs)
+        radiance, shown, _ = camera.radiance(scene, sampler, medium)
         return [(radiance, shown, channels)]
 
 

@@ -376,6 +376,10 @@ class ObservedGaze:
     def __init__(self, placed: PlacedGaze, place: Place, settings: ObserverSettings, integrals: list[list[Known]]):
         self._placed, self._place, self._settings, self._integrals = placed, place, settings, integrals
 
+    @property
+    def field(self) -> AnyGazeField:
+        return self._placed.field
+
     def parameters(self) -> list:
         """Arrays that gaze depends on, for derivatives."""
         return self._placed.parameters()

@@ -62,7 +62,7 @@ def available(scene: Scene) -> list[Layer]:
             continue
         try:
             if layer.quantity:
-                scene.integrator.asked([layer.quantity], False)
+                scene.integrator.for_aovs([layer.quantity], False)
         except NergError:
             # That is how the integrator says what it lacks.
             continue

@@ -21,19 +21,18 @@ def traced(monkeypatch):
 
 def pixel(mi, integrator, eye=(0.5, 0.4, -3), **more):
     """Of rays from a camera at ``eye`` to and past the field."""
-    from nerg_mi.plugins.nerg_pixel import Pixel
-
     scene = mi.load_dict({"type": "scene", "integrator": {**integrator, **more}, "sensor": camera(mi, eye)})
     o = mi.Point3f(*map(float, eye))
     target = mi.Point3f([0, 0.1, 9], [0, 0.1, 9], 0)
     ray = mi.Ray3f(o + dr.zeros(mi.Point3f, 3), dr.normalize(target - o))
-    return Pixel(scene.integrator(), scene, scene.sensors(), ray, mi.Bool(True), None)
+    context = scene.integrator().context()
+    return context.trace(scene, scene.sensors(), None, ray, mi.Bool(True)).for_observer()
 
 
 def test01_nothing_is_traced_before_it_is_asked_for(rgb, files, traced):
     found = pixel(rgb, with_gaze(files, "gaze,visibility", observer=observer_at(rgb, -2, 0.3, -2)))
     assert len(traced) == 1
-    found.depth, found.surface, found.p_d, found.r_o, found.distance_and_direction  # noqa: B018
+    found.camera.depth, found.camera.surface, found.camera.p_d, found.r_o  # noqa: B018
     assert len(traced) == 1
     found.sight, found.attention, found.sight  # noqa: B018
     assert len(traced) == 2 and np.allclose(traced[1], (-2, 0.3, -2))
@@ -43,14 +42,14 @@ def test01_nothing_is_traced_before_it_is_asked_for(rgb, files, traced):
 def test02_who_stands_at_the_camera_sees_what_it_sees(rgb, files, traced, observer):
     more = {} if observer is None else {"observer": observer_at(rgb, *observer)}
     found = pixel(rgb, with_gaze(files, "gaze,visibility", **more))
-    assert found.aligned and np.allclose(np.array(found.p_o).T, (0.5, 0.4, -3))
+    assert found.aligned and np.allclose(np.array(found.observer.p_o).T, (0.5, 0.4, -3))
     assert (found.sight.visibility.numpy() == 1).all() and len(traced) == 1
-    assert np.allclose(found.sight.depth.numpy()[:2], found.depth.numpy()[:2], rtol=1e-5)
+    assert np.allclose(found.sight.depth.numpy()[:2], found.camera.depth.numpy()[:2], rtol=1e-5)
 
 
 def test03_gaze_is_zero_without_a_surface(rgb, files):
     found = pixel(rgb, with_gaze(files, "gaze,emit"))
-    surface = found.surface.numpy()
+    surface = found.camera.surface.numpy()
     assert surface.tolist() == [True, True, False]
     for value in (found.attention.gaze, found.attention.emit, found.attention.capture):
         assert ((value.numpy() > 0) == surface).all()
@@ -97,36 +96,25 @@ def test05_a_map_stands_in_for_gaze_alone(rgb, files, aovs, looked_up):
     observer = observer_at(rgb, -2, 0.3, -2)
     found = pixel(rgb, with_gaze(files, aovs, observer=observer, visibility="map", map_height=32))
     assert (found.sight.gaze is not None) == looked_up
-    assert bool(found.nerg.cache.peek("gaze of map")) == looked_up
-    assert len(found.nerg.cache.peek("map")) == 1
+    assert bool(found.context.cache.peek("gaze of map")) == looked_up
+    assert len(found.context.cache.peek("map")) == 1
 
 
 def test06_colour_is_found_where_it_is_wanted(rgb, files):
     integrator = with_gaze(files, "features")
-    lit, dark = (pixel(rgb, {**integrator, "radiance": r}) for r in (True, False))
+    lit, dark = (pixel(rgb, {**integrator, "radiance": r}).camera for r in (True, False))
     assert lit.lit and not dark.lit and dark.color is None
     assert np.array(lit.color).shape[0] == 3
     for a, b in zip(lit.accumulated_features, dark.accumulated_features):
         np.testing.assert_allclose(a.numpy(), b.numpy(), rtol=1e-5, atol=1e-6)
 
 
-def test07_another_observer_takes_over_nothing_of_the_first(rgb, files):
-    """Every cached property, of subclasses too, is either shared by all observers or found anew for each."""
-    from nerg_mi.plugins.nerg_asked import AskedPixel
-    from nerg_mi.plugins.nerg_pixel import Pixel
-
-    cached = {n for kind in AskedPixel.__mro__ for n, v in vars(kind).items() if isinstance(v, cached_property)}
-    assert {"depth", "sight", "gaze", "attention", "color"} <= cached
+def test07_another_observer_is_another_object(rgb, files):
+    """All that a pixel computes follows its observer; the camera's part is one object that knows of none."""
     first = pixel(rgb, with_gaze(files, "gaze,visibility,density_evals", observer=observer_at(rgb, -2, 0.3, -2)))
-    values = {name: getattr(first, name) for name in cached}
-    at = rgb.Point3f(2, 0.3, -2)
-    other = first.for_observer(at, [at], False, first.cache)
-    # The observer is said by the caller, and nothing else is there that is not shared.
-    said = {"p_o", "observers", "aligned", "cache", "_evaluations"}
-    assert set(vars(other)) - set(Pixel._SHARED) == said
-    assert {n for n in cached - said if vars(other).get(n) is values[n]} == cached & set(Pixel._SHARED)
-    # What is shared does not follow the observer, and the rest does.
-    for name in cached & set(Pixel._SHARED):
-        np.testing.assert_array_equal(np.array(getattr(other, name)), np.array(values[name]))
-    assert not np.allclose(np.array(other.r_o), np.array(first.r_o)) and not other._evaluations
+    for name, value in vars(type(first)).items():
+        assert not isinstance(value, cached_property) or getattr(first, name) is not None
+    other = first.camera.for_observer(first.context.observer_at((2, 0.3, -2)))
+    assert other.camera is first.camera and not set(vars(other)) & {"observer", "sight", "gaze", "attention"}
+    assert not np.allclose(np.array(other.r_o), np.array(first.r_o))
     assert not np.allclose(other.attention.gaze.numpy(), first.attention.gaze.numpy())

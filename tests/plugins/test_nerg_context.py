@@ -1,4 +1,4 @@
-"""The integrator asked for other AOVs, along any rays, and for several observers of the same rays."""
+"""The integrator's context for other AOVs, along any rays, and for several observers of the same rays."""
 
 import drjit as dr
 import numpy as np
@@ -32,11 +32,11 @@ def sampler(mi):
 
 
 def test01_what_depends_on_the_observer(scene):
-    asked = scene.integrator().asked(["depth", "gaze", "position", "visibility"], True)
-    assert asked.shared == ["depth", "position"] and asked.own == ["gaze", "visibility"]
-    assert asked.channels(asked.shared) == ["depth.T", "position.X", "position.Y", "position.Z"]
+    context = scene.integrator().for_aovs(["depth", "gaze", "position", "visibility"], True)
+    assert context.shared == ["depth", "position"] and context.own == ["gaze", "visibility"]
+    assert context.channels(context.shared) == ["depth.T", "position.X", "position.Y", "position.Z"]
     # All else is the integrator's, which is left as it was.
-    assert asked.settings is scene.integrator().settings
+    assert context.settings is scene.integrator().settings
     assert scene.integrator().aov_names() == ["depth.T", "opacity.Y"]
 
 
@@ -46,16 +46,16 @@ def test01_what_depends_on_the_observer(scene):
 )
 def test02_what_cannot_be_computed(scene, aovs, said):
     with pytest.raises(NergError, match=said):
-        scene.integrator().asked(aovs, False)
+        scene.integrator().for_aovs(aovs, False)
 
 
 def test03_the_values_of_a_render(rgb, scene, ray):
     integrator = scene.integrator()
-    asked = integrator.asked(["depth", "gaze", "visibility", "gaze_evals"], False)
-    pixel = asked.pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
-    pixel.settle()
+    context = integrator.for_aovs(["depth", "gaze", "visibility", "gaze_evals"], False)
+    camera = context.trace(scene, [], sampler(rgb), ray, rgb.Bool(True))
+    camera.settle()
     for eye in EYES:
-        found = asked.watcher(eye).pixel(pixel).channels(["gaze", "visibility", "gaze_evals"])
+        found = camera.for_observer(context.observer_at(eye)).channels(["gaze", "visibility", "gaze_evals"])
         field, gaze = integrator.children["field"], integrator.children["gaze"]
         observer = {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate(list(eye))}
         alone = rgb.load_dict(
@@ -69,39 +69,39 @@ def test03_the_values_of_a_render(rgb, scene, ray):
 def test04_the_cameras_ray_is_traced_once(rgb, scene, ray, monkeypatch):
     traced, trace = [], Place.trace
     monkeypatch.setattr(Place, "trace", lambda *a, **k: traced.append(1) or trace(*a, **k))
-    asked = scene.integrator().asked(["depth", "gaze", "visibility"], False)
-    pixel = asked.pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
+    context = scene.integrator().for_aovs(["depth", "gaze", "visibility"], False)
+    camera = context.trace(scene, [], sampler(rgb), ray, rgb.Bool(True))
     for eye in EYES:
-        asked.watcher(eye).pixel(pixel).channels(["gaze", "visibility"])
+        camera.for_observer(context.observer_at(eye)).channels(["gaze", "visibility"])
     assert len(traced) == 1 + len(EYES)
 
 
 def test05_kernels_are_those_of_one_observer(rgb, scene, ray):
-    asked = scene.integrator().asked(["depth", "gaze", "visibility"], False)
-    pixel = asked.pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
-    pixel.settle()
+    context = scene.integrator().for_aovs(["depth", "gaze", "visibility"], False)
+    camera = context.trace(scene, [], sampler(rgb), ray, rgb.Bool(True))
+    camera.settle()
     kernels = []
     for eye in EYES:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
-            dr.eval(asked.watcher(eye).pixel(pixel).channels(["gaze", "visibility"]))
+            dr.eval(camera.for_observer(context.observer_at(eye)).channels(["gaze", "visibility"]))
             kernels.append({k["hash"] for k in dr.kernel_history() if "hash" in k})
     assert kernels[0] and kernels[0] == kernels[1] == kernels[2]
 
 
 def test06_an_observer_where_the_camera_stands(rgb, scene):
-    camera = rgb.load_dict(
+    sensor = rgb.load_dict(
         {"type": "perspective", "to_world": rgb.ScalarTransform4f().look_at([0, -3, 0], [0, 0, 0], [0, 0, 1])}
     )
-    ray, _ = camera.sample_ray_differential(0, 0, rgb.Point2f([0.4, 0.5], [0.5, 0.6]), rgb.Point2f(0.5))
-    asked = scene.integrator().asked(["gaze", "visibility", "density_evals"], False)
-    pixel = asked.pixel(scene, [camera], sampler(rgb), ray, rgb.Bool(True))
-    there, elsewhere = (asked.watcher(eye).pixel(pixel) for eye in ((0, -3, 0), EYES[1]))
+    ray, _ = sensor.sample_ray_differential(0, 0, rgb.Point2f([0.4, 0.5], [0.5, 0.6]), rgb.Point2f(0.5))
+    context = scene.integrator().for_aovs(["gaze", "visibility", "density_evals"], False)
+    camera = context.trace(scene, [sensor], sampler(rgb), ray, rgb.Bool(True))
+    there, elsewhere = (camera.for_observer(context.observer_at(eye)) for eye in ((0, -3, 0), EYES[1]))
     assert there.aligned and not elsewhere.aligned
     # For the others a second march decides what they see.
     evaluations = lambda pixel: np.array(pixel.channels(["visibility", "density_evals"])[1])
     assert np.all(evaluations(there) < evaluations(elsewhere))
-    own = pixel.for_origins()
+    own = camera.for_origins()
     assert own.aligned and np.allclose(
         np.array(own.channels(["gaze"])[0]), np.array(there.channels(["gaze"])[0]), rtol=1e-3
     )
@@ -110,11 +110,11 @@ def test06_an_observer_where_the_camera_stands(rgb, scene):
 def test07_nothing_to_see(rgb, ray):
     scene = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg"}})
     with pytest.raises(NergError, match="nothing to render"):
-        scene.integrator().asked(["depth"], False).pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
+        scene.integrator().for_aovs(["depth"], False).trace(scene, [], sampler(rgb), ray, rgb.Bool(True))
 
 
 def test08_integrals_of_several_observers_are_kept(rgb, files, tmp_path, ray, monkeypatch):
-    """Two observers asked for in turns: each has an integral of their own, which is found once."""
+    """Two observers in turns: each has an integral of their own, which is found once."""
     from nerg_mi.transport import observer_gaze
 
     fields.gaze(tmp_path / "gaze.safetensors", normalized=True)
@@ -125,8 +125,10 @@ def test08_integrals_of_several_observers_are_kept(rgb, files, tmp_path, ray, mo
     monkeypatch.setattr(observer_gaze, "integrate", lambda *a: found.append(1) or integrate(*a))
     values = []
     for _ in range(2):
-        asked = scene.integrator().asked(["gaze"], False)
-        pixel = asked.pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
-        values.append([np.array(asked.watcher(eye).pixel(pixel).channels(["gaze"])[0]) for eye in EYES[:2]])
+        context = scene.integrator().for_aovs(["gaze"], False)
+        camera = context.trace(scene, [], sampler(rgb), ray, rgb.Bool(True))
+        values.append(
+            [np.array(camera.for_observer(context.observer_at(eye)).channels(["gaze"])[0]) for eye in EYES[:2]]
+        )
     assert len(found) == 2
     np.testing.assert_array_equal(values[0], values[1])
