@@ -4,15 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 
 from nerg_mi.maths.arrays import log1p
 from nerg_mi.maths.types import Bool, Color, Float, UInt32
 
-from .march_primal import MarchResult, MarchSettings, Occlusion, add, advance, limits, march_hits, march_primal
-from .medium import LastHit, LocalRay, Medium, Painter
+from .march_primal import (
+    MarchResult,
+    MarchSettings,
+    Occlusion,
+    Sums,
+    advance,
+    first_hit,
+    limits,
+    march_hits,
+    march_primal,
+    nothing_absorbed,
+)
+from .medium import Hits, LastHit, LocalRay, Medium, Painter
 from .quadrature import RULES, absorbed_share, boundaries
 
 # ---- Derivatives of a march, by marching again ----
@@ -58,25 +69,48 @@ def differentiable_march(
     """A march as one differentiable ``operation``; the other arguments are those of ``march.march``."""
     # Every sample gets its own colour: a shared one would hand its derivative to the wrong samples.
     settings = replace(settings, color_cutoff=0.0)
-    fixed = (medium, active, settings, offset, color, count, until, fine_from)
-    out = dr.custom(operation, ray.o, ray.d, ray.w, t0, t1, fixed)
-    result = MarchResult(*out)
+    fixed = _Fixed(medium, active, settings, offset, color, count, until, fine_from)
+    result = dr.custom(operation, ray.o, ray.d, ray.w, t0, t1, fixed)
     for name in ("half_slope", "enter", "enter_tau"):
         setattr(result, name, dr.detach(getattr(result, name)))
     return result
 
 
 @dataclass
-class _State:
+class _Fixed:
+    """The arguments of ``march`` that no derivatives are taken of."""
+
+    medium: Medium
+    active: Bool
+    settings: MarchSettings
+    offset: Float | None
+    color: Painter | None
+    count: bool
+    until: Float | None
+    fine_from: Float | None
+
+
+@dataclass(kw_only=True)
+class _Replay(Sums):
     """Where a repeated march is: the primal's loop state as far as derivatives need it."""
 
     active: Bool
+    color: Color
+
+
+@dataclass(kw_only=True)
+class _ReplayedSteps(_Replay):
+    """Of a march in steps; the fields are those of the primal's state."""
+
     t: Float
     share: Float
-    tau: Float
-    moment: Float
-    lost: tuple[Float, Float]
-    color: Color | None
+
+
+@dataclass(kw_only=True)
+class _ReplayedHits(_Replay):
+    """Of a march from hit to hit; ``index``: of the hit to come."""
+
+    index: UInt32
 
 
 @dataclass
@@ -100,71 +134,56 @@ class March(dr.CustomOp):
     """A march as one node of the graph: ``march_primal`` forwards, and once more for the derivatives."""
 
     def eval(self, o, d, w, t0, t1, fixed):
-        self.fixed = fixed
+        self.fixed: _Fixed = fixed
         self.inputs = (o, d, w, t0, t1)
-        medium = fixed[0]
         # The medium's weights are read, not passed: tell the graph that the result depends on them.
-        for parameter in medium.parameters():
+        for parameter in fixed.medium.parameters():
             self.add_input(parameter)
         with dr.suspend_grad():
             # Symbolic also where an enclosing derivative has switched loops to evaluated ones: the
             # steps must not be stored.
             with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-                result = self._primal()
-        self.result = result
-        return (
-            result.tau,
-            result.moment,
-            result.half,
-            result.half_slope,
-            result.enter,
-            result.enter_tau,
-            result.color,
-            result.density_evals,
-            result.color_evals,
-        )
+                self.result = self._primal()
+        return self.result
 
     def _primal(self) -> MarchResult:
-        medium, *rest = self.fixed
-        t0, t1 = self.inputs[3:]
-        return march_primal(medium, LocalRay(*self.inputs), t0, t1, *rest)
+        f, (t0, t1) = self.fixed, self.inputs[3:]
+        ray = LocalRay(*self.inputs)
+        return march_primal(
+            f.medium, ray, t0, t1, f.active, f.settings, f.offset, f.color, f.count, f.until, f.fine_from
+        )
 
     def backward(self):
-        active, color = self.fixed[1], self.fixed[4]
-        adjoints: Any = self.grad_out()
-        d_tau, d_moment, d_half, _, _, _, d_color, _, _ = adjoints
-        # Colours are there wherever a painter is.
-        primal: Any = self.result
-        d_half = dr.select(dr.isfinite(primal.half), d_half, 0)
+        color, primal = self.fixed.color, self.result
+        adjoint: Any = self.grad_out()
+        d_half = dr.select(dr.isfinite(primal.half), adjoint.half, 0)
 
         def body(state, grads):
             with dr.resume_grad():
                 leaves = [dr.detach(x) for x in self.inputs]
                 dr.enable_grad(leaves)
                 step, state = self._replay(leaves, state)
-                arriving = d_moment * step.mean
-                behind = d_moment * (primal.moment - state.moment)
+                arriving = adjoint.moment * step.mean
+                behind = adjoint.moment * (primal.moment - state.moment)
                 if color is not None:
-                    arriving += dr.dot(d_color, step.color)
-                    behind += dr.dot(d_color, primal.color - state.color)
-                f = step.dtau * (d_tau - behind) + step.transmittance * absorbed_share(step.dtau) * arriving
+                    arriving += dr.dot(adjoint.color, step.color)
+                    behind += dr.dot(adjoint.color, primal.color - state.color)
+                f = step.dtau * (adjoint.tau - behind) + step.transmittance * absorbed_share(step.dtau) * arriving
                 h = dr.select(step.before, -primal.half_slope * step.dtau, dr.select(step.crosses, step.crossing, 0))
                 dr.backward_from(dr.select(step.active, f + d_half * h, 0))
                 grads = [g + dr.grad(x) for g, x in zip(grads, leaves)]
             return state, grads
 
         zeros = [dr.zeros(type(x), dr.width(x)) for x in self.inputs]
-        for name, g in zip(_INPUTS, self._march_again(body, active, zeros)):
+        for name, g in zip(_INPUTS, self._march_again(body, zeros)):
             self.set_grad_in(name, g)
 
     def forward(self):
-        active, color = self.fixed[1], self.fixed[4]
+        color, primal = self.fixed.color, self.result
         tangents = [self.grad_in(name) for name in _INPUTS]
         Float = type(self.inputs[3])
-        primal = self.result
 
-        def body(state, sums):
-            tau_dot, moment_dot, half_dot, color_dot = sums
+        def body(state, dot):
             with dr.resume_grad():
                 leaves = [dr.detach(x) for x in self.inputs]
                 dr.enable_grad(leaves)
@@ -179,79 +198,73 @@ class March(dr.CustomOp):
                 dr.forward_to(outputs, flags=dr.ADFlag.ClearNone)
                 own = [dr.select(step.active, dr.grad(x), 0) for x in outputs]
             # T_i falls with the optical depth in front of the step.
-            moment_dot = moment_dot + own[1] - dr.select(step.active, tau_dot * dr.detach(outputs[1]), 0)
-            half_dot = half_dot + own[2] - dr.select(step.crosses, tau_dot * primal.half_slope, 0)
+            moment = dot.moment + own[1] - dr.select(step.active, dot.tau * dr.detach(outputs[1]), 0)
+            half = dot.half + own[2] - dr.select(step.crosses, dot.tau * primal.half_slope, 0)
+            painted = dot.color
             if color is not None:
-                color_dot = color_dot + own[3] - dr.select(step.active, tau_dot * dr.detach(outputs[3]), 0)
-            return state, (tau_dot + own[0], moment_dot, half_dot, color_dot)
+                painted = painted + own[3] - dr.select(step.active, dot.tau * dr.detach(outputs[3]), 0)
+            return state, replace(dot, tau=dot.tau + own[0], moment=moment, half=half, color=painted)
 
-        zero = (Float(0), Float(0), Float(0), None if color is None else color.zero())
-        tau_dot, moment_dot, half_dot, color_dot = self._march_again(body, active, zero)
-        nothing = Float(0)
-        counts = [None if x is None else nothing for x in (primal.density_evals, primal.color_evals)]
-        self.set_grad_out((tau_dot, moment_dot, half_dot, nothing, nothing, nothing, color_dot, *counts))
+        start = MarchResult.start(Float, color, self.fixed.count, None)
+        self.set_grad_out(self._march_again(body, replace(start, half=Float(0))))
 
-    def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], active: Bool, extra: Any) -> Any:
+    def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], extra: Any) -> Any:
         """Repeat the primal's steps, threading ``extra`` through ``body(state, extra)``."""
-        offset, color = self.fixed[3], self.fixed[4]
-        Float = type(self.inputs[3])
-        start = _State(
-            active,
-            self.inputs[3],
-            Float(1 if offset is None else offset),
-            Float(0),
-            Float(0),
-            (Float(0), Float(0)),
-            None if color is None else color.zero(),
-        )
+        f, t0 = self.fixed, self.inputs[3]
+        Float = type(t0)
+        share, color = Float(1 if f.offset is None else f.offset), None if f.color is None else f.color.zero()
+        start = _ReplayedSteps(**nothing_absorbed(Float), active=f.active, color=color, t=t0, share=share)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
             _, extra = dr.while_loop((start, extra), lambda state, _: state.active, body, label="march adjoint")
         return extra
 
     def _replay(self, leaves: list[Any], state: Any) -> tuple[Replayed, Any]:
         """The next step, attached to ``leaves`` and the medium, and the state after it."""
-        medium, _, settings, _, color, _, until, fine_from = self.fixed
-        primal_t0, primal_t1 = self.inputs[3:]
-        Float = type(primal_t0)
-        quadrature = RULES.find(settings.quadrature)
-        cells = boundaries(quadrature, medium)
-        goal, end = limits(Float, settings, until)
+        f, (primal_t0, primal_t1) = self.fixed, self.inputs[3:]
+        quadrature = RULES.find(f.settings.quadrature)
+        cells = boundaries(quadrature, f.medium)
         ray = LocalRay(*self.inputs)
         active, t, delta, t_next = advance(
-            medium, ray, state.t, primal_t1, state.share, settings, state.active, cells, fine_from
+            f.medium, ray, state.t, primal_t1, state.share, f.settings, state.active, cells, f.fine_from
         )
         o, d, w, t0, t1 = leaves
         begin = t0 + (t - primal_t0)
         length = dr.select(t_next >= primal_t1, t1 - begin, delta)
-        step = quadrature.step(
-            medium, LocalRay(o, d, w, t0, t1), begin, length, t_next, None, active, color is not None
+        attached = LocalRay(o, d, w, t0, t1)
+        step = quadrature.step(f.medium, attached, begin, length, t_next, None, active, f.color is not None)
+        replayed, after = self._absorb(
+            state,
+            active,
+            step.dtau,
+            absorbed_share(dr.detach(step.dtau)),
+            dr.fma(length, step.share, t - primal_t0),
+            step.paint,
+            lambda missing: begin + step.crossing(missing),
         )
-        tau = state.tau
-        dtau = dr.detach(step.dtau)
-        transmittance = dr.exp(-tau)
-        weight = transmittance * absorbed_share(dtau)
-        mean = dr.fma(length, step.share, t - primal_t0)
-        total, painted = state.color, None
-        moment, lost_moment = add(state.moment, state.lost[1], weight * dr.detach(mean))
-        tau_after, lost_tau = add(tau, state.lost[0], dtau)
-        if color is not None:
+        return replayed, replace(after, active=after.active & (t_next < primal_t1), t=t_next, share=type(t0)(1))
+
+    def _absorb(
+        self,
+        state: Any,
+        active: Bool,
+        dtau: Float,
+        absorbed: Float,
+        mean: Float,
+        paint: Callable[[Painter, Bool], Color],
+        crossing: Callable[[Float], Float],
+    ) -> tuple[Replayed, Any]:
+        """One step, and the sums of ``state`` behind it: ``dtau`` and ``mean`` attached, ``absorbed`` detached."""
+        goal, end = limits(type(state.tau), self.fixed.settings, self.fixed.until)
+        after, weight, crosses = state.absorb(active, dr.detach(dtau), absorbed, dr.detach(mean), goal)
+        painted = None
+        if self.fixed.color is not None:
             lit = active & (weight > 0)
-            painted = dr.select(lit, step.paint(color, lit), 0)
-            total = total + weight * dr.detach(painted)
-        before = active & (tau_after < goal)
-        crosses = active & ~before & (tau < goal)
-        crossing = begin + step.crossing(dr.select(crosses, goal - tau, 0))
-        replayed = Replayed(active, step.dtau, mean, painted, transmittance, before, crosses, crossing)
-        after = _State(
-            active & (t_next < primal_t1) & (tau_after < end),
-            t_next,
-            Float(1),
-            tau_after,
-            moment,
-            (lost_tau, lost_moment),
-            total,
-        )
-        return replayed, after
+            painted = dr.select(lit, paint(self.fixed.color, lit), 0)
+            after.color = after.color + weight * dr.detach(painted)
+        after.active = active & (after.tau < end)
+        before = active & (after.tau < goal)
+        at = crossing(dr.select(crosses, goal - state.tau, 0))
+        return Replayed(active, dtau, mean, painted, dr.exp(-state.tau), before, crosses, at), after
 
     def name(self):
         return "march"
@@ -264,32 +277,20 @@ class March(dr.CustomOp):
 # that moves past another, or to where it is cut off, changes the sums by a jump that is not seen.
 
 
-@dataclass
-class _HitState:
-    """Where a repeated march is: the hit to come, and the sums in front of it."""
-
-    active: Bool
-    index: UInt32
-    tau: Float
-    moment: Float
-    lost: tuple[Float, Float]
-    color: Color | None
-
-
 class HitMarch(March):
     """``march_hits`` as one node of the graph."""
 
     def _primal(self) -> MarchResult:
-        medium, active, settings, _, color, count, until, _ = self.fixed
-        t0, t1 = self.inputs[3:]
-        return march_hits(medium, medium.hits, LocalRay(*self.inputs), t0, t1, active, settings, color, count, until)
+        f, (t0, t1) = self.fixed, self.inputs[3:]
+        hits, ray = cast("Hits", f.medium.hits), LocalRay(*self.inputs)
+        return march_hits(f.medium, hits, ray, t0, t1, f.active, f.settings, f.color, f.count, f.until)
 
-    def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], active: Bool, extra: Any) -> Any:
-        medium, _, settings, _, color, _, until, _ = self.fixed
-        ray, (t0, t1) = LocalRay(*(dr.detach(x) for x in self.inputs)), self.inputs[3:]
+    def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], extra: Any) -> Any:
+        f, (t0, t1) = self.fixed, self.inputs[3:]
+        hits, ray = cast("Hits", f.medium.hits), LocalRay(*(dr.detach(x) for x in self.inputs))
         Float = type(t0)
         UInt32 = dr.uint32_array_t(Float)
-        end = limits(Float, settings, until)[1]
+        end = limits(Float, f.settings, f.until)[1]
 
         def take(state, t, index, extra):
             """The first of the hits; the others move up."""
@@ -298,42 +299,34 @@ class HitMarch(March):
             return replace(state, active=state.active & (t[0] < dr.inf)), t, index, extra
 
         def group(active, last, state, extra):
-            found = medium.hits.nearest(ray, last, t1, dr.exp(-state.tau), dr.exp(-end), active)
-            farthest = LastHit(found.t[-1], found.index[-1])
-            state = replace(state, active=active & (found.t[0] < dr.inf))
+            near = hits.nearest(ray, last, t1, dr.exp(-state.tau), dr.exp(-end), active)
+            farthest = LastHit(near.t[-1], near.index[-1])
+            state = replace(state, active=active & (near.t[0] < dr.inf))
             state, _, _, extra = dr.while_loop(
-                (state, found.t, found.index, extra), lambda state, *_: state.active, take, label="hits again"
+                (state, near.t, near.index, extra), lambda state, *_: state.active, take, label="hits again"
             )
             return active & (farthest.t < dr.inf) & (state.tau < end), farthest, state, extra
 
-        nothing = None if color is None else color.zero()
-        state = _HitState(active, UInt32(0), Float(0), Float(0), (Float(0), Float(0)), nothing)
-        first = LastHit(dr.fma(dr.abs(t0), -(2.0**-22), t0 - 1e-37), UInt32(0))
+        color = None if f.color is None else f.color.zero()
+        state = _ReplayedHits(**nothing_absorbed(Float), active=f.active, color=color, index=UInt32(0))
+        first = first_hit(t0)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-            out = dr.while_loop((active, first, state, extra), lambda active, *_: active, group, label="hits adjoint")
+            out = dr.while_loop((f.active, first, state, extra), lambda active, *_: active, group, label="hits adjoint")
         return out[3]
 
     def _replay(self, leaves: list[Any], state: Any) -> tuple[Replayed, Any]:
-        medium, _, settings, _, color, _, until, _ = self.fixed
+        medium, active, index = self.fixed.medium, state.active, state.index
         o, d, w, t0, t1 = leaves
-        goal, end = limits(type(t0), settings, until)
-        active, tau = state.active, state.tau
-        t, absorbed = medium.hits.again(LocalRay(o, d, w, t0, t1), state.index, active)
-        dtau, mean = dr.select(active, -log1p(-absorbed), 0), t - t0
-        transmittance = dr.exp(-tau)
-        weight = dr.select(active, transmittance * dr.detach(absorbed), 0)
-        moment, lost_moment = add(state.moment, state.lost[1], weight * dr.detach(mean))
-        after, lost_tau = add(tau, state.lost[0], dr.detach(dtau))
-        total, painted = state.color, None
-        if color is not None:
-            lit = active & (weight > 0)
-            painted = dr.select(lit, color.paint(medium, [state.index], o + d * t, w, lit), 0)
-            total = total + weight * dr.detach(painted)
-        before = active & (after < goal)
-        crosses = active & ~before & (tau < goal)
-        replayed = Replayed(active, dtau, mean, painted, transmittance, before, crosses, t)
-        lost = lost_tau, lost_moment
-        return replayed, _HitState(active & (after < end), state.index, after, moment, lost, total)
+        t, absorbed = cast("Hits", medium.hits).again(LocalRay(o, d, w, t0, t1), index, active)
+        return self._absorb(
+            state,
+            active,
+            dr.select(active, -log1p(-absorbed), 0),
+            dr.select(active, dr.detach(absorbed), 0),
+            t - t0,
+            lambda painter, lit: painter.paint(medium, [index], o + d * t, w, lit),
+            lambda missing: t,
+        )
 
 
 # ---- March ----

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 
 from nerg_mi.maths.arrays import log1p, quotient
-from nerg_mi.maths.types import Bool, Color, Float
+from nerg_mi.maths.types import Bool, Color, Float, UInt32
 
 from .medium import Hits, LastHit, LocalRay, Medium, Occupancy, Painter, VoxelCells
 from .quadrature import RULES, absorbed_share, boundaries
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 # ---- Occlusion ----
 #
@@ -103,15 +107,55 @@ def default_stop(medium: Medium | None) -> float:
     return MarchSettings.stop if medium is None or medium.hits is None else HITS_STOP
 
 
-@dataclass
-class MarchResult:
-    """What a march gathered along each ray. Distances are in scene units, from the ray's start."""
+def add(total: Float, lost: Float, term: Float) -> tuple[Float, Float]:
+    """``(total + term, lost)`` with the rounding of the sum carried along (Kahan 1965).
+
+    A thousand plain additions lose two digits, and the derivative of a depth divides what is lost by the opacity.
+    """
+    term = term - lost
+    after = total + term
+    return after, (after - total) - term
+
+
+@dataclass(kw_only=True)
+class Sums:
+    """What matter along a ray adds up to, up to some point of it; rounding is carried along (`add`)."""
 
     # Optical depth.
     tau: Float
-    # Sum of the distances of absorption from `origin` on, weighted by what is absorbed: far from the ray's start, sums
-    # of whole distances would lose their last digits.
+    # Sum of the distances of absorption from where the march began, weighted by what is absorbed: far from the ray's
+    # start, sums of whole distances would lose their last digits.
     moment: Float
+    # What rounding took from both.
+    lost_tau: Float
+    lost_moment: Float
+
+    def absorb(
+        self, active: Bool, dtau: Float, absorbed: Float, distance: Float, goal: Float
+    ) -> tuple[Self, Float, Bool]:
+        """``(sums, weight, crosses)`` behind matter of optical depth ``dtau``, which absorbs the share ``absorbed`` of
+        the light that arrives, at the mean ``distance`` from where the march began (0 both where not ``active``).
+
+        ``weight``: share of the ray's light that it absorbs; ``crosses``: where the optical depth ``goal`` is reached
+        in it.
+        """
+        weight = dr.exp(-self.tau) * absorbed
+        moment, lost_moment = add(self.moment, self.lost_moment, weight * distance)
+        # The sum that the next step starts from: a goal between it and a plain sum would be crossed by no step.
+        tau, lost_tau = add(self.tau, self.lost_tau, dtau)
+        after = replace(self, tau=tau, moment=moment, lost_tau=lost_tau, lost_moment=lost_moment)
+        return after, weight, active & (self.tau < goal) & (tau >= goal)
+
+
+def nothing_absorbed(Float: type) -> dict[str, Any]:
+    """The fields of `Sums` where a march begins."""
+    return {name: Float(0) for name in ("tau", "moment", "lost_tau", "lost_moment")}
+
+
+@dataclass(kw_only=True)
+class MarchResult(Sums):
+    """What a march gathered along each ray. Distances are in scene units, from the ray's start."""
+
     # Distance at which transmittance crosses 1/2, or optical depth the one asked for; infinite where it does not.
     half: Float
     # Change of `half` with that optical depth. Carries no derivatives.
@@ -120,7 +164,7 @@ class MarchResult:
     enter: Float
     enter_tau: Float
     # Sum of colours, weighted by what is absorbed; None when no colour was asked for.
-    color: Color | None = None
+    color: Color = None
     # Evaluations made; None unless counted.
     density_evals: Float | None = None
     color_evals: Float | None = None
@@ -128,6 +172,34 @@ class MarchResult:
     known: Bool | None = None
     # Distance at which the march began.
     origin: Float = 0
+
+    @classmethod
+    def start(cls, Float: type, color: Painter | None, count: bool, occlusion: Occlusion | None) -> MarchResult:
+        """Of a march that has not met anything; the arguments are those of ``march.march``."""
+        return cls(
+            **nothing_absorbed(Float),
+            half=Float(dr.inf),
+            half_slope=Float(0),
+            enter=Float(0),
+            enter_tau=Float(0),
+            color=None if color is None else color.zero(),
+            density_evals=Float(0) if count else None,
+            color_evals=Float(0) if count and color is not None else None,
+            known=None if occlusion is None else dr.mask_t(Float)(False),
+        )
+
+    def cross(self, crosses: Bool, half: Float, slope: Float, enter: Float, enter_tau: Float) -> None:
+        """Note where the optical depth that is looked for is reached, on the rays that cross it."""
+        self.half = dr.select(crosses, half, self.half)
+        self.half_slope = dr.select(crosses, slope, self.half_slope)
+        self.enter = dr.select(crosses, enter, self.enter)
+        self.enter_tau = dr.select(crosses, enter_tau, self.enter_tau)
+
+    def settle(self, answered: Bool, active: Bool) -> Bool:
+        """Note on which of the ``active`` rays the question of occlusion is ``answered``; the rays that go on."""
+        answered = active & answered
+        self.known = self.known | answered
+        return active & ~answered
 
     def count_in(self, other: MarchResult) -> None:
         """Add the density evaluations of another march to this one's, if they are counted."""
@@ -260,6 +332,21 @@ def leap(
 LOG2 = 0.6931471805599453
 
 
+@dataclass
+class _Steps:
+    """Where a march in steps is."""
+
+    active: Bool
+    t: Float
+    # Length of the next step as a share of a full one; None: always 1.
+    share: Float | None
+    # What the next step reuses of the last one.
+    carry: Any
+    # Weight of the samples that have no colour yet; None without colour.
+    pending: Float
+    found: MarchResult
+
+
 def march_primal(
     medium: Medium,
     ray: LocalRay,
@@ -283,22 +370,17 @@ def march_primal(
     quadrature = RULES.find(settings.quadrature)
     cells = boundaries(quadrature, medium)
 
-    def body(active, t, share, carry, lost, tau, moment, half, slope, enter, enter_tau, total, pending, n, m, known):
-        part = Float(1) if share is None else share
-        active, t, delta, t_next = advance(medium, ray, t, t1, part, settings, active, cells, fine_from)
+    def body(state: _Steps) -> tuple[_Steps]:
+        share = Float(1) if state.share is None else state.share
+        active, t, delta, t_next = advance(medium, ray, state.t, t1, share, settings, state.active, cells, fine_from)
+        found, tau, pending = replace(state.found), state.found.tau, state.pending
         if occlusion is not None:
-            clear = active & occlusion.clear(t, tau)
-            known, active = known | clear, active & ~clear
-        step = quadrature.step(medium, ray, t, delta, t_next, carry, active, color is not None)
-        weight = dr.exp(-tau) * absorbed_share(step.dtau)
-        moment, lost_moment = add(moment, lost[1], weight * dr.fma(delta, step.share, t - t0))
-        # The sum that the next step starts from: a goal between it and a plain sum would be crossed by no step.
-        after, lost_tau = add(tau, lost[0], step.dtau)
-        crosses = active & (tau < goal) & (after >= goal)
-        half = dr.select(crosses, t + step.crossing(goal - tau), half)
-        slope = dr.select(crosses, delta / dr.select(crosses, step.dtau, 1), slope)
-        enter, enter_tau = dr.select(crosses, t, enter), dr.select(crosses, tau, enter_tau)
-
+            active = found.settle(occlusion.clear(t, tau), active)
+        step = quadrature.step(medium, ray, t, delta, t_next, state.carry, active, color is not None)
+        distance = dr.fma(delta, step.share, t - t0)
+        found, weight, crosses = found.absorb(active, step.dtau, absorbed_share(step.dtau), distance, goal)
+        slope = delta / dr.select(crosses, step.dtau, 1)
+        found.cross(crosses, t + step.crossing(goal - tau), slope, t, tau)
         if color is not None:
             painter = color
             pending = pending + weight
@@ -306,73 +388,33 @@ def march_primal(
             shown = dr.if_stmt(
                 (lit,), lit, lambda lit: step.paint(painter, lit), lambda lit: painter.zero(), label="colour"
             )
-            total = total + pending * shown
+            found.color = found.color + pending * shown
             pending = dr.select(lit, 0, pending)
-            if count:
-                m = m + dr.select(lit, 1, 0)
-        if count:
-            n = n + step.evals
-
-        tau = after
+            if found.color_evals is not None:
+                found.color_evals = found.color_evals + dr.select(lit, 1, 0)
+        if found.density_evals is not None:
+            found.density_evals = found.density_evals + step.evals
         if occlusion is not None:
-            hidden = active & occlusion.hidden(t_next, tau)
-            known, active = known | hidden, active & ~hidden
-        active = active & (t_next < t1) & (tau < end)
-        return (
-            active,
-            t_next,
-            None if share is None else Float(1),
-            step.carry,
-            (lost_tau, lost_moment),
-            tau,
-            moment,
-            half,
-            slope,
-            enter,
-            enter_tau,
-            total,
-            pending,
-            n,
-            m,
-            known,
-        )
+            active = found.settle(occlusion.hidden(t_next, found.tau), active)
+        active = active & (t_next < t1) & (found.tau < end)
+        return (_Steps(active, t_next, None if state.share is None else Float(1), step.carry, pending, found),)
 
-    start = (
+    start = _Steps(
         active,
         t0,
         # A state that never changes would have the loop recorded twice.
         None if offset is None else Float(offset),
         quadrature.start(Float),
-        (Float(0), Float(0)),
-        Float(0),
-        Float(0),
-        Float(dr.inf),
-        Float(0),
-        Float(0),
-        Float(0),
-        None if color is None else color.zero(),
         None if color is None else Float(0),
-        Float(0) if count else None,
-        Float(0) if count and color is not None else None,
-        None if occlusion is None else dr.mask_t(Float)(False),
+        MarchResult.start(Float, color, count, occlusion),
     )
-    state = dr.while_loop(start, lambda active, *_: active, body, label="march")
-    tau, moment, half, slope, enter, enter_tau, total, pending, n, m, known = state[5:]
+    (state,) = dr.while_loop((start,), lambda state: state.active, body, label="march")
+    found = state.found
     if color is not None:
         # What never gathered enough weight for a colour of its own takes that of the rest.
-        painted = absorbed_share(tau) - pending
-        total *= dr.select(painted > 0, 1 + pending / dr.select(painted > 0, painted, 1), 0)
-    return MarchResult(tau, moment, half, slope, enter, enter_tau, total, n, m, known)
-
-
-def add(total: Float, lost: Float, term: Float) -> tuple[Float, Float]:
-    """``(total + term, lost)`` with the rounding of the sum carried along (Kahan 1965).
-
-    A thousand plain additions lose two digits, and the derivative of a depth divides what is lost by the opacity.
-    """
-    term = term - lost
-    after = total + term
-    return after, (after - total) - term
+        painted = absorbed_share(found.tau) - state.pending
+        found.color *= dr.select(painted > 0, 1 + state.pending / dr.select(painted > 0, painted, 1), 0)
+    return found
 
 
 def limits(Float: type, settings: MarchSettings, until: Float | None) -> tuple[Float, Float]:
@@ -391,6 +433,22 @@ def limits(Float: type, settings: MarchSettings, until: Float | None) -> tuple[F
 # A hit that absorbs the share α adds -ln(1 - α) of optical depth at its distance, all at once; the sums are those of
 # ``primal``, with hits for steps. Half of the light is gone at the hit that takes it, so that a median needs no
 # crossing.
+
+
+@dataclass
+class _Hits:
+    """Which hits of a group are still to be met."""
+
+    active: Bool
+    t: list[Float]
+    absorbed: list[Float]
+    index: list[UInt32]
+    found: MarchResult
+
+
+def first_hit(t0: Float) -> LastHit:
+    """Behind which the first hits are looked for: one may lie at ``t0`` itself."""
+    return LastHit(dr.fma(dr.abs(t0), -(2.0**-22), t0 - 1e-37), dr.uint32_array_t(type(t0))(0))
 
 
 def march_hits(
@@ -413,68 +471,42 @@ def march_hits(
     goal, end = limits(Float, settings, until)
     stop = dr.exp(-end)
 
-    def take(going, t, absorbed, index, lost, tau, moment, half, enter, enter_tau, total, m, known):
+    def take(state: _Hits) -> tuple[_Hits]:
         """The first of the hits; the others move up."""
-        here, share, thing = t[0], absorbed[0], index[0]
+        active, found, t, index = state.active, replace(state.found), state.t[0], state.index[0]
+        tau = found.tau
         if occlusion is not None:
-            clear = going & occlusion.clear(here, tau)
-            known, going = known | clear, going & ~clear
-        dtau = dr.select(going, -log1p(-share), 0)
-        weight = dr.select(going, dr.exp(-tau) * share, 0)
-        moment, lost_moment = add(moment, lost[1], weight * (here - t0))
-        after, lost_tau = add(tau, lost[0], dtau)
-        crosses = going & (tau < goal) & (after >= goal)
-        half, enter = dr.select(crosses, here, half), dr.select(crosses, here, enter)
-        enter_tau = dr.select(crosses, tau, enter_tau)
+            active = found.settle(occlusion.clear(t, tau), active)
+        absorbed = dr.select(active, state.absorbed[0], 0)
+        found, weight, crosses = found.absorb(active, -log1p(-absorbed), absorbed, t - t0, goal)
+        found.cross(crosses, t, 0, t, tau)
         if color is not None:
-            painter, lit = color, going & (weight > 0)
-            total = total + weight * dr.if_stmt(
-                (lit, thing),
+            painter, lit = color, active & (weight > 0)
+            found.color = found.color + weight * dr.if_stmt(
+                (lit, index),
                 lit,
-                lambda lit, thing: painter.paint(medium, [thing], ray.o + ray.d * here, ray.w, lit),
-                lambda lit, thing: painter.zero(),
+                lambda lit, index: painter.paint(medium, [index], ray.o + ray.d * t, ray.w, lit),
+                lambda lit, index: painter.zero(),
                 label="colour",
             )
-            if count:
-                m = m + dr.select(lit, 1, 0)
-        tau = after
+            if found.color_evals is not None:
+                found.color_evals = found.color_evals + dr.select(lit, 1, 0)
         if occlusion is not None:
-            hidden = going & occlusion.hidden(here, tau)
-            known, going = known | hidden, going & ~hidden
-        t, absorbed, index = t[1:] + [Float(dr.inf)], absorbed[1:] + [Float(0)], index[1:] + [UInt32(0)]
-        going = going & (tau < end) & (t[0] < dr.inf)
-        return going, t, absorbed, index, (lost_tau, lost_moment), tau, moment, half, enter, enter_tau, total, m, known
+            active = found.settle(occlusion.hidden(t, found.tau), active)
+        rest = state.t[1:] + [Float(dr.inf)], state.absorbed[1:] + [Float(0)], state.index[1:] + [UInt32(0)]
+        return (_Hits(active & (found.tau < end) & (rest[0][0] < dr.inf), *rest, found),)
 
-    def group(active, last, n, lost, tau, moment, half, enter, enter_tau, total, m, known):
+    def group(active: Bool, last: LastHit, found: MarchResult) -> tuple[Bool, LastHit, MarchResult]:
         """The next hits, as many as are found at once."""
-        found = hits.nearest(ray, last, t1, dr.exp(-tau), stop, active)
-        if count:
-            n = n + found.evals
-        farthest = LastHit(found.t[-1], found.index[-1])
-        going = active & (found.t[0] < dr.inf)
-        state = going, found.t, found.absorbed, found.index, lost, tau, moment, half, enter, enter_tau, total, m, known
-        state = dr.while_loop(state, lambda going, *_: going, take, label="hits")
-        tau, known = state[5], state[12]
-        active = active & (farthest.t < dr.inf) & (tau < end)
-        if occlusion is not None:
-            active = active & ~known
-        return active, farthest, n, *state[4:]
+        near, found = hits.nearest(ray, last, t1, dr.exp(-found.tau), stop, active), replace(found)
+        if found.density_evals is not None:
+            found.density_evals = found.density_evals + near.evals
+        farthest = LastHit(near.t[-1], near.index[-1])
+        start = _Hits(active & (near.t[0] < dr.inf), near.t, near.absorbed, near.index, found)
+        (state,) = dr.while_loop((start,), lambda state: state.active, take, label="hits")
+        found = state.found
+        active = active & (farthest.t < dr.inf) & (found.tau < end)
+        return active if found.known is None else active & ~found.known, farthest, found
 
-    start = (
-        active,
-        # The first may lie at t0 itself.
-        LastHit(dr.fma(dr.abs(t0), -(2.0**-22), t0 - 1e-37), UInt32(0)),
-        Float(0) if count else None,
-        (Float(0), Float(0)),
-        Float(0),
-        Float(0),
-        Float(dr.inf),
-        Float(0),
-        Float(0),
-        None if color is None else color.zero(),
-        Float(0) if count and color is not None else None,
-        None if occlusion is None else dr.mask_t(Float)(False),
-    )
-    state = dr.while_loop(start, lambda active, *_: active, group, label="groups of hits")
-    n, _, tau, moment, half, enter, enter_tau, total, m, known = state[2:]
-    return MarchResult(tau, moment, half, Float(0), enter, enter_tau, total, n, m, known)
+    start = active, first_hit(t0), MarchResult.start(Float, color, count, occlusion)
+    return dr.while_loop(start, lambda active, *_: active, group, label="groups of hits")[2]

@@ -14,12 +14,10 @@ from .test_primal import grid, slab
 
 @pytest.fixture
 def taken(monkeypatch):
-    """Names of the marches that have been made."""
-    names = []
-    for name in ("march_primal", "differentiable_march"):
-        made = getattr(front, name)
-        monkeypatch.setattr(front, name, lambda *a, made=made, name=name: names.append(name) or made(*a))
-    return names
+    """An entry for each march that can be differentiated."""
+    calls, made = [], front.differentiable_march
+    monkeypatch.setattr(front, "differentiable_march", lambda *a: calls.append(1) or made(*a))
+    return calls
 
 
 def through(mi, medium, settings, z=None, march=front.march, **more):
@@ -30,15 +28,13 @@ def through(mi, medium, settings, z=None, march=front.march, **more):
 def test01_derivatives_are_paid_for_where_any_are_tracked(rgb, taken):
     settings, medium, z = MarchSettings(0.01), slab(rgb, 2, 1), rgb.Float(0)
     through(rgb, medium, settings, z)
-    assert taken == ["march_primal"]
-    taken.clear()
+    assert not taken
     dr.enable_grad(z)
     attached = through(rgb, medium, settings, z)
-    assert taken[0] == "differentiable_march" and dr.grad_enabled(attached.expected_depth)
-    taken.clear()
+    assert len(taken) == 1 and dr.grad_enabled(attached.expected_depth)
     with dr.suspend_grad():
         through(rgb, medium, settings, z)
-    assert taken == ["march_primal"]
+    assert len(taken) == 1
 
 
 def test02_both_marches_find_the_same(rgb):
