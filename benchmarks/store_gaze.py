@@ -56,8 +56,8 @@ def main(argv=None) -> None:
     from nerg_mi.formats.fields import load_gaze, load_radiance
     from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.probes.probes import place_probes
+    from nerg_mi.rays.filters import purge
     from nerg_mi.rays.rays import Rays
-    from nerg_mi.rays.splits import purge
     from nerg_mi.scenes import store
     from nerg_mi.scenes.store.attention_law import AttentionLaw
     from nerg_mi.transport.field_medium import FieldMedium

@@ -43,7 +43,7 @@ def presets() -> str:
 
 def checks() -> str:
     """What the sanity card of rays looks for."""
-    from nerg_mi.rays.checks.registry import check_table
+    from nerg_mi.rays.quality import check_table
 
     return check_table()
 

@@ -14,7 +14,7 @@ from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rays.checks.mirror import hit_shares, mirror_warning
+from nerg_mi.rays.direction_checks import hit_shares, mirror_warning
 from nerg_mi.rays.rays import Rays
 from nerg_mi.transport.geometry import Place, trace_depth
 from nerg_mi.transport.medium import Medium

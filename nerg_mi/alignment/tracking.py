@@ -10,8 +10,7 @@ from scipy import fft
 from scipy.stats import wilcoxon
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.checks.head import EXCHANGES, head_frames
-from nerg_mi.rays.checks.mirror import DECLARED
+from nerg_mi.rays.direction_checks import DECLARED, EXCHANGES, head_frames
 from nerg_mi.rays.rays import Rays
 
 from .constraints import Fit, PlaceSurface, Progress, Target

@@ -10,9 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.regions import Region
-from nerg_mi.rays.dataset.dataset import RayDataset
-from nerg_mi.rays.dataset.layout import is_dataset
-from nerg_mi.rays.dataset.merging import merge_rays
+from nerg_mi.rays.dataset import RayDataset, is_dataset, merge_rays
 from nerg_mi.rays.filters import time_order
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.visibility import CellsInView

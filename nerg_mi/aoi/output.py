@@ -15,7 +15,7 @@ from nerg_mi.figures.style import provenance, save
 from nerg_mi.files.atomic import replacing, write_text
 from nerg_mi.files.tables import markdown_table, write_csv
 from nerg_mi.jobs.reporter import Reporter
-from nerg_mi.rays.io import pyarrow_modules
+from nerg_mi.rays.rays import pyarrow_modules
 from nerg_mi.statistics.tables import BY_NAME, FIELD, MEASURES, PersonRows, Row, shown
 from nerg_mi.statistics.visits import Sums
 

@@ -20,9 +20,7 @@ from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.jobs.backend import select_backend
 from nerg_mi.jobs.gaze_places import file_of_training, place_key
 from nerg_mi.jobs.parts import Parts
-from nerg_mi.rays.dataset.dataset import RayDataset
-from nerg_mi.rays.dataset.layout import HEAD, is_dataset
-from nerg_mi.rays.dataset.manifest import read_head, read_source, source_path
+from nerg_mi.rays.dataset import HEAD, RayDataset, is_dataset, read_head, read_source, source_path
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene_file import files_of_scene
 from nerg_mi.statistics.visits import Cell, LookRules, Sums

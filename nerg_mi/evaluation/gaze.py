@@ -16,8 +16,8 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.kde import Backend, SphericalKde
 from nerg_mi.probes.probes import Probes, place_probes
+from nerg_mi.rays.filters import purge, split_by_person
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.splits import purge, split_by_person
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.transport.geometry import Place, default_settings
 from nerg_mi.transport.observer import ObserverSettings

@@ -16,7 +16,7 @@ from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.splats.files import is_splats
-from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import digest_rays
 from nerg_mi.train.gaze_recipes import gaze_recipe

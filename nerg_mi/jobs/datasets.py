@@ -12,20 +12,13 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_new_folder, check_writable, replacing_folder
-from nerg_mi.rays.dataset.card import summarise_dataset
-from nerg_mi.rays.dataset.conditions import Conditions
-from nerg_mi.rays.dataset.dataset import MOST, RAY_BYTES, RayDataset
-from nerg_mi.rays.dataset.importing import Recipe
-from nerg_mi.rays.dataset.layout import UNKNOWN
-from nerg_mi.rays.dataset.manifest import write_head
-from nerg_mi.rays.dataset.merging import merge_rays
-from nerg_mi.rays.dataset.updating import Update, update_dataset
-from nerg_mi.rays.dataset.writing import SourceWriter
-from nerg_mi.rays.io import SUFFIXES
+from nerg_mi.rays.dataset import MOST, RAY_BYTES, UNKNOWN, Conditions, RayDataset, merge_rays, write_head
+from nerg_mi.rays.dataset_open import summarise_dataset
+from nerg_mi.rays.dataset_write import Recipe, SourceWriter, Update, update_dataset
 from nerg_mi.rays.pseudonyms import read_salt
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.quality import RaysSummary
+from nerg_mi.rays.rays import SUFFIXES, Rays
 from nerg_mi.rays.readers.registry import reader_named
-from nerg_mi.rays.summary import RaysSummary
 
 from .filtering import FilterSteps, Step, least_mask
 from .options.rays import DATASET, FilterOptions, ImportOptions

@@ -18,7 +18,7 @@ from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.rays.dataset.opening import load_rays, rays_digest
+from nerg_mi.rays.dataset_open import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.geometry import GazePlace
 

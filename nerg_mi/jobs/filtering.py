@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays import filters, fixations
+from nerg_mi.rays import filters
 from nerg_mi.rays.rays import Rays
 
 from .options.rays import FilterOptions
@@ -62,7 +62,7 @@ class FilterSteps:
         limit |= {} if options.least is None else {"least": options.least}
         label = np.zeros(0, np.int64)
         if len(self.rays):
-            label = (fixations.ivt if by_velocity else fixations.idt)(self.rays, **limit)
+            label = (filters.ivt if by_velocity else filters.idt)(self.rays, **limit)
         count = len(np.unique(label[label >= 0]))
         self._reporter.message(f"{count:,} fixations ({options.fixations})")
         about = {"by": options.fixations, **limit}
@@ -75,7 +75,7 @@ class FilterSteps:
     def _replace(self, label: np.ndarray, about: dict[str, Any]) -> None:
         """Go on with a ray for each fixation."""
         before = len(self.rays)
-        rays = fixations.fixation_rays(self.rays, label)[0] if before else self.rays
+        rays = filters.fixation_rays(self.rays, label)[0] if before else self.rays
         self._reporter.message(f"fixations: one ray each, {len(rays):,} of {before:,} rays")
         self._take(rays, Step("fixations", len(rays), before, about))
 

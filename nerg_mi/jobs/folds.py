@@ -17,8 +17,8 @@ from nerg_mi.files.atomic import check_folder, write_text
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.probes.probes import LEVELS, level_name
-from nerg_mi.rays.dataset.layout import is_dataset
-from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.dataset import is_dataset
+from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene_file import files_of_scene
 from nerg_mi.tasks.code import RENDERS, versions

@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.rays.dataset.opening import load_rays, rays_digest
+from nerg_mi.rays.dataset_open import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_run import KAPPA, prior_field
 

@@ -23,9 +23,9 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.regions import Region
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
-from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.summary import summarise
 from nerg_mi.rendering.channels import Channels, render_channels
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.rendering.projection import pixel_of

@@ -16,15 +16,14 @@ from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
 from nerg_mi.ranges import LENGTHS, Checked
-from nerg_mi.rays import splits
-from nerg_mi.rays.dataset.layout import is_dataset
-from nerg_mi.rays.dataset.opening import load_rays
-from nerg_mi.rays.guess.proposal import Proposal, propose_imports
-from nerg_mi.rays.io import SUFFIXES
+from nerg_mi.rays import filters
+from nerg_mi.rays.dataset import is_dataset
+from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.guess import Proposal, propose_imports
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.quality import RaysSummary, summarise
+from nerg_mi.rays.rays import SUFFIXES, Rays
 from nerg_mi.rays.readers.registry import read_rays
-from nerg_mi.rays.summary import RaysSummary, summarise
 
 from .datasets import FileName, dataset_cards, filter_dataset, import_dataset
 from .filtering import FilterSteps
@@ -153,7 +152,7 @@ class SplitResult:
 def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter = SILENT) -> SplitResult:
     """Training rays, which are on the training side of each split, and test rays, on the test side of each.
 
-    ``rays``: those, or a file of them. Raises `NergError` for what `nerg_mi.rays.splits` refuses.
+    ``rays``: those, or a file of them. Raises `NergError` for what `nerg_mi.rays.filters` refuses.
     """
     _check_outputs(options.train_output, options.test_output)
     reporter.progress(0.0, "reading rays")
@@ -163,7 +162,7 @@ def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter 
     about: dict[str, Any] = {}
     if options.zones:
         where = {name: getattr(options, name) for name in ("zones", "zone_radius", "min_rays")}
-        held = splits.split_by_position(data, options.radius, test_probes=options.positions, seed=seed, **where)
+        held = filters.split_by_position(data, options.radius, test_probes=options.positions, seed=seed, **where)
         parts.append(held.sides)
         about["position"] = {
             "radius": options.radius,
@@ -172,15 +171,15 @@ def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter 
             "test_centres": held.test_centres.tolist(),
         }
     if options.people or options.persons:
-        sides = splits.split_by_person(
+        sides = filters.split_by_person(
             data, test_share=options.people or 0.5, test_persons=list(options.persons) or None, seed=seed
         )
         parts.append(sides)
         about["person"] = {"test": sorted(data.persons[p] for p in np.unique(data.person[sides[1]]))}
     if options.time:
-        parts.append(splits.split_by_time(data, test_share=options.time, gap=options.gap, of=options.clock))
+        parts.append(filters.split_by_time(data, test_share=options.time, gap=options.gap, of=options.clock))
         about["time"] = {"share": options.time, "gap": options.gap, "of": options.clock}
-    train, test = splits.combine(*parts)
+    train, test = filters.combine(*parts)
     purged = int((~(train | test)).sum())
     reporter.message(f"{train.sum():,} training rays, {test.sum():,} test rays, {purged:,} purged of {len(data):,}")
     side = lambda name, mask: data.select(mask).with_step(
@@ -220,7 +219,7 @@ def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions(), repor
         figure = maps.floor_plan(_load(rays), options.cell)
     else:
         test = None if options.test is None else _load(options.test)
-        where = {} if test is None else splits.position_of_split(test)
+        where = {} if test is None else filters.position_of_split(test)
         figure = maps.layout_figure(_load(rays), test, where.get("test_centres"), where.get("radius"))
     if options.output is not None:
         about = provenance("nerg rays plot", files_among(rays, options.test), None, options)

@@ -16,8 +16,8 @@ from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.splats.files import READERS, is_splats
 from nerg_mi.jobs.gaze_places import align_of_training
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.rays.dataset.layout import is_dataset
-from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.dataset import is_dataset
+from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene

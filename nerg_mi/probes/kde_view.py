@@ -12,8 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import Basis
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Float, Point3f, Vector3f
-from nerg_mi.rays.index import RayIndex
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.rays import RayIndex, Rays
 
 from .kde import Backend, SphericalKde, SphericalKdeTable
 from .probes import Probes, place_probes

@@ -10,8 +10,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rays.index import Neighbours, RayIndex
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.rays import Neighbours, RayIndex, Rays
 
 from .kde import Backend, SphericalKde, loo_kappas, silverman_kappas
 

@@ -1,1 +1,2 @@
-"""Rays of attention: who looked from where to where, and when; on disk, chosen among, summed up."""
+"""Gaze samples as rays: sets and datasets of them, their readers, filters and splits, and the checks of their
+quality."""

@@ -1,22 +1,336 @@
-"""Rays of attention: who looked from where to where, and when.
-
-Frame of every :class:`Rays`: right-handed, z up, metres, seconds. Readers convert into it
-(:mod:`nerg_mi.rays.readers`) and record the transform that they applied in the metadata.
-"""
+"""Sets of rays: the arrays with their metadata, files of them (.npz, .parquet), and selection without copies."""
 
 from __future__ import annotations
 
+import json
+import math
 import os
+import zipfile
+import zlib
 from dataclasses import dataclass, field, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import replacing
+from nerg_mi.files.bounded import JSON_BYTES, is_count, parse_json, reading, size_of
+from nerg_mi.files.inflating import inflated_limit
+from nerg_mi.files.npy import open_npz
 from nerg_mi.ranges import FARTHEST
 
-from .io import COLUMNS, read_rays_file, write_rays_file
+# ---- Metadata ----
+#
+# The JSON document of a rays file: what of it the rest of the package relies on is checked here, once.
+
+
+VERSION = 1
+
+
+def read_metadata(document: str | bytes, path: str | os.PathLike) -> dict[str, Any]:
+    """The metadata of the rays file ``path`` without their version, from the JSON ``document`` in it.
+
+    Known keys hold what `nerg_mi.rays.rays.Rays` documents; others are passed on as they are. Raises `NergError` for
+    what is no such document, or is of another version of the format.
+    """
+    found = parse_json(document, path, "rays file")
+    if not isinstance(found, dict):
+        raise not_rays(path, "its metadata are no JSON object")
+    if "version" not in found:
+        raise not_rays(path, 'its metadata lack "version"')
+    if found.pop("version") != VERSION:
+        raise NergError(
+            f'the rays file "{path}" was written by another version of the format; import the tracking files again'
+        )
+    for key, (holds, what) in _KNOWN.items():
+        if key in found and not holds(found[key]):
+            raise not_rays(path, f'"{key}" of its metadata is no {what}')
+    for key in ("persons", "frame"):
+        if key not in found:
+            raise not_rays(path, f'its metadata lack "{key}"')
+    return found
+
+
+def not_rays(path: str | os.PathLike, why: str) -> NergError:
+    """The error of a file ``path`` that is not one of rays, and ``why`` not."""
+    return NergError(f"\"{path}\" is not a rays file ({why}); make one with 'nerg rays import'")
+
+
+def _names(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(v, str) for v in value)
+
+
+def _objects(value: object, **keys) -> bool:
+    """Whether it is a list of objects that have all of ``keys``, each passing its test; those that end in _ may be
+    missing."""
+    return isinstance(value, list) and all(
+        isinstance(v, dict)
+        and all(test(v[k.rstrip("_")]) if k.rstrip("_") in v else k.endswith("_") for k, test in keys.items())
+        for v in value
+    )
+
+
+def _text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+def _runs(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(v, list) and len(v) == 2 and all(map(is_count, v)) for v in value)
+
+
+def _by(value: object) -> bool:
+    """How rays were split, or which rule made fixations. Where test positions are named, they are N x 3 numbers."""
+    if isinstance(value, str):
+        return True
+    if not isinstance(value, dict):
+        return False
+    position = value.get("position", {})
+    return (
+        isinstance(position, dict)
+        and _number(position.get("radius", 1.0))
+        and _points(position.get("test_centres", []))
+    )
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e12
+
+
+def _points(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(v, list) and len(v) == 3 and all(map(_number, v)) for v in value)
+
+
+def _frame(value: object) -> bool:
+    return isinstance(value, dict) and all(isinstance(value.get(k), str) for k in ("units", "up", "handedness"))
+
+
+def _transform(value: object) -> bool:
+    """4 x 4 finite numbers whose upper left part can be inverted."""
+    if not (isinstance(value, list) and len(value) == 4 and all(isinstance(r, list) and len(r) == 4 for r in value)):
+        return False
+    if not all(_number(v) for row in value for v in row):
+        return False
+    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in value[:3])
+    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    return math.isfinite(determinant) and abs(determinant) > 1e-30
+
+
+_KNOWN = {
+    "persons": (_names, "list of names"),
+    "cohorts": (_names, "list of names"),
+    "frame": (_frame, "frame of units, up and handedness"),
+    "source_frame": (_frame, "frame of units, up and handedness"),
+    "transform": (_transform, "4 x 4 matrix that can be inverted"),
+    "rows_read": (is_count, "number of rows"),
+    "sources": (lambda v: _objects(v, file=_text, sha256_=_text), "list of files"),
+    "dropped": (
+        lambda v: _objects(v, reason=_text, count=is_count, file_=_text, rows_=_runs),
+        "list of reasons and counts",
+    ),
+    "steps": (
+        lambda v: _objects(v, step=_text, kept=is_count, of=is_count, by_=_by),
+        "list of steps with their counts",
+    ),
+    "complaints": (_names, "list of sentences"),
+    "unused_columns": (_names, "list of names"),
+    "missing": (lambda v: isinstance(v, dict) and all(map(is_count, v.values())), "list of what is missing and counts"),
+    "eye_distance": (
+        lambda v: isinstance(v, dict) and all(_number(d) and d >= 0 for d in v.values()),
+        "list of persons and their distances in metres",
+    ),
+    "floor": (_text, "word"),
+    "tick": (lambda v: _number(v) and v > 0, "time in seconds"),
+}
+
+
+# ---- Io ----
+#
+# Rays on disk: ``.npz`` (NumPy alone) or ``.parquet`` (through pyarrow).
+#
+# Both hold the same columns and one JSON document of metadata. Vectors are
+# (N, 3) arrays in the ``.npz`` and three columns ``name_x, name_y, name_z`` in
+# the Parquet table, where other tools expect them.
+
+
+SUFFIXES = (".npz", ".parquet")
+_REQUIRED = ("t", "person", "origin", "direction", "confidence")
+_OPTIONAL = ("hit", "cohort", "head")
+COLUMNS = (*_REQUIRED, *_OPTIONAL)
+"""Columns of rays, one row each; hit points, cohorts and heads may be missing."""
+_VECTORS = ("origin", "direction", "hit", "head")
+# Columns of numbers of names; all others are measurements.
+_CODES = ("person", "cohort")
+# Memory of a ray with all columns.
+_BYTES = 108
+# Numbers on either side of a column's middle by which it is told whether it shrinks.
+_SAMPLE = 1 << 15
+
+
+def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], metadata: dict[str, Any]) -> None:
+    """Write columns of N rows (``t``, ``person``, ``origin``, ``direction``,
+    ``confidence``, optionally ``hit``, ``cohort`` and ``head``) and JSON-serialisable metadata, whole or not at all.
+
+    Raises `NergError` for another suffix and for metadata that `read_rays_file` would refuse, and ``ImportError`` with
+    the remedy where Parquet is asked for without pyarrow.
+    """
+    document = json.dumps({"version": VERSION, **metadata})
+    try:
+        read_metadata(document, path)
+    except NergError as error:
+        # What is written can be read again.
+        raise NergError(f"these rays cannot be kept: {error}") from error
+    if _suffix(path) == ".npz":
+        # What savez_compressed writes, with a faster level of zlib, and stored what hardly shrinks: millions of rays in
+        # seconds.
+        with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", compresslevel=1) as archive:
+            for name, value in {"metadata": np.array(document), **columns}.items():
+                archive.compression = zipfile.ZIP_DEFLATED if _shrinks(value) else zipfile.ZIP_STORED
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
+                    np.lib.format.write_array(out, value, allow_pickle=False)
+        return
+    pa, pq = pyarrow_modules()
+    table = {}
+    for name, value in columns.items():
+        if name in _VECTORS:
+            table.update({f"{name}_{axis}": value[:, i] for i, axis in enumerate("xyz")})
+        else:
+            table[name] = value
+    with replacing(path) as temporary:
+        pq.write_table(pa.table(table).replace_schema_metadata({"nerg_mi": document}), temporary, compression="zstd")
+
+
+def _shrinks(value: np.ndarray) -> bool:
+    """Whether deflate makes a column smaller by a fifth, as far as a sample from its middle tells."""
+    flat = value.reshape(-1)
+    middle = len(flat) // 2
+    sample = np.ascontiguousarray(flat[max(0, middle - _SAMPLE) : middle + _SAMPLE]).tobytes()
+    return len(zlib.compress(sample, 1)) < 0.8 * len(sample)
+
+
+def read_rays_file(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Columns and metadata as :func:`write_rays_file` took them.
+
+    Numbers of any width are read; other columns are not. Room is made for what the file's bytes warrant, column by
+    column. Raises `NergError` when the file is damaged, is no rays file, or lacks a column.
+    """
+    if _suffix(path) == ".npz":
+        columns, document = _read_npz(path)
+    else:
+        columns, document = _read_parquet(path)
+    return columns, read_metadata(document, path)
+
+
+def _read_npz(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], str]:
+    with open_npz(path, "rays file") as archive:
+        there = {name: archive.about(name) for name in archive.names if name in COLUMNS}
+        _check_columns(path, {name: (shape, dtype.kind) for name, (shape, dtype) in there.items()})
+        if "metadata" not in archive:
+            raise not_rays(path, "it lacks the metadata")
+        shape, dtype = archive.about("metadata")
+        if shape != () or dtype.kind != "U" or dtype.itemsize > 4 * JSON_BYTES:
+            raise not_rays(path, "its metadata are no text")
+        with reading(path, "rays file"):
+            document = str(archive["metadata"])
+        return {name: archive[name] for name in there}, document
+
+
+def _read_parquet(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bytes]:
+    pa, pq = pyarrow_modules()
+    size = size_of(path, "rays file")
+    with reading(path, "rays file", also=(pa.ArrowException,)), pq.ParquetFile(path) as table:
+        about, schema = table.metadata, table.schema_arrow
+        claimed = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
+        if claimed > inflated_limit(size):
+            raise _not_warranted(path, about.num_rows, size)
+        there = {}
+        for name in COLUMNS:
+            if all(part in schema.names for part in _parts(name)):
+                kinds = "".join(sorted({_arrow_kind(pa, schema.field(part).type) for part in _parts(name)}))
+                shape = (about.num_rows, 3) if name in _VECTORS else (about.num_rows,)
+                there[name] = shape, {"fi": "f"}.get(kinds, kinds)
+        _check_columns(path, there)
+        document = (schema.metadata or {}).get(b"nerg_mi")
+        if document is None:
+            raise not_rays(path, "it lacks the metadata")
+        columns = {
+            name: np.empty(shape, np.int64 if name in _CODES else np.float64) for name, (shape, _) in there.items()
+        }
+        at = 0
+        for batch in table.iter_batches(batch_size=1 << 17, columns=[part for name in there for part in _parts(name)]):
+            for name, column in columns.items():
+                for i, part in enumerate(_parts(name)):
+                    values = batch.column(batch.schema.get_field_index(part))
+                    if values.null_count and name in _CODES:
+                        raise not_rays(path, f'its column "{part}" has cells without a value')
+                    into = column[at : at + batch.num_rows]
+                    (into[:, i] if name in _VECTORS else into)[...] = values.to_numpy(zero_copy_only=False)
+            at += batch.num_rows
+        if at != about.num_rows:
+            raise not_rays(path, f"it holds {at:,} of the {about.num_rows:,} rays that it claims")
+    return columns, document
+
+
+def _parts(name: str) -> list[str]:
+    """Columns of a Parquet table that hold the column ``name``."""
+    return [f"{name}_{axis}" for axis in "xyz"] if name in _VECTORS else [name]
+
+
+def _arrow_kind(pa: Any, kind: Any) -> str:
+    return "f" if pa.types.is_floating(kind) else "i" if pa.types.is_integer(kind) else "O"
+
+
+def _check_columns(path: str | os.PathLike, there: dict[str, tuple[tuple[int, ...], str]]) -> None:
+    """Raise `NergError` where columns of these shapes and kinds (NumPy's letters) do not make rays, or are more than
+    the file's bytes warrant."""
+    missing = [name for name in _REQUIRED if name not in there]
+    if missing:
+        raise not_rays(path, f"it lacks {', '.join(missing)}")
+    n = (there["t"][0] or (0,))[0]
+    for name, (shape, kind) in there.items():
+        wanted = (n, 3) if name in _VECTORS else (n,)
+        if shape != wanted:
+            raise not_rays(path, f"{name} has the shape {shape}, where {wanted} is expected")
+        if kind not in (("i", "u") if name in _CODES else ("f", "i", "u")):
+            raise not_rays(path, f"{name} is not {'whole numbers' if name in _CODES else 'numbers'}")
+    # Narrow numbers become wide ones, and equal values may be stored once: what counts is the memory that rays take.
+    size = size_of(path, "rays file")
+    if _BYTES * n > inflated_limit(size):
+        raise _not_warranted(path, n, size)
+
+
+def _not_warranted(path: str | os.PathLike, rays: int, size: int) -> NergError:
+    return NergError(
+        f'the rays file "{path}" claims {rays:,} rays, which its {size:,} bytes do not warrant; copy it again'
+    )
+
+
+def _suffix(path: str | os.PathLike) -> str:
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise NergError(f"{path}: rays are kept as .npz or .parquet; choose a name with one of these endings")
+    return suffix
+
+
+def pyarrow_modules() -> tuple[Any, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise ImportError(
+            "Parquet needs pyarrow, which is not installed; run \"pip install 'nerg-mi[parquet]'\" or use a .npz file"
+        ) from error
+    return pyarrow, pyarrow.parquet
+
+
+# ---- Rays ----
+#
+# Rays of attention: who looked from where to where, and when.
+#
+# Frame of every :class:`Rays`: right-handed, z up, metres, seconds. Readers convert into it
+# (:mod:`nerg_mi.rays.readers`) and record the transform that they applied in the metadata.
+
 
 # Rows moved at a time.
 _BLOCK = 1 << 18
@@ -141,7 +455,7 @@ class Rays:
         return replace(self, metadata={**self.metadata, "steps": [*self.metadata.get("steps", []), what]})
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write ``.npz`` or ``.parquet``; see :mod:`nerg_mi.rays.io`."""
+        """Write ``.npz`` or ``.parquet``; see :mod:`nerg_mi.rays.rays`."""
         cohorts = {"cohorts": list(self.cohorts)} if self.cohort is not None else {}
         write_rays_file(path, self.columns(), {**self.metadata, "persons": list(self.persons), **cohorts})
 
@@ -183,3 +497,55 @@ def _refuse(bad: np.ndarray | np.bool_, what: str, remedy: str) -> None:
     if rows.size:
         listed = ", ".join(map(str, rows[:5])) + (", ..." if rows.size > 5 else "")
         raise NergError(f"{rows.size} of {bad.size} rays have {what} (rays {listed}); {remedy}")
+
+
+# ---- Index ----
+#
+# Which rays start near a place: a spatial index of millions of origins.
+
+
+_INDEX_BLOCK = 1 << 21  # neighbours held at a time: memory stays bounded
+
+
+class Neighbours(NamedTuple):
+    """The rays near each of Q places, place after place."""
+
+    indices: np.ndarray  # (n,) of rays; of a place, nearest first
+    distances: np.ndarray  # (n,) metres
+    offsets: np.ndarray  # (Q + 1,): place q has indices[offsets[q]:offsets[q + 1]]
+
+
+class RayIndex:
+    """A k-d tree of ray origins. ``rays``: a set of rays, or origins (N, 3) in metres."""
+
+    def __init__(self, rays: Rays | np.ndarray) -> None:
+        from scipy.spatial import KDTree
+
+        origin = rays.origin if isinstance(rays, Rays) else np.asarray(rays, dtype=np.float64)
+        self.count = len(origin)
+        # Without balancing: half the time to build, and as fast to ask. The order of rays that are equally far depends
+        # on the size of the leaves, and with it the bits of what is made of them.
+        self._tree = KDTree(origin, leafsize=16, balanced_tree=False)
+
+    def nearest(self, places: np.ndarray, most: int, radius: float = np.inf) -> Neighbours:
+        """The ``most`` nearest rays of each of ``places`` (Q, 3), within ``radius`` metres (those at exactly R
+        count)."""
+        places = np.asarray(places, dtype=np.float64).reshape(-1, 3)
+        if most < 1 or not radius > 0:
+            raise ValueError(f"most {most}, radius {radius}: ask for at least one ray within a positive radius")
+        most = min(most, self.count)
+        # A hair more than R: scipy leaves out what lies at the bound.
+        bound = np.nextafter(radius, np.inf) if np.isfinite(radius) else np.inf
+        step = max(1, _INDEX_BLOCK // most)
+        indices, distances, counts = [], [], []
+        for start in range(0, len(places), step):
+            part = places[start : start + step]
+            answer = self._tree.query(part, k=most, distance_upper_bound=bound, workers=-1)
+            d, i = (np.asarray(v).reshape(len(part), most) for v in answer)
+            found = np.isfinite(d)
+            indices.append(i[found])
+            distances.append(d[found])
+            counts.append(found.sum(axis=1))
+        offsets = np.concatenate([[0], np.cumsum(np.concatenate(counts))]) if counts else np.zeros(1, np.int64)
+        join = lambda parts, kind: np.concatenate(parts) if parts else np.empty(0, kind)
+        return Neighbours(join(indices, np.int64), join(distances, np.float64), offsets.astype(np.int64))

@@ -19,8 +19,8 @@ from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.overlay import srgb, to_bytes
 from nerg_mi.formats.regions import Region
 from nerg_mi.maths.arrays import vector_of
+from nerg_mi.rays.quality import RaysSummary
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.summary import RaysSummary
 from nerg_mi.rendering.channels import render_channels
 from nerg_mi.statistics.shares import Look, Shares
 from nerg_mi.statistics.visits import Landed, Thing, land, regroup

@@ -12,7 +12,7 @@ from typing import Any
 
 from nerg_mi import __version__
 from nerg_mi.evaluation.gaze_report import BLIND, HALF, WORDS, Comparison, GazeResults, Verdict
-from nerg_mi.rays.card import WARNING, card_lines
+from nerg_mi.rays.quality import WARNING, card_lines
 
 from .data import ObjectAttention, Run, Share
 from .html import Html, Point, element, figure, image, interval_chart, markup, pairs, paragraph, table

@@ -16,8 +16,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.types import Point3f, Vector3f
 from nerg_mi.probes.surface_attention import Density, attended
+from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.sessions import find_sessions
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings
 from nerg_mi.transport.observer_gaze import PlacedGaze

@@ -22,8 +22,8 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.probes.probes import Probes, person_weights, place_probes
+from nerg_mi.rays.filters import purge, split_by_person, split_by_position
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.splits import purge, split_by_person, split_by_position
 from nerg_mi.transport.field_medium import FieldMedium, accumulated, snapshot
 from nerg_mi.transport.geometry import Place, default_settings, trace_depth
 from nerg_mi.transport.observer_gaze import nearest_depth
@@ -290,7 +290,7 @@ def hold_out(
 ) -> tuple[Rays, dict]:
     """Rays to train on, when ``positions`` test positions in ``zones`` zones are held out; and an account of it (JSON).
 
-    Every ray within 2 ``radius`` metres of a test position is left out (``rays.splits``), so that no probe of
+    Every ray within 2 ``radius`` metres of a test position is left out (``rays.filters``), so that no probe of
     training comes within ``radius`` of one. With a share of ``people`` these are left out everywhere, and the test
     positions are theirs. The account holds the test ``centres`` in the rays' frame, and the names of the ``people``
     left out.

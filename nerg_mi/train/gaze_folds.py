@@ -16,8 +16,8 @@ from nerg_mi.fields.gaze_base import GazeFieldConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.interruption import Interruption
 from nerg_mi.probes.probes import Probes, calibrated_levels, region_levels
+from nerg_mi.rays.filters import purge, split_by_position
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.splits import purge, split_by_position
 
 from .gaze_data import Supervision, TargetNeeds, probes_of_rays, targets_of_probes, targets_of_rays
 from .gaze_log_density import LikelihoodTrainer, heads_box

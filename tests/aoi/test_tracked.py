@@ -47,7 +47,7 @@ def test01_blocks_hold_sittings_as_a_whole_and_all_of_the_rays():
 def test02_a_sitting_that_runs_over_two_parts_of_a_dataset_is_one(tmp_path):
     pytest.importorskip("pyarrow")
     import nerg_mi as nerg
-    from nerg_mi.rays.dataset import dataset, layout, parts, writing
+    from nerg_mi.rays import dataset, dataset_write
 
     rays = people(3, 80, cohorts=False)
     lines = ["t,p,x,y,z,a,b,c"]
@@ -57,17 +57,17 @@ def test02_a_sitting_that_runs_over_two_parts_of_a_dataset_is_one(tmp_path):
     (tmp_path / "day.csv").write_text("\n".join(lines))
     columns = "origin=x,y,z direction=a,b,c t=t person=p"
     found = {}
-    for rows in (50, writing.PART_ROWS):
-        before = writing.PART_ROWS
-        writing.PART_ROWS = rows
+    for rows in (50, dataset_write.PART_ROWS):
+        before = dataset_write.PART_ROWS
+        dataset_write.PART_ROWS = rows
         try:
             name = tmp_path / f"{rows}.rays"
             nerg.import_rays(tmp_path / "day.csv", columns=columns, output=name)
         finally:
-            writing.PART_ROWS = before
+            dataset_write.PART_ROWS = before
         found[rows] = merge(count_block(b, counting()) for b in blocks_of(name, RULES))
         if rows == 50:
-            assert len(dataset.RayDataset.open(name).parts) > 4 and layout and parts
+            assert len(dataset.RayDataset.open(name).parts) > 4 and dataset and dataset
     a, b = found.values()
     for name in ("time", "on_time", "looks", "first_sum", "sittings"):
         order = [a.rows.index(row) for row in b.rows]

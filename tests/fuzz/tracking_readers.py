@@ -55,7 +55,7 @@ def _shown(rays) -> None:
     from nerg_mi.cli.rays.arguments import print_card
     from nerg_mi.rays.filters import select_mask
     from nerg_mi.rays.pseudonyms import pseudonymise
-    from nerg_mi.rays.summary import summarise
+    from nerg_mi.rays.quality import summarise
 
     with contextlib.redirect_stdout(io.StringIO()):
         print_card(rays, summarise(rays), Path("rays.npz"))
@@ -87,7 +87,7 @@ def _read_metadata(folder: Path) -> None:
     from dataclasses import replace
 
     from nerg_mi.files.bounded import JSON_BYTES, read_bytes
-    from nerg_mi.rays.metadata import read_metadata
+    from nerg_mi.rays.rays import read_metadata
 
     raw = read_bytes(folder / "metadata.json", "rays file", JSON_BYTES)
     about = read_metadata(raw, folder / "metadata.json")
@@ -128,7 +128,7 @@ def _guess(name: str, make, *kinds: str) -> Reader:
     """What is proposed of a damaged table; nothing of it is applied."""
 
     def read(folder: Path) -> None:
-        from nerg_mi.rays.guess.proposal import propose_import
+        from nerg_mi.rays.guess import propose_import
 
         propose_import(folder / name).command  # noqa: B018
 
@@ -219,8 +219,8 @@ _PART = f"a.rays/place=shop/day=unknown/bucket=0/part-{_SOURCE}-0.parquet"
 
 
 def _make_dataset(folder: Path) -> None:
-    from nerg_mi.rays.dataset.manifest import Head, write_head
-    from nerg_mi.rays.dataset.writing import SourceWriter
+    from nerg_mi.rays.dataset import Head, write_head
+    from nerg_mi.rays.dataset_write import SourceWriter
 
     rays = _rays()
     write_head(folder / "a.rays", Head(1))
@@ -232,8 +232,7 @@ def _make_dataset(folder: Path) -> None:
 def _read_dataset(folder: Path) -> None:
     from nerg_mi.cli.rays.arguments import print_card
     from nerg_mi.jobs.tracking import card_of
-    from nerg_mi.rays.dataset.conditions import Conditions
-    from nerg_mi.rays.dataset.dataset import RayDataset
+    from nerg_mi.rays.dataset import Conditions, RayDataset
 
     with contextlib.redirect_stdout(io.StringIO()):
         for title, card in card_of(folder / "a.rays"):

@@ -13,10 +13,9 @@ from nerg_mi.jobs.evaluation import evaluate_gaze
 from nerg_mi.jobs.gaze import train_gaze
 from nerg_mi.jobs.options.rays import FilterOptions, ImportOptions
 from nerg_mi.jobs.tracking import card_of, filter_rays, import_rays
-from nerg_mi.rays.dataset.dataset import RayDataset
-from nerg_mi.rays.dataset.manifest import Head, write_head
-from nerg_mi.rays.dataset.opening import load_rays
-from nerg_mi.rays.dataset.writing import SourceWriter
+from nerg_mi.rays.dataset import Head, RayDataset, write_head
+from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.dataset_write import SourceWriter
 from nerg_mi.rays.rays import FRAME, Rays
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.rays.dataset.making import DAY, assert_same, settings, write_dataset, write_source

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from nerg_mi.rays.card import WARNING, card_lines
+from nerg_mi.rays.quality import WARNING, card_lines, summarise
 from nerg_mi.rays.rays import FRAME, Rays
-from nerg_mi.rays.summary import summarise
 
 
 def card(**change):

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerg_mi.rays.fixations import fixation_rays, idt, ivt
+from nerg_mi.rays.filters import fixation_rays, idt, ivt
 from nerg_mi.rays.rays import Rays
 
 

@@ -3,9 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.rays import frozen
-from nerg_mi.rays.frozen import find_frozen
-from nerg_mi.rays.sessions import find_sessions
+from nerg_mi.rays import filters
+from nerg_mi.rays.filters import find_frozen, find_sessions
 from tests.rays.checks.people import change, watch
 
 
@@ -15,7 +14,7 @@ def found(rays):
 
 @pytest.mark.parametrize("block", [100, 1 << 18])
 def test_gaze_that_stands_still(monkeypatch, block):
-    monkeypatch.setattr(frozen, "_BLOCK", block)
+    monkeypatch.setattr(filters, "_BLOCK", block)
     rays = watch()
     assert not found(rays).any()
     still = slice(3100, 3400)

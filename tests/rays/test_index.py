@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from nerg_mi.rays import index as module
-from nerg_mi.rays.index import RayIndex
+from nerg_mi.rays import rays as module
+from nerg_mi.rays.rays import RayIndex
 
 
 @pytest.mark.parametrize("block", [1 << 21, 64])
 def test_nearest_against_all_distances(block, monkeypatch):
-    monkeypatch.setattr(module, "_BLOCK", block)
+    monkeypatch.setattr(module, "_INDEX_BLOCK", block)
     rng = np.random.default_rng(0)
     origin, places = rng.random((500, 3)), rng.random((40, 3)) * 1.2
     index = RayIndex(origin)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.io import write_rays_file
-from nerg_mi.rays.rays import FRAME, Rays
+from nerg_mi.rays.rays import FRAME, Rays, write_rays_file
 
 ENDINGS = [
     "npz",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.metadata import VERSION, read_metadata
+from nerg_mi.rays.rays import VERSION, read_metadata
 
 GOOD = {
     "version": VERSION,

@@ -1,7 +1,7 @@
 import numpy as np
 
+from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.sessions import find_sessions
 
 
 def rays(t, person):

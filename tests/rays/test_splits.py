@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nerg_mi.probes.probes import place_probes
+from nerg_mi.rays.filters import combine, position_of_split, purge, split_by_person, split_by_position, split_by_time
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.splits import combine, position_of_split, purge, split_by_person, split_by_position, split_by_time
 
 R = 0.25
 

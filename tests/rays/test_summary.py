@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays import summary
+from nerg_mi.rays import quality
+from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.summary import summarise
 
 
 def walk(scale=1.0, height=1.6, n=100):
@@ -41,7 +41,7 @@ def test_no_rays():
 @pytest.mark.parametrize("block", [7, 64, 1 << 18])
 def test_figures_do_not_depend_on_order_or_blocks(monkeypatch, block):
     """Against the definitions, on rays of three people in any order, with pauses, duplicates and missing hits."""
-    monkeypatch.setattr(summary, "_BLOCK", block)
+    monkeypatch.setattr(quality, "_BLOCK", block)
     rng = np.random.default_rng(0)
     n = 500
     person, t = rng.integers(0, 3, n), np.round(rng.uniform(0, 60, n), 1)

@@ -8,7 +8,7 @@ import numpy as np
 
 from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.formats.regions import Region
-from nerg_mi.rays.summary import summarise
+from nerg_mi.rays.quality import summarise
 from nerg_mi.report.data import Camera, ObjectAttention, Picture, Proxy, Run, Share, Stage, pack
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.evaluation.gaze.test_verdict import scored

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from nerg_mi.rays.quality import RaysSummary
     from nerg_mi.rays.rays import Rays
-    from nerg_mi.rays.summary import RaysSummary
 
 RaysFile = Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet), or dataset (a folder).")]
 Output = Annotated[
@@ -26,7 +26,7 @@ def print_card(rays: Rays, summary: RaysSummary, path: Path | str, lines: Sequen
     from rich.table import Table
 
     from nerg_mi.files.bounded import plain
-    from nerg_mi.rays.card import WARNING, card_lines
+    from nerg_mi.rays.quality import WARNING, card_lines
 
     # Names come from files: they are neither markup nor control characters of a terminal.
     safe = lambda text: escape(plain(text, 10_000))

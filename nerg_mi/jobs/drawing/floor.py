@@ -13,9 +13,9 @@ from nerg_mi.figures.maps import Sight, Walk, floor_figure
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import COORDINATES, Checked, Range
-from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.sessions import find_sessions
 
 from .kind import Drawing, Kind
 

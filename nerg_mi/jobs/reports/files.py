@@ -10,8 +10,8 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.jobs.reporter import SILENT
 from nerg_mi.jobs.scenes.files import KINDS, PLACES, GivenFiles, kind_of_file, recognise
-from nerg_mi.rays.dataset.layout import is_dataset
-from nerg_mi.rays.dataset.opening import rays_digest
+from nerg_mi.rays.dataset import is_dataset
+from nerg_mi.rays.dataset_open import rays_digest
 
 RESULTS = "gaze.json"
 """The file of an evaluation that is read."""

@@ -15,8 +15,8 @@ from nerg_mi.formats.splats.files import is_splats, refuse_others
 from nerg_mi.jobs.gaze_places import align_of_training, file_of_training, place_key
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.rays.dataset.layout import is_dataset
-from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.dataset import is_dataset
+from nerg_mi.rays.dataset_open import load_rays
 
 KINDS = {".npz": "rays", ".parquet": "rays", **dict.fromkeys(READERS, "mesh"), ".vol": "hits", ".xml": "scene"}
 """Suffixes of what is not a checkpoint, and what they hold."""

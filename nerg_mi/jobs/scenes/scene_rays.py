@@ -7,10 +7,8 @@ from pathlib import Path
 
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.jobs.reporter import Reporter
-from nerg_mi.rays.dataset.conditions import Conditions
-from nerg_mi.rays.dataset.dataset import RayDataset
-from nerg_mi.rays.dataset.layout import is_dataset
-from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.dataset import Conditions, RayDataset, is_dataset
+from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
 
 MOST = 1_000_000

@@ -15,8 +15,7 @@ from nerg_mi.files.checksum import file_sha256
 from nerg_mi.files.line_blocks import OnBadLine
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.ranges import FARTHEST
-from nerg_mi.rays.io import COLUMNS
-from nerg_mi.rays.rays import FRAME, Rays
+from nerg_mi.rays.rays import COLUMNS, FRAME, Rays
 
 from .frames import RAYS, Frame
 from .parsing.fill_values import FilledOrigins, fill_values, is_aimed

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.cli.rays.arguments import print_card
+from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.summary import summarise
 
 
 def test_names_are_shown_as_they_are(capsys):

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from nerg_mi.rays.dataset.dataset import RayDataset
+from nerg_mi.rays.dataset import RayDataset
 from nerg_mi.rays.rays import Rays
 from tests.cli.rays.running import run
 from tests.cli.test_outputs import interrupting, largest_file, nerg, told_in_a_sentence

@@ -3,8 +3,7 @@ import pytest
 
 from nerg_mi.maths.sphere import uniform_directions
 from nerg_mi.probes.kde_view import directions_to, kde_frame, probe_at
-from nerg_mi.rays.index import RayIndex
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.rays import RayIndex, Rays
 from tests.reference.kde import kde as reference
 
 OBSERVER = np.array([1.0, 1.0, 1.6])

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.rays.readers.frames import Frame
-from nerg_mi.rays.summary import summarise
 
 
 def walk(hit=True, frame=None, seed=0):

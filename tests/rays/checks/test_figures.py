@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.checks.figures import group_medians, name_some
+from nerg_mi.rays.checks import group_medians, name_some
 
 
 @pytest.mark.parametrize("seed", range(3))

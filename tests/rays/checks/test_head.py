@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.rays.checks.head import head_frames
+from nerg_mi.rays.direction_checks import head_frames
 from tests.rays.checks.people import change, warnings_of, watch
 
 BO = slice(3000, 6000)

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.rays.checks import holding
-from nerg_mi.rays.checks.head import head_frames
+from nerg_mi.rays import direction_checks
+from nerg_mi.rays.direction_checks import head_frames
 from tests.rays.checks.people import warnings_of, watch
 
 
@@ -28,7 +28,7 @@ def test_eyes_that_turn_with_the_head(signs, word):
 
 
 def test_some_runs_speak_for_many(monkeypatch):
-    monkeypatch.setattr(holding, "_MOST", (4096, 512))
+    monkeypatch.setattr(direction_checks, "_MOST", (4096, 512))
     rays = watch()
     mixed = rays.select(np.random.default_rng(0).permutation(len(rays)))
     for some in (rays, mixed):

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerg_mi.rays.checks.head import head_frames
+from nerg_mi.rays.direction_checks import head_frames
 from tests.rays.checks.people import change, warnings_of, watch
 
 

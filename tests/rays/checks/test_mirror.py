@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.checks.mirror import DECLARED, hit_shares, mirror_warning
+from nerg_mi.rays.direction_checks import DECLARED, hit_shares, mirror_warning
 
 
 def counter(origins, directions):

@@ -1,5 +1,5 @@
-from nerg_mi.rays.checks.registry import CHECKS, check_table
-from nerg_mi.rays.checks.walking import walking_agreement
+from nerg_mi.rays.direction_checks import walking_agreement
+from nerg_mi.rays.quality import CHECKS, check_table
 from tests.rays.checks.people import walk, warnings_of
 
 

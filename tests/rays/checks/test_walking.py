@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.rays.checks import walking
-from nerg_mi.rays.checks.walking import walking_agreement
+from nerg_mi.rays import direction_checks
+from nerg_mi.rays.direction_checks import walking_agreement
 from nerg_mi.rays.readers.frames import Frame
 from tests.rays.checks.people import walk, warnings_of
 
@@ -33,7 +33,7 @@ def test_axes_are_told_in_the_frame_of_the_file(units, up):
 
 def test_some_runs_speak_for_millions(monkeypatch):
     """What people do is seen in runs of the rays of many, in whichever order they are."""
-    monkeypatch.setattr(walking, "_WALKED", (4096, 512))
+    monkeypatch.setattr(direction_checks, "_WALKED", (4096, 512))
     rays = walk(hit=False)
     many = replace(rays, person=np.repeat(np.arange(6), 1000), persons=tuple("abcdef"))
     shuffled = many.select(np.random.default_rng(0).permutation(len(many)))

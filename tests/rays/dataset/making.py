@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.dataset.dataset import RayDataset
-from nerg_mi.rays.dataset.importing import Recipe
-from nerg_mi.rays.dataset.updating import update_dataset
+from nerg_mi.rays.dataset import RayDataset
+from nerg_mi.rays.dataset_write import Recipe, update_dataset
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.parsing.column_map import ColumnMap
 from nerg_mi.rays.readers.registry import make_options, read_rays, reader_named

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.rays.dataset.card import summarise_dataset
-from nerg_mi.rays.summary import summarise
+from nerg_mi.rays.dataset_open import summarise_dataset
+from nerg_mi.rays.quality import summarise
 
 from .making import write_dataset
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.rays.dataset.choosing import sample_rows
+from nerg_mi.rays.dataset import sample_rows
 
 
 @pytest.mark.parametrize("n, runs", [(7, None), (20, None), (33, None), (8, 4), (20, 3)])

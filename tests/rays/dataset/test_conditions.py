@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.dataset.conditions import EVERYTHING, Conditions
-from nerg_mi.rays.dataset.layout import bucket_of
+from nerg_mi.rays.dataset import EVERYTHING, Conditions, bucket_of
 
 from .test_manifest import PART
 from .test_writing import crowd

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.dataset import writing
-from nerg_mi.rays.dataset.conditions import Conditions
-from nerg_mi.rays.dataset.dataset import RayDataset
-from nerg_mi.rays.dataset.parts import read_groups
-from nerg_mi.rays.dataset.updating import update_dataset
+from nerg_mi.rays import dataset_write
+from nerg_mi.rays.dataset import Conditions, RayDataset, read_groups
+from nerg_mi.rays.dataset_write import update_dataset
 from nerg_mi.rays.filters import select_mask
 
 from .making import DAY, assert_same, recipe, write_dataset, write_source
@@ -26,7 +24,7 @@ pytest.importorskip("pyarrow")
 def made(tmp_path_factory):
     """A dataset of small row groups, and the same rays at once."""
     with pytest.MonkeyPatch.context() as change:
-        change.setattr(writing, "GROUP_ROWS", 16)
+        change.setattr(dataset_write, "GROUP_ROWS", 16)
         return write_dataset(tmp_path_factory.mktemp("made"))
 
 
@@ -78,7 +76,7 @@ def test_what_cannot_hold_a_ray_is_not_read(made, monkeypatch):
             read.append(len(found[1]))
             yield found
 
-    monkeypatch.setattr("nerg_mi.rays.dataset.dataset.read_groups", counted)
+    monkeypatch.setattr("nerg_mi.rays.dataset.read_groups", counted)
     found = sum(map(len, dataset.scan(Conditions(persons=["p1_2"]))))
     assert found == np.sum(np.array(rays.persons)[rays.person] == "p1_2") and sum(read) < found + 32
     read.clear()

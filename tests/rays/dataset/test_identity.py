@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.dataset.identity import Marks
+from nerg_mi.rays.dataset_write import Marks
 from nerg_mi.rays.readers.options import NoOptions
 
 from .making import settings

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.rays.dataset.dataset import RayDataset
-from nerg_mi.rays.dataset.identity import Marks
-from nerg_mi.rays.dataset.importing import Task, has_parts, import_source
-from nerg_mi.rays.dataset.manifest import Head, read_sources, write_head
+from nerg_mi.rays.dataset import Head, RayDataset, read_sources, write_head
+from nerg_mi.rays.dataset_write import Marks, Task, has_parts, import_source
 from nerg_mi.rays.readers.frames import Frame
 from nerg_mi.rays.readers.options import NoOptions
 from nerg_mi.rays.readers.registry import read_rays
@@ -116,6 +114,6 @@ def test_a_copy_of_an_imported_source_is_known_by_its_first_rays(tmp_path, monke
     first = import_source(task(folder, path))
     (tmp_path / "b").mkdir()
     copy = write_source(tmp_path / "b" / "a.csv", people=5)
-    monkeypatch.setattr("nerg_mi.rays.dataset.importing.SourceWriter", lambda *_: pytest.fail("it was written again"))
+    monkeypatch.setattr("nerg_mi.rays.dataset_write.SourceWriter", lambda *_: pytest.fail("it was written again"))
     again = import_source(task(folder, copy))
     assert again.unchanged and again.source == first.source and len(read_sources(folder, HEAD)) == 1

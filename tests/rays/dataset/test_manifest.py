@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.dataset.manifest import Head, Part, Source, read_head, read_sources, write_head, write_source
+from nerg_mi.rays.dataset import Head, Part, Source, read_head, read_sources, write_head, write_source
 from nerg_mi.rays.rays import FRAME
 
 PART = Part("shop", "unknown", 3, 0, 5, 100, "a", "b", 0.0, 1.0, [0.0] * 3, [1.0] * 3, 0.5, 0, 2, False, False)

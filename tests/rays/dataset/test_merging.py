@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.rays.dataset.manifest import Source
-from nerg_mi.rays.dataset.merging import merge_counts, merge_metadata, merge_rays
+from nerg_mi.rays.dataset import Source, merge_counts, merge_metadata, merge_rays
 from nerg_mi.rays.rays import FRAME, Rays
 
 AHEAD = np.array([[0.0, 1.0, 0.0]])

@@ -7,8 +7,8 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.checksum import file_sha256
-from nerg_mi.rays.dataset.layout import is_dataset
-from nerg_mi.rays.dataset.opening import load_rays, rays_digest
+from nerg_mi.rays.dataset import is_dataset
+from nerg_mi.rays.dataset_open import load_rays, rays_digest
 
 from .making import assert_same, write_dataset
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.rays.dataset import writing
-from nerg_mi.rays.dataset.parts import read_groups
+from nerg_mi.rays import dataset_write
+from nerg_mi.rays.dataset import read_groups
 
 from .making import write_dataset
 
@@ -14,7 +14,7 @@ pytest.importorskip("pyarrow")
 
 
 def test_groups_their_rows_and_bounds(tmp_path, monkeypatch):
-    monkeypatch.setattr(writing, "GROUP_ROWS", 50)
+    monkeypatch.setattr(dataset_write, "GROUP_ROWS", 50)
     dataset, _ = write_dataset(tmp_path, 1)
     source, part = max(dataset.parts, key=lambda found: found[1].rays)
     seen = []

@@ -9,8 +9,8 @@ import sys
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.dataset import pool
-from nerg_mi.rays.dataset.updating import update_dataset
+from nerg_mi.rays import dataset_write
+from nerg_mi.rays.dataset_write import update_dataset
 
 from .making import recipe
 from .test_updating import content, sources
@@ -32,14 +32,14 @@ def ended(task):
 
 
 def test_a_process_that_is_ended_from_outside(tmp_path, monkeypatch):
-    monkeypatch.setattr(pool, "import_source", ended)
+    monkeypatch.setattr(dataset_write, "import_source", ended)
     with pytest.raises(NergError, match=r"fewer --workers .* what is finished is kept"):
         update_dataset(tmp_path / "a.rays", sources(tmp_path, 2), recipe(), workers=2)
 
 
 def test_processes_are_light():
     code = (
-        "import nerg_mi.rays.dataset.pool, nerg_mi.rays.dataset.importing, sys; "
+        "import nerg_mi.rays.dataset_write, nerg_mi.rays.dataset_write, sys; "
         "print([m for m in sys.modules if m.split('.')[0] in ('mitsuba', 'drjit', 'scipy', 'matplotlib', 'trimesh')])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"

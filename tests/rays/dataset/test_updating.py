@@ -15,10 +15,9 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import locked
 from nerg_mi.files.checksum import file_sha256
-from nerg_mi.rays.dataset import updating
-from nerg_mi.rays.dataset.dataset import RayDataset
-from nerg_mi.rays.dataset.layout import HEAD
-from nerg_mi.rays.dataset.updating import update_dataset
+from nerg_mi.rays import dataset_write
+from nerg_mi.rays.dataset import HEAD, RayDataset
+from nerg_mi.rays.dataset_write import update_dataset
 from nerg_mi.rays.readers.registry import read_rays
 from tests.conftest import ROOT
 
@@ -48,7 +47,9 @@ def test_again_does_nothing(tmp_path, monkeypatch):
     one = update_dataset(dataset, files, recipe(), on_done=names.append)
     assert (one.imported, one.rays, one.unchanged) == (3, 177, 0) and sorted(names) == ["0.csv", "1.csv", "2.csv"]
     before = {p: p.stat().st_mtime_ns for p in dataset.rglob("*") if p.is_file()}
-    monkeypatch.setattr(updating, "run_tasks", lambda tasks, workers: iter([]) if not tasks else pytest.fail("work"))
+    monkeypatch.setattr(
+        dataset_write, "run_tasks", lambda tasks, workers: iter([]) if not tasks else pytest.fail("work")
+    )
     two = update_dataset(dataset, files, recipe())
     assert (two.imported, two.unchanged, two.replaced) == (0, 3, 0)
     assert {p: p.stat().st_mtime_ns for p in dataset.rglob("*") if p.is_file()} == before
@@ -190,7 +191,7 @@ def test_an_import_that_is_interrupted_leaves_no_empty_dataset(tmp_path, monkeyp
         (tmp_path / "a.rays" / "place=x" / "day=y").mkdir(parents=True)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(updating, "run_tasks", interrupt)
+    monkeypatch.setattr(dataset_write, "run_tasks", interrupt)
     with pytest.raises(KeyboardInterrupt):
         update_dataset(tmp_path / "a.rays", sources(tmp_path), recipe())
     assert not (tmp_path / "a.rays").exists()
@@ -199,8 +200,8 @@ def test_an_import_that_is_interrupted_leaves_no_empty_dataset(tmp_path, monkeyp
 IMPORT = """
 import sys
 from pathlib import Path
-from nerg_mi.rays.dataset.layout import HEAD
-from nerg_mi.rays.dataset.updating import update_dataset
+from nerg_mi.rays.dataset import HEAD
+from nerg_mi.rays.dataset_write import update_dataset
 from tests.rays.dataset.making import recipe
 
 if __name__ == "__main__":

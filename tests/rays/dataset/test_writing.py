@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.dataset import layout, writing
-from nerg_mi.rays.dataset.manifest import Head, read_sources, write_head
-from nerg_mi.rays.dataset.writing import SourceWriter
+from nerg_mi.rays import dataset, dataset_write
+from nerg_mi.rays.dataset import Head, read_sources, write_head
+from nerg_mi.rays.dataset_write import SourceWriter
 from nerg_mi.rays.rays import FRAME, Rays
 
 from .making import DAY
@@ -46,7 +46,7 @@ def test_parts_by_day_and_bucket_in_the_order_of_people_and_times(tmp_path):
         table = pq.read_table(path, partitioning=None)
         who, t = table.column("person").to_pylist(), table.column("t").to_pylist()
         assert list(zip(who, t)) == sorted(zip(who, t)) and len(t) == part.rays
-        assert {layout.bucket_of(name, 4) for name in who} == {part.bucket} and (part.first, part.last) == (
+        assert {dataset.bucket_of(name, 4) for name in who} == {part.bucket} and (part.first, part.last) == (
             who[0],
             who[-1],
         )
@@ -71,8 +71,8 @@ def test_a_day_that_is_given_and_one_that_nobody_knows(tmp_path):
 
 
 def test_parts_and_groups_are_bounded(tmp_path, monkeypatch):
-    monkeypatch.setattr(writing, "PART_ROWS", 300)
-    monkeypatch.setattr(writing, "GROUP_ROWS", 100)
+    monkeypatch.setattr(dataset_write, "PART_ROWS", 300)
+    monkeypatch.setattr(dataset_write, "GROUP_ROWS", 100)
     writer = SourceWriter(tmp_path, ID, 1)
     writer.add(crowd())
     parts = writer.finish({"frame": dict(FRAME)}, **ABOUT).parts

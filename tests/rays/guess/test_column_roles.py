@@ -2,7 +2,7 @@
 
 import pytest
 
-from nerg_mi.rays.guess.column_roles import find_roles, in_degrees, time_unit
+from nerg_mi.rays.guess import find_roles, in_degrees, time_unit
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.guess.proposal import propose_import, propose_imports
+from nerg_mi.rays.guess import propose_import, propose_imports
 from nerg_mi.rays.rays import Rays
 from tests.cli.rays.running import run
 from tests.rays.guess.tables import FORWARD, N, csv, frame, walk, xyz

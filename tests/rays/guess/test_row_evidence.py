@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.guess import row_evidence as rows
+from nerg_mi.rays import guess as rows
 from tests.rays.guess.tables import FORWARD, frame, walk
 
 WALK = walk(3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.guess.table_sample import TableSample
+from nerg_mi.rays.guess import TableSample
 
 NAMES = ["a", "word", "b", "empty", "late"]
 ROWS = [["1", "x", "", "", "7"], ["2.5", "y", "-3e2", "nan", "7"], ["3", "z", "1", "", "7"]]

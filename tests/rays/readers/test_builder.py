@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.card import card_lines
+from nerg_mi.rays.quality import card_lines, summarise
 from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.rays.readers import builder as builder_module
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import UNITY, Frame
-from nerg_mi.rays.summary import summarise
 
 
 def add(builder, n, gone=(), first=1):

@@ -15,7 +15,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain, reading, size_of
 from nerg_mi.files.inflating import inflated_limit
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
-from nerg_mi.rays.io import pyarrow_modules
+from nerg_mi.rays.rays import pyarrow_modules
 
 from .clock_times import DayCounter, clock_seconds
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError
 from nerg_mi.photos.colmap import read_named_poses
 from nerg_mi.photos.images import read_split
-from nerg_mi.rays.summary import summarise
+from nerg_mi.rays.quality import summarise
 from tests.photos.test_named_poses import write_transforms
 from tests.rays.readers.examples import EXAMPLES
 from tests.rays.readers.glasses.test_place_frame import write_place

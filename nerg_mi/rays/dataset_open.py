@@ -1,16 +1,24 @@
-"""The sanity card of a dataset: what its accounts count exactly, and the rest of a stated sample."""
+"""Opening rays of either kind, a file or a dataset, and the quality report of a dataset."""
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.summary import RaysSummary, summarise
+from nerg_mi.files.checksum import file_sha256
 
-from .dataset import RayDataset
+from .dataset import MOST, RayDataset, is_dataset
+from .quality import RaysSummary, summarise
+from .rays import Rays
+
+# ---- Card ----
+#
+# The sanity card of a dataset: what its accounts count exactly, and the rest of a stated sample.
+
 
 SAMPLE = 1 << 20
 """Of so many rays at most are the figures that no account has."""
@@ -64,3 +72,27 @@ def _extent(dataset: RayDataset) -> str:
         f"{some(dataset.sources, 'source')} in {some(dataset.parts, 'part')} ({dataset.bytes / 1e6:,.1f} MB), "
         f"place {', '.join(dataset.places)}, day {spanned}"
     )
+
+
+# ---- Opening ----
+#
+# Rays from what a user names: a file of them, or a dataset.
+
+
+def load_rays(path: str | os.PathLike, most: int | None = None, seed: int = 0) -> Rays:
+    """The rays of a file, or of a dataset or a part of it (``shop.rays/place=north``).
+
+    ``most``: of a dataset, take so many at most: of more, a sample by ``seed`` in which each is as likely as any other.
+    None: all, of which there may be 50 million. Raises `NergError` for what is neither, or damaged.
+    """
+    if not Path(path).is_dir():
+        return Rays.load(path)
+    found = RayDataset.open(path)
+    if most is not None and len(found) > most:
+        return found.sample(most, seed)
+    return found.load(most=MOST if most is None else most)
+
+
+def rays_digest(path: str | os.PathLike) -> str:
+    """SHA-256 of a file of rays, or that of which rays a dataset holds."""
+    return RayDataset.open(path).digest if is_dataset(path) else file_sha256(Path(path))
