@@ -47,7 +47,7 @@ EXCEPTIONS = {
     "nerg_mi/photos/structure_worker.py": "fills a folder that `replacing_folder` has named, in its own process",
     "nerg_mi/tasks/child.py:main": "is the pipe to whoever asks",
     "nerg_mi/tasks/children.py:make": "is the pipe to the child",
-    "nerg_mi/rays/readers/parsing/skeleton_file.py:_written": "is given the name that `replacing` has chosen",
+    "nerg_mi/rays/readers/skeleton.py:_written": "is given the name that `replacing` has chosen",
 }
 
 

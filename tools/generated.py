@@ -103,7 +103,7 @@ def registered() -> str:
         ("quadrature rule", "nerg_mi/transport/quadrature.py", RULES.names()),
         ("depth", "nerg_mi/transport/depth.py", DEPTHS.names()),
         ("AOV", "plugins/nerg_aovs.py", aovs),
-        ("tracking reader", "nerg_mi/rays/readers/protocol.py", reader_names()),
+        ("tracking reader", "nerg_mi/rays/readers/base.py", reader_names()),
         ("gaze recipe", "nerg_mi/train/gaze_recipes.py", RECIPES),
     )
     cells = [(what, f"`{file}`", ", ".join(f"`{name}`" for name in names)) for what, file, names in rows]

@@ -18,7 +18,7 @@ from nerg_mi.formats.meshes import READERS, read_mesh_file
 from nerg_mi.maths.coordinates import check_coordinates, check_near_origin
 from nerg_mi.maths.sphere import uniform_directions
 from nerg_mi.photos.posed import read_semidense
-from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
+from nerg_mi.rays.readers.tables import iterate_table, table_columns
 from nerg_mi.transport.geometry import Place, trace_depth
 from nerg_mi.transport.medium import Medium
 

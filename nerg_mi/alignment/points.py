@@ -14,7 +14,7 @@ from nerg_mi.files.bounded import read_json, size_of
 from nerg_mi.photos.colmap import find_source
 from nerg_mi.photos.images import read_posed
 from nerg_mi.photos.posed import PosedImages
-from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
+from nerg_mi.rays.readers.tables import iterate_table, table_columns
 
 from .constraints import Fit, Progress, Target, angles, pair_covariance
 from .similarity import ALL, MIRROR, check_points, errors, fit_similarity, in_plane, leave_one_out, move, upright_basis

@@ -23,7 +23,7 @@ from nerg_mi.jobs.gaze_places import align_of_training, place_of_training
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
 from nerg_mi.maths.geometry import Similarity, box_interval
 from nerg_mi.ranges import COORDINATES
-from nerg_mi.rays.readers.parsing.tables import iterate_table
+from nerg_mi.rays.readers.tables import iterate_table
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.statistics.shares import Look

@@ -43,7 +43,7 @@ def import_rays(
     (2, ('Ada',))
     """
     from nerg_mi.jobs import tracking
-    from nerg_mi.rays.readers.options import options_of
+    from nerg_mi.rays.readers.base import options_of
     from nerg_mi.rays.readers.registry import make_options, reader_named, reader_names
 
     several = [files] if isinstance(files, (str, os.PathLike)) or not isinstance(files, Sequence) else files

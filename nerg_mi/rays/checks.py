@@ -15,7 +15,7 @@ import numpy as np
 
 from .filters import Sessions, find_frozen, find_sessions
 from .rays import Rays
-from .readers.frames import UNITS
+from .readers.base import UNITS
 
 # ---- What checks of rays are given, and what several of them need ----
 

@@ -52,7 +52,7 @@ from .dataset import (
 from .pseudonyms import pseudonymise
 from .quality import GAP
 from .rays import Rays, pyarrow_modules
-from .readers.protocol import Reader
+from .readers.base import Reader
 from .readers.registry import read_rays
 
 # ---- Identity ----

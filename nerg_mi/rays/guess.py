@@ -14,15 +14,12 @@ import numpy as np
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.line_blocks import line_blocks
 
-from .readers.builder import BAD_LINES
-from .readers.frames import UNITS
-from .readers.parsing import poses
-from .readers.parsing import usual_names as usual
-from .readers.parsing.clock_times import clock_seconds
-from .readers.parsing.column_finder import ColumnFinder, column_words, is_counter
-from .readers.parsing.column_map import ColumnMap
-from .readers.parsing.tables import iterate_table
-from .readers.parsing.validity import is_validity, valid_values
+from .readers import columns as usual
+from .readers import poses
+from .readers.base import BAD_LINES, UNITS
+from .readers.columns import ColumnFinder, ColumnMap, column_words, is_counter, is_validity, valid_values
+from .readers.tables import iterate_table
+from .readers.values import clock_seconds
 
 # ---- Column roles ----
 #

@@ -193,8 +193,7 @@ def simulate(layout: Layout, *, shoppers: int = 100, stops=(8, 20), seed: int = 
 
 def write_shoppers(layout: Layout, path, *, say=print, **options) -> Path:
     """Write `simulate`'s shoppers as a 22-keypoint skeleton file; one unit of its time is a millisecond."""
-    from nerg_mi.rays.readers.parsing.bodies import keypoints_from_head
-    from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
+    from nerg_mi.rays.readers.skeleton import keypoints_from_head, write_skeleton
 
     ids, times, origins, directions = simulate(layout, **options)
     path = Path(path)

@@ -146,7 +146,7 @@ def _make_parquet(path: Path) -> None:
 
 def _skeletons(name: str, *kinds: str) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.rays.readers.parsing.skeleton_file import read_skeleton
+        from nerg_mi.rays.readers.skeleton import read_skeleton
 
         read_skeleton(folder / name)
 

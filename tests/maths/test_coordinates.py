@@ -14,8 +14,7 @@ from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats.files import read_splats
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.photos.posed import Frame, settled
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import UNITY
+from nerg_mi.rays.readers.base import UNITY, RaysBuilder
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos
 
 ROOM = np.random.default_rng(0).uniform((0, 0, 0), (6, 4, 3), (200, 3))

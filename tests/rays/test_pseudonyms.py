@@ -11,7 +11,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from nerg_mi.rays.readers.columns import ColumnMap
 from tests.rays.readers.reading import read
 
 SALT = bytes(range(16))

@@ -205,8 +205,7 @@ def test_law_names_an_unknown_category():
 
 
 def test_shoppers_keep_clear_of_furniture_and_return_to_the_skeleton_file(store, law, tmp_path):
-    from nerg_mi.rays.readers.parsing.bodies import LEFT_EAR, NOSE, RIGHT_EAR, head_poses
-    from nerg_mi.rays.readers.parsing.skeleton_file import read_skeleton
+    from nerg_mi.rays.readers.skeleton import LEFT_EAR, NOSE, RIGHT_EAR, head_poses, read_skeleton
 
     ids, times, origins, directions = shoppers.simulate(store, shoppers=3, stops=(2, 4), seed=5, law=law)
     again = shoppers.simulate(store, shoppers=3, stops=(2, 4), seed=5, law=law)

@@ -18,7 +18,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.ranges import VALUES
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
+from nerg_mi.rays.readers.tables import iterate_table, table_columns
 from nerg_mi.surfaces.sources import WEIGHTS, Crowd, TrackedRays, ray_weights, thin
 
 POSITIONS = 1_000_000

@@ -1,1 +1,1 @@
-"""Recordings of headsets, trackers and skeletons, read as rays of attention."""
+"""Readers of tracking: one module a device or kind of file, and what they share."""

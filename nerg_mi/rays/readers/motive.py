@@ -11,15 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import plain
+from nerg_mi.errors import NergError, plain
 from nerg_mi.files.line_blocks import line_blocks
 
-from .builder import RaysBuilder
-from .frames import Frame
-from .options import option
-from .parsing import poses
-from .protocol import DESCRIPTION
+from . import poses
+from .base import DESCRIPTION, Frame, RaysBuilder, option
 from .table import person_from_filename
 
 _HEAD_LINES = 40

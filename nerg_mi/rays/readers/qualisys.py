@@ -9,15 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import plain
+from nerg_mi.errors import NergError, plain
 
-from .builder import RaysBuilder
-from .frames import Frame
-from .options import option
-from .parsing.column_finder import ColumnFinder
-from .parsing.gaze_vectors import iterate_gaze_vectors
-from .protocol import DESCRIPTION
+from .base import DESCRIPTION, Frame, RaysBuilder, option
+from .columns import ColumnFinder
+from .poses import iterate_gaze_vectors
 from .table import person_from_filename
 
 _EYE = re.compile(r"_g(_[12])?$")

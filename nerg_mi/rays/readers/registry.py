@@ -12,12 +12,28 @@ from typing import Any
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
-from . import markers, motive, qualisys, skeleton, table
-from .builder import RaysBuilder
-from .glasses import aria, glassestools, neon, pupil, tobii3
-from .headsets import arett, eyenavgs, hololens, openxr, quest, sranipal, unity, varjo, vr_supermarket
-from .options import Option, options_of, recorded_options
-from .protocol import Reader
+from . import (
+    arett,
+    aria,
+    eyenavgs,
+    glassestools,
+    hololens,
+    markers,
+    motive,
+    neon,
+    openxr,
+    pupil,
+    qualisys,
+    quest,
+    skeleton,
+    sranipal,
+    table,
+    tobii3,
+    unity,
+    varjo,
+    vr_supermarket,
+)
+from .base import Option, RaysBuilder, Reader, options_of, recorded_options
 
 TABLE = table.TABLE.name
 """The reader of tables through a column map; the others know their columns, and are the presets."""

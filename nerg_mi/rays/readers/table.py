@@ -12,16 +12,10 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import Checked, Range
 
-from .builder import RaysBuilder
-from .frames import Frame
-from .options import option, tick_option, valid_option
-from .parsing import poses
-from .parsing.column_finder import ColumnFinder, is_counter
-from .parsing.column_map import ColumnMap
-from .parsing.tables import TableBlock, iterate_table
-from .parsing.usual_names import PERSONS
-from .parsing.validity import mark_valid, parse_valid, require_valid_values
-from .protocol import RECORDINGS
+from . import poses
+from .base import RECORDINGS, Frame, RaysBuilder, option, tick_option, valid_option
+from .columns import PERSONS, ColumnFinder, ColumnMap, is_counter, mark_valid, parse_valid, require_valid_values
+from .tables import TableBlock, iterate_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,10 +68,10 @@ class Table:
     """CSV or Parquet tables through a column map.
 
     Directions need not be unit, and may be two angles from ``forward`` on: ``azel`` as told at
-    :func:`nerg_mi.rays.readers.parsing.poses.directions_from_azimuths`, or ``yawpitch``. Where the map has a head's
+    :func:`nerg_mi.rays.readers.poses.directions_from_azimuths`, or ``yawpitch``. Where the map has a head's
     pose (``xyzw``, ``wxyz``, ``ypr``, ``matrix``), ``direction``, angles and ``eye`` are in the head's frame, and
     without a direction the ray is where the head points: along ``forward``, an axis of its frame. How yaw, pitch and
-    roll turn is told at :func:`nerg_mi.rays.readers.parsing.poses.rotations_from_angles`. Rows with a confidence below
+    roll turn is told at :func:`nerg_mi.rays.readers.poses.rotations_from_angles`. Rows with a confidence below
     ``min_confidence`` are dropped. ``tick``: seconds in one unit of the time column; without one, in one row.
     """
 

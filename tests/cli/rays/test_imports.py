@@ -5,8 +5,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.parsing.bodies import keypoints_from_head
-from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
+from nerg_mi.rays.readers.skeleton import keypoints_from_head, write_skeleton
 from tests.cli.rays.running import run
 
 

@@ -11,7 +11,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas.reading import read_areas
 from nerg_mi.formats.areas.twin_objects import read_twin_objects
-from nerg_mi.rays.readers.frames import Frame
+from nerg_mi.rays.readers.base import Frame
 
 BOX_HEAD = (
     "object_uid,timestamp[ns],p_local_obj_xmin[m],p_local_obj_xmax[m],p_local_obj_ymin[m],p_local_obj_ymax[m],"

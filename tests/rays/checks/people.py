@@ -6,7 +6,7 @@ import numpy as np
 
 from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import FRAME, Rays
-from nerg_mi.rays.readers.frames import Frame
+from nerg_mi.rays.readers.base import Frame
 
 
 def walk(hit=True, frame=None, seed=0):

@@ -5,7 +5,7 @@ import pytest
 
 from nerg_mi.rays import direction_checks
 from nerg_mi.rays.direction_checks import walking_agreement
-from nerg_mi.rays.readers.frames import Frame
+from nerg_mi.rays.readers.base import Frame
 from tests.rays.checks.people import walk, warnings_of
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from nerg_mi.rays.dataset import RayDataset
 from nerg_mi.rays.dataset_write import Recipe, update_dataset
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from nerg_mi.rays.readers.columns import ColumnMap
 from nerg_mi.rays.readers.registry import make_options, read_rays, reader_named
 
 MAP = "origin=x,y,z direction=a,b,c t=t person=p confidence=q hit=h,i,j cohort=g"

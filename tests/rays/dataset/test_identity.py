@@ -9,7 +9,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.dataset_write import Marks
-from nerg_mi.rays.readers.options import NoOptions
+from nerg_mi.rays.readers.base import NoOptions
 
 from .making import settings
 

@@ -7,8 +7,7 @@ import pytest
 
 from nerg_mi.rays.dataset import Head, RayDataset, read_sources, write_head
 from nerg_mi.rays.dataset_write import Marks, Task, has_parts, import_source
-from nerg_mi.rays.readers.frames import Frame
-from nerg_mi.rays.readers.options import NoOptions
+from nerg_mi.rays.readers.base import Frame, NoOptions
 from nerg_mi.rays.readers.registry import read_rays
 
 from .making import assert_same, recipe, settings, write_source
@@ -24,8 +23,8 @@ def task(folder, path, **changes) -> Task:
 
 @pytest.mark.parametrize("key", [None, bytes(range(16))])
 def test_in_blocks_as_at_once(tmp_path, monkeypatch, key):
-    monkeypatch.setattr("nerg_mi.rays.readers.parsing.tables.BLOCK", 50)
-    monkeypatch.setattr("nerg_mi.rays.readers.builder.STREAMED", 120)
+    monkeypatch.setattr("nerg_mi.rays.readers.tables.BLOCK", 50)
+    monkeypatch.setattr("nerg_mi.rays.readers.base.STREAMED", 120)
     path, folder = write_source(tmp_path / "a.csv", people=5), tmp_path / "a.rays"
     write_head(folder, HEAD)
     found = import_source(task(folder, path, key=key))
@@ -67,7 +66,7 @@ class Headset:
 
 @pytest.mark.parametrize("key", [None, bytes(range(16))])
 def test_heads_eyes_and_complaints(tmp_path, monkeypatch, key):
-    monkeypatch.setattr("nerg_mi.rays.readers.builder.STREAMED", 40)
+    monkeypatch.setattr("nerg_mi.rays.readers.base.STREAMED", 40)
     (tmp_path / "a.bin").write_bytes(b"x")
     write_head(tmp_path / "a.rays", HEAD)
     given = task(tmp_path / "a.rays", tmp_path / "a.bin", reader=Headset(), settings=None, key=key)
@@ -107,8 +106,8 @@ def test_what_is_no_recording_is_refused_before_all_of_it_is_read(tmp_path, monk
 
 
 def test_a_copy_of_an_imported_source_is_known_by_its_first_rays(tmp_path, monkeypatch):
-    monkeypatch.setattr("nerg_mi.rays.readers.parsing.tables.BLOCK", 50)
-    monkeypatch.setattr("nerg_mi.rays.readers.builder.STREAMED", 120)
+    monkeypatch.setattr("nerg_mi.rays.readers.tables.BLOCK", 50)
+    monkeypatch.setattr("nerg_mi.rays.readers.base.STREAMED", 120)
     path, folder = write_source(tmp_path / "a.csv", people=5), tmp_path / "a.rays"
     write_head(folder, HEAD)
     first = import_source(task(folder, path))

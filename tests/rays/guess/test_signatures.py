@@ -4,7 +4,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.guess import check_is_table, preset_of_columns, preset_of_files, preset_of_text
-from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
+from nerg_mi.rays.readers.columns import ColumnFinder
 
 
 def table(path, head):

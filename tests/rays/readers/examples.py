@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.rays.readers.parsing.bodies import keypoints_from_head
-from nerg_mi.rays.readers.parsing.column_map import ColumnMap
-from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
+from nerg_mi.rays.readers.columns import ColumnMap
+from nerg_mi.rays.readers.skeleton import keypoints_from_head, write_skeleton
 from tests.rays.readers import headset_examples as headsets
 from tests.rays.readers import scene_examples as scenes
 from tests.rays.readers.c3d_examples import write_heads

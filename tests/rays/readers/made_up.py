@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import Frame
-from nerg_mi.rays.readers.options import TickOption, option
-from nerg_mi.rays.readers.parsing.tables import iterate_table
+from nerg_mi.rays.readers.base import Frame, RaysBuilder, TickOption, option
+from nerg_mi.rays.readers.tables import iterate_table
 
 
 @dataclass(frozen=True, kw_only=True)

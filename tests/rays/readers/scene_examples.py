@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.readers.glasses.frame_names import FrameNames
+from nerg_mi.rays.readers.scene_glasses import FrameNames
 from tests.files.movies import box_table, movie
 
 START = 1_700_000_000_000_000_000  # nanoseconds: what times of day look like

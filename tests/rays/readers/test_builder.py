@@ -8,9 +8,8 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rays.quality import card_lines, summarise
 from nerg_mi.rays.rays import FRAME, Rays
-from nerg_mi.rays.readers import builder as builder_module
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import UNITY, Frame
+from nerg_mi.rays.readers import base as builder_module
+from nerg_mi.rays.readers.base import UNITY, Frame, RaysBuilder
 
 
 def add(builder, n, gone=(), first=1):
@@ -177,7 +176,7 @@ def test_heads_and_eyes(tmp_path):
 
 def test_rays_are_handed_over_as_they_come(monkeypatch):
     """In blocks, whose rows are together those that are built at once; the metadata come with the last."""
-    monkeypatch.setattr("nerg_mi.rays.readers.builder.STREAMED", 30)
+    monkeypatch.setattr("nerg_mi.rays.readers.base.STREAMED", 30)
     taken: list = []
 
     def added(builder):

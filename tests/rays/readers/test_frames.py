@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.readers.frames import UPS, Frame
+from nerg_mi.rays.readers.base import UPS, Frame
 
 
 def test_usual_frames():

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from nerg_mi.rays.readers.columns import ColumnMap
 from tests.rays.readers.headset_examples import motive
 from tests.rays.readers.reading import dropped, read
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.options import NoOptions, TickOption, option, options_of, recorded_options
+from nerg_mi.rays.readers.base import NoOptions, TickOption, option, options_of, recorded_options
 
 
 @dataclass(frozen=True, kw_only=True)

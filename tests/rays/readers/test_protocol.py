@@ -10,7 +10,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers import registry
-from nerg_mi.rays.readers.frames import Frame
+from nerg_mi.rays.readers.base import Frame
 from tests.rays.readers.examples import EXAMPLES
 
 

@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.jobs.tracking import ImportOptions, import_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers import registry
-from nerg_mi.rays.readers.options import option
+from nerg_mi.rays.readers.base import option
 from tests.rays.readers.made_up import MadeUp, MadeUpOptions, write_recording
 
 

@@ -5,9 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.parsing.bodies import RIGHT_EAR, SKELETONS, keypoints_from_head
-from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
-from nerg_mi.rays.readers.skeleton import parse_keypoints
+from nerg_mi.rays.readers.skeleton import RIGHT_EAR, SKELETONS, keypoints_from_head, parse_keypoints, write_skeleton
 from tests.rays.readers.parsing.test_bodies import heads, poses_of
 from tests.rays.readers.reading import dropped, read
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from nerg_mi.rays.readers.base import RaysBuilder
+from nerg_mi.rays.readers.columns import ColumnMap
 from nerg_mi.rays.readers.table import TableOptions, add_tables
 from tests.rays.readers.reading import dropped, read
 

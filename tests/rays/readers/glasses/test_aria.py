@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.photos.posed import read_semidense
-from nerg_mi.rays.readers.glasses.aria_gaze import gaze_in_cpf, schema_of
+from nerg_mi.rays.readers.aria import gaze_in_cpf, schema_of
 from tests.rays.readers.examples import ARIA_POSES, aria_pose, lines
 from tests.rays.readers.reading import dropped, read
 
@@ -315,7 +315,7 @@ def test_what_is_refused(tmp_path):
 def test_gaze_between_two_blocks_of_poses_has_both(tmp_path, monkeypatch):
     """Of a trajectory only the poses around gaze are kept; those at the ends of a block too, whatever block they are
     read in."""
-    from nerg_mi.rays.readers.parsing import tables
+    from nerg_mi.rays.readers import tables
 
     times = [500 * k + 137 for k in range(60)]
     write_gaze(tmp_path / "ann/eyegaze.csv", times)

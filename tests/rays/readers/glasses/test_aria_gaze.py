@@ -3,15 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.readers.glasses.aria_gaze import (
-    GEN2,
-    LEGACY,
-    VERGENCE,
-    cpf_in_device,
-    device_named,
-    gaze_in_cpf,
-    schema_of,
-)
+from nerg_mi.rays.readers.aria import GEN2, LEGACY, VERGENCE, cpf_in_device, device_named, gaze_in_cpf, schema_of
 
 
 def test_schemas_by_their_headers(tmp_path):

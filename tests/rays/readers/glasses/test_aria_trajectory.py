@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.readers.glasses import aria_trajectory
-from nerg_mi.rays.readers.glasses.aria_trajectory import Trajectory, poses_at, up_axis
+from nerg_mi.rays.readers import aria
+from nerg_mi.rays.readers.aria import Trajectory, poses_at, up_axis
 from tests.rays.readers.examples import ARIA_POSES, aria_pose, lines
 
 
@@ -41,7 +41,7 @@ def test_what_is_no_trajectory(tmp_path, monkeypatch):
     path = write(tmp_path / "t.csv", lambda k: aria_pose(k, gravity=(0, -0.1 * k, -9.81)))
     with pytest.raises(ValueError, match="the gravity of the world w changes"):
         Trajectory(path, np.array([0.0]), None)
-    monkeypatch.setattr(aria_trajectory, "_WORLDS", 8)
+    monkeypatch.setattr(aria, "_WORLDS", 8)
     with pytest.raises(ValueError, match="more than 8 worlds"):
         Trajectory(write(tmp_path / "t.csv", lambda k: aria_pose(k, world=k)), np.array([0.0]), None)
     still = write(tmp_path / "t.csv", lambda k: aria_pose(k, turn=(0, 0, 0, 0)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.glasses.frame_names import FrameNames
+from nerg_mi.rays.readers.scene_glasses import FrameNames
 
 FRAMES = np.array([0.5, 0.54, 0.57, 0.61])
 

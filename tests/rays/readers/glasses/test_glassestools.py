@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.glasses.frame_names import FrameNames
+from nerg_mi.rays.readers.scene_glasses import FrameNames
 from tests.rays.readers import own_camera
 from tests.rays.readers.examples import EXAMPLES
 from tests.rays.readers.reading import dropped, read

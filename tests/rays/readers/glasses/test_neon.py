@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.glasses.frame_names import FrameNames
+from nerg_mi.rays.readers.scene_glasses import FrameNames
 from tests.photos.test_named_poses import write_colmap, write_transforms
 from tests.rays.readers import own_camera
 from tests.rays.readers.examples import EXAMPLES

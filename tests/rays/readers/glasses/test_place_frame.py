@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import write_checkpoint
-from nerg_mi.rays.readers.glasses.place_frame import PlaceFrame
+from nerg_mi.rays.readers.scene_glasses import PlaceFrame
 
 
 def write_place(path, **provenance):

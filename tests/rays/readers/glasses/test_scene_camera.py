@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.glasses.scene_camera import SceneCamera, angles_between, directions_from_angles
+from nerg_mi.rays.readers.scene_glasses import SceneCamera, angles_between, directions_from_angles
 from tests.rays.readers import own_camera
 from tests.rays.readers.scene_examples import LENS, MATRIX
 

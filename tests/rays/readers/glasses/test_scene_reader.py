@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.glasses.frame_names import FrameNames
-from nerg_mi.rays.readers.glasses.scene_gaze import GazeBlock, Recording, SceneOptions
-from nerg_mi.rays.readers.glasses.scene_reader import SceneReader
 from nerg_mi.rays.readers.registry import read_rays
+from nerg_mi.rays.readers.scene_glasses import FrameNames, GazeBlock, Recording, SceneOptions, SceneReader
 from tests.rays.readers.scene_examples import model
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.glasses.timed_poses import is_timed, read_timed_poses
+from nerg_mi.rays.readers.scene_glasses import is_timed, read_timed_poses
 
 NAMES = "translation_x translation_y translation_z rotation_x rotation_y rotation_z rotation_w"
 CSV = ",".join(["start_timestamp", "end_timestamp", *NAMES.split()]) + "\n"

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from nerg_mi.rays.readers.headsets.scene_settings import read_scene_settings
-from nerg_mi.rays.readers.parsing import tables
+from nerg_mi.rays.readers import tables
+from nerg_mi.rays.readers.eyenavgs import read_scene_settings
 from tests.rays.readers.reading import dropped, read
 
 RUTGERS = "ViewIndex FOV1 FOV2 FOV3 FOV4 PositionX PositionY PositionZ QuaternionX QuaternionY QuaternionZ QuaternionW "

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.readers.headsets.scene_settings import read_scene_settings
+from nerg_mi.rays.readers.eyenavgs import read_scene_settings
 
 
 def test_there_and_back(tmp_path):

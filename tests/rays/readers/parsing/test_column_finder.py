@@ -3,7 +3,7 @@
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder, column_words
+from nerg_mi.rays.readers.columns import ColumnFinder, column_words
 
 
 @pytest.fixture

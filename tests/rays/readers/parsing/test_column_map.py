@@ -1,6 +1,6 @@
 import pytest
 
-from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from nerg_mi.rays.readers.columns import ColumnMap
 
 
 @pytest.mark.parametrize(

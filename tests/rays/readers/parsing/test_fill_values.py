@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.readers.parsing.fill_values import FilledOrigins, fill_values, is_aimed
+from nerg_mi.rays.readers.values import FilledOrigins, fill_values, is_aimed
 
 
 def test_values():

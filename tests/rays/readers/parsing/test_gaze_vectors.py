@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.readers.parsing import gaze_vectors
-from nerg_mi.rays.readers.parsing.gaze_vectors import iterate_gaze_vectors
+from nerg_mi.rays.readers import poses
+from nerg_mi.rays.readers.poses import iterate_gaze_vectors
 
 HEAD = "FREQUENCY\t10\nSTART_OFFSET\t1\n"
 
@@ -12,7 +12,7 @@ HEAD = "FREQUENCY\t10\nSTART_OFFSET\t1\n"
 def test_blocks_are_one_file(tmp_path, monkeypatch):
     path = tmp_path / "a_g.tsv"
     path.write_text("\ufeff" + HEAD + "".join(f"{k}\t0\t1600\t1\t0\tNaN\n" for k in range(7)) + "\n\n")
-    monkeypatch.setattr(gaze_vectors, "_BLOCK", 3)
+    monkeypatch.setattr(poses, "_BLOCK", 3)
     blocks = list(iterate_gaze_vectors(path))
     assert len(blocks) > 2
     times, vectors, samples, lines = (np.concatenate(v) for v in zip(*blocks))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.rays.readers.parsing.pose_track import PoseTrack
+from nerg_mi.rays.readers.poses import PoseTrack
 
 
 def test_between_samples():

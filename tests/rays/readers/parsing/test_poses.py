@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.parsing import poses
+from nerg_mi.rays.readers import poses
 
 
 def test_quaternions_need_not_be_unit():
@@ -57,7 +57,7 @@ def test_axes_and_forward():
 
 def test_azimuths_turn_right_in_every_frame():
     """Against a way that knows of no cross product: the frame of rays, in which right is x where forward is y."""
-    from nerg_mi.rays.readers.frames import HANDS, Frame
+    from nerg_mi.rays.readers.base import HANDS, Frame
 
     a, e = np.radians([35.0, -12.0])
     for up in poses.AXES:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.parsing.skeleton_file import iterate_skeleton, read_skeleton, write_skeleton
+from nerg_mi.rays.readers.skeleton import iterate_skeleton, read_skeleton, write_skeleton
 
 
 @pytest.fixture

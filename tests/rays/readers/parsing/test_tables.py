@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.parsing import tables as ray_tables
-from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
+from nerg_mi.rays.readers import tables as ray_tables
+from nerg_mi.rays.readers.tables import iterate_table, table_columns
 
 
 def read(path, numbers, texts=()):

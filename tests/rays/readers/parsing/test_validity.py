@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.parsing.validity import (
+from nerg_mi.rays.readers.columns import (
     is_validity,
     looks_like_validity,
     mark_valid,

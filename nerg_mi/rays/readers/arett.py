@@ -7,11 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import UNITY, Frame
-from nerg_mi.rays.readers.options import NoOptions
-from nerg_mi.rays.readers.protocol import DESCRIPTION
-from nerg_mi.rays.readers.table import person_from_filename
+from .base import DESCRIPTION, UNITY, Frame, NoOptions, RaysBuilder
+from .table import person_from_filename
 
 _MILLISECOND = 1e-3
 _VECTORS = [f"{what}_{axis}" for what in ("gazeOrigin", "gazeDirection", "gazePoint") for axis in "xyz"]

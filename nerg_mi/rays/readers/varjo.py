@@ -7,15 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import plain
+from nerg_mi.errors import NergError, plain
 from nerg_mi.files.line_blocks import OnBadLine
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import UNITY, Frame
-from nerg_mi.rays.readers.options import NoOptions
-from nerg_mi.rays.readers.parsing import poses
-from nerg_mi.rays.readers.protocol import DESCRIPTION
-from nerg_mi.rays.readers.table import person_from_filename
+
+from . import poses
+from .base import DESCRIPTION, UNITY, Frame, NoOptions, RaysBuilder
+from .table import person_from_filename
 
 _TICK = 1e-9  # seconds: what CaptureTime counts
 _STATUS = ("INVALID", "0", "ADJUST", "1", "VALID", "2")

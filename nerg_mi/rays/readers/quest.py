@@ -10,15 +10,13 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import Range
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import UNITY, Frame
-from nerg_mi.rays.readers.options import TickOption, option
-from nerg_mi.rays.readers.parsing import poses
-from nerg_mi.rays.readers.parsing import usual_names as names
-from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
-from nerg_mi.rays.readers.parsing.fill_values import fill_values
-from nerg_mi.rays.readers.protocol import DESCRIPTION
-from nerg_mi.rays.readers.table import find_person, person_from_filename
+
+from . import columns as names
+from . import poses
+from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, TickOption, option
+from .columns import ColumnFinder
+from .table import find_person, person_from_filename
+from .values import fill_values
 
 _POSITION, _ROTATION = ("position", "pos"), ("rotation", "rot", "orientation")
 _ONE = ("eye_gaze_", "eye_", "gaze_pose_", "gaze_", "pose_", "")

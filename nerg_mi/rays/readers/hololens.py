@@ -7,12 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import OPENGL, Frame
-from nerg_mi.rays.readers.options import NoOptions
-from nerg_mi.rays.readers.parsing.tables import iterate_table
-from nerg_mi.rays.readers.protocol import DESCRIPTION
-from nerg_mi.rays.readers.table import person_from_filename
+from .base import DESCRIPTION, OPENGL, Frame, NoOptions, RaysBuilder
+from .table import person_from_filename
+from .tables import iterate_table
 
 _TICK = 1e-7  # seconds
 _JOINTS = 26  # of a hand, a 4x4 matrix each

@@ -1,4 +1,4 @@
-"""EyeNavGS: gaze of people in VR in real places that were kept as Gaussian splats (arXiv 2506.02380)."""
+"""EyeNavGS: head and eyes in scenes of Gaussian splats, with the settings of each scene."""
 
 from __future__ import annotations
 
@@ -9,16 +9,85 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import plain
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import OPENGL, Frame
-from nerg_mi.rays.readers.options import option
-from nerg_mi.rays.readers.parsing import poses
-from nerg_mi.rays.readers.parsing.tables import TableBlock, iterate_table, table_columns
-from nerg_mi.rays.readers.protocol import RECORDINGS
+from nerg_mi.errors import NergError, plain
 
-from .scene_settings import SceneSetting, read_scene_settings
+from . import poses
+from .base import OPENGL, RECORDINGS, Frame, RaysBuilder, option
+from .poses import rotations_from_quaternions
+from .tables import TableBlock, iterate_table, table_columns
+
+# ---- Scene settings ----
+#
+# How EyeNavGS put places into VR: their scale, what stands them upright, and where the play area lies in them.
+
+
+# From the viewer's axes (OpenXR's: y up, -z ahead) to those of splats (y down, z ahead), as the viewer turns cameras.
+_FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class SceneSetting:
+    """One row of ``scene_setting.csv``."""
+
+    place: str
+    scale: float  # units of the place in a metre
+    quaternion: tuple[float, ...]  # x, y, z, w: stands the place upright
+    start: tuple[float, ...]  # of the play area, metres; zero where the file has none
+
+    @property
+    def upright(self) -> np.ndarray:
+        """The rotation (3, 3) that stands the place upright."""
+        return rotations_from_quaternions(np.array([self.quaternion]))[0]
+
+    def to_area(self, x: np.ndarray) -> np.ndarray:
+        """Points (n, 3) of recordings in the play area: y up, metres, the floor at height 0."""
+        start = np.array(self.start)
+        return ((x - start) / self.scale + start) @ self.upright.T + start
+
+    def splat_from_area(self) -> np.ndarray:
+        """4x4 matrix from the play area to the axes and units of the place's splats."""
+        start, back = np.array(self.start), np.eye(4)
+        back[:3, :3] = self.scale * _FLIP @ self.upright.T
+        back[:3, 3] = _FLIP @ (start - self.scale * (self.upright.T @ start + start))
+        return back + 0.0
+
+
+def read_scene_settings(path: Path) -> dict[str, SceneSetting]:
+    """The settings of each place in ``path``, by its name. Raises `NergError` for a file that is none."""
+    texts = ["Scene_Name", "Quaternion"]
+    if "Initial_Position" in table_columns(path):
+        texts.append("Initial_Position")
+    found = {}
+    for block in iterate_table(path, ["Scale"], texts):
+        for scale, cells, line in zip(block.numbers[:, 0].tolist(), block.texts.tolist(), block.lines.tolist()):
+            quaternion, start = _numbers(cells[1], 4), _numbers(cells[2], 3) if len(cells) > 2 else (0.0, 0.0, 0.0)
+            if (
+                quaternion is None
+                or start is None
+                or not 1e-6 < scale < 1e6
+                or not 0.5 < np.hypot.reduce(quaternion) < 2
+            ):
+                raise NergError(
+                    f"{path}, line {line}: {plain(cells[0], 40)!r} needs a scale above 0, a quaternion x, y, z, w and "
+                    "an initial position of three numbers; copy the file again"
+                )
+            found[cells[0]] = SceneSetting(cells[0], scale, quaternion, start)
+    return found
+
+
+def _numbers(text: str, count: int) -> tuple[float, ...] | None:
+    """The numbers in a cell such as ``0, 1.15, 0``; None where they are not so many, or too large."""
+    try:
+        found = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        return None
+    return found if len(found) == count and all(abs(v) < 1e6 for v in found) else None
+
+
+# ---- Eyenavgs ----
+#
+# EyeNavGS: gaze of people in VR in real places that were kept as Gaussian splats (arXiv 2506.02380).
+
 
 _TICK = 1e-3  # seconds
 _TURNED = 5.0, 30.0  # degrees: a head that turned farther has eyes that turn in the world, and in the head

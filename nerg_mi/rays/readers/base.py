@@ -1,11 +1,16 @@
-"""Building rays of what readers find: one frame for all, what cannot be used dropped, with an account of it."""
+"""What readers have in common: the protocol, their options, the builder of rays, and frames of reference."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import types
+import typing
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -14,13 +19,80 @@ from nerg_mi.files.bounded import size_of
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.files.line_blocks import OnBadLine
 from nerg_mi.maths.coordinates import check_near_origin
-from nerg_mi.ranges import FARTHEST
+from nerg_mi.ranges import FARTHEST, FLAG, RANGE, TICKS, Checked, Range
 from nerg_mi.rays.rays import COLUMNS, FRAME, Rays
 
-from .frames import RAYS, Frame
-from .parsing.fill_values import FilledOrigins, fill_values, is_aimed
-from .parsing.tables import TableBlock, iterate_table, table_columns
-from .parsing.validity import looks_like_validity
+from .columns import looks_like_validity
+from .tables import TableBlock, iterate_table, table_columns
+from .values import FilledOrigins, fill_values, is_aimed
+
+# ---- Frames ----
+#
+# Declared frames of tracking data, and the way from them to the frame of rays: the only place where it is converted.
+#
+# The frame of rays is right-handed with z up, in metres.
+
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""Units of length by name, in metres."""
+
+UPS = ("y", "z", "x", "-y", "-z", "-x")
+HANDS = ("right", "left")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The frame of tracking data. Raises `NergError` for a word that is not known."""
+
+    up: str = "z"  # the axis that points up: x, y, z, -x, -y or -z
+    handedness: str = "right"  # right or left
+    units: str = "m"  # of length: m, cm or mm
+
+    def __post_init__(self) -> None:
+        if self.up not in UPS or self.handedness not in HANDS:
+            raise NergError(
+                f'frame "{self.up} up, {self.handedness}-handed" is not known; '
+                f"up is one of {', '.join(UPS)}, handedness is left or right"
+            )
+        if self.units not in UNITS:
+            raise NergError(f'units "{self.units}" are not known; use one of {", ".join(UNITS)}')
+
+    def __str__(self) -> str:
+        return f"{self.up} up, {self.handedness}-handed, {self.units}"
+
+    def to_dict(self) -> dict[str, str]:
+        """As it stands in the metadata of rays: ``up``, ``handedness`` and ``units``."""
+        return asdict(self)
+
+    def to_rays(self) -> np.ndarray:
+        """4x4 matrix from this frame to that of rays (right-handed, z up, metres).
+
+        x is kept (where x is up, y becomes x). z up, right: nothing. y up, right: (x, -z, y), a rotation. y up, left
+        (Unity): (x, z, y), the mirror that makes Unity's forward our y. z up, left (Unreal): (x, -y, z). -y up, right
+        (a camera of OpenCV): (x, z, -y).
+        """
+        z = np.eye(3)["xyz".index(self.up[-1])] * (-1.0 if self.up[0] == "-" else 1.0)
+        x = np.eye(3)[1 if self.up[-1] == "x" else 0]
+        y = np.cross(z, x) * (1.0 if self.handedness == "right" else -1.0)
+        matrix = np.eye(4)
+        matrix[:3, :3] = UNITS[self.units] * np.stack([x, y, z])
+        return matrix + 0.0  # no negative zeros
+
+
+RAYS = Frame()
+"""The frame of rays."""
+
+UNITY = Frame(up="y", handedness="left")
+"""Unity's world."""
+
+OPENGL = Frame(up="y")
+"""A world with y up as OpenGL, OpenXR and HoloLens have it."""
+
+
+# ---- Builder ----
+#
+# Building rays of what readers find: one frame for all, what cannot be used dropped, with an account of it.
+
 
 BAD_LINES = 0.01
 """Share of a file's lines that may be left out since they cannot be read."""
@@ -387,3 +459,184 @@ class _Names:
         place = np.zeros(len(names), dtype=np.int32)
         place[used] = np.arange(len(used))
         return place[codes], tuple(names[c] for c in used)
+
+
+# ---- Options ----
+#
+# Typed options of a reader: fields of a frozen dataclass, from which the command line and the manual are made.
+
+
+_KEY = "nerg_mi.reader_option"
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a reader, as :func:`options_of` finds it."""
+
+    name: str  # of the dataclass's field
+    flag: str  # on the command line: --tick
+    kind: type  # of the value, without None: str, float, int, bool, Path; str where `parse` makes the value
+    default: Any  # of the field
+    shown: str  # the default in words; empty where there is none to speak of
+    help: str  # a sentence, units included
+    parse: Callable[[str], Any] | None  # from the command line's text to the value
+    recorded: bool  # whether a value goes into the metadata of rays under its name
+
+
+def option(
+    default: Any,
+    help: str,
+    *,
+    flag: str | None = None,
+    shown: str | None = None,
+    within: Range | None = None,
+    parse: Callable[[str], Any] | None = None,
+    recorded: bool = True,
+) -> Any:
+    """A field of a reader's options, with what is said of it on the command line and in the manual.
+
+    ``flag``: on the command line, where that is not the field's name with hyphens. ``shown``: the default in words,
+    where it does not speak for itself. ``within``: the range of its numbers, which each option that has any needs, and
+    for which the dataclass derives from `Checked`. ``parse``: makes the value of the command line's text, and raises
+    `NergError` naming the flag; without it the field's type is that of the command line (str, int, float, bool or Path,
+    or None besides). ``recorded``: false for what the metadata of rays tell in another way, as the frame.
+    """
+    about = {"help": help, "flag": flag, "shown": shown, "parse": parse, "recorded": recorded}
+    return dataclasses.field(default=default, metadata={_KEY: about, RANGE: within, FLAG: flag or ""})
+
+
+def tick_option(default: float = 1.0) -> Any:
+    """The unit of the file's time, in seconds."""
+    return option(default, "Seconds in one unit of the file's time.", within=TICKS)
+
+
+def valid_option() -> Any:
+    """Which values of columns of validity mark valid rows; to be parsed by `parse_valid`."""
+    return option(
+        None,
+        'Columns of validity and the values of rows that are kept, as "gaze_status=2" or "isValid=true,1"; '
+        "none: no column is one.",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoOptions:
+    """The options of a reader that has none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TickOption(Checked):
+    """For readers of files whose unit of time is not known. Raises `NergError` for what is no length of time."""
+
+    tick: float = tick_option()
+
+
+# Annotations are evaluated as code: once, when a reader is registered, and not beside files that are read.
+@functools.cache
+def options_of(kind: type) -> tuple[Option, ...]:
+    """The options of a dataclass, in the order of its fields.
+
+    Raises ``TypeError`` for one that is no frozen dataclass, or a field that was not made by :func:`option`.
+    """
+    if not dataclasses.is_dataclass(kind):
+        raise TypeError(f"{kind.__qualname__} is no dataclass; options of a reader are a frozen one")
+    hints = typing.get_type_hints(kind)
+    found = []
+    for field in dataclasses.fields(kind):
+        if _KEY not in field.metadata:
+            raise TypeError(f"{kind.__qualname__}.{field.name} says nothing of itself; make it with option(...)")
+        about = field.metadata[_KEY]
+        shown = about["shown"]
+        if shown is None:
+            shown = "" if field.default is None or isinstance(field.default, bool) else _number(field.default)
+        found.append(
+            Option(
+                name=field.name,
+                flag=about["flag"] or "--" + field.name.replace("_", "-"),
+                kind=str if about["parse"] else _without_none(hints[field.name]),
+                default=field.default,
+                shown=shown,
+                help=about["help"],
+                parse=about["parse"],
+                recorded=about["recorded"],
+            )
+        )
+    return tuple(found)
+
+
+def recorded_options(options: Any) -> dict[str, Any]:
+    """The values that go into the metadata of rays: those that are set, tuples as lists. Files are kept there as
+    sources, when a reader begins them."""
+    known = [o for o in options_of(type(options)) if o.recorded and o.kind is not Path]
+    values = {o.name: getattr(options, o.name) for o in known}
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v is not None}
+
+
+def _without_none(hint: Any) -> type:
+    """``float`` of ``float | None``."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        (hint,) = (part for part in typing.get_args(hint) if part is not type(None))
+    return hint
+
+
+def _number(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+# ---- What a reader of tracking files is ----
+#
+# To add a format, write a module (in `glasses` or `headsets` where it is of one) with a class that has what
+# :class:`Reader` names, and an object of it in its ``READERS``; add the module to the list in
+# :mod:`nerg_mi.rays.readers.registry`. The command line, its help and the manual's table are made from it. A reader
+# takes files apart and says in which frame they are; dropping rows, converting the frame and keeping the account is the
+# builder's work, the same for all.
+
+
+O = TypeVar("O")
+"""The type of a reader's options: a frozen dataclass whose fields are made by `nerg_mi.rays.readers.base.option`."""
+
+RECORDINGS = "recordings"
+"""Of a reader that was checked on recordings of people."""
+
+DESCRIPTION = "generated files"
+"""Of one that was checked on files made after the source or manual of the program that writes them."""
+
+
+class Reader(Protocol[O]):
+    """A format of tracking files."""
+
+    name: str
+    """Its word for ``--preset``: lower case letters, digits and underscores."""
+
+    files: str
+    """What to give, in a phrase of Markdown: the files, and the columns that they need."""
+
+    world: str
+    """The frame of its files, in a phrase of Markdown."""
+
+    checked_on: str
+    """What it was checked on: `RECORDINGS`, `DESCRIPTION`, or words of its own."""
+
+    Options: type[O]
+    """Its options; `nerg_mi.rays.readers.base.NoOptions` where it has none."""
+
+    def frame(self, files: Sequence[Path], options: O) -> Frame:
+        """The frame of what `read` adds: fixed, declared by ``options``, or found in ``files``; one for all of them."""
+        ...
+
+    def read(self, files: Sequence[Path], options: O, builder: RaysBuilder) -> None:
+        """Add the rays of ``files`` (or folders), source by source, to ``builder``.
+
+        Each file is begun with ``builder.source(path)``, and its rows are added block by block with ``builder.add``:
+        times in seconds, origins and hit points in the frame and units of `frame`, directions of any length,
+        confidences in [0, 1], NaN where something is missing, the 1-based ``rows`` of the file, and reasons of the
+        format's own to ``drop`` some. The checks of rays see more where the file has heads (``head``) and both eyes
+        (``eye_distance``); where the height 0 of the files is not the floor, ``builder.note(floor="unknown")`` says so.
+        Tables are read by ``builder.read_table``, which names the columns that are not used. Where origins or
+        directions are computed, ``recorded_origin`` and ``recorded_direction`` are those of the file, in which fill
+        values are looked for. Lines that cannot be read are told to ``builder.on_bad`` where there is one. What
+        else is worth keeping goes into the metadata with ``builder.note``; options are kept there already. Memory stays
+        bounded by the blocks. Raises `NergError` for what the user can mend: a missing column or file, a damaged one,
+        an option that is needed.
+        """
+        ...

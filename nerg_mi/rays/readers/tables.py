@@ -1,4 +1,4 @@
-"""Tables of rays: CSV (also ``.gz``) and Parquet, read by named columns."""
+"""Tables of tracking: CSV and Parquet files in blocks, with their header checked against their rows."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import plain, reading, size_of
+from nerg_mi.errors import NergError, plain
+from nerg_mi.files.bounded import reading, size_of
 from nerg_mi.files.inflating import inflated_limit
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
 from nerg_mi.rays.rays import pyarrow_modules
 
-from .clock_times import DayCounter, clock_seconds
+from .values import DayCounter, clock_seconds
 
 BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
 

@@ -6,17 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import plain
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import UNITY, Frame
-from nerg_mi.rays.readers.options import TickOption, valid_option
-from nerg_mi.rays.readers.parsing import usual_names as names
-from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
-from nerg_mi.rays.readers.parsing.column_map import ColumnMap
-from nerg_mi.rays.readers.parsing.validity import is_validity, parse_valid
-from nerg_mi.rays.readers.protocol import DESCRIPTION
-from nerg_mi.rays.readers.table import TableOptions, add_tables, find_person
+from nerg_mi.errors import NergError, plain
+
+from . import columns as names
+from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, TickOption, valid_option
+from .columns import ColumnFinder, ColumnMap, is_validity, parse_valid
+from .table import TableOptions, add_tables, find_person
 
 
 @dataclass(frozen=True, kw_only=True)

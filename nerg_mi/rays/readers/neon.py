@@ -11,15 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import plain, read_json
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.parsing.tables import table_columns
-from nerg_mi.rays.readers.protocol import DESCRIPTION
+from nerg_mi.errors import NergError, plain
+from nerg_mi.files.bounded import read_json
 
-from .scene_camera import SceneCamera, directions_from_angles
-from .scene_gaze import GazeBlock, Recording
-from .scene_reader import SceneReader
+from .base import DESCRIPTION, RaysBuilder
+from .scene_glasses import GazeBlock, Recording, SceneCamera, SceneReader, directions_from_angles
+from .tables import table_columns
 
 _TIME = "timestamp [ns]"
 _PIXELS = ("gaze x [px]", "gaze y [px]")

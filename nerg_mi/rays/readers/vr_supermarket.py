@@ -13,12 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.ranges import Checked, Range
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import UNITY, Frame
-from nerg_mi.rays.readers.options import option
-from nerg_mi.rays.readers.parsing import poses
-from nerg_mi.rays.readers.protocol import RECORDINGS
-from nerg_mi.rays.readers.table import person_from_filename
+
+from . import poses
+from .base import RECORDINGS, UNITY, Frame, RaysBuilder, option
+from .table import person_from_filename
 
 _MATRIX = [f"ctw_{i}{j}" for i in range(3) for j in range(4)]
 _COLUMNS = [

@@ -9,16 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import parse_json, plain, read_json
+from nerg_mi.errors import NergError, plain
+from nerg_mi.files.bounded import parse_json, read_json
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
 from nerg_mi.files.movie_tables import frame_times
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.protocol import DESCRIPTION
 
-from .scene_camera import SceneCamera, angles_between
-from .scene_gaze import GazeBlock, Recording
-from .scene_reader import SceneReader
+from .base import DESCRIPTION, RaysBuilder
+from .scene_glasses import GazeBlock, Recording, SceneCamera, SceneReader, angles_between
 
 _RECORDING, _VIDEO = "recording.g3", "scenevideo.mp4"
 _UNUSED = 100  # parts of samples that are not used and named

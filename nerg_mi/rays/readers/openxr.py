@@ -10,15 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import OPENGL, Frame
-from nerg_mi.rays.readers.options import TickOption, tick_option
-from nerg_mi.rays.readers.parsing import poses
-from nerg_mi.rays.readers.parsing import usual_names as names
-from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
-from nerg_mi.rays.readers.parsing.validity import mark_valid, require_valid_values
-from nerg_mi.rays.readers.protocol import DESCRIPTION
-from nerg_mi.rays.readers.table import find_person, person_from_filename
+
+from . import columns as names
+from . import poses
+from .base import DESCRIPTION, OPENGL, Frame, RaysBuilder, TickOption, tick_option
+from .columns import ColumnFinder, mark_valid, require_valid_values
+from .table import find_person, person_from_filename
 
 _PLACES = (
     *("gaze_pose_position", "eye_gaze_position", "gaze_position", "gaze_pos", "gaze_origin", "pose_position"),

@@ -10,12 +10,10 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import LENGTHS, Checked, Range
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import Frame
-from nerg_mi.rays.readers.options import option
-from nerg_mi.rays.readers.parsing import poses
-from nerg_mi.rays.readers.parsing.pose_track import PoseTrack
-from nerg_mi.rays.readers.protocol import DESCRIPTION
+
+from . import poses
+from .base import DESCRIPTION, Frame, RaysBuilder, option
+from .poses import PoseTrack
 
 _GAP = 0.1  # seconds: between head poses farther apart than this nothing is interpolated
 _POSES = ["timestamp", *(f"{what}_{axis}" for what in ("rotation", "translation") for axis in "xyz")]

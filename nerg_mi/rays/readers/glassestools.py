@@ -12,12 +12,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import read_bytes
-from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.protocol import DESCRIPTION
 
-from .scene_camera import SceneCamera
-from .scene_gaze import GazeBlock, Recording
-from .scene_reader import SceneReader
+from .base import DESCRIPTION, RaysBuilder
+from .scene_glasses import GazeBlock, Recording, SceneCamera, SceneReader
 
 _MILLISECOND = 1e-3
 _XML = 1 << 20  # bytes of a calibration, at most

@@ -1,1 +1,0 @@
-"""Glasses that people wear in the place itself, and what places their gaze there: trajectories and scene cameras."""

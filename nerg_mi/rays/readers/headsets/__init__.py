@@ -1,1 +1,0 @@
-"""Headsets whose world is rendered or mixed: the exports of their programs."""
