@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nerg_mi.files.exr import threads_for_mitsuba
+from nerg_mi.files.images import threads_for_mitsuba
 
 
 def mitsuba_bitmap(path):

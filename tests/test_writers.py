@@ -39,10 +39,10 @@ OPENERS = {"open", "ZipFile", "GzipFile", "fdopen", "TarFile"}
 
 EXCEPTIONS = {
     "nerg_mi/files/atomic.py": "the writer itself",
-    "nerg_mi/files/exr.py:_raise_if_full": "finds out why the file that `replacing` has named does not take any more",
+    "nerg_mi/files/images.py:_raise_if_full": "finds out why the file that `replacing` has named takes no more",
     "nerg_mi/formats/torch_ngp/pickling.py": "puts a pickle together in memory before it opens the file",
     "nerg_mi/cli/ending.py:write": "is a standard stream",
-    "nerg_mi/files/png.py": "encodes in memory",
+    "nerg_mi/files/images.py": "encodes in memory",
     "nerg_mi/figures/style.py:encode": "encodes in memory",
     "nerg_mi/photos/structure_worker.py": "fills a folder that `replacing_folder` has named, in its own process",
     "nerg_mi/tasks/child.py:main": "is the pipe to whoever asks",

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt, label
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.files.npy import read_npy
+from nerg_mi.files.safe_read import read_npy
 from nerg_mi.formats.meshes import READERS, read_mesh_file
 from nerg_mi.maths.coordinates import check_coordinates, check_near_origin
 from nerg_mi.maths.sphere import uniform_directions

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import read_json, size_of
+from nerg_mi.files.safe_read import read_json, size_of
 from nerg_mi.photos.colmap import find_source
 from nerg_mi.photos.images import read_posed
 from nerg_mi.photos.posed import PosedImages

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.files.atomic import replacing
-from nerg_mi.files.npy import read_npz
+from nerg_mi.files.safe_read import read_npz
 from nerg_mi.formats.areas.kinds import Areas
 from nerg_mi.formats.areas.reading import files_of_areas, read_areas
 from nerg_mi.formats.checkpoint import read_metadata

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says, plain
-from nerg_mi.files.bounded import read_json
+from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import with_formula
 from nerg_mi.formats.areas.kinds import Area, Areas, Group, MeshPart, SceneShape
 from nerg_mi.formats.fields import load_gaze

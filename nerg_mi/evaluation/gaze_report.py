@@ -13,7 +13,7 @@ import numpy as np
 from nerg_mi.errors import NergError, plain
 from nerg_mi.figures.style import Provenance, find_colors, new_page, save
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.bounded import is_count, read_json
+from nerg_mi.files.safe_read import is_count, read_json
 from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid
 from nerg_mi.probes.probes import LEVELS, level_name

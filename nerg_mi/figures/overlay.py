@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files import png
+from nerg_mi.files import images
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import DECADES
 
@@ -40,7 +40,7 @@ def write_png(path, display, text: dict[str, str] | None = None) -> None:
     """Write display values (h, w, 3) in 0..1 as an 8-bit PNG. ``text``: what its header says (tEXt chunks)."""
     import mitsuba as mi
 
-    png.write_png(path, mi.Bitmap(to_bytes(display)), text)
+    images.write_png(path, mi.Bitmap(to_bytes(display)), text)
 
 
 # ---- Overlay ----

@@ -19,8 +19,7 @@ import numpy as np
 
 from nerg_mi import __version__
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import check_writable, write_bytes
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import check_writable, file_sha256, write_bytes
 
 # ---- Colors ----
 #

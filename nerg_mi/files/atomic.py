@@ -1,13 +1,10 @@
-"""Output files that are whole or absent: every writer of this package goes through here.
-
-A file is written under another name in the folder of its target, brought to the disk, and then moved into place in one
-step (POSIX rename), so that a reader, a killed process, a full disk or a power cut meets the old file or the new one.
-"""
+"""Files written whole or not at all, locks of outputs, and checksums."""
 
 from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import os
 import secrets
 import shutil
@@ -17,6 +14,17 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nerg_mi.errors import NergError
+
+from .safe_read import open_file
+
+# ---- Atomic ----
+#
+# Output files that are whole or absent: every writer of this package goes through here.
+#
+# A file is written under another name in the folder of its target, brought to the disk, and then moved into place in
+# one step (POSIX rename), so that a reader, a killed process, a full disk or a power cut meets the old file or the new
+# one.
+
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder",
@@ -248,3 +256,17 @@ def _flush(path: Path) -> None:
             raise
     finally:
         os.close(handle)
+
+
+# ---- Checksums of files, by which a result says what it was made from ----
+
+_BLOCK = 1 << 20
+
+
+def file_sha256(path: str | os.PathLike) -> str:
+    """Hex digest of a file's bytes. Raises `NergError` for what is no ordinary file, or cannot be read."""
+    digest = hashlib.sha256()
+    with open_file(path) as source:
+        while block := source.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()

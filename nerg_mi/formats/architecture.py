@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import config_type
-from nerg_mi.files.bounded import plain
+from nerg_mi.files.safe_read import plain
 from nerg_mi.ranges import VALUES
 
 _MOST = {

@@ -16,7 +16,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.bounded import open_file, parse_json, plain, reading
+from nerg_mi.files.safe_read import open_file, parse_json, plain, reading
 
 FORMAT = 1
 """The version of the files, raised when an earlier version of this package could misread them."""

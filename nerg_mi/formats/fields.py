@@ -14,7 +14,7 @@ import numpy as np
 from nerg_mi.fields.gaze_base import AnyGazeField, RaySupport, basis_of, build
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpacked
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.maths.geometry import box_of
 from nerg_mi.ranges import VALUES
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import plain
-from nerg_mi.files.bounded import is_count, parse_json, reading
+from nerg_mi.files.safe_read import is_count, parse_json, reading
 
 GLTF_MAGIC = b"glTF"
 """A file begins with these bytes."""

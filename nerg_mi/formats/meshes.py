@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import map_bytes, reading, size_of
+from nerg_mi.files.safe_read import map_bytes, reading, size_of
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.coordinates import check_near_origin
 

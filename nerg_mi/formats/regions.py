@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import read_json
+from nerg_mi.files.safe_read import read_json
 from nerg_mi.ranges import FARTHEST
 
 BYTES = 4 << 20

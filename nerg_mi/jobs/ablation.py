@@ -13,7 +13,7 @@ from nerg_mi.evaluation import ablation
 from nerg_mi.evaluation.ablation import Variant, frame_timer
 from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_folder
-from nerg_mi.files.bounded import read_json
+from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.splats.files import is_splats
 from nerg_mi.rays.dataset_open import load_rays

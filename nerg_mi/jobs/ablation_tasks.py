@@ -12,7 +12,7 @@ from typing import Any
 from nerg_mi.evaluation import ablation
 from nerg_mi.evaluation.ablation import Variant
 from nerg_mi.files.atomic import replacing
-from nerg_mi.files.bounded import read_json
+from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene_file import files_of_scene

@@ -17,8 +17,7 @@ from nerg_mi.alignment.tracking import DECLARED, Tracking, compare_flips
 from nerg_mi.errors import NergError
 from nerg_mi.figures.maps import alignment_figure
 from nerg_mi.figures.style import provenance, save
-from nerg_mi.files.atomic import check_writable
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import check_writable, file_sha256
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.photos.colmap import turn_to_z
 from nerg_mi.rays.rays import Rays

@@ -21,9 +21,8 @@ from nerg_mi.figures import overlay as figures
 from nerg_mi.figures.overlay import Heat, srgb, top_of, write_png
 from nerg_mi.figures.sphere import sphere_figure
 from nerg_mi.figures.style import Provenance, provenance, save
-from nerg_mi.files.atomic import check_folder, write_bytes
-from nerg_mi.files.checksum import file_sha256
-from nerg_mi.files.exr import write_bitmap_exr
+from nerg_mi.files.atomic import check_folder, file_sha256, write_bytes
+from nerg_mi.files.images import write_bitmap_exr
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.channels import Channels, render_channels

@@ -15,8 +15,7 @@ from nerg_mi.evaluation.gaze_report import side_by_side, write_report
 from nerg_mi.evaluation.uncertainty import calibration_rows, position_rows, rank_rows
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.style import files_among, provenance
-from nerg_mi.files.atomic import check_folder
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import check_folder, file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rays.dataset_open import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays

@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import find_overlay
 from nerg_mi.figures.style import save
 from nerg_mi.files.atomic import replacing
-from nerg_mi.files.npy import read_npy
+from nerg_mi.files.safe_read import read_npy
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.pictures import activate, load_scene
 from nerg_mi.rendering.scene_file import files_of_scene

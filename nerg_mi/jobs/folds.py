@@ -14,7 +14,7 @@ from nerg_mi.evaluation.gaze import SCORES, SPLITS
 from nerg_mi.evaluation.gaze_report import markdown, uncertainty_text
 from nerg_mi.evaluation.uncertainty import rank_rows
 from nerg_mi.files.atomic import check_folder, write_text
-from nerg_mi.files.bounded import read_json
+from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.probes.probes import LEVELS, level_name
 from nerg_mi.rays.dataset import is_dataset

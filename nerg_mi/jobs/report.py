@@ -15,8 +15,7 @@ from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.style import Provenance
 from nerg_mi.figures.style import versions as programs
-from nerg_mi.files.atomic import check_writable, write_text
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import check_writable, file_sha256, write_text
 from nerg_mi.formats.areas.kinds import Areas
 from nerg_mi.formats.areas.reading import read_areas
 from nerg_mi.formats.fields import load_gaze

@@ -15,7 +15,7 @@ from typing import Any
 from nerg_mi.evaluation import study
 from nerg_mi.evaluation.study import Setting, settings
 from nerg_mi.evaluation.study_subject import ExactSurfaces, FileSubject, Subject, open_subject
-from nerg_mi.files.bounded import read_json
+from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.rendering.scene_file import files_of_scene
 from nerg_mi.tasks.code import RENDERS, processor

@@ -16,8 +16,8 @@ from typing import BinaryIO
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, plain, sentence
-from nerg_mi.files.bounded import open_file, size_of
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
+from nerg_mi.files.safe_read import open_file, size_of
 
 from .posed import FARTHEST, FileFinder, Frame, MaskFile, PosedImages, Unused, name_some, settled
 from .transforms import read_frame_poses

@@ -12,10 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, plain
-from nerg_mi.files.bounded import reading
-from nerg_mi.files.exr import read_exr
-from nerg_mi.files.image_header import check_image
-from nerg_mi.files.npy import read_npy
+from nerg_mi.files.images import check_image, read_exr
+from nerg_mi.files.safe_read import read_npy, reading
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import LENGTHS, check_number
 

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.line_blocks import line_blocks
+from nerg_mi.files.safe_read import line_blocks
 from nerg_mi.maths.coordinates import check_near_origin
 
 from .cameras import Intrinsics

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.files.npy import read_npy
+from nerg_mi.files.safe_read import read_npy
 
 from . import cameras
 from .cameras import Camera, Intrinsics, all_used, area_average, nearest, overlap

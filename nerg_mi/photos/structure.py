@@ -24,8 +24,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.atomic import write_bytes, write_text
-from nerg_mi.files.bounded import read_bytes, reading
-from nerg_mi.files.image_header import check_image
+from nerg_mi.files.images import check_image
+from nerg_mi.files.safe_read import read_bytes, reading
 
 from .colmap import Up
 from .posed import Unused, inside

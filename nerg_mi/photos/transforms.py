@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError, plain, sentence
-from nerg_mi.files.bounded import JSON_BYTES, parse_json, read_bytes
+from nerg_mi.files.safe_read import JSON_BYTES, parse_json, read_bytes
 
 from .cameras import OPENGL_FROM_MITSUBA
 from .posed import (

@@ -13,8 +13,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.bounded import reading, size_of
-from nerg_mi.files.movie_tables import check_movie
+from nerg_mi.files.safe_read import reading, size_of
+from nerg_mi.files.video import check_movie
 
 from .structure import SIDE, SUFFIXES, Folders, Picture, encoded, shrunk, small_name, small_size
 

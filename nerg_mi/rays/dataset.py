@@ -19,8 +19,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.bounded import is_count, read_json, reading, size_of
-from nerg_mi.files.inflating import inflated_limit
+from nerg_mi.files.safe_read import inflated_limit, is_count, read_json, reading, size_of
 
 from .filters import select_mask
 from .rays import COLUMNS, FRAME, Rays, pyarrow_modules, read_metadata

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 
 from .dataset import MOST, RayDataset, is_dataset
 from .quality import RaysSummary, summarise

@@ -22,9 +22,8 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import check_folder, locked, removing_empty_parents, replacing, writing
-from nerg_mi.files.bounded import reading
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import check_folder, file_sha256, locked, removing_empty_parents, replacing, writing
+from nerg_mi.files.safe_read import reading
 
 from .dataset import (
     BUCKETS,

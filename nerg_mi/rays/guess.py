@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.line_blocks import line_blocks
+from nerg_mi.files.safe_read import line_blocks
 
 from .readers import columns as usual
 from .readers import poses

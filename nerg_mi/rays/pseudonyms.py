@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import read_bytes
+from nerg_mi.files.safe_read import read_bytes
 
 from .rays import Rays
 

@@ -16,9 +16,7 @@ from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import replacing
-from nerg_mi.files.bounded import JSON_BYTES, is_count, parse_json, reading, size_of
-from nerg_mi.files.inflating import inflated_limit
-from nerg_mi.files.npy import open_npz
+from nerg_mi.files.safe_read import JSON_BYTES, inflated_limit, is_count, open_npz, parse_json, reading, size_of
 from nerg_mi.ranges import FARTHEST
 
 # ---- Metadata ----

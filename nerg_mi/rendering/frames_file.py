@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import read_bytes, reading
+from nerg_mi.files.safe_read import read_bytes, reading
 from nerg_mi.files.tables import write_csv
 
 BYTES = 64 << 20

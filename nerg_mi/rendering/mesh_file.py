@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import map_bytes, open_file, reading
+from nerg_mi.files.safe_read import map_bytes, open_file, reading
 from nerg_mi.formats.meshes import BYTES, MeshFile, read_mesh_file
 from nerg_mi.formats.ply import PLY_MAGIC, parse_ply, write_columns
 

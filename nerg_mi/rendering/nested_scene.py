@@ -13,7 +13,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import reading, size_of
+from nerg_mi.files.safe_read import reading, size_of
 
 from .scene_file import check_scene_file
 from .scene_parts import Place, relative_name

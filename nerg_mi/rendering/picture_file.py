@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.files.atomic import check_writable, replacing
-from nerg_mi.files.exr import bitmap_channels, exr_rows
-from nerg_mi.files.png import encode_png
+from nerg_mi.files.images import bitmap_channels, encode_png, exr_rows
 
 FORMATS = (".exr", ".png")
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from nerg_mi import llvm
 from nerg_mi.errors import NergError, UnusableLLVM, mitsuba_says, sentence
-from nerg_mi.files.exr import threads_for_mitsuba
+from nerg_mi.files.images import threads_for_mitsuba
 
 from .scene_file import check_scene, check_scene_file
 

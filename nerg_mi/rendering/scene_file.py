@@ -15,8 +15,8 @@ from xml.parsers import expat
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import open_file, size_of
-from nerg_mi.files.image_header import check_image
+from nerg_mi.files.images import check_image
+from nerg_mi.files.safe_read import open_file, size_of
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.properties import resolved

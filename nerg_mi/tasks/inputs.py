@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 
 Signature = tuple[int, int, int, int]
 """Device, inode, bytes and time of change (ns) of a file: while they stay, its bytes are taken to be the same."""

@@ -10,8 +10,7 @@ import threading
 from pathlib import Path
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import replacing, replacing_folder, write_bytes
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256, replacing, replacing_folder, write_bytes
 
 from .inputs import Checksums, InputFile
 from .task import canonical

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.bounded import JSON_BYTES, read_json
+from nerg_mi.files.safe_read import JSON_BYTES, read_json
 
 from .store import HELD, PLANS, Store
 from .task import FORMAT, Task

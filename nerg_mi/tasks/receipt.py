@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import write_text
-from nerg_mi.files.bounded import is_count, read_json
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256, write_text
+from nerg_mi.files.safe_read import is_count, read_json
 
 from .task import FORMAT, Task
 

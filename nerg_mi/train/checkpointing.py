@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import reading
+from nerg_mi.files.safe_read import reading
 from nerg_mi.formats.architecture import number
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 

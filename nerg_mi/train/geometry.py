@@ -11,7 +11,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, mitsuba_says
 from nerg_mi.fields.radiance import RadianceField
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.formats.meshes import read_mesh_file

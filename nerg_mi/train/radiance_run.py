@@ -17,7 +17,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.figures.style import provenance
-from nerg_mi.files.png import write_png
+from nerg_mi.files.images import write_png
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.color import mean_score, psnr, psnr_of_fitted_half
 from nerg_mi.maths.geometry import Box

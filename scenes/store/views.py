@@ -16,7 +16,7 @@ from nerg_mi.scenes.store import cameras, twin
 from nerg_mi.scenes.store.layout import Layout
 
 from nerg_mi.files.atomic import replacing
-from nerg_mi.files.png import write_png
+from nerg_mi.files.images import write_png
 from nerg_mi.files.tables import write_json
 
 BUILD = Path(__file__).resolve().parent / "build"

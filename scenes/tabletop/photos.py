@@ -18,7 +18,7 @@ from nerg_mi.scenes.store import twin
 from nerg_mi.scenes.tabletop.denoising import denoise
 
 from nerg_mi.files.atomic import replacing
-from nerg_mi.files.png import write_png
+from nerg_mi.files.images import write_png
 from nerg_mi.files.tables import write_json
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.photos.cameras import Camera, pixel_directions, sensor_dict

@@ -11,7 +11,7 @@ import pytest
 from nerg_mi.aoi import measured
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.parts import _place_beside
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.jobs.statistics import statistics
 from nerg_mi.jobs.store_account import account_for_store

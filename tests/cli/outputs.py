@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.aoi.output import has_parquet
-from nerg_mi.files.exr import write_exr
+from nerg_mi.files.images import write_exr
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays
 from tests.evaluation.gaze.test_evaluation import crowd

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.files.exr import write_exr
+from nerg_mi.files.images import write_exr
 from nerg_mi.jobs.drawing.registry import KINDS
 from tests.jobs.drawing.test_walls import SCENE
 

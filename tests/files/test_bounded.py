@@ -10,8 +10,8 @@ import zlib
 import pytest
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.files import bounded
-from nerg_mi.files.bounded import map_bytes, parse_json, plain, read_bytes, read_json, reading, size_of
+from nerg_mi.files import safe_read
+from nerg_mi.files.safe_read import map_bytes, parse_json, plain, read_bytes, read_json, reading, size_of
 from nerg_mi.formats.regions import Region
 
 
@@ -101,14 +101,14 @@ def test_json_is_read_as_before(tmp_path):
 
 @pytest.mark.parametrize("raw", [b"[" * 200_000, b'{"a":' * 70 + b"1" + b"}" * 70, b"[" * 65 + b"]" * 65])
 def test_deep_json_is_refused_before_it_is_parsed(tmp_path, raw, monkeypatch):
-    monkeypatch.setattr(bounded.json, "loads", lambda text: pytest.fail("it was parsed"))
+    monkeypatch.setattr(safe_read.json, "loads", lambda text: pytest.fail("it was parsed"))
     (tmp_path / "a.json").write_bytes(raw)
     with pytest.raises(NergError, match="nested"):
         read_json(tmp_path / "a.json")
 
 
 def test_json_of_very_many_values_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(bounded, "JSON_VALUES", 100)
+    monkeypatch.setattr(safe_read, "JSON_VALUES", 100)
     assert len(parse_json("[" + "[]," * 40 + "1]", "a.json")) == 41
     with pytest.raises(NergError, match="more than the 100 values"):
         parse_json("[" + "{}," * 99 + "1]", "a.json")
@@ -126,14 +126,14 @@ def test_words_of_a_file_are_made_fit_for_a_message():
 
 
 def test_limits_themselves_are_within(tmp_path, monkeypatch):
-    monkeypatch.setattr(bounded, "JSON_VALUES", 100)
-    monkeypatch.setattr(bounded, "JSON_DEPTH", 3)
+    monkeypatch.setattr(safe_read, "JSON_VALUES", 100)
+    monkeypatch.setattr(safe_read, "JSON_DEPTH", 3)
     # As many values as brackets are opened and commas stand there.
     assert parse_json("[[[" + "1," * 97 + "1]]]", "a.json") == [[[1] * 98]]
     for beyond in ("[[[" + "1," * 98 + "1]]]", "[[[[1]]]]"):
         with pytest.raises(NergError, match="more than the 100 values|nested 4 deep"):
             parse_json(beyond, "a.json")
-    assert [bounded.is_count(v) for v in (0, (1 << 62) - 1, 1 << 62, -1, True, 1.0)] == [True, True, *[False] * 4]
+    assert [safe_read.is_count(v) for v in (0, (1 << 62) - 1, 1 << 62, -1, True, 1.0)] == [True, True, *[False] * 4]
 
 
 @pytest.mark.parametrize("digits", [309, 400, 5000])

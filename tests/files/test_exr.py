@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.exr import read_exr, threads_for_mitsuba, write_bitmap_exr, write_exr
+from nerg_mi.files.images import read_exr, threads_for_mitsuba, write_bitmap_exr, write_exr
 from tests.pictures import mitsuba_bitmap
 
 
@@ -72,7 +72,7 @@ import sys
 import nerg_mi, mitsuba as mi, drjit as dr, numpy as np
 mi.set_variant("llvm_ad_rgb")
 dr.set_thread_count(1)
-from nerg_mi.files.exr import write_bitmap_exr
+from nerg_mi.files.images import write_bitmap_exr
 write_bitmap_exr(sys.argv[1], mi.Bitmap(np.ones((64, 64, 3), np.float32)))
 """
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files import image_header
-from nerg_mi.files.exr import write_exr
-from nerg_mi.files.image_header import check_image
+from nerg_mi.files import images
+from nerg_mi.files.images import check_image, write_exr
 from tests.pictures import mitsuba_bitmap
 
 
@@ -59,13 +58,13 @@ def test_a_large_picture_in_a_large_file_is_read(tmp_path):
     with pytest.raises(NergError, match="make it smaller"):
         check_image(tmp_path / "a.png")
     with open(tmp_path / "a.png", "ab") as file:  # as many bytes as there may be, without room on the disk
-        file.truncate(3 * 16384 * 12288 // image_header.WARRANTED)
+        file.truncate(3 * 16384 * 12288 // images.WARRANTED)
     assert check_image(tmp_path / "a.png").size == (16384, 12288)
 
 
 def test_a_picture_of_the_largest_size_is_read(tmp_path):
     (tmp_path / "a.png").write_bytes(png(16384, 8192))
-    assert check_image(tmp_path / "a.png").bytes == image_header.DECODED_BYTES
+    assert check_image(tmp_path / "a.png").bytes == images.DECODED_BYTES
 
 
 @pytest.mark.parametrize("window", [(0, 0, 1 << 20, 1 << 20), (-(1 << 31), 0, (1 << 31) - 1, 0), (5, 0, 4, 1)])

@@ -10,8 +10,8 @@ import zipfile
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files import inflating
-from nerg_mi.files.inflating import inflated_limit, open_gzip, open_zip, read_member
+from nerg_mi.files import safe_read
+from nerg_mi.files.safe_read import inflated_limit, open_gzip, open_zip, read_member
 
 
 def _zip(path, **members):
@@ -28,11 +28,11 @@ def test_what_is_sound_is_read(tmp_path):
         assert io.TextIOWrapper(stream).read() == "x,y\n1,2\n" * 1000
     with open_zip(_zip(tmp_path / "a.zip", a=b"1" * 3_000_000, b=b"")) as archive:
         assert read_member(archive, "a", "a.zip") == b"1" * 3_000_000 and read_member(archive, "b", "a.zip") == b""
-    assert inflated_limit(10) == inflating.FREE and inflated_limit(1 << 30) == 100 << 30
+    assert inflated_limit(10) == safe_read.FREE and inflated_limit(1 << 30) == 100 << 30
 
 
 def test_inflation_stops_at_the_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(inflating, "FREE", 1 << 20)
+    monkeypatch.setattr(safe_read, "FREE", 1 << 20)
     path = tmp_path / "a.gz"
     path.write_bytes(gzip.compress(bytes(20 << 20)))
     taken = 0
@@ -106,7 +106,7 @@ def test_encrypted_doubled_and_missing_members_are_refused(tmp_path):
 
 def test_a_long_list_of_members_is_refused_before_it_is_read(tmp_path, monkeypatch):
     path = _zip(tmp_path / "a.zip", **{f"member{k}": b"" for k in range(50)})
-    monkeypatch.setattr(inflating, "DIRECTORY_BYTES", 1000)
+    monkeypatch.setattr(safe_read, "DIRECTORY_BYTES", 1000)
     monkeypatch.setattr(zipfile, "ZipFile", lambda path: pytest.fail("it was read"))
     with pytest.raises(NergError, match="fewer members"), open_zip(path):
         pass
@@ -130,11 +130,11 @@ def test_limits_themselves_are_within(tmp_path, monkeypatch):
         assert found.read("b") == b"23"
     with pytest.raises(NergError, match="inflates to more than 2 bytes"), open_zip(archive, most=2):
         pass
-    listed = inflating._directory_bytes(archive, archive.stat().st_size)
-    monkeypatch.setattr(inflating, "DIRECTORY_BYTES", listed)
+    listed = safe_read._directory_bytes(archive, archive.stat().st_size)
+    monkeypatch.setattr(safe_read, "DIRECTORY_BYTES", listed)
     with open_zip(archive) as found:
         assert found.namelist() == ["a", "b"]
-    monkeypatch.setattr(inflating, "DIRECTORY_BYTES", listed - 1)
+    monkeypatch.setattr(safe_read, "DIRECTORY_BYTES", listed - 1)
     with pytest.raises(NergError, match="fewer members"), open_zip(archive):
         pass
 

@@ -7,8 +7,8 @@ import gzip
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files import line_blocks as module
-from nerg_mi.files.line_blocks import line_blocks
+from nerg_mi.files import safe_read as module
+from nerg_mi.files.safe_read import line_blocks
 
 
 def lines(path, most=1000):
@@ -21,7 +21,7 @@ def lines(path, most=1000):
 )
 def test_lines_are_those_of_python(tmp_path, monkeypatch, text, chunk):
     """Wherever the file is cut into pieces: within characters, and between the two that end a line."""
-    monkeypatch.setattr(module, "_CHUNK", chunk)
+    monkeypatch.setattr(module, "_LINE_BLOCKS_CHUNK", chunk)
     (tmp_path / "t.csv").write_bytes(text.encode())
     with open(tmp_path / "t.csv", encoding="utf-8", newline="") as source:
         want = list(source)
@@ -34,7 +34,7 @@ def test_blocks_are_bounded_by_lines_and_characters(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     path.write_text("abc\n" * 100)
     assert [len(b) for b in line_blocks(path, "table", 40)] == [40, 40, 20]
-    monkeypatch.setattr(module, "_CHUNK", 16)
+    monkeypatch.setattr(module, "_LINE_BLOCKS_CHUNK", 16)
     monkeypatch.setattr(module, "_BLOCK_CHARACTERS", 40)
     sizes = [len(b) for b in line_blocks(path, "table", 1000)]
     assert sum(sizes) == 100 and max(sizes) <= 14
@@ -49,11 +49,11 @@ def test_what_is_no_text(tmp_path, monkeypatch):
     with pytest.raises(NergError, match="UTF-8"):
         lines(path)
     monkeypatch.setattr(module, "LINE_CHARACTERS", 100)
-    monkeypatch.setattr(module, "_CHUNK", 64)
+    monkeypatch.setattr(module, "_LINE_BLOCKS_CHUNK", 64)
     path.write_text("a\n" + "x" * 300)
     with pytest.raises(NergError, match="line 2 .* more than the 100 characters"):
         lines(path)
-    monkeypatch.setattr(module, "_CHUNK", 4096)  # the line ends within what is read at once
+    monkeypatch.setattr(module, "_LINE_BLOCKS_CHUNK", 4096)  # the line ends within what is read at once
     path.write_text("a\n" + "x" * 300 + "\nb\n")
     with pytest.raises(NergError, match="line 2 .* more than the 100 characters"):
         lines(path)

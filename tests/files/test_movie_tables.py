@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.movie_tables import check_movie, frame_times
+from nerg_mi.files.video import check_movie, frame_times
 from tests.files.movies import box, box_table, movie, sizes, track
 
 
@@ -87,7 +87,7 @@ def test_tables_hold_their_entries(kind, size, tmp_path):
 def test_what_cannot_be_looked_into_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="is compressed"):
         checked(tmp_path / FILE, box(b"moov", box(b"cmov", bytes(20))))
-    monkeypatch.setattr("nerg_mi.files.movie_tables._BOXES", 5)
+    monkeypatch.setattr("nerg_mi.files.video._BOXES", 5)
     with pytest.raises(ValueError, match="more than 5 boxes"):
         checked(tmp_path / FILE, *[box(b"free")] * 6)
 

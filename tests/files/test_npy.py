@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.npy import open_npz, read_npy, read_npz
+from nerg_mi.files.safe_read import open_npz, read_npy, read_npz
 
 _ARRAYS = [
     np.arange(12.0).reshape(3, 4),

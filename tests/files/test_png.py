@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from nerg_mi.files.png import write_png
+from nerg_mi.files.images import write_png
 
 
 def picture(rgb):
@@ -26,7 +26,7 @@ _LIMITED = """
 import resource, sys
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from nerg_mi.files.png import write_png
+from nerg_mi.files.images import write_png
 from tests.files.test_png import picture
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 write_png(sys.argv[1], picture(mi))

@@ -26,9 +26,8 @@ import numpy as np  # noqa: E402, F401
 with atheris.instrument_imports(include=["nerg_mi.formats", "nerg_mi.photos", "zipfile", "gzip"]):
     import nerg_mi  # noqa: F401
     from nerg_mi.errors import NergError
-    from nerg_mi.files.bounded import parse_json
-    from nerg_mi.files.image_header import check_image
-    from nerg_mi.files.npy import read_npy, read_npz
+    from nerg_mi.files.images import check_image
+    from nerg_mi.files.safe_read import parse_json, read_npy, read_npz
     from nerg_mi.formats.fields import load_radiance
     from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp
     from nerg_mi.formats.torch_ngp.unpickling import _Machine

@@ -124,7 +124,7 @@ def _colmap_txt(model: Path) -> None:
 
 def _picture(name: str):
     def make(folder: Path) -> None:
-        from nerg_mi.files.exr import write_exr
+        from nerg_mi.files.images import write_exr
 
         w, h = _SIZE
         random = np.random.default_rng(0)

@@ -117,7 +117,7 @@ def _make_glb(folder: Path) -> None:
 
 
 def _read_glb(folder: Path) -> object:
-    from nerg_mi.files.bounded import JSON_BYTES, read_bytes
+    from nerg_mi.files.safe_read import JSON_BYTES, read_bytes
     from nerg_mi.formats.gltf import parse_glb
     from nerg_mi.formats.meshes import read_mesh_file
 

@@ -86,7 +86,7 @@ def _make_metadata(folder: Path) -> None:
 def _read_metadata(folder: Path) -> None:
     from dataclasses import replace
 
-    from nerg_mi.files.bounded import JSON_BYTES, read_bytes
+    from nerg_mi.files.safe_read import JSON_BYTES, read_bytes
     from nerg_mi.rays.rays import read_metadata
 
     raw = read_bytes(folder / "metadata.json", "rays file", JSON_BYTES)

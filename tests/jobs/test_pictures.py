@@ -3,7 +3,7 @@
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.exr import read_exr_text
+from nerg_mi.files.images import read_exr_text
 from nerg_mi.jobs import pictures
 from nerg_mi.jobs.demo import store_scene
 from nerg_mi.jobs.pictures import PictureOptions, render_file

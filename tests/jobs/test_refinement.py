@@ -6,7 +6,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import is_field, load_radiance
 from nerg_mi.jobs.refinement import refine_checkpoint

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from nerg_mi.files.exr import write_bitmap_exr
+from nerg_mi.files.images import write_bitmap_exr
 from nerg_mi.photos.images import load_usable, load_view, read_image, split_holdout
 from nerg_mi.photos.transforms import read_transforms
 from tests.photos.written_sets import METRES_ALONG_RAYS

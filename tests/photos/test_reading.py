@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.exr import write_bitmap_exr, write_exr
+from nerg_mi.files.images import write_bitmap_exr, write_exr
 from nerg_mi.photos.images import read_depth, read_image, read_mask, read_photo
 from nerg_mi.photos.posed import DepthFile, Frame, MaskFile
 

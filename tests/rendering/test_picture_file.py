@@ -57,7 +57,7 @@ def test_a_file_that_ends_too_early_is_noticed(tmp_path, short_by):
     script = """
 import resource, signal, sys
 import numpy as np
-from nerg_mi.files.exr import exr_rows
+from nerg_mi.files.images import exr_rows
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 if sys.argv[2] != "0":
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))

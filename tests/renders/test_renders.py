@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from nerg_mi.files.exr import threads_for_mitsuba
+from nerg_mi.files.images import threads_for_mitsuba
 
 from .scenes import REFERENCES, SCENES, scene, test_of
 

@@ -25,7 +25,7 @@ def print_card(rays: Rays, summary: RaysSummary, path: Path | str, lines: Sequen
     from rich.markup import escape
     from rich.table import Table
 
-    from nerg_mi.files.bounded import plain
+    from nerg_mi.files.safe_read import plain
     from nerg_mi.rays.quality import WARNING, card_lines
 
     # Names come from files: they are neither markup nor control characters of a terminal.

@@ -19,7 +19,7 @@ def rays_guess_command(
 
     Nothing is imported: the whole command is printed, one for all files that are alike, for you to check and to run.
     """
-    from nerg_mi.files.bounded import plain
+    from nerg_mi.files.safe_read import plain
     from nerg_mi.jobs.tracking import guess_imports
 
     with TerminalReporter() as reporter:

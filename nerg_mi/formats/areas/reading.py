@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import is_count
+from nerg_mi.files.safe_read import is_count
 from nerg_mi.formats.regions import MOST, Entry, check_name, parse_box, read_entries
 
 from .kinds import Area, Areas, Group, MeshPart, SceneShape

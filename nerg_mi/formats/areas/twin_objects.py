@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import read_bytes, read_json, reading
+from nerg_mi.files.safe_read import read_bytes, read_json, reading
 from nerg_mi.formats.regions import MOST, Region
 
 BOXES, POSES, NAMES = "3d_bounding_box.csv", "scene_objects.csv", "instances.json"

@@ -7,7 +7,7 @@ import os
 import numpy as np
 
 from nerg_mi.fields.splats import Splats, harmonics_of
-from nerg_mi.files.bounded import open_file
+from nerg_mi.files.safe_read import open_file
 
 SPLAT_BYTES = 4 << 30
 """A file may have so many bytes."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.fields.splats import Splats, joined
-from nerg_mi.files.bounded import JSON_BYTES, map_bytes, open_file, reading
+from nerg_mi.files.safe_read import JSON_BYTES, map_bytes, open_file, reading
 from nerg_mi.formats.gltf import GLTF_BYTES, GLTF_MAGIC, accessor_values, instances, read_parts
 from nerg_mi.maths.geometry import Similarity
 

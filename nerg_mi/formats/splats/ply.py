@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.errors import plain
 from nerg_mi.fields.splats import Splats, logits_of, opacities_of, scales_of
-from nerg_mi.files.bounded import map_bytes, open_file, reading
+from nerg_mi.files.safe_read import map_bytes, open_file, reading
 from nerg_mi.formats.ply import PLY_MAGIC, parse_ply, write_columns
 from nerg_mi.maths.sphere import DEGREES
 

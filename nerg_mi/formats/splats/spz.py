@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.fields.splats import Splats, from_trained, logits_of
-from nerg_mi.files.bounded import open_file, reading
-from nerg_mi.files.inflating import open_gzip
+from nerg_mi.files.safe_read import open_file, open_gzip, reading
 
 COUNT = 50_000_000
 """A file may hold so many Gaussians."""

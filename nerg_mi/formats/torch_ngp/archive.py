@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import plain, reading
-from nerg_mi.files.inflating import open_zip, read_member
+from nerg_mi.files.safe_read import open_zip, plain, read_member, reading
 
 EXPANDED = 1 << 20
 """So many numbers may a tensor have that repeats those of its storage."""

@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.radiance import RadianceField
-from nerg_mi.files.bounded import plain
+from nerg_mi.files.safe_read import plain
 from nerg_mi.formats.architecture import building, check_sizes
 from nerg_mi.maths.geometry import Box
 

@@ -20,7 +20,7 @@ from typing import ClassVar
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.files.bounded import is_count, plain, reading, size_of
+from nerg_mi.files.safe_read import is_count, plain, reading, size_of
 
 from .archive import StoredTensor, TorchArchive
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene

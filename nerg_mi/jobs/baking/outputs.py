@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat, overlay
 from nerg_mi.figures.style import Provenance
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.png import encode_png
+from nerg_mi.files.images import encode_png
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.gltf import Attribute, shown_unlit
 from nerg_mi.formats.ply import write_columns

@@ -12,7 +12,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.splats.files import read_splats
 from nerg_mi.surfaces.laplacian import Sums

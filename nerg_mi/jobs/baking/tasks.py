@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.files.atomic import replacing
-from nerg_mi.files.npy import read_npy
+from nerg_mi.files.safe_read import read_npy
 from nerg_mi.jobs.backend import select_backend
 from nerg_mi.jobs.parts import Parts
 from nerg_mi.rendering.scene_file import files_of_scene

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.exr import read_exr, read_exr_text
+from nerg_mi.files.images import read_exr, read_exr_text
 from nerg_mi.rendering.channels import SURFACE
 
 EXR = ".exr"

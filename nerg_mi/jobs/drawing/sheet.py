@@ -70,7 +70,7 @@ def _display(path: Path) -> np.ndarray:
     from nerg_mi.rendering.pictures import activate
 
     if path.suffix.lower() == EXR:
-        from nerg_mi.files.exr import read_exr
+        from nerg_mi.files.images import read_exr
 
         found = read_exr(path, "picture")
         if {"R", "G", "B"} <= set(found):

@@ -11,7 +11,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.figures.overlay import Heat, gaze_figure, top_of
-from nerg_mi.files.bounded import reading
+from nerg_mi.files.safe_read import reading
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.ply import parse_ply
 from nerg_mi.formats.splats.files import is_splats

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.jobs.reporter import SILENT
 from nerg_mi.jobs.scenes.files import KINDS, PLACES, GivenFiles, kind_of_file, recognise
 from nerg_mi.rays.dataset import is_dataset

@@ -12,7 +12,7 @@ from nerg_mi.figures import maps, overlay
 from nerg_mi.figures.overlay import Heat, Layers, srgb, to_bytes, top_of, unknown_of
 from nerg_mi.figures.sphere import sphere_figure
 from nerg_mi.figures.style import Provenance, encode
-from nerg_mi.files.png import encode_png
+from nerg_mi.files.images import encode_png
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.channels import Channels
 from nerg_mi.report.data import Picture

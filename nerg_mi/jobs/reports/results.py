@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.evaluation.gaze_report import GazeResults, read_results
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.jobs.evaluation import evaluate_gaze
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
 from nerg_mi.jobs.options.report import ReportOptions

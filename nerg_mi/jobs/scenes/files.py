@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import MissingFile, NergError, plain
-from nerg_mi.files.bounded import size_of
+from nerg_mi.files.safe_read import size_of
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import is_field
 from nerg_mi.formats.meshes import READERS

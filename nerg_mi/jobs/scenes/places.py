@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import reading
+from nerg_mi.files.safe_read import reading
 from nerg_mi.formats.meshes import GREY, MeshFile, read_mesh_file
 from nerg_mi.formats.splats.files import plugin_of_field, read_splats
 from nerg_mi.formats.volumes import write_volume

@@ -15,9 +15,8 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import size_of
-from nerg_mi.files.checksum import file_sha256
-from nerg_mi.files.line_blocks import OnBadLine
+from nerg_mi.files.atomic import file_sha256
+from nerg_mi.files.safe_read import OnBadLine, size_of
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, TICKS, Checked, Range
 from nerg_mi.rays.rays import COLUMNS, FRAME, Rays

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import read_bytes
+from nerg_mi.files.safe_read import read_bytes
 
 from .base import DESCRIPTION, RaysBuilder
 from .scene_glasses import GazeBlock, Recording, SceneCamera, SceneReader

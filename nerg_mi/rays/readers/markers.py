@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import reading, size_of
+from nerg_mi.files.safe_read import reading, size_of
 from nerg_mi.ranges import ANGLES, Checked
 
 from . import poses

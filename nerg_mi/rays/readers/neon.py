@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import read_json
+from nerg_mi.files.safe_read import read_json
 
 from .base import DESCRIPTION, RaysBuilder
 from .scene_glasses import GazeBlock, Recording, SceneCamera, SceneReader, directions_from_angles

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.line_blocks import OnBadLine, line_blocks
+from nerg_mi.files.safe_read import OnBadLine, line_blocks
 from nerg_mi.ranges import FARTHEST, TIMES
 
 from .values import fill_values, is_filled_angles

@@ -12,8 +12,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import read_json
-from nerg_mi.files.line_blocks import OnBadLine
+from nerg_mi.files.safe_read import OnBadLine, read_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.photos.cameras import Intrinsics, undistort_where
 from nerg_mi.photos.colmap import NamedPoses, find_source, find_up, read_named_poses

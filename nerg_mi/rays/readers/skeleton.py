@@ -17,7 +17,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.atomic import replacing
-from nerg_mi.files.line_blocks import OnBadLine, line_blocks
+from nerg_mi.files.safe_read import OnBadLine, line_blocks
 from nerg_mi.ranges import ANGLES
 
 from .base import DESCRIPTION, UNITS, Frame, RaysBuilder, TickOption, option

@@ -12,9 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import reading, size_of
-from nerg_mi.files.inflating import inflated_limit
-from nerg_mi.files.line_blocks import OnBadLine, line_blocks
+from nerg_mi.files.safe_read import OnBadLine, inflated_limit, line_blocks, reading, size_of
 from nerg_mi.rays.rays import pyarrow_modules
 
 from .values import DayCounter, clock_seconds

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.bounded import parse_json, read_json
-from nerg_mi.files.line_blocks import OnBadLine, line_blocks
-from nerg_mi.files.movie_tables import frame_times
+from nerg_mi.files.safe_read import OnBadLine, line_blocks, parse_json, read_json
+from nerg_mi.files.video import frame_times
 
 from .base import DESCRIPTION, RaysBuilder
 from .scene_glasses import GazeBlock, Recording, SceneCamera, SceneReader, angles_between

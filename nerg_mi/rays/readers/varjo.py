@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.line_blocks import OnBadLine
+from nerg_mi.files.safe_read import OnBadLine
 
 from . import poses
 from .base import DESCRIPTION, UNITY, Frame, NoOptions, RaysBuilder

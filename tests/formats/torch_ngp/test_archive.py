@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files import inflating
+from nerg_mi.files import safe_read
 from nerg_mi.formats.torch_ngp.archive import TorchArchive
 from nerg_mi.formats.torch_ngp.unpickling import read_torch
 from tests.formats.torch_ngp.test_unpickling import archive, tensor
@@ -61,7 +61,7 @@ def test_repeated_numbers_are_bounded(tmp_path, shape, stride):
 
 
 def test_archives_that_inflate_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(inflating, "FREE", 1 << 20)
+    monkeypatch.setattr(safe_read, "FREE", 1 << 20)
     with zipfile.ZipFile(tmp_path / "z.pth", "w", zipfile.ZIP_DEFLATED) as z:
         z.writestr("a/data.pkl", tensor((2,), (1,)))
         z.writestr("a/data/0", bytes(30 << 20))

@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.figures.style import color_values
-from nerg_mi.files.exr import write_exr
+from nerg_mi.files.images import write_exr
 from nerg_mi.jobs.drawing.draw import draw
 
 from .test_files import GAZE, OPACITY, write

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.exr import write_exr
+from nerg_mi.files.images import write_exr
 from nerg_mi.jobs.drawing.files import read_stored, shared_note
 
 RNG = np.random.default_rng(0)

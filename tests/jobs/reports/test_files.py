@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.jobs.reports.files import sort_files
 from nerg_mi.jobs.reports.words import place_words
 from tests.evaluation.gaze.test_evaluation import crowd

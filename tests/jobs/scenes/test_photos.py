@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.jobs.scenes.photos import camera_of_photo, cameras_of_photos
 
 POSE = np.array([[1, 0, 0, 0.5], [0, 0, -1, -3], [0, 1, 0, 1.2], [0, 0, 0, 1]], float)  # looks along +y, up is +z

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.exr import write_bitmap_exr
+from nerg_mi.files.images import write_bitmap_exr
 from nerg_mi.photos.cameras import Intrinsics
 from nerg_mi.photos.salience import open_salience, pixel_solid_angles, read_salience
 

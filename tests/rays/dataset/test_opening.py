@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.rays.dataset import is_dataset
 from nerg_mi.rays.dataset_open import load_rays, rays_digest
 

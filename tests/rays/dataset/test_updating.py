@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import locked
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.files.atomic import file_sha256, locked
 from nerg_mi.rays import dataset_write
 from nerg_mi.rays.dataset import HEAD, RayDataset
 from nerg_mi.rays.dataset_write import update_dataset
