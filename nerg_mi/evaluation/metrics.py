@@ -95,7 +95,7 @@ class Rendered:
 
 
 # Samples that are rendered at once: the memory for those of a whole picture may not be there.
-_LAUNCH = 1 << 26
+_LAUNCH = 1 << 23
 
 
 class Renderer:
@@ -134,7 +134,10 @@ class Renderer:
             count = min(each, self.spp - first)
             with mitsuba_says():
                 part = mi.render(self.scene, sensor=sensor, spp=count, seed=mi.UInt32(seed + first))
-            out = out + np.array(part, np.float64) * (count / self.spp)
+                out = out + np.array(part, np.float64) * (count / self.spp)
+            # Mitsuba takes Ctrl-C while it renders.
+            if self.scene.integrator().should_stop():
+                raise KeyboardInterrupt
         opacity = np.clip(out[..., 4], 0, 1)
         some = np.maximum(opacity, 1e-6)[..., None]
         color = opacity[..., None] * srgb(out[..., :3] / some)

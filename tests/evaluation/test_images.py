@@ -70,6 +70,26 @@ def camera(k1=0.0):
     return Camera(Intrinsics(16, 12, 40.0, 40.0, 8.0, 6.0, k1), pose)
 
 
+def test_ctrl_c_ends_a_picture_between_two_parts(fog, monkeypatch):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    monkeypatch.setattr(metrics, "_LAUNCH", 16 * 12)
+    seeds, rendered, render = [], mi.render, Renderer(fog, 4)
+
+    def stopped(scene, **how):
+        seeds.append(how["seed"])
+        picture = rendered(scene, **how)
+        # As Mitsuba's handler does, which takes the signal while it renders.
+        scene.integrator().cancel()
+        return picture
+
+    monkeypatch.setattr(mi, "render", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        render(camera())
+    assert len(seeds) == 1
+
+
 def test_rendered_through_mitsuba_it_is_the_closed_form(fog):
     """Opacity 1 - exp(-1.5 l), sRGB 0.5 opacity, depth where half of it is reached, from the camera's centre."""
     import mitsuba as mi
