@@ -216,12 +216,13 @@ from nerg_mi.maths.types import Bool, UInt32
 from nerg_mi.properties import boolean, number, text
 from nerg_mi.ranges import VALUES, Range
 from nerg_mi.registration import register
+from nerg_mi.transport import aovs as nerg_aovs
 from nerg_mi.transport import observer
 from nerg_mi.transport.geometry import Shading
 from nerg_mi.transport.jit import no_collection, recording
 from nerg_mi.transport.observer import ObserverCache
 
-from . import nerg_aovs, nerg_properties
+from . import nerg_properties
 from .nerg_pixel import RenderContext
 
 __doc__ = nerg_properties.complete(__doc__ or "").replace("{aovs}", nerg_aovs.manual())
@@ -254,7 +255,7 @@ class NergIntegrator(mi.SamplingIntegrator):
 
         self.aovs = nerg_aovs.read_aovs(text(props, "aovs", "depth,opacity"), self)
         self.demands = nerg_aovs.demands_of(self.aovs)
-        self.views = nerg_properties.views_of(self.aovs, self._given, self.gaze)
+        self.views = nerg_aovs.views_of(self.aovs, self)
         self.cache = ObserverCache()
         self._sensors = None  # of the render in progress; None when another integrator drives ours
 
@@ -325,7 +326,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     def for_aovs(self, aovs: Sequence[str], radiance: bool) -> RenderContext:
         """The same for other AOVs, with colour or without. Raises ``NergError`` for those that it cannot compute."""
         names = nerg_aovs.read_aovs(",".join(aovs), self)
-        views = nerg_properties.views_of(names, self.children, self.gaze)
+        views = nerg_aovs.views_of(names, self)
         demands = nerg_aovs.demands_of(names)
         return replace(self.context(), aovs=names, demands=demands, views=views, radiance=radiance)
 

@@ -14,6 +14,7 @@ import mitsuba as mi
 from nerg_mi.errors import NergError
 from nerg_mi.maths.color import composite_to_linear
 from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f
+from nerg_mi.transport import aovs as nerg_aovs
 from nerg_mi.transport import observer
 from nerg_mi.transport.field_medium import FeaturePainter, color_painter
 from nerg_mi.transport.geometry import Ceiling, Place, Shading
@@ -22,8 +23,6 @@ from nerg_mi.transport.medium import Medium, Painter
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings, ObserverView, view_along
 from nerg_mi.transport.observer_gaze import ObservedGaze, PlacedGaze
 from nerg_mi.transport.occlusion import Sight, trace_sight
-
-from . import nerg_aovs
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.transport.march_primal import MarchSettings, default_growth, default_step, default_stop
 from nerg_mi.transport.medium import Medium
-from nerg_mi.transport.observer import VISIBILITIES, ObserverSettings, ObserverView, SupportView, center, require_center
+from nerg_mi.transport.observer import VISIBILITIES, ObserverSettings, center, require_center
 from nerg_mi.transport.observer_gaze import PlacedGaze
 from nerg_mi.transport.quadrature import RULES, boundaries
 from nerg_mi.transport.volume_medium import KnownEmpty, VolumeMedium
@@ -115,16 +115,6 @@ def gaze_of(children: dict, medium: Medium | None) -> PlacedGaze | None:
         has = "there is none" if given is None else f"that has {given.feature_count}"
         raise NergError(f'the "gaze" field asks for {wanted} semantic features of a "field", but {has}')
     return gaze
-
-
-def views_of(aovs: list[str], children: dict, gaze: PlacedGaze | None) -> dict[str, ObserverView]:
-    """The views of the observer that ``aovs`` ask for, by these names."""
-    views: dict[str, ObserverView] = {}
-    if "kde" in aovs:
-        views["kde"] = children["kde"].kde_view()
-    if "support" in aovs and gaze is not None and gaze.field.support is not None:
-        views["support"] = SupportView(gaze.field.support, gaze.to_world)
-    return views
 
 
 def march_settings(props, medium: Medium | None) -> MarchSettings:

@@ -93,16 +93,16 @@ def registered() -> str:
     from nerg_mi.fields import gaze_base as gaze_fields
     from nerg_mi.rays.readers.registry import reader_names
     from nerg_mi.train.gaze_recipes import RECIPES
+    from nerg_mi.transport.aovs import AOVS
     from nerg_mi.transport.depth import DEPTHS
     from nerg_mi.transport.quadrature import RULES
 
-    aovs = import_module("nerg_mi.plugins.nerg_aovs").AOVS
     rows = (
         ("encoding of positions", "nerg_mi/fields/encoding.py", encodings.kinds()),
         ("gaze field", "nerg_mi/fields/gaze_base.py", gaze_fields.kinds()),
         ("quadrature rule", "nerg_mi/transport/quadrature.py", RULES.names()),
         ("depth", "nerg_mi/transport/depth.py", DEPTHS.names()),
-        ("AOV", "plugins/nerg_aovs.py", aovs),
+        ("AOV", "nerg_mi/transport/aovs.py", AOVS),
         ("tracking reader", "nerg_mi/rays/readers/base.py", reader_names()),
         ("gaze recipe", "nerg_mi/train/gaze_recipes.py", RECIPES),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.files import images
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import DECADES
+from nerg_mi.transport.aovs import AOVS, Aov, Display, Quantity
 
 from .style import SMALL, Sheet, color_values, find_colors, hatch
 
@@ -156,17 +157,23 @@ def scale_strip(heat: Heat, steps: int = 256) -> np.ndarray:
 HIDDEN = np.array([0.16, 0.20, 0.42])
 """Tint (display sRGB) of what the observer cannot see."""
 
-GAZE = "gaze density [1/sr]"
+GAZE = AOVS["gaze"].scale_label
 
 _STEPS = 256
 
 
-def depth_limits(depth, mask) -> tuple[float, float]:
-    """The ends of a scale for ``depth`` (h, w) where ``mask`` (h, w) is true, but for the outermost half percents."""
-    depth = np.asarray(depth, np.float64)
-    some = np.asarray(mask, bool) & np.isfinite(depth)
-    low, high = (float(v) for v in np.percentile(depth[some], (0.5, 99.5))) if some.any() else (0.0, 1.0)
+def percentile_limits(values, mask) -> tuple[float, float]:
+    """The ends of a scale for ``values`` (h, w) where ``mask`` (h, w) is true, but for the outermost half percents."""
+    values = np.asarray(values, np.float64)
+    some = np.asarray(mask, bool) & np.isfinite(values)
+    low, high = (float(v) for v in np.percentile(values[some], (0.5, 99.5))) if some.any() else (0.0, 1.0)
     return low, max(high, low + 1e-6)
+
+
+def symmetric_limit(values) -> float:
+    """The end of a scale to both sides of 0: that which 99.5 percent of ``values`` stay within."""
+    size = np.abs(values)
+    return float((np.percentile(size, 99.5) if size.size else 0.0) or (size.max() if size.size else 0.0) or 1)
 
 
 def depth_figure(
@@ -178,18 +185,53 @@ def depth_figure(
     colors: str = "viridis_r",
 ):
     """``depth`` (h, w) in scene units, with a colour bar; hatched where ``mask`` (h, w) says that nothing is met.
-    ``limits``: ends of the scale, by default those of `depth_limits`."""
-    depth = np.asarray(depth, np.float64)
-    some = np.asarray(mask, bool) & np.isfinite(depth)
-    low, high = limits or depth_limits(depth, mask)
-    shown = color_values(colors, np.where(some, (depth - low) / (high - low), 0.0))
-    sheet = Sheet([_hatched(shown, ~some)], [title], scale=True)
-    inside = depth[some]
-    above, below = bool(np.any(inside > high)), bool(np.any(inside < low))
-    strip = color_values(colors, np.linspace(0, 1, _STEPS))
-    label = f"distance from the camera [{unit}]"
-    sheet.bar(strip, low, high, label, above=above, below=below, unknown=not some.all())
+    ``limits``: ends of the scale, by default those of `percentile_limits`."""
+    return map_figure(depth, mask, title, f"{AOVS['depth'].label} [{unit}]", limits, colors)
+
+
+def map_figure(
+    values,
+    mask,
+    title: str,
+    label: str,
+    limits: tuple[float, float] | None = None,
+    colors: str = "viridis",
+    kind: str = "sequential",
+    note: str = "",
+) -> Any:
+    """``values`` (h, w) in ``colors`` of that ``kind`` alone, with a bar; hatched where ``mask`` (h, w) is false.
+    ``limits``: ends of the scale, by default those of `percentile_limits`; ``note``: what they rest on."""
+    values = np.asarray(values, np.float64)
+    some = np.asarray(mask, bool) & np.isfinite(values)
+    ends = limits or percentile_limits(values, mask)
+    shown = color_of(np.where(some, values, ends[0]), ends, colors, kind)
+    sheet = Sheet([_hatched(shown, ~some)], [title], scale=True, note=note)
+    add_map_scale(sheet, ends, colors, kind, label, values[some], unknown=not some.all())
     return sheet.page
+
+
+def color_of(values, limits: tuple[float, float], colors: str, kind: str) -> np.ndarray:
+    """Display colours (..., 3) of ``values`` (...) between ``limits``; classes have each their own, as far as there
+    are so many."""
+    values = np.asarray(values, np.float64)
+    if kind == "categorical":
+        count = find_colors(colors, kind).N
+        return color_values(colors, (np.round(values) % count + 0.5) / count, kind)
+    return color_values(colors, (values - limits[0]) / (limits[1] - limits[0]), kind)
+
+
+def add_map_scale(
+    sheet: Sheet, limits: tuple[float, float], colors: str, kind: str, label: str, values, unknown: bool = False
+) -> None:
+    """The scale of `color_of` on a ``sheet``; ``values``: those that it explains."""
+    low, high = limits
+    if kind == "categorical":
+        classes = np.repeat(np.arange(round(low), round(high) + 1), _STEPS // 8)
+        sheet.bar(color_of(classes, limits, colors, kind), low - 0.5, high + 0.5, label, unknown=unknown)
+        return
+    strip = color_values(colors, np.linspace(0, 1, _STEPS), kind)
+    over = dict(above=bool(np.any(values > high)), below=bool(np.any(values < low)))
+    sheet.bar(strip, low, high, label, unknown=unknown, **over)
 
 
 def gaze_figure(
@@ -207,15 +249,17 @@ def gaze_figure(
 
 def visibility_figure(color, visibility, mask, title: str = "Visible to the observer"):
     """``visibility`` (h, w): 1 in the colours of the picture, 0 in a dark blue; hatched where ``mask`` is false."""
-    v = np.clip(np.asarray(visibility, np.float64), 0, 1)[..., None]
+    of = Layers(np.asarray(color), np.asarray(visibility), np.asarray(mask, bool))
+    return find_overlay("visibility").draw(of, None, Style(title=title))
+
+
+def shaded(color, values) -> np.ndarray:
+    """Display values (h, w, 3) of the linear picture ``color`` (h, w, 3) where ``values`` (h, w) are 1, and of a dark
+    blue one where they are 0."""
+    v = np.clip(np.asarray(values, np.float64), 0, 1)[..., None]
     luminance = srgb(np.clip(color, 0, 1) @ LUMINANCE)[..., None]
     hidden = HIDDEN * (0.35 + 0.9 * luminance)
-    unknown = ~np.asarray(mask, bool)
-    sheet = Sheet([_hatched(hidden + v * (srgb(color) - hidden), unknown)], [title], scale=True)
-    grey = np.linspace(0, 1, _STEPS)[:, None]
-    strip = HIDDEN * 0.8 + grey * (0.85 - HIDDEN * 0.8)
-    sheet.bar(strip, 0.0, 1.0, "0 hidden, 1 visible", unknown=bool(unknown.any()))
-    return sheet.page
+    return hidden + v * (srgb(color) - hidden)
 
 
 def difference_figure(
@@ -233,14 +277,8 @@ def difference_figure(
     percent of the pixels stay within; ``note``: what they rest on."""
     less = np.asarray(first, np.float64) - np.asarray(second, np.float64)
     some = np.isfinite(less) if mask is None else np.isfinite(less) & np.asarray(mask, bool)
-    size = np.abs(less[some])
-    limit = float(limit or (np.percentile(size, 99.5) if size.size else 0.0) or (size.max() if size.size else 0.0) or 1)
-    shown = color_values(colors, np.where(some, 0.5 + 0.5 * less / limit, 0.5), diverging=True)
-    sheet = Sheet([_hatched(shown, ~some)], [title], scale=True, note=note)
-    strip = color_values(colors, np.linspace(0, 1, _STEPS), diverging=True)
-    over = dict(above=bool(np.any(less[some] > limit)), below=bool(np.any(less[some] < -limit)))
-    sheet.bar(strip, -limit, limit, label, unknown=not some.all(), **over)
-    return sheet.page
+    limit = float(limit or symmetric_limit(less[some]))
+    return map_figure(less, some, title, label, (-limit, limit), colors, "diverging", note)
 
 
 def occlusion_figure(own, moved_without, moved_with, heat: Heat, marker=None, hatched: bool = False, note: str = ""):
@@ -297,9 +335,8 @@ def _hatched(shown, unknown) -> np.ndarray:
 
 # ---- Overlays ----
 #
-# What can be laid over a picture: a table of quantities, how each is drawn, and which scale several pictures share.
-#
-# One more is one more entry. Values are the AOVs of the integrator `nerg`, (h, w) each.
+# What can be laid over a picture: the AOVs of the integrator `nerg`, drawn as their table says
+# (`nerg_mi.transport.aovs`), and which scale several pictures share. Values are (h, w) each.
 
 
 Limits = tuple[float, float] | None
@@ -335,35 +372,123 @@ class Style:
 USUAL = Style()
 
 
+_USUAL_COLORS = {
+    "sequential": "viridis",
+    "heat": "inferno",
+    "diverging": "RdBu_r",
+    "categorical": "tab20",
+    "shade": "viridis",
+}
+
+
 @dataclass(frozen=True)
 class Overlay:
-    """``name`` of the AOV; ``summary`` for people; ``limits(layers)``: ends of the scale of one picture, None where it
-    shows nothing of it; ``draw(layers, limits, style)``: a figure; ``scaled``: whether it needs a scale; ``low``: the
-    lower end of every scale, or None where it depends on the pictures; ``of_gaze``: whether it is known only where rays
-    were recorded; ``rests_on``: "gaze" or "kde", the part of the scene that was made of rays."""
+    """How a ``quantity`` is laid over a picture; ``name``: that of the AOV, with its channel's where it has several."""
 
+    quantity: Quantity
     name: str
-    summary: str
-    limits: Callable[[Layers], Limits]
-    draw: Callable[..., Any]
-    scaled: bool = True
-    low: float | None = 0.0
-    of_gaze: bool = False
-    rests_on: str | None = None
 
+    @property
+    def display(self) -> Display:
+        """How its values are shown."""
+        return self.quantity.display
 
-def _heat(name: str, summary: str, title: str, label: str, of_gaze: bool = False, rests_on: str = "gaze") -> Overlay:
-    def limits(of: Layers) -> Limits:
-        return (0.0, top_of(of.values, of.mask)) if np.any(of.values[of.mask] > 0) else None
+    @property
+    def colors(self) -> str:
+        """The colour map where nobody chose another."""
+        return self.display.cmap or _USUAL_COLORS[self.display.kind]
 
-    def draw(of: Layers, limits: Limits, style: Style = USUAL) -> Any:
-        heat = Heat(1.0 if limits is None else limits[1], decades=style.decades)
-        heat = heat if style.colors is None else replace(heat, colors=style.colors)
-        shown = style.title or (title if of.supported or not of_gaze else f"{title}: nobody recorded around here")
-        unknown = unknown_of(of, of_gaze) if style.hatched else None
-        return gaze_figure(of.color, of.values, of.mask, heat, shown, label, of.marker, unknown, of.basis)
+    @property
+    def color_kind(self) -> str:
+        """The kind of its colour maps, see `style.find_colors`."""
+        return self.display.kind if self.display.kind in ("diverging", "categorical") else "sequential"
 
-    return Overlay(name, summary, limits, draw, of_gaze=of_gaze, rests_on=rests_on)
+    @property
+    def scaled(self) -> bool:
+        """Whether the ends of its scale depend on what is seen."""
+        return self.display.limits is None and self.display.kind != "categorical"
+
+    @property
+    def is_scaled_by_top(self) -> bool:
+        """Whether its scale follows from the upper end alone."""
+        return self.display.kind in ("heat", "diverging")
+
+    def limits(self, of: Layers) -> Limits:
+        """The ends of the scale of one picture; None where it shows nothing of the quantity, or needs no scale."""
+        return self.limits_of(of.values, of.mask)
+
+    def limits_of(self, values, mask) -> Limits:
+        """The same of ``values`` (h, w) where ``mask`` (h, w) is true."""
+        if not self.scaled:
+            return None
+        values, mask = np.nan_to_num(values), np.asarray(mask, bool)
+        if self.display.kind == "heat":
+            return (0.0, top_of(values, mask)) if np.any(values[mask] > 0) else None
+        if self.display.kind == "diverging":
+            limit = symmetric_limit(values[mask])
+            return -limit, limit
+        return percentile_limits(values, mask)
+
+    def paint(self, of: Layers, limits: Limits, style: Style = USUAL, unknown=None) -> np.ndarray:
+        """Display values (h, w, 3) of ``of``, hatched where ``unknown`` (h, w) bool is true."""
+        kind, colors = self.display.kind, style.colors or self.colors
+        if kind == "heat":
+            return overlay(of.color, of.values, self.heat(limits, style), of.mask, unknown)
+        if kind == "shade":
+            shown = shaded(of.color, np.nan_to_num(of.values))
+        else:
+            shown = color_of(np.nan_to_num(of.values), self._ends(of.values, of.mask, limits), colors, self.color_kind)
+        return shown if unknown is None else _hatched(shown, unknown)
+
+    def draw(self, of: Layers, limits: Limits, style: Style = USUAL) -> Any:
+        """A figure of ``of`` on a scale with these ``limits``."""
+        needs_support, label = self.quantity.needs_support, self.quantity.scale_label
+        title = style.title or self.quantity.heading
+        if self.display.kind == "heat":
+            if style.title is None and needs_support and not of.supported:
+                title = f"{title}: nobody recorded around here"
+            unknown = unknown_of(of, needs_support) if style.hatched else None
+            heat = self.heat(limits, style)
+            return gaze_figure(of.color, of.values, of.mask, heat, title, label, of.marker, unknown, of.basis)
+        unknown = ~(np.asarray(of.mask, bool) & np.isfinite(of.values))
+        sheet = Sheet([self.paint(of, limits, style, unknown)], [title], scale=True, note=of.basis)
+        self.add_scale(sheet, [of], limits, style, bool(unknown.any()))
+        return sheet.page
+
+    def add_scale(
+        self, sheet: Sheet, each: Sequence[Layers], limits: Limits, style: Style = USUAL, unknown: bool = False
+    ) -> None:
+        """The scale of the pictures ``each`` on a ``sheet``; ``unknown``: whether some are hatched."""
+        label = self.quantity.scale_label
+        if self.display.kind == "heat":
+            add_scale(sheet, self.heat(limits, style), label, [(of.values, of.mask) for of in each], unknown)
+        elif self.display.kind == "shade":
+            grey = np.linspace(0, 1, _STEPS)[:, None]
+            sheet.bar(HIDDEN * 0.8 + grey * (0.85 - HIDDEN * 0.8), 0.0, 1.0, label, unknown=unknown)
+        else:
+            seen = np.concatenate([of.values[of.mask & np.isfinite(of.values)] for of in each])
+            ends = self._ends(seen, np.ones(seen.shape, bool), limits)
+            add_map_scale(sheet, ends, style.colors or self.colors, self.color_kind, label, seen, unknown)
+
+    def check_limits(self, limits: Limits) -> None:
+        """Raise `NergError` where there is nothing to take a scale from."""
+        if limits is None and self.scaled:
+            raise NergError(
+                f'"{self.name}" is 0 wherever a surface is seen; move the camera or the observer, or give --top'
+            )
+
+    def heat(self, limits: Limits, style: Style = USUAL) -> Heat:
+        """How its values become heat on a scale with these ``limits``."""
+        return Heat(1.0 if limits is None else limits[1], style.colors or self.colors, decades=style.decades)
+
+    def _ends(self, values, mask, limits: Limits) -> tuple[float, float]:
+        """The ends of a scale of colours alone."""
+        if self.display.kind == "categorical":
+            seen = np.round(values[mask & np.isfinite(values)])
+            return (float(seen.min()), float(seen.max())) if seen.size else (0.0, 0.0)
+        if self.display.kind == "diverging" and limits is not None:
+            return -abs(limits[1]), abs(limits[1])
+        return limits or self.display.limits or percentile_limits(values, mask)
 
 
 def unknown_of(layers: Layers, of_gaze: bool) -> np.ndarray:
@@ -372,37 +497,42 @@ def unknown_of(layers: Layers, of_gaze: bool) -> np.ndarray:
     return void if layers.supported or not of_gaze else np.ones_like(void)
 
 
-def _draw_visibility(of: Layers, limits: Limits, style: Style = USUAL) -> Any:
-    return visibility_figure(of.color, of.values, of.mask, style.title or "Visible to the observer")
+def overlays_of(aov: Aov, channels: Sequence[str] | None = None) -> list[Overlay]:
+    """What can be laid over a picture of an AOV: itself, or each of its ``channels``; None: those that every medium
+    has."""
+    if not aov.several:
+        return [Overlay(aov, aov.name)]
+    return [_overlay_of_channel(aov, channel) for channel in channels or aov.channels or "0"]
 
 
-def _draw_depth(of: Layers, limits: Limits, style: Style = USUAL) -> Any:
-    colors = style.colors or "viridis_r"
-    return depth_figure(of.values, of.mask, style.title or "Depth", "scene units", limits, colors)
-
-
-OVERLAYS = {
-    overlay.name: overlay
-    for overlay in (
-        _heat("gaze", "how much the observer attends to what is seen", "Gaze", GAZE, of_gaze=True),
-        _heat("kde", "where tracked people looked", "Where people looked", "tracked gaze [1/sr]", rests_on="kde"),
-        _heat("gaze_std", "how sure that is", "Uncertainty of gaze", "standard deviation of gaze [1/sr]", of_gaze=True),
-        _heat("emit", "how much surfaces attract", "What surfaces attract", "emitted attention"),
-        _heat("capture", "how much the observer gives", "What the observer gives", "captured attention"),
-        _heat("support", "how many rays the gaze rests on", "Support", "training rays around the observer"),
-        Overlay("visibility", "what the observer sees", lambda of: None, _draw_visibility, scaled=False),
-        Overlay(
-            "depth", "distance from the camera", lambda of: depth_limits(of.values, of.mask), _draw_depth, low=None
-        ),
-    )
-}
+def _overlay_of_channel(aov: Aov, channel: str) -> Overlay:
+    words = aov.label or aov.name.replace("_", " ")
+    return Overlay(replace(aov, title=f"{aov.heading} {channel}", label=f"{words} {channel}"), f"{aov.name}.{channel}")
 
 
 def find_overlay(name: str) -> Overlay:
-    """The overlay ``name``. Raises `NergError` for one that is not known."""
-    if name not in OVERLAYS:
-        raise NergError(f'there is no overlay "{name}"; there are {", ".join(OVERLAYS)}')
-    return OVERLAYS[name]
+    """The overlay ``name``: an AOV, or a channel of one, such as "position.Z". Raises `NergError` for one that there is
+    not."""
+    first, _, channel = name.partition(".")
+    if first in AOVS:
+        aov = AOVS[first]
+        names = [of.name for of in overlays_of(aov)]
+        if not aov.several and channel in ("", aov.channels):
+            return Overlay(aov, first)
+        if name in names or (aov.channels is None and channel.isdecimal()):
+            return _overlay_of_channel(aov, channel)
+        raise NergError(f'"{name}" is no single channel: lay {" or ".join(names)} over the picture')
+    known = [of.name for aov in AOVS.values() for of in overlays_of(aov)]
+    raise NergError(f'there is no overlay "{name}"; there are {", ".join(known)}')
+
+
+def find_stored(name: str) -> Overlay:
+    """The overlay of the channel ``name`` of a file: one of a nested integrator's, which no table knows, lies over the
+    picture as a heat."""
+    first = name.partition(".")[0]
+    if first in AOVS:
+        return find_overlay(name)
+    return Overlay(Quantity(name=first, label=name, display=Display(kind="heat")), name)
 
 
 def shared_limits(each: Sequence[Limits], top: float | None) -> Limits:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from .overlay import Heat, add_scale
 from .style import Sheet
 
 
@@ -16,27 +15,23 @@ def contact_sheet(
     pictures: Sequence[np.ndarray],
     titles: Sequence[str],
     columns: int | None = None,
-    heat: Heat | None = None,
-    label: str = "",
-    values: Sequence[tuple[Any, Any]] = (),
-    unknown: bool = False,
+    add_scale: Callable[[Sheet], None] | None = None,
     note: str = "",
 ) -> Any:
     """``pictures`` (h, w, 3), display values, each under its title, in rows of ``columns`` (default: about as many as
     rows); smaller ones lie in the middle of their place.
 
-    ``heat``: the one scale of all, with its ``label``; ``values``: pairs (values, mask) that it explains; ``unknown``:
-    whether some are hatched; ``note``: what they rest on.
+    ``add_scale``: draws the one scale of all on the sheet; ``note``: what they rest on.
     """
     if not pictures:
         raise ValueError("a contact sheet needs at least one picture")
     columns = columns or math.ceil(math.sqrt(len(pictures)))
     height, width = (max(p.shape[axis] for p in pictures) for axis in (0, 1))
     sheet = Sheet(
-        [_padded(p, height, width) for p in pictures], titles, scale=heat is not None, columns=columns, note=note
+        [_padded(p, height, width) for p in pictures], titles, scale=add_scale is not None, columns=columns, note=note
     )
-    if heat is not None:
-        add_scale(sheet, heat, label, values, unknown)
+    if add_scale is not None:
+        add_scale(sheet)
     return sheet.page
 
 

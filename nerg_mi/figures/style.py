@@ -36,22 +36,30 @@ SEQUENTIAL = ("inferno", "magma", "plasma", "viridis", "cividis")
 DIVERGING = ("RdBu_r", "PuOr_r", "BrBG_r", "PRGn_r")
 """For differences, whose middle is 0."""
 
+CATEGORICAL = ("tab20", "tab10")
+"""For whole numbers that name classes."""
 
-def find_colors(name: str, diverging: bool = False) -> Any:
+_COLORS = {
+    "sequential": (SEQUENTIAL, "perceptually uniform"),
+    "diverging": (DIVERGING, "diverging"),
+    "categorical": (CATEGORICAL, "categorical"),
+}
+
+
+def find_colors(name: str, kind: str = "sequential") -> Any:
     """The colour map ``name`` of matplotlib: a function from 0..1 to RGBA. A name may end in ``_r``, for the other
-    direction. Raises `NergError` for one that is not among `SEQUENTIAL`, or `DIVERGING` where that is asked for."""
+    direction. Raises `NergError` for one that is not of the ``kind``: "sequential", "diverging" or "categorical"."""
     import matplotlib
 
-    known = DIVERGING if diverging else SEQUENTIAL
-    if name.removesuffix("_r") not in {of.removesuffix("_r") for of in known}:
-        kind = "diverging" if diverging else "perceptually uniform"
-        raise NergError(f'"{name}" is no {kind} colour map: choose one of {", ".join(known)}')
+    names, words = _COLORS[kind]
+    if name.removesuffix("_r") not in {of.removesuffix("_r") for of in names}:
+        raise NergError(f'"{name}" is no {words} colour map: choose one of {", ".join(names)}')
     return matplotlib.colormaps[name]
 
 
-def color_values(name: str, shares: Any, diverging: bool = False) -> np.ndarray:
+def color_values(name: str, shares: Any, kind: str = "sequential") -> np.ndarray:
     """Display colours (..., 3) of places ``shares`` (...) on a scale, 0..1."""
-    return np.asarray(find_colors(name, diverging)(np.asarray(shares, np.float64)))[..., :3]
+    return np.asarray(find_colors(name, kind)(np.asarray(shares, np.float64)))[..., :3]
 
 
 # ---- Hatching ----

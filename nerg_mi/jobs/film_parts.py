@@ -26,7 +26,7 @@ from nerg_mi.threads import set_thread_count
 
 from .film_tasks import OF_PICTURES, draw_layers, make_layers, make_picture, named_defaults
 from .options.parts import FilmOptions
-from .overlays import check_scale, shares_a_scale
+from .overlays import shares_a_scale
 from .parts import Parts
 from .pictures import AskedPictures, PictureResult, account, asked_pictures, provenances
 from .reporter import Reporter
@@ -80,7 +80,7 @@ class _Film:
         layers = list(self.parts.run(Plan(f"{self.what} (values)", tasks), 0.0, _LAYERS_SHARE))
         limits = [None if made.notes["limits"] is None else tuple(made.notes["limits"]) for made in layers]
         ends = shared_limits(limits, self.options.top)
-        check_scale(self.overlay, ends)
+        self.overlay.check_limits(ends)
         plan = Plan(self.what, [self._drawing(k, made, ends) for k, made in enumerate(layers)])
         self._write(plan, _LAYERS_SHARE)
         return layers[-1].notes, None if ends is None else ends[1]

@@ -18,6 +18,7 @@ from nerg_mi.files.atomic import write_bytes
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.asked import is_nerg, render_asked
 from nerg_mi.rendering.projection import pixel_of
+from nerg_mi.transport.aovs import AOVS
 from nerg_mi.transport.observer import center
 
 from .options.pictures import PictureOptions
@@ -60,14 +61,14 @@ def check_overlay(output: Path, options: PictureOptions) -> None:
                 flag = "--no-hatching" if name == "hatching" else f"--{name}"
                 raise NergError(f"{flag} is about an overlay, and there is none; give --overlay, too")
         return
-    find_overlay(options.overlay)
+    overlay = find_overlay(options.overlay)
     if output.suffix.lower() not in OVERLAY_FORMATS:
         raise NergError(
             f'an overlay is a picture to look at, and "{output}" is none: let its name end in '
             f"{' or '.join(OVERLAY_FORMATS)} (an .exr holds the quantity itself, if the scene's aovs name it)"
         )
     if options.cmap is not None:
-        find_colors(options.cmap)
+        find_colors(options.cmap, overlay.color_kind)
 
 
 def overlay_pictures(
@@ -92,7 +93,7 @@ def overlay_pictures(
     waits = shares_a_scale(overlay, len(frames), options)
 
     def finish(layers: Layers, ends: Limits) -> None:
-        check_scale(overlay, ends)
+        overlay.check_limits(ends)
         write(overlay.draw(layers, ends, style))
         stop.check()
 
@@ -129,15 +130,7 @@ def style_of(options: PictureOptions) -> Style:
 
 def shares_a_scale(overlay: Overlay, count: int, options: PictureOptions) -> bool:
     """Whether none of ``count`` pictures can be drawn before all are rendered."""
-    return count > 1 and overlay.scaled and (options.top is None or overlay.low is None)
-
-
-def check_scale(overlay: Overlay, ends: Limits) -> None:
-    """Raise `NergError` where there is nothing to draw a scale by."""
-    if ends is None and overlay.scaled:
-        raise NergError(
-            f'"{overlay.name}" is 0 wherever a surface is seen; move the camera or the observer, or give --top'
-        )
+    return count > 1 and overlay.scaled and (options.top is None or not overlay.is_scaled_by_top)
 
 
 def stacked(layers: Layers) -> np.ndarray:
@@ -166,16 +159,19 @@ def layers_of(
     path: Path, loaded: Any, camera: Any, overlay: Overlay, spp: int = 0, seed: int = 0, on_strip: OnStrip | None = None
 ) -> Layers:
     """What ``camera`` sees of the scene ``loaded`` from ``path`` with the quantity of ``overlay``, and who is there."""
-    asked = list(dict.fromkeys([overlay.name, "opacity", "depth"]))
+    quantity = overlay.quantity
+    asked = list(dict.fromkeys([quantity.name, "opacity", "depth"]))
     with mitsuba_says():
         found = render_asked(path, loaded, camera, asked, spp, seed, on_strip)
+    if overlay.name not in found.aovs:
+        raise NergError(f'"{path}" has no "{overlay.name}"; it has {", ".join(found.aovs)}')
     marker = observer_pixel(loaded, camera, found.aovs["depth"])
-    supported = not overlay.of_gaze or is_supported(loaded, camera)
-    basis = basis_words(loaded, overlay.rests_on)
+    supported = not quantity.needs_support or is_supported(loaded, camera)
+    basis = basis_words(loaded, quantity.rests_on)
     return Layers(found.color, found.aovs[overlay.name], found.mask, marker, supported, basis)
 
 
-def basis_words(loaded: Any, part: str | None = "gaze") -> str:
+def basis_words(loaded: Any, part: str = "gaze") -> str:
     """Rays and people that a ``part`` of the scene rests on, "gaze" or "kde", in words; "" where that is not known."""
     volume = loaded.integrator().children.get(part)
     if volume is None:
@@ -189,7 +185,8 @@ def basis_texts(loaded: Any) -> dict[str, str]:
     "kde.basis", as far as they are known."""
     if not is_nerg(loaded.integrator()):
         return {}
-    words = {f"{part}.basis": basis_words(loaded, part) for part in ("gaze", "kde")}
+    parts = dict.fromkeys(aov.rests_on for aov in AOVS.values() if aov.rests_on)
+    words = {f"{part}.basis": basis_words(loaded, part) for part in parts}
     return {name: text for name, text in words.items() if text}
 
 

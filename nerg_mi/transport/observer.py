@@ -322,8 +322,8 @@ def view_along(
     lane. Raises ``NergError`` in a function that is being frozen, where the observers' positions cannot be read."""
     if recording():
         raise NergError(
-            '"support" and "kde" depend on where the observer is, which a frozen function does not know while it is '
-            'recorded: leave them out of "aovs"'
+            "one of the AOVs depends on where the observer is, which a frozen function does not know while it is "
+            'recorded: leave it out of "aovs"'
         )
     known = cache.of_each(view, observers, (), view.at)
     return select_nearest(known, p_o, lambda value: value.value(r_o))

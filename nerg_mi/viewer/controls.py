@@ -100,7 +100,7 @@ class Controls:
         layer = gui.add_dropdown("Layer", titles, initial_value=session.shade.layer.title)
         self._legend = gui.add_html(layers.legend(session.shade.layer, session.scale(), self.page.stale))
         basis = gui.add_html(basis_note(session))
-        colors = gui.add_dropdown("Colours", (_USUAL, *layers.MAPS), initial_value=_USUAL)
+        colors = gui.add_dropdown("Colours", _maps_of(session.shade.layer), initial_value=_USUAL)
         automatic = gui.add_checkbox("Automatic range", True)
         ends = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)
         # As Mitsuba has it, in single precision, it would be written with all its digits.
@@ -112,8 +112,10 @@ class Controls:
                 # Written by the program, which has set all else.
                 return
             fixed = None
-            chosen = layers.LAYERS[layer.value]
-            if chosen.quantity != session.shade.layer.quantity and not automatic.value:
+            chosen = next(la for la in session.layers if la.title == layer.value)
+            if tuple(colors.options) != _maps_of(chosen):
+                colors.options = _maps_of(chosen)
+            if chosen != session.shade.layer and not automatic.value:
                 # A range in 1/sr says nothing of metres.
                 automatic.value = True
             ends.disabled = automatic.value
@@ -327,6 +329,10 @@ class Controls:
             return 0.0, 1.0
         along = proxy.points @ self.session.cut_up
         return float(np.percentile(along, 0.5)), float(np.percentile(along, 99.5))
+
+
+def _maps_of(layer: layers.Layer) -> tuple[str, ...]:
+    return _USUAL, *layers.MAPS[layers.color_kind(layer)]
 
 
 def basis_note(session: Any) -> str:

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from nerg_mi.errors import NergError, expected, sentence
-from nerg_mi.figures.overlay import OVERLAYS
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.video import check_video
 from nerg_mi.jobs.options.pictures import PictureOptions
@@ -49,16 +48,16 @@ def even(view: View, width: int) -> tuple[View, int]:
 def film_options(layer: Layer, scale: Scale, frames: Path, fps: float, mode: str) -> PictureOptions:
     """How `render_file` draws the frames of the file ``frames`` as ``layer`` shows them, with the ends and colours of
     ``scale``."""
-    if layer.quantity not in OVERLAYS:
+    overlay = layer.overlay
+    if overlay is None:
         return PictureOptions(frames=frames, fps=fps, mode=mode)
-    scaled = OVERLAYS[layer.quantity].scaled
     return PictureOptions(
         frames=frames,
         fps=fps,
         mode=mode,
-        overlay=layer.quantity,
-        top=scale.high if scaled else None,
-        cmap=scale.colors if layer.kind == "heat" else None,
+        overlay=overlay.name,
+        top=scale.high if overlay.scaled else None,
+        cmap=None if layer.kind == "shade" else scale.colors,
     )
 
 

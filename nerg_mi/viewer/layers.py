@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 
@@ -9,22 +10,49 @@ import numpy as np
 
 from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import Heat, overlay, srgb, to_bytes, top_of
-from nerg_mi.figures.style import SEQUENTIAL as MAPS
-from nerg_mi.figures.style import hatch
+from nerg_mi.figures.overlay import Layers, Overlay, Style, color_of, find_overlay, overlays_of, srgb, to_bytes
+from nerg_mi.figures.style import CATEGORICAL, DIVERGING, SEQUENTIAL, find_colors, hatch
+from nerg_mi.transport.aovs import AOVS
+
+MAPS = {"sequential": SEQUENTIAL, "diverging": DIVERGING, "categorical": CATEGORICAL}
+"""Colour maps to choose from, by the kind of what is shown."""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """``title`` for people, the ``quantity`` of the integrator beside colour, or none, its ``unit``; ``kind``: "color",
-    "heat" over the colour, "shade" (visible or hidden) or "map" (colours alone); ``of_observer``: whether it depends on
-    the observer."""
+    """Colour, and the ``overlay`` on it, or none."""
 
-    title: str
-    quantity: str = ""
-    unit: str = ""
-    kind: str = "heat"
-    of_observer: bool = True
+    overlay: Overlay | None = None
+
+    @property
+    def title(self) -> str:
+        """Its name for people."""
+        heading = "colour" if self.overlay is None else self.overlay.quantity.heading
+        return heading[0].lower() + heading[1:]
+
+    @property
+    def quantity(self) -> str:
+        """The AOV that it shows, or ""."""
+        return "" if self.overlay is None else self.overlay.quantity.name
+
+    @property
+    def kind(self) -> str:
+        """How it is shown: "color", or as the AOV's display says."""
+        return "color" if self.overlay is None else self.overlay.display.kind
+
+    @property
+    def of_observer(self) -> bool:
+        """Whether it depends on the observer."""
+        return self.overlay is not None and AOVS[self.quantity].of_observer
+
+    def values(self, by_quantity: Mapping[str, np.ndarray]) -> np.ndarray | None:
+        """Its values (...) among those of each quantity, (...) or, of several channels, (..., channels)."""
+        values = by_quantity.get(self.quantity)
+        if values is None or self.overlay is None or self.overlay.name == self.quantity:
+            return values
+        channel = self.overlay.name.partition(".")[2]
+        channels = AOVS[self.quantity].channels
+        return values[..., int(channel) if channels is None else channels.index(channel)]
 
 
 @dataclass(frozen=True)
@@ -37,44 +65,23 @@ class Shade:
     fixed: tuple[float, float] | None = None
 
 
-LAYERS = {
-    layer.title: layer
-    for layer in (
-        Layer("gaze", "gaze", "1/sr"),
-        Layer("colour", kind="color", of_observer=False),
-        Layer("depth", "depth", "units", "map", of_observer=False),
-        Layer("visibility", "visibility", kind="shade"),
-        Layer("spread of gaze", "gaze_std", "1/sr"),
-        Layer("support", "support", "rays", "map"),
-        Layer("tracked gaze (kde)", "kde", "1/sr"),
-        Layer("what surfaces attract", "emit"),
-        Layer("what the observer gives", "capture"),
-    )
-}
-"""What there is to choose from; what a scene does not have is left out (`available`)."""
+def layer_of(name: str) -> Layer:
+    """The layer of the AOV, or the channel of one, ``name``; of colour alone for "color"."""
+    return Layer(None if name == COLOR else find_overlay(name))
 
 
 def available(scene: Scene) -> list[Layer]:
-    """The layers that ``scene`` can show, without a factor that its gaze field lacks."""
-    found, lacking = [], _lacking(scene)
-    for layer in LAYERS.values():
-        if layer.quantity and layer.quantity == lacking:
-            continue
+    """The layers that ``scene`` can show: colour, and every AOV that varies in it."""
+    found = [Layer()]
+    for aov in AOVS.values():
         try:
-            if layer.quantity:
-                scene.integrator.for_aovs([layer.quantity], False)
+            scene.integrator.for_aovs([aov.name], False)
         except NergError:
             # That is how the integrator says what it lacks.
             continue
-        found.append(layer)
+        if not aov.is_constant(scene.integrator):
+            found += [Layer(overlay) for overlay in overlays_of(aov, aov.channels_of(scene.integrator.medium))]
     return found
-
-
-def _lacking(scene: Scene) -> str:
-    """The factor that the gaze field of ``scene`` has not, which the integrator takes as 1; "" where it has both."""
-    gaze = scene.integrator.gaze
-    variant = "" if gaze is None else gaze.field.config.variant
-    return {"emit": "capture", "capture": "emit"}.get(variant, "")
 
 
 def quantities(layer: Layer) -> list[str]:
@@ -82,36 +89,42 @@ def quantities(layer: Layer) -> list[str]:
     return list(dict.fromkeys([COLOR, "depth", "opacity", *([layer.quantity] if layer.quantity else [])]))
 
 
-def usual_colors(layer: Layer) -> str:
-    """The colour map of ``layer`` where nobody chose another."""
-    return "viridis" if layer.kind == "map" else "inferno"
+def color_kind(layer: Layer) -> str:
+    """The kind of the colour maps that ``layer`` may have."""
+    return "sequential" if layer.overlay is None else layer.overlay.color_kind
+
+
+def usual_scale(layer: Layer, limits: tuple[float, float] | None, colors: str | None) -> Scale:
+    """The scale of ``layer``, where nobody chose ``limits`` or ``colors`` its usual one."""
+    overlay = layer.overlay
+    if overlay is None:
+        return Scale()
+    low, high = limits or overlay.display.limits or (0.0, 1.0)
+    # What was chosen for a layer before may be a map of another kind.
+    chosen = colors if colors is not None and colors in MAPS[overlay.color_kind] else overlay.colors
+    return Scale(low, high, chosen, overlay.color_kind)
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Colours ``colors`` (one of `MAPS`) between ``low`` and ``high``."""
+    """Colours ``colors``, of that ``kind`` (`find_colors`), between ``low`` and ``high``."""
 
     low: float = 0.0
     high: float = 1.0
     colors: str = "inferno"
+    kind: str = "sequential"
 
     def __post_init__(self) -> None:
-        if self.colors not in MAPS:
-            raise NergError(f'"{self.colors}" is no perceptually uniform colour map; choose one of {", ".join(MAPS)}')
+        find_colors(self.colors, self.kind)
         if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
             raise NergError(f"a range goes from a number to a larger one, got {self.low:g} to {self.high:g}")
 
 
 def automatic(layer: Layer, values: np.ndarray, mask: np.ndarray) -> tuple[float, float] | None:
     """A range for ``values`` where ``mask`` has a surface; None where there is nothing to take one from."""
-    inside = np.asarray(values)[np.asarray(mask, bool)]
-    if layer.kind == "map":
-        if not inside.size:
-            return None
-        low, high = (float(v) for v in np.percentile(inside, [1, 99]))
-        low = 0.0 if layer.quantity == "support" else low
-        return (low, high) if high > low else (low, low + max(abs(low), 1.0) * 1e-3)
-    return (0.0, top_of(values, mask)) if (inside > 0).any() else None
+    if layer.overlay is None or not np.any(mask):
+        return None
+    return layer.overlay.limits_of(np.asarray(values), np.asarray(mask, bool))
 
 
 def colored(
@@ -119,24 +132,16 @@ def colored(
 ) -> np.ndarray:
     """uint8 (..., 3) of what ``layer`` shows: linear ``color`` (..., 3), ``values`` (...) and ``mask`` (...), where
     there is a surface. Pixels (h, w) without one are hatched."""
-    import matplotlib
-
     shape = np.shape(mask)
     # Points are a picture of one row.
     rows = shape if len(shape) == 2 else (1, shape[0])
     color, mask = np.asarray(color).reshape(*rows, 3), np.asarray(mask, bool).reshape(rows)
-    values = None if values is None else np.asarray(values).reshape(rows)
-    if layer.kind == "color" or values is None:
+    if layer.overlay is None or values is None:
         shown = srgb(color)
-    elif layer.kind == "heat":
-        shown = overlay(color, values, Heat(scale.high, scale.colors), mask)
-    elif layer.kind == "shade":
-        seen = np.clip(np.nan_to_num(values), 0, 1)[..., None]
-        shown = srgb(color) * (0.25 + 0.75 * seen) + (1 - seen) * np.array([0.02, 0.04, 0.22])
     else:
-        share = np.clip((np.nan_to_num(values) - scale.low) / (scale.high - scale.low), 0, 1)
-        shown = matplotlib.colormaps[scale.colors](share)[..., :3]
-    if hatched and len(shape) == 2 and layer.kind != "color":
+        of = Layers(color, np.asarray(values).reshape(rows), mask)
+        shown = layer.overlay.paint(of, (scale.low, scale.high), Style(scale.colors))
+    if hatched and len(shape) == 2 and layer.overlay is not None:
         shown = hatch(shown, ~mask)
     return to_bytes(shown).reshape(*shape, 3)
 
@@ -160,15 +165,17 @@ def legend(layer: Layer, scale: Scale, stale: str = "") -> str:
     """The scale as HTML; empty where there is none. ``stale``: why it is not that of what is shown; "": it is."""
     if stale:
         return f"<div style='{STALE}'>{legend(layer, scale)}</div>{note(stale)}"
-    import matplotlib
     from matplotlib.colors import to_hex
 
-    if layer.kind in ("color", "shade"):
-        words = {"color": "", "shade": "dark blue: hidden from the observer"}[layer.kind]
-        return note(words)
-    name = scale.colors
-    stops = ",".join(to_hex(matplotlib.colormaps[name](k / 8)) for k in range(9))
-    ends = f"<span>{scale.low:.3g}</span><span>{layer.unit}</span><span>{scale.high:.3g}</span>"
+    overlay = layer.overlay
+    if overlay is None:
+        return note("")
+    if overlay.display.kind in ("shade", "categorical"):
+        return note(overlay.quantity.label)
+    places = np.linspace(scale.low, scale.high, 9)
+    stops = ",".join(to_hex(c) for c in color_of(places, (scale.low, scale.high), scale.colors, scale.kind))
+    unit = overlay.quantity.unit or overlay.quantity.label
+    ends = f"<span>{scale.low:.3g}</span><span>{escape(unit)}</span><span>{scale.high:.3g}</span>"
     return (
         f"<div style='padding:0 1em;font-size:0.85em'><div style='height:10px;border-radius:3px;"
         f"background:linear-gradient(90deg,{stops})'></div>"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Callable, Generator, Hashable, Iterator, Sequence
+from collections.abc import Callable, Generator, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.api.attention import box_shares, mesh_shares
 from nerg_mi.api.queries import trace
-from nerg_mi.api.scene import Scene
+from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.api.variant import active_mitsuba
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.formats.areas.kinds import Areas
@@ -413,7 +413,7 @@ class Session:
         self.basis = basis_words(self.scene.mitsuba)
 
     def _first_layer(self) -> Layer:
-        return next((la for la in self.layers if la.quantity in ("gaze", "kde")), layers.LAYERS["colour"])
+        return next((la for la in self.layers if la.quantity in ("gaze", "kde")), self.layers[0])
 
     def _ahead_of_home(self) -> np.ndarray:
         """Where the observer stands of a scene whose camera it is: half way to what that looks at, so as to be seen."""
@@ -511,7 +511,9 @@ class Session:
     def has_scale(self) -> bool:
         """Whether the scale of the layer is known: until then it goes from 0 to 1."""
         shade = self.shade
-        return shade.layer.kind in ("color", "shade") or shade.fixed is not None or shade.layer.title in self._ranges
+        overlay = shade.layer.overlay
+        unscaled = overlay is None or not overlay.scaled
+        return unscaled or shade.fixed is not None or shade.layer.title in self._ranges
 
     @property
     def computing(self) -> list[str]:
@@ -575,8 +577,7 @@ class Session:
     def scale(self) -> Scale:
         """The scale of the layer that is shown."""
         shade = self.shade
-        low, high = shade.fixed or self._ranges.get(shade.layer.title) or (0.0, 1.0)
-        return Scale(low, high, shade.colors or layers.usual_colors(shade.layer))
+        return layers.usual_scale(shade.layer, shade.fixed or self._ranges.get(shade.layer.title), shade.colors)
 
     def points(self, level: int = 0) -> Points | None:
         """The points below the ceiling, coloured as the layer shows them, so many as the proxy has at ``level``; None
@@ -587,11 +588,11 @@ class Session:
             return None
         count, size = proxy.levels[level]
         points, color = proxy.points[:count], proxy.color[:count]
-        values = baked.get(shade.layer.quantity)
+        values = shade.layer.values(baked)
         if values is not None and len(values) == len(proxy.points):
             layer, values = shade.layer, values[:count]
         else:
-            layer, values = layers.LAYERS["colour"], None
+            layer, values = layers.layer_of(COLOR), None
         colors = layers.colored(
             layer, color, values, np.ones(count, bool), self.scale() if values is not None else Scale()
         )
@@ -621,8 +622,8 @@ class Session:
                     self.baked, self._baked_of = found, (at, version)
                     gone = not np.array_equal(self.observer, at)
                     if step == 0:
-                        for name, values in found.items():
-                            self._learn(name, values, found["visibility"] > 0.5)
+                        for name in found:
+                            self._learn(name, found, found["visibility"] > 0.5)
                 self.listener.on_baked()
                 if gone:
                     # Roughly is enough while the observer is dragged on.
@@ -676,10 +677,10 @@ class Session:
         for found in refine(self.scene, view, at, asked, width, spp, self.pace, ceiling=ceiling):
             if found is not None:
                 mask = found.values["opacity"] > 0.5
-                values = found.values.get(layer.quantity)
+                values = layer.values(found.values)
                 if leads and values is not None and layer.quantity not in self.baked:
                     with self.lock:
-                        self._learn(layer.quantity, values, mask)
+                        self._learn(layer.quantity, found.values, mask)
                 deliver(found, layers.colored(layer, found.values["color"], values, mask, self.scale()))
             yield None
 
@@ -698,12 +699,13 @@ class Session:
         values = {k: np.asarray(seen[k][0])[:count].reshape(height, width, *seen[k].shape[2:]) for k in asked}
         yield None
         mask = values["opacity"] > 0.5
-        deliver(layers.colored(layer, values["color"], values.get(layer.quantity), mask, self.scale()))
+        deliver(layers.colored(layer, values["color"], layer.values(values), mask, self.scale()))
 
-    def _learn(self, quantity: str, values: np.ndarray, mask: np.ndarray) -> None:
-        """Take the automatic range of the layers of ``quantity`` from ``values``."""
+    def _learn(self, quantity: str, by_quantity: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
+        """Take the automatic range of the layers of ``quantity`` from its values."""
         for layer in self.layers:
-            if layer.quantity == quantity:
+            values = layer.values(by_quantity)
+            if layer.quantity == quantity and values is not None:
                 found = layers.automatic(layer, values, mask)
                 if found is None:
                     self._ranges.setdefault(layer.title, (0.0, 1.0))

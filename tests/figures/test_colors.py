@@ -25,7 +25,7 @@ def test_lightness_rises_evenly(name):
 
 @pytest.mark.parametrize("name", DIVERGING)
 def test_differences_darken_alike_to_both_sides(name):
-    level = lightness(color_values(name, np.linspace(0, 1, 65), diverging=True))
+    level = lightness(color_values(name, np.linspace(0, 1, 65), kind="diverging"))
     assert level.argmax() in range(30, 35)
     assert np.all(np.diff(level[:30]) > 0) and np.all(np.diff(level[35:]) < 0)
     assert abs(level[0] - level[-1]) < 25
@@ -36,4 +36,4 @@ def test_others_are_refused():
         with pytest.raises(NergError, match="no perceptually uniform colour map: choose one of inferno"):
             find_colors(name)
     with pytest.raises(NergError, match="no diverging colour map: choose one of RdBu_r"):
-        find_colors("viridis", diverging=True)
+        find_colors("viridis", kind="diverging")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.figures.overlay import Heat
+from nerg_mi.figures.overlay import Heat, add_scale
 from nerg_mi.figures.sheets import contact_sheet, shrink
 
 RNG = np.random.default_rng(0)
@@ -24,8 +24,8 @@ def test_pictures_of_several_sizes():
 
 
 def test_one_scale():
-    heat, one = Heat(2.0), np.ones(1, bool)
-    page = contact_sheet([RNG.random((90, 160, 3))] * 2, "ab", None, heat, "gaze [1/sr]", [(np.array([3.0]), one)])
+    scale = lambda sheet: add_scale(sheet, Heat(2.0), "gaze [1/sr]", [(np.array([3.0]), np.ones(1, bool))])
+    page = contact_sheet([RNG.random((90, 160, 3))] * 2, "ab", None, scale)
     assert len(page.axes) == 3 and page.axes[-1].get_ylabel() == "gaze [1/sr]" and len(page.axes[-1].patches) == 1
 
 

@@ -6,18 +6,19 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import OVERLAYS, Layers, find_overlay, shared_limits
+from nerg_mi.figures.overlay import Layers, find_overlay, overlays_of, shared_limits
 from nerg_mi.figures.style import save
+from nerg_mi.transport.aovs import AOVS
 
 X, Y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 16))
 LAYERS = Layers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))
 
 
-@pytest.mark.parametrize("name", OVERLAYS)
+@pytest.mark.parametrize("name", [of.name for aov in AOVS.values() for of in overlays_of(aov)])
 def test_each_is_drawn(name, tmp_path):
     overlay = find_overlay(name)
     limits = overlay.limits(LAYERS)
-    assert overlay.name == name and overlay.summary and (limits is None) == (not overlay.scaled)
+    assert overlay.name == name and (limits is None) == (not overlay.scaled)
     save(overlay.draw(LAYERS, limits), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 500
 
@@ -37,5 +38,9 @@ def test_nothing_to_take_a_scale_from():
 
 
 def test_one_that_is_not_there():
-    with pytest.raises(NergError, match='no overlay "gase"; there are gaze, kde'):
+    with pytest.raises(NergError, match='no overlay "gase"; there are depth, opacity, position.X'):
         find_overlay("gase")
+    for name in ("position", "position.W", "depth.Y", "features"):
+        with pytest.raises(NergError, match=f'"{name}" is no single channel'):
+            find_overlay(name)
+    assert find_overlay("depth.T") == find_overlay("depth") and find_overlay("features.12").name == "features.12"

@@ -164,7 +164,7 @@ def test08_a_frozen_function_is_refused_in_a_sentence(rgb, rays):
     with pytest.raises(Exception) as said:
         frozen(scene, rgb.UInt32(0))
     error = said.value
-    while error is not None and "leave them out" not in str(error):
+    while error is not None and "leave it out" not in str(error):
         error = error.__cause__ or error.__context__
     assert error is not None
 

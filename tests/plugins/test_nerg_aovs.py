@@ -1,21 +1,32 @@
 """The table of AOVs: one entry is all that an AOV is."""
 
 import sys
+from pathlib import Path
 
 import drjit as dr
 import numpy as np
 import pytest
+
+from nerg_mi.api.scene import Scene
+from nerg_mi.errors import NergError
+from nerg_mi.figures.overlay import find_overlay, to_bytes
+from nerg_mi.files.images import write_exr
+from nerg_mi.jobs.drawing.draw import draw
+from nerg_mi.jobs.overlays import layers_of
+from nerg_mi.transport import aovs
+from nerg_mi.viewer.layers import automatic, available, colored, legend, usual_scale
 
 from .scenes import camera, channels, constant, named, with_field, with_gaze
 from .test_nerg_leaves_out import operations
 
 
 @pytest.fixture
-def table(rgb, monkeypatch):
+def table(rgb):
     """The table, for a test to add to."""
-    module = sys.modules["nerg_mi.plugins.nerg_aovs"]
-    monkeypatch.setattr(module, "AOVS", dict(module.AOVS))
-    return module
+    before = dict(aovs.AOVS)
+    yield aovs
+    aovs.AOVS.clear()
+    aovs.AOVS.update(before)
 
 
 def test01_an_entry_is_all_that_an_aov_is(rgb, files, table):
@@ -77,3 +88,45 @@ def test04_what_is_not_asked_for_is_not_computed(rgb, files, table):
     )
     assert operations(rgb, with_gaze(files, "depth")) == plain and not calls
     assert operations(rgb, with_gaze(files, "depth,costly")) > plain + 400 and calls
+
+
+@pytest.mark.parametrize("kind", ["sequential", "heat", "diverging", "categorical", "shade"])
+def test05_an_entry_is_shown_everywhere(rgb, table, tmp_path, kind):
+    """With its title, scale and unit, without another file that names it."""
+    table.AOVS["rows"] = table.Aov(
+        name="rows",
+        title="Shelf row",
+        label="row of the shelf",
+        unit="rows",
+        display=table.Display(kind=kind),
+        summary="number of the row in which the surface lies",
+        compute=lambda p: [dr.select(p.surface, dr.floor(p.p_d.z * 2 + 3), 0)],
+    )
+    scene = rgb.load_dict({"type": "scene", "integrator": constant(), "sensor": camera(rgb)})
+    # Overlays, with the title, the label and the unit of the table.
+    overlay = find_overlay("rows")
+    layers = layers_of(Path("scene.xml"), scene, scene.sensors()[0], overlay)
+    assert set(np.unique(layers.values[layers.mask])) <= set(range(9)) and layers.values.any()
+    limits = overlay.limits(layers)
+    if kind == "diverging":
+        assert limits[0] == -limits[1]
+    assert (limits is None) == (kind == "categorical")
+    said = [axes.get_ylabel().replace("\n", " ") for axes in overlay.draw(layers, limits).axes]
+    assert "row of the shelf [rows]" in said
+    # The viewer, with the same colours.
+    (layer,) = [la for la in available(Scene(scene)) if la.title == "shelf row"]
+    scale = usual_scale(layer, automatic(layer, layers.values, layers.mask), None)
+    shown = colored(layer, layers.color, layers.values, layers.mask, scale, hatched=False)
+    assert np.array_equal(shown[layers.mask], to_bytes(overlay.paint(layers, limits))[layers.mask])
+    assert ("rows" if kind not in ("shade", "categorical") else "row of the shelf") in legend(layer, scale)
+    # Files: sheets and differences.
+    file = tmp_path / "a.exr"
+    write_exr(file, {"rows.Y": layers.values, "opacity.Y": layers.mask.astype(np.float32)})
+    said = [axes.get_ylabel().replace("\n", " ") for axes in draw("sheet", [file], overlay="rows").axes]
+    assert "row of the shelf [rows]" in said
+    if kind == "categorical":
+        with pytest.raises(NergError, match='"rows" names classes'):
+            draw("difference", [file, file], channel="rows")
+    else:
+        said = [axes.get_ylabel() for axes in draw("difference", [file, file], channel="rows").axes]
+        assert any("difference of rows [rows]" in text.replace("\n", " ") for text in said)

@@ -11,7 +11,7 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.viewer.controls import Inset, png_bytes, slider_end, table
-from nerg_mi.viewer.layers import LAYERS, STALE, Shade
+from nerg_mi.viewer.layers import STALE, Shade, layer_of
 from nerg_mi.viewer.points import View
 from nerg_mi.viewer.scene import copied_view
 from nerg_mi.viewer.session import Worker
@@ -60,7 +60,7 @@ def test02_a_scene_of_what_is_shown(store, tmp_path):
     shown = SimpleNamespace(
         place=place,
         scene_file=store,
-        shade=Shade(LAYERS["gaze"]),
+        shade=Shade(layer_of("gaze")),
         observer=np.array([5, 3, 1.6]),
         options=options,
         spp=1,

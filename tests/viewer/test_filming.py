@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.viewer.flights import Film, even, film_options, flight, frames_csv, shown_of_flight
-from nerg_mi.viewer.layers import LAYERS, Scale
+from nerg_mi.viewer.layers import Scale, layer_of
 from nerg_mi.viewer.points import View
 from nerg_mi.viewer.scene import copied
 from nerg_mi.viewer.session import Worker
@@ -28,7 +28,7 @@ def film_of(room, tmp_path):
         (tmp_path / "view.xml").write_text(copied(room, shown))
         (tmp_path / "view.frames.csv").write_text(frames_csv(views), newline="")
         told, ended = [], []
-        options = film_options(LAYERS["colour"], Scale(), tmp_path / "view.frames.csv", 10, "llvm_ad_rgb")
+        options = film_options(layer_of("color"), Scale(), tmp_path / "view.frames.csv", 10, "llvm_ad_rgb")
         film = Film(
             tmp_path / "view.xml", tmp_path / "f.mp4", options, lambda share, text: told.append(share), ended.append
         )
@@ -106,9 +106,9 @@ def test05_sides_are_even(aspect, width):
 
 def test06_it_is_drawn_as_the_layer_is():
     frames = Path("frames.csv")
-    gaze = film_options(LAYERS["gaze"], Scale(0, 0.4, "magma"), frames, 25, "llvm_ad_rgb")
+    gaze = film_options(layer_of("gaze"), Scale(0, 0.4, "magma"), frames, 25, "llvm_ad_rgb")
     assert (gaze.overlay, gaze.top, gaze.cmap) == ("gaze", 0.4, "magma")
-    assert film_options(LAYERS["visibility"], Scale(), frames, 25, "llvm_ad_rgb").top is None
-    assert film_options(LAYERS["colour"], Scale(), frames, 25, "llvm_ad_rgb").overlay is None
-    depth = film_options(LAYERS["depth"], Scale(1, 7), frames, 25, "llvm_ad_rgb")
-    assert (depth.overlay, depth.top, depth.cmap) == ("depth", 7, None)
+    assert film_options(layer_of("visibility"), Scale(), frames, 25, "llvm_ad_rgb").top is None
+    assert film_options(layer_of("color"), Scale(), frames, 25, "llvm_ad_rgb").overlay is None
+    depth = film_options(layer_of("depth"), Scale(1, 7), frames, 25, "llvm_ad_rgb")
+    assert (depth.overlay, depth.top, depth.cmap) == ("depth", 7, "inferno")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.jobs.options.view import ViewOptions
-from nerg_mi.viewer.layers import LAYERS
+from nerg_mi.viewer.layers import layer_of
 from nerg_mi.viewer.points import View
 from nerg_mi.viewer.serve import viewer
 from tests.viewer.browser import chromium, require
@@ -207,7 +207,7 @@ def test05b_what_is_out_of_date_is_grey_and_named(running, driver):
     held(lambda: running.page.place_observer(np.array([4.4, 2.8, 1.6])), "Grey: gaze of an earlier observer")
 
     def show(title):
-        session.set_shade(layer=LAYERS[title])
+        session.set_shade(layer=layer_of(title))
         running.page.recolor()
         running.page.renew()
         for told in running.page.on_marked:

@@ -14,7 +14,7 @@ from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.view import place_to_view
 from nerg_mi.viewer import session as session_module
-from nerg_mi.viewer.layers import LAYERS
+from nerg_mi.viewer.layers import layer_of
 from nerg_mi.viewer.session import Session
 
 
@@ -109,11 +109,11 @@ def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
     settle(session)
     assert session.stale_points == "" and not session.stale_shares
     # Colours under the scale of a depth are no depth.
-    session.set_shade(layer=LAYERS["depth"])
+    session.set_shade(layer=layer_of("depth"))
     assert session.stale_points == "the points do not show depth" and not session.has_scale
-    session.set_shade(layer=LAYERS["colour"])
+    session.set_shade(layer=layer_of("color"))
     assert session.stale_points == "" and session.has_scale
-    session.set_shade(layer=LAYERS["gaze"])
+    session.set_shade(layer=layer_of("gaze"))
     session.set_falloff(0.2)
     assert session.stale_points == "gaze of earlier settings" and session.stale_shares
     settle(session)
@@ -161,7 +161,7 @@ def test03_layers_have_ranges_of_their_own(session_of, room):
     session = session_of(room)
     assert session.ceiling == 9 and np.allclose(session.cut_up, np.array([0, 0.1, 1]) / np.hypot(0.1, 1))
     settle(session)
-    session.set_shade(layer=LAYERS["depth"])
+    session.set_shade(layer=layer_of("depth"))
     session.picture("a", session.home, lambda p, c: None, 48, 1)
     settle(session)
     scale = session.scale()
@@ -206,7 +206,7 @@ def test04_shares_are_those_of_the_library(session_of, store):
 def test05_the_sphere_is_level_and_ahead_in_its_middle(session_of, room):
     session = session_of(room)
     settle(session)
-    session.set_shade(layer=LAYERS["visibility"])
+    session.set_shade(layer=layer_of("visibility"))
     shown = []
     session.sphere(shown.append, 64)
     settle(session)
@@ -236,7 +236,7 @@ def test07_variants_are_shown_in_turn(session_of, room, gaze_fields):
     first, points, shared, falloff = session.baked["gaze"], session.proxy.points, dict(session.shares), session.falloff
     assert first.max() > 0 and shared
     session.set_falloff(0.25)
-    session.set_shade(layer=LAYERS["what the observer gives"])
+    session.set_shade(layer=layer_of("capture"))
     # Even while the gaze of the other is being computed.
     session.follow_observer()
     session.set_gaze("emit")

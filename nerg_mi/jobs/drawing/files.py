@@ -3,30 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.figures.overlay import Layers, Overlay
 from nerg_mi.files.images import read_exr, read_exr_text
 from nerg_mi.rendering.channels import SURFACE
 
 EXR = ".exr"
-
-_RESTS_ON = {"gaze": "gaze", "gaze_std": "gaze", "emit": "gaze", "capture": "gaze", "kde": "kde"}
-
-
-@dataclass(frozen=True, eq=False)
-class Stored:
-    """Linear ``color`` (h, w, 3), the ``values`` (h, w) of a quantity, and where there is a surface, ``mask`` (h, w)
-    bool: everywhere, for a file without opacity. ``basis``: of how many rays of how many people gaze is made, in words,
-    or "" where the file does not say."""
-
-    color: np.ndarray
-    values: np.ndarray
-    mask: np.ndarray
-    basis: str = ""
 
 
 def shared_note(names: Sequence[str], basis: Sequence[str]) -> str:
@@ -36,19 +22,20 @@ def shared_note(names: Sequence[str], basis: Sequence[str]) -> str:
     return "; ".join(f"{name}: {words or 'not known'}" for name, words in zip(names, basis))
 
 
-def read_stored(path: Path, channel: str) -> Stored:
-    """The EXR file ``path`` with the quantity ``channel``, "gaze" or "gaze.Y". Raises `NergError` for other files and
-    for one that has no such channel."""
+def read_stored(path: Path, overlay: Overlay) -> Layers:
+    """The EXR file ``path`` with the quantity of ``overlay``; without opacity there are surfaces everywhere, and
+    nothing rests on rays where the file does not say so. Raises `NergError` for other files and for one that has no
+    such channel."""
     if path.suffix.lower() != EXR:
         raise NergError(f'"{path}" holds no quantities, which an EXR file does; give one that "nerg render" wrote')
     found = read_exr(path, "picture")
-    values = next((found[name] for name in found if channel in (name, name.partition(".")[0])), None)
+    values = next((found[name] for name in found if overlay.name in (name, name.partition(".")[0])), None)
     if values is None:
-        raise NergError(f'"{path}" has no "{channel}"; it has {", ".join(found)}')
+        raise NergError(f'"{path}" has no "{overlay.name}"; it has {", ".join(found)}')
     color = [found[name] for name in "RGB"] if {"R", "G", "B"} <= set(found) else [np.zeros_like(values)] * 3
     opacity = found.get("opacity.Y")
     mask = np.ones(values.shape, bool) if opacity is None else opacity >= SURFACE
     as_floats = lambda array: np.nan_to_num(np.asarray(array, np.float32))
-    part = _RESTS_ON.get(channel.partition(".")[0])
-    basis = "" if part is None else read_exr_text(path, "picture").get(f"{part}.basis", "")
-    return Stored(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask, basis)
+    part = overlay.quantity.rests_on
+    basis = read_exr_text(path, "picture").get(f"{part}.basis", "") if part else ""
+    return Layers(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask, basis=basis)

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import Overlay, Style
+from nerg_mi.figures.overlay import Style
 from nerg_mi.figures.style import find_colors
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
@@ -49,10 +48,11 @@ class ColorOptions(Checked):
     cmap: str | None = option(None, "Colour map: inferno, magma, plasma, viridis, cividis.  [default: inferno]")
     decades: float = option(0.0, "Powers of ten that the scale spans; 0: a linear scale.", within=DECADES)
 
-    def style(self, title: str | None = None) -> Style:
-        """How overlays are drawn by these options. Raises `NergError` for what cannot be drawn."""
+    def style(self, title: str | None = None, kind: str = "sequential") -> Style:
+        """How overlays are drawn by these options, with colour maps of that ``kind`` (`find_colors`). Raises
+        `NergError` for what cannot be drawn."""
         if self.cmap is not None:
-            find_colors(self.cmap)
+            find_colors(self.cmap, kind)
         return Style(self.cmap, self.decades, False, title)
 
 
@@ -62,9 +62,10 @@ class ScaleOptions(ColorOptions):
 
     hatching: bool = option(True, "Hatch where nothing is known.")
 
-    def style(self, title: str | None = None) -> Style:
-        """How overlays are drawn by these options. Raises `NergError` for what cannot be drawn."""
-        return replace(super().style(title), hatched=self.hatching)
+    def style(self, title: str | None = None, kind: str = "sequential") -> Style:
+        """How overlays are drawn by these options, with colour maps of that ``kind`` (`find_colors`). Raises
+        `NergError` for what cannot be drawn."""
+        return replace(super().style(title, kind), hatched=self.hatching)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,11 +78,3 @@ class SceneOptions(ScaleOptions):
     mode: str | None = option(
         None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
     )
-
-
-def need_scale(overlay: Overlay, limits: Any) -> None:
-    """Raise `NergError` where ``overlay`` has nothing to take a scale from."""
-    if limits is None and overlay.scaled:
-        raise NergError(
-            f'"{overlay.name}" is 0 wherever a surface is seen; move the camera or the observer, or give --top'
-        )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.figures.overlay import Heat, overlay, top_of
+from nerg_mi.figures.overlay import Layers, find_stored, shared_limits
 from nerg_mi.figures.sheets import contact_sheet, shrink
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
@@ -16,8 +16,6 @@ from nerg_mi.ranges import Range
 
 from .files import EXR, read_stored, shared_note
 from .kind import Drawing, Kind, ScaleOptions
-
-_UNITS = {"gaze": "gaze density [1/sr]", "kde": "tracked gaze [1/sr]", "gaze_std": "standard deviation of gaze [1/sr]"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,34 +31,36 @@ class SheetOptions(ScaleOptions):
 
 def _draw_sheet(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> Drawing:
     """The pictures of ``files``, named by their files."""
-    style, pictures, heat = options.style(), [], None
+    pictures = []
     names = [path.stem for path in files]
     if options.overlay is None:
         for k, path in enumerate(files):
             reporter.progress(k / len(files), path.name)
             pictures.append(shrink(_display(path), options.width))
         return Drawing(contact_sheet(pictures, names, options.columns), list(files))
-    tops, notes = [], []
+    overlay = find_stored(options.overlay)
+    style = options.style(kind=overlay.color_kind)
+    limits, notes = [], []
     for path in files:
-        stored = read_stored(path, options.overlay)
+        stored = read_stored(path, overlay)
         notes.append(stored.basis)
-        if np.any(stored.values[stored.mask] > 0):
-            tops.append(top_of(np.nan_to_num(stored.values), stored.mask))
-    top = options.top or max(tops, default=0.0)
-    # Raises where there is no scale.
-    heat = Heat(top or top_of(np.zeros(1), np.ones(1, bool)), style.colors or "inferno", decades=style.decades)
-    values, hatched = [], False
+        limits.append(overlay.limits(stored))
+    ends = shared_limits(limits, options.top)
+    overlay.check_limits(ends)
+    explained, hatched = [], False
     for k, path in enumerate(files):
         reporter.progress(k / len(files), path.name)
-        stored = read_stored(path, options.overlay)
-        unknown = ~(stored.mask & np.isfinite(stored.values)) if style.hatched else None
+        stored = read_stored(path, overlay)
+        seen = stored.mask & np.isfinite(stored.values)
+        unknown = ~seen if style.hatched else None
         hatched = hatched or (unknown is not None and bool(unknown.any()))
-        pictures.append(shrink(overlay(stored.color, stored.values, heat, stored.mask, unknown), options.width))
-        highest = np.max(stored.values, where=stored.mask & np.isfinite(stored.values), initial=0.0)
-        values.append((np.array([highest]), np.ones(1, bool)))
-    label = _UNITS.get(options.overlay.partition(".")[0], options.overlay)
+        pictures.append(shrink(overlay.paint(stored, ends, style, unknown), options.width))
+        # Of all values the outermost are enough for a scale.
+        outermost = [stored.values[seen].min(), stored.values[seen].max()] if seen.any() else []
+        explained.append(Layers(stored.color, np.array(outermost), np.ones(len(outermost), bool)))
+    scale = lambda sheet: overlay.add_scale(sheet, explained, ends, style, hatched)
     note = shared_note(names, notes)
-    return Drawing(contact_sheet(pictures, names, options.columns, heat, label, values, hatched, note), list(files))
+    return Drawing(contact_sheet(pictures, names, options.columns, scale, note), list(files))
 
 
 def _display(path: Path) -> np.ndarray:

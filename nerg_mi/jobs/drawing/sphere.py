@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.figures.overlay import Heat, find_overlay, shared_limits, unknown_of
+from nerg_mi.figures.overlay import find_overlay, shared_limits, unknown_of
 from nerg_mi.figures.sphere import find_projection, sphere_figure
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import Range
 from nerg_mi.transport.geometry import pixel_solid_angles
 
-from .kind import Drawing, Kind, SceneOptions, need_scale
+from .kind import Drawing, Kind, SceneOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,9 +50,8 @@ def _draw_sphere(files: Sequence[Path], options: SphereOptions, reporter: Report
         }
         seen = opened.see(mi.load_dict(panorama), overlay)
     limits = shared_limits([overlay.limits(seen)], options.top)
-    need_scale(overlay, limits)
-    assert limits is not None
-    heat = Heat(limits[1], style.colors or "inferno", decades=style.decades)
+    overlay.check_limits(limits)
+    heat = overlay.heat(limits, style)
     integral = float((seen.values.astype(np.float64) * pixel_solid_angles(width, width // 2)).sum())
     title = f"All that the observer can turn to: integral {integral:.3g}"
     unknown = unknown_of(seen, True) if style.hatched else None

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import Heat, find_overlay, occlusion_figure, shared_limits
+from nerg_mi.figures.overlay import find_overlay, occlusion_figure, shared_limits
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import Range
 from nerg_mi.rendering.projection import pixel_of
 
-from .kind import Drawing, Kind, SceneOptions, need_scale
+from .kind import Drawing, Kind, SceneOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +53,8 @@ def _draw_triptych(files: Sequence[Path], options: TriptychOptions, reporter: Re
         seen = opened.see(camera, overlay)
         marker = pixel_of(camera, center(nerg.observer))
     limits = shared_limits([overlay.limits(of) for of in (own, without, seen)], options.top)
-    need_scale(overlay, limits)
-    assert limits is not None
-    heat = Heat(limits[1], style.colors or "inferno", decades=style.decades)
+    overlay.check_limits(limits)
+    heat = overlay.heat(limits, style)
     first, second, third = ((of.color, of.values, of.mask) for of in (own, without, seen))
     figure = occlusion_figure(first, second, third, heat, marker, style.hatched, seen.basis)
     return Drawing(figure, [path], options.seed)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.figures import maps, overlay
-from nerg_mi.figures.overlay import Heat, Layers, srgb, to_bytes, top_of, unknown_of
+from nerg_mi.figures.overlay import Heat, Layers, Style, find_overlay, srgb, to_bytes, top_of, unknown_of
 from nerg_mi.figures.sphere import sphere_figure
 from nerg_mi.figures.style import Provenance, encode
 from nerg_mi.files.images import encode_png
@@ -86,12 +86,8 @@ def pictures_of_views(views: Views, top: float | None, place_known: bool, about:
 
 
 def _spread(of: Layers, text: Mapping[str, str]) -> Picture:
-    heat = Heat(top_of(of.values, of.mask), colors="viridis")
-    label = "standard deviation of the gaze [1/sr]"
-    arrays = of.color, of.values, of.mask
-    drawn = overlay.gaze_figure(
-        *arrays, heat, "Where the fields disagree", label, unknown=unknown_of(of, True), note=of.basis
-    )
+    spread = find_overlay("gaze_std")
+    drawn = spread.draw(of, spread.limits(of), Style(colors="viridis", title="Where the fields disagree"))
     return Picture(
         encode(drawn, ".png", text),
         "Standard deviation of the gaze of the ensemble's members.",

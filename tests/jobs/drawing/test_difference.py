@@ -20,7 +20,7 @@ def test_the_first_less_the_second(tmp_path):
     figure = draw("difference", [a, b], top=0.5)
     shown = figure.axes[0].images[0].get_array()
     mask = OPACITY > 0.5
-    wanted = color_values("RdBu_r", np.clip(0.5 + (GAZE - other), 0, 1), diverging=True)
+    wanted = color_values("RdBu_r", np.clip(0.5 + (GAZE - other), 0, 1), kind="diverging")
     np.testing.assert_allclose(shown[mask], wanted[mask], atol=1e-6)
     assert np.ptp(shown[~mask], axis=-1).max() < 1e-9 and figure.axes[0].get_title() == "a less b"
 

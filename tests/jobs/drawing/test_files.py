@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.figures.overlay import find_stored
 from nerg_mi.files.images import write_exr
 from nerg_mi.jobs.drawing.files import read_stored, shared_note
 
@@ -18,24 +19,24 @@ def write(path, text=None, **more):
 
 
 def test_colour_values_and_mask(tmp_path):
-    found = read_stored(write(tmp_path / "a.exr", **{"opacity.Y": OPACITY}), "gaze")
+    found = read_stored(write(tmp_path / "a.exr", **{"opacity.Y": OPACITY}), find_stored("gaze"))
     np.testing.assert_array_equal(found.color, COLOR)
     np.testing.assert_array_equal(found.values, GAZE)
     np.testing.assert_array_equal(found.mask, np.tile(np.arange(8) >= 3, (6, 1)))
-    assert read_stored(write(tmp_path / "b.exr"), "gaze.Y").mask.all()
+    assert read_stored(write(tmp_path / "b.exr"), find_stored("gaze.Y")).mask.all()
 
 
 def test_what_gaze_rests_on(tmp_path):
     text = {"gaze.basis": "made of 5 rays of 2 people", "kde.basis": "made of 3 rays of 1 person"}
     path = write(tmp_path / "a.exr", text, **{"kde.Y": GAZE, "depth.T": GAZE})
-    bases = [read_stored(path, channel).basis for channel in ("gaze", "kde.Y", "depth")]
-    assert bases == [*text.values(), ""] and read_stored(write(tmp_path / "b.exr"), "gaze").basis == ""
+    bases = [read_stored(path, find_stored(channel)).basis for channel in ("gaze", "kde.Y", "depth")]
+    assert bases == [*text.values(), ""] and read_stored(write(tmp_path / "b.exr"), find_stored("gaze")).basis == ""
     assert shared_note("ab", bases[:1] * 2) == bases[0]
     assert shared_note("ab", ["x", ""]) == "a: x; b: not known"
 
 
 def test_what_is_refused(tmp_path):
     with pytest.raises(NergError, match='has no "depth"; it has R, G, B, gaze.Y'):
-        read_stored(write(tmp_path / "a.exr"), "depth")
+        read_stored(write(tmp_path / "a.exr"), find_stored("depth"))
     with pytest.raises(NergError, match="holds no quantities"):
-        read_stored(tmp_path / "a.png", "gaze")
+        read_stored(tmp_path / "a.png", find_stored("gaze"))

@@ -4,7 +4,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Style, find_overlay
-from nerg_mi.jobs.drawing.kind import ScaleOptions, need_scale
+from nerg_mi.jobs.drawing.kind import ScaleOptions
 
 
 def test_a_style_of_options():
@@ -15,7 +15,7 @@ def test_a_style_of_options():
 
 
 def test_a_scale_is_needed():
-    need_scale(find_overlay("visibility"), None)
-    need_scale(find_overlay("gaze"), (0, 1))
+    find_overlay("visibility").check_limits(None)
+    find_overlay("gaze").check_limits((0, 1))
     with pytest.raises(NergError, match='"gaze" is 0 wherever'):
-        need_scale(find_overlay("gaze"), None)
+        find_overlay("gaze").check_limits(None)

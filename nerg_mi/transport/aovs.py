@@ -1,23 +1,22 @@
-"""The AOVs of :ref:`nerg <integrator-nerg>`: a table that its checks, its channels' names, what is computed and its
-manual follow. One more AOV is one more entry."""
+"""The AOVs of :ref:`nerg <integrator-nerg>`: a table that its checks, channel names, what is computed, its manual,
+overlays, the viewer's layers, contact sheets and differences follow. One more AOV is one more entry."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import drjit as dr
-import mitsuba as mi
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.field_medium import snapshot
+
+from .field_medium import snapshot
+from .observer import ObserverView, SupportView
 
 if TYPE_CHECKING:
-    from nerg_mi.transport.medium import Medium
-
-    from .nerg_pixel import CameraView, Pixel
+    from .medium import Medium
 
 
 @dataclass(frozen=True)
@@ -40,22 +39,73 @@ SUPPORT = Need(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Aov:
-    """One AOV. ``compute`` is called for those that are asked for, and for no others."""
+class Display:
+    """How pictures show the values of an AOV.
+
+    ``kind``: "sequential", colours from a least to a greatest value; "heat", the same over the colours of the picture,
+    the more opaque the higher; "diverging", to both sides of 0; "categorical", for whole numbers that name classes;
+    "shade", values from 0 to 1 by which the picture is darkened. ``cmap``: colour map of matplotlib, None for the usual
+    one of its kind. ``limits``: fixed ends of the scale; None for percentiles of what is seen: from 0 for a heat,
+    equally far to both sides where diverging.
+    """
+
+    kind: Literal["sequential", "heat", "diverging", "categorical", "shade"] = "sequential"
+    cmap: str | None = None
+    limits: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Quantity:
+    """What pictures of a quantity need to know. ``title``: of a picture that shows it, and of the viewer's layer, by
+    default its ``name``; ``label``: what its scale measures, by default the name, in which ``unit``; ``rests_on``: the
+    part of the integrator, "gaze" or "kde", that was made of rays, whose number pictures state; ``needs_support``:
+    whether it is hatched where no rays were recorded around the observer."""
 
     name: str
+    title: str = ""
+    label: str = ""
+    unit: str = ""
+    display: Display = Display()
+    rests_on: str = ""
+    needs_support: bool = False
+
+    @property
+    def heading(self) -> str:
+        """Its title, or its name in words."""
+        return self.title or self.name.replace("_", " ").capitalize()
+
+    @property
+    def scale_label(self) -> str:
+        """Label and unit, as they stand beside a scale."""
+        label = self.label or self.name.replace("_", " ")
+        return f"{label} [{self.unit}]" if self.unit else label
+
+
+@dataclass(frozen=True, kw_only=True)
+class Aov(Quantity):
+    """One AOV. ``compute`` is called for those that are asked for, and for no others."""
+
     # Suffixes of its channels; None: one a feature of the medium, by number.
     channels: str | None = "Y"
     # What it is, for the manual.
     summary: str
-    # A Float for each channel, of a ``CameraView``, or of a ``Pixel`` where it is ``of_observer``.
+    # A Float for each channel, of a ``plugins.nerg_pixel.CameraView``, or of a ``Pixel`` where it is ``of_observer``.
     compute: Callable[[Any], list]
+    # What is known of an observer once their position is, of the integrator, for ``Pixel.view_of_observer``.
+    view: Callable[[Any], ObserverView] | None = None
     # Whether it depends on where the observer is: what does not is computed once for several of them.
     of_observer: bool = False
+    # Whether an integrator that can compute it gives the same value everywhere.
+    is_constant: Callable[[Any], bool] = lambda nerg: False
     # In the order in which they are checked.
     needs: tuple[Need, ...] = ()
     # What has to be prepared for it, see ``Pixel``.
     demands: frozenset[str] = frozenset()
+
+    @property
+    def several(self) -> bool:
+        """Whether it has more than one channel."""
+        return self.channels is None or len(self.channels) > 1
 
     def channels_of(self, medium) -> list[str]:
         """The suffixes of its channels for that medium."""
@@ -63,13 +113,17 @@ class Aov:
 
 
 _GAZE, _FACTORS, _COUNTS = frozenset({"gaze"}), frozenset({"gaze", "factors"}), frozenset({"counts"})
+_HEAT = Display(kind="heat")
+_EVALUATIONS = "evaluations per pixel"
 
 
-def _features_at(p: CameraView) -> list:
+def _features_at(p: Any) -> list:
     return snapshot(cast("Medium", p.context.medium), p.p_d, p.surface & (p.depth < p.view.distance))
 
 
-def _color_evaluations(p: CameraView) -> list:
+def _color_evaluations(p: Any) -> list:
+    import mitsuba as mi
+
     march, medium = p.view.march, p.context.medium
     if not p.lit or march is None or medium is None:
         return [mi.Float(0)]
@@ -84,18 +138,34 @@ AOVS: dict[str, Aov] = {
             name="depth",
             channels="T",
             summary="distance along the ray from the ray's origin, wherever opacity > 0",
+            title="Depth",
+            label="distance from the camera",
+            unit="scene units",
+            display=Display(cmap="viridis_r"),
             compute=lambda p: [p.camera_depth],
         ),
-        Aov(name="opacity", summary="1 - transmittance", compute=lambda p: [dr.select(p.active, p.view.opacity, 0)]),
+        Aov(
+            name="opacity",
+            summary="1 - transmittance",
+            display=Display(limits=(0.0, 1.0)),
+            compute=lambda p: [dr.select(p.active, p.view.opacity, 0)],
+        ),
         Aov(
             name="position",
             channels="XYZ",
             summary="the surface :math:`p_d`",
+            unit="scene units",
             compute=lambda p: list(dr.select(p.surface, p.p_d, 0)),
         ),
         Aov(
             name="gaze",
             summary="density in 1/sr of the observer attending this surface, after occlusion",
+            title="Gaze",
+            label="gaze density",
+            unit="1/sr",
+            display=_HEAT,
+            rests_on="gaze",
+            needs_support=True,
             compute=lambda p: [p.attention.gaze],
             of_observer=True,
             needs=(GAZE,),
@@ -104,6 +174,11 @@ AOVS: dict[str, Aov] = {
         Aov(
             name="emit",
             summary="what the surface attracts, after its activation; 1 for a variant that lacks it",
+            title="What surfaces attract",
+            label="emitted attention",
+            display=_HEAT,
+            rests_on="gaze",
+            is_constant=lambda nerg: nerg.gaze.field.config.variant == "capture",
             compute=lambda p: [p.attention.emit],
             of_observer=True,
             needs=(GAZE,),
@@ -112,6 +187,11 @@ AOVS: dict[str, Aov] = {
         Aov(
             name="capture",
             summary="what the observer gives, after its activation; 1 for a variant that lacks it",
+            title="What the observer gives",
+            label="captured attention",
+            display=_HEAT,
+            rests_on="gaze",
+            is_constant=lambda nerg: nerg.gaze.field.config.variant == "emit",
             compute=lambda p: [p.attention.capture],
             of_observer=True,
             needs=(GAZE,),
@@ -120,6 +200,12 @@ AOVS: dict[str, Aov] = {
         Aov(
             name="gaze_std",
             summary="standard deviation of ``gaze`` over the members of an ensemble, in 1/sr, after occlusion",
+            title="Uncertainty of gaze",
+            label="standard deviation of gaze",
+            unit="1/sr",
+            display=_HEAT,
+            rests_on="gaze",
+            needs_support=True,
             compute=lambda p: [p.attention.spread],
             of_observer=True,
             needs=(GAZE, MEMBERS),
@@ -129,7 +215,12 @@ AOVS: dict[str, Aov] = {
             name="support",
             summary="how many training rays started around the observer, one at distance d counting 1 - d²/(5R)² (R of "
             "the training); one number an observer, shown where there is a surface",
+            title="Support",
+            label="training rays around the observer",
+            display=_HEAT,
+            rests_on="gaze",
             compute=lambda p: [p.view_of_observer("support")],
+            view=lambda nerg: SupportView(nerg.gaze.field.support, nerg.gaze.to_world),
             of_observer=True,
             needs=(GAZE, SUPPORT),
         ),
@@ -137,13 +228,22 @@ AOVS: dict[str, Aov] = {
             name="kde",
             summary="density in 1/sr of the tracked rays nearest to the observer, towards this surface, after "
             "occlusion",
+            title="Where people looked",
+            label="tracked gaze",
+            unit="1/sr",
+            display=_HEAT,
+            rests_on="kde",
             compute=lambda p: [p.view_of_observer("kde")],
+            view=lambda nerg: nerg.children["kde"].kde_view(),
             of_observer=True,
             needs=(KDE,),
         ),
         Aov(
             name="visibility",
             summary="1 visible to the observer .. 0 hidden",
+            title="Visible to the observer",
+            label="0 hidden, 1 visible",
+            display=Display(kind="shade", limits=(0.0, 1.0)),
             compute=lambda p: [dr.select(p.camera.surface, p.sight.visibility, 0)],
             of_observer=True,
         ),
@@ -151,6 +251,9 @@ AOVS: dict[str, Aov] = {
             name="observer_depth",
             channels="T",
             summary=":math:`d_o`; the distance to the surface where no occlusion is computed",
+            label="distance from the observer",
+            unit="scene units",
+            display=Display(cmap="viridis_r"),
             compute=lambda p: [dr.select(p.camera.surface, p.sight.depth, 0)],
             of_observer=True,
             demands=frozenset({"observer_depth"}),
@@ -173,6 +276,8 @@ AOVS: dict[str, Aov] = {
         Aov(
             name="density_evals",
             summary="evaluations of density made for the pixel",
+            title="Evaluations of density",
+            label=_EVALUATIONS,
             compute=lambda p: [p.density_evaluations()],
             of_observer=True,
             demands=_COUNTS,
@@ -180,12 +285,16 @@ AOVS: dict[str, Aov] = {
         Aov(
             name="color_evals",
             summary="evaluations of colour made for the pixel",
+            title="Evaluations of colour",
+            label=_EVALUATIONS,
             compute=_color_evaluations,
             demands=_COUNTS,
         ),
         Aov(
             name="gaze_evals",
             summary="evaluations of gaze networks made for the pixel",
+            title="Evaluations of gaze",
+            label=_EVALUATIONS,
             compute=lambda p: [p.attention.evaluations],
             of_observer=True,
             needs=(GAZE,),
@@ -215,12 +324,17 @@ def demands_of(names: Iterable[str]) -> frozenset[str]:
     return frozenset().union(*(AOVS[name].demands for name in names))
 
 
+def views_of(names: Iterable[str], nerg) -> dict[str, ObserverView]:
+    """The views of the observer that these AOVs show, by their names."""
+    return {name: view(nerg) for name in names if (view := AOVS[name].view) is not None}
+
+
 def channel_names(names: Iterable[str], medium) -> list[str]:
     """The names of all channels of these AOVs, in their order."""
     return [f"{name}.{channel}" for name in names for channel in AOVS[name].channels_of(medium)]
 
 
-def compute(names: Sequence[str], pixel: Pixel) -> list:
+def compute(names: Sequence[str], pixel: Any) -> list:
     """All channels of these AOVs, in their order."""
     # Evaluations are counted when all else has made its own.
     order = sorted((AOVS[name] for name in names), key=lambda aov: "counts" in aov.demands)
