@@ -50,16 +50,16 @@ def checks() -> str:
 
 def recipes() -> str:
     """What each gaze recipe sets: its field, length, losses and probes."""
-    from nerg_mi.train.gaze_recipes import RECIPES, FieldChoices
+    from nerg_mi.train import gaze_recipes
 
-    found = list(RECIPES.values())
+    found = list(gaze_recipes.recipes().values())
     rows = [("what it is", *(recipe.summary for recipe in found))]
     parts = (("", "settings", "gaze_settings"), ("probes: ", "probes", "probe_settings"))
     for prefix, given, made in parts:
         values = [getattr(recipe, made)() for recipe in found]
         names = dict.fromkeys(name for recipe in found for name in getattr(recipe, given))
         rows += [(f"{prefix}`{name}`", *(_shown(getattr(v, name)) for v in values)) for name in names]
-    configs = [_flat(recipe.architectures(FieldChoices())[0]) for recipe in found]
+    configs = [_flat(recipe.architectures(gaze_recipes.FieldChoices())[0]) for recipe in found]
     names = dict.fromkeys(name for config in configs for name in config)
     rows += [(f"field: `{name}`", *(_shown(c.get(name)) for c in configs)) for name in names]
     return table(("", *(f"`{recipe.name}`" for recipe in found)), rows)
@@ -92,7 +92,7 @@ def registered() -> str:
     from nerg_mi.fields import encoding as encodings
     from nerg_mi.fields import gaze_base as gaze_fields
     from nerg_mi.rays.readers.registry import reader_names
-    from nerg_mi.train.gaze_recipes import RECIPES
+    from nerg_mi.train import gaze_recipes
     from nerg_mi.transport.aovs import AOVS
     from nerg_mi.transport.depth import DEPTHS
     from nerg_mi.transport.quadrature import RULES
@@ -104,7 +104,7 @@ def registered() -> str:
         ("depth", "nerg_mi/transport/depth.py", DEPTHS.names()),
         ("AOV", "nerg_mi/transport/aovs.py", AOVS),
         ("tracking reader", "nerg_mi/rays/readers/base.py", reader_names()),
-        ("gaze recipe", "nerg_mi/train/gaze_recipes.py", RECIPES),
+        ("gaze recipe", "nerg_mi/train/gaze_recipes.py", gaze_recipes.recipes()),
     )
     cells = [(what, f"`{file}`", ", ".join(f"`{name}`" for name in names)) for what, file, names in rows]
     return table(("what", "protocol, or table", "there are"), cells)

@@ -61,7 +61,7 @@ class Variant:
     recipe: str
     # Factors: "emit", "capture" or "emit_capture".
     gaze: str = "emit_capture"
-    # Features of a radiance field that emit is given (`fields.gaze_product.SEMANTICS`).
+    # Features of a radiance field that emit is given (`train.gaze_recipes.FieldChoices`).
     semantic: str = ""
     # Whether emit has the field's own features besides.
     semantic_own: bool = False

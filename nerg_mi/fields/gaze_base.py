@@ -1,23 +1,28 @@
-"""What gaze fields have in common: the protocol, the registry of their kinds, the basis of lobes, and where
-training data supports them."""
+"""What gaze fields have in common: the protocol, the registry of their kinds, base classes, the table of the density
+that does not depend on the position, and where training data supports them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from types import ModuleType
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import plain
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.ranges import FARTHEST
 
-from .encoding import Encoding, EncodingConfig
-from .mlp import MLP
+from .encoding import Encoding, EncodingConfig, encoding_config
+from .mlp import MLP, namespace
+from .radiance import assign
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 # ---- Basis ----
 #
@@ -128,6 +133,9 @@ class RaySupport:
         return best[np.argmax((np.maximum(1 - square / self.radius**2, 0) * cells[:, 3]).sum(axis=1))]
 
 
+SIZE_LIMITS = {"width": 4096, "geometry": 4096, "hidden": 64, "layers": 64, "sh_degree": 10, "prior": 4096}
+"""The largest whole numbers of an architecture, by name; beyond them no field is trained and no kernel compiles."""
+
 # ---- What every gaze field answers, whatever it is made of ----
 #
 # A gaze field is a density over the directions around an observer (1/sr): a product of two factors (``product``), a
@@ -173,6 +181,11 @@ class GazeFieldConfig(Protocol):
     @property
     def prior(self) -> int:
         """Rows of the table of the density that does not depend on the position; 0 for a field that has none."""
+        ...
+
+    @property
+    def mix(self) -> float:
+        """The share of that density."""
         ...
 
     @property
@@ -226,6 +239,10 @@ class AnyGazeField(Protocol):
     """A gaze field on one backend: one density or the mean of several, which are its ``members``."""
 
     kind: ClassVar[str]
+    limits: ClassVar[Mapping[str, int]]
+    """The largest whole numbers that a checkpoint may claim for its sizes, by name."""
+    fixed: ClassVar[tuple[str, ...]]
+    """Parameters that no training changes."""
     support: RaySupport | None
     """How many rays it learnt from around a position, where that is known."""
     basis: Basis | None
@@ -320,6 +337,15 @@ class GazeDensity(AnyGazeField, Protocol):
         """
         ...
 
+    def log_blind(self, r_o: Vector3f) -> Float:
+        """Log of the density (1/sr) that does not depend on the position in direction ``r_o``; of fields whose
+        configuration has a ``prior``."""
+        ...
+
+    def set_mix(self, mix: float) -> None:
+        """Let the share of that density be ``mix``."""
+        ...
+
 
 # ---- The kinds of gaze fields by the names that checkpoints give them ----
 
@@ -347,3 +373,205 @@ def build(about: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
     if kind not in _KINDS:
         raise ValueError(f'it is a gaze field of the kind "{plain(kind, 40)}", which this version does not know')
     return _KINDS[kind].from_arrays(about, box, arrays)
+
+
+def limits_of(about: object) -> Mapping[str, int]:
+    """The largest sizes that a checkpoint may claim for the gaze field that it describes by ``about``; none for a kind
+    that is not registered, of which nothing is built."""
+    kind = about.get("kind", "product") if isinstance(about, dict) else None
+    return _KINDS[kind].limits if isinstance(kind, str) and kind in _KINDS else {}
+
+
+# ---- Base classes: what a kind need not write again ----
+
+
+class GazeHeadConfig:
+    """Base of the configuration of a gaze field that is one density, a frozen dataclass with the encoding ``grid``: its
+    defaults are those of a density that is normalised over the sphere, of both factors."""
+
+    kind: ClassVar[str]
+    variant: Any = "emit_capture"
+    activation: Any = "log"
+    normalized: Any = True
+    semantic: Any = ""
+    prior: Any = 0
+    mix: Any = 0.0
+    grid: Any
+
+    @property
+    def features(self) -> int:
+        """Features of a radiance field that emit is given."""
+        return 0
+
+    @property
+    def needs_surfaces(self) -> bool:
+        """Whether it matters where the observer's rays meet a surface."""
+        return True
+
+    @property
+    def fills_escaped(self) -> bool:
+        """Whether what escapes takes the depth of the nearest directions that do not."""
+        return False
+
+    def conventions(self) -> tuple:
+        """What fields must have in common for their densities to be averaged."""
+        return self.kind, self.variant
+
+    def to_dict(self) -> dict:
+        """As JSON."""
+        return {"kind": self.kind, **asdict(self), "grid": self.grid.to_dict()}  # pyright: ignore[reportArgumentType]
+
+    @classmethod
+    def from_dict(cls, d: dict) -> Self:
+        """The configuration of which `to_dict` was kept."""
+        return cls(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": encoding_config(d["grid"])})
+
+
+class GazeHead:
+    """Base of a gaze field that is one density: an encoding ``grid``, bare ``ARRAYS`` and networks ``NETS``, attributes
+    of these names. A kind says how it is made and what its ``unnormalized`` density is."""
+
+    kind: ClassVar[str]
+    limits: ClassVar[Mapping[str, int]] = SIZE_LIMITS
+    ARRAYS: ClassVar[tuple[str, ...]] = ()
+    NETS: ClassVar[tuple[str, ...]] = ()
+    fixed: ClassVar[tuple[str, ...]] = ()
+    DRJIT_STRUCT: ClassVar[dict]
+
+    config: Any
+    box: AnyBox
+    grid: Any
+    # Log of the density that does not depend on the position, of fields whose configuration has a ``prior``.
+    prior: Any
+    # How many rays it learnt from around a position, where that is known.
+    support: RaySupport | None = None
+    # How many rays and people it learnt from in all.
+    basis: Basis | None = None
+
+    def __init_subclass__(cls, **kwargs: Any):
+        super().__init_subclass__(**kwargs)
+        cls.DRJIT_STRUCT = dict.fromkeys(("grid", *cls.NETS, *cls.ARRAYS))
+
+    def architecture(self) -> dict:
+        """What ``from_arrays`` needs besides the arrays."""
+        return self.config.to_dict()
+
+    @property
+    def members(self) -> list[Self]:
+        """The field alone."""
+        return [self]
+
+    @property
+    def networks(self) -> int:
+        """Networks that one evaluation of gaze evaluates: emit's, capture's, or both."""
+        return 2 if self.config.variant == "emit_capture" else 1
+
+    @property
+    def mlps(self) -> list[MLP]:
+        """All of its networks."""
+        return [getattr(self, name) for name in self.NETS]
+
+    @property
+    def ns(self) -> ModuleType:
+        """Array types of the field's backend; see ``fields.mlp.namespace``."""
+        return namespace(self.mlps[0].weights[0])
+
+    def parameters(self) -> dict:
+        """Arrays by name, as checkpoints and ``mi.traverse`` spell them."""
+        out = {f"grid.{key}": value for key, value in self.grid.named().items()}
+        out |= {name: getattr(self, name) for name in self.ARRAYS}
+        for name in self.NETS:
+            out |= {f"{name}.{key}": value for key, value in getattr(self, name).named().items()}
+        return out
+
+    def set_parameters(self, values: dict) -> None:
+        """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
+        for name in self.ARRAYS:
+            if name in values:
+                setattr(self, name, values[name])
+        assign(self, {k: v for k, v in values.items() if k not in self.ARRAYS})
+        self.pack()
+
+    def pack(self) -> None:
+        """Refresh what the kernels read; call after any change of the weights."""
+        for name in ("grid", *self.NETS):
+            getattr(self, name).pack()
+
+    def unnormalized(self, p_od, p_o, r_o, active=True, semantic=None, escaped=False):
+        """See ``GazeDensity``."""
+        raise NotImplementedError(f"{type(self).__name__} does not say what its density is")
+
+    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
+        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr; ``active``,
+        ``semantic`` and ``escaped`` as for ``unnormalized``.
+
+        ``integral``: of a normalised field over the sphere at ``p_o`` (``transport.observer_gaze``), by which ``emit``
+        is divided; ``ValueError`` without it. With a share m of the density that does not depend on the position, gaze
+        = (1 - m) emit * capture + m blind.
+        """
+        if self.config.normalized and integral is None:
+            raise ValueError(
+                "this gaze field is normalised over the observer's sphere: evaluating it needs its integral there"
+            )
+        emit, capture = self.unnormalized(p_od, p_o, r_o, active, semantic, escaped)
+        if self.config.normalized:
+            emit = emit / integral
+        gaze = emit * capture
+        if self.config.mix:
+            gaze = (1 - self.config.mix) * gaze + self.config.mix * dr.exp(self.log_blind(r_o))
+        return gaze, emit, capture
+
+    def log_blind(self, r_o):
+        """Log of the blind density (1/sr) in direction ``r_o``, interpolated in its table, the array ``prior``."""
+        return look_up(self.prior.array, self.config.prior, r_o)
+
+    def set_mix(self, mix: float) -> None:
+        """Let the share of the blind density be ``mix``."""
+        self.config = replace(self.config, mix=mix)
+
+
+# ---- Density that does not depend on the position ----
+#
+# What people look at wherever they stand, the blind density, as a latitude-longitude table of its logarithm.
+
+
+# Of the blind density that is uniform, so that its logarithm is finite.
+_FLOOR = 1e-3
+
+
+def look_up(table, rows: int, d):
+    """Bilinear value of a flat latitude-longitude ``table`` (rows x 2 rows, texel centres, +z first) in directions
+    ``d``."""
+    Float = type(d.x)
+    UInt32 = dr.uint32_array_t(Float)
+    step, columns = dr.pi / rows, 2 * rows
+    phi = dr.atan2(d.y, d.x)
+    x = dr.select(phi < 0, phi + dr.two_pi, phi) / step - 0.5
+    x = dr.select(x < 0, x + columns, x)
+    y = dr.clip(dr.atan2(dr.sqrt(d.x * d.x + d.y * d.y), d.z) / step - 0.5, 0, rows - 1)
+    i, j = dr.minimum(UInt32(x), columns - 1), dr.minimum(UInt32(y), rows - 2)
+    fx, fy = x - Float(i), y - Float(j)
+    k = dr.select(i + 1 < columns, i + 1, 0)
+    at = lambda column, row: dr.gather(Float, table, column + columns * row)
+    return dr.lerp(dr.lerp(at(i, j), at(k, j), fx), dr.lerp(at(i, j + 1), at(k, j + 1), fx), fy)
+
+
+def table_directions(rows: int) -> np.ndarray:
+    """Directions (2 rows², 3) of the texels that ``look_up`` interpolates."""
+    theta, phi = np.meshgrid(
+        (np.arange(rows) + 0.5) * np.pi / rows, (np.arange(2 * rows) + 0.5) * np.pi / rows, indexing="ij"
+    )
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
+
+
+def blind_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.ndarray) -> np.ndarray:
+    """Log table (rows, 2 rows) of a blind density given at ``table_directions(rows)``, 1/sr.
+
+    A thousandth of it is uniform. Scaled so that what ``look_up`` makes of it integrates to one over ``directions`` (N,
+    3), a fine set of equal area.
+    """
+    density = np.asarray(density, np.float64)
+    log = np.log((1 - _FLOOR) * density + _FLOOR / (4 * np.pi))
+    d = vector_of(ns.Array3f, directions)
+    found = np.asarray(dr.exp(look_up(ns.Float(log.astype(np.float32)), rows, d)), np.float64)
+    return (log - np.log(4 * np.pi * found.mean())).reshape(rows, 2 * rows).astype(np.float32)

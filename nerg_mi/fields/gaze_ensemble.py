@@ -6,7 +6,7 @@ Members are trained alike on resamples of the people (bagging, Breiman 1996; dee
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import ClassVar
 
@@ -14,7 +14,7 @@ import drjit as dr
 
 from nerg_mi.maths.geometry import AnyBox
 
-from .gaze_base import Arrays, Basis, GazeDensity, RaySupport, build, register
+from .gaze_base import SIZE_LIMITS, Arrays, Basis, GazeDensity, RaySupport, build, register
 from .mlp import MLP
 
 
@@ -27,6 +27,8 @@ class GazeEnsemble:
 
     DRJIT_STRUCT: ClassVar[dict] = {"members": None}
     kind: ClassVar[str] = "ensemble"
+    limits: ClassVar[Mapping[str, int]] = SIZE_LIMITS
+    fixed: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, members: Sequence[GazeDensity], support: RaySupport | None = None):
         self.members, self.support = list(members), support

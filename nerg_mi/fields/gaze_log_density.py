@@ -11,22 +11,22 @@ where the surfaces are, the other where people's heads were.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from types import ModuleType
 from typing import ClassVar
 
 import drjit as dr
 import numpy as np
 
-from nerg_mi.maths.arrays import sigmoid, vector_of
+from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.ranges import FARTHEST, LENGTHS
 
-from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, encoding_config, random_encoding
-from .gaze_base import Arrays, Basis, RaySupport, register
+from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, random_encoding
+from .gaze_base import SIZE_LIMITS, Arrays, GazeHead, GazeHeadConfig, register
 from .gaze_product import VARIANTS
-from .mlp import MLP, namespace
-from .radiance import assign
+from .mlp import MLP
 
 GEOMETRIES = ("surface", "none")
 ESCAPES = ("constant", "nearest")
@@ -36,20 +36,13 @@ _HIGHEST = 30.0
 _LARGEST_LOG = 80.0
 # A surface nearer than this share of the box counts as this far: the logarithm is an input of emit.
 _NEAREST = 1e-3
-# Of the blind density that is uniform, so that its logarithm is finite.
-_FLOOR = 1e-3
 
 
 @dataclass(frozen=True)
-class LogGazeConfig:
+class LogGazeConfig(GazeHeadConfig):
     """Sizes and conventions."""
 
     kind: ClassVar[str] = "log_density"
-    # Not to be chosen: what every gaze field answers (``gaze_base.GazeFieldConfig``).
-    activation = "log"
-    normalized = True
-    semantic = ""
-    features = 0
 
     # Of emit, over the field's box; coarse levels generalise to positions where nobody stood.
     grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=3, log2_rows=14, base=2, finest=8))
@@ -113,22 +106,18 @@ class LogGazeConfig:
     def capture_sizes(self) -> list[int]:
         return [9 + self.sh_degree**2 + 1, *[self.width] * self.layers, 1]
 
-    def to_dict(self) -> dict:
-        return {"kind": self.kind, **asdict(self), "grid": self.grid.to_dict()}
-
-    @staticmethod
-    def from_dict(d: dict) -> LogGazeConfig:
-        return LogGazeConfig(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": encoding_config(d["grid"])})
-
 
 @register
-class LogGazeField:
+class LogGazeField(GazeHead):
     """A normalised gaze density. Positions are in the field's units inside ``box``; ``prior``: table (rows, 2 rows) of
     the log of the blind density, rows from +z to -z, columns by azimuth, at texel centres."""
 
-    DRJIT_STRUCT: ClassVar[dict] = {"grid": None, "emit_net": None, "capture_net": None, "escaped": None, "prior": None}
-    _NETS = ("emit_net", "capture_net")
     kind: ClassVar[str] = LogGazeConfig.kind
+    # Its "geometry" is a word.
+    limits: ClassVar[Mapping[str, int]] = {k: v for k, v in SIZE_LIMITS.items() if k != "geometry"}
+    NETS: ClassVar[tuple[str, ...]] = ("emit_net", "capture_net")
+    ARRAYS: ClassVar[tuple[str, ...]] = ("escaped", "prior")
+    fixed: ClassVar[tuple[str, ...]] = ("prior",)
 
     def __init__(
         self, config: LogGazeConfig, box: AnyBox, grid: Encoding, emit_net: MLP, capture_net: MLP, escaped, prior
@@ -143,10 +132,6 @@ class LogGazeField:
             )
         self.config, self.box, self.grid = config, box, grid
         self.emit_net, self.capture_net, self.escaped, self.prior = emit_net, capture_net, escaped, prior
-        # How many rays it learnt from around a position, where that is known.
-        self.support: RaySupport | None = None
-        # How many rays and people it learnt from in all.
-        self.basis: Basis | None = None
         self.pack()
 
     @staticmethod
@@ -182,51 +167,6 @@ class LogGazeField:
             arrays.ns.TensorXf(arrays.array("prior", config.prior, 2 * config.prior, largest=_LARGEST_LOG)),
         )
 
-    def architecture(self) -> dict:
-        """What ``from_arrays`` needs besides the arrays."""
-        return self.config.to_dict()
-
-    @property
-    def members(self) -> list[LogGazeField]:
-        """The field alone."""
-        return [self]
-
-    @property
-    def networks(self) -> int:
-        """Networks that one evaluation of gaze evaluates: emit's, capture's, or both."""
-        return 2 if self.config.variant == "emit_capture" else 1
-
-    @property
-    def mlps(self) -> list[MLP]:
-        """All of its networks."""
-        return [getattr(self, name) for name in self._NETS]
-
-    def parameters(self) -> dict:
-        """Arrays by name, as checkpoints and ``mi.traverse`` spell them."""
-        out = {f"grid.{key}": value for key, value in self.grid.named().items()}
-        out |= {"escaped": self.escaped, "prior": self.prior}
-        for name in self._NETS:
-            out |= {f"{name}.{key}": value for key, value in getattr(self, name).named().items()}
-        return out
-
-    @property
-    def ns(self) -> ModuleType:
-        """Array types of the field's backend; see ``fields.mlp.namespace``."""
-        return namespace(self.escaped)
-
-    def set_parameters(self, values: dict) -> None:
-        """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
-        for name in ("escaped", "prior"):
-            if name in values:
-                setattr(self, name, values[name])
-        assign(self, {k: v for k, v in values.items() if k not in ("escaped", "prior")})
-        self.pack()
-
-    def pack(self) -> None:
-        """Refresh what the kernels read; call after any change of the weights."""
-        for name in ("grid", *self._NETS):
-            getattr(self, name).pack()
-
     def emit_inputs(self, p_od, p_o, r_o, active=True) -> list:
         """What emit's network is given (list of Floats): a bias, the log of the distance, the direction, the place."""
         Float = type(p_od.x)
@@ -253,10 +193,6 @@ class LogGazeField:
         """What capture's network is given, for ``capture_position`` and a direction."""
         return [type(r_o.x)(1), *encode_direction(r_o, self.config.sh_degree), *position]
 
-    def log_blind(self, r_o):
-        """Log of the blind density (1/sr) in direction ``r_o``, interpolated in its table."""
-        return look_up(self.prior.array, self.config.prior, r_o)
-
     def capture(self, p_o, r_o, active=True):
         """sigmoid(F_c(p_o, r_o))."""
         return sigmoid(self.capture_net(self.capture_inputs(self.capture_position(p_o), r_o))[0])
@@ -270,59 +206,3 @@ class LogGazeField:
             emit = self.emit_net(self.emit_inputs(p_od, p_o, r_o, active))[0]
             logit += emit if c.fills_escaped else dr.select(escaped, self.escaped, emit)
         return dr.exp(dr.minimum(logit, _HIGHEST)), one if c.variant == "emit" else self.capture(p_o, r_o, active)
-
-    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
-        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr; ``escaped``
-        as for ``unnormalized``.
-
-        ``integral``: Z(p_o) (``transport.observer_gaze``); ``emit`` is divided by it and includes the blind
-        density, so that gaze = (1 - m) emit * capture + m blind. Raises ``ValueError`` without it.
-        """
-        if integral is None:
-            raise ValueError(
-                "this gaze field is normalised over the observer's sphere: evaluating it needs its integral there"
-            )
-        emit, capture = self.unnormalized(p_od, p_o, r_o, active, escaped=escaped)
-        emit = emit / integral
-        gaze = emit * capture
-        if self.config.mix:
-            gaze = (1 - self.config.mix) * gaze + self.config.mix * dr.exp(self.log_blind(r_o))
-        return gaze, emit, capture
-
-
-def look_up(table, rows: int, d):
-    """Bilinear value of a flat latitude-longitude ``table`` (rows x 2 rows, texel centres, +z first) in directions
-    ``d``."""
-    Float = type(d.x)
-    UInt32 = dr.uint32_array_t(Float)
-    step, columns = dr.pi / rows, 2 * rows
-    phi = dr.atan2(d.y, d.x)
-    x = dr.select(phi < 0, phi + dr.two_pi, phi) / step - 0.5
-    x = dr.select(x < 0, x + columns, x)
-    y = dr.clip(dr.atan2(dr.sqrt(d.x * d.x + d.y * d.y), d.z) / step - 0.5, 0, rows - 1)
-    i, j = dr.minimum(UInt32(x), columns - 1), dr.minimum(UInt32(y), rows - 2)
-    fx, fy = x - Float(i), y - Float(j)
-    k = dr.select(i + 1 < columns, i + 1, 0)
-    at = lambda column, row: dr.gather(Float, table, column + columns * row)
-    return dr.lerp(dr.lerp(at(i, j), at(k, j), fx), dr.lerp(at(i, j + 1), at(k, j + 1), fx), fy)
-
-
-def table_directions(rows: int) -> np.ndarray:
-    """Directions (2 rows², 3) of the texels that ``look_up`` interpolates."""
-    theta, phi = np.meshgrid(
-        (np.arange(rows) + 0.5) * np.pi / rows, (np.arange(2 * rows) + 0.5) * np.pi / rows, indexing="ij"
-    )
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
-
-
-def blind_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.ndarray) -> np.ndarray:
-    """Log table (rows, 2 rows) of a blind density given at ``table_directions(rows)``, 1/sr.
-
-    A thousandth of it is uniform. Scaled so that what ``look_up`` makes of it integrates to one over ``directions`` (N,
-    3), a fine set of equal area.
-    """
-    density = np.asarray(density, np.float64)
-    log = np.log((1 - _FLOOR) * density + _FLOOR / (4 * np.pi))
-    d = vector_of(ns.Array3f, directions)
-    found = np.asarray(dr.exp(look_up(ns.Float(log.astype(np.float32)), rows, d)), np.float64)
-    return (log - np.log(4 * np.pi * found.mean())).reshape(rows, 2 * rows).astype(np.float32)

@@ -20,10 +20,9 @@ import numpy as np
 from nerg_mi.maths.arrays import log1p, sigmoid
 from nerg_mi.maths.geometry import AnyBox
 
-from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, encoding_config, random_encoding
-from .gaze_base import Arrays, Basis, RaySupport, register
-from .mlp import MLP, namespace
-from .radiance import assign
+from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, random_encoding
+from .gaze_base import Arrays, GazeHead, GazeHeadConfig, register
+from .mlp import MLP
 
 VARIANTS = ("emit", "capture", "emit_capture")
 ACTIVATIONS = ("softplus", "exp", "linear")
@@ -47,7 +46,7 @@ def activate(x, activation: str):
 
 
 @dataclass(frozen=True)
-class GazeConfig:
+class GazeConfig(GazeHeadConfig):
     """Variant, output activation and sizes. The defaults are the paper's (its NeRF's configuration).
 
     With ``semantic`` emit is given the ``geometry`` features of a radiance field, ``accumulated`` along the observer's
@@ -56,10 +55,6 @@ class GazeConfig:
     """
 
     kind: ClassVar[str] = "product"
-    # Not to be chosen: what every gaze field answers (``gaze_base.GazeFieldConfig``).
-    prior = 0
-    needs_surfaces = True
-    fills_escaped = False
 
     # The encoding of positions, over the field's box.
     grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(finest=512))
@@ -128,24 +123,19 @@ class GazeConfig:
         return [self.sh_degree**2 + self.geometry, self.width, self.width]
 
     def to_dict(self) -> dict:
+        """As JSON, without the kind, which the first checkpoints did not name."""
         return {**asdict(self), "grid": self.grid.to_dict()}
-
-    @staticmethod
-    def from_dict(d: dict) -> GazeConfig:
-        named = {k: v for k, v in d.items() if k != "kind"}
-        return GazeConfig(**{**named, "grid": encoding_config(d["grid"])})
 
 
 @register
-class GazeField:
+class GazeField(GazeHead):
     """Gaze density (1/sr) of an observer attending a surface.
 
     Positions are in the field's units inside ``box`` (outside of it the grid's features are 0).
     """
 
-    _NETS = ("position_net", "direction_net", "emit_head", "capture_head")
-    DRJIT_STRUCT: ClassVar[dict] = {"grid": None, **dict.fromkeys(_NETS)}
     kind: ClassVar[str] = GazeConfig.kind
+    NETS: ClassVar[tuple[str, ...]] = ("position_net", "direction_net", "emit_head", "capture_head")
 
     def __init__(
         self,
@@ -164,17 +154,13 @@ class GazeField:
         self.config, self.box, self.grid = config, box, grid
         self.position_net, self.direction_net = position_net, direction_net
         self.emit_head, self.capture_head = emit_head, capture_head
-        # How many rays it learnt from around a position, where that is known.
-        self.support: RaySupport | None = None
-        # How many rays and people it learnt from in all.
-        self.basis: Basis | None = None
         self.pack()
 
     @staticmethod
     def _sizes(config: GazeConfig) -> dict[str, list[int]]:
         """Sizes of the layers of each network."""
         head = [config.width, 1]
-        return dict(zip(GazeField._NETS, (config.position_sizes, config.direction_sizes, head, head)))
+        return dict(zip(GazeField.NETS, (config.position_sizes, config.direction_sizes, head, head)))
 
     @staticmethod
     def _is_normalized(config: GazeConfig, name: str) -> bool:
@@ -201,48 +187,6 @@ class GazeField:
             for name, sizes in cls._sizes(config).items()
         }
         return cls(config, box, arrays.grid(config.grid), **nets)
-
-    def architecture(self) -> dict:
-        """What ``from_arrays`` needs besides the arrays."""
-        return self.config.to_dict()
-
-    @property
-    def members(self) -> list[GazeField]:
-        """The field alone."""
-        return [self]
-
-    @property
-    def networks(self) -> int:
-        """Networks that one evaluation of gaze evaluates: emit's, capture's, or both."""
-        return 2 if self.config.variant == "emit_capture" else 1
-
-    @property
-    def mlps(self) -> list[MLP]:
-        """All of its networks."""
-        return [getattr(self, name) for name in self._NETS]
-
-    def parameters(self) -> dict:
-        """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
-        return {
-            f"{name}.{key}": value
-            for name in ("grid", *self._NETS)
-            for key, value in getattr(self, name).named().items()
-        }
-
-    @property
-    def ns(self) -> ModuleType:
-        """Array types of the field's backend; see ``fields.mlp.namespace``."""
-        return namespace(self.emit_head.weights[0])
-
-    def set_parameters(self, values: dict) -> None:
-        """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
-        assign(self, values)
-        self.pack()
-
-    def pack(self) -> None:
-        """Refresh what the kernels read; call after any change of the weights."""
-        for name in ("grid", *self._NETS):
-            getattr(self, name).pack()
 
     def _trunk(self, p, d, active, semantic=None):
         if semantic is not None and not self.config.semantic_own:
@@ -280,19 +224,3 @@ class GazeField:
         one = type(p_od.x)(1)
         emit = one if self.config.variant == "capture" else self.emit(p_od, r_o, active, semantic)
         return emit, one if self.config.variant == "emit" else self.capture(p_o, r_o, active)
-
-    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
-        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``; ``escaped`` makes
-        no difference.
-
-        ``semantic``: see ``emit``. ``integral``: of a normalised field over the sphere at ``p_o``
-        (``transport.observer_gaze``), by which ``emit`` is divided; ``ValueError`` without it.
-        """
-        emit, capture = self.unnormalized(p_od, p_o, r_o, active, semantic)
-        if self.config.normalized:
-            if integral is None:
-                raise ValueError(
-                    "this gaze field is normalised over the observer's sphere: evaluating it needs its integral there"
-                )
-            emit = emit / integral
-        return emit * capture, emit, capture

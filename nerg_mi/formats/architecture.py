@@ -15,16 +15,7 @@ from nerg_mi.fields.encoding import config_type
 from nerg_mi.files.safe_read import plain
 from nerg_mi.ranges import VALUES
 
-_MOST = {
-    "width": 4096,
-    "geometry": 4096,
-    "density_hidden": 64,
-    "color_hidden": 64,
-    "hidden": 64,
-    "layers": 64,
-    "sh_degree": 10,
-    "prior": 4096,
-}
+_MOST = {"width": 4096, "geometry": 4096, "density_hidden": 64, "color_hidden": 64, "hidden": 64, "sh_degree": 10}
 """The largest whole numbers of an architecture, by name; beyond them no field is trained and no kernel compiles."""
 
 FINEST = 1 << 24
@@ -61,8 +52,6 @@ def check_sizes(about: object, what: str = "architecture", most: Mapping[str, in
     if not isinstance(about, dict):
         raise ValueError(f'its "{what}" is not a JSON object')
     for name, value in about.items():
-        if name == "geometry" and isinstance(value, str):
-            continue  # what a log density knows of surfaces, and not a size
         if name in most and not (isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most[name]):
             raise ValueError(
                 f'"{name}" of its {what} must be a whole number from 1 to {most[name]}, not {_short(value)}'

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import Encoding, EncodingConfig, encoding_of
-from nerg_mi.fields.gaze_base import LARGEST
+from nerg_mi.fields.gaze_base import LARGEST, limits_of
 from nerg_mi.fields.mlp import MLP, aligned
 
 from .architecture import check_sizes
@@ -84,7 +84,7 @@ class StoredArrays:
     def member(self, index: int, about: dict[str, Any]) -> tuple[dict[str, Any], StoredArrays]:
         """The checked architecture, and the arrays, of the member ``index`` of an ensemble."""
         own = {k.removeprefix(f"{index}."): v for k, v in self._tensors.items() if k.startswith(f"{index}.")}
-        return check_sizes(about), StoredArrays(own, self.ns)
+        return check_sizes(about, most=limits_of(about)), StoredArrays(own, self.ns)
 
     def _dr(self, name: str, *shape: int) -> Any:
         value = self.array(name, *shape)

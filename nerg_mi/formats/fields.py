@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.fields.gaze_base import AnyGazeField, RaySupport, basis_of, build
+from nerg_mi.fields.gaze_base import AnyGazeField, RaySupport, basis_of, build, limits_of
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpacked
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.files.atomic import file_sha256
@@ -137,7 +137,8 @@ def load_gaze(path: str | Path, ns: ModuleType) -> tuple[AnyGazeField, dict[str,
     """
     tensors, meta = read_checkpoint(path, "gaze")
     with building(path):
-        arrays, about = StoredArrays(tensors, ns), check_sizes(meta["architecture"])
+        arrays, about = StoredArrays(tensors, ns), meta["architecture"]
+        check_sizes(about, most=limits_of(about))
         if len(about.get("members", ())) > MEMBERS:
             raise ValueError(f"it has {len(about['members'])} members, and at most {MEMBERS} are read")
         field = build(about, box_of(meta["box"]), arrays)

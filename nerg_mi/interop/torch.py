@@ -15,6 +15,7 @@ a field of the LLVM backend and on the GPU for one of the CUDA backend.
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from typing import Any, cast
 
 import drjit as dr
@@ -33,21 +34,18 @@ from nerg_mi.fields.gaze_ensemble import GazeEnsemble
 from nerg_mi.fields.mlp import is_cuda
 from nerg_mi.fields.radiance import RadianceField
 
-_FIXED = ("prior",)
-"""Arrays that no training changes: parameters without gradients."""
-
 
 class _FieldModule(torch.nn.Module):
-    """The parameters of a field, by the field's names with "__" for "."."""
+    """The parameters of a field, by the field's names with "__" for "."; ``fixed`` ones have no gradients."""
 
-    def __init__(self, field):
+    def __init__(self, field, fixed: Sequence[str] = ()):
         super().__init__()
         self._field, self._ns = field, field.ns
         self.device_type = "cuda" if is_cuda(self._ns) else "cpu"
         for name, value in field.parameters().items():
             tensor = torch.tensor(value.numpy(), device=self.device_type)
             self.register_parameter(
-                name.replace(".", "__"), torch.nn.Parameter(tensor, requires_grad=name not in _FIXED)
+                name.replace(".", "__"), torch.nn.Parameter(tensor, requires_grad=name not in fixed)
             )
 
     def _values(self) -> dict:
@@ -162,7 +160,7 @@ class GazeModule(_FieldModule):
             raise NergError(
                 f"an ensemble of {len(field.members)} gaze fields is no GazeModule; make a GazeEnsembleModule of it"
             )
-        super().__init__(field)
+        super().__init__(field, field.fixed)
 
     def forward(
         self,

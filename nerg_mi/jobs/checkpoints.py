@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_product import GazeField
+from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.refinement import refine
 from nerg_mi.files.atomic import check_writable
@@ -26,7 +26,7 @@ class ImportedFields:
     ``files`` written."""
 
     field: RadianceField | None
-    gaze: GazeField | None
+    gaze: AnyGazeField | None
     origin: dict
     files: list[Path]
 

@@ -13,7 +13,7 @@ from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.rays.dataset_open import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
-from nerg_mi.train.gaze_run import KAPPA, prior_field
+from nerg_mi.train.gaze_log_density import KAPPA, prior_field
 
 from .backend import select_backend
 from .options.prior import PriorOptions

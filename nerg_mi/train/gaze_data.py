@@ -13,10 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import GazeFieldConfig, RaySupport
-from nerg_mi.fields.gaze_log_density import blind_table, table_directions
-from nerg_mi.fields.gaze_product import GazeConfig
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.gaze_base import GazeFieldConfig, RaySupport, blind_table, table_directions
 from nerg_mi.maths.geometry import AnyBox, box_interval
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.photos.salience import SalienceView
@@ -60,7 +57,7 @@ def check_kernels(rows: int, kappa: float) -> None:
 def blind_of_rays(
     rays: Rays, rows: int, place: GazePlace | None = None, seed: int = 0, weights: str = "equal", kappa: float = 10.0
 ) -> np.ndarray:
-    """``fields.gaze_log_density.blind_table`` (rows, 2 rows) of where ``rays`` go, in the frame of ``place`` (None:
+    """``fields.gaze_base.blind_table`` (rows, 2 rows) of where ``rays`` go, in the frame of ``place`` (None:
     that of the rays). ``weights``: with ``person`` all people count alike, however many rays are theirs; ``kappa``:
     concentration of the kernel of each ray; see `check_kernels`."""
     check_kernels(rows, kappa)
@@ -73,7 +70,7 @@ def blind_of_rays(
 
 
 def blind_of_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
-    """``fields.gaze_log_density.blind_table`` (rows, 2 rows) of what is looked at wherever the camera stands, of which
+    """``fields.gaze_base.blind_table`` (rows, 2 rows) of what is looked at wherever the camera stands, of which
     each of ``views`` shows a part.
 
     The density b of greatest likelihood when view v sees b given its part, found by Hunter's (2004) iteration for
@@ -106,13 +103,17 @@ def blind_of_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
     return blind_table(kde.evaluate(directions)[0], rows, kde.ns, fibonacci_directions(_SCALED_OVER))
 
 
+def heads_box(positions: np.ndarray, box: AnyBox) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Corners of the box of observers at ``positions`` (N, 3), with some extent along each axis of the place's
+    ``box``."""
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    return tuple(low.tolist()), tuple(np.maximum(high, low + 1e-3 * box.side).tolist())
+
+
 # ---- Semantics ----
 #
-# What a gaze field takes over from a radiance field: its features along the observers' rays, or its weights to begin
-# with.
-#
-# The paper's semantic variants, and its two initialisations: a trunk that starts as the radiance field's, frozen or
-# fine-tuned.
+# What a gaze field takes over from a radiance field: its features along the observers' rays, the paper's semantic
+# variants.
 
 
 BATCH = 1 << 18
@@ -148,31 +149,6 @@ def semantic_features(
             dr.eval(found)
             out[part] = np.stack([np.array(f) for f in found], axis=-1)
     return out
-
-
-def trunk_config(config: GazeConfig, radiance: RadianceConfig) -> GazeConfig:
-    """``config`` with the sizes that let its trunk begin as that of a radiance field of the configuration
-    ``radiance``."""
-    return replace(
-        config, grid=radiance.grid, width=radiance.width, geometry=radiance.geometry, sh_degree=radiance.sh_degree
-    )
-
-
-def initial_weights(field: RadianceField, config: GazeConfig) -> dict:
-    """Grid and position network of ``field`` by the names of a gaze field: what its features, but not its density, come
-    from.
-
-    Raises `NergError` where ``config`` has other sizes.
-    """
-    like = trunk_config(config, field.config)
-    if (config.grid, config.position_sizes) != (like.grid, like.position_sizes):
-        raise NergError("a gaze field that begins with a radiance field's weights must have its sizes")
-    weights = [dr.detach(w) for w in field.density_net.weights]
-    # The first output is the logarithm of the density.
-    weights[-1] = weights[-1][1:, :]
-    arrays = {f"grid.{k}": v for k, v in field.grid.named().items()}
-    arrays |= {f"position_net.{i}": w for i, w in enumerate(weights)}
-    return {k: type(v)(dr.detach(v)) for k, v in arrays.items()}
 
 
 # ---- Supervision ----
@@ -430,7 +406,7 @@ class Targets:
     escaped: np.ndarray
     # Features (P, D, F) of a radiance field, float16, for a gaze field that wants them.
     semantic: np.ndarray | None = None
-    # Table of the log of the density of all rays whatever their position (`fields.gaze_log_density.blind_table`).
+    # Table of the log of the density of all rays whatever their position (`fields.gaze_base.blind_table`).
     blind: np.ndarray | None = None
     # The same observers in other directions, for the epoch that is given, where each epoch has its own.
     renew: Callable[[int], Targets] | None = None

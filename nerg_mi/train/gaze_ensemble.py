@@ -21,7 +21,7 @@ from nerg_mi.rays.rays import Rays
 
 from .checkpointing import kept_unless, require_same
 from .gaze_data import Supervision
-from .gaze_folds import CHOICE, MINUTES, choose_mix, choose_variant, give_mix, mixes
+from .gaze_folds import CHOICE, MINUTES, choose_mix, choose_variant, mixes
 from .gaze_run import train_gaze
 from .gaze_settings import GazeSettings
 from .gaze_trainer import KIND as RUN
@@ -147,7 +147,7 @@ def train_ensemble(
         choice = choose_mix(supervision, place, whole, ns, tell)
     if choice is not None:
         for field in fields:
-            give_mix(field, choice.mix)
+            field.set_mix(choice.mix)
     ensemble = GazeEnsemble(fields, supervision.support(plan.probes.radius, place))
     ensemble.basis = basis_of(supervision.counts())
     provenance = _account(each, plan.settings, supervision, kind) | ({"mix": choice.to_dict()} if choice else {})

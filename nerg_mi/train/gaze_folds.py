@@ -13,14 +13,12 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeFieldConfig
-from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.interruption import Interruption
 from nerg_mi.probes.probes import Probes, calibrated_levels, region_levels
 from nerg_mi.rays.filters import purge, split_by_position
 from nerg_mi.rays.rays import Rays
 
-from .gaze_data import Supervision, TargetNeeds, probes_of_rays, targets_of_probes, targets_of_rays
-from .gaze_log_density import LikelihoodTrainer, heads_box
+from .gaze_data import Supervision, TargetNeeds, heads_box, probes_of_rays, targets_of_probes, targets_of_rays
 from .gaze_trainer import GazePlan, GazeProgress, Listener
 from .geometry import GazePlace
 
@@ -89,12 +87,7 @@ class MixChoice:
 
 def mixes(plan: GazePlan) -> bool:
     """Whether ``plan`` asks for a share that folds choose."""
-    return plan.settings.mix_folds > 0 and plan.trainer is LikelihoodTrainer
-
-
-def give_mix(field: LogGazeField, mix: float) -> None:
-    """Let the share of the blind density of ``field`` be ``mix``."""
-    field.config = replace(field.config, mix=mix)
+    return plan.settings.mix_folds > 0 and plan.config.prior > 0
 
 
 def choose_mix(
@@ -145,8 +138,8 @@ def judge_folds(
     there.
     """
     rays, config, curves, judgements = supervision.rays, plan.config, [], []
-    if rays is None or not isinstance(config, LogGazeConfig):
-        raise ValueError("folds are of rays, and of log densities")
+    if rays is None or not config.prior:
+        raise ValueError("folds are of rays, and of fields that have a density that does not depend on the position")
     if plan.settings.minutes is not None:
         plan = plan.with_settings(minutes=MINUTES * plan.settings.minutes / plan.settings.mix_folds)
     settings, needs = plan.settings, TargetNeeds.of(plan.config)
@@ -163,7 +156,7 @@ def judge_folds(
         judged = replace(probes, directions=_DIRECTIONS, min_rays=1)
         probes_held = probes_of_rays(held, judged, centres, settings.seed + 3)
         truth = targets_of_probes(probes_held, place, _DIRECTIONS, judged.depth, needs, settings.seed + 3)
-        trainer = LikelihoodTrainer(replace(targets, heads=box), place.box, config, settings, ns)
+        trainer = plan.trainer(replace(targets, heads=box), place.box, config, settings, ns)
         with Interruption() as stop:
             while trainer.progress < 1:
                 trainer.step()

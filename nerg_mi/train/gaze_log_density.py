@@ -1,21 +1,28 @@
-"""The log-density head in training: its model and the likelihood of rays."""
+"""The log-density head in training: its model, the likelihood of rays, its recipe, and a field of a prior alone."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import ModuleType
-from typing import Any
+from typing import Any, TypedDict
 
 import drjit as dr
 import numpy as np
 
-from nerg_mi.fields.encoding import Encoding, encoding_of
+from nerg_mi.fields.encoding import Encoding, HashGridConfig, encoding_of
+from nerg_mi.fields.gaze_base import blind_table, table_directions
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import softplus
 from nerg_mi.fields.mlp import MLP
-from nerg_mi.maths.geometry import AnyBox
+from nerg_mi.maths.geometry import AnyBox, Box
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.vmf import log_normaliser
+from nerg_mi.probes.probes import person_weights
+from nerg_mi.rays.rays import Rays
 
-from .gaze_data import Batch, Targets
+from .gaze_data import Batch, Targets, heads_box
+from .gaze_recipes import DEFAULT, FieldChoices, Recipe, register
 from .gaze_settings import GazeSettings
 from .gaze_trainer import GazeTrainer
 from .radiance_losses import stack
@@ -141,25 +148,8 @@ class LikelihoodTrainer(GazeTrainer):
     def _logit(self, batch: Batch, parameters: dict) -> Any:
         return log_gaze(self.config, self.box, parameters, batch.p_od, batch.p_o, batch.r_o, batch.escaped, self.ns)
 
-    def densities(self, targets: Targets) -> tuple[np.ndarray, np.ndarray]:
-        """Densities (P, D) of the averaged weights in the directions of ``targets``, as the field is without its share
-        of the blind density; and the blind density there."""
-        parts, D = [], targets.truth.shape[1]
-        with dr.suspend_grad():
-            for batch in self.batches(targets):
-                density = self._normalised(batch, self._logit(batch, {**self.constant, **self.averaged}))
-                blind = dr.exp(self.initial.log_blind(batch.r_o))
-                parts.append([np.asarray(v).reshape(-1, D) for v in (density, blind)])
-        field, blind = (np.concatenate(v) for v in zip(*parts))
-        return field, blind
-
     def density(self, batch: Batch, parameters: dict) -> Any:
-        logit, mix = self._logit(batch, parameters), self.config.mix
-        density = self._normalised(batch, logit)
-        if mix:
-            # Of a view the share counts as on the sphere: the field's integral there is not known from within.
-            density = (1 - mix) * density + mix * batch.given_view(dr.exp(self.initial.log_blind(batch.r_o)))
-        return density
+        return self._normalised(batch, self._logit(batch, parameters))
 
     @staticmethod
     def _normalised(batch: Batch, logit: Any) -> Any:
@@ -170,14 +160,128 @@ class LikelihoodTrainer(GazeTrainer):
         return kld
 
 
-def heads_box(positions: np.ndarray, box: AnyBox) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Corners of the box of observers at ``positions`` (N, 3), with some extent along each axis of the place's
-    ``box``."""
-    low, high = positions.min(axis=0), positions.max(axis=0)
-    return tuple(low.tolist()), tuple(np.maximum(high, low + 1e-3 * box.side).tolist())
-
-
 def log_mean_exp(logit: Any, count: int) -> Any:
     """Log of the mean of exp over each run of ``count`` values, without overflow."""
     top = dr.detach(dr.block_reduce(dr.ReduceOp.Max, logit, count))
     return dr.log(dr.block_sum(dr.exp(logit - dr.repeat(top, count)), count) / count) + top
+
+
+# ---- Prior ----
+#
+# A gaze field for a place where nobody was tracked: how high people look, learnt in other places.
+#
+# Of what was tried, the elevation alone carries over from place to place (docs/gaze-evaluation.md): laws of distance,
+# incidence and the like that were learnt in some places say less in others than it does.
+
+
+KAPPA = 30.0
+"""Concentration of the kernel of a ray."""
+# Bins of the sine of the elevation; directions over which the table is scaled to integrate to one.
+_BINS, _SCALED_OVER = 2048, 1 << 16
+
+
+def elevation_density(places: Sequence[Rays], sine: np.ndarray, kappa: float = KAPPA) -> np.ndarray:
+    """Density (N,), 1/sr, of a direction whose elevation has ``sine`` (N,): the kernel density of the rays of
+    ``places``, each turned to every azimuth alike. Places count alike, and people within a place.
+
+    The mean over azimuths of a von Mises-Fisher density of concentration ``kappa`` about a direction of sine t is
+    C(κ) exp(κ (s t - 1)) I₀(κ √(1 - s²) √(1 - t²)), `maths.vmf`'s C; `ive` is I₀ with its exponent taken out.
+    """
+    from scipy.special import ive
+
+    share = np.zeros(_BINS)
+    for rays in places:
+        weights = person_weights(rays) / len(rays) / len(places)
+        share += np.histogram(rays.direction[:, 2], _BINS, (-1, 1), weights=weights)[0]
+    t, s = (np.arange(_BINS) + 0.5) * 2 / _BINS - 1, np.asarray(sine, np.float64)[:, None]
+    across = np.sqrt(np.maximum(1 - s**2, 0)) * np.sqrt(1 - t**2)
+    return np.exp(log_normaliser(kappa) + kappa * (s * t + across - 1)) * ive(0, kappa * across) @ share
+
+
+def prior_field(places: Sequence[Rays], ns: ModuleType) -> LogGazeField:
+    """A gaze field that is `elevation_density` of ``places`` wherever an observer stands, with arrays of the backend
+    ``ns``: in any place whose z axis points up, of any unit of length."""
+    # All of it is the blind density: a network is there, and counts for nothing.
+    grid = HashGridConfig(levels=1, log2_rows=4, base=2, finest=2)
+    config = LogGazeConfig(grid=grid, variant="emit", width=8, layers=1, geometry="none", mix=1.0)
+    rows = config.prior
+    # One row of texels, for all columns.
+    density = np.repeat(elevation_density(places, table_directions(rows)[:: 2 * rows, 2]), 2 * rows)
+    table = blind_table(density, rows, ns, fibonacci_directions(_SCALED_OVER))
+    return LogGazeField.random(config, Box((-1.0,) * 3, (1.0,) * 3), ns, prior=table)
+
+
+# ---- Recipe ----
+
+
+def _log_density(choices: FieldChoices) -> LogGazeConfig:
+    return LogGazeConfig(
+        grid=HashGridConfig(levels=5, log2_rows=14, base=2, finest=32),
+        variant=choices.variant,
+        sh_degree=3,
+        mix=0.05,
+        **surroundings(choices.place),
+    )
+
+
+class Surroundings(TypedDict):
+    """What a log density is told of where it is."""
+
+    # What its directions without a surface are (`LogGazeConfig.escaped`).
+    escaped: str
+    # Whether there are surfaces (`LogGazeConfig.geometry`).
+    geometry: str
+
+
+def surroundings(place: str) -> Surroundings:
+    """What a log density is told of a kind of ``place``: one of hit points has holes, through which nobody saw whom it
+    was made from; no place has no surfaces."""
+    return {
+        "escaped": "nearest" if place == "hits" else "constant",
+        "geometry": "none" if place == "none" else "surface",
+    }
+
+
+register(
+    Recipe(
+        name=DEFAULT,
+        summary="a log density, normalised over the sphere, trained by the likelihood of rays; generalises best",
+        config=_log_density,
+        trainer=LikelihoodTrainer,
+        losses=("likelihood",),
+        # No zones: fits without those that a validation takes, and all around them, lack most of the probes. The
+        # decay and the few harmonics keep longer trainings from following the people at hand: two or three times
+        # the steps end alike.
+        settings={
+            "steps": 160,
+            "zones": 0,
+            "loss": "likelihood",
+            "integral": 0.0,
+            "probes": 24,
+            "directions": 512,
+            "rays": 64,
+            "learning_rate": 3e-3,
+            "final_rate": 0.1,
+            "hold": 0.5,
+            "weight_decay": 4.0,
+            "average": 0.95,
+            "watched_rays": 64,
+            "mix_folds": 5,
+        },
+        # Evenly over where people stood: as many at each place as there are rays would follow where people linger.
+        # By person, not by time: whoever stays long at a place says little of others.
+        probes={
+            "placement": "blue",
+            "spacing": 0.08,
+            "count": 1024,
+            "min_rays": 1,
+            "kappa": 30.0,
+            "mix_kappa": 10.0,
+            "directions": 2048,
+            "weights": "person",
+        },
+        views_alone={"steps": 200, "zones": 3, "patience": 10},
+        takes=frozenset({"mix-folds", "mix-kappa"}),
+        quick=True,
+    )
+)

@@ -1,21 +1,20 @@
-"""Recipes: what a gaze field is trained with, by the data at hand."""
+"""Recipes: what a gaze field is trained with, by the data at hand.
+
+A kind of field has a module ``gaze_KIND`` for its training, which registers recipes; `recipes` loads it.
+"""
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, TypedDict
+from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_base import GazeFieldConfig
-from nerg_mi.fields.gaze_log_density import LogGazeConfig
-from nerg_mi.fields.gaze_product import GazeConfig
+from nerg_mi.fields.gaze_base import GazeFieldConfig, kinds
 
-from .gaze_data import initial_weights, trunk_config
-from .gaze_log_density import LikelihoodTrainer
-from .gaze_product import ProductTrainer
-from .gaze_settings import GazeSettings, ProbeSettings, sized_gaze_config
+from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazePlan, GazeTrainer
 from .geometry import GazePlace
 
@@ -31,7 +30,7 @@ class FieldChoices:
     variant: str = ""
     # Of the emit head (`fields.gaze_product.ACTIVATIONS`); None: the recipe's.
     activation: str | None = None
-    # Of the networks (`gaze_settings.SIZES`); None: the recipe's.
+    # Of the networks, a word; None: the recipe's.
     size: str | None = None
     # Whether the density is divided by its integral over the sphere.
     normalized: bool = False
@@ -93,13 +92,12 @@ class Recipe:
             option = "--begin field" if begin else "--semantic"
             if place.radiance is None:
                 raise NergError(f"{option} needs a radiance field: give it with --field")
-            if not isinstance(config, GazeConfig):
+            if ("begin" if begin else "semantic") not in self.takes:
                 raise NergError(f"a field of the recipe {self.name} does not take {option}; leave it out")
             if begin:
-                config = trunk_config(config, place.radiance.config)
-                initial = initial_weights(place.radiance, config)
+                config, initial = self.trainer.begin_as(place.radiance, config)
             else:
-                config = replace(config, geometry=place.radiance.config.geometry)
+                config = self.trainer.with_features(place.radiance, config)
         return GazePlan(
             config=config,
             alternatives=tuple(alternatives),
@@ -133,19 +131,9 @@ class Recipe:
         if not wrong:
             return
         spelt = ", ".join("--begin field" if name == "begin" else f"--{name}" for name in wrong)
-        others = [r.name for r in RECIPES.values() if r.takes.issuperset(names)]
+        others = [r.name for r in recipes().values() if r.takes.issuperset(names)]
         remedy = f"add --recipe {others[0]}" if others else f"leave {'it' if len(wrong) == 1 else 'them'} out"
         raise NergError(f"the recipe {self.name} has no choice of {spelt}, but ways of its own; {remedy}")
-
-
-def _log_density(choices: FieldChoices) -> LogGazeConfig:
-    return LogGazeConfig(
-        grid=HashGridConfig(levels=5, log2_rows=14, base=2, finest=32),
-        variant=choices.variant,
-        sh_degree=3,
-        mix=0.05,
-        **surroundings(choices.place),
-    )
 
 
 def default_variants(place: str) -> tuple[str, ...]:
@@ -154,43 +142,8 @@ def default_variants(place: str) -> tuple[str, ...]:
     return ("capture", "emit_capture") if place == "none" else ("emit_capture",)
 
 
-class Surroundings(TypedDict):
-    """What a log density is told of where it is."""
-
-    # What its directions without a surface are (`LogGazeConfig.escaped`).
-    escaped: str
-    # Whether there are surfaces (`LogGazeConfig.geometry`).
-    geometry: str
-
-
-def surroundings(place: str) -> Surroundings:
-    """What a log density is told of a kind of ``place``: one of hit points has holes, through which nobody saw whom it
-    was made from; no place has no surfaces."""
-    return {
-        "escaped": "nearest" if place == "hits" else "constant",
-        "geometry": "none" if place == "none" else "surface",
-    }
-
-
-def _product(size: str, activation: str) -> Callable[[FieldChoices], GazeConfig]:
-    def config(choices: FieldChoices) -> GazeConfig:
-        plain = sized_gaze_config(choices.size or size, choices.variant, choices.activation or activation)
-        if choices.place == "none":
-            raise NergError(
-                "a gaze field of this recipe needs surfaces; without any geometry only a log density trains, "
-                f"such as that of the recipe {DEFAULT}"
-            )
-        return replace(
-            plain, normalized=choices.normalized, semantic=choices.semantic, semantic_own=choices.semantic_own
-        )
-
-    return config
-
-
-_OF_PRODUCTS = frozenset({"activation", "size", "normalized", "semantic", "begin", "loss", "integral"})
-
 RECIPES: dict[str, Recipe] = {}
-"""Every recipe, by its name."""
+"""Recipes that are registered so far; see `recipes`."""
 
 
 def register(recipe: Recipe) -> Recipe:
@@ -203,93 +156,17 @@ def register(recipe: Recipe) -> Recipe:
 
 def gaze_recipe(name: str = DEFAULT) -> Recipe:
     """The recipe ``name``. Raises `NergError` where there is none."""
-    if name not in RECIPES:
-        raise NergError(f'the recipe must be one of {", ".join(RECIPES)}, got "{name}"')
-    return RECIPES[name]
+    found = recipes()
+    if name not in found:
+        raise NergError(f'the recipe must be one of {", ".join(found)}, got "{name}"')
+    return found[name]
 
 
-register(
-    Recipe(
-        name=DEFAULT,
-        summary="a log density, normalised over the sphere, trained by the likelihood of rays; generalises best",
-        config=_log_density,
-        trainer=LikelihoodTrainer,
-        losses=("likelihood",),
-        # No zones: fits without those that a validation takes, and all around them, lack most of the probes. The
-        # decay and the few harmonics keep longer trainings from following the people at hand: two or three times
-        # the steps end alike.
-        settings={
-            "steps": 160,
-            "zones": 0,
-            "loss": "likelihood",
-            "integral": 0.0,
-            "probes": 24,
-            "directions": 512,
-            "rays": 64,
-            "learning_rate": 3e-3,
-            "final_rate": 0.1,
-            "hold": 0.5,
-            "weight_decay": 4.0,
-            "average": 0.95,
-            "watched_rays": 64,
-            "mix_folds": 5,
-        },
-        # Evenly over where people stood: as many at each place as there are rays would follow where people linger.
-        # By person, not by time: whoever stays long at a place says little of others.
-        probes={
-            "placement": "blue",
-            "spacing": 0.08,
-            "count": 1024,
-            "min_rays": 1,
-            "kappa": 30.0,
-            "mix_kappa": 10.0,
-            "directions": 2048,
-            "weights": "person",
-        },
-        views_alone={"steps": 200, "zones": 3, "patience": 10},
-        takes=frozenset({"mix-folds", "mix-kappa"}),
-        quick=True,
-    )
-)
-register(
-    Recipe(
-        name="small",
-        summary="emit times capture on a small grid, on the paper's losses and the integral over the sphere",
-        config=_product("small", "softplus"),
-        trainer=ProductTrainer,
-        losses=("paper", "code"),
-        settings={"steps": 600},
-        probes={},
-        takes=_OF_PRODUCTS,
-    )
-)
-register(
-    Recipe(
-        name="paper",
-        summary="the paper's networks, losses and probes, as many steps as 50 epochs have",
-        config=_product("paper", "linear"),
-        trainer=ProductTrainer,
-        losses=("paper", "code"),
-        settings={
-            "steps": 12_800,
-            "loss": "paper",
-            "integral": 0.0,
-            "probes": 16,
-            "directions": 1024,
-            "learning_rate": 1e-3,
-            "final_rate": 0.1,
-            "hold": 0.0,
-            "weight_decay": 0.0,
-        },
-        # Bandwidth and least number of rays are those of the authors' code.
-        probes={
-            "radius": 0.1,
-            "count": 4096,
-            "cap": 1024,
-            "kappa_rule": "silverman",
-            "directions": 1024,
-            "min_rays": 8,
-        },
-        takes=_OF_PRODUCTS,
-    )
-)
+def recipes() -> dict[str, Recipe]:
+    """Every recipe by its name, that of the default first, with those of every kind of gaze field."""
+    for kind in kinds():
+        module = f"{__package__}.gaze_{kind}"
+        # Kinds of other packages register their recipes where these are imported.
+        if importlib.util.find_spec(module) is not None:
+            importlib.import_module(module)
+    return dict(sorted(RECIPES.items(), key=lambda item: item[0] != DEFAULT))

@@ -1,23 +1,16 @@
-"""A training of a gaze field from its data to its checkpoint, with a prior where there is one."""
+"""A training of a gaze field from its data to its checkpoint."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import GazeDensity, basis_of
-from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField, blind_table, table_directions
-from nerg_mi.maths.geometry import Box
-from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.maths.vmf import log_normaliser
-from nerg_mi.probes.probes import person_weights
-from nerg_mi.rays.rays import Rays
 
 from .checkpointing import kept_unless
 from .gaze_data import (
@@ -29,7 +22,7 @@ from .gaze_data import (
     targets_of_rays,
     targets_of_views,
 )
-from .gaze_folds import CHOICE, MINUTES, choose_mix, choose_variant, give_mix, mixes
+from .gaze_folds import CHOICE, MINUTES, choose_mix, choose_variant, mixes
 from .gaze_trainer import (
     Fit,
     GazePlan,
@@ -44,51 +37,6 @@ from .gaze_trainer import (
     rounded,
 )
 from .geometry import GazePlace
-
-# ---- Prior ----
-#
-# A gaze field for a place where nobody was tracked: how high people look, learnt in other places.
-#
-# Of what was tried, the elevation alone carries over from place to place (docs/gaze-evaluation.md): laws of distance,
-# incidence and the like that were learnt in some places say less in others than it does.
-
-
-KAPPA = 30.0
-"""Concentration of the kernel of a ray."""
-# Bins of the sine of the elevation; directions over which the table is scaled to integrate to one.
-_BINS, _SCALED_OVER = 2048, 1 << 16
-
-
-def elevation_density(places: Sequence[Rays], sine: np.ndarray, kappa: float = KAPPA) -> np.ndarray:
-    """Density (N,), 1/sr, of a direction whose elevation has ``sine`` (N,): the kernel density of the rays of
-    ``places``, each turned to every azimuth alike. Places count alike, and people within a place.
-
-    The mean over azimuths of a von Mises-Fisher density of concentration ``kappa`` about a direction of sine t is
-    C(κ) exp(κ (s t - 1)) I₀(κ √(1 - s²) √(1 - t²)), `maths.vmf`'s C; `ive` is I₀ with its exponent taken out.
-    """
-    from scipy.special import ive
-
-    share = np.zeros(_BINS)
-    for rays in places:
-        weights = person_weights(rays) / len(rays) / len(places)
-        share += np.histogram(rays.direction[:, 2], _BINS, (-1, 1), weights=weights)[0]
-    t, s = (np.arange(_BINS) + 0.5) * 2 / _BINS - 1, np.asarray(sine, np.float64)[:, None]
-    across = np.sqrt(np.maximum(1 - s**2, 0)) * np.sqrt(1 - t**2)
-    return np.exp(log_normaliser(kappa) + kappa * (s * t + across - 1)) * ive(0, kappa * across) @ share
-
-
-def prior_field(places: Sequence[Rays], ns: ModuleType) -> LogGazeField:
-    """A gaze field that is `elevation_density` of ``places`` wherever an observer stands, with arrays of the backend
-    ``ns``: in any place whose z axis points up, of any unit of length."""
-    # All of it is the blind density: a network is there, and counts for nothing.
-    grid = HashGridConfig(levels=1, log2_rows=4, base=2, finest=2)
-    config = LogGazeConfig(grid=grid, variant="emit", width=8, layers=1, geometry="none", mix=1.0)
-    rows = config.prior
-    # One row of texels, for all columns.
-    density = np.repeat(elevation_density(places, table_directions(rows)[:: 2 * rows, 2]), 2 * rows)
-    table = blind_table(density, rows, ns, fibonacci_directions(_SCALED_OVER))
-    return LogGazeField.random(config, Box((-1.0,) * 3, (1.0,) * 3), ns, prior=table)
-
 
 # ---- Run ----
 #
@@ -165,7 +113,7 @@ def train_gaze(
             interrupted = True
     field = trainer.field(last.weights)
     if choice is not None:
-        give_mix(field, choice.mix)
+        field.set_mix(choice.mix)
     field.support = used.support(plan.probes.radius, place)
     field.basis = basis_of(supervision.counts())
     provenance = _provenance(supervision, place, plan, targets) | {

@@ -16,6 +16,7 @@ from drjit.opt import AdamW
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.fields.gaze_base import GazeDensity, GazeFieldConfig
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
@@ -84,13 +85,23 @@ class GazeTrainer(ABC):
         self.steps, self.loss = 0, None
         self._started = time.perf_counter()
 
+    @classmethod
+    def begin_as(cls, radiance: RadianceField, config: Any) -> tuple[Any, dict]:
+        """``config`` with the sizes of the field ``radiance``, and the arrays of it that a training begins with."""
+        raise NotImplementedError(f"a {config.kind} gaze field does not begin as a radiance field")
+
+    @classmethod
+    def with_features(cls, radiance: RadianceField, config: Any) -> Any:
+        """``config``, which has semantic features, with as many as ``radiance`` gives."""
+        raise NotImplementedError(f"a {config.kind} gaze field has no semantic features")
+
     @abstractmethod
     def untrained(self) -> GazeDensity:
         """The field with its random weights."""
 
-    @abstractmethod
     def trainable(self, parameters: dict) -> dict:
-        """Those of a field's ``parameters`` that are trained."""
+        """Those of a field's ``parameters`` that are trained: all that are not fixed."""
+        return {k: v for k, v in parameters.items() if k not in self.initial.fixed}
 
     @abstractmethod
     def backward(self) -> None:
@@ -98,7 +109,8 @@ class GazeTrainer(ABC):
 
     @abstractmethod
     def density(self, batch: Batch, parameters: dict) -> Any:
-        """Density (Float, 1/sr) of the field with ``parameters`` in the directions of ``batch``, for a validation."""
+        """Density (Float, 1/sr) of the field with ``parameters`` in the directions of ``batch``, for a validation, as
+        it is without its share of the density that does not depend on the position."""
 
     @abstractmethod
     def judge(self, kld: float, cc: float, mae: float, off: float) -> float:
@@ -154,7 +166,7 @@ class GazeTrainer(ABC):
         rows = []
         with dr.suspend_grad():
             for batch in self.batches(targets):
-                density = self.density(batch, {**self.constant, **(weights or self.averaged)})
+                density = self._mixed(batch, {**self.constant, **(weights or self.averaged)})
                 parts = gaze_loss(density, batch.truth, targets.truth.shape[1])
                 integral = batch.integral(density)
                 means = parts.kld, parts.cc, parts.mae, dr.mean(integral), dr.mean(dr.square(1 - integral))
@@ -162,6 +174,25 @@ class GazeTrainer(ABC):
         rows = np.array(rows)
         kld, cc, mae, integral, off = rows[:, 0] @ rows[:, 1:] / rows[:, 0].sum()
         return Scores(self.judge(kld, cc, mae, off), kld, cc, mae, integral)
+
+    def _mixed(self, batch: Batch, parameters: dict) -> Any:
+        density, mix = self.density(batch, parameters), self.config.mix
+        if mix:
+            # Of a view the share counts as on the sphere: the field's integral there is not known from within.
+            density = (1 - mix) * density + mix * batch.given_view(dr.exp(self.initial.log_blind(batch.r_o)))
+        return density
+
+    def densities(self, targets: Targets) -> tuple[np.ndarray, np.ndarray]:
+        """Densities (P, D) of the averaged weights in the directions of ``targets``, as the field is without its share
+        of the blind density; and the blind density there."""
+        parts, D = [], targets.truth.shape[1]
+        with dr.suspend_grad():
+            for batch in self.batches(targets):
+                density = self.density(batch, {**self.constant, **self.averaged})
+                blind = dr.exp(self.initial.log_blind(batch.r_o))
+                parts.append([np.asarray(v).reshape(-1, D) for v in (density, blind)])
+        field, blind = (np.concatenate(v) for v in zip(*parts))
+        return field, blind
 
     def batches(self, targets: Targets) -> Iterator[Batch]:
         """All of ``targets`` in all of their directions, some observers at a time."""
@@ -305,7 +336,7 @@ class GazePlan:
     probes: ProbeSettings
     # Moves the weights of a field of this kind.
     trainer: type[GazeTrainer]
-    # Arrays to begin with in place of random ones, by name (`gaze_data.initial_weights`); None: random ones.
+    # Arrays to begin with in place of random ones, by name (`GazeTrainer.begin_as`); None: random ones.
     initial: dict[str, Any] | None = None
 
     def with_settings(self, **changes: Any) -> GazePlan:

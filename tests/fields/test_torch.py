@@ -47,7 +47,7 @@ def test02_equation_1_of_a_gaze_field(torch):
     def head(p, d, name):
         features = np.array([f.numpy() for f in field.grid(field.box.to_unit(ns.Array3f(p.T)))]).T
         harmonics = np.array([np.broadcast_to(h.numpy(), 30) for h in encode_direction(ns.Array3f(d.T), 2)]).T
-        nets = {k: [torch.tensor(w.numpy()) for w in getattr(field, k).weights] for k in field._NETS}
+        nets = {k: [torch.tensor(w.numpy()) for w in getattr(field, k).weights] for k in field.NETS}
         geometry = forward(torch, nets["position_net"], torch.tensor(features))
         hidden = forward(torch, nets["direction_net"], torch.cat([torch.tensor(harmonics.copy()), geometry], 1))
         return forward(torch, nets[name], torch.relu(hidden))[:, 0]

@@ -3,15 +3,26 @@
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.fields.gaze_base import limits_of
 from nerg_mi.formats.architecture import FINEST, OCCUPANCY_CELLS, building, check_occupancy, check_sizes, number
 
 GRID = {"levels": 2, "features": 2, "log2_rows": 8, "base": 4, "finest": 16, "dimensions": 3}
 
 
 def test_sizes_in_bounds_pass_as_they_are():
-    about = {"grid": GRID, "width": 4096, "density_hidden": 1, "geometry": "surface", "other": "kept"}
+    about = {"grid": GRID, "width": 4096, "density_hidden": 1, "geometry": 15, "other": "kept"}
     assert check_sizes(about) is about
     assert check_sizes({"grid": {"kind": "hashgrid", **GRID}})
+
+
+def test_each_kind_of_gaze_field_has_its_own_bounds():
+    """The word "geometry" of a log density is no size."""
+    product, log = {"geometry": "surface"}, {"kind": "log_density", "geometry": "surface", "layers": 2}
+    assert check_sizes(log, most=limits_of(log)) is log
+    for about, name in ((product, "geometry"), ({**log, "layers": 65}, "layers"), ({**log, "prior": 0}, "prior")):
+        with pytest.raises(ValueError, match=f'"{name}" of its architecture must be a whole number'):
+            check_sizes(about, most=limits_of(about))
+    assert not limits_of({"kind": "wavelet"}) and not limits_of({"kind": ["product"]}) and not limits_of("product")
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ import numpy as np
 from typer.core import TyperOption
 
 from nerg_mi.ranges import COORDINATES, TIMES
-from nerg_mi.train.gaze_recipes import RECIPES
+from nerg_mi.train.gaze_recipes import recipes
 from tests.cli import outputs
 from tests.fuzz.describe import Reader
 from tests.fuzz.watch import Case
@@ -59,7 +59,7 @@ _REFUSED = {
 _TEXTS = dict(define=("level=0.5", "spp=1"), source=("field", "rays"), geometry=("hits", "none"), photo=("0", "3.png"))
 _TEXTS |= dict(person=("a", "b"), people=("a", "a,b"), persons=("a", "b"), without_persons=("a", "b"))
 _TEXTS |= dict(
-    recipe=RECIPES, salience=("spectral-residual",), semantic=("accumulated", "snapshot"), windows=("w=0:1",)
+    recipe=recipes(), salience=("spectral-residual",), semantic=("accumulated", "snapshot"), windows=("w=0:1",)
 )
 _TEXTS |= dict(observers=("0,0,1.6", "1,1,1.6"), begin=("random", "field"))
 """Parameter of a command -> values that its help does not enumerate."""

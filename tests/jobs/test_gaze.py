@@ -19,7 +19,7 @@ from nerg_mi.jobs.options.gaze import GazeOptions
 from nerg_mi.jobs.radiance import train_radiance
 from nerg_mi.train import gaze_recipes
 from nerg_mi.train.gaze_data import surface_distances
-from nerg_mi.train.gaze_log_density import LikelihoodTrainer
+from nerg_mi.train.gaze_log_density import LikelihoodTrainer, surroundings
 from nerg_mi.train.gaze_recipes import Recipe, register
 from nerg_mi.train.geometry import place_of_scene
 from tests.train.gaze.looks import RAYS, looking_at
@@ -153,7 +153,7 @@ def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, mo
         Recipe(
             name="coarse",
             summary="a log density on two levels",
-            config=lambda c: LogGazeConfig(grid, c.variant, width=8, **gaze_recipes.surroundings(c.place)),
+            config=lambda c: LogGazeConfig(grid, c.variant, width=8, **surroundings(c.place)),
             trainer=LikelihoodTrainer,
             losses=("likelihood",),
             settings={"steps": 3, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 4, "directions": 32},

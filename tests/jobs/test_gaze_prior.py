@@ -10,7 +10,7 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.jobs.evaluation import evaluate_gaze
 from nerg_mi.jobs.gaze_prior import learn_prior
 from nerg_mi.rays.rays import Rays
-from nerg_mi.train.gaze_run import elevation_density
+from nerg_mi.train.gaze_log_density import elevation_density
 
 
 def looking(elevation: float, count: int = 200, seed: int = 0) -> Rays:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField, blind_table, look_up, table_directions
+from nerg_mi.fields.gaze_base import blind_table, look_up, table_directions
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.maths.geometry import Box

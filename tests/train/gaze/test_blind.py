@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_log_density import look_up, table_directions
+from nerg_mi.fields.gaze_base import look_up, table_directions
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions

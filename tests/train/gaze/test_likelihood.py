@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation import metrics
-from nerg_mi.fields.gaze_log_density import blind_table
+from nerg_mi.fields.gaze_base import blind_table
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.train.gaze_data import Targets

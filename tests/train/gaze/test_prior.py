@@ -9,7 +9,7 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.rays.rays import Rays
-from nerg_mi.train.gaze_run import elevation_density, prior_field
+from nerg_mi.train.gaze_log_density import elevation_density, prior_field
 
 
 def looking(directions, person=None) -> Rays:

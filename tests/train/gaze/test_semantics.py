@@ -15,9 +15,9 @@ from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.maths.geometry import Box
 from nerg_mi.rays.rays import Rays
-from nerg_mi.train.gaze_data import TargetNeeds, initial_weights, semantic_features, targets_of_rays, trunk_config
-from nerg_mi.train.gaze_product import ProductTrainer, gaze_density
-from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings, sized_gaze_config
+from nerg_mi.train.gaze_data import TargetNeeds, semantic_features, targets_of_rays
+from nerg_mi.train.gaze_product import ProductTrainer, gaze_density, initial_weights, sized_gaze_config, trunk_config
+from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.geometry import GazePlace, place_of_field
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import default_settings

@@ -10,7 +10,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.train.gaze_settings import sized_gaze_config
+from nerg_mi.train.gaze_product import sized_gaze_config
 
 from .looks import BOX
 

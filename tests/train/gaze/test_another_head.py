@@ -1,0 +1,112 @@
+"""One more kind of gaze field is two modules: everything finds it by its kind and by its recipe."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+import nerg_mi.fields
+import nerg_mi.train
+from nerg_mi.fields import gaze_base
+from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.formats.fields import load_gaze, save_gaze
+from nerg_mi.jobs.ablation import ablate
+from nerg_mi.jobs.gaze import train_gaze
+from nerg_mi.jobs.options.ablation import AblationOptions
+from nerg_mi.jobs.options.gaze import GazeOptions
+from nerg_mi.train import gaze_recipes
+from tests.evaluation.gaze.test_evaluation import crowd
+
+HEADS = Path(__file__).parents[2] / "heads"
+OPTIONS = GazeOptions(recipe="place", geometry="hits", voxel=0.3, threads=1, min_rays=4, seed=1)
+
+
+@pytest.fixture(scope="module")
+def head():
+    """The two modules as if they lay in the packages, and gone again from the registers."""
+    kinds, recipes = dict(gaze_base._KINDS), dict(gaze_recipes.RECIPES)
+    for package in (nerg_mi.fields, nerg_mi.train):
+        package.__path__.append(str(HEADS / package.__name__.rpartition(".")[2]))
+    module = importlib.import_module("nerg_mi.fields.gaze_place")
+    yield module
+    for package in (nerg_mi.fields, nerg_mi.train):
+        package.__path__.pop()
+    for register, before in ((gaze_base._KINDS, kinds), (gaze_recipes.RECIPES, recipes)):
+        register.clear()
+        register.update(before)
+
+
+@pytest.fixture(scope="module")
+def trained(head, tmp_path_factory):
+    return train_gaze(crowd(3000), tmp_path_factory.mktemp("head") / "gaze.safetensors", OPTIONS)
+
+
+def test_its_recipe_trains_and_folds_choose_its_share(head, trained):
+    field, about = trained.field, trained.provenance
+    assert isinstance(field, head.PlaceField) and about["recipe"] == "place" and about["steps"] == 12
+    assert about["mix"]["folds"] == 2 and field.config.mix == about["mix"]["mix"] > 0
+    untrained = head.PlaceField.random(field.config, field.box, ns, 1, field.prior.numpy()).parameters()
+    moved = {k for k, v in field.parameters().items() if not np.allclose(v.numpy(), untrained[k].numpy())}
+    assert moved == set(field.parameters()) - {"prior"}
+
+
+def test_it_is_stored_rendered_and_a_torch_module(rgb, trained, tmp_path):
+    path = tmp_path / "gaze.safetensors"
+    save_gaze(trained.field, path, {})
+    again, meta = load_gaze(path, ns)
+    assert meta["architecture"]["kind"] == "place" and again.config == trained.field.config
+    parts = {"gaze": {"type": "gazefield", "filename": str(path)}, "aovs": "gaze,emit,capture"}
+    camera = rgb.ScalarTransform4f().look_at([0, 0, 1.5], [1.5, 0, 1.2], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "to_world": camera, "film": film}
+    ball = {"type": "sphere", "center": [1.5, 0, 1.2], "radius": 0.5}
+    scene = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg", **parts}, "sensor": sensor, "ball": ball})
+    gaze = np.array(rgb.render(scene, spp=1))[..., 3]
+    assert np.isfinite(gaze).all() and gaze[3:5, 3:5].min() > 0
+    torch = pytest.importorskip("torch")
+    from nerg_mi.interop.torch import GazeModule
+
+    # Whatever the folds chose, the networks count.
+    again.set_mix(0.1)
+    module, rng, box = GazeModule(again), np.random.default_rng(0), again.box
+    p_od, p_o, r_o = (rng.uniform(box.lower, box.upper, size=(20, 3)).astype(np.float32) for _ in range(3))
+    r_o /= np.linalg.norm(r_o, axis=1, keepdims=True)
+    found = module(*map(torch.from_numpy, (p_od, p_o, r_o)), 2.0)
+    arrays = [ns.Array3f(np.ascontiguousarray(v.T)) for v in (p_od, p_o, r_o)]
+    np.testing.assert_allclose(found.detach().numpy(), again.evaluate(*arrays, integral=2.0)[0].numpy(), rtol=1e-5)
+    found.sum().backward()
+    assert module.get_parameter("emit_net__0").grad.abs().max() > 0
+    assert not module.get_parameter("prior").requires_grad
+
+
+def test_members_of_an_ensemble_and_an_ablation_are_of_its_kind(head, tmp_path):
+    rays = crowd(3000)
+    options = AblationOptions(
+        geometry="hits",
+        recipes="place",
+        variant=("emit", "capture"),
+        seeds=1,
+        default_steps=2,
+        zones=1,
+        positions=3,
+        min_rays=4,
+        radius=0.5,
+        cameras=0,
+        probes=8,
+    )
+    rows = ablate(rays, tmp_path, options).rows
+    assert [row["variant"] for row in rows] == ["emit", "capture"] and all(np.isfinite(r["test_loss"]) for r in rows)
+    field = load_gaze(tmp_path / "place_emit_0.safetensors", ns)[0]
+    assert isinstance(field, head.PlaceField) and field.networks == 1
+    both = GazeEnsemble([field, head.PlaceField.random(field.config, field.box, ns, 2, field.prior.numpy())])
+    save_gaze(both, tmp_path / "both.safetensors", {})
+    again = load_gaze(tmp_path / "both.safetensors", ns)[0]
+    point, along = ns.Array3f(0.5, 0.1, 1.0), dr.normalize(ns.Array3f(1, 0.2, -0.1))
+    densities = [m.evaluate(point, point, along, integral=1.0)[0].numpy() for m in again.members]
+    assert len(densities) == 2 and all(isinstance(m, head.PlaceField) for m in again.members)
+    assert not np.allclose(*densities)
