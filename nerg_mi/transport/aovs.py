@@ -113,7 +113,7 @@ class Aov(Quantity):
 
 
 _GAZE, _FACTORS, _COUNTS = frozenset({"gaze"}), frozenset({"gaze", "factors"}), frozenset({"counts"})
-_HEAT = Display(kind="heat")
+_HEAT, _SIGNED = Display(kind="heat"), Display(kind="diverging")
 _EVALUATIONS = "evaluations per pixel"
 
 
@@ -262,6 +262,7 @@ AOVS: dict[str, Aov] = {
             name="features",
             channels=None,
             summary="the field's geometry features, accumulated like colour (not divided by opacity)",
+            display=_SIGNED,
             compute=lambda p: p.accumulated_features,
             needs=(FIELD,),
             demands=frozenset({"features"}),
@@ -270,6 +271,7 @@ AOVS: dict[str, Aov] = {
             name="features_at",
             channels=None,
             summary="the same features at the surface :math:`p_d`; 0 on shapes",
+            display=_SIGNED,
             compute=_features_at,
             needs=(FIELD,),
         ),

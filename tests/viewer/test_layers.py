@@ -32,6 +32,18 @@ def test01_a_factor_that_a_variant_lacks_is_no_layer(room, gaze_fields, tmp_path
         assert "gaze" in titles and titles & factors == expected
 
 
+def test01_a_channel_is_a_layer():
+    found = {
+        "position": np.arange(12.0).reshape(2, 2, 3),
+        "depth": np.ones((2, 2)),
+        "features": np.ones((2, 5)) * range(5),
+    }
+    for name, expected in (("position.Y", [[1, 4], [7, 10]]), ("depth", np.ones((2, 2))), ("features.3", [3, 3])):
+        assert np.array_equal(layer_of(name).values(found), expected), name
+    assert layer_of("gaze").values(found) is None and layer_of("color").values(found) is None
+    assert layer_of("position.Y").quantity == "position" and layer_of("position.Y").title == "position Y"
+
+
 def test02_heat_is_that_of_pictures():
     rng = np.random.default_rng(2)
     color, gaze, mask = rng.random((8, 9, 3)), rng.random((8, 9)), np.ones((8, 9), bool)
