@@ -78,7 +78,7 @@ def test01_layers_and_their_scale(running, panel):
     panel.choose("Colours", "magma")
     until(lambda: session.scale().colors == "magma")
     panel.choose("Colours", "as usual")
-    until(lambda: session.scale().colors == "viridis")
+    until(lambda: session.scale().colors == "viridis_r")
     panel.choose("Layer", "gaze")
     panel.slide("Fall-off", 0.5)
     until(lambda: abs(session.falloff - 0.5) < 0.1)
