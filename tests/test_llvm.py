@@ -84,7 +84,7 @@ def test06_only_bad_ones(machine, monkeypatch):
     fake(machine, "libLLVM-15.so.1", "libLLVM-16.so.1")
     llvm.prepare()
     assert llvm.VARIABLE not in os.environ
-    with pytest.raises(UnusableLLVM, match=r"LLVM 16 .* need LLVM 17 or newer: .*libllvm19"):
+    with pytest.raises(UnusableLLVM, match="16.*17.*libllvm19"):
         llvm.require()
     # With an NVIDIA driver the package is of use, and only an llvm variant is refused.
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)

@@ -74,10 +74,10 @@ def test_a_field_of_a_file_or_in_memory(rgb):
     assert field == filename and filename.endswith("here.safetensors") and metadata == {"about": ns}
     mine = Field(ns.TensorXf([1.0]))
     assert properties.trained({}, mine, load, ns) == (mine, {}, "")
-    with pytest.raises(NergError, match='"filename" must be a string, got nothing'):
+    with pytest.raises(NergError, match='"filename"'):
         properties.trained({}, None, load, ns)
     # Arrays that are not of the backend in use.
-    with pytest.raises(NergError, match='made for another variant than "llvm_ad_rgb"; load it again'):
+    with pytest.raises(NergError, match='"llvm_ad_rgb"'):
         properties.trained({}, Field([1.0]), load, ns)
 
 
@@ -97,5 +97,5 @@ def test_a_transform_is_a_matrix_or_the_identity(rgb):
     place = rgb.ScalarTransform4f().translate([1, 2, 3]).scale(2)
     assert np.allclose(properties.transform({"to_world": place}, "to_world"), np.array(place.matrix))
     assert np.array_equal(properties.transform({}, "to_world"), np.eye(4))
-    with pytest.raises(NergError, match='"to_world" must be a transform, got 3'):
+    with pytest.raises(NergError, match='"to_world".*3'):
         properties.transform({"to_world": 3}, "to_world")

@@ -91,7 +91,7 @@ def test_other_files_are_refused(tmp_path, name, text, why):
 
 def test_empty_cells_are_no_coordinates(tmp_path):
     (tmp_path / "a.csv").write_text(HEAD + "a,1,2,3,4,5,\nb,0,0,0,0,0,0\nc,1,0,0,1,0,0\n")
-    with pytest.raises(NergError, match="points in the frame of the .* must have coordinates from"):
+    with pytest.raises(NergError, match="points in the frame"):
         read_pairs(tmp_path / "a.csv").fit(FREE, quiet)
 
 

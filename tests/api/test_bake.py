@@ -25,5 +25,5 @@ def test02_rays_in_memory_and_in_a_file_are_one(rgb, tmp_path):
     first = bake(tmp_path / "room.ply", rays=rays, detail=1.0)
     second = bake(str(tmp_path / "room.ply"), str(tmp_path / "b.json"), rays=str(tmp_path / "a.npz"), detail=1.0)
     assert np.array_equal(first.density, second.density) and second.files == (tmp_path / "b.json",)
-    with pytest.raises(NergError, match='bake has no option "smoth"; did you mean "smooth"'):
+    with pytest.raises(NergError, match='"smoth".*"smooth"'):
         bake(tmp_path / "room.ply", rays=rays, smoth=0.1)

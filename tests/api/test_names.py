@@ -40,7 +40,7 @@ def test03_a_name_loads_its_module_and_not_the_others():
 
 
 def test04_unknown_names_are_attribute_errors():
-    with pytest.raises(AttributeError, match='module "nerg_mi" has no attribute "rendre"') as error:
+    with pytest.raises(AttributeError, match='"nerg_mi".*"rendre"') as error:
         nerg.rendre  # noqa: B018
     # With these Python suggests a name.
     assert (error.value.name, error.value.obj) == ("rendre", nerg)

@@ -97,7 +97,7 @@ def test_what_is_natural_is_taken(rgb, tmp_path):
 def test03_unknown_options_are_told(rgb):
     with pytest.raises(NergError, match='job has no option "step"; did you mean "steps"?'):
         options_of(Options, "job", None, {"step": 3})
-    with pytest.raises(NergError, match="job works in the variant that is set; call mi.set_variant"):
+    with pytest.raises(NergError, match="mi.set_variant"):
         options_of(Options, "job", None, {"mode": "scalar_rgb"})
-    with pytest.raises(NergError, match='job has no option "xyz"; it has steps, folder, store, seed'):
+    with pytest.raises(NergError, match='"xyz"'):
         options_of(Options, "job", None, {"xyz": 1})

@@ -141,14 +141,14 @@ def test07_errors_are_sentences(files, given, said):
 
 def test08_kinds_are_not_confused(files):
     field, gaze = nerg.load_field(files / "field.safetensors"), nerg.load_gaze(files / "gaze.safetensors")
-    with pytest.raises(nerg.NergError, match="a radiance field in memory is needed, got GazeField"):
+    with pytest.raises(nerg.NergError, match="radiance field in memory"):
         nerg.make_scene(gaze)
-    with pytest.raises(nerg.NergError, match="a gaze field in memory is needed, got RadianceField"):
+    with pytest.raises(nerg.NergError, match="gaze field in memory"):
         nerg.make_scene(field, field)
 
 
 def test09_other_scenes(rgb):
-    with pytest.raises(nerg.NergError, match='needs the integrator "nerg", and this one has "PathIntegrator"'):
+    with pytest.raises(nerg.NergError, match='"nerg".*"PathIntegrator"'):
         nerg.Scene(rgb.load_dict({"type": "scene", "integrator": {"type": "path"}, "ball": BALL}))
     wrapped = nerg.Scene(rgb.load_dict({"type": "scene", "integrator": {"type": "nerg"}, "ball": BALL}))
     assert nerg.trace(wrapped, (0, -5, 0), (0, 1, 0)).depth.shape == (1,)
@@ -175,7 +175,7 @@ def test11_cameras(scene, camera, rgb):
     for wrong in (1, -1):
         with pytest.raises(nerg.NergError, match=f"has 1 of its own, and camera {wrong} was asked for"):
             scene.sensor(wrong)
-    with pytest.raises(nerg.NergError, match="a Camera, a number or a Mitsuba sensor, got str"):
+    with pytest.raises(nerg.NergError, match="Camera, a number"):
         scene.sensor("first")
 
 
@@ -186,7 +186,7 @@ def test12_quantities(scene):
     for wrong in ([], 3, ["depth", 3]):
         with pytest.raises(nerg.NergError, match="quantities are names"):
             asked_quantities(scene, wrong)
-    with pytest.raises(nerg.NergError, match='no quantity "gazes" here; there are gaze, depth'):
+    with pytest.raises(nerg.NergError, match='"gazes"'):
         asked_quantities(scene, "gazes", ("gaze", "depth"))
 
 

@@ -30,7 +30,7 @@ def test02_options_of_the_import(table, tmp_path):
 def test03_wrong_options_are_told(table):
     with pytest.raises(nerg.NergError, match="colums"):
         nerg.import_rays(table, colums=COLUMNS)
-    with pytest.raises(nerg.NergError, match='there is no preset "nope"'):
+    with pytest.raises(nerg.NergError, match='"nope"'):
         nerg.import_rays(table, "nope")
 
 

@@ -37,9 +37,9 @@ def test01_options_reach_the_jobs(asked, tmp_path):
 
 
 def test02_wrong_options_are_told(asked):
-    with pytest.raises(nerg.NergError, match='train_gaze has no option "kapa"; did you mean "kappa"'):
+    with pytest.raises(nerg.NergError, match='train_gaze.*"kapa".*"kappa"'):
         nerg.train_gaze(None, kapa=9.0)
-    with pytest.raises(nerg.NergError, match="train_radiance works in the variant that is set"):
+    with pytest.raises(nerg.NergError, match="train_radiance"):
         nerg.train_radiance("photos", mode="scalar_rgb")
 
 

@@ -48,5 +48,5 @@ def test_cells_without_parts_are_empty():
 
 
 def test_bytes_that_do_not_fit():
-    with pytest.raises(ValueError, match=r"got \(7,\) for 8 of \(2, 2, 2\)"):
+    with pytest.raises(ValueError, match="7.*8.*2.*2.*2"):
         RefinedGrid(np.ones((2, 2, 2), bool), np.zeros(7, np.uint8), ns, 0, 0, 0)

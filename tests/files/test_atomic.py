@@ -74,9 +74,9 @@ def test_a_link_is_followed(tmp_path):
 
 def test_what_cannot_be_written_is_told_with_its_remedy(tmp_path):
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(NergError, match="is a folder; choose the name of a file"):
+    with pytest.raises(NergError, match="folder; choose the name"):
         write_bytes(tmp_path, b"")
-    with pytest.raises(NergError, match="one of its parents is a file"):
+    with pytest.raises(NergError, match="parents is a file"):
         write_bytes(tmp_path / "file" / "x", b"")
     with pytest.raises(NergError, match="parents is a file"):
         make_folder(tmp_path / "file" / "x")
@@ -180,9 +180,9 @@ def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
         lambda: check_new_folder(tmp_path / "empty"),
         lambda: replacing_folder(tmp_path / "empty").__enter__(),
     ):
-        with pytest.raises(NergError, match="there and not empty: choose another name, or remove it"):
+        with pytest.raises(NergError, match="empty: choose another name"):
             check()
-    with pytest.raises(NergError, match="one of its parents is a file"):
+    with pytest.raises(NergError, match="parents is a file"):
         check_new_folder(tmp_path / "empty" / "a")
     assert os.listdir(tmp_path) == ["empty"] and os.listdir(tmp_path / "empty") == ["a"]
 

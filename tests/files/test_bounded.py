@@ -85,7 +85,7 @@ def test_mapped_files_begin_as_they_should(tmp_path):
     with (tmp_path / "a").open("wb") as out:
         for size in (0, 64 << 30):
             out.truncate(size)
-            with pytest.raises(NergError, match='does not begin with "ply".*; export it again'):
+            with pytest.raises(NergError, match='"ply"'):
                 map_bytes(tmp_path / "a", "mesh", 1 << 40, b"ply", "export it again")
 
 

@@ -91,7 +91,7 @@ def test_scans_of_a_jpeg_are_counted(rgb, tmp_path):
     raw = (tmp_path / "a.jpg").read_bytes()
     at = raw.index(b"\xff\xda")
     (tmp_path / "b.jpg").write_bytes(raw[:at] + raw[at:-2] * 101 + raw[-2:])
-    with pytest.raises(NergError, match="b.jpg.*more than 100 times"):
+    with pytest.raises(NergError, match="b.jpg.*100"):
         check_image(tmp_path / "b.jpg")
 
 

@@ -151,7 +151,7 @@ def test_what_nothing_comes_out_of_is_bounded(tmp_path, monkeypatch):
         with path.open("wb") as out:
             out.write(start)
             out.truncate(64 << 30)
-        with open_gzip(path) as stream, pytest.raises(NergError, match="a.gz.*16,777,216 bytes and more"):
+        with open_gzip(path) as stream, pytest.raises(NergError, match="a.gz.*16,777,216"):
             stream.read()
     path.write_bytes(member + b"and more")
     with open_gzip(path) as stream, pytest.raises(NergError, match="a.gz"):

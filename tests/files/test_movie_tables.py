@@ -71,7 +71,7 @@ def test_edits_multiply_samples(tmp_path):
         if passes:
             checked(tmp_path / FILE, DATA, whole)
             continue
-        with pytest.raises(ValueError, match="900 samples in 40 edits"):
+        with pytest.raises(ValueError, match="900.*40"):
             checked(tmp_path / FILE, DATA, whole)
 
 
@@ -80,7 +80,7 @@ def test_tables_hold_their_entries(kind, size, tmp_path):
     checked(tmp_path / FILE, DATA, box(b"moov", track(box_table(kind, 3, bytes(3 * size)))))
     with pytest.raises(ValueError, match=f'"{kind.decode()}" claims 4 entries, and holds 3'):
         checked(tmp_path / FILE, DATA, box(b"moov", track(box_table(kind, 4, bytes(3 * size)))))
-    with pytest.raises(ValueError, match='"stsz" claims 268,435,456 entries, and holds 3'):
+    with pytest.raises(ValueError, match='"stsz".*268,435,456.*3'):
         checked(tmp_path / FILE, DATA, box(b"moov", track(sizes(0, 1 << 28, bytes(12)))))
 
 

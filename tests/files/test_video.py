@@ -78,7 +78,7 @@ def test_sizes_that_players_do_not_show(av, tmp_path, shape, said):
 
 
 def test_frames_of_one_size(av, tmp_path):
-    with pytest.raises(NergError, match="80 x 48 pixels, and one of 40 x 48"), video_frames(tmp_path / "a.mp4") as add:
+    with pytest.raises(NergError, match="80.*48.*40.*48"), video_frames(tmp_path / "a.mp4") as add:
         add(np.zeros((48, 80, 3), np.uint8))
         add(np.zeros((48, 40, 3), np.uint8))
     assert not list(tmp_path.iterdir())
@@ -103,5 +103,5 @@ def test_what_interrupts_leaves_nothing(av, tmp_path):
 
 def test_without_pyav(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(ImportError, match=r"PyAV, which is not installed: pip install \"nerg-mi\[video\]\""):
+    with pytest.raises(ImportError, match=r'"nerg-mi\[video\]\"'):
         check_video(25.0)

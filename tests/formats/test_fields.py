@@ -102,10 +102,10 @@ def test03_without_occupancy_and_step(tmp_path):
 
 def test04_the_other_kind(tmp_path):
     save_gaze(gaze(), tmp_path / "g", {})
-    with pytest.raises(ValueError, match="holds a gaze field where a radiance field is needed"):
+    with pytest.raises(ValueError, match="holds a gaze field"):
         load_radiance(tmp_path / "g", ns)
     save_radiance(radiance(), tmp_path / "f", {})
-    with pytest.raises(ValueError, match="holds a radiance field where a gaze field is needed"):
+    with pytest.raises(ValueError, match="holds a radiance field"):
         load_gaze(tmp_path / "f", ns)
 
 
@@ -262,7 +262,7 @@ def test_a_blind_density_that_single_precision_cannot_hold_is_refused(tmp_path, 
     save_gaze(LogGazeField.random(LogGazeConfig(GRID, prior=4), BOX, ns), tmp_path / "g.safetensors", {})
     load_gaze(tmp_path / "g.safetensors", ns)
     rewrite(tmp_path / "g.safetensors", lambda tensors, meta: tensors["prior"].fill(value))
-    with pytest.raises(NergError, match='g.safetensors.*"prior" holds values beyond 80'):
+    with pytest.raises(NergError, match='g.safetensors.*"prior".*80'):
         load_gaze(tmp_path / "g.safetensors", ns)
 
 

@@ -322,7 +322,7 @@ def test05_training_in_torch_and_back(torch, interop, tmp_path):
 @pytest.mark.parametrize("change", [lambda p: p.double(), lambda p: p[:, :2], lambda p: p[:10], lambda p: p[0]])
 def test06_wrong_tensors(torch, interop, change):
     module, (p, d) = interop.RadianceModule(radiance()), rays(torch, 20)
-    with pytest.raises(ValueError, match=r"must be a float32 tensor \(N, 3\) on cpu"):
+    with pytest.raises(ValueError, match="float32.*3"):
         module(change(p), d)
 
 

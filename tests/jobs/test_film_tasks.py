@@ -58,6 +58,6 @@ def test_a_scene_that_reads_another_file_than_was_planned_with_is_refused(scene,
     shutil.copy(tmp_path / "more.xml", tmp_path / "worker" / "more.xml")
     inputs = {name: tmp_path / "worker" / name for name in ("scene.xml", "more.xml")}
     parameters = {"scene": "scene.xml", "options": chosen(OPTIONS), "defaults": {}}
-    with pytest.raises(NergError, match="is not the file that the job was planned with; name files relative"):
+    with pytest.raises(NergError, match="file that the job"):
         make_picture(parameters, inputs, tmp_path / "a.png")
     assert not (tmp_path / "a.png").exists()

@@ -280,7 +280,7 @@ def test_an_ensemble_is_one_option(tmp_path):
 
 
 def test_a_place_of_hits_needs_a_file(rays):
-    with pytest.raises(NergError, match="need a file for the gaze field"):
+    with pytest.raises(NergError, match="need a file"):
         train_gaze(rays, options=replace(QUICK, geometry="hits"))
 
 

@@ -61,7 +61,7 @@ def test_a_place_is_found_again_where_its_checkpoint_is(rays, tmp_path, kind):
 
 
 def test_a_checkpoint_that_does_not_say_where_it_was_trained():
-    with pytest.raises(NergError, match="does not say what it was trained in"):
+    with pytest.raises(NergError, match="does not say"):
         place_of_training(Path("gaze.safetensors"), {}, BOX, GazeEvaluationOptions(), ns)
 
 
@@ -81,5 +81,5 @@ def test_a_similarity_is_four_rows_of_a_file(tmp_path):
     assert read_similarity(path, "--align", "rays to field").scale == pytest.approx(3)
     for wrong in ("[1, 2]", '{"a": 1}', json.dumps(np.diag([3.0, 2, 3, 1]).tolist())):
         path.write_text(wrong)
-        with pytest.raises(NergError, match=r"--align-views needs .* from photos to field; .*align\.json"):
+        with pytest.raises(NergError, match=r"--align-views.*align\.json"):
             read_similarity(path, "--align-views", "photos to field")

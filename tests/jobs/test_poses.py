@@ -188,7 +188,7 @@ def test_photos_that_are_too_few(photos, finds, tmp_path):
         find_poses(photos, tmp_path / "capture")
     for k in range(2, 6):
         (photos / f"{k}.png").write_bytes((photos / "0.png").read_bytes())
-    with pytest.raises(NergError, match='of the others, left out "2.png": it is the same file as "0.png"'):
+    with pytest.raises(NergError, match='"2.png".*"0.png"'):
         find_poses(photos, tmp_path / "capture")
     assert os.listdir(tmp_path) == ["photos"]
 

@@ -125,7 +125,7 @@ def test_evaluations_are_made(run, tmp_path, monkeypatch):
     found = make_report(files, tmp_path / "a.html", replace(SMALL, evaluate=True)).run
     assert asked == ["pos"] and found.results[0].rows[0]["method"] == "gaze field"
     assert found.verdicts[0][1].grade == "none"  # of three positions
-    with pytest.raises(NergError, match="--evaluate scores the field on rays, and there are none"):
+    with pytest.raises(NergError, match="--evaluate"):
         make_report(files[:1], tmp_path / "a.html", replace(SMALL, evaluate=True))
 
 
@@ -138,9 +138,9 @@ def test_evaluations_of_others_are_refused_or_doubted(run, tmp_path):
         return folder
 
     gaze = run / "gaze.safetensors"
-    with pytest.raises(NergError, match="is an evaluation of another gaze field"):
+    with pytest.raises(NergError, match="evaluation of another gaze"):
         make_report([gaze, evaluation(gaze_sha256="ab")], tmp_path / "a.html", SMALL)
-    with pytest.raises(NergError, match='two of the evaluations are of the split "pos"'):
+    with pytest.raises(NergError, match='"pos"'):
         make_report([gaze, evaluation(), evaluation()], tmp_path / "a.html", SMALL)
     found = make_report([gaze, evaluation(gaze="other.safetensors")], tmp_path / "a.html", SMALL).run
     assert "a field called other.safetensors" in found.doubts[0]

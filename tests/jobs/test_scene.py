@@ -162,7 +162,7 @@ def test_places_of_any_unit(rgb, tmp_path, kind, scale):
 
 def test_a_picture_that_would_be_empty_is_refused(rgb, folder, tmp_path):
     away = SceneOptions(camera_from=(9, 0, 0), camera_to=(20, 0, 0), mode=MODE)
-    with pytest.raises(NergError, match="its picture would be empty; give another one with --from"):
+    with pytest.raises(NergError, match="--from"):
         write_scene([folder / "mesh.ply"], tmp_path / "a.xml", away)
     assert not (tmp_path / "a.xml").exists()
 
@@ -192,7 +192,7 @@ def test_gaze_alone_finds_its_place_by_its_name_and_sum(rgb, folder, tmp_path):
     options = SceneOptions(observer=(0, 0, 0), mode=MODE)
     write_scene([other, folder / "field.safetensors"], tmp_path / "c.xml", options, told)
     assert any("was trained in another file" in line for line in told.warnings)
-    with pytest.raises(NergError, match="does not say what it was trained in; name its place"):
+    with pytest.raises(NergError, match="does not say"):
         write_scene([folder / "gaze.safetensors"], tmp_path / "d.xml", SceneOptions(mode=MODE))
 
 
@@ -317,7 +317,7 @@ def test_what_makes_no_scene(rgb, folder, tmp_path, names, options, said):
 
 def test_a_gaze_field_without_anything_needs_an_observer(rgb, folder, tmp_path):
     gaze = trained(folder, "of_nothing.safetensors", {"geometry": "none"})
-    with pytest.raises(NergError, match="say where the observer is with --observer"):
+    with pytest.raises(NergError, match="--observer"):
         write_scene([gaze], tmp_path / "a.xml", SceneOptions(mode=MODE))
     result = write_scene([gaze], tmp_path / "a.xml", SceneOptions(observer=(0.1, 0, 0), mode=MODE))
     _, found = shown(result.path)

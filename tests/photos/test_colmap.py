@@ -253,7 +253,7 @@ def test_a_file_without_line_ends_is_read_in_pieces(tmp_path, monkeypatch):
     write_txt(tmp_path, ["a.png"])
     monkeypatch.setattr(colmap, "_PIECE", 1 << 21)
     (tmp_path / "cameras.txt").write_bytes(bytes(1 << 23))
-    with pytest.raises(NergError, match="line 1 .*cameras.txt.* has 2,097,152 characters"):
+    with pytest.raises(NergError, match="1.*cameras.txt.*2,097,152"):
         read_colmap(tmp_path, tmp_path / "images")
 
 

@@ -88,7 +88,7 @@ def test_a_set_without_overlap_is_refused(ring):
 def test_a_set_without_a_usable_picture_is_refused(ring):
     for path in (ring / "images").iterdir():
         path.write_bytes(b"")
-    with pytest.raises(ValueError, match="none of the 9.*0.png"):
+    with pytest.raises(ValueError, match="9.*0.png"):
         open_dataset(ring, holdout=0)
 
 
@@ -204,7 +204,7 @@ def test_depth_far_outside_of_the_cameras_is_refused(ring):
     rewrite(ring, lambda c: [f.update(depth_file_path="d.npy") for f in c["frames"]])
     assert np.allclose(np.median(open_dataset(ring).train[0].depth), 2.0, rtol=0.2)
     rewrite(ring, lambda c: c.update(depth_unit_scale_factor=1.0))
-    with pytest.raises(NergError, match="does not fit its cameras.*depth_unit_scale_factor.*--no-depth"):
+    with pytest.raises(NergError, match="depth_unit_scale_factor.*--no-depth"):
         open_dataset(ring)
     assert open_dataset(ring, depth=False).train
 

@@ -89,7 +89,7 @@ def test_depth_of_an_exr_is_the_channel_of_that_name(tmp_path, names):
 def test_an_exr_of_which_no_channel_is_the_depth_is_refused(tmp_path):
     rng = np.random.default_rng(0)
     write_exr(tmp_path / "a.exr", {n: rng.random((2, 3)).astype(np.float32) for n in "RGB"})
-    with pytest.raises(NergError, match="a.exr.*R, G, B.*call one of them Z"):
+    with pytest.raises(NergError, match="a.exr"):
         read_depth(DepthFile(tmp_path / "a.exr"))
 
 

@@ -28,7 +28,7 @@ def test_points_of_one_world_that_are_known_well(tmp_path, monkeypatch):
     assert points.dtype == np.float32 and points.tolist() == [[1, 2, 3], [0.5, 0, -1]]
     assert read_semidense(path, "b").tolist() == [[1, 1, 1]]
     assert len(read_semidense(path, "a", inv_dist_std=1, dist_std=1)) == 4
-    with pytest.raises(ValueError, match='no point of the world "c"; there are a, b'):
+    with pytest.raises(ValueError, match='"c"'):
         read_semidense(path, "c")
     with pytest.raises(ValueError, match="holds no point that is known to 0.005 1/m and -1 m"):
         read_semidense(path, dist_std=-1)
@@ -49,7 +49,7 @@ def test_what_is_no_file_of_points(tmp_path):
     with pytest.raises(ValueError, match="5 cells, the header has 6"):
         read_semidense(tmp_path / "p.csv")
     (tmp_path / "p.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(ValueError, match="has no column graph_uid, px_world"):
+    with pytest.raises(ValueError, match="graph_uid.*px_world"):
         read_semidense(tmp_path / "p.csv")
 
 

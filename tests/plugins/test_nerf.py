@@ -57,13 +57,13 @@ def test03_parameters(rgb, tmp_path, field):
 def test04_placements_that_are_no_similarity(rgb, tmp_path, field, change):
     m = np.eye(4)
     m[{"mirror": (0, 0), "shear": (0, 1), "uneven": (2, 2)}[change]] = {"mirror": -1, "shear": 0.5, "uneven": 3}[change]
-    with pytest.raises(RuntimeError, match='"to_world" of a field must be a rotation'):
+    with pytest.raises(RuntimeError, match='"to_world"'):
         load(rgb, tmp_path / "f.safetensors", to_world=rgb.ScalarTransform4f(m.tolist()))
 
 
 def test05_wrong_files(rgb, tmp_path):
     fields.gaze(tmp_path / "g.safetensors")
-    with pytest.raises(RuntimeError, match="holds a gaze field where a radiance field is needed"):
+    with pytest.raises(RuntimeError, match="holds a gaze field"):
         load(rgb, tmp_path / "g.safetensors")
     (tmp_path / "x.safetensors").write_bytes(b"no")
     with pytest.raises(RuntimeError, match="x.safetensors.*not a readable safetensors file"):
@@ -130,7 +130,7 @@ def test_as_a_medium_it_absorbs_what_the_marcher_does(rgb, files, placed):
 
 
 def test_a_medium_needs_a_bound(rgb, files):
-    with pytest.raises(RuntimeError, match='give the volume a "max_density"'):
+    with pytest.raises(RuntimeError, match='"max_density"'):
         medium_scene(rgb, files, 1)
 
 

@@ -150,5 +150,5 @@ def test05_without_it_the_checkpoint_is_refused(rgb, tmp_path):
     path = tmp_path / "g.safetensors"
     volume(path, lobe())
     del gaze_base._KINDS["lobe"]
-    with pytest.raises(ValueError, match='of the kind "lobe", which this version does not know'):
+    with pytest.raises(ValueError, match='"lobe"'):
         load_gaze(path, ns)

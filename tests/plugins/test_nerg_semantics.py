@@ -54,10 +54,10 @@ def test01_emit_takes_the_fields_features(rgb, files, tmp_path, semantic, own, a
 def test02_a_field_with_other_features_is_refused(rgb, files, tmp_path):
     integrator = semantic_scene(files, tmp_path, "gaze", semantic="snapshot")
     without = {k: v for k, v in integrator.items() if k != "field"} | {"density": {"type": "constvolume", "value": 1.0}}
-    with pytest.raises(RuntimeError, match='7 semantic features of a "field", but there is none'):
+    with pytest.raises(RuntimeError, match='7.*"field"'):
         rgb.load_dict(without)
     fields.radiance(tmp_path / "field.safetensors", geometry=5)
-    with pytest.raises(RuntimeError, match='7 semantic features of a "field", but that has 5'):
+    with pytest.raises(RuntimeError, match='7.*"field".*5'):
         rgb.load_dict({**integrator, "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")}})
     assert rgb.load_dict(integrator).aov_names() == ["gaze.Y"]
 

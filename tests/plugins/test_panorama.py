@@ -153,9 +153,9 @@ def test10_is_moved_through_traverse(rgb):
 
 
 def test11_wrong_values(rgb):
-    with pytest.raises(RuntimeError, match='"to_world" of a panorama must be a rotation'):
+    with pytest.raises(RuntimeError, match='"to_world"'):
         rgb.load_dict(panorama(rgb, rgb.ScalarTransform4f().scale([1, 2, 1])))
-    with pytest.raises(RuntimeError, match='"height" of the film of a panorama'):
+    with pytest.raises(RuntimeError, match='"height"'):
         rgb.load_dict(panorama(rgb, height=1))
     with pytest.raises(RuntimeError, match="unreferenced"):
         rgb.load_dict({**panorama(rgb), "fov": 45.0})

@@ -42,7 +42,7 @@ def test_equal_to_a_list_that_has_it(rgb, files, observed):
 def test_what_cannot_be_asked(rgb, files):
     path = {"type": "scene", "integrator": {"type": "path"}, "sensor": camera(rgb), "shape": {"type": "sphere"}}
     scene = rgb.load_dict(path)
-    with pytest.raises(NergError, match='has "PathIntegrator"; "nerg scene a.xml -o new.xml" writes one'):
+    with pytest.raises(NergError, match='"PathIntegrator".*"nerg scene a.xml -o new.xml"'):
         render_asked("a.xml", scene, scene.sensors()[0], ["depth"])
     scene = rgb.load_dict({"type": "scene", "integrator": with_gaze(files), "sensor": camera(rgb)})
     with pytest.raises(NergError, match='"kde", which needs'):

@@ -158,7 +158,7 @@ def test_pictures_of_a_scene_are_looked_at(tmp_path, name):
 def test_samples_of_the_option_are_bounded(tmp_path):
     from nerg_mi.jobs.pictures import PictureOptions, render_file
 
-    with pytest.raises(NergError, match="--spp must lie in 0 .. 16777216"):
+    with pytest.raises(NergError, match="--spp.*0.*16777216"):
         render_file(tmp_path / "s.xml", tmp_path / "a.exr", PictureOptions(spp=1 << 31))
 
 

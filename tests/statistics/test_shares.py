@@ -104,5 +104,5 @@ def test04_without_areas_eyes_or_gaze():
     dark = lambda eye: lambda d: (np.zeros((1, len(d))), np.ones(len(d)))
     assert gaze_shares(dark, EYES[:1], [Box(BOXES[0])], [(0,)], 0.0).share.tolist() == [[0.0]]
     broken = lambda eye: lambda d: (np.full((1, len(d)), np.nan), np.ones(len(d)))
-    with pytest.raises(NergError, match=r"the gaze of the observer at \[0.3, -2.0, 1.6\] is not finite"):
+    with pytest.raises(NergError, match="0.3.*2.0.*1.6"):
         gaze_shares(broken, EYES[:1], [Box(BOXES[0])], [(0,)], 0.0)

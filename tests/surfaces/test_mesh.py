@@ -35,7 +35,7 @@ def test03_flat_and_repeated_faces_are_left_out_at_any_scale(scale):
 
 
 def test04_what_is_no_surface():
-    with pytest.raises(NergError, match="the vertices of the wall must have coordinates from"):
+    with pytest.raises(NergError, match="vertices of the wall"):
         weld([(0, 0, np.nan)], [(0, 0, 0)], "the wall")
     with pytest.raises(NergError, match="row 1 is"):
         weld([(0, 0, 0), (0, 0, 1.1e7), (1, 0, 0)], [(0, 1, 2)])

@@ -46,5 +46,5 @@ def test04_an_observer_beyond_what_can_be_squared_ends(far):
 
 def test05_pieces_are_counted_before_they_are_cut(monkeypatch):
     monkeypatch.setattr("nerg_mi.surfaces.sources.MOST_PIECES", 1000)
-    with pytest.raises(NergError, match="sees the surfaces in more than 1,000 pieces of .* larger --angle"):
+    with pytest.raises(NergError, match="1,000.*--angle"):
         pieces_of(ROOM, np.full(3, 0.5), 0.02)

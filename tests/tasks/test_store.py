@@ -131,7 +131,7 @@ def test_the_probe_tells_who_shares_the_folder(store, tmp_path):
 
 def test_where_nothing_can_be_written(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(NergError, match="one of its parents is a file"):
+    with pytest.raises(NergError, match="parents is a file"):
         Store(tmp_path / "file" / "store")
 
 

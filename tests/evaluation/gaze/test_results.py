@@ -54,7 +54,7 @@ def test_what_is_none(tmp_path, change):
     path = tmp_path / "gaze.json"
     whole = {**ABOUT, "methods": ROWS[1:], "persons": PERSONS}
     path.write_text(json.dumps(change if isinstance(change, list) else {**whole, **change}))
-    with pytest.raises(NergError, match='is no evaluation of a gaze field .*"nerg eval gaze"'):
+    with pytest.raises(NergError, match='"nerg eval gaze"'):
         read_results(path)
     path.write_text(json.dumps(whole))
     assert read_results(path).people == 1

@@ -116,7 +116,7 @@ def test_a_torch_module_of_a_dense_grid(torch):
 
 def test_sizes_of_a_dense_grid_have_its_own_bounds(tmp_path):
     save_radiance(RadianceField.random(RadianceConfig(DenseConfig(size=17), width=16), BOX, ns), tmp_path / "f", {})
-    with pytest.raises(ValueError, match='"size" of its grid must be a whole number from 1 to 16, not 17'):
+    with pytest.raises(ValueError, match='"size".*1.*16.*17'):
         load_radiance(tmp_path / "f", ns)
 
 

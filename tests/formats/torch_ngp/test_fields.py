@@ -157,13 +157,13 @@ def test10_a_grid_of_another_resolution(tmp_path):
 def test11_fields_without_a_torch_ngp_form(tmp_path):
     config = RadianceConfig(HashGridConfig(levels=2, log2_rows=8, base=4, finest=16), width=16)
     field = RadianceField.random(config, Box((0, 0, 0), (1, 2, 3)), ns)
-    with pytest.raises(ValueError, match="no torch-ngp form: its unit cube must be .*; its grid .*; its networks"):
+    with pytest.raises(ValueError, match="torch-ngp form: its unit"):
         write_torch_ngp(field, tmp_path / "x.pth")
     assert not list(tmp_path.iterdir())
 
 
 def test12_a_deferred_field_has_none(tmp_path):
     field = RadianceField.random(RadianceConfig(HashGridConfig(), deferred=True), Box((-1, -1, -1), (1, 1, 1)), ns)
-    with pytest.raises(ValueError, match="no torch-ngp form: torch-ngp asks the colour network at every sample"):
+    with pytest.raises(ValueError, match="torch-ngp form: torch-ngp asks"):
         write_torch_ngp(field, tmp_path / "x.pth")
     assert not list(tmp_path.iterdir())

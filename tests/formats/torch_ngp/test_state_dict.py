@@ -94,7 +94,7 @@ def test_a_grid_is_read_off_its_levels(tmp_path):
     grid = StateDict(tmp_path / "g.pth", open_checkpoint(tmp_path / "g.pth")[1])
     config = grid_config(grid, "e", 512.0)
     assert config.offsets() == where.tolist() and config.finest == 512 and isinstance(config.finest, int)
-    with pytest.raises(NergError, match="not a grid from 16 to 32: give its finest resolution with --finest"):
+    with pytest.raises(NergError, match="16.*32.*--finest"):
         grid_config(grid, "e", 32)
 
 
@@ -123,7 +123,7 @@ def test_moving_averages(tmp_path, torch):
         assert np.array_equal(field.color_net.weights[2].numpy(), factor * state["color_net.2.weight"])
         assert np.array_equal(field.grid.table.numpy()[:100], factor * state["encoder.embeddings"].ravel()[:100])
         assert origin["weights"] == said and origin["global_step"] == 30
-    with pytest.raises(ValueError, match="holds no moving averages.*--no-ema"):
+    with pytest.raises(ValueError, match="--no-ema"):
         read_torch_ngp(save(tmp_path / "raw.pth", state), ns, ema=True)
     bad = {"shadow_params": [np.zeros((2, 2), np.float32)]}
     with pytest.raises(ValueError, match="1 moving averages .* do not fit its 6 weights"):

@@ -37,7 +37,7 @@ def test02_shapes_of_a_scene_receive_or_hide(rgb, tmp_path):
     assert both.names == ("sign", "wall") and np.bincount(both.shape).tolist() == [12, 2]
     sign = read_receivers(tmp_path / "a.xml", ("sign",), 16, ns, Recorder())
     assert sign.names == ("sign",) and len(sign.mesh.faces) == 12 and len(sign.others) == 1
-    with pytest.raises(NergError, match='has no shape "door"; it has sign, wall'):
+    with pytest.raises(NergError, match='"door"'):
         read_receivers(tmp_path / "a.xml", ("door",), 16, ns, Recorder())
     (tmp_path / "b.xml").write_text(SCENE.format(more='<shape type="sphere" id="ball"/>'))
     with pytest.raises(NergError, match='"ball" .* is a Sphere'):
@@ -52,5 +52,5 @@ def test03_a_field_gives_its_surface(rgb, tmp_path):
     fields.radiance(tmp_path / "f.safetensors")
     found = read_receivers(tmp_path / "f.safetensors", (), 8, ns, Recorder())
     assert found.names == ("f",) and len(found.mesh.faces) > 10
-    with pytest.raises(NergError, match="--shape names shapes of a scene"):
+    with pytest.raises(NergError, match="--shape"):
         read_receivers(tmp_path / "f.safetensors", ("a",), 8, ns, Recorder())

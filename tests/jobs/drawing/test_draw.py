@@ -34,7 +34,7 @@ def test_what_is_refused(tmp_path):
         draw("sheet", a, tmp_path / "b.pdf")
     with pytest.raises(MissingFile, match="gone.exr"):
         draw("sheet", tmp_path / "gone.exr")
-    with pytest.raises(NergError, match="1 to 400 files, and 0"):
+    with pytest.raises(NergError, match="1.*400.*0"):
         draw("sheet", [])
     with pytest.raises(NergError, match='no figure "pie"'):
         draw("pie", a)

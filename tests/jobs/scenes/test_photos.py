@@ -49,10 +49,10 @@ def test_coordinates_of_the_training(photos):
 
 
 def test_other_photos(photos):
-    with pytest.raises(NergError, match="is not what the field was trained on"):
+    with pytest.raises(NergError, match="field was trained"):
         camera_of_photo(photos, "0", {"sha256": "0" * 64})
     for photo in ("3", "p9", "-1"):
-        with pytest.raises(NergError, match=r'give --photo a number from 0 to 2, or a name such as "p0.png"'):
+        with pytest.raises(NergError, match='--photo.*0.*2.*"p0.png"'):
             camera_of_photo(photos, photo, {})
 
 

@@ -125,7 +125,7 @@ def test_a_map_of_another_shape_or_of_nobody_is_refused(posed):
     with pytest.raises(FileNotFoundError, match="spectral-residual"):
         open_salience(folder, folder / "nothing")
     write(folder / "maps" / "b.npy", np.ones((32, 32)))
-    with pytest.raises(ValueError, match="b.npy.* 32 x 32 .* 64 x 48"):
+    with pytest.raises(ValueError, match="b.npy.*32.*32.*64.*48"):
         open_salience(folder, folder / "maps")
     with pytest.raises(ValueError, match="per pixel or per steradian"):
         open_salience(folder, folder / "maps", per="radian")
@@ -265,6 +265,6 @@ def test_maps_outside_of_their_folder_are_used_only_if_allowed(posed):
     folder = posed(("a", "b"))
     write(folder / "elsewhere.npy", np.ones((48, 64)))
     (folder / "maps" / "a.npy").symlink_to(folder / "elsewhere.npy")
-    with pytest.raises(NergError, match="salience image .* outside of .*--allow-outside"):
+    with pytest.raises(NergError, match="--allow-outside"):
         open_salience(folder, folder / "maps")
     assert len(open_salience(folder, folder / "maps", allow_outside=True).views) == 1

@@ -199,7 +199,7 @@ def test_others_are_named_and_hidden_ones_are_not(folder):
 
 
 def test_a_folder_without_photos_is_told(folder, tmp_path):
-    with pytest.raises(NergError, match=r"holds no photos .*name the folder that holds them"):
+    with pytest.raises(NergError, match="name the folder"):
         list_photos(folder)
     (folder / "images").mkdir()
     with pytest.raises(NergError, match='did you mean ".*images"'):

@@ -130,7 +130,7 @@ def test_frames_may_not_be_too_large(film, monkeypatch):
     monkeypatch.setattr(module, "PIXELS", 64 * 48 - 1)
     with pytest.raises(NergError, match="no frame that can be decoded, of 3,071 pixels at most"):
         list(sharpest_frames(film, 3))
-    with pytest.raises(NergError, match="64 x 48 pixels, and at most 3,071"):
+    with pytest.raises(NergError, match="64.*48.*3,071"):
         module._check_size(film, 64, 48)
     with pytest.raises(NergError, match="a side of at most 65,500"):
         module._check_size(film, 65_501, 1)
@@ -195,7 +195,7 @@ def test_unknown_codecs_are_told(film, tmp_path, av):
     raw = film.read_bytes()
     # Both what the track says, and what its description does.
     (tmp_path / "a.mp4").write_bytes(raw.replace(b"mp4v", b"xyzw").replace(b"esds", b"free"))
-    with pytest.raises(NergError, match="is coded in a way that is not known"):
+    with pytest.raises(NergError, match="coded in a way"):
         list(sharpest_frames(tmp_path / "a.mp4", 3))
 
 
@@ -223,7 +223,7 @@ def test_ffmpeg_prints_nothing(film, tmp_path, capfd):
 def test_a_video_that_is_mostly_destroyed_is_told(film, monkeypatch):
     monkeypatch.setattr(module, "_LOST", 2)
     monkeypatch.setattr(module, "_LOST_EACH", -1)
-    with pytest.raises(NergError, match="most of the video .* cannot be decoded"):
+    with pytest.raises(NergError, match="most of the video"):
         list(sharpest_frames(film, 3))
 
 
@@ -253,5 +253,5 @@ def test_without_pyav(tmp_path, monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", no_av)
     (tmp_path / "a.mp4").write_bytes(b"film")
-    with pytest.raises(ImportError, match=r"PyAV, which is not installed: pip install \"nerg-mi\[poses\]\""):
+    with pytest.raises(ImportError, match=r'"nerg-mi\[poses\]\"'):
         list(sharpest_frames(tmp_path / "a.mp4", 3))

@@ -99,7 +99,7 @@ def test_unknown_names(made):
 
 def test_more_than_fits(made):
     dataset, rays = made
-    with pytest.raises(NergError, match=r"holds 1,197 such rays, and 1,000 .*--sample"):
+    with pytest.raises(NergError, match="1,197.*1,000.*--sample"):
         dataset.load(most=1000)
     with pytest.raises(NergError, match="more than .* such rays"):
         dataset.load(Conditions(with_hit=True), most=300)
@@ -192,7 +192,7 @@ def test_damaged_parts(tmp_path):
         assert str(path) in str(error.value) and "\n" not in str(error.value)
         account.write_text(kept)
     path.unlink()
-    with pytest.raises(NergError, match="there is no part of a dataset"):
+    with pytest.raises(NergError, match="part of a dataset"):
         dataset.load()
     (tmp_path / "elsewhere.parquet").write_bytes(good)
     path.symlink_to(tmp_path / "elsewhere.parquet")

@@ -33,7 +33,7 @@ def ended(task):
 
 def test_a_process_that_is_ended_from_outside(tmp_path, monkeypatch):
     monkeypatch.setattr(dataset_write, "import_source", ended)
-    with pytest.raises(NergError, match=r"fewer --workers .* what is finished is kept"):
+    with pytest.raises(NergError, match="--workers"):
         update_dataset(tmp_path / "a.rays", sources(tmp_path, 2), recipe(), workers=2)
 
 

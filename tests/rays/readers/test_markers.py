@@ -90,7 +90,7 @@ def test_what_a_file_does_not_say(tmp_path):
     turn, place = turned()
     there = positions(["LFHD", "RFHD", "LBHD", "RBHD"], turn, place)
     write_c3d(path, ["LFHD", "RFHD", "LBHD", "RBHD"], there, units=None, up=None, frames=40)
-    with pytest.raises(NergError, match="names no unit of length.*--units"):
+    with pytest.raises(NergError, match="--units"):
         read("c3d", path)
     said = read("c3d", path, units="m").metadata["complaints"]
     assert "which axis points up; z was taken" in said[0] and "ends after 12 of the 40 frames" in said[1]
@@ -105,7 +105,7 @@ def test_what_a_file_does_not_say(tmp_path):
     write_c3d(tmp_path / "forces.c3d", ["A"], there[:, :0])
     with pytest.raises(NergError, match="holds no markers"):
         read("c3d", tmp_path / "forces.c3d")
-    with pytest.raises(NergError, match="no markers of a head are recognised"):
+    with pytest.raises(NergError, match="markers of a head"):
         read("c3d", path, units="m", keypoints=("A", "B", "C"))
 
 

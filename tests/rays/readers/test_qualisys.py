@@ -80,7 +80,7 @@ def test_a_line_that_is_cut_off(tmp_path):
     text = path.read_text().split("\n")
     text[20] = text[20][:20]
     path.write_text("\n".join(text))
-    with pytest.raises(ValueError, match="ann_g.tsv, line 21: .* is no sample"):
+    with pytest.raises(ValueError, match="ann_g.tsv.*21"):
         read("qualisys", path)
     assert_looks(read("qualisys", path, skip_bad_lines=True), [k for k in range(300) if k != 11])
 
@@ -119,7 +119,7 @@ def test_neon_in_motion_capture(tmp_path):
     with pytest.raises(ValueError, match="say it .--up z"):
         read("neon_mocap", other)
     other.write_text(NEON.replace("timestamp [ns]", "time") + "0\n")
-    with pytest.raises(ValueError, match='no column "timestamp .ns."; its columns are time, LF_X'):
+    with pytest.raises(ValueError, match='"timestamp .ns.".*LF_X'):
         read("neon_mocap", other, up="z")
     other.write_text(NEON.replace("gaze_dir", "dir") + "0\n")
     with pytest.raises(ValueError, match="no columns gaze_dir"):

@@ -73,7 +73,7 @@ def test_what_cannot_be_registered(made_up):
 
     reader = MadeUp()
     reader.name, reader.Options = "other", Other
-    with pytest.raises(ValueError, match="--tick of other is tick .str., and of other readers tick .float."):
+    with pytest.raises(ValueError, match="--tick"):
         registry.register(reader)
     assert "other" not in registry.reader_names()
     with pytest.raises(KeyError):
@@ -83,16 +83,16 @@ def test_what_cannot_be_registered(made_up):
 def test_names():
     assert registry.TABLE not in registry.preset_names()
     assert set(registry.reader_names()) == {*registry.preset_names(), registry.TABLE}
-    with pytest.raises(NergError, match="choose one of skeleton, .*, or give a column map"):
+    with pytest.raises(NergError, match="choose one of skeleton"):
         registry.reader_named("etch")
     with pytest.raises(NergError, match="choose one of skeleton"):
         registry.read_rays("etch", "a.csv")
 
 
 def test_options_of_another_reader():
-    with pytest.raises(NergError, match="preset varjo knows its own conventions; leave out --tick, --map"):
+    with pytest.raises(NergError, match="--tick.*--map"):
         registry.make_options("varjo", {"tick": 1.0, "columns": "x"})
-    with pytest.raises(NergError, match="--marker belongs to a preset"):
+    with pytest.raises(NergError, match="--marker"):
         registry.parse_options("table", {"marker": 0.05})
     with pytest.raises(TypeError, match="varjo takes NoOptions, not MadeUpOptions"):
         registry.read_rays("varjo", "a.csv", MadeUpOptions())

@@ -36,5 +36,5 @@ def test_durations_are_kept_of_steps_that_are_equally_far_apart(monkeypatch):
 
 @pytest.mark.parametrize("change", [{"durations": []}, {"steps": 0}, {"steps": -1}, {"each": 0}, {"extremes": [0.5]}])
 def test_steps_without_durations_and_durations_without_steps_are_refused(change):
-    with pytest.raises(ValueError, match='"clock" is not one of a run'):
+    with pytest.raises(ValueError, match='"clock"'):
         StepClock().restore({**timed(0.5, 0.25).to_dict(), **change})

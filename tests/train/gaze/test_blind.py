@@ -35,7 +35,7 @@ def test_kernels_that_the_table_cannot_show_are_refused():
     """Of one much narrower than a texel nothing would be left but the uniform part."""
     rays = Rays(np.arange(3.0), np.zeros(3), ("a",), np.zeros((3, 3)), np.tile([0.6, 0.0, 0.8], (3, 1)), np.ones(3))
     assert np.exp(blind_of_rays(rays, 64, kappa=400.0)).max() > 40  # 1/sr; its peak is 400 / 2π
-    with pytest.raises(NergError, match="table of 64 rows.*at most 1660"):
+    with pytest.raises(NergError, match="64.*1660"):
         blind_of_rays(rays, 64, kappa=1700.0)
 
 

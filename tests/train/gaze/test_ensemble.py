@@ -106,7 +106,7 @@ def test_an_interrupted_ensemble_goes_on(threads, tmp_path):
         if state.stage == "2/3 fit" and state.steps == 2:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt, match="interrupted while training member 2 of 3; go on with --resume"):
+    with pytest.raises(KeyboardInterrupt, match="2.*3.*--resume"):
         together(path=path, tell=stop)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.member0.safetensors", "a.run"]
     with pytest.raises(NergError, match="started with other probes"):

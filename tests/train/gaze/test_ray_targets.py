@@ -48,7 +48,7 @@ def test_rays_are_aligned_with_the_field(rays, wall):
 
 def test_kernels_that_vanish_between_all_directions_are_refused(rays, wall):
     probes = place_probes(rays, 0.5, count=2, min_rays=8, kappa_rule="fixed", kappa=1e8, seed=1)
-    with pytest.raises(NergError, match="vanish between 16 directions; give a smaller --kappa"):
+    with pytest.raises(NergError, match="16.*--kappa"):
         targets_of_probes(probes, wall, 16)
 
 

@@ -123,7 +123,7 @@ def test_a_result_that_cannot_be_written_is_kept(wall, refit, threads, tmp_path)
 
     settings = replace(PRODUCT, refit=refit)
     how = {"path": path, "every": 1e9}
-    with pytest.raises(NergError, match="the disk is full; .* --resume writes it"):
+    with pytest.raises(NergError, match="--resume"):
         train(wall, settings, SMALL, write=refuse, **how)
     assert path.is_file()
     watch = stopping("", 0)

@@ -17,7 +17,7 @@ from .views import around
 
 def test_there_is_something_to_learn_from():
     assert Supervision(None, around(1)).views[0].name == "v0"
-    with pytest.raises(ValueError, match="from rays, from views or from both"):
+    with pytest.raises(ValueError, match="rays, from views"):
         Supervision(None)
 
 

@@ -57,5 +57,5 @@ def test_previews_show_the_first_watched_view(dataset, tmp_path, monkeypatch):
 
 
 def test_nothing_is_resumed_without_a_state(dataset):
-    with pytest.raises(NergError, match="nothing to resume: name the file that holds the state"):
+    with pytest.raises(NergError, match="nothing to resume: name"):
         train_field(dataset, TINY, settings(steps=1), ns, resume=True)

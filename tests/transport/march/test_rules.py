@@ -95,7 +95,7 @@ def test06_wrong_rules(rgb):
     medium = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0}))
     with pytest.raises(ValueError, match='axis-aligned "gridvolume"'):
         boundaries(RULES.find("cells"), medium)
-    with pytest.raises(ValueError, match='"quadrature" must be one of constant, linear, cells.*, got "simpson"'):
+    with pytest.raises(ValueError, match='"quadrature".*"simpson"'):
         RULES.find("simpson")
 
 

@@ -44,7 +44,7 @@ def test02_sensors_without_a_center(rgb, kind):
         sensor = rgb.load_dict(
             {"type": kind, "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}}
         )
-    with pytest.raises(ValueError, match='the camera is a .* no centre .* explicit "observer"'):
+    with pytest.raises(ValueError, match='"observer"'):
         observer.require_center(sensor, "the camera")
     with pytest.raises(ValueError, match="no centre"):
         observer.center_of_ray([sensor], rays_of(rgb, rgb.load_dict(camera(rgb, [0, 0, 1]))))
@@ -81,7 +81,7 @@ def test04_same_center(rgb):
 
 def test05_no_sensor(rgb):
     ray = rays_of(rgb, rgb.load_dict(camera(rgb, [0, 0, 1])))
-    with pytest.raises(ValueError, match='give the integrator an "observer"'):
+    with pytest.raises(ValueError, match='"observer"'):
         observer.center_of_ray([], ray)
 
 

@@ -265,7 +265,7 @@ def test_worlds(tmp_path):
         "the pose is in another world (graph_uid)": [[7, 9]],
         "there is no pose of the glasses at that time": [[10, 11]],
     }
-    with pytest.raises(ValueError, match='no world "three".*one, two'):
+    with pytest.raises(ValueError, match='"three"'):
         read("aria", tmp_path / "ann", world="three")
     # Two people of different worlds are not in one place, unless one world is asked for.
     write_gaze(tmp_path / "bo/eyegaze.csv", [0, 10_000])

@@ -29,7 +29,7 @@ def test_times(pattern, name, seconds):
     names = FrameNames.parse(pattern)
     assert str(names) == pattern and names.of_recording == ("recording" in pattern)
     if seconds is None:
-        with pytest.raises(NergError, match="no image of the model is called"):
+        with pytest.raises(NergError, match="image of the model"):
             names.times([name], "ann (2)", FRAMES, None, 1.7e18)
         return
     found = names.times([name, "IMG_77x.JPG"], "ann (2)", FRAMES, None, 1.7e18)
@@ -70,5 +70,5 @@ def test_frames_that_there_are_not(pattern, name, frames, fps, message):
 
 @pytest.mark.parametrize("pattern", ["", "frame_*", "{frame0}_{s}", "{frame1}{frame1}", "{number}"])
 def test_patterns_without_a_time(pattern):
-    with pytest.raises(NergError, match="--frames is .*; write the names"):
+    with pytest.raises(NergError, match="--frames"):
         FrameNames.parse(pattern)

@@ -43,7 +43,7 @@ def test_rays_are_those_of_the_pixels(glasses):
 def test_numbers_from_0_are_a_frame_later(glasses):
     folder, options = glasses
     rays = read("glassestools", folder, **options)
-    with pytest.raises(NergError, match="frame 8 of the video, counted from 0, which has 8; check --frames"):
+    with pytest.raises(NergError, match="8.*0.*8.*--frames"):
         read("glassestools", folder, **{**options, "frames": FrameNames("scene/frame_{frame0}")})
     (folder / "frameTimestamps.tsv").write_text(table("frame_idx\ttimestamp", [[k, 40.0 * k] for k in range(9)], "\t"))
     later = read("glassestools", folder, **{**options, "frames": FrameNames("scene/frame_{frame0}")})

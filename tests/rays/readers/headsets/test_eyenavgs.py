@@ -153,9 +153,7 @@ def test_rows_without_the_other_eye(tmp_path, monkeypatch, block):
 def test_frozen_gaze(tmp_path):
     (tmp_path / "scene_setting.csv").write_text('Scene_Name,Quaternion,Scale\ntrain,"0, 0, 0, 1",2\n')
     still = write(tmp_path, "user1_train.csv", gaze=lambda k: 5.0)
-    with pytest.raises(
-        ValueError, match="nobody's eyes were tracked; of .*user1_train.csv: the gaze of the recording is frozen"
-    ):
+    with pytest.raises(ValueError, match="user1_train.csv"):
         read("eyenavgs", still)
     # Spelt as one of the sites has it. Who keeps their head still as well may have looked at one thing.
     moving, resting = (
@@ -182,20 +180,20 @@ def test_gaze_that_is_locked_to_the_head(tmp_path):
     assert rays.persons == ("user2", "user3") and len(rays) == 800
     (lost,) = rays.metadata["dropped"]
     assert "locked to the head" in lost["reason"] and lost["file"] == behind.name and lost["count"] == 400
-    with pytest.raises(ValueError, match="nobody's eyes were tracked.*locked to the head"):
+    with pytest.raises(ValueError, match="nobody's eyes were tracked"):
         read("eyenavgs", behind)
 
 
 def test_what_is_refused(tmp_path):
     path = write(tmp_path / "a/b")
-    with pytest.raises(ValueError, match="there is no scene_setting.csv beside .*user7_room.csv or above"):
+    with pytest.raises(ValueError, match="scene_setting.csv.*user7_room.csv"):
         read("eyenavgs", path)
     (tmp_path / "scene_setting.csv").write_text(
         'Scene_Name,Quaternion,Scale\nroom,"0, 0, 0, 1",2\nnyc,"0, 0, 0, 1",1\n'
     )
-    with pytest.raises(ValueError, match="user9_nyc.csv is of nyc and .*user7_room.csv of room"):
+    with pytest.raises(ValueError, match="user9_nyc.csv.*user7_room.csv"):
         read("eyenavgs", path, write(tmp_path, "user9_nyc.csv"))
-    with pytest.raises(ValueError, match='"moon", of which .* has nothing .it has room, nyc'):
+    with pytest.raises(ValueError, match='"moon"'):
         read("eyenavgs", write(tmp_path, "user9_moon.csv"))
     with pytest.raises(ValueError, match="there is no recording"):
         read("eyenavgs", tmp_path / "a")
@@ -205,5 +203,5 @@ def test_what_is_refused(tmp_path):
         read("eyenavgs", path, eye="third")
     for row in ('room,"0, 0, 0",2', 'room,"0, 0, 0, 1",0', 'room,"0, 0, 0, 0",1', "room,x,1"):
         (tmp_path / "scene_setting.csv").write_text(f"Scene_Name,Quaternion,Scale\n{row}\n")
-        with pytest.raises(ValueError, match="line 2: 'room' needs a scale above 0"):
+        with pytest.raises(ValueError, match="2.*'room'.*0"):
             read_scene_settings(tmp_path / "scene_setting.csv")

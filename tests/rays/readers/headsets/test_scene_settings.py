@@ -21,7 +21,7 @@ def test_there_and_back(tmp_path):
 
 def test_what_is_refused(tmp_path):
     (tmp_path / "s.csv").write_text('Scene_Name,Quaternion,Scale,Initial_Position\nhall,"0, 0, 0, 1",2,"1, 0"\n')
-    with pytest.raises(ValueError, match="s.csv, line 2: 'hall' needs"):
+    with pytest.raises(ValueError, match="s.csv.*2.*'hall'"):
         read_scene_settings(tmp_path / "s.csv")
     (tmp_path / "s.csv").write_text("Place,Scale\nhall,2\n")
     with pytest.raises(ValueError, match="no column Scene_Name, Quaternion"):

@@ -118,7 +118,7 @@ def test_validity(tmp_path, column, values, kept):
 def test_values_of_validity_are_of_all_files(tmp_path):
     files = log(tmp_path / "a.csv", "gaze_status", [1, 1]), log(tmp_path / "b.csv", "gaze_status", [1, 2])
     assert len(read("unity", *files)) == 1
-    with pytest.raises(ValueError, match=r"'gaze_status' holds 1 \(2 rows\), and nothing says"):
+    with pytest.raises(ValueError, match="'gaze_status'.*1.*2"):
         read("unity", files[0])
     assert len(read("unity", files[0], valid="gaze_status=1")) == 2 and len(read("unity", files[0], valid="none")) == 2
 

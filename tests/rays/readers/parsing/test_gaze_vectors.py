@@ -45,5 +45,5 @@ def test_bad_lines_count_as_samples(tmp_path):
     told = []
     (block,) = iterate_gaze_vectors(tmp_path / "a_g.tsv", lambda line, why: told.append(line))
     assert told == [4, 5] and np.allclose(block.times, [-1, -0.7]) and block.samples.tolist() == [0, 3]
-    with pytest.raises(ValueError, match="line 4: '1.2.*7 cells, not 6"):
+    with pytest.raises(ValueError, match="4.*1.2.*7.*6"):
         list(iterate_gaze_vectors(tmp_path / "a_g.tsv"))

@@ -49,7 +49,7 @@ def test_axes_and_forward():
         "x",
     ]
     assert poses.axis("-y", "up").tolist() == [0, -1, 0]
-    with pytest.raises(NergError, match='up is "w"; it is one of x, -x'):
+    with pytest.raises(NergError, match='"w"'):
         poses.axis("w", "up")
     with pytest.raises(NergError, match="both z"):
         poses.rotations_from_angles(np.zeros((1, 3)), "z", "-z")

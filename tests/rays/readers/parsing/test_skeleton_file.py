@@ -99,7 +99,7 @@ def test_bad_lines_are_told_and_left_out(tmp_path, poses):
             and rows.lines.tolist() == [1, 3, 5, 7, 9, 11, 12]
             and sorted(bad_lines) == [2, 4, 6, 8, 10, 13]
         )
-    with pytest.raises(NergError, match="line 4: 2 fields.*--skip-bad-lines"):
+    with pytest.raises(NergError, match="4.*2.*--skip-bad-lines"):
         read_skeleton(path)
 
 

