@@ -24,6 +24,8 @@
 # Set-up is done once: the second run of any of these only does its own work. `make fuzz`, `make faults` and `make bench` print
 # tables; ARGS="--update docs/trust.md" puts those of the first two there, ARGS="--page docs/performance.md" those of the third.
 
+# Tests start many processes: byte code that is kept spares each of them compiling the package, and pytest its rewriting.
+export PYTHONDONTWRITEBYTECODE =
 PYTHON ?= python3
 ARGS ?=
 RUN = .venv/bin/python

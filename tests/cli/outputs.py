@@ -71,7 +71,13 @@ def _below(folder: str, names: str) -> tuple[str, ...]:
 
 
 CASES = (
-    Case("demo", "-o {o}/demo --width 24 --spp 1 -m llvm_ad_rgb", _below("demo", DEMO), ("demo",)),
+    Case(
+        "demo",
+        "-o {o}/demo --width 24 --spp 1 -m llvm_ad_rgb",
+        _below("demo", DEMO),
+        ("demo",),
+        ("jobs.report._Work.run",),
+    ),
     Case("render", "{i}/scene.xml -o {o}/a.exr -m llvm_ad_rgb", ("a.exr",)),
     Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb", ("a.png",)),
     Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb --frames {i}/frames.csv", ("a_0001.png", "a_0002.png")),
@@ -105,6 +111,7 @@ CASES = (
         "report",
         "{i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 --points 200 -m llvm_ad_rgb",
         ("a.html",),
+        once=("jobs.report._Work.run",),
     ),
     Case("rays import", "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'", ("a.npz",)),
     Case(
@@ -129,7 +136,7 @@ CASES = (
         "{i}/photos -o {o}/a.safetensors --steps 2 --holdout 2 --half",
         ("a.safetensors", "a.preview.png"),
         ("a.safetensors", "a.preview.png", "a.run"),
-        ("training.radiance.density_grid.DensityGrid.bound",),
+        ("train.radiance_grid.DensityGrid.bound",),
     ),
     Case(
         "train gaze",
@@ -162,7 +169,7 @@ CASES = (
         "{i}/gaze.safetensors {i}/rays.npz -o {o}/eval --min-rays 8 --directions 128 --resamples 2 --pictures 1",
         _below("eval", EVALUATION),
         ("eval",),
-        tuple(f"evaluation.gaze.evaluation.{name}" for name in ("evaluate_gaze", "split_half", "person_rows")),
+        tuple(f"evaluation.gaze.{name}" for name in ("evaluate_gaze", "split_half", "person_rows")),
     ),
     Case(
         "bake",
@@ -176,7 +183,9 @@ CASES = (
         "bake", "{i}/splats.ply --gaze {i}/gaze.safetensors --observer 0,0,-3 -m llvm_ad_rgb -o {o}/a.ply", ("a.ply",)
     ),
     Case("import", "{i}/nerg.pth -o {o}/a.safetensors -g {o}/g.safetensors", ("a.safetensors", "g.safetensors")),
-    Case("refine", "{i}/ngp.safetensors -o {o}/a.safetensors", ("a.safetensors",)),
+    Case(
+        "refine", "{i}/ngp.safetensors -o {o}/a.safetensors", ("a.safetensors",), once=("jobs.refinement.refine",)
+    ),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density 3", ("a.glb",)),
     Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
@@ -195,7 +204,7 @@ CASES = (
         "slab -o {o}/study --store {i}/store --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
         _below("study", STUDY),
         ("study",),
-        ("evaluation.study.measure.measure", "evaluation.study.measure.scaling"),
+        ("evaluation.study.measure", "evaluation.study.scaling"),
     ),
 )
 

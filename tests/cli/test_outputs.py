@@ -120,7 +120,7 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb):
     assert told_in_a_sentence(code, said) and "one of its parents is a file" in said
 
     # Where there is no room each file is the old one or the new one, and there is no other.
-    for share in (0.5,) if case.once else (0, 0.5):
+    for share in (0, 0.5) if len(made) > 1 and not case.once else (0.5,):
         limit = int(share * max(map(len, made.values())))
         out = tmp_path / f"full{share}"
         for name in case.files:
