@@ -29,9 +29,10 @@ export PYTHONDONTWRITEBYTECODE =
 PYTHON ?= python3
 ARGS ?=
 RUN = .venv/bin/python
-# One process a core, four at most since each takes a gigabyte; a file's tests share what they have made.
+# One process a core, four at most since each takes a gigabyte; a file's tests share what they have made. Files come in the
+# order of tests/conftest.py.
 JOBS ?= auto
-PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
+PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_exr.py tests/files/test_png.py \
 	tests/test_interruption.py tests/renders
 

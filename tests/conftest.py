@@ -7,6 +7,7 @@ import gc
 import importlib.util
 import os
 import signal
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -78,16 +79,20 @@ def _free_memory():
 
 
 def listed_as_slow() -> set[str]:
-    """``file::function`` of the tests in slow.txt."""
+    """``file::function``, or ``file`` where all of its tests are, of what slow.txt lists."""
     lines = (ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").splitlines()
     return {line for line in lines if line and not line.startswith("#")}
 
 
 def pytest_collection_modifyitems(items):
-    slow = listed_as_slow()
+    slow, weight = listed_as_slow(), Counter()
     for item in items:
-        if item.nodeid.partition("[")[0] in slow:
+        file = item.nodeid.partition("::")[0]
+        if file in slow or item.nodeid.partition("[")[0] in slow:
             item.add_marker(pytest.mark.slow)
+        weight[file] += item.get_closest_marker("slow") is not None
+    # Files with many slow tests first: with several processes, all of them end at the same time.
+    items.sort(key=lambda item: -weight[item.nodeid.partition("::")[0]])
 
 
 # ------------------------------------------------------------------------
@@ -131,6 +136,43 @@ def pytest_make_collect_report(collector):
 def torch():
     """The module `torch`; without it the test is skipped, or fails where NERG_REQUIRE_TORCH is set."""
     return pytest.importorskip("torch", reason="torch is not installed (pip install torch)")
+
+
+# ------------------------------------------------------------------------
+#  What is trained or made at random, once a process: files that tests read, and copy where they write beside them
+# ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def standins(tmp_path_factory):
+    """A radiance and a gaze field in place of the store's own: the scene's defaults that name them."""
+    import mitsuba as mi
+
+    from tests.figures.standins import write_standins
+
+    mi.set_variant("llvm_ad_rgb")
+    return write_standins(tmp_path_factory.mktemp("standins"))
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """A folder with ``rays.npz`` of four named people, and ``gaze.safetensors``, trained in their hit points on all but
+    three positions."""
+    from dataclasses import replace
+
+    import mitsuba as mi
+
+    from nerg_mi.jobs.gaze import train_gaze
+    from nerg_mi.jobs.options.gaze import GazeOptions
+    from tests.evaluation.gaze.test_evaluation import crowd
+
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("trained")
+    replace(crowd(1500), persons=("Ada", "Grace", "Mary", "Edsger")).save(folder / "rays.npz")
+    small = {"radius": 0.5, "probes": 8, "steps": 2, "directions": 64, "zones": 0, "min_rays": 8, "voxel": 0.3}
+    options = GazeOptions(geometry="hits", test_zones=1, test_positions=3, **small)
+    train_gaze(folder / "rays.npz", folder / "gaze.safetensors", options)
+    return folder
 
 
 # ------------------------------------------------------------------------

@@ -15,7 +15,6 @@ import pytest
 
 from nerg_mi.jobs import demo
 from tests.conftest import ROOT
-from tests.figures.standins import write_standins
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -125,12 +124,13 @@ XML_PAGES = ("gaze-training.md", "performance.md", "plugins.md", "shapes-and-fie
 
 
 @pytest.fixture
-def place(rgb, tmp_path, monkeypatch):
+def place(rgb, standins, tmp_path, monkeypatch):
     """A folder with what snippets name: stand-ins of the store's fields, a scene of them, rays."""
     from tests.evaluation.gaze.test_evaluation import crowd
     from tests.formats.splats.writers import random_splats, write_inria
 
-    write_standins(tmp_path)
+    for file in standins.values():
+        shutil.copy(file, tmp_path)
     shutil.copy(demo.store_scene(), tmp_path)
     shutil.copy(tmp_path / "store.safetensors", tmp_path / "field.safetensors")
     crowd().save(tmp_path / "day.npz")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 import shlex
 from dataclasses import fields
@@ -21,6 +22,7 @@ FOREIGN = {"--tcnn", "--ff", "--hook-type"} | OF_DASK  # of torch-ngp, pre-commi
 NUMBERS = "zero one two three four five six seven eight nine ten".split()
 
 
+@functools.cache
 def options() -> set[str]:
     """Every option of every command and of every script."""
     found = {"--help"}

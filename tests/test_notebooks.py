@@ -17,6 +17,7 @@ def outputs(book) -> list[list[str]]:
     ]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.ipynb")), ids=lambda p: p.stem)
 def test_it_runs_and_gives_what_is_stored(path, tmp_path):
     nbformat = pytest.importorskip("nbformat", reason="nbclient, of the extra test, is not installed")

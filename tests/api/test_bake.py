@@ -13,6 +13,7 @@ from nerg_mi.rays.rays import Rays
 from tests.surfaces.meshes import box
 
 
+@pytest.mark.nightly
 def test01_the_example_runs(rgb):
     assert doctest.testmod(module).failed == 0
 

@@ -93,7 +93,11 @@ def rays():
     return nerg.Rays(np.arange(n) / 30, who, ("Ada", "Bob"), origin, direction, np.ones(n))
 
 
-@pytest.mark.parametrize("name", nerg.__all__)
+# Each of them trains, or measures, for seconds, which quicker tests of its job do with less.
+LONG = {"ablate", "study", "train_radiance"}
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in LONG)) for n in nerg.__all__])
 def test07_examples_run(name, tmp_path, request):
     value = getattr(nerg, name)
     (test,) = doctest.DocTestFinder(recurse=False).find(value, name, globs={"folder": tmp_path})

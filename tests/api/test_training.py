@@ -49,6 +49,7 @@ def test03_the_variant_in_use_stays(mono, asked, tmp_path):
     assert found.value.args[2].mode == "llvm_ad_mono" and mono.variant() == "llvm_ad_mono"
 
 
+@pytest.mark.nightly
 def test04_what_is_trained_can_be_shown(rgb, tmp_path):
     rng = np.random.default_rng(0)
     origin = rng.uniform((1, 1, 1.5), (2, 2, 1.6), (500, 3))

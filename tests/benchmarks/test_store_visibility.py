@@ -1,11 +1,9 @@
 """The measurement of visibility: what it leaves out, and that it can tell a good field from a wrong one."""
 
 import numpy as np
-import pytest
 
 from benchmarks.store_visibility import PAIRS, measure, near_edges
 from nerg_mi.jobs.demo import store_scene
-from tests.figures.standins import write_standins
 
 
 def test01_pixels_near_jumps_are_left_out():
@@ -20,29 +18,21 @@ def test01_pixels_near_jumps_are_left_out():
     assert not near_edges(2.0 * 1.02 ** np.arange(12.0)[None].repeat(9, 0), np.ones((9, 12), bool), 2).any()
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    return write_standins(tmp_path_factory.mktemp("standins"))
-
-
-def test02_blocks_where_the_furniture_stands_hide_what_it_hides(files):
-    row = measure(store_scene(), "aisle 3, from the south", "median", "depth", files, 48, 2)
+def test02_blocks_where_the_furniture_stands_hide_what_it_hides(standins):
+    row = measure(store_scene(), "aisle 3, from the south", "median", "depth", standins, 48, 2)
     # Blocks of 13 cm for shelves with boards and gaps
     assert row["agree"] > 0.85 and row["median cm"] < 15 and row["no surface"] < 0.05
     assert np.isclose(row["agree"] + row["wrongly seen"] + row["wrongly hidden"], 1)
 
 
-def test03_a_field_elsewhere_disagrees(files, monkeypatch):
+def test03_a_field_elsewhere_disagrees(standins, monkeypatch):
     camera, target, eye = PAIRS["aisle 3, from the south"]
-    right = measure(store_scene(), "aisle 3, from the south", "median", "depth", files, 48, 2)
+    right = measure(store_scene(), "aisle 3, from the south", "median", "depth", standins, 48, 2)
     # The field is asked about another eye than the twin
     monkeypatch.setitem(PAIRS, "moved", (camera, target, eye))
     from nerg_mi.scenes.store import twin
 
     visible = twin.visible
     monkeypatch.setattr(twin, "visible", lambda e, *a, **k: visible(np.asarray(e) + (1.7, 0, 0), *a, **k))
-    wrong = measure(store_scene(), "moved", "median", "depth", files, 48, 2)
+    wrong = measure(store_scene(), "moved", "median", "depth", standins, 48, 2)
     assert wrong["agree"] < right["agree"] - 0.1

@@ -76,7 +76,7 @@ CASES = (
         "-o {o}/demo --width 24 --spp 1 -m llvm_ad_rgb",
         _below("demo", DEMO),
         ("demo",),
-        ("jobs.report._Work.run",),
+        ("jobs.report._Work.run", "jobs.bake.sums_in_one_go"),
     ),
     Case("render", "{i}/scene.xml -o {o}/a.exr -m llvm_ad_rgb", ("a.exr",)),
     Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb", ("a.png",)),
@@ -183,9 +183,7 @@ CASES = (
         "bake", "{i}/splats.ply --gaze {i}/gaze.safetensors --observer 0,0,-3 -m llvm_ad_rgb -o {o}/a.ply", ("a.ply",)
     ),
     Case("import", "{i}/nerg.pth -o {o}/a.safetensors -g {o}/g.safetensors", ("a.safetensors", "g.safetensors")),
-    Case(
-        "refine", "{i}/ngp.safetensors -o {o}/a.safetensors", ("a.safetensors",), once=("jobs.refinement.refine",)
-    ),
+    Case("refine", "{i}/ngp.safetensors -o {o}/a.safetensors", ("a.safetensors",), once=("jobs.refinement.refine",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density 3", ("a.glb",)),
     Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),

@@ -13,7 +13,6 @@ from nerg_mi.evaluation.gaze_report import judge, read_results
 from nerg_mi.jobs import demo
 from nerg_mi.rendering.channels import render_channels
 from tests.cli.test_render import NERG, interrupt
-from tests.figures.standins import write_standins
 from tests.pictures import mitsuba_bitmap
 
 NAMES = {
@@ -36,14 +35,6 @@ def nerg(*arguments):
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(list(map(str, arguments)))
     return end.value.code or 0
-
-
-@pytest.fixture(scope="module")
-def standins(tmp_path_factory):
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    return write_standins(tmp_path_factory.mktemp("standins"))
 
 
 def defines(files):

@@ -59,7 +59,7 @@ WARM_UP = 5
 
 def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} --variant capture {ENDLESS}"
-    done = interrupted("training.gaze.likelihood.LikelihoodTrainer.step", 4, *line.split())
+    done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 4, *line.split())
     assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.run", "a.safetensors"]
     # The step during which it came is finished.
@@ -69,14 +69,14 @@ def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
 
 def test_a_gaze_training_whose_variant_is_not_chosen_yet_says_that_nothing_was_kept(inputs, tmp_path):
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {ENDLESS}"
-    done = interrupted("training.gaze.likelihood.LikelihoodTrainer.step", 4, *line.split())
+    done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 4, *line.split())
     assert done.returncode == 130 and "nothing was kept" in done.stderr and "--resume" not in done.stderr, done.stderr
     assert not os.listdir(tmp_path)
 
 
 def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
     line = f"train radiance {inputs}/photos -o {tmp_path}/a.safetensors {ENDLESS}"
-    done = interrupted("training.radiance.trainer.RadianceTrainer.step", WARM_UP + 4, *line.split())
+    done = interrupted("train.radiance_trainer.RadianceTrainer.step", WARM_UP + 4, *line.split())
     assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.preview.png", "a.run", "a.safetensors"]
     assert read_checkpoint(tmp_path / "a.run", "radiance run")[1]["steps"] == 4
@@ -86,24 +86,24 @@ def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
 def test_an_ensemble_keeps_its_members_and_its_state(inputs, tmp_path):
     some = "--variant capture --steps 3 --ensemble 2 --save-every 0"
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {some}"
-    done = interrupted("training.gaze.likelihood.LikelihoodTrainer.step", 5, *line.split())
+    done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 5, *line.split())
     assert done.returncode == 130 and "member 2 of 2; go on with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.member0.safetensors", "a.run"]
 
 
 ENDS = {
     "eval": (
-        "evaluation.images.Renderer.__call__",
+        "evaluation.metrics.Renderer.__call__",
         2,
         "eval radiance {i}/field.safetensors {i}/photos --holdout 2 -o {o}",
     ),
     "study": (
-        "evaluation.study.measure.measure",
+        "evaluation.study.measure",
         1,
         "study slab -o {o} --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
     ),
     "ablate": (
-        "training.gaze.likelihood.LikelihoodTrainer.step",
+        "train.gaze_log_density.LikelihoodTrainer.step",
         3,
         "ablate {i}/rays.npz -o {o} --geometry none --recipes default --variant emit --zones 1 --positions 4 "
         "--min-rays 8 --radius 0.5 --cameras 0 --probes 8",

@@ -24,6 +24,7 @@ def test_wrong_options_are_told_in_a_sentence(given, said, tmp_path, capsys):
     assert re.search(said, capsys.readouterr().err)
 
 
+@pytest.mark.nightly
 def test_the_machine_s_speed_and_what_is_wrong_are_told(place, capsys):  # noqa: F811
     out = place / "a.safetensors"
     with pytest.raises(SystemExit) as end:

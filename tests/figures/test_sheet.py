@@ -30,8 +30,9 @@ def overlap(a, b, slack=0.5):
     return min(a[2], b[2]) - max(a[0], b[0]) > slack and min(a[3], b[3]) - max(a[1], b[1]) > slack
 
 
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("label", ["gaze density [1/sr]", "training rays around the observer"])
+@pytest.mark.parametrize(
+    "size, label", list(zip(SIZES, itertools.cycle(("gaze density [1/sr]", "training rays around the observer"))))
+)
 def test_no_label_lies_upon_another_or_leaves_the_page(size, label):
     values = np.linspace(0, 2e-5, size[0] * size[1]).reshape(size)
     color, mask = np.zeros((*size, 3)), np.ones(size, bool)

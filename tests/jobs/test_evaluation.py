@@ -13,24 +13,13 @@ from nerg_mi.jobs.evaluation import evaluate_gaze
 from nerg_mi.jobs.gaze import train_gaze
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
 from nerg_mi.jobs.options.gaze import GazeOptions
+from nerg_mi.rays.rays import Rays
 from tests.evaluation.gaze.test_evaluation import crowd
 
 OPTIONS = GazeEvaluationOptions(min_rays=8, directions=128, resamples=2, pictures=1)
 TRAINING = GazeOptions(
     geometry="none", radius=0.5, probes=8, steps=2, directions=64, zones=0, min_rays=8, test_zones=1, test_positions=3
 )
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A folder with rays and a gaze field that was trained on some of them."""
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    folder = tmp_path_factory.mktemp("trained")
-    crowd(3000).save(folder / "rays.npz")
-    train_gaze(folder / "rays.npz", folder / "gaze.safetensors", TRAINING)
-    return folder
 
 
 def test_scores_stand_beside_the_baselines(trained, tmp_path):
@@ -53,7 +42,7 @@ def test_scores_stand_beside_the_baselines(trained, tmp_path):
 
 def test_without_a_folder_nothing_is_written(trained):
     before = set(trained.iterdir())
-    found = evaluate_gaze(trained / "gaze.safetensors", crowd(3000), options=OPTIONS)
+    found = evaluate_gaze(trained / "gaze.safetensors", Rays.load(trained / "rays.npz"), options=OPTIONS)
     assert found.files == [] and set(trained.iterdir()) == before and found.rows[0]["method"] == "gaze field"
 
 

@@ -38,11 +38,12 @@ def test_options_are_frozen_and_told(kind):
     assert set(get_type_hints(kind)) == {f.name for f in fields(kind)}
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda m: m.__name__)
-def test_they_import_nothing_heavy(module):
+def test_they_import_nothing_heavy():
     """A command shows its help by them."""
-    code = f"import sys, {module.__name__}; print(*{{'numpy', 'drjit', 'mitsuba'}} & set(sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == ""
+    code = "import importlib, sys\nfor name in sys.argv[1:]:\n    importlib.import_module(name)\n"
+    code += "    assert not {'numpy', 'drjit', 'mitsuba'} & set(sys.modules), name"
+    done = subprocess.run([sys.executable, "-c", code, *(m.__name__ for m in MODULES)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_numbers():

@@ -1,15 +1,29 @@
 """Radiance fields by jobs: what a notebook gets, and what it is told."""
 
 import json
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
+from nerg_mi.jobs import radiance
 from nerg_mi.jobs.radiance import RadianceOptions, RadianceScoreOptions, evaluate_radiance, train_radiance
+from nerg_mi.train.radiance_settings import RadianceSettings
 from tests.cli.test_eval import place  # noqa: F401  (fixture)
 from tests.jobs.recorder import Recorder
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    """A density grid of 32 cells an edge, and not of 128, most of which is looked through at the end of a training."""
+
+    @dataclass(frozen=True)
+    class Coarse(RadianceSettings):
+        resolution: int = 32
+
+    monkeypatch.setattr(radiance, "RadianceSettings", Coarse)
 
 
 class Impatient(Recorder):

@@ -23,9 +23,10 @@ def semantic_scene(files, tmp_path, aovs, **config):
     )
 
 
-@pytest.mark.parametrize("own", [False, True])
-@pytest.mark.parametrize("semantic", ["accumulated", "snapshot"])
-@pytest.mark.parametrize("aligned", [True, False])
+@pytest.mark.parametrize(
+    "semantic, own, aligned",
+    [("accumulated", False, True), ("accumulated", True, False), ("snapshot", False, False), ("snapshot", True, True)],
+)
 def test01_emit_takes_the_fields_features(rgb, files, tmp_path, semantic, own, aligned):
     """Against equation 1 evaluated apart, with features from AOVs: of a camera that stands where the observer does."""
     eye = (0.5, 0.4, -3)

@@ -162,11 +162,10 @@ def test_samples_of_the_option_are_bounded(tmp_path):
         render_file(tmp_path / "s.xml", tmp_path / "a.exr", PictureOptions(spp=1 << 31))
 
 
-def test_the_other_ways_in_are_guarded(tmp_path):
+def test_the_other_ways_in_are_guarded(standins, tmp_path):
     from nerg_mi.evaluation import study_subject
     from nerg_mi.jobs.demo import DemoOptions, make_demo
     from nerg_mi.train.geometry import place_of_scene
-    from tests.figures.standins import write_standins
 
     (tmp_path / "s.xml").write_text(scene(DEEP))
     with pytest.raises(NergError, match="deep"):
@@ -176,7 +175,7 @@ def test_the_other_ways_in_are_guarded(tmp_path):
     with pytest.raises(NergError, match="deep"):
         study_subject.load_subject(tmp_path / "s.xml", 8, 8, {})
     with pytest.raises(NergError, match="deep"):
-        options = DemoOptions(scene=tmp_path / "s.xml", defaults=write_standins(tmp_path), mode="llvm_ad_rgb")
+        options = DemoOptions(scene=tmp_path / "s.xml", defaults=standins, mode="llvm_ad_rgb")
         make_demo(tmp_path / "out", options)
 
 

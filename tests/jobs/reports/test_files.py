@@ -12,17 +12,14 @@ from nerg_mi.files.atomic import file_sha256
 from nerg_mi.jobs.reports.files import sort_files
 from nerg_mi.jobs.reports.words import place_words
 from tests.evaluation.gaze.test_evaluation import crowd
-from tests.figures.standins import write_standins
 from tests.formats.splats.writers import random_splats, write_inria
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
+def folder(standins, tmp_path_factory):
     folder = tmp_path_factory.mktemp("files")
-    write_standins(folder)
+    for file in standins.values():
+        shutil.copy(file, folder)
     crowd(100).save(folder / "rays.npz")
     (folder / "gaze.eval").mkdir()
     (folder / "gaze.eval" / "gaze.json").write_text("{}")

@@ -22,18 +22,25 @@ def photos(tmp_path_factory):
     return rendered.write_photos(tmp_path_factory.mktemp("photos"))
 
 
-def found(photos, work, longest: int = 320, **settings):
+def found(photos, work):
     """A reconstruction, its model as it is read, and what was told on the way."""
     folders, steps = Folders(work / "images", work / "small"), []
     folders.images.mkdir()
     folders.small.mkdir()
-    pictures, _ = copy_photos(list_photos(photos)[0], folders, longest, lambda *now: None)
-    made = reconstruct(pictures, work, Settings(threads=1, **settings), lambda *now: steps.append(now))
+    pictures, _ = copy_photos(list_photos(photos)[0], folders, 320, lambda *now: None)
+    made = reconstruct(pictures, work, Settings(threads=1), lambda *now: steps.append(now))
     return made, made and read_colmap(work / "sparse" / "0", folders.images), steps
 
 
-def test_poses_and_lens_are_found(photos, tmp_path):
-    made, model, steps = found(photos, tmp_path)
+@pytest.fixture(scope="module")
+def first(photos, tmp_path_factory):
+    """A folder, and what was found of the photos in it."""
+    work = tmp_path_factory.mktemp("first")
+    return work, found(photos, work)
+
+
+def test_poses_and_lens_are_found(first):
+    made, model, steps = first[1]
     assert made.parts == [[f"{k}.png" for k in range(8)]] and 0 < made.error < 0.5 and made.points > 300
     assert list(dict.fromkeys(stage for stage, _, _ in steps)) == ["features", "matching", "mapping"]
     assert steps[-1] == ("mapping", 8, 8)
@@ -52,18 +59,18 @@ def test_poses_and_lens_are_found(photos, tmp_path):
     assert len(made.surface) == len(made.colors) and made.colors.dtype == np.uint8
 
 
-def test_equal_photos_give_equal_poses_whatever_their_size(photos, tmp_path):
+def test_equal_photos_give_equal_poses_whatever_their_size(photos, first, tmp_path):
     """The second time with small copies of the same pixels, of photos that are larger: of the same place."""
     from PIL import Image
 
     (tmp_path / "large").mkdir()
     for path in photos.iterdir():
         Image.open(path).resize((960, 720), Image.Resampling.NEAREST).save(tmp_path / "large" / path.name)
-    models = []
-    for name, folder, longest in (("a", photos, 320), ("b", photos, 320), ("c", tmp_path / "large", 320)):
-        (tmp_path / name).mkdir()
-        models.append(found(folder, tmp_path / name, longest, orient=False)[1])
-    files = [[(tmp_path / n / "sparse" / "0" / f"{k}.bin").read_bytes() for k in ("images", "points3D")] for n in "ab"]
+    work, models = [first[0], tmp_path / "b", tmp_path / "c"], [first[1][1]]
+    for at, folder in zip(work[1:], (photos, tmp_path / "large")):
+        at.mkdir()
+        models.append(found(folder, at)[1])
+    files = [[(at / "sparse" / "0" / f"{k}.bin").read_bytes() for k in ("images", "points3D")] for at in work[:2]]
     assert files[0] == files[1]
     large, small = models[2].frames[0].intrinsics(960, 720), models[0].frames[0].intrinsics(320, 240)
     assert large.fx == pytest.approx(3 * small.fx, rel=0.02) and large.cx == 480
