@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -93,17 +94,22 @@ class Seen:
         """How far away most of what is met is; 0 where nothing is."""
         return float(np.median(self.depth[self.met])) if self.met.any() else 0.0
 
-    def main_direction(self, kappa: float = 8.0) -> np.ndarray:
+    @cached_property
+    def main_direction(self) -> np.ndarray:
         """Unit direction (3,) towards which most of the attention goes, within some 20 degrees (a von Mises-Fisher
-        kernel); of even attention some direction."""
+        kernel of concentration 8); of even attention some direction."""
         share = np.where(self.met, self.attention * self.weight, 0)
-        smooth = np.exp(kappa * (self.directions @ self.directions.T - 1)) @ share
-        return self.directions[np.argmax(smooth)]
+        # (P, P), in place: it takes hundreds of megabytes.
+        kernel = self.directions @ self.directions.T
+        kernel -= 1
+        kernel *= 8
+        np.exp(kernel, out=kernel)
+        return self.directions[np.argmax(kernel @ share)]
 
     def looked_at(self, width: float = 60.0) -> np.ndarray | None:
         """Mean point (3,) of the attention within ``width`` degrees around the main direction, far ones counted as
         three times the usual distance; None where there is none."""
-        towards = self.directions @ self.main_direction() > np.cos(np.radians(width))
+        towards = self.directions @ self.main_direction > np.cos(np.radians(width))
         share = np.where(self.met & towards, self.attention * self.weight, 0)
         if not share.sum() > 0:
             return None
@@ -210,7 +216,7 @@ def around_observer(trace: Trace, frame: Frame, seen: Seen, mean: Trace | None =
     if target is None:
         return None
     up = frame.up / np.linalg.norm(frame.up)
-    across = seen.main_direction() - up * (seen.main_direction() @ up)
+    across = seen.main_direction - up * (seen.main_direction @ up)
     across = across if np.linalg.norm(across) > 1e-6 else np.roll(up, 1) - up * (np.roll(up, 1) @ up)
     across /= np.linalg.norm(across)
     beside = np.cross(up, across)

@@ -57,7 +57,7 @@ def test_directions_are_those_of_the_pixels():
 def test_where_attention_goes():
     towards = np.array([0.6, 0.8, 0])
     seen = seen_from((4, 3, 1.5), room(), lambda d: np.exp(50 * (d @ towards - 1)) + 0.01)
-    assert seen.main_direction() @ towards > np.cos(np.radians(4))
+    assert seen.main_direction @ towards > np.cos(np.radians(4))
     depth, _ = room()(np.array([[4, 3, 1.5]]), towards[None])
     assert np.linalg.norm(seen.looked_at() - (seen.eye + depth[0] * towards)) < 0.6
     nothing = seen_from((4, 3, 1.5), lambda o, d: (np.zeros(len(d)), np.zeros(len(d))), lambda d: np.ones(len(d)))

@@ -117,7 +117,7 @@ def shows_anything(scene: Any) -> bool:
 
 def turned_ahead(eye: Eye, seen: Seen) -> Eye:
     """The observer at ``eye``, turned to where most of the attention goes."""
-    towards = seen.main_direction()
+    towards = seen.main_direction
     at = int(np.argmax(seen.directions @ towards))
     # An observer within matter meets it at once, and a direction needs a length.
     away = seen.depth[at] if seen.met[at] and seen.depth[at] > 0 else seen.usual or 1.0
