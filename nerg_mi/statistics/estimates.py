@@ -33,22 +33,14 @@ class Differences:
     p: np.ndarray
 
 
-def discoveries(p: np.ndarray, rate: float = 0.05) -> np.ndarray:
-    """Which of the hypotheses with these p-values (NaN: none) are rejected so that at most a share ``rate`` of the
-    rejections is expected to be wrong (Benjamini and Hochberg 1995)."""
-    return adjusted(p) <= rate
-
-
 def adjusted(p: np.ndarray) -> np.ndarray:
-    """p-values adjusted by Benjamini and Hochberg's procedure: the least false discovery rate at which each is
-    rejected; NaN stays NaN and counts for nothing."""
-    p = np.asarray(p, float)
-    out = np.full(p.shape, np.nan)
-    known = np.flatnonzero(np.isfinite(p))
-    if len(known):
-        order = known[np.argsort(p[known], kind="stable")]
-        scaled = p[order] * len(order) / np.arange(1, len(order) + 1)
-        out[order] = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1.0)
+    """p-values (K,) adjusted by the procedure of Benjamini and Hochberg (1995): the least false discovery rate at which
+    each is rejected; NaN stays NaN and counts for nothing."""
+    from scipy.stats import false_discovery_control
+
+    out = np.array(p, float)
+    is_tested = np.isfinite(out)
+    out[is_tested] = false_discovery_control(out[is_tested])
     return out
 
 

@@ -1,16 +1,23 @@
-"""Which of many differences are found."""
+"""p-values of many hypotheses, adjusted for the false discovery rate."""
 
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+import pytest
 
-from nerg_mi.statistics.estimates import adjusted, discoveries
+from nerg_mi.statistics.estimates import adjusted
 
 
-def test01_discoveries():
-    p = np.array([0.001, np.nan, 0.04, 0.03, 0.2, 0.008])
-    assert np.allclose(adjusted(p)[[0, 2, 3, 4, 5]], stats.false_discovery_control(p[[0, 2, 3, 4, 5]]))
-    assert np.isnan(adjusted(p)[1]) and not discoveries(p)[1]
-    assert discoveries(p).tolist() == (adjusted(p) <= 0.05).tolist()
-    assert adjusted(np.full(3, np.nan)).shape == (3,) and len(adjusted(np.zeros(0))) == 0
+@pytest.mark.parametrize(
+    "p, expected",
+    [
+        # 5 hypotheses: 0.001·5/1, 0.008·5/2, then 0.04·5/4 for 0.03 as well, since 0.03·5/3 is not less.
+        ([0.001, np.nan, 0.04, 0.03, 0.2, 0.008], [0.005, np.nan, 0.05, 0.05, 0.2, 0.02]),
+        ([0.9, 0.95], [0.95, 0.95]),
+        ([np.nan, 0.3], [np.nan, 0.3]),
+        ([np.nan] * 3, [np.nan] * 3),
+        ([], []),
+    ],
+)
+def test_hypotheses_without_a_p_value_do_not_count(p, expected):
+    assert np.allclose(adjusted(np.array(p)), expected, rtol=1e-12, equal_nan=True)
