@@ -16,7 +16,7 @@ from . import __version__, llvm
 from .errors import sentence
 
 EXTRAS = {
-    "torch": 'fields as torch modules: pip install "nerg-mi[torch]"',
+    "torch": 'checkpoints of torch-ngp, fields as torch modules: pip install "nerg-mi[torch]"',
     "scikit-image": 'meshes of radiance fields: pip install "nerg-mi[mesh]"',
     "xatlas": 'textures of baked gaze: pip install "nerg-mi[bake]"',
     "pyarrow": 'ray tables in Parquet: pip install "nerg-mi[parquet]"',

@@ -408,7 +408,7 @@ def member_into(stream, out: memoryview, path: str | os.PathLike, what: str = "f
 
 def _directory_bytes(path, size: int) -> int:
     """Bytes of a zip archive's list of members, which Python's reader takes in whole. Raises ``BadZipFile`` for what is
-    none.
+    none, and for one in which other readers may find another list: it ends where the records of its end begin.
     """
     with open(path, "rb") as file:
         start = max(0, size - 65557 - 20)
@@ -417,17 +417,18 @@ def _directory_bytes(path, size: int) -> int:
         end = tail.rfind(b"PK\5\6")
         if end < 0 or len(tail) < end + 22:
             raise zipfile.BadZipFile("it is not a zip archive, or not a whole one")
-        claims = [struct.unpack_from("<I", tail, end + 12)[0]]
+        (length, place), records = struct.unpack_from("<II", tail, end + 12), start + end
         if end >= 20 and tail[end - 20 : end - 16] == b"PK\6\7":
-            # Zip64: the locator says where the wider record is, but some readers take the bytes right before it.
-            for at in (struct.unpack_from("<Q", tail, end - 12)[0], start + end - 76):
-                if 0 <= at <= size - 56:
-                    file.seek(at)
-                    wide = file.read(56)
-                    if wide[:4] == b"PK\6\6":
-                        claims.append(struct.unpack_from("<Q", wide, 40)[0])
-    # All ones in the narrow record stand for the wide one.
-    return max(claims[1:] if claims[0] == 0xFFFFFFFF and len(claims) > 1 else claims)
+            # Zip64: some readers take the wider record where the locator says it is, others the bytes before it.
+            records -= 76
+            file.seek(max(records, 0))
+            wide = file.read(56)
+            if wide[:4] != b"PK\6\6" or struct.unpack_from("<Q", tail, end - 12)[0] != records:
+                raise zipfile.BadZipFile("its end is not where it says")
+            length, place = struct.unpack_from("<QQ", wide, 40)
+    if place + length != records:
+        raise zipfile.BadZipFile("its list of members is not where it says")
+    return length
 
 
 # ---- Line blocks ----

@@ -1,1 +1,1 @@
-"""File formats of fields, surfaces and volumes, our own and those of others. torch is imported in one file only."""
+"""File formats of fields, surfaces and volumes, our own and those of others."""

@@ -3,6 +3,7 @@ makes."""
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import shlex
 from dataclasses import dataclass
@@ -21,13 +22,15 @@ from tests.formats.torch_ngp.test_fields import small_state
 from tests.formats.torch_ngp.test_nerg import save, small_gaze
 from tests.jobs.drawing.scenes import write_scene
 from tests.plugins import fields
-from tests.reference.torch_ngp_numpy import nerf_state
 from tests.surfaces.meshes import box
 
 from .test_render import SCENE
 
 DEMO = "occlusion.png gaze.png gaze_sphere.png depth.png visibility.png color.png scene.exr report.html run.json"
 DEMO += " heatmap.glb aoi.csv"
+HAS_TORCH = importlib.util.find_spec("torch") is not None
+OF_TORCH = ("import", "export torch-ngp")
+"""Commands that need it."""
 STUDY = "study.csv study.md scaling.csv study.json errors.png scaling.png"
 ABLATION = (
     "ablation.md ablation.csv ablation.json ablation.png place.vol "
@@ -255,9 +258,11 @@ def make_inputs(folder: Path) -> Path:
     import drjit.llvm.ad as ns
     import mitsuba as mi
 
+    from nerg_mi.fields.encoding import HashGridConfig
+    from nerg_mi.fields.occupancy import OccupancyGrid
+    from nerg_mi.fields.radiance import RadianceConfig, RadianceField
     from nerg_mi.formats.fields import save_radiance
-    from nerg_mi.formats.torch_ngp.fields import read_torch_ngp
-    from nerg_mi.formats.torch_ngp.pickling import write_torch
+    from nerg_mi.maths.geometry import Box
 
     (folder / "scene.xml").write_text(SCENE)
     (folder / "ball.xml").write_text(SCENE.replace('type="aov"><string name="aovs" value="dd:depth"/>', 'type="nerg">'))
@@ -281,9 +286,12 @@ def make_inputs(folder: Path) -> Path:
     write_columns(folder / "baked.ply", columns, faces)
     fields.radiance(folder / "field.safetensors")
     write_inria(folder / "splats.ply", random_splats(9))
-    save(folder / "nerg.pth", small_gaze(), nerf=small_state())
-    write_torch(folder / "ngp.pth", {"model": nerf_state(1, np.random.default_rng(1))})
-    save_radiance(read_torch_ngp(folder / "ngp.pth", ns)[0], folder / "ngp.safetensors", {}, half=True)
+    if HAS_TORCH:
+        save(folder / "nerg.pth", small_gaze(), nerf=small_state())
+    # Of the sizes that torch-ngp has.
+    cells = OccupancyGrid(np.random.default_rng(1).random((128, 128, 128)) < 0.3, ns, 0.01)
+    ngp = RadianceField.random(RadianceConfig(HashGridConfig()), Box((-1, -1, -1), (1, 1, 1)), ns, occupancy=cells)
+    save_radiance(ngp, folder / "ngp.safetensors", {}, half=True)
 
     photos, frames = folder / "photos", []
     photos.mkdir()

@@ -16,7 +16,7 @@ import typer
 
 import nerg_mi.cli
 
-from .outputs import CASES, INPUTS, MAKES_A_FOLDER, READS_ONLY, make_inputs
+from .outputs import CASES, INPUTS, MAKES_A_FOLDER, OF_TORCH, READS_ONLY, make_inputs
 
 
 def nerg(capsys, *arguments) -> tuple[int, str]:
@@ -84,6 +84,8 @@ def remember(monkeypatch, name: str) -> None:
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.name} {Path(c.files[0]).suffix}")
 def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb):
+    if case.name in OF_TORCH:
+        pytest.importorskip("torch")
     if case.name == "export mesh":
         pytest.importorskip("skimage")
     if case.files[0].endswith(".parquet"):

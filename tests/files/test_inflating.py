@@ -112,6 +112,25 @@ def test_a_long_list_of_members_is_refused_before_it_is_read(tmp_path, monkeypat
         pass
 
 
+def test_an_archive_with_two_lists_of_members_is_refused(tmp_path):
+    """Readers differ in which list they take where the end of the archive and its records disagree."""
+    first, second = (_zip(tmp_path / f"{name}.zip", **{name: b"1"}).read_bytes() for name in "ab")
+    at = len(second) - 22
+    count, size, start = struct.unpack_from("<2xHII", second, at + 8)
+    wide = struct.pack("<4sQHHIIQQQQ", b"PK\6\6", 44, 45, 45, 0, 0, count, count, size, start)
+    locate = lambda place: struct.pack("<4sIQI", b"PK\6\7", 0, place, 1)
+    whole = second[:at] + wide + locate(at) + second[at:]
+    elsewhere = second[:at] + wide + wide + locate(at) + second[at:]
+    for data, is_whole in ((second, True), (whole, True), (first + second, False), (elsewhere, False)):
+        (tmp_path / "c.zip").write_bytes(data)
+        if is_whole:
+            with open_zip(tmp_path / "c.zip") as archive:
+                assert archive.namelist() == ["b"]
+        else:
+            with pytest.raises(NergError, match="c.zip"), open_zip(tmp_path / "c.zip"):
+                pass
+
+
 def test_errors_of_the_block_are_its_own(tmp_path):
     path = _zip(tmp_path / "a.zip", a=b"1")
     with pytest.raises(KeyError), open_zip(path):

@@ -177,7 +177,7 @@ def _radiance_state() -> dict:
 
 
 def _make_ngp(folder: Path) -> None:
-    from nerg_mi.formats.torch_ngp.pickling import write_torch
+    from nerg_mi.formats.torch_ngp.archive import write_torch
 
     state = _radiance_state()
     shadow = [v for k, v in state.items() if k.endswith((".embeddings", ".weight"))]
@@ -201,7 +201,7 @@ def _read_ngp(folder: Path) -> object:
 
 
 def _make_nerg(folder: Path) -> None:
-    from nerg_mi.formats.torch_ngp.pickling import write_torch
+    from nerg_mi.formats.torch_ngp.archive import write_torch
 
     names = (
         "net1.0.weight",
@@ -237,6 +237,6 @@ CHECKPOINTS = [
     Reader("gaze ensemble", _make_gaze("ensemble"), {"gaze.safetensors": ("safetensors",)}, _read_gaze),
     Reader("radiance run", _make_radiance_run, {"field.run": ("safetensors",)}, _read_radiance_run),
     Reader("gaze run", _make_gaze_run, {"gaze.run": ("safetensors",)}, _read_gaze_run),
-    Reader("torch-ngp checkpoint", _make_ngp, {"ngp.pth": ("zip",)}, _read_ngp),
-    Reader("NeRG checkpoint", _make_nerg, {"nerg.pth": ("zip",)}, _read_nerg),
+    Reader("torch-ngp checkpoint", _make_ngp, {"ngp.pth": ("zip",)}, _read_ngp, needs="torch"),
+    Reader("NeRG checkpoint", _make_nerg, {"nerg.pth": ("zip",)}, _read_nerg, needs="torch"),
 ]

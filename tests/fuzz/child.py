@@ -69,6 +69,7 @@ _LIBRARIES = frozenset(
         "matplotlib",
         "PIL",
         "av",
+        "torch",
     )
 )
 

@@ -29,6 +29,7 @@ from tests.fuzz.describe import Reader
 from tests.fuzz.watch import Case
 
 SKIPPED = {"demo", "study", "ablate", "eval folds", "export torch-ngp", "refine"}
+SKIPPED |= set() if outputs.HAS_TORCH else set(outputs.OF_TORCH)
 """Commands that take many seconds at any setting, or have no options."""
 
 FIXED = set("-o --output --mode --variant --store --scheduler --help --threads --hosts --workers".split())

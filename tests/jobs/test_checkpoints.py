@@ -1,9 +1,13 @@
 """Checkpoints of other programs by jobs: the fields themselves, with and without files."""
 
+import pytest
+
 from nerg_mi.jobs.checkpoints import ImportOptions, import_checkpoint
 from tests.formats.torch_ngp.test_fields import small_state
 from tests.formats.torch_ngp.test_nerg import save, small_gaze
 from tests.jobs.recorder import Recorder
+
+pytestmark = pytest.mark.usefixtures("torch")
 
 
 def test_fields_without_any_file(tmp_path):

@@ -13,6 +13,8 @@ from tests.reference import torch_ngp_numpy as reference
 
 from .scenes import camera, named, render
 
+pytestmark = pytest.mark.usefixtures("torch")
+
 SIZE, STEP = 6, 0.02
 
 

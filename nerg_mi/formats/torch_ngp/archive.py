@@ -1,80 +1,241 @@
-"""The zip archive that ``torch.save`` writes, and the tensors in it, read when they are asked for."""
+"""Files of ``torch.save``: read by ``torch.load(weights_only=True)``, and written.
+
+torch runs nothing that is in a file, and maps its tensors, so that only what is used is read. What a pickle repeats is
+taken at its word, though: a few hundred bytes can stand for a tuple that takes for ever to hash, or for an array of
+terabytes. So the pickle is checked first, by the effect on the stack that each operation declares.
+"""
 
 from __future__ import annotations
 
-import math
+import io
+import pickletools
+import re
+import warnings
+import zipfile
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-from nerg_mi.files.safe_read import open_zip, plain, read_member, reading
+from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.files.atomic import write_bytes
+from nerg_mi.files.safe_read import open_zip, plain, read_member, reading, size_of
+
+if TYPE_CHECKING:
+    import torch
+
+PICKLE_BYTES = 8 << 20
+"""The pickle may have so many bytes: it holds names and shapes, the numbers are in records of their own."""
+
+OPERATIONS = 1_000_000
+"""So many operations may it have."""
+
+WORK = 8 * PICKLE_BYTES
+"""So many values and characters may its operations take in all, what is repeated counted each time."""
 
 EXPANDED = 1 << 20
 """So many numbers may a tensor have that repeats those of its storage."""
 
+_TEXT = 64
+# What torch.load would also make of a file, and no checkpoint of weights has: sparse and quantised tensors, devices,
+# sets, byte arrays of any size, ...
+_NAMES = frozenset(
+    f"torch {kind}Storage"
+    for kind in ("Double", "Float", "Half", "BFloat16", "Long", "Int", "Short", "Char", "Byte", "Bool")
+) | {
+    "collections OrderedDict",
+    "torch._utils _rebuild_tensor_v2",
+    "torch._utils _rebuild_parameter",
+    "torch Size",
+    "_codecs encode",
+    "numpy dtype",
+    "numpy.core.multiarray scalar",
+    "numpy._core.multiarray scalar",
+    "nerg.gaze_prediction NeRGVariant",
+}
+_FILLED = ("APPEND", "APPENDS", "SETITEM", "SETITEMS", "BUILD")
 
-class TorchArchive:
-    """Records of a file of ``torch.save``, each read when it is asked for."""
 
-    def __init__(self, path: Path):
-        self.path = path
-        with open_zip(path, "checkpoint") as archive:
-            names = archive.namelist()
-        found = [n for n in names if n.endswith("/data.pkl")]
-        if len(found) != 1:
+class NamedValue:
+    """Stands for a member of an Enum of the file's own program: only its ``value`` is kept."""
+
+    __slots__ = ("value",)
+
+    def __init__(self, value):
+        self.value = value
+
+
+class _NumberType:
+    """Stands for NumPy's dtype, which would take fields and offsets from a file."""
+
+    def __init__(self, name, *_):
+        if not (isinstance(name, str) and re.fullmatch(r"[biuf][1248]", name)):
+            raise ValueError(f'the number type "{plain(name, 40)}" is not read here')
+        self.name = f"<{name}"
+
+    def __setstate__(self, state):
+        """Pickles repeat the byte order here, which was little on any machine that torch runs on."""
+
+
+def _number(kind: _NumberType, raw: bytes) -> int | float | bool:
+    return np.frombuffer(raw, kind.name)[0].item()
+
+
+_STANDINS = [
+    (_NumberType, "numpy.dtype"),
+    (_number, "numpy.core.multiarray.scalar"),
+    (_number, "numpy._core.multiarray.scalar"),
+    (NamedValue, "nerg.gaze_prediction.NeRGVariant"),
+]
+
+
+def _import_torch() -> Any:
+    try:
+        import torch
+    except ImportError:
+        raise ImportError(
+            'checkpoints of torch need torch, which is not installed: pip install "nerg-mi[torch]"'
+        ) from None
+    # Before, weights_only could be led to run code (CVE-2025-32434).
+    if tuple(int(n) for n in re.findall(r"\d+", torch.__version__)[:2]) < (2, 6):
+        raise ImportError(
+            f'checkpoints need torch 2.6, and {torch.__version__} is here: pip install -U "nerg-mi[torch]"'
+        )
+    return torch
+
+
+def read_torch(path: str | Path):
+    """What ``torch.save`` put into ``path``: containers, numbers, strings and tensors, which are mapped.
+
+    Raises `MissingFile`, and `NergError` for a file that is not such an archive, that names anything but tensors and
+    plain data, or that is damaged. Of an archive that torch wrote, no member is compressed.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise MissingFile(f'there is no file "{path}"; correct its name')
+    size_of(path, "checkpoint")
+    with reading(path, "checkpoint"), open(path, "rb") as file:
+        zipped = file.read(4) == b"PK\3\4" and zipfile.is_zipfile(path)
+    if not zipped:
+        raise NergError(
+            f'"{path}" is not a zip archive, as torch.save writes since version 1.6: load it with the torch that '
+            "wrote it, and save it again with a newer one"
+        )
+    pickled = _check_archive(path)
+    torch = _import_torch()
+    try:
+        check_pickle(pickled)
+        with warnings.catch_warnings(), torch.serialization.safe_globals(_STANDINS):
+            warnings.simplefilter("ignore")  # of pickle protocols: what torch does not read of them it refuses
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:
+        # Whatever torch meets in a pickle that is none, of any class; its advice is to programmers.
+        said = plain(str(error).partition("WeightsUnpickler error: ")[2] or error).split("\n")[0]
+        raise NergError(f'"{path}" is not read, for its pickle is damaged or no checkpoint\'s: {said}') from error
+
+
+def _check_archive(path: Path) -> bytes:
+    """The pickle of an archive whose members torch can map. Raises `NergError` where a checksum is not right."""
+    with open_zip(path, "checkpoint") as archive:
+        members = archive.infolist()
+        pickles = [m for m in members if m.filename.endswith("/data.pkl")]
+        # torch does not tell capitals from small letters.
+        if len(pickles) != 1 or len({m.filename.lower() for m in members}) != len(members):
             raise NergError(
                 f'"{path}" is a zip archive, but not one that torch.save wrote (no data.pkl); name one of those'
             )
-        self._folder = found[0][: -len("data.pkl")]
-        if f"{self._folder}byteorder" in names and self.record("byteorder") != b"little":
-            raise NergError(f'"{path}" was written on a big-endian machine; save it again on another')
-
-    def record(self, name: str, most: int | None = None) -> bytearray:
-        with open_zip(self.path, "checkpoint") as archive:
-            if self._folder + name not in archive.namelist():
-                raise NergError(f'"{self.path}" lacks its record "{name}": the file is incomplete; copy it again')
-            size = archive.getinfo(self._folder + name).file_size
-            if most is not None and size > most:
-                raise NergError(
-                    f'the record "{name}" of "{self.path}" has {size:,} bytes, more than the {most:,} that are read'
-                )
-            return read_member(archive, self._folder + name, self.path, "checkpoint")
-
-
-class StoredTensor:
-    """A tensor in the archive, of ``shape``; ``numpy()`` reads it."""
-
-    __slots__ = ("_archive", "_dtype", "_key", "_offset", "_stride", "shape")
-
-    def __init__(self, key: str, dtype: str, offset: int, shape: tuple, stride: tuple):
-        # The archive is given once all of the pickle is read.
-        self._archive: TorchArchive | None = None
-        self._key, self._dtype, self._offset, self.shape, self._stride = key, dtype, offset, shape, stride
-
-    def numpy(self) -> np.ndarray:
-        """The values, (``shape``); bfloat16 becomes float32. Raises `NergError` when the file does not hold them
-        all.
-        """
-        if self._archive is None:
-            raise RuntimeError("a tensor is read before its archive is known")
-        path = self._archive.path
-        raw = self._archive.record(f"data/{self._key}")
-        with reading(path, "checkpoint"):
-            flat = np.frombuffer(raw, "<u2" if self._dtype == "bfloat16" else self._dtype)
-        if self._dtype == "bfloat16":
-            flat = (flat.astype(np.uint32) << 16).view(np.float32)
-        if math.prod(self.shape) == 0:
-            with reading(path, "checkpoint"):
-                return np.zeros(self.shape, flat.dtype)
-        # A stride counts only where there is more than one.
-        stride = [s if n > 1 else 0 for n, s in zip(self.shape, self._stride)]
-        last = self._offset + sum((n - 1) * s for n, s in zip(self.shape, stride))
-        if last >= len(flat) or math.prod(self.shape) > max(len(flat), EXPANDED):
+        if pickles[0].file_size > PICKLE_BYTES:
             raise NergError(
-                f'a tensor of "{path}" of shape {plain(self.shape)} lies outside of its storage of {len(flat)} '
-                "numbers; copy the file again"
+                f'the pickle of "{path}" has {pickles[0].file_size:,} bytes, more than the {PICKLE_BYTES:,} that are '
+                "read; save its weights alone"
             )
-        strides = [s * flat.itemsize for s in stride]
+        for member in members:
+            if member.compress_type != zipfile.ZIP_STORED:
+                raise NergError(
+                    f'the member "{plain(member.filename)}" of "{path}" is compressed, as none is that torch.save '
+                    "writes; pack it again without compression"
+                )
         with reading(path, "checkpoint"):
-            return np.lib.stride_tricks.as_strided(flat[self._offset :], self.shape, strides, writeable=False).copy()
+            if damaged := archive.testzip():
+                raise ValueError(f'its member "{plain(damaged)}" is not what was written')
+        return bytes(read_member(archive, pickles[0].filename, path, "checkpoint"))
+
+
+def check_pickle(pickled: bytes) -> None:
+    """Raise `ValueError` for a name that is not in `_NAMES`, and for more than `OPERATIONS` or `WORK`.
+
+    Also raises `IndexError` and `KeyError`, for a damaged pickle. A value on the stack is a list of its size (1, its
+    characters, and the sizes of what it was made of) and of its name, where it is a function. A container that is
+    filled later remains the same list, also in the memo.
+    """
+    mark: list = [0, ""]
+    stack: list[list] = []
+    memo: dict[object, list] = {}
+    work = 0
+    for count, (operation, argument, _) in enumerate(pickletools.genops(pickled)):
+        name, takes = operation.name, operation.stack_before
+        if count >= OPERATIONS or work > WORK:
+            raise ValueError(f"it has more than {OPERATIONS:,} operations, or repeats what they make too often")
+        if name == "GLOBAL" and argument not in _NAMES:
+            raise ValueError(f'it asks for "{plain(argument, 80).replace(" ", ".")}", which no weights need')
+        if "PUT" in name:
+            memo[argument] = stack[-1]
+        elif "GET" in name:
+            stack.append(memo[argument])
+        elif name == "MARK":
+            stack.append(mark)
+        else:
+            parts: list[list] = []
+            below = len(takes)
+            if pickletools.markobject in takes:
+                below = takes.index(pickletools.markobject)
+                while (part := stack.pop()) is not mark:
+                    parts.append(part)
+            parts = [stack.pop() for _ in range(below)][::-1] + parts
+            is_filled = name in _FILLED and bool(parts)
+            size = sum(part[0] for part in parts[is_filled:])
+            work += size + 1
+            if name in ("REDUCE", "NEWOBJ") and parts[0][1] == "_codecs encode" and size > _TEXT:
+                raise ValueError("an encoded text is not read here: only the bytes of a number come so")
+            if is_filled:
+                parts[0][0] += size
+                stack.append(parts[0])
+            elif operation.stack_after:
+                length = len(argument) if isinstance(argument, (str, bytes)) else 0
+                stack.append([size + 1 + length, argument if name == "GLOBAL" else ""])
+
+
+def is_tensor(value: object) -> bool:
+    """Whether a value of a file is a tensor."""
+    import torch
+
+    return torch.is_tensor(value)
+
+
+def to_numpy(tensor: torch.Tensor, path: Path) -> np.ndarray:
+    """The values of a tensor of the file ``path``; bfloat16 becomes float32."""
+    stored = tensor.untyped_storage().nbytes() // tensor.element_size()
+    if tensor.numel() > max(stored, EXPANDED):
+        raise NergError(
+            f'a tensor of "{path}" of shape {tuple(tensor.shape)} repeats the {stored:,} numbers that are stored; copy '
+            "the file again"
+        )
+    with reading(path, "checkpoint", also=(RuntimeError, TypeError)):
+        tensor = tensor.detach()
+        return np.array((tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy())
+
+
+def write_torch(path: str | Path, value: dict) -> None:
+    """Write ``value`` (dictionaries, lists, numbers, strings and NumPy arrays) to ``path``, whole or not at all."""
+    torch = _import_torch()
+
+    def tensors(value):
+        if isinstance(value, np.ndarray):
+            return torch.from_numpy(value.copy())
+        if isinstance(value, dict):
+            return {key: tensors(part) for key, part in value.items()}
+        return [tensors(part) for part in value] if isinstance(value, list) else value
+
+    data = io.BytesIO()
+    torch.save(tensors(value), data)
+    write_bytes(path, data.getvalue())

@@ -20,8 +20,8 @@ from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig
 from nerg_mi.formats.architecture import building, check_sizes
 from nerg_mi.maths.geometry import Box
 
+from .archive import write_torch
 from .occupancy import bitfield, read_occupancy
-from .pickling import write_torch
 from .state_dict import (
     StateDict,
     averaged_weights,

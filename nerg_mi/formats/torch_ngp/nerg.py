@@ -16,9 +16,9 @@ from nerg_mi.files.safe_read import plain
 from nerg_mi.formats.architecture import building, check_sizes
 from nerg_mi.maths.geometry import Box
 
+from .archive import NamedValue
 from .fields import AS_TRAINED_BY_DEFAULT, Given, radiance_field
 from .state_dict import StateDict, decimals, grid, grid_config, open_checkpoint, origin, sh_degree
-from .unpickling import NamedValue
 
 _VARIANTS = {"Emit": "emit", "Capture": "capture", "EmitCapture": "emit_capture"}
 _HEADS = {
@@ -41,18 +41,19 @@ def read_nerg(
     for the variants that read other features than the gaze field's own.
     """
     whole, model = open_checkpoint(path)
-    if ema is False and whole.get("ema"):
+    averaged = isinstance(whole.get("ema"), dict) and bool(whole["ema"])
+    if ema is False and averaged:
         raise NergError(
             f'"{path}" keeps its moving averages as its weights and nothing else: import it without --no-ema'
         )
-    if ema and not whole.get("ema"):
+    if ema and not averaged:
         raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
     state = StateDict(Path(path), model)
     with building(path):
         gaze = gaze_field(state, _variant(state, whole.get("variant")), ns)
         nerf = state.below("model_nerf.")
         field = radiance_field(nerf, ns, given) if nerf.names() else None
-    return field, gaze, origin(path, whole, "NeRG", bool(whole.get("ema")))
+    return field, gaze, origin(path, whole, "NeRG", averaged)
 
 
 def _variant(state: StateDict, stored) -> str:

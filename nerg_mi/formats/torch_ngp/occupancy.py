@@ -35,7 +35,7 @@ def read_occupancy(state: StateDict, bound: float, ns: ModuleType, mean_density)
         # The largest density that the grid calls empty: cells never seen hold -1.
         threshold = max(float(density[~bits].max()), 0.0)
     else:
-        threshold = min(float(mean_density or 0.0), 10.0)
+        threshold = min(float(mean_density), 10.0) if isinstance(mean_density, (int, float)) else 0.0
     if not np.isfinite(threshold):
         raise NergError(f'the densities of "{state.path}" are not finite: its training has diverged')
     ordered = bits[:, morton_order()].reshape(levels, _CELLS, _CELLS, _CELLS)

@@ -15,7 +15,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGrid, HashGridConfig
 from nerg_mi.fields.mlp import MLP
 
-from .unpickling import StoredTensor, read_torch
+from .archive import is_tensor, read_torch, to_numpy
 
 # More of either than any network has that is trained.
 _LEVELS, _LAYERS = 64, 64
@@ -29,7 +29,7 @@ class StateDict:
         self._tensors = {
             k[len(prefix) :]: v
             for k, v in tensors.items()
-            if isinstance(k, str) and k.startswith(prefix) and isinstance(v, StoredTensor)
+            if isinstance(k, str) and k.startswith(prefix) and is_tensor(v)
         }
 
     def __contains__(self, name: str) -> bool:
@@ -40,7 +40,7 @@ class StateDict:
 
     def __getitem__(self, name: str) -> np.ndarray:
         self.shape(name)
-        return self._averaged.get(name, self._tensors[name]).numpy()
+        return to_numpy(self._averaged.get(name, self._tensors[name]), self.path)
 
     def shape(self, name: str) -> tuple[int, ...]:
         """The shape of ``self[name]``, which is not read."""
@@ -48,7 +48,7 @@ class StateDict:
             raise NergError(
                 f'"{self.path}" lacks "{self.prefix}{name}", which its kind of checkpoint holds; copy it again'
             )
-        return self._tensors[name].shape
+        return tuple(self._tensors[name].shape)
 
     def weights(self, name: str) -> np.ndarray:
         """``self[name]`` in fp32. Raises `NergError` when it is not finite."""
@@ -68,7 +68,7 @@ def open_checkpoint(path: str | Path) -> tuple[dict, dict]:
     if not isinstance(whole, dict):
         raise NergError(f'"{path}" holds a {type(whole).__name__}, not a checkpoint')
     model = whole.get("model", whole)
-    if not isinstance(model, dict) or not any(isinstance(v, StoredTensor) for v in model.values()):
+    if not isinstance(model, dict) or not any(is_tensor(v) for v in model.values()):
         raise NergError(f'"{path}" holds no weights: neither a state dictionary nor one under "model"')
     return whole, model
 
@@ -79,7 +79,9 @@ def averaged_weights(path: str | Path, whole: dict, model: dict, wanted: bool | 
     ``wanted``: True, False, or None for averages where the file has them. torch-ngp's best checkpoint (``ngp.pth``)
     keeps its averages as the weights themselves.
     """
-    shadow = (whole.get("ema") or {}).get("shadow_params") or []
+    ema = whole.get("ema")
+    shadow = ema.get("shadow_params") if isinstance(ema, dict) else None
+    shadow = shadow if isinstance(shadow, list) else []
     if (not wanted and wanted is not None) or not shadow:
         if wanted and not shadow:
             raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')

@@ -1,84 +1,286 @@
-"""Archives of torch.save: tensors within their storage, records that are there, and no more than the file warrants."""
+"""Files of torch.save: exact both ways, unable to run anything, and no more than their bytes warrant."""
 
+import io
+import os
+import pickle
+import struct
+import subprocess
+import sys
 import zipfile
 
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files import safe_read
-from nerg_mi.formats.torch_ngp.archive import TorchArchive
-from nerg_mi.formats.torch_ngp.unpickling import read_torch
-from tests.formats.torch_ngp.test_unpickling import archive, tensor
+from nerg_mi.formats.torch_ngp import archive as module
+from nerg_mi.formats.torch_ngp.archive import read_torch, to_numpy, write_torch
 
 ONE = np.arange(4, dtype="<f4").tobytes()
 
 
+def archive(path, pickled: bytes, compression=zipfile.ZIP_STORED, **records):
+    with zipfile.ZipFile(path, "w", compression) as z:
+        z.writestr("a/data.pkl", pickled)
+        z.writestr("a/version", b"3\n")
+        for key, value in records.items():
+            z.writestr(f"a/data/{key}" if key.isdigit() else f"a/{key}", value)
+    return path
+
+
+def tensor(shape, stride, offset=0, state=b"", stored=4):
+    """A pickle of one tensor on a storage of 4 floats, and of a state set on it afterwards."""
+    whole = lambda value: b"\x8a\x08" + struct.pack("<q", value)
+    numbers = lambda values: b"(" + b"".join(map(whole, values)) + b"t"
+    out = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((X\x07\x00\x00\x00storagectorch\nFloatStorage\n"
+    out += b"X\x01\x00\x00\x000X\x03\x00\x00\x00cpu" + whole(stored) + b"tQ"
+    return (
+        out + whole(offset) + numbers(shape) + numbers(stride) + b"\x89ccollections\nOrderedDict\n)RtR" + state + b"."
+    )
+
+
+class Calls:
+    """Pickles as a call of ``function``."""
+
+    def __init__(self, function, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+def test_what_torch_writes(tmp_path, torch):
+    x, path = torch.arange(24.0).reshape(2, 3, 4), tmp_path / "x.pth"
+    values = {
+        "plain": x,
+        "strided": x.permute(2, 0, 1)[1:, :, ::2],
+        "half": x.half(),
+        "bf": x.bfloat16(),
+        "long": x.long(),
+        "bool": x > 3,
+        "empty": torch.zeros(0, 4),
+        "scalar": torch.tensor(2.5),
+        "parameter": torch.nn.Parameter(x),
+        "number": np.float64(0.1),
+        "truth": np.bool_(True),
+        "size": x.shape,
+        "none": None,
+        "list": [1, 2.5, "a", True, 2**40],
+    }
+    torch.save(values, path)
+    got = read_torch(path)
+    for name, value in values.items():
+        if isinstance(value, torch.Tensor):
+            expected = value.detach().float().numpy() if name == "bf" else value.detach().numpy()
+            found = to_numpy(got[name], path)
+            assert np.array_equal(found, expected) and found.dtype == expected.dtype, name
+        else:
+            assert got[name] == value, name
+
+
+def test_what_is_written_torch_reads(tmp_path, torch):
+    values = {
+        "a": np.arange(6, dtype=np.float32).reshape(2, 3).T,
+        "b": {"c": np.arange(5, dtype=np.uint8), "n": -3, "big": 2**40},
+        "s": ["x", None, True, 0.1, (), "é"],
+        "h": np.ones(3, np.float16),
+        "i": np.zeros((4, 0), np.int32),
+    }
+    write_torch(tmp_path / "w.pth", values)
+    got = torch.load(tmp_path / "w.pth", weights_only=True)
+    assert got["b"]["n"] == -3 and got["b"]["big"] == 2**40 and got["s"] == values["s"]
+    for a, b in [(got[k], values[k]) for k in "ahi"] + [(got["b"]["c"], values["b"]["c"])]:
+        assert np.array_equal(a.numpy(), b) and a.numpy().dtype == b.dtype
+    first = (tmp_path / "w.pth").read_bytes()
+    write_torch(tmp_path / "w.pth", values)
+    assert (tmp_path / "w.pth").read_bytes() == first
+    with pytest.raises(AttributeError):  # a function has no pickle
+        write_torch(tmp_path / "x.pth", {"a": lambda: 0})
+    assert not (tmp_path / "x.pth").exists()
+
+
+def test_without_torch_the_extra_is_named(tmp_path):
+    archive(tmp_path / "x.pth", b"N.")
+    line = "import sys; sys.modules['torch'] = None; from nerg_mi.formats.torch_ngp.archive import *; "
+    for call in (f"read_torch({str(tmp_path / 'x.pth')!r})", f"write_torch({str(tmp_path / 'y.pth')!r}, {{}})"):
+        done = subprocess.run([sys.executable, "-c", line + call], capture_output=True, text=True)
+        assert done.stderr.endswith('which is not installed: pip install "nerg-mi[torch]"\n')
+
+
+def test_a_torch_that_could_be_led_to_run_code_is_not_used(tmp_path, torch, monkeypatch):
+    path = archive(tmp_path / "x.pth", b"\x80\x02N.")
+    for version, is_used in (("2.5.1+cpu", False), ("2.6.0", True), ("2.13.0a0+git1", True)):
+        monkeypatch.setattr(torch, "__version__", version)
+        if is_used:
+            assert read_torch(path) is None
+        else:
+            with pytest.raises(ImportError, match="2.6.*2.5.1"):
+                read_torch(path)
+
+
 @pytest.mark.parametrize(
-    "shape, stride, offset",
+    "thing, name",
     [
-        ((5,), (1,), 0),
-        ((4,), (1,), 1),
-        ((2, 2), (3, 1), 0),
-        ((2,), (1,), -1),
-        ((2,), (-1,), 1),
-        ((2,), (10**12,), 0),
-        ((2, 2), (1,), 0),
-        ((-1,), (1,), 0),
+        (Calls(exec, "import sys; sys.pwned = True"), "exec"),
+        (Calls(getattr, "x", "upper"), "getattr"),
+        (Calls(io.open, "/etc/passwd"), "open"),
+        (Calls(os.system, "true"), "system"),
+        (np.zeros(3), "_reconstruct"),
+        # What torch itself would read.
+        (bytearray(3), "bytearray"),
+        ({1, 2}, "set"),
+        (Calls(complex, 1), "complex"),
     ],
 )
-def test_tensors_do_not_reach_beyond_their_storage(tmp_path, shape, stride, offset):
-    path = archive(tmp_path / "t.pth", tensor(shape, stride, offset), **{"0": np.arange(4, dtype="<f4").tobytes()})
-    with pytest.raises(ValueError):
-        read_torch(path).numpy()
+def test_nothing_else_is_called(tmp_path, torch, thing, name):
+    path = archive(tmp_path / "evil.pth", pickle.dumps({"model": thing}, 2))
+    with pytest.raises(NergError, match=f'evil.pth" .* asks for ".*{name}"'):
+        read_torch(path)
+    with pytest.raises(NergError, match="evil.pth"):
+        read_torch(archive(tmp_path / "evil.pth", pickle.dumps({"model": thing}, 4)))
+    assert not hasattr(sys, "pwned")
 
 
-def test_damaged_archives(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no file"):
-        read_torch(tmp_path / "none.pth")
-    with zipfile.ZipFile(tmp_path / "z.pth", "w") as z:
-        z.writestr("readme", "x")
-    with pytest.raises(ValueError, match="no data.pkl"):
-        read_torch(tmp_path / "z.pth")
-    for broken in (b"", b"\x80\x02}", b"\x80\x02(t)R.", b"garbage"):
-        with pytest.raises(ValueError, match="damaged|not read"):
-            read_torch(archive(tmp_path / "d.pth", broken))
-    with pytest.raises(ValueError, match='lacks its record "data/0"'):
-        read_torch(archive(tmp_path / "d.pth", tensor((2,), (1,)))).numpy()
+def test_an_array_of_terabytes_is_not_made(tmp_path, torch):
+    for call in (b"cbuiltins\nbytearray\n", b"c__builtin__\nbytearray\n"):
+        with pytest.raises(NergError, match="bytearray"):
+            read_torch(archive(tmp_path / "b.pth", b"\x80\x02" + call + b"\x8a\x06" + b"\x7f" * 6 + b"\x85R."))
+
+
+# A tuple of two that are one, fifty times over, has 2^50 leaves to hash.
+_DOUBLED = b"K\x01q\x00" + b"".join(b"h%ch%c\x86q%c" % (k, k, k + 1) for k in range(50))
+_LONG = b"X" + (1 << 20).to_bytes(4, "little") + b"x" * (1 << 20) + b"q\x00"
+_NUMBERS = b"](" + b"K\x01" * 100_000 + b"eq\x00"
 
 
 @pytest.mark.parametrize(
-    "shape, stride", [((10**9,), (0,)), ((10**5, 10**5), (0, 0)), ((1 << 21,), (0,)), ((1,) * 40, (0,) * 40)]
+    "pickled, words",
+    [
+        (b"}" + _DOUBLED + b"Ns.", "repeats"),
+        (b"}(" + _DOUBLED + b"Nu.", "repeats"),
+        (b"]q\x00" + b"h\x00a" * 60 + b"ctorch\nSize\nh\x00\x85R.", "repeats"),
+        (_NUMBERS + b"ctorch\nSize\nq\x01" + b"h\x01h\x00\x85R" * 1000 + b".", "repeats"),
+        (_LONG + b"c_codecs\nencode\nq\x01" + b"h\x01h\x00\x85R" * 1000 + b".", "encoded text"),
+        (_LONG + b"c_codecs\nencode\nh\x00X\x08\x00\x00\x00punycode\x86R.", "encoded text"),
+        (b"N" * 200_001 + b".", "operations"),
+        (b"h\x07.", ""),
+        (b"t.", ""),
+        (b"(i\nos\nsystem\n.", ""),
+        (b"\x96\xff\xff\xff\xff\xff\xff\xff\x7f.", ""),
+        (b"\x82\x01.", ""),
+        (b"X\xff\xff\xff\x7f.", ""),
+        (b"(t)R.", ""),
+        (b"}", ""),
+        (b"N", ""),
+        (b".", ""),
+        (b"", ""),
+    ],
 )
-def test_repeated_numbers_are_bounded(tmp_path, shape, stride):
-    with pytest.raises(NergError, match="t.pth"):
-        read_torch(archive(tmp_path / "t.pth", tensor(shape, stride), **{"0": ONE})).numpy()
-    assert np.array_equal(
-        read_torch(archive(tmp_path / "s.pth", tensor((3, 2), (0, 1)), **{"0": ONE})).numpy(), [[0, 1]] * 3
+def test_pickles_that_no_checkpoint_has(tmp_path, torch, monkeypatch, pickled, words):
+    monkeypatch.setattr(module, "OPERATIONS", 200_000)
+    with pytest.raises(NergError, match=f"p.pth.*{words}") as error:
+        read_torch(archive(tmp_path / "p.pth", b"\x80\x02" + pickled))
+    assert str(error.value).isprintable()
+
+
+def test_a_huge_memo_index_makes_no_room(tmp_path, torch):
+    for put in (b"r\xff\xff\xff\xff", b"r\xff\xff\xff\x7f"):
+        assert read_torch(archive(tmp_path / "m.pth", b"\x80\x02K\x01" + put + b".")) == 1
+
+
+def test_much_of_it_is_no_attack(tmp_path, torch):
+    """Records of 100,000 steps as NumPy's numbers, a list that is shared, and one that holds itself."""
+    torch.save(
+        {"loss": [np.float64(0.5)] * 20_000 + [0.25] * 80_000, "shared": [betas := (0.9, 0.99)] * 1000},
+        tmp_path / "x.pth",
     )
-    far = tensor((1, 2), (2**61, 1))
-    assert np.array_equal(read_torch(archive(tmp_path / "s.pth", far, **{"0": ONE})).numpy(), [[0, 1]])
+    got = read_torch(tmp_path / "x.pth")
+    assert sum(got["loss"]) == 30_000 and got["shared"][999] == betas
+    looped: list = []
+    looped.append(looped)
+    torch.save(looped, tmp_path / "x.pth")
+    assert read_torch(tmp_path / "x.pth")[0][0] is not None
 
 
-def test_archives_that_inflate_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(safe_read, "FREE", 1 << 20)
-    with zipfile.ZipFile(tmp_path / "z.pth", "w", zipfile.ZIP_DEFLATED) as z:
-        z.writestr("a/data.pkl", tensor((2,), (1,)))
-        z.writestr("a/data/0", bytes(30 << 20))
-    with pytest.raises(NergError, match="z.pth.*inflates"):
-        read_torch(tmp_path / "z.pth")
+def test_what_is_made_cannot_be_changed(tmp_path, torch):
+    path = archive(tmp_path / "t.pth", tensor((2, 2), (2, 1)), **{"0": ONE})
+    assert np.array_equal(to_numpy(read_torch(path), path), [[0, 1], [2, 3]])
+    onto_function = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n}X\x01\x00\x00\x00aX\x01\x00\x00\x00xsb."
+    onto_tensor = tensor((2, 2), (2, 1), 0, b"}X\x07\x00\x00\x00_strideX\x01\x00\x00\x00xsb")
+    for pickled in (onto_function, onto_tensor):
+        with pytest.raises(NergError, match="b.pth"):
+            read_torch(archive(tmp_path / "b.pth", pickled, **{"0": ONE}))
 
 
-def test_a_record_has_a_largest_size(tmp_path):
-    found = TorchArchive(archive(tmp_path / "t.pth", b"N.", **{"0": ONE}))
-    assert found.record("data/0") == ONE and found.record("data/0", 16) == ONE
-    with pytest.raises(NergError, match='record "data/0" of ".*t.pth" has 16 bytes, more than the 15 that are read'):
-        found.record("data/0", 15)
+@pytest.mark.parametrize(
+    "shape, stride, offset, stored",
+    [
+        ((5,), (1,), 0, 4),
+        ((4,), (1,), 1, 4),
+        ((2, 2), (3, 1), 0, 4),
+        ((2,), (1,), -1, 4),
+        ((2,), (-1,), 1, 4),
+        ((2,), (10**12,), 0, 4),
+        ((2, 2), (1,), 0, 4),
+        ((-1,), (1,), 0, 4),
+        ((1 << 20,), (1,), 0, 1 << 20),
+        ((4,), (1,), 0, -4),
+        ((10**9,), (0,), 0, 4),
+        ((10**5, 10**5), (0, 0), 0, 4),
+        ((1 << 21,), (0,), 0, 4),
+    ],
+)
+def test_tensors_do_not_reach_beyond_their_storage(tmp_path, torch, shape, stride, offset, stored):
+    path = archive(tmp_path / "t.pth", tensor(shape, stride, offset, b"", stored), **{"0": ONE})
+    with pytest.raises(NergError, match="t.pth"):
+        to_numpy(read_torch(path), path)
 
 
-def test_bytes_in_the_other_order_are_refused(tmp_path):
-    with zipfile.ZipFile(tmp_path / "b.pth", "w") as z:
-        z.writestr("a/data.pkl", b"N.")
-        z.writestr("a/byteorder", b"big")
-    with pytest.raises(NergError, match="big-endian"):
-        TorchArchive(tmp_path / "b.pth")
+def test_repeated_numbers_are_read(tmp_path, torch):
+    for shape, stride, expected in (((3, 2), (0, 1), [[0, 1]] * 3), ((1, 2), (2**40, 1), [[0, 1]])):
+        path = archive(tmp_path / "s.pth", tensor(shape, stride), **{"0": ONE})
+        assert np.array_equal(to_numpy(read_torch(path), path), expected)
+
+
+def test_damaged_archives(tmp_path, torch):
+    with pytest.raises(FileNotFoundError, match="no file"):
+        read_torch(tmp_path / "none.pth")
+    for data in (b"not a zip", b"", b"PK\3\4 and no more", pickle.dumps({"a": 1})):
+        (tmp_path / "x.pth").write_bytes(data)
+        with pytest.raises(NergError, match="not a zip archive"):
+            read_torch(tmp_path / "x.pth")
+    for names in (["readme"], ["a/data.pkl", "b/data.pkl"], ["a/data.pkl", "a/DATA.pkl"]):
+        with zipfile.ZipFile(tmp_path / "z.pth", "w") as z:
+            for name in names:
+                z.writestr(name, "x")
+        with pytest.raises(NergError, match=r"z.pth.*data\.pkl"):
+            read_torch(tmp_path / "z.pth")
+    for missing in (tensor((2,), (1,)), b"\x80\x02ctorch._utils\n_rebuild_parameter\nN\x85R."):
+        with pytest.raises(NergError, match="d.pth"):
+            read_torch(archive(tmp_path / "d.pth", missing))
+    path = archive(tmp_path / "c.pth", tensor((4,), (1,)), **{"0": ONE})
+    path.write_bytes(path.read_bytes().replace(ONE, ONE[:-1] + b"A"))
+    with pytest.raises(NergError, match="c.pth.*a/data/0"):
+        read_torch(path)
+
+
+def test_archives_that_inflate_are_refused(tmp_path, torch):
+    pickled = tensor((2,), (1,))
+    with pytest.raises(NergError, match="z.pth.*compressed"):
+        read_torch(archive(tmp_path / "z.pth", pickled, zipfile.ZIP_DEFLATED, **{"0": bytes(30 << 20)}))
+    with pytest.raises(NergError, match="z.pth"):
+        read_torch(archive(tmp_path / "z.pth", pickled, **{"constants.pkl": b"."}))
+
+
+def test_a_pickle_has_a_largest_size(tmp_path, torch, monkeypatch):
+    path = archive(tmp_path / "t.pth", b"\x80\x02N.")
+    monkeypatch.setattr(module, "PICKLE_BYTES", 4)
+    assert read_torch(path) is None
+    monkeypatch.setattr(module, "PICKLE_BYTES", 3)
+    with pytest.raises(NergError, match=r"t.pth.*4 bytes.*the 3 that"):
+        read_torch(path)
+
+
+def test_bytes_in_the_other_order_are_turned(tmp_path, torch):
+    big = np.arange(4, dtype=">f4").tobytes()
+    path = archive(tmp_path / "b.pth", tensor((4,), (1,)), **{"0": big, "byteorder": b"big"})
+    assert np.array_equal(to_numpy(read_torch(path), path), np.arange(4))

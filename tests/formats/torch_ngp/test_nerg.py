@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from nerg_mi.formats.fields import load_gaze, save_gaze
+from nerg_mi.formats.torch_ngp.archive import write_torch
 from nerg_mi.formats.torch_ngp.nerg import read_nerg
-from nerg_mi.formats.torch_ngp.pickling import write_torch
 from tests.reference import torch_ngp_numpy as reference
 
 from .test_fields import small_state
+
+pytestmark = pytest.mark.usefixtures("torch")
 
 
 def save(path, state, variant="EmitCapture", nerf=None, **more):

@@ -11,6 +11,8 @@ from nerg_mi.formats.torch_ngp.occupancy import bitfield, morton_order
 from tests.formats.torch_ngp.test_fields import save
 from tests.reference import torch_ngp_numpy as reference
 
+pytestmark = pytest.mark.usefixtures("torch")
+
 
 @pytest.mark.parametrize("bound", [1, 2, 5, 2.7])
 def test_marching_sees_the_kernels_bits(tmp_path, bound):

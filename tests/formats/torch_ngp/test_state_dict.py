@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.formats.torch_ngp.archive import write_torch
 from nerg_mi.formats.torch_ngp.fields import read_torch_ngp
-from nerg_mi.formats.torch_ngp.pickling import write_torch
 from nerg_mi.formats.torch_ngp.state_dict import (
     StateDict,
     decimals,
@@ -20,6 +20,8 @@ from nerg_mi.formats.torch_ngp.state_dict import (
 )
 from tests.formats.torch_ngp.test_fields import save
 from tests.reference import torch_ngp_numpy as reference
+
+pytestmark = pytest.mark.usefixtures("torch")
 
 
 @pytest.fixture
