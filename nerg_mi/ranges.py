@@ -77,7 +77,8 @@ def check_number(value: Any, within: Range, name: str, whole: bool = False) -> N
     kind, noun = (Integral, "a whole number") if whole else (Real, "a number")
     if isinstance(value, bool) or not isinstance(value, kind):
         raise NergError(f"{name} must be {noun}, got {plain(repr(value), 60)}")
-    if value not in within:
+    number: Any = value
+    if number not in within:
         raise NergError(f"{name} must lie in {within}, got {_shown(value)}")
 
 
@@ -134,7 +135,7 @@ def _name(field: dataclasses.Field) -> str:
     return field.name if flag is None else flag or "--" + field.name.replace("_", "-")
 
 
-def _shown(value: Real) -> str:
+def _shown(value: Any) -> str:
     """``value`` in a few characters: an integer may have more digits than Python prints."""
     if isinstance(value, int) and abs(value) >= 10**20:
         return f"an integer of {int(math.log10(abs(value))) + 1} digits"

@@ -61,6 +61,8 @@ direction that its colour depends on.)
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -113,11 +115,11 @@ class NerfVolume(mi.Volume):
     def channel_count(self):
         return 1
 
-    def eval_1(self, it, active=True):
+    def eval_1(self, it: Any, active: Any = True):
         sigma = self.medium().occupied_density(self._similarity.point_to_local(it.p), active)
         return dr.minimum(sigma, self.max_density) if self.max_density else sigma
 
-    def eval(self, it, active=True):
+    def eval(self, it: Any, active: Any = True):
         # What media ask for; one density for all wavelengths.
         return mi.UnpolarizedSpectrum(self.eval_1(it, active))
 

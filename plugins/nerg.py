@@ -206,13 +206,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from nerg_mi.errors import NergError
 from nerg_mi.interruption import give_back_ctrl_c
-from nerg_mi.maths.types import Bool, UInt32
+from nerg_mi.maths.types import variant_types
 from nerg_mi.properties import boolean, number, text
 from nerg_mi.ranges import VALUES, Range
 from nerg_mi.registration import register
@@ -245,7 +246,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         nerg_properties.check_observer(self.observer)
 
         self.occlusion = boolean(props, "occlusion", True)
-        self.falloff = mi.Float(number(props, "falloff", 0.1, Range(0, VALUES.high)))
+        self.falloff: Any = mi.Float(number(props, "falloff", 0.1, Range(0, VALUES.high)))
         self.radiance = boolean(props, "radiance", True)
         self.background = nerg_properties.background_of(props)
         self.ceiling = nerg_properties.ceiling_of(props)
@@ -262,7 +263,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     def aov_names(self):
         return nerg_aovs.channel_names(self.aovs, self.medium) + self.shading.aov_names()
 
-    def render(self, scene, sensor=0, seed: UInt32 = 0, spp=0, develop=True, evaluate=True):
+    def render(self, scene, sensor=0, seed: Any = 0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         give_back_ctrl_c()
@@ -284,7 +285,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         finally:
             self._sensors = None
 
-    def render_forward(self, scene, params, sensor, seed: UInt32 = 0, spp=0):
+    def render_forward(self, scene, params, sensor, seed: Any = 0, spp=0):
         # Mitsuba 3.9.1 ends the process instead, also with its own integrators: a batch calls its cameras through a
         # table of all sensors, the observer among them.
         eyes = observer.centers([sensor]) + ([] if self.observer is None else [observer.center(self.observer)])
@@ -295,11 +296,12 @@ class NergIntegrator(mi.SamplingIntegrator):
             )
         return super().render_forward(scene, params, sensor, seed, spp)
 
-    def sample(self, scene, sampler, ray, medium=None, active: Bool = True):
-        camera = self.context().trace(scene, self._sensors or scene.sensors(), sampler, ray, mi.Bool(active))
+    def sample(self, scene, sampler, ray: Any, medium=None, active: Any = True):
+        active = variant_types().Bool(active)
+        camera = self.context().trace(scene, self._sensors or scene.sensors(), sampler, ray, active)
         aovs = camera.for_observer().channels(self.aovs)
         L, shown, nested = camera.radiance(scene, sampler, medium)
-        return dr.select(camera.active, L, 0), shown, aovs + nested
+        return dr.select(active, L, 0), shown, aovs + nested
 
     def context(self) -> RenderContext:
         """What its pictures are computed with."""

@@ -24,6 +24,9 @@ from nerg_mi.transport.observer import ObserverCache, ObserverSettings, Observer
 from nerg_mi.transport.observer_gaze import ObservedGaze, PlacedGaze
 from nerg_mi.transport.occlusion import Sight, trace_sight
 
+# Mitsuba with its arrays as `maths.types` has them.
+arrays: Any = mi
+
 
 @dataclass(frozen=True, kw_only=True)
 class RenderContext:
@@ -83,12 +86,12 @@ class RenderContext:
     ) -> CameraView:
         """What rays of ``sensors`` meet. Raises ``NergError`` for a scene with nothing in it."""
         self.check_place(scene)
-        offset = sampler.next_1d(active) if self.jitter else None
+        offset = cast("Any", sampler).next_1d(active) if self.jitter else None
         return CameraView(self, scene, sensors, ray, active, offset)
 
     def observer_at(self, position: Sequence[float], alone: bool = False) -> Observer:
         """The observer at ``position`` (3,). ``alone``: the only one, whom the integrator remembers."""
-        p_o = mi.Point3f(*map(float, position))
+        p_o = arrays.Point3f(*map(float, position))
         # A position that is a constant of the kernel would be compiled again for every observer.
         dr.make_opaque(p_o)
         return Observer(p_o, [p_o], self.cache if alone else ObserverCache(numbers=self.cache))
@@ -205,7 +208,7 @@ class CameraView:
         return self.ray.o + self.ray.d * self.depth
 
     @cached_property
-    def penetration(self) -> Float:
+    def penetration(self) -> Float | float:
         """How far light goes into the matter before the surface."""
         return self.view.penetration(self.context.observer_settings.depth, self.depth)
 
@@ -215,7 +218,7 @@ class CameraView:
         context, view, front, color = self.context, self.view, self.view.front, self.color
         if not context.radiance:
             # A nested integrator has its AOVs also where it lights nothing.
-            return mi.Spectrum(0), self.some, [mi.Float(0)] * len(context.shading.aov_names())
+            return mi.Spectrum(0), self.some, [arrays.Float(0)] * len(context.shading.aov_names())
         behind, nested, shown = context.shading.radiance(
             scene, sampler, self.ray, medium, view, context.background, context.hide_emitters, self.active
         )
@@ -250,7 +253,7 @@ class Pixel:
     def __init__(self, camera: CameraView, who: Observer | None, aligned: bool):
         self.camera, self.context = camera, camera.context
         self._who, self._aligned = who, aligned
-        self._evaluations: Float = mi.Float(0)
+        self._evaluations: Float = arrays.Float(0)
 
     def channels(self, aovs: Sequence[str]) -> list[Float]:
         """All channels of some of the AOVs."""
@@ -290,7 +293,7 @@ class Pixel:
         """What the observer sees of the surface: all of it where there is no occlusion to compute."""
         context, camera = self.context, self.camera
         if not context.occlusion or self.aligned:
-            return Sight(camera.p_d, self.distance_and_direction[0], mi.Float(1), mi.Float(0))
+            return Sight(camera.p_d, self.distance_and_direction[0], arrays.Float(1), arrays.Float(0))
         sight = trace_sight(
             camera.place,
             camera.ray,
@@ -326,7 +329,7 @@ class Pixel:
     def attention(self) -> Attention:
         """The gaze of the observer on the surface that they see towards this one."""
         sight, gaze, p_o, r_o, surface = self.sight, self.gaze, self.observer.p_o, self.r_o, self.camera.surface
-        networks = mi.Float(gaze.field.networks)
+        networks = arrays.Float(gaze.field.networks)
         # Where the observer cannot see, gaze is 0 whatever the field says.
         attended = surface & (sight.visibility > 0)
         shown = lambda value: dr.select(attended, value * sight.visibility, 0)
@@ -361,8 +364,8 @@ class Pixel:
         return dr.if_stmt(
             (needed,),
             needed,
-            lambda needed: tuple(mi.Float(v) for v in evaluate(p_od, p_o, r_o, needed)),
-            lambda needed: (mi.Float(0),) * (4 if with_spread else 3),
+            lambda needed: tuple(arrays.Float(v) for v in evaluate(p_od, p_o, r_o, needed)),
+            lambda needed: (arrays.Float(0),) * (4 if with_spread else 3),
             label="gaze",
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -164,7 +165,9 @@ def background_of(props):
 
 def describe(nerg) -> str:
     """The integrator ``nerg`` with all its parameters, for people."""
-    body = {k: str(v).replace("\n", "\n  ") for k, v in nerg.children.items() if k not in ("observer", "integrator")}
+    body: dict[str, Any] = {
+        k: str(v).replace("\n", "\n  ") for k, v in nerg.children.items() if k not in ("observer", "integrator")
+    }
     if nerg.observer is not None:
         body["observer"] = center(nerg.observer)
     march, seen = nerg.settings, nerg.observer_settings

@@ -71,6 +71,8 @@ Things that it does not do: it has no near and far clipping plane, no aperture, 
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -113,10 +115,11 @@ class Panorama(mi.Sensor):
         ray.has_differentials = True
         return ray, weight
 
-    def _pixel(self, sample):
+    def _pixel(self, sample: Any) -> Any:
         """Position on the whole film, in pixels, of a sample that is relative to the crop window."""
         film = self.film()
-        return mi.Point2f(sample) * mi.Vector2f(film.crop_size()) + mi.Vector2f(film.crop_offset())
+        size: Any = mi.Vector2f(film.crop_size())
+        return mi.Point2f(sample) * size + mi.Vector2f(film.crop_offset())
 
     def _direction(self, pixel):
         """World direction of a position on the film; beyond a pole it continues on the opposite meridian."""

@@ -66,7 +66,7 @@ def _free_memory():
 
     The suite must fit on a small machine; doing it after every file took a fifth of its time.
     """
-    global _freed
+    global _freed  # noqa: PLW0603
     yield
     if _resident() < _freed + 0.5:
         return

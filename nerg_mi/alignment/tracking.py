@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from scipy import fft
@@ -48,8 +49,8 @@ class Flips:
         there, here = float(np.median(self.degrees[best])), float(np.median(declared))
         if best == DECLARED or there > _BETTER * here:
             return None
-        # Statistic and probability.
-        if wilcoxon(self.degrees[best], declared, alternative="less")[1] > _CHANCE:
+        _, chance = wilcoxon(self.degrees[best], declared, alternative="less")
+        if cast("float", chance) > _CHANCE:
             return None
         return (
             f"the gaze passes {here:.2g} degrees from the nearest point of the place (median), and {there:.2g} with "

@@ -22,6 +22,7 @@ from nerg_mi.formats.regions import Entry, Region, check_name, is_number, parse_
 from nerg_mi.jobs.gaze_places import align_of_training, place_of_training
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
 from nerg_mi.maths.geometry import Similarity, box_interval
+from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import COORDINATES
 from nerg_mi.rays.readers.tables import iterate_table
 from nerg_mi.rendering.asked import is_nerg
@@ -114,8 +115,7 @@ class Surroundings:
 
     def support(self, eye: np.ndarray) -> float:
         """Rays that the field learnt from around ``eye`` (3,); NaN where it does not say."""
-        import mitsuba as mi
-
+        mi = variant_types()
         if self.gaze is None or self.gaze.field.support is None:
             return float("nan")
         p = self.gaze.to_world.point_to_local(mi.Point3f(*np.asarray(eye, float).tolist()))

@@ -20,6 +20,7 @@ from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.formats.meshes import READERS
 from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.reporter import SILENT, Reporter
+from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import FARTHEST, Range, check_number
 from nerg_mi.statistics.shares import Shares, SumRule, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, Box
@@ -198,8 +199,8 @@ def mesh_shares(
     Arguments and errors as of `attention`; ``observer`` (3,).
     """
     import drjit as dr
-    import mitsuba as mi
 
+    mi = variant_types()
     from nerg_mi.probes.surface_attention import Patches, patches
 
     _check(scene)

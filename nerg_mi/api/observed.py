@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from nerg_mi.maths.types import variant_types
+
 from .arrays import Floats
 from .scene import Scene
 
@@ -20,7 +22,7 @@ class ObserverOf:
         import mitsuba as mi
 
         self.scene, self.place, self.integrator = scene, scene.place, scene.integrator
-        self.center = mi.Point3f(position.tolist())
+        self.center: Any = mi.Point3f(position.tolist())
         # A position that is a constant of the kernel would be compiled anew for every observer.
         dr.make_opaque(self.center)
         self.gaze = None
@@ -38,8 +40,8 @@ class ObserverOf:
     def sees(self, p: Any, with_gaze: bool) -> dict[str, Any]:
         """Of points ``p`` (Point3f): ``distance``, ``depth`` and ``visibility``, and ``gaze`` where wanted (Floats)."""
         import drjit as dr
-        import mitsuba as mi
 
+        mi = variant_types()
         from nerg_mi.transport.observer import distance_and_direction
         from nerg_mi.transport.occlusion import trace_sight
 

@@ -14,6 +14,7 @@ from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.types import variant_types
 from nerg_mi.probes.kde import Backend, SphericalKde
 from nerg_mi.probes.probes import Probes, place_probes
 from nerg_mi.rays.filters import purge, split_by_person
@@ -211,8 +212,7 @@ class FieldDensity:
 
     def _of(self, position: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Densities (M, D) of one observer (3,), both in the field's frame."""
-        import mitsuba as mi
-
+        mi = variant_types()
         p_o, key = mi.Point3f(*position.tolist()), position.tobytes()
         new = key not in self._observed
         if new:

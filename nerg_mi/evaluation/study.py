@@ -8,7 +8,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
@@ -123,7 +123,7 @@ def _integrator_class(variant: str):
             if like.radiance:
                 L = (1 - alpha) * like.background
                 if painter is not None:
-                    color = painter.color(like.medium, total, alpha, local, active)
+                    color = painter.color(like.medium, total, alpha, local, cast("Any", active))
                     L += composite_to_linear(color, alpha, like.medium.color_space)
             return L, alpha > 0, [out[name] for name in names]
 

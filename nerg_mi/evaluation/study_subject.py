@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.types import UInt32
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.transport.geometry import Place
@@ -182,7 +182,7 @@ class Subject:
         picture = self.render(Recorder(mi.Properties()), 1, seed)[..., -6:].reshape(-1, 6).astype(float)
         return picture[:, :3], picture[:, 3:]
 
-    def render(self, integrator, spp: int, seed: UInt32) -> np.ndarray:
+    def render(self, integrator, spp: int, seed: Any) -> np.ndarray:
         """The picture (h, w, channels)."""
         import mitsuba as mi
 

@@ -10,6 +10,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths.color import decibels
 from nerg_mi.maths.geometry import box_interval
+from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer_gaze import ObservedGaze
 
@@ -230,13 +231,14 @@ def towards(p_o, p):
 def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
     """Gaze density (N,) in 1/sr at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``, one of the observers of
     ``gaze``."""
-    import mitsuba as mi
+    mi = variant_types()
 
     def points(kind, v):
         return kind(np.ascontiguousarray(np.broadcast_to(v, p_od.shape).T, np.float32))
 
     return np.array(
-        gaze.evaluate(points(mi.Point3f, p_od), points(mi.Point3f, p_o), points(mi.Vector3f, r_o), True)[0], float
+        gaze.evaluate(points(mi.Point3f, p_od), points(mi.Point3f, p_o), points(mi.Vector3f, r_o), mi.Bool(True))[0],
+        float,
     )
 
 

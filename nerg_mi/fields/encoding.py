@@ -95,14 +95,14 @@ class Encoding(Protocol):
         """An untrained encoding of backend ``ns``; equal states of ``rng`` give equal parameters."""
         ...
 
-    def __call__(self, p: Array3f, active: Bool = True) -> list[Float]:
+    def __call__(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
         """``config.size`` Floats at ``p`` (Array3f, or Array2f, of the unit cube).
 
         Zeros where ``p`` lies outside of the cube or is not ``active``. Derivatives reach the parameters and ``p``.
         """
         ...
 
-    def evaluated(self, p: Array3f, active: Bool = True) -> list[Float]:
+    def evaluated(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
         """The same numbers in memory, for many points at once; an encoding may have a faster way to them."""
         out = self(p, active)
         dr.eval(out)
@@ -303,7 +303,7 @@ class HashGrid(Encoding):
         stride = int(np.ceil(self._scales[level])) + 2
         return stride**self.config.dimensions > self._rows[level]
 
-    def __call__(self, p: Array3f, active: Bool = True) -> list[Float]:
+    def __call__(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
         """Features at ``p`` (Array3f in the unit cube, or Array2f): ``levels * features`` Floats, zero outside."""
         p, inside = self._clamped(p, active)
         out = []
@@ -311,7 +311,7 @@ class HashGrid(Encoding):
             out += self._level(level, p, inside)
         return out
 
-    def evaluated(self, p: Array3f, active: Bool = True) -> list[Float]:
+    def evaluated(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
         """The same features, evaluated one level after another: the rows of one level stay in the caches.
 
         Worth it for many scattered points whose features are to be kept in memory anyhow.

@@ -308,9 +308,9 @@ class GazeDensity(AnyGazeField, Protocol):
         p_od: Point3f,
         p_o: Point3f,
         r_o: Vector3f,
-        active: Bool = True,
+        active: Bool | bool = True,
         semantic: list[Float] | None = None,
-        escaped: Bool = False,
+        escaped: Bool | bool = False,
     ) -> tuple[Float, Float]:
         """``(emit, capture)``, whose product a normalised field divides by its integral. A variant that lacks a factor
         has 1 in its place and does not evaluate it.
@@ -325,10 +325,10 @@ class GazeDensity(AnyGazeField, Protocol):
         p_od: Point3f,
         p_o: Point3f,
         r_o: Vector3f,
-        active: Bool = True,
+        active: Bool | bool = True,
         semantic: list[Float] | None = None,
         integral: Float | None = None,
-        escaped: Bool = False,
+        escaped: Bool | bool = False,
     ) -> tuple[Float, Float, Float]:
         """``(gaze, emit, capture)`` in 1/sr of the observer at ``p_o`` attending ``p_od`` along ``r_o``.
 

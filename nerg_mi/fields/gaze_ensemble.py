@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import ModuleType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import drjit as dr
 
 from nerg_mi.maths.geometry import AnyBox
+from nerg_mi.maths.types import Float
 
 from .gaze_base import SIZE_LIMITS, Arrays, Basis, GazeDensity, RaySupport, build, register
 from .mlp import MLP
@@ -93,11 +94,11 @@ def mean(found: list[tuple]) -> tuple:
     return tuple(sum(parts[1:], parts[0]) / len(found) for parts in zip(*found))
 
 
-def spread(found: list[tuple]):
+def spread(found: list[tuple]) -> Float:
     """Standard deviation of gaze over the ``(gaze, emit, capture)`` of two or more members (1/sr, of N - 1 degrees of
     freedom)."""
     gaze = mean(found)[0]
-    variance = sum(dr.square(g - gaze) for g, _, _ in found) / (len(found) - 1)
+    variance: Any = sum(dr.square(g - gaze) for g, _, _ in found) / (len(found) - 1)
     # Where members agree, the root's derivative would not be finite.
     apart = variance > 1e-30
     return dr.select(apart, dr.sqrt(dr.select(apart, variance, 1)), 0)

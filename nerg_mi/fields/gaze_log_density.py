@@ -21,6 +21,7 @@ import numpy as np
 
 from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
+from nerg_mi.maths.types import Bool
 from nerg_mi.ranges import FARTHEST, LENGTHS
 
 from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, random_encoding
@@ -167,7 +168,7 @@ class LogGazeField(GazeHead):
             arrays.ns.TensorXf(arrays.array("prior", config.prior, 2 * config.prior, largest=_LARGEST_LOG)),
         )
 
-    def emit_inputs(self, p_od, p_o, r_o, active=True) -> list:
+    def emit_inputs(self, p_od, p_o, r_o, active: Bool | bool = True) -> list:
         """What emit's network is given (list of Floats): a bias, the log of the distance, the direction, the place."""
         Float = type(p_od.x)
         if self.config.geometry == "none":
@@ -193,11 +194,11 @@ class LogGazeField(GazeHead):
         """What capture's network is given, for ``capture_position`` and a direction."""
         return [type(r_o.x)(1), *encode_direction(r_o, self.config.sh_degree), *position]
 
-    def capture(self, p_o, r_o, active=True):
+    def capture(self, p_o, r_o, active: Bool | bool = True):
         """sigmoid(F_c(p_o, r_o))."""
         return sigmoid(self.capture_net(self.capture_inputs(self.capture_position(p_o), r_o))[0])
 
-    def unnormalized(self, p_od, p_o, r_o, active=True, semantic=None, escaped=False):
+    def unnormalized(self, p_od, p_o, r_o, active: Bool | bool = True, semantic=None, escaped: Bool | bool = False):
         """``(emit * blind, capture)``: the product of both is what ``Z`` is the integral of. ``escaped``: mask of
         directions in which no surface is met. There are no ``semantic`` features."""
         c, one = self.config, type(p_od.x)(1)

@@ -19,6 +19,7 @@ import numpy as np
 
 from nerg_mi.maths.arrays import log1p, sigmoid
 from nerg_mi.maths.geometry import AnyBox
+from nerg_mi.maths.types import Bool
 
 from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, random_encoding
 from .gaze_base import Arrays, GazeHead, GazeHeadConfig, register
@@ -200,7 +201,7 @@ class GazeField(GazeHead):
         hidden = self.direction_net(encode_direction(d, self.config.sh_degree) + geometry)
         return hidden if self.config.trunk == "linear" else [dr.maximum(h, 0) for h in hidden]
 
-    def emit(self, p_od, r_o, active=True, semantic=None):
+    def emit(self, p_od, r_o, active: Bool | bool = True, semantic=None):
         """F_e(p_od, -r_o) after its activation, in 1/sr. ``r_o``: unit, from observer to surface. ``semantic``: list of
         ``geometry`` features, for a field whose configuration asks for them."""
         c = self.config
@@ -211,11 +212,11 @@ class GazeField(GazeHead):
             )
         return activate(self.emit_head(self._trunk(p_od, -r_o, active, semantic))[0], c.activation) * c.emit_scale
 
-    def capture(self, p_o, r_o, active=True):
+    def capture(self, p_o, r_o, active: Bool | bool = True):
         """sigmoid(F_c(p_o, r_o)), the probability that what is emitted is perceived."""
         return sigmoid(self.capture_head(self._trunk(p_o, r_o, active))[0])
 
-    def unnormalized(self, p_od, p_o, r_o, active=True, semantic=None, escaped=False):
+    def unnormalized(self, p_od, p_o, r_o, active: Bool | bool = True, semantic=None, escaped: Bool | bool = False):
         """``(emit, capture)``, whose product a normalised field divides by its integral; ``escaped`` makes no
         difference.
 

@@ -8,6 +8,8 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.types import Array3f, Bool, UInt32
+
 # ---- Occupancy ----
 #
 # Where a field may hold density: a bit a cell, and how far away the next one is.
@@ -55,12 +57,12 @@ class OccupancyGrid:
         """Share of the cells that are occupied."""
         return float(self.bits.mean())
 
-    def empty_cells(self, u, active=True):
+    def empty_cells(self, u: Array3f, active: Bool | bool = True) -> UInt32:
         """Distance in cells (UInt32) from the cell of ``u`` (unit cube) to an occupied one; 0: occupied.
 
         Points outside of the cube are clamped to its nearest cell.
         """
-        uint = dr.uint32_array_t(type(u.x))
+        uint: Any = dr.uint32_array_t(type(u.x))
         c = [uint(dr.clip(x * n, 0, n - 1)) for x, n in zip((u.x, u.y, u.z), self.cells)]
         index = c[0] + self.cells[0] * (c[1] + self.cells[1] * c[2])
         return uint(dr.gather(type(self.distance), self.distance, index, active))
@@ -245,7 +247,7 @@ class CascadeGrid:
                     out[az[z], ay[y], ax[x]] = True
         return out
 
-    def empty_cells(self, u, active=True):
+    def empty_cells(self, u: Array3f, active: Bool | bool = True) -> UInt32:
         """Distance in cells of the common grid (UInt32) from that of ``u`` (unit cube) to an occupied one; 0: occupied.
 
         Points outside of the cube are clamped to its nearest cell.
@@ -419,7 +421,7 @@ class RefinedGrid:
         """Share of the parts that are occupied."""
         return float(np.unpackbits(self.masks).sum() / np.prod(self.cells))
 
-    def empty_cells(self, u, active=True):
+    def empty_cells(self, u: Array3f, active: Bool | bool = True) -> UInt32:
         """Distance in parts (UInt32) from that of ``u`` (unit cube) to an occupied one, or less; 0: occupied.
 
         Points outside of the cube are clamped to its nearest part.

@@ -11,7 +11,7 @@ import numpy as np
 
 from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
-from nerg_mi.maths.types import Float
+from nerg_mi.maths.types import Bool, Float
 from nerg_mi.ranges import FARTHEST, VALUES
 
 from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, encoding_config, random_encoding
@@ -345,7 +345,7 @@ class RadianceField:
         """The arrays that evaluations read: the encoding's and the packed networks, attached to ``parameters()``."""
         return [*self.grid.kernel_parameters(), self.density_net.buffer, self.color_net.buffer, self._head.buffer]
 
-    def density(self, p, active=True):
+    def density(self, p, active: Bool | bool = True):
         """Density in 1/unit at ``p`` (Array3f, the field's units); 0 outside of the box."""
         inside = active & self.box.contains(p)
         h = self._head(self.grid(self.box.to_unit(p), inside))
@@ -355,7 +355,7 @@ class RadianceField:
         """Density (1/unit) at ``p`` where the density net's first output is ``h``."""
         return self.box.density_along(density_from_log(h, self.config.density_scale), p)
 
-    def density_features(self, p, active=True):
+    def density_features(self, p, active: Bool | bool = True):
         """Density (1/unit) at ``p`` and the ``geometry`` features (list of Floats) that ``color`` needs."""
         inside = active & self.box.contains(p)
         h = self.density_net(self.grid(self.box.to_unit(p), inside))

@@ -8,7 +8,7 @@ near it, or where a part beside holds something.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -72,7 +72,7 @@ def _masks(field: RadianceField, bits: np.ndarray, cells: UInt32, threshold: flo
     for k in range(points):
         if k == _FIRST:
             near |= ns.UInt8(_touching(bits, _packed(found)))
-        rest: UInt32 = dr.compress((found == 0) & (near > 0) if k >= _FIRST else found == 0)
+        rest = cast("UInt32", dr.compress((found == 0) & (near > 0) if k >= _FIRST else found == 0))
         if dr.width(rest) == 0:
             break
         # As literals the points would compile a kernel each.

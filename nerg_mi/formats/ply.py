@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -181,7 +182,9 @@ class _Rows:
     def _uneven(self, at, name, count, properties: list[_Property], kinds) -> tuple[PlyTable, int]:
         starts = np.zeros((len(properties), count), np.int64)
         counts = np.zeros((len(properties), count), np.int64)
-        sizes = [(self.size(kind), counted and self.size(counted), counted) for _, kind, counted in properties]
+        sizes: list[Any] = [
+            (self.size(kind), counted and self.size(counted), counted) for _, kind, counted in properties
+        ]
         for row in range(count):
             for k, (size, head, counted) in enumerate(sizes):
                 if counted:

@@ -132,7 +132,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     write_bitmap_exr(out / "scene.exr", camera.bitmap)
     files.append(out / "scene.exr")
     clock.start("surfaces")
-    eye = tuple(float(v) for v in np.ravel(center(seen.sensors()[OWN])))
+    eye = tuple(float(v) for v in np.ravel(np.array(center(seen.sensors()[OWN]))))
     if (scene.parent / TWIN).is_file():
         files.append(_bake(scene.parent / TWIN, inputs[2], eye, out / "heatmap.glb", mode, seed))
     clock.start("tracked gaze")

@@ -3,11 +3,13 @@ overflow."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
+
+from .types import Float
 
 # ---- From NumPy to Dr.Jit so that kernels are the same for any number of values ----
 #
@@ -49,25 +51,25 @@ def _columns(rows: np.ndarray, dtype: np.dtype) -> np.ndarray:
 # 1 - exp(-x), log(1 + x), quotients of tiny numbers and the logistic function, without cancellation or overflow.
 
 
-def one_minus_exp(x):
+def one_minus_exp(x: Float) -> Float:
     """1 - exp(-x) for x >= 0, to full relative precision also for tiny x; 1 at infinity."""
     # tanh is accurate near 0 and saturates at 1: 1 - exp(-x) = 2 th / (1 + th), th = tanh(x / 2).
     th = dr.tanh(0.5 * x)
     # The derivative is written out: that of tanh, 1 - th², cancels as x grows.
-    return dr.replace_grad(2 * th / (1 + th), -dr.exp(-x))
+    return cast("Float", dr.replace_grad(2 * th / (1 + th), -dr.exp(-x)))
 
 
-def log1p(x):
+def log1p(x: Float) -> Float:
     """log(1 + x) for -1 < x <= 1, to full relative precision also for tiny x."""
     return 2 * dr.atanh(x / (2 + x))
 
 
-def quotient(a, b):
+def quotient(a: Float, b: Float) -> Float:
     """a / b for b != 0. Its first derivatives do not square b, which would overflow below 1e-19."""
     value = dr.detach(a) / dr.detach(b)
-    return dr.replace_grad(value, (a - value * b) * (1 / dr.detach(b)))
+    return cast("Float", dr.replace_grad(value, (a - value * b) * (1 / dr.detach(b))))
 
 
-def sigmoid(x):
+def sigmoid(x: Float) -> Float:
     """1 / (1 + exp(-x)), finite with its gradient for every finite x."""
     return dr.fma(0.5, dr.tanh(0.5 * x), 0.5)

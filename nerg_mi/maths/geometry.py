@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.ranges import FARTHEST
 
 from .coordinates import check_coordinates
-from .types import Array3f, Point3f, Vector3f
+from .types import Array3f, Bool, Float, Point3f, Vector3f
 
 # ---- The axis-aligned box in which a field lives, and its map to the unit cube ----
 
@@ -77,7 +77,7 @@ class Box:
     def diagonal(self) -> float:
         return float(np.linalg.norm(np.subtract(self.upper, self.lower)))
 
-    def to_unit(self, p):
+    def to_unit(self, p: Any) -> Any:
         """Unit-cube coordinates of ``p`` (Array3f or (N, 3) array)."""
         if self.bound is not None:
             return self._divided(p + self.bound, 2 * self.bound)
@@ -85,19 +85,19 @@ class Box:
             return (p - type(p)(*self.center)) / self.side + 0.5
         return (np.asarray(p) - np.asarray(self.center)) / self.side + 0.5
 
-    def from_unit(self, u):
+    def from_unit(self, u: Array3f) -> Array3f:
         """The points (Array3f) at ``u`` of the unit cube."""
         return (u - 0.5) * self.side + type(u)(*self.center)
 
-    def to_cube(self, p):
+    def to_cube(self, p: Array3f) -> Array3f:
         """``p`` (Array3f) in a unit cube in which straight lines stay straight: as `to_unit` has it."""
         return self.to_unit(p)
 
-    def distance_scale(self, p):
+    def distance_scale(self, p: Array3f) -> Float | float:
         """How much larger cells of the unit cube are at ``p`` than in the core: they are all alike."""
         return 1.0
 
-    def density_along(self, sigma, p):
+    def density_along(self, sigma: Float, p: Array3f) -> Float:
         """Density per unit of the field at ``p`` where it is ``sigma`` per unit as positions are encoded: the same."""
         return sigma
 
@@ -112,7 +112,7 @@ class Box:
             return quotient
         return dr.fma(dr.fma(-quotient, divisor, x), inverse, quotient)
 
-    def contains(self, p):
+    def contains(self, p: Array3f) -> Bool:
         """Mask of the points ``p`` (Array3f) inside the box."""
         return dr.all((p >= type(p)(*self.lower)) & (p <= type(p)(*self.upper)))
 
@@ -193,33 +193,33 @@ class ContractedBox:
         x = (p - type(p)(*self.center)) * (2 / self.side)
         return x, dr.maximum(dr.maximum(dr.maximum(dr.abs(x.x), dr.abs(x.y)), dr.abs(x.z)), 1)
 
-    def to_unit(self, p):
+    def to_unit(self, p: Any) -> Any:
         """Where ``p`` (Array3f) is encoded, in the unit cube: the inner cube is its middle, half as wide."""
         x, m = self._halves(p)
         inverse = dr.rcp(m)
         return x * ((2 - inverse) * inverse * 0.25) + 0.5
 
-    def from_unit(self, u):
+    def from_unit(self, u: Array3f) -> Array3f:
         """The points (Array3f) that are encoded at ``u``; those beyond the outer cube come to lie on its face."""
         y = (u - 0.5) * 4
         n = dr.maximum(dr.maximum(dr.maximum(dr.abs(y.x), dr.abs(y.y)), dr.abs(y.z)), 1)
         scale = dr.rcp(n * dr.maximum(2 - n, 1 / self.reach))
         return y * (scale * (0.5 * self.side)) + type(y)(*self.center)
 
-    def distance_scale(self, p):
+    def distance_scale(self, p: Array3f) -> Float | float:
         """How many times farther than the inner cube's face ``p`` (Array3f) is from the centre; 1 within the cube."""
         return self._halves(p)[1]
 
-    def density_along(self, sigma, p):
+    def density_along(self, sigma: Float, p: Array3f) -> Float:
         """Density per unit of the field at ``p`` (Array3f) where it is ``sigma`` per unit as positions are encoded, out
         along the line from the centre: σ / m². A field without structure then absorbs no more outside than within."""
         return sigma * dr.rcp(dr.square(self._halves(p)[1]))
 
-    def to_cube(self, p):
+    def to_cube(self, p: Array3f) -> Array3f:
         """``p`` (Array3f) in coordinates in which the outer cube is the unit cube: straight lines stay straight."""
         return (p - type(p)(*self.center)) / self.cube_side + 0.5
 
-    def contains(self, p):
+    def contains(self, p: Array3f) -> Bool:
         """Mask of the points ``p`` (Array3f) inside the outer cube."""
         return dr.all((p >= type(p)(*self.lower)) & (p <= type(p)(*self.upper)))
 
@@ -241,7 +241,7 @@ def box_of(about: dict) -> AnyBox:
 # ---- Where a ray is inside an axis-aligned box (slab method) ----
 
 
-def intersect_box(o, d, lower, upper):
+def intersect_box(o: Array3f, d: Array3f, lower: Sequence[Any], upper: Sequence[Any]) -> tuple[Float, Float]:
     """Parameters ``(t_near, t_far)`` at which ``o + t d`` enters and leaves the box.
 
     ``o``, ``d``: Array3f; ``lower``, ``upper``: sequences of 3 numbers, which kernels are compiled with, or of 3

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from .types import UInt32, Vector3f
+from .types import UInt32, Vector3f, variant_types
 
 # ---- Sets of directions on the unit sphere, with the solid angle of each ----
 #
@@ -54,8 +54,8 @@ def fibonacci_vectors(count: int, which: UInt32 | None = None) -> Vector3f:
     Made by its kernels, since frozen functions take no arrays from NumPy.
     """
     import drjit as dr
-    import mitsuba as mi
 
+    mi = variant_types()
     which = dr.arange(mi.UInt32, count) if which is None else which
     z = 1 - (2 * mi.Float(which) + 1) / count
     # Turns of the golden angle, of which whole ones are dropped in double precision.

@@ -84,7 +84,7 @@ def _find_features(pycolmap: Any, database: Path, folder: Path, job: dict, tell:
     options.num_threads = job["threads"]
     names = [small_name(k) for k in range(len(job["pictures"]))]
     # Several at a time, so that there is something to tell in between.
-    several = 2 * os.cpu_count() if job["threads"] < 1 else 2 * job["threads"]
+    several = 2 * (os.cpu_count() or 1) if job["threads"] < 1 else 2 * job["threads"]
     for begin in range(0, len(names), several):
         tell("features", begin, len(names))
         some = names[begin : begin + several]

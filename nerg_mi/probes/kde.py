@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import sys
 from types import ModuleType
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -353,7 +354,7 @@ class SphericalKdeTable:
         """Density in ``direction`` (unit), in 1/sr: traced, not evaluated, differentiable."""
         first, (s, t) = self._cell(direction)
         ws, wt = _cubic(s), _cubic(t)
-        total: Float = 0
+        total: Any = 0
         for j in range(4):
             row = 0
             for i in range(4):

@@ -21,7 +21,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
+from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f, variant_types
 from nerg_mi.transport.geometry import Place, default_settings
 from nerg_mi.transport.observer import ObserverSettings, distance_and_direction
 from nerg_mi.transport.occlusion import trace_sight
@@ -55,8 +55,7 @@ def patches(mesh: mi.Mesh, divisions: int = 4) -> Patches:
     ``vertex_positions`` of the mesh, or the ``to_world`` of a rectangle. Raises `NergError` for what is not a mesh,
     ``ValueError`` for no divisions.
     """
-    import mitsuba as mi
-
+    mi = variant_types()
     if not isinstance(mesh, mi.Mesh):
         raise NergError(f'"{mesh.id()}" is not a mesh; attention is received by meshes (cube, rectangle, ply, obj)')
     if divisions < 1:
@@ -67,9 +66,7 @@ def patches(mesh: mi.Mesh, divisions: int = 4) -> Patches:
     count = len(faces) // 3
     index = dr.arange(mi.UInt32, count * len(centre))
     face, piece = index // len(centre), index % len(centre)
-    corners: list[Point3f] = [
-        dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k)) for k in range(3)
-    ]
+    corners = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k)) for k in range(3)]
     a, b, c = corners
     u, v = (dr.gather(mi.Float, mi.Float(np.ascontiguousarray(centre[:, k])), piece) for k in range(2))
     across = dr.cross(b - a, c - a)
@@ -92,18 +89,17 @@ def attended(
     p_o: Point3f,
     p: Point3f,
     n: Vector3f,
-    falloff: Float = 0.0,
+    falloff: Float | float = 0.0,
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
-    penetration: Float = 0.0,
+    penetration: Float | float = 0.0,
 ) -> Float:
     """Attention per solid angle, in 1/sr, that the observer ``p_o`` gives ``p`` with normal ``n`` after occlusion.
 
     Arguments as of ``arriving``, which is this times the Jacobian from solid angle to area. ``penetration``: how far,
     along the normal, what is seen of ``p`` may begin before it, in scene units.
     """
-    import mitsuba as mi
-
+    mi = variant_types()
     distance, r_o, cosine = _faced(p_o, p, n)
     n = dr.select(two_sided & (cosine < 0), -n, n)
     active = ((cosine != 0) if two_sided else (cosine > 0)) & (distance > 0)
@@ -130,7 +126,7 @@ def arriving(
     p_o: Point3f,
     p: Point3f,
     n: Vector3f,
-    falloff: Float = 0.0,
+    falloff: Float | float = 0.0,
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
 ) -> Float:
@@ -154,7 +150,7 @@ def contributions(
     density: Density,
     observers: Point3f,
     surface: Patches,
-    falloff: Float = 0.0,
+    falloff: Float | float = 0.0,
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
 ) -> Float:
@@ -162,8 +158,7 @@ def contributions(
 
     Arguments as of ``arriving``; ``observers``: a lane an observer.
     """
-    import mitsuba as mi
-
+    mi = variant_types()
     count, people = dr.width(surface.p, surface.n, surface.area), dr.width(observers)
     index = dr.arange(mi.UInt32, count * people)
     who, where = index // count, index % count
@@ -179,7 +174,7 @@ def received(
     density: Density,
     observers: Point3f,
     surface: Patches,
-    falloff: Float = 0.0,
+    falloff: Float | float = 0.0,
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
 ) -> Float:

@@ -17,7 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from nerg_mi.maths.types import Bool
+from nerg_mi.maths.types import variant_types
 
 from . import pixel_sampler
 from .layers import Layers, OwnLayer
@@ -172,13 +172,13 @@ def _trace(scene, sensor, layers: Layers, grid: _Grid, base, seed, top, first, c
     the band at ``top``, who counts, and an iterator over their values in each layer. Follows
     ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by operation."""
     import drjit as dr
-    import mitsuba as mi
 
+    mi = variant_types()
     film, spp = sensor.film(), grid.spp
     sampler = pixel_sampler.for_samples(spp, base, seed, first, count)
     # Numbers that differ from strip to strip are kept out of the kernel, which is then the same for all.
     number = dr.arange(mi.UInt32, count)
-    active: Bool = number >= dr.opaque(mi.UInt32, max(start - first, 0))
+    active = number >= dr.opaque(mi.UInt32, max(start - first, 0))
     number += dr.opaque(mi.UInt32, first % spp)
     number = number // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first // spp % grid.width)
     line = number // grid.width

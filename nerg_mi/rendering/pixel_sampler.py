@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import functools
 import re
-from typing import Any
 
-from nerg_mi.maths.types import UInt32
+from nerg_mi.maths.types import variant_types
 
 
 def base_seed(sampler) -> int | None:
@@ -37,16 +36,14 @@ def for_samples(spp: int, base: int, seed: int, first: int, count: int):
     Mitsuba renders at most 2^32 samples at once; beyond that the sequences are those of other seeds.
     """
     import drjit as dr
-    import mitsuba as mi
 
+    mi = variant_types()
     number = dr.opaque(mi.UInt64, first) + mi.UInt64(dr.arange(mi.UInt32, count))
-    low: UInt32 = mi.UInt32(number & 0xFFFFFFFF)
-    high: UInt32 = mi.UInt32(number >> 32)
-    key: UInt32 = dr.opaque(mi.UInt32, (base + seed) & 0xFFFFFFFF) + high * 0x9E3779B9
+    low = mi.UInt32(number & 0xFFFFFFFF)
+    high = mi.UInt32(number >> 32)
+    key = dr.opaque(mi.UInt32, (base + seed) & 0xFFFFFFFF) + high * 0x9E3779B9
     state, stream = mi.sample_tea_32(key, low)
-    # Mitsuba's stubs know it as an object.
-    PCG32: Any = mi.PCG32
-    return _class(mi.variant())(spp, PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream)))
+    return _class(mi.variant())(spp, mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream)))
 
 
 @functools.cache

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.maths.types import Float, Point3f
+from nerg_mi.maths.types import Point3f, variant_types
 
 
 def clip_distances(extent: float, unit: float = 1.0) -> tuple[float, float]:
@@ -22,10 +22,9 @@ def clip_distances(extent: float, unit: float = 1.0) -> tuple[float, float]:
 def pixel_of(camera: Any, point: Point3f) -> tuple[float, float] | None:
     """Where ``point`` (one lane, scene units) lies in the picture of the perspective ``camera``: (x, y) in pixels,
     counted from the first one's centre; None outside of it, and behind the camera."""
-    import mitsuba as mi
-
+    mi = variant_types()
     film = camera.film()
-    fov: Float = mi.traverse(camera)["x_fov"]
+    fov = mi.traverse(camera)["x_fov"]
     local = camera.world_transform().inverse() @ point
     clip = camera.near_clip(), camera.far_clip()
     screen = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, *clip)

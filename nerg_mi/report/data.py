@@ -19,6 +19,7 @@ from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.overlay import srgb, to_bytes
 from nerg_mi.formats.regions import Region
 from nerg_mi.maths.arrays import vector_of
+from nerg_mi.maths.types import variant_types
 from nerg_mi.rays.quality import RaysSummary
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.channels import render_channels
@@ -74,8 +75,7 @@ class Onlooker:
 
     def density(self, observer: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Gaze (N,) in 1/sr of the ``observer`` (3,) in unit ``directions`` (N, 3)."""
-        import mitsuba as mi
-
+        mi = variant_types()
         center = mi.Point3f(*np.asarray(observer, float).tolist())
         observed = self._gaze.at([center], self._place, self._settings)
         return np.array(observed.along(center, vector_of(mi.Vector3f, directions)))

@@ -14,6 +14,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths.arrays import aligned, vector_of
 from nerg_mi.maths.coordinates import check_coordinates
+from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.geometry import Place, default_settings
 from nerg_mi.transport.medium import Medium
 from nerg_mi.transport.observer import ObserverSettings
@@ -299,8 +300,7 @@ class Target:
     def sees(self, eye: np.ndarray, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """Whether ``eye`` (3,) sees ``points`` (N, 3) of the surface, which lie in its ``faces`` (N,); of `sharp`
         targets. A point is seen where the ray at it ends at its own face, however obliquely, or not before it."""
-        import mitsuba as mi
-
+        mi = variant_types()
         to = points - eye
         distance = np.linalg.norm(to, axis=1)
         d = vector_of(mi.Vector3f, to / np.where(distance > 0, distance, 1)[:, None])
@@ -319,8 +319,7 @@ class Target:
 
     def ends(self, origins: np.ndarray, directions: np.ndarray) -> Ends:
         """Where rays with ``origins`` (N, 3) and unit ``directions`` (N, 3) end."""
-        import mitsuba as mi
-
+        mi = variant_types()
         o, d = (vector_of(mi.Point3f, v) for v in (origins, directions))
         count = len(origins)
         with dr.suspend_grad():

@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.arrays import vector_of
-from nerg_mi.maths.types import Point3f, Vector3f
+from nerg_mi.maths.types import Point3f, Vector3f, variant_types
 from nerg_mi.probes.surface_attention import Density, attended
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
@@ -49,8 +49,8 @@ _GOLDEN = np.pi * (3 - np.sqrt(5))
 def blurred(density: Callable[[Vector3f], Any], directions: Vector3f, sigma: float) -> Any:
     """``density`` along ``directions`` (unit, a lane each), seen through a cone of ``sigma`` radian."""
     import drjit as dr
-    import mitsuba as mi
 
+    mi = variant_types()
     side, up = mi.coordinate_system(directions)
     found = 0.5 * density(directions)
     sin, cos = dr.sincos(mi.Float(2 * sigma))
@@ -624,8 +624,7 @@ def _received(
 def unhidden(looker: Looker, density: Density, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """``density`` (N,) of ``looker`` at ``points`` (N, 3), along unit ``directions`` (N, 3), in 1/sr, whatever may
     stand between."""
-    import mitsuba as mi
-
+    mi = variant_types()
     r_o, p_od = vector_of(mi.Vector3f, directions), vector_of(mi.Point3f, points)
     p_o = looker.center + dr.zeros(mi.Point3f, len(points))
     found = density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(points)))
@@ -646,8 +645,7 @@ def _of_pieces(looker: Looker, density: Density, pieces: Pieces) -> np.ndarray:
 
 def _launch(target: Target, center: Point3f, density: Density, pieces: Pieces) -> np.ndarray:
     """``density`` (P,) after occlusion by what may be a medium, at the centroids of ``pieces``, in 1/sr."""
-    import mitsuba as mi
-
+    mi = variant_types()
     p_o, p = center + dr.zeros(mi.Point3f, len(pieces)), vector_of(mi.Point3f, pieces.center)
     normals = vector_of(mi.Vector3f, target.mesh.normals[pieces.face])
     found = attended(target.place, density, p_o, p, normals, target.falloff, target.settings, True)
@@ -664,8 +662,7 @@ def along_through(looker: Looker, cone: float) -> Callable[[Vector3f], Any]:
 
 
 def _center(eye: np.ndarray) -> Point3f:
-    import mitsuba as mi
-
+    mi = variant_types()
     center = mi.Point3f(np.asarray(eye, np.float64).tolist())
     # A position that is a constant of the kernel would be compiled anew for every observer.
     dr.make_opaque(center)

@@ -11,6 +11,7 @@ from scipy import sparse
 
 from nerg_mi.fields.splats import Splats, matrices_of
 from nerg_mi.maths.arrays import aligned, vector_of
+from nerg_mi.maths.types import variant_types
 from nerg_mi.probes.surface_attention import attended
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.march_primal import HITS_STOP
@@ -89,8 +90,7 @@ def groups_of_hits(
 
 def _next(hits, origins, directions, after, before, light, stop) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance, share and place in the tree (M, K) of the next hits; distances are infinite where there are none."""
-    import mitsuba as mi
-
+    mi = variant_types()
     o, d = vector_of(mi.Point3f, origins), vector_of(mi.Vector3f, directions)
     count = len(origins)
     given = lambda values: mi.Float(aligned(values))
@@ -498,8 +498,7 @@ def _seen(
     falloff: float,
 ) -> np.ndarray:
     """Visibility (N,) of ``centers`` on surfaces with ``normals``, which begin before them by ``depth``."""
-    import mitsuba as mi
-
+    mi = variant_types()
     p, n = vector_of(mi.Point3f, centers), vector_of(mi.Vector3f, normals)
     p_o = looker.center + dr.zeros(mi.Point3f, len(centers))
     uniform = lambda p_od, p_o, r_o, active: type(r_o.x)(1)

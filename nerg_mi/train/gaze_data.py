@@ -16,6 +16,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeFieldConfig, RaySupport, blind_table, table_directions
 from nerg_mi.maths.geometry import AnyBox, box_interval
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.types import variant_types
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.probes.probes import Probes, person_weights, place_probes
@@ -128,8 +129,7 @@ def semantic_features(
     ``origins``, ``directions`` (N, 3) in the frame of ``place``, unit. Raises `NergError` for a place that is no
     radiance field.
     """
-    import mitsuba as mi
-
+    mi = variant_types()
     medium = place.medium
     if not isinstance(medium, FieldMedium):
         raise NergError("semantic features are those of a radiance field; give one with --field")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -234,7 +235,7 @@ class PixelBank:
             index = dr.arange(self.ns.UInt32, min(chunk, self.size - first)) + dr.opaque(self.ns.UInt32, first)
             pixels = self.batch(index)
             if pixels.depth is not None:
-                known: UInt32 = dr.compress(pixels.depth > 0)
+                known: Any = dr.compress(pixels.depth > 0)
                 yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, known)
 
 

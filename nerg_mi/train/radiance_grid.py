@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import numpy as np
 
@@ -9,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import aligned
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, contracted_cascades, grown
 from nerg_mi.maths.geometry import AnyBox
-from nerg_mi.maths.types import Array3f, UInt32
+from nerg_mi.maths.types import Array3f
 from nerg_mi.photos.cameras import Camera, view_tangents
 
 # ---- Where density may be while a field trains, and the bound that is stored when it is done ----
@@ -138,7 +140,7 @@ class DensityGrid:
     def _allow(self, cells) -> None:
         """Restrict samples to ``cells`` (mask), all of which count as occupied until they are looked at."""
         self.seen = cells
-        count: UInt32 = dr.count(cells)
+        count: Any = dr.count(cells)
         self.seen_count = int(count[0])
         self.value = dr.zeros(self.ns.Float, self.resolution**3)
         self.bits = dr.select(cells, self.ns.UInt8(1), 0)
@@ -235,7 +237,7 @@ class DensityGrid:
         dr.make_opaque(corner)
         p = self._point(index, rng, corner, parts)
         limit = self.threshold / self.step_at(p) if self.growth else self.limit
-        hit: UInt32 = dr.compress(density(p, True) > limit)
+        hit: Any = dr.compress(density(p, True) > limit)
         if dr.width(hit) > 0:
             dr.scatter(found, self.ns.UInt8(1), dr.gather(self.ns.UInt32, index, hit))
             dr.eval(found)
@@ -253,7 +255,7 @@ class DensityGrid:
     def part(self, turn: int, parts: int = _PARTS):
         """Every ``parts``-th cell (UInt32) that may be sampled, from cell ``turn`` modulo ``parts`` on."""
         index = dr.arange(self.ns.UInt32, self.resolution**3 // parts) * parts + dr.opaque(self.ns.UInt32, turn % parts)
-        seen: UInt32 = dr.compress(dr.gather(self.ns.Bool, self.seen, index))
+        seen: Any = dr.compress(dr.gather(self.ns.Bool, self.seen, index))
         return dr.gather(self.ns.UInt32, index, seen)
 
 
@@ -308,7 +310,7 @@ class Settling:
         grid, rng = self.grid, np.random.default_rng((seed, self.at))
         if self.at < self.PROBES:
             part = grid.part(self.at)
-            open_: UInt32 = dr.compress(dr.gather(grid.ns.UInt8, self.found, part) == 0)
+            open_: Any = dr.compress(dr.gather(grid.ns.UInt8, self.found, part) == 0)
             if dr.width(open_) > 0:
                 index = dr.gather(grid.ns.UInt32, part, open_)
                 grid.probe(self.found, index, density, rng, _STRATA[self.at // _PARTS], 2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import drjit as dr
 import numpy as np
 
@@ -106,12 +108,12 @@ class _Spread(dr.CustomOp):
         return self.middle * self.segments.before(x) - self.segments.before(moment)
 
     def forward(self):
-        g: Float = self.grad_in("weight")
+        g: Any = self.grad_in("weight")
         w, kind = self.weight, type(g)
         self.set_grad_out(kind(2 * (g * self._before(w) + w * self._before(g))) + 2 * w * g * self.length / 3)
 
     def backward(self):
-        g: Float = self.grad_out()
+        g: Any = self.grad_out()
         w, kind = self.weight, type(g)
         a = g * w
         later = self.segments.after(a * self.middle) - self.middle * self.segments.after(a)
@@ -133,8 +135,8 @@ def composite(sigma: Float, parts: list, samples: Samples) -> tuple[Float, Float
     sums, opacity = [ray_sum(weight * x, s) for x in parts], ray_sum(weight, s)
     if thinned is not None:
         scale = dr.detach(thinned.opacity / dr.maximum(opacity, 1e-6))
-        sums = [dr.replace_grad(x * scale, x) for x in sums]
-        opacity = dr.replace_grad(thinned.opacity, opacity)
+        sums = [cast("Float", dr.replace_grad(x * scale, x)) for x in sums]
+        opacity = cast("Float", dr.replace_grad(thinned.opacity, opacity))
     return weight, tau, sums, opacity
 
 

@@ -108,11 +108,11 @@ class _Weights(dr.CustomOp):
         return Float(self.weight)
 
     def forward(self):
-        g: Float = self.grad_in("tau")
+        g: Any = self.grad_in("tau")
         self.set_grad_out(self.passed * g - self.weight * type(g)(self.segments.before(self.copies * g)))
 
     def backward(self):
-        g: Float = self.grad_out()
+        g: Any = self.grad_out()
         self.set_grad_in("tau", self.passed * g - self.copies * type(g)(self.segments.after(g * self.weight)))
 
     def name(self):
@@ -127,11 +127,11 @@ class _RaySum(dr.CustomOp):
         return type(x)(segments.total(x))
 
     def forward(self):
-        g: Float = self.grad_in("x")
+        g: Any = self.grad_in("x")
         self.set_grad_out(type(g)(self.segments.total(g)))
 
     def backward(self):
-        g: Float = self.grad_out()
+        g: Any = self.grad_out()
         s = self.segments
         self.set_grad_in("x", dr.gather(type(g), g, s.ray, s.active))
 
@@ -225,7 +225,8 @@ def rays_in_box(o, d, box: AnyBox, near: float) -> Rays:
     """Rays clipped to ``box``, from ``near`` on."""
     # Not maths.ray_box: of rays along a face a training may lose some, and is spared the selects that keep them.
     Float = type(d.x)
-    t0, t1 = Float(near), Float(dr.inf)
+    t0: Any = Float(near)
+    t1: Any = Float(dr.inf)
     for axis in range(3):
         inverse = dr.rcp(d[axis])
         a, b = (box.lower[axis] - o[axis]) * inverse, (box.upper[axis] - o[axis]) * inverse

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
@@ -15,7 +16,7 @@ from nerg_mi.fields.mlp import aligned
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
 from nerg_mi.fields.refinement import refine
 from nerg_mi.maths.geometry import AnyBox
-from nerg_mi.maths.types import Float, UInt32
+from nerg_mi.maths.types import Float
 from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.images import View
 from nerg_mi.transport.quadrature import mean_depth_share
@@ -188,7 +189,7 @@ class RadianceTrainer:
     def progress(self) -> float:
         """Share of the run that is done, 0..1."""
         s = self.settings
-        return min(1.0, self.steps / s.steps if s.steps is not None else self.seconds / (60 * s.minutes))
+        return min(1.0, self.steps / s.steps if s.steps is not None else self.seconds / (60 * cast("float", s.minutes)))
 
     def table(self, stride: int = 1) -> StepTable:
         """Step edges ``stride`` times as coarse as the finest."""
@@ -313,7 +314,7 @@ class RadianceTrainer:
         color = ray_color(self.config, parameters, sums, opacity, pixels.d, ns)
         total = 0
         if self.photos is not None:
-            changes = self.photos.changes(self.optimiser[PHOTOS])
+            changes = self.photos.changes(cast("Float", self.optimiser[PHOTOS]))
             color = self.photos.apply(changes, color, opacity, pixels.frame)
             total = s.photo_decay * self.photos.decay(changes)
         loss = color_loss(color, opacity, pixels, background, s.huber)
@@ -390,7 +391,7 @@ class RadianceTrainer:
         if samples is None:
             return None, None
         weight = weights(density(samples.p, True) * samples.length, samples.segments)
-        seen: UInt32 = dr.compress(weight > 1e-3)
+        seen: Any = dr.compress(weight > 1e-3)
         return samples, dr.gather(ns.Array3f, samples.p, seen)
 
     def pixels_within(self, views: list[View], samples: int) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.radiance import RadianceField, mean_features
 from nerg_mi.maths.geometry import Similarity, intersect_box
-from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Ray3f, Vector3f
+from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Ray3f, Vector3f, variant_types
 
 from .geometry import Place
 from .march_primal import MarchSettings
@@ -87,12 +87,10 @@ def observed_features(
 ) -> list[Float] | None:
     """Features of what an observer sees at ``p_od`` along unit ``r_o`` from ``p_o``, for a gaze field that wants such
     of ``kind`` (``fields.gaze_product.SEMANTICS``); None for one that wants none. ``settings``: of the march."""
-    import mitsuba as mi
-
     if kind == "snapshot":
         return snapshot(_featured(place), p_od, active)
     if kind == "accumulated":
-        return accumulated(place, mi.Ray3f(p_o, r_o), active, settings)
+        return accumulated(place, variant_types().Ray3f(p_o, r_o), active, settings)
     return None
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.coordinates import check_coordinates
-from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f
+from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f, variant_types
 
 from .depth import DEPTHS, escape_distance, surface_depth
 from .march import scouted_march
@@ -43,31 +43,26 @@ class Ceiling:
     """
 
     def __init__(self, height: float, up: ArrayLike = (0.0, 0.0, 1.0)):
-        import drjit as dr
-        import mitsuba as mi
-
         direction = np.asarray(up, float)
         length = float(np.linalg.norm(direction))
         if not (length > 0 and np.isfinite(length)):
             raise NergError(f'"up" must be a direction, three numbers that are not all 0, got {direction.tolist()}')
         self.height, self.up = float(height), direction / length
+        mi = variant_types()
         self._height, self._up = mi.Float(self.height), mi.Vector3f(*self.up.tolist())
         dr.make_opaque(self._height, self._up)
 
     def cut(self, ray: Ray3f) -> tuple[Any, Float]:
         """``ray`` (unit direction) from where it comes below the plane, and how far it went until then: 0 where it
         starts below, or never comes there. Differentiable in the ray."""
-        import drjit as dr
-        import mitsuba as mi
-
         over, fall = dr.dot(ray.o, self._up) - self._height, -dr.dot(ray.d, self._up)
-        cuts: Bool = (over > 0) & (fall > _LEAST_FALL)
+        cuts = (over > 0) & (fall > _LEAST_FALL)
         ahead = dr.select(cuts, over / dr.select(cuts, fall, 1), 0)
-        moved = type(ray)(ray)
+        moved: Any = type(ray)(ray)
         moved.o = dr.fma(ray.d, ahead, ray.o)
         moved.maxt = ray.maxt - ahead
-        if isinstance(ray, mi.RayDifferential3f):
-            moved.o_x, moved.o_y = dr.fma(ray.d_x, ahead, ray.o_x), dr.fma(ray.d_y, ahead, ray.o_y)
+        if isinstance(ray, variant_types().RayDifferential3f):
+            moved.o_x, moved.o_y = dr.fma(moved.d_x, ahead, moved.o_x), dr.fma(moved.d_y, ahead, moved.o_y)
         return moved, ahead
 
     def __str__(self) -> str:
@@ -158,7 +153,7 @@ class View:
     # Opacity of the medium in front of the shape.
     front: Float
     # Mitsuba's preliminary intersection; None without shapes.
-    cast: mi.PreliminaryIntersection3f | None
+    cast: Any
     # What `depth` does.
     find_depth: Callable[[str, Bool], Float]
 
@@ -171,7 +166,7 @@ class View:
         """Whether there is a surface: matter at all, and as much of it as ``surface_opacity``, which may be 0."""
         return (self.opacity > 0) & (self.opacity >= surface_opacity)
 
-    def penetration(self, kind: str, depth: Float) -> Float:
+    def penetration(self, kind: str, depth: Float) -> Float | float:
         """How far light goes into the matter before the surface at ``depth`` (of ``kind``), in scene units; 0 on a
         shape."""
         return 0 if self.march is None else escape_distance(kind, self.march, depth)
@@ -221,15 +216,15 @@ class Place:
         """
         Float = type(ray.maxt)
         end = ray.maxt
-        hit, distance, cast = dr.mask_t(Float)(False), Float(dr.inf), None
+        hit, distance, preliminary = dr.mask_t(Float)(False), Float(dr.inf), None
         if self.scene is not None:
-            cast, distance = _cast(self.scene, ray, active)
+            preliminary, distance = _cast(self.scene, ray, active)
             hit = active & (distance < end)
             distance = dr.select(hit, distance, dr.inf)
         if self.medium is None:
             opacity = dr.select(hit, Float(1), 0)
             at_shape = lambda kind, active: dr.select(active & hit, distance, 0)
-            return View(None, hit, distance, opacity, Float(0), cast, at_shape)
+            return View(None, hit, distance, opacity, Float(0), preliminary, at_shape)
 
         medium = self.medium
         local = medium.local(ray.o, ray.d)
@@ -246,7 +241,7 @@ class Place:
             through = DEPTHS.find(kind).with_shape(result, front, inside, hit, distance)
             return dr.select(active & hit, through, dr.select(some, inside, 0))
 
-        return View(result, hit, distance, dr.select(hit, 1, front), front, cast, in_both)
+        return View(result, hit, distance, dr.select(hit, 1, front), front, preliminary, in_both)
 
 
 def as_place(subject: Medium | Place) -> Place:
@@ -281,10 +276,9 @@ def corners_of(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     return vertices.min(0), vertices.max(0)
 
 
-def _cast(scene: Any, ray: Ray3f, active: Bool) -> tuple[mi.PreliminaryIntersection3f, Float]:
+def _cast(scene: Any, ray: Ray3f | SceneRay, active: Bool) -> tuple[Any, Float]:
     """The nearest intersection with a shape, and its distance with derivatives where any are tracked."""
-    import mitsuba as mi
-
+    mi = variant_types()
     ray = mi.Ray3f(ray)
     with dr.suspend_grad():
         cast = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
@@ -317,7 +311,8 @@ class Shading:
                 f'the integrator nested in "nerg" is a {type(nested).__name__}, which cannot be asked for the radiance '
                 'of one ray; use "path", "direct", "volpath" or another one that samples pixels'
             )
-        self.nested, self._path = nested, None
+        self.nested: mi.SamplingIntegrator | None = nested
+        self._path: Any = None
 
     def radiance(
         self,
@@ -337,17 +332,17 @@ class Shading:
         whether there is anything but that background, as a nested integrator says or an environment makes it.
         Derivatives are those of the nested integrator, or of the albedo; ``path`` has none.
         """
-        import mitsuba as mi
-
+        mi = variant_types()
         seen = active & (view.front < 1)
-        environment = None if hide_emitters else scene.environment()
-        if self.nested is not None:
-            color, valid, aovs = self.nested.sample(scene, sampler, ray, medium, seen)
+        environment: Any = None if hide_emitters else scene.environment()
+        nested: Any = self.nested
+        if nested is not None:
+            color, valid, aovs = nested.sample(scene, sampler, ray, medium, seen)
             if environment is None:
                 # Directly seen emitters are shapes; where there is nothing at all, there is the background.
                 color = dr.select(view.hit | valid, color, background)
             return color, aovs, seen & valid
-        behind = background if environment is None else environment.eval(_beyond(mi, ray), seen)
+        behind = background if environment is None else environment.eval(_beyond(ray), seen)
         shown = active & (view.hit | (environment is not None))
         if view.cast is None:
             return behind, [], shown
@@ -367,9 +362,9 @@ class Shading:
         return [] if self.nested is None else list(self.nested.aov_names())
 
 
-def _beyond(mi: Any, ray: Ray3f) -> Any:
+def _beyond(ray: Ray3f) -> Any:
     """What of an interaction an environment asks for, where ``ray`` meets nothing."""
-    si = dr.zeros(mi.SurfaceInteraction3f)
+    si: Any = dr.zeros(variant_types().SurfaceInteraction3f)
     si.wi, si.wavelengths = -ray.d, ray.wavelengths
     return si
 
@@ -413,7 +408,7 @@ def trace_depth(
     place = as_place(subject)
     settings = settings or default_settings(place)
     if dr.is_array_v(origins):
-        return _traced_jit(place, origins, directions, settings, kind, batch)
+        return _traced_jit(place, cast("Point3f", origins), cast("Vector3f", directions), settings, kind, batch)
     o, d = (np.asarray(v, np.float32) for v in (origins, directions))
     if o.shape != d.shape or o.ndim != 2 or o.shape[1] != 3:
         raise ValueError(f"origins {o.shape} and directions {d.shape} must both have shape (N, 3)")
@@ -453,8 +448,7 @@ def _types(place: Place) -> tuple[ModuleType, type]:
             if dr.is_array_v(value):
                 ns = namespace(value)
                 return ns, ns.Array3f
-    import mitsuba as mi
-
+    mi = variant_types()
     return namespace(mi.Float), mi.Point3f
 
 
@@ -463,8 +457,7 @@ def _trace(place: Place, o: Point3f, d: Vector3f, settings: MarchSettings, kind:
     with dr.suspend_grad():
         ray = SceneRay(o, d, Float(dr.inf))
         if place.scene is not None:
-            import mitsuba as mi
-
+            mi = variant_types()
             ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
         view = place.trace(ray, dr.full(dr.mask_t(Float), True, count), settings)
         opacity = view.opacity + dr.zeros(Float, count)

@@ -63,7 +63,7 @@ def differentiable_march(
     offset: Float | None,
     color: Painter | None,
     count: bool,
-    until: Float | None,
+    until: Float | float | None,
     fine_from: Float | None,
 ) -> MarchResult:
     """A march as one differentiable ``operation``; the other arguments are those of ``march.march``."""
@@ -86,7 +86,7 @@ class _Fixed:
     offset: Float | None
     color: Painter | None
     count: bool
-    until: Float | None
+    until: Float | float | None
     fine_from: Float | None
 
 
@@ -120,7 +120,7 @@ class Replayed:
     active: Bool
     dtau: Float
     mean: Float
-    color: Color | None
+    color: Color
     # Detached, in front of the step.
     transmittance: Float
     # Whether the crossing that is looked for lies behind the step, and whether it lies in it.
@@ -289,7 +289,7 @@ class HitMarch(March):
         f, (t0, t1) = self.fixed, self.inputs[3:]
         hits, ray = cast("Hits", f.medium.hits), LocalRay(*(dr.detach(x) for x in self.inputs))
         Float = type(t0)
-        UInt32 = dr.uint32_array_t(Float)
+        UInt32: Any = dr.uint32_array_t(Float)
         end = limits(Float, f.settings, f.until)[1]
 
         def take(state, t, index, extra):
@@ -352,7 +352,7 @@ def march(
     offset: Float | None = None,
     color: Painter | None = None,
     count: bool = False,
-    until: Float | None = None,
+    until: Float | float | None = None,
     fine_from: Float | None = None,
     occlusion: Occlusion | None = None,
 ) -> MarchResult:
@@ -395,7 +395,7 @@ def fine_start(
     scout = replace(settings, step=settings.step * settings.coarse, coarse=1.0, quadrature="constant")
     with dr.suspend_grad():
         found = march(medium, ray, t0, t1, active, scout, until=_TRACE, count=True)
-        return dr.select(dr.isfinite(found.half), found.enter - scout.step, dr.inf), found.density_evals
+        return dr.select(dr.isfinite(found.half), found.enter - scout.step, dr.inf), cast("Float", found.density_evals)
 
 
 def scouted_march(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
@@ -171,7 +171,7 @@ class MarchResult(Sums):
     # Where the march ended early, because what was asked of it (``occlusion``) is known; None: nowhere.
     known: Bool | None = None
     # Distance at which the march began.
-    origin: Float = 0
+    origin: Float | float = 0
 
     @classmethod
     def start(cls, Float: type, color: Painter | None, count: bool, occlusion: Occlusion | None) -> MarchResult:
@@ -198,12 +198,12 @@ class MarchResult(Sums):
     def settle(self, answered: Bool, active: Bool) -> Bool:
         """Note on which of the ``active`` rays the question of occlusion is ``answered``; the rays that go on."""
         answered = active & answered
-        self.known = self.known | answered
+        self.known = answered if self.known is None else self.known | answered
         return active & ~answered
 
     def count_in(self, other: MarchResult) -> None:
         """Add the density evaluations of another march to this one's, if they are counted."""
-        if self.density_evals is not None:
+        if self.density_evals is not None and other.density_evals is not None:
             self.density_evals = self.density_evals + other.density_evals
 
     @property
@@ -343,7 +343,7 @@ class _Steps:
     # What the next step reuses of the last one.
     carry: Any
     # Weight of the samples that have no colour yet; None without colour.
-    pending: Float
+    pending: Any
     found: MarchResult
 
 
@@ -357,7 +357,7 @@ def march_primal(
     offset: Float | None,
     color: Painter | None,
     count: bool,
-    until: Float | None,
+    until: Float | float | None,
     fine_from: Float | None,
     occlusion: Occlusion | None = None,
 ) -> MarchResult:
@@ -417,7 +417,7 @@ def march_primal(
     return found
 
 
-def limits(Float: type, settings: MarchSettings, until: Float | None) -> tuple[Float, Float]:
+def limits(Float: type, settings: MarchSettings, until: Float | float | None) -> tuple[Float, Float]:
     """Optical depths ``(goal, end)``: whose crossing is looked for, and at which marching ends. ``Float``: array type
     of distances."""
     if until is None:
@@ -448,7 +448,8 @@ class _Hits:
 
 def first_hit(t0: Float) -> LastHit:
     """Behind which the first hits are looked for: one may lie at ``t0`` itself."""
-    return LastHit(dr.fma(dr.abs(t0), -(2.0**-22), t0 - 1e-37), dr.uint32_array_t(type(t0))(0))
+    UInt32: Any = dr.uint32_array_t(type(t0))
+    return LastHit(dr.fma(dr.abs(t0), -(2.0**-22), t0 - 1e-37), UInt32(0))
 
 
 def march_hits(
@@ -461,13 +462,13 @@ def march_hits(
     settings: MarchSettings,
     color: Painter | None,
     count: bool,
-    until: Float | None,
+    until: Float | float | None,
     occlusion: Occlusion | None = None,
 ) -> MarchResult:
     """What ``ray`` meets of ``hits``, those of ``medium``, from the distance ``t0`` on and before ``t1``. The other
     arguments are those of ``march.march``; without derivatives."""
     Float = type(t0)
-    UInt32 = dr.uint32_array_t(Float)
+    UInt32: Any = dr.uint32_array_t(Float)
     goal, end = limits(Float, settings, until)
     stop = dr.exp(-end)
 
@@ -479,13 +480,13 @@ def march_hits(
             active = found.settle(occlusion.clear(t, tau), active)
         absorbed = dr.select(active, state.absorbed[0], 0)
         found, weight, crosses = found.absorb(active, -log1p(-absorbed), absorbed, t - t0, goal)
-        found.cross(crosses, t, 0, t, tau)
+        found.cross(crosses, t, Float(0), t, tau)
         if color is not None:
             painter, lit = color, active & (weight > 0)
             found.color = found.color + weight * dr.if_stmt(
                 (lit, index),
                 lit,
-                lambda lit, index: painter.paint(medium, [index], ray.o + ray.d * t, ray.w, lit),
+                lambda lit, index: painter.paint(medium, [cast("Float", index)], ray.o + ray.d * t, ray.w, lit),
                 lambda lit, index: painter.zero(),
                 label="colour",
             )

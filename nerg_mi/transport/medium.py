@@ -223,7 +223,7 @@ class Occupancy(Protocol):
         """The grid that this one refines, which holds all that it holds; itself where it refines none."""
         ...
 
-    def empty_cells(self, u: Array3f, active: Bool = True) -> UInt32:
+    def empty_cells(self, u: Array3f, active: Bool | bool = True) -> UInt32:
         """How far the cell of ``u`` is from an occupied one, in cells by the chessboard's measure, or less; 0 in an
         occupied one. Points outside of the cube belong to its nearest cell."""
         ...

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import drjit as dr
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.maths.types import Float, Point3f, Ray3f, Vector3f
+from nerg_mi.maths.types import Float, Point3f, Ray3f, Vector3f, variant_types
 
 from .geometry import Place
 from .jit import Fingerprint, of_shapes, recording
@@ -175,9 +175,7 @@ _CENTERED = {"PerspectiveCamera", "ThinLensCamera", "Panorama", "RadianceMeter"}
 
 def center(sensor: mi.Sensor) -> Point3f:
     """Centre of ``sensor`` in the scene (one lane); attached to its ``to_world``."""
-    import mitsuba as mi
-
-    return sensor.world_transform() @ mi.Point3f(0)
+    return cast("Any", sensor).world_transform() @ variant_types().Point3f(0)
 
 
 def is_batch(sensor: mi.Sensor) -> bool:
@@ -240,8 +238,6 @@ def center_of_ray(sensors: Sequence[mi.Sensor], ray: Ray3f) -> Point3f:
     A ray belongs to the camera on whose axis-aligned near plane it starts and through whose centre
     its line passes, which tells the members of a batch apart.
     """
-    import mitsuba as mi
-
     members = [m for s in sensors for m in _members(s)]
     for member in members:
         require_center(member, "the rendering sensor")
@@ -250,15 +246,16 @@ def center_of_ray(sensors: Sequence[mi.Sensor], ray: Ray3f) -> Point3f:
     best = center(members[0])
     if len(members) == 1:
         return best
+    mi = variant_types()
     miss = mi.Float(dr.inf)
     for member in members:
         c = center(member)
         v = ray.o - c
         along = dr.dot(v, ray.d)
         off_line = dr.norm(v - ray.d * along)
-        axis = dr.normalize(member.world_transform() @ mi.Vector3f(0, 0, 1))
+        axis = dr.normalize(cast("Any", member).world_transform() @ mi.Vector3f(0, 0, 1))
         # Only projective cameras have a near plane; others start at their centre.
-        near = member.near_clip() if isinstance(member, mi.ProjectiveCamera) else 0
+        near = cast("Any", member).near_clip() if isinstance(member, mi.ProjectiveCamera) else 0
         off_plane = dr.abs(dr.dot(v, axis) - near)
         error = dr.detach(off_line + off_plane)
         closer = error < miss
@@ -366,7 +363,7 @@ class ObservedSupport:
 # multiplies by s, which would show gaze only where it is hidden.)
 
 
-def visibility(d_expected: Float, d_met: Float, falloff: Float, tolerance: Float) -> Float:
+def visibility(d_expected: Float, d_met: Float, falloff: Float, tolerance: Float | float) -> Float:
     """1 visible .. 0 hidden. ``d_expected``: d_o*, ``d_met``: d_o, ``falloff``: d_f >= 0 (0: a step
     function), ``tolerance``: how much nearer than the point a surface may lie and still be it. All in
     scene units."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import cast
 
 import drjit as dr
 import numpy as np
@@ -14,7 +15,7 @@ from nerg_mi.fields.gaze_ensemble import mean, spread
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.sphere import fibonacci_vectors, neighbourly_order
-from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
+from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f, variant_types
 
 from .field_medium import observed_features
 from .geometry import Place
@@ -148,13 +149,11 @@ def trace_surroundings(
 ) -> Surroundings:
     """Those of the observer at ``center`` (one lane) in ``count`` directions (None: ``settings.directions``), for
     ``field`` in ``place``; ``filling``: see ``distance_along``."""
-    import mitsuba as mi
-
     count = count or settings.directions
     # A recording takes no arrays from NumPy.
     number = None if recording() or count > _ORDERED else neighbourly_order(count)
     with dr.suspend_grad():
-        directions = fibonacci_vectors(count, None if number is None else mi.UInt32(number))
+        directions = fibonacci_vectors(count, None if number is None else variant_types().UInt32(number))
         distance, escaped = distance_along(field, to_world, place, center, directions, settings, filling)
         dr.eval(directions, distance, escaped)
     return Surroundings(directions, distance, escaped, number)
@@ -172,8 +171,7 @@ def distance_along(
     """``(distance, escaped)`` as of ``Surroundings`` along unit ``directions``: where ``field`` is to be
     evaluated, also where there is no surface. What escapes ends on the field's box, or at the depth of the nearest
     directions that do not, as the field wants it: of ``filling``, if it has been traced."""
-    import mitsuba as mi
-
+    mi = variant_types()
     width = dr.width(directions)
     if not field.config.needs_surfaces:
         return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
@@ -213,16 +211,15 @@ def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> n
 
 
 def met_along(
-    place: Place, center: Point3f, directions: Vector3f, settings: ObserverSettings, beyond: Float = 0.0
+    place: Place, center: Point3f, directions: Vector3f, settings: ObserverSettings, beyond: Float | float = 0.0
 ) -> tuple[Bool, Float]:
     """Whether a surface is met along unit ``directions`` (lanes) from ``center``, and its distance in scene units;
     ``beyond`` where none is."""
-    import mitsuba as mi
-
+    mi = variant_types()
     everywhere = dr.full(mi.Bool, True, dr.width(directions))
     view = place.trace(mi.Ray3f(center, directions), everywhere, settings.march)
     met = everywhere & view.meets(settings.surface_opacity)
-    return met, dr.select(met, view.depth(settings.depth, met), beyond)
+    return met, cast("Float", dr.select(met, view.depth(settings.depth, met), beyond))
 
 
 def _beyond(field: AnyGazeField, to_world: Similarity, center: Point3f, directions: Vector3f) -> Float:
@@ -289,7 +286,13 @@ class PlacedGaze:
         return ObservedGaze(self, place, settings, integrals)
 
     def unnormalized(
-        self, member: GazeDensity, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool, escaped: Bool = False
+        self,
+        member: GazeDensity,
+        p_od: Point3f,
+        p_o: Point3f,
+        r_o: Vector3f,
+        active: Bool | bool,
+        escaped: Bool | bool = False,
     ) -> tuple[Float, Float]:
         """``(emit, capture)`` of one ``member`` for scene points: what an integral is made of, and no density."""
         local = self.to_world
@@ -401,7 +404,7 @@ class ObservedGaze:
         r_o: Vector3f,
         active: Bool,
         semantic: list[Float] | None = None,
-        escaped: Bool = False,
+        escaped: Bool | bool = False,
     ) -> tuple[Float, Float, Float]:
         """``(gaze, emit, capture)`` in 1/sr of observers at ``p_o`` attending ``p_od`` along unit ``r_o`` (scene points
         and direction, a lane each). Of an ensemble the means.
@@ -417,11 +420,12 @@ class ObservedGaze:
         r_o: Vector3f,
         active: Bool,
         semantic: list[Float] | None = None,
-        escaped: Bool = False,
+        escaped: Bool | bool = False,
     ) -> tuple[Float, Float, Float, Float]:
         """``evaluate`` of an ensemble, and the standard deviation of its members' gaze (1/sr)."""
         found = self._each(p_od, p_o, r_o, active, semantic, escaped)
-        return *mean(found), spread(found)
+        gaze, emit, capture = mean(found)
+        return gaze, emit, capture, spread(found)
 
     def along(self, p_o: Point3f, r_o: Vector3f) -> Float:
         """Density (1/sr) of the observer at ``p_o`` (one lane) in unit directions ``r_o``, carrying no derivatives.
@@ -436,19 +440,16 @@ class ObservedGaze:
     def look(self, p_o: Point3f, r_o: Vector3f, filling: Filling | None = None) -> tuple[list[Float], Float]:
         """``members_along``, and the distance of the surface that is met along each, infinite where there is none.
         ``filling``: that of the observer, if it has been traced."""
-        import mitsuba as mi
-
         found, distance, escaped = self._look(p_o, r_o, filling)
         if not self._placed.field.config.needs_surfaces:
             with dr.suspend_grad():
-                met, distance = met_along(self._place, mi.Point3f(dr.detach(p_o)), r_o, self._settings)
+                met, distance = met_along(self._place, variant_types().Point3f(dr.detach(p_o)), r_o, self._settings)
                 escaped = ~met
         return found, dr.select(escaped, dr.inf, distance)
 
     def _look(self, p_o: Point3f, r_o: Vector3f, filling: Filling | None = None) -> tuple[list[Float], Float, Bool]:
         """``(gaze of each member, distance, escaped)``, the last two as of ``observer_gaze.distance_along``."""
-        import mitsuba as mi
-
+        mi = variant_types()
         with dr.suspend_grad():
             center = mi.Point3f(dr.detach(p_o))
             dr.make_opaque(center)
@@ -463,7 +464,13 @@ class ObservedGaze:
             return [gaze + dr.zeros(mi.Float, width) for gaze, *_ in found], distance, escaped
 
     def _each(
-        self, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool, semantic: list[Float] | None, escaped: Bool
+        self,
+        p_od: Point3f,
+        p_o: Point3f,
+        r_o: Vector3f,
+        active: Bool,
+        semantic: list[Float] | None,
+        escaped: Bool | bool,
     ) -> list[tuple]:
         """``(gaze, emit, capture)`` of each member."""
         field, local = self._placed.field, self._placed.to_world
@@ -501,8 +508,7 @@ def look_from(
     """A function of unit directions (N, 3): the gaze (M, N) of the observer at ``eye`` (3,), in proportion to 1/sr, by
     each of M members of an ensemble or by one field, and the distance (N,) of the first surface, infinite where there
     is none; in scene units."""
-    import mitsuba as mi
-
+    mi = variant_types()
     settings = replace(settings, directions=min(settings.directions, _INTEGRAL))
     center = mi.Point3f(np.asarray(eye, np.float64).tolist())
     # A position that is a constant of the kernel would be compiled anew for every observer.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f
+from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f, variant_types
 
 from .depth import DEPTHS
 from .geometry import Place, View
@@ -30,8 +30,7 @@ class ObserverMap:
     """
 
     def __init__(self, place: Place, center: Point3f, settings: ObserverSettings):
-        import mitsuba as mi
-
+        mi = variant_types()
         self.height, self.width, self.center = settings.map_height, 2 * settings.map_height, center
         self._float, self._uint, self._vector = mi.Float, mi.UInt32, mi.Vector3f
         with dr.suspend_grad():
@@ -66,7 +65,7 @@ class ObserverMap:
         return self._vector(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta)
 
     def look_up(
-        self, r_o: Vector3f, distance: Float, falloff: Float, tolerance: Float, active: Bool
+        self, r_o: Vector3f, distance: Float, falloff: Float, tolerance: Float | float, active: Bool
     ) -> tuple[Float, Float]:
         """``(nearest depth, visibility)`` of points at ``distance`` along unit ``r_o`` from the centre."""
         Float = type(distance)
@@ -79,7 +78,7 @@ class ObserverMap:
         return nearest, seen
 
     def gaze_along(
-        self, table: Float, r_o: Vector3f, distance: Float, falloff: Float, slack: Float, active: Bool
+        self, table: Float, r_o: Vector3f, distance: Float, falloff: Float, slack: Float | float, active: Bool
     ) -> Float:
         """Density of a ``gaze_table`` at the surface that is met along unit ``r_o`` for points at ``distance``.
 
@@ -148,7 +147,7 @@ def trace_sight(
     ray: Ray3f,
     p_d: Point3f,
     p_o: Point3f,
-    penetration: Float,
+    penetration: Float | float,
     active: Bool,
     falloff: Float,
     settings: ObserverSettings,
@@ -170,8 +169,6 @@ def trace_sight(
     met, are needed where the visibility is 0 or 1 without them; otherwise rays may end there, and what they return is
     on the right side of the point, and nothing more.
     """
-    import mitsuba as mi
-
     tolerance = _tolerance(place, ray, p_d, p_o, settings)
     in_front = tolerance + penetration
     if settings.visibility == "map":
@@ -187,15 +184,16 @@ def trace_sight(
         met, seen = around.look_up(r_o, distance, falloff, tolerance, active)
         if table is not None:
             # Of the surface itself: the point in front of it lies in another direction.
-            whole, r_d = distance_and_direction(p_o, p_d)
-            attended = around.gaze_along(table, r_d, whole, falloff, _PAST * in_front, active)
+            apart, r_d = distance_and_direction(p_o, p_d)
+            attended = around.gaze_along(table, r_d, apart, falloff, _PAST * in_front, active)
         evals = type(distance)(0)
     else:
-        to_point = mi.Ray3f(p_o, r_o)
+        to_point = variant_types().Ray3f(p_o, r_o)
         if settings.visibility == "transmittance":
             to_point.maxt = distance
             between = place.trace(to_point, active, settings.march, count=count)
-            seen = dr.select(between.hit, 0, 1 if between.march is None else dr.exp(-between.march.tau))
+            reached = type(distance)(1) if between.march is None else dr.exp(-between.march.tau)
+            seen = dr.select(between.hit, 0, reached)
             return Sight(p_d, distance, seen, _evaluations(between))
         occlusion = None
         if not whole and DEPTHS.find(settings.depth).at_half:
@@ -222,7 +220,7 @@ def _met(view: View, settings: ObserverSettings, active: Bool) -> Float:
     return dr.select(active & march.known, march.half, met)
 
 
-def _tolerance(place: Place, ray: Ray3f, p_d: Point3f, p_o: Point3f, settings: ObserverSettings) -> Float:
+def _tolerance(place: Place, ray: Ray3f, p_d: Point3f, p_o: Point3f, settings: ObserverSettings) -> Float | float:
     if settings.tolerance:
         return min(settings.tolerance, LARGEST)
     if place.medium is None:

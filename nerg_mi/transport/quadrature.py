@@ -153,9 +153,9 @@ def linear_crossing(first: Float, last: Float, length: Float, missing: Float) ->
     return dr.minimum(2 * missing / dr.select(total > 0, total, 1), length)
 
 
-def _horner(coefficients: Sequence[Float], x: Float) -> Float:
+def _horner(coefficients: Sequence[Float] | Sequence[float], x: Float) -> Float:
     """Σ c_i x^i."""
-    value = coefficients[-1]
+    value: Any = coefficients[-1]
     for c in reversed(coefficients[:-1]):
         value = dr.fma(value, x, c)
     return value
@@ -367,7 +367,7 @@ class Constant:
             lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),
             paint,
             None,
-            dr.select(active, 1.0, 0.0),
+            dr.select(active, type(dtau)(1), 0),
         )
 
 
@@ -399,7 +399,7 @@ class Linear:
             first = dr.select(fresh, first, carry[0])
         last = medium.density(ray.o + ray.d * (t + delta), active)
         dtau = dr.select(active, 0.5 * (first + last) * delta, 0)
-        evaluations = dr.select(active, 1.0, 0.0) + dr.select(fresh, 1.0, 0.0)
+        evaluations = dr.select(active, type(dtau)(1), 0) + dr.select(fresh, type(dtau)(1), 0)
         return _step_along_line(medium, ray, t, delta, dtau, first, last, (last, t_next), evaluations)
 
 
@@ -427,7 +427,7 @@ class Cells:
         # The ends of the line through both samples, kept from leaving the density's range.
         tilt = dr.clip((b - a) * (0.5 / (2 * _GAUSS)), -mean, mean)
         first, last = mean - tilt, mean + tilt
-        return _step_along_line(medium, ray, t, delta, dtau, first, last, None, dr.select(active, 2.0, 0.0))
+        return _step_along_line(medium, ray, t, delta, dtau, first, last, None, dr.select(active, type(dtau)(2), 0))
 
 
 for _rule in (Constant(), Linear(), Cells()):

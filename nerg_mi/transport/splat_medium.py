@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import drjit as dr
 import numpy as np
@@ -245,7 +245,7 @@ class SplatHits:
         """See `medium.Hits`."""
         a, o, d = self.arrays, ray.o, ray.d
         Float = type(before)
-        UInt32 = dr.uint32_array_t(Float)
+        UInt32: Any = dr.uint32_array_t(Float)
         # Axes along which the ray stands still never decide, unless it is outside of a box.
         inverse = [dr.rcp(dr.select(dr.abs(v) > 1e-30, v, 1e-30)) for v in (d.x, d.y, d.z)]
         origin = (o.x, o.y, o.z)
@@ -387,7 +387,7 @@ class SplatMedium:
 
     def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         """Colour of the Gaussian whose index is the only one of ``features``."""
-        return self.arrays.color(features[0], w, active)
+        return self.arrays.color(cast("UInt32", features[0]), w, active)
 
     def background(self, o: Point3f, d: Vector3f) -> None:
         """None: what is behind splats is the scene's."""

@@ -39,7 +39,8 @@ class VolumeMedium:
 
         # Those of the variant in use: another one may be chosen later on.
         self._interaction, self._ns = mi.Interaction3f, namespace(mi.Float)
-        self._density, self._color = density, color
+        self._density: Any = density
+        self._color: Any = color
         self.has_color, self.deferred = color is not None, False
         box = density.bbox()
         self._lower, self._upper = np.array(box.min, float), np.array(box.max, float)
@@ -103,7 +104,7 @@ class VolumeMedium:
         return values
 
     def local(self, o: Point3f, d: Vector3f) -> LocalRay:
-        near, far = intersect_box(o, d, self._lower, self._upper)
+        near, far = intersect_box(o, d, self._lower.tolist(), self._upper.tolist())
         return LocalRay(o, d, d, near, far)
 
     def to_local(self, p: Point3f) -> Point3f:

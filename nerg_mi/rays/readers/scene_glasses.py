@@ -105,7 +105,7 @@ class FrameNames:
                 "the recording has no times of its video's frames, which its numbers count; put the file that has them "
                 "beside the gaze (Tobii: the scene video, Neon: world_timestamps.csv), or give a steady rate with --fps"
             )
-        if frames is None and index >= 0:
+        if frames is None and fps is not None and index >= 0:
             return index / fps
         position = index if fps is None or frames is None else _resampled(index, frames, fps)
         if frames is None or not 0 <= position < len(frames):
