@@ -497,11 +497,13 @@ class GazeHead:
         for name in ("grid", *self.NETS):
             getattr(self, name).pack()
 
-    def unnormalized(self, p_od, p_o, r_o, active=True, semantic=None, escaped=False):
+    def unnormalized(self, p_od, p_o, r_o, active: Bool | bool = True, semantic=None, escaped: Bool | bool = False):
         """See ``GazeDensity``."""
         raise NotImplementedError(f"{type(self).__name__} does not say what its density is")
 
-    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
+    def evaluate(
+        self, p_od, p_o, r_o, active: Bool | bool = True, semantic=None, integral=None, escaped: Bool | bool = False
+    ):
         """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr; ``active``,
         ``semantic`` and ``escaped`` as for ``unnormalized``.
 

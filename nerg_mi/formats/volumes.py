@@ -65,7 +65,8 @@ def density_and_color(field: RadianceField, resolution: int = 256, color: bool =
     del filled
     nearest: Any = distance_transform_edt(alpha <= _FAINT, return_distances=False, return_indices=True)
     y, x = np.ogrid[: alpha.shape[1], : alpha.shape[2]]
-    for z, layer in enumerate(out):
+    for z in range(len(out)):
+        layer = out[z]
         squared = (nearest[0, z] - z) ** 2 + (nearest[1, z] - y) ** 2 + (nearest[2, z] - x) ** 2
         near = (squared > 0) & (squared < 2.5**2)
         layer[near] = out[tuple(nearest[:, z][:, near])]

@@ -98,7 +98,9 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
 
 def _settings(options: RadianceOptions) -> RadianceSettings:
     given = chosen_settings(options, RadianceSettings)
-    return RadianceSettings(**given if {"minutes", "steps"} & given.keys() else given | {"minutes": 5.0})
+    if options.steps is None:
+        given.setdefault("minutes", 5.0)
+    return RadianceSettings(**given)
 
 
 def _open(photos: str | Path, options: RadianceOptions) -> Dataset:

@@ -119,12 +119,15 @@ def run(folder: Path, words: list[str], is_work: bool = False) -> None:
     output, printed, said = Path(tempfile.mkdtemp(prefix="nerg-out-")), io.StringIO(), io.StringIO()
     # It is ignored in what a shell runs in the background.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGPROF, lambda *_: signal.raise_signal(signal.SIGINT))
+    ended: list[bool] = []
+    signal.signal(signal.SIGPROF, lambda *_: None if ended else signal.raise_signal(signal.SIGINT))
     signal.setitimer(signal.ITIMER_PROF, PATIENCE if is_work else LIMIT)
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
             nerg_mi.cli.main([word.replace("{i}", str(folder)).replace("{o}", str(output)) for word in words])
     except SystemExit as end:
+        # What is done just now needs no Ctrl-C.
+        ended.append(True)
         last = " ".join(said.getvalue().split())[-900:]
         if end.code == FAULT or "Traceback" in said.getvalue():
             raise RuntimeError(last) from None

@@ -20,6 +20,7 @@ class GazeOptions(PlaceOptions):
 
     if TYPE_CHECKING:
         # Options that are settings, too.
+        def __init__(self, **options: Any) -> None: ...
         def __getattr__(self, name: str) -> Any: ...
 
     views: Path | None = option(None, "Posed photos (folder or transforms file) with salience.")

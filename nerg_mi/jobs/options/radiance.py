@@ -40,6 +40,7 @@ class RadianceOptions(PhotoOptions):
 
     if TYPE_CHECKING:
         # Options that are settings, too.
+        def __init__(self, **options: Any) -> None: ...
         def __getattr__(self, name: str) -> Any: ...
 
     size: str = option("small", "Size of the field: small, medium or paper.")
