@@ -49,8 +49,8 @@ def main(argv=None) -> None:
         nearest_probes,
         nearest_rays,
         position_blind,
-        print_scores,
         score_rows,
+        score_table,
     )
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze, load_radiance
@@ -106,9 +106,8 @@ def main(argv=None) -> None:
         law, probe_settings["cap"], narrow
     )
     rows = score_rows(truth, positions, directions, methods)
-    print_scores(
-        rows, f"{len(positions)} held-out positions against the law ({len(train):,} of {len(rays):,} rays trained on)"
-    )
+    title = f"{len(positions)} held-out positions against the law ({len(train):,} of {len(rays):,} rays trained on)"
+    print(score_table(rows, title))
     integral = 4 * np.pi * methods["gaze field"](positions, directions).mean(axis=1)
     print(
         f"integral of the gaze field over the sphere: mean {integral.mean():.3f}, "

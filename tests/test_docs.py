@@ -15,6 +15,7 @@ import nerg_mi.cli
 from nerg_mi.evaluation import study as study_settings
 from nerg_mi.transport.march_primal import MarchSettings
 from tests.conftest import ROOT
+from tools import command_pages
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 OF_DASK = {"--dashboard-address", "--no-dashboard", "--protocol", "--tls-ca-file", "--tls-cert", "--tls-key"}
@@ -27,14 +28,10 @@ def options() -> set[str]:
     """Every option of every command and of every script."""
     found = {"--help"}
 
-    def walk(command):
+    root = typer.main.get_command(nerg_mi.cli.build_app())
+    for command in (root, *(command for _, command, _ in command_pages.commands())):
         for parameter in command.params:
             found.update(parameter.opts + parameter.secondary_opts)
-        for other in getattr(command, "commands", {}).values():
-            walk(other)
-
-    for name in nerg_mi.cli.COMMANDS:
-        walk(typer.main.get_command(nerg_mi.cli.build_app(name)))
     for folder in ("benchmarks", "examples", "tools", "scenes/store", "scenes/tabletop", "tests/renders"):
         for script in (ROOT / folder).glob("*.py"):
             found.update(re.findall(r'"(--[a-z][a-z0-9-]*)"', script.read_text()))
@@ -99,7 +96,7 @@ def test08_commands_are_right_as_they_stand(page):
             assert len(words) == 1 and words[0] in options(), words
             continue
         if program == "nerg":
-            command = typer.main.get_command(nerg_mi.cli.build_app(words[0]))
+            command = typer.main.get_command(nerg_mi.cli.build_app())
             context = command.make_context("nerg", list(words))
             while hasattr(command, "commands"):
                 name, command, words = command.resolve_command(context, list(words))

@@ -17,14 +17,15 @@ from typer.core import TyperOption
 import nerg_mi.aoi
 import nerg_mi.jobs.options
 import nerg_mi.rays.readers
-from nerg_mi.cli import COMMANDS, build_app
-from nerg_mi.cli.options import takes
+from nerg_mi.cli.building import build_command
 from nerg_mi.errors import NergError
 from nerg_mi.jobs import tracking
+from nerg_mi.jobs.commands import Command
 from nerg_mi.jobs.drawing.registry import KINDS as FIGURES
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, Checked, Range, check_number, ranged
 from nerg_mi.rays.readers.registry import shared_options
 from nerg_mi.train import gaze_settings, radiance_settings
+from tools.command_pages import commands
 
 
 def _modules():
@@ -47,7 +48,7 @@ KINDS = list(
         and (issubclass(kind, Checked) or any(RANGE in f.metadata for f in fields(kind)))
     )
 )
-LEFT_OUT = {"settings", "output", "train_output", "test_output", "align_output", "salt", "defaults"}
+LEFT_OUT = {"settings", "output", "train_output", "test_output", "align_output", "salt"}
 """Fields that are no options of the command line, or spelt otherwise there."""
 # What other options need beside them.
 BESIDE: dict[str, dict[str, Any]] = {
@@ -107,14 +108,10 @@ def test_every_number_is_refused_beyond_its_range_and_nowhere_else(kind):
     "kind", [k for k in KINDS if all("help" in f.metadata for f in fields(k))], ids=lambda k: k.__name__
 )
 def test_the_command_line_refuses_the_same(kind):
-    app, made = typer.Typer(), []
-
-    def command(options):
-        made.append(options)
-
-    command.__annotations__["options"] = kind
-    app.command()(takes(kind, *({f.name for f in fields(kind)} & LEFT_OUT))(command))
-    run = typer.main.get_command(app)
+    made: list[Any] = []
+    left_out = tuple({f.name for f in fields(kind)} & LEFT_OUT)
+    take = lambda options, reporter: made.append(options)
+    run = build_command(Command("take", take, "", "", kind, left_out, None, {}))
     for field in _numbers(kind):
         flag = field.metadata[FLAG] or "--" + field.name.replace("_", "-")
         for value in ("nan", "1e400", "1" + 400 * "0"):
@@ -124,18 +121,11 @@ def test_the_command_line_refuses_the_same(kind):
     assert not made
 
 
-def _options(command):
-    for below in getattr(command, "commands", {}).values():
-        yield from _options(below)
-    yield from (p for p in command.params if isinstance(p, TyperOption))
-
-
 def test_every_number_of_the_command_line_shows_its_range():
     """Also where a command declares an option itself; those of readers of rays are checked by them."""
-    apps = [typer.main.get_command(build_app(name)) for name in COMMANDS]
     of_readers = {option.name for option in shared_options()}
-    numbers = [p for app in apps for p in _options(app) if p.type_descriptor.annotation in (int, float)]
-    numbers = [p for p in numbers if p.name not in of_readers]
+    options = [p for _, command, _ in commands() for p in command.params if isinstance(p, TyperOption)]
+    numbers = [p for p in options if p.type_descriptor.annotation in (int, float) and p.name not in of_readers]
     limits = {(p.name, (i := p.type_descriptor.parameter_info).min, i.max) for p in numbers}
     assert len(limits) > 80 and [limit for limit in limits if None in limit] == []
 

@@ -15,16 +15,13 @@ def commands() -> Iterator[tuple[str, Any, Any]]:
 
     from nerg_mi import cli
 
-    for name in cli.COMMANDS:
-        root = typer.main.get_command(cli.build_app(name))
-        context = root.make_context("nerg", [name], resilient_parsing=True)
-        _, command, _ = root.resolve_command(context, [name])
-        yield from _below(command, name, context)
+    yield from _below(typer.main.get_command(cli.build_app()), "nerg", None)
 
 
 def _below(command: Any, name: str, parent: Any) -> Iterator[tuple[str, Any, Any]]:
     context = command.make_context(name, [], parent=parent, resilient_parsing=True)
-    for below, other in getattr(command, "commands", {}).items():
+    for below in getattr(command, "commands", {}):
+        _, other, _ = command.resolve_command(context, [below])
         yield from _below(other, below, context)
     if not hasattr(command, "commands"):
         yield context.command_path, command, context

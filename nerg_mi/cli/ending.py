@@ -17,8 +17,8 @@ from nerg_mi.errors import expected, sentence
 if TYPE_CHECKING:
     from typing_extensions import Buffer
 
-MENDABLE = 1
-"""Exit code of what the user can mend."""
+USER_ERROR = 1
+"""Exit code of an error that the user can correct."""
 
 FAULT = 70
 """Exit code of a mistake in the program (EX_SOFTWARE of sysexits.h)."""
@@ -46,7 +46,7 @@ def shorten_values(text: str, arguments: Iterable[str]) -> str:
 def end_of(error: Exception) -> tuple[int, str]:
     """Exit code of ``error``, and what is said about it."""
     if expected(error):
-        return MENDABLE, sentence(error)
+        return USER_ERROR, sentence(error)
     text = " ".join(str(error).split())
     return FAULT, (
         f"internal error ({type(error).__name__}{': ' + text if text else ''}): this is a fault of nerg_mi and not of "

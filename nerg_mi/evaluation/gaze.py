@@ -277,8 +277,8 @@ def score_rows(
     return [{"method": name, **scores(truth, density(positions, directions))} for name, density in methods.items()]
 
 
-def print_scores(rows: list[dict], title: str) -> None:
-    """Print ``rows`` as a table."""
+def score_table(rows: list[dict], title: str) -> str:
+    """``rows`` as a table for the terminal."""
     from rich.console import Console
     from rich.table import Table
 
@@ -288,7 +288,10 @@ def print_scores(rows: list[dict], title: str) -> None:
     for row in rows:
         out.add_row(*(v if isinstance(v, str) else f"{v:.4f}" if k == "MAE" else f"{v:.3f}" for k, v in row.items()))
     # A width of its own: a table in a file or a pipe must not be folded.
-    Console(width=120).print(out)
+    console = Console(width=120)
+    with console.capture() as text:
+        console.print(out)
+    return text.get().removesuffix("\n")
 
 
 # ---- A gaze field at positions, and of people, that it was not trained on, beside what needs no field ----

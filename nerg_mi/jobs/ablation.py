@@ -1,4 +1,7 @@
-"""The paper's ablation: every variant of a gaze field, trained alike, scored on what it saw and on what it did not."""
+"""``nerg ablate``: Train every variant of a gaze field alike, and compare them.
+
+The paper's ablation: every variant of a gaze field, trained alike, scored on what it saw and on what it did not.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +27,7 @@ from nerg_mi.train.gaze_recipes import gaze_recipe
 from .ablation_bench import Bench, bench_of, law_of, plan_of, train_variant
 from .ablation_tasks import rows_in_parts
 from .backend import select_backend
+from .commands import argument, command, out
 from .gaze_places import place_kind
 from .options.ablation import AblationOptions
 from .reporter import SILENT, Reporter
@@ -39,6 +43,13 @@ class AblationResult:
     files: list[Path]
 
 
+@command(
+    "ablate",
+    "Train every variant of a gaze field alike; losses on training and held-out positions, and the time of a frame.",
+    options=AblationOptions,
+    rays=argument("Rays file (.npz or .parquet), as nerg rays import writes it."),
+    output=out("Folder for checkpoints, table and plot."),
+)
 def ablate(
     rays: Rays | str | Path, output: str | Path, options: AblationOptions | None = None, reporter: Reporter = SILENT
 ) -> AblationResult:

@@ -1,4 +1,7 @@
-"""How tracking lies in a place: found from what there is as evidence, judged, and written for ``--align``."""
+"""``nerg align``: Find how tracking lies in a place: from points, a twin, cameras, or the tracking alone.
+
+How tracking lies in a place: found from what there is as evidence, judged, and written for ``--align``.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,7 @@ from nerg_mi.train import geometry
 from nerg_mi.train.geometry import GazePlace
 
 from .backend import select_backend
+from .commands import argument, command, out
 from .options import parse_point
 from .options.alignment import AlignOptions
 from .reporter import SILENT, Reporter
@@ -40,6 +44,15 @@ class AlignResult:
     files: list[Path]
 
 
+@command(
+    "align",
+    "Find how tracking lies in a place: the similarity from the rays' frame to the place's.",
+    more="""From picked points, a twin, cameras known in both frames, or from the tracking alone: heads in free space,
+gaze that ends on surfaces. A mirrored frame is found and named.""",
+    options=AlignOptions,
+    rays=argument("Rays file (.npz or .parquet). Not needed with --pairs, --twin or --cameras.", required=False),
+    output=out("Alignment to write (.json), which --align takes; beside it a picture."),
+)
 def align(
     rays: Rays | str | Path | None,
     output: str | Path | None = None,

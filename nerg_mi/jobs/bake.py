@@ -1,4 +1,7 @@
-"""Gaze on surfaces: how much of it each square metre of a mesh receives, from a gaze field or from tracked rays."""
+"""``nerg bake``: Put gaze on surfaces: how much of it each square metre receives, as colours and tables.
+
+Gaze on surfaces: how much of it each square metre of a mesh receives, from a gaze field or from tracked rays.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from nerg_mi.evaluation.metrics import cc
 from nerg_mi.figures.overlay import Heat
 from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import check_writable
+from nerg_mi.formats.splats.files import is_splats
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import Smoother, Sums, merge
 from nerg_mi.surfaces.mesh import Mesh
@@ -27,6 +31,7 @@ from .baking.lookers import alignment_of, check_values, find_crowd, rays_of, tra
 from .baking.outputs import SUFFIXES, Baked, check_texture, write_output
 from .baking.receivers import Receivers, cut, read_receivers
 from .baking.summing import halves_of, sums_in_one_go, sums_in_parts
+from .commands import argument, command, out
 from .options.bake import BakeOptions
 from .parts import Parts
 from .reporter import SILENT, Reporter
@@ -137,6 +142,24 @@ def bake(
         reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB, {time.perf_counter() - start:.1f} s)")
     on, elsewhere, escaped, total = (summary[k] for k in ("on_surface", "elsewhere", "escaped", "total"))
     return Bake(mesh, density, share, on, elsewhere, escaped, total, summary, tuple(paths))
+
+
+@command(
+    "bake",
+    "Put gaze on surfaces: how much of it each square metre receives, from a gaze field or from tracked rays.",
+    options=BakeOptions,
+    surface=argument("Mesh (.ply, .obj, .glb), scene (.xml), radiance field (.safetensors), or Gaussian splats."),
+    output=out(
+        "Files to write, repeatable: .ply, .glb (with colours), .csv (of faces), .json (summary); of Gaussian splats "
+        ".ply and .json.",
+        list[Path],
+    ),
+)
+def bake_any(surface: Path, output: list[Path], options: BakeOptions, reporter: Reporter) -> None:
+    """`bake` on a mesh, and `bake_splats.bake_splats` on Gaussian splats."""
+    from .bake_splats import bake_splats
+
+    (bake_splats if is_splats(surface) else bake)(surface, output, options, reporter)
 
 
 def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:

@@ -1,4 +1,7 @@
-"""Fields that other programs have trained, as fields of our own."""
+"""``nerg import``: Convert checkpoints of torch-ngp and of the NeRG paper's authors.
+
+Fields that other programs have trained, as fields of our own.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from nerg_mi.formats.torch_ngp.nerg import is_nerg, read_nerg
 from nerg_mi.formats.torch_ngp.state_dict import open_checkpoint
 
 from .backend import select_backend
+from .commands import argument, command, extra, out
 from .options.checkpoints import ImportOptions
 from .reporter import SILENT, Reporter
 
@@ -73,6 +77,23 @@ def import_checkpoint(
     elif attention is not None:
         reporter.message(f'"{file}" also holds a gaze field: --gaze NAME.safetensors writes it')
     return ImportedFields(field, attention, origin, [path for path in (output, gaze) if path is not None])
+
+
+@command(
+    "import",
+    "Convert a checkpoint to the fields of the volumes `nerf` and `gazefield`. Nothing in the file is run.",
+    options=ImportOptions,
+    file=argument("Checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors."),
+    output=out("Radiance field to write (.safetensors).", default=None),
+    gaze=extra(None, "Gaze field to write (.safetensors).", Path, "-g", "--gaze"),
+)
+def import_to_files(
+    file: Path, output: Path | None, gaze: Path | None, options: ImportOptions, reporter: Reporter
+) -> None:
+    """`import_checkpoint` to one file at least."""
+    if output is None and gaze is None:
+        raise NergError("nothing is asked for: give -o FIELD.safetensors, --gaze GAZE.safetensors, or both")
+    import_checkpoint(file, output, gaze, options, reporter)
 
 
 def _about(field: RadianceField, origin: dict) -> str:

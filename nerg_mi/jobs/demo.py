@@ -1,4 +1,6 @@
-"""The demo: every picture that shows what a gaze field is, rendered from a scene with an observer.
+"""``nerg demo``: Render the demo store: pictures of what a gaze field is.
+
+The demo: every picture that shows what a gaze field is, rendered from a scene with an observer.
 
 The scene has three sensors: 0 a camera that sees behind what hides it from the observer, 1 the observer's own view, 2
 the observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field, and it has the `<default>`s of
@@ -7,6 +9,8 @@ the observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field
 
 from __future__ import annotations
 
+import shutil
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,6 +36,7 @@ from nerg_mi.transport.geometry import pixel_solid_angles
 from nerg_mi.transport.observer import center
 
 from .bake import bake
+from .commands import command, extra
 from .options.bake import BakeOptions
 from .options.pictures import DemoOptions
 from .options.report import ReportOptions
@@ -185,6 +190,29 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     for _, verdict in made.run.verdicts:
         reporter.message(verdict.sentence)
     return DemoResult(files, clock.seconds, report)
+
+
+@command(
+    "demo",
+    "Render the demo store: colour, depth, gaze, visibility, the observer's gaze sphere, occlusion, EXR, a report.",
+    options=DemoOptions,
+    without=("scene",),
+    out=extra(Path("out/demo"), "Folder to write into; it is made.", Path, "-o", "--out"),
+)
+def make_demo_to_look_at(out: Path, options: DemoOptions, reporter: Reporter) -> None:
+    """`make_demo`, and how its pictures are looked at."""
+    make_demo(out, options, reporter)
+    reporter.message(f"Look at them with: {_viewer(out)}")
+
+
+def _viewer(out: Path) -> str:
+    """The command with which this machine shows the pictures in ``out``."""
+    first = out / "occlusion.png"
+    opener = "open" if sys.platform == "darwin" else "xdg-open"
+    if shutil.which(opener):
+        return f"{opener} {first}"
+    # A machine without a desktop: any browser that reaches it will do.
+    return f"python3 -m http.server --bind 127.0.0.1 --directory {out} 8000, then http://127.0.0.1:8000/{first.name}"
 
 
 def store_scene() -> Path:

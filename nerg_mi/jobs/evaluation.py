@@ -1,4 +1,8 @@
-"""The evaluation of a gaze field, at positions and of people that it was not trained on, beside what needs no field."""
+"""``nerg eval gaze``: Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the
+people.
+
+The evaluation of a gaze field, at positions and of people that it was not trained on, beside what needs no field.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.train.geometry import GazePlace
 
 from .backend import select_backend
+from .commands import argument, command, out
 from .gaze_places import check_place, place_of_training
 from .gaze_prior import RECIPE as PRIOR
 from .options.evaluation import GazeEvaluationOptions
@@ -134,6 +139,25 @@ def evaluate_gaze(
             made = provenance("nerg eval gaze", sources, seed, options)
             side_by_side(test, {k: methods[k] for k in _DRAWN}, files[-1], options.pictures, about=made)
     return GazeEvaluation(rows, persons, split, len(test.centres), len(test.persons), files, places, ranks, regions)
+
+
+@command(
+    "eval gaze",
+    options=GazeEvaluationOptions,
+    gaze=argument("Checkpoint of a gaze field that was trained with --test-zones (.safetensors)."),
+    rays=argument("The rays file or dataset that it was trained on."),
+    output=out("Folder for tables and pictures. Default: GAZE.eval.", default=None),
+)
+def print_evaluation(
+    gaze: Path, rays: Path, output: Path | None, options: GazeEvaluationOptions, reporter: Reporter
+) -> None:
+    """`evaluate_gaze`, with its scores as a table and its files named."""
+    result = evaluate_gaze(gaze, rays, output or gaze.with_suffix(".eval"), options, reporter)
+    rows = [{k: row[k] for k in ("method", *evaluation.SCORES, "integral")} for row in result.rows]
+    title = f"{gaze.name}, {result.split}: {result.positions} positions, {result.people} persons"
+    reporter.message(evaluation.score_table(rows, title))
+    for path in result.files:
+        reporter.message(f"wrote {path}")
 
 
 def _positions(

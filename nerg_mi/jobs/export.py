@@ -1,5 +1,13 @@
-"""Radiance fields for other tools, in the field's own units: meshes, points, Gaussian splats, grid volumes,
-torch-ngp checkpoints."""
+"""``nerg export mesh``: A mesh by marching cubes, with vertex colours: .ply or .glb.
+``nerg export points``: A cloud of surface points with normals and colours: .ply or .glb.
+``nerg export splats``: Gaussian splats on the surface, with its colours: .ply, for viewers of splats and the volume
+"splats".
+``nerg export volume``: Density, and colour, as Mitsuba grid volumes (.vol).
+``nerg export torch-ngp``: A torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes.
+
+Radiance fields for other tools, in the field's own units: meshes, points, Gaussian splats, grid volumes,
+torch-ngp checkpoints.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +27,11 @@ from nerg_mi.formats.torch_ngp.fields import write_torch_ngp
 from nerg_mi.formats.volumes import density_and_color, write_volume
 
 from .backend import select_backend
+from .commands import argument, command, out
 from .options.export import MeshOptions, PointOptions, SplatOptions, TorchNgpOptions, VolumeOptions
 from .reporter import SILENT, Reporter
+
+_FIELD, _FILE = argument("Radiance field (.safetensors)."), out("File to write.")
 
 
 @dataclass(frozen=True)
@@ -31,6 +42,7 @@ class Export:
     surface: Surface | None = None
 
 
+@command("export mesh", options=MeshOptions, field=_FIELD, output=_FILE)
 def export_mesh(
     field: str | Path | RadianceField,
     output: str | Path,
@@ -67,6 +79,7 @@ def export_mesh(
     return _written([output], start, reporter, found)
 
 
+@command("export points", options=PointOptions, field=_FIELD, output=_FILE)
 def export_points(
     field: str | Path | RadianceField,
     output: str | Path,
@@ -83,6 +96,7 @@ def export_points(
     return _written([output], start, reporter, found)
 
 
+@command("export splats", options=SplatOptions, field=_FIELD, output=_FILE)
 def export_splats(
     field: str | Path | RadianceField,
     output: str | Path,
@@ -101,6 +115,7 @@ def export_splats(
     return _written([output], start, reporter)
 
 
+@command("export volume", options=VolumeOptions, field=_FIELD, output=_FILE)
 def export_volume(
     field: str | Path | RadianceField,
     output: str | Path,
@@ -129,6 +144,7 @@ def export_volume(
     return done
 
 
+@command("export torch-ngp", options=TorchNgpOptions, field=_FIELD, output=_FILE)
 def export_torch_ngp(
     field: str | Path | RadianceField,
     output: str | Path,

@@ -1,14 +1,30 @@
-"""From a scene file to pictures or a video: in one go, or in parts that are kept and that others may make."""
+"""``nerg render``: Render a scene file to a picture or a video.
+
+From a scene file to pictures or a video: in one go, or in parts that are kept and that others may make.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from .commands import argument, command, out
 from .options.parts import FilmOptions
 from .pictures import PictureResult, render_file
 from .reporter import SILENT, Reporter
 
 
+@command(
+    "render",
+    "Render a scene file to a picture or a video, with the integrator that the scene names.",
+    more="""An EXR file holds all channels in float32, those of the AOVs among them; a PNG file holds the colour,
+tonemapped to sRGB, or an overlay with its scale, which an SVG file can hold, too. Pictures of a sequence have a number
+added to their names, or are the frames of an MP4 file.
+
+With --store or --scheduler each picture is kept when it is done, and the same command goes on where it ended.""",
+    options=FilmOptions,
+    scene=argument("Mitsuba scene file (.xml)."),
+    output=out("Picture to write: .exr (all channels), .png; .svg, .mp4."),
+)
 def render_film(
     scene: str | Path, output: str | Path, options: FilmOptions | None = None, reporter: Reporter = SILENT
 ) -> PictureResult:

@@ -1,7 +1,12 @@
-"""Gaze fields over folds: trained and scored again and again, each time without other people and other zones."""
+"""``nerg eval folds``: Train and score a gaze field again and again, each time without other people and zones, and
+tell the means.
+
+Gaze fields over folds: trained and scored again and again, each time without other people and other zones.
+"""
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +15,7 @@ from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.folds import mean_rows, means
-from nerg_mi.evaluation.gaze import SCORES, SPLITS
+from nerg_mi.evaluation.gaze import SCORES, SPLITS, score_table
 from nerg_mi.evaluation.gaze_report import markdown, uncertainty_text
 from nerg_mi.evaluation.uncertainty import rank_rows
 from nerg_mi.files.atomic import check_folder, write_text
@@ -27,6 +32,7 @@ from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.task import FOLDER, Task
 from nerg_mi.threads import set_thread_count, use_share
 
+from .commands import argument, command, out
 from .evaluation import evaluate_gaze
 from .gaze import train_gaze
 from .gaze_places import place_kind
@@ -121,6 +127,21 @@ def evaluate_folds(
         reporter.message(f"wrote {path}")
     reporter.message(f"The folds are kept in {parts.store.folder}; nerg jobs says what they take.")
     return FoldResult(rows, each, fields, written, positions, ranks, held)
+
+
+@command(
+    "eval folds",
+    more="Each fold is kept when it is done, and the same command goes on where it ended.",
+    options=FoldOptions,
+    rays=argument("Rays file (.npz or .parquet) or dataset."),
+    output=out("Folder for the table."),
+)
+def print_folds(rays: Path, output: Path, options: FoldOptions, reporter: Reporter) -> None:
+    """`evaluate_folds`, with the means as a table for each split."""
+    result = evaluate_folds(rays, output, options, reporter)
+    for split in options.splits.split(","):
+        rows = [{k: row.get(k, math.nan) for k in ("method", *SCORES)} for row in result.rows if row["split"] == split]
+        reporter.message(score_table(rows, f"{split}: means of {options.folds} folds"))
 
 
 def train_and_score(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:

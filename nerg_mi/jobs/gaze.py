@@ -1,4 +1,8 @@
-"""The training of a gaze field: from rays of attention, salience images or both to a checkpoint."""
+"""``nerg train gaze``: Train a gaze field on rays of attention, and report its scores at positions that were held
+out.
+
+The training of a gaze field: from rays of attention, salience images or both to a checkpoint.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +33,7 @@ from nerg_mi.train.gaze_trainer import GazePlan, GazeProgress, StateSettings
 from nerg_mi.train.geometry import GazePlace
 
 from .backend import select_backend
+from .commands import argument, command, out
 from .gaze_places import check_place, make_place
 from .gaze_plan import check_plan, plan_gaze
 from .options.gaze import GazeOptions
@@ -52,6 +57,14 @@ class GazeResult:
     interrupted: bool
 
 
+@command(
+    "train gaze",
+    options=GazeOptions,
+    rays=argument(
+        "Rays file (.npz or .parquet) or dataset, as nerg rays import writes it. None: --views alone.", required=False
+    ),
+    output=out("Checkpoint to write (.safetensors)."),
+)
 def train_gaze(
     rays: Rays | str | Path | None,
     output: str | Path | None = None,

@@ -1,4 +1,8 @@
-"""A gaze field for a place where nobody was tracked: what people in other places say of it."""
+"""``nerg train prior``: Make a gaze field for a place where nobody was tracked: how high people looked in other
+places.
+
+A gaze field for a place where nobody was tracked: what people in other places say of it.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_log_density import KAPPA, prior_field
 
 from .backend import select_backend
+from .commands import argument, command, out
 from .options.prior import PriorOptions
 from .reporter import SILENT, Reporter
 
@@ -32,13 +37,20 @@ class PriorResult:
     output: Path | None
 
 
+@command(
+    "train prior",
+    more="It stands in any place whose z axis points up. What it is worth: docs/gaze-evaluation.md.",
+    options=PriorOptions,
+    rays=argument("Rays files (.npz or .parquet) or datasets, one a place.", list[Path]),
+    output=out("Checkpoint to write (.safetensors)."),
+)
 def learn_prior(
-    places: Rays | str | Path | Sequence[Rays | str | Path],
+    rays: Rays | str | Path | Sequence[Rays | str | Path],
     output: str | Path | None = None,
     options: PriorOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> PriorResult:
-    """A gaze field for any place whose z axis points up, of how high people looked in ``places``: rays, or their files
+    """A gaze field for any place whose z axis points up, of how high people looked: ``rays``, or their files
     (.npz or .parquet) or datasets, one a place, or those of one place alone. Places count alike, and people within a
     place. It does not depend on where an observer stands, and is written to ``output`` (.safetensors) where that is
     given.
@@ -46,17 +58,17 @@ def learn_prior(
     Raises `NergError` for what the user can mend.
     """
     options, output = options or PriorOptions(), None if output is None else Path(output)
-    places = [places] if isinstance(places, (Rays, str, Path)) else places
-    if not places:
+    rays = [rays] if isinstance(rays, (Rays, str, Path)) else rays
+    if not rays:
         raise NergError("a prior is learnt from the rays of other places: give at least one file of them")
     if output is not None:
         check_writable(output, ".safetensors")
     ns = select_backend(options.mode)
     learnt, files = [], []
-    for k, rays in enumerate(places):
-        reporter.progress(k / len(places), "reading rays")
-        data = rays if isinstance(rays, Rays) else load_rays(rays, options.most, options.seed)
-        of_file = {} if isinstance(rays, Rays) else {"file": Path(rays).name, "sha256": rays_digest(rays)}
+    for k, place in enumerate(rays):
+        reporter.progress(k / len(rays), "reading rays")
+        data = place if isinstance(place, Rays) else load_rays(place, options.most, options.seed)
+        of_file = {} if isinstance(place, Rays) else {"file": Path(place).name, "sha256": rays_digest(place)}
         learnt.append(data)
         files.append({**of_file, "rays": len(data), "persons": len(data.persons)})
     if empty := [str(k + 1) for k, data in enumerate(learnt) if not len(data)]:

@@ -1,4 +1,7 @@
-"""Photos without poses, or a video, made a capture that can be trained on."""
+"""``nerg poses``: Find out from where photos, or frames of a video, were taken.
+
+Photos without poses, or a video, made a capture that can be trained on.
+"""
 
 from __future__ import annotations
 
@@ -27,6 +30,7 @@ from nerg_mi.photos.structure import (
 )
 from nerg_mi.photos.video_frames import copy_frames
 
+from .commands import argument, command, out
 from .options.poses import PoseOptions
 from .reporter import SILENT, Reporter
 
@@ -58,6 +62,14 @@ class PosesResult:
     report: dict
 
 
+@command(
+    "poses",
+    "Find out from where photos were taken, or frames of a video, and write them as a capture for nerg train radiance.",
+    more='Needs pycolmap, and PyAV for videos: pip install "nerg-mi[poses]".',
+    options=PoseOptions,
+    pictures=argument("Folder of photos (JPEG, PNG), or a video.", metavar="PHOTOS|VIDEO"),
+    output=out("Folder to make: a capture with poses."),
+)
 def find_poses(
     pictures: str | Path, output: str | Path, options: PoseOptions | None = None, reporter: Reporter = SILENT
 ) -> PosesResult:

@@ -1,10 +1,15 @@
-"""Radiance fields from posed photos: training, and scores on the photos that were held out."""
+"""``nerg train radiance``: Train a radiance field on posed pictures, and report the error on those held out.
+``nerg eval radiance``: PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the
+integrator.
+
+Radiance fields from posed photos: training, and scores on the photos that were held out.
+"""
 
 from __future__ import annotations
 
 import math
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from nerg_mi.errors import NergError, chosen
@@ -19,6 +24,7 @@ from nerg_mi.train import radiance_run
 from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
 
 from .backend import select_backend
+from .commands import argument, command, out
 from .options import chosen_settings
 from .options.radiance import RadianceOptions, RadianceScoreOptions
 from .reporter import SILENT, Reporter
@@ -44,13 +50,19 @@ class RadianceResult:
         return None if held_out is None else held_out["mean"]
 
 
+@command(
+    "train radiance",
+    options=RadianceOptions,
+    dataset=argument("Folder of posed photos, its transforms.json, or a COLMAP model."),
+    output=out("Checkpoint to write (.safetensors)."),
+)
 def train_radiance(
-    photos: str | Path,
+    dataset: str | Path,
     output: str | Path | None = None,
     options: RadianceOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> RadianceResult:
-    """Train a radiance field on posed ``photos``: a folder, its transforms.json, or a COLMAP model.
+    """Train a radiance field on the posed photos of ``dataset``: a folder, its transforms.json, or a COLMAP model.
 
     ``output``: checkpoint to write (.safetensors). Beside it a preview (.preview.png) is kept up to date, and while the
     run is not done its state (.run), from which it can be resumed. After Ctrl-C the result so far and the state are
@@ -59,7 +71,7 @@ def train_radiance(
     Raises `NergError` for what the user can mend, before any time is spent on it.
     """
     with reserving(output):
-        return _train(photos, None if output is None else Path(output), options or RadianceOptions(), reporter)
+        return _train(dataset, None if output is None else Path(output), options or RadianceOptions(), reporter)
 
 
 def _train(photos: str | Path, output: Path | None, options: RadianceOptions, reporter: Reporter) -> RadianceResult:
@@ -226,6 +238,19 @@ def evaluate_radiance(
         write_json(options.json_file, about | scores.to_dict())
         reporter.message(f"wrote {options.json_file}")
     return scores
+
+
+@command(
+    "eval radiance",
+    more="The pictures are written into FIELD.eval where no other folder is given.",
+    options=RadianceScoreOptions,
+    field=argument("Checkpoint of a radiance field (.safetensors)."),
+    dataset=argument("Posed image set with the views to compare with."),
+)
+def evaluate_beside(field: Path, dataset: Path, options: RadianceScoreOptions, reporter: Reporter) -> None:
+    """`evaluate_radiance`, with pictures beside the ``field`` where no other folder is chosen."""
+    options = replace(options, pictures=options.pictures or field.with_suffix(".eval"))
+    evaluate_radiance(field, dataset, options, reporter)
 
 
 def _refuse_trained(field: str | Path, about: dict, data: Dataset) -> None:

@@ -1,4 +1,7 @@
-"""A report on a gaze field: one HTML file of its place, people, gaze, objects, scores, limits and provenance."""
+"""``nerg report``: Write a report on a gaze field: one HTML file with a verdict, pictures, scores and the place in 3D.
+
+A report on a gaze field: one HTML file of its place, people, gaze, objects, scores, limits and provenance.
+"""
 
 from __future__ import annotations
 
@@ -55,6 +58,7 @@ from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import center
 
 from .backend import select_backend
+from .commands import argument, command, out
 from .options.report import ReportOptions
 from .options.scene import SceneOptions
 from .overlays import basis_words, is_supported
@@ -86,6 +90,21 @@ class ReportResult:
     run: Run
 
 
+@command(
+    "report",
+    "Write a report on a gaze field: one HTML file that opens from disk and needs no network.",
+    more="""It shows the place, the data, where people were, the gaze, named objects, the scores beside their baselines
+with a verdict in a sentence, uncertainty, settings, limits, provenance and the place in 3D. What is missing is left
+out, and said so.""",
+    options=ReportOptions,
+    files=argument(
+        "In any order: a gaze field, and what there is of its place, rays, evaluations (gaze.json, or the folder of "
+        "nerg eval gaze); a folder stands for what lies in it.",
+        list[Path],
+        metavar="RUN",
+    ),
+    output=out("File to write (.html).", default=Path("report.html")),
+)
 def make_report(
     files: Sequence[str | Path],
     output: str | Path,

@@ -1,4 +1,7 @@
-"""From checkpoints, meshes and rays to a scene file that `nerg render` renders."""
+"""``nerg scene``: Write a scene file for a field, a mesh, a gaze field or rays, with a camera and an observer.
+
+From checkpoints, meshes and rays to a scene file that `nerg render` renders.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,7 @@ from nerg_mi.rendering.scene_writer import numbers, value_of
 from nerg_mi.train.geometry import place_of_hits
 
 from .backend import select_backend
+from .commands import argument, command, out
 from .options.scene import SceneOptions
 from .reporter import SILENT, Reporter
 from .scenes.cameras import (
@@ -60,6 +64,19 @@ class SceneResult:
     taken: frozenset[str] = frozenset()
 
 
+@command(
+    "scene",
+    "Write a scene file for a place, a gaze field or rays, with a camera and an observer.",
+    more="""A gaze field alone is shown in the place that it was trained in, which is found beside it. The scene is
+commented; each of its defaults can be set when it is rendered (nerg render -D).""",
+    options=SceneOptions,
+    files=argument(
+        "In any order: a place (radiance field, splats, mesh, .xml scene, .vol), a gaze field, rays.",
+        list[Path],
+        metavar="FILES",
+    ),
+    output=out("Scene file to write (.xml)."),
+)
 def write_scene(
     files: Sequence[str | Path], output: str | Path, options: SceneOptions | None = None, reporter: Reporter = SILENT
 ) -> SceneResult:

@@ -1,4 +1,7 @@
-"""Attention on things as numbers: counted in rays, foretold by a field, by cohort, time and zone; and what if."""
+"""``nerg stats``: Count attention on things, in rays and by a gaze field: numbers with intervals, and what if.
+
+Attention on things as numbers: counted in rays, foretold by a field, by cohort, time and zone; and what if.
+"""
 
 from __future__ import annotations
 
@@ -52,6 +55,7 @@ from nerg_mi.statistics.visibility import Isovists, Targets
 from nerg_mi.statistics.visits import ALL, Cell, Sums, Total
 
 from .backend import select_backend
+from .commands import argument, command, out
 from .options import parse_point
 from .parts import Parts
 from .reporter import SILENT, Reporter
@@ -86,6 +90,16 @@ class _Given:
     rays: Path | Rays | None = None
 
 
+@command(
+    "stats",
+    "Count attention on things: in rays, and as a gaze field predicts it, with intervals over people.",
+    more="""Share, dwell, reach, first looks, returns, distance, what could be seen; by cohort, time and zone;
+differences, moves from thing to thing, what if something stood elsewhere. --visibility tells what can be seen from
+where.""",
+    options=StatisticsOptions,
+    files=argument("Rays or a dataset, a scene, a gaze field, a place; in any order.", list[Path]),
+    output=out("Folder for tables and pictures."),
+)
 def statistics(
     files: Sequence[str | Path | Rays],
     output: str | Path | None = None,

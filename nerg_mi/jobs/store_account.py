@@ -1,4 +1,7 @@
-"""What the store of a job in parts holds, as lines that are read, and what of it is taken out."""
+"""``nerg jobs``: Say what is done of a long job, what is left and what is stale.
+
+What the store of a job in parts holds, as lines that are read, and what of it is taken out.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,20 @@ from nerg_mi.files.tables import markdown_table
 from nerg_mi.tasks.account import Account, JobAccount, read_account, remove_stale
 from nerg_mi.tasks.store import Store
 
+from .commands import argument, command, extra
 from .reporter import SILENT, Reporter
 
 _HEAD = ("job", "parts", "done", "left", "size", "computed in", "out of date")
 
 
+@command(
+    "jobs",
+    "Say what is done of the jobs in a store, what is left, what it takes in bytes, and what is stale.",
+    more="Stale is what no job asks for any more as it was started last, and what was made of files that have changed "
+    "since.",
+    folder=argument("Store of a job: what was given as --store, or OUTPUT.tasks."),
+    remove=extra(False, "Take out what no job asks for any more, and what is left over.", bool, "--remove-stale"),
+)
 def account_for_store(folder: str | Path, remove: bool = False, reporter: Reporter = SILENT) -> Account:
     """Tell of the jobs in the store ``folder``: how far each is, what it takes, and which inputs have changed.
 

@@ -1,4 +1,7 @@
-"""The study of error against run time: a scene at many settings, each compared with what is true."""
+"""``nerg study``: Measure error against run time: a scene at many settings, compared with what is true.
+
+The study of error against run time: a scene at many settings, each compared with what is true.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from nerg_mi.files.atomic import check_folder
 from nerg_mi.rendering.pictures import activate
 from nerg_mi.rendering.scene_file import files_of_scene
 
+from .commands import argument, command, extra
 from .options.study import StudyOptions
 from .reporter import SILENT, Reporter
 from .study_tasks import measured_in_parts, twin_beside
@@ -30,6 +34,15 @@ class StudyResult:
     report: dict
 
 
+@command(
+    "study",
+    "Measure error against run time: render a scene at many settings, compare each with what is true, and plot it.",
+    more="""Writes study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. A
+full study takes up to half an hour.""",
+    options=StudyOptions,
+    scene=argument("Scene file (.xml), or slab, sphere, sheets, fog or ramp.", str),
+    out=extra(..., "Folder to write into; it is made.", Path, "-o", "--out"),
+)
 def run_study(
     scene: str | Path, out: str | Path, options: StudyOptions | None = None, reporter: Reporter = SILENT
 ) -> StudyResult:

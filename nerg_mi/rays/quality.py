@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.safe_read import plain
 
 from .checks import RECORDING_CHECKS, Figures
 from .direction_checks import DIRECTION_CHECKS
@@ -196,6 +198,23 @@ def card_lines(rays: Rays, summary: RaysSummary) -> list[tuple[str, str]]:
     if s.duplicates:
         lines.append(("duplicates", f"{s.duplicates:,} rays share person and time with another"))
     return lines + [(WARNING, warning) for warning in s.warnings]
+
+
+def card_table(rays: Rays, summary: RaysSummary, title: str, lines: Sequence[tuple[str, str]] = ()) -> str:
+    """The card as a table for the terminal, below a ``title``; ``lines``: further ones, before what is implausible."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    # Names come from files: they are neither markup nor control characters of a terminal.
+    safe = lambda text: escape(plain(text, 10_000))
+    card = Table(show_header=False, box=None, title=safe(title), title_justify="left")
+    for name, text in sorted([*card_lines(rays, summary), *lines], key=lambda line: line[0] == WARNING):
+        card.add_row(f"[bold]{name}[/bold]" if name == WARNING else name, safe(text))
+    console = Console()
+    with console.capture() as shown:
+        console.print(card)
+    return shown.get().removesuffix("\n")
 
 
 def _recorded(s: RaysSummary) -> str:

@@ -35,16 +35,12 @@ XML = """<scene version="3.0.0">
 def test01_pixels_of_the_command_to_the_bit(files, scene, tmp_path):
     from typer.testing import CliRunner
 
-    from nerg_mi.cli.render import render_command
+    from nerg_mi.cli import build_app
 
     (files / "scene.xml").write_text(XML)
-    import typer
-
-    app = typer.Typer()
-    app.command()(render_command)
     out = tmp_path / "picture.exr"
-    arguments = [str(files / "scene.xml"), "-o", str(out), "-m", "llvm_ad_rgb", "--spp", "4", "--seed", "5"]
-    done = CliRunner().invoke(app, arguments)
+    arguments = ["render", str(files / "scene.xml"), "-o", str(out), "-m", "llvm_ad_rgb", "--spp", "4", "--seed", "5"]
+    done = CliRunner().invoke(build_app(), arguments)
     assert done.exit_code == 0, done.output
     bitmap = mitsuba_bitmap(out)
     names = [field.name for field in bitmap.struct_()]

@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.jobs import ablation
+from nerg_mi.jobs import ablation  # noqa: F401 (declares the command)
 from nerg_mi.jobs.options.ablation import AblationOptions
+
+from .handed import keep_handed
 
 ASKED = {
     "field": "place.safetensors",
@@ -38,8 +40,7 @@ ASKED = {
 
 
 def test_the_job_is_given_what_was_asked_for(monkeypatch):
-    given = []
-    monkeypatch.setattr(ablation, "ablate", lambda *a: given.append(a[:-1]))
+    given = keep_handed(monkeypatch, "ablate")
     line = [str(word) for name, value in ASKED.items() for word in ("--" + name.replace("_", "-"), value)]
     for more in ([*line, "--variant", "emit", "--variant", "begins as the field", "--no-refit"], []):
         with pytest.raises(SystemExit) as end:
@@ -47,6 +48,6 @@ def test_the_job_is_given_what_was_asked_for(monkeypatch):
         assert not end.value.code
     asked = {k: Path(v) if k in ("field", "scene", "store") else v for k, v in ASKED.items()}
     options = AblationOptions(**asked, variant=("emit", "begins as the field"), refit=False)
-    files = Path("rays.npz"), Path("out")
-    assert given == [(*files, options), (*files, AblationOptions())]
+    files = {"rays": Path("rays.npz"), "output": Path("out")}
+    assert given == [{**files, "options": options}, {**files, "options": AblationOptions()}]
     assert {*ASKED, "variant", "refit"} == {f.name for f in fields(AblationOptions)}

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from nerg_mi import cli
-from nerg_mi.cli.completion import completed_command
+from nerg_mi.cli.building import find_commands
 
 NERG = Path(sys.executable).with_name("nerg")
 needs_command = pytest.mark.skipif(not NERG.exists(), reason="the command nerg is not installed beside this Python")
@@ -28,7 +27,7 @@ def ask(shell: str, line: str) -> subprocess.CompletedProcess[str]:
 
 @needs_command
 def test_bash_is_given_commands_and_those_below():
-    assert set(ask("bash", "nerg ").stdout.split()) == set(cli.COMMANDS)
+    assert set(ask("bash", "nerg ").stdout.split()) == {name.split()[0] for name in find_commands()}
     assert ask("bash", "nerg tr").stdout.split() == ["train"]
     assert set(ask("bash", "nerg train ").stdout.split()) == {"radiance", "gaze", "prior"}
     assert {"import", "guess", "show", "filter"} <= set(ask("bash", "nerg rays ").stdout.split())
@@ -86,17 +85,3 @@ def test_help_is_there_at_once():
         subprocess.run([NERG, "--help"], capture_output=True, check=True)
         took.append(time.perf_counter() - start)
     assert min(took) < 0.5
-
-
-@pytest.mark.parametrize(
-    "environment, command",
-    [
-        ({"_NERG_COMPLETE": "complete_bash", "COMP_WORDS": "nerg rays im"}, "rays"),
-        ({"_NERG_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "nerg --debug train"}, "train"),
-        ({"_NERG_COMPLETE": "complete_bash", "COMP_WORDS": "nerg ra"}, None),
-        ({"_NERG_COMPLETE": "source_bash"}, None),
-        ({"COMP_WORDS": "nerg rays im"}, None),
-    ],
-)
-def test_the_command_is_found_on_the_line(environment, command):
-    assert completed_command(environment, ("rays", "train")) == command

@@ -9,12 +9,12 @@ import sys
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.cli.ending import FAULT, INTERRUPTED, MENDABLE, CtrlC, end_of, open_streams, shorten_values
+from nerg_mi.cli.ending import FAULT, INTERRUPTED, USER_ERROR, CtrlC, end_of, open_streams, shorten_values
 from nerg_mi.errors import NergError
 
 
 def test_what_the_user_can_mend_and_what_not():
-    assert end_of(NergError("write y")) == (MENDABLE, "write y")
+    assert end_of(NergError("write y")) == (USER_ERROR, "write y")
     code, text = end_of(KeyError("x"))
     assert code == FAULT and text.startswith("internal error (KeyError: 'x')")
 

@@ -17,7 +17,7 @@ def field(tmp_path):
 
 
 def run(*arguments):
-    return CliRunner().invoke(build_app("export"), ["export", *map(str, arguments)], catch_exceptions=False)
+    return CliRunner().invoke(build_app(), ["export", *map(str, arguments)], catch_exceptions=False)
 
 
 def test01_mesh_and_points(tmp_path, field):

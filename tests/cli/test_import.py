@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("torch")
 
 
 def run(*arguments):
-    return CliRunner().invoke(build_app("import"), ["import", *map(str, arguments)])
+    return CliRunner().invoke(build_app(), ["import", *map(str, arguments)])
 
 
 def test01_a_nerf(tmp_path):

@@ -3,50 +3,22 @@
 import re
 
 import pytest
-import typer.main
 
 import nerg_mi.cli
-from nerg_mi.cli.mode import mode_of
-
-FORMERLY = {"train radiance", "eval radiance", "import", "export mesh", "export points", "export volume"} | {
-    "export torch-ngp"
-}
-"""Commands that called it --variant."""
-
-
-def leaves(command, name=()):
-    if hasattr(command, "commands"):
-        for sub, found in command.commands.items():
-            yield from leaves(found, (*name, sub))
-    else:
-        yield " ".join(name), command
-
-
-def commands():
-    out = {}
-    for name in nerg_mi.cli.COMMANDS:
-        found = typer.main.get_command(nerg_mi.cli.build_app(name)).commands[name]
-        out |= dict(leaves(found, (name,)))
-    return out
+from tools.command_pages import commands
 
 
 def test_every_command_that_computes_has_it():
-    without = {"doctor", "jobs", "poses", "worker", "draw sheet", "draw difference"} | {
-        name for name in commands() if name.startswith("rays ")
-    }
-    for name, command in commands().items():
+    without = {"doctor", "jobs", "poses", "worker", "draw sheet", "draw difference"}
+    for path, command, _ in commands():
+        name = path.removeprefix("nerg ")
         options = {option: p for p in command.params for option in p.opts}
-        assert ("--mode" in options) == (name not in without), name
-        assert name in without or "-m" in options
-        if "--variant" in options:
-            assert options["--variant"].hidden == (name in FORMERLY), name
-        assert name not in FORMERLY or "--variant" in options
-
-
-def test_the_former_name_is_told(capsys):
-    assert mode_of("llvm_ad_rgb", None) == "llvm_ad_rgb" and not capsys.readouterr().err
-    assert mode_of("llvm_ad_rgb", "cuda_ad_rgb") == "cuda_ad_rgb"
-    assert "write --mode cuda_ad_rgb" in capsys.readouterr().err
+        assert ("--mode" in options) == (name not in without and not name.startswith("rays ")), name
+        assert ("-m" in options) == ("--mode" in options)
+        # The former name, or the factors of a gaze field.
+        assert ("--variant" in options) == ("--mode" in options), name
+        factors = name in ("train gaze", "eval folds", "ablate")
+        assert "--variant" not in options or options["--variant"].hidden != factors, name
 
 
 def test_the_former_name_works(tmp_path, capsys):

@@ -3,6 +3,7 @@ nor Ctrl-C loses anything."""
 
 from __future__ import annotations
 
+import importlib
 import os
 import pkgutil
 import resource
@@ -12,9 +13,10 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
-import typer
 
 import nerg_mi.cli
+from nerg_mi.cli.building import callback_of, find_commands
+from nerg_mi.jobs.commands import COMMANDS
 
 from .outputs import CASES, INPUTS, MAKES_A_FOLDER, OF_TORCH, READS_ONLY, make_inputs
 
@@ -172,14 +174,9 @@ def test_filtering_in_place_keeps_its_input_where_there_is_no_room(inputs, tmp_p
 
 def commands() -> dict:
     """Every command of `nerg`, a function, by its whole name."""
-    out = {}
-    for name in nerg_mi.cli.COMMANDS:
-        command = nerg_mi.cli.load_command(name)
-        if isinstance(command, typer.Typer):
-            out |= {f"{name} {c.name}": c.callback for c in command.registered_commands}
-        else:
-            out[name] = command
-    return out
+    for entry in find_commands().values():
+        importlib.import_module(entry.module)
+    return {name: callback_of(command) for name, command in COMMANDS.items()}
 
 
 def path_options(command) -> dict[str, tuple]:

@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.jobs import report
+from nerg_mi.jobs import report  # noqa: F401 (declares the command)
+
+from .handed import keep_handed
 
 
 def nerg(*arguments):
@@ -17,13 +19,11 @@ def nerg(*arguments):
 
 
 def test_options_reach_the_job(monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        report, "make_report", lambda files, output, options, reporter: asked.append((files, output, options))
-    )
+    handed = keep_handed(monkeypatch, "report")
     line = "report gaze.safetensors day.npz -o a.html --objects o.json --names --min-persons 3 --no-paths --from 1,2,3"
     assert nerg(*line.split(), "--to", "0,0,1", "--evaluate", "--title", "Mine") == 0
-    ((files, output, options),) = asked
+    (given,) = handed
+    files, output, options = (given[name] for name in ("files", "output", "options"))
     assert files == [Path("gaze.safetensors"), Path("day.npz")] and output == Path("a.html")
     assert options.objects == Path("o.json") and options.names and options.min_persons == 3 and not options.paths
     assert options.camera_from == (1, 2, 3) and options.camera_to == (0, 0, 1)

@@ -11,10 +11,12 @@ import pytest
 
 from nerg_mi.cli import main
 from nerg_mi.formats.fields import load_gaze, load_radiance
-from nerg_mi.jobs import gaze
+from nerg_mi.jobs import gaze  # noqa: F401 (declares the command)
 from nerg_mi.jobs.options.gaze import GazeOptions
 from tests.plugins import fields as radiance_fields
 from tests.train.gaze.looks import looking_at
+
+from .handed import keep_handed
 
 ASKED = {
     "field": "place.safetensors",
@@ -82,8 +84,7 @@ def nerg(capsys, *arguments):
 
 def test_the_job_is_given_what_was_asked_for(monkeypatch, capsys):
     """Every option there is, and none of them."""
-    given = []
-    monkeypatch.setattr(gaze, "train_gaze", lambda *a: given.append(a[:-1]))
+    given = keep_handed(monkeypatch, "train gaze")
     line = [word for name, value in ASKED.items() for word in ("--" + name.replace("_", "-"), value)]
     assert nerg(capsys, "rays.npz", "-o", "out.safetensors", *line, *FLAGS.values())[0] == 0
     assert nerg(capsys, "-o", "out.safetensors")[0] == 0
@@ -91,9 +92,10 @@ def test_the_job_is_given_what_was_asked_for(monkeypatch, capsys):
     options = GazeOptions(
         **{k: Path(v) if k in paths else v for k, v in ASKED.items()}, **{k: k != "refit" for k in FLAGS}
     )
+    output = Path("out.safetensors")
     assert given == [
-        (Path("rays.npz"), Path("out.safetensors"), options),
-        (None, Path("out.safetensors"), GazeOptions()),
+        {"rays": Path("rays.npz"), "output": output, "options": options},
+        {"rays": None, "output": output, "options": GazeOptions()},
     ]
     assert set(ASKED) | set(FLAGS) == {f.name for f in fields(GazeOptions)}
 

@@ -18,6 +18,7 @@ import signal
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from typer.core import TyperOption
@@ -181,15 +182,17 @@ def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) 
             yield Case(reader.name, "line.json", json.dumps([*words, *more]).encode())
 
 
+@functools.lru_cache
+def _commands() -> dict[str, Any]:
+    """The parser of each command, by its words."""
+    from tools.command_pages import commands
+
+    return {path.removeprefix("nerg "): command for path, command, _ in commands()}
+
+
 def _options(words: list[str]) -> list[TyperOption]:
     """The options of the command that the line ``words`` calls."""
-    import typer
-
-    from nerg_mi.cli import build_app
-
-    command = typer.main.get_command(build_app(words[0]))
-    for word in words:
-        command = getattr(command, "commands", {}).get(word, command)
+    command = _commands().get(" ".join(words[:2])) or _commands()[words[0]]
     return [p for p in command.params if isinstance(p, TyperOption) and FIXED.isdisjoint(p.opts)]
 
 

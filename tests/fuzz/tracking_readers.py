@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import gzip
-import io
 import json
 from pathlib import Path
 
@@ -52,13 +50,12 @@ def _rays():
 
 def _shown(rays) -> None:
     """What the commands ask of rays: the card, a selection, pseudonyms."""
-    from nerg_mi.cli.rays.arguments import print_card
+
     from nerg_mi.rays.filters import select_mask
     from nerg_mi.rays.pseudonyms import pseudonymise
-    from nerg_mi.rays.quality import summarise
+    from nerg_mi.rays.quality import card_table, summarise
 
-    with contextlib.redirect_stdout(io.StringIO()):
-        print_card(rays, summarise(rays), Path("rays.npz"))
+    card_table(rays, summarise(rays), "rays.npz")
     rays.select(select_mask(rays, time=(0, 1), with_hit=True))
     pseudonymise(rays, bytes(16))
 
@@ -230,13 +227,12 @@ def _make_dataset(folder: Path) -> None:
 
 
 def _read_dataset(folder: Path) -> None:
-    from nerg_mi.cli.rays.arguments import print_card
     from nerg_mi.jobs.tracking import card_of
     from nerg_mi.rays.dataset import Conditions, RayDataset
+    from nerg_mi.rays.quality import card_table
 
-    with contextlib.redirect_stdout(io.StringIO()):
-        for title, card in card_of(folder / "a.rays"):
-            print_card(card.rays, card.summary, title, card.lines)
+    for title, card in card_of(folder / "a.rays"):
+        card_table(card.rays, card.summary, title, card.lines)
     dataset = RayDataset.open(folder / "a.rays")
     dataset.sample(7, runs=2)
     list(dataset.scan(Conditions(time=(0, 0.3), box=[0, 1, 0, 1, 0, 3], with_hit=True), whole=True))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerg_mi.rays.quality import WARNING, card_lines, summarise
+from nerg_mi.rays.quality import WARNING, card_lines, card_table, summarise
 from nerg_mi.rays.rays import FRAME, Rays
 
 
@@ -52,3 +52,11 @@ def test_lines_that_are_not_always_there():
     assert "have the same time" in lines[WARNING]
     slow = dict(card(t=10.0 * np.arange(n)))
     assert slow["recorded time"].startswith("none: each ray of a person comes more than 1 s")
+
+
+def test_names_are_shown_as_they_are():
+    """A person or a file may be called what the terminal's library takes for a colour."""
+    eyes, ahead = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0], (3, 1))
+    rays = Rays(np.arange(3.0), [0, 0, 1], ("[red]", "[/b]"), eyes, ahead, np.ones(3))
+    shown = card_table(rays, summarise(rays), "[bold].npz")
+    assert "[bold].npz" in shown and "[red]" in shown and "[/b]" in shown

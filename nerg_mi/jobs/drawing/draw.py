@@ -1,4 +1,7 @@
-"""A figure of any kind, drawn and written."""
+"""``nerg draw``: Draw a figure: a gaze sphere, occlusion, a floor plan, a contact sheet, a difference.
+
+A figure of any kind, drawn and written.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,11 @@ from typing import Any
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.figures.style import FORMATS, provenance, save
 from nerg_mi.files.atomic import check_writable
+from nerg_mi.jobs.commands import argument, command, out
 from nerg_mi.jobs.reporter import SILENT, Reporter
 
 from .kind import Kind
-from .registry import find_kind
+from .registry import KINDS, find_kind
 
 FileName = str | os.PathLike
 
@@ -75,3 +79,21 @@ def _inputs(paths: Sequence[Path], options: Any) -> list[Path]:
         else:
             found.append(path)
     return found
+
+
+def _declare(kind: Kind) -> None:
+    """Make ``kind`` a command."""
+
+    @command(
+        f"draw {kind.name}",
+        kind.summary,
+        options=kind.options,
+        files=argument(f"{kind.takes[:1].upper()}{kind.takes[1:]}.", list[Path] if kind.most > 1 else Path),
+        output=out("Picture to write: .png or .svg."),
+    )
+    def draw_files(files: Path | list[Path], output: Path, options: Any, reporter: Reporter) -> None:
+        draw_kind(kind, files if isinstance(files, list) else [files], output, options, reporter)
+
+
+for _kind in KINDS.values():
+    _declare(_kind)

@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.figures.maps import Sight, Walk, floor_figure
-from nerg_mi.jobs.options import option
+from nerg_mi.jobs.options import definitions, option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import COORDINATES, Checked, Range
 from nerg_mi.rays.dataset_open import load_rays
@@ -30,7 +30,7 @@ class FloorOptions(Checked):
     """What a floor plan shows."""
 
     scene: Path | None = option(None, "Scene file of the place, whose walls and furniture are drawn.")
-    defaults: Mapping[str, str] | None = option(None, "Values for $KEYs and <default>s of the scene, by name.")
+    defaults: Mapping[str, str] | None = definitions()
     cut: float = option(1.2, "Height at which the place is cut, metres above its floor.", within=COORDINATES)
     floor: float = option(0.0, "Height of the floor (z).", within=COORDINATES)
     paths: bool = option(True, "Draw where people walked.")

@@ -9,7 +9,7 @@ from typing import Any
 
 from nerg_mi.figures.overlay import Style
 from nerg_mi.figures.style import find_colors
-from nerg_mi.jobs.options import option
+from nerg_mi.jobs.options import definitions, option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import DECADES, SEEDS, SPP, VALUES, Checked, Range
 
@@ -72,7 +72,7 @@ class ScaleOptions(ColorOptions):
 class SceneOptions(ScaleOptions):
     """How a scene file is rendered for a figure."""
 
-    defaults: Mapping[str, str] | None = option(None, "Values for $KEYs and <default>s of the scene, by name.")
+    defaults: Mapping[str, str] | None = definitions()
     spp: int = option(0, "Samples a pixel; 0: as the scene says.", within=Range(0, SPP.high))
     seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
     mode: str | None = option(

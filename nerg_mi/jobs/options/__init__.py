@@ -1,12 +1,12 @@
-"""Typed options of jobs: for each job a dataclass, frozen and of keywords alone, that imports nothing heavy.
+"""Typed options of jobs: for each job a dataclass, frozen and of keywords alone.
 
 A field tells its meaning once, by ``option``: a notebook reads it here, and the command makes its option of it
-(``nerg_mi.cli.options``).
+(``nerg_mi.cli.building``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import field, fields
 from typing import Any, TypeVar
 
@@ -98,3 +98,23 @@ def parse_numbers(text: str, flag: str) -> tuple[float, ...]:
         return tuple(float(v) for v in (text.split(",") if "," in text or not text else text.split()))
     except ValueError:
         raise NergError(f"{flag} is numbers with commas between them, got {plain(text, 60)!r}") from None
+
+
+def parse_definitions(pairs: Iterable[str], flag: str) -> dict[str, str]:
+    """``["spp=4", "name=a=b"]`` as ``{"spp": "4", "name": "a=b"}``.
+
+    Raises `NergError` for a pair without a key or without "=".
+    """
+    values = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not (key and equals):
+            raise NergError(f'"-D {pair}" is no definition: write -D key=value')
+        values[key] = value
+    return values
+
+
+def definitions() -> Any:
+    """The field ``defaults`` of options of what renders a scene: a mapping of texts, or None."""
+    help = "Value for $KEY or a <default> of the scene; repeatable."
+    return option(None, help, "-D", "--define", parse=parse_definitions, metavar="KEY=VALUE")

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from nerg_mi.ranges import DECADES, RATES, SEEDS, SPP, VALUES, Checked, Range
 
-from . import option
+from . import definitions, option
 
 
 @dataclass(frozen=True, kw_only=True)
 class PictureOptions(Checked):
     """How a scene file is rendered."""
 
-    defaults: Mapping[str, str] | None = option(None, "Values for $KEYs and <default>s of the scene, by name.")
+    defaults: Mapping[str, str] | None = definitions()
     sensor: int = option(0, "Index of the sensor, counted from 0.", "-s", "--sensor", within=Range(0, 65535))
     mode: str | None = option(
         None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
@@ -48,7 +48,7 @@ class DemoOptions(Checked):
     """Which pictures the demo makes."""
 
     scene: Path | None = option(None, "Scene file.  [default: the demo store's]")
-    defaults: Mapping[str, str] | None = option(None, "Values for its <default>s, such as eye or falloff, by name.")
+    defaults: Mapping[str, str] | None = definitions()
     width: int = option(600, "Width of a picture in pixels; pictures are 3:2.", within=Range(3, 16384))
     spp: int = option(8, "Samples a pixel.", within=Range(0, SPP.high))
     seed: int = option(0, "Seed of the random numbers.", within=SEEDS)

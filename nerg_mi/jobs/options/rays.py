@@ -23,17 +23,27 @@ class ImportOptions(Checked):
 
     reader: str = option("table", "Name of a registered reader (nerg_mi.rays.readers.registry).")
     settings: Any = option(None, "An object of the reader's Options. Default: as they are by default.")
-    place_name: str | None = option(None, "Of a dataset: the place of all files. Default: unknown.")
-    day: str | None = option(None, "Of a dataset: the day of all rays, as 2026-11-22. Default: by their times.")
-    workers: int | None = option(
-        None, "Of a dataset: processes that import files beside each other. Default: a core each.", within=THREADS
+    place_name: str | None = option(None, "Of a dataset: the place of all files.  [default: unknown]")
+    day: str | None = option(
+        None, "Of a dataset: the day of all rays, as 2026-11-22.  [default: by their times, in UTC, else unknown]"
     )
-    skip_bad_lines: bool = option(False, "Leave out lines that cannot be read, at most 1 % of a file's.")
-    pseudonyms: bool = option(False, "Replace the names of persons by salted hashes.")
-    salt: Path | str | None = option(None, "Of the hashes: a file of 16 bytes or more. Default: random, not kept.")
+    workers: int | None = option(
+        None, "Of a dataset: processes that import files beside each other.  [default: a core each]", within=THREADS
+    )
+    skip_bad_lines: bool = option(
+        False, "Leave out lines that cannot be read, with an account of them: at most 1 % of a file's."
+    )
+    pseudonyms: bool = option(False, "Replace the names of persons, also in the names of files, by salted hashes.")
+    salt: Path | str | None = option(
+        None,
+        "--pseudonyms: file of 16 random bytes or more, so that several imports agree.  [default: random, not kept]",
+    )
     output: Path | str | None = option(None, "Rays file (.npz or .parquet) or dataset (.rays) to write.")
     align_output: Path | str | None = option(
-        None, "Of a file: JSON to write, the similarity from rays to the files' own frame.", "--write-align"
+        None,
+        "JSON file to write: the similarity from the rays to the files' own frame, for --align where a place is in "
+        "that frame.",
+        "--write-align",
     )
 
     def __post_init__(self) -> None:

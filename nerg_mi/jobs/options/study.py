@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from nerg_mi.ranges import Range
 
-from . import option
+from . import definitions, option
 from .parts import PartOptions
 
 
@@ -21,7 +21,7 @@ class StudyOptions(PartOptions):
     repeats: int = option(5, "Timed renders of each setting; their median counts.", within=Range(1, 10000))
     quick: bool = option(False, "A few settings only, each timed once.")
     only: str = option("", "Only the default, and settings whose name matches.", metavar="REGEX")
-    defaults: Mapping[str, str] | None = option(None, "Values for <default>s of the scene file, by name.")
+    defaults: Mapping[str, str] | None = definitions()
     mode: str | None = option(
         None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
     )

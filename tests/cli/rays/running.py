@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from typer.testing import CliRunner
 
-from nerg_mi.cli.rays import rays_app
+from nerg_mi.cli import build_app
 from nerg_mi.rays.rays import Rays
 
 
 def run(*arguments):
-    return CliRunner().invoke(rays_app, [str(a) for a in arguments])
+    return CliRunner().invoke(build_app(), ["rays", *(str(a) for a in arguments)])
 
 
 def write_walk(path):

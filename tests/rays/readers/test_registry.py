@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from nerg_mi.cli import build_app
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.tracking import ImportOptions, import_rays
 from nerg_mi.rays.rays import Rays
@@ -25,8 +26,6 @@ def made_up():
 
 
 def test_a_format_is_added_by_one_object(tmp_path, made_up):
-    from nerg_mi.cli.rays.commands import make_rays_app
-
     eyes, heads = write_recording(tmp_path)
     settings = MadeUpOptions(heads=heads, scale=0.01, tick=1e-3)
     result = import_rays(eyes, ImportOptions(reader="made_up", settings=settings))
@@ -36,7 +35,7 @@ def test_a_format_is_added_by_one_object(tmp_path, made_up):
     assert rays.metadata["preset"] == "made_up" and rays.metadata["scale"] == 0.01 and rays.metadata["tick"] == 1e-3
     assert "heads" not in rays.metadata and [s["file"] for s in rays.metadata["sources"]] == ["heads.csv", "ann.csv"]
 
-    run = lambda *arguments: CliRunner().invoke(make_rays_app(), [str(a) for a in arguments])
+    run = lambda *arguments: CliRunner().invoke(build_app(), ["rays", *(str(a) for a in arguments)])
     command = ["import", eyes, "-o", tmp_path / "r.npz", "--preset", "made_up", "--heads", heads, "--scale", 0.01]
     done = run(*command, "--tick", 1e-3)
     assert done.exit_code == 0, done.output
@@ -52,9 +51,7 @@ def test_a_format_is_added_by_one_object(tmp_path, made_up):
 
 
 def test_without_it_the_command_knows_nothing_of_it(tmp_path):
-    from nerg_mi.cli.rays.commands import make_rays_app
-
-    done = CliRunner().invoke(make_rays_app(), ["import", "a.csv", "-o", str(tmp_path / "r.npz"), "--blinks"])
+    done = CliRunner().invoke(build_app(), ["rays", "import", "a.csv", "-o", str(tmp_path / "r.npz"), "--blinks"])
     assert done.exit_code == 2 and "made_up" not in registry.reader_names()
 
 

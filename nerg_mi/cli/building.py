@@ -1,0 +1,250 @@
+"""The parser of the command line: commands are found by the first lines of modules, and built of what they declare.
+
+Only the module of the command that is called is imported, so that ``nerg --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import Field, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+import typer
+import typer.core
+
+from nerg_mi import __version__
+from nerg_mi.jobs.commands import COMMANDS, Command, Parameter
+from nerg_mi.ranges import RANGE
+
+from .ending import shorten_values
+from .progress import TerminalReporter
+
+PACKAGES = ("nerg_mi.jobs", "nerg_mi.cli")
+"""Packages whose modules, and those below them, may be commands."""
+
+GROUPS = {
+    "rays": "Import tracking files as rays of attention, and look at what they hold.",
+    "train": "Train a radiance field on posed photos, or a gaze field on rays.",
+    "eval": "Score a trained radiance field on held-out views, or a gaze field on held-out rays.",
+    "export": "Write a radiance field as a mesh, points, Gaussian splats, grid volumes or a torch-ngp checkpoint.",
+}
+"""First words of commands of several words, and what is said about them."""
+
+_ORDER = (
+    "demo doctor scene view render draw rays poses align train eval report import export refine bake ablate stats jobs "
+    "worker study"
+).split()
+_LINES = re.compile(r"``nerg ([a-z -]+)``: (.*?)(?=\n``nerg |\Z)", re.S)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A command in the list: what is said about it, and the module that declares it."""
+
+    line: str
+    module: str
+
+
+def find_commands() -> dict[str, Entry]:
+    """All commands by name, those that are listed first at the beginning. No module is imported."""
+    commands: dict[str, Entry] = {}
+    for package in PACKAGES:
+        for folder in map(Path, importlib.import_module(package).__path__):
+            for path in sorted(folder.rglob("*.py")):
+                with open(path, encoding="utf-8") as file:
+                    head = file.read(2000)
+                if not head.startswith('"""``nerg '):
+                    continue
+                module = ".".join((package, *path.relative_to(folder).with_suffix("").parts))
+                for name, line in _LINES.findall(re.split(r"\n\s*\n|\"\"\"", head[3:])[0]):
+                    commands[name] = Entry(" ".join(line.split()), module)
+    place = {name: k for k, name in enumerate(_ORDER)}
+    return dict(sorted(commands.items(), key=lambda item: place.get(item[0].split()[0], len(place))))
+
+
+# That of the parser, which typer does not name.
+_UsageError: Any = typer.BadParameter.__base__
+
+
+DEBUG = ("--debug", "--traceback")
+"""The option that shows where an error arose."""
+
+
+def build_app(arguments: Sequence[str] = ()) -> typer.Typer:
+    """All commands. Messages about a wrong command line repeat the beginning of what is long among its
+    ``arguments``."""
+    help = "Neural radiance and gaze fields for Mitsuba 3."
+    settings: dict[str, Any] = {"name": "nerg", "help": help, "pretty_exceptions_enable": False}
+    return _group("", find_commands(), _global_options, arguments, **settings)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"nerg {__version__}")
+        raise typer.Exit()
+
+
+def _global_options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+    debug: Annotated[bool, typer.Option(*DEBUG, help="Show where an error arose (also: NERG_TRACEBACK=1).")] = False,
+) -> None:
+    pass
+
+
+def _group(
+    prefix: str,
+    entries: Mapping[str, Entry],
+    callback: Callable[..., None] = lambda: None,
+    arguments: Sequence[str] = (),
+    **settings: Any,
+) -> typer.Typer:
+    """The commands ``entries``, whose names begin with ``prefix``: a line for each; one that is called is built."""
+
+    class Commands(typer.core.TyperGroup):
+        def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+            name, listed, rest = super().resolve_command(ctx, args)
+            return name, None if listed is None else _build(f"{prefix}{name}", entries), rest
+
+        def make_context(self, *args: Any, **kwargs: Any) -> Any:
+            with _shortened(arguments):
+                return super().make_context(*args, **kwargs)
+
+        def invoke(self, ctx: Any) -> Any:
+            with _shortened(arguments):
+                return super().invoke(ctx)
+
+    app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None, **settings)
+    app.callback()(callback)
+    lines: dict[str, str] = {}
+    for name, entry in entries.items():
+        first, below, _ = name.removeprefix(prefix).partition(" ")
+        lines[first] = GROUPS.get(prefix + first, "") if below else entry.line
+    for word, line in lines.items():
+        app.command(word, help=line)(_listed)
+    return app
+
+
+def _listed() -> None:
+    """Stands for a command in the list of commands; one that is called is built."""
+
+
+def _build(name: str, entries: Mapping[str, Entry]) -> Any:
+    """The parser of the command ``name``, or of the group of those that begin with it."""
+    below = {other: entry for other, entry in entries.items() if other.startswith(f"{name} ")}
+    if not below:
+        entry = entries[name]
+        if name not in COMMANDS:
+            importlib.import_module(entry.module)
+        if name in COMMANDS:
+            return build_command(COMMANDS[name], entry.line)
+        # Commands that are registered elsewhere, as figures are.
+        below = {c.name: Entry(c.help, entry.module) for c in COMMANDS.values() if c.name.startswith(f"{name} ")}
+        if not below:
+            raise LookupError(f'{entry.module} names a command "{name}" and declares none')
+    help = entries[name].line if name in entries else GROUPS.get(name, "")
+    return typer.main.get_command(_group(f"{name} ", below, name=name, help=help, add_completion=False))
+
+
+@contextmanager
+def _shortened(arguments: Sequence[str]) -> Iterator[None]:
+    """A block whose errors about the command line repeat the ends of long ``arguments``."""
+    try:
+        yield
+    except _UsageError as error:
+        error.message = shorten_values(error.message, arguments)
+        raise
+
+
+def build_command(command: Command, line: str = "") -> Any:
+    """The parser of ``command``, which the list of commands has a ``line`` about."""
+    app = typer.Typer(add_completion=False, rich_markup_mode=None)
+    help = "\n\n".join(text for text in (command.help or line, command.more) if text)
+    app.command(command.name.split()[-1], help=help)(callback_of(command))
+    return typer.main.get_command(app)
+
+
+def callback_of(command: Command) -> Callable[..., None]:
+    """The function that typer calls, whose parameters are those of ``command`` and an option for each field of its
+    options.
+
+    A field that is True or False and False by default is a flag that sets it; one that is True by default can be
+    unset by ``--no-``. A field of type ``tuple[X, ...]`` or ``Mapping`` may be given several times.
+    """
+    kind = command.options
+    every = {} if kind is None else {f.name: f for f in fields(kind)}
+    more = {**command.parameters, **(command.further() if command.further else {})}
+    shown = {name: f for name, f in every.items() if name not in more and name not in command.without}
+    parameters = {name: _parameter(name, p) for name, p in more.items()}
+    parameters |= {name: _option(f, get_type_hints(kind)[name]) for name, f in shown.items()}
+    # The Mitsuba variant was called --variant, which means the factors of a gaze field elsewhere.
+    has_former = "mode" in shown and "variant" not in parameters
+    if has_former:
+        former = Parameter("Former name of --mode.", str, None, ("--variant",), {"hidden": True})
+        parameters["variant"] = _parameter("variant", former)
+
+    def call(**values: Any) -> None:
+        variant = values.pop("variant") if has_former else None
+        if variant is not None:
+            print(f"note: --variant is now --mode (-m) here: write --mode {variant}.", file=sys.stderr)
+            values["mode"] = variant
+        if kind is not None:
+            settings = {name: _value(f, parameters[name], values.pop(name)) for name, f in shown.items()}
+            settings |= {name: values.pop(name) for name in more if name in every}
+            values["options"] = kind(**settings)
+        with TerminalReporter() as reporter:
+            command.run(**values, reporter=reporter)
+
+    call.__signature__ = inspect.Signature(list(parameters.values()))
+    call.__annotations__ = {name: p.annotation for name, p in parameters.items()}
+    return call
+
+
+def _parameter(name: str, declared: Parameter) -> inspect.Parameter:
+    """The parameter that typer makes an argument, or an option that is no field, of."""
+    make = typer.Option if declared.names else typer.Argument
+    default = inspect.Parameter.empty if declared.default is ... else declared.default
+    hint = declared.kind | None if default is None else declared.kind
+    return _keyword(name, hint, default, make(*declared.names, help=declared.help, **declared.more))
+
+
+def _option(field: Field, hint: Any) -> inspect.Parameter:
+    """The parameter that typer makes the option of ``field`` of."""
+    metadata, default, names = field.metadata, field.default, field.metadata["names"]
+    more, within, is_parsed = metadata["more"], metadata[RANGE], metadata["parse"] is not None
+    if is_parsed:
+        hint = list[str] | None if any(get_origin(kind) is Mapping for kind in get_args(hint)) else str | None
+    elif get_origin(hint) is tuple:
+        hint, default = list[get_args(hint)[0]] | None, None
+    elif Path in get_args(hint):
+        hint = Path | None
+    if hint is bool and default is False and not names:
+        names = ("--" + field.name.replace("_", "-"),)
+    if within is not None and not is_parsed and not _is_repeatable(hint):
+        # Shown in the help; the dataclass checks it, as for Python.
+        more = more | {"min": within.low, "max": within.high}
+    return _keyword(field.name, hint, default, typer.Option(*names, help=metadata["help"], **more))
+
+
+def _keyword(name: str, hint: Any, default: Any, info: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[hint, info])
+
+
+def _is_repeatable(hint: Any) -> bool:
+    return any(get_origin(kind) is list for kind in get_args(hint))
+
+
+def _value(field: Field, parameter: inspect.Parameter, value: Any) -> Any:
+    """The ``value`` of ``field`` that the command line has for its ``parameter``."""
+    parse, names = field.metadata["parse"], field.metadata["names"]
+    value = tuple(value or ()) if _is_repeatable(get_args(parameter.annotation)[0]) else value
+    if parse is None or value is None:
+        return value
+    return parse(value, names[-1] if names else "--" + field.name.replace("_", "-"))

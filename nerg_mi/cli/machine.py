@@ -1,0 +1,78 @@
+"""``nerg doctor``: Say what works on this machine, and how to repair what does not.
+``nerg view``: Show a place with its gaze in the browser, where the observer is dragged.
+``nerg worker``: Run parts of long jobs for a cluster (dask).
+
+What these commands run is imported when they run: the doctor has to work where Mitsuba does not.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+
+from nerg_mi.jobs.commands import argument, command
+from nerg_mi.jobs.options import option
+from nerg_mi.jobs.options.view import ViewOptions
+from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.ranges import SECONDS, Checked, Range
+
+
+@command("doctor", more="Ends with exit code 0 if some compiled variant of Mitsuba works, else with 1.")
+def diagnose(reporter: Reporter) -> None:
+    """Tell what works. Raises ``typer.Exit``."""
+    from nerg_mi.diagnosis import examine
+
+    diagnosis = examine()
+    reporter.message(str(diagnosis))
+    raise typer.Exit(0 if diagnosis.usable else 1)
+
+
+@command(
+    "view",
+    more="The page is served to this machine alone, until Ctrl-C; nothing is fetched from anywhere else. At another "
+    "--host its address has a token.",
+    options=ViewOptions,
+    files=argument(
+        "A scene, or a place (radiance field, splats, mesh, .vol), a gaze field, rays; a folder.",
+        list[Path],
+        metavar="FILES",
+    ),
+)
+def view(files: list[Path], options: ViewOptions, reporter: Reporter) -> None:
+    """Serve the viewer's page."""
+    from nerg_mi.viewer import serve
+
+    serve.view_files(files, options, reporter)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerOptions(Checked):
+    """What a worker has of its machine, and how long it waits."""
+
+    threads: int = option(0, "Worker threads; 0: one a core.", "-t", "--threads", within=Range(0, 1024))
+    wait: float = option(600.0, "Seconds to wait for a scheduler that is not there, or is gone.", within=SECONDS)
+    name: str | None = option(None, "What the scheduler calls this worker.  [default: its address]")
+
+
+@command(
+    "worker",
+    "Run parts of jobs for a dask scheduler, one at a time, until that ends it or Ctrl-C does.",
+    more="One worker a machine, or a graphics card, has all of it. Jobs are sent there with --scheduler.",
+    options=WorkerOptions,
+    address=argument("Of a dask scheduler: tcp://HOST:PORT or tls://HOST:PORT.", str),
+)
+def work(address: str, options: WorkerOptions, reporter: Reporter) -> None:
+    """Join a cluster."""
+    from nerg_mi.tasks.addresses import unprotected
+    from nerg_mi.tasks.dask_worker import serve_cluster
+    from nerg_mi.threads import VARIABLE
+
+    if options.threads:
+        os.environ[VARIABLE] = str(options.threads)
+    danger = unprotected(address)
+    if danger is not None:
+        reporter.warn(danger)
+    serve_cluster(address, options.wait, reporter.message, options.name)

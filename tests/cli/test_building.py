@@ -1,0 +1,143 @@
+"""Commands built of what is declared: names, defaults, flags, help, what is handed on; a command in a new module."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import nerg_mi.cli
+import nerg_mi.jobs
+from nerg_mi.cli.building import callback_of
+from nerg_mi.jobs.commands import COMMANDS, Command, argument, extra
+from nerg_mi.jobs.options import option, parse_numbers
+
+
+@dataclass(frozen=True, kw_only=True)
+class Brew:
+    """Of a job that makes tea."""
+
+    leaves: str = option("green", "Which leaves.")
+    kettle_file: Path | None = option(None, "Where the kettle is.")
+    sugar: bool = option(False, "With sugar.")
+    stir: bool = option(True, "Stirred.")
+    minutes: float = option(3.0, "How long.", "-t", "--time", min=0.5)
+    guests: tuple[str, ...] = option((), "Who drinks it; may be given several times.")
+    origin: tuple[float, ...] | None = option(None, "Where it grew.", "--from", parse=parse_numbers)
+    secret: int = option(7, "Nobody's business.")
+
+
+@pytest.fixture
+def serve():
+    """Runs a command with the options of `Brew`, and gives what it was handed."""
+    handed = []
+
+    def tea(cup, table, options, reporter):
+        handed.append((cup, options, table))
+
+    cup, table = argument("What it is poured into.", str), extra(1, "Where it is served.", int, "--table")
+    command = Command("tea", tea, "Make tea.", "", Brew, ("secret",), None, {"cup": cup, "table": table})
+    app = typer.Typer(rich_markup_mode=None)
+    app.command(help="Make tea.")(callback_of(command))
+
+    def run(*line):
+        done = CliRunner().invoke(app, list(line))
+        return done, handed[-1] if handed else None
+
+    return run
+
+
+def test_defaults_are_those_of_the_dataclass(serve):
+    assert serve("mug")[1] == ("mug", Brew(), 1)
+
+
+def test_every_option_arrives(serve):
+    line = "mug --leaves black --kettle-file k.txt --sugar --no-stir -t 4.5 --guests a --guests b --table 2"
+    expected = Brew(
+        leaves="black", kettle_file=Path("k.txt"), sugar=True, stir=False, minutes=4.5, guests=("a", "b"), secret=7
+    )
+    assert serve(*line.split())[1] == ("mug", expected, 2)
+
+
+@pytest.mark.parametrize("wrong", [("--secret", "1"), ("--no-sugar",), ("--minutes", "4"), ("--time", "0.1")])
+def test_what_is_no_option_is_refused(serve, wrong):
+    done, handed = serve("mug", *wrong)
+    assert done.exit_code == 2 and handed is None
+
+
+def test_help_tells_what_each_field_means(serve):
+    shown = " ".join(serve("--help")[0].stdout.split())
+    assert "Make tea." in shown and "Where it is served." in shown
+    for f in fields(Brew):
+        assert (f.metadata["help"] in shown) == (f.name != "secret")
+
+
+def test_a_word_that_is_parsed_is_called_as_it_was_given(serve):
+    assert serve("mug", "--from", "1,2.5")[1][1].origin == (1.0, 2.5)
+    done, _ = serve("mug", "--from", "east")
+    assert "--from is numbers" in str(done.exception)
+
+
+GREETING = '''"""``nerg greet kindly``: Say something kind.
+
+Greetings, for a test.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from nerg_mi.jobs.commands import argument, command
+from nerg_mi.jobs.options import option
+from nerg_mi.ranges import Checked, Range
+
+
+@dataclass(frozen=True, kw_only=True)
+class GreetingOptions(Checked):
+    times: int = option(1, "How often.", within=Range(1, 9))
+
+
+@command("greet kindly", more="It costs nothing.", options=GreetingOptions, name=argument("Of a person.", str))
+def greet(name, options, reporter):
+    for _ in range(options.times):
+        reporter.message(f"hello {name}")
+'''
+
+
+def test_a_command_is_one_module(monkeypatch, tmp_path, capsys):
+    """It is listed, has its help and runs, as soon as its file is there."""
+
+    def nerg(*line):
+        with pytest.raises(SystemExit) as end:
+            nerg_mi.cli.main(list(line))
+        said = capsys.readouterr()
+        return end.value.code, said.out + said.err
+
+    (tmp_path / "kindness").mkdir()
+    (tmp_path / "kindness" / "greeting.py").write_text(GREETING)
+    monkeypatch.setattr(nerg_mi.jobs, "__path__", [*nerg_mi.jobs.__path__, str(tmp_path)])
+    try:
+        assert nerg("--help")[1].split("Commands:")[1].rstrip().endswith("greet")
+        assert "kindly  Say something kind." in nerg("greet", "--help")[1]
+        assert "nerg_mi.jobs.kindness.greeting" not in sys.modules
+        code, said = nerg("greet", "kindly", "--help")
+        assert code == 0 and "Say something kind.\n\n  It costs nothing." in said and "How often." in said
+        assert nerg("greet", "kindly", "Ada", "--times", "2") == (0, "hello Ada\nhello Ada\n")
+        assert nerg("greet", "kindly", "Ada", "--times", "10")[0] == 2
+    finally:
+        for name in ("nerg_mi.jobs.kindness.greeting", "nerg_mi.jobs.kindness"):
+            sys.modules.pop(name, None)
+        COMMANDS.pop("greet kindly", None)
+
+
+def test_a_line_without_a_command_is_a_mistake(monkeypatch, tmp_path, capsys):
+    (tmp_path / "nothing.py").write_text('"""``nerg nothing``: Do nothing."""\n')
+    monkeypatch.setattr(nerg_mi.jobs, "__path__", [*nerg_mi.jobs.__path__, str(tmp_path)])
+    with pytest.raises(SystemExit) as end:
+        nerg_mi.cli.main(["nothing"])
+    sys.modules.pop("nerg_mi.jobs.nothing")
+    assert end.value.code == 70 and "nerg_mi.jobs.nothing names a command" in capsys.readouterr().err
