@@ -71,7 +71,6 @@ def find_commands() -> dict[str, Entry]:
 # That of the parser, which typer does not name.
 _UsageError: Any = typer.BadParameter.__base__
 
-
 DEBUG = ("--debug", "--traceback")
 """The option that shows where an error arose."""
 
@@ -139,14 +138,16 @@ def _listed() -> None:
 def _build(name: str, entries: Mapping[str, Entry]) -> Any:
     """The parser of the command ``name``, or of the group of those that begin with it."""
     below = {other: entry for other, entry in entries.items() if other.startswith(f"{name} ")}
-    if not below:
+    if name in entries:
         entry = entries[name]
         if name not in COMMANDS:
             importlib.import_module(entry.module)
         if name in COMMANDS:
             return build_command(COMMANDS[name], entry.line)
-        # Commands that are registered elsewhere, as figures are.
-        below = {c.name: Entry(c.help, entry.module) for c in COMMANDS.values() if c.name.startswith(f"{name} ")}
+        # Commands that have no lines of their own, as figures.
+        below = {
+            c.name: Entry(c.help, entry.module) for c in COMMANDS.values() if c.name.startswith(f"{name} ")
+        } | below
         if not below:
             raise LookupError(f'{entry.module} names a command "{name}" and declares none')
     help = entries[name].line if name in entries else GROUPS.get(name, "")

@@ -105,6 +105,7 @@ def test_filters_are_those_of_a_file(tmp_path, given):
     whole = filter_rays(rays, FilterOptions(**given), expected)
     assert_same(found.rays, whole.rays)
     assert_same(Rays.load(tmp_path / "a.parquet"), whole.rays)
+    assert heard.messages.pop() == f"wrote {tmp_path / 'a.parquet'}"
     assert found.fixations == whole.fixations and sorted(heard.messages) == sorted(
         m.replace(": one ray each,", ":") for m in expected.messages
     )
