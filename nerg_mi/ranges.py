@@ -16,6 +16,9 @@ RANGE, FLAG = "nerg_mi.range", "nerg_mi.flag"
 """Keys in the metadata of a dataclass's field: the `Range` of its value, and its spelling on the command line, "" for
 that of its name; without one, it is none of the command line."""
 
+CHANGES_RESULT = "nerg_mi.changes_result"
+"""Key in the same metadata: False for a field that says where or by whom something is computed, never what."""
+
 
 @dataclass(frozen=True)
 class Range:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 VARIABLE = "NERG_THREADS"
-"""Environment variable that tells a worker's process its share of the cores."""
+"""Environment variable by which `nerg worker` hands its share of the cores to the process that computes."""
 
 
 def set_thread_count(count: int) -> None:
@@ -16,20 +16,15 @@ def set_thread_count(count: int) -> None:
     """
     import drjit as dr
 
-    dr.sync_thread()
-    dr.set_thread_count(count)
+    if dr.thread_count() != count:
+        dr.sync_thread()
+        dr.set_thread_count(count)
 
 
 def threads_of_worker() -> int:
     """The threads that this process was given by whoever started it as a worker; 0 for all."""
     text = os.environ.get(VARIABLE, "")
     return int(text) if text.isdigit() else 0
-
-
-def use_share() -> None:
-    """Compute with the threads that this worker was given from now on; in a process that is none, nothing changes."""
-    if threads := threads_of_worker():
-        set_thread_count(threads)
 
 
 def share(own: int, asked: int) -> int:

@@ -3,15 +3,16 @@
 import drjit as dr
 import numpy as np
 
-from nerg_mi import threads
-from nerg_mi.threads import set_thread_count, share, use_share
+from nerg_mi.threads import set_thread_count, share
 
 
 def test_what_is_queued_is_done_first(monkeypatch):
     order = []
     monkeypatch.setattr(dr, "sync_thread", lambda: order.append("waited"))
     monkeypatch.setattr(dr, "set_thread_count", order.append)
+    monkeypatch.setattr(dr, "thread_count", lambda: 2)
     set_thread_count(3)
+    set_thread_count(2)
     assert order == ["waited", 3]
 
 
@@ -31,13 +32,3 @@ def test_arrays_keep_their_values_however_often_it_changes(rgb):
 
 def test_a_worker_gives_a_job_what_it_asks_for_and_has():
     assert (share(4, 2), share(2, 4), share(0, 3), share(3, 0)) == (2, 2, 3, 3) and share(0, 0) >= 1
-
-
-def test_only_workers_have_a_share(monkeypatch):
-    found = []
-    monkeypatch.setattr(threads, "set_thread_count", found.append)
-    monkeypatch.delenv(threads.VARIABLE, raising=False)
-    use_share()
-    monkeypatch.setenv(threads.VARIABLE, "3")
-    use_share()
-    assert found == [3]

@@ -45,8 +45,6 @@ EXCEPTIONS = {
     "nerg_mi/files/images.py": "encodes in memory",
     "nerg_mi/figures/style.py:encode": "encodes in memory",
     "nerg_mi/photos/structure_worker.py": "fills a folder that `replacing_folder` has named, in its own process",
-    "nerg_mi/tasks/child.py:main": "is the pipe to whoever asks",
-    "nerg_mi/tasks/children.py:make": "is the pipe to the child",
     "nerg_mi/rays/readers/skeleton.py:_written": "is given the name that `replacing` has chosen",
 }
 

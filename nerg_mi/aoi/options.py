@@ -7,12 +7,12 @@ from pathlib import Path
 
 from nerg_mi.jobs.options import option, parse_numbers, parse_point
 from nerg_mi.jobs.options.parts import PartOptions
-from nerg_mi.ranges import COORDINATES, SECONDS, SEEDS, THREADS, TIMES, Range
+from nerg_mi.ranges import COORDINATES, SECONDS, SEEDS, THREADS, TIMES, Checked, Range
 
 
 @dataclass(frozen=True, kw_only=True)
-class StatisticsOptions(PartOptions):
-    """What is counted, and how. Positions are in the coordinates of the place, times in seconds."""
+class SettingOptions(Checked):
+    """The things that people look at, and how finely they are traced. Positions are in the coordinates of the place."""
 
     areas: Path | None = option(
         None, "JSON file of areas of interest: boxes, meshes, shapes, groups; or a folder of Aria Digital Twin."
@@ -20,13 +20,23 @@ class StatisticsOptions(PartOptions):
     align: Path | None = option(
         None, "JSON file with the 4x4 similarity from the rays' frame to the place's.  [default: the gaze field's]"
     )
-    tolerance: float = option(
-        0.0, "Degrees by which a ray may miss what of a thing is in nobody's way.", within=Range(0, 20)
-    )
     margin: float = option(
         0.03,
         "Metres by which surfaces may lie in front of a thing, or behind a box, and yet be its own.",
         within=Range(0, 10**6),
+    )
+    samples: int = option(48, "Points of a thing that are looked for.", within=Range(1, 4096))
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CountOptions(SettingOptions):
+    """On what sums of rays depend besides. Times are in seconds."""
+
+    tolerance: float = option(
+        0.0, "Degrees by which a ray may miss what of a thing is in nobody's way.", within=Range(0, 20)
     )
     gap: float = option(1.0, "A ray stands for the time to the next, unless that is longer than this.", within=SECONDS)
     pause: float = option(60.0, "A longer pause of a person begins another sitting.", within=SECONDS)
@@ -41,12 +51,28 @@ class StatisticsOptions(PartOptions):
     cell: float = option(
         0.1, "What could be seen is traced from middles of cells of this edge, in metres.", within=Range(0.001, 10**6)
     )
-    samples: int = option(48, "Points of a thing that are looked for.", within=Range(1, 4096))
     windows: tuple[str, ...] = option((), "A window of time on the rays' clock: NAME=FROM,TO.", "--window")
     zones: Path | None = option(None, "JSON file of boxes on whose floor areas people stand.")
     cohorts: Path | None = option(None, "CSV file of person,cohort.  [default: the cohorts in the rays]")
-    eyes: int = option(256, "Places from which the field is asked, about.", within=Range(1, 100_000))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for text in self.windows:
+            parse_window(text)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForetellOptions(SettingOptions):
+    """On what depends besides how a field answers."""
+
     directions: int = option(8192, "Directions around each.", within=Range(64, 1 << 20))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatisticsOptions(CountOptions, ForetellOptions, PartOptions):
+    """What is counted, and how."""
+
+    eyes: int = option(256, "Places from which the field is asked, about.", within=Range(1, 100_000))
     glance: float = option(
         0.3, "Seconds of a glance: the field's reach takes glances for independent.", within=Range(0.001, 10**6)
     )
@@ -65,10 +91,7 @@ class StatisticsOptions(PartOptions):
     salt: Path | None = option(None, "Secret file from which pseudonyms are made.  [default: a random one, not kept]")
     resamples: int = option(1999, "Draws of people for intervals.", within=Range(199, 100_000))
     seed: int = option(0, "Seed of the draws.", within=SEEDS)
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
-    mode: str | None = option(
-        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
-    )
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS, changes_result=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()

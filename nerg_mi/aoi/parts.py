@@ -1,10 +1,9 @@
-"""A count in parts: rays and places shared out, the task of each part, and sums taken in one order."""
+"""A count in parts: rays and places shared out, what is run for each part, and sums taken in one order."""
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby
 from pathlib import Path
@@ -19,78 +18,114 @@ from nerg_mi.formats.areas.reading import files_of_areas, read_areas
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.jobs.backend import select_backend
 from nerg_mi.jobs.gaze_places import file_of_training, place_key
-from nerg_mi.jobs.parts import Parts
+from nerg_mi.jobs.options import as_base
+from nerg_mi.jobs.parts import Parts, PlannedScene
 from nerg_mi.rays.dataset import HEAD, RayDataset, is_dataset, read_head, read_source, source_path
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene_file import files_of_scene
-from nerg_mi.statistics.visits import Cell, LookRules, Sums
-from nerg_mi.tasks.code import RENDERS, versions
-from nerg_mi.tasks.inputs import Checksums, InputFile, name_of, read_inputs
-from nerg_mi.tasks.plan import Plan
-from nerg_mi.tasks.task import Task, canonical
-from nerg_mi.threads import use_share
+from nerg_mi.statistics.visits import Cell, Sums
+from nerg_mi.tasks.engines import prepare_once
+from nerg_mi.tasks.task import RENDERS, Files, Part, Plan
 
 from .measured import Counting, Eyes, blocks_of, count_block
-from .options import StatisticsOptions
+from .options import CountOptions, ForetellOptions, SettingOptions, StatisticsOptions
 from .predicted import Foretold, Setting, setting_of
 from .scene import files_of_changes, read_changes
 
-# ---- Tasks ----
-#
-# Parts of a count as tasks: what a worker runs for some of the rays, or of the places from which a field is asked.
+# ---- What is run for a part ----
 
 
-OF_COUNTS = ("tolerance", "margin", "gap", "pause", "merge", "least", "seen", "view", "cell", "samples", "windows")
-"""The options on which sums of rays depend, besides files."""
+@dataclass(frozen=True)
+class PlannedSetting:
+    """What people look at, as a part finds it on any machine: ``options``, and the files of the place, of ``areas`` and
+    of ``changes`` to them, where there are some."""
 
-OF_FIELDS = ("margin", "samples", "directions")
-"""Those on which depends what a field foretells."""
+    options: SettingOptions
+    scene: PlannedScene | None
+    field: Path | None
+    gaze: Files | None
+    areas: Files
+    changes: Files | None = None
 
-OF_EYES = ("share", "distance", "visible", "support")
-"""What is foretold of each eye, a row each; by the members of an ensemble apart it has an axis before that."""
+    def opened(self) -> Setting:
+        """The setting, in its Mitsuba variant, after its changes."""
+        ns = select_backend(self.options.mode)
+        scene = None if self.scene is None else self.scene.checked()
+        gaze = None if self.gaze is None else self.gaze.path
+        setting = setting_of(scene, self.field, gaze, read_areas(self.areas.path), self.options, ns)
+        return setting if self.changes is None else setting.changed(read_changes(self.changes.path))
 
-RAYS = "of-the-job/rays.npz"
-"""What a task calls rays that a job holds."""
 
-_kept: dict[str, Any] = {}
+@dataclass(frozen=True)
+class PlannedCount:
+    """What all parts of a count have in common: rays end at their ``hits``, or not, and have these ``cohorts`` where no
+    table does."""
+
+    setting: PlannedSetting
+    hits: bool
+    cohorts: tuple[str, ...]
+
+    def opened(self) -> Counting:
+        """How rays are counted."""
+        return self.setting.opened().counting(self.hits, self.cohorts)
 
 
-def count_part(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> dict[str, int]:
-    """The sums (.npz) of each block of the rays `RAYS`, or of those parts of a dataset that are among ``inputs``, with
-    the number of blocks as a note. ``parameters``: see `described`, and ``hits`` and ``cohorts`` of
-    `Setting.counting`, ``source`` and ``numbers`` of the parts of a dataset."""
+@dataclass(frozen=True)
+class DatasetPart:
+    """Those parts of a ``source`` of a dataset that have these ``numbers``; ``files``: the dataset's, as far as these
+    need them."""
 
-    def make() -> Counting:
-        return _setting(parameters, inputs).counting(parameters["hits"], tuple(parameters["cohorts"]))
+    files: Files
+    source: str
+    numbers: tuple[int, ...]
 
-    counting = _prepared(parameters, make)
-    found = [count_block(block, counting) for block in _blocks(parameters, inputs, counting.rules)]
+    def opened(self) -> RayDataset:
+        """The dataset that has these parts and no others."""
+        folder = self.files.path
+        head = read_head(folder)
+        source = read_source(source_path(folder, self.source), head)
+        parts = tuple((source, part) for part in source.parts if part.number in self.numbers)
+        return RayDataset(folder, head, (source,), parts)
+
+
+def count_part(common: PlannedCount, rays: Path | DatasetPart, output: Path) -> dict[str, int]:
+    """The sums (.npz) of each block of some parts of a dataset, or of the rays of a file as one block, since they were
+    cut already; with the number of blocks as a note."""
+    counting = prepare_once(common, common.opened)
+    blocks = [Rays.load(rays)] if isinstance(rays, Path) else blocks_of(rays.opened(), counting.rules)
+    found = [count_block(block, counting) for block in blocks]
     write_sums(output, found)
     return {"blocks": len(found)}
 
 
-def foretell_part(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
-    """What a field foretells (.npz) of people at ``positions`` who look ``ahead`` and see ``view`` degrees;
-    ``parameters``: these, and see `described`."""
-    setting = _prepared(parameters, lambda: _setting(parameters, inputs))
-    at, ahead = np.array(parameters["positions"]), np.array(parameters["ahead"])
-    found = setting.foretold(Eyes(at, ahead, ("",) * len(at), (frozenset(),) * len(at)), parameters["view"])
+@dataclass(frozen=True)
+class PlannedForetelling:
+    """What all parts of asking a field have in common: people see ``view`` degrees."""
+
+    setting: PlannedSetting
+    view: float
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where some people stand, ``positions`` (M, 3), and look ``ahead`` (M, 3)."""
+
+    positions: np.ndarray
+    ahead: np.ndarray
+
+
+OF_EYES = ("share", "distance", "visible", "support")
+"""What is foretold of each eye, a row each; by the members of an ensemble apart it has an axis before that."""
+
+
+def foretell_part(common: PlannedForetelling, places: Places, output: Path) -> None:
+    """What a field foretells (.npz) of people at some places."""
+    setting: Setting = prepare_once(common, common.setting.opened)
+    count = len(places.positions)
+    eyes = Eyes(places.positions, places.ahead, ("",) * count, (frozenset(),) * count)
+    found = setting.foretold(eyes, common.view)
     with replacing(output) as temporary, temporary.open("wb") as out:
         np.savez(out, **{name: getattr(found, name) for name in (*OF_EYES, "members")})
-
-
-def described(
-    names: Mapping[str, str],
-    options: StatisticsOptions,
-    which: tuple[str, ...],
-    mode: str,
-    inputs: tuple[InputFile, ...],
-) -> dict[str, Any]:
-    """Parameters of tasks that count in one setting: what its files are called among ``inputs``, by ``names`` such as
-    scene or areas, those of the ``options`` on which they depend, and a ``digest`` of it."""
-    found = {"files": dict(names), "options": {name: getattr(options, name) for name in which}, "mode": mode}
-    files = {file.name: file.sha256 for file in inputs}
-    return found | {"digest": hashlib.sha256(canonical([found, files]).encode()).hexdigest()}
 
 
 def write_sums(path: Path, found: list[Sums]) -> None:
@@ -126,43 +161,7 @@ def read_foretold(path: Path) -> Foretold:
 _ARRAYS = tuple(f.name for f in fields(Sums) if f.name not in ("areas", "cells", "rows"))
 
 
-def _blocks(parameters: Mapping[str, Any], inputs: Mapping[str, Path], rules: LookRules) -> Iterator[Rays]:
-    if RAYS in inputs:
-        # A block as a whole: it was cut already.
-        yield Rays.load(inputs[RAYS])
-        return
-    folder = inputs[HEAD].parent
-    head = read_head(folder)
-    source = read_source(inputs[parameters["source"]], head)
-    parts = tuple((source, part) for part in source.parts if part.number in parameters["numbers"])
-    yield from blocks_of(RayDataset(folder, head, (source,), parts), rules)
-
-
-def _setting(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> Setting:
-    """The setting of the files and options of ``parameters``, in its Mitsuba variant, after changes if it has any."""
-    files = {kind: inputs[name] for kind, name in parameters["files"].items()}
-    areas = files["areas"]
-    areas = areas.parent if areas.suffix == ".csv" else areas
-    given = parameters["options"] | {kind: files.get(kind) for kind in ("align", "zones", "cohorts")}
-    given |= {"windows": tuple(given["windows"])} if "windows" in given else {}
-    options = StatisticsOptions(**given, areas=areas)
-    ns = select_backend(parameters["mode"])
-    made = setting_of(files.get("scene"), files.get("field"), files.get("gaze"), read_areas(areas), options, ns)
-    return made.changed(read_changes(files["changes"])) if "changes" in files else made
-
-
-def _prepared(parameters: Mapping[str, Any], make: Callable[[], Any]) -> Any:
-    """What is made once for all tasks of one setting; the last one is kept."""
-    use_share()
-    if parameters["digest"] not in _kept:
-        _kept.clear()
-        _kept[parameters["digest"]] = make()
-    return _kept[parameters["digest"]]
-
-
 # ---- Parts ----
-#
-# A count in parts, wherever they are made: rays and places shared out, sums taken in one order.
 
 
 EYES = 32
@@ -189,88 +188,79 @@ class CountingParts:
 
     def count(self, rays: Rays | Path, counting: Counting, seen: Callable[[Rays], None] | None) -> Iterator[Sums]:
         """The sums of each block of ``rays``, in the order of `blocks_of`. ``seen`` is shown each block before that, in
-        the same order, where it is given."""
-        names, inputs = self._files()
-        common = described(names, self.options, OF_COUNTS, self.mode, inputs)
-        common |= {"hits": counting.hits, "cohorts": counting.cohort_names}
-        tasks = []
-        if not isinstance(rays, Rays) and is_dataset(rays):
-            data = RayDataset.open(rays).one_place()
-            for (source, part), own in _groups(data):
-                numbers = [p.number for _, p in own]
-                paths = [data.folder / HEAD, source_path(data.folder, source.id)]
-                found = read_inputs([*paths, *(data.folder / p.path(source.id) for _, p in own)])
-                given = {"source": name_of(paths[1], found), "numbers": numbers}
-                label = f"{source.file}, {part.day}, bucket {part.bucket}"
-                tasks.append(self._task(count_part, {**common, **given}, (*inputs, *found), label))
-            if seen is not None:
-                for block in blocks_of(data, counting.rules):
-                    seen(block)
-        else:
-            first = 1
-            for block in blocks_of(rays, counting.rules):
+        the same order, where it is not None."""
+        common = PlannedCount(self._setting(CountOptions), counting.hits, counting.cohort_names)
+        with self.parts.store.scratch() as folder:
+            parts = []
+            if not isinstance(rays, Rays) and is_dataset(rays):
+                data = RayDataset.open(rays).one_place()
+                for (source, part), own in _groups(data):
+                    files = [data.folder / HEAD, source_path(data.folder, source.id)]
+                    files += [data.folder / p.path(source.id) for _, p in own]
+                    value = DatasetPart(Files(data.folder, tuple(files)), source.id, tuple(p.number for _, p in own))
+                    parts.append(Part(value, f"{source.file}, {part.day}, bucket {part.bucket}"))
                 if seen is not None:
-                    seen(block)
-                label = f"rays {first:,} to {first + len(block) - 1:,}"
-                tasks.append(self._task(count_part, common, (*inputs, self._held(block)), label))
-                first += len(block)
-        until = _DONE if seen is None else _COUNTED
-        for made in self.parts.run(Plan(self.what, tasks), 0.0, until):
-            yield from read_sums(made.path)
+                    for block in blocks_of(data, counting.rules):
+                        seen(block)
+            else:
+                first = 1
+                for block in blocks_of(rays, counting.rules):
+                    if seen is not None:
+                        seen(block)
+                    # Rays that the command has in memory, in files that its parts read.
+                    path = folder / str(first) / "rays.npz"
+                    _own(block).save(path)
+                    parts.append(Part(path, f"rays {first:,} to {first + len(block) - 1:,}"))
+                    first += len(block)
+            until = _DONE if seen is None else _COUNTED
+            for made in self.parts.run(self._plan(self.what, count_part, common, parts), 0.0, until):
+                yield from read_sums(made.path)
 
     def foretell(self, eyes: Eyes, view: float, changes: Path | None = None) -> Foretold:
         """What the field says of ``eyes`` that see ``view`` degrees, after the ``changes`` of a file, if there are
         any."""
-        names, inputs = self._files()
-        what, since, until = f"{self.what} (the field)", _COUNTED, _DONE
+        setting, what, since, until = self._setting(ForetellOptions), f"{self.what} (the field)", _COUNTED, _DONE
         if changes is not None:
-            found = read_inputs(files_of_changes(changes, read_changes(changes)), below="changes")
-            names, inputs = {**names, "changes": name_of(changes, found)}, (*inputs, *found)
-            what, since, until = f"{self.what} (after the changes)", _TOLD, _CHANGED
-        common = {**described(names, self.options, OF_FIELDS, self.mode, inputs), "view": view}
-        tasks = []
+            files = Files(changes, tuple(files_of_changes(changes, read_changes(changes))))
+            setting, what = replace(setting, changes=files), f"{self.what} (after the changes)"
+            since, until = _TOLD, _CHANGED
+        places = []
         for a in range(0, len(eyes.positions), EYES):
-            at, ahead = eyes.positions[a : a + EYES].tolist(), eyes.ahead[a : a + EYES].tolist()
-            label = f"places {a + 1} to {a + len(at)}"
-            tasks.append(self._task(foretell_part, {**common, "positions": at, "ahead": ahead}, inputs, label))
-        found = [read_foretold(made.path) for made in self.parts.run(Plan(what, tasks), since, until)]
+            some = Places(eyes.positions[a : a + EYES], eyes.ahead[a : a + EYES])
+            places.append(Part(some, f"places {a + 1} to {a + len(some.positions)}"))
+        plan = self._plan(what, foretell_part, PlannedForetelling(setting, view), places)
+        found = [read_foretold(made.path) for made in self.parts.run(plan, since, until)]
         each = {name: np.concatenate([getattr(f, name) for f in found]) for name in OF_EYES}
         return Foretold(**each, members=np.concatenate([f.members for f in found], axis=1))
 
-    def _task(self, function: Callable, parameters: dict, inputs: tuple[InputFile, ...], label: str) -> Task:
-        name = f"{function.__module__}:{function.__name__}"
-        return Task(name, parameters, inputs, ".npz", versions(*RENDERS, "scipy"), label)
+    def _plan(self, what: str, work: Callable, common: Any, parts: list[Part]) -> Plan:
+        return Plan(what, work, common, parts, ".npz", (*RENDERS, "scipy"))
 
-    def _held(self, block: Rays) -> InputFile:
-        """A block in the store, with nothing in it of whom and of what it does not hold."""
-        used = np.unique(block.person)
-        own = replace(
-            block,
-            person=np.searchsorted(used, block.person).astype(np.int32),
-            persons=tuple(block.persons[k] for k in used.tolist()),
-            metadata={"frame": block.metadata["frame"]},
-        )
-        return self.parts.hold_rays(RAYS, own)
-
-    def _files(self) -> tuple[dict[str, str], tuple[InputFile, ...]]:
-        """What the files of the setting are called by tasks, and all inputs that it has."""
-        o, checksums = self.options, Checksums()
-        groups: dict[str, list[Path]] = {}
-        if self.scene is not None:
-            groups["scene"] = files_of_scene(self.scene)
-        if self.gaze is not None:
-            groups["gaze"] = [self.gaze, *([] if self.scene is not None else _place_beside(self.gaze, self.field))]
-        if self.field is not None:
-            groups["field"] = [self.field]
+    def _setting(self, kind: type[CountOptions] | type[ForetellOptions]) -> PlannedSetting:
+        """The setting, with those options of ``kind``."""
+        o, gaze = self.options, None
         assert o.areas is not None
-        groups["areas"] = files_of_areas(o.areas, self.areas)
-        groups |= {k: [Path(v)] for k, v in (("align", o.align), ("zones", o.zones), ("cohorts", o.cohorts)) if v}
-        names, inputs = {}, []
-        for kind, paths in groups.items():
-            found = read_inputs(paths, checksums, below=kind)
-            names[kind] = name_of(paths[0], found)
-            inputs += found
-        return names, tuple(inputs)
+        if self.gaze is not None:
+            beside = [] if self.scene is not None else _place_beside(self.gaze, self.field)
+            gaze = Files(self.gaze, (self.gaze, *beside))
+        return PlannedSetting(
+            replace(as_base(o, kind), mode=self.mode),
+            None if self.scene is None else PlannedScene.of(self.scene),
+            self.field,
+            gaze,
+            Files(o.areas, tuple(files_of_areas(o.areas, self.areas))),
+        )
+
+
+def _own(block: Rays) -> Rays:
+    """A block with nothing in it of whom and of what it does not hold."""
+    used = np.unique(block.person)
+    return replace(
+        block,
+        person=np.searchsorted(used, block.person).astype(np.int32),
+        persons=tuple(block.persons[k] for k in used.tolist()),
+        metadata={"frame": block.metadata["frame"]},
+    )
 
 
 def _groups(data: RayDataset) -> Iterator[tuple]:

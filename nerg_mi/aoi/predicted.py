@@ -24,7 +24,7 @@ from nerg_mi.statistics.visibility import CellsInView, Isovists, Targets, in_vie
 from nerg_mi.statistics.visits import ALL, Cell, LookRules, Thing
 
 from .measured import Counting, Eyes, Window
-from .options import StatisticsOptions, parse_window
+from .options import CountOptions, ForetellOptions, SettingOptions, parse_window
 from .scene import (
     Changes,
     Surroundings,
@@ -165,14 +165,12 @@ def isovist_rows(found: Isovists, names: Sequence[str], members: Sequence[tuple[
 @dataclass(frozen=True, eq=False)
 class Setting:
     """``areas`` in what is ``around`` people, and the ``things`` that they consist of; ``options`` of how it is
-    counted, with their ``rules`` of looks and ``windows`` of time."""
+    counted (`CountOptions`), asked of a field (`ForetellOptions`), or both."""
 
     around: Surroundings
     areas: Areas
     things: Sequence[Thing]
-    options: StatisticsOptions
-    rules: LookRules
-    windows: Sequence[Window]
+    options: SettingOptions
 
     @cached_property
     def members(self) -> list[tuple[int, ...]]:
@@ -184,9 +182,17 @@ class Setting:
         """In units of the place."""
         return self.options.margin * self.around.scale
 
+    @property
+    def rules(self) -> LookRules:
+        """What a look is."""
+        o = self.options
+        assert isinstance(o, CountOptions)
+        return LookRules(o.gap, o.pause, o.merge, o.least)
+
     def counting(self, hits: bool, cohorts: tuple[str, ...]) -> Counting:
         """How rays are counted which end at their ``hits``, or not, and have these ``cohorts`` where no table does."""
         o = self.options
+        assert isinstance(o, CountOptions)
         in_view = None
         if o.seen:
             targets = Targets.of(self.things, o.samples)
@@ -205,7 +211,7 @@ class Setting:
             hits,
             o.view,
             in_view,
-            self.windows,
+            [Window(*parse_window(text)) for text in o.windows],
             [] if o.zones is None else read_regions(o.zones),
             table,
             tuple(sorted(set(table.values()))) if table else cohorts,
@@ -222,6 +228,7 @@ class Setting:
     def foretold(self, eyes: Eyes, view: float, reporter: Reporter = SILENT) -> Foretold:
         """What the field says of the gaze of ``eyes`` that see so many degrees (``view``)."""
         o = self.options
+        assert isinstance(o, ForetellOptions)
         return foretell(
             self.around, eyes, self.things, self.members, self.margin, view, o.samples, o.directions, reporter
         )
@@ -239,14 +246,12 @@ class Setting:
 
 
 def setting_of(
-    scene: Path | None, field: Path | None, gaze: Path | None, areas: Areas, options: StatisticsOptions, ns: ModuleType
+    scene: Path | None, field: Path | None, gaze: Path | None, areas: Areas, options: SettingOptions, ns: ModuleType
 ) -> Setting:
     """The setting of these files. Raises `NergError`; what is plainly wrong is told before anything is loaded."""
-    rules = LookRules(options.gap, options.pause, options.merge, options.least)
-    windows = [Window(*parse_window(text)) for text in options.windows]
     align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
     around = surroundings_of_files(scene, field, gaze, align, ns)
-    return Setting(around, areas, things_of(areas.things, shapes_of(around.scene)), options, rules, windows)
+    return Setting(around, areas, things_of(areas.things, shapes_of(around.scene)), options)
 
 
 # ---- Trust ----

@@ -66,8 +66,7 @@ class WorkerOptions(Checked):
 )
 def work(address: str, options: WorkerOptions, reporter: Reporter) -> None:
     """Join a cluster."""
-    from nerg_mi.tasks.addresses import unprotected
-    from nerg_mi.tasks.dask_worker import serve_cluster
+    from nerg_mi.tasks.engines import serve_cluster, unprotected
     from nerg_mi.threads import VARIABLE
 
     if options.threads:

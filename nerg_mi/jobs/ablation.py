@@ -7,30 +7,37 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
 from nerg_mi.evaluation.ablation import Variant, frame_timer
 from nerg_mi.figures.style import files_among, provenance
-from nerg_mi.files.atomic import check_folder
+from nerg_mi.files.atomic import check_folder, replacing
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.splats.files import is_splats
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
+from nerg_mi.tasks.engines import prepare_once
+from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan
 from nerg_mi.train.gaze_data import digest_rays
 from nerg_mi.train.gaze_recipes import gaze_recipe
 
 from .ablation_bench import Bench, bench_of, law_of, plan_of, train_variant
-from .ablation_tasks import rows_in_parts
 from .backend import select_backend
 from .commands import argument, command, out
 from .gaze_places import place_kind
 from .options.ablation import AblationOptions
+from .parts import Parts, PlannedScene
 from .reporter import SILENT, Reporter
+
+_FIELD, _ROW = "gaze.safetensors", "row.json"
 
 
 @dataclass(frozen=True)
@@ -101,13 +108,63 @@ def ablate(
 def _rows(due: list[tuple[Variant, int]], bench: Bench, data: Rays, reporter: Reporter) -> Iterator[dict]:
     """The row of each training that is ``due``."""
     if bench.options.in_parts:
-        for (variant, seed), row in zip(due, rows_in_parts(due, bench, data, reporter)):
-            _keep(row, variant, seed, bench)
-            yield row
+        yield from _rows_in_parts(due, bench, data, reporter)
         return
     for k, (variant, seed) in enumerate(due):
         reporter.progress(k / len(due), f"{variant.recipe} {variant.name}, seed {seed}")
         yield _row(variant, seed, bench)
+
+
+def _rows_in_parts(due: list[tuple[Variant, int]], bench: Bench, rays: Rays, reporter: Reporter) -> Iterator[dict]:
+    """The same from parts, of which some may have been kept; ``rays``: all of them. Checkpoints are copied into the
+    folder of ``bench``."""
+    options, folder = bench.options, bench.folder
+    scene = None if options.scene is None else PlannedScene.of(options.scene)
+    common = Ablation(training_options(options), rays, scene)
+    tasks = [Part((v.recipe, v.name, seed), f"{v.recipe} {v.name}, seed {seed}") for v, seed in due]
+    plan = Plan(f"nerg ablate {os.path.abspath(folder)}", train_part, common, tasks, FOLDER, (*RENDERS, "scipy"))
+    made = Parts(options, folder, reporter, options.threads).run(plan)
+    for (variant, seed), part in zip(due, made):
+        with replacing(folder / variant.file_name(seed)) as temporary:
+            shutil.copyfile(part.path / _FIELD, temporary)
+        row = read_json(part.path / _ROW, "row of an ablation")
+        assert isinstance(row, dict)
+        _keep(row, variant, seed, bench)
+        yield row
+
+
+@dataclass(frozen=True)
+class Ablation:
+    """What all trainings of an ablation have in common, wherever they run."""
+
+    options: AblationOptions
+    rays: Rays
+    scene: PlannedScene | None
+
+
+def training_options(options: AblationOptions) -> AblationOptions:
+    """The ``options`` without what trainings are chosen by, and without how the command times frames."""
+    plain = AblationOptions()
+    chosen = {name: getattr(plain, name) for name in ("recipes", "variant", "seeds", "cameras", "size")}
+    return replace(options, **chosen)
+
+
+def train_part(common: Ablation, value: tuple[str, str, int], output: Path) -> None:
+    """The checkpoint and the row (JSON) of one training, into the folder ``output``; ``value``: recipe, variant and
+    seed."""
+    options, (recipe, name, seed) = common.options, value
+    ns = select_backend(options.mode)
+    if common.scene is not None:
+        common.scene.checked()
+
+    def prepare() -> tuple[Bench, TemporaryDirectory]:
+        folder = TemporaryDirectory(prefix="nerg-ablation-")
+        return bench_of(common.rays, options, Path(folder.name), ns, SILENT), folder
+
+    bench = prepare_once(common, prepare)[0]
+    variants = ablation.all_variants(options.field is not None, [recipe])
+    variant = next(v for v in variants if v.name == name)
+    write_json(output / _ROW, train_variant(variant, seed, output / _FIELD, bench), allow_nan=True)
 
 
 def _row(variant: Variant, seed: int, bench: Bench) -> dict:

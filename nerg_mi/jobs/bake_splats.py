@@ -29,8 +29,7 @@ from nerg_mi.surfaces.splats import HIDDEN, SplatSmoother, splat_areas, whole_ar
 from .backend import select_backend
 from .baking.asked import UNITS, cone_of, source_of
 from .baking.lookers import alignment_of, check_values, find_crowd, rays_of, tracked_rays
-from .baking.splat_chunks import SplatPlace, SplatScene, splat_chunk, splat_place
-from .baking.splat_tasks import splat_tasks_of
+from .baking.splat_chunks import SplatPlace, SplatScene, splat_place
 from .baking.summing import halves_of, sums_in_one_go, sums_in_parts
 from .options.bake import BakeOptions
 from .parts import Parts
@@ -99,9 +98,9 @@ def bake_splats(
     name = paths[0] if paths else path
     if options.in_parts:
         parts = Parts(options, name, reporter, options.threads)
-        found = sums_in_parts(scene, groups, parts, f"nerg bake {name.absolute()}", splat_tasks_of)
+        found = sums_in_parts(scene, groups, parts, f"nerg bake {name.absolute()}")
     else:
-        found = sums_in_one_go(scene, groups, reporter, splat_chunk)
+        found = sums_in_one_go(scene, groups, reporter)
     sums = merge(found)
     reporter.progress(0.9, "areas of Gaussians")
     spread = _Spread(splat_place(given), source, options.smooth * align.scale)

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +24,8 @@ from nerg_mi.probes.probes import LEVELS, level_name
 from nerg_mi.rays.dataset import is_dataset
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.scene_file import files_of_scene
-from nerg_mi.tasks.code import RENDERS, versions
-from nerg_mi.tasks.inputs import InputFile, name_of, read_input, read_inputs
-from nerg_mi.tasks.plan import Plan
-from nerg_mi.tasks.task import FOLDER, Task
-from nerg_mi.threads import set_thread_count, use_share
+from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan
+from nerg_mi.threads import set_thread_count
 
 from .commands import argument, command, out
 from .evaluation import evaluate_gaze
@@ -39,16 +34,13 @@ from .gaze_places import place_kind
 from .options.evaluation import GazeEvaluationOptions
 from .options.folds import FoldOptions
 from .options.gaze import GazeOptions
-from .parts import Parts
+from .parts import Parts, PlannedScene
 from .reporter import SILENT, Reporter
 
 FIELD, SCORED = "gaze.safetensors", "scores.json"
 """What the output of a fold holds: its field, and the rows of each split."""
 
 _LEVELS = tuple(level_name(level) for level in LEVELS)
-_RAYS = "of-the-job/rays.npz"
-_TRAINING = ("recipe", "variant", "radius", "probes", "steps", "mix_folds", "mix_kappa", "ensemble", "mode")
-_SCORING = ("kappa", "directions", "min_rays", "mode")
 
 
 @dataclass(frozen=True)
@@ -79,32 +71,21 @@ def evaluate_folds(
     `NergError` for what the user can mend.
     """
     options, output = options or FoldOptions(), Path(output)
-    splits = _splits(options.splits)
+    splits = tuple(_splits(options.splits))
     place_kind(options)
     check_folder(output)
     parts = Parts(options, output, reporter, options.threads)
     if options.threads:
         set_thread_count(options.threads)
     reporter.progress(0.0, "reading")
-    inputs, files = _inputs(rays, options, parts)
+    common = Folds(fold_options(options), splits, *_sources(rays, options))
     seeds = range(options.first, options.first + options.folds)
-    common = {
-        "files": files,
-        "splits": splits,
-        "geometry": options.geometry,
-        "training": {name: getattr(options, name) for name in _TRAINING}
-        | {"test_zones": options.zones, "test_positions": options.positions, "test_people": options.people},
-        "scoring": {name: getattr(options, name) for name in _SCORING},
-    }
     what = f"nerg eval folds {os.path.abspath(output)}"
-    work = f"{__name__}:train_and_score"
-    tasks = [
-        Task(work, {**common, "seed": seed}, inputs, FOLDER, versions(*RENDERS, "scipy"), f"fold {seed}")
-        for seed in seeds
-    ]
+    tasks = [Part(seed, f"fold {seed}") for seed in seeds]
+    plan = Plan(what, train_and_score, common, tasks, FOLDER, (*RENDERS, "scipy"))
     each, fields, by_split = [], [], {split: [] for split in splits}
     positions, regions = [], {split: [] for split in splits}
-    for seed, made in zip(seeds, parts.run(Plan(what, tasks))):
+    for seed, made in zip(seeds, parts.run(plan)):
         found: Any = read_json(made.path / SCORED, "scores of a fold")
         fields.append(made.path / FIELD)
         for split in splits:
@@ -144,23 +125,65 @@ def print_folds(rays: Path, output: Path, options: FoldOptions, reporter: Report
         reporter.message(score_table(rows, f"{split}: means of {options.folds} folds"))
 
 
-def train_and_score(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
+@dataclass(frozen=True)
+class Folds:
+    """What all folds have in common: ``options``, ``splits`` to score in, ``rays`` or their file, and the ``scene``."""
+
+    options: FoldOptions
+    splits: tuple[str, ...]
+    rays: Rays | Path
+    scene: PlannedScene | None
+
+
+def fold_options(options: FoldOptions) -> FoldOptions:
+    """The ``options`` without what folds are counted and rays are chosen by: a fold has its seed, and all rays."""
+    plain = FoldOptions()
+    return replace(options, **{name: getattr(plain, name) for name in ("folds", "first", "splits", "most")})
+
+
+def train_and_score(common: Folds, seed: int, output: Path) -> None:
     """A fold: a gaze field that was trained without some people and zones (`FIELD`), and its rows in each split
-    (`SCORED`), into the folder ``output``. ``parameters``: ``files`` by what they are called among ``inputs``,
-    ``geometry``, ``seed``, ``splits``, and options of ``training`` and ``scoring``."""
-    files = {kind: inputs[name] for kind, name in parameters["files"].items()}
-    place = {kind: files.get(kind) for kind in ("field", "scene")}
-    use_share()
-    gaze, seed = output / FIELD, parameters["seed"]
-    given = {**place, "geometry": parameters["geometry"], "align": files.get("align"), **parameters["training"]}
-    train_gaze(files["rays"], gaze, GazeOptions(**given, seed=seed))
-    found = {}
-    for split in parameters["splits"]:
-        scoring = GazeEvaluationOptions(**place, **parameters["scoring"], split=split, seed=seed, resamples=0)
-        scored = evaluate_gaze(gaze, files["rays"], None, scoring)
-        found[split] = {"rows": scored.rows, "positions": scored.positions, "people": scored.people}
-        found[split] |= {"by_position": scored.by_position, "calibration": scored.calibration}
-    write_json(output / SCORED, found, allow_nan=True)
+    (`SCORED`), into the folder ``output``."""
+    o, gaze = common.options, output / FIELD
+    if common.scene is not None:
+        common.scene.checked()
+    training = GazeOptions(
+        field=o.field,
+        scene=o.scene,
+        geometry=o.geometry,
+        align=o.align,
+        recipe=o.recipe,
+        variant=o.variant,
+        radius=o.radius,
+        probes=o.probes,
+        steps=o.steps,
+        mix_folds=o.mix_folds,
+        mix_kappa=o.mix_kappa,
+        ensemble=o.ensemble,
+        test_zones=o.zones,
+        test_positions=o.positions,
+        test_people=o.people,
+        seed=seed,
+        mode=o.mode,
+    )
+    train_gaze(common.rays, gaze, training)
+    tables = {}
+    for split in common.splits:
+        scoring = GazeEvaluationOptions(
+            field=o.field,
+            scene=o.scene,
+            split=split,
+            kappa=o.kappa,
+            directions=o.directions,
+            min_rays=o.min_rays,
+            resamples=0,
+            seed=seed,
+            mode=o.mode,
+        )
+        scored = evaluate_gaze(gaze, common.rays, None, scoring)
+        tables[split] = {"rows": scored.rows, "positions": scored.positions, "people": scored.people}
+        tables[split] |= {"by_position": scored.by_position, "calibration": scored.calibration}
+    write_json(output / SCORED, tables, allow_nan=True)
 
 
 def _splits(text: str) -> list[str]:
@@ -171,22 +194,11 @@ def _splits(text: str) -> list[str]:
     return found
 
 
-def _inputs(
-    rays: Rays | str | Path, options: FoldOptions, parts: Parts
-) -> tuple[tuple[InputFile, ...], dict[str, str]]:
-    """The files that each fold reads, and what tasks call them by their kinds."""
-    if isinstance(rays, Rays) or is_dataset(rays):
-        data = rays if isinstance(rays, Rays) else load_rays(rays, options.most, options.first)
-        found = [parts.hold_rays(_RAYS, data)]
-    else:
-        found = [read_input(f"of-the-job/rays{Path(rays).suffix}", rays)]
-    names = {"rays": found[0].name}
-    for kind, path in (("field", options.field), ("scene", options.scene), ("align", options.align)):
-        if path is not None:
-            more = read_inputs(files_of_scene(path) if kind == "scene" else [path], below=kind)
-            found += more
-            names[kind] = name_of(path, more)
-    return tuple(found), names
+def _sources(rays: Rays | str | Path, options: FoldOptions) -> tuple[Rays | Path, PlannedScene | None]:
+    """The rays of all folds, or their file, and the scene that they look around in."""
+    if not isinstance(rays, Rays):
+        rays = load_rays(rays, options.most, options.first) if is_dataset(rays) else Path(rays)
+    return rays, None if options.scene is None else PlannedScene.of(options.scene)
 
 
 def _write(

@@ -1,68 +1,128 @@
-"""Jobs in parts: from their options to a store and a scheduler, and outputs in their order with progress told."""
+"""``nerg jobs``: Say what is done of a long job, what is left and what is stale.
+
+Jobs in parts: from their options to a store and an engine, outputs in their order with progress, and what a store
+holds as lines to read."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-import numpy as np
+from nerg_mi.errors import NergError
+from nerg_mi.files.tables import markdown_table
+from nerg_mi.rendering.scene_file import files_of_scene
+from nerg_mi.tasks.engines import Output, Progress, open_engine, run_plan
+from nerg_mi.tasks.store import Account, JobAccount, Store, read_account, remove_stale
+from nerg_mi.tasks.task import Files, Plan
 
-from nerg_mi.rays.rays import Rays
-from nerg_mi.tasks.inputs import InputFile
-from nerg_mi.tasks.opening import open_scheduler
-from nerg_mi.tasks.plan import Plan
-from nerg_mi.tasks.protocol import Scheduler
-from nerg_mi.tasks.run import Output, Progress, run_plan
-from nerg_mi.tasks.store import Store
-
+from .commands import argument, command, extra
 from .options.parts import PartOptions
-from .reporter import Reporter
+from .reporter import SILENT, Reporter
 
 SUFFIX = ".tasks"
 """Of the store beside an output, where none is named."""
 
+_HEAD = ("job", "parts", "done", "left", "size", "computed in", "out of date")
+
 
 class Parts:
-    """The store and the scheduler of one job, which writes ``output``. Raises `NergError` for a folder that cannot be
-    written to, and for a scheduler that there is none of. ``threads``: of each process that makes parts."""
+    """The store and the engine of one job, which writes ``output``. ``threads``: of each process that makes parts.
+    Raises `NergError` for a folder that cannot be written to, and for a scheduler that does not exist."""
 
     def __init__(self, options: PartOptions, output: Path, reporter: Reporter, threads: int | None = None):
         self.store = Store(output.with_suffix(SUFFIX) if options.store is None else options.store)
-        self.scheduler: Scheduler = open_scheduler(options.scheduler, threads or 0)
+        self.engine = open_engine(options.scheduler, threads or 0)
         self._reporter = reporter
-
-    def hold(self, name: str, values: np.ndarray) -> InputFile:
-        """``values`` as an input of tasks (.npy), which call it ``name``."""
-        content = io.BytesIO()
-        np.lib.format.write_array(content, np.ascontiguousarray(values), allow_pickle=False)
-        return self.store.hold(name, content.getvalue())
-
-    def hold_rays(self, name: str, rays: Rays) -> InputFile:
-        """``rays`` as an input of tasks (.npz), which call it ``name``."""
-        with TemporaryDirectory(prefix="nerg-rays-") as folder:
-            file = Path(folder) / "rays.npz"
-            rays.save(file)
-            return self.store.hold(name, file.read_bytes())
 
     def run(self, plan: Plan, since: float = 0.0, until: float = 1.0) -> Iterator[Output]:
         """The outputs of ``plan`` in its order; see `run_plan`. Of the whole job this is from the share ``since`` to
         the share ``until``. Ctrl-C says where it goes on from."""
 
-        def tell(progress: Progress) -> None:
-            line = progress.line() if until == 1.0 else progress.line().partition(" s left")[0].rpartition(",")[0]
-            self._reporter.progress(since + (until - since) * progress.share, line or progress.line())
+        def show(progress: Progress) -> None:
+            self._reporter.progress(since + (until - since) * progress.share, progress.line(until == 1.0))
 
-        with self._kept():
-            yield from run_plan(plan, self.store, self.scheduler, tell, self._reporter.warn)
-
-    @contextmanager
-    def _kept(self) -> Iterator[None]:
         try:
-            yield
+            yield from run_plan(plan, self.store, self.engine, show, self._reporter.warn)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"Interrupted; the parts that are done are kept in {self.store.folder}: the same command goes on."
             ) from None
+
+
+@dataclass(frozen=True)
+class PlannedScene:
+    """A scene file, a mesh or a field with the ``files`` that are read because of it, and values of its `<default>`s:
+    what a part is kept by, and where they lie wherever it runs."""
+
+    files: Files
+    defaults: dict[str, str]
+
+    @staticmethod
+    def of(path: str | Path, defaults: Mapping[str, str] | None = None, *others: Path) -> PlannedScene:
+        """The scene file ``path`` with these values, and files beside it that are read as well."""
+        return PlannedScene(Files(Path(path), (*files_of_scene(path, defaults), *others)), dict(defaults or {}))
+
+    def checked(self) -> Path:
+        """The scene file. Raises `NergError` where it reads other files than the job was planned with, as on a worker
+        where a whole path leads to somebody else's file."""
+        planned = {path.resolve() for path in self.files.all}
+        for file in files_of_scene(self.files.path, self.defaults):
+            if file.resolve() not in planned:
+                raise NergError(
+                    f'the scene "{self.files.path.name}" reads "{file}", which is not the file that the job was '
+                    "planned with; name files relative to the scene, so that workers find the same ones"
+                )
+        return self.files.path
+
+
+@command(
+    "jobs",
+    "Say what is done of the jobs in a store, what is left, what it takes in bytes, and what is stale.",
+    more="Stale is what no job asks for any more as it was started last, and what was made of files that have changed "
+    "since.",
+    folder=argument("Store of a job: what was given as --store, or OUTPUT.tasks."),
+    remove=extra(False, "Take out what no job asks for any more, and what is left over.", bool, "--remove-stale"),
+)
+def account_for_store(folder: str | Path, remove: bool = False, reporter: Reporter = SILENT) -> Account:
+    """Report the jobs in the store ``folder``: how far each is, what it takes, and which inputs have changed.
+
+    ``remove``: remove what no job asks for any more, what was made of files that have changed since, and what processes
+    that died left over an hour ago or earlier. Raises `NergError` for a folder that is no store.
+    """
+    if not Path(folder).is_dir():
+        raise NergError(f'there is no folder "{folder}"; name the one that was given as --store')
+    reporter.progress(0.0, "looking at what is there")
+    store = Store(folder)
+    account = read_account(store)
+    if account.jobs:
+        reporter.message(markdown_table(_HEAD, [_row(job) for job in account.jobs], _HEAD[1:]))
+    for job in account.jobs:
+        for path in job.changed:
+            reporter.message(f"changed since {job.what}: {path}")
+        for path in job.gone:
+            reporter.message(f"not there any more for {job.what}: {path}")
+    stale, left = len(account.stale), len(account.leftovers)
+    reporter.message(
+        f"{size(account.bytes)} in all; stale: {stale} outputs, {size(account.stale_bytes)}; "
+        f"left over: {left}, {size(account.leftover_bytes)}."
+    )
+    if remove:
+        reporter.message(f"Removed {size(remove_stale(store, account))}.")
+    elif stale or left:
+        reporter.message("nerg jobs --remove-stale takes out what is stale or left over.")
+    return account
+
+
+def _row(job: JobAccount) -> tuple[str, ...]:
+    counts = (job.total, job.done, job.left)
+    return (job.what, *map(str, counts), size(job.bytes), f"{job.seconds:.0f} s", str(job.outdated))
+
+
+def size(count: float) -> str:
+    """So many bytes as one says it: 12 kB, 3.4 MB."""
+    for unit in ("bytes", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "bytes" or count >= 10 else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.1f} TB"

@@ -7,23 +7,38 @@ from __future__ import annotations
 
 import re
 import time
-from dataclasses import dataclass
+import uuid
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import study, study_tables, study_truth
 from nerg_mi.evaluation.study import Setting, settings
-from nerg_mi.evaluation.study_subject import Subject, open_subject
+from nerg_mi.evaluation.study_subject import ExactSurfaces, FileSubject, Subject, open_subject
 from nerg_mi.figures.style import Provenance, files_among, provenance
 from nerg_mi.files.atomic import check_folder
+from nerg_mi.files.safe_read import read_json
+from nerg_mi.files.tables import write_json
 from nerg_mi.rendering.pictures import activate
 from nerg_mi.rendering.scene_file import files_of_scene
+from nerg_mi.tasks.engines import prepare_once
+from nerg_mi.tasks.task import Part, Plan, processor
 
+from .backend import select_backend
 from .commands import argument, command, extra
 from .options.study import StudyOptions
+from .parts import Parts, PlannedScene
 from .reporter import SILENT, Reporter
-from .study_tasks import measured_in_parts, twin_beside
 from .versions import versions
+
+ROWS = 4
+"""Settings of a part, besides the default."""
+
+_TWIN = "twin.xml"
+_PROCESS = uuid.uuid4().hex
 
 
 @dataclass(frozen=True)
@@ -70,7 +85,7 @@ def run_study(
     reporter.progress(0.0, "open")
     subject = open_subject(str(scene), options.scene_kind, width, height, options.defaults, twin_beside)
     rows = _chosen(settings(subject, options.quick), wanted, options.only)
-    repeats, samples = (1, 16) if options.quick else (options.repeats, study.PIXEL_SPP)
+    repeats, samples = effort(options)
     timed_by: list[dict] = []
     done = 0
 
@@ -81,8 +96,8 @@ def run_study(
         done += 1
 
     if options.in_parts:
-        numbers = (repeats, samples)
-        table, scaling, timed_by = measured_in_parts(subject, scene, out, rows, numbers, mode, options, reporter)
+        common = planned_study(subject, scene, replace(options, mode=mode))
+        table, scaling, timed_by = _measured_in_parts(common, subject, rows, Parts(options, out, reporter), out)
     else:
         table = study.measure(subject, rows, repeats, samples, step)
         scaling = study.scaling(subject, min(repeats, 3), options.quick, step)
@@ -143,3 +158,108 @@ def _write(out: Path, subject: Subject, report: dict, about: Provenance) -> list
     study_tables.plot_errors(out / "errors.png", report["rows"], f"Error against time: {title}", about)
     study_tables.plot_scaling(out / "scaling.png", report["scaling"], f"Cost of the default: {title}", about)
     return [*files, out / "errors.png", out / "scaling.png"]
+
+
+def effort(options: StudyOptions) -> tuple[int, int]:
+    """Timed renders of each setting, and samples of a pixel's truth."""
+    return (1, 16) if options.quick else (options.repeats, study.PIXEL_SPP)
+
+
+def twin_beside(scene: Path) -> ExactSurfaces | None:
+    """The surfaces of the shapes in ``twin.xml`` beside a scene file, which its field stands for; None where there is
+    none."""
+    file = scene.parent / _TWIN
+    if not file.is_file():
+        return None
+    from nerg_mi.scenes.store import twin  # pyright: ignore[reportMissingImports] at the root of a checkout
+
+    shapes = twin.load_twin(file)
+    return ExactSurfaces(partial(twin.cast, scene=shapes), partial(twin.visible, scene=shapes))
+
+
+# ---- Parts ----
+#
+# Settings, a few each, with the default beside them, measured wherever that is. Errors and evaluations are the same
+# wherever they are found. Times are those of the process that measured the row; its own times of the default, taken in
+# the same rounds, are in the row as well, so that rows of different machines compare.
+
+
+@dataclass(frozen=True)
+class PlannedStudy:
+    """What all parts of a study have in common: ``scene``, a file or the name of an analytic scene."""
+
+    options: StudyOptions
+    scene: PlannedScene | str
+
+
+def planned_study(subject: Subject, scene: str | Path, options: StudyOptions) -> PlannedStudy:
+    """That of the ``subject`` of ``scene``: parts have numbers of settings, whatever names were chosen."""
+    kind = "file" if isinstance(subject, FileSubject) else "analytic"
+    of_parts = replace(options, only="", defaults=None, scene_kind=kind)
+    if kind == "analytic":
+        return PlannedStudy(of_parts, str(scene))
+    twin = Path(scene).parent / _TWIN
+    others = files_of_scene(twin) if twin.is_file() else ()
+    return PlannedStudy(of_parts, PlannedScene.of(scene, options.defaults, *others))
+
+
+def _measured_in_parts(
+    common: PlannedStudy, subject: Subject, rows: Sequence[Setting], parts: Parts, out: Path
+) -> tuple[list[dict], list[dict], list[dict]]:
+    """What `study.measure` finds of ``rows`` (the default first) and `study.scaling`, in parts; and who timed what:
+    of each process its ``processor``, ``threads``, ``rows`` and, of the default there, the least and most ``seconds``.
+
+    Rows say in ``timed_by`` which process it was, counted from 1, and have ``default_seconds`` and
+    ``default_cpu_seconds`` of that one.
+    """
+    place = {row.name: k for k, row in enumerate(settings(subject, common.options.quick))}
+    chosen = [place[row.name] for row in rows[1:]]
+    some = [tuple(chosen[k : k + ROWS]) for k in range(0, len(chosen), ROWS)]
+    tasks = [Part(numbers, f"{len(numbers)} settings from number {numbers[0]}") for numbers in some]
+    tasks.append(Part(None, "cost against size"))
+    plan = Plan(f"nerg study {out.absolute()}", measure_part, common, tasks, ".json")
+    return _joined([read_json(made.path, "part of a study") for made in parts.run(plan)])
+
+
+def measure_part(common: PlannedStudy, numbers: Sequence[int] | None, output: Path) -> None:
+    """The rows (JSON) of the settings with these ``numbers``, the default first, or, for None, of the cost against
+    size; and who timed them."""
+    import drjit as dr
+
+    o = common.options
+    select_backend(o.mode)
+    repeats, samples = effort(o)
+
+    def opened() -> Subject:
+        scene, defaults = common.scene, {}
+        if isinstance(scene, PlannedScene):
+            scene, defaults = scene.checked(), scene.defaults
+        return open_subject(str(scene), o.scene_kind, o.width, o.height, defaults, twin_beside)
+
+    # Its truth may take longer than its settings.
+    subject = prepare_once(common, opened)
+    if numbers is None:
+        rows = study.scaling(subject, min(repeats, 3), o.quick)
+    else:
+        every = settings(subject, o.quick)
+        rows = study.measure(subject, [every[k] for k in (0, *numbers)], repeats, samples)
+    timed_by = {"process": _PROCESS, "processor": processor(), "threads": dr.thread_count()}
+    write_json(output, {"rows": rows, "timed_by": timed_by}, allow_nan=True)
+
+
+def _joined(parts: Iterable[Any]) -> tuple[list[dict], list[dict], list[dict]]:
+    """The rows of all parts with a single default, the cost against size, and who timed them."""
+    *of_settings, scaling = parts
+    table: list[dict] = []
+    who: dict[str, dict] = {}
+    for part in of_settings:
+        by, (default, *rest) = part["timed_by"], part["rows"]
+        of_process = who.setdefault(by["process"], {**by, "process": len(who) + 1, "rows": 0, "seconds": []})
+        of_process["seconds"].append(default["seconds"])
+        for row in rest if table else (default, *rest):
+            own = {f"default_{clock}": default[clock] for clock in ("seconds", "cpu_seconds")}
+            table.append(row | own | {"timed_by": of_process["process"]})
+            of_process["rows"] += 1
+    for found in who.values():
+        found["seconds"] = [min(found["seconds"]), max(found["seconds"])]
+    return table, scaling["rows"], list(who.values())

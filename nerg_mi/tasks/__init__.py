@@ -1,6 +1,6 @@
-"""Long work in parts: content-addressed tasks, a store of their outputs, and whoever runs them, here or on a cluster.
+"""Long work in parts: `task` names them by all that they depend on, `store` keeps their outputs, and `engines` run them
+here, in processes of this machine or on a Dask cluster.
 
-A job makes a `plan.Plan` of `task.Task`s and takes their outputs in the plan's order from `run.run_plan`; what a
-`store.Store` holds already is not made again. A `protocol.Scheduler` only says where a task is run, and never what
-comes of it.
+A job makes a `task.Plan` and takes the outputs of its parts, in its order, from `engines.run_plan`; what the store
+holds already is not made again. An engine decides where a part runs, and never what comes of it.
 """

@@ -1,33 +1,111 @@
-"""The folder in which outputs of tasks are kept, each named by its task's key, whole or absent, verified before use."""
+"""The folder in which outputs of parts are kept, each named by its key, whole or absent, verified before use; and what
+it remembers of jobs, so that it can be said what is done, left and stale."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
-import secrets
+import re
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import check_folder, make_folder, replacing, replacing_folder, write_bytes, writing
+from nerg_mi.files.atomic import (
+    check_folder,
+    file_sha256,
+    make_folder,
+    replacing,
+    replacing_folder,
+    write_bytes,
+    write_text,
+    writing,
+)
+from nerg_mi.files.safe_read import is_count, read_json
 
-from .inputs import InputFile
-from .receipt import Receipt, digest_of, read_receipt, write_receipt
-from .task import FOLDER, Task
+from .task import FOLDER, FORMAT, Checksums, Plan, Task, processor
 
-PLANS = "plans"
-HELD = "held"
+AGE = 3600.0
+"""Seconds after which unfinished files count as left by a process that died."""
+
 _RECEIPT = ".receipt.json"
+_SCRATCH = ".scratch-"
+_KEY = re.compile(r"[0-9a-f]{64}")
+_SUFFIX = re.compile(r"|/|(\.[A-Za-z0-9]+){1,2}")
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """That of the output of the task ``key``: its ``size`` in bytes and ``sha256`` (of a folder `digest_of`), the
+    ``seconds`` that it took, the ``processor`` that made it, the ``notes`` of the work, and the SHA-256 of the
+    ``inputs`` of that part alone, by their names."""
+
+    key: str
+    size: int
+    sha256: str
+    seconds: float
+    processor: str
+    notes: Mapping[str, Any]
+    label: str
+    suffix: str
+    inputs: Mapping[str, str]
+
+
+def receipt_of(task: Task, output: Path, seconds: float, notes: Mapping[str, Any]) -> Receipt:
+    """The receipt of ``output``, which ``task`` made here in so many ``seconds``."""
+    inputs = {file.name: file.sha256 for file in task.files}
+    return Receipt(task.key, *digest_of(output), seconds, processor(), notes, task.label, task.suffix, inputs)
+
+
+def read_receipt(path: str | os.PathLike) -> Receipt:
+    """The receipt in the file ``path``. Raises `NergError` for one that is damaged or of another version."""
+    about = read_json(path, "receipt", 8 << 20)
+    names = {f.name for f in fields(Receipt)}
+    if not isinstance(about, dict) or about.pop("format", None) != FORMAT or set(about) != names:
+        raise NergError(f'the receipt "{path}" is not of this version; remove it, and its output is made again')
+    kinds = {name: dict if name in ("notes", "inputs") else str for name in names - {"size", "seconds"}}
+    whole = all(isinstance(about[name], kind) for name, kind in kinds.items())
+    numbers = is_count(about["size"]) and isinstance(about["seconds"], (int, float)) and about["seconds"] >= 0
+    if not (whole and numbers and _KEY.fullmatch(about["key"]) and _SUFFIX.fullmatch(about["suffix"])):
+        raise NergError(f'the receipt "{path}" is damaged; remove it, and its output is made again')
+    return Receipt(**about)
+
+
+def digest_of(output: Path) -> tuple[int, str]:
+    """Bytes of an output and their SHA-256 (hex); of a folder the sum, and that of its files' names and digests. Raises
+    `NergError` where it cannot be read."""
+    if not output.is_dir():
+        return os.stat(output).st_size if output.exists() else 0, file_sha256(output)
+    digest, size = hashlib.sha256(), 0
+    for file in files_in(output):
+        digest.update(f"{file.relative_to(output).as_posix()}\0{file_sha256(file)}\n".encode())
+        size += file.stat().st_size
+    return size, digest.hexdigest()
+
+
+def files_in(folder: Path) -> list[Path]:
+    """All files below ``folder``, in an order that does not depend on the machine."""
+    return sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.relative_to(folder).as_posix())
+
+
+def content_of(output: Path) -> list[tuple[str, bytes]]:
+    """Names and bytes of the files of an output; the name is empty where the output is a file."""
+    if not output.is_dir():
+        return [("", output.read_bytes())]
+    return [(file.relative_to(output).as_posix(), file.read_bytes()) for file in files_in(output)]
 
 
 class Store:
     """Outputs and their receipts below ``folder``, which is made when the first is written.
 
-    Any number of processes may write into it at once, on one machine or on many that share the folder: equal tasks have
-    equal outputs, and each takes its place in one step. Raises `NergError` where nothing can be written there.
+    Any number of processes may write into it at once: equal tasks have equal outputs, and each takes its place in one
+    step. Raises `NergError` where nothing can be written there.
     """
 
     def __init__(self, folder: str | os.PathLike):
@@ -43,16 +121,16 @@ class Store:
         return self.folder / key[:2] / f"{key}{_RECEIPT}"
 
     def receipt(self, key: str) -> Receipt | None:
-        """The receipt of the task ``key``; None where there is none, or it is damaged."""
+        """The receipt of the task ``key``; None where there is none, or it is damaged or of another version: what
+        cannot be verified is made again."""
         file = self.receipt_file(key)
         if not file.exists():
             return None
         try:
-            found = read_receipt(file)
+            receipt = read_receipt(file)
         except NergError:
-            # What cannot be verified counts as not made, and is made anew.
             return None
-        return found if found.key == key else None
+        return receipt if receipt.key == key else None
 
     def find(self, key: str, suffix: str) -> Receipt | None:
         """The receipt of an output that is there and has the bytes that it had when it was made; None otherwise."""
@@ -73,37 +151,25 @@ class Store:
             with replacing(output) as temporary:
                 yield temporary
             return
-        # Whoever comes here found no whole one.
+        # `find` has seen no whole one there.
         shutil.rmtree(output, ignore_errors=True)
         with replacing_folder(output) as temporary:
             yield temporary
 
     def add(self, receipt: Receipt) -> None:
         """Write the ``receipt`` of an output that is in its place: from now on it counts as made."""
-        write_receipt(self.receipt_file(receipt.key), receipt)
+        text = json.dumps({"format": FORMAT, **asdict(receipt)}, sort_keys=True, indent=1)
+        write_text(self.receipt_file(receipt.key), text + "\n")
 
     def put(self, task: Task, receipt: Receipt, content: Sequence[tuple[str, bytes]]) -> None:
-        """Write an output that was made elsewhere: its files' names and bytes, one without a name for a file. Raises
-        `NergError` where the bytes are not those of the ``receipt``."""
+        """Write an output that was made elsewhere, as `content_of` gave it there. Raises `NergError` where the bytes
+        are not those of the ``receipt``."""
         with self.writing(task) as temporary:
             for name, data in content:
                 write_bytes(temporary / name if name else temporary, data)
             if digest_of(temporary) != (receipt.size, receipt.sha256):
                 raise NergError(f"{task.label} arrived with other bytes than it was sent with; start the job again")
         self.add(receipt)
-
-    def hold(self, name: str, content: bytes) -> InputFile:
-        """What a job has made in memory as an input called ``name``: a file of the store named by its bytes, which is
-        the same when the job is started again. Equal contents are one file."""
-        sha256 = hashlib.sha256(content).hexdigest()
-        path = self.folder / HELD / f"{sha256}{Path(name).suffix}"
-        if not path.is_file() or digest_of(path) != (len(content), sha256):
-            write_bytes(path, content)
-        return InputFile(name, sha256, len(content), str(path))
-
-    def held(self, older: float) -> list[Path]:
-        """All files that jobs hold here and that were written ``older`` seconds ago or earlier."""
-        return [p for p in sorted(self.folder.glob(f"{HELD}/*")) if time.time() - p.lstat().st_mtime > older]
 
     def remove(self, key: str, suffix: str) -> None:
         """Remove an output with its receipt, the receipt first."""
@@ -115,37 +181,172 @@ class Store:
     def receipts(self) -> Iterator[Receipt]:
         """All receipts that can be read, by their keys."""
         for file in sorted(self.folder.glob(f"[0-9a-f][0-9a-f]/*{_RECEIPT}")):
-            found = self.receipt(file.name.removesuffix(_RECEIPT))
-            if found is not None:
-                yield found
+            receipt = self.receipt(file.name.removesuffix(_RECEIPT))
+            if receipt is not None:
+                yield receipt
 
     def leftovers(self, older: float) -> list[Path]:
-        """What workers that died have left unfinished: hidden files and folders that nobody has written to for
-        ``older`` seconds, and outputs without a receipt."""
-        known = {receipt.key for receipt in self.receipts()}
-        found = []
-        for path in sorted(self.folder.glob("[0-9a-f][0-9a-f]/*")):
-            key = path.name.removesuffix(_RECEIPT).partition(".")[0]
-            if key not in known and time.time() - path.lstat().st_mtime > older:
-                found.append(path)
-        return found
+        """What processes that died have left unfinished: hidden files and folders that nobody has written to for
+        ``older`` seconds, outputs without a receipt, and scratch folders."""
+        keys = {receipt.key for receipt in self.receipts()}
+        paths = [
+            path
+            for path in sorted(self.folder.glob("[0-9a-f][0-9a-f]/*"))
+            if path.name.removesuffix(_RECEIPT).partition(".")[0] not in keys
+        ]
+        paths += sorted(self.folder.glob(f"{_SCRATCH}*"))
+        return [path for path in paths if time.time() - path.lstat().st_mtime > older]
 
     @contextmanager
-    def probe(self) -> Iterator[str]:
-        """A file in the store for as long as the block lasts: its name, which is also what it holds. Who sees it there
-        shares the folder."""
-        make_folder(self.folder)
-        name = f".probe-{secrets.token_hex(16)}"
-        write_bytes(self.folder / name, name.encode())
-        try:
-            yield name
-        finally:
-            (self.folder / name).unlink(missing_ok=True)
+    def scratch(self) -> Iterator[Path]:
+        """A folder in the store for files that a job makes for its parts to read, removed when the block ends."""
+        with TemporaryDirectory(prefix=_SCRATCH, dir=make_folder(self.folder)) as folder:
+            yield Path(folder)
+
+    # ---- Plans ----
+
+    def remember(self, plan: Plan) -> Path:
+        """Write down what ``plan`` needs, so that its outputs count as wanted."""
+        every = [*plan.shared.files, *(file for task in plan.tasks for file in task.files)]
+        # What lies in the store was made by other parts, or for these, and is made again where it has to be.
+        inputs = {file.path: file.sha256 for file in every if self.folder not in Path(file.path).parents}
+        common = sorted({inputs[file.path] for file in plan.shared.files if file.path in inputs})
+        path = self.folder / "plans" / f"{hashlib.sha256(plan.what.encode()).hexdigest()[:16]}.json"
+        keys = {task.key: task.suffix for task in plan.tasks}
+        about = {"format": FORMAT, "what": plan.what, "inputs": inputs, "common": common, "keys": keys}
+        write_text(path, json.dumps(about) + "\n")
+        return path
+
+    def plans(self) -> list[Remembered]:
+        """All plans, by their names. Raises `NergError` for one that is damaged."""
+        plans = [read_plan(path) for path in sorted(self.folder.glob("plans/*.json"))]
+        return sorted(plans, key=lambda plan: plan.what)
 
 
-def shares(folder: Path, probe: str) -> bool:
-    """Whether this process sees, and may write to, the store that holds the file ``probe``."""
-    try:
-        return (folder / probe).read_bytes() == probe.encode() and os.access(folder, os.W_OK)
-    except OSError:
-        return False
+@dataclass(frozen=True)
+class Remembered:
+    """A plan as a store has it: the ``keys`` of its tasks with their suffixes, the SHA-256 of the ``inputs`` by path,
+    where they were, and those of them that all tasks read, ``common``."""
+
+    what: str
+    keys: dict[str, str]
+    inputs: dict[str, str]
+    common: frozenset[str]
+
+
+def read_plan(path: str | os.PathLike) -> Remembered:
+    """The plan in the file ``path``. Raises `NergError` for one that is damaged or of another version."""
+    about = read_json(path, "plan")
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise NergError(
+            f'the plan "{path}" was written by another version of nerg_mi; remove its store, and start the job again'
+        )
+    texts = [about.get("inputs"), about.get("keys")]
+    good = isinstance(about.get("what"), str) and isinstance(about.get("common"), list)
+    good = good and all(isinstance(t, dict) and all(isinstance(v, str) for v in t.values()) for t in texts)
+    good = good and all(isinstance(digest, str) for digest in about["common"])
+    # Outputs are looked for, and removed, by these names: none may lead out of the store.
+    good = good and all(_KEY.fullmatch(k) and _SUFFIX.fullmatch(v) for k, v in about["keys"].items())
+    if not good:
+        raise NergError(f'the plan "{path}" is damaged; remove it, and start its job again')
+    return Remembered(about["what"], about["keys"], about["inputs"], frozenset(about["common"]))
+
+
+# ---- What is done, left and stale ----
+
+
+@dataclass(frozen=True)
+class JobAccount:
+    """How far one job is: ``done`` of ``total`` parts, with ``bytes`` of output that took ``seconds`` to make;
+    ``changed``: its inputs that have other bytes by now, ``gone``: those that are not there any more; ``outdated``:
+    parts that are done and were made of what was changed."""
+
+    what: str
+    total: int
+    done: int
+    bytes: int
+    seconds: float
+    changed: tuple[str, ...]
+    gone: tuple[str, ...]
+    outdated: int
+
+    @property
+    def left(self) -> int:
+        """Parts that are not there yet."""
+        return self.total - self.done
+
+
+@dataclass(frozen=True)
+class Account:
+    """``jobs`` of a store; ``stale``: outputs that no job asks for any more, as it was started last, and those that
+    were made of files that were changed since; ``leftovers``: what processes that died have left; ``bytes`` of all
+    outputs."""
+
+    jobs: tuple[JobAccount, ...]
+    stale: tuple[Receipt, ...]
+    leftovers: tuple[Path, ...]
+    bytes: int
+    leftover_bytes: int
+
+    @property
+    def stale_bytes(self) -> int:
+        """Bytes that removing what is stale gives back."""
+        return sum(receipt.size for receipt in self.stale)
+
+
+def read_account(store: Store, age: float = AGE) -> Account:
+    """What ``store`` holds; unfinished files count as leftovers after ``age`` seconds. Outputs are not read: whether
+    they are whole is verified before they are used. Raises `NergError` where there is no store, or its plans cannot be
+    read."""
+    plans = store.plans()
+    if not plans and not any(store.folder.glob("[0-9a-f][0-9a-f]")):
+        raise NergError(f'"{store.folder}" holds no parts of jobs; name the folder that was given as --store')
+    receipts = {receipt.key: receipt for receipt in store.receipts()}
+    checksums = Checksums()
+    jobs, wanted = [], set[str]()
+    for plan in plans:
+        job, current = _job(plan, receipts, checksums)
+        jobs.append(job)
+        wanted |= current
+    leftovers = tuple(store.leftovers(age))
+    stale = tuple(receipt for key, receipt in receipts.items() if key not in wanted)
+    size = sum(receipt.size for receipt in receipts.values())
+    return Account(tuple(jobs), stale, leftovers, size, sum(map(_size, leftovers)))
+
+
+def _job(plan: Remembered, receipts: dict[str, Receipt], checksums: Checksums) -> tuple[JobAccount, set[str]]:
+    """How far a plan is, and the keys of what it asks for that is not out of date."""
+    gone, changed, digests, others = [], [], set[str](), set[str]()
+    for path, digest in plan.inputs.items():
+        if not Path(path).is_file():
+            # Nobody can say whether it was changed.
+            gone.append(path)
+        elif checksums.of(path) != digest:
+            changed.append(path)
+            digests.add(digest)
+            continue
+        others.add(digest)
+    # Another file may still have the same bytes.
+    digests -= others
+    done = [receipts[key] for key in plan.keys if key in receipts]
+    outdated = {r.key for r in done if digests & plan.common or digests & set(r.inputs.values())}
+    size, seconds = sum(receipt.size for receipt in done), sum(receipt.seconds for receipt in done)
+    account = JobAccount(
+        plan.what, len(plan.keys), len(done), size, seconds, tuple(changed), tuple(gone), len(outdated)
+    )
+    return account, set(plan.keys) - outdated
+
+
+def remove_stale(store: Store, account: Account) -> int:
+    """Remove from ``store`` what ``account`` says is stale or left over; gives the bytes that became free."""
+    for receipt in account.stale:
+        store.remove(receipt.key, receipt.suffix)
+    for path in account.leftovers:
+        with writing(path):
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    return account.stale_bytes + account.leftover_bytes
+
+
+def _size(path: Path) -> int:
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.lstat().st_size for file in files if file.is_file())

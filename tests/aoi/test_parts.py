@@ -3,22 +3,35 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields as dataclass_fields
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from nerg_mi.aoi import measured
-from nerg_mi.aoi.options import StatisticsOptions
-from nerg_mi.aoi.parts import _place_beside
+from nerg_mi.aoi.options import ForetellOptions, StatisticsOptions
+from nerg_mi.aoi.parts import (
+    Places,
+    PlannedForetelling,
+    PlannedSetting,
+    _place_beside,
+    foretell_part,
+    read_foretold,
+    read_sums,
+    write_sums,
+)
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import save_gaze
+from nerg_mi.jobs.parts import PlannedScene, account_for_store
 from nerg_mi.jobs.statistics import statistics
-from nerg_mi.jobs.store_account import account_for_store
+from nerg_mi.statistics.visits import ALL, Cell, Sums
+from nerg_mi.tasks.task import Files
 from tests.conftest import ROOT
 from tests.jobs.recorder import Recorder
 from tests.plugins import fields
 from tests.rays.dataset.making import DAY, recipe, update_dataset, write_dataset, write_source
+from tests.tasks.works import laid_out
 
 from .place import people, write_place
 
@@ -92,12 +105,35 @@ def test_parts_of_a_dataset_are_read_where_they_lie(place):
     write_dataset(place, 2)
     whole, _ = count(place, "one", "shop.rays")
     parts, told = count(place, "two", "shop.rays", store=place / "store")
-    assert parts == whole and made(told)[0] > 3 and not list((place / "store").glob("held/*"))
+    assert parts == whole and made(told)[0] > 3 and not list((place / "store").glob(".scratch-*"))
     # Of another source those parts alone are new that are its own.
     write_source(place / "files" / "2.csv", 2, start=DAY)
     update_dataset(place / "shop.rays", [place / "files" / "2.csv"], recipe())
     _, more = count(place, "two", "shop.rays", store=place / "store")
     assert 0 < made(more)[0] < made(told)[0]
+
+
+def test_sums_come_back_one_by_one(tmp_path):
+    cells = (ALL, Cell("window", "früh"))
+    one = Sums.empty(("a", "b"), cells, [(cells[0], "p"), (cells[1], "p"), (cells[0], "q")])
+    one.time[:] = (0.1, 1 / 3, 7)
+    two = replace(one, time=one.time * 2, moves=one.moves + 1)
+    write_sums(tmp_path / "s.npz", [one, two])
+    for back, sums in zip(read_sums(tmp_path / "s.npz"), (one, two), strict=True):
+        for f in dataclass_fields(Sums):
+            assert np.array_equal(getattr(back, f.name), getattr(sums, f.name)), f.name
+
+
+def test_what_a_field_foretells_where_files_were_sent(place, tmp_path):
+    options = ForetellOptions(areas=place / "areas.json", samples=4, directions=64, mode="llvm_ad_rgb")
+    areas = Files(options.areas, (options.areas,))
+    setting = PlannedSetting(options, PlannedScene.of(place / "scene.xml"), None, None, areas)
+    common = laid_out(PlannedForetelling(setting, 120.0), tmp_path / "there")
+    places = Places(np.array([[1.0, 2, 1.6]] * 2), np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
+    foretell_part(common, places, tmp_path / "f.npz")
+    found = read_foretold(tmp_path / "f.npz")
+    assert found.share.shape == (2, 3) and np.array_equal(found.share[0], found.share[1])
+    assert found.visible[0].any() and not found.visible[1].any()
 
 
 def test_a_gaze_field_brings_the_place_that_it_was_trained_in(tmp_path, rgb):

@@ -15,7 +15,6 @@ from nerg_mi.formats.areas.kinds import Areas
 from nerg_mi.formats.regions import Region
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.statistics.tables import Floor
-from nerg_mi.statistics.visits import LookRules
 
 AREAS = Areas((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])))
 EYES = places_of(np.arange(15.0).reshape(5, 3))
@@ -38,7 +37,7 @@ def rows(tmp_path, changes, after, floor=None, members=1):
 
     before = told([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]], members=members)
     around, things = Surroundings(None, None, Similarity()), things_of(AREAS.things, {})
-    setting = Setting(around, AREAS, things, StatisticsOptions(), LookRules(1, 60, 0.15, 0.1), ())
+    setting = Setting(around, AREAS, things, StatisticsOptions())
     found = what_if_rows(tmp_path / "c.json", setting, EYES, before, foretell, floor or Floor(), 199, 0)
     return {(r["thing"], r["measure"]): r for r in found}, asked[0]
 

@@ -3,9 +3,7 @@
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.tasks.local import Local
-from nerg_mi.tasks.plan import Plan
-from nerg_mi.tasks.run import carry_out
+from nerg_mi.tasks.engines import Local, run_plan
 from nerg_mi.tasks.store import Store
 from tests.tasks import works
 
@@ -18,8 +16,8 @@ def nerg(*words) -> int:
 
 def test_a_store_is_told_of_and_swept(tmp_path, capsys):
     store = Store(tmp_path / "store")
-    carry_out(Plan("a film", works.tasks(3)), store, Local())
-    carry_out(Plan("a film", works.tasks(1)), store, Local())
+    for count in (3, 1):
+        list(run_plan(works.plan(count, what="a film"), store, Local()))
     capsys.readouterr()
     assert nerg("jobs", store.folder) == 0
     said = capsys.readouterr().out

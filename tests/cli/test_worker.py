@@ -5,14 +5,14 @@ import os
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.tasks import dask_worker
+from nerg_mi.tasks import engines
 from nerg_mi.threads import VARIABLE
 
 
 @pytest.fixture
 def served(monkeypatch):
     given = []
-    monkeypatch.setattr(dask_worker, "serve_cluster", lambda *a: given.append((*a[:2], a[3], os.environ.get(VARIABLE))))
+    monkeypatch.setattr(engines, "serve_cluster", lambda *a: given.append((*a[:2], a[3], os.environ.get(VARIABLE))))
     monkeypatch.delenv(VARIABLE, raising=False)
     # What the command sets is taken back after the test.
     monkeypatch.setenv(VARIABLE, "")

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.jobs import film_tasks
+from nerg_mi.jobs import film
 from nerg_mi.jobs.film import render_film
 from nerg_mi.jobs.options.parts import FilmOptions
 from tests.cli.test_render import SCENE
@@ -59,8 +59,8 @@ def test_parts_give_the_bytes_of_one_go(scene, name, overlay):
 
 def test_pictures_that_are_kept_are_not_rendered_again(scene, monkeypatch):
     store, rendered = scene.parent / "store", []
-    original = film_tasks.render_file
-    monkeypatch.setattr(film_tasks, "render_file", lambda *given: rendered.append(given) or original(*given))
+    original = film.render_file
+    monkeypatch.setattr(film, "render_file", lambda *given: rendered.append(given) or original(*given))
     render(scene, "one", "a.png", store=store)
     told = Recorder()
     render(scene, "two", "a.png", told, store=store)

@@ -8,7 +8,7 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.jobs import folds
 from nerg_mi.jobs.folds import SCORED, evaluate_folds
 from nerg_mi.jobs.options.folds import FoldOptions
-from nerg_mi.jobs.store_account import account_for_store
+from nerg_mi.jobs.parts import account_for_store
 from nerg_mi.threads import set_thread_count
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.jobs.recorder import Recorder
@@ -67,14 +67,15 @@ def trained(monkeypatch):
     """The seeds of the folds that were trained and scored with one thread, which cost nothing here."""
     seeds = []
 
-    def score(parameters, inputs, output):
+    def score(common, seed, output):
         assert dr.thread_count() == 1
-        seeds.append(parameters["seed"])
-        rows = [{"method": "gaze field", "KLD": 1.0 / (1 + parameters["seed"]), "CC": 0.5}]
+        seeds.append(seed)
+        rows = [{"method": "gaze field", "KLD": 1.0 / (1 + seed), "CC": 0.5}]
         write_json(
-            output / SCORED,
-            {split: {"rows": rows, "by_position": [], "calibration": []} for split in parameters["splits"]},
+            output / SCORED, {split: {"rows": rows, "by_position": [], "calibration": []} for split in common.splits}
         )
+
+    score.__qualname__ = "train_and_score"
 
     monkeypatch.setattr(folds, "train_and_score", score)
     return seeds

@@ -48,10 +48,9 @@ class ClusterOfProcesses:
             time.sleep(0.1)
         raise TimeoutError("the scheduler did not start")
 
-    def start_worker(self, before: str = "") -> subprocess.Popen:
-        """Another worker, as the command `nerg worker` is; it need not be there yet when this returns. ``before``: code
-        that its process runs first."""
-        code = f"{before}\nfrom nerg_mi.cli import main; main()"
+    def start_worker(self) -> subprocess.Popen:
+        """Another worker, as the command `nerg worker` is; it need not be there yet when this returns."""
+        code = "from nerg_mi.cli import main; main()"
         number = len(self.workers)
         line = ("-c", code, "worker", self.address, "--threads", "1", "--name", f"w{number}")
         self.workers.append(self._start(f"worker{number}", *line))
@@ -83,14 +82,6 @@ class ClusterOfProcesses:
                 process.send_signal(signal.SIGCONT)
                 process.kill()
                 process.wait()
-
-
-ELSEWHERE = """
-from nerg_mi.tasks import dask_worker, kept_inputs
-dask_worker.shares = lambda folder, probe: False
-kept_inputs.KeptInputs._is_at = lambda self, file: False
-"""
-"""What makes a worker one of another machine, which sees none of the client's files."""
 
 
 def wait_until(condition, what: str) -> None:

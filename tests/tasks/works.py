@@ -1,92 +1,138 @@
-"""Small tasks that the tests of the engine run, in processes of their own as well."""
+"""Small parts that the tests of the engines run, in processes of their own as well."""
 
 from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import signal
 import time
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import write_text
-from nerg_mi.tasks.inputs import read_input
-from nerg_mi.tasks.task import Task
-from nerg_mi.threads import threads_of_worker
+from nerg_mi.jobs.options import option
+from nerg_mi.jobs.options.parts import PartOptions
+from nerg_mi.tasks.task import FOLDER, Checksums, Part, Plan, inputs_of, relocated
 
 
-def hashed(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
-    """A line of parameters and inputs, after ``seconds``; it dies where the file ``die`` is, which it takes along.
-    Each run is noted in the folder ``runs``."""
-    if runs := parameters.get("runs"):
-        Path(runs, f"{parameters['number']}-{os.getpid()}-{time.time_ns()}").touch()
-    die = parameters.get("die")
-    if die and Path(die).exists():
-        Path(die).unlink()
+@dataclass(frozen=True, kw_only=True)
+class Settings(PartOptions):
+    """Of `hashed`: what it reads, and how it is run."""
+
+    files: tuple[Path, ...] = ()
+    seconds: float = option(0.0, "Seconds that a part takes.", changes_result=False)
+    letters: str = "abc"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a part does besides: note its run in the folder ``runs``, and end its process where the file ``die`` is,
+    which it removes. Texts, since paths are inputs."""
+
+    number: int
+    seconds: float = 0.0
+    runs: str = ""
+    die: str = ""
+
+
+def hashed(common: Settings, value: Run, output: Path) -> None:
+    """A line of the number and of what is read."""
+    if value.runs:
+        Path(value.runs, f"{value.number}-{os.getpid()}-{time.time_ns()}").touch()
+    if value.die and Path(value.die).exists():
+        Path(value.die).unlink()
         os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(parameters.get("seconds", 0))
-    text = "".join(f"{name} {path.read_text()}" for name, path in sorted(inputs.items()))
-    if parameters.get("prints"):
-        print("what tasks print is in nobody's way")
-    write_text(output, hashlib.sha256(f"{parameters['number']} {text}".encode()).hexdigest() + "\n")
+    time.sleep(value.seconds + common.seconds)
+    text = "".join(path.read_text() for path in common.files)
+    write_text(output, hashlib.sha256(f"{value.number} {text}".encode()).hexdigest() + "\n")
 
 
-def folder(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
+def mixed(common: Any, value: str, output: Path) -> dict[str, Any] | None:
+    """What is called by ``value``."""
+    if value == "fault":
+        raise TypeError("a mistake of the program")
+    if value == "refused":
+        raise NergError("the scene has no light; give it one")
+    if value == "deadly":
+        write_text(output, "half of")
+        os.kill(os.getpid(), signal.SIGKILL)
+    if value == "threads":
+        import drjit as dr
+
+        write_text(output, "")
+        return {"threads": dr.thread_count()}
+    if value.startswith("term "):
+        # Terms whose sum depends on their order.
+        number = int(value.removeprefix("term "))
+        write_text(output, "")
+        return {"term": 10.0 ** (number % 17) / 3 * (-1) ** number}
+    write_text(output, f"{value}\n")
+    return None
+
+
+def changes(common: Path, value: Any, output: Path) -> None:
+    """Reads a file that changes meanwhile."""
+    write_text(output, common.read_text())
+    common.write_text("in between")
+
+
+def reads(common: None, value: Path, output: Path) -> None:
+    write_text(output, value.read_text())
+
+
+def folder(common: Any, value: int, output: Path) -> None:
     """Two files, one of them in a folder."""
-    write_text(output / "a.txt", f"{parameters['number']}\n")
+    write_text(output / "a.txt", f"{value}\n")
     write_text(output / "below" / "b.txt", "b\n")
 
 
-def refused(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
-    raise NergError("the scene has no light; give it one")
+def plan(count: int, files: tuple[Path, ...] = (), what: str = "p", seconds: float = 0.0, **more: Any) -> Plan:
+    """So many parts of `hashed`, of which each reads all ``files``."""
+    parts = [Part(Run(k, seconds, **{k: str(v) for k, v in more.items()}), f"part {k}") for k in range(count)]
+    return Plan(what, hashed, Settings(files=files), parts, ".txt")
 
 
-def mistaken(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
-    raise TypeError("a mistake of the program")
+def some(*values: str, what: str = "p") -> Plan:
+    """Parts of `mixed`, each called by its value."""
+    return Plan(what, mixed, None, [Part(value, f"the part {value}") for value in values], ".txt")
 
 
-def deadly(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
-    write_text(output, "half of")
-    os.kill(os.getpid(), signal.SIGKILL)
+def read_one(*files: Path) -> Plan:
+    """A part for each of ``files``, which it reads."""
+    return Plan("p", reads, None, [Part(file, f"of {file.name}") for file in files], ".txt")
 
 
-def tasks(count: int, files: Mapping[str, Path] = {}, **parameters: Any) -> list[Task]:
-    """So many of `hashed`, of which each reads all ``files``."""
-    inputs = tuple(read_input(name, path) for name, path in files.items())
-    return [
-        Task(f"{__name__}:hashed", {"number": k, **parameters}, inputs, ".txt", label=f"part {k}") for k in range(count)
-    ]
+def change_one(file: Path) -> Plan:
+    """A part that changes the file that it reads."""
+    return Plan("p", changes, file, [Part(None)], ".txt")
 
 
-def expected(number: int, files: Mapping[str, Path] = {}) -> bytes:
+def folders(*numbers: int) -> Plan:
+    return Plan("p", folder, None, [Part(k, f"folder {k}") for k in numbers], FOLDER)
+
+
+def expected(number: int, files: tuple[Path, ...] = ()) -> bytes:
     """What `hashed` writes."""
-    text = "".join(f"{name} {path.read_text()}" for name, path in sorted(files.items()))
+    text = "".join(path.read_text() for path in files)
     return (hashlib.sha256(f"{number} {text}".encode()).hexdigest() + "\n").encode()
+
+
+def laid_out(value: Any, folder: Path) -> Any:
+    """``value`` on a machine that has none of its files, and was sent them into ``folder``."""
+    inputs = tuple(inputs_of(value, Checksums()).values())
+    for file in inputs:
+        (folder / file.name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file.path, folder / file.name)
+    return relocated(value, inputs, folder)
 
 
 def runs_of(folder: Path) -> dict[int, int]:
     """How often each part was run."""
-    found: dict[int, int] = {}
+    counts: dict[int, int] = {}
     for path in folder.iterdir():
         number = int(path.name.partition("-")[0])
-        found[number] = found.get(number, 0) + 1
-    return found
-
-
-def term(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> dict[str, float]:
-    """A number whose sums depend on their order, as a note."""
-    write_text(output, "")
-    return {"term": 10.0 ** (parameters["number"] % 17) / 3 * (-1) ** parameters["number"]}
-
-
-def changes(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
-    """Reads a file that changes meanwhile."""
-    write_text(output, inputs["a"].read_text())
-    inputs["a"].write_text("in between")
-
-
-def threads(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
-    """How many threads this process may compute with."""
-    write_text(output, str(threads_of_worker()))
+        counts[number] = counts.get(number, 0) + 1
+    return counts

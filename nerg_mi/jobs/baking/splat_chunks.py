@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +10,13 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats
-from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.splats.files import read_splats
 from nerg_mi.surfaces.laplacian import Sums
 from nerg_mi.surfaces.mesh import SURFACE_OPACITY
 from nerg_mi.surfaces.sources import Crowd, MakeLooker, RaySettings, TrackedRays, lookers_of_field
 from nerg_mi.surfaces.splats import gaze_and_escaped, shortest_axes, splat_densities, splat_ray_sums
+from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.transport.geometry import Place, default_settings
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import PlacedGaze
@@ -42,11 +40,35 @@ class SplatScene:
         """Of nobody."""
         return Sums.none(2 * self.count, 0)
 
-    @cached_property
-    def digest(self) -> str:
-        """SHA-256 of everything, the files' bytes included."""
-        sums = [None if path is None else file_sha256(path) for path in (self.splats, self.gaze)]
-        return hashlib.sha256(repr((sums, self.cone, self.of_rays)).encode()).hexdigest()
+    def sums(self, part: Crowd | TrackedRays) -> Sums:
+        """Partial sums of the observers, or of the rays, of ``part``: ``face`` is, of rays, shares of gaze on the sides
+        of the Gaussians, and of observers densities of theirs, which are no part of ``total``. A variant must be
+        active; what is loaded is kept for the next part. Raises `NergError`."""
+        there, make = prepare_once(self, self._loaded)
+        if isinstance(part, TrackedRays):
+            return splat_ray_sums(there.arrays, there.axes, part, self.of_rays)
+        if make is None:
+            raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --from rays")
+        sums = self.nothing
+        for k, weight in enumerate(part.weights.tolist()):
+            eye = part.positions[k : k + 1]
+            # What is known of an observer is needed twice, and made once.
+            looker = make(eye[0])
+            densities = splat_densities(
+                there.splats, there.place, lambda _, own=looker: own, eye, np.array([weight]), there.settings, self.cone
+            )
+            total, escaped = gaze_and_escaped(there.arrays, looker, eye[0], self.cone)
+            sums = sums.plus(Sums(densities.ravel(), np.zeros(0), 0.0, weight * escaped, weight * total, weight, 1))
+        return sums
+
+    def _loaded(self) -> tuple[SplatPlace, MakeLooker | None]:
+        import mitsuba as mi
+
+        there = splat_place(read_splats(self.splats))
+        if self.gaze is None:
+            return there, None
+        gaze = PlacedGaze(load_gaze(self.gaze, namespace(mi.Float))[0])
+        return there, lookers_of_field(gaze, there.place, there.settings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,42 +96,3 @@ def splat_place(splats: Splats) -> SplatPlace:
     place = Place(SplatMedium(arrays))
     settings = ObserverSettings(march=default_settings(place), surface_opacity=SURFACE_OPACITY)
     return SplatPlace(splats, arrays, place, settings, shortest_axes(splats))
-
-
-_last: list[tuple[str, str, SplatPlace, MakeLooker | None]] = []
-
-
-def splat_chunk(scene: SplatScene, part: Crowd | TrackedRays) -> Sums:
-    """Partial sums of the observers, or of the rays, of ``part``: ``face`` is, of rays, shares of gaze on the sides of
-    the Gaussians, and of observers densities of theirs, which are no part of ``total``. A variant must be active; what
-    is loaded for a scene is kept for its next part. Raises `NergError`."""
-    there, make = _prepared(scene)
-    if isinstance(part, TrackedRays):
-        return splat_ray_sums(there.arrays, there.axes, part, scene.of_rays)
-    if make is None:
-        raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --from rays")
-    found = scene.nothing
-    for k, weight in enumerate(part.weights.tolist()):
-        eye = part.positions[k : k + 1]
-        # What is known of an observer is asked for twice, and made once.
-        looker = make(eye[0])
-        densities = splat_densities(
-            there.splats, there.place, lambda _, own=looker: own, eye, np.array([weight]), there.settings, scene.cone
-        )
-        total, escaped = gaze_and_escaped(there.arrays, looker, eye[0], scene.cone)
-        found = found.plus(Sums(densities.ravel(), np.zeros(0), 0.0, weight * escaped, weight * total, weight, 1))
-    return found
-
-
-def _prepared(scene: SplatScene) -> tuple[SplatPlace, MakeLooker | None]:
-    import mitsuba as mi
-
-    variant = str(mi.variant())
-    if not _last or _last[0][:2] != (scene.digest, variant):
-        _last.clear()
-        there, make = splat_place(read_splats(scene.splats)), None
-        if scene.gaze is not None:
-            gaze = PlacedGaze(load_gaze(scene.gaze, namespace(mi.Float))[0])
-            make = lookers_of_field(gaze, there.place, there.settings)
-        _last.append((scene.digest, variant, there, make))
-    return _last[0][2:]

@@ -1,33 +1,37 @@
-"""All parts of a bake and their sums, in this process or wherever tasks are run: the same to the bit."""
+"""All parts of a bake and their sums, in this process or wherever parts are run: the same to the bit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import replacing
+from nerg_mi.files.safe_read import read_npy
 from nerg_mi.interruption import Interruption
-from nerg_mi.jobs.parts import Parts
+from nerg_mi.jobs.backend import select_backend
+from nerg_mi.jobs.parts import Parts, PlannedScene
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import Sums
 from nerg_mi.surfaces.sources import Crowd, TrackedRays
-from nerg_mi.tasks.plan import Plan
-from nerg_mi.tasks.task import Task
+from nerg_mi.tasks.engines import Output
+from nerg_mi.tasks.task import RENDERS, Part, Plan
 
-from .chunks import bake_chunk, parts_of
-from .tasks import read_sums, tasks_of
+from .chunks import BakeScene, parts_of
+from .splat_chunks import SplatScene
 
 _BEGIN, _END = 0.05, 0.9  # of a bake is this
+_NUMBERS = ("elsewhere", "escaped", "total", "weight", "count")
 
 
 def sums_in_one_go(
-    scene: Any, groups: Sequence[Crowd | TrackedRays], reporter: Reporter, make: Callable[..., Sums] = bake_chunk
+    scene: BakeScene | SplatScene, groups: Sequence[Crowd | TrackedRays], reporter: Reporter
 ) -> list[Sums]:
-    """The sums of each of ``groups``, of which nothing is kept. ``make``: the sums of a ``scene`` of its kind, such as
-    a `BakeScene`, and of a part."""
+    """The sums of each of ``groups``, of which nothing is kept."""
     parts = [list(parts_of(group)) for group in groups]
     count, done, found = sum(map(len, parts)), 0, []
     with Interruption() as stop:
@@ -35,33 +39,67 @@ def sums_in_one_go(
             sums = scene.nothing
             for part in group:
                 stop.check()
-                sums = sums.plus(make(scene, part))
+                sums = sums.plus(scene.sums(part))
                 done += 1
                 reporter.progress(_BEGIN + (_END - _BEGIN) * done / count, f"part {done} of {count}")
             found.append(sums)
     return found
 
 
-def sums_in_parts(
-    scene: Any,
-    groups: Sequence[Crowd | TrackedRays],
-    parts: Parts,
-    what: str,
-    plan: Callable[..., list[Task]] = tasks_of,
-) -> list[Sums]:
-    """The sums of each of ``groups``, whose parts are kept; ``what``: the job, as its user calls it; ``plan``: the
-    tasks of a ``scene`` of its kind, of a group of them, the variant and the parts."""
-    import mitsuba as mi
+@dataclass(frozen=True)
+class PlannedBake:
+    """What all parts of a bake have in common. ``files``: those of the ``scene``'s scene file, where it has one;
+    ``mode``: the Mitsuba variant."""
 
-    tasks = [plan(scene, group, str(mi.variant()), parts) for group in groups]
-    arriving = parts.run(Plan(what, [task for group in tasks for task in group]), _BEGIN, _END)
+    scene: BakeScene | SplatScene
+    files: PlannedScene | None
+    mode: str
+
+    @staticmethod
+    def of(scene: BakeScene | SplatScene) -> PlannedBake:
+        """That of ``scene``, in the variant in use."""
+        import mitsuba as mi
+
+        file = scene.scene if isinstance(scene, BakeScene) else None
+        return PlannedBake(scene, None if file is None else PlannedScene.of(file), str(mi.variant()))
+
+
+def sums_in_parts(
+    scene: BakeScene | SplatScene, groups: Sequence[Crowd | TrackedRays], parts: Parts, what: str
+) -> list[Sums]:
+    """The sums of each of ``groups``, whose parts are kept; ``what``: the job, as its user calls it."""
+    whole: list[Part] = []
+    for group in groups:
+        kind, start = "rays" if isinstance(group, TrackedRays) else "observers", 0
+        for part in parts_of(group):
+            whole.append(Part(part, f"{kind} {start + 1} to {start + len(part.weights)}"))
+            start += len(part.weights)
+    plan = Plan(what, bake_part, PlannedBake.of(scene), whole, ".npy", (*RENDERS, "scipy"))
+    arriving = parts.run(plan, _BEGIN, _END)
     found = []
-    for group in tasks:
+    for group in groups:
         sums = scene.nothing
-        for _ in group:
+        for _ in parts_of(group):
             sums = sums.plus(read_sums(next(arriving), len(scene.nothing.face)))
         found.append(sums)
     return found
+
+
+def bake_part(common: PlannedBake, part: Crowd | TrackedRays, output: Path) -> dict[str, float]:
+    """Sums over faces and vertices (.npy) of some observers, or rays, with the others as notes."""
+    select_backend(common.mode)
+    if common.files is not None:
+        common.files.checked()
+    sums = common.scene.sums(part)
+    with replacing(output) as temporary, temporary.open("wb") as out:
+        np.save(out, np.concatenate([sums.face, sums.vertex]))
+    return {name: getattr(sums, name) for name in _NUMBERS}
+
+
+def read_sums(made: Output, faces: int) -> Sums:
+    """What `bake_part` has written, of so many ``faces``."""
+    values = read_npy(made.path, "part of a bake")
+    return Sums(values[:faces], values[faces:], **{name: made.notes[name] for name in _NUMBERS})
 
 
 def halves_of(who: TrackedRays, rays: Rays, seed: int) -> list[Crowd | TrackedRays]:

@@ -11,7 +11,10 @@ from dataclasses import field, fields
 from typing import Any, TypeVar
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.ranges import COORDINATES, FLAG, RANGE, Range, check_number
+from nerg_mi.ranges import CHANGES_RESULT, COORDINATES, FLAG, RANGE, Range, check_number
+
+Base = TypeVar("Base")
+Class = TypeVar("Class", bound=type)
 
 
 def option(
@@ -20,6 +23,7 @@ def option(
     *names: str,
     within: Range | None = None,
     parse: Callable[[str, str], Any] | None = None,
+    changes_result: bool = True,
     **more: Any,
 ) -> Any:
     """A field of a dataclass of options, which derives from `nerg_mi.ranges.Checked`.
@@ -27,13 +31,12 @@ def option(
     ``default``: its value where none is given; ``help``: what it means, in one line. ``names``: how the command spells
     it ("-s", "--seed"), where that is not ``--`` and the field's name; ``within``: the range of its numbers, which each
     option that has any needs; ``parse(text, flag)``: its value from a word of the command line, where the type alone
-    does not tell; ``more``: what else ``typer.Option`` takes, such as ``metavar``.
+    does not tell; ``changes_result``: False for where, by whom or with how many threads something is computed, which
+    must not change what comes of it: parts of a job are kept without it, and run with the default; ``more``:
+    what else ``typer.Option`` takes, such as ``metavar``.
     """
-    about = {"help": help, "names": names, "parse": parse, "more": more}
+    about = {"help": help, "names": names, "parse": parse, "more": more, CHANGES_RESULT: changes_result}
     return field(default=default, metadata={**about, RANGE: within, FLAG: names[-1] if names else ""})
-
-
-Class = TypeVar("Class", bound=type)
 
 
 def exposes(*kinds: type, default: str = "") -> Callable[[Class], Class]:
@@ -74,12 +77,10 @@ def chosen_settings(options: Any, kind: type) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def other_fields(kind: type, *names: str) -> tuple[str, ...]:
-    """The fields of the dataclass ``kind`` but for ``names``, which it must have: a new one is among them."""
-    every = tuple(f.name for f in fields(kind))
-    if not set(names) <= set(every):
-        raise ValueError(f"{kind.__name__} has no {', '.join(sorted(set(names) - set(every)))}")
-    return tuple(name for name in every if name not in names)
+def as_base(options: Any, kind: type[Base]) -> Base:
+    """The fields of ``options`` that the dataclass ``kind`` has, of which theirs is derived: who is given it cannot
+    depend on the others."""
+    return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})  # pyright: ignore[reportArgumentType]
 
 
 def parse_point(text: str, flag: str) -> tuple[float, ...]:

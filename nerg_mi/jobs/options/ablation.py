@@ -42,5 +42,5 @@ class AblationOptions(PlaceOptions, PartOptions):
     )
     cameras: int = option(4, "Cameras that a frame is timed over (the paper: 32); 0: none.", within=Range(0, 10000))
     size: str = option("320x180", "Of a frame (the paper: 1280x720).")
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS, changes_result=False)
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")

@@ -74,7 +74,7 @@ class BakeOptions(PartOptions):
     )
     most: int | None = option(None, "Rays of a dataset at most; of more, a sample by --seed.", within=RAYS)
     seed: int = option(0, "Seed of what is drawn at random.", within=SEEDS)
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS, changes_result=False)
     mode: str | None = option(
         None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
     )

@@ -27,5 +27,5 @@ class GazeEvaluationOptions(Checked):
     resamples: int = option(200, "Of the people, for the intervals.", within=Range(0, 10**5))
     pictures: int = option(4, "Test positions to draw.", within=Range(0, 10000))
     seed: int = option(0, "Seed of rays, resamples and halves.", within=SEEDS)
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS, changes_result=False)
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")

@@ -48,6 +48,9 @@ class FoldOptions(PlaceOptions, PartOptions):
     directions: int = option(2048, "Directions that maps are compared in.", within=DIRECTIONS)
     min_rays: int = option(64, "Rays at a test position at least.", within=Range(1, 10**6))
     threads: int | None = option(
-        None, "CPU threads. Default: all; 1 makes a training repeat itself to the bit.", within=THREADS
+        None,
+        "CPU threads. Default: all; 1 makes a training repeat itself to the bit.",
+        within=THREADS,
+        changes_result=False,
     )
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")

@@ -75,5 +75,5 @@ class GazeOptions(PlaceOptions):
     )
     seed: int = option(0, "Seed of probes, directions, weights, batches and splits.", within=SEEDS)
     half: bool = option(False, "Store the weights in fp16.")
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS, changes_result=False)
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")

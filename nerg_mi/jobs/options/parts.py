@@ -16,12 +16,15 @@ class PartOptions(Checked):
     """Where finished parts of a job are kept, and who makes them."""
 
     store: Path | None = option(
-        None, "Keep finished parts in this folder, and go on from them.  [default: OUTPUT.tasks, with --scheduler]"
+        None,
+        "Keep finished parts in this folder, and go on from them.  [default: OUTPUT.tasks, with --scheduler]",
+        changes_result=False,
     )
     scheduler: str | None = option(
         None,
         "Who makes the parts: local, local:N for N processes, or a cluster at tcp://HOST:PORT or tls://HOST:PORT.  "
         "[default: local, with --store]",
+        changes_result=False,
     )
 
     @property

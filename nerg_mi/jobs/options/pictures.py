@@ -22,7 +22,9 @@ class PictureOptions(Checked):
     )
     spp: int = option(0, "Samples a pixel; 0: as the scene says.", within=Range(0, SPP.high))
     seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
-    threads: int = option(0, "Worker threads; 0: one a core.", "-t", "--threads", within=Range(0, 1024))
+    threads: int = option(
+        0, "Worker threads; 0: one a core.", "-t", "--threads", within=Range(0, 1024), changes_result=False
+    )
     memory: float = option(
         1.0, "GB that rendering may take; larger pictures are made in bands.", within=Range(1e-6, 10**6)
     )

@@ -9,19 +9,25 @@ from nerg_mi.scenes import store as ready
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
+from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.jobs.bake import bake
-from nerg_mi.jobs.baking import chunks, tasks
+from nerg_mi.jobs.baking import chunks
 from nerg_mi.jobs.baking.chunks import BakeScene
-from nerg_mi.jobs.baking.summing import halves_of, sums_in_one_go, sums_in_parts
+from nerg_mi.jobs.baking.splat_chunks import SplatScene
+from nerg_mi.jobs.baking.summing import PlannedBake, bake_part, halves_of, read_sums, sums_in_one_go, sums_in_parts
 from nerg_mi.jobs.options.bake import BakeOptions
 from nerg_mi.jobs.options.parts import PartOptions
 from nerg_mi.jobs.parts import Parts
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays
-from nerg_mi.tasks.store import Store
+from nerg_mi.tasks.engines import Output
 from tests.conftest import ROOT
 from tests.jobs.recorder import Recorder
+from tests.plugins import fields
 from tests.surfaces.meshes import box, joined
+from tests.surfaces.test_splat_rays import falling
+from tests.surfaces.walls import wall
+from tests.tasks.works import laid_out
 
 ROOM = joined(box((0, 0, 0), (8, 6, 3)))
 GAZE = files(ready) / "shoppers.safetensors"
@@ -33,7 +39,6 @@ def engine(rgb, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setattr(chunks, "RAYS", 300)
     monkeypatch.setattr(chunks, "OBSERVERS", 2)
-    tasks._last.clear()
 
 
 def crowd(n):
@@ -93,8 +98,34 @@ def test_a_part_depends_on_what_it_reads_and_on_nothing_else(tmp_path):
     higher = replace(ROOM, vertices=ROOM.vertices * (1, 1, 1.5))
     assert bake_rays(replace(scene, mesh=higher), who) == 3
     assert bake_rays(replace(scene, of_rays=RaySettings(cone=0.02, bundle=4)), who) == 3
-    # What is held for parts that nobody asks for any more is left over.
-    assert len(Store(tmp_path).held(-1.0)) == 2 + 1 + 4
+
+
+def test_files_that_were_sent_serve_as_those_that_lie_there(tmp_path):
+    """A worker of another machine has what it was sent in a folder of its own."""
+    plain = wall(0.0, 0.4, 0.05)
+    write_ply_splats(tmp_path / "wall.ply", plain)
+    for scene, who in (
+        (
+            BakeScene(ROOM, (box((1, 1, 0), (2, 2, 1)),), GAZE, of_gaze=GazeSettings(angle=0.5, directions=1024)),
+            crowd(1),
+        ),
+        (SplatScene(tmp_path / "wall.ply", len(plain), of_rays=RAYS), falling(100)),
+    ):
+        there = laid_out(PlannedBake.of(scene), tmp_path / "there")
+        notes = bake_part(there, who, tmp_path / "a.npy")
+        found = read_sums(Output(tmp_path / "a.npy", notes), len(scene.nothing.face))
+        assert there != PlannedBake.of(scene) and equal([found], sums_in_one_go(scene, [who], Recorder()))
+
+
+@pytest.mark.nightly
+def test_two_processes_give_the_sums_of_splats(tmp_path):
+    plain = wall(0.0, 0.4, 0.05)
+    write_ply_splats(tmp_path / "wall.ply", plain)
+    fields.gaze(tmp_path / "gaze.safetensors")
+    scene = SplatScene(tmp_path / "wall.ply", len(plain), tmp_path / "gaze.safetensors", of_rays=RAYS)
+    groups = [falling(500, 0.5), crowd(2)]
+    there = sums_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake")
+    assert equal(there, sums_in_one_go(scene, groups, Recorder()))
 
 
 def test_halves_are_of_people():

@@ -4,14 +4,13 @@ import json
 
 import pytest
 
-from nerg_mi.evaluation import study
 from nerg_mi.evaluation.study import settings
 from nerg_mi.evaluation.study_subject import open_subject
-from nerg_mi.jobs import study_tasks
-from nerg_mi.jobs.study import StudyOptions, run_study
-from nerg_mi.jobs.study_tasks import measure_part, twin_beside
+from nerg_mi.jobs import study
+from nerg_mi.jobs.study import StudyOptions, measure_part, planned_study, run_study, twin_beside
 from tests.evaluation.study.test_subject import SCENE, TWIN
 from tests.tasks.clusters import ClusterOfProcesses, wait_until
+from tests.tasks.works import laid_out
 
 SMALL = {"width": 12, "height": 8, "quick": True, "mode": "llvm_ad_rgb"}
 SMALL |= {"only": "jitter|spp 2|no colour|visibility transmittance|paper, 64 steps$"}
@@ -26,7 +25,7 @@ def errors(report):
 
 def test_two_workers_find_the_errors_of_this_process(tmp_path, rgb, monkeypatch):
     pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
-    monkeypatch.setattr(study_tasks, "ROWS", 2)
+    monkeypatch.setattr(study, "ROWS", 2)
     here = run_study("sphere", tmp_path / "here", StudyOptions(**SMALL)).report
     with ClusterOfProcesses(tmp_path) as cluster:
         cluster.start_worker(), cluster.start_worker()
@@ -50,13 +49,12 @@ def test_two_workers_find_the_errors_of_this_process(tmp_path, rgb, monkeypatch)
 def test_a_scene_file_is_measured_with_its_twin_where_a_worker_has_laid_them(rgb, tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE.format(eye="-2, -1, $height"))
     (tmp_path / "twin.xml").write_text(TWIN)
-    given = {"kind": "file", "scene": "at/scene.xml", "twin": "at/twin.xml", "size": [12, 8], "quick": True}
-    given |= {"defaults": {"height": "3"}, "repeats": 1, "samples": 16, "mode": "llvm_ad_rgb"}
     subject = open_subject(str(tmp_path / "scene.xml"), "auto", 12, 8, {"height": "3"}, twin_beside)
     every = settings(subject, True)
     (number,) = (k for k, row in enumerate(every) if row.name == "jitter")
-    inputs = {f"at/{name}.xml": tmp_path / f"{name}.xml" for name in ("scene", "twin")}
-    measure_part(given | {"settings": [number]}, inputs, tmp_path / "rows.json")
+    options = StudyOptions(**SMALL, defaults={"height": "3"})
+    common = planned_study(subject, tmp_path / "scene.xml", options)
+    measure_part(laid_out(common, tmp_path / "elsewhere"), (number,), tmp_path / "rows.json")
     found = json.loads((tmp_path / "rows.json").read_text())
     here = {"rows": study.measure(subject, [every[0], every[number]], 1, 16), "scaling": []}
     assert errors(found | {"scaling": []}) == errors(here) and found["rows"][1]["surface_mae"] > 0

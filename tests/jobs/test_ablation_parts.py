@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from nerg_mi.jobs import ablation_tasks
+from nerg_mi.jobs import ablation
 from nerg_mi.jobs.ablation import ablate
-from nerg_mi.jobs.store_account import account_for_store
+from nerg_mi.jobs.parts import account_for_store
 from tests.conftest import ROOT
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.jobs.recorder import Recorder
@@ -24,9 +24,8 @@ def scores(found):
 def trained(monkeypatch):
     """What was trained in this process."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    found, original = [], ablation_tasks.train_variant
-    monkeypatch.setattr(ablation_tasks, "train_variant", lambda *given: found.append(given[:2]) or original(*given))
-    ablation_tasks._last.clear()
+    found, original = [], ablation.train_variant
+    monkeypatch.setattr(ablation, "train_variant", lambda *given: found.append(given[:2]) or original(*given))
     return found
 
 
@@ -34,8 +33,10 @@ def trained(monkeypatch):
 def test_a_training_elsewhere_scores_as_one_here_and_is_kept(tmp_path, rgb, trained):
     rays = crowd(3000)
     elsewhere = ablate(rays, tmp_path / "a", replace(ONE, scheduler="local:1"))
+    assert trained == []
     here = ablate(rays, tmp_path / "b", ONE)
-    assert scores(elsewhere) == scores(here) and trained == []
+    assert scores(elsewhere) == scores(here)
+    trained.clear()
     assert (tmp_path / "a" / "default_emit_capture_0.safetensors").is_file()
     # One seed more: that one is trained, whoever does it.
     ablate(rays, tmp_path / "a", replace(ONE, seeds=2, store=tmp_path / "a.tasks"))

@@ -1,0 +1,259 @@
+"""Plans carried out here and by processes of this machine: in their order, each part once, whatever ends on the way."""
+
+import os
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+
+import drjit as dr
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.tasks import engines
+from nerg_mi.tasks.engines import Cluster, Done, Local, Processes, Progress, open_engine, prepare_once, run_plan
+from nerg_mi.tasks.store import Store
+from tests.conftest import ROOT
+from tests.tasks import works
+
+
+@pytest.fixture
+def store(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    return Store(tmp_path / "store")
+
+
+@pytest.fixture
+def runs(tmp_path):
+    (tmp_path / "runs").mkdir()
+    return tmp_path / "runs"
+
+
+class Backwards:
+    """Runs everything at once, the last first."""
+
+    def run(self, shared, tasks, store, warn):
+        yield from reversed(list(Local().run(shared, tasks, store, warn)))
+
+
+def contents(plan, store, engine=None, **more):
+    return [output.path.read_bytes() for output in run_plan(plan, store, engine or Local(), **more)]
+
+
+# ---- Plans carried out ----
+
+
+@pytest.mark.parametrize("engine", [Local(), Backwards()])
+def test_outputs_come_in_the_order_of_the_plan(store, engine):
+    assert contents(works.plan(5), store, engine) == [works.expected(k) for k in range(5)]
+
+
+def test_sums_in_the_order_of_the_plan_are_equal_to_the_bit(tmp_path):
+    """Of terms whose sum depends on the order in which they are added."""
+    plan = works.some(*(f"term {k}" for k in range(40)))
+
+    def total(engine, name):
+        out = 0.0
+        for made in run_plan(plan, Store(tmp_path / name), engine):
+            out += made.notes["term"]
+        return struct.pack("<d", out)
+
+    terms = [works.mixed(None, f"term {k}", tmp_path / "t")["term"] for k in range(40)]
+    assert total(Local(), "a") == total(Backwards(), "b") == struct.pack("<d", in_order(terms))
+    assert in_order(terms) != in_order(terms[::-1])
+
+
+def in_order(terms):
+    out = 0.0
+    for term in terms:
+        out += term
+    return out
+
+
+def test_what_is_done_is_kept_and_a_damaged_output_is_made_again(store, runs):
+    plan = works.plan(4, runs=runs)
+    first = contents(plan, store)
+    assert contents(plan, store) == first and works.runs_of(runs) == dict.fromkeys(range(4), 1)
+    store.output(plan.tasks[2].key, ".txt").write_text("damaged")
+    assert contents(plan, store) == first and works.runs_of(runs) == {0: 1, 1: 1, 2: 2, 3: 1}
+
+
+def test_a_changed_input_invalidates_what_depends_on_it_and_nothing_more(store, tmp_path):
+    for name in "ab":
+        (tmp_path / name).write_text("before")
+    plan = lambda: works.read_one(tmp_path / "a", tmp_path / "b")
+    steps = []
+    counts = lambda progress: steps.append((progress.kept, progress.done))
+    contents(plan(), store)
+    (tmp_path / "a").write_text("after")
+    assert contents(plan(), store, on_progress=counts) == [b"after", b"before"] and steps == [(1, 1), (1, 2)]
+    # And back again: what was made of the former bytes is still there.
+    (tmp_path / "a").write_text("before")
+    steps.clear()
+    contents(plan(), store, on_progress=counts)
+    assert steps == [(2, 2)]
+
+
+def test_an_input_that_changes_in_the_middle_ends_the_job_and_leaves_nothing_mixed(store, runs, tmp_path):
+    file = tmp_path / "a"
+    file.write_text("before")
+    with pytest.raises(NergError, match="was changed while the job was running"):
+        for k, _ in enumerate(run_plan(works.plan(4, (file,), runs=runs), store, Local())):
+            if k == 1:
+                file.write_text("after it")
+    assert works.runs_of(runs) == {0: 1, 1: 1} and len(list(store.receipts())) == 2
+
+
+def test_an_input_that_changes_while_it_is_read_is_noticed(store, tmp_path):
+    (tmp_path / "a").write_text("before")
+    with pytest.raises(NergError, match="was changed while the job was running"):
+        contents(works.change_one(tmp_path / "a"), store)
+    assert not list(store.receipts())
+
+
+def test_equal_parts_are_run_once_and_given_as_often_as_they_are_planned(store):
+    shares, counts = [], []
+    plan = works.some("a", "a", "a")
+    assert contents(plan, store, on_progress=lambda p: shares.append(p.share)) == [b"a\n"] * 3
+    contents(plan, store, on_progress=lambda p: counts.append((p.kept, p.done, p.total)))
+    assert shares == [0.0, 1.0] and counts == [(3, 3, 3)]
+
+
+def test_errors_name_the_part(store):
+    with pytest.raises(NergError, match=r"^the part refused: the scene has no light; give it one$"):
+        contents(works.some("a", "refused"), store)
+    assert [receipt.label for receipt in store.receipts()] == ["the part a"]
+    with pytest.raises(RuntimeError, match="the part fault: TypeError: a mistake"):
+        contents(works.some("fault"), store)
+
+
+def test_parts_that_another_version_planned_are_refused(store, monkeypatch):
+    plan = works.some("a")
+    assert plan.shared.code
+    monkeypatch.setattr(engines, "code_digest", lambda: "0" * 16)
+    with pytest.raises(NergError, match="the part a was planned by another version"):
+        contents(plan, store)
+
+
+def test_progress_has_rate_and_time_left():
+    progress = Progress(10, kept=2, done=2)
+    assert progress.line() == "2 of 10 parts" and progress.left is None and progress.share == 0.2
+    progress.done, progress.seconds = 6, 8.0
+    assert progress.left == pytest.approx(8.0) and progress.line() == "6 of 10 parts, 30 a minute, 8 s left"
+    progress.seconds = 2.0
+    assert progress.line(False) == "6 of 10 parts, 2 a second" and Progress(0).share == 1.0
+
+
+def test_other_processors_are_told_of_once(store):
+    class Elsewhere:
+        def run(self, shared, tasks, store, warn):
+            for k, done in enumerate(Local().run(shared, tasks, store, warn)):
+                receipt = type(done.receipt)(**{**vars(done.receipt), "processor": "another" if k else "one"})
+                yield Done(done.task, receipt)
+
+    told = []
+    contents(works.plan(4), store, Elsewhere(), warn=told.append)
+    (line,) = told
+    assert '"another" and "one"' in line
+
+
+def test_closing_stops_the_work(store, runs):
+    taken = run_plan(works.plan(9, runs=runs), store, Local())
+    next(taken), next(taken)
+    taken.close()
+    assert works.runs_of(runs) == {0: 1, 1: 1}
+
+
+def test_what_parts_have_in_common_is_prepared_once():
+    made, one, other = [], object(), object()
+    make = lambda: made.append(1) or len(made)
+    assert [prepare_once(common, make) for common in (one, one, other, other, one)] == [1, 1, 2, 2, 3]
+
+
+def test_engines_by_their_names():
+    assert isinstance(open_engine(None), Local) and isinstance(open_engine("local"), Local)
+    two = open_engine("local:2", 3)
+    assert isinstance(two, Processes) and (two.count, two.threads) == (2, 3)
+    with pytest.raises(NergError, match="there is no scheduler"):
+        open_engine("nowhere")
+    for name in ("local:0", "local:100000"):
+        with pytest.raises(NergError, match="1 to 1024"):
+            open_engine(name)
+    for name in ("tcp://a", "tcp://a:0", "http://a:1", "tcp://a:b"):
+        with pytest.raises(NergError, match="is no address of a scheduler"):
+            Cluster(name)
+
+
+# ---- Processes ----
+
+
+def test_two_processes_work_at_once_with_their_threads(store, tmp_path, runs):
+    (tmp_path / "a").write_text("light")
+    plan = works.plan(4, (tmp_path / "a",), seconds=0.5, runs=runs)
+    assert contents(plan, store, Processes(2)) == [works.expected(k, (tmp_path / "a",)) for k in range(4)]
+    assert len({path.name.split("-")[1] for path in runs.iterdir()}) == 2
+    (made,) = run_plan(works.some("threads"), store, Processes(1, threads=1))
+    assert made.notes == {"threads": 1} and dr.thread_count() >= 1
+
+
+def test_a_process_that_dies_costs_time_and_nothing_else(store, tmp_path, runs):
+    (tmp_path / "die").touch()
+    told = []
+    plan = works.plan(5, die=tmp_path / "die", runs=runs)
+    assert contents(plan, store, Processes(2), warn=told.append) == [works.expected(k) for k in range(5)]
+    (line,) = told
+    assert "a process was ended at part 0" in line and works.runs_of(runs)[0] <= 2
+    assert not [path for path in store.folder.rglob("*.part*") if path.stat().st_size > 0]
+
+
+def test_a_part_that_always_kills_its_process_is_named(store):
+    told = []
+    with pytest.raises(NergError, match="a process was ended at the part deadly, 3 times"):
+        contents(works.some("a", "deadly"), store, Processes(1), warn=told.append)
+    assert len(told) == 2 and [receipt.label for receipt in store.receipts()] == ["the part a"]
+
+
+def test_errors_of_processes_are_those_of_this_one(store):
+    with pytest.raises(NergError, match=r"^the part refused: the scene has no light; give it one$"):
+        contents(works.some("refused"), store, Processes(1))
+    with pytest.raises(RuntimeError, match="the part fault: TypeError: a mistake") as fault:
+        contents(works.some("fault"), store, Processes(1))
+    assert "works.py" in str(fault.value.__cause__)
+
+
+def test_ctrl_c_ends_the_processes_at_once(store):
+    timer = threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGINT))
+    start = time.monotonic()
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        contents(works.plan(4, seconds=600), store, Processes(2))
+    assert time.monotonic() - start < 60
+
+
+def test_a_job_that_is_killed_leaves_no_process_and_goes_on_where_it_ended(store, runs, tmp_path):
+    code = (
+        "from tests.tasks import works\nfrom nerg_mi.tasks.engines import *\nfrom nerg_mi.tasks.store import Store\n"
+        "from pathlib import Path\nif __name__ == '__main__':\n"
+        f" plan = works.plan(6, seconds=0.5, runs=Path({str(runs)!r}))\n"
+        f" list(run_plan(plan, Store({str(store.folder)!r}), Processes(2)))\n"
+    )
+    (tmp_path / "job.py").write_text(code)
+    job = subprocess.Popen([sys.executable, tmp_path / "job.py"], cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    until = time.monotonic() + 90
+    while len(list(store.receipts())) < 2 and time.monotonic() < until:
+        time.sleep(0.05)
+    job.kill()
+    job.wait()
+    pids = {int(path.name.split("-")[1]) for path in runs.iterdir()}
+    while any(os.path.exists(f"/proc/{pid}") for pid in pids) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not any(os.path.exists(f"/proc/{pid}") for pid in pids)
+    done = {receipt.label for receipt in store.receipts()}
+    assert 2 <= len(done) < 6
+    before = works.runs_of(runs)
+    plan = works.plan(6, seconds=0.5, runs=runs)
+    assert contents(plan, store) == [works.expected(k) for k in range(6)]
+    after = works.runs_of(runs)
+    assert all(after[k] == before[k] for k in range(6) if f"part {k}" in done)
