@@ -185,9 +185,8 @@ class Setting:
     @property
     def rules(self) -> LookRules:
         """What a look is."""
-        o = self.options
-        assert isinstance(o, CountOptions)
-        return LookRules(o.gap, o.pause, o.merge, o.least)
+        assert isinstance(self.options, CountOptions)
+        return rules_of(self.options)
 
     def counting(self, hits: bool, cohorts: tuple[str, ...]) -> Counting:
         """How rays are counted which end at their ``hits``, or not, and have these ``cohorts`` where no table does."""
@@ -245,10 +244,18 @@ class Setting:
         return reach
 
 
+def rules_of(options: CountOptions) -> LookRules:
+    """What a look is. Raises `NergError` for options that contradict each other."""
+    return LookRules(options.gap, options.pause, options.merge, options.least)
+
+
 def setting_of(
     scene: Path | None, field: Path | None, gaze: Path | None, areas: Areas, options: SettingOptions, ns: ModuleType
 ) -> Setting:
     """The setting of these files. Raises `NergError`; what is plainly wrong is told before anything is loaded."""
+    if isinstance(options, CountOptions):
+        # Before anything is read.
+        rules_of(options)
     align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
     around = surroundings_of_files(scene, field, gaze, align, ns)
     return Setting(around, areas, things_of(areas.things, shapes_of(around.scene)), options)
