@@ -5,14 +5,11 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
-import multiprocessing
 import os
-import signal
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, fields, replace
@@ -24,6 +21,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder, file_sha256, locked, removing_empty_parents, replacing, writing
 from nerg_mi.files.safe_read import reading
+from nerg_mi.tasks.engines import process_pool
 
 from .dataset import (
     BUCKETS,
@@ -444,39 +442,23 @@ def run_tasks(tasks: Sequence[Task], workers: int) -> Iterator[Outcome]:
     if workers <= 1:
         yield from map(import_source, tasks)
         return
-    # Not forked: threads of libraries would be lost, and with them their locks.
-    context = multiprocessing.get_context("spawn")
-    threads = max(1, (os.cpu_count() or 1) // workers)
-    with ProcessPoolExecutor(workers, context, initializer=_begin_pool, initargs=(threads,)) as pool:
-        waiting = [pool.submit(import_source, task) for task in tasks]
+    with process_pool(workers, _set_threads, max(1, (os.cpu_count() or 1) // workers)) as pool:
         try:
-            for done in as_completed(waiting):
+            for done in as_completed([pool.submit(import_source, task) for task in tasks]):
                 yield done.result()
         except BrokenProcessPool as error:
             raise NergError(
                 "a process that imported was ended, or could not start: give fewer --workers if memory was short; in a "
                 'script, call it below if __name__ == "__main__"; what is finished is kept'
             ) from error
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _begin_pool(threads: int) -> None:
-    """Prepare a process: it ends at once by Ctrl-C, and when its parent is gone, however that ended."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+def _set_threads(count: int) -> None:
     try:
         import pyarrow
     except ImportError:
         return  # said where it is used
-    pyarrow.set_cpu_count(threads)
+    pyarrow.set_cpu_count(count)
 
 
 # ---- Updating ----

@@ -477,6 +477,8 @@ class _Sent:
         self._held: dict[str, Any] = {}
         self._shared = shared
         self._job = self._hold("job", shared)
+        # Tasks go where what they need is: to all workers, and not to the one that has it first.
+        client.replicate([self._job])
 
     def submit(self, task: Task, threads: int) -> Any:
         """The future of `_perform` for ``task``."""

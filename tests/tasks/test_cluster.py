@@ -75,21 +75,23 @@ def test_errors_of_parts_are_the_jobs_and_threads_those_it_asks_for(cluster, tmp
         contents(plan, store, engine)
 
 
-def test_workers_that_have_no_files_are_sent_them(cluster, tmp_path, monkeypatch):
+def test_workers_that_have_no_files_are_sent_them(cluster, tmp_path, runs, monkeypatch):
     """As if on another machine: the files are not where they were planned."""
     for folder in ("here", "away"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "light.txt").write_text("light")
         (tmp_path / folder / "large.txt").write_text("x" * 20_000_000)
     files = (tmp_path / "here" / "light.txt", tmp_path / "here" / "large.txt")
-    plan = works.plan(3, files)
-    expected = [works.expected(k, files) for k in range(3)]
-    assert len(plan.tasks) == 3 and plan.shared.files
+    plan = works.plan(4, files, runs=runs, seconds=1.0)
+    expected = [works.expected(k, files) for k in range(4)]
+    assert len(plan.tasks) == 4 and plan.shared.files
     for file in files:
         file.unlink()
     original = engines.read_bytes
     monkeypatch.setattr(engines, "read_bytes", lambda path, what: original(str(path).replace("here", "away"), what))
     assert contents(plan, Store(tmp_path / "store"), Cluster(cluster.address)) == expected
+    # Few parts go to all workers too, and not to the one that has what they need first.
+    assert len({path.name.split("-")[1] for path in runs.iterdir()}) == 2
 
 
 def test_a_scheduler_that_ends_ends_the_job_which_goes_on_with_another(cluster, tmp_path, runs):
