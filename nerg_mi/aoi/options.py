@@ -62,14 +62,14 @@ class CountOptions(SettingOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ForetellOptions(SettingOptions):
+class PredictionOptions(SettingOptions):
     """On what depends besides how a field answers."""
 
     directions: int = option(8192, "Directions around each.", within=Range(64, 1 << 20))
 
 
 @dataclass(frozen=True, kw_only=True)
-class StatisticsOptions(CountOptions, ForetellOptions, PartOptions):
+class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
     """What is counted, and how."""
 
     eyes: int = option(256, "Places from which the field is asked, about.", within=Range(1, 100_000))

@@ -28,7 +28,7 @@ from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.tasks.task import RENDERS, Files, Part, Plan
 
 from .measured import Counting, Eyes, blocks_of, count_block
-from .options import CountOptions, ForetellOptions, SettingOptions, StatisticsOptions
+from .options import CountOptions, PredictionOptions, SettingOptions, StatisticsOptions
 from .predicted import Foretold, Setting, setting_of
 from .scene import files_of_changes, read_changes
 
@@ -93,13 +93,13 @@ def count_part(common: PlannedCount, rays: Path | DatasetPart, output: Path) -> 
     cut already; with the number of blocks as a note."""
     counting = prepare_once(common, common.opened)
     blocks = [Rays.load(rays)] if isinstance(rays, Path) else blocks_of(rays.opened(), counting.rules)
-    found = [count_block(block, counting) for block in blocks]
-    write_sums(output, found)
-    return {"blocks": len(found)}
+    sums = [count_block(block, counting) for block in blocks]
+    write_sums(output, sums)
+    return {"blocks": len(sums)}
 
 
 @dataclass(frozen=True)
-class PlannedForetelling:
+class PlannedPrediction:
     """What all parts of asking a field have in common: people see ``view`` degrees."""
 
     setting: PlannedSetting
@@ -118,14 +118,14 @@ OF_EYES = ("share", "distance", "visible", "support")
 """What is foretold of each eye, a row each; by the members of an ensemble apart it has an axis before that."""
 
 
-def foretell_part(common: PlannedForetelling, places: Places, output: Path) -> None:
+def foretell_part(common: PlannedPrediction, places: Places, output: Path) -> None:
     """What a field foretells (.npz) of people at some places."""
     setting: Setting = prepare_once(common, common.setting.opened)
     count = len(places.positions)
     eyes = Eyes(places.positions, places.ahead, ("",) * count, (frozenset(),) * count)
-    found = setting.foretold(eyes, common.view)
+    seen = setting.foretold(eyes, common.view)
     with replacing(output) as temporary, temporary.open("wb") as out:
-        np.savez(out, **{name: getattr(found, name) for name in (*OF_EYES, "members")})
+        np.savez(out, **{name: getattr(seen, name) for name in (*OF_EYES, "members")})
 
 
 def write_sums(path: Path, found: list[Sums]) -> None:
@@ -219,7 +219,7 @@ class CountingParts:
     def foretell(self, eyes: Eyes, view: float, changes: Path | None = None) -> Foretold:
         """What the field says of ``eyes`` that see ``view`` degrees, after the ``changes`` of a file, if there are
         any."""
-        setting, what, since, until = self._setting(ForetellOptions), f"{self.what} (the field)", _COUNTED, _DONE
+        setting, what, since, until = self._setting(PredictionOptions), f"{self.what} (the field)", _COUNTED, _DONE
         if changes is not None:
             files = Files(changes, tuple(files_of_changes(changes, read_changes(changes))))
             setting, what = replace(setting, changes=files), f"{self.what} (after the changes)"
@@ -228,7 +228,7 @@ class CountingParts:
         for a in range(0, len(eyes.positions), EYES):
             some = Places(eyes.positions[a : a + EYES], eyes.ahead[a : a + EYES])
             places.append(Part(some, f"places {a + 1} to {a + len(some.positions)}"))
-        plan = self._plan(what, foretell_part, PlannedForetelling(setting, view), places)
+        plan = self._plan(what, foretell_part, PlannedPrediction(setting, view), places)
         found = [read_foretold(made.path) for made in self.parts.run(plan, since, until)]
         each = {name: np.concatenate([getattr(f, name) for f in found]) for name in OF_EYES}
         return Foretold(**each, members=np.concatenate([f.members for f in found], axis=1))
@@ -236,7 +236,7 @@ class CountingParts:
     def _plan(self, what: str, work: Callable, common: Any, parts: list[Part]) -> Plan:
         return Plan(what, work, common, parts, ".npz", (*RENDERS, "scipy"))
 
-    def _setting(self, kind: type[CountOptions] | type[ForetellOptions]) -> PlannedSetting:
+    def _setting(self, kind: type[CountOptions] | type[PredictionOptions]) -> PlannedSetting:
         """The setting, with those options of ``kind``."""
         o, gaze = self.options, None
         assert o.areas is not None

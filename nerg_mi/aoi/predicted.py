@@ -24,7 +24,7 @@ from nerg_mi.statistics.visibility import CellsInView, Isovists, Targets, in_vie
 from nerg_mi.statistics.visits import ALL, Cell, LookRules, Thing
 
 from .measured import Counting, Eyes, Window
-from .options import CountOptions, ForetellOptions, SettingOptions, parse_window
+from .options import CountOptions, PredictionOptions, SettingOptions, parse_window
 from .scene import (
     Changes,
     Surroundings,
@@ -165,7 +165,7 @@ def isovist_rows(found: Isovists, names: Sequence[str], members: Sequence[tuple[
 @dataclass(frozen=True, eq=False)
 class Setting:
     """``areas`` in what is ``around`` people, and the ``things`` that they consist of; ``options`` of how it is
-    counted (`CountOptions`), asked of a field (`ForetellOptions`), or both."""
+    counted (`CountOptions`), asked of a field (`PredictionOptions`), or both."""
 
     around: Surroundings
     areas: Areas
@@ -227,7 +227,7 @@ class Setting:
     def foretold(self, eyes: Eyes, view: float, reporter: Reporter = SILENT) -> Foretold:
         """What the field says of the gaze of ``eyes`` that see so many degrees (``view``)."""
         o = self.options
-        assert isinstance(o, ForetellOptions)
+        assert isinstance(o, PredictionOptions)
         return foretell(
             self.around, eyes, self.things, self.members, self.margin, view, o.samples, o.directions, reporter
         )

@@ -110,11 +110,11 @@ def _rendered(
     check_scale(overlay, ends)
     drawings = []
     for k, (frame, made) in enumerate(zip(asked.frames, layers)):
-        about = {}
+        header = {}
         if not asked.video:
-            about = next(provenances(scene, [frame], options, str(options.mode), False)).text()
-        kept = {name: made.notes[name] for name in ("marker", "supported", "basis")}
-        drawings.append(Part(Drawing(made.path, ends, **kept, about=about), f"drawing {k + 1}"))
+            header = next(provenances(scene, [frame], options, str(options.mode), False)).text()
+        notes = {name: made.notes[name] for name in ("marker", "supported", "basis")}
+        drawings.append(Part(Drawing(made.path, ends, **notes, header=header), f"drawing {k + 1}"))
     _write(scene, asked, options, parts, Plan(what, draw_layers, of_each, drawings, suffix), _LAYERS_SHARE)
     return layers[-1].notes, None if ends is None else ends[1]
 
@@ -133,8 +133,8 @@ def _write(
         return last
     import mitsuba as mi
 
-    about = provenances(scene, asked.frames, options, str(options.mode), True)
-    with video_frames(asked.files[0], options.fps, next(about).text()) as add:
+    headers = provenances(scene, asked.frames, options, str(options.mode), True)
+    with video_frames(asked.files[0], options.fps, next(headers).text()) as add:
         for made in arriving:
             last = made.notes
             add(np.array(mi.Bitmap(str(made.path)))[..., :3])
@@ -180,14 +180,14 @@ def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> d
 
 @dataclass(frozen=True)
 class Drawing:
-    """``layers`` (.npy) that `make_layers` made, with its notes; ``ends`` of the scale; ``about``: for the header."""
+    """``layers`` (.npy) that `make_layers` made, with its notes; ``ends`` of the scale; ``header`` of the file."""
 
     layers: Path
     ends: Limits
     marker: Sequence[float] | None
     supported: bool
     basis: str
-    about: Mapping[str, str]
+    header: Mapping[str, str]
 
 
 def draw_layers(options: PictureOptions, drawing: Drawing, output: Path) -> None:
@@ -195,4 +195,4 @@ def draw_layers(options: PictureOptions, drawing: Drawing, output: Path) -> None
     marker = None if drawing.marker is None else (drawing.marker[0], drawing.marker[1])
     layers = unstacked(read_npy(drawing.layers, "layers"), marker, drawing.supported, drawing.basis)
     figure = find_overlay(options.overlay or "").draw(layers, drawing.ends, style_of(options))
-    save(figure, output, drawing.about)
+    save(figure, output, drawing.header)

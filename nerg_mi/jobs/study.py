@@ -64,7 +64,7 @@ def run_study(
     """Study ``scene``, a scene file or the name of an analytic scene, and write tables and plots into the folder
     ``out``: study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. With
     ``options.store`` or ``options.scheduler`` a few settings are a part, which is kept and may be measured by others:
-    errors are the same, and times those of whoever took them, with that one's time of the default beside them.
+    errors are the same, and times those of the process that took them, with its time of the default beside them.
 
     Raises `NergError` for what the user can mend, before anything is written.
     """

@@ -156,13 +156,13 @@ class Local:
 
 
 @contextmanager
-def process_pool(count: int, prepare: Callable[..., None], *given: Any) -> Iterator[ProcessPoolExecutor]:
-    """``count`` processes that call ``prepare(*given)`` first. They end at once when the block does, and with this
+def process_pool(count: int, prepare: Callable[..., None], *arguments: Any) -> Iterator[ProcessPoolExecutor]:
+    """``count`` processes that call ``prepare(*arguments)`` first. They end at once when the block does, and with this
     process, however that ends; Ctrl-C is for this process alone."""
     # Not forked: threads of libraries would be lost, and with them their locks.
     context = multiprocessing.get_context("spawn")
     listening, held = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(count, context, initializer=_begin, initargs=(listening, prepare, given))
+    pool = ProcessPoolExecutor(count, context, initializer=_begin, initargs=(listening, prepare, arguments))
     try:
         yield pool
     finally:
@@ -170,7 +170,7 @@ def process_pool(count: int, prepare: Callable[..., None], *given: Any) -> Itera
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _begin(listening: Any, prepare: Callable[..., None], given: Sequence[Any]) -> None:
+def _begin(listening: Any, prepare: Callable[..., None], arguments: Sequence[Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def end_with_parent() -> None:
@@ -180,7 +180,7 @@ def _begin(listening: Any, prepare: Callable[..., None], given: Sequence[Any]) -
             os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-    prepare(*given)
+    prepare(*arguments)
 
 
 POOL_ENDED = "if memory was short, use fewer processes; a script needs its own code below if __name__ == '__main__'"
@@ -197,7 +197,7 @@ class Processes:
 
     def __init__(self, count: int, threads: int = 0):
         if not 1 <= count <= 1024:
-            raise NergError(f"{count} worker processes were asked for; choose 1 to 1024")
+            raise NergError(f"{count} worker processes are not possible; choose 1 to 1024")
         self.count = count
         self.threads = threads or max((os.cpu_count() or 1) // count, 1)
 
@@ -246,11 +246,11 @@ def _make(task: Task) -> tuple[Receipt, str]:
 
 @dataclass
 class Progress:
-    """How far a plan is: ``done`` of ``total`` tasks, ``kept`` of them from earlier runs; ``seconds`` since the first
+    """How far a plan is: ``done`` of ``total`` tasks, ``reused`` of them from earlier runs; ``seconds`` since the first
     that was missing was begun, and the kinds of ``processors``."""
 
     total: int
-    kept: int = 0
+    reused: int = 0
     done: int = 0
     seconds: float = 0.0
     processors: set[str] = field(default_factory=set)
@@ -263,7 +263,7 @@ class Progress:
     @property
     def left(self) -> float | None:
         """Seconds until the end if the rest goes as fast as what was made in this run; None while nothing was."""
-        made = self.done - self.kept
+        made = self.done - self.reused
         return self.seconds * (self.total - self.done) / made if made else None
 
     def line(self, whole: bool = True) -> str:
@@ -271,7 +271,7 @@ class Progress:
         text = f"{self.done} of {self.total} parts"
         if self.left is None:
             return text
-        rate = (self.done - self.kept) / max(self.seconds, 1e-9)
+        rate = (self.done - self.reused) / max(self.seconds, 1e-9)
         text += f", {rate:.2g} a second" if rate >= 1 else f", {60 * rate:.2g} a minute"
         return f"{text}, {self.left:.0f} s left" if whole else text
 
@@ -311,7 +311,7 @@ def run_plan(
         else:
             whole.add(task.key)
             progress.processors.add(receipt.processor)
-    progress.kept = progress.done = sum(counts[key] for key in whole)
+    progress.reused = progress.done = sum(counts[key] for key in whole)
     on_progress(progress)
     start = time.perf_counter()
     with closing(engine.run(plan.shared, list(missing.values()), store, warn)) as arriving:
@@ -367,7 +367,7 @@ def unprotected(address: str) -> str | None:
     if match is None or match[1] == "tls" or _is_loopback(match[2].strip("[]")):
         return None
     return (
-        f"nothing protects {address}: whoever reaches that port, or a worker's, can run code there and here; "
+        f"nothing protects {address}: anybody who reaches that port, or a worker's, can run code there and here; "
         "use tls://, or a tunnel to 127.0.0.1"
     )
 
@@ -485,7 +485,9 @@ class _Sent:
         files: dict[str, Any] = {}
         if self.with_files:
             for file in (*self._shared.files, *task.files):
-                files[file.sha256] = self._hold(file.sha256, lambda path=file.path: read_bytes(path, "input"))
+                files[file.sha256] = self._hold(
+                    file.sha256, lambda file=file: read_bytes(file.path, "input", file.size)
+                )
         return self.client.submit(_perform, self._job, task, files, threads, pure=False, retries=ATTEMPTS - 1)
 
     def _hold(self, name: str, value: Any) -> Any:

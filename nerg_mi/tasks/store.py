@@ -65,16 +65,16 @@ def receipt_of(task: Task, output: Path, seconds: float, notes: Mapping[str, Any
 
 def read_receipt(path: str | os.PathLike) -> Receipt:
     """The receipt in the file ``path``. Raises `NergError` for one that is damaged or of another version."""
-    about = read_json(path, "receipt", 8 << 20)
+    content = read_json(path, "receipt", 8 << 20)
     names = {f.name for f in fields(Receipt)}
-    if not isinstance(about, dict) or about.pop("format", None) != FORMAT or set(about) != names:
+    if not isinstance(content, dict) or content.pop("format", None) != FORMAT or set(content) != names:
         raise NergError(f'the receipt "{path}" is not of this version; remove it, and its output is made again')
     kinds = {name: dict if name in ("notes", "inputs") else str for name in names - {"size", "seconds"}}
-    whole = all(isinstance(about[name], kind) for name, kind in kinds.items())
-    numbers = is_count(about["size"]) and isinstance(about["seconds"], (int, float)) and about["seconds"] >= 0
-    if not (whole and numbers and _KEY.fullmatch(about["key"]) and _SUFFIX.fullmatch(about["suffix"])):
+    whole = all(isinstance(content[name], kind) for name, kind in kinds.items())
+    numbers = is_count(content["size"]) and isinstance(content["seconds"], (int, float)) and content["seconds"] >= 0
+    if not (whole and numbers and _KEY.fullmatch(content["key"]) and _SUFFIX.fullmatch(content["suffix"])):
         raise NergError(f'the receipt "{path}" is damaged; remove it, and its output is made again')
-    return Receipt(**about)
+    return Receipt(**content)
 
 
 def digest_of(output: Path) -> tuple[int, str]:
@@ -213,8 +213,8 @@ class Store:
         common = sorted({inputs[file.path] for file in plan.shared.files if file.path in inputs})
         path = self.folder / "plans" / f"{hashlib.sha256(plan.what.encode()).hexdigest()[:16]}.json"
         keys = {task.key: task.suffix for task in plan.tasks}
-        about = {"format": FORMAT, "what": plan.what, "inputs": inputs, "common": common, "keys": keys}
-        write_text(path, json.dumps(about) + "\n")
+        content = {"format": FORMAT, "what": plan.what, "inputs": inputs, "common": common, "keys": keys}
+        write_text(path, json.dumps(content) + "\n")
         return path
 
     def plans(self) -> list[Remembered]:
@@ -236,20 +236,20 @@ class Remembered:
 
 def read_plan(path: str | os.PathLike) -> Remembered:
     """The plan in the file ``path``. Raises `NergError` for one that is damaged or of another version."""
-    about = read_json(path, "plan")
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
+    content = read_json(path, "plan")
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise NergError(
             f'the plan "{path}" was written by another version of nerg_mi; remove its store, and start the job again'
         )
-    texts = [about.get("inputs"), about.get("keys")]
-    good = isinstance(about.get("what"), str) and isinstance(about.get("common"), list)
+    texts = [content.get("inputs"), content.get("keys")]
+    good = isinstance(content.get("what"), str) and isinstance(content.get("common"), list)
     good = good and all(isinstance(t, dict) and all(isinstance(v, str) for v in t.values()) for t in texts)
-    good = good and all(isinstance(digest, str) for digest in about["common"])
+    good = good and all(isinstance(digest, str) for digest in content["common"])
     # Outputs are looked for, and removed, by these names: none may lead out of the store.
-    good = good and all(_KEY.fullmatch(k) and _SUFFIX.fullmatch(v) for k, v in about["keys"].items())
+    good = good and all(_KEY.fullmatch(k) and _SUFFIX.fullmatch(v) for k, v in content["keys"].items())
     if not good:
         raise NergError(f'the plan "{path}" is damaged; remove it, and start its job again')
-    return Remembered(about["what"], about["keys"], about["inputs"], frozenset(about["common"]))
+    return Remembered(content["what"], content["keys"], content["inputs"], frozenset(content["common"]))
 
 
 # ---- What is done, left and stale ----

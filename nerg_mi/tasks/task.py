@@ -161,7 +161,7 @@ def _members(value: Any) -> Iterator[tuple[str, Any]]:
 
 def inputs_of(value: Any, checksums: Checksums, below: str = "value") -> dict[str, InputFile]:
     """The files of all paths in ``value``, by their whole paths. One that a `Files` lists has its name there; each
-    other one is a file of its own. Raises `NergError` for a file that cannot be read."""
+    other one is a file of its inside. Raises `NergError` for a file that cannot be read."""
     groups: list[tuple[str, Files]] = []
     alone: list[tuple[str, Path]] = []
 
@@ -279,7 +279,7 @@ def processor() -> str:
 
 @dataclass(frozen=True)
 class Part:
-    """A part's own ``value``, and what people call it (``label``), which is not in its key."""
+    """A part's inside ``value``, and what people call it (``label``), which is not in its key."""
 
     value: Any
     label: str = "a part"
@@ -345,7 +345,7 @@ class Plan:
     def tasks(self) -> list[Task]:
         """A task for each part. Raises `NergError` for files that cannot be read."""
         common, inputs = self._common
-        about = {
+        basis = {
             "format": FORMAT,
             "work": f"{self.work.__module__}:{self.work.__qualname__}",
             "common": digest_of_value(common, inputs),
@@ -356,7 +356,7 @@ class Plan:
         tasks = []
         for part in self.parts:
             value = rebuilt(part.value)
-            own = inputs_of(value, self.checksums, "part")
-            key = digest_of_value({**about, "part": digest_of_value(value, own)})
-            tasks.append(Task(key, value, tuple(own.values()), self.suffix, part.label))
+            inside = inputs_of(value, self.checksums, "part")
+            key = digest_of_value({**basis, "part": digest_of_value(value, inside)})
+            tasks.append(Task(key, value, tuple(inside.values()), self.suffix, part.label))
         return tasks

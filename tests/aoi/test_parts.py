@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from nerg_mi.aoi import measured
-from nerg_mi.aoi.options import ForetellOptions, StatisticsOptions
+from nerg_mi.aoi.options import PredictionOptions, StatisticsOptions
 from nerg_mi.aoi.parts import (
     Places,
-    PlannedForetelling,
+    PlannedPrediction,
     PlannedSetting,
     _place_beside,
     foretell_part,
@@ -125,10 +125,10 @@ def test_sums_come_back_one_by_one(tmp_path):
 
 
 def test_what_a_field_foretells_where_files_were_sent(place, tmp_path):
-    options = ForetellOptions(areas=place / "areas.json", samples=4, directions=64, mode="llvm_ad_rgb")
+    options = PredictionOptions(areas=place / "areas.json", samples=4, directions=64, mode="llvm_ad_rgb")
     areas = Files(options.areas, (options.areas,))
     setting = PlannedSetting(options, PlannedScene.of(place / "scene.xml"), None, None, areas)
-    common = laid_out(PlannedForetelling(setting, 120.0), tmp_path / "there")
+    common = laid_out(PlannedPrediction(setting, 120.0), tmp_path / "there")
     places = Places(np.array([[1.0, 2, 1.6]] * 2), np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
     foretell_part(common, places, tmp_path / "f.npz")
     found = read_foretold(tmp_path / "f.npz")

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from nerg_mi.evaluation.study import settings
+from nerg_mi.evaluation.study import measure, settings
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.jobs import study
 from nerg_mi.jobs.study import StudyOptions, measure_part, planned_study, run_study, twin_beside
@@ -57,5 +57,5 @@ def test_a_scene_file_is_measured_with_its_twin_where_a_worker_has_laid_them(rgb
     common = planned_study(subject, tmp_path / "scene.xml", options)
     measure_part(laid_out(common, tmp_path / "elsewhere"), (number,), tmp_path / "rows.json")
     found = json.loads((tmp_path / "rows.json").read_text())
-    here = {"rows": study.measure(subject, [every[0], every[number]], 1, 16), "scaling": []}
+    here = {"rows": measure(subject, [every[0], every[number]], 1, 16), "scaling": []}
     assert errors(found | {"scaling": []}) == errors(here) and found["rows"][1]["surface_mae"] > 0

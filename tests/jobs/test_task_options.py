@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from nerg_mi.aoi.options import CountOptions, ForetellOptions, StatisticsOptions
+from nerg_mi.aoi.options import CountOptions, PredictionOptions, StatisticsOptions
 from nerg_mi.jobs.ablation import training_options
 from nerg_mi.jobs.film import picture_options
 from nerg_mi.jobs.folds import fold_options
@@ -40,9 +40,9 @@ COMMANDS = {
 }
 AFTER_COUNTS = {"eyes", "glance", "what_if", "visibility", "observers", "height", "floor", "step", "min_people"}
 AFTER_COUNTS |= {"names", "salt", "resamples", "seed"} | STORE
-OF_COUNTS = {f.name for f in fields(CountOptions)} - {f.name for f in fields(ForetellOptions)}
+OF_COUNTS = {f.name for f in fields(CountOptions)} - {f.name for f in fields(PredictionOptions)}
 COMMANDS["stats, counts"] = (StatisticsOptions, lambda o: as_base(o, CountOptions), AFTER_COUNTS | {"directions"})
-COMMANDS["stats, a field"] = (StatisticsOptions, lambda o: as_base(o, ForetellOptions), AFTER_COUNTS | OF_COUNTS)
+COMMANDS["stats, a field"] = (StatisticsOptions, lambda o: as_base(o, PredictionOptions), AFTER_COUNTS | OF_COUNTS)
 COMMANDS["bake, a field"] = (GazeSettings, lambda o: o, set())
 COMMANDS["bake, rays"] = (RaySettings, lambda o: o, set())
 

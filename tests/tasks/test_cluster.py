@@ -88,7 +88,7 @@ def test_workers_that_have_no_files_are_sent_them(cluster, tmp_path, runs, monke
     for file in files:
         file.unlink()
     original = engines.read_bytes
-    monkeypatch.setattr(engines, "read_bytes", lambda path, what: original(str(path).replace("here", "away"), what))
+    monkeypatch.setattr(engines, "read_bytes", lambda path, *more: original(path.replace("here", "away"), *more))
     assert contents(plan, Store(tmp_path / "store"), Cluster(cluster.address)) == expected
     # Few parts go to all workers too, and not to the one that has what they need first.
     assert len({path.name.split("-")[1] for path in runs.iterdir()}) == 2

@@ -85,7 +85,7 @@ def test_a_changed_input_invalidates_what_depends_on_it_and_nothing_more(store, 
         (tmp_path / name).write_text("before")
     plan = lambda: works.read_one(tmp_path / "a", tmp_path / "b")
     steps = []
-    counts = lambda progress: steps.append((progress.kept, progress.done))
+    counts = lambda progress: steps.append((progress.reused, progress.done))
     contents(plan(), store)
     (tmp_path / "a").write_text("after")
     assert contents(plan(), store, on_progress=counts) == [b"after", b"before"] and steps == [(1, 1), (1, 2)]
@@ -117,7 +117,7 @@ def test_equal_parts_are_run_once_and_given_as_often_as_they_are_planned(store):
     shares, counts = [], []
     plan = works.some("a", "a", "a")
     assert contents(plan, store, on_progress=lambda p: shares.append(p.share)) == [b"a\n"] * 3
-    contents(plan, store, on_progress=lambda p: counts.append((p.kept, p.done, p.total)))
+    contents(plan, store, on_progress=lambda p: counts.append((p.reused, p.done, p.total)))
     assert shares == [0.0, 1.0] and counts == [(3, 3, 3)]
 
 
@@ -138,7 +138,7 @@ def test_parts_that_another_version_planned_are_refused(store, monkeypatch):
 
 
 def test_progress_has_rate_and_time_left():
-    progress = Progress(10, kept=2, done=2)
+    progress = Progress(10, reused=2, done=2)
     assert progress.line() == "2 of 10 parts" and progress.left is None and progress.share == 0.2
     progress.done, progress.seconds = 6, 8.0
     assert progress.left == pytest.approx(8.0) and progress.line() == "6 of 10 parts, 30 a minute, 8 s left"

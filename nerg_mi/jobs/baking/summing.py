@@ -33,7 +33,7 @@ def sums_in_one_go(
 ) -> list[Sums]:
     """The sums of each of ``groups``, of which nothing is kept."""
     parts = [list(parts_of(group)) for group in groups]
-    count, done, found = sum(map(len, parts)), 0, []
+    count, done, totals = sum(map(len, parts)), 0, []
     with Interruption() as stop:
         for group in parts:
             sums = scene.nothing
@@ -42,8 +42,8 @@ def sums_in_one_go(
                 sums = sums.plus(scene.sums(part))
                 done += 1
                 reporter.progress(_BEGIN + (_END - _BEGIN) * done / count, f"part {done} of {count}")
-            found.append(sums)
-    return found
+            totals.append(sums)
+    return totals
 
 
 @dataclass(frozen=True)
@@ -76,13 +76,13 @@ def sums_in_parts(
             start += len(part.weights)
     plan = Plan(what, bake_part, PlannedBake.of(scene), whole, ".npy", (*RENDERS, "scipy"))
     arriving = parts.run(plan, _BEGIN, _END)
-    found = []
+    totals = []
     for group in groups:
         sums = scene.nothing
         for _ in parts_of(group):
             sums = sums.plus(read_sums(next(arriving), len(scene.nothing.face)))
-        found.append(sums)
-    return found
+        totals.append(sums)
+    return totals
 
 
 def bake_part(common: PlannedBake, part: Crowd | TrackedRays, output: Path) -> dict[str, float]:
