@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -108,27 +108,62 @@ def trained(props, network, load: Callable, ns: ModuleType) -> tuple[Any, dict, 
     return network, {}, ""
 
 
-def volume_of(plugin: Callable, name: str, network, to_world, called: str):
-    """The volume that the class ``plugin``, registered as ``name``, makes of the field ``network`` in memory.
-
-    ``to_world``: a Mitsuba transform, or None; ``called``: what stands where other volumes have the name of a file.
-    """
+def volume_class() -> Any:
+    """The base class of plugins that are volumes of one ``field``, whose ``parameters()`` can be trained: made for the
+    variant in use, as all classes of Mitsuba are."""
     import mitsuba as mi
 
-    props = mi.Properties(name)
-    if to_world is not None:
-        props["to_world"] = to_world
-    volume = plugin(props, network)
-    volume.filename = called
-    return volume
+    class FieldVolume(mi.Volume):
+        field: Any
+        plugin: str  # the name as which it is registered
 
+        @staticmethod
+        def check(network) -> None:
+            """Raise ``NergError`` unless ``network`` is a field of this kind."""
+            raise NotImplementedError
 
-def expose_parameters(field, callback) -> None:
-    """Tell a scene's traversal the arrays of ``field``, each of which can be trained."""
-    import mitsuba as mi
+        @classmethod
+        def of(cls, network, to_world=None, name: str = "in memory"):
+            """The volume of a field in memory, for a scene that is made from Python; ``to_world``: a Mitsuba transform,
+            ``name``: what it is called where others have a file's name."""
+            cls.check(network)
+            props = mi.Properties(cls.plugin)
+            if to_world is not None:
+                props["to_world"] = to_world
+            volume: Any = cast("Any", cls)(props, network)
+            volume.filename = name
+            return volume
 
-    for name, value in field.parameters().items():
-        callback.put(name, value, mi.ParamFlags.Differentiable)
+        def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+            """Lower and upper corner, (3,) each, in the scene."""
+            return cast("Any", self).medium().bounds()
+
+        def describe(self) -> dict[str, Any]:
+            """What the volume is, for people."""
+            raise NotImplementedError
+
+        def bbox(self):
+            lower, upper = self.bounds()
+            return mi.ScalarBoundingBox3f(lower.tolist(), upper.tolist())
+
+        def channel_count(self):
+            return 1
+
+        def eval(self, it, active=True):
+            # What media ask for; one density for all wavelengths.
+            return cast("Any", mi).UnpolarizedSpectrum(self.eval_1(it, active))
+
+        def traverse(self, cb):
+            for name, value in self.field.parameters().items():
+                cb.put(name, value, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys=()):
+            self.field.pack()
+
+        def to_string(self):
+            return f"{type(self).__name__}[\n" + ",\n".join(f"  {k} = {v}" for k, v in self.describe().items()) + "\n]"
+
+    return FieldVolume
 
 
 def transform(props, name: str) -> np.ndarray:

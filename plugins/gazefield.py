@@ -75,13 +75,14 @@ from nerg_mi.fields.gaze_base import AnyGazeField, kinds
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.properties import boolean, expose_parameters, trained, transform, volume_of
+from nerg_mi.properties import boolean, trained, transform, volume_class
 from nerg_mi.registration import register
 from nerg_mi.transport.observer_gaze import PlacedGaze
 
 
-class GazeFieldVolume(mi.Volume):
+class GazeFieldVolume(volume_class()):
     __doc__ = __doc__
+    plugin = "gazefield"
 
     def __init__(self, props, network=None):
         # ``network``: a field in memory in place of a file; see ``of``.
@@ -91,38 +92,22 @@ class GazeFieldVolume(mi.Volume):
         if boolean(props, "constant_weights", False):
             set_constant_weights(self.field)
 
-    @classmethod
-    def of(cls, network: AnyGazeField, to_world=None, name: str = "in memory") -> GazeFieldVolume:
-        """The volume of a field in memory, for a scene that is made from Python; ``to_world``: a Mitsuba transform,
-        ``name``: what it is called where others have a file's name."""
+    @staticmethod
+    def check(network: AnyGazeField) -> None:
         if getattr(network, "kind", None) not in kinds():
             raise NergError(f"a gaze field in memory is needed, got {type(network).__name__}; load one from its file")
-        return volume_of(cls, "gazefield", network, to_world, name)
 
     def placed_gaze(self) -> PlacedGaze:
         """The gaze field as the integrator sees it."""
         return PlacedGaze(self.field, self._similarity)
 
-    def bbox(self):
-        lower, upper = self._similarity.bounds(self.field.box.lower, self.field.box.upper)
-        return mi.ScalarBoundingBox3f(lower.tolist(), upper.tolist())
+    def bounds(self):
+        return self._similarity.bounds(self.field.box.lower, self.field.box.upper)
 
-    def channel_count(self):
-        return 1
-
-    def traverse(self, cb):
-        expose_parameters(self.field, cb)
-
-    def parameters_changed(self, keys=()):
-        self.field.pack()
-
-    def to_string(self):
+    def describe(self):
         c = self.field.config
-        about = "".join(f"  {k} = {v},\n" for k, v in c.to_dict().items() if k not in ("variant", "normalized"))
-        return (
-            f"GazeFieldVolume[\n  filename = {self.filename},\n  members = {len(self.field.members)},\n"
-            f"  variant = {c.variant},\n  normalized = {c.normalized},\n{about}]"
-        )
+        about = {"filename": self.filename, "members": len(self.field.members), "variant": c.variant}
+        return {**about, "normalized": c.normalized, **{k: v for k, v in c.to_dict().items() if k not in about}}
 
 
 register("volume", "gazefield", GazeFieldVolume)

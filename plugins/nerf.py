@@ -72,14 +72,15 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.properties import boolean, expose_parameters, number, trained, transform, volume_of
+from nerg_mi.properties import boolean, number, trained, transform, volume_class
 from nerg_mi.ranges import VALUES, Range
 from nerg_mi.registration import register
 from nerg_mi.transport.field_medium import FieldMedium
 
 
-class NerfVolume(mi.Volume):
+class NerfVolume(volume_class()):
     __doc__ = __doc__
+    plugin = "nerf"
 
     def __init__(self, props, network=None):
         # ``network``: a field in memory in place of a file; see ``of``.
@@ -94,34 +95,20 @@ class NerfVolume(mi.Volume):
         if boolean(props, "constant_weights", False):
             set_constant_weights(field)
 
-    @classmethod
-    def of(cls, network: RadianceField, to_world=None, name: str = "in memory") -> NerfVolume:
-        """The volume of a field in memory, for a scene that is made from Python; ``to_world``: a Mitsuba transform,
-        ``name``: what it is called where others have a file's name."""
+    @staticmethod
+    def check(network: RadianceField) -> None:
         if not isinstance(network, RadianceField):
             raise NergError(
                 f"a radiance field in memory is needed, got {type(network).__name__}; load one from its file"
             )
-        return volume_of(cls, "nerf", network, to_world, name)
 
     def medium(self) -> FieldMedium:
         """The field as the marcher sees it."""
         return FieldMedium(self.field, self._similarity)
 
-    def bbox(self):
-        lower, upper = self.medium().bounds()
-        return mi.ScalarBoundingBox3f(lower.tolist(), upper.tolist())
-
-    def channel_count(self):
-        return 1
-
     def eval_1(self, it: Any, active: Any = True):
         sigma = self.medium().occupied_density(self._similarity.point_to_local(it.p), active)
         return dr.minimum(sigma, self.max_density) if self.max_density else sigma
-
-    def eval(self, it: Any, active: Any = True):
-        # What media ask for; one density for all wavelengths.
-        return mi.UnpolarizedSpectrum(self.eval_1(it, active))
 
     def max(self):
         if not self.max_density:
@@ -134,22 +121,15 @@ class NerfVolume(mi.Volume):
         cells = int(self.field.config.grid.finest)
         return mi.ScalarVector3i(cells, cells, cells)
 
-    def traverse(self, cb):
-        expose_parameters(self.field, cb)
-
-    def parameters_changed(self, keys=()):
-        self.field.pack()
-
-    def to_string(self):
-        c = self.field.config
-        lower, upper = self.medium().bounds()
-        return (
-            f"NerfVolume[\n  filename = {self.filename},\n"
-            f"  grid = {c.grid.describe()},\n"
-            f"  networks = {c.density_sizes}, {c.color_sizes}{' (once a ray)' if c.deferred else ''},\n"
-            f"  bbox = {lower.round(4).tolist()} to {upper.round(4).tolist()},\n"
-            f"  color_space = {self.field.color_space}\n]"
-        )
+    def describe(self):
+        c, (lower, upper) = self.field.config, self.bounds()
+        return {
+            "filename": self.filename,
+            "grid": c.grid.describe(),
+            "networks": f"{c.density_sizes}, {c.color_sizes}{' (once a ray)' if c.deferred else ''}",
+            "bbox": f"{lower.round(4).tolist()} to {upper.round(4).tolist()}",
+            "color_space": self.field.color_space,
+        }
 
 
 register("volume", "nerf", NerfVolume)

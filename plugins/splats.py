@@ -73,15 +73,16 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.splats.files import read_splats
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.properties import choice, number, resolved, text, transform, volume_of
+from nerg_mi.properties import choice, number, resolved, text, transform, volume_class
 from nerg_mi.ranges import Range
 from nerg_mi.registration import register
 from nerg_mi.transport.jit import recording
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 
 
-class SplatsVolume(mi.Volume):
+class SplatsVolume(volume_class()):
     __doc__ = __doc__
+    plugin = "splats"
 
     def __init__(self, props, splats=None):
         # ``splats``: Gaussians in memory in place of a file; see ``of``.
@@ -95,36 +96,19 @@ class SplatsVolume(mi.Volume):
             log: Any = mi.Log  # of which the stubs know nothing
             log(mi.LogLevel.Warn, f"{self.filename}: {note}")
         self.color_space = self.splats.color_space if color_space == "file" else color_space
-        self.arrays = SplatArrays(self.splats, namespace(mi.Float), extent)
+        self.field = SplatArrays(self.splats, namespace(mi.Float), extent)
 
-    @classmethod
-    def of(cls, splats: Splats, to_world=None, name: str = "in memory") -> SplatsVolume:
-        """The volume of splats in memory, for a scene that is made from Python; ``to_world``: a Mitsuba transform,
-        ``name``: what it is called where others have a file's name."""
-        if not isinstance(splats, Splats):
-            raise NergError(f"splats in memory are needed, got {type(splats).__name__}; read them from their file")
-        return volume_of(cls, "splats", splats, to_world, name)
+    @staticmethod
+    def check(network: Splats) -> None:
+        if not isinstance(network, Splats):
+            raise NergError(f"splats in memory are needed, got {type(network).__name__}; read them from their file")
 
     def medium(self) -> SplatMedium:
         """The splats as rays meet them."""
-        return SplatMedium(self.arrays, self._similarity, self.color_space)
-
-    def bbox(self):
-        lower, upper = self.medium().bounds()
-        return mi.ScalarBoundingBox3f(lower.tolist(), upper.tolist())
-
-    def channel_count(self):
-        return 1
+        return SplatMedium(self.field, self._similarity, self.color_space)
 
     def eval_1(self, it, active=True):
         raise NergError('"splats" have no density at a point: give them to "nerg" as its "field"')
-
-    def eval(self, it, active=True):
-        return self.eval_1(it, active)
-
-    def traverse(self, cb):
-        for name, value in self.arrays.parameters().items():
-            cb.put(name, value, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys=()):
         if recording():
@@ -132,16 +116,17 @@ class SplatsVolume(mi.Volume):
                 "the Gaussians cannot be changed inside of a function that dr.freeze records, as their tree is built "
                 "outside of kernels: call params.update() before the function"
             )
-        self.arrays.pack()
+        super().parameters_changed(keys)
 
-    def to_string(self):
-        lower, upper = self.medium().bounds()
-        return (
-            f"SplatsVolume[\n  filename = {self.filename},\n"
-            f"  count = {len(self.splats)},\n  degree = {self.splats.degree},\n"
-            f"  bbox = {lower.round(4).tolist()} to {upper.round(4).tolist()},\n"
-            f"  color_space = {self.color_space}\n]"
-        )
+    def describe(self):
+        lower, upper = self.bounds()
+        return {
+            "filename": self.filename,
+            "count": len(self.splats),
+            "degree": self.splats.degree,
+            "bbox": f"{lower.round(4).tolist()} to {upper.round(4).tolist()}",
+            "color_space": self.color_space,
+        }
 
 
 register("volume", "splats", SplatsVolume)
