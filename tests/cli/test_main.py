@@ -198,7 +198,7 @@ def test07f_a_plugin_with_a_mistake(rgb, tmp_path, capsys, monkeypatch):
     scene = tmp_path / "a.xml"
     scene.write_text('<scene version="3.0.0"><integrator type="nerg"/><sensor type="perspective"/></scene>')
     rgb.set_variant("llvm_ad_rgb")
-    monkeypatch.setattr("nerg_mi.plugins.nerg_properties.choice", lambda *a: 1 / 0)
+    monkeypatch.setattr("nerg_mi.plugins.nerg.choice", lambda *a: 1 / 0)
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(["render", str(scene), "-o", str(tmp_path / "a.exr"), "-m", "llvm_ad_rgb"])
     said = capsys.readouterr().err

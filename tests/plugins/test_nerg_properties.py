@@ -187,9 +187,9 @@ def test07_missing_files_are_named(rgb, tmp_path):
 
 
 def test_each_text_of_the_manual_has_one_place(rgb):
-    from nerg_mi.plugins import nerg_properties
+    from nerg_mi.plugins import nerg
 
-    source = Path(nerg_properties.__file__).with_name("nerg.py").read_text("utf-8").split('"""')[1]
-    names = [*nerg_properties.TEXTS, "quadratures", "depths", "aovs"]
+    source = Path(nerg.__file__).read_text("utf-8").split('"""')[1]
+    names = [*nerg.TEXTS, "quadratures", "depths", "aovs"]
     # No formula is one of them.
     assert {name: source.count(f"{{{name}}}") for name in names} == dict.fromkeys(names, 1)
