@@ -12,6 +12,7 @@ from nerg_mi.maths.arrays import log1p
 from nerg_mi.maths.types import Bool, Color, Float, UInt32
 
 from .march_primal import (
+    MarchRequest,
     MarchResult,
     MarchSettings,
     Occlusion,
@@ -53,41 +54,16 @@ def attached(medium: Medium, ray: LocalRay, t0: Float, t1: Float) -> bool:
 
 
 def differentiable_march(
-    operation: type[March],
-    medium: Medium,
-    ray: LocalRay,
-    t0: Float,
-    t1: Float,
-    active: Bool,
-    settings: MarchSettings,
-    offset: Float | None,
-    color: Painter | None,
-    count: bool,
-    until: Float | float | None,
-    fine_from: Float | None,
+    operation: type[March], ray: LocalRay, t0: Float, t1: Float, request: MarchRequest
 ) -> MarchResult:
-    """A march as one differentiable ``operation``; the other arguments are those of ``march.march``."""
+    """A march as one differentiable ``operation``."""
     # Every sample gets its own colour: a shared one would hand its derivative to the wrong samples.
-    settings = replace(settings, color_cutoff=0.0)
-    fixed = _Fixed(medium, active, settings, offset, color, count, until, fine_from)
-    result = dr.custom(operation, ray.o, ray.d, ray.w, t0, t1, fixed)
+    settings = replace(request.settings, color_cutoff=0.0)
+    request = replace(request, settings=settings, occlusion=None)
+    result = dr.custom(operation, ray.o, ray.d, ray.w, t0, t1, request)
     for name in ("half_slope", "enter", "enter_tau"):
         setattr(result, name, dr.detach(getattr(result, name)))
     return result
-
-
-@dataclass
-class _Fixed:
-    """The arguments of ``march`` that no derivatives are taken of."""
-
-    medium: Medium
-    active: Bool
-    settings: MarchSettings
-    offset: Float | None
-    color: Painter | None
-    count: bool
-    until: Float | float | None
-    fine_from: Float | None
 
 
 @dataclass(kw_only=True)
@@ -133,28 +109,22 @@ class Replayed:
 class March(dr.CustomOp):
     """A march as one node of the graph: ``march_primal`` forwards, and once more for the derivatives."""
 
-    def eval(self, o, d, w, t0, t1, fixed):
-        self.fixed: _Fixed = fixed
+    def eval(self, o, d, w, t0, t1, request):
+        self.request: MarchRequest = request
         self.inputs = (o, d, w, t0, t1)
         # The medium's weights are read, not passed: tell the graph that the result depends on them.
-        for parameter in fixed.medium.parameters():
+        for parameter in request.medium.parameters():
             self.add_input(parameter)
-        with dr.suspend_grad():
-            # Symbolic also where an enclosing derivative has switched loops to evaluated ones: the
-            # steps must not be stored.
-            with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-                self.result = self._primal()
+        # Symbolic also where an enclosing derivative has switched loops to evaluated ones: the steps must not be
+        # stored.
+        with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
+            self.result = self._primal(LocalRay(*self.inputs), t0, t1, request)
         return self.result
 
-    def _primal(self) -> MarchResult:
-        f, (t0, t1) = self.fixed, self.inputs[3:]
-        ray = LocalRay(*self.inputs)
-        return march_primal(
-            f.medium, ray, t0, t1, f.active, f.settings, f.offset, f.color, f.count, f.until, f.fine_from
-        )
+    _primal = staticmethod(march_primal)
 
     def backward(self):
-        color, primal = self.fixed.color, self.result
+        color, primal = self.request.color, self.result
         adjoint: Any = self.grad_out()
         d_half = dr.select(dr.isfinite(primal.half), adjoint.half, 0)
 
@@ -179,7 +149,7 @@ class March(dr.CustomOp):
             self.set_grad_in(name, g)
 
     def forward(self):
-        color, primal = self.fixed.color, self.result
+        color, primal = self.request.color, self.result
         tangents = [self.grad_in(name) for name in _INPUTS]
         Float = type(self.inputs[3])
 
@@ -205,12 +175,11 @@ class March(dr.CustomOp):
                 painted = painted + own[3] - dr.select(step.active, dot.tau * dr.detach(outputs[3]), 0)
             return state, replace(dot, tau=dot.tau + own[0], moment=moment, half=half, color=painted)
 
-        start = MarchResult.start(Float, color, self.fixed.count, None)
-        self.set_grad_out(self._march_again(body, replace(start, half=Float(0))))
+        self.set_grad_out(self._march_again(body, replace(self.request.start(Float), half=Float(0))))
 
     def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], extra: Any) -> Any:
         """Repeat the primal's steps, threading ``extra`` through ``body(state, extra)``."""
-        f, t0 = self.fixed, self.inputs[3]
+        f, t0 = self.request, self.inputs[3]
         Float = type(t0)
         share, color = Float(1 if f.offset is None else f.offset), None if f.color is None else f.color.zero()
         start = _ReplayedSteps(**nothing_absorbed(Float), active=f.active, color=color, t=t0, share=share)
@@ -220,7 +189,7 @@ class March(dr.CustomOp):
 
     def _replay(self, leaves: list[Any], state: Any) -> tuple[Replayed, Any]:
         """The next step, attached to ``leaves`` and the medium, and the state after it."""
-        f, (primal_t0, primal_t1) = self.fixed, self.inputs[3:]
+        f, (primal_t0, primal_t1) = self.request, self.inputs[3:]
         quadrature = RULES.find(f.settings.quadrature)
         cells = boundaries(quadrature, f.medium)
         ray = LocalRay(*self.inputs)
@@ -254,12 +223,12 @@ class March(dr.CustomOp):
         crossing: Callable[[Float], Float],
     ) -> tuple[Replayed, Any]:
         """One step, and the sums of ``state`` behind it: ``dtau`` and ``mean`` attached, ``absorbed`` detached."""
-        goal, end = limits(type(state.tau), self.fixed.settings, self.fixed.until)
+        goal, end = limits(type(state.tau), self.request.settings, self.request.until)
         after, weight, crosses = state.absorb(active, dr.detach(dtau), absorbed, dr.detach(mean), goal)
         painted = None
-        if self.fixed.color is not None:
+        if self.request.color is not None:
             lit = active & (weight > 0)
-            painted = dr.select(lit, paint(self.fixed.color, lit), 0)
+            painted = dr.select(lit, paint(self.request.color, lit), 0)
             after.color = after.color + weight * dr.detach(painted)
         after.active = active & (after.tau < end)
         before = active & (after.tau < goal)
@@ -280,13 +249,10 @@ class March(dr.CustomOp):
 class HitMarch(March):
     """``march_hits`` as one node of the graph."""
 
-    def _primal(self) -> MarchResult:
-        f, (t0, t1) = self.fixed, self.inputs[3:]
-        hits, ray = cast("Hits", f.medium.hits), LocalRay(*self.inputs)
-        return march_hits(f.medium, hits, ray, t0, t1, f.active, f.settings, f.color, f.count, f.until)
+    _primal = staticmethod(march_hits)
 
     def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], extra: Any) -> Any:
-        f, (t0, t1) = self.fixed, self.inputs[3:]
+        f, (t0, t1) = self.request, self.inputs[3:]
         hits, ray = cast("Hits", f.medium.hits), LocalRay(*(dr.detach(x) for x in self.inputs))
         Float = type(t0)
         UInt32: Any = dr.uint32_array_t(Float)
@@ -315,7 +281,7 @@ class HitMarch(March):
         return out[3]
 
     def _replay(self, leaves: list[Any], state: Any) -> tuple[Replayed, Any]:
-        medium, active, index = self.fixed.medium, state.active, state.index
+        medium, active, index = self.request.medium, state.active, state.index
         o, d, w, t0, t1 = leaves
         t, absorbed = cast("Hits", medium.hits).again(LocalRay(o, d, w, t0, t1), index, active)
         return self._absorb(
@@ -368,17 +334,13 @@ def march(
     """
     Float = type(ray.t_near)
     active = dr.mask_t(Float)(active) & (t0 < t1)
-    arguments = (Float(t0), Float(t1), active, settings, offset, color, count, until, fine_from)
-    if medium.hits is not None:
-        if attached(medium, ray, t0, t1):
-            result = differentiable_march(HitMarch, medium, ray, *arguments)
-        else:
-            result = march_hits(medium, medium.hits, ray, *arguments[:4], color, count, until, occlusion)
-    elif attached(medium, ray, t0, t1):
-        result = differentiable_march(March, medium, ray, *arguments)
+    t0, t1 = Float(t0), Float(t1)
+    request = MarchRequest(medium, active, settings, offset, color, count, until, fine_from, occlusion)
+    if attached(medium, ray, t0, t1):
+        result = differentiable_march(March if medium.hits is None else HitMarch, ray, t0, t1, request)
     else:
-        result = march_primal(medium, ray, *arguments, occlusion)
-    result.origin = arguments[0]
+        result = (march_primal if medium.hits is None else march_hits)(ray, t0, t1, request)
+    result.origin = t0
     if until is not None and dr.grad_enabled(until):
         crossed = dr.isfinite(result.half)
         result.half = dr.select(crossed, dr.fma(result.half_slope, until - dr.detach(until), result.half), result.half)

@@ -173,21 +173,6 @@ class MarchResult(Sums):
     # Distance at which the march began.
     origin: Float | float = 0
 
-    @classmethod
-    def start(cls, Float: type, color: Painter | None, count: bool, occlusion: Occlusion | None) -> MarchResult:
-        """Of a march that has not met anything; the arguments are those of ``march.march``."""
-        return cls(
-            **nothing_absorbed(Float),
-            half=Float(dr.inf),
-            half_slope=Float(0),
-            enter=Float(0),
-            enter_tau=Float(0),
-            color=None if color is None else color.zero(),
-            density_evals=Float(0) if count else None,
-            color_evals=Float(0) if count and color is not None else None,
-            known=None if occlusion is None else dr.mask_t(Float)(False),
-        )
-
     def cross(self, crosses: Bool, half: Float, slope: Float, enter: Float, enter_tau: Float) -> None:
         """Note where the optical depth that is looked for is reached, on the rays that cross it."""
         self.half = dr.select(crosses, half, self.half)
@@ -333,6 +318,36 @@ LOG2 = 0.6931471805599453
 
 
 @dataclass
+class MarchRequest:
+    """What is asked of a march along any ray: the arguments of ``march.march``."""
+
+    medium: Medium
+    active: Bool
+    settings: MarchSettings
+    offset: Float | None
+    color: Painter | None
+    count: bool
+    until: Float | float | None
+    fine_from: Float | None
+    occlusion: Occlusion | None
+
+    def start(self, Float: type) -> MarchResult:
+        """Of a march that has not met anything; ``Float``: array type of distances."""
+        counted = self.count and self.color is not None
+        return MarchResult(
+            **nothing_absorbed(Float),
+            half=Float(dr.inf),
+            half_slope=Float(0),
+            enter=Float(0),
+            enter_tau=Float(0),
+            color=None if self.color is None else self.color.zero(),
+            density_evals=Float(0) if self.count else None,
+            color_evals=Float(0) if counted else None,
+            known=None if self.occlusion is None else dr.mask_t(Float)(False),
+        )
+
+
+@dataclass
 class _Steps:
     """Where a march in steps is."""
 
@@ -347,23 +362,11 @@ class _Steps:
     found: MarchResult
 
 
-def march_primal(
-    medium: Medium,
-    ray: LocalRay,
-    t0: Float,
-    t1: Float,
-    active: Bool,
-    settings: MarchSettings,
-    offset: Float | None,
-    color: Painter | None,
-    count: bool,
-    until: Float | float | None,
-    fine_from: Float | None,
-    occlusion: Occlusion | None = None,
-) -> MarchResult:
-    """March ``ray`` from ``t0`` to ``t1``; the arguments are those of ``march.march``."""
-    Float = type(t0)
-    goal, end = limits(Float, settings, until)
+def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> MarchResult:
+    """March ``ray`` in steps from ``t0`` to ``t1``."""
+    Float, medium, settings = type(t0), request.medium, request.settings
+    color, fine_from, occlusion = request.color, request.fine_from, request.occlusion
+    goal, end = limits(Float, settings, request.until)
 
     # The loops are functional rather than @dr.syntax: what they close over (fields, settings) stays
     # out of the loop state, where a field's weight arrays would be carried along lane by lane.
@@ -400,13 +403,13 @@ def march_primal(
         return (_Steps(active, t_next, None if state.share is None else Float(1), step.carry, pending, found),)
 
     start = _Steps(
-        active,
+        request.active,
         t0,
         # A state that never changes would have the loop recorded twice.
-        None if offset is None else Float(offset),
+        None if request.offset is None else Float(request.offset),
         quadrature.start(Float),
         None if color is None else Float(0),
-        MarchResult.start(Float, color, count, occlusion),
+        request.start(Float),
     )
     (state,) = dr.while_loop((start,), lambda state: state.active, body, label="march")
     found = state.found
@@ -452,25 +455,12 @@ def first_hit(t0: Float) -> LastHit:
     return LastHit(dr.fma(dr.abs(t0), -(2.0**-22), t0 - 1e-37), UInt32(0))
 
 
-def march_hits(
-    medium: Medium,
-    hits: Hits,
-    ray: LocalRay,
-    t0: Float,
-    t1: Float,
-    active: Bool,
-    settings: MarchSettings,
-    color: Painter | None,
-    count: bool,
-    until: Float | float | None,
-    occlusion: Occlusion | None = None,
-) -> MarchResult:
-    """What ``ray`` meets of ``hits``, those of ``medium``, from the distance ``t0`` on and before ``t1``. The other
-    arguments are those of ``march.march``; without derivatives."""
-    Float = type(t0)
+def march_hits(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> MarchResult:
+    """What ``ray`` meets of the medium's hits from the distance ``t0`` on and before ``t1``; without derivatives."""
+    Float, medium, color, occlusion = type(t0), request.medium, request.color, request.occlusion
     UInt32: Any = dr.uint32_array_t(Float)
-    goal, end = limits(Float, settings, until)
-    stop = dr.exp(-end)
+    goal, end = limits(Float, request.settings, request.until)
+    hits, stop = cast("Hits", medium.hits), dr.exp(-end)
 
     def take(state: _Hits) -> tuple[_Hits]:
         """The first of the hits; the others move up."""
@@ -509,5 +499,5 @@ def march_hits(
         active = active & (farthest.t < dr.inf) & (found.tau < end)
         return active if found.known is None else active & ~found.known, farthest, found
 
-    start = active, first_hit(t0), MarchResult.start(Float, color, count, occlusion)
+    start = request.active, first_hit(t0), request.start(Float)
     return dr.while_loop(start, lambda active, *_: active, group, label="groups of hits")[2]

@@ -70,10 +70,11 @@ def test01_equal_to_derivatives_through_the_loop(rgb, monkeypatch, quadrature):
     scene = scene_of(rgb, 5, 0.4, quadrature)
     got = gradients(rgb, scene)
 
-    def through_the_loop(medium, ray, t0, t1, active, settings, *more):
+    def through_the_loop(ray, t0, t1, request):
         # Every step is evaluated, and stays in memory until its derivative has been taken.
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
-            return march_primal(medium, ray, t0, t1, active, replace(settings, color_cutoff=0.0), *more)
+            settings = replace(request.settings, color_cutoff=0.0)
+            return march_primal(ray, t0, t1, replace(request, settings=settings))
 
     called = []
     monkeypatch.setattr(front, "differentiable_march", lambda operation, *a: called.append(1) or through_the_loop(*a))

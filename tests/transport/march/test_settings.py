@@ -1,7 +1,7 @@
 """What controls a march, and what its results mean."""
 
 import math
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import FrozenInstanceError
 from types import SimpleNamespace
 
 import drjit.llvm.ad as ns
@@ -31,8 +31,8 @@ def test03_the_step_where_none_is_asked_for(medium, step):
 
 def test04_opacity_and_expected_depth():
     tau, moment = ns.Float([0, 1e-9, math.log(2), 40]), ns.Float([0, 3e-9, 1, 2])
-    start = MarchResult.start(ns.Float, None, False, None)
-    result = replace(start, tau=tau, moment=moment, origin=ns.Float(10))
+    nothing = dict.fromkeys(("lost_tau", "lost_moment", "half", "half_slope", "enter", "enter_tau"), ns.Float(0))
+    result = MarchResult(tau=tau, moment=moment, **nothing, origin=ns.Float(10))
     assert np.allclose(result.opacity.numpy(), [0, 1e-9, 0.5, 1], rtol=1e-6)
     # Nothing is met on the first; the others lie beyond where the march began.
     assert np.allclose(result.expected_depth.numpy(), [0, 13, 12, 12], rtol=1e-6)
