@@ -1,8 +1,9 @@
 """PLY files: their tables, whatever the columns, and binary files of triangles or points with columns of their own.
 
-trimesh's reader loses columns (those of faces that it splits, attributes without a meaning for it). Its writer adds an
-alpha to colours, which makes of them an attribute of four channels that no Mitsuba texture shows, gives points an empty
-list of faces, and knows no attributes of faces that Mitsuba reads.
+Not trimesh's (5.2). Its reader refuses files of triangles and quadrilaterals whose faces have colours, and passes on
+corners that are none of the vertices. Its writer has no comments, which hold units and provenance, drops the columns of
+points or gives them an empty list of faces, and adds an alpha to colours, of which Mitsuba makes an attribute of four
+channels that none of its textures shows.
 """
 
 from __future__ import annotations
