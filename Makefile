@@ -2,7 +2,7 @@
 #
 #   make demo      set up, render the demo place into out/demo
 #   make test      set up with the test extras, run the tests; ARGS="-k panorama" chooses among them, JOBS=0 runs them in one process
-#   make test-all  the same, and the tests marked "nightly": long trainings, whole demos, kills and leaks
+#   make test-all  the same, and the tests marked "nightly": long trainings, whole demos, kills, leaks, recorded data
 #
 # While working, and before a release:
 #

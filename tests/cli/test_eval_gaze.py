@@ -1,45 +1,13 @@
-"""`nerg eval gaze`: what it hands on, and an evaluation from training to tables."""
+"""`nerg eval gaze`: an evaluation from training to tables."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.jobs import evaluation
-from nerg_mi.jobs.evaluation import GazeEvaluation
-from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
 from tests.evaluation.gaze.test_evaluation import crowd
-
-
-def test_the_job_is_given_what_was_asked_for(monkeypatch, capsys):
-    given, row = [], {"method": "gaze field", "integral": 1.0}
-    row |= dict.fromkeys(("KLD", "CC", "SIM", "MAE", "NSS", "AUC", "sAUC", "bits", "loglik"), 0.25)
-    found = GazeEvaluation([row], [], "people", 7, 3, [Path("a.eval/gaze.md")])
-    monkeypatch.setattr(evaluation, "evaluate_gaze", lambda *a: given.append(a[:-1]) or found)
-    line = "eval gaze a.safetensors rays.npz --scene room.xml --split people --kappa 9 --blind-kappa 40 --directions 99"
-    with pytest.raises(SystemExit) as end:
-        main([*line.split(), *"--min-rays 5 --resamples 11 --pictures 0 --seed 2 --threads 1 -m llvm_ad_mono".split()])
-    assert not end.value.code
-    options = GazeEvaluationOptions(
-        scene=Path("room.xml"),
-        split="people",
-        kappa=9.0,
-        blind_kappa=40.0,
-        directions=99,
-        min_rays=5,
-        resamples=11,
-        pictures=0,
-        seed=2,
-        threads=1,
-        mode="llvm_ad_mono",
-    )
-    assert given == [(Path("a.safetensors"), Path("rays.npz"), Path("a.eval"), options)]
-    said = capsys.readouterr().out
-    assert "a.safetensors, people: 7 positions, 3 persons" in said and "gaze field" in said
-    assert said.rstrip().endswith("wrote a.eval/gaze.md")
 
 
 @pytest.mark.nightly

@@ -32,7 +32,7 @@ def test_where_it_is_greatest():
     assert exact(origins, 0.3, densest, 1) > 0.9 * max(everywhere)
 
 
-@pytest.mark.parametrize("radius", [0.1, 0.25, 0.6])
+@pytest.mark.parametrize("radius", [0.1, 0.6])
 def test_cells_stand_for_their_rays(radius):
     origins = paths()
     support = RaySupport.of(origins, radius)
