@@ -24,6 +24,7 @@ def test01_the_box_climbs_to_where_the_sweep_says(shelf_run):
         assert after > before and abs(end - optimum) < 0.1 and share > 0.97, (start, end, optimum, share)
 
 
+@pytest.mark.nightly
 def test02_derivatives_without_edges_are_those_of_the_sweep(shelf_run):
     checks = shelf_run[0]["checks"]
     automatic, central = checks[:, 3], checks[:, 4]

@@ -45,7 +45,7 @@ def test_a_full_field_takes_a_few_bytes_a_voxel(monkeypatch):
     fog = Ball()
     fog.density = lambda p, active=True: dr.select(active, 1 + p.x, 0)
     whole = density_and_color(fog, 48, samples=1)
-    monkeypatch.setattr(volumes, "_BLOCK", 1000)
+    monkeypatch.setattr(volumes, "_BLOCK", 2500)
     tracemalloc.start()
     try:
         blocks = density_and_color(fog, 48, samples=1)
