@@ -102,11 +102,26 @@ def pytest_collection_modifyitems(items):
 
 
 # ------------------------------------------------------------------------
+#  Files of tests: in memory where there is room, since thousands are synchronised, which takes a disk milliseconds
+# ------------------------------------------------------------------------
+
+
+def _use_memory_for_files(config) -> None:
+    memory = Path("/dev/shm")
+    if config.option.basetemp is not None or not os.access(memory, os.W_OK):
+        return
+    free = os.statvfs(memory)
+    if free.f_bavail * free.f_frsize > 4 * 2**30:
+        os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(memory))
+
+
+# ------------------------------------------------------------------------
 #  torch: an extra. With NERG_REQUIRE_TORCH=1 a test skipped for want of it is a failure
 # ------------------------------------------------------------------------
 
 
 def pytest_configure(config):
+    _use_memory_for_files(config)
     # Where tests run in the background of a script, Ctrl-C is ignored, and their children would ignore it too.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -28,7 +28,7 @@ from .commands import argument, command, out
 from .options import as_base
 from .options.parts import FilmOptions
 from .options.pictures import PictureOptions
-from .overlays import check_memory, check_scale, layers_of, shares_a_scale, stacked, style_of, unstacked
+from .overlays import check_memory, layers_of, shares_a_scale, stacked, style_of, unstacked
 from .pictures import AskedPictures, PictureResult, account, asked_pictures, provenances, render_file, sensor_of
 from .reporter import SILENT, Reporter
 
@@ -107,7 +107,7 @@ def _rendered(
     layers = list(parts.run(Plan(f"{what} (values)", make_layers, of_each, frames, ".npy"), 0.0, _LAYERS_SHARE))
     limits = [None if made.notes["limits"] is None else tuple(made.notes["limits"]) for made in layers]
     ends = shared_limits(limits, options.top)
-    check_scale(overlay, ends)
+    overlay.check_limits(ends)
     drawings = []
     for k, (frame, made) in enumerate(zip(asked.frames, layers)):
         header = {}
