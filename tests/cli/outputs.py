@@ -139,7 +139,7 @@ CASES = (
         "{i}/photos -o {o}/a.safetensors --steps 2 --holdout 2 --half",
         ("a.safetensors", "a.preview.png"),
         ("a.safetensors", "a.preview.png", "a.run"),
-        ("train.radiance_grid.DensityGrid.bound",),
+        ("train.radiance_grid.DensityGrid.bound", "train.radiance_run.warm_up"),
     ),
     Case(
         "train gaze",
