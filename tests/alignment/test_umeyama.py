@@ -72,7 +72,7 @@ def test_leave_one_out_is_the_error_of_the_fit_to_the_others():
         (np.zeros((2, 3)), "2 pairs of points where 3"),
         (np.zeros((4, 3)), "at one place"),
         (np.outer(np.arange(5.0), [1, 2, 3]), "on a line"),
-        (np.full((4, 3), np.nan), "points in the frame of the .* must have coordinates from"),
+        (np.full((4, 3), np.nan), "points in the frame"),
     ],
 )
 def test_points_that_tell_nothing_are_refused(points, why):

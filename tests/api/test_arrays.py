@@ -21,7 +21,7 @@ def test01_points_of_every_shape():
     [
         ((1, 2), r"eyes must have the shape \(3,\) or \(N, 3\), got \(2,\)"),
         (np.zeros((0, 3)), r"shape .* got \(0, 3\)"),
-        ("here", "eyes must be numbers x, y, z"),
+        ("here", "eyes must be numbers"),
         ([(0, 0, 0), (0, np.nan, 0)], r"row 1 is \[0.0, nan, 0.0\]"),
         ([(0, 0, 0), (0, 0, 1.1e7)], "coordinates from -1e.07 to 1e.07, and row 1"),
         ((1e308, 0, 0), "row 0 is"),

@@ -111,12 +111,12 @@ def test05_both_sides_of_an_open_surface(empty, rgb):
 @pytest.mark.parametrize(
     "surface, said",
     [
-        ("nothing", 'the scene has no shape "nothing"; it has shape'),
+        ("nothing", '"nothing"'),
         ("nothing.ply", 'there is no mesh "nothing.ply"'),
         ([(0, 0, 0), (1, 1, -1)], "a box is a lower corner and an upper one"),
         ([(0, 0, 0)], "a box is a lower corner and an upper one"),
-        ({"type": "sphere"}, "is not a mesh; attention is received by meshes"),
-        (object(), "the corners of a box must be numbers"),
+        ({"type": "sphere"}, "mesh; attention is received"),
+        (object(), "corners of a box"),
     ],
 )
 def test06_what_is_no_surface(empty, surface, said):

@@ -34,9 +34,9 @@ def test02_fov_is_that_of_the_width_and_up_is_up(rgb):
         ({"width": 0}, "the width of a picture must lie in 1 .. "),
         ({"height": 2.5}, "must be a whole number, got 2.5"),
         ({"width": 1 << 20, "height": 1 << 20}, "at most 268,435,456 pixels"),
-        ({"origin": (0, float("inf"), 0)}, "origin of a camera must have coordinates from"),
+        ({"origin": (0, float("inf"), 0)}, "origin of a camera"),
         ({"origin": (0, 1)}, "origin of a camera must"),
-        ({"origin": [(0, 1, 2)]}, "origin of a camera must be x, y, z"),
+        ({"origin": [(0, 1, 2)]}, "origin of a camera"),
     ],
 )
 def test03_what_is_no_camera(wrong, said):

@@ -117,11 +117,8 @@ def test08_the_scenes_own_observer_sees(files):
         (lambda s: nerg.trace(s, (0, 0, 0), (0, 0, 0)), "directions must not be zero, and row 0 is"),
         (lambda s: nerg.trace(s, np.zeros((2, 3)), np.ones((3, 3))), "one origin or as many as directions, 3, got 2"),
         (lambda s: nerg.trace(s, (0, 0, 0), (0, 0, 1), "gazes"), "gazes"),
-        (lambda s: nerg.observe(s, (0, 0, 0)), "the scene has no observer of its own; say where they are"),
-        (
-            lambda s: nerg.observe(s, (0, 0, 0), (0, 0, 1), "color"),
-            'there is no quantity "color" here; there are gaze,',
-        ),
+        (lambda s: nerg.observe(s, (0, 0, 0)), "scene has no observer"),
+        (lambda s: nerg.observe(s, (0, 0, 0), (0, 0, 1), "color"), '"color"'),
         (lambda s: nerg.observe(s, "there", (0, 0, 1)), "points must be numbers"),
     ],
 )

@@ -28,16 +28,16 @@ def test_each_kind_of_gaze_field_has_its_own_bounds():
 @pytest.mark.parametrize(
     "about, words",
     [
-        ([1], 'its "architecture" is not a JSON object'),
-        ({"width": 0}, '"width" of its architecture must be a whole number from 1 to 4096, not 0'),
+        ([1], '"architecture"'),
+        ({"width": 0}, '"width".*1.*4096.*0'),
         ({"width": True}, "not True"),
         ({"width": 2.0}, "not 2.0"),
         ({"width": 10**99}, r"\.\.\."),
-        ({"grid": {**GRID, "levels": 65}}, '"levels" of its grid must be a whole number from 1 to 64'),
-        ({"grid": {**GRID, "finest": FINEST + 1}}, '"finest" of its grid must lie in'),
+        ({"grid": {**GRID, "levels": 65}}, '"levels".*1.*64'),
+        ({"grid": {**GRID, "finest": FINEST + 1}}, '"finest"'),
         ({"grid": {**GRID, "finest": float("nan")}}, "must be a finite number"),
-        ({"grid": "fine"}, 'its "grid" is not a JSON object'),
-        ({"grid": {**GRID, "kind": "octree"}}, "'octree', which this version does not know"),
+        ({"grid": "fine"}, '"grid"'),
+        ({"grid": {**GRID, "kind": "octree"}}, "'octree'"),
     ],
 )
 def test_sizes_out_of_bounds_are_named(about, words):

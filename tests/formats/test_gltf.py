@@ -63,7 +63,7 @@ def test02_what_trimesh_writes_is_read_with_its_nodes(tmp_path):
 @pytest.mark.parametrize(
     "values, said",
     [
-        ({"nodes": [{"children": [0]}]}, "nested too deep, or in a circle"),
+        ({"nodes": [{"children": [0]}]}, "nested too deep"),
         ({"nodes": [{}]}, "no triangles"),
         ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": 10**12, "type": "VEC3"}] * 2}, "ends before"),
         ({"accessors": [{"bufferView": 0, "componentType": 5126, "count": -1, "type": "VEC3"}] * 2}, "no whole number"),

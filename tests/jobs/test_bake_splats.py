@@ -74,10 +74,10 @@ def test02_people_on_a_path_and_places_in_other_units(rgb, place):
 @pytest.mark.parametrize(
     "options, said",
     [
-        ({"texture": 512}, "--texture is of surfaces with triangles"),
+        ({"texture": 512}, "--texture"),
         ({"shapes": ("a",)}, "--shape is of surfaces"),
         ({"source": "rays"}, "rays by --rays"),
-        ({"source": "field", "gaze": None}, "nerg train gaze RAYS --field SPLATS"),
+        ({"source": "field", "gaze": None}, "--field SPLATS"),
         ({"unit": "seconds"}, "add --from rays"),
         ({"source": "eyes"}, 'got "eyes"'),
         ({"observer": None}, "nobody looks"),

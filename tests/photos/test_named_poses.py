@@ -62,8 +62,8 @@ def test_the_checksum_is_that_of_a_training(tmp_path):
     "frames, message",
     [
         ([], "lists no images"),
-        ([{"file_path": "a.jpg"}], 'frame 0 of .* has no "file_path" or no "transform_matrix"'),
-        ([{"file_path": "a.jpg", "transform_matrix": [[1]]}], 'frame "a.jpg" of .*4 x 4'),
+        ([{"file_path": "a.jpg"}], '0.*"file_path".*"transform_matrix"'),
+        ([{"file_path": "a.jpg", "transform_matrix": [[1]]}], '"a.jpg".*4.*4'),
     ],
 )
 def test_what_is_no_pose(tmp_path, frames, message):

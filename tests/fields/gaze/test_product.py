@@ -152,8 +152,8 @@ def test09_names_and_sizes():
 @pytest.mark.parametrize(
     "wrong, words",
     [
-        (dict(variant="both"), 'variant must be one of emit, capture, emit_capture, got "both"'),
-        (dict(activation="relu"), 'activation must be one of softplus, exp, linear, got "relu"'),
+        (dict(variant="both"), 'emit_capture.*"both"'),
+        (dict(activation="relu"), '"relu"'),
         (dict(width=0), "at least 1"),
         (dict(semantic="snapshot", normalized=True), "cannot be normalised"),
         (dict(semantic="snapshot", variant="capture"), "no emit"),

@@ -29,8 +29,8 @@ def test01_whose_gaze(options, with_gaze, source):
     "options, said",
     [
         ({}, "whose gaze is it"),
-        ({"source": "eyes"}, "--from is field or rays"),
-        ({"rays": RAYS, "unit": "hours"}, "--unit is share or seconds"),
+        ({"source": "eyes"}, "--from"),
+        ({"rays": RAYS, "unit": "hours"}, "--unit"),
         ({"gaze": GAZE, "halves": True}, "add --from rays"),
         ({"rays": RAYS, "observer": (0.0, 0.0, 0.0)}, "--observer and --path"),
     ],

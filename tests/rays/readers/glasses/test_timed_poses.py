@@ -38,7 +38,7 @@ def test_quaternions_and_vectors_are_the_same(tmp_path):
         ("aligned_poses.csv", "a,b\n1,2\n", "no column start_timestamp"),
         ("camera_pose.json", "{}", "no list of camera poses"),
         ("camera_pose.json", '[{"start_timestamp": 0}]', "no list of camera poses"),
-        ("poses.p", "x", "is a pickle, which may run code, and is not read"),
+        ("poses.p", "x", "pickle, which may run"),
     ],
 )
 def test_what_holds_no_poses(tmp_path, name, text, message):
