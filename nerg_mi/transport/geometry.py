@@ -52,17 +52,17 @@ class Ceiling:
         self._height, self._up = mi.Float(self.height), mi.Vector3f(*self.up.tolist())
         dr.make_opaque(self._height, self._up)
 
-    def cut(self, ray: Ray3f) -> tuple[Any, Float]:
+    def cut(self, ray: Any) -> tuple[Any, Float]:
         """``ray`` (unit direction) from where it comes below the plane, and how far it went until then: 0 where it
         starts below, or never comes there. Differentiable in the ray."""
         over, fall = dr.dot(ray.o, self._up) - self._height, -dr.dot(ray.d, self._up)
         cuts = (over > 0) & (fall > _LEAST_FALL)
         ahead = dr.select(cuts, over / dr.select(cuts, fall, 1), 0)
-        moved: Any = type(ray)(ray)
+        moved = type(ray)(ray)
         moved.o = dr.fma(ray.d, ahead, ray.o)
         moved.maxt = ray.maxt - ahead
         if isinstance(ray, variant_types().RayDifferential3f):
-            moved.o_x, moved.o_y = dr.fma(moved.d_x, ahead, moved.o_x), dr.fma(moved.d_y, ahead, moved.o_y)
+            moved.o_x, moved.o_y = dr.fma(ray.d_x, ahead, ray.o_x), dr.fma(ray.d_y, ahead, ray.o_y)
         return moved, ahead
 
     def __str__(self) -> str:

@@ -184,8 +184,8 @@ def trace_sight(
         met, seen = around.look_up(r_o, distance, falloff, tolerance, active)
         if table is not None:
             # Of the surface itself: the point in front of it lies in another direction.
-            apart, r_d = distance_and_direction(p_o, p_d)
-            attended = around.gaze_along(table, r_d, apart, falloff, _PAST * in_front, active)
+            far, r_d = distance_and_direction(p_o, p_d)
+            attended = around.gaze_along(table, r_d, far, falloff, _PAST * in_front, active)
         evals = type(distance)(0)
     else:
         to_point = variant_types().Ray3f(p_o, r_o)
