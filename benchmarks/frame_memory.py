@@ -44,7 +44,7 @@ def peak(way: str, width: int, height: int) -> dict[str, float]:
     from nerg_mi.jobs.demo import store_scene
     from nerg_mi.jobs.options.pictures import PictureOptions
     from nerg_mi.jobs.pictures import render_file
-    from nerg_mi.rendering.pictures import load_scene
+    from nerg_mi.rendering.scene import load_scene
 
     dr.eval(mi.Float([0.0, 1.0]) + 1)
     dr.sync_thread()

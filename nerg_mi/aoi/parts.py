@@ -22,7 +22,7 @@ from nerg_mi.jobs.options import as_base
 from nerg_mi.jobs.parts import Parts, PlannedScene
 from nerg_mi.rays.dataset import HEAD, RayDataset, is_dataset, read_head, read_source, source_path
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.scene_file import files_of_scene
+from nerg_mi.rendering.scene import files_of_scene
 from nerg_mi.statistics.visits import Cell, Sums
 from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.tasks.task import RENDERS, Files, Part, Plan

@@ -25,8 +25,8 @@ from nerg_mi.maths.geometry import Similarity, box_interval
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import COORDINATES
 from nerg_mi.rays.readers.tables import iterate_table
-from nerg_mi.rendering.asked import is_nerg
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.scene import load_scene
 from nerg_mi.statistics.shares import Look
 from nerg_mi.statistics.visits import Box, Thing
 from nerg_mi.surfaces.mesh import mitsuba_mesh

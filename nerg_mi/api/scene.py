@@ -16,8 +16,8 @@ from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.splats.files import plugin_of_field
 from nerg_mi.registration import plugin_class
-from nerg_mi.rendering.asked import is_nerg
-from nerg_mi.rendering.projection import clip_distances
+from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.scene_writer import clip_distances
 from nerg_mi.transport.geometry import check_shape
 
 from .arrays import Floats, listed, points
@@ -73,7 +73,7 @@ class Scene:
 
         Raises `NergError` for what Mitsuba does not take.
         """
-        from nerg_mi.rendering.pictures import load_scene
+        from nerg_mi.rendering.scene import load_scene
 
         active_mitsuba()
         # Merged meshes lose their names.
@@ -126,7 +126,7 @@ class Scene:
         results to the bit in less time, after some seconds of compilation (the page on performance, "Weights as
         constants"). ``constant`` false takes it back."""
         from nerg_mi.fields.constant_weights import set_constant_weights
-        from nerg_mi.rendering.long_renders import fields_of
+        from nerg_mi.rendering.aovs import fields_of
 
         for trained in fields_of(self.integrator):
             set_constant_weights(trained, constant)

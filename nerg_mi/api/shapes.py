@@ -62,7 +62,7 @@ def scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
     if isinstance(shapes, (str, os.PathLike)):
         if Path(shapes).suffix.lower() != ".xml":
             return {name: mesh_child(shapes)}
-        from nerg_mi.rendering.pictures import load_scene
+        from nerg_mi.rendering.scene import load_scene
 
         return _of_scene(load_scene(Path(shapes)), name)
     if isinstance(shapes, mi.Scene):

@@ -17,7 +17,7 @@ def active_mitsuba() -> ModuleType:
 
     variant = mi.variant()
     if variant is None:
-        from nerg_mi.rendering.pictures import activate
+        from nerg_mi.rendering.scene import activate
 
         activate()
     elif variant.startswith("scalar"):

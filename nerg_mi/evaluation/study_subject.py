@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.asked import is_nerg
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import center
 from nerg_mi.transport.occlusion import EXACT

@@ -14,7 +14,7 @@ def select_backend(mode: str | None, threads: int | None = None) -> ModuleType:
     variant that does not exist or does not work.
     """
     from nerg_mi.fields.mlp import namespace
-    from nerg_mi.rendering.pictures import activate
+    from nerg_mi.rendering.scene import activate
 
     active = activate(mode)
     if threads:

@@ -29,9 +29,9 @@ from nerg_mi.files.atomic import check_folder, file_sha256, write_bytes
 from nerg_mi.files.images import write_bitmap_exr
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.interruption import Interruption
-from nerg_mi.rendering.channels import Channels, render_channels
-from nerg_mi.rendering.pictures import activate, load_scene
-from nerg_mi.rendering.projection import pixel_of
+from nerg_mi.rendering.bands import Channels, render_channels
+from nerg_mi.rendering.scene import activate, load_scene
+from nerg_mi.rendering.scene_writer import pixel_of
 from nerg_mi.transport.geometry import pixel_solid_angles
 from nerg_mi.transport.observer import center
 

@@ -21,7 +21,7 @@ from nerg_mi.files.atomic import replacing
 from nerg_mi.files.safe_read import read_npy
 from nerg_mi.files.video import video_frames
 from nerg_mi.interruption import Interruption
-from nerg_mi.rendering.pictures import activate, load_scene
+from nerg_mi.rendering.scene import activate, load_scene
 from nerg_mi.threads import set_thread_count
 
 from .commands import argument, command, out

@@ -16,8 +16,8 @@ from nerg_mi.figures.overlay import Layers, Limits, Overlay, Style, find_overlay
 from nerg_mi.figures.style import find_colors
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.interruption import Interruption
-from nerg_mi.rendering.asked import is_nerg, render_asked
-from nerg_mi.rendering.projection import pixel_of
+from nerg_mi.rendering.aovs import is_nerg, render_asked
+from nerg_mi.rendering.scene_writer import pixel_of
 from nerg_mi.transport.aovs import AOVS
 from nerg_mi.transport.observer import center
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.tables import markdown_table
-from nerg_mi.rendering.scene_file import files_of_scene
+from nerg_mi.rendering.scene import files_of_scene
 from nerg_mi.tasks.engines import Output, Progress, open_engine, run_plan
 from nerg_mi.tasks.store import Account, JobAccount, Store, read_account, remove_stale
 from nerg_mi.tasks.task import Files, Plan

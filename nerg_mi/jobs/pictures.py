@@ -19,12 +19,10 @@ from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.video import check_video, video_frames
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering import bands
-from nerg_mi.rendering.frames_file import numbered, read_frames
-from nerg_mi.rendering.long_renders import prepare_for
-from nerg_mi.rendering.pace import Pace
-from nerg_mi.rendering.picture_file import FORMATS, DisplayRows, picture_rows
-from nerg_mi.rendering.pictures import activate, load_scene
-from nerg_mi.rendering.scene_file import files_of_scene
+from nerg_mi.rendering.aovs import prepare_for
+from nerg_mi.rendering.bands import Pace
+from nerg_mi.rendering.files import FORMATS, DisplayRows, numbered, picture_rows, read_frames
+from nerg_mi.rendering.scene import activate, files_of_scene, load_scene
 from nerg_mi.threads import set_thread_count
 
 from .options.pictures import PictureOptions

@@ -28,10 +28,9 @@ from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.channels import Channels, render_channels
-from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.rendering.projection import pixel_of
-from nerg_mi.rendering.scene_parts import default_name
+from nerg_mi.rendering.bands import Channels, render_channels
+from nerg_mi.rendering.scene import load_scene
+from nerg_mi.rendering.scene_writer import default_name, pixel_of
 from nerg_mi.report.data import (
     Camera,
     Eyes,

@@ -19,10 +19,18 @@ from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.frames_file import write_frames
-from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.rendering.scene_parts import Attention, Eye, Lens, SceneText, default_name, relative_name
-from nerg_mi.rendering.scene_writer import numbers, value_of
+from nerg_mi.rendering.files import write_frames
+from nerg_mi.rendering.scene import load_scene
+from nerg_mi.rendering.scene_writer import (
+    Attention,
+    Eye,
+    Lens,
+    SceneText,
+    default_name,
+    numbers,
+    relative_name,
+    value_of,
+)
 from nerg_mi.train.geometry import place_of_hits
 
 from .backend import select_backend

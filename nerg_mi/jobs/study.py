@@ -22,8 +22,7 @@ from nerg_mi.figures.style import Provenance, files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
-from nerg_mi.rendering.pictures import activate
-from nerg_mi.rendering.scene_file import files_of_scene
+from nerg_mi.rendering.scene import activate, files_of_scene
 from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.tasks.task import Part, Plan, processor
 

@@ -19,9 +19,9 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.dataset import is_dataset
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.asked import is_nerg
-from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.rendering.scene_gaze import gaze_of_scene, with_gaze
+from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.nested_scene import gaze_of_scene, with_gaze
+from nerg_mi.rendering.scene import load_scene
 
 from .backend import select_backend
 from .options.scene import SceneOptions

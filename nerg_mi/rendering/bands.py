@@ -1,27 +1,191 @@
-"""A picture rendered in pieces: bands of rows, which bound the memory, in strips of samples, which bound the time of
-one step.
-
-A picture does not depend on how it is divided. Every sample keeps the position, the ray and the random numbers that it
-has in the whole picture (`pixel_sampler`), and the samples of a pixel are added in the same groups, so that with a box
-filter the pixels are those of ``mi.render``, bit by bit, also where a pixel's samples fall into two strips. With a
-wider filter the samples of the rows around a band are rendered again for it; what is added up is the same, in another
-order, and pixels differ by the rounding of single precision.
-"""
+"""A picture rendered in bands of rows, which bound the memory, and strips of samples, which bound the time of a
+kernel, and taken apart into colour and AOVs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import functools
+import math
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from nerg_mi.maths.types import variant_types
 
-from . import pixel_sampler
-from .layers import Layers, OwnLayer
-from .pace import Pace
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+# ---- Several pictures of the same rays, and the one that an integrator makes of them ----
+
+
+class Layers(Protocol):
+    """What is rendered in place of a scene's integrator: several pictures of the same rays, each with AOVs of its
+    own."""
+
+    names: list[list[str]]
+    """Names of the AOVs' channels of each picture."""
+
+    count: int
+    """Channels of AOVs that a picture with all of them would have: they are added up as there."""
+
+    def sample(self, scene, sampler, ray, medium, active) -> Iterable[tuple]:
+        """Of each picture, one after the other, ``(radiance, valid, aovs)`` as the ``sample`` of an integrator gives
+        them."""
+        ...
+
+
+class OwnLayer:
+    """The picture of an integrator, as the one layer."""
+
+    def __init__(self, integrator):
+        self.names, self._integrator = [integrator.aov_names()], integrator
+        self.count = len(self.names[0])
+
+    def sample(self, scene, sampler, ray, medium, active) -> Iterable[tuple]:
+        return [self._integrator.sample(scene, sampler, ray, medium, active)]
+
+
+# ---- Pace ----
+#
+# How a picture is divided into strips of samples, which an interruption and a report of progress can fall between.
+
+
+PACKET = 64
+"""Samples that Dr.Jit may add up as one (16 on a CPU, 32 on a GPU): a strip begins at a multiple of this many."""
+
+LEAST = 1 << 12
+"""Samples below which the overhead of a strip outweighs its work."""
+
+STRIP_SECONDS = 0.5
+"""A strip that took longer than this is followed by shorter ones, one that took less than half of it by longer ones."""
+
+
+class Pace:
+    """How many samples a strip has, from the time that those before it took; ``fixed``: always as many. It may serve
+    several pictures in turn, in one variant."""
+
+    def __init__(self, fixed: int = 0):
+        import mitsuba as mi
+
+        self._fixed = fixed
+        self._count = fixed or (1 << 20 if str(mi.variant()).startswith("cuda") else 1 << 15)
+        self._most = 1 << 24 if str(mi.variant()).startswith("cuda") else 1 << 18
+        self._since, self._strips = 0.0, 0
+
+    def begin(self) -> None:
+        """A picture begins: what was done since the last one is no strip's time."""
+        self._strips = 0
+
+    def strips(self, start: int, stop: int, spp: int) -> Iterator[tuple[int, int]]:
+        """``(first, count)`` of strips from sample ``start``, or from the packet that it lies in, to ``stop``."""
+        # With whole pixels in every strip, unless a pixel alone has more samples than a strip may have.
+        unit = math.lcm(PACKET, spp)
+        unit = unit if unit <= self._most else PACKET
+        first = start - start % PACKET
+        while first < stop:
+            last = min(max((first + self._count) // unit, first // unit + 1) * unit, stop)
+            yield first, last - first
+            first = last
+
+    def wait(self) -> None:
+        """Until the strip before is done."""
+        import drjit as dr
+
+        dr.sync_thread()
+        now = time.perf_counter()
+        # The first wait is for nothing, and the first strip's kernel had to be compiled.
+        if self._strips > 1 and not self._fixed:
+            seconds = now - self._since
+            if seconds > STRIP_SECONDS:
+                self._count = max(self._count // 2, LEAST)
+            elif seconds < STRIP_SECONDS / 2:
+                self._count = min(self._count * 2, self._most)
+        self._since, self._strips = now, self._strips + 1
+
+
+# ---- The random numbers of some pixels of a picture, without those of all others ----
+#
+# Mitsuba's ``independent`` sampler gives every sample of a picture its own PCG32 generator, whose state and stream are
+# the seed and the number of the sample, scrambled (Tiny Encryption Algorithm). Thus the numbers of any range of samples
+# can be had alone, and are those that they have in the whole picture.
+
+
+def base_seed(sampler) -> int | None:
+    """The ``seed`` of an ``independent`` sampler of Mitsuba; None for another kind, or for one that draws in another
+    way."""
+    import drjit as dr
+
+    found = re.search(r"base_seed = (\d+)", str(sampler))
+    if sampler.class_name() != "IndependentSampler" or not found:
+        return None
+    base, theirs, count = int(found[1]), sampler.clone(), 64
+    theirs.seed(7, count)
+    ours = for_samples(1, base, 7, 0, count)
+    # Another release of Mitsuba may seed differently: its pictures are then rendered in one piece, and stay what they
+    # are.
+    return base if dr.all(theirs.next_2d() == ours.next_2d(), axis=None) else None
+
+
+def for_samples(spp: int, base: int, seed: int, first: int, count: int):
+    """A sampler for the samples ``first``, ..., ``first + count - 1`` of a picture with ``spp`` samples a pixel, which
+    are counted pixel by pixel. ``base`` is the sampler's own seed and ``seed`` that of the render.
+
+    Mitsuba renders at most 2^32 samples at once; beyond that the sequences are those of other seeds.
+    """
+    import drjit as dr
+
+    mi = variant_types()
+    number = dr.opaque(mi.UInt64, first) + mi.UInt64(dr.arange(mi.UInt32, count))
+    low = mi.UInt32(number & 0xFFFFFFFF)
+    high = mi.UInt32(number >> 32)
+    key = dr.opaque(mi.UInt32, (base + seed) & 0xFFFFFFFF) + high * 0x9E3779B9
+    state, stream = mi.sample_tea_32(key, low)
+    return _class(mi.variant())(spp, mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream)))
+
+
+@functools.cache
+def _class(variant: str):
+    # Mitsuba's classes belong to a variant.
+    import mitsuba as mi
+
+    class Samples(mi.Sampler):
+        def __init__(self, spp, generator):
+            super().__init__(mi.Properties())
+            self.set_sample_count(spp)
+            self.generator = generator
+
+        def next_1d(self, active=True):
+            return self.generator.next_float32(mi.Bool(active))
+
+        def next_2d(self, active=True):
+            x = self.next_1d(active)
+            return mi.Point2f(x, self.next_1d(active))
+
+        def clone(self):
+            return Samples(self.sample_count(), type(self.generator)(self.generator))
+
+        def to_string(self):
+            return f"Samples[{self.sample_count()} a pixel, {variant}]"
+
+    return Samples
+
+
+# ---- Bands ----
+#
+# A picture rendered in pieces: bands of rows, which bound the memory, in strips of samples, which bound the time of
+# one step.
+#
+# A picture does not depend on how it is divided. Every sample keeps the position, the ray and the random numbers that
+# it has in the whole picture (`pixel_sampler`), and the samples of a pixel are added in the same groups, so that with a
+# box filter the pixels are those of ``mi.render``, bit by bit, also where a pixel's samples fall into two strips. With
+# a wider filter the samples of the rows around a band are rendered again for it; what is added up is the same, in
+# another order, and pixels differ by the rounding of single precision.
+
 
 BYTES_PER_VALUE = 22
 """Memory that a band needs for each value (channel of a pixel), in bytes: 4 in the block that samples are added to, the
@@ -66,7 +230,7 @@ def why_whole(scene, sensor) -> str | None:
         return f"the film {film.class_name()}"
     if is_batch(sensor):
         return "a batch of sensors"
-    if pixel_sampler.base_seed(sensor.sampler()) is None:
+    if base_seed(sensor.sampler()) is None:
         return f"the sampler {sensor.sampler().class_name()}"
     return None
 
@@ -105,8 +269,8 @@ def render_bands(
     """Render the picture of ``sensor`` band by band, from the top; in one piece where `why_whole` has a reason.
 
     ``spp``: samples a pixel, 0 for those of the sampler. ``rows`` of a band; 0: all. ``strip``: samples of a strip, 0:
-    as many as take about `pace.STRIP_SECONDS`; ``pace``: that of the pictures before this one. ``on_strip`` is told the
-    number of samples done and that of all after every strip, and may raise. ``layers``: in place of the scene's
+    as many as take about `bands.STRIP_SECONDS`; ``pace``: that of the pictures before this one. ``on_strip`` is told
+    the number of samples done and that of all after every strip, and may raise. ``layers``: in place of the scene's
     integrator, of a picture that can be divided; the bands of all of them follow each other. Raises
     ``KeyboardInterrupt`` after a picture in one piece that was to be stopped: there Mitsuba itself takes the signal.
     """
@@ -117,7 +281,7 @@ def render_bands(
     integrator = scene.integrator()
     layers = OwnLayer(integrator) if layers is None else layers
     observing = lambda: integrator.seen_by(sensor, scene) if isinstance(integrator, Observing) else nullcontext()
-    base = pixel_sampler.base_seed(sensor.sampler())
+    base = base_seed(sensor.sampler())
     pace = pace or Pace(strip)
     pace.begin()
     done = 0
@@ -175,7 +339,7 @@ def _trace(scene, sensor, layers: Layers, grid: _Grid, base, seed, top, first, c
 
     mi = variant_types()
     film, spp = sensor.film(), grid.spp
-    sampler = pixel_sampler.for_samples(spp, base, seed, first, count)
+    sampler = for_samples(spp, base, seed, first, count)
     # Numbers that differ from strip to strip are kept out of the kernel, which is then the same for all.
     number = dr.arange(mi.UInt32, count)
     active = number >= dr.opaque(mi.UInt32, max(start - first, 0))
@@ -290,3 +454,52 @@ def _crop(film, size, offset) -> None:
     params = mi.traverse(film)
     params["crop_size"], params["crop_offset"] = mi.ScalarVector2u(size), mi.ScalarPoint2u(offset)
     params.update()
+
+
+# ---- Channels ----
+#
+# A picture taken apart: its colour and its AOVs as arrays.
+
+
+SURFACE = 0.5
+"""Opacity from which on a pixel shows a surface, as the integrator has it by default."""
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """``color`` (h, w, 3): linear radiance; ``aovs``: (h, w) each, by name, a vector's as ``position.X``; ``bitmap``:
+    Mitsuba's, with all channels."""
+
+    color: np.ndarray
+    aovs: dict[str, np.ndarray]
+    bitmap: mi.Bitmap
+
+    @property
+    def mask(self) -> np.ndarray:
+        """Where there is a surface (h, w), bool; needs the AOV ``opacity``."""
+        return self.aovs["opacity"] >= SURFACE
+
+
+def render_channels(
+    scene, sensor, spp: int = 0, seed: int = 0, on_strip: Callable[[int, int], None] | None = None
+) -> Channels:
+    """Render what ``sensor`` sees of ``scene`` (`mi.Scene`) with the scene's integrator, as ``mi.render`` does.
+
+    ``spp``: samples a pixel, 0 for those of the sensor's sampler. ``on_strip`` is told the samples done and those of
+    all, several times a second, and may raise.
+    """
+    (band,) = render_bands(scene, sensor, spp=spp, seed=seed, on_strip=on_strip)
+    return channels_of(band.film, scene.integrator().aov_names())
+
+
+def channels_of(film, aov_names: Sequence[str]) -> Channels:
+    """What a developed ``film`` holds, whose last channels are those of AOVs, with these names."""
+    names = [name.split(".") for name in aov_names]
+    pixels = np.array(film.develop())
+    color = pixels[..., : pixels.shape[2] - len(names)]
+    first = color.shape[2]
+    several = {parts[0] for parts in names if [p[0] for p in names].count(parts[0]) > 1}
+    key = lambda parts: ".".join(parts) if parts[0] in several else parts[0]
+    aovs = {key(parts): pixels[..., first + k] for k, parts in enumerate(names)}
+    # Mono variants render one channel.
+    return Channels(np.broadcast_to(color[..., :3], (*color.shape[:2], 3)), aovs, film.bitmap())

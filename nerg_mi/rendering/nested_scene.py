@@ -1,9 +1,4 @@
-"""Somebody's scene file as the place of a scene with gaze.
-
-Mitsuba takes one integrator a scene, which has to be `nerg`; the one of the file then lights its shapes from within
-(docs/shapes-and-fields.md). An `<include>` cannot do that, so that the file is copied: what it includes becomes a part
-of the copy, its sensors come after ours, and a `<path>` leads to the files that it names.
-"""
+"""A scene file read as elements: as the place of a scene with gaze, and with another gaze field in it."""
 
 from __future__ import annotations
 
@@ -11,13 +6,20 @@ from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import reading, size_of
 
-from .scene_file import check_scene_file
-from .scene_parts import Place, relative_name
-from .scene_writer import Blank, Comment, Node, Verbatim, element, value_of
+from .scene import check_scene_file
+from .scene_writer import Blank, Comment, Node, Place, Verbatim, document, element, relative_name, value_of
+
+# ---- Somebody's scene file as the place of a scene with gaze ----
+#
+# Mitsuba takes one integrator a scene, which has to be `nerg`; the one of the file then lights its shapes from within
+# (docs/shapes-and-fields.md). An `<include>` cannot do that, so that the file is copied: what it includes becomes a
+# part of the copy, its sensors come after ours, and a `<path>` leads to the files that it names.
+
 
 BYTES = 16 << 20
 """A scene file that is copied may have so many bytes, with each that it includes."""
@@ -139,3 +141,57 @@ def _paths(path: Path, children: list[ElementTree.Element], folder: Path) -> lis
     given = [path.parent, *(path.parent / child.get("value", "") for child in children if child.tag == "path")]
     names = [relative_name(place, folder) for place in given]
     return [element("path", value=value_of(name)) for name in dict.fromkeys(names) if name != "."]
+
+
+# ---- A scene file with another gaze field in its place ----
+
+ROLE = "gaze"
+"""The integrator's property that is its gaze field."""
+
+
+def gaze_of_scene(path: Path) -> Path | None:
+    """The file of the gaze field in the integrator of the scene file ``path``; None where it has none.
+
+    Raises `NergError` for a scene without an integrator of its own in the file.
+    """
+    _, own = _elements(path)
+    volume = _gaze_volume(_integrator(path, own))
+    if volume is None:
+        return None
+    name = next((c.get("value", "") for c in volume if c.get("name") == "filename"), "")
+    return path.parent / fill(name, filled_values(own)) if name else None
+
+
+def with_gaze(path: Path, gaze: Path) -> str:
+    """The scene file ``path`` as text, with the gaze field of the file ``gaze`` in place of its own, or beside what it
+    has; names of files are absolute, so that it may be written anywhere.
+
+    Raises `NergError` as `gaze_of_scene`.
+    """
+    version, own = _elements(path)
+    integrator = _integrator(path, own)
+    volume = _gaze_volume(integrator)
+    if volume is not None:
+        integrator.remove(volume)
+    volume = SubElement(integrator, "volume", name=ROLE, type="gazefield")
+    SubElement(volume, "string", name="filename", value=value_of(str(gaze.resolve())))
+    return document(list(map(verbatim, own)), f"{path.name} with the gaze field {gaze.name}.", version)
+
+
+def _elements(path: Path) -> tuple[str, list[Element]]:
+    """The version of a scene file, and its elements with absolute names of files."""
+    version, children = scene_elements(path)
+    own = [deepcopy(child) for child in children if child.tag != "path"]
+    name_files(own, path, children)
+    return version, own
+
+
+def _integrator(path: Path, children: list[Element]) -> Element:
+    found = [child for child in children if child.tag == "integrator"]
+    if len(found) != 1:
+        raise NergError(f'"{path}" has {len(found)} integrators, where a gaze field goes into one; leave one of them')
+    return found[0]
+
+
+def _gaze_volume(integrator: Element) -> Element | None:
+    return next((child for child in integrator if child.tag == "volume" and child.get("name") == ROLE), None)

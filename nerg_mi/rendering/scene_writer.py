@@ -1,18 +1,56 @@
-"""Scene files as text: elements with comments, escaped, in the layout in which people write them by hand.
-
-Nothing here knows what a scene is for: `scene_parts` says what belongs into one.
-"""
+"""Scene files as text: elements with comments, and the parts of a scene with a place, a gaze field and an observer."""
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
+from nerg_mi.maths.types import Point3f, variant_types
+
+# ---- Where a point of a scene lies in a camera's picture, and how near and far the camera sees ----
+
+
+def clip_distances(extent: float, unit: float = 1.0) -> tuple[float, float]:
+    """Distances at which a camera begins and ends to see, in scene units: a centimetre and ten kilometres, and nearer
+    and farther where the scene is smaller or larger than what people are in, or in other units.
+
+    ``extent``: diagonal of a box around the scene and the camera; ``unit``: scene units of a metre. Of traced rays the
+    ratio of both costs no precision.
+    """
+    return min(0.01 * unit, 3e-3 * extent), max(1e4 * unit, 100 * extent)
+
+
+def pixel_of(camera: Any, point: Point3f) -> tuple[float, float] | None:
+    """Where ``point`` (one lane, scene units) lies in the picture of the perspective ``camera``: (x, y) in pixels,
+    counted from the first one's centre; None outside of it, and behind the camera."""
+    mi = variant_types()
+    film = camera.film()
+    fov = mi.traverse(camera)["x_fov"]
+    local = camera.world_transform().inverse() @ point
+    clip = camera.near_clip(), camera.far_clip()
+    screen = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, *clip)
+    x, y, _ = (float(v[0]) for v in np.array(screen @ local).reshape(3, -1))
+    depth = float(np.array(local).reshape(3, -1)[2, 0])
+    if depth <= 0 or not (0 < x < 1 and 0 < y < 1):
+        return None
+    width, height = film.crop_size()
+    return x * width - 0.5, y * height - 0.5
+
+
+# ---- Scene writer ----
+#
+# Scene files as text: elements with comments, escaped, in the layout in which people write them by hand.
+#
+# Nothing here knows what a scene is for: `scene_parts` says what belongs into one.
+
 
 _INDENT = "    "
 _WIDTH = 120
@@ -143,3 +181,268 @@ def _comment(text: str, indent: str) -> list[str]:
     out = [f"{indent}<!-- {first}", *(f"{indent}     {line}" if line else "" for line in others)]
     out[-1] += " -->"
     return out
+
+
+# ---- Scene parts ----
+#
+# What a written scene consists of: the integrator `nerg` with a place, a gaze field and an observer, and three
+# sensors, all of it set by `<default>`s at the top of the file.
+#
+# Sensors: 0 a camera, 1 the observer's own view, 2 all directions around the observer. These are the sensors, and the
+# names, of ``scenes/store/scene.xml``.
+
+
+@dataclass(frozen=True)
+class Eye:
+    """Where somebody, or a camera, is and what they look at: (3,) each in scene units; ``up``: (3,), where it is not
+    that of the scene."""
+
+    origin: np.ndarray
+    target: np.ndarray
+    up: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Lens:
+    """``fov``: degrees between the left and right border; ``aspect``: width by height; ``offset``: of the principal
+    point, as shares of width and height, as Mitsuba counts it."""
+
+    fov: float = 70.0
+    aspect: float = 1.5
+    offset: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a scene shows. ``inside``: children of the integrator (a field, volumes, an integrator that lights shapes);
+    ``beside``: of the scene (shapes, lights); ``first``: before all else (paths and defaults of another file).
+    ``files``: names of files by the `<default>` that holds them."""
+
+    inside: tuple[Node, ...] = ()
+    beside: tuple[Node, ...] = ()
+    first: tuple[Node, ...] = ()
+    files: Mapping[str, str] = field(default_factory=dict)
+    # Samples a pixel that make a picture without much noise.
+    spp: int = 16
+    version: str = "3.0.0"
+    # Names of <default>s, and ids, that another file has taken.
+    taken: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Attention:
+    """Whose attention it shows: files of a gaze field and of rays, or None; ``align`` (4, 4): from the rays to the
+    scene, None where they are the same."""
+
+    gaze: str | None = None
+    rays: str | None = None
+    align: np.ndarray | None = None
+
+    @property
+    def quantity(self) -> str | None:
+        """The AOV that is shown."""
+        return "gaze" if self.gaze is not None else "kde" if self.rays is not None else None
+
+
+@dataclass(frozen=True)
+class SceneText:
+    """All that a scene file says. ``unit``: scene units of a metre, or what stands for one; ``extent``: length of the
+    diagonal of a box around the place and its cameras, in scene units; ``observer``: None where the camera is the
+    observer."""
+
+    place: Place
+    attention: Attention
+    camera: Eye
+    observer: Eye | None
+    up: np.ndarray
+    lens: Lens = Lens()
+    width: int = 480
+    unit: float = 1.0
+    extent: float = 10.0
+    # Sentences for whoever opens the file: of the file, of the camera, of the observer.
+    about: str = ""
+    about_camera: str = ""
+    about_observer: str = ""
+
+    @property
+    def falloff(self) -> float:
+        """Distance over which gaze fades behind what the observer sees: 5 cm, within what a place of this size shows
+        and single precision resolves."""
+        return float(np.clip(0.05 * self.unit, 1e-4 * self.extent, 0.02 * self.extent))
+
+    def xml(self) -> str:
+        """The text of the file."""
+        return document(_nodes(self), self.about, self.place.version)
+
+
+class _Names:
+    """The `<default>`s and ids of a scene, under names that no other file has taken."""
+
+    def __init__(self, taken: frozenset[str]):
+        self._taken = taken
+
+    def __call__(self, name: str) -> str:
+        return default_name(name, self._taken)
+
+    def default(self, name: str, value: object) -> Element:
+        return element("default", name=self(name), value=value)
+
+    def use(self, name: str) -> str:
+        return f"${self(name)}"
+
+
+def _nodes(scene: SceneText) -> Sequence[Node]:
+    names, place = _Names(scene.place.taken), scene.place
+    return [
+        *place.first,
+        *_defaults(scene, names),
+        Blank(),
+        _integrator(scene, names),
+        Blank(),
+        _camera(scene, names),
+        Blank(),
+        *_own_sensors(scene, names),
+        *([Blank(), *place.beside] if place.beside else []),
+    ]
+
+
+def _defaults(scene: SceneText, names: _Names) -> list[Node]:
+    height = max(1, round(scene.width / scene.lens.aspect))
+    attention, sphere = scene.attention, 2 * round(0.4 * scene.width)
+    files = {**scene.place.files, "gaze": attention.gaze, "rays": attention.rays}
+    out: list[Node] = [names.default(name, file) for name, file in files.items() if file is not None]
+    out += [
+        names.default(name, value)
+        for name, value in {
+            "spp": scene.place.spp,
+            "width": scene.width,
+            "height": height,
+            "sphere_width": sphere,
+            "sphere_height": sphere // 2,
+        }.items()
+    ]
+    out += [Blank(), Comment(scene.about_camera)]
+    out += [
+        names.default("camera", numbers(scene.camera.origin)),
+        names.default("target", numbers(scene.camera.target)),
+    ]
+    out += [names.default("fov", numbers([scene.lens.fov])), names.default("up", numbers(scene.up))]
+    if scene.observer is not None:
+        out += [Blank(), Comment(scene.about_observer)]
+        out += [names.default("eye", numbers(scene.observer.origin))]
+        out += [names.default("ahead", numbers(scene.observer.target))]
+    aovs = ["depth", "opacity", *([attention.quantity] if attention.quantity else []), "visibility"]
+    falloff = Comment(
+        "How far behind what the observer sees gaze fades to zero, in units of the scene; 0: a hard edge."
+    )
+    return [
+        *out,
+        Blank(),
+        names.default("aovs", ",".join(aovs)),
+        names.default("depth", "median"),
+        falloff,
+        names.default("falloff", numbers([scene.falloff])),
+        names.default("visibility", "depth"),
+        names.default("tolerance", "0"),
+        names.default("occlusion", "true"),
+        names.default("radiance", "true"),
+    ]
+
+
+def _integrator(scene: SceneText, names: _Names) -> Element:
+    attention = scene.attention
+    children: list[Node] = list(scene.place.inside)
+    if attention.gaze is not None:
+        children.append(element("volume", prop("string", "filename", names.use("gaze")), name="gaze", type="gazefield"))
+    if attention.rays is not None:
+        where = [] if attention.align is None else [transform(matrix(attention.align))]
+        file = prop("string", "filename", names.use("rays"))
+        children.append(element("volume", file, *where, name="kde", type="gazekde"))
+    if scene.observer is not None:
+        pose = _look(names.use("eye"), names.use("ahead"), _up(scene.observer, names))
+        children.append(element("sensor", pose, name="observer", type="perspective"))
+    kinds = {"occlusion": "boolean", "radiance": "boolean", "falloff": "float", "tolerance": "float"}
+    for name in ("occlusion", "radiance", "visibility", "falloff", "tolerance", "depth", "aovs"):
+        children.append(prop(kinds.get(name, "string"), name, names.use(name)))
+    return element("integrator", *children, type="nerg", id=names("integrator"))
+
+
+def _camera(scene: SceneText, names: _Names) -> Element:
+    pose = _look(names.use("camera"), names.use("target"), _up(scene.camera, names))
+    return _perspective("camera", pose, scene, names, scene.lens.offset)
+
+
+def _own_sensors(scene: SceneText, names: _Names) -> list[Node]:
+    observer = scene.observer
+    eye, ahead = ("camera", "target") if observer is None else ("eye", "ahead")
+    pose = _look(names.use(eye), names.use(ahead), _up(observer or scene.camera, names))
+    front = ahead_level((observer or scene.camera), scene.up)
+    around = transform(
+        element("lookat", origin="0, 0, 0", target=numbers(front), up=numbers(scene.up)),
+        element("translate", value=names.use(eye)),
+    )
+    film = _film(names.use("sphere_width"), names.use("sphere_height"))
+    sphere = element("sensor", around, _sampler(names), film, type="panorama", id=names("gaze_sphere"))
+    towards = "the direction in which the observer looks" if observer is not None else "where the camera looks"
+    return [
+        _perspective("own_view", pose, scene, names),
+        Blank(),
+        Comment(f"The middle of this picture is the horizon towards {towards}."),
+        sphere,
+    ]
+
+
+def ahead_level(eye: Eye, up: np.ndarray) -> np.ndarray:
+    """Unit direction (3,) in which ``eye`` looks, made level; any level one for an eye that looks straight up or
+    down."""
+    up = np.asarray(up, float) / np.linalg.norm(up)
+    for along in (np.subtract(eye.target, eye.origin), np.roll(up, 1)):
+        level = along - up * (along @ up)
+        if np.linalg.norm(level) > 1e-3 * np.linalg.norm(along):
+            return level / np.linalg.norm(level)
+    raise ValueError(f"no direction is level under the up {up}")
+
+
+def _perspective(name: str, pose: Node, scene: SceneText, names: _Names, offset: Sequence[float] = (0, 0)) -> Element:
+    lens: list[Node] = [prop("float", "fov", names.use("fov")), prop("string", "fov_axis", "x")]
+    lens += [prop("float", f"principal_point_offset_{a}", numbers([v])) for a, v in zip("xy", offset) if v]
+    near, far = (numbers([distance]) for distance in clip_distances(scene.extent, scene.unit))
+    film = _film(names.use("width"), names.use("height"))
+    clip = [prop("float", "near_clip", near), prop("float", "far_clip", far)]
+    return element("sensor", *lens, *clip, pose, _sampler(names), film, type="perspective", id=names(name))
+
+
+def _film(width: str, height: str) -> Element:
+    return element(
+        "film",
+        prop("integer", "width", width),
+        prop("integer", "height", height),
+        element("rfilter", type="box"),
+        prop("string", "component_format", "float32"),
+        prop("string", "pixel_format", "rgb"),
+        type="hdrfilm",
+    )
+
+
+def _sampler(names: _Names) -> Element:
+    return element("sampler", prop("integer", "sample_count", names.use("spp")), type="independent")
+
+
+def _look(origin: str, target: str, up: str) -> Element:
+    return transform(element("lookat", origin=origin, target=target, up=up))
+
+
+def _up(eye: Eye, names: _Names) -> str:
+    return names.use("up") if eye.up is None else numbers(eye.up)
+
+
+def default_name(name: str, taken: frozenset[str]) -> str:
+    """The `<default>` of a written scene that is called ``name`` where no other file has ``taken`` that name."""
+    return f"nerg_{name}" if name in taken else name
+
+
+def relative_name(path: Path, folder: Path) -> str:
+    """``path`` as a scene file in ``folder`` names it: relative where both lie below a common folder, else absolute."""
+    path, folder = Path(os.path.realpath(path)), Path(os.path.realpath(folder))
+    common = os.path.commonpath([path, folder])
+    return os.path.relpath(path, folder) if common != os.path.dirname(common) else str(path)

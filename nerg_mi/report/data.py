@@ -22,7 +22,7 @@ from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.types import variant_types
 from nerg_mi.rays.quality import RaysSummary
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.channels import render_channels
+from nerg_mi.rendering.bands import render_channels
 from nerg_mi.statistics.shares import Look, Shares
 from nerg_mi.statistics.visits import Landed, Thing, land, regroup
 from nerg_mi.train.gaze_data import SURFACE_OPACITY

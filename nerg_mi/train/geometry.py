@@ -20,8 +20,8 @@ from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.geometry import AnyBox, Box, Similarity, box_interval
 from nerg_mi.ranges import LENGTHS, check_number
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.mesh_file import check_vol
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.files import check_vol
+from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import Place

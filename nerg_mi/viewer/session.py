@@ -28,7 +28,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.ranges import FARTHEST
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.scene import load_scene
 from nerg_mi.statistics.shares import ROUGH
 from nerg_mi.transport.geometry import Ceiling
 

@@ -11,7 +11,7 @@ from nerg_mi.aoi.scene import changed_areas, changed_scene, read_changes
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas.kinds import Areas, Group, SceneShape
 from nerg_mi.formats.regions import Region
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.scene import load_scene
 
 from .place import SIGN, write_place
 

@@ -9,7 +9,7 @@ from nerg_mi.aoi.scene import scene_of, shape_named, shapes_of, thing_of_shape, 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas.kinds import MeshPart, SceneShape
 from nerg_mi.formats.regions import Region
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.mesh import mitsuba_mesh
 
 from .place import SIGN, STAND, write_place

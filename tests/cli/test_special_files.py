@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.scene_file import check_scene_file
+from nerg_mi.rendering.scene import check_scene_file
 from tests.surfaces.meshes import box as box_of
 
 from .test_mendable import ended, rays  # noqa: F401

@@ -55,7 +55,7 @@ def _read(folder: Path) -> object:
     import mitsuba as mi
 
     import nerg_mi  # noqa: F401
-    from nerg_mi.rendering.pictures import load_scene
+    from nerg_mi.rendering.scene import load_scene
 
     if mi.variant() != "llvm_ad_rgb":
         mi.set_variant("llvm_ad_rgb")
@@ -65,7 +65,7 @@ def _read(folder: Path) -> object:
 
 def _nest(folder: Path) -> object:
     from nerg_mi.rendering.nested_scene import nested_place
-    from nerg_mi.rendering.scene_parts import Attention, Eye, SceneText
+    from nerg_mi.rendering.scene_writer import Attention, Eye, SceneText
 
     place = nested_place(folder / "theirs.xml", folder / "ours")
     camera = Eye(np.zeros(3), np.ones(3))
@@ -101,7 +101,7 @@ def _read_regions(folder: Path) -> object:
 
 
 def _read_frames(folder: Path) -> object:
-    from nerg_mi.rendering.frames_file import read_frames
+    from nerg_mi.rendering.files import read_frames
 
     return read_frames(folder / "walk.frames.csv")
 

@@ -14,8 +14,8 @@ from nerg_mi.files.atomic import write_bytes
 from nerg_mi.jobs import overlays
 from nerg_mi.jobs.options.pictures import PictureOptions
 from nerg_mi.jobs.pictures import render_file
-from nerg_mi.rendering.asked import render_asked
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.aovs import render_asked
+from nerg_mi.rendering.scene import load_scene
 from tests.jobs.recorder import Recorder
 from tests.pictures import mitsuba_bitmap
 from tests.plugins import fields

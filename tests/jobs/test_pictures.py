@@ -7,8 +7,8 @@ from nerg_mi.files.images import read_exr_text
 from nerg_mi.jobs import pictures
 from nerg_mi.jobs.demo import store_scene
 from nerg_mi.jobs.pictures import PictureOptions, render_file
-from nerg_mi.rendering import long_renders
-from nerg_mi.rendering.long_renders import prepare_for
+from nerg_mi.rendering import aovs
+from nerg_mi.rendering.aovs import prepare_for
 from tests.cli.test_render import SCENE
 from tests.jobs.recorder import Recorder
 from tests.pictures import mitsuba_bitmap
@@ -62,7 +62,7 @@ def test_long_renders_are_prepared_and_the_same_to_the_byte(tmp_path, monkeypatc
     options = PictureOptions(defaults={"width": "24", "height": "16"}, spp=2, mode="llvm_ad_rgb")
     render_file(store_scene(), tmp_path / "a.png", options)
     prepared = []
-    monkeypatch.setattr(long_renders, "SAMPLES", 24 * 16 * 2)
+    monkeypatch.setattr(aovs, "SAMPLES", 24 * 16 * 2)
     monkeypatch.setattr(
         pictures, "prepare_for", lambda samples, scene: prepared.append(prepare_for(samples, scene)) or prepared[-1]
     )

@@ -23,9 +23,9 @@ from nerg_mi.jobs.scene import write_scene
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.channels import render_channels
-from nerg_mi.rendering.frames_file import read_frames
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.bands import render_channels
+from nerg_mi.rendering.files import read_frames
+from nerg_mi.rendering.scene import load_scene
 from tests.formats.splats.writers import write_inria
 from tests.jobs.recorder import Recorder
 from tests.pictures import mitsuba_bitmap

@@ -14,7 +14,7 @@ from nerg_mi.formats.gltf import shown_unlit
 from nerg_mi.jobs import demo
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.view import place_to_view, write_variants
-from nerg_mi.rendering.scene_gaze import gaze_of_scene
+from nerg_mi.rendering.nested_scene import gaze_of_scene
 from tests.formats.splats.writers import random_splats, write_spz
 from tests.jobs.recorder import Recorder
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.asked import render_asked
-from nerg_mi.rendering.channels import render_channels
+from nerg_mi.rendering.aovs import render_asked
+from nerg_mi.rendering.bands import render_channels
 from tests.plugins import fields
 from tests.plugins.scenes import camera, observer_at, with_gaze
 

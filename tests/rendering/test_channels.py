@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rendering.channels import Channels, render_channels
+from nerg_mi.rendering.bands import Channels, render_channels
 
 
 @pytest.fixture

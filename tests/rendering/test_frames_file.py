@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering import frames_file
-from nerg_mi.rendering.frames_file import numbered, read_frames, write_frames
+from nerg_mi.rendering import files
+from nerg_mi.rendering.files import numbered, read_frames, write_frames
 
 
 def test_what_is_written_is_read(tmp_path):
@@ -42,7 +42,7 @@ def test_bounds(tmp_path, monkeypatch):
     with pytest.raises(NergError, match="cannot be read"):
         read_frames(tmp_path / "a.csv")
     (tmp_path / "b.csv").write_text("eye\n1\n2\n")
-    monkeypatch.setattr(frames_file, "FRAMES", 1)
+    monkeypatch.setattr(files, "FRAMES", 1)
     with pytest.raises(NergError, match="more than 1 frames"):
         read_frames(tmp_path / "b.csv")
     with pytest.raises(NergError, match="there is no file of frames"):

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rendering.bands import render_bands
-from nerg_mi.rendering.layers import OwnLayer
+from nerg_mi.rendering.bands import OwnLayer, render_bands
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.mesh_file import check_mesh, check_points, check_vol
+from nerg_mi.rendering.files import check_mesh, check_points, check_vol
 
 CORNERS = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.channels import render_channels
+from nerg_mi.rendering.bands import render_channels
 from nerg_mi.rendering.nested_scene import nested_place
-from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.rendering.scene_parts import Attention, Eye, SceneText
+from nerg_mi.rendering.scene import load_scene
+from nerg_mi.rendering.scene_writer import Attention, Eye, SceneText
 
 THEIRS = """<scene version="3.0.0">
     <!-- theirs -->

@@ -2,8 +2,8 @@
 
 import pytest
 
-from nerg_mi.rendering import pace
-from nerg_mi.rendering.pace import LEAST, PACKET, Pace
+from nerg_mi.rendering import bands
+from nerg_mi.rendering.bands import LEAST, PACKET, Pace
 
 
 class Clock:
@@ -11,7 +11,7 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.now = 0.0
-        monkeypatch.setattr(pace.time, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(bands.time, "perf_counter", lambda: self.now)
 
     def take(self, it, seconds, times=1):
         for _ in range(times):
@@ -40,11 +40,11 @@ def test02_short_ones_grow_and_long_ones_shrink_to_a_limit(rgb, monkeypatch):
     assert first_strip(it) == before
     clock.take(it, 0.01)
     assert first_strip(it) == 2 * before
-    clock.take(it, 0.7 * pace.STRIP_SECONDS)
+    clock.take(it, 0.7 * bands.STRIP_SECONDS)
     assert first_strip(it) == 2 * before
     clock.take(it, 0.01, 20)
     assert first_strip(it) == 1 << 18
-    clock.take(it, 2 * pace.STRIP_SECONDS, 40)
+    clock.take(it, 2 * bands.STRIP_SECONDS, 40)
     assert first_strip(it) == LEAST
 
 
@@ -62,8 +62,8 @@ def test04_the_next_picture_goes_on_with_the_pace_of_the_last(rgb, monkeypatch):
     assert grown > before
     # Reading the next scene is no strip's time.
     it.begin()
-    clock.take(it, 10 * pace.STRIP_SECONDS)
-    clock.take(it, 10 * pace.STRIP_SECONDS)
+    clock.take(it, 10 * bands.STRIP_SECONDS)
+    clock.take(it, 10 * bands.STRIP_SECONDS)
     assert first_strip(it) == grown
-    clock.take(it, 2 * pace.STRIP_SECONDS)
+    clock.take(it, 2 * bands.STRIP_SECONDS)
     assert first_strip(it) == grown // 2

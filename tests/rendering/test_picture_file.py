@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.picture_file import picture_rows
+from nerg_mi.rendering.files import picture_rows
 from tests.pictures import mitsuba_bitmap
 
 

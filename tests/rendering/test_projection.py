@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rendering.projection import pixel_of
+from nerg_mi.rendering.scene_writer import pixel_of
 
 
 @pytest.fixture

@@ -9,8 +9,7 @@ import sys
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.rendering.scene_file import DEPTH, check_scene_file
+from nerg_mi.rendering.scene import DEPTH, check_scene_file, load_scene
 
 SENSOR = """<sensor type="perspective"><sampler type="{sampler}"><integer name="sample_count" value="{spp}"/></sampler>
 <film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{height}"/></film></sensor>"""
@@ -136,7 +135,7 @@ def test_what_is_no_xml(tmp_path, text, said):
 
 
 def test_too_many_elements(tmp_path, monkeypatch):
-    monkeypatch.setattr("nerg_mi.rendering.scene_file.ELEMENTS", 100)
+    monkeypatch.setattr("nerg_mi.rendering.scene.ELEMENTS", 100)
     refused(tmp_path, scene('<shape type="cube"/>' * 101), "more than 100 elements")
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.rendering.scene_parts import (
+from nerg_mi.rendering.scene import load_scene
+from nerg_mi.rendering.scene_writer import (
     Attention,
     Eye,
     Lens,
@@ -16,9 +16,9 @@ from nerg_mi.rendering.scene_parts import (
     SceneText,
     ahead_level,
     default_name,
+    element,
     relative_name,
 )
-from nerg_mi.rendering.scene_writer import element
 
 CUBE = Place(beside=(element("shape", type="cube"),))
 UP = np.array([0.0, 0, 1])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.frames_file import read_frames
+from nerg_mi.rendering.files import read_frames
 from nerg_mi.viewer.flights import flight, frames_csv
 from nerg_mi.viewer.points import View
 

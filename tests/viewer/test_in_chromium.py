@@ -70,7 +70,7 @@ def drag(driver, start, end):
 @pytest.fixture(scope="module")
 def running():
     from nerg_mi.jobs import demo
-    from nerg_mi.rendering.pictures import activate
+    from nerg_mi.rendering.scene import activate
 
     require("viser")
     activate("llvm_ad_rgb")

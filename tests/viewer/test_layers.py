@@ -9,7 +9,7 @@ import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat, overlay, to_bytes
 from nerg_mi.figures.style import LINE, lines
-from nerg_mi.rendering.scene_gaze import with_gaze
+from nerg_mi.rendering.nested_scene import with_gaze
 from nerg_mi.viewer import layers
 from nerg_mi.viewer.layers import Scale, layer_of
 

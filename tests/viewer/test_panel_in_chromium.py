@@ -33,7 +33,7 @@ def two_people() -> nerg.Rays:
 @pytest.fixture(scope="module")
 def running(tmp_path_factory):
     from nerg_mi.jobs import demo
-    from nerg_mi.rendering.pictures import activate
+    from nerg_mi.rendering.scene import activate
 
     require("viser")
     activate("llvm_ad_rgb")

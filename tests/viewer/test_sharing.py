@@ -7,7 +7,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.formats.regions import Region
-from nerg_mi.rendering.scene_gaze import with_gaze
+from nerg_mi.rendering.nested_scene import with_gaze
 from nerg_mi.viewer import session
 
 AT = np.array([0.2, 0.1, 0.6])

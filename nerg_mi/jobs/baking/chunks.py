@@ -16,8 +16,8 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.rendering.asked import is_nerg
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.laplacian import Sums
 from nerg_mi.surfaces.mesh import Mesh, Target, Triangles
 from nerg_mi.surfaces.sources import (

@@ -15,7 +15,7 @@ from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.splats.files import refuse_others
 from nerg_mi.formats.surfaces import mesh as mesh_of_field
 from nerg_mi.jobs.reporter import Reporter
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.mesh import Mesh, Refined, Triangles, refine, shape_triangles, weld
 
 FACES = 100_000

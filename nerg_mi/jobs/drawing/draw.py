@@ -70,7 +70,7 @@ def draw_kind(kind: Kind, files: Sequence[Path], output: Path | None, options: A
 
 def _inputs(paths: Sequence[Path], options: Any) -> list[Path]:
     """The files that were read: of a scene those that it names, too."""
-    from nerg_mi.rendering.scene_file import files_of_scene
+    from nerg_mi.rendering.scene import files_of_scene
 
     found: list[Path] = []
     for path in paths:

@@ -10,7 +10,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Layers, Overlay
 from nerg_mi.files.images import read_exr, read_exr_text
-from nerg_mi.rendering.channels import SURFACE
+from nerg_mi.rendering.bands import SURFACE
 
 EXR = ".exr"
 

@@ -54,8 +54,8 @@ def _draw_floor(files: Sequence[Path], options: FloorOptions, reporter: Reporter
     low, high = _corners(rays)
     inputs, walls = [path], None
     if options.scene is not None:
-        from nerg_mi.rendering.asked import nerg_of
-        from nerg_mi.rendering.pictures import activate, load_scene
+        from nerg_mi.rendering.aovs import nerg_of
+        from nerg_mi.rendering.scene import activate, load_scene
 
         from .walls import cut_place
 

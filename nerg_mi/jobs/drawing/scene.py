@@ -14,8 +14,8 @@ from nerg_mi.figures.overlay import Layers, Overlay
 from nerg_mi.interruption import Interruption
 from nerg_mi.jobs.overlays import layers_of
 from nerg_mi.jobs.reporter import Reporter
-from nerg_mi.rendering.asked import nerg_of
-from nerg_mi.rendering.pictures import activate, load_scene
+from nerg_mi.rendering.aovs import nerg_of
+from nerg_mi.rendering.scene import activate, load_scene
 
 from .kind import SceneOptions
 

@@ -67,7 +67,7 @@ def _display(path: Path) -> np.ndarray:
     """The picture as it is shown (h, w, 3), in 0..1."""
     from nerg_mi.figures.overlay import srgb
     from nerg_mi.photos.images import read_image
-    from nerg_mi.rendering.pictures import activate
+    from nerg_mi.rendering.scene import activate
 
     if path.suffix.lower() == EXR:
         from nerg_mi.files.images import read_exr

@@ -20,7 +20,7 @@ from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.ranges import COORDINATES, Range
-from nerg_mi.rendering.pictures import activate
+from nerg_mi.rendering.scene import activate
 from nerg_mi.surfaces.mesh import Mesh, mitsuba_mesh
 
 from .kind import ColorOptions, Drawing, Kind

@@ -14,7 +14,7 @@ from nerg_mi.figures.overlay import find_overlay, occlusion_figure, shared_limit
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import Range
-from nerg_mi.rendering.projection import pixel_of
+from nerg_mi.rendering.scene_writer import pixel_of
 
 from .kind import Drawing, Kind, SceneOptions
 

@@ -14,7 +14,7 @@ from nerg_mi.figures.sphere import sphere_figure
 from nerg_mi.figures.style import Provenance, encode
 from nerg_mi.files.images import encode_png
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.channels import Channels
+from nerg_mi.rendering.bands import Channels
 from nerg_mi.report.data import Picture
 
 

@@ -12,8 +12,8 @@ from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.figures.overview import Frame, Judge, Seen, Shot, around_observer, of_place
 from nerg_mi.maths.geometry import box_of
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rendering.channels import render_channels
-from nerg_mi.rendering.scene_parts import Eye, ahead_level
+from nerg_mi.rendering.bands import render_channels
+from nerg_mi.rendering.scene_writer import Eye, ahead_level
 from nerg_mi.transport.geometry import Place, pixel_directions, pixel_solid_angles, trace_depth
 
 from .photos import PhotoCamera

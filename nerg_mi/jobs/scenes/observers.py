@@ -10,7 +10,7 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.scene_parts import Eye
+from nerg_mi.rendering.scene_writer import Eye
 
 RADIUS = 0.5
 """Rays that started within so many metres of each other are counted as of one place."""

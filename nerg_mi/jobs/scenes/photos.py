@@ -10,7 +10,7 @@ import numpy as np
 from nerg_mi.errors import NergError, plain
 from nerg_mi.photos.images import find_source, read_photo, read_posed
 from nerg_mi.photos.posed import Frame, PosedImages
-from nerg_mi.rendering.scene_parts import Eye, Lens
+from nerg_mi.rendering.scene_writer import Eye, Lens
 
 
 @dataclass(frozen=True)

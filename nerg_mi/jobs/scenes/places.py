@@ -13,10 +13,9 @@ from nerg_mi.files.safe_read import reading
 from nerg_mi.formats.meshes import GREY, MeshFile, read_mesh_file
 from nerg_mi.formats.splats.files import plugin_of_field, read_splats
 from nerg_mi.formats.volumes import write_volume
-from nerg_mi.rendering.mesh_file import check_vol, write_mesh
+from nerg_mi.rendering.files import check_vol, write_mesh
 from nerg_mi.rendering.nested_scene import nested_place
-from nerg_mi.rendering.scene_parts import Place, relative_name
-from nerg_mi.rendering.scene_writer import Comment, Node, element, prop, value_of
+from nerg_mi.rendering.scene_writer import Comment, Node, Place, element, prop, relative_name, value_of
 from nerg_mi.train.geometry import NOWHERE, shade_hits
 
 from .files import GivenFiles

@@ -9,7 +9,7 @@ from nerg_mi.figures.overlay import find_overlay
 from nerg_mi.jobs.drawing import scene as scenes
 from nerg_mi.jobs.drawing.draw import draw
 from nerg_mi.jobs.drawing.kind import SceneOptions
-from nerg_mi.rendering.asked import render_asked
+from nerg_mi.rendering.aovs import render_asked
 from tests.jobs.recorder import Recorder
 
 from .scenes import MODE, write_scene

@@ -10,9 +10,8 @@ from nerg_mi.figures.overview import Frame, Seen
 from nerg_mi.jobs.scenes.cameras import Probe, best_camera, best_photo, given_point, probe_values, turned_ahead, upright
 from nerg_mi.jobs.scenes.photos import PhotoCamera
 from nerg_mi.maths.geometry import box_interval
-from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.rendering.scene_parts import Attention, Eye, Lens, Place, SceneText
-from nerg_mi.rendering.scene_writer import element
+from nerg_mi.rendering.scene import load_scene
+from nerg_mi.rendering.scene_writer import Attention, Eye, Lens, Place, SceneText, element
 
 EYE = Eye(np.array([0.3, -0.2, 0.1]), np.array([1.0, 0.6, 0.4]))
 

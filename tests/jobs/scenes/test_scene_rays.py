@@ -8,7 +8,7 @@ from nerg_mi.jobs.options.scene import SceneOptions
 from nerg_mi.jobs.scene import write_scene
 from nerg_mi.jobs.scenes import scene_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.scene import load_scene
 from tests.jobs.recorder import Recorder
 
 pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
