@@ -58,8 +58,7 @@ class Population:
 def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     from nerg_mi.aoi.measured import count_block
     from nerg_mi.aoi.scene import things_of
-    from nerg_mi.formats.areas.kinds import Areas
-    from nerg_mi.formats.regions import Region
+    from nerg_mi.formats.areas import Areas, Region
     from nerg_mi.statistics.tables import People
     from nerg_mi.statistics.visits import ALL
 

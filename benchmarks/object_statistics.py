@@ -24,7 +24,7 @@ def made_store():
 
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.aoi.scene import shapes_of, surroundings_of_scene, things_of
-    from nerg_mi.formats.areas.reading import read_areas
+    from nerg_mi.formats.areas import read_areas
     from nerg_mi.jobs.demo import store_scene
 
     folder = store_scene().parent

@@ -210,7 +210,7 @@ def main(argv=None) -> None:
     if args.hits:
         print(f"{peak(args.hits):.2f}")
         return
-    from nerg_mi.formats.splats.files import read_splats
+    from nerg_mi.formats.splats import read_splats
     from splats import make
 
     path = args.splats

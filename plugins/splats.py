@@ -71,7 +71,7 @@ import mitsuba as mi
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats
-from nerg_mi.formats.splats.files import read_splats
+from nerg_mi.formats.splats import read_splats
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import choice, number, resolved, text, transform, volume_class
 from nerg_mi.ranges import Range

@@ -113,7 +113,7 @@ def test03_every_line_of_a_shell_is_known():
 
 
 def test04_areas_are_read(tmp_path):
-    from nerg_mi.formats.regions import read_regions
+    from nerg_mi.formats.areas import read_regions
 
     for block in blocks("json", page="report.md"):
         (tmp_path / "a.json").write_text(block.text)

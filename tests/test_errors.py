@@ -10,7 +10,7 @@ from nerg_mi import errors
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.ablation import frame_timer
 from nerg_mi.evaluation.metrics import Renderer
-from nerg_mi.formats.volumes import write_volume
+from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.photos.cameras import Camera, Intrinsics
 from nerg_mi.train.geometry import place_of_scene, place_of_volume
 

@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 
 from nerg_mi.aoi.scene import read_changes
-from nerg_mi.formats.areas.reading import read_areas
+from nerg_mi.formats.areas import read_areas
 from nerg_mi.jobs import demo
 from nerg_mi.rays.rays import Rays
 from tests.conftest import ROOT

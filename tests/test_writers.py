@@ -40,7 +40,7 @@ OPENERS = {"open", "ZipFile", "GzipFile", "fdopen", "TarFile"}
 EXCEPTIONS = {
     "nerg_mi/files/atomic.py": "the writer itself",
     "nerg_mi/files/images.py:_raise_if_full": "finds out why the file that `replacing` has named takes no more",
-    "nerg_mi/formats/torch_ngp/archive.py:write_torch": "has torch write to memory",
+    "nerg_mi/formats/torch_files.py:write_torch": "has torch write to memory",
     "nerg_mi/cli/ending.py:write": "is a standard stream",
     "nerg_mi/files/images.py": "encodes in memory",
     "nerg_mi/figures/style.py:encode": "encodes in memory",

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.rays.dataset import RayDataset, is_dataset, merge_rays
 from nerg_mi.rays.filters import time_order
 from nerg_mi.rays.rays import Rays

@@ -13,8 +13,7 @@ import numpy as np
 
 from nerg_mi.files.atomic import replacing
 from nerg_mi.files.safe_read import read_npz
-from nerg_mi.formats.areas.kinds import Areas
-from nerg_mi.formats.areas.reading import files_of_areas, read_areas
+from nerg_mi.formats.areas import Areas, files_of_areas, read_areas
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.jobs.backend import select_backend
 from nerg_mi.jobs.gaze_places import file_of_training, place_key

@@ -14,8 +14,7 @@ import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
-from nerg_mi.formats.areas.kinds import Areas, Group
-from nerg_mi.formats.regions import read_regions
+from nerg_mi.formats.areas import Areas, Group, read_regions
 from nerg_mi.jobs.reporter import SILENT, Reporter
 from nerg_mi.statistics.estimates import adjusted, ratio_differences
 from nerg_mi.statistics.shares import ROUGH, gaze_shares

@@ -15,10 +15,20 @@ import numpy as np
 from nerg_mi.errors import NergError, mitsuba_says, plain
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import with_formula
-from nerg_mi.formats.areas.kinds import Area, Areas, Group, MeshPart, SceneShape
+from nerg_mi.formats.areas import (
+    Area,
+    Areas,
+    Entry,
+    Group,
+    MeshPart,
+    Region,
+    SceneShape,
+    check_name,
+    is_number,
+    parse_box,
+)
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.meshes import read_mesh_file
-from nerg_mi.formats.regions import Entry, Region, check_name, is_number, parse_box
 from nerg_mi.jobs.gaze_places import align_of_training, place_of_training
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
 from nerg_mi.maths.geometry import Similarity, box_interval

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.formats.areas import Region
 from nerg_mi.formats.meshes import READERS
-from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.reporter import SILENT, Reporter
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import FARTHEST, Range, check_number

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.fields.splats import Splats
-from nerg_mi.formats.splats.files import plugin_of_field
+from nerg_mi.formats.splats import plugin_of_field
 from nerg_mi.registration import plugin_class
 from nerg_mi.rendering.aovs import is_nerg
 from nerg_mi.rendering.scene_writer import clip_distances
@@ -193,7 +193,7 @@ def make_scene(
     """A scene of a trained place, a gaze field, or shapes, without writing XML.
 
     ``field``, ``gaze``: what `load_field`, `load_gaze` or a training gave, or the name of a checkpoint; a place may be
-    Gaussian splats, too: a file of them, or what `nerg_mi.formats.splats.files.read_splats` gave. ``shapes``: what
+    Gaussian splats, too: a file of them, or what `nerg_mi.formats.splats.read_splats` gave. ``shapes``: what
     stands in the field, or is all there is: a mesh file (.ply, .obj, .glb), a scene file, a dict for ``mi.load_dict``,
     a Mitsuba scene or shape, or several of these in a list or a dict by name. ``camera``: a `Camera`, or a sensor as
     Mitsuba takes it. ``observer``: position (3,) of the one whose gaze it is; without it the camera is the observer.

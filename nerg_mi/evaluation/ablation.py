@@ -14,7 +14,7 @@ from nerg_mi.errors import mitsuba_says
 from nerg_mi.figures.style import Provenance, new_page, save
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.tables import markdown_table, write_csv, write_json
-from nerg_mi.formats.splats.files import plugin_of_field
+from nerg_mi.formats.splats import plugin_of_field
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_recipes import gaze_recipe
 from nerg_mi.train.geometry import GazePlace, volume_dict

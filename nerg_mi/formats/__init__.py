@@ -1,1 +1,2 @@
-"""File formats of fields, surfaces and volumes, our own and those of others."""
+"""File formats of fields, meshes, splats and areas of interest. Each reader refuses what it can not read, and runs
+nothing."""

@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.errors import MissingFile, NergError, plain
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.safe_read import open_file, parse_json, plain, reading
+from nerg_mi.files.safe_read import open_file, parse_json, reading
 
 FORMAT = 1
 """The version of the files, raised when an earlier version of this package could misread them."""

@@ -1,26 +1,193 @@
-"""Radiance and gaze fields in and out of checkpoint files.
-
-Which kinds of gaze fields there are is known to ``fields.gaze_base``.
-"""
+"""Radiance and gaze fields in and out of checkpoints: their architectures, checked sizes, and weights as arrays."""
 
 from __future__ import annotations
 
+import math
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from nerg_mi.fields.gaze_base import AnyGazeField, RaySupport, basis_of, build, limits_of
+from nerg_mi.errors import NergError, plain
+from nerg_mi.fields.encoding import Encoding, EncodingConfig, config_type, encoding_of
+from nerg_mi.fields.gaze_base import LARGEST, AnyGazeField, RaySupport, basis_of, build, limits_of
+from nerg_mi.fields.mlp import MLP, aligned
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpacked
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.maths.geometry import box_of
 from nerg_mi.ranges import VALUES
 
-from .architecture import MEMBERS, building, check_occupancy, check_sizes, number
-from .arrays import StoredArrays, stored
 from .checkpoint import read_checkpoint, read_metadata, write_checkpoint
+
+# ---- Sizes that a checkpoint claims for its field, checked before anything is built of them ----
+#
+# The file's arrays bound most sizes, but lists of layers and levels are made from the numbers alone.
+
+
+_MOST = {"width": 4096, "geometry": 4096, "density_hidden": 64, "color_hidden": 64, "hidden": 64, "sh_degree": 10}
+"""The largest whole numbers of an architecture, by name; beyond them no field is trained and no kernel compiles."""
+
+FINEST = 1 << 24
+"""The finest resolution of a grid: float32 tells no more cells apart."""
+
+MEMBERS = 64
+"""Members of an ensemble."""
+
+OCCUPANCY_CELLS = 1 << 26
+"""Cells of an occupancy grid, over all of its levels: 400 along each edge."""
+
+
+@contextmanager
+def building(path: str | os.PathLike) -> Iterator[None]:
+    """Whatever a checkpoint's contents make the block raise that builds a field of them, as a `NergError` that names
+    it."""
+    remedy = "copy it again, or train it anew"
+    try:
+        yield
+    except NergError:
+        raise
+    except KeyError as e:
+        raise NergError(f'the checkpoint "{path}" lacks {plain(e)}, which its kind of field needs; {remedy}') from e
+    except (TypeError, ValueError, AttributeError, IndexError, OverflowError, MemoryError) as e:
+        raise NergError(f'the checkpoint "{path}" holds no usable field: {plain(e)}; {remedy}') from e
+
+
+def check_sizes(about: object, what: str = "architecture", most: Mapping[str, int] = _MOST) -> dict:
+    """``about``, the JSON object of a configuration, where its sizes are whole numbers in their bounds, ``most``.
+
+    The sizes of an encoding, its ``grid``, have the bounds that its kind gives. Raises ``ValueError`` otherwise; which
+    entries there must be is for the configuration to say.
+    """
+    if not isinstance(about, dict):
+        raise ValueError(f'its "{what}" is not a JSON object')
+    for name, value in about.items():
+        if name in most and not (isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most[name]):
+            raise ValueError(
+                f'"{name}" of its {what} must be a whole number from 1 to {most[name]}, not {_short(value)}'
+            )
+    if "finest" in about and not 1 <= number(about, "finest", what) <= FINEST:
+        raise ValueError(f'"finest" of its {what} must lie in 1..{FINEST}, not {_short(about["finest"])}')
+    if "grid" in about:
+        grid = about["grid"]
+        check_sizes(grid, "grid", config_type(grid).limits if isinstance(grid, dict) else {})
+    return about
+
+
+def number(about: object, name: str, what: str) -> float:
+    """The number ``name`` of the JSON object ``about``. Raises ``ValueError`` where it is none, or single precision
+    cannot hold it."""
+    value = about[name] if isinstance(about, dict) else None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= VALUES.high:
+        raise ValueError(f'"{name}" of its {what} must be a finite number, not {_short(value)}')
+    return value
+
+
+def check_occupancy(about: dict) -> dict:
+    """``about``, the JSON object of an occupancy grid, where its size is in bounds; raises ``ValueError`` otherwise."""
+    resolution, levels = number(about, "resolution", "occupancy"), 1
+    number(about, "threshold", "occupancy")
+    if "bound" in about:
+        levels = 1 + math.ceil(math.log2(max(number(about, "bound", "occupancy"), 1)))
+    if not (isinstance(resolution, int) and resolution >= 1 and levels * resolution**3 <= OCCUPANCY_CELLS):
+        raise ValueError(
+            f'"resolution" of its occupancy must be a whole number of cells along an edge, {OCCUPANCY_CELLS:,} '
+            f"cells at most, not {_short(resolution)}"
+        )
+    return about
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:40] + "..."
+
+
+# ---- Arrays ----
+#
+# Weights of fields as the arrays of a checkpoint: checked on their way in and on their way out.
+#
+# Weights may be stored in fp16 (half the size); they are fp32 once loaded.
+
+
+def stored(parameters: Mapping[str, Any], half: bool) -> dict[str, np.ndarray]:
+    """The Dr.Jit arrays ``parameters`` for a file, in fp16 if ``half``. Raises `NergError` for what is not finite, or
+    beyond `LARGEST`."""
+    out = {}
+    for name, value in parameters.items():
+        value = value.numpy()
+        with np.errstate(over="ignore"):  # what exceeds fp16 is refused below, by name
+            out[name] = value.astype(np.float16 if half else np.float32)
+        if not np.all(np.abs(value) <= LARGEST):
+            raise NergError(
+                f'the weight array "{name}" is not finite, or beyond {LARGEST:g}, so that the training has diverged; '
+                "train with a lower learning rate"
+            )
+        if not np.all(np.isfinite(out[name])):
+            raise NergError(f'the weight array "{name}" exceeds what fp16 can hold; leave out --half')
+    return out
+
+
+class StoredArrays:
+    """The arrays of a checkpoint by name, as parts of fields on the backend ``ns``.
+
+    All methods raise ``KeyError`` for an array that is not there and ``ValueError`` for one that does not fit.
+    """
+
+    def __init__(self, tensors: Mapping[str, np.ndarray], ns: ModuleType):
+        self._tensors, self.ns = tensors, ns
+
+    def raw(self, name: str) -> np.ndarray:
+        """The array ``name`` as it is stored."""
+        return self._tensors[name]
+
+    def array(self, name: str, *shape: int | None, largest: float = LARGEST) -> np.ndarray:
+        """The array ``name`` in fp32, aligned, where it has the ``shape`` (None: of any length) and no value beyond
+        ``largest``."""
+        found = self._tensors[name].shape
+        if len(found) != len(shape) or any(want not in (None, have) for want, have in zip(shape, found)):
+            needed = " x ".join("any" if n is None else str(n) for n in shape)
+            raise ValueError(f'the weight array "{name}" has the shape {found} where its configuration needs {needed}')
+        with np.errstate(over="ignore"):  # what fp32 cannot hold is not finite
+            value = aligned(self._tensors[name])
+        if not np.all(np.isfinite(value)):
+            raise ValueError(f'the weight array "{name}" is not finite')
+        if np.abs(value).max(initial=0) > largest:
+            raise ValueError(f'the weight array "{name}" holds values beyond {largest:g}, as no training makes them')
+        return value
+
+    def grid(self, config: EncodingConfig, name: str = "grid") -> Encoding:
+        """The encoding ``name`` of ``config``."""
+        arrays = {f"{name}.{key}": self._dr(f"{name}.{key}", *shape) for key, shape in config.shapes().items()}
+        return encoding_of(config, arrays, name)
+
+    def net(self, name: str, sizes: list[int], normalized: bool = False) -> MLP:
+        """The network ``name`` whose layers have these ``sizes``; ``normalized``: with LayerNorm's gains and shifts."""
+        tensor = lambda key, *shape: self.ns.TensorXf(self.array(f"{name}.{key}", *shape))
+        layers, norms = list(enumerate(zip(sizes, sizes[1:]))), None
+        if normalized:
+            norms = [
+                {"gain": tensor(f"{i}.gain", n), "shift": tensor(f"{i}.shift", n), "bias": tensor(f"{i}.bias", m)}
+                for i, (n, m) in layers
+            ]
+        return MLP([tensor(i, m, n) for i, (n, m) in layers], norms)
+
+    def member(self, index: int, about: dict[str, Any]) -> tuple[dict[str, Any], StoredArrays]:
+        """The checked architecture, and the arrays, of the member ``index`` of an ensemble."""
+        own = {k.removeprefix(f"{index}."): v for k, v in self._tensors.items() if k.startswith(f"{index}.")}
+        return check_sizes(about, most=limits_of(about)), StoredArrays(own, self.ns)
+
+    def _dr(self, name: str, *shape: int) -> Any:
+        value = self.array(name, *shape)
+        return self.ns.Float(value) if len(shape) == 1 else self.ns.TensorXf(value)
+
+
+# ---- Radiance and gaze fields in and out of checkpoint files ----
+#
+# Which kinds of gaze fields there are is known to ``fields.gaze_base``.
 
 
 def _occupancy(arrays: StoredArrays, about: dict) -> OccupancyGrid | RefinedGrid | CascadeGrid:

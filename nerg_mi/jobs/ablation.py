@@ -21,7 +21,7 @@ from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_folder, replacing
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
-from nerg_mi.formats.splats.files import is_splats
+from nerg_mi.formats.splats import is_splats
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.engines import prepare_once

@@ -18,7 +18,7 @@ from nerg_mi.evaluation.metrics import cc
 from nerg_mi.figures.overlay import Heat
 from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import check_writable
-from nerg_mi.formats.splats.files import is_splats
+from nerg_mi.formats.splats import is_splats
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import Smoother, Sums, merge
 from nerg_mi.surfaces.mesh import Mesh

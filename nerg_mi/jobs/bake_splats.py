@@ -17,8 +17,7 @@ from nerg_mi.figures.overlay import Heat, overlay, top_of
 from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
-from nerg_mi.formats.splats.files import read_splats
-from nerg_mi.formats.splats.ply import write_ply_splats
+from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.sphere import C0
 from nerg_mi.rays.rays import Rays

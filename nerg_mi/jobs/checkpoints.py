@@ -14,9 +14,7 @@ from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.refinement import refine
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.fields import save_gaze, save_radiance
-from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp
-from nerg_mi.formats.torch_ngp.nerg import is_nerg, read_nerg
-from nerg_mi.formats.torch_ngp.state_dict import open_checkpoint
+from nerg_mi.formats.torch_ngp import Given, is_nerg, open_checkpoint, read_nerg, read_torch_ngp
 
 from .backend import select_backend
 from .commands import argument, command, extra, out

@@ -20,11 +20,9 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.formats.splats.ply import write_ply_splats
-from nerg_mi.formats.splats.surfels import splats_of_field
-from nerg_mi.formats.surfaces import Surface, mesh, points, write_glb, write_ply
-from nerg_mi.formats.torch_ngp.fields import write_torch_ngp
-from nerg_mi.formats.volumes import density_and_color, write_volume
+from nerg_mi.formats.splats import splats_of_field, write_ply_splats
+from nerg_mi.formats.surfaces import Surface, density_and_color, mesh, points, write_glb, write_ply, write_volume
+from nerg_mi.formats.torch_ngp import write_torch_ngp
 
 from .backend import select_backend
 from .commands import argument, command, out

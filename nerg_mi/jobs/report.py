@@ -19,10 +19,8 @@ from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.style import Provenance
 from nerg_mi.figures.style import versions as programs
 from nerg_mi.files.atomic import check_writable, file_sha256, write_text
-from nerg_mi.formats.areas.kinds import Areas
-from nerg_mi.formats.areas.reading import read_areas
+from nerg_mi.formats.areas import Areas, Region, read_areas
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.formats.regions import Region
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.rays.dataset_open import load_rays

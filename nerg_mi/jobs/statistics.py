@@ -33,8 +33,7 @@ from nerg_mi.aoi.predicted import (
 from nerg_mi.aoi.scene import read_changes
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder, make_folder
-from nerg_mi.formats.areas.kinds import Areas
-from nerg_mi.formats.areas.reading import read_areas
+from nerg_mi.formats.areas import Areas, read_areas
 from nerg_mi.interruption import Interruption
 from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays

@@ -13,7 +13,7 @@ from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.checkpoint import read_metadata
-from nerg_mi.formats.splats.files import READERS, is_splats
+from nerg_mi.formats.splats import READERS, is_splats
 from nerg_mi.jobs.gaze_places import align_of_training
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.dataset import is_dataset

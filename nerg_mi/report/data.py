@@ -17,7 +17,7 @@ import numpy as np
 from nerg_mi.evaluation.gaze_report import GazeResults, Verdict, judge, widening
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.overlay import srgb, to_bytes
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.types import variant_types
 from nerg_mi.rays.quality import RaysSummary

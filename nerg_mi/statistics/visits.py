@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import box_interval
 from nerg_mi.ranges import SECONDS, check_number
 from nerg_mi.rays.filters import person_order

@@ -13,8 +13,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import reading
-from nerg_mi.formats.architecture import number
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
+from nerg_mi.formats.fields import number
 
 # ---- The whole state of a training in a file, so that an interrupted run goes on as if it had not been ----
 #

@@ -15,8 +15,8 @@ from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.formats.meshes import read_mesh_file
-from nerg_mi.formats.splats.files import READERS, is_splats, read_splats, refuse_others
-from nerg_mi.formats.volumes import write_volume
+from nerg_mi.formats.splats import READERS, is_splats, read_splats, refuse_others
+from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import AnyBox, Box, Similarity, box_interval
 from nerg_mi.ranges import LENGTHS, check_number
 from nerg_mi.rays.rays import Rays
@@ -254,7 +254,7 @@ def _passed(origins: np.ndarray, hits: np.ndarray, extent: HitExtent) -> np.ndar
 
 
 def volume_dict(path: str | Path) -> dict:
-    """The Mitsuba plugin, as a dict, that shows what ``formats.volumes.write_volume`` wrote of hit points.
+    """The Mitsuba plugin, as a dict, that shows what ``formats.surfaces.write_volume`` wrote of hit points.
 
     Without interpolation, which would bring every surface nearer by most of a voxel.
     """

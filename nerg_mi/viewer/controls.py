@@ -13,7 +13,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sentence
 from nerg_mi.figures.style import Provenance, provenance
 from nerg_mi.files.images import encode_png
-from nerg_mi.formats.regions import MOST, Region, to_json
+from nerg_mi.formats.areas import MOST, Region, to_json
 from nerg_mi.rendering.scene import files_of_scene
 
 from . import layers

@@ -17,9 +17,7 @@ from nerg_mi.api.queries import trace
 from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.api.variant import active_mitsuba
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.formats.areas.kinds import Areas
-from nerg_mi.formats.areas.reading import read_areas
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Areas, Region, read_areas
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.overlays import basis_words
 from nerg_mi.jobs.scenes.cameras import given_point

@@ -151,7 +151,7 @@ def build(seed: int = 0) -> Layout:
 
 
 def write_regions(layout: Layout, path) -> Path:
-    """Write ``regions.json``: the room's bounds and the areas of interest, boxes in metres."""
+    """Write ``areas.json``: the room's bounds and the areas of interest, boxes in metres."""
     path = Path(path)
     content = {
         "units": "metres, x east, y north, z up",

@@ -9,8 +9,7 @@ import pytest
 
 from nerg_mi.aoi.scene import changed_areas, changed_scene, read_changes
 from nerg_mi.errors import NergError
-from nerg_mi.formats.areas.kinds import Areas, Group, SceneShape
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Areas, Group, Region, SceneShape
 from nerg_mi.rendering.scene import load_scene
 
 from .place import SIGN, write_place

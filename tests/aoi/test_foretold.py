@@ -8,7 +8,7 @@ import pytest
 from nerg_mi.aoi.measured import Eyes
 from nerg_mi.aoi.predicted import eyes_of_some, foretell, foretold_people
 from nerg_mi.aoi.scene import Surroundings
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.jobs.reporter import SILENT
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.statistics.visits import ALL, Box, Cell

@@ -9,7 +9,7 @@ import pytest
 from nerg_mi.aoi.predicted import isovist_rows, look_around, places_of
 from nerg_mi.aoi.scene import surroundings_of_files
 from nerg_mi.errors import NergError
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.statistics.visibility import Targets, isovists
 from nerg_mi.statistics.visits import Box
 

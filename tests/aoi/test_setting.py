@@ -7,7 +7,7 @@ from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.predicted import setting_of
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.formats.areas.reading import read_areas
+from nerg_mi.formats.areas import read_areas
 
 from .place import write_place
 

@@ -7,8 +7,7 @@ import pytest
 
 from nerg_mi.aoi.scene import scene_of, shape_named, shapes_of, thing_of_shape, things_of
 from nerg_mi.errors import NergError
-from nerg_mi.formats.areas.kinds import MeshPart, SceneShape
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import MeshPart, Region, SceneShape
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.mesh import mitsuba_mesh
 

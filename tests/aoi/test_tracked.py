@@ -10,7 +10,7 @@ import pytest
 from nerg_mi.aoi.measured import Counting, EyePicker, Window, ahead, blocks_of, count_block
 from nerg_mi.aoi.scene import Surroundings
 from nerg_mi.errors import NergError
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.visits import ALL, Box, Cell, LookRules, merge

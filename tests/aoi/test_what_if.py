@@ -11,8 +11,7 @@ import pytest
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.predicted import Foretold, Setting, places_of, what_if_rows
 from nerg_mi.aoi.scene import Surroundings, things_of
-from nerg_mi.formats.areas.kinds import Areas
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Areas, Region
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.statistics.tables import Floor
 

@@ -7,7 +7,7 @@ import nerg_mi as nerg
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.api.attention import box_shares
 from nerg_mi.api.shapes import box_dict
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.jobs.statistics import statistics
 from nerg_mi.report.data import Onlooker
 from nerg_mi.statistics.shares import ROUGH, gaze_shares

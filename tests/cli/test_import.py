@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from nerg_mi.cli import build_app, main
-from nerg_mi.formats.torch_ngp.archive import write_torch
+from nerg_mi.formats.torch_files import write_torch
 from tests.formats.torch_ngp.test_fields import small_state
 from tests.formats.torch_ngp.test_nerg import save, small_gaze
 

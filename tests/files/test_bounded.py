@@ -12,7 +12,7 @@ import pytest
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files import safe_read
 from nerg_mi.files.safe_read import map_bytes, parse_json, plain, read_bytes, read_json, reading, size_of
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import limits_of
-from nerg_mi.formats.architecture import FINEST, OCCUPANCY_CELLS, building, check_occupancy, check_sizes, number
+from nerg_mi.formats.fields import FINEST, OCCUPANCY_CELLS, building, check_occupancy, check_sizes, number
 
 GRID = {"levels": 2, "features": 2, "log2_rows": 8, "base": 4, "finest": 16, "dimensions": 3}
 

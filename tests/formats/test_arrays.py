@@ -7,7 +7,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.mlp import MLP
-from nerg_mi.formats.arrays import LARGEST, StoredArrays, stored
+from nerg_mi.formats.fields import LARGEST, StoredArrays, stored
 
 GRID = HashGridConfig(levels=1, log2_rows=3, base=1, finest=1)
 

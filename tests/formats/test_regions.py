@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.regions import MOST, Region, read_regions, to_json
+from nerg_mi.formats.areas import MOST, Region, read_regions, to_json
 from nerg_mi.jobs import demo
 
 

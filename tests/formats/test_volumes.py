@@ -7,8 +7,8 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.fields.extraction import Sampler
-from nerg_mi.formats import volumes
-from nerg_mi.formats.volumes import density_and_color, write_volume
+from nerg_mi.formats import surfaces
+from nerg_mi.formats.surfaces import density_and_color, write_volume
 from tests.formats.ball import Ball
 
 
@@ -45,7 +45,7 @@ def test_a_full_field_takes_a_few_bytes_a_voxel(monkeypatch):
     fog = Ball()
     fog.density = lambda p, active=True: dr.select(active, 1 + p.x, 0)
     whole = density_and_color(fog, 48, samples=1)
-    monkeypatch.setattr(volumes, "_BLOCK", 2500)
+    monkeypatch.setattr(surfaces, "_BLOCK", 2500)
     tracemalloc.start()
     try:
         blocks = density_and_color(fog, 48, samples=1)

@@ -21,7 +21,7 @@ def _make_areas(folder: Path) -> None:
 
 
 def _read_areas(folder: Path) -> object:
-    from nerg_mi.formats.areas.reading import read_areas
+    from nerg_mi.formats.areas import read_areas
 
     areas = read_areas(folder / "areas.json")
     assert all(of for of in areas.solids.values())
@@ -37,7 +37,7 @@ def _make_twin(folder: Path) -> None:
 
 
 def _read_twin(folder: Path) -> object:
-    from nerg_mi.formats.areas.reading import read_areas
+    from nerg_mi.formats.areas import read_areas
 
     return read_areas(folder / "twin").boxes
 
@@ -56,8 +56,7 @@ def _make_changes(folder: Path) -> None:
 
 def _read_changes(folder: Path) -> object:
     from nerg_mi.aoi.scene import changed_areas, read_changes
-    from nerg_mi.formats.areas.kinds import Areas
-    from nerg_mi.formats.regions import Region
+    from nerg_mi.formats.areas import Areas, Region
 
     return changed_areas(Areas((Region.of("shelf", [0, 0, 0], [1, 1, 1]),)), read_changes(folder / "changes.json"))
 

@@ -29,8 +29,8 @@ with atheris.instrument_imports(include=["nerg_mi.formats", "nerg_mi.photos", "z
     from nerg_mi.files.images import check_image
     from nerg_mi.files.safe_read import parse_json, read_npy, read_npz
     from nerg_mi.formats.fields import load_radiance
-    from nerg_mi.formats.torch_ngp.archive import check_pickle
-    from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp
+    from nerg_mi.formats.torch_files import check_pickle
+    from nerg_mi.formats.torch_ngp import Given, read_torch_ngp
     from nerg_mi.photos.colmap import read_colmap
     from nerg_mi.photos.images import read_image
 

@@ -177,7 +177,7 @@ def _radiance_state() -> dict:
 
 
 def _make_ngp(folder: Path) -> None:
-    from nerg_mi.formats.torch_ngp.archive import write_torch
+    from nerg_mi.formats.torch_files import write_torch
 
     state = _radiance_state()
     shadow = [v for k, v in state.items() if k.endswith((".embeddings", ".weight"))]
@@ -195,13 +195,13 @@ def _make_ngp(folder: Path) -> None:
 
 
 def _read_ngp(folder: Path) -> object:
-    from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp
+    from nerg_mi.formats.torch_ngp import Given, read_torch_ngp
 
     return read_torch_ngp(folder / "ngp.pth", _parts()[0], given=Given(finest=32))
 
 
 def _make_nerg(folder: Path) -> None:
-    from nerg_mi.formats.torch_ngp.archive import write_torch
+    from nerg_mi.formats.torch_files import write_torch
 
     names = (
         "net1.0.weight",
@@ -224,8 +224,7 @@ def _make_nerg(folder: Path) -> None:
 
 
 def _read_nerg(folder: Path) -> object:
-    from nerg_mi.formats.torch_ngp.fields import Given
-    from nerg_mi.formats.torch_ngp.nerg import read_nerg
+    from nerg_mi.formats.torch_ngp import Given, read_nerg
 
     return read_nerg(folder / "nerg.pth", _parts()[0], given=Given(finest=32))
 

@@ -39,7 +39,7 @@ def _make_boxes(folder: Path) -> None:
 
 
 def _read_regions(folder: Path) -> None:
-    from nerg_mi.formats.regions import read_regions
+    from nerg_mi.formats.areas import read_regions
 
     for box in read_regions(folder / "objects.json"):
         box.holds(box.corners)

@@ -95,7 +95,7 @@ def _make_regions(folder: Path) -> None:
 
 
 def _read_regions(folder: Path) -> object:
-    from nerg_mi.formats.regions import read_regions
+    from nerg_mi.formats.areas import read_regions
 
     return read_regions(folder / "areas.json")
 

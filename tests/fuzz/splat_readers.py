@@ -23,7 +23,7 @@ def _make(name: str, **how):
 
 def _read(name: str):
     def read(folder: Path) -> object:
-        from nerg_mi.formats.splats.files import read_splats
+        from nerg_mi.formats.splats import read_splats
 
         splats = read_splats(folder / name)
         return splats.axes(), splats.degree

@@ -9,8 +9,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.figures.style import color_values
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.formats.splats.files import read_splats
-from nerg_mi.formats.splats.ply import write_ply_splats
+from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.jobs.bake_splats import COLUMN, bake_splats
 from nerg_mi.jobs.baking import chunks
 from nerg_mi.jobs.options.bake import BakeOptions

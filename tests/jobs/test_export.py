@@ -6,7 +6,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.formats.splats.files import read_splats
+from nerg_mi.formats.splats import read_splats
 from nerg_mi.jobs.export import PointOptions, SplatOptions, VolumeOptions, export_points, export_splats, export_volume
 from tests.jobs.recorder import Recorder
 from tests.plugins import fields

@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
-from nerg_mi.formats.volumes import write_volume
+from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.jobs.gaze_places import make_place
 from nerg_mi.jobs.options.pictures import PictureOptions
 from nerg_mi.jobs.options.place import PlaceOptions

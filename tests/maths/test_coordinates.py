@@ -11,7 +11,7 @@ import pytest
 from nerg_mi.alignment.constraints import read_surface
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
-from nerg_mi.formats.splats.files import read_splats
+from nerg_mi.formats.splats import read_splats
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.photos.posed import Frame, settled
 from nerg_mi.rays.readers.base import UNITY, RaysBuilder

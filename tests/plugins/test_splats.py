@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.fields.splats import Splats, harmonics_of, joined
-from nerg_mi.formats.splats.ply import write_ply_splats
+from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.registration import plugin_class
 from tests.conftest import ROOT
 from tests.formats.splats.writers import random_splats

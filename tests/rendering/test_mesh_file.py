@@ -125,7 +125,7 @@ def test_wrong_volumes_are_a_sentence(tmp_path, data):
 
 
 def test_a_volume_of_ours_passes(tmp_path):
-    from nerg_mi.formats.volumes import write_volume
+    from nerg_mi.formats.surfaces import write_volume
 
     write_volume(tmp_path / "a.vol", np.ones((2, 3, 4)), (0, 0, 0), (1, 1, 1))
     check_vol(tmp_path / "a.vol")

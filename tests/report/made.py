@@ -7,7 +7,7 @@ import json
 import numpy as np
 
 from nerg_mi.evaluation.gaze_report import GazeResults
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.rays.quality import summarise
 from nerg_mi.report.data import Camera, ObjectAttention, Picture, Proxy, Run, Share, Stage, pack
 from tests.evaluation.gaze.test_evaluation import crowd

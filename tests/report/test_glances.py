@@ -10,7 +10,7 @@ import pytest
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.report.data import pack
 from tests.report.made import stage
 

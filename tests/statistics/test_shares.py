@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.maths.sphere import fibonacci_directions, numbers_in_cone
 from nerg_mi.statistics.shares import FIRST, SumRule, gaze_shares
 from nerg_mi.statistics.visits import Box, land

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import box_interval
 from nerg_mi.statistics.visibility import CellsInView, Targets, in_view, isovists, standing, unhidden
 from nerg_mi.statistics.visits import Box

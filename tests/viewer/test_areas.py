@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.viewer.controls import box_around, edges
 from nerg_mi.viewer.points import View
 

@@ -10,7 +10,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.view import place_to_view
 from nerg_mi.viewer import session as session_module

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Region
 from nerg_mi.rendering.nested_scene import with_gaze
 from nerg_mi.viewer import session
 

@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.meshes import read_mesh_file
-from nerg_mi.formats.splats.files import refuse_others
+from nerg_mi.formats.splats import refuse_others
 from nerg_mi.formats.surfaces import mesh as mesh_of_field
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.rendering.scene import load_scene

@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.formats.splats.files import read_splats
+from nerg_mi.formats.splats import read_splats
 from nerg_mi.surfaces.laplacian import Sums
 from nerg_mi.surfaces.mesh import SURFACE_OPACITY
 from nerg_mi.surfaces.sources import Crowd, MakeLooker, RaySettings, TrackedRays, lookers_of_field

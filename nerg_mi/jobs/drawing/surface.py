@@ -14,7 +14,7 @@ from nerg_mi.figures.overlay import Heat, gaze_figure, top_of
 from nerg_mi.files.safe_read import reading
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.ply import parse_ply
-from nerg_mi.formats.splats.files import is_splats
+from nerg_mi.formats.splats import is_splats
 from nerg_mi.jobs.options import option, parse_numbers
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.jobs.scenes.cameras import given_point

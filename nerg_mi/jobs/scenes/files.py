@@ -11,7 +11,7 @@ from nerg_mi.files.safe_read import size_of
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import is_field
 from nerg_mi.formats.meshes import READERS
-from nerg_mi.formats.splats.files import is_splats, refuse_others
+from nerg_mi.formats.splats import is_splats, refuse_others
 from nerg_mi.jobs.gaze_places import align_of_training, file_of_training, place_key
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.maths.geometry import Similarity

@@ -11,8 +11,8 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import reading
 from nerg_mi.formats.meshes import GREY, MeshFile, read_mesh_file
-from nerg_mi.formats.splats.files import plugin_of_field, read_splats
-from nerg_mi.formats.volumes import write_volume
+from nerg_mi.formats.splats import plugin_of_field, read_splats
+from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.rendering.files import check_vol, write_mesh
 from nerg_mi.rendering.nested_scene import nested_place
 from nerg_mi.rendering.scene_writer import Comment, Node, Place, element, prop, relative_name, value_of

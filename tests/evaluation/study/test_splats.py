@@ -8,7 +8,7 @@ import pytest
 from nerg_mi.evaluation import study_truth
 from nerg_mi.evaluation.study import measure, settings
 from nerg_mi.evaluation.study_subject import extent, open_subject
-from nerg_mi.formats.splats.ply import write_ply_splats
+from nerg_mi.formats.splats import write_ply_splats
 from tests.formats.splats.writers import random_splats
 
 SCENE = """<scene version="3.0.0"><integrator type="nerg"><volume name="field" type="splats">

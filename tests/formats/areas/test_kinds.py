@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.areas.kinds import Areas, Group
-from nerg_mi.formats.regions import Region
+from nerg_mi.formats.areas import Areas, Group, Region
 
 A, B = Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])
 

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.areas.kinds import Group, MeshPart, SceneShape
-from nerg_mi.formats.areas.reading import files_of_areas, read_areas
-from nerg_mi.formats.regions import Region, read_regions, to_json
+from nerg_mi.formats.areas import Group, MeshPart, Region, SceneShape, files_of_areas, read_areas, read_regions, to_json
 
 BOX = {"name": "shelf", "min": [0, 0, 0], "max": [1, 2, 3]}
 

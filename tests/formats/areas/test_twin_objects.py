@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.areas.reading import read_areas
-from nerg_mi.formats.areas.twin_objects import read_twin_objects
+from nerg_mi.formats.areas import read_areas, read_twin_objects
 from nerg_mi.rays.readers.base import Frame
 
 BOX_HEAD = (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.splats.antimatter import read_splat
+from nerg_mi.formats.splats import read_splat
 from nerg_mi.maths.sphere import C0
 from tests.formats.splats.writers import random_splats, write_antimatter
 

@@ -3,7 +3,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.gltf import pack_glb, read_parts
-from nerg_mi.formats.splats.khronos import read_gltf_splats
+from nerg_mi.formats.splats import read_gltf_splats
 from tests.formats.splats.test_ply import equal
 from tests.formats.splats.writers import random_splats, write_khronos
 

@@ -7,7 +7,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats import ply as ply_tables
 from nerg_mi.formats.ply import parse_ply, write_columns
-from nerg_mi.formats.splats.ply import read_ply_splats, write_ply_splats
+from nerg_mi.formats.splats import read_ply_splats, write_ply_splats
 from tests.formats.splats.writers import random_splats, write_inria
 
 NAMES = ("centers", "scales", "rotations", "opacities", "harmonics")

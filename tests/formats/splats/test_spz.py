@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.splats.spz import read_spz
+from nerg_mi.formats.splats import read_spz
 from tests.formats.splats.writers import random_splats, write_spz
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.formats.splats.surfels import splats_of_field
+from nerg_mi.formats.splats import splats_of_field
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.torch_ngp import archive as module
-from nerg_mi.formats.torch_ngp.archive import read_torch, to_numpy, write_torch
+from nerg_mi.formats import torch_files as module
+from nerg_mi.formats.torch_files import read_torch, to_numpy, write_torch
 
 ONE = np.arange(4, dtype="<f4").tobytes()
 
@@ -100,7 +100,7 @@ def test_what_is_written_torch_reads(tmp_path, torch):
 
 def test_without_torch_the_extra_is_named(tmp_path):
     archive(tmp_path / "x.pth", b"N.")
-    line = "import sys; sys.modules['torch'] = None; from nerg_mi.formats.torch_ngp.archive import *; "
+    line = "import sys; sys.modules['torch'] = None; from nerg_mi.formats.torch_files import *; "
     for call in (f"read_torch({str(tmp_path / 'x.pth')!r})", f"write_torch({str(tmp_path / 'y.pth')!r}, {{}})"):
         done = subprocess.run([sys.executable, "-c", line + call], capture_output=True, text=True)
         assert done.stderr.endswith('which is not installed: pip install "nerg-mi[torch]"\n')

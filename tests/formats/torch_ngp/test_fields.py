@@ -8,8 +8,8 @@ import pytest
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_radiance, save_radiance
-from nerg_mi.formats.torch_ngp.archive import write_torch
-from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp, write_torch_ngp
+from nerg_mi.formats.torch_files import write_torch
+from nerg_mi.formats.torch_ngp import Given, read_torch_ngp, write_torch_ngp
 from nerg_mi.maths.geometry import Box
 from tests.reference import torch_ngp_numpy as reference
 

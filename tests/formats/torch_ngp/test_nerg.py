@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.formats.fields import load_gaze, save_gaze
-from nerg_mi.formats.torch_ngp.archive import write_torch
-from nerg_mi.formats.torch_ngp.nerg import read_nerg
+from nerg_mi.formats.torch_files import write_torch
+from nerg_mi.formats.torch_ngp import read_nerg
 from tests.reference import torch_ngp_numpy as reference
 
 from .test_fields import small_state

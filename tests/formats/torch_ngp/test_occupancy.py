@@ -6,8 +6,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
-from nerg_mi.formats.torch_ngp.fields import read_torch_ngp
-from nerg_mi.formats.torch_ngp.occupancy import bitfield, morton_order
+from nerg_mi.formats.torch_ngp import bitfield, morton_order, read_torch_ngp
 from tests.formats.torch_ngp.test_fields import save
 from tests.reference import torch_ngp_numpy as reference
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.torch_ngp.archive import write_torch
-from nerg_mi.formats.torch_ngp.fields import read_torch_ngp
-from nerg_mi.formats.torch_ngp.state_dict import (
+from nerg_mi.formats.torch_files import write_torch
+from nerg_mi.formats.torch_ngp import (
     StateDict,
     decimals,
     grid_config,
     layers,
     open_checkpoint,
     origin,
+    read_torch_ngp,
     sh_degree,
 )
 from tests.formats.torch_ngp.test_fields import save

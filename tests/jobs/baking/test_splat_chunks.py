@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.splats.ply import write_ply_splats
+from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.jobs.baking.splat_chunks import SplatScene, splat_place
 from nerg_mi.surfaces.sources import Crowd, RaySettings
 from tests.surfaces.test_splat_rays import falling

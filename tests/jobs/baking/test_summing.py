@@ -9,7 +9,7 @@ from nerg_mi.scenes import store as ready
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
-from nerg_mi.formats.splats.ply import write_ply_splats
+from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.jobs.bake import bake
 from nerg_mi.jobs.baking import chunks
 from nerg_mi.jobs.baking.chunks import BakeScene

@@ -8,7 +8,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat, overlay
 from nerg_mi.formats.ply import write_columns
-from nerg_mi.formats.splats.ply import write_ply_splats
+from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.jobs.drawing.draw import draw
 from nerg_mi.jobs.drawing.surface import read_baked
 from tests.surfaces.walls import wall

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.volumes import write_volume
+from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.jobs.scenes.files import GivenFiles
 from nerg_mi.jobs.scenes.places import colors_of, place_of_files
 from nerg_mi.maths.color import encode_srgb

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.volumes import write_volume
+from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.geometry import HitExtent, volume_dict, voxelise_hits
 from nerg_mi.transport.geometry import trace_depth

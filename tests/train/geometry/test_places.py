@@ -10,8 +10,8 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.splats import Splats, joined
-from nerg_mi.formats.splats.ply import write_ply_splats
-from nerg_mi.formats.volumes import write_volume
+from nerg_mi.formats.splats import write_ply_splats
+from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rendering.scene import files_of_scene
 from nerg_mi.train.geometry import GazePlace, place_of_field, place_of_nothing, place_of_scene, place_of_volume

@@ -14,7 +14,7 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.formats.volumes import write_volume
+from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.train.geometry import place_of_volume

@@ -1,9 +1,4 @@
-"""Files of ``torch.save``: read by ``torch.load(weights_only=True)``, and written.
-
-torch runs nothing that is in a file, and maps its tensors, so that only what is used is read. What a pickle repeats is
-taken at its word, though: a few hundred bytes can stand for a tuple that takes for ever to hash, or for an array of
-terabytes. So the pickle is checked first, by the effect on the stack that each operation declares.
-"""
+"""Files of PyTorch, read and written by torch, with what torch does not bound checked before."""
 
 from __future__ import annotations
 
@@ -17,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.errors import MissingFile, NergError, plain
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.safe_read import open_zip, plain, read_member, reading, size_of
+from nerg_mi.files.safe_read import open_zip, read_member, reading, size_of
 
 if TYPE_CHECKING:
     import torch
+
 
 PICKLE_BYTES = 8 << 20
 """The pickle may have so many bytes: it holds names and shapes, the numbers are in records of their own."""
