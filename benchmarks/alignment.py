@@ -52,11 +52,11 @@ class World:
 
 
 def make_world(shoppers: int, rays: int) -> World:
-    from nerg_mi.jobs.backend import select_backend
     from nerg_mi.scenes.store import twin
     from nerg_mi.scenes.store.layout import build
     from nerg_mi.scenes.store.shoppers import simulate
     from nerg_mi.train.geometry import place_of_field
+    from nerg_mi.workflows.base import select_backend
 
     ns, folder = select_backend("llvm_ad_rgb"), Path(twin.__file__).parent
     ids, times, origin, direction = simulate(build(0), shoppers=shoppers, seed=5)

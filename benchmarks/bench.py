@@ -29,9 +29,9 @@ import cold_kernels  # noqa: F401
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import torch_frames
 from nerg_mi.figures.style import save
-from nerg_mi.jobs.demo import store_scene
 from nerg_mi.llvm import has_cuda
 from nerg_mi.probes.kde import SphericalKde
+from nerg_mi.workflows.demo import store_scene
 from timing import at_the_end, exponent, in_turns, median, print_table, spread, write_rows
 
 import numpy as np

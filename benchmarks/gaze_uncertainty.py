@@ -31,9 +31,8 @@ def main(argv=None) -> None:
 def measure(name: str, make: Make, args: argparse.Namespace) -> list[dict]:
     """A row a population and error of one place, which is printed."""
     from nerg_mi.cli.progress import TerminalReporter
-    from nerg_mi.jobs.backend import select_backend
-    from nerg_mi.jobs.folds import evaluate_folds
-    from nerg_mi.jobs.options.folds import FoldOptions
+    from nerg_mi.workflows.base import select_backend
+    from nerg_mi.workflows.evaluate import FoldOptions, evaluate_folds
 
     select_backend("llvm_ad_rgb", args.threads)
     folder, rays, where = write_place(name, make, args)

@@ -25,7 +25,7 @@ def made_store():
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.aoi.scene import shapes_of, surroundings_of_scene, things_of
     from nerg_mi.formats.areas import read_areas
-    from nerg_mi.jobs.demo import store_scene
+    from nerg_mi.workflows.demo import store_scene
 
     folder = store_scene().parent
     around = surroundings_of_scene(folder / "shapes.xml", None, None, None)
@@ -94,12 +94,12 @@ class Walks:
 def errors() -> None:
     from nerg_mi.aoi.measured import Eyes, count_block
     from nerg_mi.aoi.predicted import foretell
-    from nerg_mi.jobs.reporter import SILENT
     from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.scenes.store import twin
     from nerg_mi.statistics.tables import People
     from nerg_mi.statistics.visibility import Targets
     from nerg_mi.statistics.visits import ALL, land
+    from nerg_mi.workflows.base import SILENT
 
     around, areas, things = made_store()
     walks = Walks(12, seed=5)

@@ -27,9 +27,8 @@ ORDER = ("emit", "capture", "loss code")
 
 def main(argv=None) -> None:
     from nerg_mi.cli.progress import TerminalReporter
-    from nerg_mi.jobs.ablation import ablate
-    from nerg_mi.jobs.backend import select_backend
-    from nerg_mi.jobs.options.ablation import AblationOptions
+    from nerg_mi.workflows.ablation import AblationOptions, ablate
+    from nerg_mi.workflows.base import select_backend
 
     parser = place_parser(__doc__, "paper_claims", folds=4)
     parser.set_defaults(only="supermarket,store")

@@ -87,7 +87,7 @@ def makers(data: Path) -> dict[str, Make]:
 
 def recorded(files: list[Path], reader: str, folder: Path) -> Path:
     """Rays of recordings; a reader leaves out those whose gaze is frozen, and says so."""
-    from nerg_mi.jobs.tracking import ImportOptions, import_rays
+    from nerg_mi.workflows.rays import ImportOptions, import_rays
 
     path = folder / "rays.npz"
     import_rays(files, ImportOptions(reader=reader, output=path))
@@ -96,10 +96,10 @@ def recorded(files: list[Path], reader: str, folder: Path) -> Path:
 
 def store(folder: Path) -> tuple[Path, dict]:
     """The demo store's shoppers among its radiance field."""
-    from nerg_mi.jobs import demo
-    from nerg_mi.jobs.tracking import ImportOptions, import_rays
     from nerg_mi.rays.readers.skeleton import SkeletonOptions
     from nerg_mi.scenes.store import make
+    from nerg_mi.workflows import demo
+    from nerg_mi.workflows.rays import ImportOptions, import_rays
 
     csv = Path(make.__file__).parent / "build" / "shoppers.csv"
     if not csv.is_file():
@@ -146,9 +146,8 @@ def main(argv=None) -> None:
 def score(name: str, make: Make, args: argparse.Namespace) -> list[dict]:
     """A row a fold and method."""
     from nerg_mi.cli.progress import TerminalReporter
-    from nerg_mi.jobs.backend import select_backend
-    from nerg_mi.jobs.folds import evaluate_folds
-    from nerg_mi.jobs.options.folds import FoldOptions
+    from nerg_mi.workflows.base import select_backend
+    from nerg_mi.workflows.evaluate import FoldOptions, evaluate_folds
 
     select_backend("llvm_ad_rgb", args.threads)
     folder, rays, where = write_place(name, make, args)

@@ -54,9 +54,9 @@ def room(folder: Path, observers: int, count: int) -> None:
 
 def bake(folder: Path, name: str, detail: float, **more) -> tuple[int, bytes]:
     """Observers and the bytes of what is made of them."""
-    from nerg_mi.jobs.bake import bake
-    from nerg_mi.jobs.options.bake import BakeOptions
     from nerg_mi.scenes import store
+    from nerg_mi.workflows.bake import bake
+    from nerg_mi.workflows.bake_options import BakeOptions
 
     out = folder / f"{name}.ply"
     gaze = files(store) / "shoppers.safetensors"
@@ -68,7 +68,7 @@ def bake(folder: Path, name: str, detail: float, **more) -> tuple[int, bytes]:
 def count(folder: Path, name: str, **more) -> tuple[int, bytes]:
     """Rays and the bytes of the table."""
     from nerg_mi.aoi.options import StatisticsOptions
-    from nerg_mi.jobs.statistics import statistics as stats
+    from nerg_mi.workflows.statistics import statistics as stats
 
     options = StatisticsOptions(areas=folder / "areas.json", resamples=199, names=True, mode="llvm_ad_rgb", **more)
     stats([folder / "scene.xml", folder / "rays.npz"], folder / name, options)

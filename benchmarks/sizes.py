@@ -11,7 +11,7 @@ from functools import partial
 
 import nerg_mi as nerg
 from nerg_mi.figures.style import INK, new_page
-from nerg_mi.jobs.demo import store_scene
+from nerg_mi.workflows.demo import store_scene
 from torch_frames import camera_rays
 
 import numpy as np

@@ -30,8 +30,8 @@ PAIR = "demo"
 
 def make(path: Path, resolution: int) -> None:
     """Splats of the store's field."""
-    from nerg_mi.jobs.demo import store_scene
-    from nerg_mi.jobs.export import SplatOptions, export_splats
+    from nerg_mi.workflows.demo import store_scene
+    from nerg_mi.workflows.export import SplatOptions, export_splats
 
     path.parent.mkdir(parents=True, exist_ok=True)
     export_splats(store_scene().parent / "store.safetensors", path, SplatOptions(resolution=resolution))
@@ -39,7 +39,7 @@ def make(path: Path, resolution: int) -> None:
 
 def splat_scene(folder: Path) -> Path:
     """The store's scene with splats for a field, written to ``folder``."""
-    from nerg_mi.jobs.demo import store_scene
+    from nerg_mi.workflows.demo import store_scene
 
     path = folder / "splats.xml"
     text = store_scene().read_text()
@@ -188,7 +188,7 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.jobs.demo import store_scene
+    from nerg_mi.workflows.demo import store_scene
 
     folder = args.out.parent
     folder.mkdir(parents=True, exist_ok=True)

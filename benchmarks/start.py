@@ -18,7 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from nerg_mi.jobs.demo import store_scene
+from nerg_mi.workflows.demo import store_scene
 from timing import median, print_table, spread, write_rows
 
 COMMAND = [str(Path(sys.executable).with_name("nerg"))]

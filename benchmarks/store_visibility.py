@@ -172,7 +172,7 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.jobs.demo import store_scene
+    from nerg_mi.workflows.demo import store_scene
 
     files = {k: str(v.resolve()) for k, v in (("field", args.field), ("gaze", args.gaze)) if v is not None}
     rows = [

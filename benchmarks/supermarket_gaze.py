@@ -27,9 +27,8 @@ OURS, BAR = "gaze field", "4,096 nearest rays"
 
 def main(argv=None) -> None:
     from nerg_mi.cli.progress import TerminalReporter
-    from nerg_mi.jobs.folds import evaluate_folds
-    from nerg_mi.jobs.options.folds import FoldOptions
-    from nerg_mi.jobs.tracking import ImportOptions, import_rays
+    from nerg_mi.workflows.evaluate import FoldOptions, evaluate_folds
+    from nerg_mi.workflows.rays import ImportOptions, import_rays
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "vr_supermarket"

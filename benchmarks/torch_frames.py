@@ -30,8 +30,8 @@ import cold_kernels  # noqa: F401
 import nerg_mi as nerg
 from nerg_mi.figures.overlay import srgb
 from nerg_mi.formats.fields import load_gaze, load_radiance
-from nerg_mi.jobs.demo import store_scene
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.workflows.demo import store_scene
 from timing import in_turns, median, print_table, spread, write_rows
 from torch_radiance import _PRIMES, TorchModel, harmonics
 

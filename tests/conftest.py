@@ -183,8 +183,7 @@ def trained(tmp_path_factory):
 
     import mitsuba as mi
 
-    from nerg_mi.jobs.gaze import train_gaze
-    from nerg_mi.jobs.options.gaze import GazeOptions
+    from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
     from tests.evaluation.gaze.test_evaluation import crowd
 
     mi.set_variant("llvm_ad_rgb")

@@ -8,8 +8,8 @@ import re
 import pytest
 
 from tests.conftest import ROOT
-from tests.jobs.drawing.scenes import write_scene
-from tests.jobs.drawing.test_floor import walk
+from tests.workflows.drawing.scenes import write_scene
+from tests.workflows.drawing.test_floor import walk
 
 PAGE = ROOT / "docs" / "pictures.md"
 

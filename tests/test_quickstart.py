@@ -9,7 +9,7 @@ import shutil
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.jobs import demo
+from nerg_mi.workflows import demo
 from tests.conftest import ROOT
 from tests.figures.standins import write_standins
 

@@ -15,25 +15,25 @@ import typer
 from typer.core import TyperOption
 
 import nerg_mi.aoi
-import nerg_mi.jobs.options
 import nerg_mi.rays.readers
+import nerg_mi.workflows.options
 from nerg_mi.cli.building import build_command
 from nerg_mi.errors import NergError
-from nerg_mi.jobs import tracking
-from nerg_mi.jobs.commands import Command
-from nerg_mi.jobs.drawing.registry import KINDS as FIGURES
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, Checked, Range, check_number, ranged
 from nerg_mi.rays.readers.registry import shared_options
 from nerg_mi.train import gaze_settings, radiance_settings
+from nerg_mi.workflows import rays
+from nerg_mi.workflows.base import Command
+from nerg_mi.workflows.draw import KINDS as FIGURES
 from tools.command_pages import commands
 
 
 def _modules():
-    for package in (nerg_mi.aoi, nerg_mi.jobs.options, nerg_mi.rays.readers):
+    for package in (nerg_mi.aoi, nerg_mi.workflows.options, nerg_mi.rays.readers):
         yield package
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             yield importlib.import_module(module.name)
-    yield from (gaze_settings, radiance_settings, tracking)
+    yield from (gaze_settings, radiance_settings, rays)
 
 
 KINDS = list(

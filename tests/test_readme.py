@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nerg_mi.jobs import demo
+from nerg_mi.workflows import demo
 from tests.figures.standins import write_standins
 
 README = Path(__file__).resolve().parents[1] / "README.md"

@@ -10,8 +10,8 @@ import numpy as np
 
 from nerg_mi.aoi.scene import read_changes
 from nerg_mi.formats.areas import read_areas
-from nerg_mi.jobs import demo
 from nerg_mi.rays.rays import Rays
+from nerg_mi.workflows import demo
 from tests.conftest import ROOT
 
 

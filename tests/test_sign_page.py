@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.jobs import demo
+from nerg_mi.workflows import demo
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "sign.md"
 

@@ -53,7 +53,7 @@ def slope(unit: Callable[[int], object], count: int) -> float:
 def store(**values: str):
     import mitsuba as mi
 
-    from nerg_mi.jobs.demo import store_scene
+    from nerg_mi.workflows.demo import store_scene
 
     return mi.load_file(str(store_scene()), **({"width": "36", "height": "24"} | values))
 

@@ -254,7 +254,7 @@ def prepare(folder: Path) -> None:
 
     import mitsuba as mi
 
-    from nerg_mi.jobs.demo import store_scene
+    from nerg_mi.workflows.demo import store_scene
     from tests import tiny
 
     mi.set_variant("scalar_rgb")

@@ -326,7 +326,7 @@ def _finished(means, solid, free, lower, step, bounded: bool) -> PlaceSurface:
 #
 # What an alignment is found from: one file a kind, each a class that fulfils `Evidence`.
 #
-# Another kind is another such file, and a line where the job chooses among them (`nerg_mi.jobs.alignment`).
+# Another kind is another such file, and a line where the job chooses among them (`nerg_mi.workflows.align`).
 
 
 Progress = Callable[[float, str], None]

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.jobs.options import option, parse_numbers, parse_point
-from nerg_mi.jobs.options.parts import PartOptions
 from nerg_mi.ranges import COORDINATES, SECONDS, SEEDS, THREADS, TIMES, Checked, Range
+from nerg_mi.workflows.options import PartOptions, option, parse_numbers, parse_point
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,10 +14,10 @@ from nerg_mi.figures.statistics import map_figure, moves_figure, things_figure
 from nerg_mi.figures.style import provenance, save
 from nerg_mi.files.atomic import replacing, write_text
 from nerg_mi.files.tables import markdown_table, write_csv
-from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.rays.rays import pyarrow_modules
 from nerg_mi.statistics.tables import BY_NAME, FIELD, MEASURES, PersonRows, Row, shown
 from nerg_mi.statistics.visits import Sums
+from nerg_mi.workflows.base import Reporter
 
 from .options import StatisticsOptions
 
@@ -175,7 +175,7 @@ _COLUMNS = {"things": thing_columns, "differences": difference_columns, "what_if
 
 
 class Results(Protocol):
-    """The tables of `nerg_mi.jobs.statistics.StatisticsResult`."""
+    """The tables of `nerg_mi.workflows.statistics.StatisticsResult`."""
 
     @property
     def things(self) -> list[Row]: ...

@@ -15,16 +15,16 @@ from nerg_mi.files.atomic import replacing
 from nerg_mi.files.safe_read import read_npz
 from nerg_mi.formats.areas import Areas, files_of_areas, read_areas
 from nerg_mi.formats.checkpoint import read_metadata
-from nerg_mi.jobs.backend import select_backend
-from nerg_mi.jobs.gaze_places import file_of_training, place_key
-from nerg_mi.jobs.options import as_base
-from nerg_mi.jobs.parts import Parts, PlannedScene
 from nerg_mi.rays.dataset import HEAD, RayDataset, is_dataset, read_head, read_source, source_path
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import files_of_scene
 from nerg_mi.statistics.visits import Cell, Sums
 from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.tasks.task import RENDERS, Files, Part, Plan
+from nerg_mi.workflows.base import select_backend
+from nerg_mi.workflows.geometry import file_of_training, place_key
+from nerg_mi.workflows.options import as_base
+from nerg_mi.workflows.parts import Parts, PlannedScene
 
 from .measured import Counting, Eyes, blocks_of, count_block
 from .options import CountOptions, PredictionOptions, SettingOptions, StatisticsOptions

@@ -15,12 +15,12 @@ import numpy as np
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Areas, Group, read_regions
-from nerg_mi.jobs.reporter import SILENT, Reporter
 from nerg_mi.statistics.estimates import adjusted, ratio_differences
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.statistics.tables import BY_NAME, FIELD, PLACES, Floor, People, Row
 from nerg_mi.statistics.visibility import CellsInView, Isovists, Targets, in_view, standing, unhidden
 from nerg_mi.statistics.visits import ALL, Cell, LookRules, Thing
+from nerg_mi.workflows.base import SILENT, Reporter
 
 from .measured import Counting, Eyes, Window
 from .options import CountOptions, PredictionOptions, SettingOptions, parse_window

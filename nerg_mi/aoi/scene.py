@@ -29,8 +29,6 @@ from nerg_mi.formats.areas import (
 )
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.meshes import read_mesh_file
-from nerg_mi.jobs.gaze_places import align_of_training, place_of_training
-from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
 from nerg_mi.maths.geometry import Similarity, box_interval
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import COORDINATES
@@ -46,6 +44,7 @@ from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place, corners_of, default_settings, trace_depth
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import PlacedGaze, look_from
+from nerg_mi.workflows.geometry import GazeEvaluationOptions, align_of_training, place_of_training
 
 if TYPE_CHECKING:
     import mitsuba as mi

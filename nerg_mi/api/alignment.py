@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from nerg_mi.jobs.reporter import SILENT, Reporter
+from nerg_mi.workflows.base import SILENT, Reporter
 
 from .fields import FilePath
 from .options import options_of, rays_of
 
 if TYPE_CHECKING:
     from nerg_mi.alignment.check import Alignment
-    from nerg_mi.jobs.options.alignment import AlignOptions
     from nerg_mi.rays.rays import Rays
+    from nerg_mi.workflows.align import AlignOptions
 
 
 def align(
@@ -29,7 +29,7 @@ def align(
     ``output``: alignment to write besides (.json), which ``align=`` of `train_gaze` takes, with a picture beside it.
     ``changes``: options one by one on top of ``options``: the place (``field=``, ``scene=``, ``surface=``), evidence
     (``pairs=``, ``twin=``, ``cameras=`` with ``place_cameras=``; none of them: the tracking alone), and what is known
-    (``up=``, ``scale=``, ...); `nerg_mi.jobs.options.alignment.AlignOptions` says what there is. Raises `NergError` for
+    (``up=``, ``scale=``, ...); `nerg_mi.workflows.align.AlignOptions` says what there is. Raises `NergError` for
     evidence that leaves it open, for a mirrored frame and for a bad fit.
 
     >>> import nerg_mi as nerg
@@ -39,8 +39,8 @@ def align(
     >>> (found.matrix.round(6) + 0.0)[0].tolist()
     [2.0, 0.0, 0.0, 1.0]
     """
-    from nerg_mi.jobs import alignment
-    from nerg_mi.jobs.options.alignment import AlignOptions
+    from nerg_mi.workflows import align as alignment
+    from nerg_mi.workflows.align import AlignOptions
 
     job = options_of(AlignOptions, "align", options, changes)
     return alignment.align(None if rays is None else rays_of(rays), output, job, reporter).alignment

@@ -19,11 +19,11 @@ from numpy.typing import ArrayLike
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.formats.areas import Region
 from nerg_mi.formats.meshes import READERS
-from nerg_mi.jobs.reporter import SILENT, Reporter
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import FARTHEST, Range, check_number
 from nerg_mi.statistics.shares import Shares, SumRule, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, Box
+from nerg_mi.workflows.base import SILENT, Reporter
 
 from . import arrays
 from .arrays import Floats

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nerg_mi.jobs.reporter import SILENT, Reporter
+from nerg_mi.workflows.base import SILENT, Reporter
 
 from .fields import FilePath
 from .options import file_of, options_of
 
 if TYPE_CHECKING:
-    from nerg_mi.jobs.bake import Bake, BakeOptions
     from nerg_mi.rays.rays import Rays
+    from nerg_mi.workflows.bake import Bake, BakeOptions
 
 
 def bake(
@@ -30,7 +30,7 @@ def bake(
     ``rays``: what `load_rays` gave, or a file of them; the people whose places a gaze field is asked for, or whose gaze
     it is. ``outputs``: files to write (.ply, .glb, .csv, .json). ``changes``: options one by one
     (``gaze="gaze.safetensors"``, ``observer=(4.4, 2.8, 1.6)``, ``smooth=0.05``, ...) on top of ``options``;
-    `nerg_mi.jobs.options.bake.BakeOptions` says what there is. Raises `NergError`.
+    `nerg_mi.workflows.bake_options.BakeOptions` says what there is. Raises `NergError`.
 
     >>> from importlib.resources import files
     >>> from nerg_mi.api.bake import bake
@@ -39,9 +39,9 @@ def bake(
     >>> 0.9 < baked.on_surface < 1, abs(baked.unaccounted) < 0.01
     (True, True)
     """
-    from nerg_mi.jobs import bake as baking
-    from nerg_mi.jobs.options.bake import BakeOptions
     from nerg_mi.rays.rays import Rays
+    from nerg_mi.workflows import bake as baking
+    from nerg_mi.workflows.bake_options import BakeOptions
 
     in_memory = rays if isinstance(rays, Rays) else None
     if rays is not None and in_memory is None:

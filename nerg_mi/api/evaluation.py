@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from nerg_mi.jobs.reporter import SILENT, Reporter
+from nerg_mi.workflows.base import SILENT, Reporter
 
 from .fields import FilePath, TrainedField
 from .options import checkpoint_of, file_of, options_of, rays_of
@@ -13,13 +13,12 @@ if TYPE_CHECKING:
     from nerg_mi.evaluation.metrics import ViewScores
     from nerg_mi.fields.gaze_base import AnyGazeField
     from nerg_mi.fields.radiance import RadianceField
-    from nerg_mi.jobs.ablation import AblationResult
-    from nerg_mi.jobs.evaluation import GazeEvaluation
-    from nerg_mi.jobs.options.ablation import AblationOptions
-    from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
-    from nerg_mi.jobs.radiance import RadianceScoreOptions
-    from nerg_mi.jobs.study import StudyOptions, StudyResult
     from nerg_mi.rays.rays import Rays
+    from nerg_mi.workflows.ablation import AblationOptions, AblationResult
+    from nerg_mi.workflows.evaluate import GazeEvaluation
+    from nerg_mi.workflows.geometry import GazeEvaluationOptions
+    from nerg_mi.workflows.study import StudyOptions, StudyResult
+    from nerg_mi.workflows.train_radiance import RadianceScoreOptions
 
 
 def evaluate_radiance(
@@ -34,7 +33,7 @@ def evaluate_radiance(
 
     ``field``: a checkpoint, or a field in memory. ``photos``: as for `train_radiance`; those that were held out are
     scored. ``changes``: options one by one (``spp=16``, ``pictures="folder"``, ...) on top of ``options``;
-    `nerg_mi.jobs.radiance.RadianceScoreOptions` says what there is. Raises `NergError`.
+    `nerg_mi.workflows.train_radiance.RadianceScoreOptions` says what there is. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
@@ -43,11 +42,11 @@ def evaluate_radiance(
     >>> len(scores.psnr) == len(scores.views), scores.psnr_mean > 20  # of a folder of posed photos
     (True, True)
     """
-    from nerg_mi.jobs import radiance
+    from nerg_mi.workflows import train_radiance
 
-    job = options_of(radiance.RadianceScoreOptions, "evaluate_radiance", options, changes)
+    job = options_of(train_radiance.RadianceScoreOptions, "evaluate_radiance", options, changes)
     with checkpoint_of(field, "field") as path:
-        return radiance.evaluate_radiance(path, file_of(photos, "photos"), job, reporter)
+        return train_radiance.evaluate_radiance(path, file_of(photos, "photos"), job, reporter)
 
 
 def evaluate_gaze(
@@ -64,7 +63,7 @@ def evaluate_gaze(
     ``gaze``: a checkpoint that was trained with ``test_zones``, or what that training gave. ``rays``: those that it
     was trained on, or their file. ``output``: folder for tables and pictures, which is made. ``changes``: options
     one by one (``split="pos"``, ``resamples=200``, ...) on top of ``options``;
-    `nerg_mi.jobs.options.evaluation.GazeEvaluationOptions` says what there is. Raises `NergError`.
+    `nerg_mi.workflows.geometry.GazeEvaluationOptions` says what there is. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> held_out = {"test_zones": 1, "test_positions": 4, "geometry": "none", "zones": 0}
@@ -74,13 +73,13 @@ def evaluate_gaze(
     >>> scores.rows[0]["method"], scores.split
     ('gaze field', 'pos')
     """
-    from nerg_mi.jobs import evaluation
-    from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
+    from nerg_mi.workflows import evaluate
+    from nerg_mi.workflows.geometry import GazeEvaluationOptions
 
     job = options_of(GazeEvaluationOptions, "evaluate_gaze", options, changes)
     data = rays_of(rays)
     with checkpoint_of(gaze, "gaze") as path:
-        return evaluation.evaluate_gaze(path, data, output, job, reporter)
+        return evaluate.evaluate_gaze(path, data, output, job, reporter)
 
 
 def ablate(
@@ -96,7 +95,7 @@ def ablate(
     ``rays``: what `load_rays` or `import_rays` gave, or a file of them. ``output``: folder for checkpoints, table and
     plot, which is made; what an earlier run has left there is not trained again. Where people looked around is said as
     for `train_gaze`. ``changes``: options one by one (``recipes="small"``, ``seeds=1``, ...) on top of ``options``;
-    `nerg_mi.jobs.options.ablation.AblationOptions` says what there is. Raises `NergError`.
+    `nerg_mi.workflows.ablation.AblationOptions` says what there is. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> small = {"recipes": "default", "variant": ("emit",), "seeds": 1, "default_steps": 2, "probes": 8, "cameras": 0}
@@ -105,8 +104,8 @@ def ablate(
     >>> [row["variant"] for row in result.rows]
     ['emit']
     """
-    from nerg_mi.jobs import ablation
-    from nerg_mi.jobs.options.ablation import AblationOptions
+    from nerg_mi.workflows import ablation
+    from nerg_mi.workflows.ablation import AblationOptions
 
     job = options_of(AblationOptions, "ablate", options, changes)
     return ablation.ablate(rays_of(rays), output, job, reporter)
@@ -124,15 +123,15 @@ def study(
 
     ``scene``: a scene file, or one with a known truth: ``slab``, ``sphere``, ``sheets``, ``fog`` or ``ramp``.
     ``output``: folder for tables and plots, which is made. ``changes``: options one by one (``quick=True``,
-    ``only="depth"``, ...) on top of ``options``; `nerg_mi.jobs.study.StudyOptions` says what there is. A full study
-    takes up to half an hour. Raises `NergError`.
+    ``only="depth"``, ...) on top of ``options``; `nerg_mi.workflows.study.StudyOptions` says what there is. A full
+    study takes up to half an hour. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> result = nerg.study("slab", folder / "study", quick=True, width=8, height=8)
     >>> result.files[0].name
     'study.csv'
     """
-    from nerg_mi.jobs import study as studies
+    from nerg_mi.workflows import study as studies
 
     job = options_of(studies.StudyOptions, "study", options, changes)
     return studies.run_study(str(scene if isinstance(scene, str) else file_of(scene, "scene")), output, job, reporter)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.jobs.reporter import SILENT, Reporter
 from nerg_mi.ranges import SEEDS, SPP, Range, check_number
+from nerg_mi.workflows.base import SILENT, Reporter
 
 from .arrays import Floats, Labelled, points, same_for_all
 from .camera import Camera

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.jobs.reporter import SILENT, Reporter
 from nerg_mi.maths.arrays import vector_of
+from nerg_mi.workflows.base import SILENT, Reporter
 
 from . import arrays
 from .arrays import Floats, Labelled, same_for_all

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nerg_mi.jobs.reporter import SILENT, Reporter
 from nerg_mi.rays.rays import Rays
+from nerg_mi.workflows.base import SILENT, Reporter
 
 from .options import file_of, options_of
 
 if TYPE_CHECKING:
-    from nerg_mi.jobs.statistics import StatisticsResult
+    from nerg_mi.workflows.statistics import StatisticsResult
 
 
 def stats(
@@ -29,7 +29,7 @@ def stats(
     ``files``: rays (in memory, or their file, or a dataset), a scene, a gaze field, a radiance field, in any order.
     ``areas``: a JSON file of boxes, meshes, shapes and groups (docs/statistics.md). ``output``: folder for the tables.
     ``options``: those of `nerg stats` (`nerg_mi.aoi.options.StatisticsOptions`). Gives a
-    `nerg_mi.jobs.statistics.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
+    `nerg_mi.workflows.statistics.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
 
     >>> import json, nerg_mi as nerg
     >>> from nerg_mi.api.statistics import stats
@@ -41,7 +41,7 @@ def stats(
     ('shelf', 0.667, 1.0, 2.0)
     """
     from nerg_mi.aoi.options import StatisticsOptions
-    from nerg_mi.jobs.statistics import statistics
+    from nerg_mi.workflows.statistics import statistics
 
     given = [files] if isinstance(files, (str, os.PathLike, Rays)) else list(files)
     if areas is not None:

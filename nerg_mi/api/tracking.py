@@ -8,7 +8,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.jobs.reporter import SILENT, Reporter
+from nerg_mi.workflows.base import SILENT, Reporter
 
 from .options import check_names, file_of
 
@@ -30,9 +30,9 @@ def import_rays(
 
     ``files``: one or several. ``reader``: the format's name, as for ``nerg rays import --preset``; ``table`` reads any
     CSV or Parquet table through the option ``columns``. ``output``: rays file to write besides (.npz or .parquet), or a
-    dataset (.rays), of which large ones are given as a sample (`nerg_mi.jobs.tracking.ImportResult`).
+    dataset (.rays), of which large ones are given as a sample (`nerg_mi.workflows.rays.ImportResult`).
     ``options``: those of the reader, and ``skip_bad_lines``, ``pseudonyms`` and ``salt``, of a dataset ``place_name``,
-    ``day`` and ``workers`` (`nerg_mi.jobs.tracking.ImportOptions`). What was dropped, and why, is in the rays'
+    ``day`` and ``workers`` (`nerg_mi.workflows.rays.ImportOptions`). What was dropped, and why, is in the rays'
     ``metadata``. Raises `NergError`.
 
     >>> import nerg_mi as nerg
@@ -42,9 +42,9 @@ def import_rays(
     >>> len(rays), rays.persons
     (2, ('Ada',))
     """
-    from nerg_mi.jobs import tracking
     from nerg_mi.rays.readers.base import options_of
     from nerg_mi.rays.readers.registry import make_options, reader_named, reader_names
+    from nerg_mi.workflows import rays
 
     several = [files] if isinstance(files, (str, os.PathLike)) or not isinstance(files, Sequence) else files
     if not all(isinstance(file, (str, os.PathLike)) for file in several):
@@ -53,7 +53,7 @@ def import_rays(
             'write a table to a file (df.to_csv("day.csv")), and name its columns (columns="origin=x,y,z ...")'
         )
     of_readers = options_of(reader_named(reader).Options)
-    ours = {f.name for f in fields(tracking.ImportOptions)} - {"reader", "settings", "output"}
+    ours = {f.name for f in fields(rays.ImportOptions)} - {"reader", "settings", "output"}
     every = {option.name for name in reader_names() for option in options_of(reader_named(name).Options)}
     check_names("import_rays", options, sorted(every | ours))
     paths = [file_of(file, "files") for file in several]
@@ -64,5 +64,5 @@ def import_rays(
         # Values may be written as for the command.
         if isinstance(value, str) and (read := parse.get(name)) is not None:
             of_reader[name] = read(value)
-    job = tracking.ImportOptions(reader=reader, settings=make_options(reader, of_reader), output=output, **of_job)
-    return tracking.import_rays(paths, job, reporter).rays
+    job = rays.ImportOptions(reader=reader, settings=make_options(reader, of_reader), output=output, **of_job)
+    return rays.import_rays(paths, job, reporter).rays

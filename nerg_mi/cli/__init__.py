@@ -1,6 +1,6 @@
 """The command `nerg`: finds the sub-command, runs it, and tells an expected error in one sentence.
 
-Commands are declared in the modules of their workflows (`nerg_mi.jobs.commands`), and found and built by `.building`.
+Commands are declared in the modules of their workflows (`nerg_mi.workflows.base`), and found and built by `.building`.
 """
 
 from __future__ import annotations

@@ -19,13 +19,13 @@ import typer
 import typer.core
 
 from nerg_mi import __version__
-from nerg_mi.jobs.commands import COMMANDS, Command, Parameter
 from nerg_mi.ranges import RANGE
+from nerg_mi.workflows.base import COMMANDS, Command, Parameter
 
 from .ending import shorten_values
 from .progress import TerminalReporter
 
-PACKAGES = ("nerg_mi.jobs", "nerg_mi.cli")
+PACKAGES = ("nerg_mi.workflows", "nerg_mi.cli")
 """Packages whose modules, and those below them, may be commands."""
 
 GROUPS = {

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import typer
 
-from nerg_mi.jobs.commands import argument, command
-from nerg_mi.jobs.options import option
-from nerg_mi.jobs.options.view import ViewOptions
-from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.ranges import SECONDS, Checked, Range
+from nerg_mi.workflows.base import Reporter, argument, command
+from nerg_mi.workflows.options import option
+from nerg_mi.workflows.view import ViewOptions
 
 
 @command("doctor", more="Ends with exit code 0 if some compiled variant of Mitsuba works, else with 1.")

@@ -18,7 +18,7 @@ SOON = 2.0
 
 
 class TerminalReporter:
-    """A `nerg_mi.jobs.reporter.Reporter`, and a context that takes the bar away again.
+    """A `nerg_mi.workflows.base.Reporter`, and a context that takes the bar away again.
 
     Messages go to the standard output and warnings to the standard error. The bar is on the standard error, from the
     first ``progress`` on and only where that is a terminal, so that neither a pipe nor a file ever holds it. Where it

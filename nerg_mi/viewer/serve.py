@@ -10,9 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.jobs.options.view import ViewOptions
-from nerg_mi.jobs.reporter import SILENT, Reporter
-from nerg_mi.jobs.view import place_to_view
+from nerg_mi.workflows.base import SILENT, Reporter
+from nerg_mi.workflows.view import ViewOptions, place_to_view
 
 from .controls import Areas, Controls
 from .flights import Flying
@@ -34,7 +33,7 @@ class Viewing:
 def viewer(
     files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT
 ) -> Iterator[Viewing]:
-    """Serve ``files`` as a page for as long as the block lasts: what `jobs.view.place_to_view` takes.
+    """Serve ``files`` as a page for as long as the block lasts: what `workflows.view.place_to_view` takes.
 
     Bound to this machine alone by default; at another host the address has a token. Raises `NergError` for files that
     cannot be shown, for a port that is taken, and where the extra "viewer" is missing.

@@ -18,10 +18,6 @@ from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.api.variant import active_mitsuba
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.formats.areas import Areas, Region, read_areas
-from nerg_mi.jobs.options.view import ViewOptions
-from nerg_mi.jobs.overlays import basis_words
-from nerg_mi.jobs.scenes.cameras import given_point
-from nerg_mi.jobs.view import PlaceToView
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.ranges import FARTHEST
@@ -29,6 +25,9 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.statistics.shares import ROUGH
 from nerg_mi.transport.geometry import Ceiling
+from nerg_mi.workflows.render import basis_words
+from nerg_mi.workflows.scene_cameras import given_point
+from nerg_mi.workflows.view import PlaceToView, ViewOptions
 
 from . import layers
 from .layers import Layer, Scale, Shade

@@ -54,7 +54,7 @@ def make_field(job: Job) -> list[Path]:
     """The radiance field, trained on the pictures and their exact depth; the test views are held out."""
     import mitsuba as mi
 
-    from nerg_mi.jobs.radiance import RadianceOptions, train_radiance
+    from nerg_mi.workflows.train_radiance import RadianceOptions, train_radiance
 
     _require(job.build / "transforms.json", "views")
     path = job.build / "store.safetensors"
@@ -89,8 +89,7 @@ def make_gaze(job: Job) -> list[Path]:
     it."""
     import mitsuba as mi
 
-    from nerg_mi.jobs.gaze import train_gaze
-    from nerg_mi.jobs.options.gaze import GazeOptions
+    from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
 
     source, place = job.build / "rays.npz", job.store / "store.safetensors"
     _require(source, "rays")
@@ -116,9 +115,9 @@ def make_evaluation(job: Job) -> list[Path]:
     """Scores of the gaze field at the positions that were held out, beside those of what needs no field."""
     import mitsuba as mi
 
-    from nerg_mi.jobs.evaluation import evaluate_gaze
-    from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
-    from nerg_mi.jobs.reports.files import RESULTS
+    from nerg_mi.workflows.evaluate import evaluate_gaze
+    from nerg_mi.workflows.geometry import GazeEvaluationOptions
+    from nerg_mi.workflows.report import RESULTS
 
     source, gaze = job.build / "rays.npz", job.store / "shoppers.safetensors"
     _require(source, "rays")

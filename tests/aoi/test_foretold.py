@@ -9,10 +9,10 @@ from nerg_mi.aoi.measured import Eyes
 from nerg_mi.aoi.predicted import eyes_of_some, foretell, foretold_people
 from nerg_mi.aoi.scene import Surroundings
 from nerg_mi.formats.areas import Region
-from nerg_mi.jobs.reporter import SILENT
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.statistics.visits import ALL, Box, Cell
-from tests.jobs.recorder import Recorder
+from nerg_mi.workflows.base import SILENT
+from tests.workflows.recorder import Recorder
 
 
 class Law(Surroundings):

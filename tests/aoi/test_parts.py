@@ -23,15 +23,15 @@ from nerg_mi.aoi.parts import (
 )
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.jobs.parts import PlannedScene, account_for_store
-from nerg_mi.jobs.statistics import statistics
 from nerg_mi.statistics.visits import ALL, Cell, Sums
 from nerg_mi.tasks.task import Files
+from nerg_mi.workflows.parts import PlannedScene, account_for_store
+from nerg_mi.workflows.statistics import statistics
 from tests.conftest import ROOT
-from tests.jobs.recorder import Recorder
 from tests.plugins import fields
 from tests.rays.dataset.making import DAY, recipe, update_dataset, write_dataset, write_source
 from tests.tasks.works import laid_out
+from tests.workflows.recorder import Recorder
 
 from .place import people, write_place
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.output import write_results
-from nerg_mi.jobs.statistics import StatisticsResult
-from tests.jobs.recorder import Recorder
+from nerg_mi.workflows.statistics import StatisticsResult
+from tests.workflows.recorder import Recorder
 
 THING = {
     "cell": "all",

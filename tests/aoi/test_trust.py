@@ -9,7 +9,7 @@ from nerg_mi.aoi.measured import Eyes
 from nerg_mi.aoi.predicted import Foretold, add_trust, support_of, tell_places, tell_support
 from nerg_mi.statistics.tables import PLACES
 from nerg_mi.statistics.visits import ALL, Cell
-from tests.jobs.recorder import Recorder
+from tests.workflows.recorder import Recorder
 
 ZONE = Cell("zone", "z")
 EYES = Eyes(

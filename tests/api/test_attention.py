@@ -8,11 +8,11 @@ from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.api.attention import box_shares
 from nerg_mi.api.shapes import box_dict
 from nerg_mi.formats.areas import Region
-from nerg_mi.jobs.statistics import statistics
 from nerg_mi.report.data import Onlooker
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, Box
 from nerg_mi.train.geometry import GazePlace
+from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import SIGN, STAND, write_place
 
 BOX = [(-0.2, 1.8, -0.1), (0.2, 2.2, 0.1)]

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.jobs import ablation, evaluation, radiance, study
-from nerg_mi.jobs.options.ablation import AblationOptions
-from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
+from nerg_mi.workflows import ablation, evaluate, study, train_radiance
+from nerg_mi.workflows.ablation import AblationOptions
+from nerg_mi.workflows.geometry import GazeEvaluationOptions
 
 
 class Asked(Exception):
@@ -22,17 +22,17 @@ def raise_it(*arguments):
     "module, job, call, expected",
     [
         (
-            radiance,
+            train_radiance,
             "evaluate_radiance",
             lambda: nerg.evaluate_radiance("f.safetensors", "photos", spp=3, pictures="out"),
             (
                 Path("f.safetensors"),
                 Path("photos"),
-                radiance.RadianceScoreOptions(spp=3, pictures=Path("out"), mode="llvm_ad_rgb"),
+                train_radiance.RadianceScoreOptions(spp=3, pictures=Path("out"), mode="llvm_ad_rgb"),
             ),
         ),
         (
-            evaluation,
+            evaluate,
             "evaluate_gaze",
             lambda: nerg.evaluate_gaze("g.safetensors", "r.npz", "out", split="pos"),
             (Path("g.safetensors"), Path("r.npz"), "out", GazeEvaluationOptions(split="pos", mode="llvm_ad_rgb")),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from tests.jobs.recorder import Recorder
 from tests.plugins import fields
+from tests.workflows.recorder import Recorder
 
 BALL = {"type": "sphere", "radius": 0.5}
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.jobs import gaze as gaze_job
-from nerg_mi.jobs import radiance as radiance_job
-from nerg_mi.jobs.options.gaze import GazeOptions
-from nerg_mi.jobs.radiance import RadianceOptions
+from nerg_mi.workflows import train_gaze as gaze_job
+from nerg_mi.workflows import train_radiance as radiance_job
+from nerg_mi.workflows.train_gaze import GazeOptions
+from nerg_mi.workflows.train_radiance import RadianceOptions
 
 
 class Asked(Exception):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.store_visibility import PAIRS, measure, near_edges
-from nerg_mi.jobs.demo import store_scene
+from nerg_mi.workflows.demo import store_scene
 
 
 def test01_pixels_near_jumps_are_left_out():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from nerg_mi.jobs.commands import COMMANDS
+from nerg_mi.workflows.base import COMMANDS
 
 
 def keep_handed(monkeypatch, name: str) -> list[dict[str, Any]]:

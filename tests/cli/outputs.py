@@ -20,9 +20,9 @@ from tests.figures.standins import write_standins
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.formats.torch_ngp.test_fields import small_state
 from tests.formats.torch_ngp.test_nerg import save, small_gaze
-from tests.jobs.drawing.scenes import write_scene
 from tests.plugins import fields
 from tests.surfaces.meshes import box
+from tests.workflows.drawing.scenes import write_scene
 
 from .test_render import SCENE
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.jobs import ablation  # noqa: F401 (declares the command)
-from nerg_mi.jobs.options.ablation import AblationOptions
+from nerg_mi.workflows import ablation  # noqa: F401 (declares the command)
+from nerg_mi.workflows.ablation import AblationOptions
 
 from .handed import keep_handed
 

@@ -11,10 +11,10 @@ import typer
 from typer.testing import CliRunner
 
 import nerg_mi.cli
-import nerg_mi.jobs
+import nerg_mi.workflows
 from nerg_mi.cli.building import callback_of
-from nerg_mi.jobs.commands import COMMANDS, Command, argument, extra
-from nerg_mi.jobs.options import option, parse_numbers
+from nerg_mi.workflows.base import COMMANDS, Command, argument, extra
+from nerg_mi.workflows.options import option, parse_numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,8 +91,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from nerg_mi.jobs.commands import argument, command
-from nerg_mi.jobs.options import option
+from nerg_mi.workflows.base import argument, command
+from nerg_mi.workflows.options import option
 from nerg_mi.ranges import Checked, Range
 
 
@@ -119,25 +119,25 @@ def test_a_command_is_one_module(monkeypatch, tmp_path, capsys):
 
     (tmp_path / "kindness").mkdir()
     (tmp_path / "kindness" / "greeting.py").write_text(GREETING)
-    monkeypatch.setattr(nerg_mi.jobs, "__path__", [*nerg_mi.jobs.__path__, str(tmp_path)])
+    monkeypatch.setattr(nerg_mi.workflows, "__path__", [*nerg_mi.workflows.__path__, str(tmp_path)])
     try:
         assert nerg("--help")[1].split("Commands:")[1].rstrip().endswith("greet")
         assert "kindly  Say something kind." in nerg("greet", "--help")[1]
-        assert "nerg_mi.jobs.kindness.greeting" not in sys.modules
+        assert "nerg_mi.workflows.kindness.greeting" not in sys.modules
         code, said = nerg("greet", "kindly", "--help")
         assert code == 0 and "Say something kind.\n\n  It costs nothing." in said and "How often." in said
         assert nerg("greet", "kindly", "Ada", "--times", "2") == (0, "hello Ada\nhello Ada\n")
         assert nerg("greet", "kindly", "Ada", "--times", "10")[0] == 2
     finally:
-        for name in ("nerg_mi.jobs.kindness.greeting", "nerg_mi.jobs.kindness"):
+        for name in ("nerg_mi.workflows.kindness.greeting", "nerg_mi.workflows.kindness"):
             sys.modules.pop(name, None)
         COMMANDS.pop("greet kindly", None)
 
 
 def test_a_line_without_a_command_is_a_mistake(monkeypatch, tmp_path, capsys):
     (tmp_path / "nothing.py").write_text('"""``nerg nothing``: Do nothing."""\n')
-    monkeypatch.setattr(nerg_mi.jobs, "__path__", [*nerg_mi.jobs.__path__, str(tmp_path)])
+    monkeypatch.setattr(nerg_mi.workflows, "__path__", [*nerg_mi.workflows.__path__, str(tmp_path)])
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(["nothing"])
-    sys.modules.pop("nerg_mi.jobs.nothing")
-    assert end.value.code == 70 and "nerg_mi.jobs.nothing names a command" in capsys.readouterr().err
+    sys.modules.pop("nerg_mi.workflows.nothing")
+    assert end.value.code == 70 and "nerg_mi.workflows.nothing names a command" in capsys.readouterr().err

@@ -10,8 +10,8 @@ import pytest
 
 import nerg_mi.cli
 from nerg_mi.evaluation.gaze_report import judge, read_results
-from nerg_mi.jobs import demo
 from nerg_mi.rendering.bands import render_channels
+from nerg_mi.workflows import demo
 from tests.cli.test_render import NERG, interrupt
 from tests.pictures import mitsuba_bitmap
 

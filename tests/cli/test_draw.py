@@ -7,8 +7,8 @@ import pytest
 
 import nerg_mi.cli
 from nerg_mi.files.images import write_exr
-from nerg_mi.jobs.drawing.registry import KINDS
-from tests.jobs.drawing.test_walls import SCENE
+from nerg_mi.workflows.draw import KINDS
+from tests.workflows.drawing.test_walls import SCENE
 
 
 def nerg(capsys, *arguments):
@@ -35,7 +35,7 @@ def test_a_difference(capsys, tmp_path):
 
 
 def test_values_for_the_scene(capsys, tmp_path):
-    from tests.jobs.drawing.test_floor import walk
+    from tests.workflows.drawing.test_floor import walk
 
     walk().save(tmp_path / "rays.npz")
     text = SCENE.replace('<scene version="3.0.0">', '<scene version="3.0.0"><default name="tall" value="1"/>')

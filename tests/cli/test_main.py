@@ -11,7 +11,7 @@ import nerg_mi.cli
 import nerg_mi.cli.machine
 from nerg_mi.cli.building import GROUPS, find_commands
 from nerg_mi.errors import MissingFile, NergError, UnusableLLVM, chosen, mitsuba_says, sentence
-from nerg_mi.jobs.commands import COMMANDS
+from nerg_mi.workflows.base import COMMANDS
 from tests.conftest import ROOT
 
 HEAVY = {"mitsuba", "drjit", "numpy", "scipy", "matplotlib", "torch", "trimesh", "OpenEXR"}
@@ -131,7 +131,7 @@ def test07_a_mistake_in_the_program_is_shown_as_one(monkeypatch, capsys, error, 
 def test07b_nothing_is_said_where_nobody_reads(lines):
     """Neither in the middle of the output nor at its end, which is written when the interpreter stops."""
     code = (
-        "import sys, dataclasses\nimport nerg_mi.cli.machine\nfrom nerg_mi.jobs.commands import COMMANDS\n"
+        "import sys, dataclasses\nimport nerg_mi.cli.machine\nfrom nerg_mi.workflows.base import COMMANDS\n"
         f"def run(reporter):\n    for i in range({lines}): print('a line of output')\n"
         "COMMANDS['doctor'] = dataclasses.replace(COMMANDS['doctor'], run=run)\n"
         "from nerg_mi.cli import main\nsys.argv[1:] = ['doctor']\nmain()"

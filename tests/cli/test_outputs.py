@@ -16,7 +16,7 @@ import pytest
 
 import nerg_mi.cli
 from nerg_mi.cli.building import callback_of, find_commands
-from nerg_mi.jobs.commands import COMMANDS
+from nerg_mi.workflows.base import COMMANDS
 
 from .outputs import CASES, INPUTS, MAKES_A_FOLDER, OF_TORCH, READS_ONLY, make_inputs
 

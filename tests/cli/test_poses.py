@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from nerg_mi.cli import main
-from nerg_mi.jobs import poses as job
+from nerg_mi.workflows import poses as job
 from tests.photos.structure import rendered
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.jobs import report  # noqa: F401 (declares the command)
+from nerg_mi.workflows import report  # noqa: F401 (declares the command)
 
 from .handed import keep_handed
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.jobs import gaze_prior  # noqa: F401 (declares the command)
-from nerg_mi.jobs.options.prior import PriorOptions
+from nerg_mi.workflows import train_prior  # noqa: F401 (declares the command)
+from nerg_mi.workflows.train_prior import PriorOptions
 
 from .handed import keep_handed
 

@@ -13,8 +13,8 @@ import pytest
 import nerg_mi
 from nerg_mi.errors import NergError
 from nerg_mi.figures.style import files_among, provenance
-from nerg_mi.jobs.options.bake import BakeOptions
-from nerg_mi.jobs.options.pictures import PictureOptions
+from nerg_mi.workflows.bake_options import BakeOptions
+from nerg_mi.workflows.options import PictureOptions
 
 
 def test_everything_is_said(tmp_path):

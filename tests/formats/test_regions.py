@@ -9,7 +9,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import MOST, Region, read_regions, to_json
-from nerg_mi.jobs import demo
+from nerg_mi.workflows import demo
 
 
 def test01_there_and_back(tmp_path):

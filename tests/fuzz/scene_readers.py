@@ -133,7 +133,7 @@ def _make_path(folder: Path) -> None:
 
 
 def _read_path(folder: Path) -> object:
-    from nerg_mi.jobs.baking.lookers import read_path
+    from nerg_mi.workflows.bake_chunks import read_path
 
     return read_path(folder / "walk.csv")
 

@@ -227,9 +227,9 @@ def _make_dataset(folder: Path) -> None:
 
 
 def _read_dataset(folder: Path) -> None:
-    from nerg_mi.jobs.tracking import card_of
     from nerg_mi.rays.dataset import Conditions, RayDataset
     from nerg_mi.rays.quality import card_table
+    from nerg_mi.workflows.rays import card_of
 
     for title, card in card_of(folder / "a.rays"):
         card_table(card.rays, card.summary, title, card.lines)

@@ -11,10 +11,10 @@ from nerg_mi.api.scene import Scene
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import find_overlay, to_bytes
 from nerg_mi.files.images import write_exr
-from nerg_mi.jobs.drawing.draw import draw
-from nerg_mi.jobs.overlays import layers_of
 from nerg_mi.transport import aovs
 from nerg_mi.viewer.layers import automatic, available, colored, legend, usual_scale
+from nerg_mi.workflows.draw import draw
+from nerg_mi.workflows.render import layers_of
 
 from .scenes import camera, channels, constant, named, with_field, with_gaze
 from .test_nerg_leaves_out import operations

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from nerg_mi.jobs.demo import store_scene
 from nerg_mi.rendering.aovs import SAMPLES, fields_of, prepare_for
 from nerg_mi.rendering.scene import load_scene
+from nerg_mi.workflows.demo import store_scene
 
 SMALL = {"width": "24", "height": "16", "spp": "1"}
 

@@ -4,8 +4,8 @@ import pytest
 
 from nerg_mi import llvm
 from nerg_mi.errors import NergError, UnusableLLVM
-from nerg_mi.jobs.pictures import sensor_of
 from nerg_mi.rendering.scene import activate, load_scene
+from nerg_mi.workflows.render import sensor_of
 
 
 def test_the_best_variant_that_works(rgb, monkeypatch):

@@ -7,8 +7,8 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
-from nerg_mi.jobs import demo
 from nerg_mi.rendering.nested_scene import gaze_of_scene, with_gaze
+from nerg_mi.workflows import demo
 
 PLAIN = """<scene version="3.0.0"><default name="n" value="a"/>{}<shape type="sphere"/></scene>"""
 NERG = """<integrator type="nerg"><volume name="gaze" type="gazefield"><string name="filename" value="$n.bin"/></volume>

@@ -13,9 +13,8 @@ from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import write_text
-from nerg_mi.jobs.options import option
-from nerg_mi.jobs.options.parts import PartOptions
 from nerg_mi.tasks.task import FOLDER, Checksums, Part, Plan, inputs_of, relocated
+from nerg_mi.workflows.options import PartOptions, option
 
 
 @dataclass(frozen=True, kw_only=True)

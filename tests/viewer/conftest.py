@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.jobs import demo
+from nerg_mi.workflows import demo
 from tests.viewer.room import ROOM, write_gaze_fields
 
 

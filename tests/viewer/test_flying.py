@@ -6,10 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.viewer.flights import Flying
 from nerg_mi.viewer.points import View
 from nerg_mi.viewer.serve import viewer
+from nerg_mi.workflows.view import ViewOptions
 from tests.viewer.browser import require
 
 

@@ -11,10 +11,10 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.viewer.layers import layer_of
 from nerg_mi.viewer.points import View
 from nerg_mi.viewer.serve import viewer
+from nerg_mi.workflows.view import ViewOptions
 from tests.viewer.browser import chromium, require
 
 pytestmark = pytest.mark.slow
@@ -69,8 +69,8 @@ def drag(driver, start, end):
 
 @pytest.fixture(scope="module")
 def running():
-    from nerg_mi.jobs import demo
     from nerg_mi.rendering.scene import activate
+    from nerg_mi.workflows import demo
 
     require("viser")
     activate("llvm_ad_rgb")

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.viewer.serve import viewer
+from nerg_mi.workflows.view import ViewOptions
 from tests.viewer.browser import chromium, require
 from tests.viewer.panel import Panel
 from tests.viewer.room import ROOM, write_gaze_fields
@@ -32,8 +32,8 @@ def two_people() -> nerg.Rays:
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory):
-    from nerg_mi.jobs import demo
     from nerg_mi.rendering.scene import activate
+    from nerg_mi.workflows import demo
 
     require("viser")
     activate("llvm_ad_rgb")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.viewer.page import Page
 from nerg_mi.viewer.scene import People, color_of
 from nerg_mi.viewer.serve import viewer
+from nerg_mi.workflows.view import ViewOptions
 from tests.viewer.browser import require
 
 

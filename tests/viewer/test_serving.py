@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.viewer import serve
 from nerg_mi.viewer.serve import view_files, viewer
-from tests.jobs.recorder import Recorder
+from nerg_mi.workflows.view import ViewOptions
 from tests.viewer.browser import require
+from tests.workflows.recorder import Recorder
 
 
 @pytest.fixture(autouse=True)

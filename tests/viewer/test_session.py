@@ -11,11 +11,10 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
-from nerg_mi.jobs.options.view import ViewOptions
-from nerg_mi.jobs.view import place_to_view
 from nerg_mi.viewer import session as session_module
 from nerg_mi.viewer.layers import layer_of
 from nerg_mi.viewer.session import Session
+from nerg_mi.workflows.view import ViewOptions, place_to_view
 
 
 class Heard:

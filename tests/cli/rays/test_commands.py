@@ -17,6 +17,6 @@ def test_the_import_has_the_options_of_all_readers():
 
 
 def test_help_loads_no_renderer():
-    code = "import sys; import nerg_mi.jobs.tracking; print(*{'mitsuba', 'drjit', 'scipy'} & set(sys.modules))"
+    code = "import sys; import nerg_mi.workflows.rays; print(*{'mitsuba', 'drjit', 'scipy'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip() == ""

@@ -1,7 +1,7 @@
 """``nerg rays show``."""
 
 from nerg_mi.errors import NergError
-from nerg_mi.jobs.tracking import SplitOptions, split_rays
+from nerg_mi.workflows.rays import SplitOptions, split_rays
 from tests.cli.rays.running import run, write_walk
 
 

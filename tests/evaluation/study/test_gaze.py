@@ -7,10 +7,10 @@ import pytest
 
 from nerg_mi.evaluation import study_truth as study_shapes
 from nerg_mi.evaluation.study_subject import open_subject
-from nerg_mi.jobs.study import StudyOptions, run_study
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.train.gaze_data import box_exit
+from nerg_mi.workflows.study import StudyOptions, run_study
 from tests.evaluation.gaze_fields import KINDS, saved
 
 BOX = Box((-3, -3, -3), (3, 3, 3))

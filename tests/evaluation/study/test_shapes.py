@@ -8,8 +8,8 @@ import pytest
 from nerg_mi.cli import main
 from nerg_mi.evaluation import study_subject
 from nerg_mi.evaluation import study_truth as study_shapes
-from nerg_mi.jobs.demo import store_scene
 from nerg_mi.transport.geometry import Place
+from nerg_mi.workflows.demo import store_scene
 
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg">

@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.evaluation import study_scenes
 from nerg_mi.evaluation.study_subject import open_subject
-from nerg_mi.jobs.study import twin_beside
+from nerg_mi.workflows.study import twin_beside
 from tests.reference import march_numpy
 
 SCENE = """<scene version="3.0.0">

@@ -5,8 +5,8 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.formats.gltf import shown_unlit
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import READERS, is_splats, plugin_of_field, read_splats, refuse_others
-from nerg_mi.jobs.scenes.files import kind_of_file
 from nerg_mi.train.geometry import place_of_field
+from nerg_mi.workflows.scene_places import kind_of_file
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos, write_spz
 
 WRITERS = {".ply": write_inria, ".splat": write_antimatter, ".spz": write_spz, ".glb": write_khronos}

@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from nerg_mi.cli import build_app
 from nerg_mi.errors import NergError
-from nerg_mi.jobs.tracking import ImportOptions, import_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers import registry
 from nerg_mi.rays.readers.base import option
+from nerg_mi.workflows.rays import ImportOptions, import_rays
 from tests.rays.readers.made_up import MadeUp, MadeUpOptions, write_recording
 
 

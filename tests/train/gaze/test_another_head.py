@@ -15,11 +15,9 @@ import nerg_mi.train
 from nerg_mi.fields import gaze_base
 from nerg_mi.fields.gaze_ensemble import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
-from nerg_mi.jobs.ablation import ablate
-from nerg_mi.jobs.gaze import train_gaze
-from nerg_mi.jobs.options.ablation import AblationOptions
-from nerg_mi.jobs.options.gaze import GazeOptions
 from nerg_mi.train import gaze_recipes
+from nerg_mi.workflows.ablation import AblationOptions, ablate
+from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
 from tests.evaluation.gaze.test_evaluation import crowd
 
 HEADS = Path(__file__).parents[2] / "heads"

@@ -1,1 +1,0 @@
-"""What a scene file is made of when it is written for checkpoints: its files, its place, its observer, its camera."""

@@ -1,0 +1,493 @@
+"""What a kind of figure is, and the figures of scenes: gaze spheres, occlusion, and floor plans.
+
+To add a kind, define a `Kind` here and add it to ``SCENE_KINDS``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.figures.maps import Sight, Walk, Walls, floor_figure
+from nerg_mi.figures.overlay import Layers, Overlay, Style, find_overlay, occlusion_figure, shared_limits, unknown_of
+from nerg_mi.figures.sphere import find_projection, sphere_figure
+from nerg_mi.figures.style import find_colors
+from nerg_mi.interruption import Interruption
+from nerg_mi.ranges import COORDINATES, DECADES, SEEDS, SPP, VALUES, Checked, Range
+from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.filters import find_sessions
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.aovs import nerg_of
+from nerg_mi.rendering.scene import activate, load_scene
+from nerg_mi.rendering.scene_writer import pixel_of
+from nerg_mi.transport.geometry import Place, pixel_solid_angles, trace_depth
+
+from .base import Reporter
+from .options import definitions, option
+from .render import layers_of
+
+# ---- Kind ----
+#
+# A kind of figure: what it is called, which files and options it takes, and how it is drawn.
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A ``figure`` of matplotlib, the files that it was made of (``inputs``), and the ``seed`` of what is random in it,
+    or None."""
+
+    figure: Any
+    inputs: Sequence[Path]
+    seed: int | None = None
+
+
+@dataclass(frozen=True)
+class Kind:
+    """``name`` and ``summary`` for people; ``takes``: what its files are; ``most``: how many of them at most;
+    ``options``: a dataclass, frozen and of keywords alone, whose fields ``option`` makes (`nerg_mi.workflows.options`);
+    ``draw(files, options, reporter)``. Raises `NergError` for what the user can mend."""
+
+    name: str
+    summary: str
+    takes: str
+    most: int
+    options: type
+    draw: Callable[[Sequence[Path], Any, Reporter], Drawing]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColorOptions(Checked):
+    """The colours of a figure's values."""
+
+    top: float | None = option(
+        None, "Upper end of the scale, in its unit.  [default: the 99.5th percentile]", within=VALUES
+    )
+    cmap: str | None = option(None, "Colour map: inferno, magma, plasma, viridis, cividis.  [default: inferno]")
+    decades: float = option(0.0, "Powers of ten that the scale spans; 0: a linear scale.", within=DECADES)
+
+    def style(self, title: str | None = None, kind: str = "sequential") -> Style:
+        """How overlays are drawn by these options, with colour maps of that ``kind`` (`find_colors`). Raises
+        `NergError` for what cannot be drawn."""
+        if self.cmap is not None:
+            find_colors(self.cmap, kind)
+        return Style(self.cmap, self.decades, False, title)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleOptions(ColorOptions):
+    """The same of a figure that can be hatched."""
+
+    hatching: bool = option(True, "Hatch where nothing is known.")
+
+    def style(self, title: str | None = None, kind: str = "sequential") -> Style:
+        """How overlays are drawn by these options, with colour maps of that ``kind`` (`find_colors`). Raises
+        `NergError` for what cannot be drawn."""
+        return replace(super().style(title, kind), hatched=self.hatching)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(ScaleOptions):
+    """How a scene file is rendered for a figure."""
+
+    defaults: Mapping[str, str] | None = definitions()
+    spp: int = option(0, "Samples a pixel; 0: as the scene says.", within=Range(0, SPP.high))
+    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
+
+
+# ---- Floor ----
+#
+# The floor plan of rays in their place: paths, where people looked, and fields of view.
+
+
+_GAP = 1.0  # seconds without a ray after which a path begins anew
+_JUMP = 1.0  # metres between two rays that nobody walks
+_FINEST = 0.02  # metres between points of a path
+_REACH = 1.2  # metres that a field of view, or a ray whose hit is not known, is drawn long
+
+
+@dataclass(frozen=True, kw_only=True)
+class FloorOptions(Checked):
+    """What a floor plan shows."""
+
+    scene: Path | None = option(None, "Scene file of the place, whose walls and furniture are drawn.")
+    defaults: Mapping[str, str] | None = definitions()
+    cut: float = option(1.2, "Height at which the place is cut, metres above its floor.", within=COORDINATES)
+    floor: float = option(0.0, "Height of the floor (z).", within=COORDINATES)
+    paths: bool = option(True, "Draw where people walked.")
+    rays: int = option(0, "Draw so many rays, from the eye to what was looked at.", within=Range(0, 20000))
+    views: int = option(0, "Draw so many fields of view of each person.", within=Range(0, 1000))
+    fov: float = option(60.0, "Degrees that a field of view is wide.", within=Range(1, 180))
+    people: str | None = option(None, "Draw these people alone: names with commas between them.")
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
+
+
+def _draw_floor(files: Sequence[Path], options: FloorOptions, reporter: Reporter) -> Drawing:
+    """The plan of the rays of a file, over the place of ``options.scene`` where there is one."""
+    (path,) = files
+    rays = _of_people(load_rays(path), options.people)
+    if not len(rays):
+        raise NergError(f'"{path}" holds no rays; give a file of rays that has some')
+    if not options.cut > 0:
+        raise NergError(f"--cut is a height above the floor, got {options.cut}")
+    low, high = _corners(rays)
+    inputs, walls = [path], None
+    if options.scene is not None:
+        from nerg_mi.rendering.aovs import nerg_of
+        from nerg_mi.rendering.scene import activate, load_scene
+
+        activate(options.mode)
+        reporter.progress(0.0, "loading the scene")
+        scene = load_scene(options.scene, options.defaults)
+        reporter.progress(0.2, "cutting the place")
+        nerg = nerg_of(options.scene, scene)
+        walls = cut_place(nerg, scene, low, high, options.floor + options.cut, options.floor)
+        inputs.append(options.scene)
+    number = {person: k for k, person in enumerate(np.unique(rays.person))}
+    walks = _walks(rays, number) if options.paths else []
+    people = f"{len(number)} {'person' if len(number) == 1 else 'people'}"
+    figure = floor_figure(
+        low,
+        high,
+        walls,
+        walks,
+        _sights(rays, number, options.rays),
+        _fields(rays, number, options.views),
+        options.fov,
+        f"{len(rays):,} rays of {people}",
+    )
+    return Drawing(figure, inputs)
+
+
+def _of_people(rays: Rays, names: str | None) -> Rays:
+    if names is None:
+        return rays
+    wanted = [name.strip() for name in names.split(",")]
+    missing = [name for name in wanted if name not in rays.persons]
+    if missing:
+        some = ", ".join(rays.persons[:8])
+        raise NergError(f'the rays have no person "{missing[0]}"; they have {some}{", ..." * (len(rays.persons) > 8)}')
+    return rays.select(np.isin(rays.person, [rays.persons.index(name) for name in wanted]))
+
+
+def _corners(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a plan that holds where people were and, but for strays, what they looked at."""
+    parts = [rays.origin[:, :2]]
+    if rays.hit is not None:
+        hits = rays.hit[np.isfinite(rays.hit).all(axis=1), :2]
+        parts += [np.percentile(hits, [1, 99], axis=0)] if len(hits) else []
+    every = np.concatenate(parts)
+    low, high = every.min(axis=0), every.max(axis=0)
+    edge = max(0.06 * float((high - low).max()), 0.5)
+    return low - edge, high + edge
+
+
+def _walks(rays: Rays, people: Mapping[int, int]) -> list[Walk]:
+    """The path of each person: not finer than can be seen, and with breaks where they were not recorded."""
+    sessions = find_sessions(rays)
+    order = np.arange(len(rays)) if sessions.order is None else sessions.order
+    label, found = sessions.label(), []
+    for person in people:
+        mine = rays.person[order] == person
+        rows, recording = order[mine], label[mine]
+        places, t = rays.origin[rows, :2], rays.t[rows]
+        step = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        breaks = np.r_[True, (np.abs(np.diff(t)) > _GAP) | (step > _JUMP) | (np.diff(recording) != 0)]
+        kept = breaks | np.r_[True, np.diff(np.floor(np.cumsum(np.r_[0.0, step]) / _FINEST)) > 0]
+        found.append(Walk(rays.persons[person], places[kept], breaks[kept]))
+    return found
+
+
+def _sights(rays: Rays, number: dict[int, int], count: int) -> Sight | None:
+    """``count`` rays, evenly taken."""
+    if not count:
+        return None
+    some = np.unique(np.linspace(0, len(rays) - 1, count).astype(int))
+    origins, ends = rays.origin[some, :2], _ahead(rays, some)
+    if rays.hit is not None:
+        hit = rays.hit[some, :2]
+        ends = np.where(np.isfinite(hit), hit, ends)
+    return Sight(origins, ends, np.array([number[p] for p in rays.person[some]]))
+
+
+def _fields(rays: Rays, number: dict[int, int], count: int) -> Sight | None:
+    """Fields of view at ``count`` moments of each person, evenly spread over their rays."""
+    if not count:
+        return None
+    chosen = []
+    for person in number:
+        mine = np.flatnonzero(rays.person == person)
+        mine = mine[np.argsort(rays.t[mine], kind="stable")]
+        chosen.append(mine[np.unique(np.linspace(0, len(mine) - 1, count).astype(int))])
+    some = np.concatenate(chosen)
+    return Sight(rays.origin[some, :2], _ahead(rays, some), np.array([number[p] for p in rays.person[some]]))
+
+
+def _ahead(rays: Rays, some: np.ndarray) -> np.ndarray:
+    """Places (n, 2) on the floor where the rays ``some`` lead, as far as people look level."""
+    return rays.origin[some, :2] + _REACH * rays.direction[some, :2]
+
+
+FLOOR_KIND = Kind(
+    "floor", "The floor plan of rays in their place.", "file of rays (.npz)", 1, FloorOptions, _draw_floor
+)
+
+
+# ---- A scene file opened for a figure, and what its cameras see ----
+
+MOST_PIXELS = 1 << 23
+"""A figure is drawn in one piece, in double precision, some 200 bytes a pixel; a film of 3,840 x 2,160 is allowed."""
+
+
+class OpenScene:
+    """The scene file ``path`` as it is loaded, its integrator ``nerg`` and its ``camera``.
+
+    ``see`` renders, and tells of it as the next of ``parts`` pictures. Made by `open_scene`.
+    """
+
+    def __init__(self, path: Path, scene: Any, options: SceneOptions, tell: Callable[[float], None], parts: int):
+        self.path, self.scene, self._options = path, scene, options
+        self.nerg = nerg_of(path, scene)
+        if not scene.sensors():
+            raise NergError(f'"{path}" has no sensor; give it one')
+        self._tell, self._parts, self._done = tell, parts, 0
+
+    def camera(self, index: int) -> Any:
+        """The sensor with this ``index``. Raises `NergError` for one that is not there."""
+        count = len(self.scene.sensors())
+        if not 0 <= index < count:
+            raise NergError(
+                f'"{self.path}" has {count} sensor(s) and number {index} was asked for: choose -s from 0 on'
+            )
+        return self.scene.sensors()[index]
+
+    def see(self, sensor: Any, overlay: Overlay) -> Layers:
+        """What ``sensor`` sees with the ``overlay``'s quantity."""
+        options, first = self._options, self._done
+        on_strip = lambda part, total: self._tell((first + part / total) / self._parts)
+        found = layers_of(self.path, self.scene, sensor, overlay, options.spp, options.seed, on_strip)
+        self._done += 1
+        return found
+
+
+@contextmanager
+def open_scene(path: Path, options: SceneOptions, reporter: Reporter, parts: int = 1) -> Iterator[OpenScene]:
+    """The scene file ``path``, of which ``parts`` pictures will be rendered within the block, which Ctrl-C ends. Raises
+    `NergError` for what is none, or has another integrator than `nerg`."""
+    activate(options.mode)
+    with Interruption() as stop:
+
+        def tell(share: float) -> None:
+            stop.check()
+            reporter.progress(share, f"rendering, {100 * share:.0f} %")
+
+        loaded = load_scene(path, options.defaults)
+        stop.check()
+        yield OpenScene(path, loaded, options, tell, parts)
+        stop.check()
+
+
+def upright_pose(sensor: Any) -> Any:
+    """A pose (scalar transform) at the place of ``sensor``, turned to the same side but level: its up is the axis of
+    the scene that is nearest to the sensor's."""
+    import mitsuba as mi
+
+    matrix = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)
+    eye, up, ahead = matrix[:3, 3], matrix[:3, 1], matrix[:3, 2]
+    axis = int(np.argmax(np.abs(up)))
+    level = np.zeros(3)
+    level[axis] = np.sign(up[axis]) or 1.0
+    heading = ahead - level * (ahead @ level)
+    if np.linalg.norm(heading) < 1e-3 * np.linalg.norm(ahead):
+        heading = np.roll(level, 1)  # it looks straight up or down
+    heading = heading / np.linalg.norm(heading)
+    look_at = mi.ScalarTransform4f().look_at
+    return look_at(origin=eye.tolist(), target=(eye + heading).tolist(), up=level.tolist())
+
+
+def film(width: int, height: int) -> dict[str, Any]:
+    """A film of so many pixels on which no value is blended with its neighbours'. Raises `NergError` for too many."""
+    if width * height > MOST_PIXELS:
+        raise NergError(
+            f"a figure of {width:,} x {height:,} pixels is too large to be drawn in one piece; ask for less"
+        )
+    return {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "rfilter": {"type": "box"},
+        "pixel_format": "rgb",
+        "component_format": "float32",
+    }
+
+
+def sampler_like(sensor: Any) -> dict[str, Any]:
+    """As many samples a pixel as ``sensor`` has, drawn independently."""
+    return {"type": "independent", "sample_count": int(sensor.sampler().sample_count())}
+
+
+# ---- The gaze of a scene's observer over all directions, as a map of the sphere ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class SphereOptions(SceneOptions):
+    """How an observer's sphere is drawn."""
+
+    sensor: int = option(
+        0, "Where no observer is: whose place it is, counted from 0.", "-s", "--sensor", within=Range(0, 65535)
+    )
+    projection: str = option("mollweide", "Projection: mollweide (equal areas) or equirectangular.")
+    width: int = option(800, "Width of the map in pixels; it is half as high.", within=Range(64, 2896))
+
+
+def _draw_sphere(files: Sequence[Path], options: SphereOptions, reporter: Reporter) -> Drawing:
+    """The sphere of the observer of the scene file, or of its camera where it has none, turned to where they look."""
+    import mitsuba as mi
+
+    find_projection(options.projection)
+    style = options.style()
+    (path,) = files
+    overlay = find_overlay("gaze")
+    with open_scene(path, options, reporter) as opened:
+        camera = opened.camera(options.sensor)
+        width = options.width // 2 * 2
+        panorama = {
+            "type": "panorama",
+            "to_world": upright_pose(opened.nerg.observer or camera),
+            "film": film(width, width // 2),
+            "sampler": sampler_like(camera),
+        }
+        seen = opened.see(mi.load_dict(panorama), overlay)
+    limits = shared_limits([overlay.limits(seen)], options.top)
+    overlay.check_limits(limits)
+    heat = overlay.heat(limits, style)
+    integral = float((seen.values.astype(np.float64) * pixel_solid_angles(width, width // 2)).sum())
+    title = f"All that the observer can turn to: integral {integral:.3g}"
+    unknown = unknown_of(seen, True) if style.hatched else None
+    figure = sphere_figure(
+        seen.color, seen.values, seen.mask, heat, title, options.projection, unknown, note=seen.basis
+    )
+    return Drawing(figure, [path], options.seed)
+
+
+SPHERE_KIND = Kind(
+    "sphere", "The gaze of an observer over all directions.", "scene file (.xml)", 1, SphereOptions, _draw_sphere
+)
+
+
+# ---- Triptych ----
+#
+# The paper's occlusion figure of any scene: the observer's view, and another camera without and with occlusion.
+
+
+@dataclass(frozen=True, kw_only=True)
+class TriptychOptions(SceneOptions):
+    """How occlusion is shown."""
+
+    sensor: int = option(0, "The other camera, counted from 0.", "-s", "--sensor", within=Range(0, 65535))
+
+
+def _draw_triptych(files: Sequence[Path], options: TriptychOptions, reporter: Reporter) -> Drawing:
+    """Three pictures with one scale; the scene file needs an observer who is not the camera."""
+    from nerg_mi.transport.observer import center
+
+    style = options.style()
+    (path,) = files
+    overlay = find_overlay("gaze")
+    with open_scene(path, options, reporter, 3) as opened:
+        camera, nerg = opened.camera(options.sensor), opened.nerg
+        if nerg.observer is None:
+            raise NergError(
+                f'"{path}" has no observer beside its camera, so that nothing is hidden from either; give its '
+                'integrator a <sensor name="observer">'
+            )
+        if camera.class_name() != "PerspectiveCamera":
+            raise NergError(f'sensor {options.sensor} of "{path}" is no perspective camera; choose another with -s')
+        own = opened.see(_own_camera(nerg.observer, camera), overlay)
+        with_occlusion, nerg.occlusion = nerg.occlusion, False
+        try:
+            without = opened.see(camera, overlay)
+        finally:
+            nerg.occlusion = with_occlusion
+        seen = opened.see(camera, overlay)
+        marker = pixel_of(camera, center(nerg.observer))
+    limits = shared_limits([overlay.limits(of) for of in (own, without, seen)], options.top)
+    overlay.check_limits(limits)
+    heat = overlay.heat(limits, style)
+    first, second, third = ((of.color, of.values, of.mask) for of in (own, without, seen))
+    figure = occlusion_figure(first, second, third, heat, marker, style.hatched, seen.basis)
+    return Drawing(figure, [path], options.seed)
+
+
+def _own_camera(observer: Any, camera: Any) -> Any:
+    """A camera with the field of view and film of ``camera`` where the ``observer`` is, turned as they are."""
+    import mitsuba as mi
+
+    width, height = map(int, camera.film().crop_size())
+    matrix = np.array(observer.world_transform().matrix, np.float64).reshape(4, 4)
+    own = {
+        "type": "perspective",
+        "fov": float(np.ravel(np.array(mi.traverse(camera)["x_fov"]))[0]),
+        "fov_axis": "x",
+        "near_clip": camera.near_clip(),
+        "far_clip": camera.far_clip(),
+        "to_world": mi.ScalarTransform4f(matrix.tolist()),
+        "film": film(width, height),
+        "sampler": sampler_like(camera),
+    }
+    return mi.load_dict(own)
+
+
+TRIPTYCH_KIND = Kind(
+    "triptych", "Occlusion: three views of a gaze.", "scene file (.xml)", 1, TriptychOptions, _draw_triptych
+)
+
+
+# ---- The kinds of figures of scenes, in the order in which they are listed ----
+
+SCENE_KINDS: tuple[Kind, ...] = (SPHERE_KIND, TRIPTYCH_KIND, FLOOR_KIND)
+
+
+# ---- Walls ----
+#
+# A place cut at a height, seen from above: what a floor plan of it shows.
+
+
+CELLS = 360
+"""Cells along the longer side of a plan."""
+
+_SURFACE = 0.5
+
+
+def cut_place(nerg: Any, scene: Any, low: np.ndarray, high: np.ndarray, level: float, floor: float) -> Walls:
+    """The place of the integrator ``nerg`` in ``scene`` between the corners ``low`` and ``high`` (2,), cut at the
+    height ``level``; all in scene units, +z up.
+
+    From each cell's centre rays go down, to the height of what they meet, and to the next cells: the cut goes through
+    what lies between. A cell in the midst of thick matter meets it at once. ``floor``: the height from which others are
+    counted.
+    """
+    place = Place(nerg.medium, scene)
+    side = float(max(high - low)) / CELLS
+    nx, ny = (max(int(np.ceil(v / side)), 1) for v in high - low)
+    x, y = low[0] + (np.arange(nx) + 0.5) * side, low[1] + (np.arange(ny) + 0.5) * side
+    centres = np.stack([*np.meshgrid(x, y), np.full((ny, nx), level)], axis=-1).reshape(-1, 3)
+
+    def met(direction: tuple[float, float, float]) -> np.ndarray:
+        depth, opacity = trace_depth(place, centres, np.broadcast_to(direction, centres.shape), nerg.settings)
+        return np.where(opacity >= _SURFACE, depth, np.inf).reshape(ny, nx)
+
+    down = met((0, 0, -1))
+    height = np.where(np.isfinite(down), level - floor - down, np.nan)
+    cut = (met((1, 0, 0)) < side) | (met((0, 1, 0)) < side) | (met((-1, 0, 0)) < side) | (met((0, -1, 0)) < side)
+    return Walls(low, low + side * np.array([nx, ny]), height, cut, level - floor)

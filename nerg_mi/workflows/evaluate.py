@@ -1,0 +1,511 @@
+"""``nerg eval gaze``: Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the
+people.
+``nerg eval folds``: Train and score a gaze field again and again, each time without other people and zones, and tell
+the means.
+
+Scoring a gaze field on held-out rays, and trainings and scores over folds.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation import gaze as evaluation
+from nerg_mi.evaluation.folds import mean_rows, means
+from nerg_mi.evaluation.gaze import (
+    EPS,
+    SCORES,
+    SPLITS,
+    Baseline,
+    Remembered,
+    gaze_field,
+    score_table,
+    standard_baselines,
+)
+from nerg_mi.evaluation.gaze_report import markdown, side_by_side, uncertainty_text, write_report
+from nerg_mi.evaluation.uncertainty import calibration_rows, position_rows, rank_rows
+from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.figures.style import files_among, provenance
+from nerg_mi.files.atomic import check_folder, file_sha256, write_text
+from nerg_mi.files.safe_read import read_json
+from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.formats.fields import load_gaze
+from nerg_mi.probes.probes import LEVELS, level_name
+from nerg_mi.ranges import DIRECTIONS, FIRST_SEEDS, KAPPAS, LENGTHS, RAYS, STEPS, THREADS, Range
+from nerg_mi.rays.dataset import is_dataset
+from nerg_mi.rays.dataset_open import load_rays, rays_digest
+from nerg_mi.rays.rays import Rays
+from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan
+from nerg_mi.threads import set_thread_count
+from nerg_mi.train.geometry import GazePlace
+
+from .base import SILENT, Reporter, argument, command, out, select_backend
+from .geometry import GazeEvaluationOptions, check_place, place_kind, place_of_training
+from .options import PartOptions, PlaceOptions, option
+from .parts import Parts, PlannedScene
+from .train_gaze import GazeOptions, train_gaze
+from .train_prior import RECIPE as PRIOR
+
+# ---- Evaluation ----
+#
+# ``nerg eval gaze``: Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the
+# people.
+#
+# The evaluation of a gaze field, at positions and of people that it was not trained on, beside what needs no field.
+
+
+# Methods whose scores are told for each person, and those that are drawn.
+_BY_PERSON = ("gaze field", "4,096 nearest rays")
+_DRAWN = ("gaze field", "position-blind", "16 nearest probes", "4,096 nearest rays")
+# Those whose regions are looked at, by what they are called.
+_BLIND = "position-blind"
+_CALIBRATED = ("gaze field", _BLIND, "4,096 nearest rays")
+
+
+@dataclass(frozen=True)
+class GazeEvaluation:
+    """What a gaze field scored."""
+
+    # A row a method, the gaze field's first; scores by `gaze.SCORES`, intervals with ".low" and ".high".
+    rows: list[dict]
+    # A row a method and person.
+    persons: list[dict]
+    # "both", "pos" or "people": what was new to the field.
+    split: str
+    # Test positions, and people in the test.
+    positions: int
+    people: int
+    # Tables and pictures that were written.
+    files: list[Path]
+    # A row a position: its error, and how sure the field is there (`uncertainty.position_rows`).
+    by_position: list[dict[str, Any]] = field(default_factory=list)
+    # A row a signal and error: how well it ranks them (`uncertainty.rank_rows`).
+    uncertainty: list[dict[str, Any]] = field(default_factory=list)
+    # A row a method: what its regions hold (`uncertainty.calibration_rows`).
+    calibration: list[dict[str, Any]] = field(default_factory=list)
+
+
+def evaluate_gaze(
+    gaze: str | Path,
+    rays: Rays | str | Path,
+    output: str | Path | None = None,
+    options: GazeEvaluationOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> GazeEvaluation:
+    """Score the gaze field in the checkpoint ``gaze`` beside uniform, position-blind, nearest probes, nearest rays and
+    the other half of the people.
+
+    ``rays``: those that it was trained on, or their file; ``output``: folder for tables and pictures, None: none are
+    written. Raises `NergError` where nothing was held out of the training, and for other rays or another place than
+    those of the training.
+    """
+    options, gaze = options or GazeEvaluationOptions(), Path(gaze)
+    output = None if output is None else Path(output)
+    if output is not None:
+        check_folder(output)
+    ns = select_backend(options.mode, options.threads)
+    loaded, metadata = load_gaze(gaze, ns)
+    about = metadata["provenance"]
+    data = _rays_of_training(gaze, about, rays)
+    account, seed = about["test"], options.seed
+    split = options.split or ("both" if account.get("people") else "pos")
+    reporter.progress(0.0, "test")
+    train, scored, centres = evaluation.held_out_rays(data, account, split, seed)
+    test = evaluation.make_test(
+        scored, centres, account["radius"], options.kappa, options.directions, options.min_rays, seed=seed
+    )
+    place = place_of_training(gaze, about, loaded.box, options, ns)
+    option = f"--{place.kind} {options.field or options.scene or 'FILE'}"
+    # What was trained by force is scored, and told.
+    check_place(place, scored, option, True, reporter)
+    blind, others = standard_baselines(train, account["radius"], options.kappa, options.blind_kappa, seed)
+    depth, count = about.get("probes", {}).get("depth", "median"), len(test.centres)
+    # Most of the time goes to the densities of the field.
+    known = lambda number: reporter.progress(0.05 + 0.6 * min(number / count, 1), f"position {number} of {count}")
+    # Each table asks for the same densities.
+    members = Remembered(gaze_field(loaded, place.medium, place.align, depth, known).members)
+    field_density = lambda positions, directions: members(positions, directions).mean(axis=0)
+    kept = Remembered(blind)
+    methods = {"gaze field": field_density} | {k: kept if m is blind else Remembered(m) for k, m in others.items()}
+    reporter.progress(0.05, "scores")
+    told = lambda share: reporter.progress(0.65 + 0.2 * share, "scores") if share > 0 else None
+    rows = evaluation.evaluate_gaze(test, methods, kept, options.resamples, seed, told)
+    half = evaluation.split_half(scored, test.centres, account["radius"], options.kappa, blind, options.min_rays, seed)
+    rows += [half] if half else []
+    reporter.progress(0.86, "each person")
+    persons = evaluation.person_rows(test, {k: methods[k] for k in _BY_PERSON}, kept, options.min_rays)
+    reporter.progress(0.9, "uncertainty")
+    places = _positions(test, loaded, place, members, methods[_BLIND], _groups(account, split, test.centres), seed)
+    ranks = rank_rows(places, options.resamples, seed)
+    at = lambda method: method(test.centres, test.drawn)[:, : test.at.shape[1]]
+    asked = {k: (methods[k](test.centres, test.directions), at(methods[k])) for k in _CALIBRATED}
+    found = about.get("mix", {}).get("regions")
+    regions = calibration_rows(test, asked, options.resamples, seed, {"gaze field": found} if found else None)
+    files = []
+    if output is not None:
+        summary = {
+            "gaze": gaze.name,
+            "gaze_sha256": file_sha256(gaze),
+            "split": split,
+            "kappa": options.kappa,
+            "positions": len(test.centres),
+            "people": len(test.persons),
+            "resamples": options.resamples,
+        }
+        notes = _notes(gaze.name, split, test, (len(train), len(data)), account["radius"], options)
+        files = write_report(output, rows, persons, summary, notes, places, ranks, regions)
+        if options.pictures:
+            reporter.progress(0.95, "pictures")
+            files.append(output / "positions.png")
+            sources = files_among(gaze, rays, options.field, options.scene)
+            made = provenance("nerg eval gaze", sources, seed, options)
+            side_by_side(test, {k: methods[k] for k in _DRAWN}, files[-1], options.pictures, about=made)
+    return GazeEvaluation(rows, persons, split, len(test.centres), len(test.persons), files, places, ranks, regions)
+
+
+@command(
+    "eval gaze",
+    options=GazeEvaluationOptions,
+    gaze=argument("Checkpoint of a gaze field that was trained with --test-zones (.safetensors)."),
+    rays=argument("The rays file or dataset that it was trained on."),
+    output=out("Folder for tables and pictures. Default: GAZE.eval.", default=None),
+)
+def print_evaluation(
+    gaze: Path, rays: Path, output: Path | None, options: GazeEvaluationOptions, reporter: Reporter
+) -> None:
+    """`evaluate_gaze`, with its scores as a table and its files named."""
+    result = evaluate_gaze(gaze, rays, output or gaze.with_suffix(".eval"), options, reporter)
+    rows = [{k: row[k] for k in ("method", *evaluation.SCORES, "integral")} for row in result.rows]
+    title = f"{gaze.name}, {result.split}: {result.positions} positions, {result.people} persons"
+    reporter.message(evaluation.score_table(rows, title))
+    for path in result.files:
+        reporter.message(f"wrote {path}")
+
+
+def _positions(
+    test: evaluation.GazeTest,
+    loaded: AnyGazeField,
+    place: GazePlace,
+    members_of: Baseline,
+    blind: Baseline,
+    groups: list[str] | None,
+    seed: int,
+) -> list[dict[str, Any]]:
+    """The error at each position, and what tells how sure the field ``loaded`` is there. ``members_of``: densities
+    (M, P, D) of its members."""
+    members = members_of(test.centres, test.directions)
+    support = spread = None
+    if loaded.support is not None:
+        points = place.points_from_rays(test.centres)
+        support = np.array([np.ravel(loaded.support.at(loaded.ns.Array3f(*map(float, p))))[0] for p in points])
+    if len(members) > 1:
+        spread = 4 * np.pi * members.std(axis=0, ddof=1).mean(axis=1)
+    of_blind = np.asarray(blind(test.centres, test.directions))
+    maps = members.mean(axis=0)
+    return position_rows(test, maps, of_blind, support=support, spread=spread, groups=groups, seed=seed)
+
+
+def _groups(account: dict, split: str, centres: np.ndarray) -> list[str] | None:
+    """The zone of each of the ``centres`` (P, 3) that a test held out; None where they lie anywhere, and where a
+    checkpoint of before does not say."""
+    if split == "people" or "zone" not in account:
+        return None
+    whole = np.array(account["centres"])
+    return [str(account["zone"][int(np.argmin(((whole - c) ** 2).sum(axis=1)))]) for c in centres]
+
+
+def _rays_of_training(gaze: Path, about: dict, rays: Rays | str | Path) -> Rays:
+    """The rays that the field was trained on. Raises `NergError` for others, and where none were held out of it."""
+    if about.get("recipe") == PRIOR:
+        raise NergError(f'"{gaze}" was learnt in other places, so that none of its rays are of this one to be held out')
+    if "test" not in about:
+        raise NergError(
+            f'"{gaze}" was trained on all positions, so that none is left to score; train it with --test-zones 3'
+        )
+    if isinstance(rays, Rays):
+        return rays
+    trained = about.get("rays_file", {})
+    if trained.get("sha256") not in (None, rays_digest(rays)):
+        raise NergError(
+            f'"{gaze}" was trained on other rays than "{rays}"; give the file {trained["file"]}, as it was then'
+        )
+    # Of a dataset the same sample.
+    return load_rays(rays, trained.get("most"), trained.get("seed", 0))
+
+
+def _notes(
+    name: str,
+    split: str,
+    test: evaluation.GazeTest,
+    count: tuple[int, int],
+    radius: float,
+    options: GazeEvaluationOptions,
+) -> str:
+    """What the tables say, for whoever reads them later; ``count``: of the rays that were trained on, and of all."""
+    trained, whole = count
+    return (
+        f"# {name}: {split}\n\n{len(test.centres)} positions, {len(test.persons)} persons; {trained:,} of {whole:,} "
+        f"rays trained on. Truth: rays within {radius:g} m, kappa {options.kappa:g}, {options.directions} directions "
+        f"of equal area; KLD in nats with {EPS:g} of the uniform density added; MAE in 1/sr; AUC against all "
+        "directions, sAUC against rays of other positions; bits a ray beyond the position-blind density of kappa "
+        f"{options.blind_kappa:g}; loglik in nats of 1/sr. Brackets: 1.96 standard errors either way, from "
+        f"{options.resamples} resamples of the persons. Split half: half of the people predict the other half, where "
+        "both have enough rays; a reference, no bound."
+    )
+
+
+# ---- Options of the evaluation of gaze fields over folds ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoldOptions(PlaceOptions, PartOptions):
+    """How many folds there are, what each holds out, and how its field is trained and scored. Lengths are metres."""
+
+    folds: int = option(5, "Folds: each holds out other people and other zones.", within=Range(2, 10_000))
+    first: int = option(0, "Seed of the first fold; the others have those that follow.", within=FIRST_SEEDS)
+    splits: str = option(
+        "both,pos,people", "What is new, with commas between: both (people and positions), pos, people."
+    )
+    zones: int = option(3, "Zones of test positions of a fold.", within=Range(1, 1000))
+    positions: int = option(60, "Test positions in them.", within=Range(1, 10**5))
+    people: float = option(0.5, "Share of the people who are held out of a fold's training.", within=Range(0.01, 0.99))
+    recipe: str = option("default", "Recipe of the trainings; see docs/gaze-training.md.")
+    variant: str | None = option(
+        None, "emit, capture or emit_capture. Default: emit_capture, and capture without any geometry."
+    )
+    ensemble: int = option(
+        0, "Members of each fold's field, whose spread is judged as support is. 0: one field.", within=Range(0, 100)
+    )
+    align: Path | None = option(None, "JSON file with the 4x4 similarity from the rays' frame to the place's.")
+    radius: float | None = option(None, "Radius R of a probe in metres. Default: the recipe's.", within=LENGTHS)
+    probes: int | None = option(None, "Probes of a training at most. Default: the recipe's.", within=Range(1, 10**6))
+    steps: int | None = option(None, "Steps of a training. Default: the recipe's.", within=STEPS)
+    mix_folds: int | None = option(
+        None,
+        "Folds within each training that choose the share of the blind density. Default: the recipe's.",
+        within=Range(0, 1000),
+    )
+    mix_kappa: float | None = option(
+        None, "Concentration of the kernels of that blind density. Default: the recipe's.", within=KAPPAS
+    )
+    most: int = option(10_000_000, "Rays of a dataset at most; of more, a sample by --first.", within=RAYS)
+    kappa: float = option(20.0, "Concentration of the kernel of truth and baselines.", within=KAPPAS)
+    directions: int = option(2048, "Directions that maps are compared in.", within=DIRECTIONS)
+    min_rays: int = option(64, "Rays at a test position at least.", within=Range(1, 10**6))
+    threads: int | None = option(
+        None,
+        "CPU threads. Default: all; 1 makes a training repeat itself to the bit.",
+        within=THREADS,
+        changes_result=False,
+    )
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+
+
+# ---- Folds ----
+#
+# ``nerg eval folds``: Train and score a gaze field again and again, each time without other people and zones, and
+# tell the means.
+#
+# Gaze fields over folds: trained and scored again and again, each time without other people and other zones.
+
+
+FIELD, SCORED = "gaze.safetensors", "scores.json"
+"""What the output of a fold holds: its field, and the rows of each split."""
+
+_LEVELS = tuple(level_name(level) for level in LEVELS)
+
+
+@dataclass(frozen=True)
+class FoldResult:
+    """``rows``: a row a split and method, means over folds (`evaluation.folds.mean_rows`); ``each``: a row a fold,
+    split and method; ``fields``: the checkpoint of each fold, where the store keeps it; ``files`` written;
+    ``by_position``: a row a fold, split and position; ``uncertainty``: how well a signal ranks the errors of all folds'
+    positions, in each split and in all of them ("anywhere"); ``calibration``: a row a split and method, means over
+    folds."""
+
+    rows: list[dict[str, Any]]
+    each: list[dict[str, Any]]
+    fields: list[Path]
+    files: list[Path]
+    by_position: list[dict[str, Any]]
+    uncertainty: list[dict[str, Any]]
+    calibration: list[dict[str, Any]]
+
+
+def evaluate_folds(
+    rays: Rays | str | Path, output: str | Path, options: FoldOptions | None = None, reporter: Reporter = SILENT
+) -> FoldResult:
+    """Train and score a gaze field for each fold on ``rays``, or their file or dataset, and write one table into the
+    folder ``output``: folds.md, folds.csv (fold by fold), positions.csv (position by position), folds.json.
+
+    A fold is a part that is kept, in ``OUTPUT.tasks`` or in ``options.store``: it depends on the rays, the place, its
+    seed and its options. Equal ones give equal scores to the bit with one thread, and to rounding with more. Raises
+    `NergError` for what the user can mend.
+    """
+    options, output = options or FoldOptions(), Path(output)
+    splits = tuple(_splits(options.splits))
+    place_kind(options)
+    check_folder(output)
+    parts = Parts(options, output, reporter, options.threads)
+    if options.threads:
+        set_thread_count(options.threads)
+    reporter.progress(0.0, "reading")
+    common = Folds(fold_options(options), splits, *_sources(rays, options))
+    seeds = range(options.first, options.first + options.folds)
+    what = f"nerg eval folds {os.path.abspath(output)}"
+    tasks = [Part(seed, f"fold {seed}") for seed in seeds]
+    plan = Plan(what, train_and_score, common, tasks, FOLDER, (*RENDERS, "scipy"))
+    each, fields, by_split = [], [], {split: [] for split in splits}
+    positions, regions = [], {split: [] for split in splits}
+    for seed, made in zip(seeds, parts.run(plan)):
+        found: Any = read_json(made.path / SCORED, "scores of a fold")
+        fields.append(made.path / FIELD)
+        for split in splits:
+            by_split[split].append(found[split]["rows"])
+            each += [{"fold": seed, "split": split, **row} for row in found[split]["rows"]]
+            # A zone of one fold is none of another, and its people are others in another split.
+            of = lambda row, seed=seed, split=split: {"group": f"{seed} {split} {row['group']}"}
+            positions += [{"fold": seed, "split": split, **row, **of(row)} for row in found[split]["by_position"]]
+            regions[split].append(found[split]["calibration"])
+        score = by_split[splits[0]][-1][0]
+        reporter.message(f"fold {seed}, {splits[0]}: KLD {score['KLD']:.3f}, CC {score['CC']:.3f}")
+    rows = [{"split": split, **row} for split, found in by_split.items() for row in mean_rows(found)]
+    populations = {split: [p for p in positions if p["split"] == split] for split in splits}
+    if len(splits) > 1:
+        populations["anywhere"] = positions
+    ranks = [{"split": split, **row} for split, found in populations.items() for row in rank_rows(found)]
+    held = [{"split": split, **row} for split, found in regions.items() for row in means(found, _LEVELS)]
+    written = _write(output, rows, each, options, positions, ranks, held)
+    for path in written:
+        reporter.message(f"wrote {path}")
+    reporter.message(f"The folds are kept in {parts.store.folder}; nerg jobs says what they take.")
+    return FoldResult(rows, each, fields, written, positions, ranks, held)
+
+
+@command(
+    "eval folds",
+    more="Each fold is kept when it is done, and the same command goes on where it ended.",
+    options=FoldOptions,
+    rays=argument("Rays file (.npz or .parquet) or dataset."),
+    output=out("Folder for the table."),
+)
+def print_folds(rays: Path, output: Path, options: FoldOptions, reporter: Reporter) -> None:
+    """`evaluate_folds`, with the means as a table for each split."""
+    result = evaluate_folds(rays, output, options, reporter)
+    for split in options.splits.split(","):
+        rows = [{k: row.get(k, math.nan) for k in ("method", *SCORES)} for row in result.rows if row["split"] == split]
+        reporter.message(score_table(rows, f"{split}: means of {options.folds} folds"))
+
+
+@dataclass(frozen=True)
+class Folds:
+    """What all folds have in common: ``options``, ``splits`` to score in, ``rays`` or their file, and the ``scene``."""
+
+    options: FoldOptions
+    splits: tuple[str, ...]
+    rays: Rays | Path
+    scene: PlannedScene | None
+
+
+def fold_options(options: FoldOptions) -> FoldOptions:
+    """The ``options`` without what folds are counted and rays are chosen by: a fold has its seed, and all rays."""
+    plain = FoldOptions()
+    return replace(options, **{name: getattr(plain, name) for name in ("folds", "first", "splits", "most")})
+
+
+def train_and_score(common: Folds, seed: int, output: Path) -> None:
+    """A fold: a gaze field that was trained without some people and zones (`FIELD`), and its rows in each split
+    (`SCORED`), into the folder ``output``."""
+    o, gaze = common.options, output / FIELD
+    if common.scene is not None:
+        common.scene.checked()
+    training = GazeOptions(
+        field=o.field,
+        scene=o.scene,
+        geometry=o.geometry,
+        align=o.align,
+        recipe=o.recipe,
+        variant=o.variant,
+        radius=o.radius,
+        probes=o.probes,
+        steps=o.steps,
+        mix_folds=o.mix_folds,
+        mix_kappa=o.mix_kappa,
+        ensemble=o.ensemble,
+        test_zones=o.zones,
+        test_positions=o.positions,
+        test_people=o.people,
+        seed=seed,
+        mode=o.mode,
+    )
+    train_gaze(common.rays, gaze, training)
+    tables = {}
+    for split in common.splits:
+        scoring = GazeEvaluationOptions(
+            field=o.field,
+            scene=o.scene,
+            split=split,
+            kappa=o.kappa,
+            directions=o.directions,
+            min_rays=o.min_rays,
+            resamples=0,
+            seed=seed,
+            mode=o.mode,
+        )
+        scored = evaluate_gaze(gaze, common.rays, None, scoring)
+        tables[split] = {"rows": scored.rows, "positions": scored.positions, "people": scored.people}
+        tables[split] |= {"by_position": scored.by_position, "calibration": scored.calibration}
+    write_json(output / SCORED, tables, allow_nan=True)
+
+
+def _splits(text: str) -> list[str]:
+    found = list(dict.fromkeys(text.split(",")))
+    unknown = [split for split in found if split not in SPLITS]
+    if unknown:
+        raise NergError(f'--splits names some of {", ".join(SPLITS)}, got "{unknown[0]}"')
+    return found
+
+
+def _sources(rays: Rays | str | Path, options: FoldOptions) -> tuple[Rays | Path, PlannedScene | None]:
+    """The rays of all folds, or their file, and the scene that they look around in."""
+    if not isinstance(rays, Rays):
+        rays = load_rays(rays, options.most, options.first) if is_dataset(rays) else Path(rays)
+    return rays, None if options.scene is None else PlannedScene.of(options.scene)
+
+
+def _write(
+    folder: Path,
+    rows: list[dict[str, Any]],
+    each: list[dict[str, Any]],
+    options: FoldOptions,
+    positions: list[dict[str, Any]],
+    ranks: list[dict[str, Any]],
+    regions: list[dict[str, Any]],
+) -> list[Path]:
+    files = [folder / name for name in ("folds.md", "folds.csv", "positions.csv", "folds.json")]
+    text = (
+        f"# {options.folds} folds\n\nEach holds out {100 * options.people:g} % of the people and {options.positions} "
+        f"positions in {options.zones} zones. Means over folds; brackets: 95 % of Student's t for {options.folds} "
+        "folds, which share people who train: the spread over what was held out. The last row of each table is a "
+        "difference fold by fold. How uncertainty ranks errors is of all folds' positions, with 95 % of resamples of "
+        "their zones.\n"
+    )
+    of = lambda table, split: [row for row in table if row["split"] == split]
+    for split in dict.fromkeys(row["split"] for row in (*rows, *ranks)):
+        text += f"\n# {split}\n\n"
+        if own := of(rows, split):
+            text += f"{markdown(own, ('method', *SCORES, 'integral', 'folds'))}\n"
+        text += uncertainty_text(of(ranks, split), of(regions, split))
+    write_text(files[0], text)
+    write_csv(files[1], each)
+    write_csv(files[2], positions)
+    tables = {"methods": rows, "uncertainty": ranks, "calibration": regions}
+    write_json(files[3], {"folds": options.folds, "first": options.first, **tables})
+    return files

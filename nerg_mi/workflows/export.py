@@ -1,0 +1,451 @@
+"""``nerg import``: Convert checkpoints of torch-ngp and of the NeRG paper's authors.
+``nerg export mesh``: A mesh by marching cubes, with vertex colours: .ply or .glb.
+``nerg export points``: A cloud of surface points with normals and colours: .ply or .glb.
+``nerg export splats``: Gaussian splats on the surface, with its colours: .ply, for viewers of splats and the volume
+"splats".
+``nerg export volume``: Density, and colour, as Mitsuba grid volumes (.vol).
+``nerg export torch-ngp``: A torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes.
+``nerg refine``: Find more closely where a radiance field holds matter, so that it renders faster.
+
+Fields as other files: meshes, points, splats, volumes and checkpoints of other programs; and fields from these.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerg_mi.errors import NergError
+from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.occupancy import RefinedGrid
+from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.refinement import refine
+from nerg_mi.files.atomic import check_writable, file_sha256
+from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
+from nerg_mi.formats.fields import load_radiance, occupancy_arrays, save_gaze, save_radiance
+from nerg_mi.formats.splats import splats_of_field, write_ply_splats
+from nerg_mi.formats.surfaces import Surface, density_and_color, mesh, points, write_glb, write_ply, write_volume
+from nerg_mi.formats.torch_ngp import Given, is_nerg, open_checkpoint, read_nerg, read_torch_ngp, write_torch_ngp
+from nerg_mi.ranges import VALUES, Checked, Range
+
+from .base import SILENT, Reporter, argument, command, extra, out, select_backend
+from .options import option
+
+# ---- Options of the import of checkpoints of other programs, and of their refinement ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions(Checked):
+    """What a checkpoint does not say of itself, and how its fields are stored."""
+
+    ema: bool | None = option(
+        None, "Moving averages of the weights, or the weights.  [default: averages, if there are any]", "--ema/--no-ema"
+    )
+    color_space: str = option("srgb", "What --color_space was in training: srgb or linear.")
+    bg_radius: float | None = option(
+        None,
+        "What --bg_radius was in training, where there is a background network; 0: leave it out.",
+        within=Range(0, 10**6),
+    )
+    finest: int | None = option(
+        None, "Finest resolution of the hash grid.  [default: 2048 x bound]", within=Range(2, 1 << 24)
+    )
+    half: bool = option(False, "Store the weights in fp16.")
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineOptions(Checked):
+    """On what a bound is refined."""
+
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+
+
+# ---- Checkpoints ----
+#
+# ``nerg import``: Convert checkpoints of torch-ngp and of the NeRG paper's authors.
+#
+# Fields that other programs have trained, as fields of our own.
+
+
+@dataclass(frozen=True)
+class ImportedFields:
+    """``field`` and ``gaze``, each None where the checkpoint holds none; ``origin``: where they are from (JSON);
+    ``files`` written."""
+
+    field: RadianceField | None
+    gaze: AnyGazeField | None
+    origin: dict
+    files: list[Path]
+
+
+def import_checkpoint(
+    file: str | Path,
+    output: str | Path | None = None,
+    gaze: str | Path | None = None,
+    options: ImportOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> ImportedFields:
+    """Read a checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors; nothing in the file is run.
+
+    ``output``, ``gaze``: files for the radiance and the gaze field (.safetensors), None: not written. Raises
+    `NergError` where the file does not hold what is to be written, and for what the user can mend.
+    """
+    options = options or ImportOptions()
+    output, gaze = (None if path is None else Path(path) for path in (output, gaze))
+    for path in (output, gaze):
+        if path is not None:
+            check_writable(path, ".safetensors")
+    given = Given(options.color_space, options.finest, options.bg_radius)
+    reporter.progress(0.0, f"converting {Path(file).name}")
+    ns = select_backend(options.mode)
+    if is_nerg(open_checkpoint(file)[1]):
+        field, attention, origin = read_nerg(file, ns, options.ema, given)
+    else:
+        if gaze is not None:
+            raise NergError(f'"{file}" holds no gaze field: leave out --gaze')
+        (field, origin), attention = read_torch_ngp(file, ns, options.ema, given), None
+    if field is not None:
+        field.occupancy = refine(field) or field.occupancy
+    if output is not None:
+        if field is None:
+            raise NergError(f'"{file}" holds a gaze field without its NeRF: import that from its own file')
+        save_radiance(field, output, origin, options.half)
+        reporter.message(_about(field, origin))
+        _tell(output, reporter)
+    if attention is not None and gaze is not None:
+        save_gaze(attention, gaze, origin, options.half)
+        config = attention.config
+        reporter.message(f"gaze: {config.variant}, trunk {config.trunk}, bound {attention.box.side / 2:g}")
+        _tell(gaze, reporter)
+    elif attention is not None:
+        reporter.message(f'"{file}" also holds a gaze field: --gaze NAME.safetensors writes it')
+    return ImportedFields(field, attention, origin, [path for path in (output, gaze) if path is not None])
+
+
+@command(
+    "import",
+    "Convert a checkpoint to the fields of the volumes `nerf` and `gazefield`. Nothing in the file is run.",
+    options=ImportOptions,
+    file=argument("Checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors."),
+    output=out("Radiance field to write (.safetensors).", default=None),
+    gaze=extra(None, "Gaze field to write (.safetensors).", Path, "-g", "--gaze"),
+)
+def import_to_files(
+    file: Path, output: Path | None, gaze: Path | None, options: ImportOptions, reporter: Reporter
+) -> None:
+    """`import_checkpoint` to one file at least."""
+    if output is None and gaze is None:
+        raise NergError("nothing is asked for: give -o FIELD.safetensors, --gaze GAZE.safetensors, or both")
+    import_checkpoint(file, output, gaze, options, reporter)
+
+
+def _about(field: RadianceField, origin: dict) -> str:
+    cells = "no occupancy grid (marching evaluates all of space)"
+    if field.occupancy is not None:
+        cells = f"{100 * field.occupancy.fraction:.1f} % of its box occupied"
+    behind = "" if field.background is None else f", background of radius {field.background.config.radius:g}"
+    return f"radiance: bound {field.box.side / 2:g}, {origin['weights']} weights, {cells}{behind}"
+
+
+def _tell(path: Path, reporter: Reporter) -> None:
+    reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
+
+
+# ---- Options of the exports of a radiance field ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class LatticeOptions(Checked):
+    """Where a radiance field is evaluated."""
+
+    resolution: int = option(256, "Lattice cells along the longest edge of the field's box.", within=Range(2, 2048))
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceOptions(LatticeOptions):
+    """Where the surface of a field lies."""
+
+    density: float | None = option(
+        None,
+        "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]",
+        within=VALUES,
+    )
+    up: str = option("z", "Up axis of the field, for .glb: z or y.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshOptions(SurfaceOptions):
+    """What is left out of a mesh, and what is added to it."""
+
+    fill: int = option(1, "Close holes of up to twice so many cells; 0: none.", within=Range(0, 2048))
+    keep: float = option(0.001, "Drop pieces with less than this share of the largest one's area.", within=Range(0, 1))
+    unseen: bool = option(False, "Keep the backs and insides that training never looked at.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointOptions(SurfaceOptions):
+    """Which points of a surface are written."""
+
+    count: int | None = option(None, "Points at most.  [default: all]", within=Range(1, 10**9))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplatOptions(LatticeOptions):
+    """How many Gaussians a surface becomes, and where it lies."""
+
+    density: float | None = option(
+        None,
+        "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]",
+        within=VALUES,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeOptions(LatticeOptions):
+    """What a grid volume holds."""
+
+    color: Path | None = option(None, "Also write the colour, to this .vol file.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TorchNgpOptions(Checked):
+    """How a field is read that becomes a torch-ngp checkpoint."""
+
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+
+
+# ---- Export ----
+#
+# ``nerg export mesh``: A mesh by marching cubes, with vertex colours: .ply or .glb.
+# ``nerg export points``: A cloud of surface points with normals and colours: .ply or .glb.
+# ``nerg export splats``: Gaussian splats on the surface, with its colours: .ply, for viewers of splats and the volume
+# "splats".
+# ``nerg export volume``: Density, and colour, as Mitsuba grid volumes (.vol).
+# ``nerg export torch-ngp``: A torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes.
+#
+# Radiance fields for other tools, in the field's own units: meshes, points, Gaussian splats, grid volumes,
+# torch-ngp checkpoints.
+
+
+_FIELD, _FILE = argument("Radiance field (.safetensors)."), out("File to write.")
+
+
+@dataclass(frozen=True)
+class Export:
+    """``files`` written; ``surface``: what a mesh or a cloud of points holds, None for other kinds."""
+
+    files: list[Path]
+    surface: Surface | None = None
+
+
+@command("export mesh", options=MeshOptions, field=_FIELD, output=_FILE)
+def export_mesh(
+    field: str | Path | RadianceField,
+    output: str | Path,
+    options: MeshOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> Export:
+    """Write a mesh by marching cubes, with vertex colours: .ply or .glb. Needs scikit-image.
+
+    Raises `NergError` for what the user can mend.
+    """
+    options, output, start = options or MeshOptions(), Path(output), time.perf_counter()
+    write = _surface_writer(output, options.up)
+    found = mesh(
+        _load(field, options.mode, reporter),
+        options.resolution,
+        options.density,
+        options.fill,
+        options.keep,
+        options.unseen,
+    )
+    write(found, output)
+    r = found.report
+    reporter.message(
+        f"surface at a density of {r['threshold']:.4g} / unit, cells of {r['cell']:.4g} units ({_by(r['lattice'])})"
+    )
+    reporter.message(
+        f"{r['cells_filled']:,} cells of holes filled; dropped {r['unseen_faces']:,} faces that training never looked "
+        f"at, and {r['floater_faces']:,} of {r['pieces'] - r['pieces_kept']:,} floaters; {r['pieces_kept']} pieces kept"
+    )
+    reporter.message(
+        f"{len(found.vertices):,} vertices, {found.face_count:,} faces; open edges: {r['edges_at_the_box']:,} where "
+        f"the box cuts, {r['edges_of_holes']:,} around holes"
+    )
+    return _written([output], start, reporter, found)
+
+
+@command("export points", options=PointOptions, field=_FIELD, output=_FILE)
+def export_points(
+    field: str | Path | RadianceField,
+    output: str | Path,
+    options: PointOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> Export:
+    """Write a cloud of surface points with normals and colours: .ply or .glb. Raises `NergError` for what the user can
+    mend."""
+    options, output, start = options or PointOptions(), Path(output), time.perf_counter()
+    write = _surface_writer(output, options.up)
+    found = points(_load(field, options.mode, reporter), options.resolution, options.density, options.count)
+    write(found, output)
+    reporter.message(f"{len(found.vertices):,} points, at a density of {found.report['threshold']:.4g} / unit")
+    return _written([output], start, reporter, found)
+
+
+@command("export splats", options=SplatOptions, field=_FIELD, output=_FILE)
+def export_splats(
+    field: str | Path | RadianceField,
+    output: str | Path,
+    options: SplatOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> Export:
+    """Write Gaussian splats on the field's surface: .ply. Raises `NergError` for what the user can mend."""
+    options, output, start = options or SplatOptions(), Path(output), time.perf_counter()
+    check_writable(output, ".ply")
+    splats, done = splats_of_field(_load(field, options.mode, reporter), options.resolution, options.density)
+    write_ply_splats(output, splats, comments=("Gaussian splats of a radiance field, by nerg_mi",))
+    reporter.message(
+        f"{len(splats):,} Gaussians, cells of {done['cell']:.4g} units; moved by {done['moved']:.2g} units (median) to "
+        "the depth that rays find"
+    )
+    return _written([output], start, reporter)
+
+
+@command("export volume", options=VolumeOptions, field=_FIELD, output=_FILE)
+def export_volume(
+    field: str | Path | RadianceField,
+    output: str | Path,
+    options: VolumeOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> Export:
+    """Write density, and colour, as Mitsuba grid volumes (.vol). Raises `NergError` for what the user can mend."""
+    options, output, start = options or VolumeOptions(), Path(output), time.perf_counter()
+    files = [output] if options.color is None else [Path(options.color), output]
+    for path in reversed(files):
+        check_writable(path, ".vol")
+    loaded = _load(field, options.mode, reporter)
+    density, color, lower, upper = density_and_color(loaded, options.resolution, options.color is not None)
+    write_volume(output, density, lower, upper)
+    reporter.message(
+        f"{_by(density.shape[::-1])} voxels from {_corner(lower)} to {_corner(upper)}; "
+        f"density up to {density.max():.4g} / unit"
+    )
+    if color is not None:
+        write_volume(files[0], color, lower, upper)
+    done = _written(files, start, reporter)
+    reporter.message(
+        'use: <volume type="gridvolume"> with <boolean name="use_grid_bbox" value="true"/>, '
+        'and "raw" true for the colour'
+    )
+    return done
+
+
+@command("export torch-ngp", options=TorchNgpOptions, field=_FIELD, output=_FILE)
+def export_torch_ngp(
+    field: str | Path | RadianceField,
+    output: str | Path,
+    options: TorchNgpOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> Export:
+    """Write a torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes; raises
+    `NergError` for another."""
+    options, output, start = options or TorchNgpOptions(), Path(output), time.perf_counter()
+    check_writable(output, ".pth")
+    write_torch_ngp(_load(field, options.mode, reporter), output)
+    return _written([output], start, reporter)
+
+
+def _load(field: str | Path | RadianceField, mode: str, reporter: Reporter) -> RadianceField:
+    reporter.progress(0.0, "reading the field")
+    ns = select_backend(mode)
+    loaded = field if isinstance(field, RadianceField) else load_radiance(field, ns)[0]
+    reporter.progress(0.01, "looking through its volume")
+    if loaded.box.contracted:
+        reporter.message("the place has no end: written is the box that it resolves best, not what is around it")
+    return loaded
+
+
+def _surface_writer(output: Path, up: str) -> Callable[[Surface, Path], None]:
+    if up not in ("y", "z"):
+        raise NergError(f'--up must be z or y, not "{up}"')
+    check_writable(output, ".ply", ".glb")
+    if output.suffix.lower() == ".ply":
+        return write_ply
+    return lambda surface, path: write_glb(surface, path, up)
+
+
+def _written(files: list[Path], start: float, reporter: Reporter, surface: Surface | None = None) -> Export:
+    for path in files:
+        size, seconds = path.stat().st_size / 1e6, time.perf_counter() - start
+        reporter.message(f"wrote {path} ({size:.1f} MB, {seconds:.1f} s)")
+    return Export(files, surface)
+
+
+def _by(shape) -> str:
+    return " x ".join(map(str, shape))
+
+
+def _corner(values) -> str:
+    return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
+
+
+# ---- Refinement ----
+#
+# ``nerg refine``: Find more closely where a radiance field holds matter, so that it renders faster.
+#
+# A finer bound on where a trained field holds matter, for checkpoints that were written without one.
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """``occupancy``: the finer bound; ``before``: share of the box's cells that the bound had before; ``output``: the
+    file."""
+
+    occupancy: RefinedGrid
+    before: float
+    output: Path
+
+
+@command(
+    "refine",
+    "Find more closely where a trained field holds matter, so that it renders with fewer evaluations.",
+    more="Fields that are trained or imported now have it. Weights stay as they are, and gaze fields know the new "
+    "file.",
+    options=RefineOptions,
+    field=argument("Radiance field (.safetensors)."),
+    output=out("Radiance field to write (.safetensors)."),
+)
+def refine_checkpoint(
+    field: str | Path, output: str | Path, options: RefineOptions | None = None, reporter: Reporter = SILENT
+) -> Refinement:
+    """Write the radiance field in ``field`` to ``output`` with a finer bound, and everything else as it is.
+
+    The new file names the checksum of the old one, so that gaze fields that were trained in that one know it. Raises
+    `NergError` for what the user can mend.
+    """
+    options, field, output, start = options or RefineOptions(), Path(field), Path(output), time.perf_counter()
+    check_writable(output, ".safetensors")
+    ns = select_backend(options.mode)
+    loaded, _ = load_radiance(field, ns)
+    if loaded.occupancy is None:
+        raise NergError(f'"{field}" has no occupancy grid to refine: its field is marched through all of its box')
+    reporter.progress(0.0, f"refining {field.name}")
+    before, grid = loaded.occupancy.coarse.fraction, refine(loaded)
+    if grid is None:
+        raise NergError(f'the occupancy of "{field}" is nested cubes, which are not refined: use the field as it is')
+    tensors, meta = read_checkpoint(field, "radiance")
+    arrays, about = occupancy_arrays(grid)
+    origin = meta.get("refined_from") or file_sha256(field)
+    kept = {key: value for key, value in meta.items() if key not in ("format", "kind")}
+    write_checkpoint(output, "radiance", tensors | arrays, kept | {"occupancy": about, "refined_from": origin})
+    reporter.message(
+        f"matter in {100 * grid.fraction:.2f} % of the box, where it was {100 * before:.2f} %; a random line misses an "
+        f"optical depth of {grid.missed:.1e}"
+    )
+    seconds = time.perf_counter() - start
+    reporter.message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB) in {seconds:.1f} s")
+    return Refinement(grid, before, output)

@@ -1,0 +1,238 @@
+"""Options of workflows: how one is declared, which are settings, too, and those that several workflows share.
+
+An option is a field that `option` makes of a dataclass, which stands beside its workflow: a notebook reads it there,
+and the command line makes its option of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+from nerg_mi.errors import NergError, plain
+from nerg_mi.ranges import (
+    CHANGES_RESULT,
+    COORDINATES,
+    DECADES,
+    FLAG,
+    RANGE,
+    RATES,
+    SEEDS,
+    SPP,
+    VALUES,
+    Checked,
+    Range,
+    check_number,
+)
+
+# ---- Options ----
+#
+# Typed options of jobs: for each job a dataclass, frozen and of keywords alone.
+#
+# A field tells its meaning once, by ``option``: a notebook reads it here, and the command makes its option of it
+# (``nerg_mi.cli.building``).
+
+
+Base = TypeVar("Base")
+Class = TypeVar("Class", bound=type)
+
+
+def option(
+    default: Any,
+    help: str,
+    *names: str,
+    within: Range | None = None,
+    parse: Callable[[str, str], Any] | None = None,
+    changes_result: bool = True,
+    **more: Any,
+) -> Any:
+    """A field of a dataclass of options, which derives from `nerg_mi.ranges.Checked`.
+
+    ``default``: its value where none is given; ``help``: what it means, in one line. ``names``: how the command spells
+    it ("-s", "--seed"), where that is not ``--`` and the field's name; ``within``: the range of its numbers, which each
+    option that has any needs; ``parse(text, flag)``: its value from a word of the command line, where the type alone
+    does not tell; ``changes_result``: False for where, by whom or with how many threads something is computed, which
+    must not change what comes of it: parts of a job are kept without it, and run with the default; ``more``:
+    what else ``typer.Option`` takes, such as ``metavar``.
+    """
+    about = {"help": help, "names": names, "parse": parse, "more": more, CHANGES_RESULT: changes_result}
+    return field(default=default, metadata={**about, RANGE: within, FLAG: names[-1] if names else ""})
+
+
+def exposes(*kinds: type, default: str = "") -> Callable[[Class], Class]:
+    """Decorator of a class, under ``dataclass``: gives it an option for each `nerg_mi.ranges.setting` of ``kinds``.
+
+    Parameters
+    ----------
+    kinds
+        Dataclasses of settings, for which `chosen_settings` reads the options again. A field that the class declares
+        itself stays as it is.
+    default
+        Ends the help of options that are None until they are set, where something else decides. Without it an option
+        has the default of its setting.
+    """
+
+    def decorate(kind: Class) -> Class:
+        for setting in (f for settings in kinds for f in fields(settings) if "help" in f.metadata):
+            about, name, hint = setting.metadata, setting.metadata["option"] or setting.name, str(setting.type)
+            if name in kind.__annotations__:
+                continue
+            names, value = about["names"], setting.default
+            if default:
+                value, hint = None, f"{hint.removesuffix(' | None')} | None"
+                if "bool" in hint:
+                    flag = (names[-1] if names else f"--{name.replace('_', '-')}").removeprefix("--")
+                    names = (f"--{flag}/--no-{flag}",)
+            kind.__annotations__[name] = hint
+            setattr(kind, name, option(value, f"{about['help']} {default}".rstrip(), *names, within=about[RANGE]))
+        return kind
+
+    return decorate
+
+
+def chosen_settings(options: Any, kind: type) -> dict[str, Any]:
+    """Keywords of the settings ``kind``, for those of its exposed fields that are set in ``options``."""
+    exposed = {f.name: f.metadata["option"] or f.name for f in fields(kind) if "help" in f.metadata}
+    values = {name: getattr(options, option) for name, option in exposed.items()}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def as_base(options: Any, kind: type[Base]) -> Base:
+    """The fields of ``options`` that the dataclass ``kind`` has, of which theirs is derived: who is given it cannot
+    depend on the others."""
+    return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})  # pyright: ignore[reportArgumentType]
+
+
+def parse_point(text: str, flag: str) -> tuple[float, ...]:
+    """Three coordinates with commas between them. Raises `NergError` naming ``flag`` for other texts."""
+    numbers = parse_numbers(text, flag)
+    if len(numbers) != 3:
+        raise NergError(f"{flag} is three numbers x,y,z, got {plain(text, 60)!r}")
+    for number in numbers:
+        check_number(number, COORDINATES, flag)
+    return numbers
+
+
+def parse_numbers(text: str, flag: str) -> tuple[float, ...]:
+    """Numbers with commas, or spaces, between them. Raises `NergError` naming ``flag`` for other texts."""
+    try:
+        return tuple(float(v) for v in (text.split(",") if "," in text or not text else text.split()))
+    except ValueError:
+        raise NergError(f"{flag} is numbers with commas between them, got {plain(text, 60)!r}") from None
+
+
+def parse_definitions(pairs: Iterable[str], flag: str) -> dict[str, str]:
+    """``["spp=4", "name=a=b"]`` as ``{"spp": "4", "name": "a=b"}``.
+
+    Raises `NergError` for a pair without a key or without "=".
+    """
+    values = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not (key and equals):
+            raise NergError(f'"-D {pair}" is no definition: write -D key=value')
+        values[key] = value
+    return values
+
+
+def definitions() -> Any:
+    """The field ``defaults`` of options of what renders a scene: a mapping of texts, or None."""
+    help = "Value for $KEY or a <default> of the scene; repeatable."
+    return option(None, help, "-D", "--define", parse=parse_definitions, metavar="KEY=VALUE")
+
+
+# ---- Options of the rendering of a scene file, and of the demo's pictures ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions(Checked):
+    """How a scene file is rendered."""
+
+    defaults: Mapping[str, str] | None = definitions()
+    sensor: int = option(0, "Index of the sensor, counted from 0.", "-s", "--sensor", within=Range(0, 65535))
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
+    spp: int = option(0, "Samples a pixel; 0: as the scene says.", within=Range(0, SPP.high))
+    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
+    threads: int = option(
+        0, "Worker threads; 0: one a core.", "-t", "--threads", within=Range(0, 1024), changes_result=False
+    )
+    memory: float = option(
+        1.0, "GB that rendering may take; larger pictures are made in bands.", within=Range(1e-6, 10**6)
+    )
+    overlay: str | None = option(
+        None, "Lay this over the colour, with its scale (.png, .svg, .mp4): gaze, kde, visibility, depth, support, ..."
+    )
+    top: float | None = option(
+        None, "Upper end of the overlay's scale, for gaze in 1/sr.  [default: the 99.5th percentile]", within=VALUES
+    )
+    cmap: str | None = option(
+        None, "Colour map of the overlay: inferno, magma, plasma, viridis, cividis.  [default: the overlay's own]"
+    )
+    decades: float = option(0.0, "Powers of ten that the overlay's scale spans; 0: a linear scale.", within=DECADES)
+    hatching: bool = option(True, "Hatch the overlay where nothing is known.")
+    frames: Path | None = option(
+        None, "Render a sequence: CSV file whose header names <default>s, a line of values for each picture."
+    )
+    fps: float = option(25.0, "Pictures a second of an .mp4.", within=RATES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(Checked):
+    """Which pictures the demo makes."""
+
+    scene: Path | None = option(None, "Scene file.  [default: the demo store's]")
+    defaults: Mapping[str, str] | None = definitions()
+    width: int = option(600, "Width of a picture in pixels; pictures are 3:2.", within=Range(3, 16384))
+    spp: int = option(8, "Samples a pixel.", within=Range(0, SPP.high))
+    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
+
+
+# ---- Options of jobs that are done in parts, each of which is kept ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartOptions(Checked):
+    """Where finished parts of a job are kept, and who makes them."""
+
+    store: Path | None = option(
+        None,
+        "Keep finished parts in this folder, and go on from them.  [default: OUTPUT.tasks, with --scheduler]",
+        changes_result=False,
+    )
+    scheduler: str | None = option(
+        None,
+        "Who makes the parts: local, local:N for N processes, or a cluster at tcp://HOST:PORT or tls://HOST:PORT.  "
+        "[default: local, with --store]",
+        changes_result=False,
+    )
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether the job is to be done in parts at all."""
+        return self.store is not None or self.scheduler is not None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmOptions(PictureOptions, PartOptions):
+    """How a scene file is rendered, in one go or in parts."""
+
+
+# ---- Options that say where people looked around ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaceOptions(Checked):
+    """Exactly one of them is given."""
+
+    field: Path | None = option(None, "Radiance field, or Gaussian splats, in which people looked around.")
+    scene: Path | None = option(None, "Or: a Mitsuba scene, or a mesh (.ply, .obj, .glb), whose shapes they looked at.")
+    geometry: str | None = option(
+        None, 'Or: "hits" makes a place from the rays\' own hit points, "none" does without any.'
+    )

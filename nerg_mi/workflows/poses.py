@@ -1,0 +1,241 @@
+"""``nerg poses``: Find out from where photos, or frames of a video, were taken.
+
+Photos without poses, or a video, made a capture that can be trained on.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.figures.maps import camera_figure
+from nerg_mi.figures.style import provenance, save
+from nerg_mi.files.atomic import check_new_folder, make_folder, replacing_folder
+from nerg_mi.files.tables import write_json
+from nerg_mi.photos.colmap import read_colmap
+from nerg_mi.photos.posed import Unused, name_some
+from nerg_mi.photos.structure import (
+    Folders,
+    Picture,
+    Reconstruction,
+    Settings,
+    check_installed,
+    copy_photos,
+    list_photos,
+    reconstruct,
+)
+from nerg_mi.photos.video_frames import copy_frames
+from nerg_mi.ranges import SEEDS, THREADS, Checked, Range
+
+from .base import SILENT, Reporter, argument, command, out
+from .options import option
+
+# ---- Options of finding the poses of photos ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseOptions(Checked):
+    """How the poses of photos are found."""
+
+    frames: int = option(
+        80, "Of a video: frames to take, each the sharpest of an equally long stretch.", within=Range(3, 10**6)
+    )
+    size: int = option(
+        960, "Longer side, in pixels, of the copies that features are found in.", within=Range(64, 65536)
+    )
+    matching: str = option(
+        "auto", "Pictures to compare: exhaustive (all), sequential (in order), auto (all up to 100, else in order)."
+    )
+    lens: str = option(
+        "auto",
+        "What is found of a lens: radial (f, k1), opencv (fx, fy, k1, k2, p1, p2), auto (opencv from 10 photos on).",
+    )
+    single_camera: bool = option(
+        True, "Photos of equal size (and maker, model, focal length, where told) share a camera; else each has its own."
+    )
+    allow_outside: bool = option(False, "Follow links that lead out of the folder of photos.")
+    orient: bool = option(True, "Turn the place so that up is +z, as far as cameras and a floor tell.")
+    seed: int = option(0, "Seed of what is drawn at random.", within=SEEDS)
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
+
+
+# ---- Poses ----
+#
+# ``nerg poses``: Find out from where photos, or frames of a video, were taken.
+#
+# Photos without poses, or a video, made a capture that can be trained on.
+
+
+STAGES = {"pictures": 0.0, "features": 0.08, "matching": 0.25, "mapping": 0.65, "writing": 0.98}
+"""Stages -> the share of the work that is done when each begins."""
+
+FEWEST = 3
+"""So many pictures are needed; a useful capture has dozens."""
+
+_ADVICE = (
+    "take more of them, each sharing more than half of what it shows with its neighbours, sharp, from places some "
+    "steps apart (not by turning on the spot), of things that do not move, shine or look all alike"
+)
+
+
+@dataclass(frozen=True)
+class PosesResult:
+    """``output``: the capture; ``registered``, ``unregistered``: names of the pictures with a pose, and without;
+    ``skipped``: files that were not used, each with its reason; ``error``: mean reprojection error in pixels, at the
+    size at which features were found; ``points``: how many were found on surfaces; ``report``: what poses.json
+    holds."""
+
+    output: Path
+    registered: list[str]
+    unregistered: list[str]
+    skipped: list[Unused]
+    error: float
+    points: int
+    report: dict
+
+
+@command(
+    "poses",
+    "Find out from where photos were taken, or frames of a video, and write them as a capture for nerg train radiance.",
+    more='Needs pycolmap, and PyAV for videos: pip install "nerg-mi[poses]".',
+    options=PoseOptions,
+    pictures=argument("Folder of photos (JPEG, PNG), or a video.", metavar="PHOTOS|VIDEO"),
+    output=out("Folder to make: a capture with poses."),
+)
+def find_poses(
+    pictures: str | Path, output: str | Path, options: PoseOptions | None = None, reporter: Reporter = SILENT
+) -> PosesResult:
+    """Find the poses of ``pictures``, a folder of photos or a video, and make the capture ``output``: a folder with
+    images/, a COLMAP model in sparse/0/, poses.png (cameras and points from above and from the side) and poses.json.
+
+    Lengths are in units of the capture's own. The folder is finished or absent. Raises `NergError` for what the user
+    can mend, and ``ImportError`` where pycolmap, or for a video PyAV, is not installed.
+    """
+    options = options or PoseOptions()
+    pictures, output = Path(pictures), Path(output)
+    settings = Settings(
+        options.lens, options.matching, options.single_camera, options.orient, options.seed, options.threads
+    )
+    check_new_folder(output)
+    check_installed()
+    with replacing_folder(output) as folder, tempfile.TemporaryDirectory(prefix=".work-", dir=folder) as work:
+        folders = Folders(make_folder(folder / "images"), make_folder(Path(work, "small")))
+        copies, skipped = _copy(pictures, folders, options, reporter)
+        _tell_pictures(copies, skipped, reporter)
+        found = reconstruct(copies, Path(work), settings, lambda *now: _progress(reporter, *now))
+        if found is None:
+            raise NergError(f'no {FEWEST} of the {len(copies)} pictures of "{pictures}" show the same place; {_ADVICE}')
+        _progress(reporter, "writing", 0, 1)
+        registered = set(found.parts[0])
+        unregistered = [p.name for p in copies if p.name not in registered]
+        for name in unregistered:
+            (folders.images / name).unlink()
+        Path(work, "sparse").rename(folder / "sparse")
+        # A disk that fills is not told of by COLMAP, whose files would then end too early.
+        read_colmap(folder / "sparse" / "0", folders.images)
+        report = _report(copies, unregistered, skipped, found, options)
+        write_json(folder / "poses.json", report)
+        title = f"{len(registered)} of {len(copies)} pictures, {found.points:,} points"
+        about = provenance("nerg poses", (folders.images / name for name in sorted(registered)), None, options)
+        save(camera_figure(found.to_world, found.surface, found.colors, title), folder / "poses.png", about)
+    result = PosesResult(output, found.parts[0], unregistered, skipped, found.error, found.points, report)
+    _tell_result(result, found, options, reporter)
+    return result
+
+
+def _copy(
+    pictures: Path, folders: Folders, options: PoseOptions, reporter: Reporter
+) -> tuple[list[Picture], list[Unused]]:
+    progress = lambda done, of: _progress(reporter, "pictures", done, of)
+    skipped: list[Unused] = []
+    if pictures.is_dir():
+        photos, others = list_photos(pictures)
+        copies, unused = copy_photos(photos, folders, options.size, progress, options.allow_outside)
+        skipped = [*others, *unused]
+    else:
+        copies = copy_frames(pictures, options.frames, folders, options.size, options.threads, progress)
+    if len(copies) < FEWEST:
+        why = f"; of the others, {skipped[0]}" if skipped else ""
+        raise NergError(
+            f'"{pictures}" has {len(copies)} pictures that can be used, and poses need {FEWEST} or more of the same '
+            f"place{why}"
+        )
+    return copies, skipped
+
+
+def _progress(reporter: Reporter, stage: str, done: int, of: int) -> None:
+    names = list(STAGES)
+    after = [*STAGES.values(), 1.0][names.index(stage) + 1]
+    share = STAGES[stage] + (after - STAGES[stage]) * done / max(of, 1)
+    text = {
+        "pictures": f"copying pictures, {done} of {of}",
+        "features": f"finding features, {done} of {of} pictures",
+        "matching": f"comparing pictures, {done} of {of} pairs",
+        "mapping": f"placing pictures, {done} of {of}",
+        "writing": "writing",
+    }
+    reporter.progress(min(share, 1.0), text[stage])
+
+
+def _tell_pictures(copies: list[Picture], skipped: list[Unused], reporter: Reporter) -> None:
+    for line in skipped:
+        reporter.message(str(line))
+    sizes = sorted({p.size for p in copies})
+    shown = ", ".join(f"{w} x {h}" for w, h in sizes[:4]) + (", ..." if len(sizes) > 4 else "")
+    reporter.message(f"{len(copies)} pictures of {shown} pixels")
+
+
+def _report(
+    copies: list[Picture], unregistered: list[str], skipped: list[Unused], found: Reconstruction, options: PoseOptions
+) -> dict:
+    up = found.up
+    return {
+        "registered": found.parts[0],
+        "unregistered": unregistered,
+        "skipped": {u.name: u.reason for u in skipped},
+        "other_parts": found.parts[1:],
+        "reprojection_error_pixels": found.error,
+        "reprojection_error_at": options.size,
+        "points": found.points,
+        "cameras": found.lenses,
+        "up": None
+        if up is None
+        else {"roll_degrees": up.roll, "plane_share": up.plane, "plane_degrees_from_cameras": up.between},
+        "seconds": {p.name: p.seconds for p in copies if p.seconds is not None},
+        "seed": options.seed,
+    }
+
+
+def _tell_result(result: PosesResult, found: Reconstruction, options: PoseOptions, reporter: Reporter) -> None:
+    count = len(result.registered) + len(result.unregistered)
+    reporter.message(
+        f"{len(result.registered)} of {count} pictures have a pose, {result.points:,} points; mean reprojection error "
+        f"{result.error:.2f} pixels, at a longer side of {options.size} at most"
+    )
+    if result.unregistered:
+        reporter.message(f"without a pose: {name_some(result.unregistered)}")
+    if found.up is None:
+        reporter.message("up was not looked for")
+    else:
+        reporter.message(f"turned so that up is +z: {found.up}")
+        if not found.up.sure:
+            reporter.warn("the cameras do not agree on what is up; look at poses.png, or leave it with --no-orient")
+    spread = float(np.max(np.ptp(found.to_world[:, :3, 3], axis=0)))
+    reporter.message(
+        f"lengths have no unit (the cameras spread over {spread:.3g}); nerg train radiance gives them one by --scale"
+    )
+    others = [part for part in found.parts[1:] if set(part) - set(result.registered)]
+    if others:
+        reporter.warn(
+            f"the pictures fall into parts that nothing connects; the largest was kept, another has {len(others[0])} "
+            f"({name_some(others[0])}); take pictures between them"
+        )
+    if 2 * len(result.registered) < count:
+        reporter.warn(f"less than half of the pictures have a pose; {_ADVICE}")
+    reporter.message(
+        f"wrote {result.output} (poses.png shows it); next: nerg train radiance {result.output} -o FIELD.safetensors"
+    )

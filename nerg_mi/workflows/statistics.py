@@ -1,0 +1,352 @@
+"""``nerg stats``: Count attention on things, in rays and by a gaze field: numbers with intervals, and what if.
+
+Attention on things as numbers: counted in rays, foretold by a field, by cohort, time and zone; and what if.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from nerg_mi.aoi.measured import Counting, EyePicker, Eyes, blocks_of, cohort_names, count_block, ray_count
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.output import write_results
+from nerg_mi.aoi.parts import CountingParts
+from nerg_mi.aoi.predicted import (
+    Foretold,
+    Setting,
+    add_trust,
+    eyes_of_some,
+    foretold_people,
+    isovist_rows,
+    look_around,
+    places_of,
+    setting_of,
+    tell_places,
+    tell_support,
+    what_if_rows,
+)
+from nerg_mi.aoi.scene import read_changes
+from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import check_folder, make_folder
+from nerg_mi.formats.areas import Areas, read_areas
+from nerg_mi.interruption import Interruption
+from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
+from nerg_mi.rays.rays import Rays
+from nerg_mi.statistics.estimates import LEAST_PEOPLE
+from nerg_mi.statistics.tables import (
+    FIELD,
+    TRACKED,
+    Floor,
+    People,
+    PersonRows,
+    Row,
+    difference_rows,
+    duration_rows,
+    move_rows,
+    thing_rows,
+)
+from nerg_mi.statistics.visibility import Isovists, Targets
+from nerg_mi.statistics.visits import ALL, Cell, Sums, Total
+
+from .base import SILENT, Reporter, argument, command, out, select_backend
+from .options import parse_point
+from .parts import Parts
+from .scene_places import kind_of_file
+
+
+@dataclass(frozen=True, eq=False)
+class StatisticsResult:
+    """Rows of tables, each a dict: ``things`` (by cell, thing and source), ``differences``, ``moves``, ``durations``,
+    ``people``, ``what_if``, ``isovists``; ``sums``: what they were made of; ``blanked``: numbers on too few people;
+    ``files`` that were written."""
+
+    things: list[Row] = field(default_factory=list)
+    differences: list[Row] = field(default_factory=list)
+    moves: list[Row] = field(default_factory=list)
+    durations: list[Row] = field(default_factory=list)
+    people: Sequence[Row] = ()
+    what_if: list[Row] = field(default_factory=list)
+    isovists: list[Row] = field(default_factory=list)
+    sums: Sums | None = None
+    blanked: int = 0
+    files: list[Path] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """The files, by what they are."""
+
+    scene: Path | None = None
+    field: Path | None = None
+    gaze: Path | None = None
+    rays: Path | Rays | None = None
+
+
+@command(
+    "stats",
+    "Count attention on things: in rays, and as a gaze field predicts it, with intervals over people.",
+    more="""Share, dwell, reach, first looks, returns, distance, what could be seen; by cohort, time and zone;
+differences, moves from thing to thing, what if something stood elsewhere. --visibility tells what can be seen from
+where.""",
+    options=StatisticsOptions,
+    files=argument("Rays or a dataset, a scene, a gaze field, a place; in any order.", list[Path]),
+    output=out("Folder for tables and pictures."),
+)
+def statistics(
+    files: Sequence[str | Path | Rays],
+    output: str | Path | None = None,
+    options: StatisticsOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> StatisticsResult:
+    """Numbers of attention on the areas of ``options``.
+
+    ``files``, in any order: rays or a dataset of them, a scene, a gaze field, a radiance field; a gaze field's place is
+    found beside it. ``output``: folder for the tables; None: nothing is written. Raises `NergError`.
+    """
+    options = options or StatisticsOptions()
+    if output is not None:
+        check_folder(output)
+    given = _sort(files)
+    reporter.progress(0.0, "reading")
+    areas = _areas(options)
+    ns = select_backend(options.mode, options.threads)
+    result = _Work(given, areas, options, ns, reporter, output).run()
+    if output is not None:
+        inputs = [p for p in (given.scene, given.field, given.gaze, given.rays) if isinstance(p, Path)]
+        inputs += [p for p in (options.areas, options.what_if) if p is not None and p.is_file()]
+        result.files.extend(write_results(make_folder(output), result, inputs, options, reporter))
+    return result
+
+
+def _sort(files: Sequence[str | Path | Rays]) -> _Given:
+    found: dict[str, Path | Rays] = {}
+    for given in files:
+        path = given if isinstance(given, Rays) else Path(given)
+        if not isinstance(path, Rays) and path.suffix.lower() in (".json", ".csv"):
+            raise NergError(f'"{path}" is no rays, scene or field; areas are given with --areas, and so on')
+        kind = "rays" if isinstance(path, Rays) else kind_of_file(path)
+        if kind not in ("scene", "field", "gaze", "rays"):
+            raise NergError(f'"{path}" is a {kind}; statistics take rays, a scene (.xml), a gaze and a radiance field')
+        if kind in found:
+            raise NergError(f'"{found[kind]}" and "{path}" are both a {kind}; give one')
+        found[kind] = path
+    if not found:
+        raise NergError("give rays, a scene, or a gaze field to tell of")
+    return _Given(**found)  # pyright: ignore[reportArgumentType]
+
+
+def _areas(options: StatisticsOptions) -> Areas:
+    if options.areas is None:
+        if options.visibility:
+            return Areas(())
+        raise NergError("say which things are asked about: --areas FILE")
+    return read_areas(options.areas)
+
+
+class _Work:
+    """What is computed, with what its parts have in common."""
+
+    def __init__(
+        self,
+        given: _Given,
+        areas: Areas,
+        options: StatisticsOptions,
+        ns: ModuleType,
+        reporter: Reporter,
+        output: str | Path | None,
+    ):
+        self.given, self.areas, self.options, self.reporter = given, areas, options, reporter
+        self.setting = setting_of(given.scene, given.field, given.gaze, areas, options, ns)
+        self.around, self.things, self.members = self.setting.around, self.setting.things, self.setting.members
+        if options.what_if is not None and self.around.gaze is None:
+            raise NergError("--what-if is what a gaze field foretells: give one, or a scene that has one")
+        if options.what_if is not None:
+            # What is wrong with it is told before anything is counted.
+            read_changes(options.what_if)
+        self.parts = self._in_parts(output) if options.in_parts else None
+
+    def run(self) -> StatisticsResult:
+        """All that is asked for."""
+        o, floor = self.options, Floor(self.options.min_people)
+        if o.visibility:
+            return StatisticsResult(isovists=isovist_rows(self._isovists(), self.areas.names, self.members))
+        counting = None if self.given.rays is None else self._counting(self.given.rays)
+        sums, eyes = (None, self._standing()) if counting is None else self._count(counting)
+        if counting is None and self.around.gaze is None:
+            raise NergError("there is nobody to tell of: give rays, or a gaze field (or --visibility for isovists)")
+        cells = [ALL] if counting is None else list(sums.cells) if sums is not None else []
+        seen = counting is not None and counting.cells_in_view is not None
+        people: dict[Cell, dict[str, People]] = {cell: {} for cell in cells}
+        times: dict[Cell, dict[str, float]] = {cell: {} for cell in cells}
+        for cell in cells:
+            if sums is not None:
+                people[cell][TRACKED] = tracked = People.of(sums, cell, seen)
+                times[cell] = dict(zip(tracked.names, tracked.time.tolist()))
+            else:
+                times[cell] = dict.fromkeys(eyes.person, 1.0)
+        foretold = None
+        if self.around.gaze is not None:
+            foretold = self._foretold(eyes)
+            tell_support(foretold, self.reporter)
+            for cell in cells:
+                found = foretold_people(foretold, eyes, cell, times[cell], o.glance)
+                if found is not None:
+                    people[cell][FIELD] = found
+        self._tell(people)
+        names = self.areas.names
+        self.reporter.progress(0.9, "intervals")
+        things = thing_rows(names, people, floor, resamples=o.resamples, seed=o.seed)
+        if foretold is not None:
+            add_trust(things, foretold, eyes, times, o.glance)
+        result = StatisticsResult(
+            things,
+            difference_rows(
+                names, people, floor, source=TRACKED if sums is not None else FIELD, resamples=o.resamples, seed=o.seed
+            ),
+            [] if sums is None else move_rows(sums, floor),
+            [] if sums is None else duration_rows(sums, floor),
+            self._people(sums, seen),
+            [] if o.what_if is None else self._what_if(eyes, foretold, floor),
+            [],
+            sums,
+            floor.blanked,
+        )
+        if floor.blanked:
+            self.reporter.message(f"{floor.blanked:,} numbers rest on fewer than {floor.least} people and are blank")
+        return result
+
+    def _counting(self, rays: Path | Rays) -> Counting:
+        first = next(blocks_of(rays, self.setting.rules))
+        hits = self.around.place is None and first.hit is not None and bool(np.isfinite(first.hit).any())
+        if self.around.place is None:
+            self.reporter.message(
+                "no place is given: rays end at their hit points"
+                if hits
+                else "no place is given: things hide each other, and nothing else hides them"
+            )
+        return self.setting.counting(hits, cohort_names(rays, first))
+
+    def _count(self, counting: Counting) -> tuple[Sums, Eyes]:
+        assert self.given.rays is not None
+        count = ray_count(self.given.rays)
+        picker = EyePicker(max(1, count // self.options.eyes))
+        total: Total | None = None
+
+        def pick(block: Rays) -> None:
+            picker.take(block, counting)
+
+        seen = None if self.around.gaze is None else pick
+        if self.parts is None:
+            arriving = self._counted(self.given.rays, counting, seen, count)
+        else:
+            arriving = self.parts.count(self.given.rays, counting, seen)
+        for part in arriving:
+            total = total or Total(part.areas, part.cells)
+            total.add(part)
+        if total is None:
+            raise NergError("there are no rays to count; import some")
+        sums = total.sums()
+        self.reporter.message(f"{count:,} rays of {len(sums.persons_of(ALL)[0]):,} people")
+        if self.around.gaze is None:
+            return sums, Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ())
+        eyes = eyes_of_some(picker.eyes(), self.options.eyes, self.reporter)
+        tell_places(eyes, self.reporter)
+        return sums, eyes
+
+    def _counted(
+        self, rays: Rays | Path, counting: Counting, seen: Callable[[Rays], None] | None, count: int
+    ) -> Iterator[Sums]:
+        """The sums of each block, in this process."""
+        done = 0
+        with Interruption() as stop:
+            for block in blocks_of(rays, self.setting.rules):
+                stop.check()
+                yield count_block(block, counting)
+                if seen is not None:
+                    seen(block)
+                done += len(block)
+                self.reporter.progress(0.8 * done / count, f"{done:,} of {count:,} rays")
+
+    def _in_parts(self, output: str | Path | None) -> CountingParts:
+        g, o = self.given, self.options
+        if output is None and o.store is None:
+            raise NergError("parts are kept in a folder: name one by --store, or an output beside which it is made")
+        import mitsuba as mi
+
+        name = Path(output or o.store or "")
+        parts = Parts(o, name, self.reporter, o.threads)
+        what = f"nerg stats {name.absolute()}"
+        return CountingParts(parts, what, g.scene, g.field, g.gaze, self.areas, o, str(mi.variant()))
+
+    def _standing(self) -> Eyes:
+        """Observers who were not tracked."""
+        o = self.options
+        if o.observers:
+            return places_of(np.array([parse_point(text, "--observer") for text in o.observers]))
+        if self.around.observer is not None:
+            return places_of(self.around.observer[None])
+        found = look_around(self.around, o.height, o.step, o.floor)
+        every = max(1, len(found) // o.eyes)
+        self.reporter.message(f"nobody was tracked: {len(found[::every])} places on the floor, each somebody's")
+        return places_of(found[::every])
+
+    @property
+    def _view(self) -> float:
+        """Degrees that people see. Without rays nobody knows where somebody is turned."""
+        return self.options.view if self.given.rays is not None else 360.0
+
+    def _foretold(self, eyes: Eyes) -> Foretold:
+        """What the field says where people stood."""
+        if self.parts is None:
+            return self.setting.foretold(eyes, self._view, self.reporter)
+        return self.parts.foretell(eyes, self._view)
+
+    def _isovists(self) -> Isovists:
+        from nerg_mi.statistics.visibility import isovists
+
+        o = self.options
+        points = look_around(self.around, o.height, o.step, o.floor)
+        box = self.around.bounds()
+        self.reporter.message(f"{len(points):,} places on the floor")
+        reach = float(np.linalg.norm(box[1] - box[0]))
+        return isovists(points, self.around.depth, Targets.of(self.things, o.samples), self.setting.margin, reach)
+
+    def _what_if(self, eyes: Eyes, before: Foretold | None, floor: Floor) -> list[Row]:
+        o, parts = self.options, self.parts
+        assert o.what_if is not None and before is not None
+
+        def foretell(there: Setting, others: Eyes) -> Foretold:
+            if parts is None:
+                return there.foretold(others, self._view, self.reporter)
+            return parts.foretell(others, self._view, o.what_if)
+
+        return what_if_rows(o.what_if, self.setting, eyes, before, foretell, floor, o.resamples, o.seed)
+
+    def _people(self, sums: Sums | None, seen: bool) -> Sequence[Row]:
+        o = self.options
+        if sums is None:
+            return ()
+        if o.min_people > 1:
+            self.reporter.message("no table of single people is made, since each number in it would be of one person")
+            return ()
+        persons = sums.persons_of(ALL)[1]
+        named = {p: p for p in persons}
+        if not o.names:
+            named = pseudonyms(persons, None if o.salt is None else read_salt(o.salt))
+        return PersonRows(sums, named, seen)
+
+    def _tell(self, people: Mapping[Cell, Mapping[str, People]]) -> None:
+        for cell in (c for c, found in people.items() if TRACKED in found and not found[TRACKED].names):
+            self.reporter.message(f"nobody is in the {cell.dimension} {cell.value}; windows are on the rays' own clock")
+        few = [cell for cell, found in people.items() for p in found.values() if 0 < p.there.sum() < LEAST_PEOPLE]
+        if few:
+            which = "all of it" if few[0] == ALL else f"{few[0].dimension} {few[0].value}"
+            self.reporter.message(
+                f"there are no intervals where there are fewer than {LEAST_PEOPLE} people ({which}"
+                + (f" and {len(set(few)) - 1} more)" if len(set(few)) > 1 else ")")
+            )

@@ -1,0 +1,288 @@
+"""``nerg study``: Measure error against run time: a scene at many settings, compared with what is true.
+
+A study of the settings of a scene, in one go or in parts.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+import uuid
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation import study, study_tables, study_truth
+from nerg_mi.evaluation.study import Setting, settings
+from nerg_mi.evaluation.study_subject import ExactSurfaces, FileSubject, Subject, open_subject
+from nerg_mi.figures.style import Provenance, files_among, provenance
+from nerg_mi.files.atomic import check_folder
+from nerg_mi.files.safe_read import read_json
+from nerg_mi.files.tables import write_json
+from nerg_mi.ranges import Range
+from nerg_mi.rendering.scene import activate, files_of_scene
+from nerg_mi.tasks.engines import prepare_once
+from nerg_mi.tasks.task import Part, Plan, processor
+
+from .base import SILENT, Reporter, argument, command, extra, select_backend, versions
+from .options import PartOptions, definitions, option
+from .parts import Parts, PlannedScene
+
+# ---- Options of the study of error against run time ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions(PartOptions):
+    """What a study renders, and how often."""
+
+    scene_kind: str = option("auto", "What SCENE is: auto, analytic or file.")
+    width: int = option(192, "Width of a picture in pixels.", within=Range(1, 16384))
+    height: int = option(128, "Height of a picture in pixels.", within=Range(1, 16384))
+    repeats: int = option(5, "Timed renders of each setting; their median counts.", within=Range(1, 10000))
+    quick: bool = option(False, "A few settings only, each timed once.")
+    only: str = option("", "Only the default, and settings whose name matches.", metavar="REGEX")
+    defaults: Mapping[str, str] | None = definitions()
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
+
+
+# ---- Study ----
+#
+# ``nerg study``: Measure error against run time: a scene at many settings, compared with what is true.
+#
+# The study of error against run time: a scene at many settings, each compared with what is true.
+
+
+ROWS = 4
+"""Settings of a part, besides the default."""
+
+_TWIN = "twin.xml"
+_PROCESS = uuid.uuid4().hex
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """``files`` written; ``report``: what study.json holds, ``rows`` and ``against_paper`` in it."""
+
+    files: list[Path]
+    report: dict
+
+
+@command(
+    "study",
+    "Measure error against run time: render a scene at many settings, compare each with what is true, and plot it.",
+    more="""Writes study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. A
+full study takes up to half an hour.""",
+    options=StudyOptions,
+    scene=argument("Scene file (.xml), or slab, sphere, sheets, fog or ramp.", str),
+    out=extra(..., "Folder to write into; it is made.", Path, "-o", "--out"),
+)
+def run_study(
+    scene: str | Path, out: str | Path, options: StudyOptions | None = None, reporter: Reporter = SILENT
+) -> StudyResult:
+    """Study ``scene``, a scene file or the name of an analytic scene, and write tables and plots into the folder
+    ``out``: study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. With
+    ``options.store`` or ``options.scheduler`` a few settings are a part, which is kept and may be measured by others:
+    errors are the same, and times those of the process that took them, with its time of the default beside them.
+
+    Raises `NergError` for what the user can mend, before anything is written.
+    """
+    options = options or StudyOptions()
+    width, height = options.width, options.height
+    if min(width, height) < 4 or options.repeats < 1:
+        raise NergError(
+            "a study needs pictures of at least 4 x 4 pixels and one timed render, "
+            f"got {width} x {height} and {options.repeats}"
+        )
+    wanted = _expression(options.only)
+    out = Path(out)
+    check_folder(out)
+    mode = activate(options.mode)
+    import drjit as dr
+
+    begin = time.perf_counter()
+    reporter.progress(0.0, "open")
+    subject = open_subject(str(scene), options.scene_kind, width, height, options.defaults, twin_beside)
+    rows = _chosen(settings(subject, options.quick), wanted, options.only)
+    repeats, samples = effort(options)
+    timed_by: list[dict] = []
+    done = 0
+
+    def step(name: str) -> None:
+        nonlocal done
+        # The rows' first renders and their times, and the scaling, which is about a tenth of it.
+        reporter.progress(min(done / (2.2 * len(rows)), 0.99), name)
+        done += 1
+
+    if options.in_parts:
+        common = planned_study(subject, scene, replace(options, mode=mode))
+        table, scaling, timed_by = _measured_in_parts(common, subject, rows, Parts(options, out, reporter), out)
+    else:
+        table = study.measure(subject, rows, repeats, samples, step)
+        scaling = study.scaling(subject, min(repeats, 3), options.quick, step)
+    study_tables.mark_fronts(table)
+    known = subject.truth(study.SEED, "expected", "depth")
+    report = {
+        "scene": subject.name,
+        "variant": mode,
+        "size": [width, height],
+        "extent": subject.extent,
+        "step": subject.step,
+        "tolerance": subject.tolerance,
+        "reference": known.source,
+        "reference_change_when_step_halved": known.convergence,
+        "precision": study.precision(),
+        "gaze_kld_eps": study_truth.KLD_EPS,
+        "repeats": repeats,
+        "threads": timed_by[0]["threads"] if timed_by else dr.thread_count(),
+        "timed_by": timed_by,
+        "peak_mb": "what Dr.Jit allocated at most during a first render, in MiB, beyond scene and field",
+        "seconds_of_study": time.perf_counter() - begin,
+        "versions": versions(mode),
+        "against_paper": study_tables.against_paper(table),
+        "rows": table,
+        "scaling": scaling,
+    }
+    sources = files_of_scene(scene, options.defaults) if files_among(scene) else []
+    files = _write(out, subject, report, provenance("nerg study", sources, study.SEED, options))
+    for line in study_tables.summary(report):
+        reporter.message(line)
+    for path in files:
+        reporter.message(f"wrote {path}")
+    return StudyResult(files, report)
+
+
+def _expression(only: str) -> re.Pattern:
+    try:
+        return re.compile(only)
+    except re.error as error:
+        raise NergError(f'"{only}" is no regular expression ({error}): name settings as in "depth|paper"') from error
+
+
+def _chosen(all_settings: list[Setting], wanted: re.Pattern, only: str) -> list[Setting]:
+    """The first of the settings, which is the default, and those whose names match."""
+    default, *others = all_settings
+    rows = [default, *(row for row in others if wanted.search(row.name))]
+    if only and len(rows) == 1:
+        raise NergError(
+            f'no setting matches "{only}"; their names are those of an earlier study.csv, such as "{others[0].name}"'
+        )
+    return rows
+
+
+def _write(out: Path, subject: Subject, report: dict, about: Provenance) -> list[Path]:
+    files = study_tables.write_tables(out, report)
+    width, height = report["size"]
+    title = f"{subject.name}, {width} x {height}, {report['variant']}"
+    study_tables.plot_errors(out / "errors.png", report["rows"], f"Error against time: {title}", about)
+    study_tables.plot_scaling(out / "scaling.png", report["scaling"], f"Cost of the default: {title}", about)
+    return [*files, out / "errors.png", out / "scaling.png"]
+
+
+def effort(options: StudyOptions) -> tuple[int, int]:
+    """Timed renders of each setting, and samples of a pixel's truth."""
+    return (1, 16) if options.quick else (options.repeats, study.PIXEL_SPP)
+
+
+def twin_beside(scene: Path) -> ExactSurfaces | None:
+    """The surfaces of the shapes in ``twin.xml`` beside a scene file, which its field stands for; None where there is
+    none."""
+    file = scene.parent / _TWIN
+    if not file.is_file():
+        return None
+    from nerg_mi.scenes.store import twin  # pyright: ignore[reportMissingImports] at the root of a checkout
+
+    shapes = twin.load_twin(file)
+    return ExactSurfaces(partial(twin.cast, scene=shapes), partial(twin.visible, scene=shapes))
+
+
+# ---- Parts ----
+#
+# Settings, a few each, with the default beside them, measured wherever that is. Errors and evaluations are the same
+# wherever they are found. Times are those of the process that measured the row; its own times of the default, taken in
+# the same rounds, are in the row as well, so that rows of different machines compare.
+
+
+@dataclass(frozen=True)
+class PlannedStudy:
+    """What all parts of a study have in common: ``scene``, a file or the name of an analytic scene."""
+
+    options: StudyOptions
+    scene: PlannedScene | str
+
+
+def planned_study(subject: Subject, scene: str | Path, options: StudyOptions) -> PlannedStudy:
+    """That of the ``subject`` of ``scene``: parts have numbers of settings, whatever names were chosen."""
+    kind = "file" if isinstance(subject, FileSubject) else "analytic"
+    of_parts = replace(options, only="", defaults=None, scene_kind=kind)
+    if kind == "analytic":
+        return PlannedStudy(of_parts, str(scene))
+    twin = Path(scene).parent / _TWIN
+    others = files_of_scene(twin) if twin.is_file() else ()
+    return PlannedStudy(of_parts, PlannedScene.of(scene, options.defaults, *others))
+
+
+def _measured_in_parts(
+    common: PlannedStudy, subject: Subject, rows: Sequence[Setting], parts: Parts, out: Path
+) -> tuple[list[dict], list[dict], list[dict]]:
+    """What `study.measure` finds of ``rows`` (the default first) and `study.scaling`, in parts; and who timed what:
+    of each process its ``processor``, ``threads``, ``rows`` and, of the default there, the least and most ``seconds``.
+
+    Rows say in ``timed_by`` which process it was, counted from 1, and have ``default_seconds`` and
+    ``default_cpu_seconds`` of that one.
+    """
+    place = {row.name: k for k, row in enumerate(settings(subject, common.options.quick))}
+    chosen = [place[row.name] for row in rows[1:]]
+    some = [tuple(chosen[k : k + ROWS]) for k in range(0, len(chosen), ROWS)]
+    tasks = [Part(numbers, f"{len(numbers)} settings from number {numbers[0]}") for numbers in some]
+    tasks.append(Part(None, "cost against size"))
+    plan = Plan(f"nerg study {out.absolute()}", measure_part, common, tasks, ".json")
+    return _joined([read_json(made.path, "part of a study") for made in parts.run(plan)])
+
+
+def measure_part(common: PlannedStudy, numbers: Sequence[int] | None, output: Path) -> None:
+    """The rows (JSON) of the settings with these ``numbers``, the default first, or, for None, of the cost against
+    size; and who timed them."""
+    import drjit as dr
+
+    o = common.options
+    select_backend(o.mode)
+    repeats, samples = effort(o)
+
+    def opened() -> Subject:
+        scene, defaults = common.scene, {}
+        if isinstance(scene, PlannedScene):
+            scene, defaults = scene.checked(), scene.defaults
+        return open_subject(str(scene), o.scene_kind, o.width, o.height, defaults, twin_beside)
+
+    # Its truth may take longer than its settings.
+    subject = prepare_once(common, opened)
+    if numbers is None:
+        rows = study.scaling(subject, min(repeats, 3), o.quick)
+    else:
+        every = settings(subject, o.quick)
+        rows = study.measure(subject, [every[k] for k in (0, *numbers)], repeats, samples)
+    timed_by = {"process": _PROCESS, "processor": processor(), "threads": dr.thread_count()}
+    write_json(output, {"rows": rows, "timed_by": timed_by}, allow_nan=True)
+
+
+def _joined(parts: Iterable[Any]) -> tuple[list[dict], list[dict], list[dict]]:
+    """The rows of all parts with a single default, the cost against size, and who timed them."""
+    *of_settings, scaling = parts
+    table: list[dict] = []
+    who: dict[str, dict] = {}
+    for part in of_settings:
+        by, (default, *rest) = part["timed_by"], part["rows"]
+        of_process = who.setdefault(by["process"], {**by, "process": len(who) + 1, "rows": 0, "seconds": []})
+        of_process["seconds"].append(default["seconds"])
+        for row in rest if table else (default, *rest):
+            own = {f"default_{clock}": default[clock] for clock in ("seconds", "cpu_seconds")}
+            table.append(row | own | {"timed_by": of_process["process"]})
+            of_process["rows"] += 1
+    for found in who.values():
+        found["seconds"] = [min(found["seconds"]), max(found["seconds"])]
+    return table, scaling["rows"], list(who.values())

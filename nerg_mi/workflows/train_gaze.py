@@ -1,0 +1,451 @@
+"""``nerg train gaze``: Train a gaze field on rays of attention, and report its scores at positions that were held out.
+
+Training a gaze field on rays: what is trained on which rays, and the run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nerg_mi.alignment.check import read_similarity
+from nerg_mi.errors import NergError, chosen
+from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.files.atomic import check_writable, reserving
+from nerg_mi.formats.checkpoint import read_checkpoint
+from nerg_mi.formats.fields import save_gaze
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.photos.salience import SalienceSet, open_salience
+from nerg_mi.ranges import LENGTHS, RAYS, SECONDS, SEEDS, TEST_SHARES, THREADS, Range
+from nerg_mi.rays.dataset import is_dataset
+from nerg_mi.rays.dataset_open import load_rays, rays_digest
+from nerg_mi.rays.rays import Rays
+from nerg_mi.train import gaze_run
+from nerg_mi.train.gaze_data import Supervision, TargetNeeds, check_kernels, far_views, hold_out
+from nerg_mi.train.gaze_ensemble import train_ensemble
+from nerg_mi.train.gaze_folds import mixes
+from nerg_mi.train.gaze_recipes import FieldChoices, Recipe, gaze_recipe
+from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
+from nerg_mi.train.gaze_trainer import GazePlan, GazeProgress, StateSettings
+from nerg_mi.train.geometry import GazePlace
+
+from .base import SILENT, Reporter, argument, command, out, select_backend
+from .geometry import check_place, make_place, place_kind
+from .options import PlaceOptions, chosen_settings, exposes, option
+
+# ---- Options of the training of a gaze field ----
+
+
+@dataclass(frozen=True, kw_only=True)
+@exposes(ProbeSettings, GazeSettings, default="Default: the recipe's.")
+class GazeOptions(PlaceOptions):
+    """How a gaze field is trained; what is None is the recipe's. Lengths are metres, in the rays' frame."""
+
+    if TYPE_CHECKING:
+        # Options that are settings, too.
+        def __init__(self, **options: Any) -> None: ...
+        def __getattr__(self, name: str) -> Any: ...
+
+    views: Path | None = option(None, "Posed photos (folder or transforms file) with salience.")
+    salience: str | None = option(
+        None, "Folder of them, called as the photos are (.png, .exr, .npy), or spectral-residual."
+    )
+    salience_per: str = option("pixel", "What they count gaze per: pixel or steradian.")
+    align_views: Path | None = option(None, "JSON file with the 4x4 similarity from the photos' frame to the place's.")
+    allow_outside: bool = option(
+        False, "Read files outside of --views' folder and that of --salience too, where they name them."
+    )
+    recipe: str = option(
+        "default", "Word of docs/gaze-training.md; default generalises best. Sets what is not set below."
+    )
+    voxel: float | None = option(
+        None,
+        "Edge of the voxels of --geometry hits in metres.  [default: 0.08, more in very large places]",
+        within=LENGTHS,
+    )
+    align: Path | None = option(
+        None, "How the rays lie in the place: what nerg align writes, or JSON with the 4x4 similarity. Default: alike."
+    )
+    force: bool = option(False, "Train even where no gaze meets a surface of the place.")
+    most: int = option(
+        10_000_000, "Rays of a dataset at most; of more, a sample by --seed in which each is as likely.", within=RAYS
+    )
+    variant: str | None = option(
+        None, "emit, capture or emit_capture. Default: emit_capture; without any geometry folds choose it or capture."
+    )
+    activation: str | None = option(None, "Of the emit head of small and paper: softplus, exp or linear.")
+    size: str | None = option(None, "Of the field of small and paper: small or paper.")
+    normalized: bool = option(False, "Divide the field of small and paper by its integral over the sphere.")
+    semantic: str = option(
+        "", "Give emit the features of --field: accumulated along the ray, or snapshot at the surface."
+    )
+    semantic_own: bool = option(False, "Besides the gaze field's own, not in their place.")
+    begin: str = option("random", "Weights of the trunk to begin with: random, or those of the radiance field (field).")
+    test_zones: int = option(
+        0, "Zones of test positions that are left out of everything; 0: none.", within=Range(0, 1000)
+    )
+    test_positions: int = option(64, "Test positions in them.", within=Range(1, 10**5))
+    test_people: float = option(0.0, "Share of the people who are left out of everything besides.", within=TEST_SHARES)
+    ensemble: int = option(
+        0,
+        "Train so many fields on resamples of the people and the images; the mean is the gaze, their spread its "
+        "uncertainty. 0: one field.",
+        within=Range(0, 1000),
+    )
+    resume: bool = option(False, "Go on with the interrupted run of this output.")
+    save_every: float = option(
+        60.0, "Seconds between two states for --resume; 0: only one, when it ends early.", within=SECONDS
+    )
+    seed: int = option(0, "Seed of probes, directions, weights, batches and splits.", within=SEEDS)
+    half: bool = option(False, "Store the weights in fp16.")
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS, changes_result=False)
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+
+
+# ---- Gaze plan ----
+#
+# What the options of a gaze training come to: whether they go together, and the plan that they make of a recipe.
+
+
+def plan_gaze(options: GazeOptions, place: GazePlace, views_alone: bool = False) -> GazePlan:
+    """How ``options`` have a field trained in ``place``; ``views_alone``: there are no rays.
+
+    Raises `NergError` for what does not go together.
+    """
+    with chosen(_named(options)):
+        return gaze_recipe(options.recipe).plan(
+            place,
+            _choices(options, place.kind, views_alone),
+            settings=chosen_settings(options, GazeSettings),
+            probes=chosen_settings(options, ProbeSettings),
+            begin=options.begin == "field",
+            views_alone=views_alone,
+        )
+
+
+def check_plan(options: GazeOptions, views_alone: bool = False) -> ProbeSettings:
+    """Find what cannot be trained before any time is spent on it; returns the settings of the probes, which do not
+    depend on the place. Raises `NergError` for options that do not go together, and for values that are wrong."""
+    recipe = gaze_recipe(options.recipe)
+    _check(options, recipe, views_alone)
+    with chosen(_named(options)):
+        config = recipe.architectures(_choices(options, place_kind(options), views_alone))[0]
+    recipe.gaze_settings(chosen_settings(options, GazeSettings), views_alone)
+    probes = recipe.probe_settings(chosen_settings(options, ProbeSettings))
+    if rows := TargetNeeds.of(config).blind_rows:
+        check_kernels(rows, probes.mix_kappa)
+    return probes
+
+
+def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
+    """Raise `NergError` for options that do not go together."""
+    kind = place_kind(options)
+    if views_alone and options.views is None:
+        raise NergError("say what to learn from: a rays file, or --views with --salience, or both")
+    mixed = options.mix_folds or options.mix_kappa is not None
+    if views_alone and (options.test_zones or kind == "hits" or options.align or options.semantic or mixed):
+        raise NergError(
+            "--test-zones, --geometry hits, --align, --semantic, --mix-folds and --mix-kappa belong to rays; give a "
+            "rays file besides --views (or hold views out by leaving their images out of the folder, and align them "
+            "with --align-views)"
+        )
+    if options.geometry is not None and options.align is not None:
+        raise NergError("--align belongs to --field and --scene; a place made from rays is in the rays' own frame")
+    if options.test_people and not options.test_zones:
+        raise NergError("--test-people leaves people out at test positions: say where, with --test-zones")
+    if (options.views is None or options.salience is None) and (
+        options.views or options.salience or options.align_views
+    ):
+        raise NergError(
+            "salience needs both: --views, the posed photos, and --salience, the images' folder or spectral-residual"
+        )
+    if options.begin not in ("random", "field"):
+        raise NergError(f'--begin must be "random" or "field", got "{options.begin}"')
+    if options.freeze and options.begin != "field":
+        raise NergError("--freeze keeps the weights that --begin field gives; add it, or leave --freeze out")
+    if options.field is None and (options.semantic or options.begin == "field"):
+        raise NergError(
+            f"{'--semantic' if options.semantic else '--begin field'} needs a radiance field: give it with --field"
+        )
+    asked = {
+        "activation": options.activation,
+        "size": options.size,
+        "semantic": options.semantic,
+        "begin": options.begin == "field",
+        "loss": options.loss,
+        "integral": options.integral is not None,
+        "normalized": options.normalized,
+        "mix-folds": bool(options.mix_folds),
+        "mix-kappa": options.mix_kappa is not None,
+    }
+    recipe.require([name for name, given in asked.items() if given])
+    if options.loss and options.loss not in recipe.losses:
+        raise NergError(f'the loss must be one of {", ".join(recipe.losses)}, got "{options.loss}"')
+
+
+def _named(options: GazeOptions) -> str:
+    """By which options the architecture was chosen."""
+    given = options.semantic or options.begin == "field"
+    return "--semantic, --variant and --begin" if given else "--variant and --activation"
+
+
+def _choices(options: GazeOptions, kind: str, views_alone: bool) -> FieldChoices:
+    return FieldChoices(
+        variant=options.variant or "",
+        activation=options.activation,
+        size=options.size,
+        # Views alone do not say how much is looked altogether.
+        normalized=options.normalized or views_alone,
+        semantic=options.semantic,
+        semantic_own=options.semantic_own,
+        place=kind,
+    )
+
+
+# ---- Gaze ----
+#
+# ``nerg train gaze``: Train a gaze field on rays of attention, and report its scores at positions that were held
+# out.
+#
+# The training of a gaze field: from rays of attention, salience images or both to a checkpoint.
+
+
+# From this share of the blind density on, that is most of what a field says.
+_MOSTLY_BLIND = 0.5
+
+
+@dataclass(frozen=True)
+class GazeResult:
+    """A gaze field that was trained."""
+
+    # The field, or the ensemble.
+    field: AnyGazeField
+    # What its checkpoint says about the training (JSON).
+    provenance: dict
+    # The checkpoint; None where none was asked for.
+    output: Path | None
+    # Whether the run was ended early.
+    interrupted: bool
+
+
+@command(
+    "train gaze",
+    options=GazeOptions,
+    rays=argument(
+        "Rays file (.npz or .parquet) or dataset, as nerg rays import writes it. None: --views alone.", required=False
+    ),
+    output=out("Checkpoint to write (.safetensors)."),
+)
+def train_gaze(
+    rays: Rays | str | Path | None,
+    output: str | Path | None = None,
+    options: GazeOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> GazeResult:
+    """Train a gaze field on ``rays`` of attention, or their file (.npz or .parquet) or dataset; None: on salience
+    images alone.
+
+    ``output``: checkpoint to write (.safetensors). Beside it are kept the state of the run while that is not done
+    (.run), from which it can be resumed, and a place of hit points (.vol). After Ctrl-C the result so far and the state
+    are written and ``KeyboardInterrupt`` is raised; without ``output`` the result so far is returned, as
+    ``interrupted``.
+
+    Raises `NergError` for what the user can mend, before any time is spent on it.
+    """
+    with reserving(output):
+        return _train(rays, None if output is None else Path(output), options or GazeOptions(), reporter)
+
+
+def _train(rays: Rays | str | Path | None, output: Path | None, options: GazeOptions, reporter: Reporter) -> GazeResult:
+    probes = check_plan(options, views_alone=rays is None)
+    state = None if output is None else output.with_suffix(".run")
+    if output is not None and state is not None:
+        _check_outputs(options, output, state)
+    elif options.resume or options.geometry == "hits":
+        raise NergError("a run that is resumed, and a place of hit points, need a file for the gaze field: give one")
+    ns = select_backend(options.mode, options.threads)
+    if options.resume and not options.ensemble and (state is None or not state.is_file()):
+        raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
+    align = Similarity() if options.align is None else read_similarity(options.align, "--align", "rays to field")
+    if not isinstance(rays, Rays):
+        reporter.progress(0.0, "reading rays")
+    supervision, about = _supervision(rays, options, probes, align, reporter)
+    volume = None if output is None else output.with_suffix(".vol")
+    place = make_place(options, supervision.rays, supervision.views, volume, ns, options.voxel, reporter)
+    place = replace(place, align=align)
+    check_place(place, supervision.rays, _place_option(options), options.force, reporter)
+    about |= place.about
+    reporter.progress(0.0, "placing probes and tracing their depths")
+    plan = plan_gaze(options, place, views_alone=supervision.rays is None)
+    if place.kind == "none" and options.variant is None:
+        choose = plan.alternatives and mixes(plan) and supervision.rays is not None
+        how = "folds choose between capture alone and emit x capture" if choose else "capture alone is trained"
+        reporter.message(f"no surfaces are known: {how}")
+    if plan.initial and options.field is not None:
+        about["begins_as"] = Path(options.field).name
+    result = train_planned(
+        supervision,
+        place,
+        plan,
+        ns,
+        output,
+        ensemble=options.ensemble,
+        state=StateSettings(
+            path=state, resume=options.resume, every=options.save_every or float("inf"), about=dict(about)
+        ),
+        half=options.half,
+        reporter=reporter,
+    )
+    _tell(result, reporter)
+    if result.interrupted and output is not None:
+        raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {state})")
+    return result
+
+
+def train_planned(
+    supervision: Supervision,
+    place: GazePlace,
+    plan: GazePlan,
+    ns: ModuleType,
+    output: Path | None = None,
+    *,
+    ensemble: int = 0,
+    state: StateSettings | None = None,
+    half: bool = False,
+    reporter: Reporter = SILENT,
+) -> GazeResult:
+    """Train a field as ``plan`` says, or an ``ensemble`` of so many, and write it to ``output``, with ``state.about``
+    among its provenance. Without ``output`` nothing is written but the state."""
+    state = state or StateSettings()
+    write = None
+    if output is not None:
+        write = lambda field, provenance: save_gaze(field, output, {**state.about, **provenance}, half)
+    train = partial(train_ensemble, ensemble) if ensemble else gaze_run.train_gaze
+    tell = lambda progress: reporter.progress(progress.done, _progress(progress))
+    field, provenance = train(supervision, place, plan, ns, state=state, tell=tell, write=write)
+    return GazeResult(field, {**state.about, **provenance}, output, provenance["interrupted"])
+
+
+def _place_option(options: GazeOptions) -> str:
+    """The option by which the place was given."""
+    return f"--field {options.field}" if options.field is not None else f"--scene {options.scene}"
+
+
+def _check_outputs(options: GazeOptions, output: Path, state: Path) -> None:
+    """Raise `NergError` where one of the files cannot be written."""
+    check_writable(output, ".safetensors")
+    check_writable(state)
+    if options.geometry == "hits":
+        check_writable(output.with_suffix(".vol"))
+
+
+def _supervision(
+    rays: Rays | str | Path | None, options: GazeOptions, probes: ProbeSettings, align: Similarity, reporter: Reporter
+) -> tuple[Supervision, dict]:
+    """What is learnt from, without what a test holds out; and what the provenance says of it (JSON)."""
+    about: dict = {"recipe": options.recipe}
+    data = None
+    if isinstance(rays, Rays):
+        data = rays
+    elif rays is not None:
+        path, data = Path(rays), load_rays(rays, options.most, options.seed)
+        about["rays_file"] = {"file": path.name, "sha256": rays_digest(path), "persons": len(data.persons)}
+        if is_dataset(path):
+            about["rays_file"] |= {"most": options.most, "seed": options.seed, "rays": len(data)}
+            reporter.message(f"{len(data):,} rays of {path}")
+    views = []
+    if options.views is not None and options.salience is not None:
+        found, similarity = _open_views(options, options.views, options.salience)
+        views = found.views
+        about |= {"salience": found.about, **similarity}
+        _tell_views(found, reporter)
+    if options.test_zones and data is not None:
+        data, test = hold_out(
+            data,
+            probes.radius,
+            options.test_zones,
+            options.test_positions,
+            options.seed,
+            max(64, probes.min_rays),
+            options.test_people,
+        )
+        about["test"] = test
+        reporter.message(
+            f"{len(test['centres'])} test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays left"
+        )
+        centres = np.array(test["centres"]) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
+        views = far_views(views, centres, 2 * probes.radius * align.scale)
+    return Supervision(data, tuple(views)), about
+
+
+def _open_views(options: GazeOptions, photos: Path, salience: str) -> tuple[SalienceSet, dict]:
+    """Salience images in the frame of the place, and what the provenance says of their alignment (JSON)."""
+    matrix = None
+    if options.align_views is not None:
+        matrix = read_similarity(options.align_views, "--align-views", "photos to field").matrix
+    trained = None
+    if options.field is not None:
+        trained = read_checkpoint(options.field, "radiance")[1].get("provenance")
+    found = open_salience(photos, salience, options.salience_per, matrix, trained, options.allow_outside)
+    return found, {} if matrix is None else {"align_views": matrix.tolist()}
+
+
+def _tell_views(found: SalienceSet, reporter: Reporter) -> None:
+    for line in found.unused:
+        reporter.message(line)
+    without = f"; without: {', '.join(found.missing)}" if found.missing else ""
+    stray = f"; images of no frame: {', '.join(found.stray)}" if found.stray else ""
+    reporter.message(f"{len(found.views)} views with salience{without}{stray}")
+
+
+def _progress(now: GazeProgress) -> str:
+    scores = "" if now.scores is None else f", held out KLD {now.scores.kld:.3f}, CC {now.scores.cc:.3f}"
+    return f"{now.stage}: step {now.steps}{scores}" if now.steps else now.stage
+
+
+def _tell(result: GazeResult, reporter: Reporter) -> None:
+    about = result.provenance
+    views = about["salience_views"]
+    counts = f"{about['probes_made'] - views} probes" + (f" and {views} views" if views else "")
+    reporter.message(
+        f"{counts}; {100 * about['escaped_directions']:.2f} % of the directions meet no surface, "
+        f"and {100 * about['escaped_gaze']:.2f} % of the gaze"
+    )
+    if "validation" in about:
+        v = about["validation"]
+        reporter.message(
+            f"held-out positions: KLD {v['kld']:.3f}, CC {v['cc']:.3f}, MAE {v['mae']:.4f} /sr, "
+            f"integral {v['integral']:.3f}, best after {v['best_step']} steps"
+        )
+    reporter.message(
+        f"{about['steps']} steps; {about['seconds']:.0f} s in all, of it {about['seconds_preparing']:.0f} s for the "
+        f"probes{'; interrupted' if result.interrupted else ''}"
+    )
+    if "mix" in about:
+        m = about["mix"]
+        if m["variant"]:
+            klds = ", ".join(f"{kld:.3f} of {name}" for name, kld in m["variants"].items())
+            reporter.message(f"held-out KLD {klds}: {m['variant']} is trained")
+        if m["folds"]:
+            folds = f"{m['folds']} fold{'' if m['folds'] == 1 else 's'}"
+            reporter.message(
+                f"held out in {folds}: KLD {m['kld_field']:.3f} of the field, {m['kld_blind']:.3f} of where people "
+                f"look wherever they stand; {100 * m['mix']:.0f} % of the latter are mixed in"
+            )
+            reporter.message(f"regions of {100 * m['regions']['80%']:.0f} % of the field's gaze held 80 % of theirs")
+        else:
+            reporter.message(
+                "too few rays at any place to hold people out: whether position tells where others look is not known"
+            )
+        if m["mix"] >= _MOSTLY_BLIND:
+            reporter.warn(
+                "position tells little of where others look here: the gaze field is mostly where people look wherever "
+                "they stand; record more people, or give the place's surfaces"
+            )
+    if result.output is not None:
+        reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")

@@ -1,0 +1,346 @@
+"""``nerg train radiance``: Train a radiance field on posed pictures, and report the error on those held out.
+``nerg eval radiance``: PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the
+integrator.
+
+Radiance fields from posed photos: training, and scores on the photos that were held out.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nerg_mi.errors import NergError, chosen
+from nerg_mi.evaluation.metrics import ViewScores, score_views
+from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.files.atomic import check_folder, check_writable, reserving
+from nerg_mi.files.tables import write_json
+from nerg_mi.formats.checkpoint import read_checkpoint
+from nerg_mi.formats.fields import save_radiance
+from nerg_mi.photos.dataset import Dataset, open_dataset
+from nerg_mi.ranges import COORDINATES, LENGTHS, SECONDS, SPP, THREADS, Checked, Range
+from nerg_mi.train import radiance_run
+from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
+
+from .base import SILENT, Reporter, argument, command, out, select_backend
+from .options import chosen_settings, exposes, option, parse_numbers
+
+# ---- Options of the training and of the evaluation of a radiance field ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoOptions(Checked):
+    """How a posed image set is read."""
+
+    holdout: int | None = option(
+        None, "Hold out every so many frames, 0 none. Default: transforms_test.json, else 8.", within=Range(0, 10**6)
+    )
+    width: int | None = option(
+        None, "Width of the pictures in pixels. Default: as they are, or as it was trained.", within=Range(1, 65536)
+    )
+    scale: float = option(
+        1.0, "Multiply all lengths by this: what a unit of the data set measures, in metres.", within=LENGTHS
+    )
+    coordinates: str = option(
+        "file",
+        "Of the field: file, upright (+z up), original (applied_transform undone), a dataparser_transforms.json.",
+    )
+    depth: bool = option(True, "Use the data set's depth, where it has any.")
+    allow_outside: bool = option(False, "Read files outside of the data set's folder too, where it names them.")
+
+
+@dataclass(frozen=True, kw_only=True)
+@exposes(RadianceSettings)
+class RadianceOptions(PhotoOptions):
+    """How a radiance field is trained."""
+
+    if TYPE_CHECKING:
+        # Options that are settings, too.
+        def __init__(self, **options: Any) -> None: ...
+        def __getattr__(self, name: str) -> Any: ...
+
+    size: str = option("small", "Size of the field: small, medium or paper.")
+    deferred: bool = option(False, "Ask the colour network once a ray, not at every sample: faster frames.")
+    downscale: float | None = option(
+        None, "In place of a width: divide the pictures' size by this.", within=Range(1, 1000)
+    )
+    aabb: tuple[float, ...] | None = option(
+        None,
+        "Bounds of what is seen: x0,y0,z0,x1,y1,z1, in the coordinates of the field.",
+        parse=parse_numbers,
+        within=COORDINATES,
+    )
+    unbounded: bool | None = option(
+        None,
+        "Whether anything is to be seen beyond those bounds. Default: as the points tell, and no without any.",
+        "--unbounded/--bounded",
+    )
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
+    half: bool = option(False, "Store the weights in fp16.")
+    resume: bool = option(False, "Go on with the interrupted run of this output.")
+    save_every: float = option(
+        60.0, "Seconds between two states for --resume; 0: only one, when it ends early.", within=SECONDS
+    )
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RadianceScoreOptions(PhotoOptions):
+    """On which views a radiance field is scored, and how they are rendered. The photos are read as in its training."""
+
+    train: bool = option(False, "Score the training views instead.")
+    spp: int = option(16, "Rays a pixel. The scatter of few is part of the score.", within=SPP)
+    pictures: Path | None = option(None, "Folder for the pictures, each beside its photo.", "-o", "--output")
+    json_file: Path | None = option(None, "Write the scores to this file.", "--json")
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+
+
+# ---- Radiance ----
+#
+# ``nerg train radiance``: Train a radiance field on posed pictures, and report the error on those held out.
+# ``nerg eval radiance``: PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the
+# integrator.
+#
+# Radiance fields from posed photos: training, and scores on the photos that were held out.
+
+
+# Photos whose exposures differ by less than this, which nobody sees, are not told of.
+_STOPS = 0.05
+
+
+@dataclass(frozen=True)
+class RadianceResult:
+    """``field``, with its occupancy; ``provenance``: what its checkpoint says about the training (JSON); ``output``:
+    the checkpoint, None where none was asked for; ``interrupted``: the run was ended early."""
+
+    field: RadianceField
+    provenance: dict
+    output: Path | None
+    interrupted: bool
+
+    @property
+    def psnr(self) -> float | None:
+        """Mean PSNR in dB on the held-out views; None where none are held out, or masks leave nothing of them."""
+        held_out = self.provenance.get("psnr_held_out")
+        return None if held_out is None else held_out["mean"]
+
+
+@command(
+    "train radiance",
+    options=RadianceOptions,
+    dataset=argument("Folder of posed photos, its transforms.json, or a COLMAP model."),
+    output=out("Checkpoint to write (.safetensors)."),
+)
+def train_radiance(
+    dataset: str | Path,
+    output: str | Path | None = None,
+    options: RadianceOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> RadianceResult:
+    """Train a radiance field on the posed photos of ``dataset``: a folder, its transforms.json, or a COLMAP model.
+
+    ``output``: checkpoint to write (.safetensors). Beside it a preview (.preview.png) is kept up to date, and while the
+    run is not done its state (.run), from which it can be resumed. After Ctrl-C the result so far and the state are
+    written and ``KeyboardInterrupt`` is raised; without ``output`` the result so far is returned, as ``interrupted``.
+
+    Raises `NergError` for what the user can mend, before any time is spent on it.
+    """
+    with reserving(output):
+        return _train(dataset, None if output is None else Path(output), options or RadianceOptions(), reporter)
+
+
+def _train(photos: str | Path, output: Path | None, options: RadianceOptions, reporter: Reporter) -> RadianceResult:
+    state = preview = None
+    if output is not None:
+        state, preview = output.with_suffix(".run"), output.with_suffix(".preview.png")
+        check_writable(output, ".safetensors")
+        check_writable(state)
+        check_writable(preview)
+    ns = select_backend(options.mode, options.threads)
+    settings = _settings(options)
+    if options.resume and (state is None or not state.is_file()):
+        raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
+    reporter.progress(0.0, "reading photos")
+    data = _open(photos, options)
+    _tell_about(data, reporter)
+    field, provenance = radiance_run.train_field(
+        data,
+        sized_config(options.size, data.box, options.deferred),
+        settings,
+        ns,
+        options.depth,
+        lambda now: reporter.progress(now.done, _progress(now)),
+        state=state,
+        resume=options.resume,
+        save_every=options.save_every or float("inf"),
+        preview=preview,
+        write=None if output is None else lambda field, about: save_radiance(field, output, about, options.half),
+    )
+    result = RadianceResult(field, provenance, output, provenance["interrupted"])
+    _tell_result(result, reporter)
+    if result.interrupted and output is not None:
+        raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {state})")
+    return result
+
+
+def _settings(options: RadianceOptions) -> RadianceSettings:
+    given = chosen_settings(options, RadianceSettings)
+    if options.steps is None:
+        given.setdefault("minutes", 5.0)
+    return RadianceSettings(**given)
+
+
+def _open(photos: str | Path, options: RadianceOptions) -> Dataset:
+    with chosen("--aabb") if options.aabb else nullcontext():
+        return open_dataset(
+            photos,
+            options.holdout,
+            options.width,
+            options.downscale,
+            options.aabb,
+            options.depth,
+            options.scale,
+            options.coordinates,
+            options.allow_outside,
+            options.unbounded,
+        )
+
+
+def _tell_about(data: Dataset, reporter: Reporter) -> None:
+    corner, core = lambda values: ", ".join(f"{x:.3g}" for x in values), data.box.core
+    for line in (*data.unused, *data.notes):
+        reporter.message(str(line))
+    reporter.message(f"taken for {data.kind}; --unbounded, --bounded or --aabb say otherwise")
+    reporter.message(f"box: ({corner(core.lower)}) to ({corner(core.upper)}), {data.box_from}")
+    reporter.message(data.unit)
+    reporter.message(data.up)
+    reporter.message(
+        f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
+        f"{data.source['width']} x {data.source['height']} pixels"
+    )
+
+
+def _progress(now: radiance_run.Progress) -> str:
+    left = now.seconds * (1 - now.done) / max(now.done, 1e-6)
+    error = f", held out {now.psnr:.2f} dB" if now.psnr is not None else ""
+    return f"{left:.0f} s left, step {now.steps}{error}"
+
+
+def _tell_result(result: RadianceResult, reporter: Reporter) -> None:
+    about = result.provenance
+    speed = f"; {about['evaluations_a_second']:.3g} field evaluations a second" if about["steps"] else ""
+    reporter.message(f"{about['steps']} steps in {about['seconds']:.0f} s{speed}")
+    if result.psnr is not None:
+        fitted = about["psnr_held_out"]["mean_fitted"]
+        halves = "" if fitted is None else f"; of right halves, colours fitted on left ones: {fitted:.2f} dB"
+        reporter.message(f"held-out PSNR: {result.psnr:.2f} dB{halves}")
+    if about.get("photo_stops", 0) >= _STOPS:
+        reporter.message(f"the photos' exposures differ by {about['photo_stops']:.2f} stops (standard deviation)")
+    if "beyond_box" in about:
+        reporter.message(f"{about['beyond_box']:.0%} of the watched pixels show what lies beyond the box")
+    for complaint in about["complaints"]:
+        reporter.warn(complaint)
+    if result.output is not None:
+        reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")
+
+
+def evaluate_radiance(
+    field: str | Path, photos: str | Path, options: RadianceScoreOptions | None = None, reporter: Reporter = SILENT
+) -> ViewScores:
+    """PSNR, SSIM and, where the ``photos`` have depth, its error, of the ``field`` in a checkpoint as rendered by the
+    integrator.
+
+    Raises `NergError` for what the user can mend, among it views that the field was trained on.
+    """
+    options = options or RadianceScoreOptions()
+    pictures = None if options.pictures is None else Path(options.pictures)
+    if pictures is not None:
+        check_folder(pictures)
+    if options.json_file is not None:
+        check_writable(options.json_file)
+    select_backend(options.mode, options.threads)
+    about = read_checkpoint(field, "radiance")[1].get("provenance", {})
+    trained_width = about.get("width") if isinstance(about.get("width"), int) else None
+    data = open_dataset(
+        photos,
+        options.holdout,
+        options.width or trained_width,
+        None,
+        None,
+        options.depth,
+        options.scale,
+        options.coordinates,
+        options.allow_outside,
+    )
+    for line in (*data.unused, *data.notes):
+        reporter.message(str(line))
+    if not options.train:
+        _refuse_trained(field, about, data)
+    views = data.train if options.train else data.held_out
+    done = 0
+
+    def row(name: str, psnr: float, ssim: float) -> None:
+        similarity = "-" if math.isnan(ssim) else f"{ssim:.4f}"
+        likeness = "-" if math.isnan(psnr) else f"{psnr:.2f}"
+        reporter.message(f"{name[-32:]:32s} {likeness:>8s} {similarity:>7s}")
+
+    def scored(name: str, psnr: float, ssim: float) -> None:
+        nonlocal done
+        done += 1
+        row(name, psnr, ssim)
+        reporter.progress(done / len(views), f"{done} of {len(views)} views")
+
+    reporter.message(f"{'view':32s} {'PSNR dB':>8s} {'SSIM':>7s}")
+    scores = score_views(field, views, options.spp, pictures, scored)
+    row("mean", scores.psnr_mean, scores.ssim_mean)
+    if not math.isnan(scores.psnr_fitted_mean):
+        reporter.message(f"PSNR of right halves, their colours fitted on left ones: {scores.psnr_fitted_mean:.2f} dB")
+    if any(map(math.isnan, scores.ssim)):
+        reporter.warn(
+            f"views of {scores.width} x {scores.height} pixels hold no whole window of 11 x 11, which SSIM needs; give "
+            "a larger --width"
+        )
+    if scores.depth is not None:
+        d = scores.depth
+        reporter.message(
+            f"depth: median error {d.median:.4f} units, {d.off:.1%} of the pixels off by more than 10 %; "
+            f"opacity {d.opacity:.3f}, {d.translucent:.1%} of the pixels below 0.9"
+        )
+    if pictures is not None:
+        reporter.message(f"wrote {len(views)} pictures to {pictures}")
+    if options.json_file is not None:
+        about = {"field": Path(field).name, "dataset": data.source["dataset"]}
+        write_json(options.json_file, about | scores.to_dict())
+        reporter.message(f"wrote {options.json_file}")
+    return scores
+
+
+@command(
+    "eval radiance",
+    more="The pictures are written into FIELD.eval where no other folder is given.",
+    options=RadianceScoreOptions,
+    field=argument("Checkpoint of a radiance field (.safetensors)."),
+    dataset=argument("Posed image set with the views to compare with."),
+)
+def evaluate_beside(field: Path, dataset: Path, options: RadianceScoreOptions, reporter: Reporter) -> None:
+    """`evaluate_radiance`, with pictures beside the ``field`` where no other folder is chosen."""
+    options = replace(options, pictures=options.pictures or field.with_suffix(".eval"))
+    evaluate_radiance(field, dataset, options, reporter)
+
+
+def _refuse_trained(field: str | Path, about: dict, data: Dataset) -> None:
+    """Raise `NergError` where views would be scored that the field in ``field`` was trained on."""
+    held_out = about.get("held_out")
+    trained = held_out.get("frames") if isinstance(held_out, dict) else None
+    if trained is None or about.get("sha256") != data.source["sha256"]:
+        return
+    seen = sorted({v.name for v in data.held_out} - set(trained))
+    if seen:
+        raise NergError(
+            f'"{field}" was trained on {seen[0]} and {len(seen) - 1} other of the views that would be scored; '
+            "give --holdout as it was trained with"
+        )

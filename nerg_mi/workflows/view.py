@@ -1,0 +1,205 @@
+"""Options of the viewer. From files and folders to the scene that a viewer shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from nerg_mi.alignment.check import read_similarity
+from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.files.atomic import write_text
+from nerg_mi.formats.checkpoint import read_metadata
+from nerg_mi.formats.splats import READERS, is_splats
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.ranges import COORDINATES, SPP, Checked, Range
+from nerg_mi.rays.dataset import is_dataset
+from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.nested_scene import gaze_of_scene, with_gaze
+from nerg_mi.rendering.scene import load_scene
+
+from .base import SILENT, Reporter, select_backend
+from .geometry import align_of_training
+from .options import option, parse_numbers
+from .scene import SceneOptions, write_scene
+from .scene_cameras import given_point
+from .scene_places import KINDS, kind_of_file, training_place
+
+# ---- Options of the viewer ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions(Checked):
+    """Where the page is, how fine its pictures are, and what is shown first."""
+
+    host: str = option("127.0.0.1", "Address to serve at; another than this machine's own asks pages for a token.")
+    port: int = option(8080, "Port to serve at; 0: any that is free.", within=Range(0, 65535))
+    names: tuple[str, ...] = option((), "Name by which others reach this machine, beside its address.", "--name")
+    width: int = option(720, "Width of a refined picture in pixels.", within=Range(16, 8192))
+    spp: int = option(0, "Samples a pixel of it; 0: as the scene says.", within=Range(0, SPP.high))
+    observer: tuple[float, ...] | None = option(
+        None, "Position of the observer's eye, x,y,z.  [default: the scene's]", parse=parse_numbers, within=COORDINATES
+    )
+    up: tuple[float, ...] | None = option(
+        None,
+        "Which way is up in the place, x,y,z.  [default: as its files say]",
+        parse=parse_numbers,
+        within=COORDINATES,
+    )
+    regions: Path | None = option(None, "JSON file of areas of interest: boxes with names.")
+    align: Path | None = option(
+        None, "JSON file with the 4x4 similarity from the rays' frame to the place's.  [default: the gaze field's]"
+    )
+    geometry: str | None = option(
+        None, 'What rays alone are shown in: "hits", their hit points, or "none".  [default: hits if there are any]'
+    )
+    open: bool = option(False, "Open the page in this machine's browser.")
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
+
+
+# ---- From files and folders to the scene that a viewer shows ----
+
+RAYS = 2_000_000
+"""Of larger datasets so many rays are shown, drawn at random."""
+
+_SUFFIXES = {*KINDS, *READERS, ".safetensors", ".rays"}
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceToView:
+    """``scene``: a scene file with the integrator `nerg`; ``made``: whether it was written for the viewer, and ends
+    with it; ``rays`` in their own frame, or None, and ``align`` from there to the place; ``up`` (3,), a unit vector;
+    ``name`` for people; ``variants``: scene files that differ in their gaze field alone, by its name, of which
+    ``scene`` is the first; none where there is nothing to choose."""
+
+    scene: Path
+    made: bool
+    rays: Rays | None
+    align: Similarity
+    up: np.ndarray
+    name: str
+    variants: dict[str, Path] = field(default_factory=dict)
+
+
+def place_to_view(
+    files: Sequence[str | Path], folder: Path, options: ViewOptions | None = None, reporter: Reporter = SILENT
+) -> PlaceToView:
+    """The scene of ``files``: a scene file with `nerg`, or whatever `write_scene` makes one of, in ``folder``.
+
+    A folder stands for the files in it, of which there must be one of a kind, or is a dataset of rays (.rays). Rays
+    beside a scene are shown in it. Several gaze fields, as `nerg ablate` trains them, are variants to choose among; a
+    scene's own is the first of them. Raises `NergError` for what the user can mend.
+    """
+    options = options or ViewOptions()
+    select_backend(options.mode)
+    found = [path for file in files for path in _expanded(Path(file))]
+    if not found:
+        raise NergError(
+            "there is nothing to view; name a scene, a field, a mesh, a gaze field, rays, or a run's folder"
+        )
+    kinds = {path: kind_of_file(path) for path in found}
+    rays_files = [path for path, kind in kinds.items() if kind == "rays"]
+    if len(rays_files) > 1:
+        raise NergError(f'"{rays_files[0]}" and "{rays_files[1]}" are both rays; a viewer shows one of them')
+    rays = load_rays(rays_files[0], RAYS) if rays_files else None
+    name = " + ".join(path.name for path in found)
+    scenes = [path for path, kind in kinds.items() if kind == "scene"]
+    gaze = [path for path, kind in kinds.items() if kind == "gaze"]
+    if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays", "gaze"} and _is_nerg(scenes[0]):
+        align = _given_align(options) or Similarity(np.eye(4))
+        own = gaze_of_scene(scenes[0]) if gaze else None
+        variants = write_variants(scenes[0], [*([own] if own else []), *gaze], folder, reporter) if gaze else {}
+        scene = next(iter(variants.values()), scenes[0])
+        return PlaceToView(scene, bool(gaze), rays, align, _up(options, np.array([0.0, 0, 1])), name, variants)
+    given = [path for path in found if not is_dataset(path) and path not in gaze[1:]]
+    if rays is not None and rays_files[0] not in given:
+        copy = folder / "rays.npz"
+        rays.save(copy)
+        given.append(copy)
+    output = folder / "scene.xml"
+    chosen = SceneOptions(
+        observer=options.observer, up=options.up, align=options.align, geometry=options.geometry, mode=options.mode
+    )
+    write_scene(given, output, chosen, reporter)
+    align = _given_align(options)
+    if align is None:
+        align = align_of_training(read_metadata(gaze[0]).get("provenance", {}) if gaze else {})
+    variants = write_variants(output, gaze, folder, reporter) if len(gaze) > 1 else {}
+    return PlaceToView(output, True, rays, align, _up(options, _up_of(output)), name, variants)
+
+
+def write_variants(scene: Path, gaze: Sequence[Path], folder: Path, reporter: Reporter = SILENT) -> dict[str, Path]:
+    """Copies of the file ``scene``, with each of the files ``gaze`` as its gaze field, into ``folder``: by the names of
+    these, which are their paths' last parts as far as they differ.
+
+    Warns of fields that were trained in other places than the first. Raises `NergError` for a scene that takes none.
+    """
+    first = read_metadata(gaze[0]).get("provenance", {})
+    found: dict[str, Path] = {}
+    for number, path in enumerate(gaze):
+        if training_place(read_metadata(path).get("provenance", {})) != training_place(first):
+            reporter.warn(
+                f'"{path}" was trained in another place than "{gaze[0]}"; its gaze is right only where surfaces and '
+                "coordinates are the same"
+            )
+        name = next(n for n in _names(path, number) if n not in found)
+        found[name] = folder / f"variant{number}.xml"
+        write_text(found[name], with_gaze(scene, path))
+    return found
+
+
+def _names(path: Path, number: int) -> Iterator[str]:
+    """Names for the gaze field of a file, the shortest first."""
+    yield path.stem
+    yield f"{path.parent.name}/{path.stem}"
+    yield f"{path.stem} ({number})"
+
+
+def _expanded(path: Path) -> list[Path]:
+    """A file itself; of a folder the files in it that a viewer knows."""
+    if not path.exists():
+        raise MissingFile(f'there is no file "{path}"; correct its name')
+    if not path.is_dir() or is_dataset(path):
+        return [path]
+    inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _SUFFIXES)
+    # Of glTF a viewer shows splats alone.
+    inside = [p for p in inside if p.suffix.lower() != ".glb" or is_splats(p)]
+    if not inside:
+        raise NergError(f'the folder "{path}" holds nothing that a viewer shows; name a file, or another folder')
+    ready = [p for p in inside if p.suffix.lower() == ".xml"]
+    if len(ready) > 1:
+        ready = [p for p in ready if p.name == "scene.xml"] or ready
+    if len(ready) > 1:
+        raise NergError(f'the folder "{path}" has {len(ready)} scenes; name the one to view')
+    return ready or inside
+
+
+def _is_nerg(path: Path) -> bool:
+    return is_nerg(load_scene(path).integrator())
+
+
+def _given_align(options: ViewOptions) -> Similarity | None:
+    return None if options.align is None else read_similarity(options.align, "--align", "rays to place")
+
+
+def _up(options: ViewOptions, otherwise: np.ndarray) -> np.ndarray:
+    up = given_point(options.up, "--up")
+    up = otherwise if up is None else up
+    length = float(np.linalg.norm(up))
+    if not length > 0:
+        raise NergError("up must be a direction, three numbers that are not all 0; give --up x,y,z")
+    return up / length
+
+
+def _up_of(written: Path) -> np.ndarray:
+    """Up in a scene that `write_scene` wrote."""
+    defaults = {d.get("name"): d.get("value", "") for d in ElementTree.parse(written).getroot().iter("default")}
+    text = defaults.get("nerg_up", defaults.get("up", "0, 0, 1"))
+    return np.array([float(v) for v in text.split(",")])

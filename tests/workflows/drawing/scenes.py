@@ -1,0 +1,22 @@
+"""A scene with a field, a gaze and an observer, so small that a picture takes a second."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.plugins import fields
+from tests.workflows.test_overlays import SCENE
+
+MODE = "llvm_ad_rgb"
+
+
+def write_scene(folder: Path, name: str = "scene.xml") -> Path:
+    """Write it into ``folder``, which is made, with its fields."""
+    import mitsuba as mi
+
+    mi.set_variant(MODE)
+    folder.mkdir(exist_ok=True)
+    fields.radiance(folder / "field.safetensors", density_scale=6.0)
+    fields.gaze(folder / "gaze.safetensors")
+    (folder / name).write_text(SCENE)
+    return folder / name

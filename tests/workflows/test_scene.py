@@ -1,0 +1,322 @@
+"""Scenes written for every kind of place, each rendered as it stands: what is in the picture, and who looks."""
+
+from __future__ import annotations
+
+import json
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import trimesh
+
+from nerg_mi.errors import NergError
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.splats import Splats
+from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
+from nerg_mi.formats.surfaces import write_volume
+from nerg_mi.maths.geometry import Box, ContractedBox
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.bands import render_channels
+from nerg_mi.rendering.files import read_frames
+from nerg_mi.rendering.scene import load_scene
+from nerg_mi.workflows.geometry import make_place
+from nerg_mi.workflows.options import PictureOptions, PlaceOptions
+from nerg_mi.workflows.render import render_file
+from nerg_mi.workflows.scene import SceneOptions, write_scene
+from tests.formats.splats.writers import write_inria
+from tests.pictures import mitsuba_bitmap
+from tests.plugins import fields
+from tests.workflows.recorder import Recorder
+
+MODE = "llvm_ad_rgb"
+SMALL = {"width": "18", "height": "12", "sphere_width": "16", "sphere_height": "8", "spp": "2"}
+ROOM = """<scene version="3.0.0">
+    <integrator type="path"/>
+    <shape type="cube">
+        <transform name="to_world"><scale value="2"/></transform><boolean name="flip_normals" value="true"/>
+    </shape>
+    <emitter type="point"><point name="position" value="0, 0, 1.5"/><rgb name="intensity" value="5"/></emitter>
+    <sensor type="perspective"/>
+</scene>"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Places of all kinds around the origin, a gaze field, and rays of two people."""
+    import mitsuba as mi
+
+    mi.set_variant(MODE)
+    folder = tmp_path_factory.mktemp("places")
+    fields.radiance(folder / "field.safetensors", density_scale=6.0)
+    fields.gaze(folder / "gaze.safetensors")
+    (folder / "room.xml").write_text(ROOM)
+    mesh = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale(2)})
+    mesh.write_ply(str(folder / "mesh.ply"))
+    rays().save(folder / "rays.npz")
+    return folder
+
+
+def rays():
+    """Two people near (0.3, 0.2, 0.1), who look at the wall x = 2 from inside of a cube of ±2."""
+    rng = np.random.default_rng(0)
+    n = 800
+    origin = rng.normal((0.3, 0.2, 0.1), 0.05, (n, 3))
+    direction = rng.normal((1, 0, 0), 0.15, (n, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    hit = origin + direction * ((2 - origin[:, 0]) / direction[:, 0])[:, None]
+    return Rays(np.arange(n) / 50, np.arange(n) % 2, ("Ada", "Bob"), origin, direction, np.ones(n), hit)
+
+
+def trained(folder, name, about):
+    """The gaze field with another provenance."""
+    import drjit.llvm.ad as ns
+
+    field = load_gaze(folder / "gaze.safetensors", ns)[0]
+    save_gaze(field, folder / name, about)
+    return folder / name
+
+
+def shown(path, sensor=0, **values):
+    """What a sensor of a written scene shows."""
+    scene = load_scene(path, {**SMALL, **values})
+    return scene, render_channels(scene, scene.sensors()[sensor])
+
+
+def position(sensor):
+    return np.array(sensor.world_transform().matrix, float).reshape(4, 4)[:3, 3]
+
+
+def defaults(path):
+    return {d.get("name"): d.get("value") for d in ElementTree.parse(path).iter("default")}
+
+
+@pytest.mark.parametrize("place", ["field.safetensors", "room.xml"])
+def test_a_place_with_gaze_and_an_observer(rgb, folder, tmp_path, place):
+    options = SceneOptions(observer=(0.3, 0.2, 0.1), mode=MODE)
+    result = write_scene([folder / "gaze.safetensors", folder / place], tmp_path / "a.xml", options)
+    assert result.quantity == "gaze" and result.path.is_file()
+    scene, found = shown(result.path)
+    np.testing.assert_allclose(
+        np.ravel(scene.integrator().observer.world_transform().translation()), (0.3, 0.2, 0.1), atol=1e-6
+    )
+    np.testing.assert_allclose(position(scene.sensors()[1]), (0.3, 0.2, 0.1), atol=1e-6)
+    np.testing.assert_allclose(position(scene.sensors()[0]), result.camera.origin, atol=1e-6)
+    assert found.mask.mean() > 0.5 and found.aovs["gaze"].max() > 0 and found.color.max() > 0.01
+    # The observer's own view hides nothing from them.
+    _, own = shown(result.path, 1)
+    assert own.mask.any() and own.aovs["visibility"][own.mask].min() == 1
+    # What is written is relative to the folder of the scene.
+    named = defaults(result.path)["gaze"]
+    assert not named.startswith("/") and (tmp_path / named).samefile(folder / "gaze.safetensors")
+
+
+def test_a_place_alone_is_shown_from_where_it_can_be_seen(rgb, folder, tmp_path):
+    told = Recorder()
+    result = write_scene([folder / "mesh.ply"], tmp_path / "a.xml", SceneOptions(mode=MODE), told)
+    scene, found = shown(result.path)
+    assert result.observer is None and result.quantity is None and scene.integrator().observer is None
+    assert found.mask.mean() > 0.5 and found.color[found.mask].mean() > 0.05
+    assert f"wrote {result.path}" in told.messages and any("best overview" in line for line in told.messages)
+
+
+def written_place(folder, kind, scale):
+    """A room of 6 x 4 x 3 metres, or a cloud in it, in units of 1/scale metres: its file, and its upper corner."""
+    corner = np.array([3, 2, 1.5]) * scale
+    path = folder / ("place" + {"hits": ".vol", "scene": ".xml", "field": ".safetensors"}.get(kind, ".ply"))
+    if kind == "mesh":
+        trimesh.creation.box(2 * corner).export(path)
+    elif kind == "hits":
+        walls = np.pad(np.zeros((10, 14, 18), np.float32), 1, constant_values=50 / scale)
+        write_volume(path, walls, -corner, corner)
+    elif kind == "scene":
+        size = '<transform name="to_world"><scale value="{}, {}, {}"/></transform>'.format(*corner)
+        path.write_text(f'<scene version="3.0.0"><shape type="cube">{size}</shape></scene>')
+    elif kind == "field":
+        config = RadianceConfig(fields.GRID, width=16, geometry=3, sh_degree=2, density_scale=6 / scale)
+        box = Box(tuple(-corner), tuple(corner))
+        save_radiance(RadianceField.random(config, box, _ns(), march_step=0.1 * scale), path, {})
+    else:
+        n, centers = 2000, fibonacci_directions(2000) * corner
+        write_inria(path, Splats(centers, [[0.1 * scale] * 3] * n, [[1, 0, 0, 0]] * n, [0.99] * n, np.ones((n, 1, 3))))
+    return path, corner
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("scale", [1e-4, 1e6])
+@pytest.mark.parametrize("kind", ["mesh", "scene", "field", "splats", "hits"])
+def test_places_of_any_unit(rgb, tmp_path, kind, scale):
+    path, corner = written_place(tmp_path, kind, scale)
+    told, eye = Recorder(), tuple(0.1 * corner)
+    result = write_scene([path], tmp_path / "a.xml", SceneOptions(observer=eye, mode=MODE), told)
+    for sensor in (0, 1):
+        _, found = shown(result.path, sensor)
+        assert found.mask.mean() > 0.9 and found.color.mean() > 0.1
+    # Own eyes see all that is visible, whatever the unit; and near what is seen gaze fades within the place.
+    assert found.aovs["visibility"][found.mask].min() == 1
+    assert 1e-4 * np.linalg.norm(corner) < float(defaults(result.path)["falloff"]) < 0.1 * np.linalg.norm(corner)
+    assert any("light leaks" in line for line in told.warnings) == (kind in ("mesh", "scene") and scale < 1)
+
+
+def test_a_picture_that_would_be_empty_is_refused(rgb, folder, tmp_path):
+    away = SceneOptions(camera_from=(9, 0, 0), camera_to=(20, 0, 0), mode=MODE)
+    with pytest.raises(NergError, match="--from"):
+        write_scene([folder / "mesh.ply"], tmp_path / "a.xml", away)
+    assert not (tmp_path / "a.xml").exists()
+
+
+def test_a_field_without_an_end(rgb, tmp_path):
+    config = RadianceConfig(fields.GRID, width=16, geometry=3, sh_degree=2, density_scale=1.0)
+    box = ContractedBox(Box((-2, -2, -2), (2, 2, 2)), 16)
+    field = RadianceField.random(config, box, _ns(), march_step=0.1, march_growth=1 / 64)
+    save_radiance(field, tmp_path / "far.safetensors", {"up": [0, 1, 0]})
+    result = write_scene([tmp_path / "far.safetensors"], tmp_path / "a.xml", SceneOptions(mode=MODE))
+    # The camera stands in the inner cube, and up is what the photos said.
+    assert np.abs(result.camera.origin).max() <= 2 and defaults(result.path)["up"] == "0, 1, 0"
+    _, found = shown(result.path)
+    assert found.mask.mean() > 0.5
+
+
+def test_gaze_alone_finds_its_place_by_its_name_and_sum(rgb, folder, tmp_path):
+    place = make_place(PlaceOptions(field=folder / "field.safetensors"), None, (), None, _ns())
+    gaze = trained(folder, "of_field.safetensors", place.about)
+    result = write_scene([gaze], tmp_path / "a.xml", SceneOptions(observer=(0, 0, 0), mode=MODE))
+    _, found = shown(result.path)
+    assert found.mask.any() and found.aovs["gaze"].max() > 0
+    other = trained(folder, "of_other.safetensors", {"field_file": {"file": "gaze.safetensors", "sha256": "0"}})
+    with pytest.raises(NergError, match="is not the file that .*; name that one: nerg scene PLACE GAZE"):
+        write_scene([other], tmp_path / "b.xml", SceneOptions(mode=MODE))
+    told = Recorder()
+    options = SceneOptions(observer=(0, 0, 0), mode=MODE)
+    write_scene([other, folder / "field.safetensors"], tmp_path / "c.xml", options, told)
+    assert any("was trained in another file" in line for line in told.warnings)
+    with pytest.raises(NergError, match="does not say"):
+        write_scene([folder / "gaze.safetensors"], tmp_path / "d.xml", SceneOptions(mode=MODE))
+
+
+def _ns():
+    import drjit.llvm.ad as ns
+
+    return ns
+
+
+def test_hit_points_are_a_place_with_colours(rgb, folder, tmp_path):
+    place = make_place(PlaceOptions(geometry="hits"), rays(), (), folder / "hits.vol", _ns(), 0.1)
+    gaze = trained(folder, "of_hits.safetensors", {**place.about, "rays_file": {}})
+    result = write_scene([gaze, folder / "rays.npz"], tmp_path / "a.xml", SceneOptions(mode=MODE))
+    assert [path.name for path in result.files] == ["a.xml", "a.color.vol"]
+    np.testing.assert_allclose(result.observer.origin, (0.3, 0.2, 0.1), atol=0.1)
+    _, own = shown(result.path, 1)
+    # The wall fills what they look at, at its distance, in the grey of walls along x.
+    middle = own.mask[4:8, 7:11]
+    assert middle.all() and own.aovs["depth"][6, 9] == pytest.approx(1.7, abs=0.25)
+    assert own.color[6, 9, 0] == pytest.approx(0.34, abs=0.03)
+
+
+@pytest.mark.parametrize("geometry", [None, "none"])
+def test_rays_alone_show_where_people_looked(rgb, folder, tmp_path, geometry):
+    options = SceneOptions(geometry=geometry, mode=MODE)
+    result = write_scene([folder / "rays.npz"], tmp_path / "a.xml", options)
+    assert result.quantity == "kde"
+    made = ["a.xml"] if geometry == "none" else ["a.xml", "a.vol", "a.color.vol"]
+    assert [path.name for path in result.files] == made
+    ahead = result.observer.target - result.observer.origin
+    assert ahead[0] / np.linalg.norm(ahead) > 0.97
+    scene, sphere = shown(result.path, 2)
+    if geometry == "none":
+        np.testing.assert_allclose(sphere.aovs["depth"], 2, atol=1e-3)
+        np.testing.assert_allclose(result.camera.origin, result.observer.origin)
+    # Attention is where they looked, the middle of the sphere's picture, and not behind them.
+    assert sphere.aovs["kde"][3:5, 7:9].min() > 10 * max(sphere.aovs["kde"][:, 0].max(), 1e-6)
+
+
+def test_an_observer_who_looks_along_up(rgb, folder, tmp_path):
+    """Until they are turned to the gaze, and then as well: up is where all of it goes."""
+    options = SceneOptions(geometry="none", up=(1.0, 0.0, 0.0), mode=MODE)
+    result = write_scene([folder / "rays.npz"], tmp_path / "a.xml", options)
+    ahead = result.observer.target - result.observer.origin
+    assert ahead[0] / np.linalg.norm(ahead) > 0.97 and shown(result.path, 1)[0] is not None
+
+
+def test_rays_in_another_frame_than_the_place(rgb, folder, tmp_path):
+    matrix = np.array([[0, 0, 2, 0.5], [2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 0, 1]], float)
+    align = tmp_path / "align.json"
+    align.write_text(json.dumps(matrix.tolist()))
+    options = SceneOptions(align=align, person="Ada", time=4.0, mode=MODE)
+    result = write_scene([folder / "mesh.ply", folder / "rays.npz"], tmp_path / "a.xml", options)
+    nearest = rays().origin[200]
+    np.testing.assert_allclose(result.observer.origin, matrix[:3, :3] @ nearest + matrix[:3, 3], atol=1e-6)
+    ahead = result.observer.target - result.observer.origin
+    np.testing.assert_allclose(ahead, matrix[:3, :3] @ rays().direction[200], atol=1e-6)
+    # Up of the rays, +z, is +x of the place, and a metre two units.
+    given = defaults(result.path)
+    assert given["up"] == "1, 0, 0" and given["falloff"] == "0.1"
+    _, own = shown(result.path, 1)
+    assert own.aovs["kde"].max() > 0.5
+
+
+def test_cameras_that_are_given(rgb, folder, tmp_path):
+    files, at = [folder / "mesh.ply"], tmp_path / "a.xml"
+    given = SceneOptions(camera_from=(0, 0, 1.5), camera_to=(0, 0, -1), fov=50, width=30, mode=MODE)
+    result = write_scene(files, at, given)
+    np.testing.assert_allclose(result.camera.target, (0, 0, -1))
+    # It looks straight down, and has an up all the same.
+    scene = load_scene(at)
+    assert np.isfinite(np.array(scene.sensors()[0].world_transform().matrix)).all()
+    assert tuple(scene.sensors()[0].film().crop_size()) == (30, 20)
+    own = write_scene(files, at, SceneOptions(observer=(0.5, 0, 0), own=True, mode=MODE))
+    np.testing.assert_allclose(own.camera.origin, (0.5, 0, 0))
+
+
+def test_a_walk(rgb, folder, tmp_path):
+    options = SceneOptions(person="Bob", times=(2.0, 2.4), fps=5, own=True, mode=MODE)
+    result = write_scene([folder / "mesh.ply", folder / "rays.npz"], tmp_path / "a.xml", options)
+    assert result.frames == 3 and result.files[-1].name == "a.frames.csv"
+    frames = read_frames(result.files[-1])
+    assert [set(frame) for frame in frames] == [{"eye", "ahead", "camera", "target"}] * 3
+    bob = rays()
+    own = np.flatnonzero(bob.person == 1)
+    eye = np.array([float(x) for x in frames[0]["eye"].split(",")])
+    wanted = [np.interp(2.0, bob.t[own], bob.origin[own, axis]) for axis in range(3)]
+    np.testing.assert_allclose(eye, wanted, atol=1e-6)
+    pictures = PictureOptions(overlay="kde", frames=result.files[-1], defaults=SMALL, mode=MODE)
+    made = render_file(result.path, tmp_path / "walk.png", pictures)
+    assert [p.name for p in made.files] == ["walk_0001.png", "walk_0002.png", "walk_0003.png"]
+    assert len({p.read_bytes() for p in made.files}) == 3 and made.top > 0
+    sizes = {tuple(mitsuba_bitmap(p).size()) for p in made.files}
+    assert len(sizes) == 1
+
+
+@pytest.mark.parametrize(
+    "names, options, said",
+    [
+        ([], {}, "a scene needs a field"),
+        (["nowhere.ply"], {}, "there is no file"),
+        (["room.xml", "mesh.ply"], {}, "are both a place"),
+        (["rays.npz"], {"geometry": "hit"}, '--geometry.*"hits".*"none"'),
+        (["mesh.ply"], {"geometry": "hits"}, "--geometry"),
+        (["mesh.ply"], {"person": "Ada"}, "--person.*--time.*--times"),
+        (["mesh.ply"], {"person": "Ada", "time": 1.0}, "--person"),
+        (["rays.npz"], {"person": "Eve", "time": 1.0}, "nobody in the rays"),
+        (["mesh.ply"], {"camera_to": (0, 0, 1)}, "--from.*--to"),
+        (["mesh.ply"], {"photo": "1"}, "give these, --photos DATASET"),
+        (["mesh.ply"], {"observer": (1, 2)}, "--observer is three numbers"),
+        (["mesh.ply"], {"camera_from": (1, 2, 3), "camera_to": (1, 2, 3)}, "cannot look at the point"),
+        (["mesh.ply"], {"own": True}, "--own is the observer's view"),
+        (["mesh.ply"], {"up": (0, 0, 0)}, "up must be a direction"),
+        (["mesh.ply"], {"fov": 200.0}, "--fov must lie in"),
+    ],
+)
+def test_what_makes_no_scene(rgb, folder, tmp_path, names, options, said):
+    with pytest.raises(NergError, match=said):
+        write_scene([folder / name for name in names], tmp_path / "a.xml", SceneOptions(mode=MODE, **options))
+    assert not (tmp_path / "a.xml").exists()
+
+
+def test_a_gaze_field_without_anything_needs_an_observer(rgb, folder, tmp_path):
+    gaze = trained(folder, "of_nothing.safetensors", {"geometry": "none"})
+    with pytest.raises(NergError, match="--observer"):
+        write_scene([gaze], tmp_path / "a.xml", SceneOptions(mode=MODE))
+    result = write_scene([gaze], tmp_path / "a.xml", SceneOptions(observer=(0.1, 0, 0), mode=MODE))
+    _, found = shown(result.path)
+    assert found.mask.all() and found.aovs["gaze"].max() > 0 and len(np.unique(found.color.round(3))) > 1
