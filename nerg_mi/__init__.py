@@ -26,42 +26,46 @@ from . import llvm as _llvm
 from . import registration as _registration
 
 if TYPE_CHECKING:
-    from .api.alignment import align
-    from .api.attention import attention
-    from .api.camera import Camera
-    from .api.evaluation import ablate, evaluate_gaze, evaluate_radiance, study
-    from .api.fields import load_field, load_gaze, load_rays
-    from .api.pictures import render
-    from .api.queries import observe, trace
-    from .api.scene import Scene, make_scene
-    from .api.tracking import import_rays
-    from .api.training import train_gaze, train_radiance
+    from .api.arrays import Camera
+    from .api.query import attention, observe, trace
+    from .api.render import render
+    from .api.scene import Scene, load_field, load_gaze, load_rays, make_scene
+    from .api.workflows import (
+        ablate,
+        align,
+        evaluate_gaze,
+        evaluate_radiance,
+        import_rays,
+        study,
+        train_gaze,
+        train_radiance,
+    )
     from .errors import NergError
     from .rays.rays import Rays
 
 __version__ = "0.1.0"
 
 _WHERE = {
-    "Camera": "nerg_mi.api.camera",
+    "Camera": "nerg_mi.api.arrays",
     "NergError": "nerg_mi.errors",
     "Rays": "nerg_mi.rays.rays",
     "Scene": "nerg_mi.api.scene",
-    "ablate": "nerg_mi.api.evaluation",
-    "align": "nerg_mi.api.alignment",
-    "attention": "nerg_mi.api.attention",
-    "evaluate_gaze": "nerg_mi.api.evaluation",
-    "evaluate_radiance": "nerg_mi.api.evaluation",
-    "import_rays": "nerg_mi.api.tracking",
-    "load_field": "nerg_mi.api.fields",
-    "load_gaze": "nerg_mi.api.fields",
-    "load_rays": "nerg_mi.api.fields",
+    "ablate": "nerg_mi.api.workflows",
+    "align": "nerg_mi.api.workflows",
+    "attention": "nerg_mi.api.query",
+    "evaluate_gaze": "nerg_mi.api.workflows",
+    "evaluate_radiance": "nerg_mi.api.workflows",
+    "import_rays": "nerg_mi.api.workflows",
+    "load_field": "nerg_mi.api.scene",
+    "load_gaze": "nerg_mi.api.scene",
+    "load_rays": "nerg_mi.api.scene",
     "make_scene": "nerg_mi.api.scene",
-    "observe": "nerg_mi.api.queries",
-    "render": "nerg_mi.api.pictures",
-    "study": "nerg_mi.api.evaluation",
-    "trace": "nerg_mi.api.queries",
-    "train_gaze": "nerg_mi.api.training",
-    "train_radiance": "nerg_mi.api.training",
+    "observe": "nerg_mi.api.query",
+    "render": "nerg_mi.api.render",
+    "study": "nerg_mi.api.workflows",
+    "trace": "nerg_mi.api.query",
+    "train_gaze": "nerg_mi.api.workflows",
+    "train_radiance": "nerg_mi.api.workflows",
 }
 """The public names, and the module of each."""
 

@@ -1,38 +1,363 @@
-"""Scenes: a place, whose gaze it is, and from where it is seen."""
+"""Scenes and fields: opened, made of fields, meshes and observers, and what calls of workflows take of them."""
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.errors import MissingFile, NergError, mitsuba_says
+from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats
+from nerg_mi.formats.fields import load_gaze as read_gaze
+from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
+from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.splats import plugin_of_field
+from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import plugin_class
 from nerg_mi.rendering.aovs import is_nerg
 from nerg_mi.rendering.scene_writer import clip_distances
 from nerg_mi.transport.geometry import check_shape
 
-from .arrays import Floats, listed, points
-from .camera import Camera
-from .fields import FilePath, TrainedField
-from .options import check_names, file_of
-from .shapes import scene_children
-from .variant import active_mitsuba
+from .arrays import Camera, Floats, listed, points
 
 if TYPE_CHECKING:
     import mitsuba as mi
+    from _typeshed import DataclassInstance
 
-    from nerg_mi.fields.gaze_base import AnyGazeField
-    from nerg_mi.fields.radiance import RadianceField
     from nerg_mi.transport.geometry import Place
+
+
+# ---- Shapes as a user has them (files, dicts, scenes, objects), as children of a Mitsuba scene ----
+
+
+def mesh_child(path: str | os.PathLike[str]) -> Any:
+    """The mesh file ``path`` as a child of a Mitsuba scene, in its colours or in grey, and seen from both sides: a
+    dict, or a mesh of what Mitsuba does not show as it is. What of the file is not used goes to Mitsuba's log. Raises
+    `NergError` for a file that is missing or damaged."""
+    import mitsuba as mi
+
+    from nerg_mi.surfaces.mesh import mitsuba_mesh
+
+    mesh = read_mesh_file(path)
+    log: Any = mi.Log  # of which the stubs know nothing
+    for note in mesh.notes:
+        log(mi.LogLevel.Warn, f"{path}: {note}")
+    name, colors = ("face_color", mesh.face_colors) if mesh.colors is None else ("vertex_color", mesh.colors)
+    tint = {} if colors is None else {"reflectance": {"type": "mesh_attribute", "name": name}}
+    bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", **tint}}
+    if mesh.is_plain:
+        return {"type": Path(path).suffix.lower()[1:], "filename": str(path), "bsdf": bsdf}
+    shown = mitsuba_mesh(mesh.vertices, mesh.faces, Path(path).stem, bsdf)
+    if colors is not None:
+        shown.add_attribute(name, 3, colors.astype(np.float32).ravel())
+    return shown
+
+
+def box_dict(lower: np.ndarray, upper: np.ndarray, turn: np.ndarray | None = None) -> dict:
+    """The box between two corners as a mesh that Mitsuba takes, turned about its middle by the rotation ``turn`` (3, 3)
+    if there is one; a variant must be set."""
+    import mitsuba as mi
+
+    center, half = (lower + upper) / 2, (upper - lower) / 2
+    frame = np.eye(4)
+    frame[:3, :3] = (np.eye(3) if turn is None else turn) * half
+    frame[:3, 3] = center
+    return {"type": "cube", "to_world": mi.ScalarTransform4d(frame.tolist())}
+
+
+def scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
+    """``shapes`` by their names, as a scene's dict takes them; the variant must be active.
+
+    ``shapes``: a mesh file, a scene file, what `mi.load_dict` takes for a shape or a scene, a Mitsuba shape or scene,
+    or several of these in a list or in a dict by name. ``name``: of those that bring none. Raises `NergError` for
+    anything else.
+    """
+    import mitsuba as mi
+
+    if shapes is None:
+        return {}
+    if isinstance(shapes, (str, os.PathLike)):
+        if Path(shapes).suffix.lower() != ".xml":
+            return {name: mesh_child(shapes)}
+        from nerg_mi.rendering.scene import load_scene
+
+        return _of_scene(load_scene(Path(shapes)), name)
+    if isinstance(shapes, mi.Scene):
+        return _of_scene(shapes, name)
+    if isinstance(shapes, mi.Object):
+        return {name: shapes}
+    if isinstance(shapes, Mapping):
+        if shapes.get("type") == "scene":
+            with mitsuba_says():
+                return _of_scene(mi.load_dict(dict(shapes), optimize=False), name)
+        if "type" in shapes:
+            return {name: dict(shapes)}
+        named = [scene_children(child, str(key)) for key, child in shapes.items()]
+    elif isinstance(shapes, (list, tuple)):
+        named = [scene_children(child, f"{name}_{i}") for i, child in enumerate(shapes)]
+    else:
+        raise NergError(
+            f"shapes are mesh or scene files, dicts for mi.load_dict or Mitsuba objects, got {type(shapes).__name__}"
+        )
+    return {key: child for children in named for key, child in children.items()}
+
+
+def _of_scene(scene, name: str) -> dict[str, Any]:
+    """Shapes of a scene, and those of its lights that are no shapes."""
+    shapes = list(scene.shapes())
+    found = {shape.id() or f"{name}_{i}": shape for i, shape in enumerate(shapes)}
+    if len(found) < len(shapes):
+        found = {f"{name}_{i}": shape for i, shape in enumerate(shapes)}
+    lights = [light for light in scene.emitters() if not any(s.is_emitter() and s.emitter() is light for s in shapes)]
+    return found | {f"{name}_light_{i}": light for i, light in enumerate(lights)}
+
+
+# ---- Variant ----
+#
+# The Mitsuba variant that the library works in: the one that is set, or the best where none is.
+
+
+def active_mitsuba() -> ModuleType:
+    """The module ``mitsuba`` with a variant that fields work in.
+
+    A variant that is set stays set. Where none is, it is ``cuda_ad_rgb`` if that works here, and ``llvm_ad_rgb``
+    otherwise, as for the command `nerg`. Raises `NergError` for a variant without kernels.
+    """
+    import mitsuba as mi
+
+    variant = mi.variant()
+    if variant is None:
+        from nerg_mi.rendering.scene import activate
+
+        activate()
+    elif variant.startswith("scalar"):
+        raise NergError(
+            f'fields need a variant that compiles its kernels, and "{variant}" is active: '
+            'call mi.set_variant("llvm_ad_rgb") (or "cuda_ad_rgb") first'
+        )
+    return mi
+
+
+def array_module() -> ModuleType:
+    """The Dr.Jit array types of the active variant (`nerg_mi.fields.mlp.namespace`)."""
+    from nerg_mi.fields.mlp import namespace
+
+    return namespace(active_mitsuba().variant())
+
+
+# ---- Fields ----
+#
+# Fields and rays in memory: read from files, handed to scenes, and saved again.
+
+
+FilePath: TypeAlias = str | Path
+Network = TypeVar("Network", RadianceField, AnyGazeField)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TrainedField(Generic[Network]):
+    """A radiance field or a gaze field in memory.
+
+    ``network``: the field itself (`nerg_mi.fields`), whose arrays belong to the variant that was active when it was
+    made. ``provenance``: what it was trained on and with, as its file keeps it. ``name``: the file's, or what it is.
+    ``path``: the checkpoint that holds it, None where there is none.
+    """
+
+    network: Network
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    name: str = "in memory"
+    path: Path | None = None
+
+    @property
+    def kind(self) -> str:
+        """``radiance`` or ``gaze``."""
+        return "radiance" if isinstance(self.network, RadianceField) else "gaze"
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lower and upper corner (2, 3) of where the field may hold density, in its own units."""
+        return np.array([self.network.box.lower, self.network.box.upper], np.float64)
+
+    @property
+    def weights(self) -> int:
+        """How many numbers were trained."""
+        return sum(int(np.prod(value.shape)) for value in self.network.parameters().values())
+
+    def save(self, path: FilePath, half: bool = False) -> Path:
+        """Write a checkpoint (.safetensors), whole or not at all, and give its path; ``half``: weights in fp16.
+
+        Raises `NergError` for weights that are not finite or exceed fp16, and for a file that cannot be written.
+        """
+        path = Path(path)
+        if path.suffix.lower() != ".safetensors":
+            raise NergError(f'a field is saved as .safetensors, and "{path}" ends otherwise; choose another name')
+        if isinstance(self.network, RadianceField):
+            save_radiance(self.network, path, dict(self.provenance), half)
+        else:
+            save_gaze(self.network, path, dict(self.provenance), half)
+        return path
+
+    def __repr__(self) -> str:
+        lower, upper = (", ".join(f"{x:.3g}" for x in corner) for corner in self.bounds)
+        members = 1 if isinstance(self.network, RadianceField) else len(self.network.members)
+        what = f"{self.kind} field" if members == 1 else f"ensemble of {members} gaze fields"
+        return f"<{what} {self.name}: {self.weights:,} weights, box ({lower}) to ({upper})>"
+
+
+def load_field(path: FilePath) -> TrainedField[RadianceField]:
+    """Read a radiance field: density and colour of a place.
+
+    ``path``: a checkpoint that ``nerg train radiance``, `train_radiance` or ``nerg import`` has written. Give what
+    comes back to `make_scene`, look at ``.bounds``, write it again with ``.save(path)``. Raises `NergError` for a file
+    that is missing, damaged, or holds something else.
+
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> store = files("nerg_mi.scenes.store")
+    >>> field = nerg.load_field(store / "store.safetensors")
+    >>> field.bounds.tolist()
+    [[-0.1, -0.1, -0.1], [8.1, 6.1, 3.1]]
+    """
+    network, metadata = load_radiance(_existing(path), array_module())
+    return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
+
+
+def load_gaze(path: FilePath) -> TrainedField[AnyGazeField]:
+    """Read a gaze field, or an ensemble of them: how much surfaces attract an observer.
+
+    ``path``: a checkpoint that ``nerg train gaze``, `train_gaze` or ``nerg import`` has written; the rest is as for
+    `load_field`.
+
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> store = files("nerg_mi.scenes.store")
+    >>> gaze = nerg.load_gaze(store / "shoppers.safetensors")
+    >>> gaze.kind
+    'gaze'
+    """
+    network, metadata = read_gaze(_existing(path), array_module())
+    return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
+
+
+def load_rays(path: FilePath) -> Rays:
+    """Read rays of attention: who looked from where to where, and when.
+
+    ``path``: a file (.npz or .parquet) that ``nerg rays import``, `import_rays` or the method ``save`` of rays has
+    written; or a dataset (.rays), of at most 50 million rays. Right-handed, z up, metres and seconds (`Rays`). Raises
+    `NergError` for a file that is missing or damaged.
+
+    >>> import nerg_mi as nerg
+    >>> rays = nerg.Rays(t=[0, 0.1], person=[0, 0], persons=("Ada",), origin=[[1, 1, 1.6]] * 2,
+    ...                  direction=[[1, 0, 0], [0, 1, 0]], confidence=[1, 1])
+    >>> rays.save(folder / "rays.npz")
+    >>> len(nerg.load_rays(folder / "rays.npz"))
+    2
+    """
+    from nerg_mi.rays.dataset_open import load_rays as load
+
+    return load(_existing(path))
+
+
+def _existing(path: FilePath) -> Path:
+    try:
+        return Path(path)
+    except TypeError as error:
+        raise NergError(f"a file is named by a string or a path, got {type(path).__name__}") from error
+
+
+# ---- Options ----
+#
+# What a call of the library is given, looked at before any work: names of options first, then files.
+
+
+Options = TypeVar("Options", bound="DataclassInstance")
+
+_WRITTEN = {"pictures", "json_file", "store"}
+"""Options that name a file or a folder which is written."""
+
+
+def options_of(kind: type[Options], job: str, given: Options | None, changes: dict[str, Any]) -> Options:
+    """An object of the dataclass ``kind``: ``given`` (or the defaults) with ``changes``, for the variant in use. Files
+    may be named by strings.
+
+    Raises `NergError` for an option that the ``job`` has not, naming those that it has, and for a file that is missing
+    or is none.
+    """
+    types = {f.name: str(f.type) for f in fields(kind)}
+    if "mode" in changes:
+        raise NergError(f"{job} works in the variant that is set; call mi.set_variant({changes['mode']!r}) before it")
+    check_names(job, changes, [name for name in types if name != "mode"])
+    if "mode" in types:
+        changes = {**changes, "mode": active_mitsuba().variant()}
+    options = replace(kind() if given is None else given, **changes)
+    files = {k: getattr(options, k) for k, of in types.items() if "Path" in of}
+    return replace(
+        options, **{k: Path(v) if k in _WRITTEN else file_of(v, k) for k, v in files.items() if v is not None}
+    )
+
+
+def check_names(job: str, given: Iterable[str], known: Collection[str], what: str = "option") -> None:
+    """Raise `NergError` for a name ``given`` that is none of those ``known``."""
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            meant = f'did you mean "{near[0]}"?' if near else f"it has {listed(list(known))}"
+            raise NergError(f'{job} has no {what} "{name}"; {meant}')
+
+
+def file_of(value: object, name: str) -> Path:
+    """The file or folder that the argument ``name`` is: a string, a path, or a field or scene that has a file.
+
+    Raises `NergError` for one that is missing, and for anything else.
+    """
+    path = getattr(value, "path", None) or value
+    if not isinstance(path, (str, os.PathLike)):
+        remedy = "save it, and give the file" if hasattr(value, "save") else "give its name"
+        raise NergError(f'"{name}" is a file, named by a string or a path, got {type(value).__name__}; {remedy}')
+    if not os.path.exists(path):
+        raise MissingFile(f'there is no file "{os.fspath(path)}", which "{name}" names; correct its name')
+    return Path(path)
+
+
+def rays_of(value: object) -> Rays | Path:
+    """Rays in memory as they are, or their file. Raises `NergError` for anything else."""
+    if isinstance(value, Rays):
+        return value
+    if not isinstance(value, (str, os.PathLike)):
+        raise NergError(
+            f"rays are what load_rays and import_rays give, or a file of theirs, got {type(value).__name__}; "
+            "import_rays makes rays of a table (.csv, .parquet)"
+        )
+    return file_of(value, "rays")
+
+
+@contextmanager
+def checkpoint_of(value: object, name: str) -> Iterator[Path]:
+    """The checkpoint of a field that is the argument ``name``: its file, or one that is written for the block."""
+    if isinstance(value, TrainedField) and value.path is None:
+        with TemporaryDirectory() as folder:
+            yield value.save(Path(folder) / f"{value.kind}.safetensors")
+        return
+    yield file_of(value, name)
+
+
+# ---- Scene ----
+#
+# Scenes: a place, whose gaze it is, and from where it is seen.
+
 
 COLOR = "color"
 """The quantity that is no AOV: linear colour."""

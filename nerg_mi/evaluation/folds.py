@@ -22,7 +22,7 @@ _SCORES = (*SCORES, "integral")
 
 
 def mean_rows(folds: Sequence[Sequence[Mapping[str, Any]]], confidence: float = 0.95) -> list[dict[str, Any]]:
-    """`means` of the scores and of the integral of ``folds``, which have the rows of `evaluation.evaluate_gaze`, the
+    """`means` of the scores and of the integral of ``folds``, which have the rows of `workflows.evaluate_gaze`, the
     field's first. The last row is the field less the last method, fold by fold."""
     found = means(folds, _SCORES, confidence)
     names = [row["method"] for row in found]

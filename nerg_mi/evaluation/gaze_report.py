@@ -228,7 +228,7 @@ def _damaged(path: str | Path, why: str) -> NergError:
 # field.
 #    The sentence names the strongest baseline, which is the one with the highest log score.
 #
-# Intervals are those of the bootstrap over people (`evaluation.evaluate_gaze`), made wider for few: by sqrt(n / (n -
+# Intervals are those of the bootstrap over people (`workflows.evaluate_gaze`), made wider for few: by sqrt(n / (n -
 # 1)), since a bootstrap of n people is too narrow by as much, and by Student's quantile of n - 1 degrees of freedom in
 # place of 1.96 (Hesterberg, What Teachers Should Know About the Bootstrap, 2015). Where only the two methods' own
 # intervals are known, the reach of the lead is the sum of theirs, which is never too small.

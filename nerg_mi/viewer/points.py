@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.api.camera import Camera
-from nerg_mi.api.queries import observe, trace
+from nerg_mi.api.arrays import Camera
+from nerg_mi.api.query import observe, trace
 from nerg_mi.api.scene import Scene
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.transport.geometry import Ceiling

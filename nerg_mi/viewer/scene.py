@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element, SubElement
 import matplotlib
 import numpy as np
 
-from nerg_mi.api.queries import trace
+from nerg_mi.api.query import trace
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.nested_scene import name_files, scene_elements, verbatim
 from nerg_mi.rendering.scene_writer import Comment, document, element, numbers, prop

@@ -12,10 +12,8 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from nerg_mi.api.attention import box_shares, mesh_shares
-from nerg_mi.api.queries import trace
-from nerg_mi.api.scene import COLOR, Scene
-from nerg_mi.api.variant import active_mitsuba
+from nerg_mi.api.query import box_shares, mesh_shares, trace
+from nerg_mi.api.scene import COLOR, Scene, active_mitsuba
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.formats.areas import Areas, Region, read_areas
 from nerg_mi.maths.geometry import Similarity

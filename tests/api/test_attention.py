@@ -5,8 +5,8 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.aoi.options import StatisticsOptions
-from nerg_mi.api.attention import box_shares
-from nerg_mi.api.shapes import box_dict
+from nerg_mi.api.query import box_shares
+from nerg_mi.api.scene import box_dict
 from nerg_mi.formats.areas import Region
 from nerg_mi.report.data import Onlooker
 from nerg_mi.statistics.shares import ROUGH, gaze_shares

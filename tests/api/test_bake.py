@@ -1,12 +1,12 @@
-"""`nerg_mi.api.bake`: its example, and rays in memory or in a file."""
+"""`nerg_mi.api.workflows`: its example, and rays in memory or in a file."""
 
 import doctest
 
 import numpy as np
 import pytest
 
-import nerg_mi.api.bake as module
-from nerg_mi.api.bake import bake
+import nerg_mi.api.workflows as module
+from nerg_mi.api.workflows import bake
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays

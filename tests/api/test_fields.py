@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.fields import TrainedField
+from nerg_mi.api.scene import TrainedField
 
 
 def test01_a_field_is_what_its_file_says(files):

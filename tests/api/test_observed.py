@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.observed import ObserverOf
+from nerg_mi.api.query import ObserverOf
 
 
 def test01_the_density_is_the_fields(scene, rgb):

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.bake import bake
-from nerg_mi.api.options import options_of
-from nerg_mi.api.statistics import stats
+from nerg_mi.api.scene import options_of
+from nerg_mi.api.workflows import bake, stats
 from nerg_mi.errors import NergError
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.pictures import split
+from nerg_mi.api.render import split
 from tests.pictures import mitsuba_bitmap
 
 BALL = {"type": "sphere", "center": [1.4, -1.0, 0.3], "radius": 0.4}

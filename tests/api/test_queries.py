@@ -79,13 +79,13 @@ def test05_gaze_at_a_point_is_that_of_the_ray_that_meets_it(scene):
 
 
 def test06_many_are_batches_of_few(scene, monkeypatch):
-    from nerg_mi.api import queries
+    from nerg_mi.api import query
 
     rng = np.random.default_rng(0)
     o, d = np.tile((0.3, -3, 0.4), (50, 1)), rng.normal(size=(50, 3)) * 0.2 + (0, 1, 0)
     whole = nerg.trace(scene, o, d, observers=[(2.5, -1, 0.5)])
     points = nerg.observe(scene, rng.uniform(-1, 1, (50, 3)), (2.5, -1, 0.5))
-    monkeypatch.setattr(queries, "BATCH", 16)
+    monkeypatch.setattr(query, "BATCH", 16)
     rng = np.random.default_rng(0)
     d = rng.normal(size=(50, 3)) * 0.2 + (0, 1, 0)
     parts = nerg.trace(scene, o, d, observers=[(2.5, -1, 0.5)])

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.fields import TrainedField
-from nerg_mi.api.scene import asked_quantities
+from nerg_mi.api.scene import TrainedField, asked_quantities
 from tests.formats.splats.writers import random_splats, write_inria
 
 BALL = {"type": "sphere", "radius": 0.3}

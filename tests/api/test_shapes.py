@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.api.shapes import box_dict, mesh_child, scene_children
+from nerg_mi.api.scene import box_dict, mesh_child, scene_children
 from nerg_mi.errors import NergError
 
 

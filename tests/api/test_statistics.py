@@ -6,7 +6,7 @@ import doctest
 
 import pytest
 
-from nerg_mi.api import statistics
+from nerg_mi.api import workflows
 from nerg_mi.errors import NergError
 
 
@@ -14,10 +14,10 @@ def test01_the_example(tmp_path):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    found = doctest.testmod(statistics, extraglobs={"folder": tmp_path})
+    found = doctest.testmod(workflows, extraglobs={"folder": tmp_path})
     assert found.attempted > 4 and not found.failed
 
 
 def test02_an_option_that_there_is_not():
     with pytest.raises(NergError, match='no option "area"'):
-        statistics.stats("a.npz", area="x")
+        workflows.stats("a.npz", area="x")

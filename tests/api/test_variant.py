@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from nerg_mi.api.variant import active_mitsuba, array_module
+from nerg_mi.api.scene import active_mitsuba, array_module
 from nerg_mi.errors import NergError
 
 
@@ -17,7 +17,7 @@ def run(code: str) -> str:
 
 def test01_one_is_set_where_there_is_none():
     code = "import nerg_mi as nerg, mitsuba as mi; nerg.Scene; print(mi.variant()); "
-    code += "from nerg_mi.api.variant import active_mitsuba; print(active_mitsuba().variant())"
+    code += "from nerg_mi.api.scene import active_mitsuba; print(active_mitsuba().variant())"
     before, after = run(code).split()
     assert before == "None" and after in ("cuda_ad_rgb", "llvm_ad_rgb")
 

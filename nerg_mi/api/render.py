@@ -13,14 +13,12 @@ from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.ranges import SEEDS, SPP, Range, check_number
 from nerg_mi.workflows.base import SILENT, Reporter
 
-from .arrays import Floats, Labelled, points, same_for_all
-from .camera import Camera
-from .fields import FilePath
-from .scene import COLOR, Scene, asked_quantities, context_for
-from .variant import active_mitsuba
+from .arrays import Camera, Floats, Labelled, points, same_for_all
+from .scene import COLOR, FilePath, Scene, active_mitsuba, asked_quantities, context_for
 
 if TYPE_CHECKING:
     import mitsuba as mi
+
 
 AXES = ("observer", "row", "column")
 
