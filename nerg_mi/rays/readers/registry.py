@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import pkgutil
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,27 +14,7 @@ from typing import Any
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
-from . import (
-    arett,
-    aria,
-    eyenavgs,
-    glassestools,
-    hololens,
-    markers,
-    motive,
-    neon,
-    openxr,
-    pupil,
-    qualisys,
-    quest,
-    skeleton,
-    sranipal,
-    table,
-    tobii3,
-    unity,
-    varjo,
-    vr_supermarket,
-)
+from . import skeleton, table
 from .base import Option, RaysBuilder, Reader, options_of, recorded_options
 
 TABLE = table.TABLE.name
@@ -209,26 +191,8 @@ def preset_table() -> str:
     return "\n".join(rows) + "\n"
 
 
-for _module in (
-    skeleton,
-    markers,
-    unity,
-    varjo,
-    hololens,
-    arett,
-    sranipal,
-    openxr,
-    quest,
-    pupil,
-    qualisys,
-    motive,
-    aria,
-    eyenavgs,
-    neon,
-    tobii3,
-    glassestools,
-    vr_supermarket,
-    table,
-):
-    for _reader in _module.READERS:
-        register(_reader)
+# Each module of this package that has ``READERS`` is one of readers.
+for _name in sorted(module.name for module in pkgutil.iter_modules([os.path.dirname(__file__)])):
+    if f"{__package__}.{_name}" != __name__:
+        for _reader in getattr(importlib.import_module(f"{__package__}.{_name}"), "READERS", ()):
+            register(_reader)

@@ -80,9 +80,9 @@ def test_what_cannot_be_registered(made_up):
 def test_names():
     assert registry.TABLE not in registry.preset_names()
     assert set(registry.reader_names()) == {*registry.preset_names(), registry.TABLE}
-    with pytest.raises(NergError, match="choose one of skeleton"):
+    with pytest.raises(NergError, match="choose one of arett"):
         registry.reader_named("etch")
-    with pytest.raises(NergError, match="choose one of skeleton"):
+    with pytest.raises(NergError, match="choose one of arett"):
         registry.read_rays("etch", "a.csv")
 
 
@@ -100,7 +100,7 @@ def test_options_of_another_reader():
 
 def test_options_that_several_have(made_up):
     shared = {o.name: o for o in registry.shared_options()}
-    assert shared["up"].help == "Up axis: x, y, z, -x, -y or -z.  [default: z; c3d: the file's, or z; pupil, motive: y]"
+    assert shared["up"].help == "Up axis: x, y, z, -x, -y or -z.  [default: z; c3d: the file's, or z; motive, pupil: y]"
     sure = shared["min_confidence"].help
     assert sure.startswith("Drop rows below this confidence.  [default: 0; ") and "pupil: 0.6" in sure
     assert shared["marker"].help == "pupil: Edge of a tracking marker in metres."
