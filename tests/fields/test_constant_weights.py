@@ -14,6 +14,7 @@ from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import MLP, evaluate
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box
+from nerg_mi.transport.jit import no_collection
 
 GRID = HashGridConfig(levels=2, log2_rows=8, base=2, finest=8)
 BOX = Box((0, 0, 0), (1, 1, 1))
@@ -108,7 +109,12 @@ def test04_derivatives_are_as_without(slope, unrolled):
 def test05_a_recorded_function_sees_weights_that_change(unrolled):
     field = radiance()
     set_constant_weights(field)
-    recorded = dr.freeze(lambda field, p: field.density(p))
+
+    @dr.freeze
+    def recorded(field, p):
+        with no_collection():
+            return field.density(p)
+
     p = points()
     first = recorded(field, p).numpy()
     field.set_parameters({"density_net.1": field.parameters()["density_net.1"] * 2})
