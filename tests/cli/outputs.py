@@ -186,7 +186,7 @@ CASES = (
         "bake", "{i}/splats.ply --gaze {i}/gaze.safetensors --observer 0,0,-3 -m llvm_ad_rgb -o {o}/a.ply", ("a.ply",)
     ),
     Case("import", "{i}/nerg.pth -o {o}/a.safetensors -g {o}/g.safetensors", ("a.safetensors", "g.safetensors")),
-    Case("refine", "{i}/ngp.safetensors -o {o}/a.safetensors", ("a.safetensors",), once=("jobs.refinement.refine",)),
+    Case("refine", "{i}/full.safetensors -o {o}/a.safetensors", ("a.safetensors",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density 3", ("a.glb",)),
     Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
@@ -285,6 +285,8 @@ def make_inputs(folder: Path) -> Path:
     columns = dict(zip("xyz", vertices.T)) | {"value": np.arange(len(vertices), dtype=np.float32)}
     write_columns(folder / "baked.ply", columns, faces)
     fields.radiance(folder / "field.safetensors")
+    full = OccupancyGrid(np.ones((4, 4, 4), bool), ns, 0.1)
+    fields.radiance(folder / "full.safetensors", density_scale=1e-2, occupancy=full)
     write_inria(folder / "splats.ply", random_splats(9))
     if HAS_TORCH:
         save(folder / "nerg.pth", small_gaze(), nerf=small_state())
