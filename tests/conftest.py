@@ -96,6 +96,8 @@ def pytest_collection_modifyitems(items):
         file = item.nodeid.partition("::")[0]
         if file in slow or item.nodeid.partition("[")[0] in slow:
             item.add_marker(pytest.mark.slow)
+        if "recorded" in item.fixturenames:  # large files, which are not everywhere
+            item.add_marker(pytest.mark.nightly)
         weight[file] += item.get_closest_marker("slow") is not None
     # Files with many slow tests first: with several processes, all of them end at the same time.
     items.sort(key=lambda item: -weight[item.nodeid.partition("::")[0]])
