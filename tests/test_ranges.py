@@ -16,7 +16,7 @@ from typer.core import TyperOption
 
 import nerg_mi.aoi
 import nerg_mi.rays.readers
-import nerg_mi.workflows.options
+import nerg_mi.workflows
 from nerg_mi.cli.building import build_command
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, Checked, Range, check_number, ranged
@@ -29,7 +29,7 @@ from tools.command_pages import commands
 
 
 def _modules():
-    for package in (nerg_mi.aoi, nerg_mi.workflows.options, nerg_mi.rays.readers):
+    for package in (nerg_mi.aoi, nerg_mi.workflows, nerg_mi.rays.readers):
         yield package
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             yield importlib.import_module(module.name)

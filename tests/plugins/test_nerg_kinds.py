@@ -47,7 +47,7 @@ class LobeField:
     """exp(sharpness axis . r_o), as a second recipe of log densities would be."""
 
     kind = "lobe"
-    networks, support = 1, None
+    networks, support, limits = 1, None, {}
     DRJIT_STRUCT: ClassVar[dict] = {"axis": None}
 
     def __init__(self, config, box, axis):

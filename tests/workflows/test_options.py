@@ -1,4 +1,4 @@
-"""Typed options of every job: frozen, of keywords alone, each told once, and light to import."""
+"""Typed options of every workflow: frozen, of keywords alone, each with its help."""
 
 from __future__ import annotations
 
@@ -9,15 +9,27 @@ from typing import get_type_hints
 
 import pytest
 
+import nerg_mi.workflows
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import Checked
 from nerg_mi.workflows import options
 
-MODULES = [importlib.import_module(f"{options.__name__}.{m.name}") for m in pkgutil.iter_modules(options.__path__)]
+MODULES = [
+    importlib.import_module(f"nerg_mi.workflows.{m.name}") for m in pkgutil.iter_modules(nerg_mi.workflows.__path__)
+]
 MODULES.append(importlib.import_module(StatisticsOptions.__module__))
 # What has to be said where the defaults alone mean nothing.
 SAID = {"FilterOptions": {"thin": 1.0}, "SplitOptions": {"zones": 3}}
-KINDS = [k for m in MODULES for k in vars(m).values() if is_dataclass(k) and k.__module__ == m.__name__]
+KINDS = [
+    kind
+    for module in MODULES
+    for kind in vars(module).values()
+    if is_dataclass(kind)
+    and isinstance(kind, type)
+    and issubclass(kind, Checked)
+    and kind.__module__ == module.__name__
+]
 
 
 def test_there_are_options():
