@@ -21,7 +21,6 @@ does. Everything else works there, the command `nerg doctor` first of all.
 from pathlib import Path as _Path
 from typing import TYPE_CHECKING
 
-from . import checkout as _checkout
 from . import llvm as _llvm
 from . import registration as _registration
 
@@ -110,6 +109,9 @@ def __dir__() -> list[str]:
     return sorted({*__all__, "__version__", *(name for name in globals() if name.startswith("__"))})
 
 
-_checkout.find_folders(__name__, _Path(__file__).resolve().parent)
+_root = _Path(__file__).resolve().parents[1]
+if not (_root / "nerg_mi" / "plugins").is_dir() and (_root / "plugins" / "__init__.py").is_file():
+    # In a checkout the plugins and the scenes lie beside the package, and an installation maps them into it.
+    __path__.append(str(_root))
 _llvm.prepare()
 _registration.install()

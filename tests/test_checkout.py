@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy
 import pytest
 
-from nerg_mi import checkout
 from tests.conftest import ROOT
 
 # Where the dependencies are: without the site module nothing of that folder's .pth files, and so no editable
@@ -22,10 +21,9 @@ SITE = Path(numpy.__file__).parents[1]
 
 @pytest.fixture
 def clone(tmp_path):
-    """The checkout as it is cloned: nothing within the package but what is committed there."""
-    for name in ("nerg_mi", *checkout.FOLDERS):
-        others = checkout.FOLDERS if name == "nerg_mi" else ()
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "build", *others))
+    """The checkout as it is cloned."""
+    for name in ("nerg_mi", "plugins", "scenes"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "build"))
     return tmp_path
 
 
@@ -63,29 +61,3 @@ def test01_plugins_and_scenes_are_found(clone, elsewhere):
     kind, files = done.stdout.strip().splitlines()[-2:]
     assert kind == "NergIntegrator"
     assert files.split() == [str(clone / "plugins" / "nerg.py"), str(clone / "scenes" / "store" / "layout.py")]
-
-
-def test02_nothing_else_becomes_part_of_the_package():
-    done = uninstalled(
-        "import nerg_mi\ntry:\n    import nerg_mi.tests\nexcept ModuleNotFoundError as e:\n    print(e)", ROOT
-    )
-    assert "No module named 'nerg_mi.tests'" in done.stdout, done.stderr
-
-
-def test03_an_installation_is_left_alone():
-    """Where something else finds the plugins, as here, or where they lie in the package, no finder is added."""
-    code = "import nerg_mi, importlib, sys; importlib.reload(nerg_mi); "
-    code += "print(sum(type(f).__name__ == 'Beside' for f in sys.meta_path))"
-    here = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd="/")
-    assert here.stdout.strip() == "0", here.stderr
-    assert uninstalled(code, ROOT).stdout.strip() == "1"
-
-
-def test04_a_package_without_its_folders_stays_without(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
-    before = len(sys.meta_path)
-    (tmp_path / "lonely").mkdir()
-    (tmp_path / "lonely" / "__init__.py").write_text("")
-    monkeypatch.syspath_prepend(tmp_path)
-    checkout.find_folders("lonely", tmp_path / "lonely")
-    assert len(sys.meta_path) == before
