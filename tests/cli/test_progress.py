@@ -7,7 +7,6 @@ import pytest
 
 from nerg_mi.cli import progress
 from nerg_mi.cli.progress import TerminalReporter
-from tests.conftest import ROOT
 
 
 class Terminal(io.StringIO):
@@ -122,14 +121,3 @@ def test_the_bar_says_how_long_the_rest_takes(monkeypatch):
 )
 def test_durations(seconds, said):
     assert progress.duration(seconds) == said
-
-
-def test_every_job_tells_its_progress():
-    """From the start, so that whoever waits for longer than ten seconds hears of it."""
-    silent = []
-    for path in (ROOT / "nerg_mi" / "jobs").glob("*.py"):
-        text = path.read_text(encoding="utf-8")
-        if "reporter: Reporter = SILENT" in text and "progress" not in text:
-            silent.append(path.name)
-    # Their callers tell.
-    assert sorted(silent) == ["filtering.py", "gaze_places.py", "view.py"]
