@@ -186,7 +186,7 @@ def trained(tmp_path_factory):
     import mitsuba as mi
 
     from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
-    from tests.evaluation.gaze.test_evaluation import crowd
+    from tests.evaluation.test_gaze import crowd
 
     mi.set_variant("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("trained")

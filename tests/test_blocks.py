@@ -126,7 +126,7 @@ XML_PAGES = ("gaze-training.md", "performance.md", "plugins.md", "shapes-and-fie
 @pytest.fixture
 def place(rgb, standins, tmp_path, monkeypatch):
     """A folder with what snippets name: stand-ins of the store's fields, a scene of them, rays."""
-    from tests.evaluation.gaze.test_evaluation import crowd
+    from tests.evaluation.test_gaze import crowd
     from tests.formats.splats.writers import random_splats, write_inria
 
     for file in standins.values():

@@ -1,12 +1,17 @@
+"""Tests of `nerg_mi.alignment.icp`."""
+
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.constraints import Target
-from nerg_mi.alignment.icp import Twin
-from nerg_mi.alignment.similarity import MIRROR, errors
+from nerg_mi.alignment.constraints import Target, surface_of_traces
+from nerg_mi.alignment.icp import AtZero, GazeEnds, HeadHeight, Twin, groups_of, refine
+from nerg_mi.alignment.similarity import ALL, MIRROR, Chart, errors
 from nerg_mi.errors import NergError
 
 from . import rooms
+
+# ---- Icp ----
+
 
 PLACE = rooms.traces(12_000).end
 
@@ -31,3 +36,88 @@ def test_a_twin_in_millimetres_is_placed_and_a_mirrored_one_named():
 def test_a_twin_that_is_none_is_refused(points, why):
     with pytest.raises(NergError, match=why):
         Twin(points).fit(Target(points=PLACE), quiet)
+
+
+# ---- Refine ----
+
+
+def test_a_near_start_comes_to_the_truth_and_says_how_sure_it_is():
+    rays, truth = rooms.people(1500), rooms.similarity(np.random.default_rng(6))
+    surface = surface_of_traces(rooms.traces().moved(truth), 1 << 18)
+    nudge = np.eye(4)
+    nudge[:2, :2] = 1.03 * np.array([[np.cos(0.06), -np.sin(0.06)], [np.sin(0.06), np.cos(0.06)]])
+    nudge[2, 2], nudge[:3, 3] = 1.03, (0.12, -0.1, 0.05)
+    start = truth @ nudge
+    scores = [
+        AtZero(surface.distance, rays.hit, rays.person, "hits"),
+        AtZero(surface.blocked, rays.origin, rays.person, "heads"),
+    ]
+    center = rooms.carried(truth, rays.origin).mean(axis=0)
+    found = refine(scores, start, center, ALL)
+    target = rooms.carried(truth, rays.origin)
+    assert errors(start, rays.origin, target).max() > 0.1 and errors(found.matrix, rays.origin, target).max() < 0.02
+    spread = np.sqrt(np.diag(found.covariance))
+    assert found.covariance.shape == (7, 7) and (spread[:3] < 0.01).all() and 0 < spread[6] < 0.01
+
+
+def test_groups_are_people_or_stretches_of_few():
+    t, who = np.arange(0, 60, 0.5), np.zeros(120, int)
+    assert len(np.unique(groups_of(who, t))) == 6
+    assert len(np.unique(groups_of(np.arange(120) % 12, t))) == 12
+
+
+# ---- Scores ----
+
+
+RAYS = rooms.people(400, 0.0)
+
+
+GROUP = RAYS.person
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return surface_of_traces(rooms.traces(), 1 << 16)
+
+
+def scores(surface):
+    return [
+        AtZero(surface.distance, RAYS.hit, GROUP, "hits"),
+        AtZero(surface.blocked, RAYS.origin, GROUP, "heads"),
+        GazeEnds(surface, RAYS.origin, RAYS.direction, GROUP),
+        HeadHeight(0.0, RAYS.origin, GROUP),
+    ]
+
+
+@pytest.mark.parametrize("which", range(4))
+def test_derivatives_are_those_of_central_differences(surface, which):
+    score = scores(surface)[which]
+    rng = np.random.default_rng(0)
+    chart, q = Chart(rooms.similarity(rng, scale=1.3), np.array([2.0, 1.5, 1.0]), ALL), rng.normal(0, 0.3, 7)
+    r, by = score.residuals(chart, q)
+    assert (r > 0).mean() > 0.05 and by.shape == (len(r), 7)
+    for k, e in enumerate(1e-6 * np.eye(7)):
+        numeric = (score.residuals(chart, q + e)[0] - score.residuals(chart, q - e)[0]) / 2e-6
+        # Where a point lies on an edge of a cell, or a ray has two nearest places, there are two slopes.
+        assert np.mean(np.abs(by[:, k] - numeric) > 1e-6) < 0.02
+
+
+@pytest.mark.parametrize("which", range(4))
+def test_all_is_well_in_the_right_place_and_not_elsewhere(surface, which):
+    score = scores(surface)[which]
+    right = score.residuals(Chart(np.eye(4), np.zeros(3)), np.zeros(7))[0]
+    far = np.eye(4)
+    far[:3, 3] = 1.5, 4.0, 3.0
+    wrong = score.residuals(Chart(far, np.zeros(3)), np.zeros(7))[0]
+    assert np.median(right) < 0.7 * surface.step and np.mean(wrong) > 10 * np.mean(right)
+
+
+def test_residuals_are_metres_of_the_tracking_whatever_the_scale_of_the_place(surface):
+    grown = surface_of_traces(rooms.traces().moved(np.diag([7.0, 7, 7, 1])), 1 << 16)
+    for a, b in zip(scores(surface), scores(grown)):
+        if isinstance(a, HeadHeight):
+            continue
+        shifted, scaled = np.eye(4), np.diag([7.0, 7, 7, 1])
+        shifted[:3, 3], scaled[:3, 3] = 0.2, 1.4
+        one, other = (s.residuals(Chart(m, np.zeros(3)), np.zeros(7))[0] for s, m in ((a, shifted), (b, scaled)))
+        np.testing.assert_allclose(one, other, atol=2e-2)

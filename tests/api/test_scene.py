@@ -1,11 +1,168 @@
-"""Scenes of fields, shapes, observers and cameras, without XML."""
+"""Tests of `nerg_mi.api.scene`."""
+
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.scene import TrainedField, asked_quantities
+from nerg_mi.api.scene import TrainedField, asked_quantities, box_dict, mesh_child, options_of, scene_children
+from nerg_mi.api.workflows import bake, stats
+from nerg_mi.errors import NergError
 from tests.formats.splats.writers import random_splats, write_inria
+
+# ---- Fields and rays in memory, from files and back ----
+
+
+def test01_a_field_is_what_its_file_says(files):
+    field = nerg.load_field(files / "field.safetensors")
+    assert field.kind == "radiance" and field.name == "field.safetensors" and field.provenance == {"test": 0}
+    assert np.array_equal(field.bounds, [(-1, -1, -1), (1, 1, 1)])
+    assert field.weights == sum(value.numpy().size for value in field.network.parameters().values())
+    assert repr(field).startswith("<radiance field field.safetensors: ") and "box (-1, -1, -1) to (1, 1, 1)>" in repr(
+        field
+    )
+
+
+def test02_what_is_saved_is_the_same_field(files, tmp_path):
+    for load, name in ((nerg.load_field, "field"), (nerg.load_gaze, "gaze")):
+        field = load(str(files / f"{name}.safetensors"))
+        path = field.save(tmp_path / f"{name}.safetensors")
+        again = load(path)
+        assert again.provenance == field.provenance
+        for key, value in field.network.parameters().items():
+            assert np.array_equal(value.numpy(), again.network.parameters()[key].numpy()), key
+
+
+def test03_half_the_size(files, tmp_path):
+    field = nerg.load_field(files / "field.safetensors")
+    whole, half = (field.save(tmp_path / f"{h}.safetensors", half=h).stat().st_size for h in (False, True))
+    assert half < 0.7 * whole
+
+
+@pytest.mark.parametrize(
+    "load, name, said",
+    [
+        (nerg.load_field, "gaze.safetensors", "holds a gaze field"),
+        (nerg.load_gaze, "field.safetensors", "holds a radiance field"),
+        (nerg.load_field, "nowhere.safetensors", "does not exist"),
+        (nerg.load_rays, "nowhere.npz", "nowhere.npz"),
+        (nerg.load_rays, "field.safetensors", "rays are kept"),
+    ],
+)
+def test04_errors_are_sentences(files, load, name, said):
+    with pytest.raises((nerg.NergError, FileNotFoundError), match=said):
+        load(files / name)
+
+
+def test05_what_is_no_name(files):
+    with pytest.raises(nerg.NergError, match="named by a string"):
+        nerg.load_field(3)
+    with pytest.raises(nerg.NergError, match="saved as .safetensors"):
+        nerg.load_field(files / "field.safetensors").save(files / "field.ckpt")
+
+
+def test06_a_field_without_a_file(files):
+    network = nerg.load_gaze(files / "gaze.safetensors").network
+    assert repr(TrainedField(network)).startswith("<gaze field in memory: ")
+
+
+# ---- Options of jobs one by one ----
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Of a job."""
+
+    steps: int = 5
+    folder: Path | None = None
+    store: Path | None = None
+    seed: int = 0
+    mode: str | None = None
+
+
+def test01_changes_are_on_top_of_what_is_given(rgb):
+    assert options_of(Options, "job", None, {}) == Options(mode="llvm_ad_rgb")
+    assert options_of(Options, "job", Options(steps=9, seed=2), {"seed": 3}) == Options(
+        steps=9, seed=3, mode="llvm_ad_rgb"
+    )
+
+
+def test02_the_variant_in_use_is_kept(mono):
+    assert options_of(Options, "job", Options(mode="llvm_ad_rgb"), {}).mode == "llvm_ad_mono"
+
+
+def test04_files_may_be_named_by_strings(rgb):
+    assert options_of(Options, "job", None, {"folder": "tests"}).folder == Path("tests")
+    assert options_of(Options, "job", None, {"store": "to be made"}).store == Path("to be made")
+
+
+def cube():
+    return nerg.make_scene(shapes={"type": "cube"})
+
+
+CALLS = [
+    (lambda: nerg.train_gaze("no.npz", scene="no.xml", test_peple=0.3), 'did you mean "test_people"'),
+    (lambda: nerg.train_gaze("no.npz", scene="no.xml", test_people=0.3), 'no file "no.xml", which "scene" names'),
+    (lambda: nerg.train_gaze("no.npz", geometry="none"), 'no file "no.npz", which "rays" names'),
+    (lambda: nerg.train_gaze(np.zeros(3), geometry="none"), "rays are what load_rays .* got ndarray; import_rays"),
+    (lambda: nerg.train_gaze(None, scene=cube()), '"scene" is a file, .* got Scene; give its name'),
+    (lambda: nerg.train_radiance(None), '"photos" is a file, named by a string or a path, got NoneType; give'),
+    (lambda: nerg.train_radiance("no"), 'no file "no", which "photos" names'),
+    (lambda: nerg.evaluate_gaze("no.safetensors", "no.npz"), "no.npz"),
+    (lambda: nerg.evaluate_radiance(3, "."), '"field" is a file, .* got int'),
+    (lambda: nerg.ablate("no.npz", "new", geometry="none"), "no.npz"),
+    (lambda: nerg.align("no.npz", scene="no.xml"), "no.xml"),
+    (lambda: nerg.study(cube(), "new"), '"scene" is a file, .* got Scene'),
+    (lambda: nerg.import_rays(np.zeros(3)), r"reads files, .* got ndarray; write a table to a file \(df.to_csv"),
+    (lambda: nerg.import_rays("no.csv", colums="t=t"), 'has no option "colums"; did you mean "columns"'),
+    (lambda: nerg.import_rays(["no.csv"], "unity"), 'no file "no.csv"'),
+    (lambda: nerg.make_scene("no.safetensors", falof=0.1), 'no setting "falof"; did you mean "falloff"?'),
+    (lambda: nerg.make_scene("no.safetensors"), '^there is no file "no.safetensors", which "field" names'),
+    (lambda: nerg.render("no.xml"), 'there is no scene file "no.xml"'),
+    (lambda: nerg.render(None), "a scene is what make_scene .* got NoneType"),
+    (lambda: nerg.trace(3, [0, 0, 0], [1, 0, 0]), "a scene is what make_scene .* got int"),
+    (lambda: bake("no.ply", gaze="no.safetensors"), "no.safetensors"),
+    (lambda: stats("no.npz", "no.json"), "no.json"),
+]
+
+
+@pytest.mark.parametrize("call, said", CALLS)
+def test_names_come_before_files_and_files_before_work(rgb, tmp_path, monkeypatch, call, said):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(NergError, match=said) as told:
+        call()
+    assert len(str(told.value)) < 300 and not any(tmp_path.iterdir())
+
+
+def test_what_is_natural_is_taken(rgb, tmp_path):
+    import mitsuba as mi
+
+    path = tmp_path / "room.xml"
+    path.write_text(
+        '<scene version="3.0.0"><integrator type="nerg"/><shape type="cube"/><sensor type="perspective"><film '
+        'type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film></sensor></scene>'
+    )
+    scene = nerg.Scene.load(path)
+    pictures = [nerg.render(given, quantities="opacity").opacity for given in (path, str(path), scene, scene.mitsuba)]
+    assert all((picture == pictures[0]).all() for picture in pictures)
+    assert options_of(Options, "job", None, {"folder": scene}).folder == path
+    # Values of `<default>`s make another scene of it than the file says.
+    assert nerg.Scene.load(path).path == path and nerg.Scene(mi.load_file(str(path))).path is None
+
+
+def test03_unknown_options_are_told(rgb):
+    with pytest.raises(NergError, match='job has no option "step"; did you mean "steps"?'):
+        options_of(Options, "job", None, {"step": 3})
+    with pytest.raises(NergError, match="mi.set_variant"):
+        options_of(Options, "job", None, {"mode": "scalar_rgb"})
+    with pytest.raises(NergError, match='"xyz"'):
+        options_of(Options, "job", None, {"xyz": 1})
+
+
+# ---- Scenes of fields, shapes, observers and cameras, without XML ----
+
 
 BALL = {"type": "sphere", "radius": 0.3}
 
@@ -213,3 +370,85 @@ def test_a_camera_sees_a_scene_of_any_unit(rgb, scale):
 def test_shapes_beyond_all_places_are_refused(rgb, radius):
     with pytest.raises(nerg.NergError, match="corners of the shape .* must have coordinates from"):
         nerg.make_scene(shapes={"type": "sphere", "radius": radius})
+
+
+# ---- Shapes from files, dicts and objects, by name ----
+
+
+def test01_names(rgb):
+    ball = {"type": "sphere"}
+    assert scene_children(None) == {}
+    assert list(scene_children(ball, "thing")) == ["thing"]
+    assert list(scene_children([ball, [ball, ball]])) == ["shape_0", "shape_1_0", "shape_1_1"]
+    assert list(scene_children({"left": ball, "right": rgb.load_dict(ball)})) == ["left", "right"]
+
+
+def test02_a_scene_gives_its_shapes_and_lights(rgb):
+    lamp = {"type": "sphere", "emitter": {"type": "area"}}
+    scene = rgb.load_dict({"type": "scene", "lamp": lamp, "sky": {"type": "constant"}, "spot": {"type": "point"}})
+    children = scene_children(scene)
+    # The lamp brings its own light.
+    assert set(children) == {"lamp", "shape_light_0", "shape_light_1"}
+    again = rgb.load_dict({"type": "scene", **children})
+    assert len(again.emitters()) == 3 and len(again.shapes()) == 1
+
+
+PLY = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+property {0} red
+property {0} green
+property {0} blue
+property float quality
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0 {1}
+1 0 0 {1}
+0 1 0 {1}
+3 0 1 2
+"""
+
+
+def test03_a_box_reaches_from_corner_to_corner(rgb):
+    box = rgb.load_dict(box_dict(np.array((1.0, 2, 3)), np.array((2.0, 5, 4)))).bbox()
+    assert np.allclose(np.ravel(box.min), (1, 2, 3)) and np.allclose(np.ravel(box.max), (2, 5, 4))
+
+
+def test04_files_are_looked_at_first(rgb, tmp_path):
+    path = tmp_path / "cube.ply"
+    rgb.load_dict({"type": "cube"}).write_ply(str(path))
+    assert rgb.load_dict(mesh_child(path)).face_count() == 12
+    path.write_bytes(path.read_bytes()[:-10])
+    with pytest.raises(NergError, match="cube.ply"):
+        mesh_child(path)
+    # Mitsuba reads no quads; what takes a mesh does, with the material that others have.
+    (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf -4 -3 -2 -1\n")
+    shape = rgb.load_dict({"type": "scene", **scene_children(tmp_path / "quad.obj", "quad")}).shapes()[0]
+    assert shape.face_count() == 2 and shape.id() == "quad" and shape.bsdf().class_name() == "TwoSidedBRDF"
+    (tmp_path / "empty.obj").write_text("v 0 0 0\n")
+    with pytest.raises(NergError, match="empty.obj"):
+        mesh_child(tmp_path / "empty.obj")
+
+
+@pytest.mark.parametrize(
+    "name, text, said",
+    [
+        ("a.obj", "mtllib a.mtl\nv 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\nf 1 2 3\n", "mtllib"),
+        ("a.ply", PLY.format("uchar", "255 0 0 7"), "quality"),
+        ("a.ply", PLY.format("float", "1 0 0 7"), "quality"),
+    ],
+)
+def test_colours_of_files_are_shown_and_the_rest_is_named(rgb, monkeypatch, tmp_path, name, text, said):
+    (tmp_path / name).write_text(text)
+    notes = []
+    monkeypatch.setattr(rgb, "Log", lambda level, note: notes.append(note))
+    child = mesh_child(tmp_path / name)
+    shape = child if isinstance(child, rgb.Mesh) else rgb.load_dict(child)
+    (note,) = notes
+    assert said in note and str(tmp_path / name) in note
+    si = rgb.load_dict({"type": "scene", "a": shape}).ray_intersect(rgb.Ray3f((0.2, 0.2, 1), (0, 0, -1)))
+    assert np.allclose(np.ravel(si.bsdf().eval_diffuse_reflectance(si)), (1, 0, 0), atol=1e-4)

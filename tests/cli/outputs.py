@@ -15,7 +15,7 @@ from nerg_mi.aoi.output import has_parquet
 from nerg_mi.files.images import write_exr
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays
-from tests.evaluation.gaze.test_evaluation import crowd
+from tests.evaluation.test_gaze import crowd
 from tests.figures.standins import write_standins
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.formats.torch_ngp.test_fields import small_state

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from nerg_mi.cli import main
-from tests.evaluation.gaze.test_evaluation import crowd
+from tests.evaluation.test_gaze import crowd
 
 
 @pytest.mark.nightly

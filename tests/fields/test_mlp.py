@@ -1,12 +1,46 @@
-"""Networks: cooperative vectors, tensor products and NumPy agree, with their gradients."""
+"""Tests of `nerg_mi.fields.mlp`."""
 
 import drjit as dr
+import drjit.cuda.ad
+import drjit.llvm.ad
 import drjit.llvm.ad as ns
+import drjit.scalar
 import numpy as np
 import pytest
 
-from nerg_mi.fields.mlp import MLP
+from nerg_mi.errors import NergError
+from nerg_mi.fields.mlp import MLP, aligned, evaluate, is_cuda, namespace
 from tests.reference import fields_numpy as reference
+
+# ---- The array types of a backend, and arrays at addresses that Dr.Jit reads fast ----
+
+
+def test_types_of_a_variant_or_an_array(rgb):
+    for source in ("llvm_ad_rgb", "llvm", drjit.llvm.ad.Float, drjit.llvm.ad.Float(1), rgb.Point3f, rgb.TensorXf):
+        assert namespace(source) is drjit.llvm.ad
+    for source in ("cuda_ad_spectral", "cuda", drjit.cuda.ad.Float):
+        assert namespace(source) is drjit.cuda.ad
+    assert is_cuda(drjit.cuda.ad) and not is_cuda(drjit.llvm.ad)
+
+
+@pytest.mark.parametrize("source", ["scalar_rgb", drjit.scalar.Array3f])
+def test_scalar_variants_have_none(source):
+    with pytest.raises(NergError, match='"llvm_ad_rgb"'):
+        namespace(source)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.uint32])
+def test_arrays_are_aligned_copies(dtype):
+    source = np.arange(24).reshape(2, 3, 4)[:, ::2]
+    for _ in range(8):
+        copy = aligned(source, dtype)
+        assert copy.ctypes.data % 64 == 0 and copy.dtype == dtype and np.array_equal(copy, source)
+        assert not np.shares_memory(copy, source)
+    assert aligned(np.zeros((0, 3))).shape == (0, 3)
+
+
+# ---- Networks: cooperative vectors, tensor products and NumPy agree, with their gradients ----
+
 
 SIZES = [[3, 1], [8, 16, 5], [6, 16, 16, 3]]
 
@@ -128,3 +162,37 @@ def test07_layer_normalisation(mode):
         assert np.isclose(
             (dr.grad(array).numpy() * direction).sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-3, atol=1e-4
         ), name
+
+
+# ---- A network whose weights are constants gives what its cooperative vectors give, to the bit ----
+
+
+@pytest.mark.parametrize("sizes", [[1, 1], [3, 1], [8, 16, 5], [6, 16, 16, 3], [24, 64, 64, 2]])
+def test01_to_the_bit_small_and_large(sizes):
+    rng = np.random.default_rng(3)
+    net = MLP.random(sizes, ns, rng)
+    x = rng.normal(size=(50, sizes[0])).astype(np.float32)
+    columns = [ns.Float(c) for c in x.T]
+    weights = [w.numpy() for w in net.weights]
+    found = np.array(evaluate([w.tolist() for w in weights], columns)).T
+    assert np.array_equal(found, np.array(net(columns)).T)
+    assert np.allclose(found, reference.mlp(x, weights), atol=1e-5)
+
+
+@pytest.mark.parametrize("sizes", [[3, 4, 1], [24, 64, 64, 1]])
+def test02_in_loops_and_branches(sizes):
+    net = MLP.random(sizes, ns, np.random.default_rng(4))
+    layers = [w.numpy().tolist() for w in net.weights]
+
+    def summed(network):
+        def body(i, total):
+            x = [ns.Float(i) * 0.1 + k for k in range(sizes[0])]
+            some = (i & 1) == 0
+            value = dr.if_stmt((some,), some, lambda some: network(x)[0], lambda some: ns.Float(0))
+            return i + 1, total + value
+
+        start = (dr.arange(ns.UInt32, 20), dr.zeros(ns.Float, 20))
+        return dr.while_loop(start, lambda i, total: i < 25, body)[1].numpy()
+
+    found = summed(lambda x: evaluate(layers, x))
+    assert np.ptp(found) > 0 and np.array_equal(found, summed(net))

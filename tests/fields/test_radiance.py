@@ -1,4 +1,4 @@
-"""The radiance field against its NumPy version, and its handling of parameters."""
+"""Tests of `nerg_mi.fields.radiance`."""
 
 from dataclasses import replace
 
@@ -8,16 +8,168 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields.encoding import HashGrid, HashGridConfig, encode_direction
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField, density_from_log
+from nerg_mi.fields.mlp import MLP
+from nerg_mi.fields.radiance import (
+    Background,
+    BackgroundConfig,
+    RadianceConfig,
+    RadianceField,
+    density_from_log,
+    mean_features,
+    network_color,
+    network_inputs,
+    point_features,
+)
 from nerg_mi.maths.geometry import Box
 from tests.reference import fields_numpy as reference
 
-GRID = dict(levels=4, features=2, log2_rows=12, base=4, finest=32)
-CONFIG = RadianceConfig(grid=HashGridConfig(**GRID), width=16, geometry=7, density_scale=2.5)
+# ---- Background ----
+#
+# What lies behind a field: where a ray leaves the sphere about it, whatever it comes from, and sizes that must fit.
+
+
+GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8, dimensions=2)
+
+
+CONFIG = BackgroundConfig(2.5, GRID, width=16)
+
+
+def jit(v):
+    return ns.Array3f(np.ascontiguousarray(np.asarray(v, np.float32).T))
+
+
+def test_rays_leave_the_sphere_where_they_do():
+    rng = np.random.default_rng(0)
+    o, d = rng.uniform(-1.4, 1.4, (300, 3)), rng.normal(size=(300, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    b = (o * d).sum(1)
+    t = -b + np.sqrt(b * b - (o * o).sum(1) + 2.5**2)
+    p = o + d * t[:, None]
+    assert np.allclose(np.linalg.norm(p, axis=1), 2.5)
+    found = np.stack([c.numpy() for c in Background.random(CONFIG, ns).coordinates(jit(o), jit(d))], axis=1)
+    assert np.allclose(found[:, 0], 2 / np.pi * np.arccos(p[:, 1] / 2.5) - 1, atol=1e-5)
+    assert np.allclose(found[:, 1], np.arctan2(p[:, 2], p[:, 0]) / np.pi, atol=1e-5)
+
+
+def test_a_ray_that_misses_takes_the_nearest_point():
+    # Past the sphere along +z, 4 to the right: nearest at (4, 0, 0), which is seen along +x.
+    theta, phi = Background.random(CONFIG, ns).coordinates(jit([[4, 0, -9]]), jit([[0, 0, 1]]))
+    assert abs(theta[0]) < 1e-6 and abs(phi[0]) < 1e-6
+
+
+def test_colours_are_those_of_the_place_and_of_the_direction():
+    back = Background.random(CONFIG, ns, 3)
+    table = np.random.default_rng(1).normal(size=len(back.grid.table)).astype(np.float32)
+    back.grid.table = ns.Float(table)
+    o, d = np.zeros((2, 3)), np.array([[0.6, 0, 0.8], [0, 0.6, 0.8]])
+    c = np.array(back(jit(o), jit(d)))
+    assert c.shape == (3, 2) and (c > 0).all() and (c < 1).all() and np.abs(c[:, 0] - c[:, 1]).max() > 1e-3
+    # From elsewhere towards the same place, the direction still counts.
+    place = 2.5 * d[0]
+    other = np.array([1.0, 0.5, 0])
+    towards = (place - other) / np.linalg.norm(place - other)
+    same = back.coordinates(jit([other]), jit([towards]))
+    assert np.allclose([s[0] for s in same], [s.numpy()[0] for s in back.coordinates(jit(o), jit(d))], atol=1e-5)
+    assert np.abs(np.array(back(jit([other]), jit([towards])))[:, 0] - c[:, 0]).max() > 1e-4
+
+
+def test_the_default_is_a_square_grid_and_others_are_refused():
+    assert BackgroundConfig(1.0).grid.dimensions == 2
+    for wrong in ({"grid": HashGridConfig(levels=2)}, {"width": 0}, {"hidden": 0}):
+        with pytest.raises(ValueError, match="2 dimensions and sizes of at least 1"):
+            BackgroundConfig(1.0, **wrong)
+    for radius in (0.0, -1.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match="radius"):
+            BackgroundConfig(radius)
+    assert BackgroundConfig.from_dict(CONFIG.to_dict()) == CONFIG
+
+
+def test_what_does_not_belong_together_is_refused():
+    rng = np.random.default_rng(0)
+    grid, net = HashGrid.random(GRID, ns, rng), MLP.random(CONFIG.sizes, ns, rng)
+    Background(CONFIG, grid, net)
+    with pytest.raises(ValueError, match="grid"):
+        Background(
+            CONFIG, HashGrid.random(HashGridConfig(levels=2, log2_rows=9, base=4, finest=8, dimensions=2), ns, rng), net
+        )
+    with pytest.raises(ValueError, match="background_net"):
+        Background(CONFIG, grid, MLP.random([CONFIG.sizes[0], 32, 3], ns, rng))
+
+
+# ---- How a deferred field makes colours of features, against NumPy, and where rays meet next to nothing ----
+
+
+RNG = np.random.default_rng(0)
+
+
+def floats(rows):
+    return [ns.Float(np.ascontiguousarray(r, np.float32)) for r in rows]
+
+
+def values(rows):
+    return np.stack([r.numpy() for r in rows])
+
+
+def logistic(x):
+    return 0.5 + 0.5 * np.tanh(0.5 * x)
+
+
+def test_a_network_at_every_sample_is_asked_with_the_features_as_they_are():
+    outputs = floats(RNG.normal(size=(5, 8)))
+    assert point_features(outputs, False) is outputs and network_inputs(outputs, False) is outputs
+    assert np.allclose(values(network_color(outputs[:3], outputs, False)), logistic(values(outputs[:3])), atol=1e-6)
+
+
+def test_what_the_network_leaves_alone_is_the_diffuse_colour():
+    outputs = 2 * RNG.normal(size=(5, 40))
+    features = point_features(floats(outputs), True)
+    assert np.allclose(values(features), [*logistic(outputs[:3]), *outputs[3:]], atol=1e-6)
+    inputs = network_inputs(features, True)
+    assert np.allclose(values(inputs[3:]), outputs[3:], atol=1e-6)
+    nothing, more = (network_color(floats(np.full((3, 40), v)), inputs, True) for v in (0, 0.7))
+    # Its logit is taken a thousandth inside of 0..1.
+    assert np.abs(values(nothing) - values(features[:3])).max() < 1.1e-3
+    inside = 1e-3 + (1 - 2e-3) * logistic(outputs[:3])
+    assert np.allclose(values(more), logistic(np.log(inside / (1 - inside)) + 0.7), atol=1e-5)
+
+
+def test_diffuse_colours_composite_as_colours_do():
+    """A ray over two surfaces has the mean of their colours, which the mean of their logits is not."""
+    g = np.array([[0.1, 0.9], [0.3, 0.3], [0.8, 0.2], [-1, 1]])
+    w = np.array([0.5, 0.25])
+    means = mean_features(floats((g @ w)[:, None]), ns.Float(w.sum()))
+    color = network_color(floats(np.zeros((3, 1))), network_inputs(means, True), True)
+    assert np.allclose(values(color)[:, 0], g[:3] @ w / w.sum(), atol=1.1e-3)
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1e-42, 1e-38, 1e-13, 1e-12, 1e-6, 1.0])
+def test_nothing_is_infinite_however_little_a_ray_meets(opacity):
+    """Values and derivatives, of features up to 1 that this opacity composites."""
+    for g in (0.0, 0.5, 1.0):
+        a, s = ns.Float(opacity), ns.Float(np.float32(g * opacity))
+        dr.enable_grad(a, s)
+        means = mean_features([s] * 4, a)
+        color = network_color(floats(np.full((3, 1), 0.3)), network_inputs(means, True), True)
+        assert all(0 <= float(c[0]) <= 1 for c in color) and abs(float(means[0][0])) <= 1 + 1e-6
+        dr.backward(a * (color[0] + color[1] * color[2]))
+        assert np.isfinite(dr.grad(a)[0]) and np.isfinite(dr.grad(s)[0])
+        if opacity >= 1e-12:
+            assert abs(float(means[0][0]) - g) < 1e-5
+
+
+# ---- The radiance field against its NumPy version, and its handling of parameters ----
+
+
+RADIANCE_GRID = dict(levels=4, features=2, log2_rows=12, base=4, finest=32)
+
+
+RADIANCE_CONFIG = RadianceConfig(grid=HashGridConfig(**RADIANCE_GRID), width=16, geometry=7, density_scale=2.5)
+
+
 BOX = Box((-1, 0, 2), (3, 2, 4))
 
 
-def make(seed=0, config=CONFIG, **kwargs):
+def make(seed=0, config=RADIANCE_CONFIG, **kwargs):
     field = RadianceField.random(config, BOX, ns, seed, **kwargs)
     # Features of order one, or every output would be that of zero input.
     rng = np.random.default_rng(seed)
@@ -40,7 +192,7 @@ def test01_equals_numpy():
     field, (p, d) = make(), points()
     sigma, features = field.density_features(ns.Array3f(p.T))
     rgb = np.array(field.color(features, ns.Array3f(d.T))).T
-    s, c = reference.radiance(p, d, arrays(field), GRID, BOX.lower, BOX.upper, scale=2.5)
+    s, c = reference.radiance(p, d, arrays(field), RADIANCE_GRID, BOX.lower, BOX.upper, scale=2.5)
     outside = s == 0
     assert 5 < outside.sum() < 55
     assert np.allclose(sigma.numpy(), s, rtol=2e-5) and np.all(sigma.numpy()[outside] == 0)
@@ -86,7 +238,7 @@ def test06_set_parameters_changes_every_output():
     field.set_parameters(values)
     after = outputs()
     assert all(not np.allclose(a, b) for a, b in zip(before, after))
-    s, c = reference.radiance(p, d, arrays(field), GRID, BOX.lower, BOX.upper, scale=2.5)
+    s, c = reference.radiance(p, d, arrays(field), RADIANCE_GRID, BOX.lower, BOX.upper, scale=2.5)
     assert np.allclose(after[0], s, rtol=2e-5) and np.allclose(after[1], s, rtol=2e-5)
 
 
@@ -117,7 +269,7 @@ def test08_gradients_reach_every_parameter(name):
         moved = dict(values)
         moved[name] = values[name].copy()
         moved[name].flat[i] += h
-        s, c = reference.radiance(p, d, moved, GRID, BOX.lower, BOX.upper, scale=2.5)
+        s, c = reference.radiance(p, d, moved, RADIANCE_GRID, BOX.lower, BOX.upper, scale=2.5)
         return (2 * s + c @ [1, 2, 3]).sum()
 
     for i in np.argsort(-np.abs(gradient))[[0, 3, 20]]:
@@ -126,7 +278,7 @@ def test08_gradients_reach_every_parameter(name):
 
 
 def test09_equal_seeds_give_equal_fields():
-    a, b, c = (arrays(RadianceField.random(CONFIG, BOX, ns, s)) for s in (1, 1, 2))
+    a, b, c = (arrays(RadianceField.random(RADIANCE_CONFIG, BOX, ns, s)) for s in (1, 1, 2))
     assert all(np.array_equal(a[k], b[k]) for k in a) and not np.array_equal(a["grid.table"], c["grid.table"])
     assert list(a) == ["grid.table", "density_net.0", "density_net.1", "color_net.0", "color_net.1", "color_net.2"]
 
@@ -135,7 +287,7 @@ def test10_defaults_are_the_papers():
     config = RadianceConfig()
     assert config.density_sizes == [32, 64, 16] and config.color_sizes == [31, 64, 64, 3]
     assert sum(a * b for s in (config.density_sizes, config.color_sizes) for a, b in zip(s, s[1:])) == 3072 + 6272
-    assert RadianceConfig.from_dict(CONFIG.to_dict()) == CONFIG
+    assert RadianceConfig.from_dict(RADIANCE_CONFIG.to_dict()) == RADIANCE_CONFIG
 
 
 @pytest.mark.parametrize(
@@ -172,19 +324,22 @@ def test14_a_matrix_of_another_shape_is_refused():
 
 
 def test15_networks_that_do_not_fit_the_grid_are_refused():
-    a, b = make(), make(config=RadianceConfig(grid=HashGridConfig(**{**GRID, "levels": 3}), width=16, geometry=7))
+    a, b = (
+        make(),
+        make(config=RadianceConfig(grid=HashGridConfig(**{**RADIANCE_GRID, "levels": 3}), width=16, geometry=7)),
+    )
     with pytest.raises(ValueError):
-        RadianceField(CONFIG, BOX, a.grid, b.density_net, a.color_net)
+        RadianceField(RADIANCE_CONFIG, BOX, a.grid, b.density_net, a.color_net)
 
 
 def test16_the_grid_belongs_to_one_configuration():
-    grid = HashGrid.random(HashGridConfig(**GRID), ns, np.random.default_rng(0))
-    assert grid.config == CONFIG.grid and make().config.grid == CONFIG.grid
+    grid = HashGrid.random(HashGridConfig(**RADIANCE_GRID), ns, np.random.default_rng(0))
+    assert grid.config == RADIANCE_CONFIG.grid and make().config.grid == RADIANCE_CONFIG.grid
 
 
 def test17_a_deferred_field():
     """Its features and its colours are those of ``color_head``; a file of another field says nothing of it."""
-    config = replace(CONFIG, deferred=True)
+    config = replace(RADIANCE_CONFIG, deferred=True)
     field, plain, (p, d) = make(config=config), make(), points()
     sigma, features = field.density_features(ns.Array3f(p.T))
     same, raw = plain.density_features(ns.Array3f(p.T))
@@ -197,7 +352,7 @@ def test17_a_deferred_field():
     outputs = np.array(plain.color_net([*encode_direction(ns.Array3f(d.T), config.sh_degree), *map(ns.Float, given)]))
     found = np.array(field.color(features, ns.Array3f(d.T)))
     assert np.allclose(found, reference.sigmoid(outputs + given[:3]), atol=1e-5)
-    assert RadianceConfig.from_dict(config.to_dict()) == config and "deferred" not in CONFIG.to_dict()
+    assert RadianceConfig.from_dict(config.to_dict()) == config and "deferred" not in RADIANCE_CONFIG.to_dict()
 
 
 @pytest.mark.parametrize("change, words", [({"deferred": 1}, "true or false"), ({"geometry": 2}, "at least 3")])

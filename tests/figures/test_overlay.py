@@ -1,10 +1,31 @@
-"""Heat over a picture."""
+"""Tests of `nerg_mi.figures.overlay`."""
+
+from __future__ import annotations
 
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import Heat, overlay, scale_strip, top_of, underlay
+from nerg_mi.figures import overlay as figures
+from nerg_mi.figures.overlay import (
+    Heat,
+    Layers,
+    find_overlay,
+    overlay,
+    overlays_of,
+    scale_strip,
+    shared_limits,
+    srgb,
+    to_bytes,
+    top_of,
+    underlay,
+    write_png,
+)
+from nerg_mi.figures.style import save
+from nerg_mi.transport.aovs import AOVS
+
+# ---- Heat over a picture ----
+
 
 COLOR = np.random.default_rng(0).random((6, 8, 3))
 
@@ -56,3 +77,146 @@ def test06_errors_are_sentences():
         Heat(top=0.0)
     with pytest.raises(NergError, match="choose one of inferno"):
         Heat(top=1.0, colors="jet")
+
+
+# ---- The table of overlays: scales that are shared, and figures of each ----
+
+
+X, Y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 16))
+
+
+LAYERS = Layers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))
+
+
+@pytest.mark.parametrize("name", [of.name for aov in AOVS.values() for of in overlays_of(aov)])
+def test_each_is_drawn(name, tmp_path):
+    overlay = find_overlay(name)
+    limits = overlay.limits(LAYERS)
+    assert overlay.name == name and (limits is None) == (not overlay.scaled)
+    save(overlay.draw(LAYERS, limits), tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 500
+
+
+def test_a_scale_for_all():
+    assert shared_limits([(0, 2.0), None, (0, 3.0)], None) == (0, 3.0)
+    assert shared_limits([(1.0, 2.0), (0.5, 3.0)], 7.0) == (0.5, 7.0)
+    assert shared_limits([(1.0, 2.0)], 0.5) == (0.0, 0.5)
+    assert shared_limits([None, None], None) is None and shared_limits([None], 2.0) == (0.0, 2.0)
+
+
+def test_nothing_to_take_a_scale_from():
+    dark = Layers(LAYERS.color, 0 * Y, LAYERS.mask)
+    assert find_overlay("gaze").limits(dark) is None
+    hidden = Layers(LAYERS.color, 2 * Y, X > 2)
+    assert find_overlay("gaze").limits(hidden) is None
+
+
+def test_one_that_is_not_there():
+    with pytest.raises(NergError, match='no overlay "gase"; there are depth, opacity, position.X'):
+        find_overlay("gase")
+    for name in ("position", "position.W", "depth.Y", "features"):
+        with pytest.raises(NergError, match=f'"{name}" is no single channel'):
+            find_overlay(name)
+    assert find_overlay("depth.T") == find_overlay("depth") and find_overlay("features.12").name == "features.12"
+
+
+# ---- Figures show each pixel once, and are the same file for the same input ----
+
+
+RNG = np.random.default_rng(0)
+
+
+PLOTS_COLOR, GAZE = RNG.random((24, 36, 3)), RNG.random((24, 36))
+
+
+MASK = np.ones((24, 36), bool)
+
+
+MASK[:4] = False
+
+
+HEAT = Heat(top=0.8)
+
+
+def read(mi, path):
+    return np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True))
+
+
+def test01_pixel_for_pixel(rgb, tmp_path):
+    save(figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT), tmp_path / "gaze.png")
+    page = read(rgb, tmp_path / "gaze.png").astype(float) / 255
+    shown = overlay(PLOTS_COLOR, GAZE, HEAT, MASK)
+    # It is so small that a pixel is shown as a square of 5 x 5.
+    shown = np.repeat(np.repeat(shown, 5, axis=0), 5, axis=1)
+    figure = figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT)
+    box = figure.axes[0].get_window_extent()
+    x, y = round(box.x0), round(figure.bbox.height - box.y1)
+    assert (round(box.width), round(box.height)) == (180, 120)
+    assert np.abs(page[y : y + 120, x : x + 180] - shown).max() < 0.01
+
+
+@pytest.mark.parametrize("name", ["depth", "gaze", "visibility", "occlusion"])
+def test02_equal_input_equal_file(tmp_path, name):
+    draw = {
+        "depth": lambda: figures.depth_figure(3 + GAZE, MASK),
+        "gaze": lambda: figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT),
+        "visibility": lambda: figures.visibility_figure(PLOTS_COLOR, GAZE, MASK),
+        "occlusion": lambda: figures.occlusion_figure(*[(PLOTS_COLOR, GAZE, MASK)] * 3, HEAT, (3, 4)),
+    }[name]
+    for k in "ab":
+        save(draw(), tmp_path / f"{k}.png", {"Comment": "seed 1"})
+    a, b = ((tmp_path / f"{k}.png").read_bytes() for k in "ab")
+    assert a == b and b"seed 1" in a
+
+
+def test02b_a_note_stands_below_and_moves_nothing():
+    """The picture and its scale are where they are without it."""
+    plain, noted = (
+        figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT, note=n) for n in ("", "made of 300 rays of 3 people")
+    )
+    assert noted.bbox.height > plain.bbox.height and noted.bbox.width == plain.bbox.width
+    for a, b in zip(plain.axes, noted.axes):
+        (x, y, w, h), lower = a.get_window_extent().bounds, noted.bbox.height - plain.bbox.height
+        np.testing.assert_allclose(b.get_window_extent().bounds, (x, y + lower, w, h), atol=0.01)
+    (text,) = noted.texts
+    noted.canvas.draw()
+    box = text.get_window_extent()
+    assert 0 <= box.y0 and box.x1 <= noted.bbox.width
+    assert box.y1 <= min(a.get_window_extent().y0 for a in noted.axes) + 0.5
+
+
+def test03_depth_without_any_surface(tmp_path):
+    save(figures.depth_figure(np.zeros((8, 12)), np.zeros((8, 12), bool)), tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 0
+
+
+def test04_one_scale_for_the_three_panels_says_what_it_clips():
+    figure = figures.occlusion_figure(
+        (PLOTS_COLOR, GAZE, MASK), (PLOTS_COLOR, GAZE, MASK), (PLOTS_COLOR, 0 * GAZE, MASK), HEAT
+    )
+    assert len(figure.axes) == 4
+    bar = figure.axes[-1]
+    # A tip beyond the end of the scale, in the colour of the end.
+    assert "1/sr" in bar.get_ylabel().replace("\n", " ") and len(bar.patches) == 1
+    assert bar.patches[0].get_xy()[:, 1].max() > 1
+    calm = figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, Heat(top=2.0))
+    assert not calm.axes[-1].patches
+
+
+# ---- Linear radiance as bytes ----
+
+
+def test01_srgb_against_known_values():
+    # IEC 61966-2-1: the knee, middle grey, white
+    assert np.allclose(srgb([0, 0.0031308, 0.214041, 0.5, 1]), [0, 0.04045, 0.5, 0.735357, 1], atol=1e-5)
+
+
+def test02_out_of_range_is_clipped():
+    assert np.array_equal(to_bytes(srgb([-1.0, 7.0, np.nan, np.inf])), [0, 255, 0, 255])
+
+
+def test03_png_has_the_pixels_and_the_text(rgb, tmp_path):
+    picture = np.random.default_rng(0).random((5, 7, 3))
+    write_png(tmp_path / "a.png", picture, {"Comment": "seed 3"})
+    assert np.array_equal(np.array(rgb.Bitmap(str(tmp_path / "a.png"))), to_bytes(picture))
+    assert b"seed 3" in (tmp_path / "a.png").read_bytes()

@@ -1,7 +1,8 @@
-"""Output files are whole or absent, and errors say what to do."""
+"""Tests of `nerg_mi.files.atomic`."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import time
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.files import atomic
 from nerg_mi.files.atomic import (
     check_folder,
     check_new_folder,
@@ -22,6 +24,8 @@ from nerg_mi.files.atomic import (
     write_bytes,
     write_text,
 )
+
+# ---- Output files are whole or absent, and errors say what to do ----
 
 
 def test_parents_are_made_and_nothing_else_is_left(tmp_path):
@@ -220,3 +224,21 @@ def test_a_killed_process_reserves_nothing(tmp_path):
     with reserving(path):
         write_bytes(path, b"x")
     assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
+
+
+# ---- Checksums of files ----
+
+
+def test_of_a_file_larger_than_a_block(tmp_path, monkeypatch):
+    monkeypatch.setattr(atomic, "_BLOCK", 7)
+    data = bytes(range(256)) * 3
+    (tmp_path / "a").write_bytes(data)
+    (tmp_path / "empty").write_bytes(b"")
+    assert atomic.file_sha256(tmp_path / "a") == hashlib.sha256(data).hexdigest()
+    assert atomic.file_sha256(tmp_path / "empty") == hashlib.sha256(b"").hexdigest()
+
+
+def test_what_is_no_file(tmp_path):
+    for path in (tmp_path / "absent", tmp_path):
+        with pytest.raises(NergError, match=path.name):
+            atomic.file_sha256(path)

@@ -1,15 +1,189 @@
-"""Videos read back by FFmpeg: every frame, its colours, the rate and what the header says."""
+"""Tests of `nerg_mi.files.video`."""
 
 from __future__ import annotations
 
+import struct
 import sys
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.video import check_video, video_frames
+from nerg_mi.files.video import check_movie, check_video, frame_times, video_frames
+from tests.files.movies import box, box_table, movie, sizes, track
+
+# ---- Times of frames, and MP4 files whose tables claim more samples than their bytes warrant ----
+
+
+def checked(path: Path, *boxes: bytes) -> None:
+    path.write_bytes(b"".join(boxes))
+    check_movie(path)
+
+
+DATA = box(b"mdat", bytes(1000))
+
+
+FILE = "film.mp4"
+
+
+def test_sound_tables_pass(tmp_path):
+    edits = box_table(b"elst", 2, bytes(40), flags=1 << 24)
+    whole = track(sizes(0, 3, bytes(12)), box_table(b"stts", 1, bytes(8)), box_table(b"stco", 1, bytes(4)), edits=edits)
+    checked(tmp_path / FILE, box(b"ftyp", b"isom"), DATA, box(b"moov", whole, track(sizes(2, 500))))
+    # Of a size that takes eight bytes, and one that runs to the end.
+    large = struct.pack(">I4sQ", 1, b"mdat", 16 + 1000) + bytes(1000)
+    checked(tmp_path / FILE, large, struct.pack(">I4s", 0, b"moov") + whole)
+
+
+def test_other_kinds_of_files_pass(tmp_path):
+    for data in (
+        b"",
+        b"RIFF",
+        b"\x1aE\xdf\xa3" + bytes(50),
+        b"GP" * 500,
+        bytes(100),
+        box(b"stsz", b"1"),
+        b"\0\0\0\5moov",
+    ):
+        checked(tmp_path / FILE, data)
+
+
+@pytest.mark.parametrize("within", [b"moov", b"free", b"udta", b"meta"])
+def test_samples_need_bytes(within, tmp_path):
+    head = {b"free": box(b"mvhd", bytes(100)), b"meta": bytes(4)}.get(within, b"")
+    with pytest.raises(ValueError, match=r"claims 30,000,000 samples in [\d,]+ bytes"):
+        checked(tmp_path / FILE, DATA, box(within, head, track(sizes(1, 30_000_000))))
+
+
+def test_samples_of_parts_count_together(tmp_path):
+    parts = [box(b"moof", box(b"traf", box_table(b"trun", 400))) for _ in range(3)]
+    checked(tmp_path / FILE, DATA, parts[0], box(b"free", bytes(100)))
+    with pytest.raises(ValueError, match="claims 1,200 samples"):
+        checked(tmp_path / FILE, DATA, *parts)
+
+
+def test_tables_that_are_too_short_run_on(tmp_path):
+    """FFmpeg reads their beginning from what follows."""
+    with pytest.raises(ValueError, match=r"claims 16,777,215 samples"):
+        checked(tmp_path / FILE, box(b"moof", box(b"traf", box(b"trun", bytes(2)))) + b"\0\0\0\xff\xff\xff" + bytes(9))
+
+
+def test_edits_multiply_samples(tmp_path):
+    for edits, passes in ((2, True), (40, False)):
+        whole = box(b"moov", track(sizes(1, 900), edits=box_table(b"elst", edits, bytes(12 * edits))))
+        if passes:
+            checked(tmp_path / FILE, DATA, whole)
+            continue
+        with pytest.raises(ValueError, match="900.*40"):
+            checked(tmp_path / FILE, DATA, whole)
+
+
+@pytest.mark.parametrize("kind, size", [(b"stts", 8), (b"ctts", 8), (b"stsc", 12), (b"stss", 4), (b"stco", 4)])
+def test_tables_hold_their_entries(kind, size, tmp_path):
+    checked(tmp_path / FILE, DATA, box(b"moov", track(box_table(kind, 3, bytes(3 * size)))))
+    with pytest.raises(ValueError, match=f'"{kind.decode()}" claims 4 entries, and holds 3'):
+        checked(tmp_path / FILE, DATA, box(b"moov", track(box_table(kind, 4, bytes(3 * size)))))
+    with pytest.raises(ValueError, match='"stsz".*268,435,456.*3'):
+        checked(tmp_path / FILE, DATA, box(b"moov", track(sizes(0, 1 << 28, bytes(12)))))
+
+
+def test_what_cannot_be_looked_into_is_refused(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="is compressed"):
+        checked(tmp_path / FILE, box(b"moov", box(b"cmov", bytes(20))))
+    monkeypatch.setattr("nerg_mi.files.video._BOXES", 5)
+    with pytest.raises(ValueError, match="more than 5 boxes"):
+        checked(tmp_path / FILE, *[box(b"free")] * 6)
+
+
+def runs(kind: bytes, *pairs: tuple[int, int], version: int = 0) -> bytes:
+    entries = b"".join(struct.pack(">Ii", *pair) for pair in pairs)
+    return box_table(kind, len(pairs), entries, version << 24)
+
+
+def edits(*entries: tuple[int, int, int], long: bool = False) -> bytes:
+    form = ">QqI" if long else ">IiI"
+    return box_table(b"elst", len(entries), b"".join(struct.pack(form, *e) for e in entries), long << 24)
+
+
+STEADY = runs(b"stts", (6, 1000))
+
+
+ONCE = 1 << 16  # the speed of an edit
+
+
+@pytest.mark.parametrize(
+    "tables, edited, seconds",
+    [
+        ([STEADY], b"", np.arange(6) / 24.95),
+        # A rate that varies, with two frames lost.
+        (
+            [runs(b"stts", (2, 1000), (1, 3000), (1, 900), (1, 1000))],
+            b"",
+            [0, 1 / 24.95, 2 / 24.95, 5 / 24.95, 5.9 / 24.95],
+        ),
+        # Frames that are decoded before those that they are shown after: offsets of both signs.
+        ([runs(b"stts", (4, 1000)), runs(b"ctts", (1, 0), (1, 2000), (2, -1000))], b"", np.arange(4) / 24.95),
+        # 0.08 s of nothing, then the track from its third frame on.
+        ([STEADY], edits((80, -1, ONCE), (400, 2000, ONCE)), 0.08 + np.arange(4) / 24.95),
+        # The first 0.1 s, and again what follows 0.12 s; an edit of no duration runs to the end.
+        (
+            [STEADY],
+            edits((100, 0, ONCE), (0, 3000, ONCE), long=True),
+            [*np.arange(3) / 24.95, *(0.1 + np.arange(3) / 24.95)],
+        ),
+    ],
+)
+@pytest.mark.parametrize("version", [0, 1])
+def test_times_of_frames(tables, edited, seconds, version, tmp_path):
+    path = tmp_path / FILE
+    path.write_bytes(movie(1000, 24_950, *tables, edits=edited, version=version))
+    assert np.allclose(frame_times(path), seconds, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        (b"RIFF" + bytes(100), "no track of pictures, or is no MP4"),
+        (movie(1000, 48_000, STEADY, kind=b"soun"), "no track of pictures"),
+        (movie(1000, 0, STEADY), "no ticks"),
+        (movie(1000, 24_950, STEADY, edits=edits((100, 0, ONCE // 2))), "changes its speed"),
+        (movie(1000, 24_950, STEADY, runs(b"ctts", (5, 0))), "tell of 6 and of 5 frames"),
+        (movie(1000, 24_950, runs(b"stts", (1 << 30, 1))), "more than 16,777,216 frames"),
+        (movie(1000, 24_950, STEADY, edits=edits((100, 9000, ONCE))), "has no frames"),
+        (movie(1000, 24_950, STEADY, edits=edits((100, 0, ONCE))).replace(b"mvhd", b"free"), "a clock that it lacks"),
+        (movie(1000, 24_950, STEADY) + box(b"moof"), "in fragments.*ffmpeg -i VIDEO -c copy"),
+        (movie(1000, 24_950, box(b"stts", bytes(5))), "cannot be read"),
+    ],
+)
+def test_times_that_cannot_be_read(data, message, tmp_path):
+    (tmp_path / FILE).write_bytes(data)
+    with pytest.raises(NergError, match=f"film.mp4.*{message}"):
+        frame_times(tmp_path / FILE)
+
+
+def test_times_are_those_that_ffmpeg_shows(tmp_path):
+    """A steady video of another rate, coded with frames that are decoded out of order, which starts after 0.28 s."""
+    av = pytest.importorskip("av")
+    path, base = tmp_path / FILE, Fraction(1, 24_950)
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mpeg4", rate=Fraction(24_950, 1000))
+        stream.width = stream.height = 32
+        stream.pix_fmt, stream.time_base, stream.codec_context.time_base = "yuv420p", base, base
+        stream.codec_context.max_b_frames = 2
+        for k in range(12):
+            frame = av.VideoFrame(32, 32, "yuv420p")
+            frame.pts, frame.time_base = 7000 + 1000 * k + 300 * (k % 3), base
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    with av.open(str(path)) as video:
+        shown = [frame.time for frame in video.decode(video=0)]
+    assert shown[0] > 0.2 and np.allclose(frame_times(path), shown, rtol=0, atol=2e-5)
+
+
+# ---- Videos read back by FFmpeg: every frame, its colours, the rate and what the header says ----
+
 
 HEIGHT, WIDTH = 48, 80
 

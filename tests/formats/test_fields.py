@@ -1,4 +1,4 @@
-"""Fields in and out of files: exact in fp32, rounded in fp16, and a sentence for what does not fit."""
+"""Tests of `nerg_mi.formats.fields`."""
 
 import json
 
@@ -10,21 +10,179 @@ from safetensors.numpy import save_file
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_base import limits_of
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import OccupancyGrid, contracted_cascades
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
-from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
+from nerg_mi.formats.fields import (
+    FINEST,
+    LARGEST,
+    OCCUPANCY_CELLS,
+    StoredArrays,
+    building,
+    check_occupancy,
+    check_sizes,
+    load_gaze,
+    load_radiance,
+    number,
+    save_gaze,
+    save_radiance,
+    stored,
+)
 from nerg_mi.maths.geometry import Box, ContractedBox
 
-GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
+# ---- Sizes that checkpoints claim: in bounds, or said in a sentence that names the file ----
+
+
+GRID = {"levels": 2, "features": 2, "log2_rows": 8, "base": 4, "finest": 16, "dimensions": 3}
+
+
+def test_sizes_in_bounds_pass_as_they_are():
+    about = {"grid": GRID, "width": 4096, "density_hidden": 1, "geometry": 15, "other": "kept"}
+    assert check_sizes(about) is about
+    assert check_sizes({"grid": {"kind": "hashgrid", **GRID}})
+
+
+def test_each_kind_of_gaze_field_has_its_own_bounds():
+    """The word "geometry" of a log density is no size."""
+    product, log = {"geometry": "surface"}, {"kind": "log_density", "geometry": "surface", "layers": 2}
+    assert check_sizes(log, most=limits_of(log)) is log
+    for about, name in ((product, "geometry"), ({**log, "layers": 65}, "layers"), ({**log, "prior": 0}, "prior")):
+        with pytest.raises(ValueError, match=f'"{name}" of its architecture must be a whole number'):
+            check_sizes(about, most=limits_of(about))
+    assert not limits_of({"kind": "wavelet"}) and not limits_of({"kind": ["product"]}) and not limits_of("product")
+
+
+@pytest.mark.parametrize(
+    "about, words",
+    [
+        ([1], '"architecture"'),
+        ({"width": 0}, '"width".*1.*4096.*0'),
+        ({"width": True}, "not True"),
+        ({"width": 2.0}, "not 2.0"),
+        ({"width": 10**99}, r"\.\.\."),
+        ({"grid": {**GRID, "levels": 65}}, '"levels".*1.*64'),
+        ({"grid": {**GRID, "finest": FINEST + 1}}, '"finest"'),
+        ({"grid": {**GRID, "finest": float("nan")}}, "must be a finite number"),
+        ({"grid": "fine"}, '"grid"'),
+        ({"grid": {**GRID, "kind": "octree"}}, "'octree'"),
+    ],
+)
+def test_sizes_out_of_bounds_are_named(about, words):
+    with pytest.raises(ValueError, match=words):
+        check_sizes(about)
+
+
+def test_numbers_are_finite_and_no_booleans():
+    assert number({"a": 2}, "a", "thing") == 2
+    for wrong in ({"a": True}, {"a": "2"}, {"a": float("inf")}, {"a": None}, [2]):
+        with pytest.raises(ValueError, match='"a"'):
+            number(wrong, "a", "thing")
+
+
+def test_occupancy_has_a_largest_size():
+    about = {"resolution": 400, "threshold": 0.5}
+    assert check_occupancy(about) is about
+    check_occupancy({**about, "resolution": 128, "bound": 16.0})
+    for wrong in ({"resolution": 407}, {"resolution": 2.0}, {"resolution": 128, "bound": 2.0**40}):
+        with pytest.raises(ValueError, match=f"{OCCUPANCY_CELLS:,} cells at most"):
+            check_occupancy({**about, **wrong})
+
+
+@pytest.mark.parametrize("error", [KeyError("box"), ValueError("x"), TypeError("x"), OverflowError("x")])
+def test_what_building_raises_names_the_file(error):
+    with pytest.raises(NergError, match='the checkpoint "a.safetensors" (lacks .box.|holds no usable field: x)') as e:
+        with building("a.safetensors"):
+            raise error
+    assert e.value.__cause__ is error
+
+
+def test_finished_sentences_and_faults_of_the_program_pass():
+    own = NergError("as it is")
+    with pytest.raises(NergError) as e, building("a"):
+        raise own
+    assert e.value is own
+    with pytest.raises(ZeroDivisionError), building("a"):
+        _ = 1 / 0
+
+
+# ---- Arrays of checkpoints as parts of fields, and the other way ----
+
+
+ARRAYS_GRID = HashGridConfig(levels=1, log2_rows=3, base=1, finest=1)
+
+
+def test_arrays_are_float32_of_the_shape_that_is_asked_for():
+    arrays = StoredArrays({"a": np.ones((2, 3), np.float16), "n": np.array([1, np.nan]), "big": np.array([1e300])}, ns)
+    found = arrays.array("a", 2, None)
+    assert found.dtype == np.float32 and found.ctypes.data % 64 == 0
+    assert arrays.raw("a").dtype == np.float16
+    for shape in ((3, 2), (2,), (2, 3, 1)):
+        with pytest.raises(ValueError, match='"a".*2.*3'):
+            arrays.array("a", *shape)
+    for name, size in (("n", 2), ("big", 1)):
+        with pytest.raises(ValueError, match=f'"{name}" is not finite'):
+            arrays.array(name, size)
+    with pytest.raises(KeyError, match="b"):
+        arrays.array("b", 1)
+
+
+@pytest.mark.parametrize("value, largest", [(1e30, LARGEST), (-1.1e6, LARGEST), (81.0, 80.0)])
+def test_values_whose_products_single_precision_cannot_hold_are_refused(value, largest):
+    arrays = StoredArrays({"a": np.array([0.0, value])}, ns)
+    with pytest.raises(ValueError, match=f'"a" holds values beyond {largest:g}'.replace("+", ".")):
+        arrays.array("a", 2, largest=largest)
+    assert arrays.array("a", 2, largest=2 * abs(value)).shape == (2,)
+
+
+def test_networks_and_encodings():
+    net = MLP.random([3, 4, 2], ns, np.random.default_rng(0), normalized=True)
+    (size,) = ARRAYS_GRID.shapes()["table"]
+    tensors = {f"net.{k}": v.numpy() for k, v in net.named().items()} | {"grid.table": np.arange(size, dtype="f4")}
+    arrays = StoredArrays(tensors, ns)
+    again = arrays.net("net", [3, 4, 2], normalized=True)
+    assert all(np.array_equal(again.named()[k].numpy(), v.numpy()) for k, v in net.named().items())
+    assert arrays.net("net", [3, 4, 2]).norms is None
+    assert arrays.grid(ARRAYS_GRID).table.numpy().tolist() == list(range(size))
+    with pytest.raises(ValueError, match='"grid.table" has the shape'):
+        arrays.grid(HashGridConfig(levels=2, log2_rows=3, base=1, finest=2))
+
+
+def test_members_have_names_of_their_own():
+    arrays = StoredArrays({"0.a": np.zeros(1), "1.a": np.ones(1), "10.a": np.full(1, 10)}, ns)
+    about, own = arrays.member(1, {"width": 4})
+    assert about == {"width": 4} and own.array("a", 1).tolist() == [1]
+    with pytest.raises(ValueError, match="width"):
+        arrays.member(0, {"width": 0})
+
+
+def test_what_is_stored_is_finite():
+    values = {"a": ns.Float([1.0, 70000.0])}
+    assert stored(values, False)["a"].dtype == np.float32
+    with pytest.raises(NergError, match='"a".*fp16.*--half'):
+        stored(values, True)
+    with pytest.raises(NergError, match='"a" is not finite.*diverged'):
+        stored({"a": ns.Float([np.inf])}, False)
+    with pytest.raises(NergError, match='"a".*06'):
+        stored({"a": ns.Float([-2e6])}, True)
+    assert stored({"a": ns.TensorXf(np.ones((2, 2), np.float32))}, True)["a"].dtype == np.float16
+
+
+# ---- Fields in and out of files: exact in fp32, rounded in fp16, and a sentence for what does not fit ----
+
+
+FIELDS_GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
+
+
 BOX = Box((-1, 0, 2), (3, 2, 4))
 
 
 def radiance(resolution=5):
     bits = np.random.default_rng(0).random((resolution,) * 3) < 0.2
     return RadianceField.random(
-        RadianceConfig(GRID, width=16, color_hidden=1, geometry=3, sh_degree=2, density_scale=7.0),
+        RadianceConfig(FIELDS_GRID, width=16, color_hidden=1, geometry=3, sh_degree=2, density_scale=7.0),
         BOX,
         ns,
         1,
@@ -35,7 +193,7 @@ def radiance(resolution=5):
 
 
 def gaze():
-    return GazeField.random(GazeConfig(GRID, "capture", "exp", width=16, geometry=3, sh_degree=3), BOX, ns, 2)
+    return GazeField.random(GazeConfig(FIELDS_GRID, "capture", "exp", width=16, geometry=3, sh_degree=3), BOX, ns, 2)
 
 
 def arrays(field):
@@ -86,7 +244,7 @@ def test02b_what_a_gaze_field_rests_on(tmp_path):
 
 
 def test02c_a_deferred_field(tmp_path):
-    made = RadianceField.random(RadianceConfig(GRID, width=16, deferred=True), Box((-1, -1, -1), (1, 1, 1)), ns)
+    made = RadianceField.random(RadianceConfig(FIELDS_GRID, width=16, deferred=True), Box((-1, -1, -1), (1, 1, 1)), ns)
     save_radiance(made, tmp_path / "f.safetensors", {})
     assert load_radiance(tmp_path / "f.safetensors", ns)[0].config.deferred
     save_radiance(radiance(), tmp_path / "g.safetensors", {})
@@ -94,7 +252,7 @@ def test02c_a_deferred_field(tmp_path):
 
 
 def test03_without_occupancy_and_step(tmp_path):
-    field = RadianceField.random(RadianceConfig(GRID, width=16), BOX, ns)
+    field = RadianceField.random(RadianceConfig(FIELDS_GRID, width=16), BOX, ns)
     save_radiance(field, tmp_path / "f", {})
     again, _ = load_radiance(tmp_path / "f", ns)
     assert again.occupancy is None and again.march_step is None and again.color_space == "srgb"
@@ -110,6 +268,8 @@ def test04_the_other_kind(tmp_path):
 
 
 NAMES = ["grid.table", "density_net.0", "color_net.1", "occupancy.bits"]
+
+
 GAZE_NAMES = ["grid.table", "position_net.1", "direction_net.0", "emit_head.0", "capture_head.0"]
 
 
@@ -220,7 +380,7 @@ def test_cascades_that_float32_cannot_address_are_refused():
 def test_a_place_without_an_end(tmp_path):
     box, r = ContractedBox(Box((-1, 0, 2), (3, 2, 4)), 8), 8
     field = RadianceField.random(
-        RadianceConfig(GRID, width=16, color_hidden=1, geometry=3, sh_degree=2),
+        RadianceConfig(FIELDS_GRID, width=16, color_hidden=1, geometry=3, sh_degree=2),
         box,
         ns,
         1,
@@ -235,7 +395,7 @@ def test_a_place_without_an_end(tmp_path):
     assert np.array_equal(again.occupancy.bits, field.occupancy.bits) and again.occupancy.bound == 8
     p = ns.Array3f(np.random.default_rng(1).uniform(-14, 14, (3, 100)).astype(np.float32))
     assert np.array_equal(again.density(p).numpy(), field.density(p).numpy())
-    attention = GazeField.random(GazeConfig(GRID, width=16, geometry=3, sh_degree=3), box, ns, 2)
+    attention = GazeField.random(GazeConfig(FIELDS_GRID, width=16, geometry=3, sh_degree=3), box, ns, 2)
     save_gaze(attention, path, {})
     assert load_gaze(path, ns)[0].box == box
 
@@ -259,7 +419,7 @@ def test_a_place_without_an_end_that_makes_no_sense(tmp_path, change):
 
 @pytest.mark.parametrize("value", [1e30, 81.0, 1e5])
 def test_a_blind_density_that_single_precision_cannot_hold_is_refused(tmp_path, value):
-    save_gaze(LogGazeField.random(LogGazeConfig(GRID, prior=4), BOX, ns), tmp_path / "g.safetensors", {})
+    save_gaze(LogGazeField.random(LogGazeConfig(FIELDS_GRID, prior=4), BOX, ns), tmp_path / "g.safetensors", {})
     load_gaze(tmp_path / "g.safetensors", ns)
     rewrite(tmp_path / "g.safetensors", lambda tensors, meta: tensors["prior"].fill(value))
     with pytest.raises(NergError, match='g.safetensors.*"prior".*80'):

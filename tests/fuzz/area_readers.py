@@ -31,7 +31,7 @@ def _read_areas(folder: Path) -> object:
 
 
 def _make_twin(folder: Path) -> None:
-    from tests.formats.areas.test_twin_objects import write_twin
+    from tests.formats.test_areas import write_twin
 
     write_twin(folder / "twin")
 

@@ -10,7 +10,7 @@ from tests.fuzz.describe import Reader
 
 def _make_results(folder: Path) -> None:
     from nerg_mi.evaluation.gaze_report import write_report
-    from tests.evaluation.gaze.test_verdict import scored
+    from tests.evaluation.test_gaze_report import scored
 
     person = {"method": "gaze field", "person": "Ada", "rays": 9, "bits": 0.1, "CC": 0.5, "KLD": 0.2}
     about = {

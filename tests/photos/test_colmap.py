@@ -1,6 +1,9 @@
-"""COLMAP models, built byte by byte and line by line here: cameras, poses, points, and what cannot be read."""
+"""Tests of `nerg_mi.photos.colmap`."""
+
+from __future__ import annotations
 
 import hashlib
+import json
 import struct
 import tracemalloc
 
@@ -10,7 +13,22 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.photos import colmap
-from nerg_mi.photos.colmap import model_files, read_colmap, read_image_poses
+from nerg_mi.photos.colmap import (
+    describe_other_models,
+    find_source,
+    find_up,
+    model_files,
+    read_colmap,
+    read_image_poses,
+    read_named_poses,
+    turn_to_z,
+)
+from nerg_mi.photos.transforms import read_transforms
+
+# ---- Colmap ----
+#
+# COLMAP models, built byte by byte and line by line here: cameras, poses, points, and what cannot be read.
+
 
 # COLMAP's camera models: number, name, parameters.
 CAMERAS = {
@@ -25,6 +43,8 @@ CAMERAS = {
     9: (9, "RADIAL_FISHEYE", 40, 30, (50.0, 20.5, 14.5, 0.1, 0.02)),
     10: (7, "FOV", 40, 30, (50.0, 51.0, 20.5, 14.5, 0.9)),
 }
+
+
 # fx, fy, k1, k2, p1, p2, k3, k4, k5, k6, fisheye of the first nine.
 EXPECTED = {
     1: (50, 50, 0, 0, 0, 0, 0, 0, 0, 0, False),
@@ -51,7 +71,11 @@ def quaternion(matrix):
 
 
 POINTS = np.random.default_rng(2).normal(size=(6, 3))
+
+
 TRACKS, ERRORS = [4, 3, 2, 5, 3, 7], [0.5, 1.0, 0.5, 9.0, 2.0, 0.1]
+
+
 TRUSTED = [0, 1, 4, 5]
 
 
@@ -359,3 +383,196 @@ def test_more_than_is_read_is_refused_before_it_is_read(tmp_path, monkeypatch, w
         out.truncate(64 << 30)
     with pytest.raises(NergError, match=f"{name}.* has 68,719,476,736 bytes, more than"):
         read_colmap(tmp_path, tmp_path)
+
+
+# ---- Poses by names, without images ----
+
+
+def write_transforms(path, poses):
+    frames = [{"file_path": name, "transform_matrix": pose.tolist()} for name, pose in poses.items()]
+    path.write_text(json.dumps({"frames": frames}))
+    return path
+
+
+def write_colmap(folder, poses):
+    """A text model of OpenGL camera-to-world poses: COLMAP's are world-to-camera, y down and z forward."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
+    text = "# images\n"
+    for k, (name, pose) in enumerate(poses.items()):
+        x, y, z, w = Rotation.from_matrix((pose[:3, :3] @ np.diag([1, -1, -1])).T).as_quat()
+        t = -(pose[:3, :3] @ np.diag([1, -1, -1])).T @ pose[:3, 3]
+        text += f"{k + 1} {w} {x} {y} {z} {t[0]} {t[1]} {t[2]} 1 {name}\n\n"
+    (folder / "images.txt").write_text(text)
+    return folder
+
+
+def some_poses(n=4):
+    rng = np.random.default_rng(1)
+    poses = {}
+    for k in range(n):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = Rotation.random(random_state=k).as_matrix(), rng.normal(size=3)
+        poses[f"images/scene_{k:04d}.jpg"] = pose
+    return poses
+
+
+def test_both_kinds_give_the_same_poses(tmp_path):
+    poses = some_poses()
+    a = read_named_poses(write_transforms(tmp_path / "transforms.json", poses))
+    b = read_named_poses(write_colmap(tmp_path / "sparse", poses))
+    for found in (a, b):
+        assert found.names == list(poses) and np.allclose(found.to_world, list(poses.values()), atol=1e-12)
+    assert a.path.name == "transforms.json" and b.path.name == "images.txt" and a.sha256 != b.sha256
+
+
+def test_the_checksum_is_that_of_a_training(tmp_path):
+    poses = some_poses(2)
+    path = write_transforms(tmp_path / "transforms.json", poses)
+    (tmp_path / "images").mkdir()
+    for name in poses:
+        (tmp_path / name).write_bytes(b"")
+    assert read_named_poses(path).sha256 == read_transforms(path).sha256
+
+
+@pytest.mark.parametrize(
+    "frames, message",
+    [
+        ([], "lists no images"),
+        ([{"file_path": "a.jpg"}], '0.*"file_path".*"transform_matrix"'),
+        ([{"file_path": "a.jpg", "transform_matrix": [[1]]}], '"a.jpg".*4.*4'),
+    ],
+)
+def test_what_is_no_pose(tmp_path, frames, message):
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"frames": frames}))
+    with pytest.raises(NergError, match=message):
+        read_named_poses(path)
+
+
+def test_a_model_whose_quaternion_is_zero(tmp_path):
+    folder = write_colmap(tmp_path / "sparse", some_poses(1))
+    (folder / "images.txt").write_text("1 0 0 0 0 0 0 0 1 a.jpg\n\n")
+    with pytest.raises(NergError, match='image "a.jpg" of .*its quaternion is zero'):
+        read_named_poses(folder)
+
+
+@pytest.mark.parametrize("base", ["sparse", "colmap/sparse", "."])
+@pytest.mark.parametrize("counts", [{"0": 2, "1": 5}, {"0": 5, "1": 2}, {"0": 1, "2": 3, "10": 4}, {"0": 3, ".": 3}])
+def test_of_several_models_the_largest_is_taken(tmp_path, base, counts):
+    for name, count in counts.items():
+        write_colmap(tmp_path / base / name, some_poses(count))
+    best = max(counts, key=lambda name: counts[name])
+    assert find_source(tmp_path).resolve() == (tmp_path / base / best).resolve()
+    (note,) = describe_other_models(tmp_path / base / best)
+    assert f"of {len(counts)} COLMAP models" in note and f"({max(counts.values())} images) is used" in note
+
+
+def test_binary_models_are_counted_by_their_header(tmp_path):
+    for name, count in (("0", 2), ("1", 24)):
+        (tmp_path / "sparse" / name).mkdir(parents=True)
+        for file in ("cameras.bin", "images.bin"):
+            (tmp_path / "sparse" / name / file).write_bytes(count.to_bytes(8, "little"))
+    assert find_source(tmp_path).name == "1"
+    assert describe_other_models(tmp_path / "sparse/0")[0].endswith('"0" (2 images) is used, and not "1" (24 images)')
+
+
+def test_a_single_model_needs_no_note(tmp_path):
+    assert describe_other_models(write_colmap(tmp_path / "sparse/0", some_poses(2))) == []
+
+
+def test_notes_on_a_model_come_with_its_poses(tmp_path):
+    for name, count in (("0", 2), ("1", 4)):
+        write_colmap(tmp_path / "sparse" / name, some_poses(count))
+    images = tmp_path / "sparse/1/images.txt"
+    images.write_text("# Number of images: 24, mean observations per image: 0\n" + images.read_text())
+    few, other = read_named_poses(find_source(tmp_path)).notes
+    assert "has 4 records, but its header states 24" in few and '"1" (4 images) is used' in other
+
+
+# ---- Up, of cameras and points whose up is known ----
+
+
+SOME = Rotation.from_euler("xyz", [40, -70, 110], degrees=True).as_matrix()
+
+
+def around(count: int = 24, arc: float = 2 * np.pi, down: float = 30.0, roll: float = 0.0, seed: int = 0) -> np.ndarray:
+    """Cameras on an arc about the z axis, looking ``down`` by so many degrees, rolled by up to ``roll``."""
+    rng, out = np.random.default_rng(seed), []
+    for a in np.linspace(0, arc, count, endpoint=False):
+        back = np.array([np.cos(a) * np.cos(np.radians(down)), np.sin(a) * np.cos(np.radians(down)), 0])
+        back[2] = np.sin(np.radians(down))
+        right = np.cross([0, 0, 1], back) / np.cos(np.radians(down))
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+        pose[:3, :3] = pose[:3, :3] @ Rotation.from_rotvec([0, 0, np.radians(rng.uniform(-roll, roll))]).as_matrix()
+        pose[:3, 3] = 3 * back + [0, 0, 1]
+        out.append(pose)
+    return np.array(out)
+
+
+def turned(poses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    out = poses.copy()
+    out[:, :3] = SOME @ poses[:, :3]
+    return out, points @ SOME.T
+
+
+def angle(up: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(up @ SOME[:, 2], -1, 1))))
+
+
+NOTHING = np.zeros((0, 3))
+
+
+@pytest.mark.parametrize("arc, most", [(2 * np.pi, 0.01), (np.pi, 1.0), (np.pi / 2, 4.0)])
+def test_level_cameras_tell_it_wherever_they_look_down(arc, most):
+    up = find_up(*turned(around(arc=arc), NOTHING))
+    assert angle(up.direction) < most and up.roll < most and up.plane is None and up.sure
+
+
+def test_cameras_that_all_look_ahead_tell_it_by_their_pictures():
+    """Their horizontal axes agree, and leave open how far they look down."""
+    up = find_up(*turned(np.repeat(around(1, down=10), 8, axis=0), NOTHING))
+    assert angle(up.direction) == pytest.approx(10, abs=0.01)
+
+
+def test_a_few_that_are_held_on_end_do_not_matter():
+    poses = around(30)
+    quarter = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
+    poses[::6, :3, :3] = poses[::6, :3, :3] @ quarter
+    up = find_up(*turned(poses, NOTHING))
+    assert angle(up.direction) < 1 and up.sure
+
+
+def floor(count: int = 900, walls: int = 900) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    ground = rng.uniform(-2, 2, (count, 3)) * [1, 1, 0.003]
+    wall = rng.uniform(-2, 2, (walls, 3)) * [1, 0.003, 1] + [0, 2, 1]
+    return np.concatenate([ground, wall, rng.uniform(-2, 2, (300, 3))])
+
+
+def test_a_floor_is_more_exact_than_hands():
+    poses, points = turned(around(roll=20, seed=1), floor())
+    by_hands, up = find_up(poses, NOTHING), find_up(poses, points)
+    assert angle(up.direction) < 0.3 < angle(by_hands.direction)
+    assert 0.35 < up.plane < 0.55 and up.between == pytest.approx(angle(by_hands.direction), abs=0.4)
+    assert "plane of" in str(up) and "no plane" in str(by_hands)
+
+
+def test_walls_ceilings_and_lines_are_no_floor():
+    poses = around()
+    walls = floor(count=0)
+    ceiling = floor(walls=0) + [0, 0, 6]
+    edge = np.random.default_rng(0).uniform(-2, 2, (900, 3)) * [1, 0.003, 0.003]
+    for points in (walls, ceiling, edge):
+        assert find_up(*turned(poses, points)).plane is None
+
+
+def test_cameras_that_do_not_agree_say_so():
+    assert not find_up(*turned(around(roll=180), NOTHING)).sure
+
+
+@pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.6, 0, -0.8]])
+def test_up_becomes_z(up):
+    turn = turn_to_z(np.array(up, float))
+    assert np.allclose(turn @ up, [0, 0, 1]) and np.allclose(turn @ turn.T, np.eye(3)) and np.linalg.det(turn) > 0

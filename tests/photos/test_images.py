@@ -1,14 +1,50 @@
-"""Loading pictures, masks and depth at a size, and splitting them."""
+"""Tests of `nerg_mi.photos.images`."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from nerg_mi.files.images import write_bitmap_exr
-from nerg_mi.photos.images import load_usable, load_view, read_image, split_holdout
+from nerg_mi.errors import NergError
+from nerg_mi.files.images import write_bitmap_exr, write_exr
+from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.dataset import open_dataset
+from nerg_mi.photos.images import (
+    View,
+    load_usable,
+    load_view,
+    pinhole,
+    read_depth,
+    read_image,
+    read_mask,
+    read_photo,
+    read_split,
+    split_holdout,
+    through_lens,
+    undistorted,
+)
+from nerg_mi.photos.posed import DepthFile, Frame, MaskFile
 from nerg_mi.photos.transforms import read_transforms
-from tests.photos.written_sets import METRES_ALONG_RAYS
+from tests.photos.written_sets import (
+    METRES_ALONG_RAYS,
+    OPENCV,
+    H,
+    W,
+    cameras,
+    colmap_bin,
+    colmap_txt,
+    expected_rays,
+    instant_ngp,
+    nerfstudio,
+    opengl,
+    picture,
+    rewrite,
+)
+
+# ---- Loading pictures, masks and depth at a size, and splitting them ----
 
 
 @pytest.fixture
@@ -96,3 +132,488 @@ def test_every_kth_of_the_sorted_frames_is_held_out(dataset):
     assert split_holdout(frames, 0) == (frames, [])
     with pytest.raises(ValueError, match="holdout"):
         split_holdout(frames, 1)
+
+
+# ---- Pictures, depth and masks of every kind of file, written here with known numbers ----
+
+
+def to_srgb(x):
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_png_is_kept_as_stored(tmp_path, rgb, dtype, channels):
+    values = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (5, 7, channels)).astype(dtype)
+    formats = {1: rgb.Bitmap.PixelFormat.Y, 3: rgb.Bitmap.PixelFormat.RGB, 4: rgb.Bitmap.PixelFormat.RGBA}
+    rgb.Bitmap(values, formats[channels]).write(str(tmp_path / "a.png"))
+    out = read_image(tmp_path / "a.png")
+    assert out.dtype == dtype and np.array_equal(out, np.repeat(values, 3, axis=2) if channels == 1 else values)
+
+
+def test_jpeg(tmp_path, rgb):
+    rgb.Bitmap(np.full((8, 8, 3), 77, np.uint8)).write(str(tmp_path / "a.jpg"))
+    out = read_image(tmp_path / "a.jpg")
+    assert out.dtype == np.uint8 and np.abs(out.astype(int) - 77).max() <= 1
+
+
+def test_exr_is_linear_and_clipped(tmp_path, rgb):
+    linear = np.array([[[0.001, 0.2, 0.5], [1.0, 3.0, -0.5]]], np.float32)
+    write_bitmap_exr(tmp_path / "a.exr", rgb.Bitmap(linear))
+    assert np.allclose(read_image(tmp_path / "a.exr"), to_srgb(np.clip(linear, 0, 1)), atol=1e-3)
+
+
+def test_exr_with_alpha_is_premultiplied(tmp_path, rgb):
+    straight = np.array([[[0.8, 0.4, 0.1, 0.5], [0.3, 0.2, 0.1, 1.0], [0, 0, 0, 0]]], np.float32)
+    premultiplied = straight.copy()
+    premultiplied[..., :3] *= straight[..., 3:]
+    write_bitmap_exr(tmp_path / "a.exr", rgb.Bitmap(premultiplied, rgb.Bitmap.PixelFormat.RGBA))
+    expected = np.concatenate([to_srgb(straight[..., :3]), straight[..., 3:]], axis=2)
+    assert np.allclose(read_image(tmp_path / "a.exr"), expected, atol=1e-3)
+
+
+def test_colour_of_an_exr_with_more_layers(tmp_path):
+    import OpenEXR
+
+    values = {k: np.full((2, 3), v, np.float32) for k, v in {"R": 0.1, "G": 0.2, "B": 0.3, "depth.T": 7.0}.items()}
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, values) as file:
+        file.write(str(tmp_path / "a.exr"))
+    assert np.allclose(read_image(tmp_path / "a.exr"), to_srgb(np.array([0.1, 0.2, 0.3])), atol=1e-3)
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"depth.T": values["depth.T"], "x.Y": values["R"]}) as file:
+        file.write(str(tmp_path / "b.exr"))
+    with pytest.raises(ValueError, match="b.exr.*R, G and B"):
+        read_image(tmp_path / "b.exr")
+
+
+def test_unreadable_and_broken_images_are_named(tmp_path, rgb):
+    (tmp_path / "a.png").write_bytes(b"no image")
+    with pytest.raises(ValueError, match="a.png"):
+        read_image(tmp_path / "a.png")
+    write_bitmap_exr(tmp_path / "b.exr", rgb.Bitmap(np.full((2, 2, 3), np.nan, np.float32)))
+    with pytest.raises(ValueError, match="b.exr.*not finite"):
+        read_image(tmp_path / "b.exr")
+
+
+def test_depth_of_every_kind(tmp_path, rgb):
+    depth = np.array([[0.5, 1.25, 0.0], [2.0, 60.0, 3.5]], np.float32)
+    np.save(tmp_path / "a.npy", depth)
+    write_bitmap_exr(tmp_path / "a.exr", rgb.Bitmap(depth))
+    rgb.Bitmap((depth * 1000).astype(np.uint16)).write(str(tmp_path / "a.png"))
+    for name, unit in (("a.npy", 1.0), ("a.exr", 1.0), ("a.png", 1e-3)):
+        assert np.allclose(read_depth(DepthFile(tmp_path / name, unit)), depth, rtol=1e-6), name
+    np.save(tmp_path / "b.npy", np.array([[np.nan, np.inf, -1.0, 2.0]]))
+    assert np.array_equal(read_depth(DepthFile(tmp_path / "b.npy", 3.0)), [[0, 0, 0, 6]])
+
+
+@pytest.mark.parametrize("names", [["V"], ["A", "B", "G", "R", "ViewLayer.Depth.Z"], ["R", "G", "B", "depth.T"], "RGB"])
+def test_depth_of_an_exr_is_the_channel_of_that_name(tmp_path, names):
+    rng, depth = np.random.default_rng(0), np.full((2, 3), 2.5, np.float32)
+    grey = list(names) == ["R", "G", "B"]
+    channels = {n: depth if grey or n == names[-1] else rng.random((2, 3)).astype(np.float32) for n in names}
+    write_exr(tmp_path / "a.exr", channels)
+    assert np.array_equal(read_depth(DepthFile(tmp_path / "a.exr")), depth)
+
+
+def test_an_exr_of_which_no_channel_is_the_depth_is_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    write_exr(tmp_path / "a.exr", {n: rng.random((2, 3)).astype(np.float32) for n in "RGB"})
+    with pytest.raises(NergError, match="a.exr"):
+        read_depth(DepthFile(tmp_path / "a.exr"))
+
+
+def test_depth_that_cannot_be_read_is_named(tmp_path, rgb):
+    rgb.Bitmap(np.zeros((2, 2), np.uint8)).write(str(tmp_path / "a.png"))
+    np.save(tmp_path / "b.npy", np.zeros((2, 2, 2)))
+    (tmp_path / "c.tif").write_bytes(b"")
+    (tmp_path / "d.npy").write_bytes(b"junk")
+    for name, part in (("a.png", "16-bit"), ("b.npy", "one number"), ("c.tif", ".npy"), ("d.npy", "d.npy")):
+        with pytest.raises(ValueError, match=f"{name}.*{part}" if part != name else name):
+            read_depth(DepthFile(tmp_path / name))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.array([[0, 255, 3], [1, 127, 128]], np.uint8),
+        np.array([[0, 1, 0], [0, 0, 1]], np.uint8),
+        np.array([[0, 65535, 700], [9, 0, 40000]], np.uint16),
+        np.array([[0, 255, 0], [0, 0, 255]], np.uint16),
+    ],
+    ids=["8-bit", "labels", "16-bit", "8-in-16-bit"],
+)
+def test_masks_are_white_above_half(tmp_path, rgb, values):
+    white = np.array([[0, 1, 0], [0, 0, 1]], bool)
+    rgb.Bitmap(values).write(str(tmp_path / "a.png"))
+    assert np.array_equal(read_mask(MaskFile(tmp_path / "a.png"), (2, 3)), white)
+    assert np.array_equal(read_mask(MaskFile(tmp_path / "a.png", hides=True), (2, 3)), ~white)
+    opaque = np.full_like(values, np.iinfo(values.dtype).max)
+    rgb.Bitmap(np.dstack([*3 * [values], opaque]), rgb.Bitmap.PixelFormat.RGBA).write(str(tmp_path / "b.png"))
+    assert np.array_equal(read_mask(MaskFile(tmp_path / "b.png"), (2, 3)), white)
+
+
+def test_a_mask_stored_as_jpeg(tmp_path, rgb):
+    mask = np.zeros((24, 32), np.uint8)
+    mask[5:17, 9:21] = 255
+    rgb.Bitmap(mask).write(str(tmp_path / "a.jpg"), quality=60)
+    stored = np.array(rgb.Bitmap(str(tmp_path / "a.jpg")))
+    assert ((stored > 0) & (stored < 30)).any()
+    assert np.array_equal(read_mask(MaskFile(tmp_path / "a.jpg"), mask.shape), mask > 0)
+
+
+@pytest.mark.parametrize("color", [255, 0])
+@pytest.mark.parametrize("channels", [2, 4])
+def test_alpha_of_a_mask_of_one_colour_is_the_mask(tmp_path, rgb, color, channels):
+    alpha = np.array([[0, 255, 3], [0, 100, 200]], np.uint8)
+    values = np.dstack([*(channels - 1) * [np.full_like(alpha, color)], alpha])
+    formats = {2: rgb.Bitmap.PixelFormat.YA, 4: rgb.Bitmap.PixelFormat.RGBA}
+    rgb.Bitmap(values, formats[channels]).write(str(tmp_path / "a.png"))
+    assert np.array_equal(read_mask(MaskFile(tmp_path / "a.png"), (2, 3)), alpha > 127)
+
+
+def test_alpha_and_colour_of_a_mask(tmp_path, rgb):
+    """Transparent white is left out, as is opaque black."""
+    color, alpha = np.array([[255, 255, 0]], np.uint8), np.array([[255, 0, 255]], np.uint8)
+    rgb.Bitmap(np.dstack([*3 * [color], alpha]), rgb.Bitmap.PixelFormat.RGBA).write(str(tmp_path / "a.png"))
+    assert np.array_equal(read_mask(MaskFile(tmp_path / "a.png"), (1, 3)), [[True, False, False]])
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path, rgb):
+    rgb.Bitmap(np.zeros((2, 3), np.uint8)).write(str(tmp_path / "a.png"))
+    with pytest.raises(ValueError, match="3 x 2 pixels.*4 x 4"):
+        read_mask(MaskFile(tmp_path / "a.png"), (4, 4))
+
+
+# EXIF orientation (where the first row and column of the stored pixels are shown) -> the stored pixel, its row and
+# column, that each upright one is, for stored pixels of 2 rows and 3 columns.
+UPRIGHT = {
+    1: [[(0, 0), (0, 1), (0, 2)], [(1, 0), (1, 1), (1, 2)]],
+    2: [[(0, 2), (0, 1), (0, 0)], [(1, 2), (1, 1), (1, 0)]],
+    3: [[(1, 2), (1, 1), (1, 0)], [(0, 2), (0, 1), (0, 0)]],
+    4: [[(1, 0), (1, 1), (1, 2)], [(0, 0), (0, 1), (0, 2)]],
+    5: [[(0, 0), (1, 0)], [(0, 1), (1, 1)], [(0, 2), (1, 2)]],
+    6: [[(1, 0), (0, 0)], [(1, 1), (0, 1)], [(1, 2), (0, 2)]],
+    7: [[(1, 2), (0, 2)], [(1, 1), (0, 1)], [(1, 0), (0, 0)]],
+    8: [[(0, 2), (1, 2)], [(0, 1), (1, 1)], [(0, 0), (1, 0)]],
+}
+
+
+def save_turned(path, values, orientation):
+    """A photo whose EXIF notes say that it is to be turned."""
+    image = pytest.importorskip("PIL.Image")
+    notes = image.Exif()
+    notes[0x0112] = orientation
+    image.fromarray(values).save(path, exif=notes, quality=100)
+
+
+def camera(path, shape, ignores_exif=False):
+    return Frame(path.name, path, np.eye(4), {"w": shape[1], "h": shape[0]}, ignores_exif=ignores_exif)
+
+
+@pytest.mark.parametrize("orientation", range(5, 9))
+def test_a_turned_photo_has_the_pixels_that_its_camera_describes(tmp_path, rgb, orientation):
+    """As stored, or upright, by the camera's width and height, at any size."""
+    path, stored = tmp_path / "a.png", np.random.default_rng(0).integers(0, 256, (2, 3, 3)).astype(np.uint8)
+    save_turned(path, stored, orientation)
+    upright = np.array([[stored[at] for at in row] for row in UPRIGHT[orientation]])
+    assert np.array_equal(read_photo(camera(path, (2, 3))), stored)
+    assert np.array_equal(read_photo(camera(path, (3, 2))), upright)
+    assert np.array_equal(read_photo(camera(path, (1200, 800), ignores_exif=True)), upright)
+
+
+@pytest.mark.parametrize("orientation, shape", [(2, (2, 3)), (3, (2, 3)), (4, (2, 3)), (6, (4, 4)), (8, (4, 4))])
+def test_a_turned_photo_of_which_nothing_tells_is_refused(tmp_path, rgb, orientation, shape):
+    """Square, or turned by half, where width and height are equal: poses of COLMAP are of the stored pixels."""
+    path, stored = tmp_path / "a.png", np.random.default_rng(0).integers(0, 256, (*shape, 3)).astype(np.uint8)
+    save_turned(path, stored, orientation)
+    with pytest.raises(NergError, match=f"a.png.*EXIF orientation .{orientation}.*nothing tells"):
+        read_photo(camera(path, shape))
+    with pytest.raises(NergError, match="nothing tells"):
+        read_photo(Frame("a.png", path, np.eye(4), {"fl_x": 3.0}))
+    assert np.array_equal(read_photo(camera(path, shape, ignores_exif=True)), stored)
+
+
+def test_photos_that_are_not_to_be_turned(tmp_path, rgb):
+    """No notes, notes of an upright photo, an orientation that there is not, damaged notes."""
+    stored = np.random.default_rng(0).integers(0, 256, (4, 4, 3)).astype(np.uint8)
+    rgb.Bitmap(stored).write(str(tmp_path / "a.png"))
+    assert np.array_equal(read_photo(camera(tmp_path / "a.png", (4, 4))), stored)
+    for orientation in (1, 0, 9):
+        save_turned(tmp_path / "a.jpg", stored, orientation)
+        assert read_photo(camera(tmp_path / "a.jpg", (4, 4))).shape == (4, 4, 3)
+    raw = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "a.jpg").write_bytes(raw.replace(b"MM\0*", b"XX\0*").replace(b"II*\0", b"XX*\0"))
+    assert read_photo(camera(tmp_path / "a.jpg", (4, 4))).shape == (4, 4, 3)
+
+
+# ---- Which frames of a data set are held out, and the coordinates that are asked for ----
+
+
+def test_blender_style_folders_keep_their_split(tmp_path, rgb):
+    """Suffixes left out, RGBA, an angle for a lens, and three files that name the parts."""
+    parts = {"train": range(5), "val": range(5, 6), "test": range(6, 9)}
+    angle = 0.9
+    for part, numbers in parts.items():
+        (tmp_path / part).mkdir()
+        frames = []
+        for k in numbers:
+            rgba = np.dstack([picture(k), np.full((H, W), 40 * (k % 6), np.uint8)])
+            rgb.Bitmap(rgba, rgb.Bitmap.PixelFormat.RGBA).write(str(tmp_path / part / f"r_{k}.png"))
+            frames.append(
+                {"file_path": f"./{part}/r_{k}", "rotation": 0.1, "transform_matrix": opengl(cameras()[k]).tolist()}
+            )
+        (tmp_path / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    data = open_dataset(tmp_path)
+    assert [v.name for v in data.train] == [f"./train/r_{k}" for k in range(5)]
+    assert [v.name for v in data.held_out] == [f"./test/r_{k}" for k in range(6, 9)]
+    assert (
+        data.source["held_out"]["how"] == "transforms_test.json" and data.box_from == "the region that the views share"
+    )
+    plain = Intrinsics(W, H, *2 * [W / 2 / np.tan(angle / 2)], W / 2, H / 2)
+    for view, k in zip(data.train, parts["train"]):
+        _, d = expected_rays(plain, cameras()[k])
+        assert np.abs(pixel_directions(view.camera.intrinsics) @ view.camera.to_world[:3, :3].T - d).max() < 1e-6
+        assert np.array_equal(view.pixels[..., 3], np.full((H, W), 40 * (k % 6)))
+    (tmp_path / "transforms_test.json").unlink()
+    assert open_dataset(tmp_path).source["held_out"]["how"] == "transforms_val.json"
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="COLMAP"):
+        open_dataset(tmp_path)
+
+
+def test_frames_held_out_are_never_trained_on(ring):
+    """A test file that repeats frames of the training file takes them away from it."""
+    content = json.loads((ring / "transforms.json").read_text())
+    (ring / "transforms_test.json").write_text(json.dumps({**content, "frames": content["frames"][:2]}))
+    data = open_dataset(ring)
+    assert (len(data.train), len(data.held_out)) == (7, 2)
+    assert not {v.name for v in data.train} & {v.name for v in data.held_out}
+    assert sum("held out" in u.reason for u in data.unused) == 2
+    assert [v.name for v in open_dataset(ring, holdout=5).held_out] == ["./images/0.png", "./images/5.png"]
+
+
+def test_lists_of_file_names_split(ring):
+    rewrite(
+        ring, lambda c: c.update(train_filenames=[f"images/{k}.png" for k in range(5)], test_filenames=["images/8.png"])
+    )
+    data = open_dataset(ring)
+    assert (len(data.train), [v.name for v in data.held_out]) == (5, ["./images/8.png"])
+    assert "3 frames" in data.notes[0]
+
+
+def test_coordinates_of_a_nerfstudio_training(tmp_path, rgb):
+    """dataparser_transforms.json goes from the original coordinates, not from those of transforms.json."""
+    nerfstudio(tmp_path, rgb, OPENCV)
+    turn = Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    path = tmp_path / "dataparser_transforms.json"
+    path.write_text(json.dumps({"transform": np.column_stack([turn, [1, 2, 3]]).tolist(), "scale": 0.25}))
+    data = open_dataset(tmp_path, holdout=0, coordinates=str(path))
+    for view, pose in zip(data.train, cameras()):
+        assert np.allclose(view.camera.center, 0.25 * (turn @ pose[:, 3] + [1, 2, 3]))
+        assert np.allclose(view.camera.to_world[:3, :3], turn @ opengl(pose)[:3, :3])
+
+
+def tip(content, turn):
+    """Turn all frames of a transforms file by the rotation ``turn``."""
+    for frame in content["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3] = turn @ pose[:3]
+        frame["transform_matrix"] = pose.tolist()
+
+
+def test_upright_coordinates_have_up_along_z(ring):
+    level = open_dataset(ring, holdout=0)
+    assert level.up.startswith("up is +z") and np.allclose(level.source["up"], [0, 0, 1], atol=0.02)
+    turn = Rotation.from_euler("xyz", [100, -30, 70], degrees=True).as_matrix()
+    rewrite(ring, lambda c: tip(c, turn))
+    tipped = open_dataset(ring, holdout=0)
+    assert "--coordinates upright" in tipped.up and "degrees from +z" in tipped.up
+    assert np.allclose(tipped.source["up"], turn[:, 2], atol=0.02)
+    data = open_dataset(ring, holdout=0, coordinates="upright")
+    assert data.up.startswith("up is +z to 0.0") and np.allclose(data.source["up"], [0, 0, 1], atol=1e-5)
+    back = np.array(data.source["to_file"])
+    for a, b, c in zip(data.train, tipped.train, level.train):
+        assert np.allclose(back @ a.camera.to_world, b.camera.to_world, atol=1e-6)
+        assert np.allclose(a.camera.to_world[2], c.camera.to_world[2], atol=0.02)
+
+
+def test_cameras_that_do_not_agree_on_up_say_so(ring):
+    def roll(content):
+        for k, frame in enumerate(content["frames"]):
+            about = np.eye(4)
+            about[:3, :3] = Rotation.from_euler("z", 80 * (-1) ** k * (k % 3), degrees=True).as_matrix()
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ about).tolist()
+
+    rewrite(ring, roll)
+    data = open_dataset(ring, holdout=0)
+    assert data.up.startswith("the cameras do not agree") and "up" not in data.source
+    with pytest.raises(NergError, match='"file"'):
+        open_dataset(ring, holdout=0, coordinates="upright")
+
+
+def test_held_out_frames_of_a_file_of_their_own_are_turned_alike(ring):
+    turn = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    rewrite(ring, lambda c: tip(c, turn))
+    content = json.loads((ring / "transforms.json").read_text())
+    test = {**content, "frames": content["frames"][6:]}
+    (ring / "transforms_test.json").write_text(json.dumps(test))
+    data = open_dataset(ring, coordinates="upright")
+    whole = open_dataset(ring, holdout=0, coordinates="upright")
+    everywhere = {v.name: v.camera.to_world for v in whole.train}
+    assert len(data.held_out) == 3
+    for view in [*data.train, *data.held_out]:
+        assert np.allclose(view.camera.to_world, everywhere[view.name], atol=1e-6)
+
+
+@pytest.mark.parametrize("write", [instant_ngp, colmap_bin, colmap_txt])
+def test_what_a_capture_holds_and_is_not_used_is_named_once(tmp_path, rgb, monkeypatch, write):
+    """Photos without a pose, counted; other files and folders of the capture; not those that are used."""
+    write(tmp_path, rgb, OPENCV)
+    assert read_split(tmp_path).posed.notes == []
+    for name in ("images/new.png", "images/other.JPG", "images/notes.txt", "images/.hidden.png", "mesh.ply", ".cache"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "images_2").mkdir()
+    monkeypatch.chdir(tmp_path.parent)
+    assert read_split(tmp_path.name).posed.notes == read_split(tmp_path).posed.notes
+    stray, rest = read_split(tmp_path).posed.notes
+    assert stray.startswith("2 of 11 photos have no pose") and stray.endswith("new.png, other.JPG")
+    assert rest == f'not used of "{tmp_path.name}": images_2, mesh.ply'
+
+
+def test_files_of_frames_and_of_held_out_frames_are_no_leftovers(ring):
+    content = json.loads((ring / "transforms.json").read_text())
+    frames = content["frames"]
+    for k, f in enumerate(frames):
+        f["mask_path"], f["depth_file_path"] = f"images/mask_{k}.png", f"images/depth_{k}.png"
+        for key in ("mask_path", "depth_file_path"):
+            (ring / f[key]).write_bytes(b"")
+    (ring / "transforms.json").write_text(json.dumps({**content, "frames": frames[:6]}))
+    (ring / "transforms_test.json").write_text(json.dumps({**content, "frames": frames[6:]}))
+    assert read_split(ring).posed.notes == []
+
+
+def test_models_that_are_not_used_are_named(tmp_path, rgb):
+    colmap_bin(tmp_path, rgb, OPENCV)
+    shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
+    assert any("of 2 COLMAP models" in note for note in read_split(tmp_path).posed.notes)
+
+
+def test_photos_of_another_camera_without_any_pose_are_counted(tmp_path, rgb):
+    """COLMAP keeps the photos of each camera in a folder of its own."""
+    colmap_bin(tmp_path, rgb, OPENCV)
+    (tmp_path / "images/right").mkdir()
+    for k in range(9):
+        (tmp_path / f"images/right/{k}.jpg").write_bytes(b"")
+    (note,) = read_split(tmp_path).posed.notes
+    assert note.startswith("9 of 18 photos have no pose") and note.endswith(
+        "0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 4 more"
+    )
+
+
+# ---- Undistort ----
+#
+# Photos made pinhole and renderings bent to a lens, against a smooth picture of the sky known in every direction.
+
+
+PLAIN = Intrinsics(90, 70, 80.0, 80.0, 44.0, 36.5)
+
+
+LENSES = {
+    "barrel": replace(PLAIN, k1=-0.15, k2=0.03, p1=0.002, p2=-0.001),
+    "pincushion": replace(PLAIN, k1=0.1),
+    "oblong": replace(PLAIN, fy=84.0),
+    "fisheye": replace(PLAIN, k1=0.02, k2=-0.004, fisheye=True),
+}
+
+
+POSE = np.array([[0, 0, 1.0, 1], [1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]])
+
+
+def sky(d):
+    """Smooth colours of world directions."""
+    return np.stack(
+        [
+            0.5 + 0.3 * np.sin(4 * d[..., 0] + 2 * d[..., 1]),
+            0.5 + 0.4 * np.cos(3 * d[..., 2] - d[..., 0]),
+            0.5 + 0.3 * np.sin(5 * d[..., 1] * d[..., 2]),
+        ],
+        axis=-1,
+    )
+
+
+def picture_undistort(intrinsics):
+    return sky(pixel_directions(intrinsics) @ POSE[:3, :3].T).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_an_undistorted_photo_shows_what_its_sensor_renders(name, rgb):
+    """The directions are those of the sensor's own rays, not of this module's idea of them."""
+    i = LENSES[name]
+    image, mask, sensor = undistorted(View("a", Camera(i, POSE), picture_undistort(i)))
+    rays = rgb.load_dict(sensor)
+    x, y = np.meshgrid((np.arange(90) + 0.5) / 90, (np.arange(70) + 0.5) / 70)
+    ray, _ = rays.sample_ray(0.0, 0.5, rgb.Point2f(x.ravel(), y.ravel()), rgb.Point2f(0.5, 0.5))
+    expected = sky(ray.d.numpy().T.reshape(70, 90, 3))
+    assert mask.mean() > 0.9 and image.shape == (70, 90, 3)
+    assert np.abs(image - expected)[mask].max() < 1e-3
+    assert np.all(image[~mask] == 0)
+
+
+def test_an_undistorted_photo_of_a_plain_lens_is_the_photo():
+    photo = picture_undistort(PLAIN)
+    image, mask, sensor = undistorted(View("a", Camera(PLAIN, POSE), photo))
+    assert np.array_equal(image, photo) and mask.all() and sensor["film"]["width"] == 90
+
+
+def test_what_the_photo_does_not_show_is_masked():
+    """A pincushion photo holds less than the pinhole picture of its size; the mask says so pixel by pixel."""
+    i = replace(PLAIN, k1=0.3)
+    _, mask, _ = undistorted(View("a", Camera(i, POSE), picture_undistort(i)))
+    d = pixel_directions(PLAIN)
+    x, y = d[..., 0] / -d[..., 2], d[..., 1] / d[..., 2]
+    grow = 1 + 0.3 * (x * x + y * y)
+    u, v = 80 * x * grow + 44, 80 * y * grow + 36.5
+    expected = (u >= 0.5) & (u <= 89.5) & (v >= 0.5) & (v <= 69.5)
+    assert np.array_equal(mask, expected) and 0.5 < mask.mean() < 0.95
+
+
+def test_transparent_pixels_lend_no_colour():
+    i = LENSES["barrel"]
+    color = np.concatenate([picture_undistort(i), np.ones((70, 90, 1), np.float32)], axis=2)
+    color[:, 45:] = [1, 0, 1, 0]
+    image, mask, _ = undistorted(View("a", Camera(i, POSE), color))
+    clear = mask & (image[..., 3] > 0.5)
+    assert (
+        np.abs(image[..., :3] - undistorted(View("a", Camera(i, POSE), picture_undistort(i))).image)[clear].max() < 0.15
+    )
+    assert np.all(image[..., 3][:, 50:] < 0.3)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_rendering_bent_to_the_lens_equals_the_photo(name):
+    i = LENSES[name]
+    camera = Camera(i, POSE)
+    source = pinhole(camera, oversample=2.0)
+    bent, mask = through_lens(picture_undistort(source.intrinsics), source, camera)
+    assert mask.all() and bent.shape == (70, 90, 3)
+    assert np.abs(bent - picture_undistort(i)).max() < 1e-3
+
+
+def test_a_wide_fisheye_is_covered_as_far_as_a_pinhole_reaches():
+    i = Intrinsics(80, 80, 26.0, 26.0, 40.0, 40.0, fisheye=True)
+    camera = Camera(i, POSE)
+    source = pinhole(camera)
+    bent, mask = through_lens(picture_undistort(source.intrinsics), source, camera)
+    angle = np.degrees(np.arccos(-pixel_directions(i)[..., 2]))
+    assert np.all(mask[angle < 75]) and not np.any(mask[angle > 88])
+    assert np.abs(bent - picture_undistort(i))[angle < 75].max() < 5e-3
+
+
+def test_errors_of_through_lens():
+    camera = Camera(LENSES["barrel"], POSE)
+    source = pinhole(camera)
+    with pytest.raises(ValueError, match="pixels"):
+        through_lens(np.zeros((3, 3, 3)), source, camera)
+    with pytest.raises(ValueError, match="same place"):
+        through_lens(picture_undistort(source.intrinsics), source, Camera(LENSES["barrel"], np.eye(4)))

@@ -1,15 +1,207 @@
+"""Tests of `nerg_mi.probes.probes`."""
+
+from __future__ import annotations
+
 import numpy as np
 import pytest
 
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.kde import leave_one_out_kappa
-from nerg_mi.probes.probes import person_weights, place_probes
+from nerg_mi.probes.kde import kappa_grid, leave_one_out_kappa, leave_one_out_scores
+from nerg_mi.probes.probes import (
+    LEVELS,
+    asked_level,
+    calibrated_levels,
+    effective_persons,
+    effective_rays,
+    entropy,
+    integral,
+    level_name,
+    person_weights,
+    place_probes,
+    place_queries,
+    region_levels,
+    sample,
+)
 from nerg_mi.rays.rays import Rays
+
+# ---- Measures ----
 
 
 @pytest.fixture(scope="module")
-def rays():
+def rays_measures():
+    """Four people in a 3 x 2 m room who look at (1.5, 4, 1), give or take κ = 60; the first of them twice as often."""
+    rng = np.random.default_rng(5)
+    n = 12_000
+    origin = rng.uniform([0, 0, 1.5], [3, 2, 1.7], (n, 3))
+    to = np.array([1.5, 4, 1]) - origin
+    mu = to / np.linalg.norm(to, axis=1, keepdims=True)
+    return Rays(
+        np.arange(n) * 0.1,
+        np.maximum(rng.integers(-1, 4, n), 0),
+        tuple("abcd"),
+        origin,
+        vmf.sample(mu, 60.0, rng),
+        np.ones(n),
+    )
+
+
+def test_integral_is_one_at_a_thousand_random_positions(rays_measures):
+    probes = place_probes(
+        rays_measures, 0.2, placement="random", count=1100, cap=64, min_rays=4, kappa_max=100.0, weights="distance"
+    )
+    assert len(probes) > 1000
+    assert np.abs(integral(probes, 8192, "llvm") - 1).max() < 1e-3
+
+
+def test_entropy_of_known_laws(rays_measures):
+    probes = place_probes(rays_measures, 0.25, count=3, min_rays=1, cap=1, kappa_rule="fixed", kappa=40.0)
+    # One ray: von Mises-Fisher, whose entropy is κ (1 - A(κ)) - log C(κ).
+    want = 40 * (1 - vmf.mean_resultant_length(40.0)) - vmf.log_normaliser(40.0)
+    assert np.allclose(entropy(probes, backend="llvm"), want, atol=1e-4)
+    flat = place_probes(rays_measures, 0.25, count=3, kappa_rule="fixed", kappa=0.0)
+    assert np.allclose(entropy(flat, backend="llvm"), np.log(4 * np.pi), atol=1e-6)
+
+
+def test_samples_follow_the_density(rays_measures):
+    probes = place_probes(
+        rays_measures, 0.3, count=2, cap=20, min_rays=20, kappa_rule="fixed", kappa=30.0, weights="distance"
+    )
+    x = sample(probes, 40_000, np.random.default_rng(0))
+    assert np.allclose(np.linalg.norm(x, axis=2), 1)
+    for p in range(2):
+        run = slice(probes.offsets[p], probes.offsets[p + 1])
+        w = probes.weights[run] / probes.weights[run].sum()
+        assert np.allclose(x[p].mean(axis=0), vmf.mean_resultant_length(30.0) * (w @ probes.directions[run]), atol=0.01)
+        # E[log p] under its own samples is minus the entropy.
+        log = np.log(probes.density(np.stack([x[0], x[1]]), "llvm")[p])
+        assert np.isclose(-log.mean(), entropy(probes, backend="llvm")[p], atol=0.02)
+
+
+def test_effective_numbers(rays_measures):
+    probes = place_probes(rays_measures, 0.3, count=20)
+    assert np.array_equal(effective_rays(probes), probes.counts)
+    people = effective_persons(probes, rays_measures)
+    assert ((people > 2.5) & (people < 4)).all()
+    even = place_probes(rays_measures, 0.3, queries=probes.queries, ray_weights=person_weights(rays_measures))
+    assert (effective_rays(even) < even.counts).all() and effective_persons(
+        even, rays_measures
+    ).mean() > people.mean() + 0.1
+    assert np.isclose(person_weights(rays_measures).mean(), 1)
+    counts = np.bincount(rays_measures.person)
+    assert (
+        np.allclose(np.bincount(rays_measures.person, weights=person_weights(rays_measures)), len(rays_measures) / 4)
+        and counts[0] > 1.5 * counts[1]
+    )
+
+
+def test_weights_of_rays_and_distance(rays_measures):
+    q = np.array([[1.5, 1.0, 1.6]])
+    plain = place_probes(rays_measures, 0.3, queries=q, cap=5000)
+    near = place_probes(rays_measures, 0.3, queries=q, cap=5000, weights="distance", centre="query")
+    d = np.linalg.norm(rays_measures.origin[near.indices] - q, axis=1)
+    assert np.array_equal(near.indices, plain.indices) and np.allclose(near.weights, 1 - d / 0.3, atol=1e-6)
+    only = place_probes(rays_measures, 0.3, queries=q, cap=5000, ray_weights=(rays_measures.person == 2).astype(float))
+    assert (rays_measures.person[only.indices] == 2).all() and np.array_equal(
+        np.sort(only.indices), np.sort(plain.indices[rays_measures.person[plain.indices] == 2])
+    )
+    assert np.array_equal(only.directions, rays_measures.direction[only.indices])
+    with pytest.raises(ValueError, match="ray_weights"):
+        place_probes(rays_measures, 0.3, ray_weights=np.ones(3))
+
+
+def test_one_kappa_for_all(rays_measures):
+    for rule in ("silverman", "loo"):
+        each = place_probes(rays_measures, 0.25, count=12, kappa_rule=rule)
+        shared = place_probes(rays_measures, 0.25, count=12, kappa_rule=rule, kappa_shared=True)
+        assert (
+            len(set(shared.kappa)) == 1
+            and each.kappa.min() <= shared.kappa[0] <= each.kappa.max()
+            and len(set(each.kappa)) > 1
+        )
+
+
+def test_leave_one_out_finds_the_true_width():
+    # Many groups, one ray each: the best kernel is narrower than the law, and the likelihood near that of the law
+    # itself.
+    rng = np.random.default_rng(0)
+    x = vmf.sample(np.tile([0, 0, 1.0], (256, 1)), 60.0, rng)
+    scores = leave_one_out_scores(x, None, kappa_grid(1000.0))
+    truth = np.mean(vmf.log_density(x, np.array([0, 0, 1.0]), 60.0))
+    assert truth - 0.15 < scores.max() < truth + 0.02 and 60 < kappa_grid(1000.0)[scores.argmax()] < 600
+
+
+def test_heads_widened_to_gaze(rays_measures):
+    heads = place_probes(rays_measures, 0.25, count=4, kappa_rule="fixed", kappa=200.0)
+    gaze = place_probes(rays_measures, 0.25, count=4, kappa_rule="fixed", kappa=200.0, widen=37.0)
+    assert np.allclose(gaze.kappa, vmf.convolved_kappa(200.0, 37.0)) and (gaze.kappa < 37).all()
+    # Against what eyes do: turn each sample of the heads' density by a law of κ = 37.
+    rng = np.random.default_rng(1)
+    x = sample(heads, 20_000, rng)
+    eyes = vmf.sample(x.reshape(-1, 3), 37.0, rng).reshape(x.shape)
+    y = sample(gaze, 20_000, rng)
+    assert np.allclose(eyes.mean(axis=1), y.mean(axis=1), atol=0.01)
+    second = lambda v: np.einsum("pni,pnj->pij", v, v) / v.shape[1]
+    assert np.allclose(second(eyes), second(y), atol=0.01)
+
+
+# ---- Placement ----
+
+
+@pytest.fixture(scope="module")
+def origin():
+    """A walk, most of it standing in one corner."""
+    rng = np.random.default_rng(0)
+    return np.concatenate(
+        [rng.uniform([0, 0, 1.5], [4, 3, 1.7], (3000, 3)), rng.normal([1, 1, 1.6], 0.02, (20_000, 3))]
+    )
+
+
+def test_blue_noise_is_even_and_covers(origin):
+    rng = np.random.default_rng(1)
+    found = place_queries(origin, "blue", 10_000, 0.3, 0.25, rng)
+    apart = np.linalg.norm(found[:, None] - found[None], axis=2) + 10 * np.eye(len(found))
+    assert apart.min() > 0.3
+    # Where someone was, a probe is near: no gap wider than the discs (and the cells of the candidates).
+    assert np.linalg.norm(origin[:, None] - found[None], axis=2).min(axis=1).max() < 0.3 * 1.5
+    assert {tuple(p) for p in found} <= {tuple(p) for p in origin}
+    # Random origins crowd where people stood.
+    crowd = lambda p: (np.linalg.norm(p[:, :2] - [1, 1], axis=1) < 0.1).mean()
+    assert crowd(place_queries(origin, "data", 500, None, 0.25, rng)) > 0.5 > 10 * crowd(found)
+
+
+@pytest.mark.parametrize("count", [20, 200])
+def test_blue_noise_of_a_number(origin, count):
+    found = place_queries(origin, "blue", count, None, 0.1, np.random.default_rng(2))
+    assert 0.4 * count <= len(found) <= count
+
+
+def test_lattice_and_box(origin):
+    rng = np.random.default_rng(3)
+    grid = place_queries(origin, "grid", 1, None, 0.25, rng)
+    assert np.allclose(np.diff(np.unique(grid[:, 0].round(9))), 0.5)
+    # As far from one wall as from the other.
+    assert np.allclose(grid.min(axis=0) + grid.max(axis=0), origin.min(axis=0) + origin.max(axis=0))
+    box = place_queries(origin, "random", 300, None, 0.25, rng)
+    assert len(box) == 300 and (box >= origin.min(axis=0)).all() and (box <= origin.max(axis=0)).all()
+    with pytest.raises(ValueError, match="placement"):
+        place_queries(origin, "hexagons", 1, None, 0.25, rng)
+
+
+def test_places_that_are_far_enough_apart_all_have_a_probe():
+    """Few, down a steep line, where the cells of candidates are easily taken for one another."""
+    steps = np.arange(5.0)
+    for axes in ([0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1]):
+        down = np.stack([0 * steps, 0.26 * steps, 1.26 * (4 - steps)], axis=1)[:, axes]
+        found = place_queries(np.repeat(down, 7, axis=0), "blue", 100, 1.0, 0.25, np.random.default_rng(0))
+        assert sorted(map(tuple, found)) == sorted(map(tuple, down))
+
+
+# ---- Probes ----
+
+
+@pytest.fixture(scope="module")
+def rays_probes():
     """Four people in a 3 x 2 m room who look at (1.5, 4, 1), give or take κ = 60."""
     rng = np.random.default_rng(5)
     n = 6000
@@ -21,45 +213,45 @@ def rays():
 
 @pytest.mark.parametrize("placement", ["data", "grid", "random"])
 @pytest.mark.parametrize("rule", ["silverman", "fixed"])
-def test_density_integrates_to_one(rays, placement, rule):
+def test_density_integrates_to_one(rays_probes, placement, rule):
     probes = place_probes(
-        rays, 0.25, placement=placement, count=30, min_rays=16, kappa_rule=rule, kappa=100.0, kappa_max=100.0
+        rays_probes, 0.25, placement=placement, count=30, min_rays=16, kappa_rule=rule, kappa=100.0, kappa_max=100.0
     )
     density = probes.density(fibonacci_directions(8192), "llvm")
     assert density.shape == (len(probes), 8192) and (probes.kappa <= 100).all()
     assert np.abs(density.mean(axis=1, dtype=np.float64) * 4 * np.pi - 1).max() < 1e-3
 
 
-def test_holds_the_nearest_rays_within_the_radius(rays):
-    probes = place_probes(rays, 0.2, count=20, cap=40, min_rays=10)
+def test_holds_the_nearest_rays_within_the_radius(rays_probes):
+    probes = place_probes(rays_probes, 0.2, count=20, cap=40, min_rays=10)
     for p in range(len(probes)):
         held = probes.indices[probes.offsets[p] : probes.offsets[p + 1]]
-        far = np.linalg.norm(rays.origin - probes.queries[p], axis=1)
+        far = np.linalg.norm(rays_probes.origin - probes.queries[p], axis=1)
         inside = np.flatnonzero(far < 0.2)
         assert 10 <= len(held) <= 40 and len(held) == min(40, len(inside))
         assert np.all(np.diff(far[held]) >= 0) and np.isclose(far[held].max(), np.sort(far)[len(held) - 1])
-        assert np.allclose(probes.positions[p], rays.origin[held].mean(axis=0))
-        assert np.array_equal(probes.directions[probes.offsets[p] : probes.offsets[p + 1]], rays.direction[held])
+        assert np.allclose(probes.positions[p], rays_probes.origin[held].mean(axis=0))
+        assert np.array_equal(probes.directions[probes.offsets[p] : probes.offsets[p + 1]], rays_probes.direction[held])
 
 
-def test_centre_seed_and_queries(rays):
-    a, b = (place_probes(rays, 0.25, count=10, seed=3) for _ in range(2))
+def test_centre_seed_and_queries(rays_probes):
+    a, b = (place_probes(rays_probes, 0.25, count=10, seed=3) for _ in range(2))
     assert np.array_equal(a.queries, b.queries) and np.array_equal(a.indices, b.indices)
-    c = place_probes(rays, 0.25, queries=a.queries, centre="query")
+    c = place_probes(rays_probes, 0.25, queries=a.queries, centre="query")
     assert np.array_equal(c.positions, a.queries) and not np.array_equal(a.positions, a.queries)
-    grid = place_probes(rays, 0.25, placement="grid", spacing=0.5, min_rays=8)
+    grid = place_probes(rays_probes, 0.25, placement="grid", spacing=0.5, min_rays=8)
     steps = np.unique(np.round(np.diff(np.unique(np.round(grid.queries[:, 0], 9))), 9))
     assert np.allclose(steps, 0.5)
 
 
-def test_kappa_rules(rays):
-    silverman = place_probes(rays, 0.25, count=8)
+def test_kappa_rules(rays_probes):
+    silverman = place_probes(rays_probes, 0.25, count=8)
     R = [
-        np.linalg.norm(rays.direction[silverman.indices[a:b]].mean(axis=0))
+        np.linalg.norm(rays_probes.direction[silverman.indices[a:b]].mean(axis=0))
         for a, b in zip(silverman.offsets, silverman.offsets[1:])
     ]
     assert np.allclose(silverman.kappa, vmf.silverman_kappa(R, silverman.counts))
-    loo = place_probes(rays, 0.25, count=8, kappa_rule="loo")
+    loo = place_probes(rays_probes, 0.25, count=8, kappa_rule="loo")
     assert ((loo.kappa > 20) & (loo.kappa < 1000)).all()
 
 
@@ -73,15 +265,15 @@ def test_leave_one_out_sees_through_repetition():
     assert leave_one_out_kappa(rays, person) < 100
 
 
-def test_refusals(rays):
+def test_refusals(rays_probes):
     with pytest.raises(ValueError, match="placement"):
-        place_probes(rays, 0.25, placement="hexagons", queries=np.zeros((1, 3)))
+        place_probes(rays_probes, 0.25, placement="hexagons", queries=np.zeros((1, 3)))
     with pytest.raises(ValueError, match="kappa_rule"):
-        place_probes(rays, 0.25, kappa_rule="magic")
+        place_probes(rays_probes, 0.25, kappa_rule="magic")
     with pytest.raises(ValueError, match="enlarge the radius"):
-        place_probes(rays, 0.001, count=10)
+        place_probes(rays_probes, 0.001, count=10)
     with pytest.raises(ValueError, match="min_rays"):
-        place_probes(rays, 0.25, cap=10, min_rays=20)
+        place_probes(rays_probes, 0.25, cap=10, min_rays=20)
 
 
 def test_people_of_a_probe_can_count_alike():
@@ -125,3 +317,36 @@ def test_person_weights_of_people_without_rays():
     weights = person_weights(rays)
     assert weights == pytest.approx([8 / 2 / 6] * 6 + [8 / 2 / 2] * 2)
     assert weights.mean() == pytest.approx(1)
+
+
+# ---- Smallest regions of densities on the sphere, and the shares to ask for ----
+
+
+def test_regions_of_a_cap_hold_what_they_say():
+    """A density that falls with the angle from z: the region that ends at cos a holds (e^k - e^ka) / (e^k - e^-k)."""
+    d, kappa = fibonacci_directions(20_000), 3.0
+    maps, at = np.exp(kappa * d[None, :, 2]), np.array([[1.0, 0.5, 0.0, -1.0]])
+    level = region_levels(maps, np.exp(kappa * at))
+    expected = (np.exp(kappa) - np.exp(kappa * at)) / (2 * np.sinh(kappa))
+    np.testing.assert_allclose(level, expected, atol=1e-3)
+    assert region_levels(np.ones((1, 5)), np.ones((1, 2))).tolist() == [[0.5, 0.5]]
+    assert region_levels(np.zeros((1, 5)), np.zeros((1, 2))).tolist() == [[0.5, 0.5]]
+
+
+def test_calibrated_levels_are_weighted_quantiles():
+    rng = np.random.default_rng(0)
+    # Of a density whose looks lie at the square root of a uniform level, the share q holds q^2 of them.
+    levels = np.sqrt(rng.random(40_000))
+    found = calibrated_levels(levels, np.ones(len(levels)))
+    np.testing.assert_allclose([found[level_name(q)] for q in LEVELS], np.sqrt(LEVELS), atol=0.01)
+    # A look of weight 3 is three looks; those of weight zero are none.
+    some = levels[:999]
+    times = rng.integers(0, 4, len(some))
+    assert calibrated_levels(some, times.astype(float)) == calibrated_levels(
+        np.repeat(some, times), np.ones(times.sum())
+    )
+    assert calibrated_levels(np.array([0.3]), np.ones(1)) == {"50%": 0.3, "80%": 0.3, "95%": 0.3}
+
+
+def test_nothing_calibrated_is_asked_for_as_it_is():
+    assert asked_level(0.8, None) == 0.8 and asked_level(0.8, {"80%": 0.7}) == 0.7

@@ -1,10 +1,35 @@
+"""Tests of `nerg_mi.rays.filters`."""
+
+import warnings
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerg_mi.rays.filters import label_stays, select_mask, thin_mask
+from nerg_mi.probes.probes import place_probes
+from nerg_mi.rays import filters
+from nerg_mi.rays.filters import (
+    combine,
+    find_frozen,
+    find_sessions,
+    fixation_rays,
+    idt,
+    ivt,
+    label_stays,
+    position_of_split,
+    purge,
+    select_mask,
+    split_by_person,
+    split_by_position,
+    split_by_time,
+    thin_mask,
+)
 from nerg_mi.rays.rays import Rays
+from tests.rays.checks.people import change, watch
+
+# ---- Filters ----
 
 
 def walk(origin, t=None, person=None, **more):
@@ -121,3 +146,461 @@ def test_stays_as_long_and_as_far_as_they_may_be():
     t = np.array([0, 1, 2, 3.25])
     assert label_stays(walk(line(np.zeros(4)), t=t), gap=1.0).tolist() == [0, 0, 0, 1]
     assert label_stays(walk(line(np.array([0, 0.5, -0.5, 0.75])), t=t * 0), distance=0.5).tolist() == [0, 0, 0, 1]
+
+
+# ---- Fixations ----
+
+
+def gaze(azimuth, elevation=0.0, dt=0.02, person=None, t=None):
+    """Rays of somebody whose gaze turns: degrees at steps of ``dt`` seconds."""
+    a, e = np.broadcast_arrays(np.radians(np.asarray(azimuth, float)), np.radians(elevation))
+    d = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=1)
+    n = len(d)
+    return Rays(
+        np.arange(n) * dt if t is None else t,
+        np.zeros(n) if person is None else person,
+        ("ann", "bo"),
+        np.tile([0, 0, 1.6], (n, 1)),
+        d,
+        np.ones(n),
+    )
+
+
+# Ten rays at 0 degrees, a saccade of two, ten at 20, one at 40, ten at 60: 50 Hz.
+SEQUENCE = [*[0] * 10, 8, 16, *[20] * 10, 40, *[60] * 10]
+
+
+WANT = np.array([*[0] * 10, -1, -1, *[1] * 10, -1, *[2] * 10])
+
+
+def test_ivt_by_hand():
+    label = ivt(gaze(SEQUENCE), velocity=100)
+    # A ray belongs to the run that its step leads into: the first of a run comes after a fast step.
+    assert label.tolist() == WANT.tolist()
+    # 8 degrees in 0.02 s are 400 a second: a limit above that joins the first two.
+    assert len(set(ivt(gaze(SEQUENCE), velocity=450)) - {-1}) == 2
+    # Nine steps of 0.02 s are 0.18 s.
+    assert (ivt(gaze(SEQUENCE), velocity=100, least=0.19) == -1).all()
+
+
+def test_idt_by_hand():
+    assert idt(gaze(SEQUENCE), dispersion=1.0).tolist() == WANT.tolist()
+    # Within five degrees 16 joins 20.
+    assert idt(gaze(SEQUENCE), dispersion=5.0).tolist() == [*WANT[:11], 1, *WANT[12:]]
+    # A slow drift of half a degree a ray: no velocity finds its end, the dispersion does, every seven rays (3 degrees).
+    drift = gaze(0.5 * np.arange(28))
+    assert idt(drift, dispersion=3.01).tolist() == [k // 7 for k in range(28)] and (ivt(drift) == 0).all()
+    # Sideways and upwards add up.
+    both = gaze(0.5 * np.arange(28), 0.5 * np.arange(28))
+    assert idt(both, dispersion=3.05, least=0.04).tolist() == [k // 4 for k in range(28)]
+
+
+@pytest.mark.parametrize("find", [ivt, idt])
+def test_people_and_pauses_end_fixations(find):
+    still = gaze(
+        [0] * 40,
+        person=np.r_[np.zeros(20), np.ones(20)],
+        t=np.r_[np.arange(20) * 0.02 + (np.arange(20) >= 10), np.arange(20) * 0.02],
+    )
+    assert find(still).tolist() == [0] * 10 + [1] * 10 + [2] * 20
+    order = np.random.default_rng(0).permutation(40)
+    assert np.array_equal(find(still.select(order)), find(still)[order])
+
+
+@pytest.mark.parametrize("find", [ivt, idt])
+def test_a_pause_of_a_tenth_of_a_second_ends_a_fixation_unless_told_otherwise(find):
+    paused = lambda gap: gaze([0] * 20, t=np.arange(20) * 0.02 + (np.arange(20) >= 10) * (gap - 0.02))
+    assert (
+        len(set(find(paused(0.09)))) == 1
+        and len(set(find(paused(0.11)))) == 2
+        and len(set(find(paused(0.11), gap=0.12))) == 1
+    )
+
+
+def test_straight_up_is_measured_as_anywhere():
+    """Who looks straight up has no level: what they look at next is as far away as it is."""
+    for degrees, parts in ((2.9, 1), (3.1, 2)):
+        polar = np.r_[np.zeros(5), np.full(5, degrees)]
+        d = np.stack([np.sin(np.radians(polar)), np.zeros(10), np.cos(np.radians(polar))], axis=1)
+        up = Rays(np.arange(10) * 0.02, np.zeros(10), ("ann",), np.zeros((10, 3)), d, np.ones(10))
+        assert len(set(idt(up, dispersion=3.0, least=0.04))) == parts
+
+
+@pytest.mark.parametrize("elevation", [0.0, 60.0, -85.0])
+def test_dispersion_is_measured_on_the_sphere(elevation):
+    # Where gaze is steep, a degree of azimuth is less: 3 degrees of arc are kept together, 4 are not.
+    arc = lambda degrees: gaze(np.linspace(0, degrees / np.cos(np.radians(elevation)), 12), elevation)
+    assert (idt(arc(2.0), dispersion=3.0) == 0).all() and len(set(idt(arc(6.0), dispersion=3.0, least=0.04))) > 1
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_idt_by_definition(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 120))
+    azimuth = np.cumsum(rng.choice([0.2, 6.0], n, p=[0.9, 0.1]) * rng.choice([-1, 1], n))
+    label = idt(gaze(azimuth), dispersion=2.1)  # no sum of steps
+    # Salvucci and Goldberg's loop, for gaze that turns sideways only.
+    want, s, number = np.full(n, -1), 0, 0
+    while s < n:
+        e = s + 5  # 0.1 s
+        if e >= n:
+            break
+        if np.ptp(azimuth[s : e + 1]) <= 2.1:
+            while e + 1 < n and np.ptp(azimuth[s : e + 2]) <= 2.1:
+                e += 1
+            want[s : e + 1] = number
+            number, s = number + 1, e + 1
+        else:
+            s += 1
+    assert label.tolist() == want.tolist()
+
+
+def test_one_ray_a_fixation():
+    rays = gaze([*[0, 2] * 5, *[40] * 10])
+    hit = np.full((20, 3), np.nan)
+    hit[:4] = rays.origin[:4] + 2 * rays.direction[:4]
+    rays = Rays(rays.t, rays.person, rays.persons, rays.origin, rays.direction, rays.confidence, hit)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # a fixation without a hit is nothing to be warned of
+        one, seconds = fixation_rays(rays, idt(rays))
+    assert len(one) == 2 and np.allclose(seconds, 0.18) and np.allclose(one.t, [0.09, 0.29])
+    assert np.allclose(np.degrees(np.arctan2(one.direction[:, 1], one.direction[:, 0])), [1, 40])
+    assert np.allclose(one.hit[0], hit[:4].mean(axis=0)) and np.isnan(one.hit[1]).all()
+    with pytest.raises(ValueError, match="no fixation"):
+        fixation_rays(rays, np.full(20, -1))
+    with pytest.raises(ValueError, match="velocity must be positive"):
+        ivt(rays, velocity=0)
+
+
+@pytest.mark.parametrize("find", [ivt, idt])
+@pytest.mark.parametrize("gap", [0.02, -0.1, 0.0, -1000.0])
+def test_two_people_are_never_one_fixation(find, gap):
+    """Somebody's first ray may come any time after, or before, another one's last, in the very same direction."""
+    t = np.arange(20) * 0.02
+    still = gaze([0] * 40, person=np.r_[np.zeros(20), np.ones(20)], t=np.r_[t, t + t[-1] + gap])
+    assert find(still).tolist() == [0] * 20 + [1] * 20
+    # Each stay is too short by itself; together they would not be.
+    assert (find(still, least=0.5) == -1).all()
+
+
+def test_a_fixation_has_the_mean_head():
+    rays = gaze([*[0, 2] * 5, *[40] * 10])
+    head = np.tile([1.0, 0, 0], (20, 1))
+    head[1], head[2], head[10:] = [0, 1, 0], [np.nan] * 3, np.nan
+    one, _ = fixation_rays(replace(rays, head=head), idt(rays))
+    want = np.array([8.0, 1, 0])
+    assert np.allclose(one.head[0], want / np.linalg.norm(want)) and np.isnan(one.head[1]).all()
+
+
+@pytest.mark.parametrize("find", [ivt, idt])
+def test_a_pause_as_long_as_it_may_be(find):
+    still = gaze([0] * 9, dt=0.125)
+    assert (find(still, gap=0.125) == 0).all() and (find(still, gap=0.12) == -1).all()
+
+
+@pytest.mark.parametrize("find", [ivt, idt])
+def test_a_fixation_as_short_as_it_may_be(find):
+    still = gaze([0] * 3, dt=0.125)
+    assert (find(still, least=0.25, gap=0.2) == 0).all() and (find(still, least=0.251, gap=0.2) == -1).all()
+
+
+# ---- Frozen ----
+
+
+def found(rays):
+    return find_frozen(rays, find_sessions(rays))
+
+
+@pytest.mark.parametrize("block", [100, 1 << 18])
+def test_gaze_that_stands_still(monkeypatch, block):
+    monkeypatch.setattr(filters, "_BLOCK", block)
+    rays = watch()
+    assert not found(rays).any()
+    still = slice(3100, 3400)
+    world = change(rays, still, direction=rays.direction[3100])
+    assert np.flatnonzero(found(world)).tolist() == list(range(3100, 3400))
+    # Less than a second is a fixation or a blink.
+    assert not found(change(rays, slice(3100, 3140), direction=rays.direction[3100])).any()
+    # The head in place of the eyes; without it, nothing is seen of that.
+    as_head = change(rays, still, direction=rays.head[still])
+    assert found(as_head)[3101:3399].all() and found(as_head).sum() <= 302
+    assert not found(type(rays)(**{**vars(as_head), "head": None})).any()
+
+
+@pytest.mark.parametrize("turns, moves", [(True, False), (False, True)])
+def test_a_head_that_only_turns_or_only_moves(turns, moves):
+    rays, rows = watch(), slice(3100, 3400)
+    columns = {"direction": rays.direction[3100]}
+    if not turns:
+        columns["head"] = rays.head[3100]
+    if not moves:
+        columns["origin"] = rays.origin[3100]
+    frozen_rays = change(rays, rows, **columns)
+    assert np.flatnonzero(found(frozen_rays)).tolist() == list(range(3100, 3400))
+    # Where no head is recorded, only a movement tells.
+    assert found(type(rays)(**{**vars(frozen_rays), "head": None}))[3101:3399].all() == moves
+
+
+@pytest.mark.parametrize("seconds, expected", [(1.0, True), (0.98, False)])
+def test_a_second_is_long_enough(seconds, expected):
+    rays = watch(1)
+    t = np.arange(len(rays)) / 64
+    rays = change(rays, slice(None), t=lambda _: t)
+    count = round(seconds * 64) + 1
+    assert found(change(rays, slice(640, 640 + count), direction=rays.direction[640])).any() == expected
+
+
+def test_a_headset_on_a_table_is_not_frozen_gaze():
+    rays = watch()
+    rows = slice(3100, 3400)
+    put = change(rays, rows, direction=rays.direction[3100], head=rays.head[3100], origin=rays.origin[3100])
+    assert not found(put).any()
+
+
+def test_people_among_each_other():
+    rays = watch()
+    mixed = change(rays, slice(3000, 3600), direction=rays.direction[3000])
+    order = np.argsort(mixed.t, kind="stable")
+    assert set(order[found(mixed.select(order))]) == set(range(3000, 3600))
+
+
+def test_pauses_end_what_stands_still():
+    rays = watch(1)
+    still = change(rays, slice(0, 90), direction=rays.direction[0])
+    paused = change(still, slice(45, None), t=lambda t: t + 0.6)
+    assert found(still)[:90].all() and not found(paused).any()
+
+
+def test_a_pause_as_long_as_it_may_be_and_the_next_person():
+    """Neither is a run of two people, of whom each stands still for less than a second."""
+    rays, rows = watch(1), slice(1470, 1530)
+    still = change(rays, rows, direction=rays.direction[1470])
+    assert found(still)[1470:1530].all()
+    two = replace(still, person=(np.arange(len(rays)) >= 1500).astype(int), persons=("ann", "bo"))
+    assert not found(two).any()
+    slow = change(change(rays, slice(0, 4), direction=rays.direction[0]), slice(0, 4), t=np.array([-2, -1.5, -1, -0.5]))
+    assert found(slow)[:4].all()
+
+
+# ---- Sessions ----
+
+
+def rays(t, person):
+    n = len(t)
+    return Rays(t, person, ("ann", "bo"), np.zeros((n, 3)), np.tile([1.0, 0, 0], (n, 1)), np.ones(n))
+
+
+def test_recordings_end_where_clocks_go_back_or_pause():
+    t = [*range(5), *range(10, 100, 50), *range(300, 310), *np.arange(0, 40), *range(7)]
+    person = [0] * 57 + [1] * 7
+    found = find_sessions(rays(t, person))
+    assert found.order is None and found.starts.tolist() == [0, 7, 17, 57, 64]
+    assert found.person.tolist() == [0, 0, 0, 1] and found.back.tolist() == [False, False, True, False]
+    assert found.label().tolist() == [0] * 7 + [1] * 10 + [2] * 40 + [3] * 7
+
+
+def test_people_among_each_other_and_rays_that_were_mixed():
+    t, person = np.repeat(np.arange(300) * 0.02, 2), np.tile([0, 1], 300)
+    found = find_sessions(rays(t, person))
+    assert found.order.tolist() == [*range(0, 600, 2), *range(1, 600, 2)] and found.starts.tolist() == [0, 300, 600]
+    assert found.rows(slice(1, 3)).tolist() == [2, 4]
+    # Rows in the wrong place by less than a second are no other recording.
+    swapped = t.copy()
+    swapped[[10, 20]] = t[[20, 10]]
+    assert find_sessions(rays(swapped, person)).starts.tolist() == [0, 300, 600]
+    mixed = rays(10 * t, person)
+    mixed = mixed.select(np.random.default_rng(0).permutation(600))
+    found = find_sessions(mixed)
+    assert found.starts.tolist() == [0, 300, 600] and not found.back.any()
+    assert (np.diff(mixed.t[found.order[:300]]) > 0).all()
+
+
+def test_nobody_is_two():
+    one = rays([0.0], [1])
+    assert find_sessions(one).starts.tolist() == [0, 1] and find_sessions(one).person.tolist() == [1]
+
+
+# ---- Splits ----
+
+
+R = 0.25
+
+
+@pytest.fixture(scope="module")
+def rays_splits():
+    rng = np.random.default_rng(2)
+    n = 20_000
+    d = rng.normal(size=(n, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    origin = rng.uniform([0, 0, 1.5], [6, 4, 1.7], (n, 3))
+    return Rays(np.arange(n) * 0.02, np.arange(n) % 5, tuple("abcde"), origin, d, np.ones(n))
+
+
+def rows(mask, probes):
+    """Rays held by probes made on a part, as rows of the whole."""
+    return set(np.flatnonzero(mask)[probes.indices].tolist())
+
+
+def test_train_and_test_probes_share_no_ray(rays_splits):
+    split = split_by_position(rays_splits, R, test_probes=30, seed=1)
+    train = place_probes(rays_splits.select(split.train), R, count=400, min_rays=8)
+    test = place_probes(rays_splits.select(split.test), R, queries=split.test_centres, min_rays=8)
+    everywhere = place_probes(rays_splits, R, queries=split.test_centres, min_rays=8)
+    assert len(test) == 30 and len(train) > 300
+    a, b, c = rows(split.train, train), rows(split.test, test), rows(np.ones(len(rays_splits), bool), everywhere)
+    assert a and b and not a & b and not a & c
+    assert b == c  # a test probe loses nothing to the split
+    # And training probes keep their distance: no training ray within 2R.
+    apart = np.linalg.norm(rays_splits.origin[split.train][:, None] - split.test_centres[None], axis=2)
+    assert apart.min() > 2 * R
+    within = np.linalg.norm(rays_splits.origin[:, None] - split.test_centres[None], axis=2).min(axis=1)
+    assert np.array_equal(split.test, within <= R) and np.array_equal(split.purged, (within > R) & (within <= 2 * R))
+    assert not (split.train & split.test).any() and (split.train | split.test | split.purged).all()
+
+
+def test_zones_are_apart_and_repeatable(rays_splits):
+    a, b = (split_by_position(rays_splits, R, zones=4, zone_radius=0.3, seed=7) for _ in range(2))
+    assert np.array_equal(a.train, b.train) and np.array_equal(a.test_centres, b.test_centres)
+    gaps = np.linalg.norm(a.zone_centres[:, None, :2] - a.zone_centres[None, :, :2], axis=2)
+    assert gaps[~np.eye(4, dtype=bool)].min() > 1.0
+    for z in range(4):
+        assert np.linalg.norm(a.test_centres[a.zone == z][:, :2] - a.zone_centres[z, :2], axis=1).max() <= 0.3
+
+
+def test_people_and_both(rays_splits):
+    train, test = split_by_person(rays_splits, test_share=0.4, seed=0)
+    assert (
+        not set(rays_splits.person[train]) & set(rays_splits.person[test]) and len(set(rays_splits.person[test])) == 2
+    )
+    assert (train ^ test).all()
+    train, test = split_by_person(rays_splits, test_persons=["b"])
+    assert set(rays_splits.person[test]) == {1}
+    split = split_by_position(rays_splits, R, test_probes=20)
+    a = place_probes(rays_splits.select(split.train & train), R, count=100, min_rays=4)
+    b = place_probes(rays_splits.select(split.test & test), R, queries=split.test_centres, min_rays=4)
+    assert not rows(split.train & train, a) & rows(split.test & test, b)
+
+
+def test_purge(rays_splits):
+    mask = purge(rays_splits, np.array([[3, 2, 1.6]]), 1.0)
+    assert np.array_equal(mask, np.linalg.norm(rays_splits.origin - [3, 2, 1.6], axis=1) > 1.0)
+
+
+def test_refusals(rays_splits):
+    with pytest.raises(ValueError, match="no person is called 'zoe'"):
+        split_by_person(rays_splits, test_persons=["zoe"])
+    with pytest.raises(ValueError, match="cannot be split"):
+        split_by_person(rays_splits.select(rays_splits.person == 0))
+    with pytest.raises(ValueError, match="enlarge the radius"):
+        split_by_position(rays_splits, 0.01)
+    with pytest.raises(ValueError, match="left to train on"):
+        split_by_position(rays_splits, 3.0)
+
+
+def test_by_time_with_a_gap(rays_splits):
+    train, test = split_by_time(rays_splits, test_share=0.25, gap=10)
+    span = rays_splits.t.max() - rays_splits.t.min()
+    assert (
+        np.isclose(rays_splits.t[test].min(), 0.75 * span, atol=0.02)
+        and rays_splits.t[test].min() - rays_splits.t[train].max() >= 10
+    )
+    # Clocks of their own: everybody's last quarter.
+    own = Rays(
+        rays_splits.t + 5000 * rays_splits.person,
+        rays_splits.person,
+        rays_splits.persons,
+        rays_splits.origin,
+        rays_splits.direction,
+        rays_splits.confidence,
+    )
+    train, test = split_by_time(own, test_share=0.25, gap=10, of="person")
+    for p in range(5):
+        mine = own.person == p
+        assert own.t[test & mine].min() - own.t[train & mine].max() >= 10 and 0.24 < test[mine].mean() < 0.26
+    with pytest.raises(ValueError, match="smaller gap"):
+        split_by_time(rays_splits, gap=1e6)
+    with pytest.raises(ValueError, match='"all" or "person"'):
+        split_by_time(rays_splits, of="day")
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    st.integers(0, 2**16),
+    st.sampled_from(["position", "person", "time", "position person", "person time", "position person time"]),
+)
+def test_no_combination_shares_a_ray(rays_splits, seed, kinds):
+    by_position = split_by_position(rays_splits, R, test_probes=20, seed=seed) if "position" in kinds else None
+    made = {
+        "position": lambda: by_position.sides,
+        "person": lambda: split_by_person(rays_splits, test_share=0.4, seed=seed),
+        "time": lambda: split_by_time(rays_splits, test_share=0.4, gap=2.0),
+    }
+    train, test = combine(*(made[k]() for k in kinds.split()))
+    assert train.any() and test.any() and not (train & test).any()
+    if "person" in kinds:
+        assert not set(rays_splits.person[train]) & set(rays_splits.person[test])
+    if "time" in kinds:
+        assert rays_splits.t[test].min() - rays_splits.t[train].max() >= 2
+    if "position" in kinds:
+        a = place_probes(rays_splits.select(train), R, placement="blue", count=300, min_rays=4)
+        b = place_probes(rays_splits.select(test), R, queries=by_position.test_centres, min_rays=1)
+        assert not rows(train, a) & rows(test, b)
+        apart = np.linalg.norm(rays_splits.origin[train][:, None] - by_position.test_centres[None], axis=2)
+        assert apart.min() > 2 * R
+
+
+def test_both_refuses_what_leaves_nothing(rays_splits):
+    nobody = np.zeros(len(rays_splits), bool)
+    with pytest.raises(ValueError, match="0 rays to train on"):
+        combine((nobody, ~nobody))
+    with pytest.raises(ValueError, match="how to split"):
+        combine()
+
+
+@pytest.mark.parametrize("count, each", [(10, [4, 3, 3]), (11, [4, 4, 3]), (12, [4, 4, 4]), (2, [1, 1, 0])])
+def test_every_test_position_that_was_asked_for(rays_splits, count, each):
+    """What does not divide by the zones goes to the first of them."""
+    split = split_by_position(rays_splits, R, zones=3, zone_radius=0.4, test_probes=count, min_rays=8)
+    assert len(split.test_centres) == count and np.bincount(split.zone, minlength=3).tolist() == each
+
+
+def test_the_metadata_tell_how_rays_were_split(rays_splits):
+    """What the layout draws; nothing where there was none."""
+    assert position_of_split(rays_splits) == {}
+    by = {"position": {"radius": R, "test_centres": [[0.0, 0.0, 1.5]]}, "person": {"test": ["a"]}}
+    split = rays_splits.with_step(step="filter", kept=9, of=9).with_step(step="split", side="test", kept=9, of=9, by=by)
+    assert position_of_split(split) == by["position"]
+    assert position_of_split(rays_splits.with_step(step="split", kept=9, of=9, by={"time": {"share": 0.2}})) == {}
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_of_two_people_one_is_on_each_side(rays_splits, share):
+    train, test = split_by_person(rays_splits.select(rays_splits.person < 2), test_share=share)
+    assert train.any() and test.any()
+
+
+def test_distances_and_times_on_the_bounds():
+    """Rays at R from a test centre are of the test, those at 2R of neither side."""
+    near = [[0.5, 0, 0], [-0.5, 0, 0], [0, 0.5, 0], [0, -0.5, 0]]
+    twice, far = [[1.0, 0, 0]], [[5.0 + 3 * k, 0, 0] for k in range(9)]
+    origin = np.array([[0.0, 0, 0]] * 70 + near + twice + far)
+    n = len(origin)
+    rays = Rays(np.arange(n) * 1.0, np.zeros(n), ("ann",), origin, np.tile([1.0, 0, 0], (n, 1)), np.ones(n))
+    # Of all places the first alone has so many rays within R.
+    split = split_by_position(rays, 0.5, zones=1, test_probes=1, min_rays=73, min_train=9)
+    with pytest.raises(ValueError, match="9 rays are left to train on"):
+        split_by_position(rays, 0.5, zones=1, test_probes=1, min_rays=73, min_train=10)
+    assert split.test.tolist() == [True] * 74 + [False] * 10 and split.train.tolist() == [False] * 75 + [True] * 9
+    assert purge(rays, np.zeros((1, 3)), 1.0).tolist() == split.train.tolist()
+    some = rays.select(np.arange(11))
+    train, test = split_by_time(some, test_share=0.5, gap=2.0)
+    assert some.t[train].tolist() == [0, 1, 2] and some.t[test].tolist() == [5, 6, 7, 8, 9, 10]
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_both_sides_of_several_splits_have_rays(missing):
+    a, b = np.array([True, False, False]), np.array([False, True, False])
+    sides = (a, b), ((b, b) if missing == 0 else (a, a))
+    with pytest.raises(ValueError, match="together the splits leave"):
+        combine(*sides)

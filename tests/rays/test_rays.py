@@ -1,10 +1,365 @@
+"""Tests of `nerg_mi.rays.rays`."""
+
+import importlib.util
+import json
+import zipfile
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from nerg_mi.rays.rays import Rays
+from nerg_mi.errors import NergError
+from nerg_mi.rays import rays as module
+from nerg_mi.rays.rays import FRAME, VERSION, RayIndex, Rays, read_metadata, write_rays_file
+
+# ---- Index ----
 
 
-def some(n=6, **change):
+@pytest.mark.parametrize("block", [1 << 21, 64])
+def test_nearest_against_all_distances(block, monkeypatch):
+    monkeypatch.setattr(module, "_INDEX_BLOCK", block)
+    rng = np.random.default_rng(0)
+    origin, places = rng.random((500, 3)), rng.random((40, 3)) * 1.2
+    index = RayIndex(origin)
+    apart = np.linalg.norm(origin[None] - places[:, None], axis=2)
+    for most, radius in ((10, 0.2), (1000, 0.3), (7, np.inf)):
+        found = index.nearest(places, most, radius)
+        for q in range(40):
+            run = slice(found.offsets[q], found.offsets[q + 1])
+            want = np.argsort(apart[q])[: min(most, (apart[q] <= radius).sum())]
+            assert np.array_equal(found.indices[run], want) and np.allclose(found.distances[run], apart[q][want])
+
+
+def test_the_rim_counts_and_nonsense_is_refused():
+    index = RayIndex(np.array([[0.25, 0, 0], [0.3, 0, 0]]))
+    assert index.nearest([[0, 0, 0]], 5, 0.25).indices.tolist() == [0]
+    with pytest.raises(ValueError, match="at least one ray"):
+        index.nearest([[0, 0, 0]], 0)
+
+
+def test_rays_that_are_equally_far_keep_their_order():
+    """It decides bits of every training: that of scipy's cKDTree as it is by default."""
+    rng = np.random.default_rng(3)
+    origin = rng.integers(0, 30, (20_000, 3)).astype(float)  # on a lattice: many are equally far
+    near = RayIndex(origin).nearest(origin[:50], 300)
+    _, indices = cKDTree(origin, balanced_tree=False).query(origin[:50], k=300)
+    assert np.array_equal(near.indices, indices.ravel())
+
+
+# ---- Io ----
+
+
+ENDINGS = [
+    "npz",
+    pytest.param(
+        "parquet",
+        marks=pytest.mark.skipif(
+            importlib.util.find_spec("pyarrow") is None, reason="pyarrow is not installed (pip install pyarrow)"
+        ),
+    ),
+]
+
+
+def some(hit):
+    rng = np.random.default_rng(0)
+    d = rng.normal(size=(9, 3))
+    points = rng.random((9, 3))
+    points[4] = np.nan
+    heads = np.where(np.isnan(points), points, np.float32([0.6, 0.0, 0.8]))
+    return Rays(
+        np.arange(9) / 7,
+        np.arange(9) % 2,
+        ("ann", "bo"),
+        rng.random((9, 3)),
+        d / np.linalg.norm(d, axis=1, keepdims=True),
+        rng.random(9),
+        points if hit else None,
+        {"frame": dict(FRAME), "dropped": [{"reason": "blink", "count": 2, "rows": [[3, 4]]}]},
+        head=heads if hit else None,
+    )
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("hit", [True, False])
+def test_round_trip(tmp_path, ending, hit):
+    rays, path = some(hit), tmp_path / f"rays.{ending}"
+    rays.save(path)
+    back = Rays.load(path)
+    assert back.persons == rays.persons and back.metadata == rays.metadata and (back.hit is None) == (not hit)
+    for name in ("t", "person", "origin", "direction", "confidence"):
+        assert np.array_equal(getattr(back, name), getattr(rays, name))
+    if hit:
+        assert np.array_equal(back.hit, rays.hit, equal_nan=True) and back.head.dtype == np.float32
+        assert np.array_equal(back.head, rays.head, equal_nan=True)
+
+
+def test_refusals(tmp_path):
+    with pytest.raises(ValueError, match=".npz or .parquet"):
+        some(False).save(tmp_path / "rays.csv")
+    np.savez(tmp_path / "other.npz", t=np.zeros(3))
+    with pytest.raises(ValueError, match="not a rays file .*person.*nerg rays import"):
+        Rays.load(tmp_path / "other.npz")
+    (tmp_path / "text.npz").write_text("hello")
+    with pytest.raises(NergError, match="text.npz.*not a zip archive"):
+        Rays.load(tmp_path / "text.npz")
+    with pytest.raises(NergError, match='no rays file "'):
+        Rays.load(tmp_path / "absent.npz")
+
+
+def test_parquet_without_pyarrow(tmp_path, monkeypatch):
+    import builtins
+
+    real = builtins.__import__
+
+    def no_pyarrow(name, *args, **kwargs):
+        if name.startswith("pyarrow"):
+            raise ImportError("no module")
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", no_pyarrow)
+    with pytest.raises(ImportError, match="nerg-mi\\[parquet\\]"):
+        some(False).save(tmp_path / "rays.parquet")
+
+
+def stored(path, **changes):
+    """A rays file in which some arrays, or keys of the metadata, are others; None: left out."""
+    rays = some(True)
+    arrays = {k: getattr(rays, k) for k in ("t", "person", "origin", "direction", "confidence", "hit")}
+    metadata = {"version": 1, **rays.metadata, "persons": list(rays.persons)}
+    for name, value in changes.items():
+        into = arrays if name in (*arrays, "cohort", "metadata") else metadata
+        into.pop(name, None)
+        if value is not None:
+            into[name] = value
+    np.savez(path, **{"metadata": np.array(json.dumps(metadata)), **arrays})
+    return path
+
+
+@pytest.mark.parametrize(
+    "changes, why",
+    [
+        ({"person": np.full(9, 2)}, "unknown person"),
+        ({"person": np.full(9, -1)}, "unknown person"),
+        ({"person": np.full(9, 1 << 32)}, "unknown person"),
+        ({"person": np.zeros(9)}, "person is not whole numbers"),
+        ({"direction": np.full((9, 3), np.nan)}, "direction that is not finite"),
+        ({"direction": np.zeros((9, 3))}, "zero direction"),
+        ({"direction": np.full((9, 3), np.inf)}, "not finite"),
+        ({"origin": np.full((9, 3), np.inf)}, "origin that is not finite"),
+        ({"t": np.full(9, np.nan)}, "time that is not finite"),
+        ({"confidence": np.full(9, 2.0)}, "confidence outside"),
+        ({"origin": np.zeros((9, 2))}, r"origin has the shape \(9, 2\)"),
+        ({"t": np.zeros(8)}, "expected"),
+        ({"t": np.zeros((3, 3))}, "expected"),
+        ({"t": np.array(1.0)}, "expected"),
+        ({"hit": np.array(["a"] * 9)}, "expected"),
+        ({"confidence": np.ones(9) * 1j}, "not numbers"),
+        ({"t": np.arange(9).astype("M8[s]")}, "not numbers"),
+        ({"hit": None, "cohort": np.zeros(9, int)}, "unknown cohort"),
+        ({"t": None}, "lacks t"),
+        ({"metadata": np.array("[1, 2]")}, "no JSON object"),
+        ({"metadata": np.array("{")}, "not valid JSON"),
+        ({"metadata": np.array("[" * 5000)}, "nested"),
+        ({"metadata": np.zeros(3)}, "no text"),
+        ({"metadata": np.array("{}")}, 'lack "version"'),
+        ({"version": None}, 'lack "version"'),
+        ({"version": 2}, "another version"),
+        ({"version": "1"}, "another version"),
+        ({"persons": None}, 'lack "persons"'),
+        ({"persons": "ann"}, "no list of names"),
+        ({"persons": [1, 2]}, "no list of names"),
+        ({"frame": None}, 'lack "frame"'),
+        ({"frame": []}, "no frame"),
+        ({"transform": np.zeros((4, 4)).tolist()}, "inverted"),
+        ({"transform": [[1e400]]}, "inverted"),
+        ({"transform": 3}, "inverted"),
+        ({"rows_read": "x"}, "number of rows"),
+        ({"rows_read": -1}, "number of rows"),
+        ({"dropped": [{"reason": "x"}]}, "reasons and counts"),
+        ({"dropped": [{"reason": "x", "count": 1, "rows": [3]}]}, "reasons and counts"),
+        ({"steps": [{}]}, "steps"),
+        ({"steps": [{"step": "split", "kept": 1, "of": 2, "by": {"position": {"test_centres": [[0, 0]]}}}]}, "steps"),
+        ({"source_frame": {"up": "y"}}, "no frame"),
+        ({"tick": 0}, "time in seconds"),
+    ],
+)
+def test_what_is_no_rays_file_is_one_sentence(tmp_path, changes, why):
+    path = stored(tmp_path / "changed.npz", **changes)
+    with pytest.raises(NergError, match=why) as caught:
+        Rays.load(path)
+    assert "changed.npz" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_narrow_numbers_and_other_columns_are_read(tmp_path):
+    rays = some(True)
+    path = stored(
+        tmp_path / "narrow.npz",
+        person=rays.person.astype(np.uint8),
+        confidence=np.ones(9, np.float16),
+        t=np.arange(9),
+        origin=rays.origin.astype(np.float32),
+        notes=[1],
+    )
+    back = Rays.load(path)
+    assert back.t.dtype == np.float64 and np.array_equal(back.person, rays.person) and back.person.dtype == np.int32
+    assert np.allclose(back.origin, rays.origin, atol=1e-6) and back.metadata["notes"] == [1]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_every_cut_and_every_flipped_byte(tmp_path, ending):
+    """A file that lost its end, or of which one byte is another, is read or refused in a sentence; nothing else."""
+    whole, path = tmp_path / f"whole.{ending}", tmp_path / f"hurt.{ending}"
+    some(True).save(whole)
+    data, rng = whole.read_bytes(), np.random.default_rng(0)
+    refused = 0
+    for at in rng.integers(0, len(data), 120).tolist():
+        for hurt in (data[:at], data[:at] + bytes([data[at] ^ 0x41]) + data[at + 1 :], data[:at] + data[at + 7 :]):
+            path.write_bytes(hurt)
+            try:
+                assert len(Rays.load(path)) == 9
+            except NergError as error:
+                refused += 1
+                assert "hurt" in str(error)
+    assert refused > 200
+
+
+def test_a_small_file_does_not_become_a_large_array(tmp_path):
+    """Zeros take no room in the file: 8 million rays would be three quarters of a gigabyte."""
+    n, path = 8_000_000, tmp_path / "zeros.npz"
+    metadata = {"version": 1, "persons": ["a"], "frame": dict(FRAME)}
+    half = {
+        "origin": np.zeros((n, 3), np.float16),
+        "direction": np.zeros((n, 3), np.float16),
+        "confidence": np.zeros(n, np.float16),
+    }
+    np.savez_compressed(
+        path, metadata=np.array(json.dumps(metadata)), t=np.zeros(n, np.float16), person=np.zeros(n, np.int8), **half
+    )
+    assert path.stat().st_size < 1 << 20
+    with pytest.raises(NergError, match="8,000,000 rays, which its .* bytes do not warrant"):
+        Rays.load(path)
+
+
+@pytest.mark.parametrize("column, value", [("person", None), ("t", "x"), ("origin_y", "x")])
+def test_parquet_of_other_types(tmp_path, column, value):
+    pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install pyarrow)")
+    import pyarrow.parquet as pq
+
+    path = tmp_path / "other.parquet"
+    some(False).save(path)
+    table = pq.read_table(path)
+    at = table.column_names.index(column)
+    other = pa.array([value] * 9, pa.int32() if value is None else None)
+    pq.write_table(table.set_column(at, column, other).replace_schema_metadata(table.schema.metadata), path)
+    with pytest.raises(NergError, match="other.parquet"):
+        Rays.load(path)
+    pq.write_table(table.replace_schema_metadata(None), path)
+    with pytest.raises(NergError, match="lacks the metadata"):
+        Rays.load(path)
+
+
+def test_what_does_not_shrink_is_stored(tmp_path):
+    """Random digits are not worth the time of deflating them, and of inflating them each time."""
+    rng = np.random.default_rng(0)
+    n = 50_000  # of a column more than the sample that is looked at
+    d = rng.normal(size=(n, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    rays = Rays(np.arange(n) * 0.02, np.zeros(n, int), ("a",), np.zeros((n, 3)), d, np.ones(n))
+    rays.save(tmp_path / "r.npz")
+    with zipfile.ZipFile(tmp_path / "r.npz") as archive:
+        kinds = {m.filename: m.compress_type for m in archive.infolist()}
+    assert kinds["direction.npy"] == zipfile.ZIP_STORED
+    assert all(
+        kind == zipfile.ZIP_DEFLATED for name, kind in kinds.items() if name not in ("direction.npy", "metadata.npy")
+    )
+    assert np.array_equal(Rays.load(tmp_path / "r.npz").direction, rays.direction)
+
+
+@pytest.mark.parametrize("metadata", [{"tick": 0}, {"persons": 3}, {"note": [[]] * 9_000_000}])
+def test_nothing_is_written_that_could_not_be_read(tmp_path, metadata):
+    rays = some(False)
+    columns = {k: getattr(rays, k) for k in ("t", "person", "origin", "direction", "confidence")}
+    with pytest.raises(NergError, match="cannot be kept"):
+        write_rays_file(tmp_path / "r.npz", columns, {**rays.metadata, "persons": list(rays.persons), **metadata})
+    assert not list(tmp_path.iterdir())
+
+
+# ---- The JSON document of a rays file: what is read, and what is refused ----
+
+
+GOOD = {
+    "version": VERSION,
+    "frame": {"units": "m", "up": "z", "handedness": "right"},
+    "persons": ["ann", "bo"],
+    "cohorts": [],
+    "source_frame": {"units": "cm", "up": "y", "handedness": "left"},
+    "transform": np.eye(4).tolist(),
+    "rows_read": 12,
+    "sources": [{"file": "a.csv", "sha256": "00"}, {"file": "b.csv"}],
+    "dropped": [{"reason": "blink", "count": 2, "file": "a.csv", "rows": [[3, 4]]}, {"reason": "other", "count": 1}],
+    "steps": [
+        {"step": "filter", "kept": 9, "of": 10},
+        {"step": "fixations", "kept": 9, "of": 9, "by": "ivt"},
+        {"step": "split", "kept": 5, "of": 9, "by": {"position": {"radius": 0.25, "test_centres": [[0, 0, 1.5]]}}},
+    ],
+    "tick": 0.001,
+    "anything": {"else": [1, "two"]},
+}
+
+
+def read(**change):
+    about = {**GOOD, **change}
+    return read_metadata(json.dumps({k: v for k, v in about.items() if v is not ...}), "r.npz")
+
+
+def test_what_is_known_and_what_is_not():
+    assert read() == {k: v for k, v in GOOD.items() if k != "version"}
+    least = json.dumps({k: GOOD[k] for k in ("version", "frame", "persons")})
+    assert set(read_metadata(least.encode(), "r.npz")) == {"frame", "persons"}
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"version": VERSION + 1}, "another version"),
+        ({"version": ...}, 'lack "version"'),
+        ({"persons": ...}, 'lack "persons"'),
+        ({"frame": ...}, 'lack "frame"'),
+        ({"frame": {"units": "m", "up": "z"}}, '"frame" .*frame of units'),
+        ({"persons": ["ann", 2]}, '"persons" .*list of names'),
+        ({"transform": np.zeros((4, 4)).tolist()}, "can be inverted"),
+        ({"transform": np.eye(3).tolist()}, "can be inverted"),
+        ({"transform": (np.arange(16).reshape(4, 4) + 1).tolist()}, "can be inverted"),
+        ({"rows_read": -1}, "number of rows"),
+        ({"rows_read": True}, "number of rows"),
+        ({"sources": [{"sha256": "00"}]}, "list of files"),
+        ({"dropped": [{"reason": "blink", "count": 2, "rows": [[3]]}]}, "list of reasons"),
+        ({"dropped": [{"count": 2}]}, "list of reasons"),
+        ({"steps": [{"step": "filter", "kept": 1}]}, "list of steps"),
+        ({"steps": [{"step": "split", "kept": 1, "of": 2, "by": {"position": {"radius": "far"}}}]}, "list of steps"),
+        ({"steps": [{"step": "split", "kept": 1, "of": 2, "by": {"position": {"test_centres": [[1, 2]]}}}]}, "steps"),
+        ({"eye_distance": {"ann": "wide"}}, "distances in metres"),
+        ({"eye_distance": [0.06]}, "distances in metres"),
+        ({"floor": 0}, '"floor" .*word'),
+        ({"tick": 0}, "time in seconds"),
+        ({"tick": "1"}, "time in seconds"),
+    ],
+)
+def test_metadata_refusals(change, message):
+    with pytest.raises(NergError, match=f"r.npz.*{message}|{message}.*r.npz"):
+        read(**change)
+
+
+def test_what_is_no_document():
+    for text in ("[]", "1", "{", ""):
+        with pytest.raises(NergError, match=r"r\.npz"):
+            read_metadata(text, "r.npz")
+
+
+# ---- Rays ----
+
+
+def some_rays(n=6, **change):
     rng = np.random.default_rng(0)
     d = rng.normal(size=(n, 3))
     values = dict(
@@ -19,7 +374,7 @@ def some(n=6, **change):
 
 
 def broken(name, row, value):
-    array = getattr(some(), name).copy()
+    array = getattr(some_rays(), name).copy()
     array[row] = value
     return {name: array}
 
@@ -48,12 +403,14 @@ def broken(name, row, value):
 )
 def test_refuses_by_row(change, message):
     with pytest.raises(ValueError, match=message):
-        some(**change)
+        some_rays(**change)
 
 
 @pytest.mark.parametrize("kind", [list, tuple, np.array, lambda names: np.array(names, object)])
 def test_people_may_be_named(kind):
-    rays = some(person=kind(["bo", "ann", "bo", "bo", "ann", "ann"]), cohort=kind(["old"] * 6), cohorts=("new", "old"))
+    rays = some_rays(
+        person=kind(["bo", "ann", "bo", "bo", "ann", "ann"]), cohort=kind(["old"] * 6), cohorts=("new", "old")
+    )
     assert rays.person.tolist() == [1, 0, 1, 1, 0, 0] and rays.person.dtype == np.int32
     assert rays.cohort is not None and rays.cohort.tolist() == [1] * 6
 
@@ -75,7 +432,7 @@ def test_whole_numbers_are_taken_as_what_they_stand_for():
 
 
 def test_select_keeps_codes_and_provenance():
-    rays = some()
+    rays = some_rays()
     part = rays.select(rays.person == 1)
     assert len(part) == 3 and part.persons == rays.persons and part.metadata == rays.metadata
     assert np.array_equal(part.origin, rays.origin[1::2])

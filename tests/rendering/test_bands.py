@@ -1,4 +1,4 @@
-"""A picture is the same however it is divided, and its memory is that of a band."""
+"""Tests of `nerg_mi.rendering.bands`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.rendering import bands
+from nerg_mi.rendering.bands import LEAST, PACKET, Channels, OwnLayer, Pace, render_bands, render_channels
 from tests.plugins import fields
 from tests.plugins.scenes import camera, constant, observer_at
+
+# ---- A picture is the same however it is divided, and its memory is that of a band ----
 
 
 def neural(mi, folder, sensor, **kwargs):
@@ -212,3 +215,199 @@ def test_progress_and_stopping(rgb):
     with pytest.raises(KeyboardInterrupt):
         divided(scene, 2, rows=4, strip=64, on_strip=stop)
     assert tuple(scene.sensors()[0].film().crop_size()) == (18, 11)
+
+
+# ---- A picture taken apart, against what Mitsuba makes of it ----
+
+
+@pytest.fixture
+def scene_channels(rgb):
+    return rgb.load_dict(
+        {
+            "type": "scene",
+            "integrator": {
+                "type": "nerg",
+                "density": {"type": "constvolume", "value": 3.0},
+                "aovs": "depth,opacity,position",
+            },
+            "sensor": {
+                "type": "perspective",
+                "to_world": rgb.ScalarTransform4f().look_at([0.5, 0.5, -2], [0.5, 0.5, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 9, "height": 6, "rfilter": {"type": "box"}},
+            },
+        }
+    )
+
+
+def test_each_channel_by_its_name(rgb, scene_channels):
+    seen = render_channels(scene_channels, scene_channels.sensors()[0], spp=4, seed=3)
+    whole = np.array(rgb.render(scene_channels, spp=4, seed=3))
+    assert list(seen.aovs) == ["depth", "opacity", "position.X", "position.Y", "position.Z"]
+    assert seen.color.shape == (6, 9, 3) and np.array_equal(seen.color, whole[..., :3])
+    for k, channel in enumerate(seen.aovs.values()):
+        assert np.array_equal(channel, whole[..., 3 + k])
+    assert tuple(seen.bitmap.size()) == (9, 6)
+
+
+def test_one_channel_of_colour_becomes_three(mono):
+    scene = mono.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct"},
+            "light": {"type": "constant"},
+            "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 3}},
+        }
+    )
+    assert render_channels(scene, scene.sensors()[0], spp=1).color.shape == (3, 4, 3)
+
+
+def test_a_surface_is_where_half_is_absorbed():
+    seen = Channels(np.zeros((1, 3, 3)), {"opacity": np.array([[0.49, 0.5, 1.0]])}, None)
+    assert seen.mask.tolist() == [[False, True, True]]
+
+
+def test_whoever_is_told_may_end_it(scene_channels):
+    def end(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_channels(scene_channels, scene_channels.sensors()[0], spp=1, on_strip=end)
+
+
+# ---- Several pictures of the same rays: each is the one that an integrator makes alone ----
+
+
+@pytest.fixture
+def scene_layers(rgb):
+    film = {"type": "hdrfilm", "width": 9, "height": 7, "rfilter": {"type": "box"}, "component_format": "float32"}
+    camera = {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate([0, 0, -4]), "film": film}
+    integrator = {"type": "nerg", "aovs": "depth,opacity"}
+    return rgb.load_dict({"type": "scene", "integrator": integrator, "camera": camera, "ball": {"type": "sphere"}})
+
+
+class Both:
+    """The scene's own picture, and one of twice its depths."""
+
+    def __init__(self, integrator):
+        self.integrator, self.names, self.count = integrator, [integrator.aov_names(), ["twice.T"]], 3
+
+    def sample(self, *ray):
+        radiance, valid, aovs = self.integrator.sample(*ray)
+        yield radiance, valid, aovs
+        yield 0, valid, [2 * aovs[0]]
+
+
+def test01_the_picture_of_an_integrator_is_one_layer(rgb, scene_layers):
+    layer = OwnLayer(scene_layers.integrator())
+    assert layer.names == [["depth.T", "opacity.Y"]] and layer.count == 2
+    (band,) = render_bands(scene_layers, scene_layers.sensors()[0], spp=4, layers=layer)
+    assert band.layer == 0
+    assert np.array_equal(np.array(band.film.develop()), np.array(rgb.render(scene_layers, spp=4)))
+
+
+@pytest.mark.parametrize("rows", [0, 3])
+def test02_layers_follow_each_other_in_each_band(rgb, scene_layers, rows):
+    expected, pictures = np.array(rgb.render(scene_layers, spp=4)), ([], [])
+    for band in render_bands(
+        scene_layers, scene_layers.sensors()[0], spp=4, rows=rows, layers=Both(scene_layers.integrator())
+    ):
+        pictures[band.layer].append(np.array(band.film.develop())[: band.rows])
+    own, twice = (np.concatenate(parts) for parts in pictures)
+    assert np.array_equal(own, expected)
+    assert np.allclose(twice[..., 3], 2 * expected[..., 3]) and not twice[..., :3].any()
+
+
+# ---- Strips of samples: where they begin and end, and how long they become ----
+
+
+class Clock:
+    """A clock that stands still but for ``take``."""
+
+    def __init__(self, monkeypatch):
+        self.now = 0.0
+        monkeypatch.setattr(bands.time, "perf_counter", lambda: self.now)
+
+    def take(self, it, seconds, times=1):
+        for _ in range(times):
+            self.now += seconds
+            it.wait()
+
+
+@pytest.mark.parametrize(("fixed", "spp"), [(1 << 12, 1), (1 << 12, 3), (100, 1), (0, 4)])
+def test01_strips_follow_each_other_in_whole_packets_and_pixels(rgb, fixed, spp):
+    start, stop = 1000 * spp, 1000 * spp + 50_000 * spp
+    strips = list(Pace(fixed).strips(start, stop, spp))
+    assert strips[0][0] == start - start % PACKET and sum(strips[-1]) == stop
+    assert all(a + n == b for (a, n), (b, _) in zip(strips, strips[1:]))
+    assert all((a + n) % PACKET == 0 == (a + n) % spp for a, n in strips[:-1])
+
+
+def first_strip(it):
+    return next(iter(it.strips(0, 1 << 22, 1)))[1]
+
+
+def test02_short_ones_grow_and_long_ones_shrink_to_a_limit(rgb, monkeypatch):
+    clock, it = Clock(monkeypatch), Pace()
+    before = first_strip(it)
+    # The first two are not asked: they were compiled, or wait for what was.
+    clock.take(it, 0.01, 2)
+    assert first_strip(it) == before
+    clock.take(it, 0.01)
+    assert first_strip(it) == 2 * before
+    clock.take(it, 0.7 * bands.STRIP_SECONDS)
+    assert first_strip(it) == 2 * before
+    clock.take(it, 0.01, 20)
+    assert first_strip(it) == 1 << 18
+    clock.take(it, 2 * bands.STRIP_SECONDS, 40)
+    assert first_strip(it) == LEAST
+
+
+def test03_fixed_ones_stay(rgb, monkeypatch):
+    clock, it = Clock(monkeypatch), Pace(1 << 13)
+    clock.take(it, 0.01, 10)
+    assert first_strip(it) == 1 << 13
+
+
+def test04_the_next_picture_goes_on_with_the_pace_of_the_last(rgb, monkeypatch):
+    clock, it = Clock(monkeypatch), Pace()
+    before = first_strip(it)
+    clock.take(it, 0.01, 4)
+    grown = first_strip(it)
+    assert grown > before
+    # Reading the next scene is no strip's time.
+    it.begin()
+    clock.take(it, 10 * bands.STRIP_SECONDS)
+    clock.take(it, 10 * bands.STRIP_SECONDS)
+    assert first_strip(it) == grown
+    clock.take(it, 2 * bands.STRIP_SECONDS)
+    assert first_strip(it) == grown // 2
+
+
+# ---- A range of samples draws the numbers that it has in Mitsuba's whole picture ----
+
+
+@pytest.mark.parametrize("base, seed", [(0, 0), (5, 9), (4294967295, 3)])
+def test_numbers_are_those_of_the_whole(rgb, base, seed):
+    sampler = rgb.load_dict({"type": "independent", "seed": base, "sample_count": 2})
+    assert bands.base_seed(sampler) == base
+    sampler.seed(seed, 1000)
+    theirs = np.array([sampler.next_1d(), *sampler.next_2d()])
+    part = bands.for_samples(2, base, seed, 137, 500)
+    assert np.array_equal(np.array([part.next_1d(), *part.next_2d()]), theirs[:, 137:637])
+
+
+def test_a_copy_goes_its_own_way(rgb):
+    sampler = bands.for_samples(1, 0, 0, 0, 10)
+    copy = sampler.clone()
+    first = np.array(sampler.next_1d())
+    assert np.array_equal(np.array(copy.next_1d()), first)
+    assert not np.array_equal(np.array(copy.next_1d()), first)
+
+
+def test_beyond_two_to_the_32_numbers_do_not_repeat(rgb):
+    near, far = (np.array(bands.for_samples(1, 0, 0, first, 64).next_1d()) for first in (0, 1 << 32))
+    assert not np.any(near == far)
+
+
+def test_other_samplers_are_none_of_ours(rgb):
+    assert bands.base_seed(rgb.load_dict({"type": "stratified"})) is None

@@ -10,8 +10,8 @@ from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.formats.areas import Region
 from nerg_mi.rays.quality import summarise
 from nerg_mi.report.data import Camera, ObjectAttention, Picture, Proxy, Run, Share, Stage, pack
-from tests.evaluation.gaze.test_evaluation import crowd
-from tests.evaluation.gaze.test_verdict import scored
+from tests.evaluation.test_gaze import crowd
+from tests.evaluation.test_gaze_report import scored
 
 HOSTILE = "<script>alert(1)</script>\"'&\u202egnp.exe<img src=http://example.org/x onerror=alert(2)>"
 """A name that is markup, breaks out of attributes and turns the direction of text."""

@@ -1,4 +1,4 @@
-"""Tables of numbers, and the floor on people."""
+"""Tests of `nerg_mi.statistics.tables`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import pytest
 
 from nerg_mi.statistics.tables import (
     BY_NAME,
+    MEASURES,
     TRACKED,
     Floor,
     People,
+    PersonRows,
     difference_rows,
     duration_rows,
     move_rows,
@@ -18,7 +20,104 @@ from nerg_mi.statistics.tables import (
 )
 from nerg_mi.statistics.visits import ALL, BINS, Cell, Sums
 
+# ---- The numbers that are told, from sums that are written out ----
+
+
+# Three people, two things: Ada looks at the first alone, Bo at both, Cy at none and has no time.
+PEOPLE = People(
+    ("Ada", "Bo", "Cy"),
+    np.array([10.0, 20.0, 0.0]),
+    on_time=np.array([[2.0, 0], [4, 1], [0, 0]]),
+    distance=np.array([[6.0, 0], [4, 3], [0, 0]]),
+    visible=np.array([[5.0, 1], [4, 2], [0, 0]]),
+    reached=np.array([[1.0, 0], [1, 1], [0, 0]]),
+    looks=np.array([[3.0, 0], [1, 1], [0, 0]]),
+    first_sum=np.array([[4.0, 0], [6, 8], [0, 0]]),
+    first_count=np.array([[2.0, 0], [1, 1], [0, 0]]),
+)
+
+
+EXPECTED = {
+    "share": ([(0.2 + 0.2) / 2, (0 + 0.05) / 2], [2, 2]),
+    "dwell": ([6 / 3, 1 / 3], [3, 3]),
+    "reach": ([2 / 3, 1 / 3], [3, 3]),
+    "first_look": ([(2 + 6) / 2, 8], [2, 1]),
+    "looks": ([4 / 3, 1 / 3], [3, 3]),
+    "returns": ([(2 + 0) / 2, 0], [2, 1]),
+    "distance": ([10 / 6, 3], [2, 1]),
+    "visible": ([(0.5 + 0.2) / 2, (0.1 + 0.1) / 2], [2, 2]),
+    "given_visible": ([6 / 9, 1 / 3], [2, 2]),
+    "unseen": ([0, 1 / 2], [2, 2]),
+}
+
+
+def test01_every_measure_is_written_out_here():
+    assert set(EXPECTED) == {m.name for m in MEASURES} == set(BY_NAME)
+
+
+@pytest.mark.parametrize("name", list(EXPECTED))
+def test02_values_and_people(name):
+    found = BY_NAME[name].estimate(PEOPLE, 199, 0)
+    assert found.value == pytest.approx(EXPECTED[name][0]) and found.people.tolist() == EXPECTED[name][1]
+
+
+def test03_a_field_tells_less():
+    told = People(PEOPLE.names, PEOPLE.time, PEOPLE.on_time, PEOPLE.distance, None, np.full((3, 2), 0.5))
+    known = {m.name for m in MEASURES if m.estimate(told, 199, 0) is not None}
+    assert known == {"share", "dwell", "reach", "distance"}
+    assert BY_NAME["reach"].estimate(told, 199, 0).value == pytest.approx([0.5, 0.5])
+
+
+def test04_those_who_are_not_there_count_for_nothing():
+    more = PEOPLE.aligned(["Ada", "Bo", "Cy", "Dee", "Eve"])
+    assert more.there.tolist() == [True, True, True, False, False]
+    for measure in MEASURES:
+        a, b = measure.estimate(PEOPLE, 199, 0), measure.estimate(more, 199, 0)
+        assert np.allclose(a.value, b.value, equal_nan=True) and a.people.tolist() == b.people.tolist(), measure.name
+
+
+def test05_nobody():
+    none = People((), np.zeros(0), *(np.zeros((0, 2)) for _ in range(7)))
+    for measure in MEASURES:
+        found = measure.estimate(none, 199, 0)
+        assert np.isnan(found.value).all() and found.people.tolist() == [0, 0]
+
+
+# ---- The table of single people ----
+
+
+def sums():
+    found = Sums.empty(("x", "y"), (ALL, Cell("zone", "z")), [(ALL, "Bo"), (Cell("zone", "z"), "Bo"), (ALL, "Ada")])
+    found.time[:] = 10, 5, 20
+    found.rays[:] = 50, 25, 100
+    found.on_time[:] = [[1, 2], [9, 9], [3, 0]]
+    found.looks[:] = [[1, 1], [1, 1], [2, 0]]
+    found.visible[:] = [[4, 5], [9, 9], [6, 7]]
+    found.first_sum[:], found.first_count[:] = [[4, 6], [0, 0], [1, 0]], [[1, 2], [1, 1], [1, 0]]
+    return found
+
+
+def test01_each_persons_own_in_the_order_of_their_names():
+    rows = PersonRows(sums(), {"Ada": "p2", "Bo": "p1"}, True)
+    assert len(rows) == 4 and list(rows) == rows[:] == [rows[k] for k in range(-4, 0)]
+    assert [(r["person"], r["thing"]) for r in rows] == [("p1", "x"), ("p1", "y"), ("p2", "x"), ("p2", "y")]
+    bo = {"person": "p1", "thing": "y", "time": 10.0, "rays": 50, "dwell": 2.0, "looks": 1, "first_look": 3.0}
+    assert rows[1] == bo | {"visible": 5.0} and tuple(rows[1]) == rows.columns
+    assert rows[3]["first_look"] is None and rows[2]["first_look"] == 1.0
+    with pytest.raises(IndexError):
+        rows[4]
+
+
+def test02_nobody_knows_what_was_visible():
+    assert [r["visible"] for r in PersonRows(sums(), {"Ada": "a", "Bo": "b"}, False)] == [None] * 4
+
+
+# ---- Tables of numbers, and the floor on people ----
+
+
 A, B = Cell("cohort", "a"), Cell("cohort", "b")
+
+
 HOW = {"resamples": 299, "seed": 0}
 
 
@@ -76,7 +175,7 @@ def test04_one_value_has_nothing_to_be_compared_with():
     assert difference_rows(("x", "y"), {ALL: {TRACKED: people(5, 0.2, 0)}}, Floor(), **HOW) == []
 
 
-def sums():
+def sums_tables():
     found = Sums.empty(("x", "y"), (ALL,), [(ALL, "Bo"), (ALL, "Ada")])
     found.time[:] = 10, 20
     found.rays[:] = 50, 100
@@ -89,10 +188,10 @@ def sums():
 
 
 def test05_moves_and_durations():
-    rows = move_rows(sums(), Floor())
+    rows = move_rows(sums_tables(), Floor())
     assert [(r["from"], r["to"], r["moves"], r["share"]) for r in rows] == [("x", "y", 3, 1.0), ("y", "x", 1, 1.0)]
-    assert all(r["moves"] is None for r in move_rows(sums(), Floor(3)))
-    lasted = duration_rows(sums(), Floor())
+    assert all(r["moves"] is None for r in move_rows(sums_tables(), Floor(3)))
+    lasted = duration_rows(sums_tables(), Floor())
     assert len(lasted) == 2 and lasted[0]["0.2 to 0.5 s"] == 3 and len(lasted[0]) == 3 + len(BINS) - 1
 
 

@@ -1,11 +1,56 @@
-"""The Laplacian of meshes, good and bad."""
+"""Tests of `nerg_mi.surfaces.laplacian`."""
 
 import numpy as np
 import pytest
+import trimesh
 
-from nerg_mi.surfaces.laplacian import laplacian
-from nerg_mi.surfaces.mesh import Mesh
+from nerg_mi.surfaces.laplacian import Smoother, Sums, delaunay, deposit, heron, laplacian, merge, twins
+from nerg_mi.surfaces.mesh import Mesh, weld
 from tests.surfaces.meshes import box, joined, plate
+
+# ---- Intrinsic flips: no weight is negative any more, and the surface is what it was ----
+
+
+def lengths_of(mesh):
+    return np.linalg.norm(np.roll(mesh.corners, -1, axis=1) - mesh.corners, axis=2)
+
+
+def angles_facing(lengths):
+    a, b, c = (np.roll(lengths, -n, axis=1) for n in range(3))
+    return np.arccos(np.clip((b * b + c * c - a * a) / (2 * b * c), -1, 1))
+
+
+@pytest.mark.parametrize("mesh", [joined(plate(21, 0.45)), joined(box((0, 0, 0), (5, 0.1, 1)))])
+def test01_no_edge_faces_more_than_two_right_angles(mesh):
+    faces, lengths = delaunay(mesh.faces, lengths_of(mesh))
+    assert np.isclose(heron(*lengths.T).sum(), mesh.area.sum(), rtol=1e-9)
+    assert np.allclose(angles_facing(lengths).sum(axis=1), np.pi)
+    # In the plane flips are those of the points: SciPy's circles are empty, too.
+    total = {}
+    for face, angle in zip(faces, angles_facing(lengths)):
+        for k in range(3):
+            edge = tuple(sorted((face[k], face[(k + 1) % 3])))
+            total.setdefault(edge, []).append(angle[k])
+    # Of pairs; an edge that two flips made twice is counted with its own two.
+    assert all(sum(v) < np.pi + 1e-6 for v in total.values() if len(v) == 2)
+    assert len(faces) == len(mesh.faces) and set(np.unique(faces)) == set(np.unique(mesh.faces))
+
+
+def test02_what_is_delaunay_stays():
+    mesh = joined(plate(8))
+    faces, lengths = delaunay(mesh.faces, lengths_of(mesh))
+    assert np.array_equal(faces, mesh.faces) and np.array_equal(lengths, lengths_of(mesh))
+
+
+def test03_twins_are_those_of_sheets():
+    two = np.array([(0, 1, 2), (2, 1, 3)])
+    assert twins(two).tolist() == [-1, 3, -1, 1, -1, -1]
+    # Three faces at an edge, and two that see it alike, are none.
+    assert (twins(np.array([(0, 1, 2), (1, 0, 3), (0, 1, 4)])) == -1).all()
+    assert (twins(np.array([(0, 1, 2), (0, 1, 3)])) == -1).all()
+
+
+# ---- The Laplacian of meshes, good and bad ----
 
 
 def sound(matrix):
@@ -44,3 +89,94 @@ def test03_needles_books_and_components(scale):
     assert (dense[:5, 5:] == 0).all() and dense[0, 1] < 0
     # Free of the unit of length.
     assert np.allclose(dense, laplacian(Mesh(book / scale, pages.faces)).toarray(), rtol=1e-6, atol=1e-9)
+
+
+# ---- Smoothing ----
+#
+# Heat on surfaces against closed forms: a plane's Gaussian, a sphere's harmonics; and what it never does.
+
+
+def spike(mesh, at=(0, 0, 0)):
+    out = np.zeros(len(mesh.vertices))
+    out[np.argmin(np.linalg.norm(mesh.vertices - at, axis=1))] = 1
+    return out
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test01_on_a_plane_a_point_becomes_a_gaussian(jitter):
+    mesh, s = joined(plate(61, jitter)), 0.07
+    start = spike(mesh)
+    origin = mesh.vertices[start > 0][0]
+    exact = np.exp(-((mesh.vertices - origin) ** 2).sum(1) / (2 * s * s)) / (2 * np.pi * s * s) * mesh.vertex_area
+    errors = [np.abs(Smoother(mesh, s, steps)(start) - exact).sum() for steps in (4, 16, 64)]
+    assert errors[0] > 2 * errors[1] > 3 * errors[2] and errors[2] < 0.03
+    for k in (0, 1):
+        variance = (Smoother(mesh, s)(start) * (mesh.vertices - origin)[:, k] ** 2).sum()
+        assert abs(variance / s**2 - 1) < (0.02 if jitter else 1e-3)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 4])
+def test02_on_a_sphere_harmonics_decay(degree):
+    ball = trimesh.creation.icosphere(4)
+    mesh, s, steps = Mesh(np.array(ball.vertices), np.array(ball.faces)), 0.3, 8
+    wave = np.polynomial.legendre.Legendre.basis(degree)(mesh.vertices[:, 2])
+    found = Smoother(mesh, s, steps)(wave * mesh.vertex_area)
+    left = (found * wave).sum() / (wave * wave * mesh.vertex_area).sum()
+    rate = degree * (degree + 1) * s * s / 2
+    # Of steps backwards in time exactly, of heat to their order.
+    assert np.isclose(left, (1 + rate / steps) ** -steps, rtol=6e-3)
+    assert np.isclose(left, np.exp(-rate), rtol=rate**2 / steps + 6e-3)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test03_nothing_crosses_a_gap_of_5_cm(scale):
+    """Two plates 5 cm apart: what is on one stays there, all of it, and exactly nothing comes to the other."""
+    v, f = plate(20, 0.3)
+    mesh, _, _ = weld(scale * np.concatenate([v, v + [0, 0, 0.05]]), np.concatenate([f, f + len(v)]))
+    upper = mesh.vertices[:, 2] > 0.02 * scale
+    start = np.where(upper, 0, np.random.default_rng(0).random(len(upper)))
+    found = Smoother(mesh, 0.3 * scale)(start)
+    assert (found[upper] == 0).all() and np.isclose(found.sum(), start.sum(), rtol=1e-10)
+    assert found[~upper].min() > 0
+
+
+def test04_a_uniform_density_stays_and_none_becomes_negative_on_bad_meshes():
+    needles = joined(box((0, 0, 0), (3, 1e-3, 1)), box((1, 2, 0), (4, 2 + 1e-7, 1e-4)))
+    for mesh in (needles, joined(plate(12, 0.49))):
+        smoother = Smoother(mesh, 0.2)
+        assert np.allclose(smoother(mesh.vertex_area), mesh.vertex_area, rtol=1e-6)
+        for k in range(0, len(mesh.vertices), 7):
+            start = np.zeros(len(mesh.vertices))
+            start[k] = 1.0
+            found = smoother(start)
+            assert found.min() >= 0 and np.isclose(found.sum(), 1, rtol=1e-9)
+        assert not smoother(np.zeros(len(mesh.vertices))).any()
+
+
+@pytest.mark.parametrize("length, steps", [(0.0, 8), (np.nan, 8), (0.1, 0)])
+def test05_lengths_that_are_none(length, steps):
+    with pytest.raises(ValueError, match="positive length"):
+        Smoother(joined(plate(3)), length, steps)
+
+
+# ---- Partial sums ----
+
+
+def test01_a_deposit_is_divided_among_corners_and_keeps_its_sum():
+    faces = np.array([(0, 1, 2), (2, 1, 3)])
+    place = np.array([(0.2, 0.3, 0.5), (1.0, 0, 0), (0, 0.25, 0.75)])
+    on_faces, on_vertices = deposit(faces, 5, np.array([0, 1, 1]), place, np.array([1.0, 2.0, 4.0]))
+    assert on_faces.tolist() == [1, 6]
+    assert np.allclose(on_vertices, [0.2, 0.3 + 1.0, 0.5 + 2.0, 3.0, 0])
+
+
+def test02_sums_add_up_in_their_order():
+    rng = np.random.default_rng(0)
+    parts = [Sums(rng.random(3), rng.random(4), *rng.random(4), 1) for _ in range(5)]
+    whole = merge(parts)
+    assert np.array_equal(
+        whole.face, ((((parts[0].face + parts[1].face) + parts[2].face) + parts[3].face) + parts[4].face)
+    )
+    assert whole.count == 5 and np.isclose(whole.weight, sum(p.weight for p in parts))
+    assert np.isclose(whole.unaccounted, whole.total - whole.face.sum() - whole.elsewhere - whole.escaped)
+    assert Sums.none(2, 3).on_surface == 0

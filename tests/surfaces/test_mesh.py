@@ -1,11 +1,16 @@
-"""Meshes made whole: vertices of one place are one, and faces that are none are left out."""
+"""Tests of `nerg_mi.surfaces.mesh`."""
 
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.surfaces.mesh import weld
-from tests.surfaces.meshes import box
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.surfaces import mesh
+from nerg_mi.surfaces.mesh import Target, refine, shape_triangles, weld
+from nerg_mi.transport.volume_medium import VolumeMedium
+from tests.surfaces.meshes import box, joined, plate
+
+# ---- Meshes made whole: vertices of one place are one, and faces that are none are left out ----
 
 
 def test01_a_box_whose_sides_repeat_its_corners_is_one_surface():
@@ -41,3 +46,85 @@ def test04_what_is_no_surface():
         weld([(0, 0, 0), (0, 0, 1.1e7), (1, 0, 0)], [(0, 1, 2)])
     with pytest.raises(NergError, match="no face with an area"):
         weld([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2)])
+
+
+# ---- Shapes of scenes as triangles ----
+
+
+def test01_shapes_of_scenes(rgb):
+    flat = rgb.load_dict(
+        {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([1, 2, 3]).scale([2, 1, 1])}
+    )
+    vertices, faces = shape_triangles(flat)
+    assert np.allclose(sorted(map(tuple, vertices)), [(-1, 1, 3), (-1, 3, 3), (3, 1, 3), (3, 3, 3)])
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    assert np.allclose(np.cross(b - a, c - a).sum(axis=0), [0, 0, 16])
+    assert len(shape_triangles(rgb.load_dict({"type": "cube"}))[1]) == 12
+    assert shape_triangles(rgb.load_dict({"type": "sphere"})) is None
+
+
+# ---- Triangles cut alike on both sides of every edge ----
+
+
+def edge_counts(faces):
+    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return np.unique(pairs, axis=0, return_counts=True)[1]
+
+
+@pytest.mark.parametrize("longest", [3.0, 1.0, 0.37, 0.11])
+def test01_a_closed_box_stays_closed_and_its_area_what_it_is(longest):
+    whole = joined(box((0, 0, 0), (1, 2, 3)))
+    found = refine(whole, longest)
+    assert set(edge_counts(found.mesh.faces)) == {2}
+    assert found.mesh.longest.max() <= longest
+    assert np.allclose(np.bincount(found.parent, found.mesh.area), whole.area, rtol=1e-12)
+    # Outwards still: the flux of x is three times the volume, with the sign of the whole's.
+    flux = lambda m: np.einsum("fi,fi->", m.corners.mean(1), m.normals * m.area[:, None])
+    assert np.isclose(flux(found.mesh), flux(whole)) and np.isclose(abs(flux(whole)), 18)
+    # Each corner is where its place in the parent says.
+    told = np.einsum("fij,fjk->fik", found.place, whole.corners[found.parent])
+    assert np.allclose(told, found.mesh.corners, atol=1e-12)
+
+
+def test02_what_is_fine_already_stays():
+    sheet = joined(plate(5, 0.3))
+    found = refine(sheet, 10.0)
+    assert np.array_equal(found.mesh.faces, sheet.faces) and np.array_equal(found.parent, np.arange(32))
+
+
+def test03_too_many(monkeypatch):
+    monkeypatch.setattr(mesh, "MOST_REFINED_FACES", 1000)
+    with pytest.raises(NergError, match="larger --detail"):
+        refine(joined(box((0, 0, 0), (1, 1, 1))), 0.01)
+
+
+# ---- Rays that end on a surface, at something else, or nowhere ----
+
+
+def test01_each_ray_ends_where_it_should(rgb):
+    room, inner = joined(box((0, 0, 0), (4, 3, 2), without=1)), box((2, 1, 0.5), (3, 2, 1.5))
+    target = Target(room, [inner])
+    d = fibonacci_directions(4000)[1:]
+    eye = np.array([1.0, 1.5, 1.0])
+    found = target.ends(np.broadcast_to(eye, d.shape), d)
+    # Slabs, in NumPy: the inner box first, then the open side, then the room.
+    with np.errstate(divide="ignore"):
+        t = (np.array([(2, 1, 0.5), (3, 2, 1.5)])[:, None] - eye) / d
+        hits = t.min(0).max(1) < t.max(0).min(1)
+        hits &= t.min(0).max(1) > 0
+        walls = np.where(d > 0, (np.array([4, 3, 2]) - eye) / d, -eye / d)
+    out = ~hits & (walls.argmin(1) == 0) & (d[:, 0] > 0)
+    assert np.array_equal(found.elsewhere, hits)
+    assert np.mean((found.face < 0) == (hits | out)) > 0.9995
+    on = found.face >= 0
+    p = np.einsum("pi,pik->pk", found.place, room.corners[found.face])[on]
+    assert np.allclose(p, (eye + walls.min(1)[:, None] * d)[on], atol=1e-5)
+
+
+def test02_a_ray_may_end_in_a_medium_before(rgb):
+    fog = rgb.load_dict({"type": "constvolume", "value": 100.0, "to_world": rgb.ScalarTransform4f().scale(0.5)})
+    sheet = (np.array([(-2.0, -2, 2), (2, -2, 2), (2, 2, 2), (-2, 2, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
+    target = Target(joined(sheet), medium=VolumeMedium(fog))
+    origins = np.array([(0.25, 0.25, -1), (1.0, 1.0, -1)])
+    found = target.ends(origins, np.broadcast_to([0.0, 0, 1], (2, 3)))
+    assert found.elsewhere.tolist() == [True, False] and (found.face >= 0).tolist() == [False, True]

@@ -1,18 +1,284 @@
-"""Gaze on Gaussian splats: closed forms, and the sum that looks at all Gaussians in double precision."""
+"""Tests of `nerg_mi.surfaces.splats`."""
 
 import drjit as dr
+import drjit.llvm.ad as ns
 import numpy as np
+import pytest
 
-from nerg_mi.fields.splats import Splats, matrices_of
-from nerg_mi.surfaces.sources import lookers_of_law
-from nerg_mi.surfaces.splats import splat_densities
+from nerg_mi.fields.splats import Splats, joined, matrices_of
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.surfaces.laplacian import merge
+from nerg_mi.surfaces.sources import RaySettings, TrackedRays, lookers_of_law
+from nerg_mi.surfaces.splats import (
+    HIDDEN,
+    SplatSmoother,
+    gaze_and_escaped,
+    groups_of_hits,
+    shortest_axes,
+    sides_of,
+    splat_areas,
+    splat_densities,
+    splat_ray_sums,
+    whole_areas,
+)
 from nerg_mi.transport.geometry import Place, default_settings
 from nerg_mi.transport.observer import ObserverSettings
+from nerg_mi.transport.splat_medium import SplatArrays
 from tests.reference import splats as reference
+from tests.reference.splats import peaks
 from tests.surfaces.meshes import vmf
-from tests.transport.media.splats.scenes import medium_of, stack
+from tests.surfaces.walls import TURN_X, wall
+from tests.transport.media.splats.scenes import medium_of, rays, stack
+
+# ---- Areas of Gaussians: closed forms, and what they add up to where many overlap ----
+
+
+def areas(splats, tolerance=0.002):
+    return splat_areas(splats, SplatArrays(splats, ns), tolerance)
+
+
+def test01_one_that_nothing_hides_and_its_sides(rgb):
+    turn = [np.cos(0.4), np.sin(0.4), 0.1, 0]
+    one = Splats([[1, 2, 3]], [[0.2, 0.01, 0.1]], [turn], [0.5], np.zeros((1, 1, 3)))
+    expected = 2 * np.pi * 0.2 * 0.1 * 0.5 * (1 - np.exp(-4.5))
+    assert np.allclose(areas(one), expected, rtol=1e-6) and np.allclose(whole_areas(one, 3.0), expected)
+    axis = shortest_axes(one)
+    assert np.allclose(axis[0], one.axes()[0, :, 1]) and list(sides_of(np.r_[axis, -axis], np.r_[axis, axis])) == [0, 1]
+
+
+def test02_overlapping_ones_share_what_there_is(rgb):
+    """A wall that lets no light through has its area, however many Gaussians it is made of."""
+    plain = wall(jitter=0.0005)
+    found = areas(plain)
+    edge = 4 * 0.014  # the last of the disks lie over the edge
+    assert whole_areas(plain, 3.0).sum() > 2.5
+    assert (found.sum(axis=1) > 0.99).all() and (found.sum(axis=1) < (1 + edge) ** 2).all()
+
+
+def test03_one_behind_another_is_hidden_from_there_and_what_stands_before_it_hides_nothing(rgb):
+    both = joined([wall(0.0, 0.2), wall(0.003, 0.2, turned=TURN_X)])
+    found, n = areas(both, 0.004), len(both) // 2
+    # Along +z the first wall is seen: that is side 0 of it, whose axis is +z, and side 1 of the other.
+    assert (found[0, :n] > 4 * found[1, n:]).mean() > 0.8 and found[1, n:].sum() < 0.3 * found[0, :n].sum()
+    far = joined([wall(0.0, 0.2), wall(0.05, 0.2)])
+    assert np.allclose(areas(far, 0.004)[:, :n], areas(wall(0.0, 0.2), 0.004)) and 0 < HIDDEN < 1
+
+
+# ---- Splat hits ----
+#
+# Hits of rays as arrays: all of them, in their order, beside a look at every Gaussian in double precision.
+
+
+def some(n=80, seed=3):
+    rng = np.random.default_rng(seed)
+    centers, scales = rng.uniform(-1, 1, (n, 3)), rng.uniform(0.05, 0.4, (n, 3))
+    return Splats(centers, scales, rng.normal(size=(n, 4)), rng.uniform(0.05, 0.6, n), np.zeros((n, 1, 3)))
+
+
+def shares(splats, o, d, **more):
+    """Light that each Gaussian takes (R, N), what is left (R,), and how many groups there were."""
+    taken, left, count = np.zeros((len(o), len(splats))), np.ones(len(o)), 0
+    for group in groups_of_hits(SplatArrays(splats, ns), o, d, **more):
+        ray, hit = np.nonzero(group.index >= 0)
+        taken[group.rows[ray], group.index[ray, hit]] += (group.arriving * group.absorbed)[ray, hit]
+        left[group.rows] = group.left
+        count += 1
+    return taken, left, count
+
+
+def test01_all_gaussians_in_double_precision(rgb):
+    splats, (o, d) = some(), rays(300)
+    taken, left, count = shares(splats, o, d, stop=1e-6)
+    t, absorbed = peaks(splats, o, d)
+    absorbed = np.where(t >= 0, absorbed, 0)
+    order = np.argsort(t, axis=1)
+    sorted_ = np.take_along_axis(absorbed, order, 1)
+    through = np.cumprod(1 - sorted_, axis=1)
+    expected = np.zeros_like(taken)
+    np.put_along_axis(expected, order, np.concatenate([np.ones((300, 1)), through[:, :-1]], 1) * sorted_, 1)
+    assert count >= 3 and np.abs(taken - expected).max() < 2e-5
+    # All that a ray brings is found, or goes on.
+    assert np.abs(taken.sum(axis=1) + left - 1).max() < 1e-12
+
+
+def test02_up_to_a_distance_and_no_farther_than_is_asked_for(rgb):
+    splats = stack(np.arange(30.0), np.full(30, 0.1))
+    o, d = np.array([[0, 0, -1.0], [0, 0, -1.0]]), np.array([[0, 0, 1.0], [0, 0, 1.0]])
+    taken, left, _ = shares(splats, o, d, before=np.array([5.5, np.inf]))
+    assert np.allclose(taken.sum(axis=1), 1 - 0.9 ** np.array([5, 30]), atol=1e-6) and np.allclose(
+        1 - left, taken.sum(1)
+    )
+    groups = groups_of_hits(SplatArrays(splats, ns), o, d)
+    first = next(groups)
+    assert list(first.rows) == [0, 1] and not first.through.any()
+    assert list(groups.send(np.array([1])).rows) == [1]
+
+
+# ---- Tracked rays on Gaussians: what is left where, to whom it adds up, and per area ----
+
+
+LINE = RaySettings()
+
+
+CONE = RaySettings(cone=np.radians(1.5), bundle=8, seed=5)
+
+
+def falling(n, side=1.2, z=-1.0, seed=0):
+    """Rays along z that are spread evenly over a square."""
+    at = np.random.default_rng(seed).uniform(-side / 2, side / 2, (n, 2))
+    o = np.concatenate([at, np.full((n, 1), z)], axis=1)
+    return TrackedRays(o, np.tile([0.0, 0, 1], (n, 1)), np.full(n, 1 / n))
+
+
+def sums(splats, rays, settings=LINE):
+    return splat_ray_sums(SplatArrays(splats, ns), shortest_axes(splats), rays, settings)
+
+
+def test01_all_is_found_again_and_each_has_its_share_of_the_ray(rgb):
+    splats, rays = some(), falling(500, 3.0)
+    found = sums(splats, rays)
+    taken, left, _ = shares(splats, rays.origins, rays.directions)
+    assert np.allclose(found.face.reshape(2, -1).sum(axis=0), taken.mean(axis=0))
+    axes = shortest_axes(splats)
+    assert not found.face.reshape(2, -1)[np.where(axes[:, 2] > 0, 1, 0), np.arange(len(splats))].any()
+    # What a march leaves behind where it ends is a ten-thousandth of a ray at most.
+    assert abs(found.unaccounted) < 1e-4 and 0.2 < found.escaped < 0.8 and np.isclose(found.total, 1)
+    assert np.isclose(found.escaped + found.unaccounted, left.mean())
+    cone = sums(splats, rays, CONE)
+    assert abs(cone.on_surface + cone.escaped - 1) < 1e-3 and cone.count == 500
+
+
+def test02_per_area_it_is_what_falls_on_a_square_metre(rgb):
+    """On a wall of overlapping Gaussians in two layers, whichever of them a ray ends at."""
+    splats = joined([wall(0.0, 0.6, 0.03, 0.0005), wall(0.004, 0.6, 0.05, turned=TURN_X, seed=1)])
+    rays = falling(20_000, 1.2)
+    found = sums(splats, rays).face.reshape(2, -1)
+    areas = splat_areas(splats, SplatArrays(splats, ns), 0.006)
+    inner = (np.abs(splats.centers[:, :2]) < 0.25).all(axis=1)
+    side = (shortest_axes(splats)[:, 2] <= 0).astype(int)
+    of, own = found[side, np.arange(len(splats))], areas[side, np.arange(len(splats))]
+    assert np.isclose(of[inner].sum() / own[inner].sum() * 1.2**2, 1, rtol=0.03)
+    front = inner & (splats.centers[:, 2] < 0.003)
+    assert abs(np.median(of[front] / own[front]) * 1.2**2 - 1) < 0.05
+
+
+def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
+    splats, every = wall(1.0, 1.0, 0.05), falling(900)
+    parts = [every.part(a, a + 400) for a in range(0, 900, 400)]
+    first, again = (merge(sums(splats, part, CONE) for part in parts) for _ in range(2))
+    assert np.array_equal(first.face, again.face) and first.count == 900 and first.escaped == again.escaped
+    assert not np.array_equal(sums(splats, parts[0], RaySettings(cone=CONE.cone, bundle=8, seed=6)).face, first.face)
+
+
+@pytest.mark.parametrize("cone", [0.0, 0.03])
+def test04_of_gaze_meets_none_what_comes_through(rgb, cone):
+    """A density along z, most of which a wall stops, and the light of every ray by all Gaussians in float64."""
+    splats, eye, kappa = some(), np.array([0.1, -0.2, -1.5]), 8.0
+    looker = lookers_of_law(vmf(rgb, (0, 0, 1), kappa))(eye)
+    total, escaped = gaze_and_escaped(SplatArrays(splats, ns), looker, eye, cone)
+    d = fibonacci_directions(20_000)
+    share = np.exp(kappa * (d[:, 2] - 1))
+    left = shares(splats, np.broadcast_to(eye, d.shape), d)[1]
+    assert abs(total - 1) < 2e-3 and 0.1 < escaped < 0.95
+    assert np.isclose(escaped, (share * left).sum() / share.sum(), atol=0.01 if cone == 0 else 0.02)
+
+
+# ---- Splat smoothing ----
+#
+# Smoothing over Gaussians: as wide as is said, nothing lost, nothing through the air, around an edge or a board.
+
+
+TOLERANCE = 0.002
+
+
+def smoother(splats, length, areas=None):
+    each = np.full((2, len(splats)), 0.02**2) if areas is None else areas
+    return SplatSmoother(
+        splats.centers, shortest_axes(splats), each, np.full(len(splats), 1e-6), length, TOLERANCE
+    ), each
+
+
+def spike(splats, at, side=0):
+    start = np.zeros((2, len(splats)))
+    start[side, np.argmin(np.linalg.norm(splats.centers - np.asarray(at), axis=1))] = 1
+    return start
+
+
+@pytest.mark.parametrize("length", [0.03, 0.05, 0.1])
+def test01_a_point_becomes_a_gaussian_of_that_width(length):
+    rng = np.random.default_rng(0)
+    plain = wall(side=1.2)
+    plain.centers[:, :2] += rng.uniform(-0.004, 0.004, (len(plain), 2))
+    flow, areas = smoother(plain, length)
+    start = spike(plain, (0, 0, 0))
+    found = flow(start)
+    assert np.isclose(found.sum(), 1, rtol=1e-12) and (found >= 0).all() and not found[1].any()
+    apart = plain.centers - plain.centers[start[0].argmax()]
+    for axis in (0, 1):
+        width = np.sqrt((found[0] * apart[:, axis] ** 2).sum())
+        assert abs(width / length - 1) < 0.08
+    square = (apart**2).sum(axis=1)
+    exact = np.exp(-square / (2 * length**2)) / (2 * np.pi * length**2) * areas[0]
+    assert np.abs(found[0] - exact).sum() < 0.25
+    # What is even stays even, whatever the areas.
+    flow, areas = smoother(plain, length, rng.uniform(0.5, 1.5, (2, len(plain))) * areas)
+    assert np.allclose(flow(areas), areas, rtol=1e-9)
+
+
+@pytest.mark.parametrize("turned", [(1.0, 0.0, 0.0, 0.0), TURN_X])
+@pytest.mark.parametrize("length", [0.05, 0.2])
+def test02_walls_5_cm_apart_stay_apart(turned, length):
+    """Parallel ones and such that face each other, whichever side is looked at."""
+    both = joined([wall(0.0, 0.8), wall(0.05, 0.8, turned=turned)])
+    flow, _ = smoother(both, length)
+    n = len(both) // 2
+    for side in (0, 1):
+        found = flow(spike(both, (0, 0, 0), side))
+        assert np.isclose(found[side, :n].sum(), 1, rtol=1e-12) and not found[1 - side].any() and not found[:, n:].any()
+
+
+def test03_neither_through_a_board_nor_around_its_edge():
+    board = joined([wall(0.0, 0.4), wall(0.001, 0.4, turned=TURN_X)])
+    n = len(board) // 2
+    front = spike(board, (0.1, 0.1, 0))
+    found = smoother(board, 0.05)[0](front)
+    # Seen along +z are side 0 of the first and side 1 of the other.
+    assert not found[1, :n].any() and not found[0, n:].any() and found[1, n:].sum() > 0.1
+    hidden = np.full((2, len(board)), 0.02**2)
+    hidden[1, n:] = hidden[1, :n] = 1e-7
+    found = smoother(board, 0.05, hidden)[0](front)
+    assert np.isclose(found[0, :n].sum(), 1)
+    upright = Splats(
+        wall(0.0, 0.4).centers[:, [2, 1, 0]] + [0.2, 0, 0.2],
+        np.tile([1e-3, 0.014, 0.014], (n, 1)),
+        [[1, 0, 0, 0]] * n,
+        [0.9] * n,
+        np.zeros((n, 1, 3)),
+    )
+    corner = joined([wall(0.0, 0.4), upright])
+    assert not smoother(corner, 0.1)[0](spike(corner, (0.19, 0, 0)))[:, n:].any()
+
+
+def test04_many_in_one_cell_have_one_density_and_a_length_has_to_be_positive():
+    many = wall(0.0, 0.1, apart=0.001)
+    areas = np.full((2, len(many)), 0.001**2)
+    flow, _ = smoother(many, 0.02, areas)
+    start = spike(many, (0, 0, 0))
+    start[1] = 0.3
+    found = flow(start)
+    assert np.isclose(found.sum(), start.sum(), rtol=1e-12) and len(np.unique((found / areas)[0])) < len(many) / 2
+    with pytest.raises(ValueError, match="positive length"):
+        smoother(many, 0.0, areas)
+    none = SplatSmoother(many.centers, shortest_axes(many), areas, np.full(len(many), 1.0), 0.02, TOLERANCE)
+    assert np.array_equal(none(start), start)
+
+
+# ---- Gaze on Gaussian splats: closed forms, and the sum that looks at all Gaussians in double precision ----
+
 
 EYE = np.array([[0.0, 0, -2]])
+
+
 ALONG = np.array([0.0, 0, 1])
 
 

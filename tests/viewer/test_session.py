@@ -1,7 +1,8 @@
-"""What is viewed: the observer's gaze, numbers and pictures, on one thread."""
+"""Tests of `nerg_mi.viewer.session`."""
 
 from __future__ import annotations
 
+import inspect
 import threading
 from pathlib import Path
 
@@ -11,10 +12,28 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.nested_scene import with_gaze
+from nerg_mi.viewer import session as session_
 from nerg_mi.viewer import session as session_module
 from nerg_mi.viewer.layers import layer_of
-from nerg_mi.viewer.session import Session
+from nerg_mi.viewer.page import Page
+from nerg_mi.viewer.session import ALL, GAP, Listener, Session, Tracks, Worker
 from nerg_mi.workflows.view import ViewOptions, place_to_view
+
+# ---- The page is told all that a session tells ----
+
+
+TOLD = [name for name in vars(Listener) if name.startswith("on_")]
+
+
+@pytest.mark.parametrize("name", TOLD)
+def test_the_page_listens(name):
+    assert inspect.signature(getattr(Page, name)) == inspect.signature(getattr(Listener, name))
+
+
+# ---- What is viewed: the observer's gaze, numbers and pictures, on one thread ----
 
 
 class Heard:
@@ -264,3 +283,200 @@ def test08_what_cannot_be_counted_is_told_once(session_of, room, gaze_fields, mo
     assert [str(e) for e in session.listener.errors] == ["no"]
     session.place_observer(np.array([0.0, 1, 1]))
     assert not session.follow_shares()
+
+
+# ---- Shares of attention in steps: those of the library, whichever are counted together ----
+
+
+AT = np.array([0.2, 0.1, 0.6])
+
+
+@pytest.fixture
+def scene(room, gaze_fields, tmp_path):
+    path = tmp_path / "with.xml"
+    path.write_text(with_gaze(room, gaze_fields[0]))
+    return nerg.Scene.load(path)
+
+
+def test01_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
+    faces = {"floor": 2, "box": 12}
+    regions = [Region.of("left", (0, 0.5, -0.1), (2, 2, 0.4)), Region.of("right", (0, -2, -0.1), (2, -0.5, 0.4))]
+    shapes = [name for name in faces if name in {s.id() for s in scene.mitsuba.shapes() if s.is_mesh()}]
+    steps = list(session_.shares_in_steps(scene, AT, regions, shapes))
+    assert [sorted(step) for step in steps] == [["left", "right"], sorted(shapes)]
+    one = nerg.attention(scene, regions[0].corners, observers=AT[None]).share[0]
+    assert steps[0]["left"] == pytest.approx(float(one), rel=0.03) and steps[0]["left"] > 0
+    monkeypatch.setattr(session_, "FACES", 1)
+    assert list(session_.shape_groups(scene, shapes)) == [[name] for name in shapes]
+
+
+def test02_without_areas_and_shapes_there_is_nothing(scene):
+    assert list(session_.shares_in_steps(scene, AT, [], [])) == []
+
+
+# ---- Paths of people, and where they are at a moment ----
+
+
+SAME = Similarity(np.eye(4))
+
+
+def walk(align=SAME, cohorts=True):
+    """Ada walks along x for 10 s, with a gap of 3 s in it; Ben stands for 2 s. Rays are out of order."""
+    t = np.concatenate([np.arange(0, 4, 0.1), np.arange(7, 10, 0.1), np.arange(0, 2, 0.1)])
+    person = np.concatenate([np.zeros(70, int), np.ones(20, int)])
+    origin = np.stack([np.where(person == 0, t, 5.0), np.zeros(90), np.full(90, 1.6)], axis=1)
+    direction = np.tile([0.0, 1.0, 0.0], (90, 1))
+    mixed = np.random.default_rng(3).permutation(90)
+    more = dict(cohort=person[mixed], cohorts=("grown", "small")) if cohorts else {}
+    rays = Rays(t[mixed], person[mixed], ("Ada", "Ben"), origin[mixed], direction[mixed], np.ones(90), **more)
+    return Tracks(rays, align)
+
+
+def test01_a_gap_ends_a_path():
+    segments, person = walk().segments()
+    assert len(segments) == 39 + 29 + 19 and segments.shape[1:] == (2, 3)
+    ada = segments[person == 0]
+    assert np.allclose(ada[:, 1, 0] - ada[:, 0, 0], 0.1, atol=1e-4)
+    assert np.allclose(segments[person == 1][..., 0], 5)
+
+
+def test02_a_moment():
+    tracks = walk()
+    assert tracks.times == (0.0, pytest.approx(9.9)) and tracks.people == ["Ada", "Ben"]
+    poses = {p.person: p for p in tracks.at_time(1.0)}
+    assert set(poses) == {"Ada", "Ben"} and np.allclose(poses["Ada"].at, [1, 0, 1.6], atol=1e-6)
+    assert np.allclose(poses["Ada"].ahead, [0, 1, 0])
+    assert [p.person for p in tracks.at_time(8.0)] == ["Ada"]
+    assert tracks.at_time(5.45 + 0 * GAP) == [] and tracks.at_time(99.0) == []
+
+
+def test03_cohorts():
+    tracks = walk()
+    assert tracks.groups == [ALL, "grown", "small"]
+    assert [p.person for p in tracks.at_time(1.0, "small")] == ["Ben"]
+    assert len(tracks.segments("small")[0]) == 19
+    assert walk(cohorts=False).groups == [ALL]
+
+
+def test04_in_the_place():
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = 2 * turn, [10, 0, 0]
+    (ada,) = walk(Similarity(matrix)).at_time(8.0)
+    assert np.allclose(ada.at, [10, 16, 3.2], atol=1e-6) and np.allclose(ada.ahead, [-1, 0, 0], atol=1e-6)
+
+
+# ---- The render thread: the most urgent first, and what is replaced is not gone on with ----
+
+
+@pytest.fixture
+def worker():
+    errors = []
+    made = Worker(errors.append)
+    made.errors = errors
+    yield made
+    made.stop()
+
+
+def steps(name, count, log, gate=None):
+    for k in range(count):
+        if gate is not None:
+            assert gate.wait(10)
+        log.append((name, k, threading.get_ident()))
+        yield
+
+
+def test01_all_steps_are_made_on_one_thread(worker):
+    log = []
+    worker.submit("a", 1, steps("a", 3, log))
+    worker.submit("b", 1, steps("b", 3, log))
+    assert worker.wait_idle(10)
+    assert sorted(entry[:2] for entry in log) == [(n, k) for n in "ab" for k in range(3)]
+    assert len({entry[2] for entry in log}) == 1 and log[0][2] != threading.get_ident()
+
+
+def test02_the_urgent_comes_between_the_steps_of_another(worker):
+    log, gate = [], threading.Event()
+    started = threading.Event()
+
+    def slow():
+        for k in range(4):
+            started.set()
+            assert gate.wait(10)
+            log.append(("slow", k))
+            yield
+
+    worker.submit("slow", 5, slow())
+    assert started.wait(10)
+    worker.submit("urgent", 0, (log.append(("urgent", k)) for k in range(2)))
+    gate.set()
+    assert worker.wait_idle(10)
+    assert log == [("slow", 0), ("urgent", 0), ("urgent", 1), ("slow", 1), ("slow", 2), ("slow", 3)]
+
+
+def test03_a_new_task_of_a_name_replaces_the_old_one(worker):
+    log, gate, started = [], threading.Event(), threading.Event()
+
+    def old():
+        for k in range(100):
+            started.set()
+            assert gate.wait(10)
+            log.append(("old", k))
+            yield
+
+    worker.submit("picture", 3, old())
+    assert started.wait(10)
+    worker.submit("picture", 3, (log.append(("new", k)) for k in range(3)))
+    gate.set()
+    assert worker.wait_idle(10)
+    assert log == [("old", 0), ("new", 0), ("new", 1), ("new", 2)]
+
+
+def test04_cancelled_tasks_end(worker):
+    log, gate, started = [], threading.Event(), threading.Event()
+
+    def task():
+        for k in range(100):
+            started.set()
+            assert gate.wait(10)
+            log.append(k)
+            yield
+
+    worker.submit("picture", 3, task())
+    assert started.wait(10)
+    worker.cancel("picture")
+    gate.set()
+    assert worker.wait_idle(10) and worker.idle
+    assert worker.call(lambda: 7).result(10) == 7
+    assert log == [0]
+
+
+def test05_tasks_of_one_urgency_take_turns(worker):
+    log, gate = [], threading.Event()
+    worker.submit("first", 2, steps("first", 3, log, gate))
+    worker.submit("second", 2, steps("second", 3, log, gate))
+    gate.set()
+    assert worker.wait_idle(10)
+    assert [name for name, *_ in log] == ["first", "second"] * 3
+
+
+def test06_errors_are_told_and_end_one_task_alone(worker):
+    def bad():
+        yield
+        raise ValueError("no such thing")
+
+    worker.submit("bad", 0, bad())
+    worker.submit("good", 1, (None for _ in range(2)))
+    assert worker.wait_idle(10)
+    (error,) = worker.errors
+    assert isinstance(error, ValueError)
+    with pytest.raises(KeyError):
+        worker.call(lambda: {}["x"]).result(10)
+    assert len(worker.errors) == 1
+
+
+def test07_after_the_end_nothing_is_begun():
+    worker = Worker(lambda error: None)
+    worker.stop()
+    worker.submit("late", 0, iter([1]))
+    assert worker.idle

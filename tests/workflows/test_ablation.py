@@ -1,4 +1,4 @@
-"""The ablation as a job: rows that are kept and found again, frames, laws, what is refused."""
+"""Tests of `nerg_mi.workflows.ablation`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
 from nerg_mi.workflows import ablation as ablation_bench
-from nerg_mi.workflows.ablation import AblationOptions, ablate
-from tests.evaluation.gaze.test_evaluation import crowd
+from nerg_mi.workflows.ablation import AblationOptions, Bench, ablate, law_of, plan_of
+from tests.evaluation.test_gaze import crowd
 from tests.formats.splats.writers import random_splats, write_inria
+
+# ---- The ablation as a job: rows that are kept and found again, frames, laws, what is refused ----
+
 
 OPTIONS = AblationOptions(
     geometry="hits",
@@ -121,3 +124,32 @@ def test_another_first_seed_holds_others_out(tmp_path, monkeypatch):
         ablate(crowd(1000), tmp_path / str(first), replace(OPTIONS, first=first, variant=("emit",), cameras=0))
     assert [m[:2] for m in made] == [(0, 0), (1, 1), (5, 5), (6, 6)]
     assert made[0][2] == made[1][2] != made[2][2] == made[3][2]
+
+
+# ---- How variants are planned, and the laws that are named ----
+
+
+def test_a_semantic_variant_is_planned_with_the_features_of_the_place(tmp_path):
+    import drjit.llvm.ad as ns
+
+    from nerg_mi.train.geometry import place_of_field
+    from tests.plugins import fields
+
+    fields.radiance(tmp_path / "field.safetensors")
+    place = place_of_field(tmp_path / "field.safetensors", ns)
+    bench = Bench(None, {}, None, 0, place, tmp_path, ns, replace(OPTIONS, geometry=None))
+    for variant in ablation.all_variants(True, ["small"]):
+        plan = plan_of(variant, 0, bench)
+        c = plan.config
+        assert (c.variant, c.semantic, c.semantic_own) == (variant.gaze, variant.semantic, variant.semantic_own)
+        assert (plan.initial is not None, plan.settings.frozen) == (variant.begin, variant.frozen)
+        assert plan.settings.loss == (variant.loss or "paper")
+        if variant.semantic or variant.begin:
+            assert c.geometry == place.radiance.config.geometry
+
+
+def test_a_law_is_that_of_the_class_that_is_named():
+    assert law_of("tests.workflows.test_ablation:Uniform")([[0, 0, 0]], [[1, 0, 0]] * 3).shape == (1, 3)
+    for name in ("nowhere:Law", "tests.workflows.test_ablation:Nobody", "tests.workflows.test_ablation"):
+        with pytest.raises(NergError, match="MODULE:CLASS"):
+            law_of(name)

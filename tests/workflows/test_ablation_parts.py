@@ -8,7 +8,7 @@ from nerg_mi.workflows import ablation
 from nerg_mi.workflows.ablation import ablate
 from nerg_mi.workflows.parts import account_for_store
 from tests.conftest import ROOT
-from tests.evaluation.gaze.test_evaluation import crowd
+from tests.evaluation.test_gaze import crowd
 from tests.workflows.recorder import Recorder
 from tests.workflows.test_ablation import OPTIONS
 

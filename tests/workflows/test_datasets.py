@@ -16,11 +16,11 @@ from nerg_mi.workflows import rays
 from nerg_mi.workflows.evaluate import evaluate_gaze
 from nerg_mi.workflows.rays import FilterOptions, ImportOptions, card_of, filter_rays, import_rays
 from nerg_mi.workflows.train_gaze import train_gaze
-from tests.evaluation.gaze.test_evaluation import crowd
+from tests.evaluation.test_gaze import crowd
 from tests.rays.dataset.making import DAY, assert_same, settings, write_dataset, write_source
+from tests.workflows.test_evaluation import OPTIONS, TRAINING
 
 from .recorder import Recorder
-from .test_evaluation import OPTIONS, TRAINING
 
 pytest.importorskip("pyarrow")
 

@@ -13,7 +13,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.evaluate import evaluate_gaze
 from nerg_mi.workflows.geometry import GazeEvaluationOptions
 from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
-from tests.evaluation.gaze.test_evaluation import crowd
+from tests.evaluation.test_gaze import crowd
 
 OPTIONS = GazeEvaluationOptions(min_rays=8, directions=128, resamples=2, pictures=1)
 TRAINING = GazeOptions(

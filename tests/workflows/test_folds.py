@@ -9,7 +9,7 @@ from nerg_mi.threads import set_thread_count
 from nerg_mi.workflows import evaluate
 from nerg_mi.workflows.evaluate import SCORED, FoldOptions, evaluate_folds
 from nerg_mi.workflows.parts import account_for_store
-from tests.evaluation.gaze.test_evaluation import crowd
+from tests.evaluation.test_gaze import crowd
 from tests.tasks.clusters import ClusterOfProcesses, wait_until
 from tests.workflows.recorder import Recorder
 

@@ -14,8 +14,8 @@ from nerg_mi.evaluation.gaze_report import write_report
 from nerg_mi.workflows import report
 from nerg_mi.workflows.report import ReportOptions, make_report
 from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
-from tests.evaluation.gaze.test_evaluation import crowd
-from tests.evaluation.gaze.test_verdict import scored
+from tests.evaluation.test_gaze import crowd
+from tests.evaluation.test_gaze_report import scored
 from tests.report.made import packed_scene
 from tests.workflows.recorder import Recorder
 

@@ -10,8 +10,7 @@ from scipy.stats import spearmanr
 
 from nerg_mi.evaluation import gaze, metrics, uncertainty
 from nerg_mi.probes.probes import LEVELS, calibrated_levels, level_name, region_levels
-
-from .test_evaluation import crowd
+from tests.evaluation.test_gaze import crowd
 
 
 def row(support, error, group, **more):

@@ -12,8 +12,7 @@ from nerg_mi.fields.gaze_log_density import LogGazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.maths.geometry import Box
-
-from .test_log_density import SMALL, made
+from tests.fields.gaze.test_log_density import SMALL, made
 
 
 def test_members_are_alike():

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.readers.skeleton import RIGHT_EAR, SKELETONS, keypoints_from_head, parse_keypoints, write_skeleton
-from tests.rays.readers.parsing.test_bodies import heads, poses_of
 from tests.rays.readers.reading import dropped, read
+from tests.rays.readers.test_skeleton_skeleton_file import heads, poses_of
 
 # A head that looks along x, with y to its left and z up, in metres from between the ears; and its trunk.
 FORWARD = np.array([1.0, 0, 0])

@@ -18,7 +18,7 @@ from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.train import gaze_recipes
 from nerg_mi.workflows.ablation import AblationOptions, ablate
 from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
-from tests.evaluation.gaze.test_evaluation import crowd
+from tests.evaluation.test_gaze import crowd
 
 HEADS = Path(__file__).parents[2] / "heads"
 OPTIONS = GazeOptions(recipe="place", geometry="hits", voxel=0.3, threads=1, min_rays=4, seed=1)

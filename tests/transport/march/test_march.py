@@ -1,15 +1,311 @@
-"""The front of the march: which of the two it takes, and where its steps become fine."""
+"""Tests of `nerg_mi.transport.march`."""
+
+import gc
+from dataclasses import replace
 
 import drjit as dr
+import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.fields.splats import matrices_of
 from nerg_mi.transport import march as front
-from nerg_mi.transport.march_primal import MarchSettings
-from nerg_mi.transport.medium import ColorPainter
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings, march_primal
+from nerg_mi.transport.medium import ColorPainter, LocalRay
 from nerg_mi.transport.volume_medium import VolumeMedium
+from tests.formats.splats.writers import random_splats
+from tests.reference.splats import peaks, trace
+from tests.transport.march.test_march_primal import grid, slab
+from tests.transport.media.splats.scenes import medium_of, rays, stack
 
-from .test_primal import grid, slab
+# ---- Adjoint ----
+#
+# Derivatives by marching again, against those that Dr.Jit takes through the march itself, and what they hold in
+# memory.
+
+
+def scene_of(mi, size, step, quadrature="constant"):
+    """Voxels with a colour each: all rays of a camera cross them."""
+    rng = np.random.default_rng(2)
+    place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
+    volume = lambda data: {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid(data.astype(np.float32)),
+        "to_world": place,
+        "raw": True,
+    }
+    film = {"type": "hdrfilm", "width": size, "height": size, "component_format": "float32", "rfilter": {"type": "box"}}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {
+                "type": "nerg",
+                "density": volume(0.1 + rng.exponential(1.2, (4, 5, 6))),
+                "color": volume(rng.uniform(0.1, 0.9, (4, 5, 6, 3))),
+                "step": step,
+                "stop": 0.0,
+                "color_cutoff": 0.0,
+                "quadrature": quadrature,
+                "depth": "expected",
+                "aovs": "depth,opacity",
+            },
+            "sensor": {
+                "type": "perspective",
+                "fov": 20,
+                "to_world": mi.ScalarTransform4f().look_at([0.3, 0.2, -3], [0, 0, 0], [0, 1, 0]),
+                "film": film,
+                "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
+            },
+        }
+    )
+
+
+def gradients(mi, scene):
+    """Of one weighted sum of all channels with respect to all voxels."""
+    params = mi.traverse(scene)
+    keys = ["integrator.density.data", "integrator.color.data"]
+    for key in keys:
+        params[key] = dr.detach(params[key])
+        dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(scene, params, spp=1)
+    weights = np.random.default_rng(0).uniform(0.2, 1, image.shape).astype(np.float32)
+    dr.backward(dr.sum(image * mi.TensorXf(weights), axis=None))
+    return [dr.grad(params[key]).numpy() for key in keys]
+
+
+@pytest.mark.parametrize("quadrature", ["constant", "linear"])
+def test01_equal_to_derivatives_through_the_loop(rgb, monkeypatch, quadrature):
+    scene = scene_of(rgb, 5, 0.4, quadrature)
+    got = gradients(rgb, scene)
+
+    def through_the_loop(ray, t0, t1, request):
+        # Every step is evaluated, and stays in memory until its derivative has been taken.
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
+            settings = replace(request.settings, color_cutoff=0.0)
+            return march_primal(ray, t0, t1, replace(request, settings=settings))
+
+    called = []
+    monkeypatch.setattr(front, "differentiable_march", lambda operation, *a: called.append(1) or through_the_loop(*a))
+    expected = gradients(rgb, scene)
+    assert called
+    for g, e in zip(got, expected):
+        assert np.abs(e).max() > 0 and np.linalg.norm(g - e) < 1e-5 * np.linalg.norm(e)
+
+
+def test02_memory_does_not_grow_with_samples(rgb):
+    peaks = []
+    for samples in (16, 512):
+        scene = scene_of(rgb, 32, 2 / samples)
+        gradients(rgb, scene)  # compiles, and makes what stays
+        gc.collect()
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
+        gradients(rgb, scene)
+        dr.sync_thread()
+        peaks.append(dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before)
+    # Storing one number of each sample would add 2 MB.
+    assert 0 < peaks[0] < 1e6 and abs(peaks[1] - peaks[0]) < 0.1 * peaks[0], peaks
+
+
+# ------------------------------------------------------------------------
+#  Entry, exit and position, in closed form
+# ------------------------------------------------------------------------
+
+
+class Slanted:
+    """Density ``base`` + ``rise`` z, and a colour that is z itself, everywhere."""
+
+    occupancy = cells = step = hits = None
+
+    def __init__(self, base, rise=0.0):
+        self.base, self.rise = ns.Float(base), rise
+
+    def parameters(self):
+        return [self.base]
+
+    def density(self, p, active):
+        return dr.select(active, self.base + self.rise * p.z, 0)
+
+    def density_features(self, p, active):
+        return self.density(p, active), [p.z]
+
+    def color(self, features, p, w, active):
+        return ns.Array3f(features[0])
+
+
+def slopes(medium, value, mode, settings, offset=None):
+    """Derivative of ``value`` (a function of the march) with respect to entry, exit, the origin's z and the density."""
+    z = ns.Array3f(0, 0, 1)
+    found = []
+    for k in range(4):
+        x = [dr.opaque(ns.Float, v) for v in (0.25, 1.125, 0, float(medium.base[0]))]
+        dr.enable_grad(*(x if mode == "backward" else [x[k]]))
+        medium.base = x[3]
+        ray = LocalRay(ns.Array3f(0, 0, x[2]), z, z, dr.opaque(ns.Float, 0), dr.opaque(ns.Float, 2))
+        result = value(march(medium, ray, x[0], x[1], True, settings, color=ColorPainter(ns.Array3f), offset=offset))
+        if mode == "backward":
+            dr.backward(result)
+            medium.base = dr.detach(x[3])
+            return [dr.grad(v)[0] for v in x]
+        dr.forward(x[k])
+        medium.base = dr.detach(x[3])
+        found.append(dr.grad(result)[0])
+    return found
+
+
+@pytest.mark.parametrize("offset", [None, 0.3])
+@pytest.mark.parametrize("quadrature", ["constant", "linear"])
+@pytest.mark.parametrize("mode", ["forward", "backward"])
+def test03_a_slab_between_entry_and_exit(mode, quadrature, offset):
+    sigma, t0, t1 = 1.7, 0.25, 1.125
+    length, passed = t1 - t0, np.exp(-1.7 * (1.125 - 0.25))
+    settings = MarchSettings(1 / 16, stop=0, color_cutoff=0, quadrature=quadrature)
+    offset = None if offset is None else ns.Float(offset)
+    of = lambda value: slopes(Slanted(sigma), value, mode, settings, offset)
+    assert np.allclose(of(lambda r: r.tau), [-sigma, sigma, 0, length], rtol=1e-5, atol=1e-5)
+    # E = t0 + 1 / sigma - L / (exp(sigma L) - 1), the mean distance of absorption, of which the opacity is 1 - passed.
+    q = passed / (1 - passed)
+    by_length = -q + length * sigma * q / (1 - passed)
+    by_density = -1 / sigma**2 + length**2 * q / (1 - passed)
+    assert np.allclose(of(lambda r: r.expected_depth), [1 - by_length, by_length, 0, by_density], rtol=1e-4, atol=1e-5)
+    half = [1, 0, 0, -np.log(2) / sigma**2]
+    assert np.allclose(of(lambda r: r.half), half, rtol=1e-4, atol=1e-5)
+    # The colour z is that of the mean absorption: C = opacity (o + E). A step takes it at its middle, or at its mean.
+    opacity, mean = 1 - passed, t0 + 1 / sigma - length * q
+    want = [
+        -sigma * passed * mean + opacity * (1 - by_length),
+        sigma * passed * mean + opacity * by_length,
+        opacity,
+        length * passed * mean + opacity * by_density,
+    ]
+    assert np.allclose(of(lambda r: r.color.x), want, rtol=2e-2 if quadrature == "constant" else 1e-4)
+
+
+@pytest.mark.parametrize("mode", ["forward", "backward"])
+def test04_density_at_the_ends_is_what_moving_them_takes_in(mode):
+    # tau = base (t1 - t0) + rise ((t1 + o)^2 - (t0 + o)^2) / 2, exact by either rule.
+    for quadrature in ("constant", "linear"):
+        settings = MarchSettings(1 / 16, stop=0, color_cutoff=0, quadrature=quadrature)
+        got = slopes(Slanted(0.5, 3.0), lambda r: r.tau, mode, settings)
+        assert np.allclose(got, [-(0.5 + 3 * 0.25), 0.5 + 3 * 1.125, 3 * 0.875, 0.875], rtol=1e-4)
+
+
+# ---- Derivatives of splats against central differences in float64, of the ray and of what Gaussians are ----
+
+
+# Ends nowhere, so that the sums are smooth but for the rims of Gaussians.
+SETTINGS = MarchSettings(0.01, stop=0.0)
+
+
+NAMES = ("centers", "scales", "rotations", "opacities", "harmonics")
+
+
+STEP = 1e-5
+
+
+class Double:
+    """Splats in float64, with one array of another value."""
+
+    def __init__(self, splats, name="", value=None):
+        self.degree = splats.degree
+        for n in NAMES:
+            setattr(self, n, value if n == name else getattr(splats, n).astype(np.float64))
+
+    def axes(self):
+        return matrices_of(self.rotations / np.linalg.norm(self.rotations, axis=1, keepdims=True))
+
+
+def outputs(mi, medium, o, d):
+    """A number that depends on all sums of a march."""
+    ray = medium.local(o, d)
+    result = march(medium, ray, mi.Float(0), ray.t_far, True, SETTINGS, color=ColorPainter(mi.Color3f))
+    half = dr.select(dr.isfinite(result.half), result.half, 0)
+    return dr.sum(result.opacity + 0.3 * result.expected_depth + dr.dot(result.color, [0.5, 0.2, 0.1]) + 0.1 * half)
+
+
+def reference(splats, o, d):
+    """The same in float64."""
+    opacity, color, expected, _ = trace(splats, o, d, stop=0.0)
+    t, absorbed = peaks(splats, o, d)
+    order = np.argsort(t, axis=1)
+    t, absorbed = (np.take_along_axis(v, order, 1) for v in (t, np.where(t >= 0, absorbed, 0)))
+    halved = np.cumprod(1 - absorbed, axis=1) <= 0.5
+    half = np.where(halved.any(axis=1), t[np.arange(len(t)), np.argmax(halved, axis=1)], 0)
+    return float((opacity + 0.3 * expected + color @ [0.5, 0.2, 0.1] + 0.1 * half).sum())
+
+
+@pytest.fixture
+def case():
+    # Rims of Gaussians, where they jump by a hundredth, pass no ray within the step of these differences.
+    return random_splats(14, degree=1, size=0.5), *rays(12, size=0.6)
+
+
+def test_gradients_of_gaussians(rgb, case):
+    splats, o, d = case
+    medium = medium_of(splats)
+    arrays = medium.arrays
+    dr.enable_grad(list(arrays.parameters().values()))
+    arrays.pack()
+    loss = outputs(rgb, medium, rgb.Point3f(o.T), rgb.Vector3f(d.T))
+    assert np.isclose(loss[0], reference(Double(splats), o, d), rtol=1e-5)
+    dr.backward(loss)
+    rng = np.random.default_rng(7)
+    for name, value in arrays.parameters().items():
+        base = getattr(splats, name).astype(np.float64)
+        along = rng.normal(size=base.shape)
+        ends = [reference(Double(splats, name, base + s * STEP * along), o, d) for s in (1, -1)]
+        wanted = (ends[0] - ends[1]) / (2 * STEP)
+        found = (np.array(dr.grad(value)).reshape(base.shape) * along).sum()
+        assert abs(wanted) > 0.02 and np.isclose(found, wanted, rtol=1e-3, atol=2e-4), name
+
+
+@pytest.mark.parametrize("mode", ["backward", "forward"])
+def test_gradients_of_rays(rgb, case, mode):
+    splats, o, d = case
+    along = np.array([0.3, -0.5, 0.8])
+    ends = [reference(Double(splats), o + s * STEP * along, d) for s in (1, -1)]
+    shift = rgb.Float(0)
+    dr.enable_grad(shift)
+    at = rgb.Point3f(o.T) + rgb.Vector3f(*along.tolist()) * shift
+    loss = outputs(rgb, medium_of(splats), at, rgb.Vector3f(d.T))
+    getattr(dr, mode)(loss if mode == "backward" else shift)
+    found = dr.grad(shift if mode == "backward" else loss)[0]
+    assert np.isclose(found, (ends[0] - ends[1]) / (2 * STEP), rtol=1e-3)
+
+
+@pytest.mark.nightly
+def test_memory_does_not_grow_with_hits(rgb):
+    medium, count = medium_of(stack(np.arange(1, 151) * 0.5, np.full(150, 0.01))), 1 << 13
+
+    def gradient(end):
+        o = rgb.Point3f(dr.linspace(rgb.Float, -0.1, 0.1, count), 0, 0)
+        dr.enable_grad(o)
+        ray = medium.local(o, rgb.Vector3f(0, 0, 1))
+        result = march(medium, ray, rgb.Float(0), rgb.Float(end), True, SETTINGS, color=ColorPainter(rgb.Color3f))
+        dr.backward(result.tau + result.color.x)
+        dr.eval(dr.grad(o))
+        return result.tau.numpy().mean()
+
+    found, memory = [], []
+    for end in (2.2, 80.0):
+        gradient(end)
+        gc.collect()
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
+        found.append(gradient(end))
+        dr.sync_thread()
+        memory.append(dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before)
+    # Four hits and 150; a number for each of these would be 5 MB.
+    assert found[1] > 30 * found[0] > 0 and abs(memory[1] - memory[0]) < 5e5, memory
+
+
+# ---- The front of the march: which of the two it takes, and where its steps become fine ----
 
 
 @pytest.fixture

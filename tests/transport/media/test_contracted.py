@@ -12,7 +12,7 @@ from nerg_mi.maths.geometry import Box, ContractedBox, Similarity
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
-from tests.maths.test_similarity import turn
+from tests.maths.test_geometry import turn
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = ContractedBox(Box((-1, -2, -2), (3, 2, 2)), 64)

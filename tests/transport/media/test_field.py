@@ -13,7 +13,7 @@ from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.medium import ColorPainter
-from tests.maths.test_similarity import turn
+from tests.maths.test_geometry import turn
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((0, 0, 0), (1, 1, 2))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.plugins import fields
-from tests.workflows.test_overlays import SCENE
+from tests.workflows.test_render import OVERLAYS_SCENE as SCENE
 
 MODE = "llvm_ad_rgb"
 

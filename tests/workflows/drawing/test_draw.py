@@ -1,17 +1,19 @@
-"""Figures drawn and written, with where they come from."""
+"""Tests of `nerg_mi.workflows.draw`."""
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 
 import pytest
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.workflows.draw import draw
+from nerg_mi.workflows.draw import KINDS, draw, find_kind
+from tests.workflows.drawing.test_draw_files import write
 from tests.workflows.recorder import Recorder
 
-from .test_files import write
+# ---- Figures drawn and written, with where they come from ----
 
 
 def test_a_file_says_where_it_comes_from(tmp_path):
@@ -39,3 +41,18 @@ def test_what_is_refused(tmp_path):
     with pytest.raises(NergError, match='no figure "pie"'):
         draw("pie", a)
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+# ---- The table of kinds ----
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_each_tells_what_it_is(name):
+    kind = find_kind(name)
+    assert kind.name == name and kind.summary.endswith(".") and kind.most >= 1
+    assert kind.options() is not None and all(f.metadata["help"] for f in dataclasses.fields(kind.options))
+
+
+def test_one_that_is_not_there():
+    with pytest.raises(NergError, match='no figure "pie"; there are sphere, triptych'):
+        find_kind("pie")

@@ -8,8 +8,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.draw import draw
-
-from .test_walls import SCENE
+from tests.workflows.drawing.test_draw_scenes import WALLS_SCENE as SCENE
 
 
 def walk(hits=True):

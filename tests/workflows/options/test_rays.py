@@ -1,4 +1,4 @@
-"""Options of filtering and splitting; what they do to rays is tried in tests/workflows/test_tracking.py."""
+"""Options of filtering and splitting; what they do to rays is tried in tests/workflows/test_rays.py."""
 
 import pytest
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.readers.scene_glasses import FrameNames
-from tests.photos.test_named_poses import write_colmap, write_transforms
+from tests.photos.test_colmap import write_colmap, write_transforms
 from tests.rays.readers import own_camera
 from tests.rays.readers.examples import EXAMPLES
 from tests.rays.readers.reading import dropped, read

@@ -1,0 +1,234 @@
+"""Tests of `nerg_mi.alignment.constraints`."""
+
+import gzip
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.interpolate import RegularGridInterpolator
+
+from nerg_mi.alignment.constraints import (
+    DistanceGrid,
+    PlaceTraces,
+    Target,
+    angles,
+    pair_covariance,
+    read_surface,
+    surface_of_points,
+    surface_of_traces,
+    thinned,
+    trace_place,
+)
+from nerg_mi.alignment.similarity import ALL, fit_similarity, scale_of
+from nerg_mi.errors import NergError
+from nerg_mi.formats.ply import write_columns
+
+from . import rooms
+from .rooms import carried, similarity
+
+# ---- Evidence ----
+
+
+def test_angles_are_seen_from_the_viewpoint():
+    at, to = np.array([[1.0, 0, 0], [0, 2, 0]]), np.array([[1.0, 1, 0], [0, 2, 2e-7]])
+    np.testing.assert_allclose(angles(np.zeros(3), at, to), [45, np.degrees(1e-7)], rtol=1e-6)
+
+
+def test_the_covariance_is_that_of_many_fits():
+    rng = np.random.default_rng(0)
+    truth, x, noise = similarity(rng, scale=2.0), rng.normal(size=(12, 3)), 0.02
+    exact = carried(truth, x)
+    draws = [fit_similarity(x, exact + rng.normal(0, noise, x.shape)) for _ in range(2000)]
+    scales = np.log([scale_of(m) for m in draws])
+    middle = np.array([carried(m, x.mean(axis=0)[None])[0] for m in draws])
+    y = exact + rng.normal(0, noise, x.shape)
+    stated = [pair_covariance(x, exact + rng.normal(0, noise, x.shape), fit_similarity(x, y), ALL) for _ in range(50)]
+    mean = np.mean(stated, axis=0)
+    assert np.sqrt(mean[6, 6]) == pytest.approx(scales.std(), rel=0.25)
+    np.testing.assert_allclose(np.sqrt(np.diag(mean)[3:6]), middle.std(axis=0), rtol=0.3)
+    assert pair_covariance(x[:2], y[:2], truth, ALL) is None
+
+
+def test_a_place_is_needed_by_what_asks_for_it():
+    with pytest.raises(NergError, match="--field"):
+        _ = Target().surface
+
+
+def test_a_turned_place_is_turned_back():
+    rng = np.random.default_rng(1)
+    turn, matrix = similarity(rng, scale=1.0), similarity(rng)
+    turn[:3, 3] = 0
+    np.testing.assert_allclose(turn @ Target(turn=turn).to_place(matrix), matrix, atol=1e-12)
+
+
+# ---- Grid ----
+
+
+GRID = DistanceGrid(np.random.default_rng(0).random((6, 7, 5)), np.array([-1.0, 0, 2]), 0.5)
+
+
+def test_inside_it_is_the_trilinear_interpolation():
+    axes = [GRID.lower[a] + GRID.step * np.arange(n) for a, n in enumerate(GRID.values.shape)]
+    p = np.random.default_rng(1).uniform(GRID.lower, GRID.upper, (300, 3))
+    np.testing.assert_allclose(GRID.at(p), RegularGridInterpolator(axes, GRID.values)(p), atol=1e-12)
+
+
+def test_beyond_it_the_distance_to_it_is_added():
+    p = GRID.upper + np.array([[3.0, 4, 0], [0, 0, 2]])
+    np.testing.assert_allclose(GRID.at(p), GRID.values[-1, -1, -1] + np.array([5, 2]))
+
+
+def test_gradients_are_those_of_central_differences():
+    p = np.random.default_rng(2).uniform(GRID.lower - 1, GRID.upper + 1, (500, 3))
+    slope = GRID.with_slope(p)[1]
+    for a, e in enumerate(1e-7 * np.eye(3)):
+        np.testing.assert_allclose(slope[:, a], (GRID.at(p + e) - GRID.at(p - e)) / 2e-7, atol=1e-6)
+
+
+def test_a_lattice_of_one_layer_has_no_slope_across():
+    flat = DistanceGrid(np.arange(4.0).reshape(4, 1, 1), np.zeros(3), 1.0)
+    value, slope = flat.with_slope(np.array([[1.5, 0, 0]]))
+    assert value[0] == 1.5 and slope[0].tolist() == [1, 0, 0]
+
+
+# ---- Point file ----
+
+
+def test_points_are_on_the_triangles_evenly_by_area(tmp_path):
+    v = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [10, 0, 0], [10.0, 1, 0], [10, 0, 1]])
+    write_columns(tmp_path / "a.ply", dict(zip("xyz", v.T)), np.array([[0, 1, 2], [3, 4, 5]]))
+    trimesh.Trimesh(v, [[0, 1, 2], [3, 4, 5]], process=False).export(tmp_path / "a.obj")
+    for name in ("a.ply", "a.obj"):
+        p = read_surface(tmp_path / name, 5000)
+        small = p[:, 0] > 5
+        assert len(p) == 5000 and small.mean() == pytest.approx(0.1, abs=0.02)
+        assert np.abs(p[~small, 2]).max() == 0 and (p[~small, :2].sum(axis=1) <= 3 + 1e-9).all()
+        np.testing.assert_array_equal(p, read_surface(tmp_path / name, 5000))
+
+
+def test_clouds_tables_and_arrays(tmp_path):
+    p = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    write_columns(tmp_path / "a.ply", dict(zip("xyz", p.T)))
+    np.save(tmp_path / "a.npy", p)
+    (tmp_path / "a.csv").write_text("x,y,z\n" + "".join(f"{a},{b},{c}\n" for a, b, c in p.tolist()) + "nan,1,2\n")
+    head = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std\n"
+    rows = "".join(f"{k},g,{x},{y},{z},0.001,0.01\n" for k, (x, y, z) in enumerate(p.tolist()))
+    (tmp_path / "s.csv.gz").write_bytes(gzip.compress((head + rows).encode()))
+    for name in ("a.ply", "a.npy", "a.csv", "s.csv.gz"):
+        np.testing.assert_allclose(read_surface(tmp_path / name), p, atol=1e-6)
+    assert len(read_surface(tmp_path / "a.npy", 10)) == 10
+
+
+@pytest.mark.parametrize(
+    "name, data, why",
+    [
+        ("a.txt", b"", "no surface that is read"),
+        ("a.ply", b"ply\nno", "no header"),
+        ("a.obj", b"", "no vertices"),
+        ("a.csv", b"x,y,z\n", "no points"),
+        ("a.csv", b"a,b\n1,2\n", "x"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, name, data, why):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(NergError, match=why):
+        read_surface(tmp_path / name)
+    with pytest.raises(NergError, match="there is no surface"):
+        read_surface(tmp_path / "no.ply")
+
+
+def test_arrays_of_another_shape_are_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((3, 2)))
+    with pytest.raises(NergError, match=r"shape \(3, 2\)"):
+        read_surface(tmp_path / "a.npy")
+
+
+def test_rows_that_do_not_match_the_header_are_refused(tmp_path):
+    (tmp_path / "points.csv").write_text("x,y,z\n1,2,3\n1,2,3,4,5\n")
+    with pytest.raises(NergError, match="line 3: 5 cells, the header has 3"):
+        read_surface(tmp_path / "points.csv")
+
+
+@pytest.mark.parametrize("far", ["1.1e7", "-1e30", "1e308"])
+def test_points_beyond_all_places_are_refused(tmp_path, far):
+    (tmp_path / "a.csv").write_text(f"x,y,z\n0,0,0\n1,{far},0\n")
+    with pytest.raises(NergError, match="the points of .*a.csv.* must have coordinates from"):
+        read_surface(tmp_path / "a.csv")
+
+
+# ---- Surface ----
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return surface_of_traces(rooms.traces(), 1 << 17)
+
+
+def exact(points):
+    """Distance to the nearest wall or face of a block."""
+    out = np.minimum(points, rooms.SIZE - points).min(axis=1)
+    for low, high in rooms.BOXES:
+        out = np.minimum(out, np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0), axis=1))
+    return out
+
+
+def test_distances_are_those_to_walls_and_blocks(surface):
+    p = np.random.default_rng(0).uniform(0, rooms.SIZE, (4000, 3))
+    p = p[rooms.free(p)]
+    off = np.abs(surface.distance.at(p) - exact(p))
+    assert np.median(off) < 0.5 * surface.step and np.percentile(off, 95) < 1.5 * surface.step
+
+
+def test_solids_are_blocked_and_the_room_is_free(surface):
+    p = np.random.default_rng(1).uniform(0, rooms.SIZE, (4000, 3))
+    blocked = surface.blocked.at(p)
+    deep = ~rooms.free(p, -2 * surface.step)
+    assert surface.bounded and (blocked[deep] > 0).mean() > 0.97
+    assert (blocked[rooms.free(p, 1.5 * surface.step)] == 0).mean() > 0.99
+
+
+def test_the_inside_of_a_hollow_thing_is_no_free_space():
+    room, block = rooms.traces(80_000), rooms.BOXES[0]
+    rng = np.random.default_rng(2)
+    begin = rng.uniform(*block, (4000, 3))
+    along = rooms.directions(4000, rng)
+    to_wall = np.where(along > 0, (block[1] - begin) / along, (block[0] - begin) / along).min(axis=1)
+    both = PlaceTraces(
+        np.concatenate([room.begin, begin]),
+        np.concatenate([room.end, begin + along * to_wall[:, None]]),
+        np.ones(len(room.met) + 4000, bool),
+    )
+    found = surface_of_traces(both, 1 << 16)
+    middle = block.mean(axis=0)[None]
+    assert found.blocked.at(middle)[0] > 0.2
+
+
+def test_the_floor_is_found(surface):
+    assert surface.floor() == pytest.approx(0, abs=0.5 * surface.step)
+
+
+def test_bare_points_know_no_free_space_and_must_be_some():
+    points = rooms.traces().end
+    found = surface_of_points(points, 1 << 15)
+    assert not found.bounded and found.distance.at(points[:500]).max() < 2 * found.step
+    with pytest.raises(NergError, match="99 points, and 100"):
+        surface_of_points(np.zeros((99, 3)))
+    with pytest.raises(NergError, match="single point"):
+        surface_of_points(np.zeros((200, 3)))
+
+
+def test_thinned_points_are_the_means_of_voxels():
+    p = np.array([[0.0, 0, 0], [0.2, 0, 0], [1.1, 0, 0]])
+    np.testing.assert_allclose(thinned(p, 1.0), [[0.1, 0, 0], [1.1, 0, 0]])
+
+
+class _Nothing:
+    pass
+
+
+def test_a_place_without_surfaces_is_refused(monkeypatch):
+    monkeypatch.setattr(
+        "nerg_mi.alignment.constraints.trace_depth", lambda s, o, d: (np.zeros(len(o)), np.zeros(len(o)))
+    )
+    with pytest.raises(NergError, match="no surfaces that rays could meet"):
+        trace_place(_Nothing(), np.zeros(3), np.ones(3), 1000)  # pyright: ignore[reportArgumentType] # traced by nothing

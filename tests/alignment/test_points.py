@@ -1,0 +1,196 @@
+"""Tests of `nerg_mi.alignment.points`."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from nerg_mi.alignment.constraints import Target
+from nerg_mi.alignment.points import Cameras, Pairs, mean_rotation, read_cameras, read_pairs
+from nerg_mi.alignment.similarity import MIRROR, errors, scale_of
+from nerg_mi.errors import NergError
+
+from .rooms import carried, similarity
+
+# ---- Camera poses ----
+
+
+FREE = Target(upright=False)
+
+
+def both(truth, count=12, seed=0):
+    """The same cameras in two frames."""
+    rng = np.random.default_rng(seed)
+    one = np.tile(np.eye(4), (count, 1, 1))
+    one[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
+    one[:, :3, 3] = rng.normal(size=(count, 3))
+    other = truth @ one
+    other[:, :3, :3] /= scale_of(truth)
+    return one, other
+
+
+def quiet(share, text):
+    pass
+
+
+def test_two_cameras_are_enough():
+    truth = similarity(np.random.default_rng(1))
+    np.testing.assert_allclose(Cameras(*both(truth, 2)).fit(FREE, quiet).matrix, truth, atol=1e-8)
+
+
+def test_wrong_poses_do_no_harm():
+    truth = similarity(np.random.default_rng(2))
+    one, other = both(truth)
+    other[:3, :3, 3] += 5
+    other[2:4, :3, :3] = Rotation.random(2, random_state=9).as_matrix()
+    fit = Cameras(one, other).fit(FREE, quiet)
+    assert errors(fit.matrix, one[:, :3, 3], carried(truth, one[:, :3, 3])).max() < 1e-3
+    assert fit.about == {"cameras": 12, "agreeing": 8}
+
+
+def test_a_mirrored_model_is_named():
+    truth = similarity(np.random.default_rng(3))
+    one, other = both(truth)
+    one[:, :3, 3] = carried(MIRROR, one[:, :3, 3])
+    try:
+        said = Cameras(one, other).fit(FREE, quiet).mirrored
+    except NergError as error:
+        said = str(error)
+    assert "mirrored" in said or "axis negated" in said
+
+
+def test_another_convention_is_told():
+    one, other = both(similarity(np.random.default_rng(4)), seed=5)
+    other[:, :3, 1:3] *= -1
+    assert any("convention" in d for d in Cameras(one, other).fit(FREE, quiet).doubts)
+
+
+def test_cameras_that_leave_it_open_are_refused():
+    one, other = both(np.eye(4))
+    with pytest.raises(NergError, match="1 pictures in common"):
+        Cameras(one[:1], other[:1]).fit(FREE, quiet)
+    one[:, :3, 3] = 1.0
+    with pytest.raises(NergError, match="all stand at one place"):
+        Cameras(one, other).fit(FREE, quiet)
+
+
+def test_the_mean_rotation_is_the_median_of_most():
+    truth = Rotation.random(random_state=1)
+    given = Rotation.concatenate([truth] * 7 + [Rotation.random(random_state=k) for k in range(2, 6)])
+    np.testing.assert_allclose(mean_rotation(given.as_matrix()), truth.as_matrix(), atol=1e-3)
+
+
+def write_model(folder, poses, names):
+    folder.mkdir()
+    frames = [{"file_path": n, "transform_matrix": p.tolist()} for n, p in zip(names, poses)]
+    for n in names:
+        (folder / n).write_bytes(b"")
+    (folder / "transforms.json").write_text(json.dumps({"fl_x": 10.0, "w": 8, "h": 6, "frames": frames}))
+
+
+def test_pictures_are_known_again_by_their_names(tmp_path):
+    truth = similarity(np.random.default_rng(6))
+    one, other = both(truth, 5)
+    write_model(tmp_path / "a", one, ["0.png", "1.png", "2.png", "3.png", "x.png"])
+    write_model(tmp_path / "b", other[::-1], ["y.png", "3.jpg", "2.jpg", "1.jpg", "0.jpg"])
+    found = read_cameras(tmp_path / "a", tmp_path / "b")
+    assert len(found.tracking) == 4
+    np.testing.assert_allclose(found.fit(FREE, quiet).matrix, truth, atol=1e-6)
+    write_model(tmp_path / "c", one, [f"{k}.tif" for k in range(10, 15)])
+    with pytest.raises(NergError, match="no two pictures of the same name"):
+        read_cameras(tmp_path / "a", tmp_path / "c")
+
+
+# ---- Pairs ----
+
+
+HEAD = "name,x,y,z,place_x,place_y,place_z\n"
+
+
+def quiet_pairs(share, text):
+    assert 0 <= share <= 1 and text
+
+
+def made(count=6, seed=0, noise=0.01):
+    rng = np.random.default_rng(seed)
+    truth, x = similarity(rng), rng.uniform(0, 4, (count, 3))
+    return truth, x, carried(truth, x + rng.normal(0, noise, x.shape))
+
+
+def test_picked_points_give_the_alignment_its_errors_and_its_uncertainty():
+    truth, x, y = made()
+    fit = Pairs(x, y).fit(FREE, quiet_pairs)
+    assert errors(fit.matrix, x, carried(truth, x)).max() < 0.03
+    assert np.median(fit.centimetres) < 3 and len(fit.degrees) == 6 and fit.mirrored is None
+    assert fit.covariance.shape == (7, 7) and fit.about["leave_one_out_cm"]["largest"] > max(fit.centimetres)
+
+
+def test_a_mirrored_frame_is_named():
+    _, x, y = made()
+    assert "x axis negated the pairs meet to" in Pairs(carried(MIRROR, x), y).fit(FREE, quiet_pairs).mirrored
+
+
+def test_points_in_a_plane_do_not_tell_a_mirror():
+    truth, x, _ = made()
+    flat = x * (1, 1, 0)
+    fit = Pairs(flat, carried(truth @ MIRROR, flat)).fit(FREE, quiet_pairs)
+    assert fit.mirrored is None and any("in a plane" in note for note in fit.notes)
+
+
+def test_a_pair_that_was_picked_wrong_is_named():
+    _, x, y = made(7, noise=0.001)
+    y[3] += 2.0
+    (doubt,) = Pairs(x, y, names=tuple("abcdefg")).fit(FREE, quiet_pairs).doubts
+    assert 'pair 4 ("d")' in doubt and "picked wrong" in doubt
+
+
+def test_two_pairs_and_up_that_is_another_axis():
+    rng = np.random.default_rng(5)
+    truth, x = similarity(rng, upright=True), rng.uniform(0, 4, (2, 3))
+    turn = np.eye(4)[[0, 2, 1, 3]] * [[1], [-1], [1], [1]]
+    y_up = carried(np.linalg.inv(turn) @ truth, x)
+    fit = Pairs(x, y_up).fit(Target(turn=turn, upright=True), quiet_pairs)
+    np.testing.assert_allclose(fit.matrix, np.linalg.inv(turn) @ truth, atol=1e-9)
+
+
+def test_files_are_read_as_they_are_described(tmp_path):
+    rows = [[1, 2, 3, 4, 5, 6], [0, 0, 1, 1, 0, 0.5]]
+    (tmp_path / "p.csv").write_text(HEAD + "".join(f"n{k},{','.join(map(str, r))}\n" for k, r in enumerate(rows)))
+    pairs = [{"tracking": r[:3], "place": r[3:], "name": f"n{k}"} for k, r in enumerate(rows)]
+    (tmp_path / "p.json").write_text(json.dumps(pairs))
+    (tmp_path / "q.json").write_text(json.dumps({"pairs": pairs}))
+    for name in ("p.csv", "p.json", "q.json"):
+        found = read_pairs(tmp_path / name)
+        np.testing.assert_array_equal(np.c_[found.tracking, found.place], rows)
+        assert found.names == ("n0", "n1")
+
+
+@pytest.mark.parametrize(
+    "name, text, why",
+    [
+        ("a.csv", "x,y,z\n1,2,3\n", "no column place_x"),
+        ("a.csv", HEAD, "no pairs"),
+        ("a.json", "[]", "no pairs"),
+        ("a.json", '{"a": 1}', "cannot be used"),
+        ("a.json", '[{"tracking": [1, 2], "place": [1, 2]}]', "three coordinates"),
+        ("a.json", "[1, 2]", "cannot be used"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, name, text, why):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(NergError, match=why):
+        read_pairs(tmp_path / name)
+
+
+def test_empty_cells_are_no_coordinates(tmp_path):
+    (tmp_path / "a.csv").write_text(HEAD + "a,1,2,3,4,5,\nb,0,0,0,0,0,0\nc,1,0,0,1,0,0\n")
+    with pytest.raises(NergError, match="points in the frame"):
+        read_pairs(tmp_path / "a.csv").fit(FREE, quiet_pairs)
+
+
+def test_rows_that_do_not_match_the_header_are_refused(tmp_path):
+    path = tmp_path / "pairs.csv"
+    path.write_text("x,y,z,place_x,place_y,place_z\n0,5,1,5,0,1,1,2,3\n")
+    with pytest.raises(NergError, match="line 2: 9 cells, the header has 6; are these decimal commas"):
+        read_pairs(path)

@@ -1,0 +1,326 @@
+"""Tests of `nerg_mi.aoi.predicted`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.aoi.measured import Eyes
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.predicted import (
+    Foretold,
+    Setting,
+    add_trust,
+    eyes_of_some,
+    foretell,
+    foretold_people,
+    isovist_rows,
+    look_around,
+    places_of,
+    setting_of,
+    support_of,
+    tell_places,
+    tell_support,
+    what_if_rows,
+)
+from nerg_mi.aoi.scene import Surroundings, surroundings_of_files, things_of
+from nerg_mi.errors import NergError
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.formats.areas import Areas, Region, read_areas
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.statistics.tables import PLACES, Floor
+from nerg_mi.statistics.visibility import Targets, isovists
+from nerg_mi.statistics.visits import ALL, Box, Cell
+from nerg_mi.workflows.base import SILENT
+from tests.workflows.recorder import Recorder
+
+from .place import SIGN, write_place
+
+# ---- What a field foretells, against sums over directions that are written out ----
+
+
+class Law(Surroundings):
+    """A gaze that is known: twice as dense ahead (x > 0) as behind, and seven units of support."""
+
+    def look_from(self, eye):
+        return lambda d: (np.where(d[:, 0] > 0, 2.0, 1.0)[None], None)
+
+    def support(self, eye):
+        return 7.0
+
+
+AROUND = Law(None, None, Similarity())
+
+
+EYES = Eyes(
+    np.array([[0.0, 0, 0], [0, 0, 0.2], [0, 0, 0]]),
+    np.tile([1.0, 0, 0], (3, 1)),
+    ("Ada", "Ada", "Bo"),
+    (frozenset([ALL]), frozenset([ALL]), frozenset([ALL, Cell("zone", "z")])),
+)
+
+
+def test01_shares_are_integrals():
+    # A cube of which the eye sees a face of 2 x 2 at x = 1: a sixth of the sphere; of the hemisphere's gaze 2/3.
+    things = [Box(Region.of("ahead", [1, -1, -1], [2, 1, 1])), Box(Region.of("behind", [-2, -1, -1], [-1, 1, 1]))]
+    found = foretell(AROUND, EYES, things, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    assert np.allclose(found.share[0], [2 / 9, 1 / 9, 3 / 9], rtol=2e-3)
+    # The mean distance to a square face, over its solid angle, by quadrature in its plane.
+    u = (np.arange(400) + 0.5) / 200 - 1
+    y, z = np.meshgrid(u, u)
+    r2 = 1 + y**2 + z**2
+    mean = (r2**-1.5 * np.sqrt(r2)).sum() / (r2**-1.5).sum()
+    assert found.distance[0, 0] / found.share[0, 0] == pytest.approx(mean, rel=2e-3)
+    assert found.visible.tolist() == [[True, False, True]] * 3 and found.support.tolist() == [7, 7, 7]
+
+
+def test02_people():
+    things = [Box(Region.of("ahead", [1, -1, -1], [2, 1, 1]))]
+    found = foretell(AROUND, EYES, things, [(0,)], 0.0, 120.0, 24, 4096, SILENT)
+    people = foretold_people(found, EYES, ALL, {"Ada": 3.0, "Bo": 6.0}, 0.3)
+    assert people.names == ("Ada", "Bo")
+    share = found.share[:2].mean(axis=0)
+    assert people.on_time[0] == pytest.approx(3 * share)
+    # Ten glances, five from each place.
+    missed = np.prod([(1 - s) ** 5 for s in found.share[:2, 0]])
+    assert people.reached[0, 0] == pytest.approx(1 - missed)
+    (bo,) = foretold_people(found, EYES, Cell("zone", "z"), {"Bo": 6.0}, 0.3).names
+    assert bo == "Bo" and foretold_people(found, EYES, Cell("zone", "other"), {"Bo": 6.0}, 0.3) is None
+
+
+class Two(Law):
+    """Two members who look to opposite sides, ten times as long at one as at the other."""
+
+    def look_from(self, eye):
+        return lambda d: (np.array([np.where(s * d[:, 0] > 0, 10.0, 1.0) for s in (1, -1)]), None)
+
+
+def test03_members_of_an_ensemble():
+    things = [Box(Region.of("ahead", [1, -1, -1], [2, 1, 1])), Box(Region.of("behind", [-2, -1, -1], [-1, 1, 1]))]
+    found = foretell(Two(None, None, Similarity()), EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    # A sixth of the sphere each: evenly of both, and 10/11 or 1/11 of a hemisphere's third by one.
+    assert found.members.shape == (2, 3, 2) and np.allclose(found.share[0], 1 / 6, rtol=3e-3)
+    assert np.allclose(found.members[:, 0], [[10 / 33, 1 / 33], [1 / 33, 10 / 33]], rtol=3e-3)
+    assert foretell(AROUND, EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 64, SILENT).members.shape == (1, 3, 2)
+
+
+def test04_of_very_many_people_some_are_asked():
+    names = tuple(f"{k // 2:04d}" for k in range(400))
+    many = Eyes(np.arange(1200.0).reshape(400, 3), np.ones((400, 3)), names, (frozenset([ALL]),) * 400)
+    told = Recorder()
+    some = eyes_of_some(many, 50, told)
+    assert len(set(some.person)) == 50 and len(some.person) == 100 and len(some.positions) == len(some.cells) == 100
+    assert all((some.positions[k] == many.positions[names.index(n) + k % 2]).all() for k, n in enumerate(some.person))
+    back = np.arange(400)[::-1]
+    turned = eyes_of_some(Eyes(many.positions[back], many.ahead, names[::-1], many.cells), 50, SILENT)
+    assert set(turned.person) == set(some.person) and eyes_of_some(many, 200, SILENT) is many
+    assert "50 of 200 people" in told.messages[0]
+
+
+# ---- Places on the floor where nobody was tracked ----
+
+
+def test01_on_the_floor_of_a_room(tmp_path):
+    around = surroundings_of_files(write_place(tmp_path, gaze=False), None, None, None, ns)
+    found = look_around(around, 1.6, 0.25, 0.0)
+    inside = ((found[:, :2] > (2.5, 1.0)) & (found[:, :2] < (2.9, 2.0))).all(axis=1)
+    assert 330 < len(found) < 24 * 16 and not inside.any() and np.allclose(found[:, 2], 1.6)
+    with pytest.raises(NergError, match="--floor"):
+        look_around(around, 1.6, 0.25, -2.0)
+    rows = isovist_rows(
+        isovists(found[:4], around.depth, Targets.of([Box(Region.of("s", *SIGN))], 24), 0.01, 9.0),
+        ("s", "g"),
+        [(0,), (0,)],
+    )
+    assert len(rows) == 4 and rows[0]["sees s"] == rows[0]["sees g"] and 0 < rows[0]["area"] < 24.1
+
+
+def test02_observers_have_names():
+    eyes = places_of(np.zeros((12, 3)))
+    assert eyes.person[0] == "observer 01" and len(set(eyes.person)) == 12
+
+
+# ---- What a count needs besides rays ----
+
+
+def setting(folder, scene=True, **options):
+    asked = StatisticsOptions(areas=folder / "areas.json", **options)
+    place = folder / "scene.xml" if scene else None
+    return setting_of(place, None, None, read_areas(folder / "areas.json"), asked, namespace("llvm_ad_rgb"))
+
+
+def test_cohorts_are_those_of_the_table_or_of_the_rays(tmp_path, rgb):
+    write_place(tmp_path)
+    (tmp_path / "who.csv").write_text("person,cohort\na,old\nb,new\n")
+    found = setting(tmp_path)
+    assert found.members == [(0,), (1,), (0, 1)] and found.margin == 0.03
+    assert found.counting(False, ("x",)).cohort_names == ("x",) and found.counting(True, ()).hits
+    table = setting(tmp_path, cohorts=tmp_path / "who.csv").counting(False, ("x",))
+    assert table.cohort_names == ("new", "old") and list(table.movable) == [0, 1]
+
+
+def test_where_no_place_is_known_things_hide_each_other(tmp_path, rgb):
+    write_place(tmp_path)
+    areas = (
+        (tmp_path / "areas.json").read_text().replace('"shape": "stand"', '"min": [2.5, 1, 0], "max": [2.9, 2, 2.2]')
+    )
+    (tmp_path / "areas.json").write_text(areas)
+    found = setting(tmp_path, scene=False, seen=True)
+    depth = found._depth_or_things(np.array([[0.0, 1.6, 1.5], [0, 2.4, 1.5]]), np.array([[1.0, 0, 0]] * 2))
+    assert np.allclose(depth, (2.5, 4.0))
+
+
+def test_what_is_plainly_wrong_is_told_before_anything_is_loaded(tmp_path, rgb):
+    write_place(tmp_path)
+    with pytest.raises(NergError, match="--window is NAME=FROM,TO"):
+        setting(tmp_path, windows=("late",))
+
+
+# ---- Support and the spread of an ensemble, from foretold numbers that are known ----
+
+
+ZONE = Cell("zone", "z")
+
+
+TRUST_EYES = Eyes(
+    np.zeros((3, 3)),
+    np.ones((3, 3)),
+    ("Ada", "Ada", "Bo"),
+    (frozenset([ALL]), frozenset([ALL, ZONE]), frozenset([ALL])),
+)
+
+
+TIMES = {ALL: {"Ada": 2.0, "Bo": 6.0}, ZONE: {"Ada": 1.0}}
+
+
+def foretold(*members, support=(1.0, 8.0, 3.0)):
+    each = np.array(members, float)[:, :, None]
+    return Foretold(each.mean(axis=0), each.mean(axis=0), each.mean(axis=0) > 0, np.array(support), each)
+
+
+def rows():
+    both = [{"cell": "all", "value": ""}, {"cell": "zone", "value": "z"}]
+    made = [c | {"thing": "a", "source": s, "people": 2} for c in both for s in ("tracked", "field")]
+    return [row | {"share": 0.1, "dwell": 1.0, "reach": 0.5} for row in made]
+
+
+def test01_spread_and_support_of_each_cell():
+    found = rows()
+    add_trust(found, foretold([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
+    tracked, field, _, zone = found
+    assert tracked["support"] is tracked["share_spread"] is None
+    assert field["support"] == 3 and zone["support"] == 8
+    assert (field["places"], zone["places"], tracked["places"]) == (1.5, 1.0, None)
+    # Ada's mean and Bo's, of the first member 0.3 over both, of the second 0.2.
+    assert field["share_spread"] == pytest.approx(0.1 / np.sqrt(2))
+    assert field["dwell_spread"] == pytest.approx((0.2 * 2 + 0.4 * 6 - 0.2 * 2 - 0.2 * 6) / 2 / np.sqrt(2))
+    assert zone["share_spread"] == pytest.approx(0.1 / np.sqrt(2)) and 0 < zone["reach_spread"] < 1
+
+
+def test02_nothing_of_one_field_or_what_is_blank():
+    found = rows()
+    add_trust(found, foretold([0.1, 0.3, 0.4]), TRUST_EYES, TIMES, 0.3)
+    assert all(row["share_spread"] is None for row in found)
+    blank = [row | {"people": None, "share": None} for row in rows()]
+    add_trust(blank, foretold([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
+    assert all(row["share_spread"] is row["support"] is None for row in blank)
+    assert blank[1]["dwell_spread"] is not None
+
+
+def test03_a_checkpoint_without_support_is_told_of():
+    told = Recorder()
+    tell_support(foretold([0.1, 0.3, 0.4]), told)
+    assert told.messages == []
+    none = foretold([0.1, 0.3, 0.4], support=(np.nan,) * 3)
+    assert support_of(none) is None and support_of(foretold([1, 1, 1]), np.zeros(3, bool)) is None
+    tell_support(none, told)
+    assert "keeps no support" in told.messages[0] and "nerg train gaze" in told.messages[0]
+
+
+def test_few_places_a_person_are_told():
+    told = Recorder()
+    tell_places(TRUST_EYES, told)
+    assert len(told.messages) == 1 and "1.5 places a person" in told.messages[0] and "--eyes 32 " in told.messages[0]
+    count = 2 * PLACES
+    many = Eyes(np.zeros((count, 3)), np.ones((count, 3)), ("Ada", "Bo") * PLACES, (frozenset([ALL]),) * count)
+    tell_places(many, told)
+    tell_places(Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ()), told)
+    assert len(told.messages) == 1
+
+
+# ---- The table of a change, from foretold numbers that are known ----
+
+
+AREAS = Areas((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])))
+
+
+WHAT_IF_EYES = places_of(np.arange(15.0).reshape(5, 3))
+
+
+def told(share, support=5.0, members=1):
+    """Of an ensemble the members differ by 0.1 times their number from the first, at the first eye."""
+    share = np.asarray(share, float)
+    each = np.stack([share + 0.1 * k * (np.arange(len(share)) == 0)[:, None] for k in range(members)])
+    return Foretold(share, share, share > 0, np.full(len(share), support), each)
+
+
+def rows_what_if(tmp_path, changes, after, floor=None, members=1):
+    (tmp_path / "c.json").write_text(json.dumps(changes))
+    asked = []
+
+    def foretell(there, eyes):
+        asked.append((eyes, there.areas, there.things))
+        return after
+
+    before = told([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]], members=members)
+    around, things = Surroundings(None, None, Similarity()), things_of(AREAS.things, {})
+    setting = Setting(around, AREAS, things, StatisticsOptions())
+    found = what_if_rows(tmp_path / "c.json", setting, WHAT_IF_EYES, before, foretell, floor or Floor(), 199, 0)
+    return {(r["thing"], r["measure"]): r for r in found}, asked[0]
+
+
+def test01_the_same_people_are_compared_with_themselves(tmp_path):
+    after = told([[0.2, 0.1], [0.3, 0.1], [0.21, 0.1], [0.29, 0.1], [0.25, 0.1]])
+    found, (eyes, areas, things) = rows_what_if(tmp_path, {"move": [{"area": "a", "by": [5, 0, 0]}]}, after)
+    share = found["a", "share"]
+    assert share["before"] == pytest.approx(0.15) and share["after"] == pytest.approx(0.25)
+    assert share["difference"] == pytest.approx(0.1) and 0.08 < share["low"] < 0.1 < share["high"] < 0.12
+    assert share["support"] == 5 and share["source"] == "field" and share["people"] == 5
+    assert found["b", "visible"]["after"] == 1 and found["b", "visible"]["before"] == 0
+    assert areas.boxes[0].lower[0] == 5 and eyes is WHAT_IF_EYES and len(things) == 2
+
+
+def test02_other_observers_are_other_people(tmp_path):
+    after = told([[0.5, 0.5]] * 2)
+    found, (eyes, *_) = rows_what_if(tmp_path, {"observers": [[9, 9, 9], [8, 8, 8]], "shift": [0, 0, 1]}, after)
+    assert eyes.positions.tolist() == [[9, 9, 10], [8, 8, 9]]
+    assert found["a", "share"]["after"] == 0.5 and found["a", "share"]["before"] == pytest.approx(0.15)
+
+
+def test03_a_floor_on_people(tmp_path):
+    floor = Floor(9)
+    found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5), floor)
+    assert all(r["before"] is None and r["difference"] is None for r in found.values()) and floor.blanked == 4
+
+
+def test04_members_of_an_ensemble(tmp_path):
+    after = told([[0.2, 0.1]] * 5, members=2)
+    found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, after, members=2)
+    # Both move alike, of which the mean says nothing; then only one of them.
+    assert found["a", "share"]["difference_spread"] == pytest.approx(0, abs=1e-12)
+    assert found["a", "visible"]["difference_spread"] is None
+    found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, replace(after, members=after.members[[0, 0]]), members=2)
+    assert found["a", "share"]["difference_spread"] == pytest.approx(0.1 / 5 / np.sqrt(2))
+    assert (
+        rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5))[0]["a", "share"]["difference_spread"]
+        is None
+    )
+
+
+def test05_no_support(tmp_path):
+    found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5, np.nan))
+    assert all(row["support"] is None for row in found.values())

@@ -1,0 +1,309 @@
+"""Tests of `nerg_mi.aoi.scene`."""
+
+from __future__ import annotations
+
+import json
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.aoi.scene import (
+    changed_areas,
+    changed_scene,
+    read_changes,
+    read_cohorts,
+    scene_of,
+    shape_named,
+    shapes_of,
+    surroundings_of_files,
+    thing_of_shape,
+    things_of,
+)
+from nerg_mi.errors import NergError
+from nerg_mi.files.tables import write_csv
+from nerg_mi.formats.areas import Areas, Group, MeshPart, Region, SceneShape
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.rendering.scene import load_scene
+from nerg_mi.surfaces.mesh import mitsuba_mesh
+
+from .place import SIGN, STAND, first_box, people, write_place
+
+# ---- Changes to a scene: read, and made ----
+
+
+@pytest.fixture(scope="module")
+def scene_changes(tmp_path_factory):
+    return load_scene(write_place(tmp_path_factory.mktemp("place"), gaze=False), merge=False)
+
+
+def written(tmp_path, **changes):
+    (tmp_path / "c.json").write_text(json.dumps(changes))
+    return read_changes(tmp_path / "c.json")
+
+
+def cast(scene, o, d):
+    import mitsuba as mi
+
+    ray = mi.Ray3f(mi.Point3f(*map(float, o)), mi.Vector3f(*map(float, d)))
+    return float(np.array(scene.ray_intersect_preliminary(ray).t).ravel()[0])
+
+
+EYE, EAST = (1.0, 1.6, 1.6), (1.0, 0, 0)
+
+
+def test01_moved_and_turned(scene_changes, tmp_path):
+    assert cast(scene_changes, EYE, EAST) == pytest.approx(1.5)
+    moved, shapes = changed_scene(scene_changes, written(tmp_path, move=[{"shape": "stand", "by": [0.3, 0, 0]}]))
+    assert cast(moved, EYE, EAST) == pytest.approx(1.8, abs=1e-5) and set(shapes) == {"room", "sign", "stand"}
+    # A quarter turn about its own middle: 0.4 x 1 m become 1 x 0.4 m.
+    turned, _ = changed_scene(scene_changes, written(tmp_path, move=[{"shape": "stand", "turn": 90}]))
+    assert cast(turned, EYE, EAST) == pytest.approx(2.7 - 0.5 - 1.0, abs=1e-5)
+    assert cast(turned, (1.0, 1.9, 1.6), EAST) == pytest.approx(3.0, abs=1e-5)
+    # The scene that there was is as it was, and so are the names of its shapes.
+    assert cast(scene_changes, EYE, EAST) == pytest.approx(1.5)
+    assert {s.id() for s in scene_changes.shapes()} == {"room", "sign", "stand"}
+
+
+def test02_removed_added_and_swapped(scene_changes, tmp_path):
+    removed, shapes = changed_scene(scene_changes, written(tmp_path, remove=["stand"]))
+    assert cast(removed, EYE, EAST) == pytest.approx(3.0) and "stand" not in shapes
+    wall = {"name": "wall", "min": [2, 0, 0], "max": [2.1, 4, 3]}
+    added, shapes = changed_scene(scene_changes, written(tmp_path, add=[wall]))
+    assert cast(added, EYE, EAST) == pytest.approx(1.0) and cast(added, (2.05, 1, 1), EAST) == pytest.approx(
+        0.05, abs=1e-5
+    )
+    swapped, _ = changed_scene(scene_changes, written(tmp_path, swap=[wall | {"shape": "stand"}]))
+    assert cast(swapped, EYE, EAST) == pytest.approx(1.0)
+    (tmp_path / "tri.obj").write_text("v 2.2 0 0\nv 2.2 4 0\nv 2.2 2 9\nf 1 2 3\n")
+    mesh, _ = changed_scene(scene_changes, written(tmp_path, swap=[{"shape": "stand", "mesh": "tri.obj"}]))
+    assert cast(mesh, EYE, EAST) == pytest.approx(1.2)
+
+
+def test03_areas_follow(tmp_path):
+    box = Region.of("shelf", *SIGN)
+    areas = Areas((box, SceneShape("stand", "stand"), Group("all", ("shelf", "stand")), Group("g", ("stand",))))
+    found = changed_areas(
+        areas, written(tmp_path, move=[{"area": "shelf", "by": [1, 0, 0], "turn": 90}], remove=["stand"])
+    )
+    assert found.names == ("shelf", "all") and found.members()["all"] == (0,)
+    assert np.allclose(found.boxes[0].bounds, [[4.6, 1.9, 1.0], [5.6, 2.1, 2.0]])
+    more = changed_areas(areas, written(tmp_path, add=[{"name": "x", "min": [0, 0, 0], "max": [1, 1, 1]}]))
+    assert more.areas[-1] == SceneShape("x", "x")
+    for wrong in ("stand", "nobody"):
+        with pytest.raises(NergError, match="cannot be moved as an area"):
+            changed_areas(areas, written(tmp_path, move=[{"area": wrong}]))
+
+
+def test04_observers(tmp_path):
+    found = written(tmp_path, observers=[[1, 2, 3]], shift=[0, 0, -0.5])
+    assert found.observers.tolist() == [[1, 2, 3]] and found.shift.tolist() == [0, 0, -0.5] and not found.of_shapes
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"remove": ["nobody"]}, 'no shape "nobody"'),
+        ({"move": [{"shape": "nobody"}]}, 'no shape "nobody"'),
+        ({"remove": ["sign"], "move": [{"shape": "sign"}]}, "taken away"),
+        ({"add": [{"name": "sign", "min": [0, 0, 0], "max": [1, 1, 1]}]}, "already"),
+        ({"remove": ["sign", "stand", "room"]}, "no shape is left"),
+    ],
+)
+def test05_what_cannot_be_done(scene_changes, tmp_path, changes, said):
+    with pytest.raises(NergError, match=said):
+        changed_scene(scene_changes, written(tmp_path, **changes))
+
+
+def test06_a_field_cannot_be_taken_apart(tmp_path):
+    with pytest.raises(NergError, match="give one"):
+        changed_scene(None, written(tmp_path, remove=["sign"]))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"mvoe": []},
+        {"move": []},
+        {"move": 3},
+        {"move": [3]},
+        {"move": [{"by": [1, 0, 0]}]},
+        {"move": [{"shape": "a", "area": "b"}]},
+        {"move": [{"shape": "a", "by": [1, 0]}]},
+        {"move": [{"shape": "a", "by": [1, 0, 1e300]}]},
+        {"move": [{"shape": "a", "turn": "x"}]},
+        {"move": [{"shape": "a", "spin": 1}]},
+        {"remove": [3]},
+        {"remove": [""]},
+        {"add": [{"min": [0, 0, 0], "max": [1, 1, 1]}]},
+        {"add": [{"name": "a"}]},
+        {"add": [{"name": "a", "mesh": "../a.ply"}]},
+        {"add": [{"name": "a", "mesh": "/a.ply"}]},
+        {"add": [{"name": "a", "mesh": "a.stl"}]},
+        {"swap": [{"name": "a", "mesh": "a.ply"}]},
+        {"observers": [[1, 2]]},
+        {"shift": [1, 2, None]},
+    ],
+)
+def test07_others_are_told_in_a_sentence(tmp_path, changes):
+    with pytest.raises(NergError) as told:
+        written(tmp_path, **changes)
+    assert str(tmp_path) in str(told.value) and "\n" not in str(told.value)
+
+
+# ---- Cohorts of people from a table ----
+
+
+def test01_read(tmp_path):
+    (tmp_path / "c.csv").write_text("cohort;person\nold;Ada\nyoung;Bo\nold;Ada\n")
+    assert read_cohorts(tmp_path / "c.csv") == {"Ada": "old", "Bo": "young"}
+
+
+def test_names_come_back_as_they_were_written(tmp_path):
+    cohorts = {"=Ada": "-old", "@Bo": "+young", "'Cy": "old", "'=Di": "-1"}
+    write_csv(tmp_path / "c.csv", [{"person": k, "cohort": v} for k, v in cohorts.items()])
+    assert read_cohorts(tmp_path / "c.csv") == cohorts
+
+
+@pytest.mark.parametrize(
+    "text", ["person,cohort\n", "person,group\nAda,old\n", "person,cohort\nAda,old\nAda,young\n", ""]
+)
+def test02_refused(tmp_path, text):
+    (tmp_path / "c.csv").write_text(text)
+    with pytest.raises(NergError, match=r"c\.csv"):
+        read_cohorts(tmp_path / "c.csv")
+
+
+# ---- What files say of a place: surfaces, gaze, frames ----
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("place")
+    write_place(made)
+    (made / "bare").mkdir()
+    write_place(made / "bare", gaze=False)
+    return made
+
+
+def test01_depths_are_those_of_the_shapes(folder):
+    around = surroundings_of_files(folder / "bare" / "scene.xml", None, None, None, ns)
+    rays = people()
+    expected = [first_box(o, d)[1] for o, d in zip(rays.origin, rays.direction)]
+    assert np.allclose(around.depth(rays.origin, rays.direction), expected, rtol=1e-4) and around.gaze is None
+    assert np.allclose(around.bounds(), [[0, 0, 0], [6, 4, 3]], atol=1e-5)
+
+
+def test02_gaze_of_the_scene_or_beside_it(folder):
+    d = np.array([[1.0, 0, 0], [0, 1, 0]])
+    own = surroundings_of_files(folder / "scene.xml", None, None, None, ns)
+    beside = surroundings_of_files(folder / "bare" / "scene.xml", None, folder / "gaze.safetensors", None, ns)
+    eye = np.array([1.0, 1.0, 1.5])
+    found, other = own.look_from(eye)(d), beside.look_from(eye)(d)
+    assert found[0].shape == (1, 2) and np.allclose(found[0], other[0], rtol=1e-4)
+    assert np.allclose(found[1], own.depth(np.broadcast_to(eye, d.shape), d)) and np.allclose(found[1], other[1])
+    assert np.isnan(own.support(eye))
+
+
+def test03_frames(folder):
+    matrix = np.diag([2.0, 2, 2, 1])
+    matrix[:3, 3] = 1, 0, 0
+    around = surroundings_of_files(folder / "scene.xml", None, None, Similarity(matrix), ns)
+    assert around.scale == pytest.approx(2) and np.allclose(around.points(np.ones(3)), [3, 2, 2])
+    assert np.allclose(around.directions(np.array([0, 0, 1.0])), [0, 0, 1])
+
+
+def test04_nothing_is_known(folder):
+    around = surroundings_of_files(None, None, None, None, ns)
+    assert np.isinf(around.depth(np.zeros((3, 3)), np.eye(3))).all()
+    with pytest.raises(NergError, match="no place"):
+        around.bounds()
+
+
+def test05_two_places(folder):
+    with pytest.raises(NergError, match="both a place"):
+        surroundings_of_files(folder / "scene.xml", folder / "field.safetensors", None, None, ns)
+    (folder / "empty.xml").write_text('<scene version="3.0.0"><integrator type="path"/></scene>')
+    with pytest.raises(NergError, match="neither shapes nor a field"):
+        surroundings_of_files(folder / "empty.xml", None, None, None, ns)
+
+
+# ---- Areas as things: meshes, some of their faces, shapes of a scene ----
+
+
+TWO = "v 1 0 0\nv 1 1 0\nv 1 0 1\nv 3 0 0\nv 3 1 0\nv 3 0 1\nf 1 2 3\nf 4 5 6\n"
+
+
+@pytest.fixture(scope="module")
+def scene_things(tmp_path_factory):
+    return load_scene(write_place(tmp_path_factory.mktemp("place"), gaze=False), merge=False)
+
+
+def test01_one_of_each(scene_things, tmp_path):
+    (tmp_path / "two.obj").write_text(TWO)
+    areas = [
+        Region.of("box", *SIGN),
+        MeshPart("both", tmp_path / "two.obj"),
+        MeshPart("far", tmp_path / "two.obj", ((1, 1),)),
+        SceneShape("stand", "stand"),
+    ]
+    things = things_of(areas, shapes_of(scene_things))
+    assert [t.name for t in things] == ["box", "both", "far", "stand"] and [t.open for t in things] == [
+        False,
+        True,
+        True,
+        True,
+    ]
+    o, d = np.array([[0.0, 0.2, 0.2], [0, 1.5, 1.5]]), np.tile([1.0, 0, 0], (2, 1))
+    near = np.array([t.interval(o, d)[0] for t in things])
+    assert np.allclose(near[1:], [[1.0, np.inf], [3.0, np.inf], [np.inf, 2.5]])
+    # The scene's shapes have their names still.
+    assert set(shapes_of(scene_things)) == {"room", "sign", "stand"}
+
+
+def test02_samples_lie_on_the_surface(scene_things, tmp_path):
+    (tmp_path / "two.obj").write_text(TWO)
+    both, stand = things_of(
+        [MeshPart("m", tmp_path / "two.obj"), SceneShape("stand", "stand")], shapes_of(scene_things)
+    )
+    points, normals = both.samples(64)
+    assert points.shape == (64, 3) and not normals.any()
+    assert (np.isclose(points[:, 0], 1) | np.isclose(points[:, 0], 3)).all() and 20 < np.isclose(
+        points[:, 0], 1
+    ).sum() < 44
+    points, _ = stand.samples(64)
+    on = np.isclose(points, STAND[0], atol=1e-5) | np.isclose(points, STAND[1], atol=1e-5)
+    assert on.any(axis=1).all() and (points > STAND[0] - 1e-5).all() and (points < STAND[1] + 1e-5).all()
+
+
+def test03_a_sphere():
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    ball = thing_of_shape("ball", mi.load_dict({"type": "sphere", "radius": 0.5, "center": [2, 0, 0]}))
+    near, far = ball.interval(np.zeros((1, 3)), np.array([[1.0, 0, 0]]))
+    assert near == pytest.approx(1.5) and far == near
+    points, _ = ball.samples(50)
+    assert np.allclose(np.linalg.norm(points - (2, 0, 0), axis=1), 0.5, atol=1e-5)
+
+
+def test04_what_there_is_not(scene_things, tmp_path):
+    with pytest.raises(NergError, match='"x"'):
+        shape_named(shapes_of(scene_things), "x")
+    with pytest.raises(NergError, match="give a scene"):
+        shape_named(shapes_of(None), "x")
+    with pytest.raises(NergError, match="there is no mesh"):
+        things_of([MeshPart("m", tmp_path / "none.ply")], {})
+    (tmp_path / "two.obj").write_text(TWO)
+    with pytest.raises(NergError, match="face 2"):
+        things_of([MeshPart("m", tmp_path / "two.obj", ((0, 2),))], {})
+
+
+def test05_meshes_keep_their_names_in_a_scene():
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    mesh = mitsuba_mesh(np.eye(3), np.array([[0, 1, 2]]), "tri")
+    before = mesh.id()
+    assert len(scene_of({"tri": mesh}).shapes()) == 1 and mesh.id() == before

@@ -1,0 +1,448 @@
+"""Tests of `nerg_mi.api.query`."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import nerg_mi as nerg
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.api.query import ObserverOf, box_shares
+from nerg_mi.api.scene import box_dict
+from nerg_mi.formats.areas import Region
+from nerg_mi.report.data import Onlooker
+from nerg_mi.statistics.shares import ROUGH, gaze_shares
+from nerg_mi.statistics.visits import MARGIN, Box
+from nerg_mi.train.geometry import GazePlace
+from nerg_mi.workflows.statistics import statistics
+from tests.aoi.place import SIGN, STAND, write_place
+from tests.plugins import fields
+from tests.workflows.recorder import Recorder
+
+# ---- Attention on boxes, meshes and shapes: what it adds up to, and what hides it ----
+
+
+BOX = [(-0.2, 1.8, -0.1), (0.2, 2.2, 0.1)]
+
+
+EYE = (1.2, 2.2, 1.5)
+
+
+FAR = {"type": "sphere", "radius": 0.01, "center": [0, 0, -50]}
+
+
+def on_sphere(count: int) -> np.ndarray:
+    """Unit directions of equal area (count, 3)."""
+    i = np.arange(count)
+    z, phi = 1 - (2 * i + 1) / count, i * np.pi * (3 - np.sqrt(5))
+    return np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=1)
+
+
+def hits_box(o, d, low, high) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        a, b = (np.array(low) - o) / d, (np.array(high) - o) / d
+    return np.minimum(a, b).max(axis=1) < np.maximum(a, b).min(axis=1)
+
+
+@pytest.fixture
+def empty(files):
+    """Nothing near, and a gaze field."""
+    return nerg.make_scene(gaze=files / "gaze.safetensors", shapes=FAR)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A room with a sign, a stand before it for some, and one side open, as a file; and its scene."""
+    path = write_place(tmp_path_factory.mktemp("room"))
+    return path, nerg.Scene.load(path)
+
+
+def test01_the_share_is_the_integral_over_directions(empty):
+    eye = np.array((0.4, 0.1, 0.2))
+    seen = nerg.attention(empty, box_dict(*np.array(BOX)), eye, divisions=16)
+    d = on_sphere(400_000)
+    d = d[hits_box(eye, d, *BOX) & (d @ (np.mean(BOX, axis=0) - eye) > 0)]
+    # Where the rays enter the box is where its gaze is.
+    low, high = ((np.array(corner) - eye) / d for corner in BOX)
+    entry = eye + d * np.minimum(low, high).max(axis=1)[:, None]
+    gaze = nerg.observe(empty, entry, eye, "gaze").gaze[0]
+    # A field that is not normalised is divided by its own integral.
+    whole = box_shares(empty, [], eye[None].astype(np.float32)).whole[0]
+    assert np.isclose(seen.share[0], gaze.sum() * 4 * np.pi / 400_000 / whole, rtol=1e-2) and abs(whole - 1) > 0.1
+
+
+def test02_density_times_area_is_the_share(empty):
+    eyes = [(0.4, 0.1, 0.2), (-1, 0.5, 0.3), (0, 5, 0)]
+    seen = nerg.attention(empty, box_dict(*np.array(BOX)), eyes, divisions=3)
+    assert seen.density.shape == (3, 12 * 9) and seen.points.shape == seen.normals.shape == (108, 3)
+    assert np.allclose(seen.density @ seen.area, seen.share, rtol=1e-5)
+    assert np.isclose(seen.area.sum(), 2 * (0.4 * 0.4 + 0.4 * 0.2 + 0.4 * 0.2), rtol=1e-5)
+    assert np.allclose(np.linalg.norm(seen.normals, axis=1), 1, atol=1e-5)
+    # A side that is turned away receives nothing.
+    away = (np.array(eyes)[:, None] - seen.points) @ np.eye(3) * seen.normals
+    assert np.array_equal(seen.density[away.sum(axis=-1) < -1e-5], np.zeros((away.sum(axis=-1) < -1e-5).sum()))
+    assert seen.mean == pytest.approx(float(seen.share.mean()))
+    assert repr(seen).startswith("<Attention: mean share ") and "3 observers" in repr(seen) and seen.error is None
+
+
+def test03_what_stands_before_it_hides_it(files, empty):
+    wall = box_dict(np.array((-3.0, 1.0, -3.0)), np.array((3.0, 1.1, 3.0)))
+    hidden = nerg.make_scene(gaze=files / "gaze.safetensors", shapes=wall)
+    eyes = [(0, 0, 0), (0, 4, 0)]
+    seen, before = (nerg.attention(scene, box_dict(*np.array(BOX)), eyes) for scene in (hidden, empty))
+    assert before.share.min() > 0 and seen.share[0] == 0
+    assert np.isclose(seen.share[1], before.share[1], rtol=1e-3)
+
+
+def test04_a_shape_of_the_scene_by_its_id(files, rgb, tmp_path):
+    box = box_dict(*np.array(BOX))
+    scene = nerg.make_scene(gaze=files / "gaze.safetensors", shapes={"product": box, "far": FAR})
+    path = tmp_path / "box.ply"
+    rgb.load_dict(box).write_ply(str(path))
+    eye = (0.4, 0.1, 0.2)
+    by_id = nerg.attention(scene, "product", eye)
+    # It does not hide itself.
+    assert by_id.share[0] > 0
+    alone = nerg.make_scene(gaze=files / "gaze.safetensors", shapes=FAR)
+    for surface in (box, path, str(path), rgb.load_dict(box)):
+        assert np.isclose(nerg.attention(alone, surface, eye).share[0], by_id.share[0], rtol=1e-4)
+
+
+def test05_both_sides_of_an_open_surface(empty, rgb):
+    mesh = rgb.Mesh("sheet", 3, 1)
+    params = rgb.traverse(mesh)
+    params["vertex_positions"] = np.float32([0, 2, 0, 0.3, 2, 0, 0, 2, 0.3])
+    params["faces"] = np.uint32([0, 1, 2])
+    params.update()
+    eyes = [(0, 0, 0), (0, 4, 0)]
+    one, both = (nerg.attention(empty, mesh, eyes, two_sided=t).share for t in (False, True))
+    assert (one > 0).sum() == 1 and (both > 0).all() and np.allclose(one[one > 0], both[one > 0])
+
+
+@pytest.mark.parametrize(
+    "surface, said",
+    [
+        ("nothing", '"nothing"'),
+        ("nothing.ply", 'there is no mesh "nothing.ply"'),
+        ([(0, 0, 0), (1, 1, -1)], "a box is a lower corner and an upper one"),
+        ([(0, 0, 0)], "a box is a lower corner and an upper one"),
+        ({"type": "sphere"}, "mesh; attention is received"),
+        (object(), "corners of a box"),
+    ],
+)
+def test06_what_is_no_surface(empty, surface, said):
+    with pytest.raises(nerg.NergError, match=said):
+        nerg.attention(empty, surface, (0, 0, 0))
+
+
+def test07_errors_are_sentences(files, empty):
+    with pytest.raises(nerg.NergError, match="make_scene"):
+        nerg.attention(nerg.make_scene(files / "field.safetensors"), BOX, (0, 0, 0))
+    for wrong in (0, 2.5, True):
+        with pytest.raises(nerg.NergError, match="divisions must be a whole number from 1"):
+            nerg.attention(empty, box_dict(*np.array(BOX)), (0, 0, 0), divisions=wrong)
+    for wrong in ({"margin": -1}, {"margin": "a"}, {"tolerance": 0}, {"tolerance": float("nan")}):
+        with pytest.raises(nerg.NergError, match=f"{next(iter(wrong))} must"):
+            nerg.attention(empty, BOX, (0, 0, 0), **wrong)
+    with pytest.raises(nerg.NergError, match="two_sided"):
+        nerg.attention(empty, BOX, (0, 0, 0), divisions=2)
+    with pytest.raises(nerg.NergError, match="no observer of its own"):
+        nerg.attention(empty, BOX)
+
+
+def test09_pieces_are_small_against_their_distance(empty):
+    cube = box_dict(*np.array(BOX))
+    near, far = nerg.attention(empty, cube, (0, 1.5, 0)), nerg.attention(empty, cube, [(0, 0, 0), (0, -30, 0)])
+    assert len(near.area) > len(far.area)
+    finer = nerg.attention(empty, cube, (0, 1.5, 0), divisions=32)
+    assert np.isclose(near.share[0], finer.share[0], rtol=5e-3)
+    assert len(nerg.attention(empty, cube, np.mean(BOX, axis=0)).area) == 12 * 32**2
+
+
+def test08_progress_is_told(empty):
+    told = []
+
+    class Reporter:
+        def message(self, text): ...
+        def warn(self, text): ...
+        def progress(self, share, text=""):
+            told.append(share)
+
+    nerg.attention(empty, box_dict(*np.array(BOX)), [(0, 0, 0), (0.1, 0, 0)], reporter=Reporter())
+    assert told == [0.5, 1.0]
+
+
+def rays_of_gaze(scene, eye, count=40_000, seed=0):
+    """Where so many rays end that are drawn from an observer's gaze by rejection: (count, 3)."""
+    d = np.random.default_rng(seed).normal(size=(20 * count, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    seen = nerg.trace(scene, eye, d, ["gaze", "depth"], observers=[eye])
+    gaze, depth = seen.gaze[0], np.ravel(seen.depth)
+    chosen = np.flatnonzero(np.random.default_rng(seed + 1).random(len(d)) * gaze.max() < gaze)[:count]
+    assert len(chosen) == count and (depth[chosen] > 0).all()
+    return eye + depth[chosen, None] * d[chosen]
+
+
+def test10_a_larger_box_never_has_less_and_has_what_rays_say(room):
+    _, scene = room
+    grown = (0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 9.0)
+    regions = [Region.of("sign", SIGN[0] - g, SIGN[1] + g) for g in grown]
+    found = box_shares(scene, regions, np.float32([EYE]))
+    share, error = found.share[0], found.error[0]
+    assert (np.diff(share) >= -error[1:]).all() and share[-1] == pytest.approx(1, abs=2e-6)
+    assert (error < 0.01 * share + 1e-4).all()
+    ends = rays_of_gaze(scene, EYE)
+    for region, value, err in zip(regions, share, error):
+        rays = region.holds(ends, 1e-4).mean()
+        assert abs(value - rays) < 3 * np.sqrt(rays * (1 - rays) / len(ends)) + err
+    alone = nerg.attention(scene, "sign", EYE)
+    assert share[0] == pytest.approx(alone.share[0], abs=error[0] + 5e-3 * share[0])
+    one = nerg.attention(scene, SIGN, EYE)
+    assert one.share[0] == pytest.approx(share[0], abs=error[0]) and one.error[0] < 0.01 * one.share[0]
+
+
+@pytest.mark.parametrize("eye", [EYE, (5.5, 3.5, 0.4)])
+def test11_boxes_that_fill_space_share_out_all_of_the_gaze(files, eye):
+    """With what escapes; planes between them pass through the observer, too."""
+    shapes = {"floor": box_dict(np.array((0.0, 0, -1)), np.array((6.0, 4, 0)))}
+    shapes["stand"] = box_dict(*STAND)
+    scene = nerg.make_scene(gaze=files / "gaze.safetensors", shapes=shapes)
+    cuts = [(-1e6, eye[0], 2.5, 1e6), (-1e6, 1.0, eye[1], 1e6), (-1e6, 0.001, 1.1, 1e6)]
+    cuts = [sorted(set(c)) for c in cuts]
+    spans = [list(zip(c[:-1], c[1:])) for c in cuts]
+    corners = [np.transpose((a, b, c)) for a in spans[0] for b in spans[1] for c in spans[2]]
+    regions = [Region.of(f"{k}", *corner) for k, corner in enumerate(corners)]
+    found = box_shares(scene, regions, np.float32([eye]), margin=0.0)
+    assert 0.2 < found.escaped[0] < 0.8
+    assert found.share.sum() + found.escaped[0] == pytest.approx(1, abs=3 * np.linalg.norm(found.error))
+    assert np.linalg.norm(found.error) < 2e-3
+    # Of two boxes beside each other it is the sum.
+    whole = nerg.attention(scene, [(2.0, 0.5, -0.5), (4.0, 3.0, 2.3)], eye, margin=0)
+    parts = [nerg.attention(scene, [(2 + k, 0.5, -0.5), (3 + k, 3.0, 2.3)], eye, margin=0) for k in range(2)]
+    assert sum(p.share[0] for p in parts) == pytest.approx(whole.share[0], abs=3 * float(whole.error[0]))
+    everything = nerg.attention(scene, [(-1e7,) * 3, (1e7,) * 3], eye)
+    assert everything.share[0] + everything.escaped[0] == pytest.approx(1, abs=1e-5)
+
+
+def test12_small_things_are_seen(files):
+    """A cube of 2 cm, three metres away, which no direction of a coarse rule meets; and none of what it hides."""
+    thing = np.array([(-0.01, 2.99, 0.2), (0.01, 3.01, 0.22)])
+    scene = nerg.make_scene(gaze=files / "gaze.safetensors", shapes={"thing": box_dict(*thing), "far": FAR})
+    by_id = nerg.attention(scene, "thing", (0, 0, 0.1))
+    by_box = nerg.attention(scene, thing, (0, 0, 0.1), tolerance=1e-3)
+    assert 0 < by_id.share[0] < 1e-4 and by_box.share[0] == pytest.approx(by_id.share[0], rel=0.05)
+    assert nerg.attention(scene, thing + (0, 0, 0.5), (0, 0, 0.1)).share[0] == 0
+    assert nerg.attention(scene, thing + (0, 1, 0), (0, 0, 0.1)).share[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("box", "eye", "said"),
+    [
+        ([(-1e30,) * 3, (1e30,) * 3], EYE, "the corners of a box must have coordinates from"),
+        ([(0, 0, 0), (10**400, 1, 1)], EYE, "the corners of a box must have coordinates from"),
+        (BOX, (10**400, 0, 0), "observers must have coordinates from"),
+        (BOX, (float("nan"), 0, 0), "observers must have coordinates from"),
+    ],
+)
+def test13_what_is_beyond_all_measure_is_told(empty, box, eye, said):
+    with pytest.raises(nerg.NergError, match=said):
+        nerg.attention(empty, box, eye)
+
+
+def test14_statistics_viewer_and_report_say_the_same(room):
+    from nerg_mi.viewer.session import shares_in_steps
+
+    path, scene = room
+    regions = [Region.of("the sign", *SIGN), Region.of("corner", (4.5, 2.5, 0), (6.1, 4.1, 3.1), 20)]
+    eye = np.array(EYE)
+    here = nerg.attention(scene, SIGN, eye)
+    options = StatisticsOptions(
+        areas=path.parent / "areas.json", observers=(",".join(map(str, EYE)),), resamples=199, mode="llvm_ad_rgb"
+    )
+    told = {row["thing"]: row["share"] for row in statistics([path], options=options).things}
+    assert options.margin == MARGIN
+    assert told["the sign"] == pytest.approx(here.share[0], rel=0.03)
+    assert told["the stand"] == pytest.approx(nerg.attention(scene, "stand", eye).share[0], rel=0.03)
+    (viewer, *_) = shares_in_steps(scene, eye, regions, [])
+    assert viewer["the sign"] == pytest.approx(here.share[0], rel=0.03)
+    field = scene.integrator.gaze.field
+    onlooker = Onlooker(field, GazePlace(scene.place, field.box, "scene"))
+    things = [Box(region) for region in regions]
+    report = gaze_shares(onlooker.look_from, eye[None], things, [(0,), (1,)], MARGIN, ROUGH)
+    assert report.share[0, 0] == pytest.approx(here.share[0], rel=0.03)
+    assert report.share[0, 1] == pytest.approx(viewer["corner"], rel=0.03) and viewer["corner"] > 1e-3
+
+
+# ---- One observer of a scene: what is known of them, and the density of their gaze ----
+
+
+def test01_the_density_is_the_fields(scene, rgb):
+    observer = ObserverOf(scene, np.float32((0.3, -3, 0.4)))
+    p_od, r_o = rgb.Point3f(0.2, -0.5, 0.1), dr.normalize(rgb.Vector3f(-0.1, 2.5, -0.3))
+    field = nerg.load_gaze(scene.integrator.children["gaze"].filename).network
+    expected = field.evaluate(p_od, rgb.Point3f(0.3, -3, 0.4), r_o)[0]
+    assert np.isclose(observer.density(p_od, observer.center, r_o, True)[0], expected[0], rtol=1e-5)
+
+
+def test02_one_kernel_serves_all_observers(scene, rgb):
+    points = rgb.Point3f([0.1, 0.2, 0.3], [-1, -1, -1], [0, 0, 0.1])
+    kernels = []
+    for eye in ((0.3, -3, 0.4), (2.5, -1, 0.5), (0, -2, 0)):
+        observer = ObserverOf(scene, np.float32(eye))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(observer.sees(points, True))
+            kernels.append({k["hash"] for k in dr.kernel_history() if "hash" in k})
+    assert kernels[0] and kernels[0] == kernels[1] == kernels[2]
+
+
+def test03_without_a_gaze_field_there_is_no_density(files):
+    observer = ObserverOf(nerg.make_scene(files / "field.safetensors"), np.float32((0, -3, 0)))
+    with pytest.raises(ValueError, match="without a gaze field"):
+        observer.density(None, None, None, True)
+
+
+# ---- What rays meet and what observers see of points: against pictures, and where the answer is known ----
+
+
+BALL = {"type": "sphere", "radius": 0.5}
+
+
+@pytest.fixture
+def ball(files):
+    """A ball of radius 1/2 around the origin, with a gaze field."""
+    return nerg.make_scene(gaze=files / "gaze.safetensors", shapes=BALL)
+
+
+def pixel_rays(rgb, scene, camera):
+    """Rays through the middles of a camera's pixels."""
+    sensor = scene.sensor(camera)
+    x, y = np.meshgrid((np.arange(camera.width) + 0.5) / camera.width, (np.arange(camera.height) + 0.5) / camera.height)
+    at = rgb.Point2f(np.float32(x.ravel()), np.float32(y.ravel()))
+    ray, _ = sensor.sample_ray(0, 0, at, rgb.Point2f(0.5))
+    return np.array(ray.o).T, np.array(ray.d).T
+
+
+def test01_rays_are_those_of_a_fine_picture(scene, rgb):
+    # One pixel of half a degree, through whose middle a ray goes.
+    camera = nerg.Camera((0.3, -3, 0.4), (0, 0, 0), fov=0.01, width=1, height=1)
+    o, d = pixel_rays(rgb, scene, camera)
+    eye = (2.5, -1, 0.5)
+    quantities = ("color", "depth", "gaze", "visibility", "position", "opacity")
+    picture = nerg.render(scene, eye, quantities, camera=camera, spp=4)
+    seen = nerg.trace(scene, o, d, quantities, observers=eye)
+    for name in quantities:
+        assert np.allclose(seen[name][0, 0], picture[name][0, 0, 0], rtol=2e-2, atol=1e-3), name
+
+
+def test02_depth_and_position_on_a_ball(ball):
+    seen = nerg.trace(ball, [(0, -3, 0), (0, 3, 0.1), (0, 3, 1)], [(0, 2, 0), (0, -1, 0), (0, -1, 0)])
+    assert np.allclose(seen.depth, [2.5, 3 - np.sqrt(0.25 - 0.01), 0], atol=1e-5)
+    assert np.array_equal(seen.opacity, [1, 1, 0])
+    where = nerg.trace(ball, (0, -3, 0), (0, 1, 0), "position")
+    assert np.allclose(where.position, [(0, -0.5, 0)], atol=1e-5) and where.names == ("position",)
+
+
+def test03_who_stands_at_the_origin_of_a_ray_looks_along_it(scene):
+    o = np.array([(0.3, -3, 0.4), (2.5, -1, 0.5), (0.3, -3, 0.4)])
+    d = -o + [(0, 0, 0), (0, 0, 0), (0.1, 0, 0.1)]
+    seen = nerg.trace(scene, o, d, ["gaze", "visibility", "depth"])
+    assert seen.gaze.shape == (3,) and seen.observers is None
+    for i in range(3):
+        alone = nerg.trace(scene, o[i], d[i], ["gaze", "visibility", "depth"], observers=o[i])
+        assert np.allclose([alone.gaze[0, 0], alone.depth[0, 0]], [seen.gaze[i], seen.depth[i]], rtol=1e-4)
+        assert seen.visibility[i] == 1
+    assert seen.gaze.min() > 0
+
+
+def test04_points_before_on_and_behind_a_ball(ball):
+    eye, points = (0, -3, 0), [(0, -1, 0), (0, -0.5, 0), (0, 0.5, 0), (0, 2, 0), (2, 0, 0)]
+    seen = nerg.observe(ball, points, eye)
+    assert np.array_equal(seen.visibility, [[1, 1, 0, 0, 1]])
+    assert np.allclose(seen.distance, [[2, 2.5, 3.5, 5, np.sqrt(13)]])
+    assert np.allclose(seen.depth[0, 2:4], 2.5, atol=1e-4) and np.isclose(seen.depth[0, 4], np.sqrt(13), atol=1e-3)
+    assert np.array_equal(seen.gaze[0] > 0, [True, True, False, False, True])
+
+
+def test05_gaze_at_a_point_is_that_of_the_ray_that_meets_it(scene):
+    eyes = [(0.3, -3, 0.4), (2.5, -1, 0.5)]
+    there = nerg.trace(
+        scene, eyes[0], [(-0.1, 1, -0.1), (-0.1, 1, 0)], ["position", "gaze", "visibility"], observers=eyes
+    )
+    points = there.position[0]
+    seen = nerg.observe(scene, points, eyes)
+    # The first observer's own rays meet the points; the second sees some of them.
+    assert np.allclose(seen.gaze[0], there.gaze[0], rtol=1e-3) and np.array_equal(seen.visibility[0], [1, 1])
+    assert seen.gaze.shape == (2, 2)
+
+
+def test06_many_are_batches_of_few(scene, monkeypatch):
+    from nerg_mi.api import query
+
+    rng = np.random.default_rng(0)
+    o, d = np.tile((0.3, -3, 0.4), (50, 1)), rng.normal(size=(50, 3)) * 0.2 + (0, 1, 0)
+    whole = nerg.trace(scene, o, d, observers=[(2.5, -1, 0.5)])
+    points = nerg.observe(scene, rng.uniform(-1, 1, (50, 3)), (2.5, -1, 0.5))
+    monkeypatch.setattr(query, "BATCH", 16)
+    rng = np.random.default_rng(0)
+    d = rng.normal(size=(50, 3)) * 0.2 + (0, 1, 0)
+    parts = nerg.trace(scene, o, d, observers=[(2.5, -1, 0.5)])
+    for name in whole:
+        assert np.array_equal(whole[name], parts[name]), name
+    again = nerg.observe(scene, rng.uniform(-1, 1, (50, 3)), (2.5, -1, 0.5))
+    for name in points:
+        assert np.array_equal(points[name], again[name]), name
+
+
+def test07_shapes_of_what_comes_out(scene):
+    rays = {"origins": (0, -3, 0), "directions": np.tile((0.0, 1, 0), (5, 1))}
+    assert nerg.trace(scene, **rays, quantities=["color", "depth"]).color.shape == (5, 3)
+    both = nerg.trace(scene, **rays, quantities=["color", "gaze"], observers=[(0, -3, 0), (1, -3, 0)])
+    assert both.color.shape == (2, 5, 3) and both.gaze.shape == (2, 5) and both.axes == ("observer", "ray")
+    assert nerg.trace(scene, np.tile((0.0, -3, 0), (5, 1)), (0, 1, 0), "depth").depth.shape == (5,)
+
+
+def test08_the_scenes_own_observer_sees(files):
+    scene = nerg.make_scene(files / "field.safetensors", files / "gaze.safetensors", observer=(0, -3, 0))
+    own, given = nerg.observe(scene, (0, -2, 0)), nerg.observe(scene, (0, -2, 0), (0, -3, 0))
+    assert np.array_equal(own.gaze, given.gaze) and np.array_equal(own.observers, [(0, -3, 0)])
+
+
+@pytest.mark.parametrize(
+    "call, said",
+    [
+        (lambda s: nerg.trace(s, (0, 0), (1, 0, 0)), "origins must have the shape"),
+        (lambda s: nerg.trace(s, (0, 0, 0), (0, 0, 0)), "directions must not be zero, and row 0 is"),
+        (lambda s: nerg.trace(s, np.zeros((2, 3)), np.ones((3, 3))), "one origin or as many as directions, 3, got 2"),
+        (lambda s: nerg.trace(s, (0, 0, 0), (0, 0, 1), "gazes"), "gazes"),
+        (lambda s: nerg.observe(s, (0, 0, 0)), "scene has no observer"),
+        (lambda s: nerg.observe(s, (0, 0, 0), (0, 0, 1), "color"), '"color"'),
+        (lambda s: nerg.observe(s, "there", (0, 0, 1)), "points must be numbers"),
+    ],
+)
+def test09_errors_are_sentences(scene, call, said):
+    with pytest.raises(nerg.NergError, match=said) as error:
+        call(scene)
+    assert "\n" not in str(error.value)
+
+
+def test10_without_gaze_points_are_still_seen(files):
+    scene = nerg.make_scene(files / "field.safetensors")
+    assert nerg.observe(scene, (0, -2, 0), (0, -3, 0)).names == ("visibility", "distance", "depth")
+    with pytest.raises(nerg.NergError, match='no quantity "gaze" here'):
+        nerg.observe(scene, (0, -2, 0), (0, -3, 0), "gaze")
+
+
+def test11_mono(mono, files):
+    scene = nerg.make_scene(files / "field.safetensors", files / "gaze.safetensors")
+    assert nerg.trace(scene, (0, -3, 0), (0, 1, 0), "color").color.shape == (1, 1)
+    camera = nerg.Camera((0, -3, 0), (0, 0, 0), width=4, height=3)
+    assert nerg.render(scene, quantities="color", camera=camera, spp=1).color.shape == (1, 3, 4, 1)
+
+
+@pytest.mark.parametrize(("normalized", "expected"), [(True, [0.5, 1.0]), (False, [])])
+def test_progress_is_told_where_every_origin_is_integrated(tmp_path, rgb, normalized, expected):
+    fields.gaze(tmp_path / "gaze.safetensors", normalized=normalized)
+    scene = nerg.make_scene(gaze=tmp_path / "gaze.safetensors", shapes=BALL)
+    told = Recorder()
+    nerg.trace(scene, [(0, -3, 0), (0, 3, 0), (0, -3, 0)], (0, 1, 0), "gaze", reporter=told)
+    assert [share for share, _ in told.steps] == expected

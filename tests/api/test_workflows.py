@@ -1,0 +1,241 @@
+"""Tests of `nerg_mi.api.workflows`."""
+
+from __future__ import annotations
+
+import doctest
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nerg_mi as nerg
+import nerg_mi.api.workflows as module
+from nerg_mi.api import workflows
+from nerg_mi.api.workflows import bake
+from nerg_mi.errors import NergError
+from nerg_mi.formats.ply import write_columns
+from nerg_mi.rays.rays import Rays
+from nerg_mi.workflows import ablation, evaluate, study, train_radiance
+from nerg_mi.workflows import train_gaze as gaze_job
+from nerg_mi.workflows import train_radiance as radiance_job
+from nerg_mi.workflows.ablation import AblationOptions
+from nerg_mi.workflows.geometry import GazeEvaluationOptions
+from nerg_mi.workflows.train_gaze import GazeOptions
+from nerg_mi.workflows.train_radiance import RadianceOptions
+from tests.surfaces.meshes import box
+
+# ---- Alignment ----
+
+
+ROWS = "0,0,0,1,0,0\n2,0,0,5,0,0\n0,1,0,1,2,0\n0,0,1,1,0,2\n"
+
+
+def test_files_may_be_named_by_strings_and_options_are_checked(tmp_path):
+    (tmp_path / "p.csv").write_text("x,y,z,place_x,place_y,place_z\n" + ROWS)
+    found = nerg.align(output=str(tmp_path / "a.json"), pairs=str(tmp_path / "p.csv"))
+    np.testing.assert_allclose(found.matrix, json.loads((tmp_path / "a.json").read_text())["matrix"])
+    np.testing.assert_allclose(found.matrix[:3, :3], 2 * np.eye(3), atol=1e-12)
+    with pytest.raises(nerg.NergError, match='"pair".*"pairs"'):
+        nerg.align(pair="p.csv")
+
+
+# ---- `nerg_mi.api.workflows`: its example, and rays in memory or in a file ----
+
+
+@pytest.mark.nightly
+def test01_the_example_runs(rgb):
+    assert doctest.testmod(module).failed == 0
+
+
+def test02_rays_in_memory_and_in_a_file_are_one(rgb, tmp_path):
+    v, f = box((0, 0, 0), (4, 3, 2.5))
+    write_columns(tmp_path / "room.ply", dict(zip("xyz", v.T)), f)
+    rays = Rays([0.0, 0.1], [0, 0], ("a",), np.ones((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]]), np.ones(2))
+    rays.save(tmp_path / "a.npz")
+    first = bake(tmp_path / "room.ply", rays=rays, detail=1.0)
+    second = bake(str(tmp_path / "room.ply"), str(tmp_path / "b.json"), rays=str(tmp_path / "a.npz"), detail=1.0)
+    assert np.array_equal(first.density, second.density) and second.files == (tmp_path / "b.json",)
+    with pytest.raises(NergError, match='"smoth".*"smooth"'):
+        bake(tmp_path / "room.ply", rays=rays, smoth=0.1)
+
+
+# ---- Evaluation ----
+#
+# Scores from a call: options are passed on to the jobs. That these work is shown by the examples (test_names).
+
+
+class Asked(Exception):
+    """Ends a job before it begins, with what it was asked."""
+
+
+def raise_it(*arguments):
+    raise Asked(*arguments)
+
+
+@pytest.mark.parametrize(
+    "module, job, call, expected",
+    [
+        (
+            train_radiance,
+            "evaluate_radiance",
+            lambda: nerg.evaluate_radiance("f.safetensors", "photos", spp=3, pictures="out"),
+            (
+                Path("f.safetensors"),
+                Path("photos"),
+                train_radiance.RadianceScoreOptions(spp=3, pictures=Path("out"), mode="llvm_ad_rgb"),
+            ),
+        ),
+        (
+            evaluate,
+            "evaluate_gaze",
+            lambda: nerg.evaluate_gaze("g.safetensors", "r.npz", "out", split="pos"),
+            (Path("g.safetensors"), Path("r.npz"), "out", GazeEvaluationOptions(split="pos", mode="llvm_ad_rgb")),
+        ),
+        (
+            ablation,
+            "ablate",
+            lambda: nerg.ablate("r.npz", "out", options=AblationOptions(seeds=2), recipes="small"),
+            (Path("r.npz"), "out", AblationOptions(seeds=2, recipes="small", mode="llvm_ad_rgb")),
+        ),
+        (
+            study,
+            "run_study",
+            lambda: nerg.study("slab", "out", quick=True),
+            ("slab", "out", study.StudyOptions(quick=True, mode="llvm_ad_rgb")),
+        ),
+    ],
+)
+def test01_options_reach_the_jobs(monkeypatch, tmp_path, module, job, call, expected):
+    monkeypatch.chdir(tmp_path)
+    for name in ("f.safetensors", "g.safetensors", "r.npz", "photos"):
+        Path(name).touch()
+    monkeypatch.setattr(module, job, raise_it)
+    with pytest.raises(Asked) as found:
+        call()
+    assert found.value.args[:-1] == expected
+
+
+@pytest.mark.parametrize("name", ["evaluate_radiance", "evaluate_gaze", "ablate", "study"])
+def test02_wrong_options_are_told(name):
+    with pytest.raises(nerg.NergError, match=f'{name} has no option "nothing"'):
+        getattr(nerg, name)("a", "b", nothing=3)
+
+
+# ---- Statistics from a notebook: the example of its docstring, and its options ----
+
+
+def test01_the_example(tmp_path):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    found = doctest.testmod(workflows, extraglobs={"folder": tmp_path})
+    assert found.attempted > 4 and not found.failed
+
+
+def test02_an_option_that_there_is_not():
+    with pytest.raises(NergError, match='no option "area"'):
+        workflows.stats("a.npz", area="x")
+
+
+# ---- Tracking files in, rays out ----
+
+
+COLUMNS = "origin=x,y,z direction=dx,dy,dz t=t person=who"
+
+
+@pytest.fixture
+def table(tmp_path):
+    path = tmp_path / "day.csv"
+    path.write_text("t,who,x,y,z,dx,dy,dz\n0,Ada,100,200,160,1,0,0\n1,Bob,100,200,160,0,0,1\n")
+    return path
+
+
+def test01_options_are_the_readers(table):
+    rays = nerg.import_rays(table, columns=COLUMNS, units="cm")
+    assert np.allclose(rays.origin, [(1, 2, 1.6)] * 2) and rays.persons == ("Ada", "Bob")
+
+
+def test02_options_of_the_import(table, tmp_path):
+    out = tmp_path / "rays.npz"
+    rays = nerg.import_rays([table], columns=COLUMNS, output=out, pseudonyms=True)
+    assert not {"Ada", "Bob"} & set(rays.persons)
+    assert nerg.load_rays(out).persons == rays.persons
+
+
+def test03_wrong_options_are_told(table):
+    with pytest.raises(nerg.NergError, match="colums"):
+        nerg.import_rays(table, colums=COLUMNS)
+    with pytest.raises(nerg.NergError, match='"nope"'):
+        nerg.import_rays(table, "nope")
+
+
+def test04_progress_is_told(table):
+    told = []
+
+    class Reporter:
+        def message(self, text): ...
+        def warn(self, text): ...
+        def progress(self, share, text=""):
+            told.append(text)
+
+    nerg.import_rays(table, columns=COLUMNS, reporter=Reporter())
+    assert any("day.csv" in text for text in told)
+
+
+# ---- Training ----
+#
+# Trainings from a call: options are passed on, and what comes back is a field in memory with its provenance.
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What the jobs were asked last."""
+
+    def raise_it(*arguments):
+        raise Asked(*arguments)
+
+    monkeypatch.setattr(gaze_job, "train_gaze", raise_it)
+    monkeypatch.setattr(radiance_job, "train_radiance", raise_it)
+
+
+def test01_training_options_reach_the_jobs(asked, tmp_path):
+    with pytest.raises(Asked) as found:
+        nerg.train_radiance(str(tmp_path), "out.safetensors", options=RadianceOptions(seed=3), steps=7)
+    photos, output, options, _ = found.value.args
+    assert (photos, output) == (tmp_path, "out.safetensors")
+    assert options == RadianceOptions(seed=3, steps=7, mode="llvm_ad_rgb")
+    with pytest.raises(Asked) as found:
+        nerg.train_gaze(None, geometry="none", kappa=9.0)
+    assert found.value.args[2] == GazeOptions(geometry="none", kappa=9.0, mode="llvm_ad_rgb")
+
+
+def test02_training_wrong_options_are_told(asked):
+    with pytest.raises(nerg.NergError, match='train_gaze.*"kapa".*"kappa"'):
+        nerg.train_gaze(None, kapa=9.0)
+    with pytest.raises(nerg.NergError, match="train_radiance"):
+        nerg.train_radiance("photos", mode="scalar_rgb")
+
+
+def test03_the_variant_in_use_stays(mono, asked, tmp_path):
+    with pytest.raises(Asked) as found:
+        nerg.train_radiance(tmp_path)
+    assert found.value.args[2].mode == "llvm_ad_mono" and mono.variant() == "llvm_ad_mono"
+
+
+@pytest.mark.nightly
+def test04_what_is_trained_can_be_shown(rgb, tmp_path):
+    rng = np.random.default_rng(0)
+    origin = rng.uniform((1, 1, 1.5), (2, 2, 1.6), (500, 3))
+    direction = rng.normal(size=(500, 3)) * (1, 1, 0.2)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    rays = nerg.Rays(np.arange(500.0), np.zeros(500, int), ("Ada",), origin, direction, np.ones(500))
+    field = nerg.train_gaze(rays, tmp_path / "gaze.safetensors", geometry="none", steps=1, zones=0, probes=4)
+    assert field.name == "gaze.safetensors" and field.provenance["steps"] == 1
+    again = nerg.load_gaze(tmp_path / "gaze.safetensors")
+    walls = {"type": "cube", "to_world": rgb.ScalarTransform4f().scale(4)}
+    a, b = (
+        nerg.trace(nerg.make_scene(gaze=g, shapes=walls), (1.5, 1.5, 1.5), [(1, 0, 0), (0, 1, 0.1)], "gaze").gaze
+        for g in (field, again)
+    )
+    assert np.array_equal(a, b) and (a > 0).all()

@@ -1,0 +1,492 @@
+"""Tests of `nerg_mi.evaluation.gaze`."""
+
+from __future__ import annotations
+
+import itertools
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation import gaze, metrics
+from nerg_mi.evaluation.gaze import gaze_field, position_blind, scores, uniform
+from nerg_mi.evaluation.gaze_report import markdown
+from nerg_mi.maths import vmf
+from nerg_mi.maths.geometry import Box, Similarity
+from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
+from nerg_mi.probes.probes import place_probes
+from nerg_mi.rays.rays import Rays
+from nerg_mi.train.gaze_data import hold_out
+from nerg_mi.train.geometry import place_of_field, place_of_scene
+from tests.evaluation.gaze_fields import KINDS, made, saved
+from tests.plugins import fields
+from tests.plugins.scenes import channels
+from tests.reference.kde import kde as reference
+
+# ---- Baselines ----
+
+
+X = fibonacci_directions(1024)
+
+
+@pytest.fixture(scope="module")
+def rays_baselines():
+    """People who look at one thing in the middle of the room."""
+    rng = np.random.default_rng(1)
+    origin = rng.uniform([0, 0, 1.5], [4, 4, 1.6], (9000, 3))
+    to = np.array([2.0, 2.0, 1.0]) - origin
+    mu = to / np.linalg.norm(to, axis=1, keepdims=True)
+    n = len(mu)
+    return Rays(np.arange(n) * 1.0, np.zeros(n), ("a",), origin, vmf.sample(mu, 40.0, rng), np.ones(n))
+
+
+def test_position_blind_is_the_kde_of_all(rays_baselines):
+    density = gaze.position_blind(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((3, 3)), X)
+    want = reference(X, rays_baselines.direction, [0, len(rays_baselines)], [30.0])
+    assert density.shape == (3, 1024) and np.allclose(density, want, rtol=2e-4)
+    own = gaze.position_blind(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((2, 3)), np.stack([X, X[::-1]]))
+    assert np.allclose(own[0], own[1, ::-1], rtol=1e-5)
+
+
+def test_nearest_probes(rays_baselines):
+    probes = place_probes(rays_baselines, 0.4, count=50, kappa_rule="fixed", kappa=20.0)
+    density = probes.density(X, "llvm")
+    one = gaze.nearest_probes(probes, 1, backend="llvm")(probes.positions[:5], X)
+    assert np.allclose(one, density[:5], rtol=1e-5)
+    at = np.array([[1.0, 1.0, 1.55]])
+    near = np.argsort(np.linalg.norm(probes.positions - at, axis=1))[:4]
+    four = gaze.nearest_probes(probes, 4, backend="llvm")
+    assert np.allclose(four(at, X)[0], density[near].mean(axis=0), rtol=1e-5)
+    assert np.allclose(four(at, X[None])[0], four(at, X)[0], rtol=1e-5)
+    # Averaged in float64 either way: float32 would lose digits of what differs little.
+    assert four(at, X).dtype == four(at, X[None]).dtype == np.float64
+
+
+def test_nearest_rays(rays_baselines):
+    at = np.array([[1.0, 1.0, 1.55], [3.0, 2.0, 1.55]])
+    density = gaze.nearest_rays(rays_baselines, 300, kappa=20.0, backend="llvm")(at, X)
+    near = np.argsort(np.linalg.norm(rays_baselines.origin - at[1], axis=1))[:300]
+    assert np.allclose(density[1], reference(X, rays_baselines.direction[near], [0, 300], [20.0])[0], rtol=2e-4)
+
+
+def test_all_integrate_to_one_and_position_helps(rays_baselines):
+    rng = np.random.default_rng(0)
+    at = rng.uniform([0.5, 0.5, 1.5], [3.5, 3.5, 1.6], (12, 3))
+    to = np.array([2.0, 2.0, 1.0]) - at
+    truth = np.exp(vmf.log_density(X, (to / np.linalg.norm(to, axis=1, keepdims=True))[:, None], 40.0))
+    probes = place_probes(rays_baselines, 0.4, count=200, kappa_rule="fixed", kappa=20.0)
+    scores = {}
+    for name, baseline in {
+        "uniform": gaze.uniform(),
+        "blind": gaze.position_blind(rays_baselines, backend="llvm"),
+        "probes": gaze.nearest_probes(probes, 4, backend="llvm"),
+        "rays": gaze.nearest_rays(rays_baselines, 256, backend="llvm"),
+    }.items():
+        density = baseline(at, X)
+        assert np.allclose(density.mean(axis=1) * 4 * np.pi, 1, atol=1e-3)
+        scores[name] = metrics.cc(truth, density).mean()
+    assert scores["uniform"] == 0 and scores["blind"] < 0.5 < 0.7 < min(scores["probes"], scores["rays"])
+
+
+def test_own_directions_of_nearest_rays(rays_baselines):
+    rng = np.random.default_rng(0)
+    at, own = rays_baselines.origin[:70], uniform_directions(70 * 8, rng).reshape(70, 8, 3)
+    f = gaze.nearest_rays(rays_baselines, 100, backend="llvm")
+    assert np.allclose(f(at, own)[66], f(at[66:67], own[66])[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("weights", ["distance", "person"])
+def test_probes_keep_their_weights(rays_baselines, weights):
+    """What a probe weighs its rays by is part of its density, for one probe and for several."""
+    one = lambda w: np.concatenate([np.zeros(8000), np.arange(1, 1001) % 7]).astype(int) if w else np.zeros(9000, int)
+    people = Rays(
+        rays_baselines.t, one(True), tuple("abcdefg"), rays_baselines.origin, rays_baselines.direction, np.ones(9000)
+    )
+    probes = place_probes(people, 0.4, count=50, kappa_rule="fixed", kappa=20.0, weights=weights)
+    assert probes.weights is not None and np.ptp(probes.weights) > 0
+    density = probes.density(X, "llvm")
+    plain = place_probes(people, 0.4, count=50, kappa_rule="fixed", kappa=20.0).density(X, "llvm")
+    assert np.abs(density - plain).max() > 0.02
+    at = probes.positions[:4]
+    assert np.allclose(gaze.nearest_probes(probes, 1, backend="llvm")(at, X), density[:4], rtol=1e-4, atol=1e-5)
+    near = np.argsort(np.linalg.norm(probes.positions - at[0], axis=1))[:3]
+    assert np.allclose(
+        gaze.nearest_probes(probes, 3, backend="llvm")(at[:1], X)[0], density[near].mean(axis=0), rtol=1e-4, atol=1e-5
+    )
+
+
+def test_the_standard_ones_are_what_they_are_called(rays_baselines):
+    blind, named = gaze.standard_baselines(rays_baselines, 0.4, count=60)
+    at = np.array([[1.0, 1.0, 1.55], [3.0, 2.0, 1.55]])
+    assert np.allclose(blind(at, X), named["position-blind, kappa 50"](at, X))
+    assert np.allclose(
+        blind(at, X)[0], reference(X, rays_baselines.direction, [0, len(rays_baselines)], [50.0])[0], rtol=2e-4
+    )
+    # Without a say, one alone has the width that it has among the others.
+    assert np.allclose(blind(at, X), gaze.position_blind(rays_baselines)(at, X), rtol=1e-6)
+    assert np.allclose(named["uniform"](at, X), 1 / (4 * np.pi))
+    assert np.allclose(named["4,096 nearest rays"](at, X), gaze.nearest_rays(rays_baselines, 4096, kappa=20.0)(at, X))
+
+
+def test_a_remembered_density_is_asked_once_for_the_same_arrays():
+    asked = []
+    method = gaze.Remembered(lambda *given: asked.append(1) or gaze.uniform()(*given))
+    positions, directions = np.zeros((2, 3)), fibonacci_directions(8)
+    first = method(positions, directions)
+    assert method(positions, directions) is first and len(asked) == 1
+    # Equal values are not the same arrays: they are not compared.
+    np.testing.assert_array_equal(method(positions.copy(), directions), first)
+    assert len(asked) == 2
+    with pytest.raises(ValueError, match="read-only"):
+        first[0] = 0
+
+
+# ---- Evaluation of gaze: truth from persons, scores against closed forms, what is held out ----
+
+
+def crowd(n=3000, people=4, seed=0):
+    """People along a corridor who look at a point of the wall x = 1.5, each at another height."""
+    rng = np.random.default_rng(seed)
+    origin = np.stack([rng.uniform(-1, 0, n), rng.uniform(-5, 5, n), rng.uniform(1.5, 1.7, n)], axis=1)
+    person = rng.integers(0, people, n)
+    hit = np.stack([np.full(n, 1.5), rng.normal(0, 0.2, n), 1 + 0.3 * person + rng.normal(0, 0.1, n)], axis=1)
+    way = hit - origin
+    return Rays(
+        np.arange(n),
+        person,
+        tuple("abcdefgh"[:people]),
+        origin,
+        way / np.linalg.norm(way, axis=1, keepdims=True),
+        np.ones(n),
+        hit,
+    )
+
+
+@pytest.fixture(scope="module")
+def rays_evaluation():
+    return crowd()
+
+
+@pytest.fixture(scope="module")
+def test_set(rays_evaluation):
+    return gaze.make_test(
+        rays_evaluation, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, 512, min_rays=20
+    )
+
+
+def test_truth_is_the_probes(rays_evaluation, test_set):
+    assert len(test_set.centres) == 2
+    probes = place_probes(
+        rays_evaluation,
+        0.6,
+        queries=test_set.centres,
+        cap=1024,
+        min_rays=1,
+        kappa_rule="fixed",
+        kappa=20.0,
+        centre="query",
+    )
+    np.testing.assert_allclose(test_set.truth, probes.density(test_set.directions), rtol=1e-4, atol=1e-6)
+    assert (test_set.counts.sum(axis=1) == probes.counts).all() and set(test_set.persons) == set("abcd")
+
+
+def test_scores_of_the_truth_and_of_nothing(test_set):
+    rows = gaze.evaluate_gaze(
+        test_set,
+        {"truth": lambda p, d: test_set.truth if d.ndim == 2 else np.ones(d.shape[:2]), "uniform": uniform()},
+        uniform(),
+        20,
+    )
+    best, flat = rows
+    assert (
+        best["KLD"] < 1e-6 and best["CC"] == pytest.approx(1) and best["SIM"] == pytest.approx(1) and best["MAE"] == 0
+    )
+    assert flat["CC"] == 0 and flat["AUC"] == 0.5 and flat["sAUC"] == 0.5 and flat["NSS"] == 0
+    assert (
+        flat["bits"] == 0
+        and flat["loglik"] == pytest.approx(-np.log(4 * np.pi))
+        and flat["integral"] == pytest.approx(1)
+    )
+    assert flat["KLD"] == pytest.approx(float(metrics.kld(test_set.truth, np.ones((2, 512)), eps=1e-6).mean()))
+    assert (
+        best["KLD.less"] == pytest.approx(best["KLD"] - flat["KLD"])
+        and best["KLD.less.low"] < best["KLD.less"] < best["KLD.less.high"]
+    )
+    assert flat["bits.low"] == 0 and flat["KLD.low"] < flat["KLD"] < flat["KLD.high"]
+    for end in ("", ".low", ".high"):
+        assert flat[f"KLD.gap{end}"] == best[f"KLD.less{end}"]
+    assert not any(".gap" in key for key in best)
+
+
+def test_other_rays_are_of_positions_farther_than_two_radii_where_there_are_any(rays_evaluation):
+    """A to C stand in a row; B is within 2R of A, C of none."""
+    centres = np.array([[-0.5, 0, 1.6], [-0.5, 1, 1.6], [-0.5, 4, 1.6]])
+    of = lambda a: {tuple(v) for v in a.reshape(-1, 3)}
+    found = gaze.make_test(rays_evaluation, centres, 0.6, 20.0, 64, min_rays=20)
+    (a, b, c), others = map(of, found.at), [of(o) for o in found.others]
+    assert a.isdisjoint(c) and b.isdisjoint(c)
+    assert others[0] <= c and others[1] <= c and others[2] <= a | b and others[2] & a and others[2] & b
+    # Where all are nearer, any other one, and its own where it is alone.
+    found = gaze.make_test(rays_evaluation, centres[:2], 0.6, 20.0, 64, min_rays=20)
+    a, b = map(of, found.at)
+    assert of(found.others[0]) <= b and of(found.others[1]) <= a
+    found = gaze.make_test(rays_evaluation, centres[:1], 0.6, 20.0, 64, min_rays=20)
+    assert np.array_equal(found.others, found.at)
+
+
+def by_hand(persons: int) -> gaze.GazeTest:
+    """One position and sixteen directions, of which each person sees one of their own; the rays are of them in turn."""
+    d = np.eye(16, 3)
+    parts = 16 / (4 * np.pi) * np.eye(16)[None, :persons]
+    who = np.arange(4 * persons)[None] % persons
+    at, counts, names = np.zeros((1, 4 * persons, 3)), np.full((1, persons), 4.0), tuple("abcdefgh"[:persons])
+    return gaze.GazeTest(np.zeros((1, 3)), d, parts.mean(axis=1), parts, counts, names, at, who, at)
+
+
+def test_intervals_are_a_bootstrap_over_persons():
+    """Of three persons all 27 draws can be made: the error of what one of them sees is the share of the others."""
+    test = by_hand(3)
+    sees = lambda k: lambda p, d: test.parts[:, k] if d.ndim == 2 else np.ones(d.shape[:2])
+    row, _ = gaze.evaluate_gaze(test, {"first": sees(0), "second": sees(1)}, uniform(), resamples=1000)
+    draws = list(itertools.product(range(3), repeat=3))
+    mae = [2 * (1 - draw.count(0) / 3) / (4 * np.pi) for draw in draws]
+    assert row["MAE"] == pytest.approx(np.mean(mae))
+    assert row["MAE.high"] - row["MAE"] == pytest.approx(1.96 * np.std(mae), rel=0.1)
+    assert row["MAE"] - row["MAE.low"] == pytest.approx(1.96 * np.std(mae), rel=0.1)
+    # Of a difference: over the same draws.
+    less = [2 * (draw.count(1) - draw.count(0)) / 3 / (4 * np.pi) for draw in draws]
+    assert row["MAE.less.high"] - row["MAE.less"] == pytest.approx(1.96 * np.std(less), rel=0.1)
+    assert row["MAE.less"] - row["MAE.less.low"] == pytest.approx(1.96 * np.std(less), rel=0.1)
+
+
+@pytest.mark.parametrize("persons, known", [(2, False), (3, True), (4, True)])
+def test_fewer_than_three_persons_have_no_interval(persons, known):
+    for row in gaze.evaluate_gaze(by_hand(persons), {"a": uniform(), "b": uniform()}, uniform(), resamples=5):
+        assert all((f"{k}.low" in row) == known and (f"{k}.high" in row) == known for k in gaze.SCORES)
+
+
+def test_ray_scores_by_hand():
+    maps = np.array([[0.0, 1.0, 2.0, 5.0]]) / (4 * np.pi * 2)
+    at, others = maps[:, [3, 1]], maps[:, [0, 0, 1, 3]]
+    scores = gaze.ray_scores(maps, at, others, np.zeros((1, 2)))
+    np.testing.assert_allclose(scores["AUC"], [[3.5 / 4, 1.5 / 4]])
+    np.testing.assert_allclose(scores["sAUC"], [[3.5 / 4, 2.5 / 4]])
+    np.testing.assert_allclose(scores["loglik"], np.log(at), rtol=1e-6)
+    np.testing.assert_allclose(scores["bits"], np.log2(at), rtol=1e-6)
+    values = np.array([0, 1, 2, 5.0])
+    np.testing.assert_allclose(scores["NSS"], [[(5 - 2) / values.std(), (1 - 2) / values.std()]])
+
+
+def test_persons_are_scored_each_by_their_own(rays_evaluation, test_set):
+    blind = position_blind(rays_evaluation, kappa=50)
+    rows = gaze.person_rows(test_set, {"blind": blind}, blind, min_rays=10)
+    assert [r["person"] for r in rows] == list(test_set.persons) and sum(
+        r["rays"] for r in rows
+    ) == test_set.counts.sum()
+    assert all(r["bits"] == pytest.approx(0) for r in rows)
+    # The heights of what they look at differ, and so does how well one density for all fits.
+    assert np.ptp([r["KLD"] for r in rows]) > 0.01
+
+
+def test_nothing_is_on_both_sides(rays_evaluation):
+    _, account = hold_out(rays_evaluation, 0.3, zones=2, positions=8, min_rays=8, people=0.5)
+    for split in gaze.SPLITS:
+        train, scored, centres = gaze.held_out_rays(rays_evaluation, account, split)
+        named = lambda r: {rays_evaluation.persons[i] for i in np.unique(r.person)}
+        assert named(train).isdisjoint(account["people"])
+        assert named(scored) == (named(train) if split == "pos" else set(account["people"]))
+        assert np.linalg.norm(train.origin[:, None] - np.array(account["centres"])[None], axis=2).min() > 0.6
+    _, without = hold_out(rays_evaluation, 0.3, zones=2, positions=8, min_rays=8)
+    with pytest.raises(ValueError, match="--test-people"):
+        gaze.held_out_rays(rays_evaluation, without, "both")
+    with pytest.raises(ValueError, match="both, pos, people"):
+        gaze.held_out_rays(rays_evaluation, account, "time")
+
+
+def test_positions_without_rays_are_refused(rays_evaluation):
+    with pytest.raises(ValueError, match="lower min_rays"):
+        gaze.make_test(rays_evaluation, np.array([[40.0, 0, 0]]), 0.5)
+
+
+def test_maps_that_no_memory_holds_are_refused(rays_evaluation, monkeypatch):
+    monkeypatch.setattr(gaze, "_MOST_BYTES", 1e5)
+    with pytest.raises(NergError, match="--directions"):
+        gaze.make_test(rays_evaluation, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6]]), 0.6, 20.0, 512, min_rays=20)
+
+
+def test_markdown_has_intervals_and_gaps():
+    text = markdown(
+        [
+            {"method": "a", "KLD": 0.5, "KLD.low": 0.4, "KLD.high": 0.6, "MAE": 0.01234},
+            {"method": "b", "KLD": float("nan")},
+        ]
+    )
+    assert text.splitlines()[0] == "| method | KLD | MAE |"
+    assert text.splitlines()[2:] == ["| a | 0.500 [0.400, 0.600] | 0.0123 |", "| b |  |  |"]
+
+
+def test_halves_of_the_people_are_compared_where_both_were(rays_evaluation, test_set):
+    row = gaze.split_half(
+        rays_evaluation, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, uniform(), min_rays=20
+    )
+    assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0
+    nobody = np.array([[40.0, 0, 0]])
+    assert gaze.split_half(rays_evaluation, nobody, 0.6, 20.0, uniform(), min_rays=20) is None
+    two = gaze.split_half(
+        rays_evaluation.select(rays_evaluation.person < 2), test_set.centres, 0.6, 20.0, uniform(), min_rays=20
+    )
+    assert two is not None and two["KLD"] > 0
+    alone = rays_evaluation.select(rays_evaluation.person == 0)
+    assert gaze.split_half(alone, test_set.centres, 0.6, 20.0, uniform(), min_rays=20) is None
+    with pytest.raises(ValueError, match="kappa is negative"):
+        # What is wrong is said, and not taken for "nobody was there".
+        gaze.split_half(rays_evaluation, test_set.centres, 0.6, -1.0, uniform(), min_rays=20)
+
+
+# ---- Scores ----
+#
+# What is scored is what is rendered: the field's densities at positions against the integrator's pictures, for every
+# kind of field.
+
+
+BOX = Box((-1, -1, -1), (1, 1, 1))
+
+
+EYES = [(0.1, -0.2, 0.3), (-0.4, 0.3, -0.1)]
+
+
+ROOM = """<scene version="3.0.0">
+  <shape type="cube"><boolean name="flip_normals" value="true"/>
+    <transform name="to_world"><scale value="0.9"/></transform></shape>
+  <shape type="cube"><transform name="to_world"><scale value="0.2"/><translate x="0.5"/></transform></shape></scene>"""
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    """What gaze fields are evaluated in, and the same as children of an integrator and of a scene."""
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("places")
+    (folder / "room.xml").write_text(ROOM)
+    shapes = {f"s{i}": s for i, s in enumerate(mi.load_string(ROOM).shapes())}
+    fields.radiance(folder / "field.safetensors", density_scale=30.0)
+    volume = {"type": "nerf", "filename": str(folder / "field.safetensors")}
+    return {
+        "shapes": (place_of_scene(folder / "room.xml").medium, {}, shapes),
+        "field": (place_of_field(folder / "field.safetensors", ns).medium, {"field": volume}, {}),
+    }
+
+
+def pictured(mi, gaze, children: dict, shapes: dict, eye) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (N, 3) in which the observer at ``eye`` meets a surface, and the gaze (N,) that a panorama shows
+    there."""
+    sensor = {
+        "type": "panorama",
+        "to_world": mi.ScalarTransform4f().translate(list(eye)),
+        "sampler": {"type": "independent", "sample_count": 1},
+        "film": {
+            "type": "hdrfilm",
+            "width": 32,
+            "height": 16,
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+    }
+    integrator = {
+        "type": "nerg",
+        "aovs": "opacity,position,gaze",
+        "radiance": False,
+        "gaze": {"type": "gazefield", "filename": str(gaze)},
+        **children,
+    }
+    out = channels(mi, integrator, sensor, **shapes)
+    met = out["opacity.Y"] >= 0.5
+    way = np.stack([out[f"position.{c}"][met] for c in "XYZ"], axis=-1) - np.array(eye)
+    return way / np.linalg.norm(way, axis=-1, keepdims=True), out["gaze.Y"][met]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("place", ["shapes", "field"])
+def test01_is_what_is_rendered(rgb, places, tmp_path, place, kind):
+    """To 2e-4 of the largest density: directions are read back from positions in single precision."""
+    medium, children, shapes = places[place]
+    field = saved(tmp_path / "g.safetensors", kind, BOX)
+    density = gaze_field(field, medium)
+    for eye in EYES:
+        directions, expected = pictured(rgb, tmp_path / "g.safetensors", children, shapes, eye)
+        assert len(expected) > 50 and np.ptp(expected) > 0.2 * expected.max()
+        found = density(np.array([eye]), directions)
+        assert found.shape == (1, len(expected))
+        np.testing.assert_allclose(found[0], expected, atol=2e-4 * expected.max())
+
+
+@pytest.mark.parametrize("kind", ["normalised", "default recipe", "ensemble"])
+def test02_other_positions_have_integrals_of_their_own(rgb, places, kind):
+    """As many of them as the first ones: nothing is kept by how many there are."""
+    medium, field, d = places["shapes"][0], made(kind, BOX), fibonacci_directions(256)
+    density = gaze_field(field, medium)
+    first, second = (np.array([eye]) for eye in EYES)
+    alone = gaze_field(field, medium)(second, d)
+    a = density(first, d)
+    np.testing.assert_array_equal(density(second, d), alone)
+    # Kept, and in an order of their own.
+    np.testing.assert_array_equal(density(np.concatenate([second, first]), d), np.concatenate([alone, a]))
+    integral = density(first, fibonacci_directions(4096)).mean() * 4 * np.pi
+    assert integral == pytest.approx(1, abs=5e-3)
+
+
+@pytest.mark.parametrize("kind", ["linear", "default recipe"])
+def test03_alignment_moves_turns_and_scales(rgb, places, kind):
+    medium, field, d = places["shapes"][0], made(kind, BOX), fibonacci_directions(64)
+    scaled = np.array([[0, -0.5, 0, 0.1], [0.5, 0, 0, -0.2], [0, 0, 0.5, 0.05], [0, 0, 0, 1]])
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    at = np.array(EYES)
+    inside = gaze_field(field, medium)(at @ scaled[:3, :3].T + scaled[:3, 3], d @ turn.T)
+    np.testing.assert_allclose(gaze_field(field, medium, Similarity(scaled))(at, d), inside, rtol=2e-4)
+    assert np.ptp(inside) > 1e-2
+
+
+def test04_each_position_may_have_its_own_directions(rgb, places):
+    medium, field, d = places["shapes"][0], made("default recipe", BOX), fibonacci_directions(64)
+    density, own = gaze_field(field, medium), np.stack([d, d[::-1]])
+    common, found = density(np.array(EYES), d), density(np.array(EYES), own)
+    np.testing.assert_array_equal(found[0], common[0])
+    np.testing.assert_allclose(found[1], common[1][::-1], rtol=1e-5)
+
+
+def test05_a_field_of_surfaces_needs_a_place(rgb):
+    with pytest.raises(NergError, match="there is no place"):
+        gaze_field(made("default recipe", BOX), None)
+    without = made("default recipe", BOX, geometry="none", reach=1.5)
+    d = fibonacci_directions(2048)
+    assert gaze_field(without, None)(np.array(EYES), d).mean() * 4 * np.pi == pytest.approx(1, abs=5e-3)
+
+
+def test06_semantic_features_are_those_of_the_render(rgb, places, tmp_path):
+    """Of the place's field, as the integrator hands them over."""
+    medium, children, shapes = places["field"]
+    for kind in ("snapshot", "accumulated"):
+        field = saved(tmp_path / "g.safetensors", "linear", BOX, semantic=kind)
+        directions, expected = pictured(rgb, tmp_path / "g.safetensors", children, shapes, EYES[0])
+        found = gaze_field(field, medium)(np.array(EYES[:1]), directions)[0]
+        np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())
+
+
+def test07_scores_of_a_map_and_of_itself():
+    truth = np.abs(np.random.default_rng(0).normal(size=(3, 100)))
+    found = scores(truth, 2 * truth)
+    assert found["KLD"] < 1e-6 and found["CC"] == pytest.approx(1) and found["SIM"] == pytest.approx(1)
+    assert found["MAE"] == pytest.approx(truth.mean()) and found["integral"] == pytest.approx(8 * np.pi * truth.mean())
+
+
+def test_a_density_of_zero_costs_what_a_millionth_of_the_uniform_one_does():
+    """Half of the sphere is empty, the other twice as dense: ½ ln 1/2 + ½ ln 1e6."""
+    half = np.repeat([0.0, 2.0], 32)[None] / (4 * np.pi)
+    flat = np.ones((1, 64)) / (4 * np.pi)
+    millionth = np.where(half > 0, half, 1e-6 / (4 * np.pi))
+    assert scores(flat, half)["KLD"] == pytest.approx(0.5 * np.log(1e6 / 2), abs=1e-5)
+    assert scores(flat, half)["KLD"] == pytest.approx(np.mean(np.log(flat / millionth)), abs=1e-5)
+    # The other way round nothing hinges on it.
+    assert scores(half, flat)["KLD"] == pytest.approx(np.log(2), abs=2e-5)

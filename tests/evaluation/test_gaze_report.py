@@ -1,0 +1,320 @@
+"""Tests of `nerg_mi.evaluation.gaze_report`."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation import gaze_report
+from nerg_mi.evaluation.gaze_report import (
+    BETTER,
+    UNDECIDED,
+    WORSE,
+    Comparison,
+    Lead,
+    judge,
+    lead_of,
+    markdown,
+    read_results,
+    side_by_side,
+    widening,
+    write_report,
+)
+from nerg_mi.maths.sphere import fibonacci_directions
+
+# ---- Report ----
+#
+# What an evaluation of gaze writes: cells by hand, files that are valid, and pictures of what was asked for.
+
+
+ROWS = [
+    {
+        "method": "field",
+        "KLD": 0.51234,
+        "KLD.low": 0.4,
+        "KLD.high": 0.65,
+        "CC": 0.9,
+        "MAE": 0.012345,
+        "KLD.less": -0.25,
+        "NSS": math.nan,
+    },
+    {"method": "uniform", "KLD": 1.5, "CC": 0.0, "MAE": 0.05, "integral": 1.0},
+    {"method": "split half", "KLD": 0.25},
+]
+
+
+def test_a_table_by_hand():
+    assert markdown(ROWS, ("method", "KLD", "CC", "MAE", "NSS", "integral", "AUC")).splitlines() == [
+        "| method | KLD | CC | MAE | NSS | integral |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
+        "| field | 0.512 [0.400, 0.650] | 0.900 | 0.0123 |  |  |",
+        "| uniform | 1.500 | 0.000 | 0.0500 |  | 1.000 |",
+        "| split half | 0.250 |  |  |  |  |",
+    ]
+    people = markdown([{"method": "a", "person": "ann", "rays": 12}], ("method", "person", "rays"))
+    assert people.splitlines()[1:] == ["| --- | --- | ---: |", "| a | ann | 12 |"]
+
+
+def test_files(tmp_path):
+    persons = [{"method": "field", "person": "ann", "rays": 3, "KLD": 0.5, "NSS": math.nan}]
+    files = write_report(tmp_path, ROWS, persons, {"seed": 4}, "notes")
+    page = files[0].read_text()
+    # Our method is compared with the last of the baselines, which the people's own agreement is none of.
+    assert (
+        page.startswith("notes\n")
+        and "| field less uniform | -0.250 |" in page
+        and "| field | ann | 3 | 0.500 |  |" in page
+    )
+    with open(files[1], newline="") as f:
+        rows = list(csv.DictReader(f))
+    assert [r["method"] for r in rows] == ["field", "uniform", "split half"] and float(rows[0]["MAE"]) == 0.012345
+    about = json.loads(files[3].read_text(), parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert about["seed"] == 4 and about["methods"][0]["NSS"] is None and about["persons"][0]["NSS"] is None
+    assert about["methods"][0]["KLD"] == 0.51234 and about["persons"][0]["rays"] == 3
+
+
+def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
+    d = fibonacci_directions(500)
+    centres = np.arange(15.0).reshape(5, 3)
+    truth = np.exp(3 * d @ np.array([1.0, 0, 0])) * np.arange(1, 6)[:, None]
+    counts = np.array([[3, 0, 4], [1, 1, 1], [1, 1, 1], [1, 1, 1], [900, 600, 0]])
+    test, drawn = SimpleNamespace(centres=centres, directions=d, truth=truth, counts=counts), []
+    monkeypatch.setattr(gaze_report, "save", lambda figure, path, about: drawn.append(figure))
+    asked = []
+
+    def twice(positions, directions):
+        asked.append(positions)
+        return 2 * np.exp(3 * directions[:, 0]) * np.ones((len(positions), 1))
+
+    side_by_side(test, {"twice": twice}, tmp_path / "a.png", count=2, height=8)
+    images = [a for a in drawn[0].axes if a.images]
+    # Each row has a scale of its own, which says what its colours mean.
+    scales = [a for a in drawn[0].axes if a not in images]
+    assert [a.get_ylabel() for a in scales] == ["1/sr", "1/sr"]
+    assert [tuple(a.get_ylim()) for a in scales] == [images[k].images[0].get_clim() for k in (0, 2)]
+    assert np.array_equal(asked[0], centres[[0, 4]]) and [a.get_title() for a in images] == ["truth", "twice", "", ""]
+    assert images[0].get_ylabel() == "0.0, 1.0, 2.0 m\n7 rays of 2 people"
+    assert images[2].get_ylabel() == "12.0, 13.0, 14.0 m\n1,500 rays of 2 people"
+    for a, b in (images[:2], images[2:]):
+        # One scale a row.
+        assert a.images[0].get_clim() == b.images[0].get_clim() and a.images[0].get_clim()[0] == 0
+        shown = [np.asarray(x.images[0].get_array()) for x in (a, b)]
+        row = 1 if a is images[0] else 5
+        # The truth's nearest directions are off by up to a tenth of a radian.
+        assert shown[0].shape == (8, 16) and np.allclose(2 * shown[0], row * shown[1], rtol=0.6)
+
+
+# ---- Results are read as they were written, and what is none is a sentence ----
+
+
+RESULTS_ROWS = [
+    {"method": "gaze field", "bits": 0.5, "KLD": float("nan")},
+    {"method": "uniform", "bits": 0.0, "KLD": 1.0},
+]
+
+
+PERSONS = [{"method": "gaze field", "person": "Ada", "rays": 4, "bits": 0.1}]
+
+
+ABOUT = {"gaze": "g.safetensors", "split": "both", "kappa": 20.0, "positions": 12}
+
+
+def test_as_it_was_written(tmp_path):
+    write_report(tmp_path, RESULTS_ROWS, PERSONS, {**ABOUT, "people": 7, "gaze_sha256": "ab"}, "# notes")
+    found = read_results(tmp_path / "gaze.json")
+    assert (found.gaze, found.split, found.positions, found.people, found.sha256) == (
+        "g.safetensors",
+        "both",
+        12,
+        7,
+        "ab",
+    )
+    assert found.rows[0]["KLD"] is None and found.rows[1]["KLD"] == 1.0 and found.persons[0]["person"] == "Ada"
+
+
+def test_an_earlier_file_says_less(tmp_path):
+    write_report(tmp_path, RESULTS_ROWS, PERSONS, ABOUT, "# notes")
+    found = read_results(tmp_path / "gaze.json")
+    assert found.people == 1 and found.sha256 == ""
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        [],
+        {"gaze": 1},
+        {"methods": []},
+        {"methods": [{"bits": 1}]},
+        {"methods": [{"method": "a", "bits": "1"}]},
+        {"methods": {"a": 1}},
+        {"positions": -1},
+        {"positions": True},
+        {"people": "three"},
+        {"split": "x" * 999},
+        {"kappa": None},
+        {"persons": [{"method": "m", "person": ["a"]}]},
+    ],
+)
+def test_what_is_none(tmp_path, change):
+    path = tmp_path / "gaze.json"
+    whole = {**ABOUT, "methods": RESULTS_ROWS[1:], "persons": PERSONS}
+    path.write_text(json.dumps(change if isinstance(change, list) else {**whole, **change}))
+    with pytest.raises(NergError, match='"nerg eval gaze"'):
+        read_results(path)
+    path.write_text(json.dumps(whole))
+    assert read_results(path).people == 1
+
+
+# ---- Verdict ----
+#
+# The verdict on constructed scores: better, worse, undecided, too few, and what speaks for two things at once.
+
+
+def row(method, bits, cc, kld, reach=0.05, gap=None):
+    """Scores with intervals of ``reach`` either way; ``gap``: that of the field's lead, where it is known."""
+    values = {"bits": bits, "CC": cc, "KLD": kld}
+    out = {"method": method, **values}
+    for name, value in values.items():
+        out |= {f"{name}.low": value - reach, f"{name}.high": value + reach}
+        if gap is not None:
+            out |= {f"{name}.gap.low": -gap, f"{name}.gap.high": gap}
+    return out
+
+
+def scored(field, nearest=(0.4, 0.65, 0.55), **more):
+    return [
+        row("gaze field", *field, **more),
+        row("uniform", -0.5, 0.0, 1.0, **more),
+        row("position-blind", 0.0, 0.4, 0.75, **more),
+        row("position-blind, kappa 50", -0.1, 0.38, 0.8, **more),
+        row("4,096 nearest rays", *nearest, **more),
+        {"method": "split half", "bits": 0.1, "CC": 0.7, "KLD": 0.9},
+    ]
+
+
+@pytest.mark.parametrize(
+    "field, grade, words",
+    [
+        ((0.9, 0.85, 0.3), "use", "Better than nearest rays, the strongest baseline, for new people at new places."),
+        ((0.42, 0.66, 0.54), "limited", "whether it is better than nearest rays is undecided with 30 people"),
+        ((0.2, 0.5, 0.65), "limited", "worse than nearest rays for new people at new places: use the rays"),
+        ((0.01, 0.41, 0.74), "unclear", "Not shown to be better than position-blind for new people"),
+        ((-0.3, 0.2, 0.95), "reject", "Worse than position-blind for new people at new places: do not use."),
+        ((-0.9, -0.3, 1.6), "reject", "Worse than knowing nothing for new people at new places: do not use."),
+    ],
+)
+def test_each_grade(field, grade, words):
+    verdict = judge(scored(field, reach=0.02), "both", 30, 60)
+    assert verdict.grade == grade and words in verdict.sentence
+    assert verdict.sentence.count(".") == 1 and verdict.sentence.endswith(".")
+
+
+@pytest.mark.parametrize("people, positions", [(4, 60), (30, 9), (0, 0), (1, 1)])
+def test_never_a_verdict_from_too_few(people, positions):
+    verdict = judge(scored((0.9, 0.85, 0.3), reach=0.0), "pos", people, positions)
+    assert verdict.grade == "none" and verdict.comparisons == () and "too few" in verdict.sentence
+    assert judge(scored((0.9, 0.85, 0.3)), "pos", 5, 10).grade != "none"
+
+
+def test_wide_intervals_decide_nothing():
+    assert judge(scored((0.9, 0.85, 0.3), reach=2.0), "both", 30, 60).grade == "unclear"
+    assert judge(scored((-0.9, -0.3, 1.6), reach=9.0), "both", 30, 60).grade == "unclear"
+
+
+def test_scores_that_contradict_each_other_decide_nothing():
+    leads = lambda *ends: tuple(Lead("x", (a + b) / 2, a, b) for a, b in ends)
+    good, bad, open_ = (0.1, 0.3), (-0.3, -0.1), (-0.1, 0.2)
+    cases = [
+        ((good, good, good), BETTER),
+        ((good, good, open_), BETTER),
+        ((good, open_, open_), UNDECIDED),
+        ((good, good, bad), UNDECIDED),
+        ((bad, bad, good), UNDECIDED),
+        ((bad, open_, bad), WORSE),
+        ((bad, open_, open_), UNDECIDED),
+        (((np.nan, np.nan), good, open_), UNDECIDED),
+        (((0.0, 0.1), (0.0, 0.1), (0.0, 0.1)), UNDECIDED),
+    ]
+    for ends, outcome in cases:
+        assert Comparison("r", leads(*ends)).outcome == outcome, ends
+
+
+@pytest.mark.parametrize(
+    "strongest, words",
+    [
+        ("position-blind", "Better than position-blind, the strongest baseline, and than nearest rays for"),
+        ("position-blind, kappa 50", "Better than position-blind, the strongest baseline, and than nearest rays for"),
+        ("uniform", "Better than uniform, the strongest baseline, and than nearest rays for"),
+        ("16 nearest probes", "Better than 16 nearest probes, the strongest baseline, and than nearest rays for"),
+        ("4,096 nearest rays", "Better than nearest rays, the strongest baseline, for"),
+    ],
+)
+def test_the_strongest_baseline_is_named(strongest, words):
+    rows = [*scored((0.9, 0.85, 0.3), reach=0.02), row("16 nearest probes", 0.1, 0.5, 0.6, 0.02)]
+    next(r for r in rows if r["method"] == strongest).update(row(strongest, 0.5, 0.6, 0.6, 0.02))
+    verdict = judge(rows, "both", 30, 60)
+    assert verdict.grade == "use" and verdict.sentence.startswith(words)
+    # The other half of the people is no baseline, however well it does.
+    rows[5]["bits"] = 2.0
+    assert judge(rows, "both", 30, 60).sentence == verdict.sentence
+
+
+def test_a_baseline_stronger_than_nearest_rays_decides_too():
+    rows = lambda bits, reach: [*scored((0.9, 0.85, 0.3), reach=0.02), row("16 nearest probes", bits, *reach)]
+    better = judge(rows(1.2, (0.9, 0.2, 0.02)), "both", 30, 60)
+    assert better.grade == "limited" and "worse than 16 nearest probes for" in better.sentence
+    level = judge(rows(0.91, (0.84, 0.31, 0.2)), "both", 30, 60)
+    assert level.grade == "limited" and "better than 16 nearest probes is undecided" in level.sentence
+    assert {c.reference for c in level.comparisons} >= {"uniform", "position-blind", "16 nearest probes"}
+
+
+def test_the_stronger_of_the_blind_densities_is_the_reference():
+    rows = scored((0.2, 0.5, 0.65), reach=0.02)
+    rows[3] |= row("position-blind, kappa 50", 0.35, 0.6, 0.6, 0.02)
+    assert judge(rows, "both", 30, 60).grade == "reject"
+
+
+def test_missing_numbers_and_methods():
+    rows = scored((0.9, 0.85, 0.3), reach=0.02)
+    assert judge([r | {"bits": None} for r in rows], "both", 30, 60).grade == "use"
+    assert judge(
+        [{k: None if k in ("bits", "CC") else v for k, v in r.items()} for r in rows], "both", 30, 60
+    ).grade == ("unclear")
+    assert "not compared with nearest rays" in judge(rows[:4], "both", 30, 60).sentence
+    assert judge(rows[:2], "both", 30, 60).grade == "none"
+    bare = [{k: v for k, v in r.items() if "." not in k} for r in rows]
+    assert judge(bare, "both", 30, 60).grade == "unclear"
+
+
+def test_the_lead_by_its_own_interval_is_sharper_than_by_two():
+    field, other = row("f", 0.6, 0.7, 0.5, 0.2), row("o", 0.4, 0.6, 0.6, 0.2)
+    wide = lead_of(field, other, "bits", 30)
+    assert wide.value == pytest.approx(0.2) and wide.high - wide.value == pytest.approx(0.4 * widening(30))
+    paired = lead_of(field, row("o", 0.4, 0.6, 0.6, 0.2, gap=0.1), "bits", 30)
+    assert paired.outcome == BETTER and wide.outcome == UNDECIDED
+    # Less KLD is better.
+    assert lead_of(field, other, "KLD", 30).value == pytest.approx(0.1)
+
+
+def test_intervals_for_few_people_cover_as_they_should():
+    """Leads of n people drawn from a normal law around zero: 95 of 100 intervals hold zero, and those without the
+    widening far fewer."""
+    rng, n, trials = np.random.default_rng(0), 6, 4000
+    x = rng.normal(size=(trials, n))
+    reach = 1.96 * x.std(axis=1) / np.sqrt(n)  # what a bootstrap of the mean has in the limit of many resamples
+    mean = np.abs(x.mean(axis=1))
+    assert np.mean(mean <= reach * widening(n)) == pytest.approx(0.95, abs=0.012)
+    assert np.mean(mean <= reach) < 0.88
+    assert widening(10**6) == pytest.approx(1, abs=1e-3)
+
+
+def test_the_way_to_the_other_half_of_the_people():
+    verdict = judge(scored((0.3, 0.55, 0.6)), "both", 30, 60)
+    assert verdict.half == pytest.approx((0.55 - 0.4) / (0.7 - 0.4))
+    assert judge(scored((0.3, 0.55, 0.6))[:5], "both", 30, 60).half is None

@@ -1,0 +1,321 @@
+"""Tests of `nerg_mi.evaluation.study`."""
+
+from __future__ import annotations
+
+import math
+import re
+from types import SimpleNamespace
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.evaluation import study as study_measure
+from nerg_mi.evaluation import study as study_paper
+from nerg_mi.evaluation import study_scenes
+from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, Setting, settings, traced_operations
+from nerg_mi.evaluation.study_subject import open_subject
+from nerg_mi.fields.occupancy import OccupancyGrid
+from nerg_mi.transport.medium import LocalRay
+from tests.plugins import fields
+from tests.plugins.scenes import camera
+from tests.reference import march_numpy
+
+# ---- Measure ----
+#
+# What a study measures and says meanwhile: one sample unless told, rounds over all rows, and the axes of the cost.
+
+
+class Recorded:
+    """A subject of step 0.5 that renders nothing and keeps what it was asked for."""
+
+    size, step, marched, hits = (12, 8), 0.5, True, False
+
+    def __init__(self):
+        self.renders, self.steps = [], []
+
+    def integrator(self, params=None, resolution=0):
+        params = params or {}
+        self.steps.append(params.get("step"))
+        return SimpleNamespace(params=params)
+
+    def resize(self, width, height):
+        self.size = (width, height)
+
+    def aovs(self):
+        return "depth,opacity"
+
+    def render(self, integrator, spp, seed):
+        self.renders.append((self.size, spp, integrator.params.get("step")))
+
+    def channels(self, integrator, spp, seed):
+        return {n: np.full(4, 3.0) for n in study_measure.COUNTS}
+
+
+def test_a_render_has_one_sample_a_pixel_unless_told():
+    subject = Recorded()
+    study_measure.timed(subject, subject.integrator())
+    study_measure.timed(subject, subject.integrator(), 4)
+    assert [spp for _, spp, _ in subject.renders] == [1, 4]
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_cost_is_taken_along_doublings_from_the_scene_itself(quick):
+    subject, said = Recorded(), []
+    rows = study_measure.scaling(subject, 2, quick, said.append)
+    of = lambda axis: [r["value"] for r in rows if r["axis"] == axis]
+    assert len(said) == len(rows) and (len(rows) == 6) == quick
+    for axis in ("samples", "extent"):
+        assert of(axis) == [2**k for k in range(len(of(axis)))]
+    sizes = [(k, 2 * k // 3) for k in (16 * 2**n for n in range(len(of("pixels"))))]
+    assert of("pixels") == [width * height for width, height in sizes]
+    assert list(dict.fromkeys(size for size, _, _ in subject.renders))[: len(sizes)] == sizes
+    # An extent k times as large: steps k times shorter, in the picture that was asked for, with one sample.
+    renders = [r for r in subject.renders if r[2] is not None]
+    assert renders == [((12, 8), 1, 0.5 / k) for k in of("extent") for _ in range(3)]
+    assert all(r["density_evals"] == 3.0 * (r["value"] if r["axis"] == "samples" else 1) for r in rows)
+
+
+def test_every_row_is_announced_before_it_is_rendered_and_before_its_times():
+    subject, said = open_subject("slab", "auto", 6, 4), []
+    less = {"aovs": "depth,opacity", "radiance": False}
+    rows = [Setting("default", "default"), Setting("depth only", "leave out", less)]
+    study_measure.measure(subject, rows, 2, on_step=said.append)
+    assert said == ["default", "depth only", "time of default", "time of depth only"]
+
+
+# ---- What is counted: operations that are traced, whatever the machine ----
+
+
+def test_more_work_has_more_operations_and_more_lanes_have_not():
+    x = lambda n: dr.arange(ns.Float, n)
+    one, two = (traced_operations(lambda f=f: f(x(100))) for f in (dr.sin, lambda v: dr.sin(v) + dr.cos(v * v)))
+    assert 0 < one < two
+    assert traced_operations(lambda: dr.sin(x(100_000))) == one
+
+
+def test_what_was_computed_before_is_not_counted():
+    y = dr.sin(dr.arange(ns.Float, 100))
+    dr.eval(y)
+    assert traced_operations(lambda: y) == 0
+
+
+# ---- The paper's marching: what it counts, what it paints, and that leaving empty cells loses nothing ----
+
+
+@pytest.fixture
+def seen(rgb):
+    """A function from AOVs, radiance and steps to the subject and its channels by the paper's rule."""
+    subject = open_subject("sphere", "auto", 24, 16)
+
+    def render(aovs, radiance=True, steps=256):
+        made = subject.integrator({"aovs": aovs, "radiance": radiance})
+        return subject.channels(study_paper.as_in_the_paper(made, subject.sensor, subject.tolerance, steps), 1, 1)
+
+    render.subject = subject
+    return render
+
+
+def test_the_observers_evaluations_are_added_and_gaze_takes_none(seen):
+    depth = seen("depth,opacity,density_evals")
+    looked = seen("depth,opacity,visibility,density_evals")
+    gazed = seen("depth,opacity,visibility,gaze,density_evals")
+    surface = depth["opacity"] >= 0.5
+    more = looked["density_evals"] - depth["density_evals"]
+    assert surface.any() and not surface.all()
+    assert (depth["density_evals"] >= 0).all() and (more[surface] >= 1).all() and (more[~surface] == 0).all()
+    for name in ("density_evals", "visibility"):
+        assert np.array_equal(looked[name], gazed[name])
+    attended = gazed["visibility"] > 0
+    assert attended.any() and (gazed["gaze"][attended] > 0).any() and (gazed["gaze"][~attended] == 0).all()
+
+
+def test_the_picture_tends_to_the_true_one_and_is_black_without_radiance(seen):
+    known = seen.subject.truth(1, "expected", "depth")
+    off = [np.abs(seen("depth,opacity", steps=n)["color"] - known.color).mean() for n in (128, 2048)]
+    assert known.color.max() > 0.5 and off[1] < off[0] / 4 < 0.01
+    dark = seen("depth,opacity", radiance=False, steps=128)
+    assert (dark["color"] == 0).all() and dark["opacity"].max() > 0.9
+
+
+def test_a_deferred_field_is_asked_for_colour_once_a_ray(rgb, tmp_path):
+    """And its picture tends to that of ``nerg``."""
+    fields.radiance(tmp_path / "f.safetensors", deferred=True)
+    field = {"type": "nerf", "filename": str(tmp_path / "f.safetensors")}
+    made = rgb.load_dict({"type": "nerg", "field": field, "aovs": "depth,opacity,color_evals", "step": 2e-3})
+    scene = rgb.load_dict({"type": "scene", "sensor": camera(rgb, size=8)})
+    known = np.array(rgb.render(scene, integrator=made, spp=1, seed=0))
+    off = []
+    for steps in (64, 1024):
+        paper = study_paper.as_in_the_paper(made, scene.sensors()[0], 0.01, steps)
+        seen = np.array(rgb.render(scene, integrator=paper, spp=1, seed=0))
+        off.append(np.abs(seen - known)[..., :3].mean())
+        assert np.array_equal(seen[..., 5], seen[..., 4] > 0)
+    assert known[..., :3].max() > 0.2 and off[1] < off[0] / 4 < 0.01
+
+
+@pytest.mark.parametrize("dt_gamma", [0.0, 0.05])
+def test_empty_cells_are_left_without_a_loss(dt_gamma):
+    """Where steps do not grow, the same samples are taken beyond an empty cell as without a leap; none in it."""
+    rng = np.random.default_rng(3)
+    grid = OccupancyGrid(rng.random((5, 4, 6)) < 0.4, ns, 0)
+
+    def density(p, active):
+        full = grid.empty_cells(p) == 0
+        return dr.select(full, 2 + 3 * p.x + p.z, 0)
+
+    count, step = 200, 1 / 300
+    o = np.stack([rng.random(count), rng.random(count), np.full(count, -0.5)])
+    d = np.stack([rng.random(count), rng.random(count), np.full(count, 1.2)]) - o
+    d /= np.linalg.norm(d, axis=0)
+    t0, t1 = (ns.Float(np.asarray(a / d[2], np.float32)) for a in (0.5, 1.5))
+    origin, way = (ns.Array3f(v.astype(np.float32)) for v in (o, d))
+    ray = LocalRay(origin, way, way, t0, t1)
+    found = []
+    # Of a refined grid that which it refines.
+    for occupancy in (grid, SimpleNamespace(coarse=grid), None):
+        medium = SimpleNamespace(occupancy=occupancy, to_unit=lambda p: p, vector_to_unit=lambda v: v, density=density)
+        how = {"steps": 4096, "shortest": step, "longest": 0.02, "dt_gamma": dt_gamma}
+        alpha, depth, _, n = study_paper.march(medium, ray, t0, t1, True, None, **how)
+        found.append([np.array(v, float) for v in (alpha, depth, n)])
+    leaping, refining, whole = found
+    assert all(np.array_equal(a, b) for a, b in zip(leaping, refining))
+    assert (leaping[2] <= whole[2]).all() and leaping[2].mean() < 0.6 * whole[2].mean()
+    # A sample at a wall may fall to either side of it by rounding; grown steps begin elsewhere behind a leap.
+    bound = 0.04 if dt_gamma else 0.01
+    assert whole[0].max() > 0.5 and np.abs(leaping[0] - whole[0]).max() < bound
+    assert np.abs(leaping[1] - whole[1]).max() < 2 * bound
+    if not dt_gamma:
+        assert np.median(np.abs(leaping[0] - whole[0])) < 1e-5
+        # As many as lie in occupied cells of the unit cube.
+        t = 0.5 / d[2] + step * np.arange(600)[:, None]
+        p = o[:, None] + d[:, None] * t
+        cell = np.floor(p * np.array([6, 4, 5])[:, None, None]).astype(int)
+        inside = (p[2] < 1) & (p[2] >= 0)
+        full = grid.bits[np.clip(cell[2], 0, 4), np.clip(cell[1], 0, 3), np.clip(cell[0], 0, 5)] & inside
+        assert np.abs(leaping[2] - full.sum(0)).max() <= 3 and np.median(np.abs(leaping[2] - full.sum(0))) == 0
+
+
+def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
+    subject = open_subject("slab", "auto", 12, 8)
+    o, d = subject.rays(1)
+    steps = 64
+    step = subject.extent / steps
+    seen = subject.channels(
+        study_paper.as_in_the_paper(subject.integrator(), subject.sensor, subject.tolerance, steps), 1, 1
+    )
+    for i in range(0, len(o), 7):
+        hit = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
+        depth, T = 0.0, 1.0
+        if hit is not None:
+            t = hit[0]
+            while t < hit[1]:
+                w = T * -math.expm1(-study_scenes.SLAB_DENSITY * step)
+                t += step
+                depth, last = depth + w * t, T < study_paper.STOP
+                T -= w
+                if last:
+                    break
+        assert abs(seen["depth"][i] - depth) < 2e-2 * step + 0.04 * (1 - seen["opacity"][i])
+        assert abs(seen["opacity"][i] - (1 - T)) < 2e-2
+    half = (seen["opacity"] > 0.3) & (seen["opacity"] < 0.9)
+    known = subject.truth(1, "expected", "depth")
+    assert half.any() and np.all(seen["depth"][half] < 0.95 * known.depth[half])
+
+
+# ---- The rows of a study: sweeps that are even on log axes, and what a row's name promises ----
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return settings(
+        SimpleNamespace(marched=True, hits=False, extent=2.0, has_gaze=True, normalized=True, resampled=True)
+    )
+
+
+def test_sweeps_are_even_on_a_log_axis(rows):
+    steps = lambda group: [2.0 / r.params["step"] for r in rows if r.group == group]
+    sweeps = {
+        "steps": steps("steps, linear"),
+        "resolutions": [r.resolution for r in rows if re.fullmatch(r"grid \d+, cells", r.name)],
+        "dt_gamma": [r.params["dt_gamma"] for r in rows if r.group == "dt_gamma"],
+        "coarse": [r.params["coarse"] for r in rows if r.group == "coarse"],
+        "steps at a grid": [2.0 / r.params["step"] for r in rows if re.fullmatch(r"grid 64, cells, \d+ steps", r.name)],
+        "map heights": [r.params["map_height"] for r in rows if "map_height" in r.params and not r.first_frame],
+        "tolerances": [r.params["integral_tolerance"] for r in rows if r.group == "integral"][1:],
+        "samples": [r.spp for r in rows if r.group == "spp"],
+    }
+    for name, values in sweeps.items():
+        ratios = np.divide(values[1:], values[:-1])
+        assert len(values) >= 3 and np.allclose(ratios, ratios[0]) and ratios[0] in (2, 4), (name, values)
+    assert tuple(sweeps["steps"]) == STEP_COUNTS and tuple(sweeps["resolutions"]) == RESOLUTIONS
+
+
+def test_a_sweep_ends_before_what_the_factor_is_without(rows):
+    """The default stands for them: steps that do not grow, and nothing coarser than a step."""
+    assert min(r.params["coarse"] for r in rows if r.group == "coarse") > 1
+    assert min(r.params["dt_gamma"] for r in rows if r.group == "dt_gamma") > 0
+
+
+def test_rows_do_what_their_names_say(rows):
+    for row in rows:
+        assert row.first_frame == row.name.endswith("first frame"), row.name
+        if found := re.search(r"(\d+) steps", row.name):
+            n = row.paper[0] if row.paper else 2.0 / row.params["step"]
+            assert n == int(found[1]), row.name
+        if found := re.search(r"dt_gamma 1/(\d+)", row.name):
+            gamma = row.paper[1] if row.paper else row.params["dt_gamma"]
+            assert gamma == 1 / int(found[1]), row.name
+        elif row.paper:
+            assert row.paper[1] == 0, row.name
+
+
+@pytest.mark.parametrize("has_gaze", [True, False])
+def test_gaze_is_left_out_where_there_is_one(has_gaze):
+    subject = SimpleNamespace(marched=True, hits=False, extent=2.0, has_gaze=has_gaze, normalized=False, resampled=True)
+    left_out = {r.name: r.params.get("aovs", "") for r in settings(subject) if r.group == "leave out"}
+    assert ("no gaze" in left_out) == has_gaze and all("gaze" not in aovs for aovs in left_out.values())
+    assert not has_gaze or "visibility" in left_out["no gaze"]
+
+
+@pytest.mark.parametrize("normalized", [True, False])
+def test_integrals_are_varied_where_there_are_any(normalized):
+    subject = SimpleNamespace(
+        marched=True, hits=False, extent=2.0, has_gaze=True, normalized=normalized, resampled=False
+    )
+    found = [r.params["integral_tolerance"] for r in settings(subject, quick=True) if r.group == "integral"]
+    assert found == ([0.0, 5e-3] if normalized else [])
+
+
+def test_settings_vary_one_factor_at_a_time():
+    subject = open_subject("slab", "auto", 12, 8)
+    rows = settings(subject)
+    assert rows[0].name == "default" and not rows[0].params
+    names = [r.name for r in rows]
+    assert len(set(names)) == len(names)
+    for rule in ("constant", "linear"):
+        assert {r.params["step"] for r in rows if r.group == f"steps, {rule}"} == {
+            subject.extent / n for n in STEP_COUNTS
+        }
+    groups = {r.group for r in rows}
+    assert groups >= {
+        "dt_gamma",
+        "coarse",
+        "stop",
+        "color_cutoff",
+        "depth",
+        "visibility",
+        "jitter",
+        "leave out",
+        "spp",
+        "resolution",
+        "paper",
+    }
+
+
+def test_a_quick_study_is_a_part_of_a_whole_one():
+    subject = open_subject("slab", "auto", 12, 8)
+    whole = {r.name for r in settings(subject)}
+    quick = [r for r in settings(subject, quick=True) if r.group not in ("visibility", "spp", "paper")]
+    assert len(quick) > 15 and {r.name for r in quick} <= whole

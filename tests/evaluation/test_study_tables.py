@@ -1,0 +1,159 @@
+"""Tests of `nerg_mi.evaluation.study_tables`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgba
+
+from nerg_mi.evaluation import study_tables
+from nerg_mi.evaluation import study_tables as study_plots
+
+# ---- The pictures of a study: what is drawn, asked of matplotlib's figures ----
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    figures = []
+    monkeypatch.setattr(study_plots, "save", lambda figure, path, about: figures.append(figure))
+    return figures
+
+
+def row(group, seconds, error, pareto=""):
+    return {"group": group, "seconds": seconds, "pareto": pareto, "spp": 1, "resolution": "", "visibility": "depth"} | {
+        name: error for name, _ in study_plots.PANELS
+    }
+
+
+ALL = "color depth visibility gaze"
+
+
+ROWS = [
+    row("default", 0.02, 1e-3, ALL),
+    row("steps", 0.01, 2e-3, ALL),
+    row("steps", 0.16, 0.0, ALL),
+    row("paper", 0.08, 5e-3),
+]
+
+
+SCALING = [
+    {"axis": axis, "value": v, "seconds": 0.1 * v**p}
+    for axis, p in (("pixels", 1.0), ("samples", 0.5), ("extent", 2.0))
+    for v in (1, 2, 4, 8)
+]
+
+
+def test_panels_show_all_rows_and_the_front_below_them(drawn):
+    study_plots.plot_errors("a.png", ROWS, "title")
+    panels = drawn[0].axes
+    assert [a.get_ylabel() for a in panels] == [label for _, label in study_plots.PANELS]
+    assert {a.get_xlabel() for a in panels} == {"seconds a picture"}
+    for axes in panels:
+        (front,) = axes.lines
+        # In the order of time; an error of zero stands on the axis' lower end.
+        assert np.allclose(front.get_xydata(), [(0.01, 2e-3), (0.02, 1e-3), (0.16, study_plots.FLOOR)])
+        assert front.get_drawstyle() == "steps-post"
+        points = {len(c.get_offsets()): c for c in axes.collections}
+        assert sum(len(c.get_offsets()) for c in axes.collections) == 4
+        assert np.allclose(points[2].get_offsets(), [(0.01, 2e-3), (0.16, study_plots.FLOOR)])
+        assert all(c.get_zorder() > front.get_zorder() for c in axes.collections)
+        assert axes.get_xscale() == axes.get_yscale() == "log"
+    crosses = [c for c in panels[0].collections if np.allclose(c.get_offsets(), [(0.08, 5e-3)])]
+    assert len(crosses) == 1 and tuple(crosses[0].get_facecolor()[0]) == to_rgba("crimson")
+    named = sorted(t.get_text() for t in drawn[0].legends[0].get_texts())
+    assert named == ["Pareto front", "default", "paper", "steps"]
+
+
+def test_an_axis_of_hardly_a_decade_is_labelled_at_2_and_5_and_nowhere_between(drawn):
+    # 12 to 240 ms: the single decade within does not say how far apart the points are; whole decades elsewhere do.
+    for seconds, labelled in (((0.012, 0.24), True), ((0.012, 12.0), False)):
+        study_plots.plot_errors("a.png", [row("steps", s, 1e-3 * s) for s in seconds], "title")
+        axis = drawn[-1].axes[0].xaxis
+        at = axis.get_minorticklocs()
+        shown = [round(t, 6) for t, text in zip(at, axis.get_minor_formatter().format_ticks(at)) if text]
+        assert [t for t in shown if seconds[0] < t < seconds[1]] == ([0.02, 0.05, 0.2] if labelled else [])
+
+
+def test_cost_is_drawn_over_named_axes_with_the_exponent(drawn):
+    study_plots.plot_scaling("a.png", SCALING, "title")
+    panels = drawn[0].axes
+    assert [a.get_xlabel() for a in panels] == ["pixels", "samples a pixel", "extent of the scene at equal step"]
+    assert [a.get_title().split()[1] for a in panels] == ["1.00", "0.50", "2.00"]
+    assert {a.get_ylabel() for a in panels} == {"seconds a picture"}
+    assert np.allclose(panels[2].lines[0].get_xydata(), [(v, 0.1 * v**2) for v in (1, 2, 4, 8)])
+    # The exponent is that of the upper half: what a render costs at least is none of it.
+    study_plots.plot_scaling("a.png", [r | {"seconds": 9.0} if r["value"] == 1 else r for r in SCALING], "title")
+    assert [a.get_title() for a in drawn[1].axes] == [a.get_title() for a in panels]
+
+
+def test_both_pictures_are_as_wide_and_their_lines_as_thin(drawn):
+    """They stand below each other on a page."""
+    study_plots.plot_errors("a.png", ROWS, "title")
+    study_plots.plot_scaling("b.png", SCALING, "title")
+    errors, cost = drawn
+    pixels = [f.get_size_inches()[0] * f.dpi for f in drawn]
+    assert pixels[0] == pixels[1] and errors.get_size_inches()[1] > cost.get_size_inches()[1]
+    widths = {line.get_linewidth() for f in drawn for a in f.axes for line in a.lines}
+    assert widths == {cost.axes[0].lines[0].get_linewidth()}
+
+
+def test_exponent():
+    x = np.array([1.0, 2, 8, 64])
+    assert math.isclose(study_plots.exponent(x, 3 * x**1.5), 1.5)
+
+
+# ---- What follows from a study's rows: Pareto fronts, and the comparison with the paper's marching ----
+
+
+def test_pareto():
+    assert study_tables.pareto([(1, 5), (2, 3), (3, 4), (4, 1), (5, 1)]) == [True, True, False, True, False]
+    assert study_tables.pareto([(1, 1), (1, 1), (1, 2)]) == [True, True, False]
+    assert study_tables.pareto([]) == []
+    rng = np.random.default_rng(0)
+    points = [tuple(p) for p in rng.random((200, 2))]
+    beaten = [any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points) for p in points]
+    assert study_tables.pareto(points) == [not b for b in beaten]
+
+
+def test_a_page_shows_times_in_ms_shares_in_percent_and_errors_as_they_are():
+    units = {"seconds": 1e3, "cpu_seconds": 1e3, "visibility_wrong": 100}
+    names = [*units, "density_evals", "color_evals", "peak_mb", "color_rmse", "depth_mae", "depth_p99", "surface_mae"]
+    names += ["visibility_mae", "gaze_mae", "gaze_kld"]
+    row = {"setting": "a", "group": "leave out", "spp": 1, "resolution": "", "visibility": "depth"}
+    row |= {name: (k + 1) / 128 for k, name in enumerate(names)}
+    about = {"scene": "s", "size": (1, 1), "variant": "v", "reference": "r", "reference_change_when_step_halved": {}}
+    page = study_tables.markdown({"rows": [{**row, "group": "default"}, row], **about})
+    assert "against the paper" not in page
+    shown = [float(cell) for cell in page.split("| a |")[2].split("\n")[0].strip(" |").split("|")]
+    assert sorted(shown) == sorted(float(f"{row[name] * units.get(name, 1):.3g}") for name in names)
+
+
+def test_against_paper_takes_the_best_of_either_kind():
+    def row(setting, group, seconds, depth_mae):
+        return {
+            "setting": setting,
+            "group": group,
+            "seconds": seconds,
+            "cpu_seconds": 2 * seconds,
+            "depth_mae": depth_mae,
+            "density_evals": 1.0,
+            "spp": 1,
+            "resolution": "",
+            "visibility": "depth",
+        }
+
+    rows = [
+        row("default", "default", 3, 0.1),
+        row("short", "steps", 1, 0.4),
+        row("map", "visibility", 0.1, 0.1) | {"visibility": "map"},
+        row("slow", "steps", 9, 0.01),
+        row("p", "paper", 4, 0.5),
+        row("fast", "paper", 0.5, 0.001),
+    ]
+    for clock in ("seconds", "cpu_seconds"):
+        first, second = study_tables.against_paper(rows, clock)
+        assert first["equal_time"]["setting"] == "default" and math.isclose(first["equal_time"]["error_ratio"], 5)
+        assert first["equal_error"]["setting"] == "short" and math.isclose(first["equal_error"]["time_ratio"], 4)
+        assert second["equal_time"] is None and second["equal_error"] is None

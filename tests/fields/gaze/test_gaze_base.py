@@ -1,0 +1,185 @@
+"""Tests of `nerg_mi.fields.gaze_base`."""
+
+from __future__ import annotations
+
+import inspect
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.fields import gaze_base
+from nerg_mi.fields.gaze_base import REACH, Basis, RaySupport, basis_of
+from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_log_density import LogGazeField
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.mlp import namespace
+from tests.fields.gaze.test_log_density import BOX, GRID, SMALL
+
+# ---- What a field rests on, in words, and as a checkpoint has it ----
+
+
+@pytest.mark.parametrize(
+    ("basis", "words"),
+    [
+        (Basis(81_751, 100), "81,751 rays of 100 people"),
+        (Basis(1, 1), "1 ray of 1 person"),
+        (Basis(300), "300 rays"),
+        (Basis(300, 3, 1), "300 rays of 3 people and 1 salience image"),
+        (Basis(0, None, 12), "12 salience images"),
+        (Basis(0), ""),
+    ],
+)
+def test_words(basis, words):
+    assert basis.words() == words
+
+
+def test_of_a_checkpoint():
+    assert basis_of({"rays": 5, "people": 2, "salience_views": 0}) == Basis(5, 2)
+    # Checkpoints of earlier versions do not count people, and those of views have no rays.
+    assert basis_of({"rays": 5}) == Basis(5)
+    assert basis_of({"rays": 0, "people": 0, "salience_views": 3}) == Basis(0, None, 3)
+    assert basis_of({"made": "random"}) is None
+
+
+@pytest.mark.parametrize("value", [-1, 1e300, "5", [5], True, None, 1 << 70, float("nan")])
+def test_what_is_no_count_is_not_shown(value):
+    assert basis_of({"rays": value}) is None and basis_of({"rays": 7, "people": value}) == Basis(7)
+
+
+# ---- What every gaze field answers: each kind that the library has answers all of it ----
+
+
+def asked(of) -> set:
+    """Names of what a protocol asks for."""
+    inherited = set().union(*(vars(c) for c in of.__mro__ if c.__module__ == of.__module__))
+    annotated = set().union(*(inspect.get_annotations(c) for c in of.__mro__ if c.__module__ == of.__module__))
+    return {n for n in inherited | annotated if not n.startswith("_")}
+
+
+def fields():
+    ns = namespace("llvm")
+    log = [LogGazeField.random(SMALL, BOX, ns, seed) for seed in (1, 2)]
+    return {
+        "product": GazeField.random(GazeConfig(GRID, width=16), BOX, ns),
+        "log_density": log[0],
+        "ensemble": GazeEnsemble(log),
+    }
+
+
+@pytest.mark.parametrize("kind", ["product", "log_density", "ensemble"])
+def test_every_kind_answers_what_the_protocol_asks(kind):
+    field = fields()[kind]
+    assert field.kind == kind in gaze_base.kinds()
+    one = len(field.members) == 1
+    assert all(hasattr(field, n) for n in asked(gaze_base.GazeDensity if one else gaze_base.AnyGazeField))
+    assert all(hasattr(field.config, n) for n in asked(gaze_base.GazeFieldConfig))
+    assert one == (field.members[0] is field)
+    assert field.networks == (4 if kind == "ensemble" else 2)
+    # What it says of itself is what it is built of.
+    assert field.architecture().get("kind", "product") == kind
+
+
+# ---- Kinds of gaze fields by the names that checkpoints give them ----
+
+
+def test_the_kinds_of_the_library_are_known():
+    """Whichever module is imported first: they register themselves."""
+    assert {"product", "log_density", "ensemble"} <= set(gaze_base.kinds())
+
+
+def test_a_kind_builds_its_checkpoints(monkeypatch):
+    """A checkpoint that names none is a product's."""
+    monkeypatch.setattr(gaze_base, "_KINDS", dict(gaze_base._KINDS))
+    built = []
+
+    @gaze_base.register
+    class Other:
+        kind = "other"
+
+        @classmethod
+        def from_arrays(cls, about, box, arrays):
+            built.append((about, box, arrays))
+            return cls()
+
+    about = {"kind": "other", "width": 3}
+    assert isinstance(gaze_base.build(about, BOX, "arrays"), Other) and built == [(about, BOX, "arrays")]
+    for about, cls in (({}, GazeField), ({"kind": "log_density"}, LogGazeField)):
+        monkeypatch.setattr(cls, "from_arrays", classmethod(lambda c, *given: (c, *given)))
+        assert gaze_base.build(about, BOX, "arrays") == (cls, about, BOX, "arrays")
+
+
+@pytest.mark.parametrize("kind", ["wavelet", ["product"], 3])
+def test_an_unknown_kind_is_refused(kind):
+    with pytest.raises((ValueError, TypeError), match="wavelet|kind|unhashable"):
+        gaze_base.build({"kind": kind}, BOX, None)
+
+
+# ---- How much data there is around a position: cells against the sum over all rays ----
+
+
+def exact(origins, radius, p, reach=REACH):
+    return np.maximum(1 - ((origins - p) ** 2).sum(axis=1) / (reach * radius) ** 2, 0).sum()
+
+
+def at(support, p):
+    return float(support.at(ns.Array3f(*map(float, p)))[0])
+
+
+def paths(n=20_000, seed=0):
+    """People who walk through a hall and stop here and there."""
+    rng = np.random.default_rng(seed)
+    walk = np.cumsum(rng.normal(0, 0.03, (n, 2)) * (rng.random((n, 1)) < 0.5), axis=0) % 4
+    return np.concatenate([walk, rng.normal(1.6, 0.08, (n, 1))], axis=1)
+
+
+def test_where_it_is_greatest():
+    rng = np.random.default_rng(0)
+    origins = np.concatenate([rng.normal(c, 0.05, (n, 3)) for c, n in (((0, 0, 1), 400), ((3, 1, 2), 900))])
+    support = RaySupport.of(origins, 0.3)
+    densest = support.densest()
+    assert np.linalg.norm(densest - (3, 1, 2)) < 0.1
+    everywhere = [exact(origins, 0.3, p, 1) for p in origins[::7]]
+    assert exact(origins, 0.3, densest, 1) > 0.9 * max(everywhere)
+
+
+@pytest.mark.parametrize("radius", [0.1, 0.6])
+def test_cells_stand_for_their_rays(radius):
+    origins = paths()
+    support = RaySupport.of(origins, radius)
+    assert support.cells[:, 3].sum() == len(origins) and len(support.cells) < len(origins)
+    rng = np.random.default_rng(1)
+    places = np.concatenate([origins[rng.integers(0, len(origins), 200)], rng.uniform(-6, 10, (100, 3))])
+    found, expected = (
+        np.array([f(p) for p in places]) for f in (lambda p: at(support, p), lambda p: exact(origins, radius, p))
+    )
+    many = expected >= 5
+    assert many.sum() > 100 and (expected == 0).sum() > 20
+    off = np.abs(found / np.where(many, expected, 1) - 1)[many]
+    assert np.percentile(off, 95) < 0.04 and np.median(off) < 0.01
+    assert np.abs(found - expected)[~many].max() < 4
+
+
+def test_inside_of_the_radius_cells_are_exact():
+    origins = np.random.default_rng(0).normal(0, 0.05, (1000, 3))
+    support = RaySupport.of(origins, 1.0)
+    assert at(support, (1.2, 2.1, 0)) == pytest.approx(exact(origins, 1.0, [1.2, 2.1, 0]), rel=1e-5)
+
+
+def test_one_ray_counts_one_where_it_started_and_nothing_five_radii_away():
+    support = RaySupport.of([[1.0, 2, 3]], 0.5)
+    assert at(support, (1, 2, 3)) == 1 and at(support, (1, 2, 4.25)) == 0.75 and at(support, (3.5, 2, 3)) < 1e-6
+    assert support.reach == 2.5
+
+
+def test_what_is_no_support_is_refused():
+    for cells, radius in (([[0, 0, 0, 1, np.nan]], 1.0), ([[0, 0, 0, 1, 0]], 0.0)):
+        with pytest.raises(ValueError, match="finite cells and a positive radius"):
+            RaySupport(np.array(cells), radius)
+
+
+def test_a_cube_of_the_radius_has_eight_cells():
+    """However its lowest rays lie on their borders."""
+    axis = np.arange(4) / 4
+    origins = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    assert RaySupport.of(origins, 1.0).cells[:, 3].tolist() == [8] * 8

@@ -1,0 +1,438 @@
+"""Tests of `nerg_mi.photos.structure`."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import signal
+import struct
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from nerg_mi.errors import NergError
+from nerg_mi.photos import structure
+from nerg_mi.photos.images import read_image
+from nerg_mi.photos.structure import (
+    EXHAUSTIVE,
+    Folders,
+    Picture,
+    Settings,
+    cameras_of,
+    check_installed,
+    chosen_pairs,
+    copy_photos,
+    encoded,
+    fit_similarity,
+    list_photos,
+    pose_errors,
+    reconstruct,
+    shrunk,
+    small_name,
+    small_size,
+)
+
+# ---- Poses against others: similarities and errors that are known ----
+
+
+def similarity(scale: float, seed: int = 0) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, :3] = scale * Rotation.random(random_state=seed).as_matrix()
+    out[:3, 3] = 1, -2, 3
+    return out
+
+
+def poses(count: int = 12) -> np.ndarray:
+    out = np.tile(np.eye(4), (count, 1, 1))
+    out[:, :3, :3] = Rotation.random(count, random_state=1).as_matrix()
+    out[:, :3, 3] = np.random.default_rng(2).normal(size=(count, 3))
+    return out
+
+
+def moved(all_poses: np.ndarray, by: np.ndarray) -> np.ndarray:
+    out = all_poses.copy()
+    scale = np.cbrt(np.linalg.det(by[:3, :3]))
+    out[:, :3, :3] = by[:3, :3] / scale @ all_poses[:, :3, :3]
+    out[:, :3, 3] = all_poses[:, :3, 3] @ by[:3, :3].T + by[:3, 3]
+    return out
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_a_similarity_is_found_again(flat):
+    points = np.random.default_rng(0).normal(size=(9, 3)) * [1, 1, 0 if flat else 1]
+    by = similarity(2.5)
+    assert np.allclose(fit_similarity(points, points @ by[:3, :3].T + by[:3, 3]), by)
+
+
+def test_a_mirror_is_none():
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    assert np.linalg.det(fit_similarity(points, points * [1, 1, -1])[:3, :3]) > 0
+
+
+@pytest.mark.parametrize(
+    "points, said", [(np.eye(3)[:2], "3 pairs"), (np.outer(np.arange(5.0), [1, 2, 3]), "on a line")]
+)
+def test_what_leaves_it_open_is_refused(points, said):
+    with pytest.raises(ValueError, match=said):
+        fit_similarity(points, points)
+
+
+def test_errors_do_not_depend_on_coordinates():
+    errors = pose_errors(poses(), moved(poses(), similarity(0.3)))
+    assert errors.rotation.max() < 1e-6 and errors.position.max() < 1e-12
+
+
+def test_errors_are_those_that_were_made():
+    reference, wrong = poses(), poses()
+    wrong[4, :3, :3] = wrong[4, :3, :3] @ Rotation.from_rotvec([0, np.radians(7), 0]).as_matrix()
+    errors = pose_errors(wrong, reference)
+    assert errors.rotation[4] == pytest.approx(7) and np.delete(errors.rotation, 4).max() < 1e-6
+    wrong = poses()
+    wrong[:, :3, :3] = wrong[:, :3, :3] @ Rotation.from_rotvec([0.02, -0.01, 0]).as_matrix()
+    errors = pose_errors(wrong, reference)
+    assert errors.rotation == pytest.approx(np.degrees(np.hypot(0.02, 0.01))) and errors.scatter.max() < 1e-6
+    wrong = moved(poses(), similarity(5))
+    wrong[0, :3, 3] += 0.01
+    assert 0 < pose_errors(wrong, reference).position.argmax() + 1 == 1
+
+
+# ---- Which pictures are compared ----
+
+
+def test_few_are_all_compared():
+    assert chosen_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    assert len(chosen_pairs(EXHAUSTIVE)) == EXHAUSTIVE * (EXHAUSTIVE - 1) // 2
+    assert chosen_pairs(4, "exhaustive") == chosen_pairs(4) and chosen_pairs(0) == []
+
+
+def test_many_are_compared_with_neighbours_and_landmarks():
+    pairs = chosen_pairs(600)
+    assert pairs == sorted(set(pairs)) and all(0 <= i < j < 600 for i, j in pairs)
+    assert {(5, 6), (5, 15), (5, 21), (5, 37), (0, 590)} <= set(pairs) and (5, 16) not in pairs
+    # The work grows with their number, and not with its square.
+    assert len(pairs) < 600 * 16 + 60 * 60 and len(chosen_pairs(4000)) < 4000 * 19 + 60 * 60
+
+
+def test_all_of_many_where_it_is_asked_for():
+    assert len(chosen_pairs(150, "exhaustive")) == 150 * 149 // 2 > len(chosen_pairs(150, "sequential"))
+    with pytest.raises(NergError, match="matching must be auto"):
+        chosen_pairs(4, "vocabulary")
+
+
+# ---- Photos of a folder: turned as they are to be looked at, and what is wrong with others named ----
+
+
+def ramp(width: int = 48, height: int = 32, seed: int = 0) -> Image.Image:
+    """A smooth picture, red to the right and green downwards; the seed is in its blue."""
+    x, y = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
+    return Image.fromarray(np.stack([x, y, np.full_like(x, 20 * seed)], axis=-1).astype(np.uint8))
+
+
+@pytest.fixture
+def folders(tmp_path) -> Folders:
+    made = Folders(tmp_path / "images", tmp_path / "small")
+    made.images.mkdir()
+    made.small.mkdir()
+    return made
+
+
+def copied(folder: Path, folders: Folders, longest: int = 24):
+    steps = []
+    pictures, unused = copy_photos(list_photos(folder)[0], folders, longest, lambda *now: steps.append(now))
+    assert steps and steps[-1][0] == steps[-1][1] == len(steps)
+    return pictures, {u.name: u.reason for u in unused}
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    out = tmp_path / "photos"
+    out.mkdir()
+    return out
+
+
+def test_what_stands_upright_is_copied_byte_for_byte(folder, folders):
+    ramp().save(folder / "b.JPG", quality=90)
+    ramp(seed=2).convert("L").save(folder / "a c.png")
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["a c.png", "b.JPG"] and not unused
+    for k, p in enumerate(pictures):
+        assert (folders.images / p.name).read_bytes() == (folder / p.name).read_bytes()
+        assert p.size == (48, 32) and p.small == (24, 16) == Image.open(folders.small / small_name(k)).size
+        assert p.focal is None
+
+
+# Where red and green grow in the file, so that after turning red grows to the right and green downwards.
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_photo_is_turned_as_its_notes_say(orientation, folder, folders):
+    """EXIF, tag 0x0112: the file of an upright picture is made by the inverse of what viewers do."""
+    undo = {
+        2: Image.Transpose.FLIP_LEFT_RIGHT,
+        3: Image.Transpose.ROTATE_180,
+        4: Image.Transpose.FLIP_TOP_BOTTOM,
+        5: Image.Transpose.TRANSPOSE,
+        6: Image.Transpose.ROTATE_90,
+        7: Image.Transpose.TRANSVERSE,
+        8: Image.Transpose.ROTATE_270,
+    }
+    stored = ramp() if orientation == 1 else ramp().transpose(undo[orientation])
+    notes = Image.Exif()
+    notes[0x0112] = orientation
+    stored.save(folder / "a.jpg", quality=98, exif=notes)
+    (picture,), unused = copied(folder, folders)
+    assert picture.size == (48, 32) and not unused
+    # As the trainer sees it, which passes over such notes.
+    seen = read_image(folders.images / "a.jpg").astype(int)
+    assert np.abs(seen - np.asarray(ramp())).mean() < 3
+    assert Image.open(folders.images / "a.jpg").getexif().get(0x0112, 1) == 1
+
+
+def test_notes_tell_focal_length_and_camera(folder, folders):
+    notes = Image.Exif()
+    notes[0x010F], notes[0x0110] = "Maker", "Model"
+    notes.get_ifd(0x8769)[0xA405] = 26
+    notes.get_ifd(0x8769)[0x920A] = 4.25
+    ramp(360, 240).save(folder / "a.jpg", exif=notes)
+    (picture,), _ = copied(folder, folders)
+    # A picture of the shape of film, on which 36 mm are 360 pixels.
+    assert picture.focal == pytest.approx(260, rel=1e-4) and picture.made_by[:2] == ("Maker", "Model")
+    assert float(picture.made_by[2]) == 4.25
+
+
+def test_damaged_notes_do_not_matter(folder, folders):
+    ramp().save(folder / "a.jpg", exif=b"Exif\x00\x00MM\x00*\xff\xff\xff\xff" + bytes(range(256)))
+    (picture,), unused = copied(folder, folders)
+    assert picture.made_by in ((), ("", "", "")) and not unused
+
+
+def test_palettes_are_stored_anew(folder, folders):
+    ramp().quantize(16).save(folder / "a.png")
+    (picture,), _ = copied(folder, folders)
+    assert Image.open(folders.images / picture.name).mode == "RGB"
+
+
+def test_what_cannot_be_used_is_named(folder, folders):
+    ramp().save(folder / "a.jpg", quality=95)
+    ramp().save(folder / "b.jpg", quality=95)
+    ramp(seed=5).save(folder / "good.jpg")
+    raw = (folder / "good.jpg").read_bytes()
+    (folder / "cut.jpg").write_bytes(raw[: len(raw) // 2])
+    (folder / "empty.png").write_bytes(b"")
+    (folder / "text.jpg").write_text("no picture")
+    ramp().save(folder / "a gif.jpg", "gif")
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["a.jpg", "good.jpg"]
+    assert unused["b.jpg"] == 'it is the same file as "a.jpg"'
+    assert set(unused) == {"b.jpg", "cut.jpg", "empty.png", "text.jpg", "a gif.jpg"}
+    assert all("cannot be read" in unused[n] and n in unused[n] for n in set(unused) - {"b.jpg"})
+    assert {p.name for p in folders.images.iterdir()} == {"a.jpg", "good.jpg"}
+
+
+def test_pictures_of_other_kinds_are_named_whatever_they_are_called(folder, folders):
+    ramp().save(folder / "a.jpg", "bmp")
+    ramp(seed=1).save(folder / "b.jpg", "png")
+    (folder / "c.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["b.jpg"] and 'of the kind "bmp"' in unused["a.jpg"]
+    assert "no picture of a kind that is read" in unused["c.jpg"]
+
+
+def test_links_out_of_the_folder_are_followed_only_if_allowed(folder, folders, tmp_path):
+    ramp().save(tmp_path / "private.jpg")
+    ramp(seed=1).save(folder / "a.jpg")
+    (folder / "b.jpg").symlink_to(tmp_path / "private.jpg")
+    (folder / "c.jpg").symlink_to("a.jpg")
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["a.jpg"] and "same file" in unused["c.jpg"]
+    assert "outside of" in unused["b.jpg"] and "--allow-outside" in unused["b.jpg"]
+    found, _ = copy_photos(list_photos(folder)[0], folders, 24, lambda *now: None, allow_outside=True)
+    assert [p.name for p in found] == ["a.jpg", "b.jpg"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes on Linux alone")
+def test_names_that_cannot_be_stored_are_told(folder, folders):
+    ramp().save(folder / "good.jpg")
+    for k, name in enumerate((b"caf\xe9.jpg", b"two\nlines.jpg", b"\x1b[31m.jpg")):
+        ramp(seed=k + 1).save(folder / os.fsdecode(name))
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["good.jpg"]
+    assert len(unused) == 3 and all("rename it" in reason for reason in unused.values())
+
+
+def test_photos_are_as_large_as_their_bytes_warrant(folder, folders, monkeypatch):
+    ramp().save(folder / "a.png")
+    raw = (folder / "a.png").read_bytes()
+    claim = raw[12:16] + struct.pack(">II", 8193, 8193) + raw[24:29]
+    (folder / "b.png").write_bytes(raw[:12] + claim + zlib.crc32(claim).to_bytes(4, "big") + raw[33:])
+    with (folder / "c.jpg").open("wb") as file:
+        file.truncate((1 << 28) + 1)
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["a.png"]
+    assert "8,193 x 8,193 pixels" in unused["b.png"] and "make it smaller" in unused["b.png"]
+    assert "268,435,457 bytes" in unused["c.jpg"]
+    # JPEG, in which it is stored where it is turned, has no longer sides.
+    Image.new("L", (65_501, 1)).save(folder / "d.png")
+    assert "a side of 65,501 pixels" in copied(folder, folders)[1]["d.png"]
+    # Pillow's own limit is lower than what telephones take by now.
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    assert [p.name for p in copied(folder, folders)[0]] == ["a.png"]
+
+
+def test_odd_notes_leave_a_photo_as_it_is(folder, folders):
+    """Of each kind and size: Pillow's own turning writes the notes anew, and fails on some."""
+    entry = lambda *numbers: struct.pack(">HHII", *numbers)
+    notes = [
+        entry(0x0112, 3, 0xFFFFFFFF, 8) + entry(0x8769, 4, 1 << 30, 8),
+        entry(0x0112, 11, 1, 0x7FC00000),
+        entry(0x0112, 2, 4, 0x36363636),
+        entry(0x8769, 4, 1, 8) + entry(0x0112, 5, 1, 8),
+    ]
+    for k, found in enumerate(notes):
+        head = b"Exif\0\0MM\0*\0\0\0\x08" + struct.pack(">H", len(found) // 12)
+        # What follows are the same notes again.
+        ramp(seed=k).save(folder / f"{k}.jpg", exif=head + found + struct.pack(">I", 8))
+    pictures, unused = copied(folder, folders)
+    assert [p.size for p in pictures] == [(48, 32)] * 4 and not unused
+
+
+def test_others_are_named_and_hidden_ones_are_not(folder):
+    ramp().save(folder / "a.jpg")
+    for name in ("b.HEIC", ".c.jpg", "notes.txt"):
+        (folder / name).write_bytes(b"x")
+    photos, others = list_photos(folder)
+    assert [p.name for p in photos] == ["a.jpg"] and [o.name for o in others] == ["b.HEIC"]
+    assert "JPEG and PNG" in others[0].reason
+
+
+def test_a_folder_without_photos_is_told(folder, tmp_path):
+    with pytest.raises(NergError, match="name the folder"):
+        list_photos(folder)
+    (folder / "images").mkdir()
+    with pytest.raises(NergError, match='did you mean ".*images"'):
+        list_photos(folder)
+    (folder / "a.heic").write_bytes(b"x")
+    with pytest.raises(NergError, match="convert them"):
+        list_photos(folder)
+    with pytest.raises(NergError, match="there is no folder of photos"):
+        list_photos(tmp_path / "nowhere")
+
+
+# ---- Copies of pictures, and which of them share a camera ----
+
+
+def test_the_longer_side_is_bounded():
+    assert small_size((1080, 1920), 960) == (540, 960)
+    assert small_size((640, 480), 960) == (640, 480) and small_size((5000, 2), 960) == (960, 1)
+    assert small_name(7) == "000007.png"
+
+
+def test_small_copies_are_averages():
+    pixels = np.zeros((40, 60, 3), np.uint8)
+    pixels[:, ::2] = 200
+    small = np.asarray(Image.open(io.BytesIO(shrunk(Image.fromarray(pixels), (15, 10)))))
+    assert small.shape == (10, 15, 3) and abs(small.astype(int) - 100).max() <= 12
+    assert np.array_equal(np.asarray(Image.open(io.BytesIO(shrunk(Image.fromarray(pixels), (60, 40))))), pixels)
+
+
+@pytest.mark.parametrize("suffix, kind", [(".png", "PNG"), (".JPG", "JPEG"), (".jpeg", "JPEG")])
+def test_files_are_of_their_names_kind(suffix, kind):
+    image = Image.fromarray(np.full((8, 9), 77, np.uint8))
+    opened = Image.open(io.BytesIO(encoded(image, suffix)))
+    assert opened.format == kind and opened.mode == "RGB" and opened.size == (9, 8)
+
+
+def test_pictures_of_one_size_share_a_camera():
+    upright, across = ((3, 4), (3, 4)), ((4, 3), (4, 3))
+    sizes = [upright, across, upright, upright]
+    pictures = [Picture(str(k), *size) for k, size in enumerate(sizes)]
+    assert cameras_of(pictures) == [0, 1, 0, 0] and cameras_of(pictures, share=False) == [0, 1, 2, 3]
+    made = [Picture(str(k), *upright, made_by=("maker", focal)) for k, focal in enumerate(["4.2", "4.2", "9"])]
+    assert cameras_of(made) == [0, 0, 1]
+
+
+# ---- The process that finds poses, from outside: what it is given, and how its end is told ----
+
+
+PICTURES = [Picture(f"{k}.jpg", (400, 300), (200, 150), focal=380.0 if k else None) for k in range(4)]
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    monkeypatch.setattr(structure, "check_installed", lambda: None)
+
+
+def ending(monkeypatch, program: str) -> None:
+    """A process of ours in place of the worker."""
+    started = structure.subprocess.Popen
+    monkeypatch.setattr(
+        structure.subprocess,
+        "Popen",
+        lambda command, **more: started([sys.executable, "-c", program, command[-1]], **more),
+    )
+
+
+def told(tmp_path: Path) -> str:
+    with pytest.raises(NergError) as said:
+        reconstruct(PICTURES, tmp_path, Settings(), lambda *now: None)
+    return str(said.value)
+
+
+def test_without_pycolmap(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    for call in (check_installed, lambda: reconstruct(PICTURES, tmp_path, Settings(), lambda *now: None)):
+        with pytest.raises(ImportError, match=r'"nerg-mi\[poses\]"'):
+            call()
+
+
+def test_what_is_asked_for(installed, monkeypatch, tmp_path):
+    ending(monkeypatch, "import os; os._exit(3)")
+    told(tmp_path)
+    job = json.loads((tmp_path / "job.json").read_text())
+    # The focal length is that of the small pictures; the median of what photos say counts for their camera.
+    assert job["cameras"] == [{"size": [400, 300], "small": [200, 150], "focal": 190.0, "pictures": 4}]
+    assert [p["camera"] for p in job["pictures"]] == [0] * 4 and job["lens"] is None and job["threads"] == -1
+
+
+@pytest.mark.parametrize(
+    "settings, said", [(Settings(lens="fish"), "lens must be auto"), (Settings(matching="a"), "matching must be auto")]
+)
+def test_wrong_settings(installed, settings, said, tmp_path):
+    with pytest.raises(NergError, match=said):
+        reconstruct(PICTURES, tmp_path, settings, lambda *now: None)
+
+
+@pytest.mark.parametrize(
+    "program, said",
+    [
+        ("import sys; sys.exit('E1 a.cc:1] Check failed: x\\n  @ trace')", "Check failed: x"),
+        ("raise ValueError('some reason')", r"with code 1 \(ValueError: some reason\)"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "want of memory"),
+        ("import os; os.abort()", f"with code {-signal.SIGABRT}"),
+    ],
+)
+def test_an_end_of_its_own_is_told_in_a_sentence(installed, program, said, monkeypatch, tmp_path):
+    ending(monkeypatch, program)
+    words = told(tmp_path)
+    assert re.search(said, words) and "\n" not in words
+
+
+def test_it_ends_with_whoever_started_it(installed, monkeypatch, tmp_path):
+    """Ctrl-C comes while its lines are read."""
+    program = "import os, sys, time; print([os.getpid(), 0, 1], flush=True); time.sleep(600)"
+    ending(monkeypatch, program)
+    found = []
+
+    def progress(pid, done, of):
+        found.append(pid)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(PICTURES, tmp_path, Settings(), progress)
+    with pytest.raises(ProcessLookupError):
+        os.kill(found[0], 0)

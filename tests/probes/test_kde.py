@@ -1,0 +1,161 @@
+"""Tests of `nerg_mi.probes.kde`."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.maths import vmf
+from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
+from nerg_mi.probes.kde import SphericalKde, SphericalKdeTable
+from tests.reference.kde import kde as reference
+
+# ---- Estimate ----
+
+
+def ragged(seed=0, counts=(1, 7, 300, 64)):
+    rng = np.random.default_rng(seed)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    return uniform_directions(offsets[-1], rng), offsets, rng.uniform(0.5, 90, len(counts)), rng
+
+
+def test_agrees_with_float64():
+    rays, offsets, kappa, rng = ragged()
+    x = fibonacci_directions(333)
+    got = SphericalKde(rays, offsets, kappa, backend="llvm").evaluate(x)
+    assert np.allclose(got, reference(x, rays, offsets, kappa), rtol=2e-4, atol=1e-6)
+
+    weights = rng.random(len(rays))
+    got = SphericalKde(rays, offsets, kappa, weights, "llvm").evaluate(x)
+    assert np.allclose(got, reference(x, rays, offsets, kappa, weights), rtol=2e-4, atol=1e-6)
+
+
+def test_own_directions_for_each_probe():
+    rays, offsets, kappa, rng = ragged()
+    kde = SphericalKde(rays, offsets, kappa, backend="llvm")
+    x = uniform_directions(4 * 50, rng).reshape(4, 50, 3)
+    got = kde.evaluate(x)
+    for p in range(4):
+        assert np.allclose(got[p], kde.evaluate(x[p])[p], rtol=1e-6)
+
+
+@pytest.mark.parametrize("kappa", [1e-8, 1e-3, 1.0, 100.0])
+def test_integrates_to_one(kappa):
+    rays, offsets, _, _ = ragged()
+    density = SphericalKde(rays, offsets, kappa, backend="llvm").evaluate(fibonacci_directions(8192))
+    assert np.allclose(density.mean(axis=1, dtype=np.float64) * 4 * np.pi, 1, atol=1e-3)
+
+
+def test_extreme_concentration_is_finite_and_right():
+    mu = np.array([[0.0, 0.6, 0.8]])
+    kde = SphericalKde(mu, [0, 1], 1e8, backend="llvm")
+    assert np.isclose(kde.evaluate(mu)[0, 0], np.exp(vmf.log_normaliser(1e8)), rtol=1e-5)
+    assert kde.evaluate(-mu)[0, 0] == 0
+
+
+def test_gradient_to_the_direction():
+    import drjit.llvm.ad as ns
+
+    rays, offsets, kappa, _ = ragged()
+    kde = SphericalKde(rays, offsets, kappa, backend=ns)
+    x0 = np.array([0.36, 0.48, 0.8])
+    x = ns.Array3f(x0.tolist())
+    dr.enable_grad(x)
+    dr.set_grad(x, ns.Array3f(1, 0, 0))
+    slope = dr.forward_to(kde.density(ns.UInt32(2), x))
+    h = 1e-5
+    # Off the sphere the kernel is exp(-κ|x - μ|²/2): differentiate that.
+    a, b = offsets[2:4]
+    f = lambda y: np.exp(vmf.log_density(y, rays[a:b], kappa[2])).mean()
+    want = (f(x0 + [h, 0, 0]) - f(x0 - [h, 0, 0])) / (2 * h)
+    assert np.isclose(slope[0], want, rtol=1e-3)
+
+
+def test_refusals():
+    rays, offsets, kappa, _ = ragged()
+    with pytest.raises(ValueError, match="probe 1 has no ray"):
+        SphericalKde(rays, [0, 5, 5, len(rays)], 1.0, backend="llvm")
+    with pytest.raises(ValueError, match="do not fit"):
+        SphericalKde(rays, [0, 5], 1.0, backend="llvm")
+    with pytest.raises(ValueError, match="all zero"):
+        SphericalKde(rays, [0, len(rays)], 1.0, np.zeros(len(rays)), "llvm")
+    with pytest.raises(ValueError, match="expected"):
+        SphericalKde(rays, offsets, kappa, backend="llvm").evaluate(np.zeros((2, 5, 3)))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_part_is_the_same_densities(weighted):
+    rays, offsets, kappa, rng = ragged()
+    # Some rays of each probe weigh much more than others: equal weights would be off by a large share of the peak.
+    weights = rng.random(len(rays)) ** 4 if weighted else None
+    kde, x = SphericalKde(rays, offsets, kappa, weights, "llvm"), fibonacci_directions(200)
+    whole = kde.evaluate(x)
+    for first, last in [(0, 2), (1, 3), (2, 4), (3, 4), (0, 4)]:
+        part = kde.part(first, last)
+        assert part.count == last - first
+        assert np.allclose(part.evaluate(x), whole[first:last], rtol=1e-5, atol=1e-7)
+
+
+# ---- Table ----
+
+
+@pytest.mark.parametrize("kappa", [1e-3, 5.0, 50.0, 900.0])
+@pytest.mark.parametrize("count", [1, 40])
+def test_close_to_exact_everywhere(kappa, count):
+    rng = np.random.default_rng(0)
+    mu = uniform_directions(count, rng)
+    kde = SphericalKde(mu, [0, count], kappa, backend="llvm")
+    # All over, near the peaks, and on the cube's edges and corners.
+    edges = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
+    edges = np.concatenate([edges, edges + 1e-6, edges - 1e-6])
+    x = np.concatenate(
+        [
+            uniform_directions(5000, rng),
+            mu,
+            vmf.sample(np.repeat(mu, 9, 0), kappa, rng),
+            edges / np.linalg.norm(edges, axis=1, keepdims=True),
+        ]
+    )
+    peak = np.exp(vmf.log_normaliser(kappa))
+    table = SphericalKdeTable(kde)
+    assert np.abs(table.evaluate(x) - kde.evaluate(x)[0]).max() < 1e-4 * peak
+    if kappa < 300:
+        assert np.abs(table.evaluate(x) - reference(x, mu, [0, count], [kappa])[0]).max() < 1e-4 * peak
+    assert table.evaluate(fibonacci_directions(8192)).min() >= 0
+
+
+def test_only_what_is_used_is_evaluated():
+    rng = np.random.default_rng(1)
+    kde = SphericalKde(uniform_directions(30, rng), [0, 30], 60.0, backend="llvm")
+    x = vmf.sample(np.tile([0.6, 0.0, 0.8], (2000, 1)), 100.0, rng)
+    part, whole = SphericalKdeTable(kde, used=x), SphericalKdeTable(kde)
+    assert np.array_equal(part.evaluate(x), whole.evaluate(x)) and part.evaluated < 0.2 * whole.evaluated
+
+
+def test_one_probe_of_several_and_its_slope():
+    import drjit.llvm.ad as ns
+
+    rng = np.random.default_rng(2)
+    kde = SphericalKde(uniform_directions(50, rng), [0, 20, 50], [5.0, 30.0], backend=ns)
+    table = SphericalKdeTable(kde, probe=1)
+    x0 = np.array([0.36, 0.48, 0.8])
+    assert np.isclose(table.evaluate(x0[None])[0], kde.evaluate(x0[None])[1, 0], rtol=1e-3)
+    x = ns.Array3f(x0.tolist())
+    dr.enable_grad(x)
+    side = np.array([0.8, -0.6, 0.0])  # along the sphere, where both are the same function
+    dr.set_grad(x, ns.Array3f(side.tolist()))
+    slope = dr.forward_to(table.density(x))[0]
+    ends = np.array([x0 + h * side for h in (1e-3, -1e-3)])
+    a, b = reference(
+        ends / np.linalg.norm(ends, axis=1, keepdims=True),
+        np.array(kde.part(1, 2)._rays).reshape(-1, 4)[:, :3],
+        [0, 30],
+        [30.0],
+    )[0]
+    assert np.isclose(slope, (a - b) / 2e-3, rtol=2e-2)
+
+
+def test_too_sharp_for_a_table():
+    kde = SphericalKde(np.array([[0.0, 0, 1]]), [0, 1], 1e8, backend="llvm")
+    with pytest.raises(ValueError, match="evaluate the density directly"):
+        SphericalKdeTable(kde)
+    assert not SphericalKdeTable.fits(kde, 10**6)

@@ -1,0 +1,214 @@
+"""Tests of `nerg_mi.rays.checks`."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nerg_mi.rays.checks import group_medians, name_some
+from nerg_mi.rays.rays import FRAME
+from tests.rays.checks.people import change, walk, warnings_of, watch
+
+from .people import walk as walk_participants
+from .people import warnings_of as warnings_of_participants
+
+# ---- Clocks ----
+
+
+BO = slice(3000, 6000)
+
+
+@pytest.mark.parametrize("by, text", [(-20.0, "-20 s"), (3600.0, "+3,600 s"), (-3600.0, "-3,600 s")])
+def test_a_clock_that_jumps_while_people_go_on(by, text):
+    said = warnings_of(change(watch(), slice(4500, 6000), t=lambda t: t + by))
+    assert f"the clock of bo jumps once, by {text} at most" in said and "mend the times" in said
+
+
+def test_pauses_and_recordings_one_after_the_other_are_right():
+    rays = watch()
+    # Whoever goes away for ten minutes is somewhere else afterwards.
+    gone = np.r_[0:1000, 1700:3000]
+    assert warnings_of(change(rays, slice(1700, 3000), t=lambda t: t + 600.0).select(gone)) == ""
+    # Files in another order than their times.
+    later = change(rays, slice(0, 1500), t=lambda t: t + 1000.0)
+    assert warnings_of(later.select(np.r_[0:1400, 1700:9000])) == ""
+
+
+def test_recordings_under_one_name():
+    rays = watch()
+    shared = replace(rays, person=np.where(rays.person == 2, 1, rays.person))
+    said = warnings_of(shared)
+    assert "bo is at two places at the same times: do several people share a name? (--person-from" in said
+    between = change(shared, slice(6000, None), t=lambda t: t + 0.003)
+    assert "recordings of bo overlap in time" in warnings_of(between)
+    twice = rays.select(np.r_[0:9000, 3000:6000])
+    assert warnings_of(twice) == "rays of bo are there twice: was a file imported two times?"
+
+
+def test_clocks_in_other_units():
+    rays = watch(5)
+    said = warnings_of(change(rays, BO, t=lambda t: 1000 * t))
+    assert "a ray of bo comes every 20 s, and of others every 0.02 s" in said and "--tick" in said
+    said = warnings_of(change(rays, slice(4500, 6000), t=lambda t: 30 + 1000 * (t - 30)))
+    assert "the clock of bo changes its pace" in said and "two units" in said
+
+
+def test_clocks_that_count_from_other_moments():
+    rays = watch()
+    assert "the clock of bo counts from another moment" in warnings_of(change(rays, BO, t=lambda t: t + 1.7e9))
+    assert "(--clock person)" in warnings_of(change(rays, BO, t=lambda t: t + 1.7e9))
+    # Recordings of one study may lie months apart.
+    assert warnings_of(change(rays, BO, t=lambda t: t + 2e7)) == ""
+
+
+def test_rays_that_were_chosen_say_nothing_of_clocks():
+    rays = watch()
+    slow = np.r_[0:3000, 3000:6000:40, 6000:9000]
+    thinned = rays.select(slow).with_step(step="thin", kept=len(slow), of=len(rays))
+    assert "comes every" in warnings_of(rays.select(slow)) and warnings_of(thinned) == ""
+
+
+# ---- Eyes ----
+
+
+def said(units="m", **distances):
+    rays = watch(max(3, len(distances)), 400)
+    about = {**rays.metadata, "eye_distance": distances}
+    about["source_frame"] = {"units": units, "up": "z", "handedness": "right"}
+    return warnings_of(replace(rays, metadata=about))
+
+
+@pytest.mark.parametrize(
+    "units, metres, remedy",
+    [
+        ("m", 63.0, "is the unit mm? (--units mm)"),
+        ("m", 6.1, "is the unit cm? (--units cm)"),
+        ("cm", 0.00062, "is the unit m? (--units m)"),
+        ("mm", 0.065e-3, "is the unit m? (--units m)"),
+        ("m", 0.126, "is about 0.5 m: scale"),
+        ("cm", 0.0315, "is about 0.02 m: scale"),
+    ],
+)
+def test_the_unit_by_the_eyes(units, metres, remedy):
+    assert remedy in said(units, ann=metres, bo=metres * 1.02, cy=metres * 0.99)
+
+
+def test_people_differ():
+    assert said(ann=0.052, bo=0.076) == "" and "the eyes of bo are 82 mm apart" in said(ann=0.06, bo=0.082)
+    # Half of several people are not all small.
+    few, several = dict(ann=0.053, bo=0.054), dict(ann=0.053, bo=0.054, cy=0.053, di=0.052, ed=0.055)
+    assert said(**few) == "" and "the eyes are 53 mm apart" in said(**several)
+    # Nobody who is not there any more.
+    assert said(ann=0.06, zoe=63.0) == "" and said() == ""
+
+
+# ---- Figures ----
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_medians_of_groups(seed):
+    rng = np.random.default_rng(seed)
+    values, group = rng.normal(size=97), rng.integers(0, 7, 97) * 2
+    found = group_medians(values, group, 15)
+    for g in range(15):
+        mine = values[group == g]
+        assert found[g] == np.median(mine) if mine.size else np.isnan(found[g])
+    assert np.isnan(group_medians(np.empty(0), np.empty(0, int), 3)).all()
+
+
+def test_names():
+    assert (
+        name_some(["ann"]) == "ann"
+        and name_some(list("abc")) == "a, b, c"
+        and name_some(list("abcd")) == "a, b, c and 1 more"
+    )
+
+
+# ---- Files ----
+
+
+def test_what_a_reader_complained_of_is_on_the_card():
+    rays = watch(3, 400)
+    assert warnings_of(rays) == ""
+    found = ["the two accounts of ann's gaze differ by 7 degrees: check the calibration"]
+    assert warnings_of(replace(rays, metadata={**rays.metadata, "complaints": found})) == found[0]
+
+
+# ---- Frozen ----
+
+
+def test_who_lost_the_eyes_and_when():
+    rays = watch()
+    assert warnings_of(rays) == ""
+    rows = slice(3000, 6000)
+    whole = change(rays, rows, direction=rays.direction[3000])
+    assert "the gaze of bo (100 % of the rays) stands still" in warnings_of(whole)
+    assert "--without-person" in warnings_of(whole)
+    part = change(rays, slice(4000, 5000), direction=rays.direction[4000])
+    assert "bo (33 % of the rays)" in warnings_of(part) and "--from, --to" in warnings_of(part)
+    # A moment is not worth a word.
+    assert "stands still" not in warnings_of(change(rays, slice(4000, 4100), direction=rays.direction[4000]))
+
+
+# ---- Lengths ----
+
+
+@pytest.mark.parametrize("scale, word", [(1000, "--units mm"), (100, "--units cm")])
+def test_units(scale, word):
+    rays = walk(hit=False)
+    assert word in warnings_of(replace(rays, origin=rays.origin * scale))
+
+
+def test_the_axis_that_is_up():
+    # A file with y up that was declared with z up: heights stand in y.
+    rays = walk(hit=False)
+    assert "--up y" in warnings_of(replace(rays, origin=rays.origin[:, [0, 2, 1]]))
+    assert "--up -x" in warnings_of(replace(rays, origin=rays.origin[:, [2, 0, 1]] * (-1, 1, 1)))
+    assert "floor is not at height 0" in warnings_of(replace(rays, origin=rays.origin - (0, 0, 1.6)))
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_a_kilometre_is_the_most_that_origins_in_metres_span(along):
+    """Heads at eye height: nothing but how far they are apart gives the unit away."""
+    rays = walk(hit=False)
+    for span, warned in ((999.5, False), (1000.5, True)):
+        origin = rays.origin.copy()
+        origin[:, along] *= span / np.ptp(origin[:, along])
+        slow = replace(rays, origin=origin, t=rays.t * 40)  # nobody runs
+        assert ("--units mm" in warnings_of(slow)) == warned
+
+
+def test_heights_over_a_floor_that_is_not_known():
+    rays = walk(hit=False)
+    low = replace(rays, origin=rays.origin - (0, 0, 1.8), metadata={**rays.metadata, "floor": "unknown"})
+    assert warnings_of(low) == ""
+
+
+def test_a_moment_says_nothing_of_extents_and_elevations():
+    down = np.array([0.1, 0.1, -1.0]) / np.linalg.norm([0.1, 0.1, -1.0])
+    moment = walk(hit=False).select(slice(0, 2))
+    moment = replace(moment, direction=np.tile(down, (2, 1)))
+    assert warnings_of(moment) == ""
+
+
+# ---- Participants who are rows ----
+
+
+@pytest.mark.parametrize("of_each, is_counter", [(1, True), (2, True), (10, False), (6000, False)])
+def test_one_participant_a_row(of_each, is_counter):
+    rays = walk_participants(hit=False)
+    person = np.arange(len(rays)) // of_each
+    rays = replace(rays, person=person, persons=tuple(map(str, range(person.max() + 1))))
+    assert ("does their column count rows" in warnings_of_participants(rays)) == is_counter
+    thinned = replace(rays, metadata={"frame": dict(FRAME), "steps": [{"step": "thin", "kept": 6000, "of": 9000}]})
+    assert "does their column" not in warnings_of_participants(thinned)
+
+
+# ---- Times ----
+
+
+def test_times_and_steep_gaze():
+    rays = walk(hit=False)
+    assert "a ray comes every 20 s" in warnings_of(replace(rays, t=rays.t * 1000))
+    down = np.tile([0.1, 0.1, -1.0], (len(rays), 1)) / np.linalg.norm([0.1, 0.1, -1.0])
+    assert "degrees down" in warnings_of(replace(rays, direction=down))

@@ -1,0 +1,162 @@
+"""Tests of `nerg_mi.rays.readers.poses`."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from nerg_mi.errors import NergError
+from nerg_mi.rays.readers import poses
+from nerg_mi.rays.readers.poses import PoseTrack, iterate_gaze_vectors
+
+# ---- Files of gaze vectors ----
+
+
+HEAD = "FREQUENCY\t10\nSTART_OFFSET\t1\n"
+
+
+def test_blocks_are_one_file(tmp_path, monkeypatch):
+    path = tmp_path / "a_g.tsv"
+    path.write_text("\ufeff" + HEAD + "".join(f"{k}\t0\t1600\t1\t0\tNaN\n" for k in range(7)) + "\n\n")
+    monkeypatch.setattr(poses, "_BLOCK", 3)
+    blocks = list(iterate_gaze_vectors(path))
+    assert len(blocks) > 2
+    times, vectors, samples, lines = (np.concatenate(v) for v in zip(*blocks))
+    assert np.allclose(times, 0.1 * np.arange(7) - 1) and samples.tolist() == list(range(7))
+    assert (
+        lines.tolist() == list(range(3, 10))
+        and vectors[:, 0].tolist() == list(range(7))
+        and np.isnan(vectors[:, 5]).all()
+    )
+
+
+def test_columns_in_any_order_and_named_after_what_looks(tmp_path):
+    names = ["Sample", "Time", *(f"ann {a} Vec" for a in "XYZ"), *(f"ann {a} Pos" for a in "XYZ")]
+    (tmp_path / "a_g.tsv").write_text("\t".join(names) + "\n1\t0.5\t1\t2\t3\t4\t5\t6\n")
+    (block,) = iterate_gaze_vectors(tmp_path / "a_g.tsv")
+    assert block.times.tolist() == [0.5] and block.vectors.tolist() == [[4, 5, 6, 1, 2, 3]]
+
+
+@pytest.mark.parametrize("rate", ["FREQUENCY\tEXT\n", "FREQUENCY\t0\n", ""])
+def test_times_that_nothing_tells(tmp_path, rate):
+    (tmp_path / "a_g.tsv").write_text(rate + "1\t2\t3\t4\t5\t6\n")
+    with pytest.raises(ValueError, match="tells no time"):
+        list(iterate_gaze_vectors(tmp_path / "a_g.tsv"))
+
+
+def test_bad_lines_count_as_samples(tmp_path):
+    (tmp_path / "a_g.tsv").write_text(
+        HEAD + "1\t2\t3\t4\t5\t6\n1\t2\t3\t4\t5\t6\t7\n1\t2\t3\t4\t5\tx\n1\t2\t3\t4\t5\t6\n"
+    )
+    told = []
+    (block,) = iterate_gaze_vectors(tmp_path / "a_g.tsv", lambda line, why: told.append(line))
+    assert told == [4, 5] and np.allclose(block.times, [-1, -0.7]) and block.samples.tolist() == [0, 3]
+    with pytest.raises(ValueError, match="4.*1.2.*7.*6"):
+        list(iterate_gaze_vectors(tmp_path / "a_g.tsv"))
+
+
+# ---- Poses between samples ----
+
+
+def test_between_samples():
+    """A quarter turn about z and two metres along x in a second, sampled ten times."""
+    times = np.linspace(5, 6, 11)
+    vectors = np.outer(times - 5, [0, 0, np.pi / 2])
+    places = np.outer(times - 5, [2.0, 0, 0])
+    track = PoseTrack.of_samples(times, vectors, places)
+    t = np.array([5.0, 5.123, 6.0, 4.99, 6.01, np.nan])
+    turn, place, lost = track.at(t, 0.2)
+    assert lost.tolist() == [False, False, False, True, True, True]
+    assert np.allclose(turn[:3], Rotation.from_rotvec(np.outer(t[:3] - 5, [0, 0, np.pi / 2])).as_matrix())
+    assert np.allclose(place[:3, 0], 2 * (t[:3] - 5)) and not place[:3, 1:].any()
+    assert np.isfinite(turn).all() and np.isfinite(place).all()
+
+
+def test_gaps():
+    track = PoseTrack.of_samples(np.array([0.0, 0.05, 1.0]), np.zeros((3, 3)), np.zeros((3, 3)))
+    assert track.at(np.array([0.02, 0.14, 0.16, 0.5, 0.91]), 0.1)[2].tolist() == [False, False, True, True, False]
+
+
+@pytest.mark.parametrize("far", [1.1e7, -1e200, 1e308, np.inf])
+@pytest.mark.parametrize("of", ["times", "vectors", "places"])
+def test_samples_beyond_all_places_are_left_out(far, of):
+    samples = {"times": np.arange(4.0), "vectors": np.zeros((4, 3)), "places": np.zeros((4, 3))}
+    samples[of][2] = far * (1e14 if of == "times" and abs(far) < 1e100 else 1)
+    with np.errstate(over="raise"):
+        turn, place, lost = PoseTrack.of_samples(**samples).at(np.array([0.1, 2.0, 2.9]), 0.2)
+    assert np.isfinite(turn).all() and np.isfinite(place).all() and lost.tolist() == [False, True, False]
+
+
+def test_samples_in_any_order_with_something_missing():
+    times = np.array([3.0, 1.0, np.nan, 1.0, 2.0, 4.0])
+    places = np.arange(18.0).reshape(6, 3)
+    places[5, 1] = np.nan
+    track = PoseTrack.of_samples(times, np.zeros((6, 3)), places)
+    assert track.times.tolist() == [1, 2, 3] and track.places[:, 0].tolist() == [3, 12, 0]
+    assert PoseTrack.of_samples(times[:1], np.zeros((1, 3)), places[:1]) is None
+    assert PoseTrack.of_samples(times[1:4], np.zeros((3, 3)), places[1:4]) is None
+
+
+# ---- Heads' poses as rotations; what their angles mean is tried in tests/rays/readers/test_table.py ----
+
+
+def test_quaternions_need_not_be_unit():
+    turn = Rotation.from_quat(np.random.default_rng(0).normal(size=(20, 4)))
+    q = turn.as_quat() * 3
+    assert np.allclose(poses.rotations_from_quaternions(q), turn.as_matrix())
+    assert np.allclose(poses.rotations_from_quaternions(np.roll(q, 1, axis=1), "wxyz"), turn.as_matrix())
+    q[3], q[4, 1] = 0, np.nan
+    assert np.isnan(poses.rotations_from_quaternions(q)[3:5]).all()
+    for bad, order in ((q[:, :3], "xyzw"), (q, "zyxw")):
+        with pytest.raises(ValueError, match="expected"):
+            poses.rotations_from_quaternions(bad, order)
+
+
+def test_matrices_lose_their_scale_and_others_are_none():
+    turn = Rotation.from_quat(np.random.default_rng(1).normal(size=(4, 4))).as_matrix()
+    rows = np.concatenate([turn * 2, np.arange(12.0).reshape(4, 3, 1)], axis=2)
+    rows[3, 0, 0] += 1
+    R, place = poses.rotations_from_matrices(rows.reshape(4, 12))
+    assert np.allclose(R[:3], turn[:3]) and np.isnan(R[3]).all() and np.array_equal(place.ravel(), np.arange(12.0))
+
+
+@pytest.mark.parametrize("mirror", [-np.eye(3), np.diag([-1.0, 1, 1]), np.diag([1.0, 1, -2]), np.eye(3)[[1, 0, 2]]])
+def test_mirrored_matrices_are_no_rotations(mirror):
+    turn = Rotation.from_quat(np.random.default_rng(1).normal(size=(4, 4))).as_matrix()
+    turn[2] = turn[2] @ mirror
+    R, _ = poses.rotations_from_matrices(np.concatenate([turn, np.ones((4, 3, 1))], axis=2).reshape(4, 12))
+    assert np.isnan(R[2]).all() and np.allclose(R[[0, 1, 3]], turn[[0, 1, 3]])
+
+
+def test_vectors_are_each_turned_by_their_own():
+    turn = Rotation.from_quat(np.random.default_rng(2).normal(size=(5, 4)))
+    v = np.random.default_rng(3).normal(size=(5, 3))
+    assert np.allclose(poses.rotate(turn.as_matrix(), v), turn.apply(v))
+
+
+def test_axes_and_forward():
+    assert [poses.default_forward(up, hand) for up, hand in (("y", "left"), ("-y", "right"), ("z", "right"))] == [
+        "z",
+        "-z",
+        "x",
+    ]
+    assert poses.axis("-y", "up").tolist() == [0, -1, 0]
+    with pytest.raises(NergError, match='"w"'):
+        poses.axis("w", "up")
+    with pytest.raises(NergError, match="both z"):
+        poses.rotations_from_angles(np.zeros((1, 3)), "z", "-z")
+
+
+def test_azimuths_turn_right_in_every_frame():
+    """Against a way that knows of no cross product: the frame of rays, in which right is x where forward is y."""
+    from nerg_mi.rays.readers.base import HANDS, Frame
+
+    a, e = np.radians([35.0, -12.0])
+    for up in poses.AXES:
+        for hand in HANDS:
+            to_rays = Frame(up, hand).to_rays()[:3, :3]
+            for forward in (f for f in poses.AXES if f[-1] != up[-1]):
+                found = poses.directions_from_azimuths(np.array([[35.0, -12.0]]), up, forward, hand)[0] @ to_rays.T
+                ahead = to_rays @ poses.AXES[forward]
+                heading = np.arctan2(ahead[0], ahead[1])  # clockwise from y, seen from above
+                want = [np.cos(e) * np.sin(heading + a), np.cos(e) * np.cos(heading + a), np.sin(e)]
+                assert np.allclose(found, want), (up, hand, forward)

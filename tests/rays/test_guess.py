@@ -1,0 +1,493 @@
+"""Tests of `nerg_mi.rays.guess`."""
+
+import shlex
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.rays import guess as rows
+from nerg_mi.rays.guess import (
+    TableSample,
+    check_is_table,
+    find_roles,
+    in_degrees,
+    preset_of_columns,
+    preset_of_files,
+    preset_of_text,
+    propose_import,
+    propose_imports,
+    time_unit,
+)
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers.columns import ColumnFinder
+from tests.cli.rays.running import run
+from tests.rays.guess.tables import FORWARD, N, csv, frame, walk, xyz
+from tests.rays.readers.examples import EXAMPLES
+
+# ---- What names of columns tell ----
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        ["x", "y", "z"],
+        ["PositionX", "PositionY", "PositionZ"],
+        ["tx_world_device", "ty_world_device", "tz_world_device"],
+        ["head.pos.x", "head.pos.y", "head.pos.z"],
+        ["X Pos", "Y Pos", "Z Pos"],
+        ["gaze origin x [mm]", "gaze origin y [mm]", "gaze origin z [mm]"],
+        ["px", "py", "pz"],
+    ],
+)
+def test_vectors(columns):
+    assert list(find_roles(["t", *columns, "other"]).vectors.values()) == [tuple(columns)]
+
+
+def test_quaternions_and_matrices():
+    roles = find_roles([*(f"q{a}" for a in "wxyz"), *(f"QuaternionG{a}" for a in "XYZW")])
+    assert roles.quaternions["q*"] == ("qx", "qy", "qz", "qw") and len(roles.quaternions) == 2
+    m = [f"ctw_{r}{c}" for r in range(3) for c in range(4)]
+    assert find_roles(m[::-1]).matrices == {"ctw": tuple(m)} and find_roles(m[1:]).matrices == {}
+    whole = [f"m{r}{c}" for r in range(4) for c in range(4)]
+    assert find_roles(whole).matrices == {"": tuple(whole)}
+
+
+def test_what_is_no_place_has_no_role():
+    names = ["velocity", "angular_velocity", "gyro", "gaze_target_pos", "head_scale", "PupilPos"]
+    assert find_roles([f"{n}_{a}" for n in names for a in "xyz"]).vectors == {}
+    assert find_roles(["gaze_x_px", "gaze_y_px", "a,b", "c=d"]).vectors == {}
+    assert find_roles([f"gravity_{a}_world" for a in "xyz"]).gravity == tuple(f"gravity_{a}_world" for a in "xyz")
+
+
+def test_angles_times_and_people():
+    roles = find_roles(
+        ["device_timestamp_ns", "timestamp [ns]", "relative time", "left_yaw_rads", "yaw_rads", "pitch_rads", "UserId"]
+    )
+    assert roles.yaw_pitch_roll == ("yaw_rads", "pitch_rads") and roles.person == "UserId"
+    assert roles.times[0] == "timestamp [ns]" and sorted(roles.times[1:]) == ["device_timestamp_ns", "relative time"]
+    assert find_roles(["azimuth [deg]", "elevation [deg]"]).azel == ("azimuth [deg]", "elevation [deg]")
+    assert find_roles(["duration", "blink"]).times == []
+
+
+@pytest.mark.parametrize(
+    "name, unit",
+    [
+        ("timestamp [ns]", 1e-9),
+        ("time_us", 1e-6),
+        ("Time (ms)", 1e-3),
+        ("time_s", 1.0),
+        ("time", None),
+        ("t [h]", None),
+    ],
+)
+def test_units_of_time(name, unit):
+    assert time_unit(name) == unit
+
+
+def test_units_of_angles():
+    assert (
+        in_degrees(["yaw_deg", "pitch"]) is True and in_degrees(["yaw_rads"]) is False and in_degrees(["yaw"]) is None
+    )
+
+
+# ---- Proposals: the command that is printed imports the rays that were meant ----
+
+
+WALK = walk()
+
+
+def imported(path, monkeypatch) -> Rays:
+    """The rays by the command that is proposed for ``path``."""
+    monkeypatch.chdir(path.parent)
+    proposal = propose_import(path)
+    assert proposal.command is not None
+    words = shlex.split(proposal.command)
+    assert words[:3] == ["nerg", "rays", "import"]
+    done = run(*words[2:])
+    assert done.exit_code == 0, (proposal.command, done.exception)
+    return Rays.load(path.parent / words[words.index("-o") + 1])
+
+
+def gaze_in_world(to, metre, tick, **names):
+    eye, gaze, _ = frame(WALK, to, metre)
+    stems = {"time": "time", "eye": "gaze_origin_", "gaze": "gaze_direction_", **names}
+    return {stems["time"]: WALK.t / tick, **xyz(stems["eye"], eye), **xyz(stems["gaze"], gaze)}
+
+
+def gaze_in_head(to, local=True, **names):
+    eye, gaze, head = frame(WALK, to)
+    stems = {"head": "head_pos_", "turn": "head_rot_", "gaze": "look_dir_", **names}
+    gaze = head.inv().apply(gaze) if local else gaze
+    return {
+        "t": WALK.t,
+        **xyz(stems["head"], eye),
+        **xyz(stems["turn"], head.as_quat(), "xyzw"),
+        **xyz(stems["gaze"], gaze),
+    }
+
+
+TABLES = {
+    "ros, millimetres, microseconds": gaze_in_world("z right", 1e-3, 1e-6, eye="eyePos", gaze="rayVec"),
+    "unity, named units": gaze_in_world("y left", 1.0, 1e-3, time="timestamp (ms)", eye="Origin.", gaze="Dir."),
+    "centimetres, nanoseconds": gaze_in_world("y left", 1e-2, 1e-9, time="time", eye="o_pos", gaze="d"),
+    "unity, local": gaze_in_head("y left"),
+    "unity, world beside the head": gaze_in_head("y left", local=False),
+    "openxr, local": gaze_in_head("y right", head="pos", turn="q", gaze="gaze_vec_"),
+    "openxr, world beside the head": gaze_in_head("y right", local=False),
+    "ros, local": gaze_in_head("z right", head="camera.position.", turn="camera.orientation."),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_command_imports_what_was_meant(tmp_path, monkeypatch, name):
+    path = tmp_path / "log.csv"
+    path.write_text(csv(**TABLES[name]))
+    rays = imported(path, monkeypatch)
+    assert len(rays) == N and np.allclose(rays.t, WALK.t, atol=1e-4)
+    assert np.abs(rays.origin - WALK.eye).max() < 1e-5
+    assert np.abs(rays.direction - WALK.gaze).max() < 1e-5
+
+
+@pytest.mark.parametrize("radians", [False, True])
+def test_angles_are_a_direction(tmp_path, monkeypatch, radians):
+    eye, gaze, head = frame(WALK, "y left")
+    local = head.inv().apply(gaze)
+    unit = 1.0 if radians else 180 / np.pi
+    angles = {"azimuth": unit * np.arctan2(local[:, 0], local[:, 2]), "elevation": unit * np.arcsin(local[:, 1])}
+    path = tmp_path / "log.csv"
+    table = {"t": WALK.t, **xyz("head_pos_", eye), **xyz("head_rot_", head.as_quat(), "xyzw"), **angles}
+    path.write_text(csv(**table))
+    rays = imported(path, monkeypatch)
+    assert np.abs(rays.direction - WALK.gaze).max() < 1e-5 and np.abs(rays.origin - WALK.eye).max() < 1e-5
+    assert ("--radians" in propose_import(path).options) == radians
+
+
+def test_heads_alone_and_matrices(tmp_path, monkeypatch):
+    """Each head looks where it walks; the rows of its matrix in the names of the columns."""
+    eye, _, head = frame(WALK, "y right")
+    ahead = np.c_[np.cos(WALK.heading), np.sin(WALK.heading), np.zeros(N)]
+    path = tmp_path / "log.csv"
+    m = np.concatenate([head.as_matrix(), eye[:, :, None]], axis=2)
+    path.write_text(csv(t=WALK.t, **{f"m_{r}{c}": m[:, r, c] for r in range(3) for c in range(4)}))
+    rays = imported(path, monkeypatch)
+    assert np.abs(rays.direction - ahead).max() < 1e-5 and np.abs(rays.origin - WALK.eye).max() < 1e-5
+
+
+def test_people_confidence_and_hits(tmp_path, monkeypatch):
+    table = gaze_in_world("z right", 1.0, 1.0)
+    table |= {"participant_id": np.repeat(["ann", "bo"], N // 2), "confidence": np.full(N, 0.5)}
+    table |= xyz("hit_point_", WALK.eye + 2 * WALK.gaze)
+    path = tmp_path / "log.tsv"
+    path.write_text(csv(**table).replace(",", "\t"))
+    rays = imported(path, monkeypatch)
+    assert rays.persons == ("ann", "bo") and np.all(rays.confidence == 0.5)
+    assert rays.hit is not None and np.allclose(rays.hit, rays.origin + 2 * rays.direction, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", [n for n in EXAMPLES if n not in ("table", "unity", "unity_local", "unity_head")])
+def test_examples_of_presets_are_known(tmp_path, name):
+    """By their header, or by the files of their folder."""
+    given = EXAMPLES[name].make(tmp_path)
+    assert propose_import(given).preset == name
+    proposal = propose_import(given)
+    assert proposal.command is not None and f"--preset {name}" in proposal.command
+
+
+@pytest.mark.parametrize("name", ["unity", "unity_local", "unity_head"])
+def test_a_map_does_for_presets_that_look_alike(tmp_path, name):
+    """What Unity projects call the gaze does not say of which frame it is."""
+    proposal = propose_import(EXAMPLES[name].make(tmp_path))
+    assert proposal.preset is None and proposal.columns is not None and proposal.options["--hand"] == "left"
+    assert (proposal.columns.xyzw is not None) == (name != "unity")
+
+
+def test_folders(tmp_path):
+    EXAMPLES["neon"].make(tmp_path)
+    proposal = propose_import(tmp_path)
+    assert proposal.preset == "neon" and proposal.open and "--poses MODEL" in (proposal.command or "")
+    (tmp_path / "info.json").unlink()
+    assert propose_import(tmp_path).preset == "neon"
+    (tmp_path / "world_timestamps.csv").unlink()
+    with pytest.raises(NergError, match="of no recording that is known"):
+        propose_import(tmp_path)
+
+
+def test_what_is_not_known_is_to_be_said(tmp_path):
+    """Nobody stands in these rows, and no name says what they are: the command does not run as it is."""
+    path = tmp_path / "log.csv"
+    rising = np.outer(np.arange(9.0), [1, 7, 5])
+    path.write_text(csv(**xyz("a_", rising), **xyz("dir_", np.tile([1.0, 0, 0], (9, 1)))))
+    proposal = propose_import(path)
+    assert proposal.options["--up"] == "UP" and any("which axis is up" in s for s in proposal.open)
+    assert any("the time" in s for s in proposal.open) and not proposal.sure
+    with pytest.raises(NergError, match='"UP up'):
+        raise run(*shlex.split(proposal.command or "")[2:]).exception
+    path.write_text(csv(speed=np.arange(9.0), note=["x"] * 9))
+    proposal = propose_import(path)
+    assert proposal.command is None and "origin is missing" in proposal.open[-1]
+
+
+def test_gravity_says_what_is_up(tmp_path):
+    table = {**gaze_in_world("y right", 1.0, 1.0), **xyz("gravity_", np.tile([0, -9.81, 0], (N, 1)))}
+    table = {name: v + (50 if name == "gaze_origin_y" else 0) for name, v in table.items()}
+    path = tmp_path / "log.csv"
+    path.write_text(csv(**{k.replace("gaze_direction", "d"): v for k, v in table.items()}))
+    proposal = propose_import(path)
+    assert proposal.options["--up"] == "y" and any("gravity" in s for s in proposal.sure)
+
+
+@pytest.mark.parametrize("text, message", [("1,2,3\n4,5,6\n", "holds no names of columns"), ("", "holds no names")])
+def test_what_is_no_table(tmp_path, text, message):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(NergError, match=message):
+        propose_import(path)
+
+
+def test_forward_axes_are_those_of_the_frames():
+    """The tables of this file look along the axes that they are meant to."""
+    for to, forward in FORWARD.items():
+        _, _, head = frame(WALK, to)
+        eye, _, _ = frame(WALK, to)
+        moved = np.diff(eye[::25], axis=0)
+        assert np.mean(np.sum(head.apply(forward)[::25][:-1] * moved, axis=1)) > 0.3
+
+
+def alike(eye, gaze, **more):
+    return csv(t=WALK.t, **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze), **more)
+
+
+def test_unreal_is_left_handed(tmp_path, monkeypatch):
+    flip = [1, -1, 1]
+    (tmp_path / "log.csv").write_text(alike(100 * WALK.eye * flip, WALK.gaze * flip))
+    rays = imported(tmp_path / "log.csv", monkeypatch)
+    assert np.allclose(rays.origin, WALK.eye, atol=1e-5) and np.allclose(rays.direction, WALK.gaze, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "to, hand",
+    [
+        (lambda v: v[:, [0, 2, 1]], "left"),  # Unity
+        (lambda v: v[:, [0, 2, 1]] * [1, -1, 1], "right"),  # OpenCV, Kinect
+        (lambda v: v * [1, -1, 1] * 100, "left"),  # Unreal
+        (lambda v: 1000 * v, "right"),  # Vicon
+        (lambda v: v[:, [2, 0, 1]], "right"),
+    ],
+    ids=["y", "-y", "z cm", "z mm", "x"],
+)
+def test_hands_of_worlds(tmp_path, to, hand):
+    eye, gaze = to(WALK.eye), to(WALK.gaze)
+    (tmp_path / "log.csv").write_text(alike(eye, gaze / np.linalg.norm(gaze, axis=1, keepdims=True)))
+    proposal = propose_import(tmp_path / "log.csv")
+    assert proposal.options["--hand"] == hand
+    assert any(f"{hand}-handed" in sentence for sentence in proposal.guessed)
+
+
+@pytest.mark.parametrize("name, cell", [("time", "12:00"), ("timestamp", "5/1/2024 12:00:00"), ("utc", "noon")])
+def test_times_that_are_not_read_are_named(tmp_path, name, cell):
+    eye, gaze, _ = frame(WALK, "y left")
+    table = {name: [cell] * N, **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
+    (tmp_path / "log.csv").write_text(csv(**table))
+    (sentence,) = (s for s in propose_import(tmp_path / "log.csv").open if "the time" in s)
+    assert f"{name!r} holds {cell!r}" in sentence
+
+
+@pytest.mark.parametrize(
+    "ids",
+    [np.arange(N), [f"u{k:05d}" for k in range(N)], [f"{k / 90:.3f}" for k in range(N)], np.arange(N)[::-1]],
+    ids=["counter", "words", "times", "backwards"],
+)
+@pytest.mark.parametrize("name", ["subject", "user_id"])
+def test_what_differs_in_each_row_is_no_participant(tmp_path, name, ids):
+    (tmp_path / "log.csv").write_text(alike(*frame(WALK, "y left")[:2], **{name: ids}))
+    proposal = propose_import(tmp_path / "log.csv")
+    assert proposal.columns.person is None and any(f"{name!r} has another value" in s for s in proposal.open)
+
+
+@pytest.mark.parametrize("form", ["2024-05-01T12:00:{:08.5f}", "12:00:{:08.5f}", "2024/05/01 12:00:{:08.5f}Z"])
+def test_times_as_text(tmp_path, monkeypatch, form):
+    eye, gaze, _ = frame(WALK, "y left")
+    table = {"when": [form.format(t - 100) for t in WALK.t], **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
+    (tmp_path / "log.csv").write_text(csv(**table))
+    assert np.allclose(np.diff(imported(tmp_path / "log.csv", monkeypatch).t), 0.02, atol=1e-5)
+    assert "'when' holds times of day" in propose_import(tmp_path / "log.csv").sure[0]
+
+
+def test_a_counter_and_validity(tmp_path, monkeypatch):
+    eye, gaze, _ = frame(WALK, "y left")
+    status = np.arange(N) % 3
+    (tmp_path / "log.csv").write_text(alike(eye, gaze, id=np.arange(N), gaze_status=status, tracking_state=status))
+    proposal = propose_import(tmp_path / "log.csv")
+    assert proposal.columns.person is None and proposal.options["--valid"] == "gaze_status=2"
+    assert any("'id' has another value in nearly every row" in sentence for sentence in proposal.open)
+    assert any("which values of 'tracking_state' mark valid rows" in sentence for sentence in proposal.open)
+    assert len(imported(tmp_path / "log.csv", monkeypatch)) == N // 3
+
+
+def test_decimal_commas(tmp_path, monkeypatch):
+    eye, gaze, _ = frame(WALK, "y left")
+    text = alike(eye, gaze)
+    (tmp_path / "log.csv").write_text(text.replace(",", ";").replace(".", ","))
+    assert np.allclose(imported(tmp_path / "log.csv", monkeypatch).origin, WALK.eye)
+    (tmp_path / "log.csv").write_text(text.replace(".", ","))
+    with pytest.raises(NergError, match="are these decimal commas"):
+        propose_import(tmp_path / "log.csv")
+
+
+def test_repeated_names_and_mirrored_matrices(tmp_path):
+    eye, gaze, head = frame(WALK, "y left")
+    rows = np.concatenate([head.as_matrix() @ np.diag([1, 1, -1.0]), eye[:, :, None]], axis=2).reshape(N, 12)
+    names = {f"m{r}{c}": rows[:, 4 * r + c] for r in range(3) for c in range(4)}
+    (tmp_path / "log.csv").write_text(csv(t=WALK.t, **names, x=eye[:, 0], X=eye[:, 0]).replace(",X", ",x"))
+    found = propose_import(tmp_path / "log.csv").open
+    assert any("1,500 of 1,500 rows: the head's matrix is mirrored" in sentence for sentence in found)
+    assert any("several columns are called 'x'" in sentence for sentence in found)
+
+
+def test_several_files_and_folders(tmp_path):
+    eye, gaze, _ = frame(WALK, "y left")
+    (tmp_path / "data").mkdir()
+    for name in ("a.csv", "data/b.csv", "data/c.csv"):
+        (tmp_path / name).write_text(alike(eye, gaze))
+    (tmp_path / "data" / "d.csv").write_text(alike(100 * WALK.eye, WALK.gaze))
+    (tmp_path / "data" / "notes.md").write_text("no table")
+    metres, centimetres = propose_imports([tmp_path / "a.csv", tmp_path / "data"])
+    assert [p.name for p in metres.paths] == ["a.csv", "b.csv", "c.csv"] and "--units cm" in centimetres.command
+    assert shlex.split(metres.command)[3:6] == [str(p) for p in metres.paths]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(NergError, match="is of no recording"):
+        propose_imports([tmp_path / "empty"])
+
+
+# ---- What rows tell of their frame ----
+
+
+ROW_EVIDENCE_WALK = walk(3)
+
+
+@pytest.mark.parametrize("to, up", [("z right", "z"), ("y left", "y"), ("y right", "y")])
+@pytest.mark.parametrize("units", ["m", "cm", "mm"])
+def test_heads_stand(to, up, units):
+    eye, _, _ = frame(ROW_EVIDENCE_WALK, to, rows.UNITS[units])
+    found = rows.find_standing(eye)
+    assert found is not None and (found.up, found.units) == (up, units) and abs(found.height - 1.62) < 0.02
+    upside_down = rows.find_standing(-eye)
+    assert upside_down is not None and upside_down.up == "-" + up
+
+
+def test_rows_that_tell_nothing():
+    eye = frame(ROW_EVIDENCE_WALK, "z right")[0]
+    assert rows.find_standing(eye + [0, 0, 40]) is None and rows.find_standing(np.full((5, 3), np.nan)) is None
+    assert rows.find_standing(np.tile([0.0, 0.0, 1.6], (9, 1))) is None  # nothing moves
+    # Somebody who sits at 1.3 m along two axes.
+    still = np.array([1.3, 5.0, 1.3]) + np.random.default_rng(0).normal(0, 0.05, (500, 3))
+    assert rows.find_standing(still) is None
+
+
+@pytest.mark.parametrize("rate", [11.0, 50.0, 200.0, 1000.0])
+@pytest.mark.parametrize("tick", [1e-3, 1e-6, 1e-9])
+def test_clocks(rate, tick):
+    found = rows.find_tick(np.arange(100) / rate / tick)
+    # At 11 to 2,100 a second units a thousand apart cannot both fit.
+    assert found == tick
+    assert rows.find_tick(np.zeros(9)) is None and rows.find_tick(np.array([1.0])) is None
+    assert rows.find_tick(np.arange(9) * 3.6e8) is None
+
+
+@pytest.mark.parametrize("to", FORWARD)
+def test_heads_look_where_they_walk(to):
+    eye, gaze, head = frame(ROW_EVIDENCE_WALK, to)
+    turns, up = head.as_matrix(), "z" if to.startswith("z") else "y"
+    name = rows.find_forward(turns, eye, ROW_EVIDENCE_WALK.t, up, 1.0)
+    assert name is not None and np.allclose(rows.poses.AXES[name], FORWARD[to])
+    assert rows.find_forward(turns, eye * 0, ROW_EVIDENCE_WALK.t, up, 1.0) is None
+    assert rows.find_forward(turns[:20], eye[:20], ROW_EVIDENCE_WALK.t[:20], up, 1.0) is None
+    assert rows.find_local(head.inv().apply(gaze), turns, name) is True
+    assert rows.find_local(gaze, turns, name) is False
+    assert rows.find_local(gaze, np.tile(np.eye(3), (len(gaze), 1, 1)), name) is None
+
+
+def test_unit_vectors():
+    assert rows.is_unit(np.eye(3)) and not rows.is_unit(2 * np.eye(3)) and not rows.is_unit(np.zeros((3, 3)))
+    assert rows.is_unit(np.array([[np.nan, 0, 0], [0, 0, 0], [0, 0, 1.0]]))
+
+
+# ---- Presets by names ----
+
+
+def table(path, head):
+    path.write_text(head + "\n")
+    return ColumnFinder(path)
+
+
+@pytest.mark.parametrize(
+    "head, preset",
+    [
+        ("tracking_timestamp_us,yaw_rads_cpf,pitch_rads_cpf,depth_m", "aria"),
+        ("ViewIndex,FOV1,PositionX,QuaternionX,GazePosX,GazeQX,Timestamp", "eyenavgs"),
+        ("timestamp [ns],gaze_origin_X,gaze_origin_Y,gaze_origin_Z,gaze_dir_X", "neon_mocap"),
+    ],
+)
+def test_columns(tmp_path, head, preset):
+    found = preset_of_columns(table(tmp_path / "a.csv", head))
+    assert found is not None and found[0] == preset
+    assert preset_of_columns(table(tmp_path / "a.csv", head.partition(",")[0])) is None
+
+
+def test_gaze_alone_is_no_sign_of_unity(tmp_path):
+    """Of which world it is, rows tell, and no name."""
+    gaze = "gaze_dir_x,gaze_dir_y,gaze_dir_z,gaze_origin_x,gaze_origin_y,gaze_origin_z"
+    assert preset_of_columns(table(tmp_path / "a.csv", gaze)) is None
+    assert preset_of_columns(table(tmp_path / "c.csv", "x,y,z")) is None
+
+
+def test_files_and_first_lines(tmp_path):
+    (tmp_path / "x_head_hand_eye.csv").write_text("0\n")
+    (tmp_path / "day.csv").write_text("ann|3|[1, 2]\n")
+    found = preset_of_files(tmp_path / "x_head_hand_eye.csv"), preset_of_text(tmp_path / "day.csv")
+    assert found[0] and found[0][0] == "hololens" and found[1] and found[1][0] == "skeleton"
+    (tmp_path / "a.csv").write_text("a|b|c\n")
+    assert preset_of_text(tmp_path / "a.csv") is None and preset_of_files(tmp_path / "a.csv") is None
+    check_is_table(tmp_path / "a.csv")
+    with pytest.raises(NergError, match="name a file of it"):
+        check_is_table(tmp_path)
+
+
+# ---- The first rows of a table ----
+
+
+NAMES = ["a", "word", "b", "empty", "late"]
+
+
+ROWS = [["1", "x", "", "", "7"], ["2.5", "y", "-3e2", "nan", "7"], ["3", "z", "1", "", "7"]]
+
+
+def test_columns_of_numbers(tmp_path):
+    path = tmp_path / "t.csv"
+    rows = ROWS + [["1", "x", "1", "", "7"]] * 60 + [["1", "x", "1", "", "word"], ["1"]]
+    path.write_text(";".join(NAMES) + "\n" + "\n".join(";".join(r) for r in rows) + "\n")
+    sample = TableSample(path, NAMES)
+    # What comes late is left out by line, as is a line that is cut off.
+    assert list(sample.numbers) == ["a", "b", "late"] and sample.rows == 63
+    assert np.array_equal(
+        sample.vector(["b", "word"])[:3], [[np.nan, np.nan], [-300, np.nan], [1, np.nan]], equal_nan=True
+    )
+
+
+def test_parquet(tmp_path):
+    pa = pytest.importorskip("pyarrow")
+    import pyarrow.parquet as pq
+
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.table({"a": [1.0, 2.0], "word": ["x", "y"], "k": [3, 4]}), path)
+    sample = TableSample(path, ["a", "word", "k"])
+    assert list(sample.numbers) == ["a", "k"] and sample.rows == 2
+
+
+@pytest.mark.parametrize("text", ["", "a,b\n", "a,b\nx,y\n"])
+def test_no_numbers(tmp_path, text):
+    path = tmp_path / "t.csv"
+    path.write_text(text)
+    sample = TableSample(path, ["a", "b"] if text else [])
+    assert sample.rows == 0 and sample.vector(["a", "b", "c"]).shape == (0, 3)

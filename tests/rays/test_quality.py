@@ -1,0 +1,144 @@
+"""Tests of `nerg_mi.rays.quality`."""
+
+import numpy as np
+import pytest
+
+from nerg_mi.rays import quality
+from nerg_mi.rays.quality import WARNING, card_lines, card_table, summarise
+from nerg_mi.rays.rays import FRAME, Rays
+
+# ---- The card in words; what its figures are is tried in test_summary.py ----
+
+
+def card(**change):
+    n = 200
+    origin = np.stack([0.02 * np.arange(n), np.zeros(n), np.full(n, 1.6)], axis=1)
+    values = dict(
+        t=0.02 * np.arange(n),
+        person=np.arange(n) // 20,
+        persons=tuple("abcdefghij"),
+        origin=origin,
+        direction=np.tile([1.0, 0, 0], (n, 1)),
+        confidence=np.ones(n),
+    )
+    rays = Rays(**{**values, **change})
+    return card_lines(rays, summarise(rays))
+
+
+def test_lines():
+    about = {
+        "frame": dict(FRAME),
+        "source_frame": {"up": "y", "handedness": "left", "units": "cm"},
+        "rows_read": 210,
+        "dropped": [
+            {"reason": "blink", "file": "a.csv", "count": 9, "rows": [[2, 4], [7, 7], [9, 9], [11, 14]]},
+            {"reason": "blink", "file": "b.csv", "count": 1, "rows": [[3, 3]]},
+        ],
+        "steps": [{"step": "split", "side": "test", "kept": 200, "of": 300}],
+    }
+    lines = dict(card(metadata=about))
+    assert lines["rays"] == "200 of 210 rows" and lines["persons"] == "10: a, b, c, d, e, f, g, h, ..."
+    assert lines["recorded time"] == "3.8 s at 50 rays a second"
+    assert lines["dropped"] == "10 (4.8 %): blink; lines 2-4, 7, 9, ... of a.csv and of 1 more"
+    assert lines["then"] == "split test: 200 of 300 rays kept" and lines["from"] == "y up, left-handed, cm"
+    assert lines["eye height"] == "1.60 m (5 to 95 %: 1.60 to 1.60)" and lines["speed"] == "95 % below 1.00 m/s"
+    assert not {"cohorts", "hit points", "duplicates", WARNING} & set(lines)
+
+
+def test_lines_that_are_not_always_there():
+    n = 200
+    hit = np.tile([9.0, 0, 1.6], (n, 1))
+    hit[50:] = np.nan
+    lines = dict(card(hit=hit, cohort=np.arange(n) % 2, cohorts=("new", "old"), t=np.zeros(n)))
+    assert lines["cohorts"] == "new 100, old 100" and lines["hit points"].startswith("25.0 % of the rays")
+    assert lines["recorded time"].startswith("unknown") and lines["speed"].startswith("unknown")
+    assert lines["duplicates"] == "190 rays share person and time with another"
+    assert "have the same time" in lines[WARNING]
+    slow = dict(card(t=10.0 * np.arange(n)))
+    assert slow["recorded time"].startswith("none: each ray of a person comes more than 1 s")
+
+
+def test_names_are_shown_as_they_are():
+    """A person or a file may be called what the terminal's library takes for a colour."""
+    eyes, ahead = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0], (3, 1))
+    rays = Rays(np.arange(3.0), [0, 0, 1], ("[red]", "[/b]"), eyes, ahead, np.ones(3))
+    shown = card_table(rays, summarise(rays), "[bold].npz")
+    assert "[bold].npz" in shown and "[red]" in shown and "[/b]" in shown
+
+
+# ---- Summary ----
+
+
+def walk(scale=1.0, height=1.6, n=100):
+    t = np.arange(n) * 0.02
+    origin = np.stack([t * scale, 0 * t, np.full(n, height)], axis=1)
+    d = np.tile([1.0, 0, 0], (n, 1))
+    return Rays(t, np.zeros(n), ("ann",), origin, d, np.ones(n), hit=origin + 2 * d)
+
+
+def test_figures_of_a_walk():
+    s = summarise(walk())
+    assert (s.rays, s.persons, s.duplicates, s.warnings) == (100, 1, 0, ())
+    assert np.isclose(s.rate, 50) and np.isclose(s.duration, 1.98) and np.isclose(s.speed_p95, 1)
+    assert np.isclose(s.hit_distance, 2) and s.hit_share == 1 and np.isclose(s.eye_height[1], 1.6)
+
+
+@pytest.mark.parametrize(
+    "rays, word",
+    [
+        (walk(1000, 1600.0), "units mm"),
+        (walk(1, 0.0), "up axis"),
+        (walk(20), "walking pace"),
+        (walk(0.001, 0.0016), "larger"),
+    ],
+)
+def test_names_the_likely_mistake(rays, word):
+    assert any(word in w for w in summarise(rays).warnings)
+
+
+def test_no_rays():
+    with pytest.raises(ValueError, match="no rays"):
+        summarise(walk().select(np.zeros(100, dtype=bool)))
+
+
+@pytest.mark.parametrize("block", [7, 64, 1 << 18])
+def test_figures_do_not_depend_on_order_or_blocks(monkeypatch, block):
+    """Against the definitions, on rays of three people in any order, with pauses, duplicates and missing hits."""
+    monkeypatch.setattr(quality, "_BLOCK", block)
+    rng = np.random.default_rng(0)
+    n = 500
+    person, t = rng.integers(0, 3, n), np.round(rng.uniform(0, 60, n), 1)
+    origin, d = rng.random((n, 3)), np.tile([1.0, 0, 0], (n, 1))
+    hit = np.where(rng.random((n, 1)) < 0.3, np.nan, origin + rng.random((n, 1)) * d)
+    rays = Rays(t, person, ("a", "b", "c", "nobody"), origin, d, np.ones(n), hit)
+    found = summarise(rays)
+    step, speed = [], []
+    for p in range(3):
+        mine = np.flatnonzero(person == p)
+        mine = mine[np.argsort(t[mine], kind="stable")]
+        dt = np.diff(t[mine])
+        step.append(dt)
+        moving = (dt > 0) & (dt <= 1)
+        speed.append(np.linalg.norm(np.diff(origin[mine], axis=0), axis=1)[moving] / dt[moving])
+    step, speed = np.concatenate(step), np.concatenate(speed)
+    moving = step[(step > 0) & (step <= 1)]
+    assert found.duration == pytest.approx(moving.sum()) and found.rate == pytest.approx(1 / np.median(moving))
+    assert found.speed_p95 == pytest.approx(np.percentile(speed, 95)) and found.duplicates == (step == 0).sum() > 0
+    distance = np.linalg.norm(hit - origin, axis=1)
+    assert found.hit_share == np.isfinite(distance).mean() and found.hit_distance == pytest.approx(
+        np.nanmedian(distance)
+    )
+    assert found.persons == 3
+
+
+def test_rate_of_rays_far_apart():
+    """Rays every two seconds have a rate, although no recorded time."""
+    rays = Rays(
+        np.arange(9) * 2.0, np.zeros(9, int), ("a",), np.full((9, 3), 1.6), np.tile([1.0, 0, 0], (9, 1)), np.ones(9)
+    )
+    found = summarise(rays)
+    assert (
+        found.rate == 0.5 and found.duration == 0 and np.isnan(found.speed_p95) and "--tick 0.001" in found.warnings[-1]
+    )
+    alone = summarise(rays.select([0]))
+    assert np.isnan(alone.rate) and alone.duplicates == 0 and not any("tick" in w or "t=" in w for w in alone.warnings)

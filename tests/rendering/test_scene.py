@@ -1,0 +1,316 @@
+"""Tests of `nerg_mi.rendering.scene`."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+
+import pytest
+
+from nerg_mi import llvm
+from nerg_mi.errors import NergError, UnusableLLVM
+from nerg_mi.rendering.scene import DEPTH, activate, check_scene_file, load_scene
+from nerg_mi.workflows.render import sensor_of
+
+# ---- Variants that work and that do not, and scenes that are loaded ----
+
+
+def test_the_best_variant_that_works(rgb, monkeypatch):
+    tried = []
+    monkeypatch.setattr(rgb, "set_variant", tried.append)
+    monkeypatch.setattr(llvm, "has_cuda", lambda: True)
+    assert activate() == "cuda_ad_rgb" and activate("llvm_ad_mono") == "llvm_ad_mono"
+    monkeypatch.setattr(llvm, "has_cuda", lambda: False)
+    assert activate() == "llvm_ad_rgb" and tried == ["cuda_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"]
+
+
+def test_a_backend_that_cannot_start_is_followed_by_the_next(rgb, monkeypatch):
+    def only_llvm(name):
+        if name.startswith("cuda"):
+            raise ImportError("no device")
+
+    monkeypatch.setattr(rgb, "set_variant", only_llvm)
+    monkeypatch.setattr(llvm, "has_cuda", lambda: True)
+    assert activate() == "llvm_ad_rgb"
+    with pytest.raises(NergError, match='"cuda_ad_rgb"'):
+        activate("cuda_ad_rgb")
+
+
+def test_an_unusable_libllvm_is_told_as_such(rgb, monkeypatch):
+    def refuse(name):
+        raise UnusableLLVM("LLVM 15 cannot")
+
+    monkeypatch.setattr(rgb, "set_variant", refuse)
+    with pytest.raises(UnusableLLVM):
+        activate()
+
+
+def test_values_of_a_scene(rgb, tmp_path):
+    (tmp_path / "s.xml").write_text(
+        '<scene version="3.0.0"><default name="wide" value="6"/><sensor type="perspective"><film type="hdrfilm">'
+        '<integer name="width" value="$wide"/></film></sensor></scene>'
+    )
+    width = lambda scene: scene.sensors()[0].film().size()[0]
+    assert width(load_scene(tmp_path / "s.xml")) == 6 and width(load_scene(tmp_path / "s.xml", {"wide": "9"})) == 9
+    with pytest.raises(NergError, match=r'asks for no "\$tall"'):
+        load_scene(tmp_path / "s.xml", {"tall": "2"})
+
+
+@pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
+def test_names_that_mitsuba_has_for_itself(rgb, tmp_path, name):
+    file = tmp_path / "scene.xml"
+    file.write_text(f'<scene version="3.0.0"><default name="{name}" value="1"/></scene>')
+    with pytest.raises(NergError, match=f'"{name}" is a name that Mitsuba keeps .*scene.xml"'):
+        load_scene(file, {name: "2"})
+
+
+def test_a_scene_that_is_not_there(tmp_path):
+    with pytest.raises(NergError, match="there is no scene file"):
+        load_scene(tmp_path / "s.xml")
+
+
+SCENE = '<scene version="3.0.0">{}</scene>'
+
+
+SCALED = '<shape type="{}"><transform name="to_world"><scale value="{}"/></transform></shape>'
+
+
+@pytest.mark.parametrize(
+    "inside, said",
+    [
+        *[(f'<shape type="sphere"><float name="radius" value="{r}"/></shape>', "Sphere") for r in ("nan", "inf", 1e38)],
+        *[(SCALED.format("cube", scale), "Mesh|Cube") for scale in ("nan", 1.1e7, -1e200)],
+        (SCALED.format("disk", "inf"), "corners of the Disk"),
+        (SCALED.format("cube", 1) + SCALED.format("cube", 1e9), "corners"),  # which Mitsuba makes one mesh of
+        (
+            '<sensor type="perspective"><transform name="to_world"><translate x="1e30"/></transform></sensor>',
+            "the to_world of sensor 0",
+        ),
+    ],
+)
+def test_shapes_and_sensors_beyond_all_places(rgb, tmp_path, inside, said):
+    (tmp_path / "s.xml").write_text(SCENE.format(inside))
+    with pytest.raises(NergError, match=f"({said}).* must have coordinates from"):
+        load_scene(tmp_path / "s.xml")
+
+
+def test_shapes_as_large_as_can_be_are_taken(rgb, tmp_path):
+    (tmp_path / "s.xml").write_text(SCENE.format(SCALED.format("cube", 9.9e6) + SCALED.format("sphere", 1e-6)))
+    assert len(load_scene(tmp_path / "s.xml").shapes()) == 2
+
+
+def test_a_picture_needs_an_integrator(rgb, tmp_path):
+    (tmp_path / "s.xml").write_text(SCENE.format('<sensor type="perspective"/>'))
+    with pytest.raises(NergError, match="s.xml"):
+        sensor_of(tmp_path / "s.xml", load_scene(tmp_path / "s.xml"), 0)
+
+
+# ---- Scene file ----
+#
+# A scene that would end the process or fill the memory is one sentence, by whichever command it comes in.
+
+
+SENSOR = """<sensor type="perspective"><sampler type="{sampler}"><integer name="sample_count" value="{spp}"/></sampler>
+<film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{height}"/></film></sensor>"""
+
+
+def scene(*things: str, sampler="independent", spp="1", width="8", height="8") -> str:
+    sensor = SENSOR.format(sampler=sampler, spp=spp, width=width, height=height)
+    return (
+        f'<scene version="3.0.0"><integrator type="direct"/><emitter type="constant"/>{"".join(things)}{sensor}</scene>'
+    )
+
+
+def shape(kind: str, file: str) -> str:
+    return f'<shape type="{kind}"><string name="filename" value="{file}"/></shape>'
+
+
+def mesh(corner: int) -> bytes:
+    head = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    )
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    return head.encode() + struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + b"\x03" + struct.pack("<3i", 0, 1, corner)
+
+
+EMPTY_VOLUME = b"VOL\x03" + struct.pack("<5i6f", 1, 0, 0, 0, 1, 0, 0, 0, 1, 1, 1)
+
+
+GRID = """<shape type="cube"><medium name="interior" type="heterogeneous"><volume name="sigma_t" type="gridvolume">
+<string name="filename" value="a.vol"/></volume></medium></shape>"""
+
+
+DEEP = '<shape type="cube">' * 20000 + "</shape>" * 20000
+
+
+# What ends the process without the checks.
+DEADLY = {
+    "deep": (scene(DEEP), {}, f"more than {DEPTH} deep"),
+    "corner": (scene(shape("ply", "a.ply")), {"a.ply": mesh(999999999)}, "none of its 3 vertices"),
+    "volume": (scene(GRID), {"a.vol": EMPTY_VOLUME}, "0 x 0 x 0 voxels"),
+    "samples": (scene(spp="0"), {}, "must lie in 1 .. 16777216, got 0"),
+    "multijitter": (scene(sampler="multijitter", spp="0"), {}, "must lie in 1 .. 16777216, got 0"),
+    "film": (scene(width="2000000000", height="2000000000"), {}, "pixels"),
+    "long film": (scene(width="2000000000", height="1"), {}, "pixels"),
+}
+
+
+@pytest.mark.parametrize("name", DEADLY)
+def test_what_would_end_the_process_is_a_sentence(tmp_path, name):
+    text, files, said = DEADLY[name]
+    (tmp_path / "s.xml").write_text(text)
+    for file, data in files.items():
+        (tmp_path / file).write_bytes(data)
+    run = [
+        sys.executable,
+        "-c",
+        "from nerg_mi.cli import main; main()",
+        "render",
+        "s.xml",
+        "-o",
+        "a.exr",
+        "-m",
+        "llvm_ad_rgb",
+    ]
+    done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, timeout=180)
+    assert done.returncode == 1, done.stderr[-500:]
+    assert len(done.stderr.strip().splitlines()) == 1 and said in done.stderr
+    assert not (tmp_path / "a.exr").exists()
+
+
+def refused(tmp_path, text, said, **defaults):
+    (tmp_path / "s.xml").write_text(text)
+    with pytest.raises(NergError, match=said) as error:
+        load_scene(tmp_path / "s.xml", defaults)
+    assert "\n" not in str(error.value)
+
+
+def test_values_that_grow_with_every_default_are_refused_before_they_are_made(tmp_path):
+    grown = "".join(f'<default name="{b}" value="{f"${a}" * 100}"/>' for a, b in zip("abcdef", "bcdefg"))
+    (tmp_path / "s.xml").write_text(scene(f'<default name="a" value="{"x" * 1000}"/>{grown}'))
+    with pytest.raises(NergError, match="more than 256 MB of XML"):
+        check_scene_file(tmp_path / "s.xml")
+
+
+def test_good_scenes_load(rgb, tmp_path):
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "part.xml").write_text('<scene version="3.0.0"><shape type="cube"/></scene>')
+    (tmp_path / "a.ply").write_bytes(mesh(2))
+    text = scene(
+        '<default name="part" value="more/part.xml"/><include filename="$part"/>', shape("ply", "$mesh"), spp="$n"
+    )
+    (tmp_path / "s.xml").write_text(text.replace("<integrator", '<default name="n" value="3"/><integrator', 1))
+    loaded = load_scene(tmp_path / "s.xml", {"mesh": "a.ply"})
+    assert len(loaded.shapes()) == 2 and loaded.sensors()[0].sampler().sample_count() == 3
+
+
+def test_values_given_count_and_not_the_defaults(tmp_path):
+    text = scene(spp="$spp").replace("<integrator", '<default name="spp" value="4"/><integrator', 1)
+    refused(tmp_path, text, "must lie in 1 .. 16777216, got 0", spp="0")
+    refused(tmp_path, text, "got -3", spp="-3")
+    (tmp_path / "s.xml").write_text(text)
+    check_scene_file(tmp_path / "s.xml", {})
+    assert load_scene(tmp_path / "s.xml", {"spp": 2}).sensors()[0].sampler().sample_count() == 2
+
+
+def test_entities_are_not_expanded(tmp_path):
+    levels = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10}">' for k in range(1, 12))
+    refused(
+        tmp_path,
+        f'<!DOCTYPE scene [<!ENTITY e0 "lol">{levels}]><scene version="3.0.0" id="&e11;"/>',
+        "declares an entity",
+    )
+
+
+def test_includes_are_followed_and_do_not_go_round(tmp_path):
+    refused(tmp_path, scene('<include filename="s.xml"/>'), "includes itself")
+    (tmp_path / "b.xml").write_text(f'<scene version="3.0.0">{DEEP}</scene>')
+    refused(tmp_path, scene('<include filename="b.xml"/>'), 'b.xml" .line 1. nests')
+    for k in range(40):
+        (tmp_path / f"i{k}.xml").write_text(f'<scene version="3.0.0"><include filename="i{k + 1}.xml"/></scene>')
+    refused(tmp_path, scene('<include filename="i0.xml"/>'), "files deep")
+
+
+@pytest.mark.parametrize(
+    "text, said", [("<scene", "well-formed"), ("", "well-formed"), ("<scene></shape>", "well-formed")]
+)
+def test_what_is_no_xml(tmp_path, text, said):
+    refused(tmp_path, text, said)
+
+
+def test_too_many_elements(tmp_path, monkeypatch):
+    monkeypatch.setattr("nerg_mi.rendering.scene.ELEMENTS", 100)
+    refused(tmp_path, scene('<shape type="cube"/>' * 101), "more than 100 elements")
+
+
+HUGE = {
+    "a.png": b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 100000, 100000, 1, 0, 0, 0, 0),
+    "a.hdr": b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 100000 +X 100000\n",
+    "a.pfm": b"PF\n100000 100000\n-1.0\n",
+    "a.bmp": b"BM" + struct.pack("<IHHIIiiHH", 94, 0, 0, 54, 40, 100000, 100000, 1, 24),
+}
+
+
+@pytest.mark.parametrize("name", HUGE)
+def test_pictures_of_a_scene_are_looked_at(tmp_path, name):
+    (tmp_path / name).write_bytes(HUGE[name] + bytes(40))
+    texture = f'<texture name="reflectance" type="bitmap"><string name="filename" value="{name}"/></texture>'
+    refused(tmp_path, scene(f'<shape type="cube"><bsdf type="diffuse">{texture}</bsdf></shape>'), "100,000 x 100,000")
+
+
+def test_samples_of_the_option_are_bounded(tmp_path):
+    from nerg_mi.workflows.render import PictureOptions, render_file
+
+    with pytest.raises(NergError, match="--spp.*0.*16777216"):
+        render_file(tmp_path / "s.xml", tmp_path / "a.exr", PictureOptions(spp=1 << 31))
+
+
+def test_the_other_ways_in_are_guarded(standins, tmp_path):
+    from nerg_mi.evaluation import study_subject
+    from nerg_mi.train.geometry import place_of_scene
+    from nerg_mi.workflows.demo import DemoOptions, make_demo
+
+    (tmp_path / "s.xml").write_text(scene(DEEP))
+    with pytest.raises(NergError, match="deep"):
+        place_of_scene(tmp_path / "s.xml")
+    with pytest.raises(NergError, match="there is no scene file"):
+        place_of_scene(tmp_path / "missing.xml")
+    with pytest.raises(NergError, match="deep"):
+        study_subject.load_subject(tmp_path / "s.xml", 8, 8, {})
+    with pytest.raises(NergError, match="deep"):
+        options = DemoOptions(scene=tmp_path / "s.xml", defaults=standins, mode="llvm_ad_rgb")
+        make_demo(tmp_path / "out", options)
+
+
+ROW = "0 0 0 {0}\n1 0 0 {0}\n0 1 0 {0}\n3 0 1 2\n"
+
+
+PROPERTIES = "".join(f"property float {name}\n" for name in "xyz")
+
+
+TINT = """<shape type="ply"><string name="filename" value="a.ply"/><bsdf type="diffuse"><texture name="reflectance"
+type="mesh_attribute"><string name="name" value="vertex_color"/></texture></bsdf></shape>"""
+
+
+@pytest.mark.parametrize(
+    "columns, value, shown, said",
+    [
+        ("red green blue alpha", "9 9 9 9", TINT, "alpha"),
+        ("red green blue alpha", "9 9 9 9", shape("ply", "a.ply"), None),
+        ("red green blue", "9 9 9", TINT, None),
+        ("nx ny nz", "0 0 0", shape("ply", "a.ply"), "normals are 0"),
+        ("nx ny nz", "0 0 1", shape("ply", "a.ply"), None),
+    ],
+)
+def test_meshes_that_would_be_black_are_refused(tmp_path, columns, value, shown, said):
+    kind = "float" if columns.startswith("n") else "uchar"
+    more = "".join(f"property {kind} {name}\n" for name in columns.split())
+    head = f"ply\nformat ascii 1.0\nelement vertex 3\n{PROPERTIES}{more}element face 1\n"
+    (tmp_path / "a.ply").write_text(f"{head}property list uchar int vertex_indices\nend_header\n{ROW.format(value)}")
+    (tmp_path / "a.xml").write_text(scene(shown))
+    if said is None:
+        check_scene_file(tmp_path / "a.xml")
+        return
+    with pytest.raises(NergError, match=f"a.ply.*{said}.*nerg scene"):
+        check_scene_file(tmp_path / "a.xml")

@@ -1,0 +1,419 @@
+"""Tests of `nerg_mi.statistics.visits`."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.formats.areas import Region
+from nerg_mi.rays.rays import Rays
+from nerg_mi.statistics.visits import (
+    ALL,
+    BINS,
+    Box,
+    Cell,
+    Landed,
+    LookRules,
+    Sums,
+    concatenate,
+    cone,
+    land,
+    looks_at,
+    merge,
+    partial_sums,
+    regroup,
+    timeline,
+    unite,
+)
+
+# ---- Which things rays land on, against loops over rays and planes ----
+
+
+def box(name, lower, upper, turn=None):
+    return Box(Region.of(name, lower, upper, turn))
+
+
+def brute(region, o, d):
+    """Where a ray is inside of a box, by clipping it at six planes one after the other in the box's own frame."""
+    turn = region.matrix.T
+    o, d = turn @ (np.array(o, float) - region.middle), turn @ np.array(d, float)
+    half = (region.corners[1] - region.corners[0]) / 2
+    near, far = -np.inf, np.inf
+    for axis in range(3):
+        if d[axis] == 0:
+            if abs(o[axis]) > half[axis]:
+                return None
+            continue
+        a, b = (-half[axis] - o[axis]) / d[axis], (half[axis] - o[axis]) / d[axis]
+        near, far = max(near, min(a, b)), min(far, max(a, b))
+    return (near, far) if near < far and far > 0 else None
+
+
+def some_rays(n=2000, seed=0):
+    rng = np.random.default_rng(seed)
+    o = rng.uniform(-3, 3, (n, 3))
+    d = rng.normal(size=(n, 3))
+    return o, d / np.linalg.norm(d, axis=1, keepdims=True), rng.uniform(0.2, 6, n)
+
+
+def test01_surfaces_in_boxes():
+    things = [
+        box("a", [-1, -1, -1], [1, 0.5, 1]),
+        box("b", [0, 0, 0], [2, 1, 1], 35),
+        box("c", [1.5, -2, -1], [2, 2, 0]),
+    ]
+    o, d, depth = some_rays()
+    found = land(things, o, d, depth, 0.03).matrix()
+    expected = np.zeros_like(found)
+    for i in range(len(o)):
+        for k, thing in enumerate(things):
+            span = brute(thing.region, o[i], d[i])
+            if span is None:
+                continue
+            near, far = span
+            expected[i, k] = near - 0.03 <= depth[i] < far + 0.03
+    assert np.array_equal(found, expected) and 20 < expected.sum() and not expected.all(axis=1).all()
+    inside = np.array([thing.region.holds(o) for thing in things]).T
+    assert (inside & expected).any() and (inside & ~expected).any()
+
+
+def test02_distances_are_those_of_the_entrance_or_from_within_of_the_surface():
+    things = [box("a", [1, -1, -1], [2, 1, 1]), box("around", [-1, -1, -1], [3, 1, 1])]
+    o, d = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
+    landed = land(things, o, d, np.array([1.7]))
+    assert [v.tolist() for v in landed.distance] == [[1.0], [1.7]]
+    # Beyond a box, or nowhere: they look through it, or out of that in which they stand.
+    assert [len(v) for v in land(things, o, d, np.array([2.5])).rows] == [0, 1]
+    assert [len(v) for v in land(things, o, d, np.array([3.5])).rows] == [0, 0]
+    assert [len(v) for v in land(things, o, d, np.array([np.inf])).rows] == [0, 0]
+
+
+def test03_without_surfaces_things_are_solid():
+    front, behind, in_front = (
+        box("f", [1, -1, -1], [2, 1, 1]),
+        box("b", [3, -1, -1], [4, 1, 1]),
+        box("i", [1.5, 0, 0], [2.5, 1, 1]),
+    )
+    o, d = np.array([[0, 0.5, 0.5], [0, -0.5, -0.5], [0, 5.0, 0]]), np.tile([1.0, 0, 0], (3, 1))
+    found = land([front, behind, in_front], o, d, None).matrix()
+    # Overlapping ones share a look, what begins behind the end of another is hidden.
+    assert found.tolist() == [[True, False, True], [True, False, False], [False, False, False]]
+
+
+def test04_a_box_that_is_grazed_or_behind_is_not_met():
+    thing = box("a", [1, 0, 0], [2, 1, 1])
+    o = np.array([[0.0, 1, 0.5], [3, 0.5, 0.5], [0, 0.5, 0.5]])
+    d = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
+    assert land([thing], o, d, np.array([1.5, 0.5, 1.5])).matrix()[1:, 0].tolist() == [False, True]
+
+
+def test05_groups_are_unions_at_their_least_distance():
+    things = [box("a", [1, -1, -1], [2, 1, 1]), box("b", [1.5, 0, -1], [4, 1, 1])]
+    o, d = np.array([[0, 0.5, 0.0], [0, -0.5, 0], [3, 0.5, -5]]), np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1]])
+    landed = regroup(land(things, o, d, np.array([1.6, 1.0, 5.0])), [(0,), (1,), (0, 1)])
+    assert [rows.tolist() for rows in landed.rows] == [[0, 1], [0, 2], [0, 1, 2]]
+    assert landed.distance[2].tolist() == [1.0, 1.0, 4.0]
+
+
+def test06_parts_and_ways_are_put_together():
+    things = [box("a", [1, -1, -1], [2, 1, 1])]
+    o, d = np.zeros((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]])
+    one, two = land(things, o, d, None), land(things, o, d[::-1], None)
+    assert concatenate([one, two]).rows[0].tolist() == [0, 3]
+    assert unite([one, two]).rows[0].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("degrees", [0.5, 2.0, 10.0])
+def test07_a_cone_leaves_no_hole_wider_than_half_of_it(degrees):
+    d = np.array([[0, 0, 1.0], [0, 0, -1], [0.6, 0, 0.8], [0.36, -0.48, -0.8]])
+    ways = np.stack(cone(d, degrees))
+    assert len(ways) == 19 and np.allclose(np.linalg.norm(ways, axis=2), 1)
+    angle = np.degrees(np.arccos(np.clip((ways * d).sum(axis=2), -1, 1)))
+    assert np.allclose(angle[0], 0, atol=1e-5) and np.allclose(angle[1:7], degrees / 2, rtol=1e-3)
+    assert np.allclose(angle[7:], degrees, rtol=1e-3)
+    rng = np.random.default_rng(0)
+    for k in range(len(d)):
+        u = np.cross(d[k], [1, 0.3, 0.2])
+        u /= np.linalg.norm(u)
+        v = np.cross(d[k], u)
+        r, turn = np.radians(degrees) * np.sqrt(rng.random(500)), 2 * np.pi * rng.random(500)
+        within = np.cos(r)[:, None] * d[k] + np.sin(r)[:, None] * (
+            np.cos(turn)[:, None] * u + np.sin(turn)[:, None] * v
+        )
+        nearest = np.degrees(np.arccos(np.clip(within @ ways[:, k].T, -1, 1)).min(axis=1))
+        assert nearest.max() < 0.5 * degrees
+
+
+def test08_samples_cover_a_box_evenly():
+    thing = box("a", [0, 0, 0], [2, 1, 0.5], 20)
+    points, normals = thing.samples(70)
+    own = thing.region.to_own(points)
+    lower, upper = thing.region.corners
+    on_face = np.isclose(own, lower) | np.isclose(own, upper)
+    assert (on_face.sum(axis=1) == 1).all() and ((own > lower - 1e-9) & (own < upper + 1e-9)).all()
+    assert np.allclose(((points - thing.region.middle) * normals).sum(axis=1) > 0, True)
+    assert 40 < len(points) < 110
+
+
+# ---- How long rays stand for, and what is one look ----
+
+
+def slow_weights(person, t, rules):
+    """Ray by ray."""
+    n = len(t)
+    sitting, weight = [0] * n, [0.0] * n
+    for i in range(1, n):
+        goes_on = person[i] == person[i - 1] and t[i] - t[i - 1] <= rules.pause
+        sitting[i] = sitting[i - 1] + (not goes_on)
+    for i in range(n):
+        steps = [
+            t[j + 1] - t[j]
+            for j in range(n - 1)
+            if sitting[j] == sitting[i] == sitting[j + 1] and 0 < t[j + 1] - t[j] <= rules.gap
+        ]
+        usual = float(np.median(steps)) if steps else 0.0
+        near = i + 1 < n and sitting[i + 1] == sitting[i] and t[i + 1] - t[i] <= rules.gap
+        weight[i] = t[i + 1] - t[i] if near else usual
+    return sitting, weight
+
+
+def slow_looks(rows, t, weight, sitting, rules):
+    """Ray by ray."""
+    looks, now = [], None
+    for r in rows:
+        start, end = t[r], t[r] + weight[r]
+        if now is not None and sitting[now[0]] == sitting[r] and start - now[2] <= rules.merge + 1e-9:
+            now = (now[0], now[1], end)
+        else:
+            if now is not None:
+                looks.append(now)
+            now = (r, start, end)
+    return [found for found in [*looks, now] if found is not None and found[2] - found[1] >= rules.least - 1e-9]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test01_against_loops(seed):
+    rng = np.random.default_rng(seed)
+    rules = LookRules(gap=0.5, pause=5.0, merge=0.25, least=0.15)
+    person = np.sort(rng.integers(0, 4, 120))
+    step = rng.choice([0.0, 0.1, 0.2, 0.2, 0.3, 0.7, 6.0], 120)
+    t = np.concatenate([np.cumsum(step[person == p]) for p in range(4)])
+    line = timeline(person, t, rules)
+    sitting, weight = slow_weights(person, t, rules)
+    assert line.sitting.tolist() == sitting and np.allclose(line.weight, weight)
+    rows = np.flatnonzero(rng.random(120) < 0.5)
+    looks = looks_at(rows, line, rules)
+    expected = slow_looks(rows, t, weight, sitting, rules)
+    assert looks.first.tolist() == [e[0] for e in expected]
+    assert np.allclose(looks.start, [e[1] for e in expected]) and np.allclose(looks.end, [e[2] for e in expected])
+
+
+def test02_one_ray_stands_for_no_time():
+    line = timeline(np.array([0, 1, 1]), np.array([5.0, 1.0, 1.2]), LookRules())
+    assert np.allclose(line.weight, [0, 0.2, 0.2])
+    assert len(looks_at(np.array([0]), line, LookRules())) == 0
+    assert len(looks_at(np.array([0]), line, LookRules(least=0.0))) == 1
+    assert len(looks_at(np.zeros(0, int), line, LookRules())) == 0
+
+
+def test03_equal_times_count_once():
+    line = timeline(np.zeros(4, int), np.array([0.0, 0.0, 0.2, 0.2]), LookRules())
+    assert np.allclose(line.weight, [0, 0.2, 0, 0.2])
+
+
+def test04_no_rays():
+    assert len(timeline(np.zeros(0, int), np.zeros(0), LookRules()).t) == 0
+
+
+@pytest.mark.parametrize("t", [[0.0, np.nan], [1.0, 0.0], [0.0, np.inf]])
+def test05_times_that_are_none_or_unsorted(t):
+    with pytest.raises(ValueError):
+        timeline(np.zeros(2, int), np.array(t), LookRules())
+
+
+@pytest.mark.parametrize("bad", [{"gap": 0}, {"gap": -1}, {"pause": 0.5}, {"merge": np.nan}, {"least": np.inf}])
+def test06_rules_that_are_none(bad):
+    with pytest.raises(NergError, match="--"):
+        LookRules(**bad)
+
+
+def test07_times_on_the_bounds():
+    """A pause as long as it may be joins sittings, an interruption as long as it may be looks."""
+    rules = LookRules(gap=0.5, pause=4.0, merge=0.25, least=0.25)
+    line = timeline(np.zeros(4, int), np.array([0.0, 4.0, 8.0, 12.5]), rules)
+    assert line.sitting.tolist() == [0, 0, 0, 1]
+    line = timeline(np.zeros(6, int), np.arange(6) * 0.25, rules)
+    at = lambda *rows: looks_at(np.array(rows), line, rules).first.tolist()
+    assert at(0, 2) == [0] and at(0, 3) == [0, 3] and at(1) == [1]
+    assert timeline(np.zeros(3, int), np.array([0.0, 0.5, 1.25]), rules).weight.tolist() == [0.5, 0.5, 0.5]
+
+
+# ---- Sums of blocks, against dictionaries filled ray by ray, and in any number of parts ----
+
+
+RULES = LookRules(gap=0.5, pause=5.0, merge=0.25, least=0.15)
+
+
+AREAS = ("a", "b", "c")
+
+
+def made(seed=0, n=150, people=3):
+    """Rays in disorder, what they are on, and what could be seen."""
+    rng = np.random.default_rng(seed)
+    person = rng.integers(0, people, n)
+    step = rng.choice([0.1, 0.2, 0.2, 0.3, 0.7, 6.0], n)
+    t = np.zeros(n)
+    for p in range(people):
+        own = np.flatnonzero(person == p)
+        t[own] = rng.permutation(np.cumsum(step[own]))
+    d = np.tile([1.0, 0, 0], (n, 1))
+    names = tuple(f"person {k}" for k in range(people))
+    rays = Rays(t, person, names, rng.random((n, 3)), d, np.ones(n))
+    on = rng.random((n, 3)) < (0.5, 0.2, 0.0)
+    far = rng.random((n, 3)) + 1
+    rows = tuple(np.flatnonzero(on[:, k]) for k in range(3))
+    landed = Landed(n, rows, tuple(far[r, k] for k, r in enumerate(rows)))
+    return rays, landed, on, far, rng.random((n, 3)) < 0.4
+
+
+def slow_sums(rays, on, far, visible, cells):
+    """Ray by ray, look by look, in dictionaries."""
+    order = sorted(range(len(rays)), key=lambda i: (rays.person[i], rays.t[i]))
+    person, t = [int(rays.person[i]) for i in order], [float(rays.t[i]) for i in order]
+    sitting, weight = slow_weights(person, t, RULES)
+    out = defaultdict(float)
+    for cell, mask in cells:
+        mine = [mask is None or bool(mask[i]) for i in order]
+        begin = {}
+        for k in range(len(order)):
+            if not mine[k]:
+                continue
+            who = rays.persons[person[k]]
+            begin.setdefault(sitting[k], t[k])
+            out["time", cell, who] += weight[k]
+            out["time2", cell, who] += weight[k] ** 2
+            out["rays", cell, who] += 1
+            for a in range(3):
+                i = order[k]
+                if on[i, a]:
+                    out["on_time", cell, who, a] += weight[k]
+                    out["on_rays", cell, who, a] += 1
+                    out["distance", cell, who, a] += weight[k] * far[i, a]
+                if on[i, a] or visible[i, a]:
+                    out["visible", cell, who, a] += weight[k]
+        every = []
+        for a in range(3):
+            rows = [k for k in range(len(order)) if on[order[k], a]]
+            known = set()
+            for first, start, end in slow_looks(rows, t, weight, sitting, RULES):
+                every.append((sitting[first], start, a, first))
+                if not mine[first]:
+                    continue
+                who = rays.persons[person[first]]
+                out["looks", cell, who, a] += 1
+                out["first", cell, who, a] = min(out.get(("first", cell, who, a), np.inf), start)
+                out["last", cell, who, a] = max(out.get(("last", cell, who, a), -np.inf), end)
+                bin_ = max(b for b in range(len(BINS) - 1) if end - start >= BINS[b])
+                out["lasted", cell, a, bin_] += 1
+                if sitting[first] not in known:
+                    known.add(sitting[first])
+                    out["first_sum", cell, who, a] += start - begin[sitting[first]]
+                    out["first_count", cell, who, a] += 1
+        every.sort()
+        for one, two in zip(every[:-1], every[1:]):
+            if one[0] == two[0] and one[2] != two[2] and mine[two[3]]:
+                out["moves", cell, one[2], two[2]] += 1
+    return out
+
+
+def cells_of(rays):
+    return [(ALL, None), (Cell("window", "early"), rays.t < 4), (Cell("zone", "none"), np.zeros(len(rays), bool))]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test01_sums_against_loops(seed):
+    rays, landed, on, far, visible = made(seed)
+    cells = cells_of(rays)
+    sums = partial_sums(rays, landed, AREAS, cells, RULES, visible)
+    slow = slow_sums(rays, on, far, visible, cells)
+    for r, (cell, who) in enumerate(sums.rows):
+        for name in ("time", "time2", "rays"):
+            assert getattr(sums, name)[r] == pytest.approx(slow[name, cell, who])
+        for name in ("on_time", "on_rays", "distance", "looks", "visible", "first_sum", "first_count"):
+            assert getattr(sums, name)[r] == pytest.approx([slow[name, cell, who, a] for a in range(3)]), name
+        for name, none in (("first", np.inf), ("last", -np.inf)):
+            expected = [slow.get((name, cell, who, a), none) for a in range(3)]
+            assert getattr(sums, name)[r] == pytest.approx(expected), name
+    for c, (cell, _) in enumerate(cells):
+        assert sums.lasted[c].tolist() == [[slow["lasted", cell, a, b] for b in range(len(BINS) - 1)] for a in range(3)]
+        assert sums.moves[c].tolist() == [[slow["moves", cell, a, b] for b in range(3)] for a in range(3)]
+    assert {cell for cell, _ in sums.rows} == {ALL, Cell("window", "early")} and sums.moves[0].sum() > 3
+    # Nobody looks at c.
+    assert sums.on_time[:, 2].sum() == 0 and np.isinf(sums.first[:, 2]).all() and sums.visible[:, 2].sum() > 0
+
+
+def pick(landed, rows):
+    place = {int(r): k for k, r in enumerate(rows)}
+    keep = [[place[int(r)] for r in of if int(r) in place] for of in landed.rows]
+    far = [np.array([d for r, d in zip(of, ds) if int(r) in place]) for of, ds in zip(landed.rows, landed.distance)]
+    return Landed(len(rows), tuple(np.array(k, int) for k in keep), tuple(far))
+
+
+def test02_in_parts_it_is_the_same():
+    rays, landed, _, _, visible = made(7, 300, 6)
+    whole = partial_sums(rays, landed, AREAS, [(ALL, None)], RULES, visible)
+    parts = []
+    for p in range(6):
+        rows = np.flatnonzero(rays.person == p)
+        parts.append(partial_sums(rays.select(rows), pick(landed, rows), AREAS, [(ALL, None)], RULES, visible[rows]))
+    merged = merge(parts)
+    assert merged.rows == whole.rows
+    for f in fields(Sums):
+        value = getattr(whole, f.name)
+        if isinstance(value, np.ndarray):
+            assert np.array_equal(getattr(merged, f.name), value), f.name
+    # And so in parts of parts, to the bit, in the same order.
+    again = merge([merge(parts[:1]), *parts[1:]])
+    assert all(np.array_equal(getattr(again, n), getattr(merged, n)) for n in ("time", "on_time", "moves", "first"))
+
+
+def test03_somebody_who_comes_twice_is_one_person():
+    rays, landed, _, _, visible = made(3)
+    one = partial_sums(rays, landed, AREAS, [(ALL, None)], RULES, visible)
+    twice = merge([one, one])
+    assert twice.rows == one.rows and np.allclose(twice.time, 2 * one.time) and np.array_equal(twice.first, one.first)
+
+
+def test04_others_cannot_be_added():
+    rays, landed, *_ = made()
+    one = partial_sums(rays, landed, AREAS, [(ALL, None)], RULES)
+    other = partial_sums(rays, landed, ("x", "b", "c"), [(ALL, None)], RULES)
+    with pytest.raises(ValueError, match="other areas"):
+        merge([one, other])
+    with pytest.raises(ValueError, match="nothing"):
+        merge([])
+
+
+def test03b_the_last_visit_ends_when_its_last_ray_does():
+    """Not when that begins, nor when the look before it ended; of two parts it is the later one."""
+    t = np.arange(8) * 0.25
+    d = np.tile([1.0, 0, 0], (8, 1))
+    rays = Rays(t, np.zeros(8, int), ("ann",), d, d, np.ones(8))
+    on = np.array([1, 2, 5, 6])
+    landed = Landed(8, (on,), (np.ones(4),))
+    early = partial_sums(rays, landed, ("a",), [(ALL, None)], LookRules())
+    assert early.looks[0, 0] == 2 and early.first[0, 0] == 0.25 and early.last[0, 0] == 1.75
+    late = partial_sums(replace(rays, t=t + 100), landed, ("a",), [(ALL, None)], LookRules())
+    for parts in ([early, late], [late, early]):
+        assert merge(parts).first[0, 0] == 0.25 and merge(parts).last[0, 0] == 101.75
+
+
+def test05_no_rays_at_all():
+    rays, landed, *_ = made()
+    none = partial_sums(rays.select(np.zeros(0, int)), pick(landed, []), AREAS, [(ALL, None)], RULES)
+    assert none.rows == () and none.time.shape == (0,) and none.moves.sum() == 0
+    assert none.persons_of(ALL)[1] == []

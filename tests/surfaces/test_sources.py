@@ -1,0 +1,429 @@
+"""Tests of `nerg_mi.surfaces.sources`."""
+
+import dataclasses
+
+import drjit as dr
+import numpy as np
+import pytest
+from scipy.special import eval_legendre
+from scipy.stats import norm
+
+from nerg_mi.errors import NergError
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.rays.rays import Rays
+from nerg_mi.surfaces.laplacian import merge
+from nerg_mi.surfaces.mesh import Target, refine
+from nerg_mi.surfaces.sources import (
+    GazeSettings,
+    RaySettings,
+    TrackedRays,
+    blurred,
+    bundle,
+    gaze_sums,
+    lookers_of_law,
+    pieces_of,
+    ray_seconds,
+    ray_sums,
+    ray_weights,
+    solid_angles,
+    sphere_rule,
+    thin,
+    visible_pieces,
+)
+from tests.surfaces.meshes import box, joined, plate, vmf
+
+# ---- Cones: the rule on the sphere against Legendre polynomials, and bundles against Rayleigh's law ----
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test01_a_harmonic_is_multiplied_by_a_number(rgb, degree):
+    sigma = 0.2
+    d = rgb.Vector3f(fibonacci_directions(500).T.astype(np.float32))
+    # Zonal harmonics about an axis of no symmetry; written out, since Dr.Jit has none.
+    zonal = {
+        0: lambda x: x * 0 + 1,
+        1: lambda x: x,
+        2: lambda x: 1.5 * x * x - 0.5,
+        3: lambda x: 2.5 * x * x * x - 1.5 * x,
+    }
+    axis = dr.normalize(rgb.Vector3f(0.3, -0.5, 0.8))
+
+    def density(u):
+        # Fields gather single precision only.
+        assert isinstance(u, rgb.Vector3f)
+        return zonal[degree](dr.dot(u, axis))
+
+    found = np.array(blurred(density, d, sigma))
+    expected = 0.5 * (1 + eval_legendre(degree, np.cos(2 * sigma))) * np.array(zonal[degree](dr.dot(d, axis)))
+    assert np.allclose(found, expected, atol=1e-5)
+
+
+def test02_it_is_heat_on_the_sphere_to_the_fourth_order():
+    for sigma in (0.02, 0.04):
+        for degree in (1, 5, 12):
+            rule = 0.5 * (1 + eval_legendre(degree, np.cos(2 * sigma)))
+            # In the tangent plane the harmonic of degree l is a wave of the number l + 1/2, about.
+            assert abs(rule - np.exp(-degree * (degree + 1) * sigma**2 / 2)) < 2 * (degree + 1) ** 4 * sigma**4 / 24
+
+
+def test03_bundles_are_gaussian_unit_and_the_same_for_a_seed():
+    d = fibonacci_directions(400)
+    out = bundle(d, 0.05, 64, np.random.default_rng(3))
+    assert out.shape == (400, 64, 3) and np.allclose(np.linalg.norm(out, axis=2), 1)
+    angle = np.arccos(np.clip(np.einsum("nik,nk->ni", out, d), -1, 1)).ravel()
+    for share in (0.1, 0.5, 0.9):
+        assert abs(np.quantile(angle, share) / (0.05 * np.sqrt(-2 * np.log1p(-share))) - 1) < 0.01
+    assert np.linalg.norm(out.mean(axis=1) - d, axis=1).mean() < 0.01
+    assert np.array_equal(out, bundle(d, 0.05, 64, np.random.default_rng(3)))
+    assert np.array_equal(bundle(d, 0, 2, np.random.default_rng(0)), np.repeat(d[:, None], 2, axis=1))
+
+
+# ---- Gaze on surfaces: conserved, and what `nerg.attention` says of the same ----
+
+
+ROOM = box((0, 0, 0), (4, 3, 2.5))
+
+
+SHELF = box((1.5, 2, 0), (3, 2.4, 1.8))
+
+
+SETTINGS = GazeSettings()
+
+
+MEAN = np.array([0.84, 0.5, -0.2]) / np.linalg.norm([0.84, 0.5, -0.2])
+
+
+@pytest.mark.parametrize(("kappa", "eye"), [(1.0, (1.0, 0.7, 1.5)), (500.0, (0.001, 1.3, 1.2))])
+def test01_a_closed_room_receives_all(rgb, kappa, eye):
+    """Also an observer a millimetre from a wall."""
+    target = Target(refine(joined(ROOM, SHELF), 0.4).mesh)
+    sums = gaze_sums(target, lookers_of_law(vmf(rgb, MEAN, kappa)), np.array([eye]), [1.0], SETTINGS)
+    assert abs(sums.total - 1) < 3e-4 and sums.escaped == 0 and sums.elsewhere == 0
+    assert abs(sums.unaccounted) < 1e-3
+    assert np.isclose(sums.vertex.sum(), sums.face.sum(), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("y", "kappa"), [(0.7, 500.0), (0.69, 5000.0)])
+def test02_surfaces_what_hides_them_and_what_escapes_are_what_they_are(rgb, y, kappa):
+    """Against a sum in double precision that shares no line with it, narrow laws on an outline that runs along the
+    cuts of a wall included."""
+    for without in (None, 1):
+        room = joined(box((0, 0, 0), (4, 3, 2.5), without))
+        sums = gaze_sums(
+            Target(room, [SHELF]), lookers_of_law(vmf(rgb, MEAN, kappa)), np.array([(1.0, y, 1.5)]), [2.0], SETTINGS
+        )
+        exact = _shares(kappa, np.array([1.0, y, 1.5]), without is not None)
+        found = np.array([sums.on_surface, sums.elsewhere, sums.escaped]) / 2
+        assert np.abs(found - exact).max() < 1.2e-3 and abs(sums.unaccounted) < 1e-3 * sums.total and sums.weight == 2
+
+
+def _shares(kappa: float, eye: np.ndarray, window: bool, count: int = 1 << 17) -> np.ndarray:
+    """Of the law on room, shelf and window: slab tests along directions that each have as much of it."""
+    i, side = np.arange(count), np.cross(MEAN, [0, 0, 1]) / np.linalg.norm(np.cross(MEAN, [0, 0, 1]))
+    cos = 1 + np.log1p((i + 0.5) / count * np.expm1(-2 * kappa)) / kappa
+    turn, sin = 2 * np.pi * (i * (np.sqrt(5) - 1) / 2 % 1), np.sqrt(1 - cos**2)
+    d = (
+        cos[:, None] * MEAN
+        + (sin * np.cos(turn))[:, None] * side
+        + (sin * np.sin(turn))[:, None] * np.cross(MEAN, side)
+    )
+    ends = (np.array([(1.5, 2, 0), (3, 2.4, 1.8)])[:, None] - eye) / d
+    shelf = (ends.min(axis=0).max(axis=1) < ends.max(axis=0).min(axis=1)) & (ends.min(axis=0).max(axis=1) > 0)
+    wall = ((np.array([(0, 0, 0), (4, 3, 2.5)])[:, None] - eye) / d).max(axis=0).argmin(axis=1)
+    out = ~shelf & (wall == 0) & (d[:, 0] > 0) & window
+    return np.array([1 - shelf.mean() - out.mean(), shelf.mean(), out.mean()])
+
+
+def test03_a_uniform_law_gives_solid_angles_and_a_cone_changes_nothing_of_it(rgb):
+    uniform = lambda d: dr.full(rgb.Float, 1 / (4 * np.pi), dr.width(d))
+    target, eye = Target(joined(ROOM)), np.array([(1.0, 0.7, 1.5)])
+    for cone in (0.0, 0.03):
+        sums = gaze_sums(target, lookers_of_law(uniform), eye, [1.0], GazeSettings(angle=0.1, cone=cone))
+        floor = sums.face[(target.mesh.corners[:, :, 2] == 0).all(axis=1)].sum()
+        # Of a rectangle, by the four rectangles between the foot point and its corners.
+        x, y, h = np.array([1.0, 3.0]), np.array([0.7, 2.3]), 1.5
+        exact = sum(np.arctan2(a * b, h * np.sqrt(a * a + b * b + h * h)) for a in x for b in y)
+        assert np.isclose(floor, exact / (4 * np.pi), rtol=1e-4)
+
+
+def test04_a_cone_widens_a_law_and_keeps_its_total(rgb):
+    target, eye = Target(refine(joined(ROOM), 0.2).mesh), np.array([(2.0, 1.5, 1.2)])
+    law, cone = lookers_of_law(vmf(rgb, (1, 0.1, 0), 400.0)), 0.026
+    plain = gaze_sums(target, law, eye, [1.0], SETTINGS)
+    wide = gaze_sums(target, law, eye, [1.0], dataclasses.replace(SETTINGS, cone=cone))
+    # A vMF law after a Gaussian is nearly one whose variance is the sum.
+    expected = gaze_sums(target, lookers_of_law(vmf(rgb, (1, 0.1, 0), 1 / (1 / 400 + cone**2))), eye, [1.0], SETTINGS)
+    assert abs(wide.face.sum() - 1) < 1e-3
+    assert np.abs(wide.face - expected.face).sum() < 0.03 < np.abs(plain.face - expected.face).sum()
+
+
+def test05_it_is_what_attention_says(rgb, tmp_path):
+    from importlib.resources import files
+
+    from nerg_mi.scenes import store
+
+    import nerg_mi as nerg
+    from nerg_mi.api.scene import box_dict
+
+    here = files(store)
+    eye = (4.4, 2.8, 1.6)
+    scene = nerg.make_scene(gaze=here / "shoppers.safetensors", shapes=here / "twin.ply", falloff=0.0)
+    thing = box((4.4, 4.65, 0.0), (4.9, 5.0, 1.45))
+    expected = nerg.attention(scene, box_dict(*np.array([(4.4, 4.65, 0.0), (4.9, 5.0, 1.45)])), [eye], divisions=24)
+    from nerg_mi.formats.meshes import read_mesh_file
+    from nerg_mi.surfaces.sources import lookers_of_field
+
+    read = read_mesh_file(here / "twin.ply")
+    twin = read.vertices, read.faces
+    target = Target(joined(thing), [twin])
+    # Looked at as if it stood there: the goods in the box hide it, as they hide the box of `attention`.
+    make = lookers_of_field(scene.integrator.gaze, target.place, target.settings)
+    sums = gaze_sums(target, make, np.array([eye]), [1.0], SETTINGS)
+    assert expected.share[0] > 0.001
+    # The field is normalised over what is seen: with the box there, and without it.
+    gaze, at = scene.integrator.gaze, rgb.Point3f(eye)
+    there, without = (
+        float(gaze.at([at], place, target.settings).integrals(at)[0][0])
+        for place in (target.place, Target(joined(twin)).place)
+    )
+    assert abs(there / without - 1) > 0.03
+    assert np.isclose(sums.face.sum() * there / without, expected.share[0], rtol=0.01)
+
+
+def test06_parts_add_up_to_the_whole_bit_by_bit(rgb):
+    target, law, coarse = Target(joined(ROOM)), lookers_of_law(vmf(rgb, (0, 1, 0), 5.0)), GazeSettings(angle=0.2)
+    eyes, weights = np.random.default_rng(0).uniform(0.5, 2, (3, 3)), np.array([0.2, 0.3, 0.5])
+    each = [gaze_sums(target, law, eyes[k : k + 1], weights[k : k + 1], coarse) for k in range(3)]
+    whole = gaze_sums(target, law, eyes, weights, coarse)
+    assert np.array_equal(merge(each).vertex, whole.vertex) and whole.count == 3
+
+
+# ---- Pieces that an outline crosses are cut until what is left out is little ----
+
+
+FLOOR = (np.array([(-1.0, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]), np.array([(0, 1, 2), (0, 2, 3)]))
+
+
+def test01_the_edge_of_a_shadow_along_the_cuts_of_a_face(rgb):
+    """A plate above the floor hides what lies beyond x, wherever that line falls between two cuts."""
+    eye = np.array([0.0, 0.0, 2.0])
+    for x in (0.07, 0.13, 0.51):
+        plate = FLOOR[0] * [0.5, 1, 1] + [0.5 + x / 2, 0, 1]
+        target = Target(joined(FLOOR), [(plate, FLOOR[1])])
+        pieces = pieces_of(target.mesh, eye, 0.3)
+        parts = list(visible_pieces(target, pieces, lambda some: np.ones(len(some)), 2 * np.pi, 1 << 12))
+        found = sum(received.sum() for _, received in parts)
+        # Of the strip from -1 to x, by the four corners of half of each of its two parts.
+        exact = sum(2 * np.arctan2(a, 2 * np.sqrt(a * a + 5)) for a in (1.0, x))
+        assert abs(found - exact) < 1e-3
+        uncut = pieces.solid_angle[target.sees(eye, pieces.center, pieces.face)].sum()
+        assert abs(uncut - exact) > 1e-3
+
+
+def test02_a_narrow_density_is_integrated(rgb):
+    """Of a density that is narrower than a piece the pieces are cut, too."""
+    target, eye = Target(joined(FLOOR)), np.array([0.13, 0.06, 0.5])
+    pieces = pieces_of(target.mesh, eye, 0.4)
+
+    def law(some):
+        d = some.relative.mean(axis=1)
+        cos = -d[:, 2] / np.linalg.norm(d, axis=1)
+        return 60 / (2 * np.pi) * np.exp(60 * (cos - 1))
+
+    found = sum(received.sum() for _, received in visible_pieces(target, pieces, law, 1.0, 1 << 12))
+    assert abs(found - 1) < 1e-3 and abs((pieces.solid_angle * law(pieces)).sum() - 1) > 1e-2
+
+
+# ---- Solid angles of pieces, however near the observer stands ----
+
+
+PIECES_ROOM = joined(box((0, 0, 0), (1.0, 1.0, 1.0)))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("eye", [(0.5, 0.5, 0.5), (0.999, 0.3, 0.2), (1 - 1e-9, 0.9999, 0.5)])
+def test01_a_room_around_an_observer_is_the_whole_sphere(eye, scale):
+    room = joined(box((0, 0, 0), (scale, scale, scale)))
+    found = pieces_of(room, scale * np.array(eye), 0.2)
+    assert np.isclose(found.solid_angle.sum(), 4 * np.pi, rtol=1e-9)
+    center = np.einsum("pi,pik->pk", found.place, room.corners[found.face])
+    assert np.allclose(center, found.center, atol=1e-9 * scale)
+    # As many pieces as the sphere has room for, not as the nearness would ask.
+    assert len(found.face) < 50_000
+    away = np.linalg.norm(found.center - scale * np.array(eye), axis=1)
+    assert np.all(np.sqrt(found.solid_angle) < 0.2) and away.min() > 0
+
+
+def test02_an_octant_and_what_lies_far_away():
+    assert np.isclose(solid_angles(np.eye(3)[None])[0], np.pi / 2, rtol=1e-14)
+    # A square metre that faces the observer a kilometre away, and one edge on.
+    near = np.array([(1e3, 0, 0), (1e3, 1, 0), (1e3, 0, 1)])
+    assert np.isclose(solid_angles(near[None])[0], 0.5e-6, rtol=1e-5)
+    assert solid_angles(np.array([[(1.0, 0, 0), (2, 0, 0), (1, 1, 0)]]))[0] == 0
+
+
+def test03_an_observer_on_a_face_ends():
+    sheet = joined((np.array([(-1.0, -1, 0), (2, -1, 0), (-1, 2, 0)]), np.array([(0, 1, 2)])))
+    found = pieces_of(sheet, np.zeros(3), 0.5)
+    assert found.solid_angle.sum() == 0 and len(found.face) < 20_000
+
+
+@pytest.mark.parametrize("far", [1e155, 1e200, 1e308, np.inf, np.nan])
+def test04_an_observer_beyond_what_can_be_squared_ends(far):
+    with np.errstate(all="ignore"):
+        assert len(pieces_of(PIECES_ROOM, np.array([far, 0, 0]), 0.03).face) == len(PIECES_ROOM.faces)
+
+
+def test05_pieces_are_counted_before_they_are_cut(monkeypatch):
+    monkeypatch.setattr("nerg_mi.surfaces.sources.MOST_PIECES", 1000)
+    with pytest.raises(NergError, match="1,000.*--angle"):
+        pieces_of(PIECES_ROOM, np.full(3, 0.5), 0.02)
+
+
+# ---- Time of rays, and observers that stand for a crowd ----
+
+
+def rays(t, person):
+    n = len(t)
+    return Rays(t, person, ("a", "b"), np.zeros((n, 3)), np.tile([1.0, 0, 0], (n, 1)), np.ones(n))
+
+
+def test01_a_ray_stands_for_the_time_until_the_next_of_its_person():
+    of = rays([0, 0.1, 0.3, 9.0, 9.1, 0.0, 0.2], [0, 0, 0, 0, 0, 1, 1])
+    # Pauses count as half a second at most; the last of each as the median of theirs.
+    assert np.allclose(ray_seconds(of), [0.1, 0.2, 0.5, 0.1, 0.15, 0.2, 0.2])
+    assert np.allclose(ray_seconds(of, gap=0.05), 0.05)
+    assert np.allclose(ray_seconds(rays([5.0], [0])), 0.5)
+
+
+@pytest.mark.parametrize("by, share", [("time", 1.05 / 1.45), ("person", 0.5), ("equal", 5 / 7)])
+def test02_weights_add_up_to_one(by, share):
+    of = rays([0, 0.1, 0.3, 9.0, 9.1, 0.0, 0.2], [0, 0, 0, 0, 0, 1, 1])
+    w = ray_weights(of, by)
+    assert np.isclose(w.sum(), 1) and np.isclose(w[:5].sum(), share)
+
+
+def test03_observers_stand_where_somebody_was_with_the_time_of_all_near():
+    rng = np.random.default_rng(0)
+    places = np.array([(0, 0, 1.6), (4, 0, 1.6), (0, 5, 1.6)])
+    which = rng.choice(3, 3000, p=(0.5, 0.3, 0.2))
+    positions = places[which] + rng.normal(0, 0.05, (3000, 3))
+    weights = rng.random(3000)
+    found = thin(positions, weights, 3, seed=1)
+    expected = np.bincount(which, weights) / weights.sum()
+    order = np.argsort(-found.weights)
+    assert np.allclose(found.weights[order], expected[np.argsort(-expected)])
+    assert all((positions == p).all(axis=1).any() for p in found.positions)
+    # The error that is told is that of the positions from the nearest observer.
+    near = np.linalg.norm(positions[:, None] - found.positions, axis=2).min(axis=1)
+    assert np.isclose(found.mean, np.sqrt((weights * near**2).sum() / weights.sum()))
+    assert abs(np.mean(near <= found.farthest) - 0.95) < 0.02
+    again = thin(positions, weights, 3, seed=1)
+    assert np.array_equal(again.positions, found.positions)
+
+
+def test04_more_observers_are_nearer_and_fewer_places_than_observers_are_all_taken():
+    positions = np.random.default_rng(2).uniform(0, 5, (2000, 3))
+    errors = [thin(positions, np.ones(2000), n).mean for n in (4, 32, 256)]
+    assert errors[0] > 1.5 * errors[1] > 2 * errors[2]
+    few = thin(np.tile([[1.0, 2, 3], [4, 5, 6]], (50, 1)), np.ones(100), 10)
+    assert len(few.weights) == 2 and few.mean == few.farthest == 0 and np.allclose(few.weights, 0.5)
+
+
+# ---- Tracked rays as cones: what passes a gap, and what parts of them add up to ----
+
+
+SIGMA = np.radians(1.5)
+
+
+def rays_ray_source(n, spread=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    d = np.concatenate([rng.normal(0, spread, (n, 2)), np.ones((n, 1))], axis=1)
+    return TrackedRays(np.zeros((n, 3)), d / np.linalg.norm(d, axis=1, keepdims=True), np.full(n, 1 / n))
+
+
+def test01_a_line_goes_through_a_gap_whole_and_a_cone_by_what_passes(rgb):
+    """Two plates with a slit of 5 cm between them, two metres away, and a wall behind."""
+    slit = 0.025
+    left = (np.array([(-3.0, -3, 2), (-slit, -3, 2), (-slit, 3, 2), (-3, 3, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
+    right = (-left[0] * [1, 1, -1], left[1])
+    wall = box((-5, -5, 4), (5, 5, 4.1))
+    mesh = joined(left, right, wall)
+    target, behind = Target(mesh), mesh.corners[:, :, 2].min(axis=1) > 3
+    line = ray_sums(target, rays_ray_source(1000), RaySettings())
+    assert line.face[behind].sum() == np.float64(1000) * (1 / 1000) or np.isclose(line.face[behind].sum(), 1)
+    cone = ray_sums(target, rays_ray_source(4000), RaySettings(cone=SIGMA, bundle=16))
+    # One of the two angles of the Gaussian has to stay within the slit's.
+    passes = 2 * norm.cdf(np.arctan(slit / 2) / SIGMA) - 1
+    assert abs(cone.face[behind].sum() - passes) < 0.01 and 0.3 < passes < 0.4
+    left_of = mesh.corners[:, :, 0].max(axis=1) < 0
+    assert abs(cone.face[left_of & ~behind].sum() - (1 - passes) / 2) < 0.01
+    assert np.isclose(cone.face.sum() + cone.escaped + cone.elsewhere, cone.total)
+
+
+def test02_a_thin_edge_gets_its_part(rgb):
+    """A rod of 1 cm, which hardly any line meets that is aimed at it with an error of a degree."""
+    rod = joined(box((-0.005, -3, 2), (0.005, 3, 2.01)))
+    sums = ray_sums(Target(rod), rays_ray_source(20_000), RaySettings(cone=SIGMA))
+    expected = 2 * norm.cdf(np.arctan(0.005 / 2) / SIGMA) - 1
+    assert np.isclose(sums.face.sum(), expected, rtol=0.05)
+    assert np.isclose(sums.escaped, 1 - sums.face.sum())
+
+
+def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
+    target, settings = Target(joined(plate(9, side=4.0, z=2.0))), RaySettings(cone=SIGMA, bundle=8, seed=5)
+    every = rays_ray_source(1000, spread=0.2, seed=1)
+    parts = [every.part(a, a + 300) for a in range(0, 1000, 300)]
+    assert [p.first for p in parts] == [0, 300, 600, 900] and len(parts[-1]) == 100
+    first, again = (merge(ray_sums(target, p, settings) for p in parts) for _ in range(2))
+    assert np.array_equal(first.vertex, again.vertex) and first.count == 1000
+    assert np.isclose(first.total, 1) and abs(first.unaccounted) < 1e-12
+    other = ray_sums(target, parts[0], RaySettings(cone=SIGMA, bundle=8, seed=6))
+    assert not np.array_equal(other.vertex, ray_sums(target, parts[0], settings).vertex)
+
+
+@pytest.mark.parametrize("cone", [0.0, SIGMA])
+def test04_on_elsewhere_and_escaped_add_up_where_something_hides_the_surface(rgb, cone):
+    """A plate across x < 0 at z = 2, of which a shape at z = 1 hides y < 0 and reaches beyond it; the rest escapes."""
+    plate_left = (np.array([(-9.0, -9, 2), (0, -9, 2), (0, 9, 2), (-9, 9, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
+    hiding = (np.array([(-9.0, -9, 1), (9, -9, 1), (9, 0, 1), (-9, 0, 1)]), np.array([(0, 1, 2), (0, 2, 3)]))
+    some = rays_ray_source(4000, spread=0.3, seed=2)
+    some = TrackedRays(some.origins, some.directions, np.linspace(0.5, 1.5, 4000))
+    sums = ray_sums(Target(joined(plate_left), [hiding]), some, RaySettings(cone=cone, bundle=8))
+    hidden, left = some.directions[:, 1] < 0, some.directions[:, 0] < 0
+    expected = [some.weights[rows].sum() for rows in (~hidden & left, hidden, ~hidden & ~left)]
+    found = [sums.on_surface, sums.elsewhere, sums.escaped]
+    assert np.allclose(found, expected, rtol=1e-9 if cone == 0 else 0.03)
+    assert sum(found) == pytest.approx(sums.weight, rel=1e-12) and sums.total == sums.weight == some.weights.sum()
+
+
+# ---- Directions over the sphere: all of it, and as exact for narrow densities as for wide ones ----
+
+
+SPHERE_RULE_MEAN = np.array([0.3, -0.5, 0.81]) / np.linalg.norm([0.3, -0.5, 0.81])
+
+
+def law(kappa):
+    return lambda d: kappa / (2 * np.pi * -np.expm1(-2 * kappa)) * np.exp(kappa * (d @ SPHERE_RULE_MEAN - 1))
+
+
+@pytest.mark.parametrize("kappa", [0.1, 40.0, 3000.0])
+def test01_totals_and_halves_of_laws(kappa):
+    directions, angles = sphere_rule(law(kappa), 1 << 15)
+    assert np.isclose(angles.sum(), 4 * np.pi, rtol=1e-12)
+    assert np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-14)
+    share = angles * law(kappa)(directions)
+    assert abs(share.sum() - 1) < 1e-3
+    # A vertical plane through the middle of the law leaves half of it on either side.
+    side = directions @ np.cross(SPHERE_RULE_MEAN, [0, 0, 1]) > 0
+    assert abs(share[side].sum() - 0.5) < 1e-3
+    assert np.allclose(sphere_rule(lambda d: np.zeros(len(d)), 1)[1].sum(), 4 * np.pi)
+
+
+def test02_upright_planes_cut_a_uniform_density_by_their_angle():
+    directions, angles = sphere_rule(lambda d: np.ones(len(d)), 1 << 14)
+    turn = np.arctan2(directions[:, 1], directions[:, 0])
+    for edge in (0.1, 0.7, np.pi / 2):
+        assert np.isclose(angles[(turn > 0) & (turn < edge)].sum(), 2 * edge, atol=0.004)
+    with pytest.raises(ValueError, match="a direction"):
+        sphere_rule(lambda d: np.ones(len(d)), 0)

@@ -1,0 +1,128 @@
+"""Tests of `nerg_mi.runtime`."""
+
+from __future__ import annotations
+
+import signal
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.interruption import Interruption
+from nerg_mi.threads import set_thread_count, share
+
+from .plugins import fields
+
+# ---- Ctrl-C: noted between steps, and heard by Python after and while a picture is rendered ----
+
+
+def test_the_first_is_noted_and_the_second_raised():
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), Interruption() as stop:
+        stop.check()
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        stop.check()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_handler_that_is_not_pythons_is_left_alone(monkeypatch):
+    """As where Python is part of another program: it could not be put back."""
+    set_handlers = []
+    monkeypatch.setattr(signal, "getsignal", lambda which: None)
+    monkeypatch.setattr(signal, "signal", lambda *given: set_handlers.append(given))
+    with Interruption() as stop:
+        stop.check()
+    assert not set_handlers
+
+
+def test_an_ignored_ctrl_c_stays_ignored():
+    """As for a command in the background of a script, which Ctrl-C is not meant for."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Interruption() as stop:
+            signal.raise_signal(signal.SIGINT)
+            stop.check()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def scene(rgb, tmp_path):
+    fields.radiance(tmp_path / "f.safetensors")
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    return rgb.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "nerg", "field": {"type": "nerf", "filename": str(tmp_path / "f.safetensors")}},
+            "sensor": {
+                "type": "perspective",
+                "film": film,
+                "to_world": rgb.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0]),
+            },
+        }
+    )
+
+
+def test_python_hears_ctrl_c_after_a_picture(rgb, scene):
+    for _ in range(2):
+        rgb.render(scene, spp=1)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    with Interruption() as stop:
+        rgb.render(scene, spp=1)
+        signal.raise_signal(signal.SIGINT)
+        assert stop.asked
+
+
+def test_ctrl_c_during_a_picture_is_raised(rgb, scene, monkeypatch):
+    integrator = scene.integrator()
+    sample = type(integrator).sample
+
+    def interrupted(self, *given):
+        signal.raise_signal(signal.SIGINT)
+        return sample(self, *given)
+
+    with monkeypatch.context() as change:
+        change.setattr(type(integrator), "sample", interrupted)
+        # `mi.render` makes an error of its own of what an integrator raises.
+        with pytest.raises(RuntimeError) as found:
+            rgb.render(scene, spp=1)
+    error = found.value
+    while error.__cause__ is not None:
+        error = error.__cause__
+    assert isinstance(error, KeyboardInterrupt)
+    rgb.render(scene, spp=1)
+
+
+# ---- Threads are changed between computations, never within one ----
+
+
+def test_what_is_queued_is_done_first(monkeypatch):
+    order = []
+    monkeypatch.setattr(dr, "sync_thread", lambda: order.append("waited"))
+    monkeypatch.setattr(dr, "set_thread_count", order.append)
+    monkeypatch.setattr(dr, "thread_count", lambda: 2)
+    set_thread_count(3)
+    set_thread_count(2)
+    assert order == ["waited", 3]
+
+
+def test_arrays_keep_their_values_however_often_it_changes(rgb):
+    before = dr.thread_count()
+    try:
+        for count in (2, 1, 3, before) * 5:
+            x = dr.arange(rgb.Float, 1 << 20) * 2 + count
+            dr.schedule(x)
+            dr.eval()
+            set_thread_count(count)
+            assert dr.thread_count() == count
+            np.testing.assert_array_equal(x.numpy()[[0, 5, -1]], np.float32([count, 10 + count, 2**21 - 2 + count]))
+    finally:
+        set_thread_count(before)
+
+
+def test_a_worker_gives_a_job_what_it_asks_for_and_has():
+    assert (share(4, 2), share(2, 4), share(0, 3), share(3, 0)) == (2, 2, 3, 3) and share(0, 0) >= 1

@@ -1,0 +1,389 @@
+"""Tests of `nerg_mi.train.gaze_trainer`."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.maths.geometry import Box, Similarity
+from nerg_mi.probes.probes import place_probes
+from nerg_mi.train.gaze_data import Supervision, targets_of_probes, targets_of_rays
+from nerg_mi.train.gaze_product import ProductTrainer
+from nerg_mi.train.gaze_settings import GazeSettings
+from nerg_mi.train.gaze_trainer import (
+    Fit,
+    GazeRunFile,
+    GazeTrainer,
+    Scores,
+    StateSettings,
+    alignment,
+    fit_again,
+    fit_watched,
+    rounded,
+)
+
+from .looks import BOX, LIKELIHOOD, LOG, NOWHERE, PROBES, PRODUCT, RAYS, SMALL, looking_at, planned, stopping, train
+from .views import around
+
+# ---- Fits: what is kept of them, when they end, how long the second one is ----
+
+
+NO_FILE = GazeRunFile(None, {})
+
+
+@pytest.fixture(scope="module")
+def targets_fit():
+    return targets_of_rays(looking_at((1.5, 0.4, 1.2)), NOWHERE, PROBES)
+
+
+def test_what_was_found_is_kept_as_json():
+    fit = Fit(None, {}, 4, 9, Scores(1.0, 2.0, 0.5, 0.1, 1.0), [{"steps": 4, "kld": 2.0}], False, 2, 3)
+    assert Fit.of(json.loads(json.dumps(fit.found()))) == fit
+    assert Fit.of(Fit(None).found()).scores is None
+    assert rounded(Scores(1 / 3, 2, 0.5, 0.1, 1)) == {"loss": 0.33333, "kld": 2, "cc": 0.5, "mae": 0.1, "integral": 1}
+
+
+@pytest.mark.parametrize("patience, looks", [(3, 4), (1, 2), (0, 10)])
+def test_a_fit_ends_when_looking_has_been_in_vain_for_long_enough(wall, patience, looks):
+    """Nothing is learnt at a rate of next to nothing: the first look is the best, and ``patience`` more are taken."""
+    settings = GazeSettings(
+        steps=20,
+        looks=10,
+        patience=patience,
+        zones=2,
+        watched=6,
+        probes=4,
+        directions=32,
+        learning_rate=1e-30,
+        refit=False,
+    )
+    _, about = train(wall, settings, SMALL)
+    v = about["validation"]
+    assert [h["steps"] for h in v["history"]] == [2 * k for k in range(1, looks + 1)]
+    assert v["best_step"] == 2 and about["steps"] == 2 * looks
+
+
+def test_a_fit_that_nobody_watches_ends_with_its_schedule(targets_fit):
+    told = []
+    fit = fit_watched(targets_fit, None, BOX, planned(SMALL, replace(PRODUCT, zones=0)), ns, 1.0, NO_FILE, told.append)
+    assert (fit.best_step, fit.schedule, fit.scores, fit.history, fit.interrupted) == (16, 16, None, [], False)
+    assert [p.steps for p in told] == list(range(1, 17)) and told[-1].done == 1 and {p.stage for p in told} == {"fit"}
+
+
+def test_the_second_fit_has_as_many_steps_as_were_best_along_the_same_schedule(targets_fit):
+    plan, told = planned(SMALL, PRODUCT), []
+    first = fit_watched(targets_fit, targets_fit, BOX, plan, ns, 1.0, NO_FILE, lambda progress: None)
+    first.best_step = 5
+    second = fit_again(targets_fit, first, BOX, plan, ns, NO_FILE, told.append)
+    assert second.trainer.steps == second.best_step == 5 and second.scores is first.scores
+    assert second.trainer.progress == pytest.approx(5 / 16) and [p.done for p in told] == [0.2, 0.4, 0.6, 0.8, 1.0]
+    # The same seed and targets: the first five steps of the first fit.
+    plain = planned(SMALL, replace(PRODUCT, steps=16))
+    trainer = plain.trainer(targets_fit, BOX, SMALL, plain.settings, ns)
+    for _ in range(5):
+        trainer.step()
+    for name, value in trainer.weights().items():
+        np.testing.assert_allclose(second.weights[name].numpy(), value.numpy(), atol=1e-6, err_msg=name)
+
+
+def test_an_interrupted_fit_ends_after_its_step(targets_fit):
+    def stop(progress):
+        if progress.steps == 3:
+            raise KeyboardInterrupt
+
+    fit = fit_watched(targets_fit, None, BOX, planned(SMALL, replace(PRODUCT, zones=0)), ns, 1.0, NO_FILE, stop)
+    assert fit.interrupted and fit.trainer.steps == fit.best_step == 3 and fit.weights
+
+
+@pytest.mark.parametrize("stopped", [2, 99])
+def test_a_schedule_of_minutes_is_told_in_steps(targets_fit, monkeypatch, stopped):
+    """Half a minute of steps of six seconds: five, also where the fit ends before."""
+    monkeypatch.setattr(GazeTrainer, "seconds", property(lambda trainer: 6.0 * trainer.steps))
+
+    def stop(progress):
+        if progress.steps == stopped:
+            raise KeyboardInterrupt
+
+    plan = planned(SMALL, replace(PRODUCT, steps=None, minutes=1.0, zones=0))
+    fit = fit_watched(targets_fit, None, BOX, plan, ns, 0.5, NO_FILE, stop)
+    assert fit.schedule == 5 and fit.best_step == min(stopped, 5)
+
+
+def test_minutes_are_those_of_both_fits(wall, monkeypatch):
+    """The first fit has half of them; the second follows its schedule, in steps."""
+    # A clock that goes on by six seconds a step.
+    monkeypatch.setattr(GazeTrainer, "seconds", property(lambda trainer: 6.0 * trainer.steps))
+    settings = replace(PRODUCT, steps=None, minutes=1.0, looks=5)
+    _, about = train(wall, settings, SMALL)
+    v = about["validation"]
+    assert [h["steps"] for h in v["history"]] == [1, 2, 3, 4, 5] and about["refitted"]
+    assert about["steps"] == v["best_step"] <= 5
+
+
+# ---- Plans: what a run must agree on to be gone on with ----
+
+
+MOVED = replace(NOWHERE, align=Similarity(np.diag([2.0, 2, 2, 1])))
+
+
+@pytest.mark.parametrize(
+    "name, plan, supervision, place, about",
+    [
+        ("settings", planned(SMALL, replace(PRODUCT, seed=1)), None, NOWHERE, {}),
+        ("probes", planned(SMALL, PRODUCT, replace(PROBES, kappa=9.0)), None, NOWHERE, {}),
+        ("architecture", planned(replace(SMALL, variant="emit"), PRODUCT), None, NOWHERE, {}),
+        ("rays", None, Supervision(RAYS.select(np.arange(100))), NOWHERE, {}),
+        ("views", None, Supervision(RAYS, around(2)), NOWHERE, {}),
+        ("box", None, None, replace(NOWHERE, box=Box((0, 0, 0), (1, 1, 1))), {}),
+        ("align", None, None, MOVED, {}),
+        ("place", None, None, NOWHERE, {"place": "elsewhere"}),
+    ],
+)
+def test_runs_differ_in_what_they_are_made_of(name, plan, supervision, place, about):
+    base = planned(SMALL, PRODUCT).identity(Supervision(RAYS), NOWHERE, StateSettings())
+    other = (plan or planned(SMALL, PRODUCT)).identity(
+        supervision or Supervision(RAYS), place, StateSettings(about=about)
+    )
+    assert {k for k in other if other[k] != base.get(k)} == {name}
+
+
+def test_an_alignment_that_moves_nothing_is_none():
+    assert alignment(NOWHERE) is None and alignment(MOVED) == np.diag([2.0, 2, 2, 1]).tolist()
+
+
+def test_settings_are_changed_by_name():
+    plan = planned(LOG, replace(PRODUCT, loss="likelihood"))
+    assert plan.with_settings(seed=7) == replace(plan, settings=replace(plan.settings, seed=7))
+
+
+# ---- A gaze training that is interrupted and resumed comes to what an uninterrupted one comes to ----
+
+
+@pytest.mark.parametrize(
+    "settings, config, probes, count",
+    [(PRODUCT, SMALL, PROBES, 1), (LIKELIHOOD, LOG, replace(PROBES, fresh=True), 1), (LIKELIHOOD, LOG, PROBES, 2)],
+    ids=["product", "fresh", "two threads"],
+)
+def test_a_resumed_run_equals_an_uninterrupted_one(wall, settings, config, probes, count, threads, tmp_path):
+    """Bit for bit at one thread, to 1e-5 at two; interrupted in both of its fits, past validations and epochs."""
+    threads(count)
+    expected, whole = train(wall, settings, config, probes)
+    path = tmp_path / "a.run"
+    _, about = train(wall, settings, config, probes, path=path, tell=stopping("fit", 5))
+    assert about["interrupted"] and about["steps"] <= 5 and path.is_file()
+    assert whole["validation"]["best_step"] > 3
+    watch = stopping("refit", 3)
+    _, about = train(wall, settings, config, probes, path=path, resume=True, tell=watch)
+    assert about["interrupted"] and path.is_file() and ("fit", 5) not in watch.seen and ("fit", 6) in watch.seen
+    watch = stopping("", 0)
+    there = []
+    got, about = train(
+        wall,
+        settings,
+        config,
+        probes,
+        path=path,
+        resume=True,
+        tell=watch,
+        write=lambda *_: there.append(path.is_file()),
+    )
+    assert (
+        not about["interrupted"]
+        and there == [True]
+        and not path.exists()
+        and {s for s, _ in watch.seen} == {"probes", "refit"}
+    )
+    assert ("refit", 3) not in watch.seen and ("refit", 4) in watch.seen
+    for name, value in expected.parameters().items():
+        compare = (
+            np.testing.assert_array_equal
+            if count == 1
+            else lambda a, b, err_msg: np.testing.assert_allclose(a, b, atol=1e-5, err_msg=err_msg)
+        )
+        compare(np.array(got.parameters()[name]), np.array(value), err_msg=name)
+    if count == 1:
+        assert about["validation"] == whole["validation"] and about["steps"] == whole["steps"]
+
+
+def test_another_run_is_not_resumed(wall, tmp_path):
+    path = tmp_path / "a.run"
+    train(wall, PRODUCT, SMALL, path=path, tell=stopping("fit", 1))
+    with pytest.raises(NergError, match="other settings;"):
+        train(wall, replace(PRODUCT, seed=3), SMALL, path=path, resume=True)
+    with pytest.raises(NergError, match="other place, probes;"):
+        train(wall, PRODUCT, SMALL, replace(PROBES, kappa=9.0), path=path, resume=True, about={"place": "elsewhere"})
+    with pytest.raises(NergError, match="nothing to resume"):
+        train(wall, PRODUCT, SMALL, path=tmp_path / "b.run", resume=True)
+
+
+def test_the_state_is_kept_every_so_often_and_when_asked(monkeypatch, tmp_path):
+    from nerg_mi.train import gaze_trainer as gaze_state
+
+    clock, kept = [100.0], []
+    monkeypatch.setattr(gaze_state.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(
+        gaze_state, "write_checkpoint", lambda path, kind, tensors, meta: kept.append((clock[0], meta["spent"]))
+    )
+    file = gaze_state.GazeRunFile(tmp_path / "a.run", {}, 10.0, False)
+    for clock[0] in (105.0, 109.0, 111.0, 112.0, 120.0, 122.5):
+        file.keep("fit", None, {}, {}, now=clock[0] == 112.0)
+    assert kept == [(111.0, 11.0), (112.0, 12.0), (122.5, 22.5)]
+    gaze_state.GazeRunFile(None, {}, 10.0, False).keep("fit", None, {}, {}, now=True)
+
+
+def test_what_was_found_is_kept_before_the_second_fit_is_prepared(wall, monkeypatch, tmp_path):
+    """Probes and depths of all rays take long: whoever ends the run there does not train the first fit again."""
+    from nerg_mi.train import gaze_run
+
+    make_targets, calls = gaze_run.make_targets, []
+
+    def killed(supervision, *rest):
+        calls.append(len(supervision.rays))
+        if len(calls) == 3:
+            raise MemoryError("killed")
+        return make_targets(supervision, *rest)
+
+    path, how = tmp_path / "a.run", {"path": tmp_path / "a.run", "every": 1e9}
+    monkeypatch.setattr(gaze_run, "make_targets", killed)
+    with pytest.raises(MemoryError):
+        train(wall, PRODUCT, SMALL, **how)
+    # To watch, to learn without what is watched, and of all rays.
+    assert calls[0] == calls[2] > calls[1] and path.is_file()
+    watch = stopping("", 0)
+    _, about = train(wall, PRODUCT, SMALL, resume=True, tell=watch, **how)
+    assert {stage for stage, _ in watch.seen} == {"probes", "refit"} and about["refitted"]
+
+
+@pytest.mark.parametrize("refit", [True, False])
+def test_a_result_that_cannot_be_written_is_kept(wall, refit, threads, tmp_path):
+    """A full disk at the end, once: nothing is trained again."""
+    threads(1)
+    path, written = tmp_path / "a.run", []
+
+    def refuse(field, about):
+        raise NergError("the disk is full.")
+
+    settings = replace(PRODUCT, refit=refit)
+    how = {"path": path, "every": 1e9}
+    with pytest.raises(NergError, match="--resume"):
+        train(wall, settings, SMALL, write=refuse, **how)
+    assert path.is_file()
+    watch = stopping("", 0)
+    field, _ = train(wall, settings, SMALL, resume=True, tell=watch, write=lambda *given: written.append(given), **how)
+    assert {s for s, _ in watch.seen} == {"probes"} and written[0][0] is field and not path.exists()
+    expected = train(wall, settings, SMALL)[0].parameters()
+    for name, value in field.parameters().items():
+        np.testing.assert_array_equal(np.array(value), np.array(expected[name]), err_msg=name)
+
+
+_CHILD = """
+import sys
+import drjit as dr, mitsuba as mi
+from pathlib import Path
+import nerg_mi
+from dataclasses import replace
+from tests.train.gaze.looks import *
+mi.set_variant("llvm_ad_rgb")
+dr.set_thread_count(1)
+config = replace(LOG, geometry="none")
+train(NOWHERE, replace(LIKELIHOOD, steps=10**6, zones=0), config, path=Path(sys.argv[1]), every=0.0)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(rgb, how, threads, tmp_path):
+    """Killed at any moment, the state is one that an uninterrupted run has been in; Ctrl-C is heard between steps."""
+    from nerg_mi.formats.checkpoint import read_checkpoint
+
+    threads(1)
+    path = tmp_path / "a.run"
+    child = subprocess.Popen([sys.executable, "-c", _CHILD, str(path)], env={**os.environ, "PYTHONPATH": os.getcwd()})
+    until = time.time() + 120
+    while not path.exists() and child.poll() is None and time.time() < until:
+        time.sleep(0.05)
+    time.sleep(0.05)
+    child.send_signal(how)
+    assert child.wait() == (0 if how == signal.SIGINT else -how)
+    tensors, meta = read_checkpoint(path, "gaze run")
+    same = tmp_path / "same.run"
+    settings = replace(LIKELIHOOD, steps=10**6, zones=0)
+    train(NOWHERE, settings, replace(LOG, geometry="none"), path=same, tell=stopping("fit", meta["steps"]))
+    expected, _ = read_checkpoint(same, "gaze run")
+    assert meta["steps"] > 0 and set(tensors) == set(expected)
+    for name, value in expected.items():
+        np.testing.assert_array_equal(tensors[name], value, err_msg=name)
+
+
+# ---- What all trainers share: averaged weights, the schedule, seeds, frozen weights ----
+
+
+@pytest.fixture
+def targets_trainer(rays, wall):
+    """Of one probe in 64 directions."""
+    probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
+    return targets_of_probes(probes, wall, 64)
+
+
+@pytest.mark.parametrize("average", [0.0, 0.3, 0.999])
+def test_what_is_kept_is_the_average_of_the_weights_so_far(targets_trainer, average):
+    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) after k steps, of ``average``
+    later."""
+    settings = GazeSettings(steps=5, learning_rate=1e-2, zones=0, average=average)
+    trainer = ProductTrainer(targets_trainer, BOX, SMALL, settings, ns)
+    expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
+    for k in range(1, 6):
+        trainer.step()
+        memory = min(average, (k + 1) / (k + 10))
+        for name, value in trainer.optimiser.items():
+            expected[name] = memory * expected[name] + (1 - memory) * value.numpy()
+    for name, value in trainer.weights().items():
+        np.testing.assert_allclose(value.numpy(), expected[name], atol=1e-6)
+    assert average == 0 or np.abs(expected["emit_head.0"] - trainer.optimiser["emit_head.0"].numpy()).max() > 1e-4
+
+
+def test_equal_seeds_draw_equal_batches(targets_trainer):
+    def weights(seed):
+        settings = GazeSettings(steps=6, zones=0, directions=32, seed=seed)
+        trainer = ProductTrainer(targets_trainer, BOX, SMALL, settings, ns)
+        while trainer.progress < 1:
+            trainer.step()
+        return {name: value.numpy() for name, value in trainer.weights().items()}
+
+    first, second, other = weights(0), weights(0), weights(1)
+    for name, value in first.items():
+        np.testing.assert_allclose(value, second[name], atol=1e-6)
+    assert np.abs(first["emit_head.0"] - other["emit_head.0"]).max() > 1e-3
+
+
+def test_the_schedule_may_be_longer_than_the_run(targets_trainer):
+    """As that of a second fit is, which ends where the first one was best."""
+    trainer = ProductTrainer(targets_trainer, BOX, SMALL, GazeSettings(steps=2, zones=0), ns, schedule=10)
+    trainer.step()
+    assert trainer.progress == pytest.approx(0.1) and trainer.steps == 1
+
+
+def test_weights_that_are_given_and_frozen_stay(targets_trainer):
+    field = ProductTrainer(targets_trainer, BOX, SMALL, GazeSettings(steps=1, zones=0), ns).initial
+    given = {"grid.table": field.grid.table * 0 + 0.25}
+    for frozen in (True, False):
+        trainer = ProductTrainer(
+            targets_trainer, BOX, SMALL, GazeSettings(steps=1, zones=0, frozen=frozen), ns, initial=given
+        )
+        trainer.step()
+        same = np.array_equal(trainer.field().grid.table.numpy(), given["grid.table"].numpy())
+        assert same == frozen and ("grid.table" in trainer.optimiser.keys()) != frozen
+
+
+def test_a_kind_of_field_must_say_how_it_is_trained():
+    with pytest.raises(TypeError, match="abstract"):
+        GazeTrainer(None, BOX, SMALL, GazeSettings(steps=1), ns)

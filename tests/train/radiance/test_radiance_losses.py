@@ -1,0 +1,275 @@
+"""Tests of `nerg_mi.train.radiance_losses`."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.train.radiance_losses import (
+    PHOTOS,
+    PhotoColors,
+    color_loss,
+    density,
+    density_of,
+    density_summand,
+    depth_loss,
+    huber,
+    ray_color,
+    stack,
+    unstack,
+)
+from nerg_mi.train.radiance_sampling import Samples, Segments
+from nerg_mi.train.radiance_trainer import RadianceTrainer
+from tests.tiny import ball_pose
+
+from .ball import BOX, TINY, ball, settings
+
+# ---- What radiance training is fitted to, against NumPy: colours and the place of absorption ----
+
+
+RAY = np.array([0, 0, 0, 0, 1, 1, 1, 2, 2])
+
+
+T = np.array([0.5, 1.0, 1.5, 2.0, 0.2, 0.4, 3.0, 1.0, 1.2])
+
+
+LENGTH = np.array([0.5, 0.5, 0.5, 0.25, 0.2, 0.1, 1.0, 0.2, 0.4])
+
+
+TAU = np.array([0.1, 0.7, 2.0, 3.0, 0.2, 40.0, 0.5, 0.3, 1.0])
+
+
+def samples():
+    segments = Segments(ns.UInt32(RAY), dr.full(ns.Bool, True, len(RAY)), 3)
+    return Samples(ns.UInt32(RAY), ns.Float(T), ns.Float(LENGTH), None, segments, len(RAY))
+
+
+def absorbed():
+    """Weights of the samples, in float64."""
+    weight = -np.expm1(-TAU)
+    for r in range(3):
+        of = RAY == r
+        weight[of] *= np.exp(-np.concatenate([[0], np.cumsum(TAU[of])[:-1]]))
+    return weight
+
+
+@pytest.mark.parametrize("margin", [0.05, 0.3, 10.0])
+def test_depth_loss(margin):
+    truth, scale = np.array([1.45, 0.46, 0.0]), 0.2
+    weight = absorbed()
+    near = (T < truth[RAY] + margin) & (T + LENGTH > truth[RAY] - margin)
+    # Mean distance of absorption into a step: the integral of s tau exp(-tau s) over it, by the midpoint rule.
+    s = (np.arange(200_000) + 0.5) / 200_000
+    mean = np.array([(s * np.exp(-tau * s)).sum() / np.exp(-tau * s).sum() for tau in TAU])
+    offset = T + LENGTH * mean - truth[RAY]
+    caught = np.bincount(RAY, weight * near)
+    shift = np.bincount(RAY, weight * near * offset)
+    want = np.where(truth > 0, 1 - caught + np.minimum(np.abs(shift) / scale, 10), 0)
+    got = depth_loss(ns.Float(weight), ns.Float(TAU), samples(), ns.Float(truth), margin, scale).numpy()
+    assert np.allclose(got, want, rtol=1e-5, atol=1e-6)
+    assert want[2] == 0 and (want[:2] > 0.01).all()
+
+
+def test_depth_loss_is_bounded_where_all_is_at_the_wrong_place():
+    far = ns.Float(100.0, 100.0, 100.0)
+    got = depth_loss(ns.Float(absorbed()), ns.Float(TAU), samples(), far, 1e3, 1e-3).numpy()
+    assert np.allclose(got, 1 - np.bincount(RAY, absorbed()) + 10, rtol=1e-5)
+
+
+@pytest.mark.parametrize("alpha", [None, [1.0, 0.25, 0.0]])
+def test_color_loss(alpha):
+    rng = np.random.default_rng(0)
+    color, target, behind = rng.random((3, 3, 3))
+    opacity, delta = np.array([0.9, 0.4, 0.0]), 0.2
+    pixels = SimpleNamespace(rgb=[ns.Float(c) for c in target], alpha=None if alpha is None else ns.Float(alpha))
+    got = color_loss([ns.Float(c) for c in color], ns.Float(opacity), pixels, ns.Array3f(behind), delta).numpy()
+    # Of a picture with alpha the colour is that before nothing: what is transparent shows the background.
+    goal = target if alpha is None else behind * (1 - np.array(alpha)) + target * np.array(alpha)
+    error = np.abs(color + (1 - opacity) * behind - goal)
+    want = np.where(error < delta, error**2 / 2, delta * (error - delta / 2)).mean(axis=0)
+    assert np.allclose(got, want, rtol=1e-5) and (error < delta).any() and (error > delta).any()
+
+
+def test_huber_is_smooth_where_its_pieces_meet():
+    x = ns.Float([-0.3, -0.1001, -0.0999, 0, 0.0999, 0.1001, 0.3])
+    dr.enable_grad(x)
+    y = huber(x, 0.1)
+    dr.backward(dr.sum(y))
+    assert np.allclose(dr.grad(x).numpy(), [-0.1, -0.1, -0.0999, 0, 0.0999, 0.1, 0.1], atol=1e-6)
+    assert np.allclose(y.numpy()[[0, 3, 6]], [0.1 * 0.25, 0, 0.1 * 0.25])
+
+
+# ---- Model ----
+#
+# The forward pass that trains: what was looked up already changes no value and no derivative, and heads are the
+# field's.
+
+
+def field():
+    out, rng = RadianceField.random(TINY, BOX, ns, 0), np.random.default_rng(1)
+    out.set_parameters({"grid.table": ns.Float(rng.normal(size=len(out.grid.table)).astype(np.float32))})
+    return out
+
+
+def points():
+    rng = np.random.default_rng(2)
+    p = ns.Array3f(rng.uniform(-0.9, 0.9, (3, 40)).astype(np.float32))
+    return p, dr.normalize(ns.Array3f(rng.normal(size=(3, 40)).astype(np.float32)))
+
+
+def test_known_features_change_no_value_and_no_derivative():
+    f, (p, d), found = field(), points(), []
+    known = [dr.detach(x) for x in f.grid(BOX.to_unit(p))]
+    for features in (None, known):
+        parameters = {k: type(v)(v) for k, v in f.parameters().items()}
+        dr.enable_grad(parameters)
+        sigma, rgb = density_summand(TINY, BOX, parameters, p, d, ns, features)
+        dr.backward(dr.sum(sigma + rgb[0] - 2 * rgb[1] * rgb[2]))
+        found.append([dr.detach(sigma).numpy()] + [dr.grad(v).numpy() for v in parameters.values()])
+    for a, b in zip(*found):
+        assert np.abs(b).max() > 0 and np.allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_density_alone_is_that_of_the_field():
+    f, (p, _) = field(), points()
+    want = f.density(p).numpy()
+    assert np.allclose(density(TINY, BOX, f.parameters(), p, ns).numpy(), want, rtol=1e-4)
+    features = [ns.Float(x) for x in f.grid(BOX.to_unit(p))]
+    assert np.allclose(density_of(TINY, BOX, f.parameters(), p, features).numpy(), want, rtol=1e-4)
+
+
+def test_rows_are_stacked_and_taken_apart():
+    rows = [ns.Float([1, 2, 3]), ns.Float([4, 5, 6])]
+    x = stack(rows, ns)
+    assert x.shape == (3, 2) and np.array_equal(x.numpy(), [[1, 4], [2, 5], [3, 6]])
+    assert np.array_equal([r.numpy() for r in unstack(x, ns)], [[1, 2, 3], [4, 5, 6]])
+    dr.enable_grad(x)
+    a, b = unstack(x, ns)
+    dr.backward(dr.sum(a * ns.Float([1, 10, 100]) + 2 * b))
+    assert np.array_equal(dr.grad(x).numpy(), [[1, 2], [10, 2], [100, 2]])
+
+
+def test_tensor_products_equal_the_fields_own_evaluation():
+    rng = np.random.default_rng(2)
+    field = RadianceField.random(TINY, BOX, ns, 0)
+    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    p = ns.Array3f(rng.uniform(-0.99, 0.99, (3, 200)).astype(np.float32))
+    d = dr.normalize(ns.Array3f(rng.normal(size=(3, 200)).astype(np.float32)))
+    sigma, rgb = density_summand(TINY, BOX, field.parameters(), p, d, ns)
+    expected, features = field.density_features(p)
+    assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4)
+    assert np.allclose(np.array([c.numpy() for c in rgb]), field.color(features, d).numpy(), atol=1e-5)
+
+
+def test_a_deferred_field_composites_features_and_colours_rays():
+    config, (p, d) = replace(TINY, deferred=True), points()
+    made = RadianceField.random(config, BOX, ns, 0)
+    sigma, parts = density_summand(config, BOX, made.parameters(), p, d, ns)
+    expected, features = made.density_features(p)
+    assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4) and len(parts) == TINY.geometry
+    assert np.allclose([x.numpy() for x in parts], [x.numpy() for x in features], atol=1e-6)
+    opacity = ns.Float(np.linspace(0, 1, 40).astype(np.float32))
+    rgb = ray_color(config, made.parameters(), [opacity * f for f in features], opacity, d, ns)
+    assert np.allclose([c.numpy() for c in rgb], opacity.numpy() * made.color(features, d).numpy(), atol=1e-5)
+    assert ray_color(TINY, {}, parts, opacity, d, ns) is parts
+
+
+# ---- Photo colors ----
+#
+# Photos of one place that differ in exposure and white balance: what is learnt is the place of the average photo.
+
+
+def numbers(count=3):
+    return np.random.default_rng(0).normal(size=12 * count).astype(np.float32)
+
+
+def test_colors_change_by_a_matrix_and_an_offset_of_each_photo():
+    """Against NumPy; the mean over the photos is no change."""
+    photos, given = PhotoColors(ns, 3), numbers()
+    matrices = photos.matrices(ns.Float(given))
+    shifted = 0.01 * (given.reshape(3, 3, 4) - given.reshape(3, 3, 4).mean(axis=0))
+    assert np.allclose(matrices, np.eye(3, 4) + shifted, atol=1e-6)
+    assert np.allclose(matrices.mean(axis=0), np.eye(3, 4), atol=1e-6)
+    color, opacity, frame = np.random.default_rng(1).random((3, 5)), np.linspace(0, 1, 5), [0, 2, 1, 2, 0]
+    out = photos.apply(
+        photos.changes(ns.Float(given)), [ns.Float(c) for c in color], ns.Float(opacity), ns.UInt32(frame)
+    )
+    m = matrices[frame]
+    expected = np.einsum("nij,jn->in", m[..., :3], color) + m[..., 3].T * opacity
+    assert np.allclose(np.array([c.numpy() for c in out]), expected, atol=1e-6)
+    assert photos.decay(photos.changes(ns.Float(given)))[0] == pytest.approx(np.sum(shifted**2) / 3, rel=1e-5)
+
+
+def test_photos_that_agree_change_nothing():
+    photos = PhotoColors(ns, 2)
+    assert np.array_equal(photos.matrices(photos.start()), np.tile(np.eye(3, 4), (2, 1, 1)))
+    assert photos.stops(photos.start()) == 0
+
+
+def test_stops_of_photos_with_twice_and_half_the_light():
+    photos, gain = PhotoColors(ns, 2), 2 ** (1 / 2.2)
+    # Their mean is to be no change: one photo is brighter by what the other is darker.
+    half = (gain - 1) / (gain + 1)
+    given = np.zeros((2, 3, 4), np.float32)
+    for k, sign in enumerate((1, -1)):
+        given[k, :, :3] = sign * half / 0.01 * np.eye(3)
+    assert photos.stops(ns.Float(given.ravel())) == pytest.approx(0.5, rel=1e-5)
+
+
+def test_derivatives_are_those_of_the_formula():
+    photos, given = PhotoColors(ns, 3), numbers()
+    color, frame = np.random.default_rng(1).random((3, 4)), np.array([0, 1, 2, 1])
+
+    def value(x):
+        parameter = ns.Float(x)
+        dr.enable_grad(parameter)
+        out = photos.apply(photos.changes(parameter), [ns.Float(c) for c in color], ns.Float(1), ns.UInt32(frame))
+        loss = sum(dr.sum(dr.square(c)) for c in out)
+        dr.backward(loss)
+        return loss[0], dr.grad(parameter).numpy()
+
+    gradient = value(given)[1]
+    for k in (0, 7, 13, 30):
+        step = np.zeros_like(given)
+        step[k] = 0.5
+        # A quadratic: central differences are exact.
+        assert gradient[k] == pytest.approx(value(given + step)[0] - value(given - step)[0], abs=2e-4)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_exposures_are_found():
+    """Of photos that show the same, so that nothing else can explain how they differ."""
+    gains = np.linspace(0.9, 1.1, 6)[:, None] * (1 + np.random.default_rng(0).uniform(-0.02, 0.02, (6, 3)))
+    view, views = ball(ball_pose(np.array([0, -2.0, 0])), depth=False), []
+    for gain in gains:
+        pixels = view.pixels.copy()
+        pixels[..., :3] *= gain.astype(np.float32)
+        views.append(replace(view, pixels=np.clip(pixels, 0, 1)))
+    trainer = RadianceTrainer(views, BOX, TINY, settings(steps=500, photo_decay=1e-4), ns, depth=False)
+    while trainer.progress < 1:
+        trainer.step()
+    found = trainer.photos.matrices(trainer.averaged[PHOTOS])
+    # What becomes of the mean colour of the ball.
+    mean = view.pixels[view.pixels[..., 3] > 0.5][:, :3].mean(axis=0)
+    changed = (found[..., :3] @ mean + found[..., 3]) / mean
+    assert np.allclose(changed, gains / gains.mean(axis=0), atol=0.005)
+
+
+def test_a_single_photo_has_nothing_to_differ_from(dataset):
+    alone = RadianceTrainer(dataset.train[:1], BOX, TINY, settings(), ns, depth=False)
+    without = RadianceTrainer(dataset.train, BOX, TINY, settings(photo_colors=False), ns, depth=False)
+    assert alone.photos is None and without.photos is None and PHOTOS not in without.averaged
+    alone.step()
+    without.step()
+
+
+def test_the_field_is_the_place_without_any_photos_colors(dataset):
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns, depth=False)
+    trainer.step()
+    trainer.averaged[PHOTOS] = ns.Float(numbers(len(dataset.train)))
+    assert PHOTOS not in trainer.field(bound=False).parameters()

@@ -1,0 +1,243 @@
+"""Tests of `nerg_mi.train.radiance_run`."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.formats.fields import load_radiance, save_radiance
+from nerg_mi.maths.color import psnr, psnr_of_fitted_half
+from nerg_mi.maths.geometry import Box
+from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.images import View
+from nerg_mi.train import radiance_run
+from nerg_mi.train.radiance_run import (
+    HeldOutError,
+    complaints,
+    measure,
+    share_beyond,
+    train_field,
+    warm_up,
+    write_preview,
+)
+from nerg_mi.train.radiance_trainer import Preview, RadianceTrainer
+
+from .ball import BOX, TINY, settings, state, trainer
+
+# ---- The share of pixels beyond a box, where depths are known in closed form ----
+
+
+LENS = Intrinsics(40, 20, 40.0, 40.0, 20.0, 10.0)
+
+
+def made(x, opacity=1.0):
+    """A camera at (x, 0, 0) that looks along -z at the plane z = -4, and what it sees."""
+    pose = np.eye(4)
+    pose[0, 3] = x
+    depth = 4 / -pixel_directions(LENS)[..., 2]
+    view = View("plane", Camera(LENS, pose), np.zeros((20, 40, 3), np.float32))
+    return view, Preview(np.zeros((20, 40, 3)), np.full((20, 40), opacity), depth)
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_half_of_a_plane_lies_beyond(every):
+    core = Box((0, -9, -9), (9, 9, 0))
+    part = slice(every // 2, None, every)
+    views = {view.camera.center[0]: (view, seen) for view, seen in (made(0.0), made(-50.0))}
+
+    def render(view):
+        seen = views[view.camera.center[0]][1]
+        return Preview(seen.color[part, part], seen.opacity[part, part], seen.depth[part, part])
+
+    ahead, aside = (views[x][0] for x in (0.0, -50.0))
+    assert share_beyond([ahead], render, core, every) == 0.5
+    assert share_beyond([ahead, aside], render, core, every) == 0.75
+
+
+def test_what_lets_light_through_shows_nothing_within():
+    view, seen = made(0.0, opacity=0.3)
+    assert share_beyond([view], lambda v: seen, Box((-9, -9, -9), (9, 9, 0))) == 1
+
+
+# ---- The error on views that are not learnt from: of which pixels, of which colours ----
+
+
+def test_what_a_mask_hides_does_not_count_in_the_progress(dataset):
+    view = dataset.held_out[0]
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns, depth=False)
+    mask = np.arange(24)[:, None] < np.full(24, 12)
+    spoilt = view.pixels.copy()
+    spoilt[~mask] = 1 - spoilt[~mask]
+    whole, other, masked, same = measure(
+        trainer,
+        [
+            view,
+            replace(view, pixels=spoilt),
+            *(replace(view, pixels=pixels, mask=mask) for pixels in (view.pixels, spoilt)),
+        ],
+        2,
+    ).psnr
+    assert masked == same and whole != other and masked != whole
+
+
+def test_both_errors_are_those_of_the_rendered_view(dataset):
+    trainer, views = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns, depth=False), dataset.held_out[:2]
+    field = trainer.field(bound=False)
+    error = measure(trainer, views, 2, field)
+    for k, view in enumerate(views):
+        seen, truth = trainer.render(view, 2, field).color, view.over(0)[1::2, 1::2]
+        assert error.psnr[k] == pytest.approx(psnr(seen, truth), rel=1e-6)
+        alpha = view.color[1::2, 1::2, 3]
+        assert error.fitted[k] == pytest.approx(psnr_of_fitted_half(seen, truth, alpha), rel=1e-6)
+
+
+def test_views_of_which_nothing_counts_are_left_out_of_the_mean():
+    error = HeldOutError([20.0, float("nan"), 22.0], [float("nan"), 25.0, 27.0])
+    assert error.mean == 21 and error.mean_fitted == 26
+    assert np.isnan(HeldOutError([20.0], [float("nan")]).mean_fitted)
+
+
+# ---- Whole radiance trainings: they learn, and show how they do ----
+
+
+@pytest.mark.slow
+def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
+    """20 dB on held-out views after 300 small steps; the checkpoint says how."""
+    seen = []
+    field, provenance = train_field(dataset, TINY, settings(), ns, on_progress=seen.append)
+    assert provenance["psnr_held_out"]["mean"] > 20
+    assert provenance["depth_supervision"] and provenance["steps"] == 300 and seen[-1].done == 1
+    save_radiance(field, tmp_path / "ball.safetensors", provenance, half=True)
+    loaded, meta = load_radiance(tmp_path / "ball.safetensors", ns)
+    assert meta["provenance"]["settings"]["seed"] == 1
+    assert loaded.color_space == "srgb" and loaded.march_step == pytest.approx(2 / 64)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_learns_without_depth(dataset):
+    _, provenance = train_field(dataset, TINY, settings(), ns, depth=False)
+    assert provenance["psnr_held_out"]["mean"] > 19 and not provenance["depth_supervision"]
+
+
+def test_a_preview_shows_colours_within_their_range_beside_the_truth(dataset, tmp_path, rgb):
+    """What is brighter than white is white, and not dark again."""
+    seen = np.zeros((12, 12, 3), np.float32)
+    seen[:, :4], seen[:, 4:8], seen[:, 8:] = 1.7, -0.4, 0.5
+    found = SimpleNamespace(color=seen)
+    trainer = SimpleNamespace(pixels_within=lambda views, most: 2, render=lambda view, every: found)
+    write_preview(trainer, dataset.held_out[0], tmp_path / "a.png")
+    picture = np.array(rgb.Bitmap(str(tmp_path / "a.png")))
+    assert picture.shape == (12, 24, 3)
+    assert (picture[:, :4] == 255).all() and (picture[:, 4:8] == 0).all() and (picture[:, 8:12] == 128).all()
+    truth = 255 * dataset.held_out[0].over(0)[1::2, 1::2]
+    assert np.abs(picture[:, 12:] - truth).max() <= 1
+
+
+def test_previews_show_the_first_watched_view(dataset, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(radiance_run, "write_preview", lambda trainer, view, path: shown.append(view))
+    monkeypatch.setattr(radiance_run, "LOOK_GAP", 1)
+    train_field(dataset, TINY, settings(steps=3), ns, preview=tmp_path / "a.png")
+    assert len(shown) > 1 and all(view is dataset.held_out[0] for view in shown)
+
+
+def test_nothing_is_resumed_without_a_state(dataset):
+    with pytest.raises(NergError, match="nothing to resume: name"):
+        train_field(dataset, TINY, settings(steps=1), ns, resume=True)
+
+
+# ---- A training says when its result is worse than it might be ----
+
+
+def looks(*psnr):
+    return [{"steps": 100 * (k + 1), "psnr": x} for k, x in enumerate(psnr)]
+
+
+def test_a_sound_run_has_nothing_to_say():
+    assert complaints(looks(18, 22, 25.9, 25.2), 2000, 1, 2.0, 120.0) == []
+    assert complaints([], 2000, 1, None) == []
+
+
+def test_a_fall_below_an_earlier_look_is_named_with_its_numbers():
+    (said,) = complaints(looks(18, 24.31, 22, 23.2), 2000, 1, 2.0, 120.0)
+    assert "23.20 dB" in said and "step 200 had 24.31 dB" in said and "1.1 dB worse" in said and "--minutes" in said
+    assert complaints(looks(18, 24.2, 22, 23.3), 2000, 1, 2.0, 120.0) == []
+
+
+def test_an_end_at_a_coarse_stride_is_named():
+    (said,) = complaints([], 2000, 4, None)
+    assert "4 times coarser" in said and "--steps" in said and "--minutes" not in said
+
+
+def test_few_steps_are_named_with_the_machine_s_rate():
+    (said,) = complaints(looks(10, 12.6), 44, 1, 2.0, 120.0)
+    assert "only 44 steps (0.37 a second: this machine is slow or busy)" in said and "--minutes" in said
+    (said,) = complaints(looks(10, 12.6), 40, 1, None, 2.0)
+    assert "only 40 steps," in said and "machine" not in said and "--minutes" not in said
+    assert complaints([], 500, 1, None) == [] != complaints([], 499, 1, None)
+
+
+# ---- Warm up ----
+#
+# Compiling before a run's clock starts changes nothing of the run, and leaves nothing to be compiled in it.
+
+
+def kernels_of_a_run(t) -> list[tuple[int, int, int]]:
+    """Step, size and operations of each kernel that the rest of a run compiles, or loads from the cache on the disk."""
+    found = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history()
+        while t.progress < 1:
+            t.step()
+            found += [
+                (t.steps, k["size"], k["operation_count"])
+                for k in dr.kernel_history([dr.KernelType.JIT])
+                if not k["cache_hit"] or k["cache_disk"]
+            ]
+    # Those of a few operations take no longer than a step.
+    return [k for k in found if k[2] > 20]
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_a_run_is_the_same_bit_for_bit(dataset, one_thread, depth):
+    plain, warm = (trainer(dataset, steps=24, depth=depth) for _ in range(2))
+    warm_up(warm)
+    assert warm.steps == warm.settling.at == 0 and not warm.clock.durations
+    for t in (plain, warm):
+        while t.progress < 1:
+            t.step()
+    expected, got = state(plain), state(warm)
+    for name, value in expected.items():
+        assert np.array_equal(value, got[name]), name
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_nothing_is_compiled_in_a_run(dataset, depth):
+    """Through all strides, grid updates, the drawing of hard pixels, the end of damping near cameras, and settling."""
+    t = trainer(dataset, steps=120, depth=depth, settle=0.4)
+    # Other trainings of this process have made most kernels already.
+    dr.flush_kernel_cache()
+    warm_up(t)
+    assert not kernels_of_a_run(t)
+    assert t.stride == 1 and t.settling.done
+
+
+def test_nothing_is_compiled_once_fog_has_cleared(dataset):
+    """Where all is fog at first nothing is known to be empty, and the bound of rendering holds nothing."""
+    t = trainer(dataset, steps=60, depth=False, settle=0.4)
+    value = type(t.grid.value)(t.grid.value)
+    t.grid.value, t.grid.grown = (
+        dr.full(type(value), 1, len(value)),
+        lambda found: np.zeros((t.grid.resolution,) * 3, bool),
+    )
+    dr.eval(t.grid.value)
+    dr.flush_kernel_cache()
+    warm_up(t)
+    t.grid.value = value
+    del t.grid.grown
+    assert not kernels_of_a_run(t)

@@ -1,0 +1,368 @@
+"""Tests of `nerg_mi.train.radiance_trainer`."""
+
+from dataclasses import replace
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.maths.geometry import Box
+from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.images import View
+from nerg_mi.train import radiance_trainer
+from nerg_mi.train.radiance_data import PixelBank
+from nerg_mi.train.radiance_losses import color_loss, composite, density_summand, depth_loss, feature_decay, ray_color
+from nerg_mi.train.radiance_run import measure
+from nerg_mi.train.radiance_sampling import StepTable, Thinning, damp_near, ray_sum, rays_in_box, visible_samples
+from nerg_mi.train.radiance_trainer import RadianceTrainer, render_view
+
+from .ball import BOX, TINY, settings
+
+# ---- The trainer's own pictures against a march in NumPy, pixel by pixel, and PSNR by its definition ----
+
+
+LENS = Intrinsics(13, 9, 12.0, 12.0, 6.5, 4.5)
+
+
+STEP, NEAR = 0.1, 0.3
+
+
+class Lump:
+    """A soft ball in a box, brighter to the right, redder to the camera."""
+
+    box, ns, config = Box((-1, -1, -1), (1, 1, 1)), ns, RadianceConfig()
+
+    def density(self, p, active=True):
+        return dr.select(active, 20 * dr.exp(-12 * dr.squared_norm(p)), 0)
+
+    def density_features(self, p):
+        return self.density(p), [p.x]
+
+    def color(self, features, d):
+        return ns.Array3f(0.5 + 0.4 * features[0], 0.5 - 0.3 * d.x, 0.25)
+
+
+def view():
+    pose = np.eye(4)
+    pose[:3, 3] = 0.1, -0.2, 2.5
+    return View("v", Camera(LENS, pose), np.zeros((9, 13, 3), np.uint8))
+
+
+def expected():
+    """Colour, opacity and expected depth of all pixels: steps of the table, shifted by half, of constant density."""
+    o = np.array([0.1, -0.2, 2.5])
+    d = pixel_directions(LENS).reshape(-1, 3)
+    edges = np.arange(0, 45) * STEP + STEP / 2
+    t, middle = edges[:-1], edges[:-1] + STEP / 2
+    p = o + d[:, None] * middle[:, None]
+    sigma = 20 * np.exp(-12 * (p**2).sum(-1)) * (np.abs(p).max(-1) < 1) * (middle > NEAR)
+    tau = sigma * STEP
+    weight = np.exp(-(np.cumsum(tau, 1) - tau)) * -np.expm1(-tau)
+    rgb = np.stack(
+        [0.5 + 0.4 * p[..., 0], np.broadcast_to(0.5 - 0.3 * d[:, None, 0], tau.shape), np.full(tau.shape, 0.25)], -1
+    )
+    small = np.maximum(tau, 1e-9)
+    share = np.where(tau > 1e-4, 1 / small - 1 / np.expm1(small), 0.5)
+    opacity = weight.sum(1)
+    depth = (weight * (t + STEP * share)).sum(1) / np.where(opacity > 0, opacity, 1)
+    return (weight[..., None] * rgb).sum(1).reshape(9, 13, 3), opacity.reshape(9, 13), depth.reshape(9, 13)
+
+
+@pytest.mark.parametrize("chunk", [2**22, 1000])
+@pytest.mark.parametrize("every", [1, 2, 3])
+def test_pictures(every, chunk, monkeypatch):
+    monkeypatch.setattr(radiance_trainer, "_CHUNK", chunk)
+    table = StepTable(ns, 0.0, 4.4, STEP, 0.0)
+    seen = render_view(Lump(), lambda p, active: active, table, view(), NEAR, every=every, stop=0.0)
+    color, opacity, depth = (v[every // 2 :: every, every // 2 :: every] for v in expected())
+    assert seen.color.shape == color.shape and np.allclose(seen.color, color, atol=2e-5)
+    assert np.allclose(seen.opacity, opacity, atol=2e-5) and 0.8 < opacity.max()
+    assert np.allclose(seen.depth[opacity > 0.01], depth[opacity > 0.01], rtol=1e-4)
+
+
+def test_a_deferred_field_has_the_colour_of_its_mean_features():
+    """Which for one that is linear in them is the mean of colours."""
+    lump = Lump()
+    lump.config = RadianceConfig(deferred=True)
+    table, anywhere = StepTable(ns, 0.0, 4.4, STEP, 0.0), lambda p, active: active
+    seen = render_view(lump, anywhere, table, view(), NEAR, stop=0.0)
+    assert np.allclose(seen.color, expected()[0], atol=2e-5)
+    lump.color = lambda features, d: ns.Array3f(dr.square(features[0]))
+    squares = render_view(lump, lambda p, a: a, StepTable(ns, 0.0, 4.4, STEP, 0.0), view(), NEAR, stop=0.0).color[
+        ..., 0
+    ]
+    opacity = expected()[1]
+    mean = (expected()[0][..., 0] - 0.5 * opacity) / 0.4 / np.where(opacity > 0, opacity, 1)
+    assert np.allclose(squares, opacity * mean**2, atol=2e-5)
+
+
+def test_a_background_shows_through():
+    table = StepTable(ns, 0.0, 4.4, STEP, 0.0)
+    color, opacity, _ = expected()
+    seen = render_view(Lump(), lambda p, active: active, table, view(), NEAR, background=0.8, stop=0.0)
+    assert np.allclose(seen.color, color + 0.8 * (1 - opacity[..., None]), atol=2e-5)
+
+
+def test_empty_cells_and_pictures_of_nothing():
+    table = StepTable(ns, 0.0, 4.4, STEP, 0.0)
+    seen = render_view(Lump(), lambda p, active: active & False, table, view(), NEAR)
+    assert not seen.color.any() and not seen.opacity.any() and not seen.depth.any() and seen.color.shape == (9, 13, 3)
+
+
+# ---- The radiance trainer on a tiny place: it repeats itself, and its gradients are right ----
+
+
+DEFERRED = replace(TINY, deferred=True)
+
+
+def test_equal_seeds_give_equal_fields_to_rounding(dataset):
+    """The sums of several threads come in no fixed order; a few steps differ by rounding alone."""
+
+    def weights(seed):
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(seed=seed), ns)
+        for _ in range(4):
+            trainer.step()
+        return trainer.optimiser["density_net.0"].numpy()
+
+    assert np.allclose(weights(3), weights(3), atol=1e-4)
+    assert not np.allclose(weights(3), weights(4), atol=1e-2)
+
+
+@pytest.mark.parametrize("average", [0.0, 0.5, 0.999])
+def test_what_is_kept_is_the_average_of_every_fourth_steps_weights(dataset, average):
+    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) a step after k steps, of ``average``
+    later."""
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(average=average), ns)
+    expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
+    for k in range(1, 13):
+        trainer.step()
+        memory = min(average, (k + 1) / (k + 10)) ** 4
+        if k % 4 == 0:
+            for name, value in trainer.optimiser.items():
+                expected[name] = memory * expected[name] + (1 - memory) * value.numpy()
+    for name, value in trainer.averaged.items():
+        assert np.allclose(value.numpy(), expected[name], atol=1e-6)
+    assert average == 0 or np.abs(expected["density_net.0"] - trainer.optimiser["density_net.0"].numpy()).max() > 1e-4
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_stored_occupancy_leaves_nothing_out_that_shows(dataset):
+    """Held-out views through the occupied cells and through the whole box; free space is empty."""
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns)
+    while trainer.progress < 1:
+        trainer.step()
+    field = trainer.field()
+    assert 0 < field.occupancy.fraction < 0.5
+    bounded = lambda p, active: active & (field.occupancy.empty_cells(BOX.to_unit(p)) == 0)
+    for view in dataset.held_out:
+        with_grid, without = (
+            render_view(field, occupied, trainer.table(), view, 0.01)
+            for occupied in (bounded, lambda p, active: active)
+        )
+        assert np.mean(np.abs(with_grid.opacity - without.opacity)) < 0.02
+        assert np.mean(np.abs(with_grid.color - without.color)) < 0.02
+
+
+@pytest.mark.parametrize("config", [TINY, DEFERRED])
+def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset, config):
+    """Fixed samples, all loss terms, a direction through all weights: central differences to 1 %."""
+    rng = np.random.default_rng(6)
+    field = RadianceField.random(config, BOX, ns, 0)
+    table = rng.normal(size=len(field.grid.table)).astype(np.float32)
+    field.set_parameters({"grid.table": ns.Float(table)})
+    pixels = PixelBank(ns, dataset.train).batch(ns.UInt32(rng.integers(0, 24 * 24, 64).astype(np.uint32)))
+    rays = rays_in_box(pixels.o, pixels.d, BOX, 0.01)
+    offset = ns.Float(rng.random(64).astype(np.float32))
+    background = ns.Array3f(rng.random((3, 64)).astype(np.float32))
+    with dr.suspend_grad():
+        samples, covered = visible_samples(
+            rays, StepTable(ns, 0.01, 4, 0.03, 0), offset, lambda p, a: a, field.density, 2e-3, pad=2**13
+        )
+    assert covered == 64
+    start = {k: dr.detach(v) for k, v in field.parameters().items()}
+
+    def loss(parameters):
+        d = dr.gather(ns.Array3f, pixels.d, samples.ray)
+        sigma, parts = density_summand(config, BOX, parameters, samples.p, d, ns)
+        weight, tau, sums, opacity = composite(sigma, parts, samples)
+        color = ray_color(config, parameters, sums, opacity, pixels.d, ns)
+        terms = color_loss(color, opacity, pixels, background, 0.1)
+        terms += 0.1 * depth_loss(weight, tau, samples, pixels.depth, 0.1, 0.1)
+        return dr.sum(ns.Float64(terms))
+
+    parameters = {k: type(v)(v) for k, v in start.items()}
+    dr.enable_grad(parameters)
+    dr.backward(loss(parameters))
+    # Along the signs of the gradient the parts of the slope do not cancel.
+    direction = {
+        k: type(v)(dr.sign(dr.grad(v))) * type(v)(rng.random(v.shape).astype(np.float32)) for k, v in parameters.items()
+    }
+    slope = sum(float(np.sum(dr.grad(parameters[k]).numpy() * direction[k].numpy())) for k in parameters)
+    h = 3e-4
+    up, down = (loss({k: v + s * h * direction[k] for k, v in start.items()}).numpy()[0] for s in (1, -1))
+    assert slope == pytest.approx((up - down) / (2 * h), rel=0.01)
+
+
+@pytest.mark.nightly
+def test_a_deferred_field_learns_the_same_pictures(dataset):
+    """As well as one that is asked at every sample; it is what is kept, looked at and rendered."""
+    errors = []
+    for config in (TINY, DEFERRED):
+        trainer = RadianceTrainer(dataset.train, BOX, config, settings(steps=150), ns)
+        while trainer.progress < 1:
+            trainer.step()
+        field = trainer.field()
+        assert field.config == config
+        errors.append(measure(trainer, dataset.held_out, field=field).mean)
+    assert min(errors) > 22 and errors[1] > errors[0] - 1.5, errors
+
+
+def test_thinned_samples_stand_for_all():
+    """Opacity is exact, colours (a ratio) nearly and derivatives wholly those of all samples on the mean over many
+    choices."""
+    rng = np.random.default_rng(8)
+    o = ns.Array3f(np.tile([[0.0], [0.0], [-2.0]], 16).astype(np.float32))
+    d = dr.normalize(
+        ns.Array3f(*[ns.Float(rng.normal(size=16).astype(np.float32) * 0.3) for _ in range(2)], ns.Float(np.ones(16)))
+    )
+    rays, table = rays_in_box(o, d, BOX, 0.01), StepTable(ns, 0.01, 4, 0.03, 0)
+    offset, per_ray = ns.Float(rng.random(16).astype(np.float32)), ns.Float(rng.normal(size=16).astype(np.float32))
+    density = lambda p, active=True: 0.3 + 20 * dr.exp(-40 * dr.square(p.z - 0.3 * p.x))
+
+    def render(thinning):
+        samples, _ = visible_samples(rays, table, offset, lambda p, a: a, density, 1e-9, thinning=thinning)
+        gain = ns.Float(1)
+        dr.enable_grad(gain)
+        rgb = [0.5 + 0.4 * dr.sin(4 * samples.p.z + k) for k in range(3)]
+        weight, _, color, opacity = composite(gain * density(samples.p), rgb, samples)
+        plain = sum(ray_sum(weight * c, samples.segments) for c in rgb)
+        dr.backward(dr.sum((plain + opacity) * per_ray))
+        return (samples.count, np.array([c.numpy() for c in color]), opacity.numpy(), dr.grad(gain).numpy()[0])
+
+    count, color, opacity, slope = render(None)
+    found = [render(Thinning(1 / 16, 1 / 32, k)) for k in range(400)]
+    assert max(f[0] for f in found) < 0.5 * count
+    for f in found[::40]:
+        assert np.allclose(f[2], opacity, atol=1e-6)
+    assert np.allclose(np.mean([f[1] for f in found], 0), color, atol=0.03)
+    slopes = [f[3] for f in found]
+    assert abs(np.mean(slopes) - slope) < 4 * np.std(slopes) / 20 and np.std(slopes) > 0
+
+
+def test_damping_near_cameras(dataset):
+    """Derivatives nearer than the reach fall with the square of the distance, values stay; a trainer's step follows."""
+    t, x = ns.Float([0.1, 0.2, 0.4, 3]), ns.Float([1, 2, 3, 4])
+    dr.enable_grad(x)
+    (y,) = damp_near([x], t, 0.4)
+    dr.backward(dr.sum(2 * y))
+    assert np.array_equal(y.numpy(), x.numpy()) and np.allclose(dr.grad(x).numpy(), [2 / 16, 2 / 4, 2, 2])
+
+    def first_step(reach):
+        # All samples are nearer than a reach of a thousand sides: nothing of the pictures reaches the weights.
+        trainer = RadianceTrainer(
+            dataset.train, BOX, TINY, settings(reach=reach, empty_weight=0.0, photo_colors=False), ns, False
+        )
+        trainer.step()
+        return max(np.abs(state[3][1].numpy()).max() for state in trainer.optimiser.state.values())
+
+    assert first_step(1000.0) < 1e-4 * first_step(0.0)
+
+
+def test_a_box_that_no_camera_sees_is_refused(dataset):
+    with pytest.raises(ValueError, match="--aabb"):
+        RadianceTrainer(dataset.train, Box((50, 50, 50), (51, 51, 51)), TINY, settings(), ns)
+
+
+def test_features_that_no_ray_shapes_are_let_go(dataset):
+    x = ns.Float([1, -2, 0, 4])
+    dr.enable_grad(x)
+    y = feature_decay(x)
+    dr.backward(y)
+    assert float(y[0]) == pytest.approx(21 / 4) and np.allclose(dr.grad(x).numpy(), [0.5, -1, 0, 2])
+
+    def left(weight):
+        # Nearer than a reach of a thousand sides: nothing of the pictures reaches the features.
+        trainer = RadianceTrainer(
+            dataset.train, BOX, TINY, settings(reach=1000.0, empty_weight=0.0, grid_decay=weight), ns, depth=False
+        )
+        trainer.optimiser["grid.table"] = dr.full(ns.Float, 0.5, len(trainer.live.parameters()["grid.table"]))
+        for _ in range(10):
+            trainer.step()
+        return float(dr.mean(dr.abs(trainer.optimiser["grid.table"]))[0])
+
+    assert left(0.1) < 0.4 < left(0.0)
+    with pytest.raises(ValueError, match="grid_decay must lie in"):
+        settings(grid_decay=-1.0)
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_free_space_is_carved_where_all_depth_is_known(dataset, depth):
+    """Cells far in front of the surface are then empty from the start; without depth nothing is known of them."""
+    views = [replace(v, depth=np.where(v.depth > 0, v.depth, 9).astype(np.float32)) for v in dataset.train]
+    trainer = RadianceTrainer(views, BOX, TINY, settings(), ns, depth=depth)
+    assert trainer.carved == depth and trainer.pixels.depth_everywhere
+    # Where the cameras are looking from to the ball: nearer to them than its surface by four cells and more.
+    p = dr.normalize(ns.Array3f(*np.random.default_rng(0).normal(size=(3, 500)).astype(np.float32))) * 0.9
+    seen = trainer.grid.occupied(p, dr.full(ns.Bool, True, 500)).numpy()
+    assert (seen.mean() < 0.2) == depth
+
+
+def test_places_count_first_and_colours_later(dataset, monkeypatch):
+    """The loss of depth alone, of one a ray: its weight, which falls by ``final_depth`` over the run."""
+    from nerg_mi.train import radiance_trainer as radiance
+
+    monkeypatch.setattr(radiance, "color_loss", lambda *given: 0 * color_loss(*given))
+    monkeypatch.setattr(radiance, "depth_loss", lambda *given: 0 * depth_loss(*given) + 1)
+    for steps in (0, 49, 99):
+        given = settings(steps=100, depth_weight=0.3, final_depth=0.04, distortion_weight=0.0)
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, given, ns)
+        trainer.steps = steps
+        trainer.step()
+        assert float(trainer.loss[0]) == pytest.approx(0.3 * 0.04 ** ((steps + 1) / 100), rel=1e-4)
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.4])
+def test_damping_reaches_a_share_of_the_box_from_the_camera(dataset, monkeypatch, reach):
+    from nerg_mi.train import radiance_trainer as radiance
+
+    reaches = []
+    noted = lambda values, t, width: reaches.append(float(width[0])) or damp_near(values, t, width)
+    monkeypatch.setattr(radiance, "damp_near", noted)
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(steps=100, reach=reach, reach_share=0.5), ns)
+    trainer.step()
+    # The first of a hundred steps, of which half are damped.
+    assert reaches == ([pytest.approx(reach * BOX.side * 0.98)] if reach else [])
+
+
+def test_weights_move_however_faint_their_gradient(dataset):
+    """Entries of the grid that few rays see are not left behind: steps do not depend on the gradient's scale."""
+    moved = []
+    for scale in (1.0, 1e-13):
+        optimiser = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns).optimiser
+        name = "grid.table"
+        before = optimiser[name].numpy().astype(float)
+        dr.set_grad(optimiser[name], dr.full(type(optimiser[name]), scale, dr.width(optimiser[name])))
+        optimiser.step()
+        moved.append(np.abs(optimiser[name].numpy() - before))
+    assert moved[0].min() > 0 and np.allclose(moved[1], moved[0], rtol=0.05)
+
+
+def test_rays_that_do_not_fit_into_a_batch_do_not_count(dataset, monkeypatch):
+    """With a loss of 1 a ray the mean over those that are complete is 1."""
+    from nerg_mi.train import radiance_trainer as module
+
+    monkeypatch.setattr(module, "color_loss", lambda _, opacity, *rest: dr.ones(ns.Float, dr.width(opacity)))
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(batch=2**10), ns, depth=False)
+    trainer.rays, seen = 2**10, []
+    visible = module.visible_samples
+    monkeypatch.setattr(
+        module,
+        "visible_samples",
+        lambda rays, *a, **k: seen.append((rays.count, visible(rays, *a, **k))) or seen[-1][1],
+    )
+    trainer.step()
+    count, (_, covered) = seen[0]
+    assert 0 < covered < count and trainer.loss.numpy()[0] == pytest.approx(1, rel=1e-5)

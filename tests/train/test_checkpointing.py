@@ -1,0 +1,207 @@
+"""Tests of `nerg_mi.train.checkpointing`."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.formats.checkpoint import read_checkpoint
+from nerg_mi.formats.fields import save_radiance
+from nerg_mi.train import checkpointing
+from nerg_mi.train.checkpointing import StepClock, load_run, save_run
+from nerg_mi.train.radiance_run import train_field
+from nerg_mi.train.radiance_trainer import RadianceTrainer
+from tests.train.radiance.ball import TINY, settings, state, trainer
+
+# ---- A training that is killed and resumed comes to what an uninterrupted one comes to ----
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thread, tmp_path):
+    """Past updates of the grid, its settling and the drawing of hard pixels, on either side of the interruption."""
+    whole, first, second = (trainer(dataset) for _ in range(3))
+    while whole.progress < 1:
+        whole.step()
+    while first.steps < 21:
+        first.step()
+    save_run(first, tmp_path / "a.run", {"sha": 1}, [{"psnr": 3.0}])
+    assert load_run(second, tmp_path / "a.run", {"sha": 1}) == [{"psnr": 3.0}]
+    assert second.steps == 21
+    while second.progress < 1:
+        second.step()
+    expected, got = state(whole), state(second)
+    for name, value in expected.items():
+        assert np.array_equal(value, got[name]), name
+    assert whole.settling.at == second.settling.at > 0
+
+
+def test_another_run_is_not_resumed(dataset, tmp_path):
+    t = trainer(dataset)
+    save_run(t, tmp_path / "a.run", {"sha": 1, "width": 24}, [])
+    with pytest.raises(NergError, match="other width"):
+        load_run(t, tmp_path / "a.run", {"sha": 1, "width": 48})
+
+
+def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):
+    path, seen, written = tmp_path / "a.run", [], []
+
+    def stop(progress):
+        seen.append(progress)
+        if progress.steps == 5 and len(seen) == 5:
+            raise KeyboardInterrupt
+
+    options = {
+        "state": path,
+        "preview": tmp_path / "a.png",
+        "on_progress": stop,
+        "write": lambda field, about: written.append((about["steps"], path.is_file())),
+    }
+    _, about = train_field(dataset, TINY, settings(steps=12), ns, **options)
+    assert about["interrupted"] and path.is_file()
+    _, about = train_field(dataset, TINY, settings(steps=12), ns, resume=True, **options)
+    assert not about["interrupted"] and seen[5].steps == 6 and (tmp_path / "a.png").stat().st_size > 100
+    assert written == [(5, True), (12, True)] and not path.exists()
+
+
+def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
+    """Weights beyond fp16, and then without --half: no step is trained again."""
+    path, seen = tmp_path / "a.run", []
+
+    def refuse(field, about):
+        parameters = field.parameters()
+        field.set_parameters(parameters | {"grid.table": parameters["grid.table"] * 0 + 1e6})
+        save_radiance(field, tmp_path / "a.safetensors", about, half=True)
+
+    options = {"state": path, "save_every": 1e9, "on_progress": seen.append}
+    with pytest.raises(NergError, match="fp16.*--half.*--resume"):
+        train_field(dataset, TINY, settings(steps=6), ns, write=refuse, **options)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.run"]
+    seen.clear()
+    _, about = train_field(
+        dataset,
+        TINY,
+        settings(steps=6),
+        ns,
+        resume=True,
+        write=lambda f, a: save_radiance(f, tmp_path / "a.safetensors", a),
+        **options,
+    )
+    assert about["steps"] == 6 and not seen and [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+def test_a_second_ctrl_c_leaves_the_state_before_the_step(dataset, one_thread, monkeypatch, tmp_path):
+    """Raised in the middle of a step, when weights and random numbers are of different steps: that state is not
+    kept."""
+    path, descend = tmp_path / "a.run", RadianceTrainer._descend
+
+    def twice(self, *given):
+        if self.steps == 5:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+        descend(self, *given)
+
+    monkeypatch.setattr(RadianceTrainer, "_descend", twice)
+    with pytest.raises(KeyboardInterrupt):
+        train_field(dataset, TINY, settings(steps=12), ns, state=path, save_every=0.0)
+    assert read_checkpoint(path, "radiance run")[1]["steps"] == 4
+
+
+_CHILD = """
+import sys
+import drjit as dr, drjit.llvm.ad as ns
+from pathlib import Path
+from tests.train.radiance.ball import TINY, ball_dataset, settings
+from nerg_mi.train.radiance_run import train_field
+dr.set_thread_count(1)
+train_field(ball_dataset(), TINY, settings(steps=10**6), ns, state=Path(sys.argv[1]), save_every=0.0)
+"""
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
+def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thread, sent, tmp_path):
+    """Killed at any moment, the state is one that an uninterrupted run has been in; Ctrl-C is heard between steps."""
+    path = tmp_path / "a.run"
+    child = subprocess.Popen([sys.executable, "-c", _CHILD, str(path)], env={**os.environ, "PYTHONPATH": os.getcwd()})
+    until = time.time() + 120
+    while not path.exists() and child.poll() is None and time.time() < until:
+        time.sleep(0.05)
+    time.sleep(0.3)
+    child.send_signal(sent)
+    assert child.wait(120) == (0 if sent == signal.SIGINT else -sent)
+    about = dict.fromkeys(("sha256", "training_frames", "width", "height"))
+    killed = trainer(dataset, steps=10**6)
+    load_run(killed, path, about)
+    same = trainer(dataset, steps=10**6)
+    while same.steps < killed.steps:
+        same.step()
+    for name, value in state(same).items():
+        assert np.array_equal(value, state(killed)[name]), name
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tensors, meta: meta.pop("taken"),
+        lambda tensors, meta: meta.update(about=[]),
+        lambda tensors, meta: meta.update(steps="7"),
+        lambda tensors, meta: meta.update(random={"bit_generator": "PCG64", "state": 3}),
+        lambda tensors, meta: meta.update(seconds=None),
+        lambda tensors, meta: tensors.pop("hard"),
+        lambda tensors, meta: tensors.update({"grid.bits": np.zeros(3, np.uint8)}),
+        lambda tensors, meta: tensors.update({"weights.grid.table": np.zeros(5, np.float32)}),
+        lambda tensors, meta: meta.update(history=3),
+    ],
+)
+def test_a_damaged_state_is_told_with_its_name(dataset, tmp_path, change):
+    from nerg_mi.formats.checkpoint import write_checkpoint
+
+    t = trainer(dataset)
+    save_run(t, tmp_path / "a.run", {"sha": 1}, [])
+    tensors, meta = read_checkpoint(tmp_path / "a.run", "radiance run")
+    change(tensors, meta)
+    write_checkpoint(
+        tmp_path / "b.run", "radiance run", tensors, {k: v for k, v in meta.items() if k not in ("kind", "format")}
+    )
+    with pytest.raises(NergError, match="b.run"):
+        load_run(t, tmp_path / "b.run", {"sha": 1})
+
+
+# ---- The clock of a training's steps: what it gives to a state, and which states are none of its own ----
+
+
+def timed(*seconds):
+    clock = StepClock()
+    for s in seconds:
+        clock.add(s)
+    return clock
+
+
+@pytest.mark.parametrize("seconds", [(), (0.5,), (0.25, 1.0, 0.5)])
+def test_a_state_is_restored_with_and_without_steps(seconds):
+    clock, again = timed(*seconds), StepClock()
+    again.restore(json.loads(json.dumps(clock.to_dict())))
+    assert again.to_dict() == clock.to_dict() and again.summary() == clock.summary()
+    again.add(2.0)
+    clock.add(2.0)
+    assert again.summary() == clock.summary() and again.summary()["step_ms"]["max"] == 2000
+
+
+def test_durations_are_kept_of_steps_that_are_equally_far_apart(monkeypatch):
+    monkeypatch.setattr(checkpointing, "KEPT", 4)
+    for steps, each in ((4, 1), (5, 2), (9, 4), (30, 8)):
+        clock = timed(*range(steps))
+        assert clock.each == each and clock.durations == list(range(0, steps, each))
+
+
+@pytest.mark.parametrize("change", [{"durations": []}, {"steps": 0}, {"steps": -1}, {"each": 0}, {"extremes": [0.5]}])
+def test_steps_without_durations_and_durations_without_steps_are_refused(change):
+    with pytest.raises(ValueError, match='"clock"'):
+        StepClock().restore({**timed(0.5, 0.25).to_dict(), **change})

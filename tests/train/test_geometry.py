@@ -1,0 +1,315 @@
+"""Tests of `nerg_mi.train.geometry`."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.fields.splats import Splats, joined
+from nerg_mi.formats.splats import write_ply_splats
+from nerg_mi.formats.surfaces import write_volume
+from nerg_mi.maths.geometry import Box, Similarity
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.scene import files_of_scene
+from nerg_mi.train.geometry import (
+    PAD,
+    VOXEL,
+    GazePlace,
+    HitExtent,
+    hit_extent,
+    place_of_field,
+    place_of_hits,
+    place_of_nothing,
+    place_of_scene,
+    place_of_volume,
+    shade_hits,
+    volume_dict,
+    voxelise_hits,
+)
+from nerg_mi.transport.geometry import trace_depth
+from nerg_mi.transport.volume_medium import VolumeMedium
+from tests.formats.splats.writers import random_splats
+from tests.reference.office import ROOM, looks_out, office
+from tests.train.gaze.looks import looking_at
+
+# ---- Places of hit points that reach far: an office with windows, in closed form ----
+
+
+# A box around everything would be a hundred times as large.
+MOST = 1 << 19
+
+
+@pytest.fixture(scope="module")
+def rays_hit_extent():
+    return office(100_000)
+
+
+@pytest.fixture(scope="module")
+def extent(rays_hit_extent):
+    return hit_extent(rays_hit_extent, most=MOST)
+
+
+def test_the_box_of_an_office_is_the_room(rays_hit_extent, extent):
+    """At the voxels' usual edge, though the hits outside would make it 45 x 60 m."""
+    spread = np.ptp(np.quantile(rays_hit_extent.hit, [0.005, 0.995], axis=0), axis=0)
+    assert np.prod(spread / VOXEL) > 16 * MOST
+    assert extent.cut and extent.voxel == VOXEL and np.prod(extent.shape) <= MOST
+    low, high = extent.shell
+    assert np.abs(low - ROOM[0]).max() < VOXEL and np.abs(high - ROOM[1]).max() < 1.5 * VOXEL
+    assert extent.beyond == pytest.approx(looks_out(rays_hit_extent.origin, rays_hit_extent.direction).mean(), abs=2e-3)
+
+
+def test_depths_in_an_office(rgb, rays_hit_extent, extent, tmp_path, monkeypatch):
+    """What is in the room is where it is; what is outside is met where it is looked at through the box's shell."""
+    monkeypatch.setattr("nerg_mi.train.geometry.hit_extent", lambda *_: extent)
+    place = place_of_hits(rays_hit_extent, tmp_path / "office.vol")
+    assert place.about["geometry_file"]["beyond"] == pytest.approx(extent.beyond, abs=1e-4)
+    seen = office(4000, seed=1)  # other rays than the place was made of
+    depth, opacity = trace_depth(place.medium, seen.origin, seen.direction)
+    out = looks_out(seen.origin, seen.direction)
+    true = np.linalg.norm(seen.hit - seen.origin, axis=1)
+    off = np.abs(depth - true)[~out]
+    assert (opacity[~out] > 0.99).mean() > 0.995
+    assert np.median(off) < 1.5 * VOXEL and np.quantile(off, 0.99) < 4 * VOXEL
+    # The shell stands in the plane of the window, which is where the box was cut.
+    window = ((ROOM[1, 0] - seen.origin[:, 0]) / seen.direction[:, 0])[out]
+    assert out.sum() > 100 and (opacity[out] > 0.99).mean() > 0.97
+    assert np.quantile(np.abs(depth[out] - window), 0.95) < 4 * VOXEL
+
+
+def test_a_place_that_is_not_too_large_is_left_as_it_was(rays_hit_extent):
+    room = rays_hit_extent.select(~looks_out(rays_hit_extent.origin, rays_hit_extent.direction))
+    extent = hit_extent(room)
+    assert not extent.cut and extent.beyond == 0 and extent.voxel == VOXEL
+    low = np.minimum(np.quantile(room.hit, 0.005, axis=0), room.origin.min(axis=0)) - PAD * VOXEL
+    np.testing.assert_array_equal(extent.lower, low)
+    assert not extent.beyond_shell(np.full((1, 3), 1e6)).any()
+
+
+def test_what_stands_on_the_shell_is_more_than_half_a_voxel_beyond_it():
+    extent = HitExtent(np.array([1.0, 2.0, 3.0]), (PAD * 2 + 4,) * 3, 0.5, cut=True)
+    low, high = extent.shell
+    np.testing.assert_allclose([low, high], [[4, 5, 6], [6, 7, 8]])
+    for axis in np.eye(3):
+        hits = [end + side * by * 0.5 * axis for end, side in ((low, -1), (high, 1)) for by in (0.45, 0.55)]
+        assert extent.beyond_shell(np.array(hits)).tolist() == [False, True, False, True]
+
+
+def test_a_place_is_a_file_of_64_mib_at_most():
+    """A cube of 24 m, all of which people looked at, is nearly twice as many voxels."""
+    corners = np.array(list(np.ndindex(2, 2, 2))) * 24.0
+    extent = hit_extent(replace(office(8), origin=corners, hit=corners))
+    assert 4 * np.prod(extent.shape) <= 64 * 2**20 and (extent.cut or extent.voxel > VOXEL)
+
+
+def test_voxels_grow_where_people_were_everywhere():
+    """A hall that people fill has no far part to give up."""
+    rng = np.random.default_rng(0)
+    room = office(2000)
+    hall = replace(room, origin=room.origin * 20, hit=room.origin * 20 + rng.normal(0, 2, (2000, 3)))
+    extent = hit_extent(hall, most=1 << 18)
+    assert extent.voxel > VOXEL and np.prod(extent.shape) <= 1 << 18
+    low, high = extent.shell
+    assert ((hall.hit >= low) & (hall.hit <= high)).all(axis=1).mean() >= 0.74
+
+
+def test_one_lost_head_does_not_make_the_box(rays_hit_extent):
+    origin = rays_hit_extent.origin.copy()
+    origin[7] = [900.0, -900.0, 50.0]
+    extent = hit_extent(replace(rays_hit_extent, origin=origin), most=MOST)
+    assert extent.voxel == VOXEL and np.abs(extent.shell[1] - ROOM[1]).max() < 2 * VOXEL
+
+
+def test_a_voxel_that_is_asked_for_is_kept(rays_hit_extent):
+    assert hit_extent(rays_hit_extent, 0.2, MOST).voxel == 0.2
+    fine = hit_extent(rays_hit_extent, 0.05, 1 << 21)
+    assert fine.voxel == 0.05 and fine.cut
+    with pytest.raises(NergError, match=r"enlarge the voxel \(--voxel\)"):
+        hit_extent(rays_hit_extent, 0.005, MOST)
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(NergError, match="--voxel"):
+            hit_extent(rays_hit_extent, bad)
+    with pytest.raises(NergError, match="--field"):
+        hit_extent(replace(rays_hit_extent, hit=None))
+
+
+def test_hits_seen_from_outside_of_the_box_are_left_out(rays_hit_extent, extent):
+    """Rays that start and end beyond the shell on one side never are in it."""
+    away = replace(
+        rays_hit_extent.select(np.arange(100)),
+        origin=np.full((100, 3), 60.0),
+        hit=np.full((100, 3), 70.0),
+        direction=np.full((100, 3), 3**-0.5),
+    )
+    density, _ = voxelise_hits(away, extent=extent)
+    assert not density.any()
+
+
+# ---- Places made of hit points: their surfaces are where rays ended ----
+
+
+@pytest.fixture
+def rays_hit_geometry():
+    return looking_at((1.5, 0.4, 1.2))
+
+
+def test_a_place_made_of_hits(rgb, rays_hit_geometry, tmp_path):
+    density, box = voxelise_hits(rays_hit_geometry, 0.1)
+    assert density.dtype == np.float32 and (density > 0).any()
+    write_volume(tmp_path / "place.vol", density, box.lower, box.upper)
+    medium = VolumeMedium(rgb.load_dict(volume_dict(tmp_path / "place.vol")))
+    np.testing.assert_allclose(medium.bounds(), [box.lower, box.upper], atol=1e-5)
+    central = np.abs(rays_hit_geometry.hit - np.median(rays_hit_geometry.hit, axis=0)).max(axis=1) < 0.1
+    depth, opacity = trace_depth(medium, rays_hit_geometry.origin[central], rays_hit_geometry.direction[central])
+    truth = np.linalg.norm(rays_hit_geometry.hit - rays_hit_geometry.origin, axis=1)[central]
+    assert central.sum() > 5 and (opacity > 0.99).all() and np.abs(depth - truth).max() < 0.15
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("gap, closed", [(8, True), (9, False)])
+def test_gaps_of_up_to_eight_voxels_are_closed(axis, gap, closed):
+    along, across = np.eye(3)[[axis, axis - 1]]
+    hit = np.array([20.5 + 0 * along, 20.5 + (gap + 1) * along])
+    rays = Rays(np.zeros(2), np.zeros(2), ("a",), hit - 15 * across, np.tile(across, (2, 1)), np.ones(2), hit)
+    density, _ = voxelise_hits(rays, extent=HitExtent(np.zeros(3), (50, 50, 50), 1.0))
+    z, y, x = (20 + np.outer(np.arange(gap + 2), along)).astype(int).T[::-1]
+    solid = density[z, y, x] > 0
+    assert solid[[0, -1]].all() and (solid[1:-1] == closed).all()
+
+
+def test_a_place_needs_hits(rays_hit_geometry):
+    with pytest.raises(NergError, match="--field"):
+        voxelise_hits(replace(rays_hit_geometry, hit=None))
+    with pytest.raises(NergError, match="enlarge the voxel"):
+        voxelise_hits(rays_hit_geometry, 1e-3)
+
+
+# ---- Greys of hit points: by the axis that a surface faces, in the box of the voxels ----
+
+
+@pytest.mark.parametrize("axis, grey", [(0, 0.34), (1, 0.16), (2, 0.55)])
+def test_a_sheet_has_the_grey_of_its_axis(axis, grey):
+    density = np.zeros((24, 24, 24), np.float32)
+    sheet = [slice(None)] * 3
+    sheet[2 - axis] = slice(11, 13)
+    density[tuple(sheet)] = 9
+    color, upper = shade_hits(density, np.zeros(3), np.full(3, 2.4))
+    assert color.shape == (12, 12, 12, 3) and color.dtype == np.float32
+    np.testing.assert_allclose(upper, 2.4)
+    middle = color[6, 6, 6]
+    np.testing.assert_allclose(middle, grey, atol=0.01)
+
+
+def test_odd_numbers_of_voxels_and_nothing():
+    color, upper = shade_hits(np.zeros((5, 4, 3), np.float32), np.array([1.0, 2, 3]), np.array([4.0, 6, 8]))
+    assert color.shape == (3, 2, 2, 3) and np.isfinite(color).all()
+    # A voxel is 1 wide.
+    np.testing.assert_allclose(upper, [5, 6, 9])
+
+
+# ---- Places: frames and boxes, and damaged files of hit points (Mitsuba believes their headers) ----
+
+
+@pytest.fixture
+def volume(tmp_path):
+    path = tmp_path / "place.vol"
+    write_volume(path, np.eye(3, dtype=np.float32)[None] + np.zeros((4, 1, 1)), (0, 0, 0), (1, 2, 3))
+    return path
+
+
+def test_a_whole_one(rgb, volume):
+    # Mitsuba returns the box by a transform in single precision.
+    assert np.allclose(place_of_volume(volume).box.upper, (1, 2, 3), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "at, value",
+    [
+        (0, b"XOL"),
+        (3, b"\x02"),
+        (4, struct.pack("<i", 2)),
+        (8, struct.pack("<i", -3)),
+        (8, struct.pack("<i", 0)),
+        (12, struct.pack("<i", 2**31 - 1)),
+        (20, struct.pack("<i", -1)),
+        (20, struct.pack("<i", 10**9)),
+        (24, struct.pack("<f", np.nan)),
+        (36, struct.pack("<f", -1)),
+    ],
+)
+def test_a_header_that_lies(rgb, volume, at, value):
+    data = volume.read_bytes()
+    volume.write_bytes(data[:at] + value + data[at + len(value) :])
+    with pytest.raises(NergError, match="place.vol"):
+        place_of_volume(volume)
+
+
+@pytest.mark.parametrize("size", [0, 10, 30, 48, 100])
+def test_one_that_is_cut_off(rgb, volume, size):
+    volume.write_bytes(volume.read_bytes()[:size])
+    with pytest.raises(NergError, match="place.vol"):
+        place_of_volume(volume)
+
+
+def test_frames_of_rays_and_place():
+    """Twice the size, a quarter turn about z, and moved."""
+    align = Similarity([[0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    place = GazePlace(None, Box((0, 0, 0), (1, 1, 1)), "none", align=align)
+    np.testing.assert_allclose(place.points_from_rays(np.array([[1.0, 0, 0], [0, 1, 1]])), [[1, 4, 3], [-1, 2, 5]])
+    d = np.array([[[0.6, 0.8, 0], [0, 0, 1.0]]])
+    turned = place.directions_from_rays(d)
+    np.testing.assert_allclose(turned, [[[-0.8, 0.6, 0], [0, 0, 1]]], atol=1e-12)
+    np.testing.assert_allclose(place.directions_to_rays(turned), d, atol=1e-12)
+
+
+def test_without_geometry_the_box_is_around_whoever_looked():
+    assert place_of_nothing(np.array([[0.0, 1, 2], [1, 0, 2]])).box == Box((-2, -2, 0), (3, 3, 4))
+
+
+def test_a_scenes_box_holds_its_field_and_its_shapes_and_a_hundredth_more(rgb, tmp_path):
+    (tmp_path / "both.xml").write_text("""<scene version="3.0.0">
+      <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="1"/>
+      </volume></integrator>
+      <shape type="cube"><transform name="to_world"><translate x="-2" y="-2" z="-3"/></transform></shape></scene>""")
+    box = place_of_scene(tmp_path / "both.xml").box
+    np.testing.assert_allclose([box.lower, box.upper], [[-3.05, -3.05, -4.05], [1.05, 1.05, 1.05]], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.obj"])
+def test_a_mesh_is_a_scene_of_its_own(rgb, tmp_path, name):
+    rgb.load_dict({"type": "cube"}).write_ply(str(tmp_path / "a.ply"))
+    corners, faces = "-1 -1 -1|1 -1 -1|1 1 -1|-1 1 1".split("|"), ("1 2 3", "1 3 4")
+    (tmp_path / "a.obj").write_text("".join(f"v {c}\n" for c in corners) + "".join(f"f {f}\n" for f in faces))
+    place = place_of_scene(tmp_path / name)
+    np.testing.assert_allclose([place.box.lower, place.box.upper], [[-1.02] * 3, [1.02] * 3], atol=1e-6)
+    assert place.kind == "scene" and place.about["scene_file"]["file"] == name
+    assert files_of_scene(tmp_path / name) == [tmp_path / name]
+
+
+def test_splats_are_no_scene(rgb, tmp_path):
+    write_ply_splats(tmp_path / "a.ply", random_splats(10))
+    with pytest.raises(NergError, match="--field"):
+        place_of_scene(tmp_path / "a.ply")
+
+
+def test_a_scene_without_anything_is_no_place(rgb, tmp_path):
+    (tmp_path / "empty.xml").write_text('<scene version="3.0.0"/>')
+    with pytest.raises(NergError, match="neither shapes nor a field"):
+        place_of_scene(tmp_path / "empty.xml")
+
+
+def test_splats_are_a_place_without_their_strays(tmp_path):
+    splats = random_splats(1000, degree=0, size=0.02)
+    far = Splats([[90, 0, 0]], [[1, 1, 1]], [[1, 0, 0, 0]], [0.5], np.zeros((1, 1, 3)))
+    write_ply_splats(tmp_path / "a.ply", joined([splats, far]))
+    place = place_of_field(tmp_path / "a.ply", ns)
+    assert place.kind == "field" and place.radiance is None and place.about["field_file"]["file"] == "a.ply"
+    assert np.allclose(place.box.upper, 1, atol=0.15) and np.allclose(place.box.lower, -1, atol=0.15)
+    origin, along = np.float32([[0, 0, -3]]), np.float32([[0, 0, 1]])
+    # Trained in as it is rendered.
+    assert 1.9 < trace_depth(place.medium, origin, along)[0][0] < 4.1

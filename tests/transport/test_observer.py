@@ -1,0 +1,401 @@
+"""Tests of `nerg_mi.transport.observer`."""
+
+from dataclasses import fields, replace
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.fields.gaze_base import RaySupport
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.transport import observer
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.jit import Fingerprint
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.observer import (
+    Known,
+    ObserverCache,
+    ObserverSettings,
+    SupportView,
+    fingerprint_of,
+    view_along,
+    visibility,
+)
+from nerg_mi.transport.volume_medium import VolumeMedium
+
+# ---- What is kept of observers: for the same position, as long as what it was made of is the same ----
+
+
+@pytest.fixture
+def made():
+    """A list, and a maker that appends to it the position that it was called for."""
+    calls = []
+
+    def make(center):
+        calls.append(np.array(center).ravel().tolist())
+        return len(calls)
+
+    return calls, make
+
+
+def values(known):
+    return [k.value for k in known]
+
+
+def test_the_same_position_is_served_again(rgb, made):
+    cache, (calls, make) = ObserverCache(), made
+    eyes = [rgb.Point3f(1, 2, 3), rgb.Point3f(4, 5, 6)]
+    first = cache.of_each("thing", eyes, 0, make)
+    assert values(first) == [1, 2] and calls == [[1, 2, 3], [4, 5, 6]]
+    assert np.allclose(np.array(first[1].center).ravel(), [4, 5, 6])
+    # In another order, and one of them alone: the other one is not kept then.
+    assert values(cache.of_each("thing", eyes[::-1], 0, make)) == [2, 1]
+    assert values(cache.of_each("thing", eyes[:1], 0, make)) == [1]
+    assert values(cache.of_each("thing", eyes, 0, make)) == [1, 3]
+    # To the bit.
+    next_to = rgb.Point3f(1, 2, float(np.nextafter(np.float32(3), np.float32(4))))
+    assert values(cache.of_each("thing", [next_to], 0, make)) == [4]
+
+
+def test_numbers_of_others_are_kept(rgb, made):
+    (calls, make), whole = made, ObserverCache()
+    own = lambda known: make(known.center)
+    at = lambda x: [Known(rgb.Point3f(x, 0, 0), None)]
+    assert [values(whole.of_numbers("n", at(x), 0, own)) for x in (1, 2, 1)] == [[1], [2], [1]]
+    # Of a cache that lives shortly they are those of the whole; what is more than a number is its own.
+    part = ObserverCache(numbers=whole)
+    assert values(part.of_numbers("n", at(2), 0, own)) == [2]
+    assert values(part.of_known("n", at(2), 0, own)) == [3] and values(whole.of_known("m", at(2), 0, own)) == [4]
+    # Others of what has changed are dropped, and of very many those who were asked for first.
+    assert values(whole.of_numbers("n", at(1), 1, own)) == [5] and len(whole.peek("n")) == 1
+    for x in range(2, 300):
+        whole.of_numbers("n", at(x), 1, own)
+    assert len(whole.peek("n")) == 257
+    count = len(calls)
+    whole.of_numbers("n", at(298), 1, own)
+    assert len(calls) == count
+    whole.of_numbers("n", at(1), 1, own)
+    assert len(calls) == count + 1
+
+
+def test_two_who_stand_at_one_place_share(rgb, made):
+    cache, (_, make) = ObserverCache(), made
+    assert values(cache.of_each("thing", [rgb.Point3f(1, 2, 3)] * 2, 0, make)) == [1, 1]
+
+
+def test_each_thing_has_its_own(rgb, made):
+    cache, (_, make) = ObserverCache(), made
+    eye = [rgb.Point3f(1, 2, 3)]
+    assert [values(cache.of_each(t, eye, 0, make)) for t in ("a", "b", "a")] == [[1], [2], [1]]
+    assert values(cache.peek("a")) == [1] and cache.peek("c") == []
+    cache.forget()
+    assert values(cache.of_each("a", eye, 0, make)) == [3] and cache.peek("b") == []
+
+
+def test_other_arrays_make_it_anew(rgb, made):
+    cache, (_, make) = ObserverCache(), made
+    eye, weights = [rgb.Point3f(1, 2, 3)], rgb.Float([1, 2, 3])
+    ask = lambda: values(cache.of_each("thing", eye, Fingerprint([weights]), make))
+    assert ask() == ask() == [1]
+    weights += 0
+    # Equal in value, and another array: it may be another one in every lane.
+    weights = rgb.Float(weights.numpy())
+    assert ask() == [2]
+    dr.scatter(weights, rgb.Float(7), rgb.UInt32(1))
+    assert ask() == [3]
+
+
+def test_positions_carry_no_derivatives(rgb, made):
+    cache, (_, make) = ObserverCache(), made
+    p = rgb.Point3f(1, 2, 3)
+    dr.enable_grad(p)
+    (known,) = cache.of_each("thing", [p], 0, make)
+    assert not dr.grad_enabled(known.center)
+
+
+def test_nothing_is_kept_of_a_recording(rgb):
+    """What is made in a frozen function is the recording's, and is looked up in none."""
+    cache = ObserverCache()
+
+    @dr.freeze
+    def double(p):
+        (known,) = cache.of_each("thing", [p], 0, lambda center: center.x * 2)
+        return known.value + 0
+
+    for x in (1.0, 2.0, 3.0):
+        assert double(rgb.Point3f(rgb.Float([x]), 0, 0)).numpy()[0] == 2 * x
+    assert cache.peek("thing") == []
+
+
+def test_a_place_is_told_by_its_shapes_and_its_medium(rgb):
+    scene = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
+    of = fingerprint_of
+    first = of(Place(None, scene))
+    assert first == of(Place(None, scene)) != of(Place(None))
+    params = rgb.traverse(scene)
+    params[next(k for k in params.keys() if k.endswith("to_world"))] = rgb.Transform4f().translate([0, 0, 0.5])
+    params.update()
+    assert of(Place(None, scene)) != first
+    volume = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.ones((2, 2, 2), np.float32))})
+    medium = VolumeMedium(volume)
+    before = of(Place(medium))
+    assert before == of(Place(medium))
+    params = rgb.traverse(volume)
+    params["data"] = params["data"] * 2
+    params.update()
+    assert of(Place(medium)) != before
+
+
+# ---- Settings of what is traced from an observer: which of them decide where a ray meets its surface ----
+
+
+SETTINGS = ObserverSettings(march=MarchSettings(0.1))
+
+
+OTHERS = {
+    "march": MarchSettings(0.2),
+    "depth": "expected",
+    "surface_opacity": 0.7,
+    "visibility": "map",
+    "tolerance": 0.1,
+    "map_height": 8,
+    "directions": 64,
+    "integral_tolerance": 0.1,
+}
+
+
+OF_A_POINT = ("visibility", "tolerance", "map_height", "directions", "integral_tolerance")
+
+
+def test_each_setting_is_tried():
+    assert {f.name for f in fields(ObserverSettings)} == set(OTHERS)
+
+
+@pytest.mark.parametrize("name", list(OTHERS))
+def test_surfaces_are_decided_by_the_ray_and_not_by_what_is_compared(name):
+    """What an observer sees all around is kept for other visibilities, and made anew for other surfaces."""
+    other = replace(SETTINGS, **{name: OTHERS[name]})
+    assert (other.surfaces == SETTINGS.surfaces) == (name in OF_A_POINT)
+
+
+# ---- Where eyes are: the sensor's centre, whatever the near plane, and for every member of a batch ----
+
+
+def camera(mi, origin, target=(0, 0, 0), kind="perspective", **kwargs):
+    d = {
+        "type": kind,
+        "to_world": mi.ScalarTransform4f().look_at(origin, target, [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 4, "height": 4},
+        **kwargs,
+    }
+    return d
+
+
+def rays_of(mi, sensor, n=16):
+    rng = np.random.default_rng(0)
+    xy = mi.Point2f(rng.random((2, n)).astype(np.float32))
+    return sensor.sample_ray(mi.Float(0), mi.Float(0.5), xy, mi.Point2f(0.5), True)[0]
+
+
+@pytest.mark.parametrize("kind", ["perspective", "thinlens", "panorama"])
+def test01_center_is_not_the_near_plane(rgb, kind):
+    extra = {"aperture_radius": 0.1, "focus_distance": 3.0} if kind == "thinlens" else {}
+    extra |= {} if kind == "panorama" else {"near_clip": 1.0}
+    sensor = rgb.load_dict(camera(rgb, [1, 2, 3], kind=kind, **extra))
+    assert np.allclose(np.array(observer.center(sensor)).ravel(), [1, 2, 3], atol=1e-6)
+    observer.require_center(sensor, "x")
+    got = np.array(observer.center_of_ray([sensor], rays_of(rgb, sensor)))
+    assert np.allclose(got.reshape(3, -1).T, [1, 2, 3], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["orthographic", "distant", "irradiancemeter"])
+def test02_sensors_without_a_center(rgb, kind):
+    if kind == "irradiancemeter":
+        shape = rgb.load_dict({"type": "rectangle", "s": {"type": "irradiancemeter", "film": {"type": "hdrfilm"}}})
+        sensor = shape.sensor()
+    else:
+        sensor = rgb.load_dict(
+            {"type": kind, "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}}
+        )
+    with pytest.raises(ValueError, match='"observer"'):
+        observer.require_center(sensor, "the camera")
+    with pytest.raises(ValueError, match="no centre"):
+        observer.center_of_ray([sensor], rays_of(rgb, rgb.load_dict(camera(rgb, [0, 0, 1]))))
+
+
+def batch(mi, *cameras):
+    d = {"type": "batch", "film": {"type": "hdrfilm", "width": 4 * len(cameras), "height": 4}}
+    return mi.load_dict(d | {f"c{i}": c for i, c in enumerate(cameras)})
+
+
+@pytest.mark.parametrize("near", [0.01, 1.0, 8.0])
+def test03_rays_of_a_batch_find_their_camera(rgb, near):
+    origins = [[0, 0, 3], [0.5, 0, 3], [-3, 1, 0], [0, 0, -3]]
+    sensor = batch(rgb, *(camera(rgb, o, near_clip=near) for o in origins))
+    ray = rays_of(rgb, sensor, 200)
+    got = np.array(observer.center_of_ray([sensor], ray)).T
+    # The ray's own camera: its line passes through exactly one of the centres.
+    o, d = np.array(ray.o).T, np.array(ray.d).T
+    v = o[:, None] - np.array(origins)
+    along = (v * d[:, None]).sum(-1, keepdims=True)
+    own = np.linalg.norm(v - along * d[:, None], axis=-1).argmin(-1)
+    assert len(set(own)) == 4 and np.allclose(got, np.array(origins)[own], atol=1e-5)
+
+
+def test04_same_center(rgb):
+    a, b = rgb.load_dict(camera(rgb, [1, 2, 3], near_clip=1.0)), rgb.load_dict(camera(rgb, [1, 2, 3.001]))
+    turned = rgb.load_dict(camera(rgb, [1, 2, 3], target=(5, 0, 1), fov=70))
+    assert observer.same_center([a], observer.center(turned)) and not observer.same_center([a], observer.center(b))
+    assert not observer.same_center([a, b], observer.center(a)) and not observer.same_center([], observer.center(a))
+    ortho = rgb.load_dict({"type": "orthographic"})
+    assert not observer.same_center([ortho], observer.center(ortho))
+    assert observer.same_center([batch(rgb, camera(rgb, [1, 2, 3]), camera(rgb, [1, 2, 3]))], observer.center(a))
+
+
+def test05_no_sensor(rgb):
+    ray = rays_of(rgb, rgb.load_dict(camera(rgb, [0, 0, 1])))
+    with pytest.raises(ValueError, match='"observer"'):
+        observer.center_of_ray([], ray)
+
+
+def test06_center_is_attached_to_the_placement(rgb):
+    sensor = rgb.load_dict(camera(rgb, [1, 2, 3]))
+    params = rgb.traverse(sensor)
+    x = rgb.Float(0)
+    dr.enable_grad(x)
+    params["to_world"] = rgb.Transform4f().translate([x, 2 * x, 0]) @ rgb.Transform4f(params["to_world"])
+    params.update()
+    c = observer.center(sensor)
+    dr.backward(c.x + c.y)
+    assert np.isclose(dr.grad(x).numpy()[0], 3)
+
+
+@pytest.mark.parametrize("near", [0.5, 1.5])
+def test_cameras_on_one_line_are_told_apart_by_where_their_rays_start(rgb, near):
+    """Both look along the line that both stand on: a ray on it starts on the near plane of its own."""
+    sensor = batch(rgb, camera(rgb, [0, 0, 3], near_clip=near), camera(rgb, [0, 0, 1], [0, 0, -1], near_clip=near))
+    for z in (3, 1):
+        ray = rgb.Ray3f(rgb.Point3f(0, 0, z - near), rgb.Vector3f(0, 0, -1))
+        assert np.allclose(np.array(observer.center_of_ray([sensor], ray)).ravel(), [0, 0, z], atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_each_lane_has_what_belongs_to_the_nearest(rgb, count):
+    rng = np.random.default_rng(count)
+    centers, p = rng.normal(size=(count, 3)), rng.normal(size=(60, 3))
+    known = [Known(rgb.Point3f(*map(float, c)), rgb.Float(k)) for k, c in enumerate(centers)]
+    lanes = rgb.Point3f(np.ascontiguousarray(p.T, np.float32))
+    found = observer.select_nearest(known, lanes, lambda value: value).numpy()
+    assert np.array_equal(np.broadcast_to(found, 60), np.linalg.norm(p[:, None] - centers, axis=2).argmin(axis=1))
+
+
+# ---- What else is known of observers: made once for each, and shown to every lane that belongs to them ----
+
+
+class Counting:
+    """A view that counts for whom it was made: the x of the observer, plus that of the direction."""
+
+    occluded = True
+
+    def __init__(self):
+        self.made = 0
+
+    def at(self, p_o):
+        self.made += 1
+        return Of(p_o.x)
+
+
+class Of:
+    def __init__(self, x):
+        self.x = x
+
+    def value(self, r_o):
+        return self.x + r_o.x
+
+
+def test_a_view_is_made_once_an_observer(rgb):
+    view, cache = Counting(), ObserverCache()
+    eyes = [rgb.Point3f(1, 0, 0), rgb.Point3f(5, 0, 0)]
+    p_o, r_o = rgb.Point3f([1, 5, 5], 0, 0), rgb.Vector3f([0.1, 0.2, 0.3], 0, 0)
+    for _ in range(2):
+        assert np.allclose(view_along(view, eyes, p_o, r_o, cache).numpy(), [1.1, 5.2, 5.3])
+        assert view.made == 2
+
+
+def test_a_frozen_function_is_refused(rgb):
+    cache = ObserverCache()
+
+    @dr.freeze
+    def frozen(p):
+        return view_along(Counting(), [p], p, rgb.Vector3f(0, 0, 1), cache)
+
+    with pytest.raises(RuntimeError) as refused:
+        frozen(rgb.Point3f(rgb.Float([1]), 0, 0))
+    assert isinstance(refused.value.__cause__, NergError) and 'out of "aovs"' in str(refused.value.__cause__)
+
+
+def test_support_is_that_of_the_place_in_the_scene(rgb):
+    origins = np.random.default_rng(0).normal(size=(100, 3))
+    support = RaySupport.of(origins, 2.0)
+    m = np.array([[0, -2.0, 0, 5], [2, 0, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]])
+    p = np.array([0.2, -0.3, 0.4])
+    alone = support.at(rgb.Point3f(*map(float, p)))[0]
+    there = rgb.Point3f(*map(float, (m @ [*p, 1])[:3]))
+    found = SupportView(support, Similarity(m)).at(there).value(rgb.Vector3f(0, 0, 1))
+    assert found[0] == pytest.approx(alone, rel=1e-5) and alone > 1
+
+
+# ---- The shadow factor: its sign, its ramp, and fall-off zero ----
+
+
+def seen(d_expected, d_met, falloff, tolerance=0.0):
+    return visibility(ns.Float(d_expected), ns.Float(d_met), ns.Float(falloff), ns.Float(tolerance)).numpy().tolist()
+
+
+def test01_the_sign_is_corrected():
+    # The observer meets something at 2: a point at 5 is hidden, one at 2 or before is seen.
+    assert seen([5, 2, 1], 2, 1) == [0, 1, 1]
+
+
+def test02_the_ramp():
+    d = np.linspace(1.5, 3.5, 21)
+    expected = 1 - np.clip((d - 2 - 0.25) / 0.5, 0, 1)
+    assert np.allclose(seen(d, 2, 0.5, 0.25), expected, atol=1e-6)
+
+
+def test03_falloff_zero_is_a_step():
+    assert seen([2, 2.25, 2.2500005, 9], 2, 0, 0.25) == [1, 1, 0, 0]
+
+
+@pytest.mark.parametrize("falloff", [1e-38, 1e-6, 1e6, 3e38])
+def test04_extreme_falloffs(falloff):
+    values = seen([0, 1, 2, 1e6], 1, falloff)
+    assert np.all(np.isfinite(values)) and values[:2] == [1, 1] and min(values) >= 0
+    assert values[2] == (0 if falloff <= 1e-6 else pytest.approx(1 - 1 / falloff))
+
+
+def test05_nothing_met_is_visible():
+    assert seen([1, 1e30], np.inf, 0) == [1, 1] and seen([1, 1e30], np.inf, 0.5) == [1, 1]
+
+
+@pytest.mark.parametrize("falloff", [0.0, 0.5])
+def test06_gradients(falloff):
+    f = ns.Float(falloff)
+    d = ns.Float([1, 2, 2.25, 5])
+    dr.enable_grad(f, d)
+    y = visibility(d, ns.Float(2), f, ns.Float(0.1))
+    dr.backward(dr.sum(y), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    # d/dd_f of 1 - 0.15 / d_f = 0.15 / d_f²; only the point on the ramp counts
+    assert np.allclose(dr.grad(f).numpy(), 0 if falloff == 0 else 0.15 / 0.25, rtol=1e-5)
+    assert np.allclose(dr.grad(d).numpy(), [0, 0, 0 if falloff == 0 else -2, 0], rtol=1e-5)
+
+
+def test07_gradients_are_finite_on_the_very_edge():
+    d = ns.Float([2.25, 2.0, 3.0])
+    dr.enable_grad(d)
+    y = visibility(d, ns.Float(2), ns.Float(0), ns.Float(0.25))
+    assert y.numpy().tolist() == [1, 1, 0]
+    dr.backward(dr.sum(y), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    assert not dr.grad(d).numpy().any()

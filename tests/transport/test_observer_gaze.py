@@ -1,0 +1,348 @@
+"""Tests of `nerg_mi.transport.observer_gaze`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeField
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.formats.surfaces import write_volume
+from nerg_mi.maths.geometry import Box, Similarity
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.train.geometry import place_of_volume
+from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.observer import ObserverCache, ObserverSettings
+from nerg_mi.transport.observer_gaze import FEWEST, FIRST, USUAL, PlacedGaze, integrate, nearest_depth
+from nerg_mi.transport.occlusion import trace_sight
+from tests.fields.gaze.test_log_density import BOX, SMALL
+
+# ---- Gaze ----
+#
+# A placed gaze field, which only what it says of observers can be evaluated of; its integral over an observer's
+# sphere.
+
+
+SETTINGS = ObserverSettings(march=MarchSettings(0.1))
+
+
+def integral_at(mi, gaze, place, p, settings=SETTINGS, count=1 << 12, **more):
+    p_o = mi.Point3f(*map(float, p))
+    return float(gaze.at([p_o], place, replace(settings, directions=count), **more).integrals(p_o)[0][0])
+
+
+@pytest.fixture(scope="module")
+def speckled(tmp_path_factory):
+    """A room whose walls are known in places only, as hit points know them."""
+    mi.set_variant("llvm_ad_rgb")
+    rng = np.random.default_rng(3)
+    density = 1e4 * (rng.random((24, 32, 32)) < 0.003)
+    density[8:16, 12:20, 12:20] = 0
+    path = tmp_path_factory.mktemp("place") / "hits.vol"
+    write_volume(path, density, BOX.lower, BOX.upper)
+    return place_of_volume(path).medium
+
+
+@pytest.mark.parametrize("escaped", ["constant", "nearest"])
+def test_does_not_depend_on_the_number_of_directions(speckled, escaped):
+    config, ns = replace(SMALL, escaped=escaped), namespace("llvm_ad_rgb")
+    field = LogGazeField.random(config, BOX, ns, 1)
+    rng = np.random.default_rng(1)
+    # Steep, so that it matters where what escapes is taken to end.
+    field.set_parameters({"grid.table": ns.Float(10 * rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    place, settings = Place(speckled), ObserverSettings(march=default_settings(speckled))
+    integral = lambda count, p: integral_at(mi, PlacedGaze(field), place, p, settings, count)
+    for p in ((0, 0, 1.5), (0.3, -0.2, 1.6)):
+        assert integral(1 << 17, p) == pytest.approx(integral(1 << 19, p), rel=3e-4), p
+
+
+@pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
+def test_is_the_sum_over_what_is_seen_all_around(rgb, variant):
+    """In a room of shapes, whose walls are where a formula says."""
+    ns, rng = namespace("llvm_ad_rgb"), np.random.default_rng(1)
+    field = LogGazeField.random(
+        replace(SMALL, variant=variant, mix=0.0), BOX, ns, 1, rng.normal(size=(SMALL.prior, 2 * SMALL.prior))
+    )
+    field.set_parameters({"grid.table": ns.Float(3 * rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    room = rgb.load_dict(
+        {
+            "type": "scene",
+            "walls": {
+                "type": "cube",
+                "to_world": rgb.ScalarTransform4f().translate([0, 0, 1.5]).scale([1.9, 1.9, 1.4]),
+            },
+        }
+    )
+    o = np.array([0.4, -0.7, 1.7])
+    found = integral_at(rgb, PlacedGaze(field), Place(None, room), o, SETTINGS, 1 << 16)
+    d = fibonacci_directions(20_000)
+    walls = np.where(d > 0, [1.9, 1.9, 2.9], [-1.9, -1.9, 0.1])
+    # Parallel to a wall, a direction never meets it.
+    distance = np.divide(walls - o, d, out=np.full(d.shape, np.inf), where=d != 0).min(axis=1)
+    array = lambda v: ns.Array3f(np.ascontiguousarray(v.T, np.float32))
+    emit, capture = field.unnormalized(array(o + d * distance[:, None]), array(np.broadcast_to(o, d.shape)), array(d))
+    assert found == pytest.approx(4 * np.pi * np.mean(np.array(emit * capture, np.float64)), rel=3e-3)
+
+
+def room(mi):
+    return Place(None, mi.load_dict({"type": "scene", "walls": {"type": "cube"}}))
+
+
+def normalized():
+    field = LogGazeField.random(SMALL, BOX, namespace("llvm_ad_rgb"), 1)
+    rng = np.random.default_rng(1)
+    table = namespace("llvm_ad_rgb").Float(3 * rng.normal(size=len(field.grid.table)).astype(np.float32))
+    field.set_parameters({"grid.table": table})
+    return field
+
+
+def test_a_placed_field_has_no_densities(rgb):
+    """Neither the field's own are offered, nor those of observers whom nobody named."""
+    gaze = PlacedGaze(normalized())
+    assert not any(hasattr(gaze, name) for name in ("evaluate", "spread", "along"))
+    with pytest.raises(ValueError, match="needs to know the observers"):
+        gaze.at([], room(rgb), SETTINGS)
+
+
+def test_what_is_observed_stays_as_it_was(rgb):
+    """Other observers, who are asked for with the same cache, change nothing of it."""
+    gaze, place, cache = PlacedGaze(normalized()), room(rgb), ObserverCache()
+    eyes = [rgb.Point3f(0.1, 0.2, 0.3), rgb.Point3f(-0.4, 0.1, 0)]
+    point, d = rgb.Point3f(0.2, 0.9, 0.4), rgb.Vector3f(0, 1, 0)
+    first = gaze.at(eyes[:1], place, replace(SETTINGS, directions=1 << 10), cache)
+    before = first.evaluate(point, eyes[0], d, True)[0].numpy()
+    second = gaze.at(eyes[1:], place, replace(SETTINGS, directions=1 << 10), cache)
+    assert first.evaluate(point, eyes[0], d, True)[0].numpy() == before
+    assert first.integrals(eyes[0])[0].numpy() != second.integrals(eyes[1])[0].numpy()
+    # Of both together each lane has that of its own observer.
+    both = gaze.at(eyes, place, replace(SETTINGS, directions=1 << 10), cache)
+    lanes = rgb.Point3f([0.1, -0.4], [0.2, 0.1], [0.3, 0.0])
+    each = np.concatenate([o.integrals(eye)[0].numpy() for o, eye in zip((first, second), eyes)])
+    assert np.array_equal(both.integrals(lanes)[0].numpy(), each)
+
+
+def test_surroundings_are_traced_once_an_observer(rgb, monkeypatch):
+    """Whatever becomes of the weights; anew for another observer, another place or other settings."""
+    traced, trace = [], Place.trace
+    monkeypatch.setattr(Place, "trace", lambda *a, **k: (traced.append(a), trace(*a, **k))[1])
+    field = normalized()
+    gaze, place, cache = PlacedGaze(field), room(rgb), ObserverCache()
+    counts = []
+
+    def ask(p=(0.1, 0.2, 0.3), place=place, **more):
+        value = integral_at(rgb, gaze, place, p, replace(SETTINGS, **more), cache=cache)
+        counts.append(len(traced))
+        return value
+
+    first = ask()
+    assert ask() == first and counts == [1, 1]
+    field.set_parameters({"prior": field.prior + 1})
+    assert ask() == pytest.approx(np.e * first, rel=1e-4) and counts[-1] == 1
+    # What decides of a surface counts, what decides of a point's visibility does not.
+    ask(visibility="map", tolerance=0.1, map_height=8)
+    assert counts[-1] == 1
+    ask(surface_opacity=0.7)
+    ask()
+    ask((0.1, 0.2, 0.2))
+    ask((0.1, 0.2, 0.2), room(rgb))
+    assert counts[-4:] == [2, 3, 4, 5]
+
+
+def test_derivatives_pass_the_integral_and_are_not_kept(rgb):
+    field, eye = normalized(), rgb.Point3f(0.1, 0.2, 0.3)
+    gaze, place, cache = PlacedGaze(field), room(rgb), ObserverCache()
+    prior = field.prior
+    for _ in range(2):
+        shift = rgb.Float(0)
+        dr.enable_grad(shift)
+        field.set_parameters({"prior": prior + shift})
+        value = gaze.at([eye], place, replace(SETTINGS, directions=1 << 10), cache).integrals(eye)[0]
+        dr.forward_from(shift)
+        assert dr.grad(value)[0] == pytest.approx(float(value[0]), rel=1e-4)
+    assert cache.peek((gaze, "integral", field)) == []
+
+
+def test_gaze_turns_and_does_not_scale(rgb):
+    ns, grid = namespace("llvm_ad_rgb"), HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
+    g = GazeField.random(GazeConfig(grid, width=16), Box((0, 0, 0), (1, 1, 2)), ns)
+    table = np.random.default_rng(0).normal(size=len(g.grid.table)).astype(np.float32)
+    g.set_parameters({"grid.table": ns.Float(table)})
+    p_o, p_od = np.array([0.2, 0.3, 0.1]), np.array([0.7, 0.6, 1.5])
+    r = (p_od - p_o) / np.linalg.norm(p_od - p_o)
+
+    def evaluate(gaze, p_od, p_o, r):
+        p_od, p_o, r = (kind(v.tolist()) for kind, v in zip((rgb.Point3f, rgb.Point3f, rgb.Vector3f), (p_od, p_o, r)))
+        return [v.numpy()[0] for v in gaze.at([p_o], Place(None), SETTINGS).evaluate(p_od, p_o, r, True)]
+
+    plain = evaluate(PlacedGaze(g), p_od, p_o, r)
+    m = np.array([[0, -50.0, 0, 3], [50, 0, 0, -7], [0, 0, 50, 11], [0, 0, 0, 1]])
+    moved = evaluate(PlacedGaze(g, Similarity(m)), (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r / 50)
+    assert np.allclose(plain, moved, rtol=1e-4)
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_derivatives_of_the_observer_pass_the_integral(rgb, trained):
+    """Against central differences of sums over walls where a formula says, in many directions."""
+    field = normalized()
+    # Steep, so that it matters where walls are.
+    field.set_parameters({k: 16 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")})
+    gaze, place, o = PlacedGaze(field), room(rgb), np.array([0.3, -0.2, 0.4])
+    array = lambda v: namespace("llvm_ad_rgb").Array3f(np.ascontiguousarray(v.T, np.float32))
+    d = fibonacci_directions(200_000)
+
+    def integral(at):
+        walls = np.where(d > 0, 1.0, -1.0)
+        distance = np.divide(walls - at, d, out=np.full(d.shape, np.inf), where=d != 0).min(axis=1)
+        points = (at + d * distance[:, None], np.broadcast_to(at, d.shape), d)
+        emit, capture = field.unnormalized(*map(array, points))
+        return 4 * np.pi * np.mean(np.array(emit * capture, np.float64))
+
+    h = 0.02
+    true = [(integral(o + h * e) - integral(o - h * e)) / (2 * h) for e in np.eye(3)]
+    p_o = rgb.Point3f(o)
+    dr.enable_grad(p_o)
+    if trained:
+        dr.enable_grad(field.grid.table)
+    found = gaze.at([p_o], place, replace(SETTINGS, directions=1 << 15)).integrals(p_o)[0]
+    assert float(dr.detach(found)[0]) == pytest.approx(integral(o), rel=2e-3)
+    dr.backward(found)
+    assert np.linalg.norm(true) > 0.1 * integral(o)
+    assert np.linalg.norm(np.array(dr.grad(p_o)).ravel() - true) < 0.03 * np.linalg.norm(true)
+    assert not trained or np.abs(np.array(dr.grad(field.grid.table))).max() > 0
+
+
+def test_a_cache_tells_tolerances_of_the_integral_apart(rgb):
+    """Of integrals, and of the densities that a map of them holds."""
+    field, eye = normalized(), rgb.Point3f(0.1, 0.2, 0.3)
+    # Steep, so that sums over few directions are off.
+    field.set_parameters({k: 16 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")})
+    gaze, place, cache = PlacedGaze(field), room(rgb), ObserverCache()
+    point, ray = rgb.Point3f(0.2, 1, 0.4), rgb.Ray3f(rgb.Point3f(0.2, 0, 0.4), rgb.Vector3f(0, 1, 0))
+
+    def ask(cache, **settings):
+        chosen = replace(SETTINGS, directions=1 << 15, visibility="map", map_height=16, **settings)
+        observed = gaze.at([eye], place, chosen, cache)
+        sight = trace_sight(
+            place, ray, point, eye, rgb.Float(0), rgb.Bool(True), 0.0, chosen, gaze=observed, cache=cache
+        )
+        return float(observed.integrals(eye)[0][0]), float(sight.gaze[0])
+
+    rough, exact = {"integral_tolerance": 0.9}, {"integral_tolerance": 0.0}
+    alone = [ask(ObserverCache(), **s) for s in (rough, exact)]
+    assert alone[0][0] != alone[1][0] and alone[0][1] != alone[1][1] and min(alone[0][1], alone[1][1]) > 0
+    for s, expected in zip((rough, exact, rough, exact), 2 * alone):
+        assert ask(cache, **s) == expected
+
+
+# ---- Integral ----
+#
+# Integrals over the sphere against closed forms: in as few directions as do, and never worse than is said.
+
+
+MOST = 1 << 17
+
+
+def cap(direction, cos: float, background: float):
+    """Values of 1 within a cone, and of ``background`` elsewhere, at all directions; what they integrate to."""
+    exact = 2 * np.pi * (1 - cos) + background * 2 * np.pi * (1 + cos)
+    return lambda count: np.where(fibonacci_directions(count) @ direction > cos, 1.0, background), exact
+
+
+def lobe(direction, kappa: float):
+    """A von Mises-Fisher density, whose integral is 1."""
+    scale = kappa / (2 * np.pi * -np.expm1(-2 * kappa))
+    return lambda count: scale * np.exp(kappa * (fibonacci_directions(count) @ direction - 1)), 1.0
+
+
+@pytest.fixture
+def turned():
+    rng = np.random.default_rng(0)
+    return [v / np.linalg.norm(v) for v in rng.normal(size=(20, 3))]
+
+
+@pytest.mark.parametrize("tolerance", [1e-2, 2e-3])
+def test_jumps_are_integrated_to_the_tolerance(turned, tolerance):
+    off, share, counts = [], [], []
+    for k, direction in enumerate(turned):
+        values, exact = cap(direction, np.cos(0.2 + 0.1 * k), 0.1)
+        found = integrate(values, MOST, tolerance)
+        off.append(abs(found.value / exact - 1))
+        share.append(off[-1] / found.error)
+        counts.append(found.directions)
+        assert found.error <= tolerance or found.directions == MOST
+    # One sum is no proof: the error of four in five is below what is told, and that of all below twice the tolerance.
+    assert max(off) <= 2 * tolerance and np.mean(off) < tolerance / 2 and np.mean(np.array(share) < 1) >= 0.75
+    assert np.median(counts) < MOST / 4
+    if tolerance == 1e-2:
+        assert max(counts) <= FIRST
+
+
+def test_narrow_lobes_take_more_directions(turned):
+    counts = []
+    for kappa in (1, 100, 1e4):
+        values, exact = lobe(turned[0], kappa)
+        found = integrate(values, 1 << 18, 5e-3)
+        assert found.value == pytest.approx(exact, rel=1e-3)
+        counts.append(found.directions)
+    assert FIRST == counts[0] < counts[1] < counts[2]
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "first"),
+    [(1e-4, FIRST), (USUAL, FIRST), (1.9 * USUAL, FIRST // 2), (4 * USUAL, FIRST // 4), (1.0, FEWEST)],
+)
+def test_a_wider_tolerance_begins_with_fewer(tolerance, first):
+    asked = []
+
+    def even(count):
+        asked.append(count)
+        return np.ones(count)
+
+    assert integrate(even, MOST, tolerance).value == pytest.approx(4 * np.pi) and asked == [first]
+    assert integrate(even, 1000, tolerance).directions == 1000
+
+
+def test_a_tolerance_of_zero_takes_all(turned):
+    values, exact = lobe(turned[0], 10)
+    asked = []
+    found = integrate(lambda count: (asked.append(count), values(count))[1], 1 << 15, 0.0)
+    assert asked == [1 << 15] == [found.directions]
+    assert found.value == pytest.approx(exact, rel=1e-6)
+
+
+@pytest.mark.parametrize("most", [1, 5, 64, FIRST])
+def test_no_more_than_are_allowed(most):
+    found = integrate(lambda count: np.arange(count) % 2 + 1.0, most, 1e-9)
+    assert found.directions == most and found.value == pytest.approx(4 * np.pi * np.mean(np.arange(most) % 2 + 1))
+
+
+def test_nothing_at_all_is_zero():
+    found = integrate(np.zeros, MOST, 1e-3)
+    assert found.value == 0 and found.error == 0 and found.directions == FIRST
+
+
+# ---- What an observer meets all around, and what is made of the directions in which that is nothing ----
+
+
+@pytest.mark.parametrize("count", [1, 5, 8, 40])
+def test_depths_of_what_escapes_are_those_of_its_neighbours(count):
+    """By hand: the weighted mean of the logarithm over the eight nearest, or all where there are fewer."""
+    rng = np.random.default_rng(count)
+    unit = lambda n: (lambda v: v / np.linalg.norm(v, axis=1, keepdims=True))(rng.normal(size=(n, 3)))
+    known, wanted, depth = unit(count), unit(30), rng.uniform(0.2, 9.0, count)
+    expected = []
+    for w in wanted:
+        apart = np.linalg.norm(known - w, axis=1)
+        near = np.argsort(apart)[:8]
+        weight = 1 / (apart[near] ** 2 + 1e-3)
+        expected.append(np.exp(np.sum(weight * np.log(depth[near])) / weight.sum()))
+    np.testing.assert_allclose(nearest_depth(known, depth, wanted), expected, rtol=1e-5)
+    # A depth of zero has a logarithm too.
+    assert nearest_depth(known, np.zeros(count), wanted) == pytest.approx(1e-6)

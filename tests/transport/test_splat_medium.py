@@ -1,0 +1,166 @@
+"""Tests of `nerg_mi.transport.splat_medium`."""
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.sphere import harmonics
+from nerg_mi.transport.medium import LastHit
+from nerg_mi.transport.splat_medium import AT_ONCE, SplatArrays, build_tree
+from tests.formats.splats.writers import random_splats
+from tests.reference.splats import peaks
+from tests.transport.media.splats.scenes import medium_of, rays, stack
+
+# ---- Arrays ----
+
+
+def test_peaks_and_colors_are_those_of_float64():
+    splats = random_splats(30, degree=3)
+    arrays = SplatArrays(splats, ns)
+    o, d = rays(200)
+    place = np.random.default_rng(0).integers(0, 30, 200)
+    index = np.array(arrays.order)[place]
+    t, absorbed, distance = arrays.peak(ns.UInt32(place), ns.Array3f(o.T), ns.Array3f(d.T), True)
+    wanted = [v[np.arange(200), index] for v in peaks(splats, o, d, extent=np.inf)]
+    assert np.allclose(t, wanted[0], atol=1e-5) and np.allclose(absorbed, wanted[1], atol=1e-5)
+    assert np.allclose(np.minimum(splats.opacities[index] * np.exp(-0.5 * np.array(distance)), 0.9999), wanted[1])
+    color = np.stack([np.array(c) for c in arrays.color(ns.UInt32(place), ns.Array3f(d.T), True)], axis=1)
+    seen = np.einsum("rk,rkc->rc", harmonics(d, 3), splats.harmonics[index].astype(float)) + 0.5
+    assert np.allclose(color, np.maximum(seen, 0), atol=1e-5)
+
+
+def test_what_is_set_is_packed_again():
+    arrays = SplatArrays(random_splats(5, degree=0), ns)
+    before, colors = arrays.lower.copy(), arrays.colors
+    arrays.centers = arrays.centers + 1
+    arrays.pack()
+    assert np.allclose(arrays.lower, before + 1, atol=1e-6) and next(iter(arrays.parameters())) == "centers"
+    assert dr.width(colors) == 4 * 5 and dr.width(arrays.shapes) == 16 * 5
+    # Of any length: a rotation is a direction.
+    turned = np.array(arrays.shapes)
+    arrays.rotations = arrays.rotations * 3
+    arrays.pack()
+    assert np.allclose(arrays.shapes, turned, rtol=1e-5, atol=1e-5)
+
+
+# ---- Medium ----
+
+
+def test_a_placed_medium_meets_what_placed_splats_would(rgb):
+    splats, (o, d) = random_splats(20, degree=2), rays(50)
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = 2.5 * Rotation.random(random_state=np.random.default_rng(1)).as_matrix(), [1, 0, 2]
+    to_world = Similarity(matrix)
+    placed, there = medium_of(splats, to_world), medium_of(splats.placed(to_world))
+    assert np.isclose(placed.step, there.step, rtol=1e-5)
+    # A turned box has a larger one around it.
+    (low, high), (least, most) = placed.bounds(), there.bounds()
+    assert (low <= least + 1e-5).all() and (most <= high + 1e-5).all()
+    of = []
+    for medium in (placed, there):
+        ray = medium.local(rgb.Point3f((2.5 * o).T), rgb.Vector3f(d.T))
+        index = np.argsort(np.array(medium.arrays.order))[np.arange(50) % 20]
+        t, share = medium.hits.again(ray, rgb.UInt32(index), True)
+        color = medium.color([rgb.UInt32(index)], None, ray.w, True)
+        of.append(np.stack([np.array(v) for v in (t, share, *color)]))
+    assert np.allclose(of[0], of[1], rtol=1e-3, atol=1e-4)
+
+
+def test_there_is_no_density(rgb):
+    medium = medium_of(stack([1], [0.5]))
+    for ask in (medium.density, medium.density_features):
+        with pytest.raises(ValueError, match="along rays"):
+            ask(rgb.Point3f(0), True)
+    assert medium.background(None, None) is None and medium.refresh() is None and len(medium.parameters()) == 2
+    assert np.allclose(medium.to_unit(medium.to_local(rgb.Point3f(0, 0, 1))), 0.5)
+    assert np.allclose(medium.vector_to_unit(rgb.Vector3f(0.6, 0, 0)), [[1], [0], [0]], atol=1e-5)
+
+
+# ---- Nearest ----
+
+
+def test_groups_are_the_next_of_all_in_their_order(rgb):
+    splats = random_splats(80, degree=0, size=0.3)
+    medium, (o, d) = medium_of(splats), rays(300)
+    ray = medium.local(rgb.Point3f(o.T), rgb.Vector3f(d.T))
+    all_t, share = peaks(splats, o, d)
+    wanted = np.sort(np.where((share > 0) & (all_t > 0), all_t, np.inf), axis=1)
+    after, everywhere = LastHit(rgb.Float(0), rgb.UInt32(0)), dr.full(rgb.Bool, True, 300)
+    # No light is ever used up: three groups hold the first of them, and nothing twice.
+    for group in range(3):
+        found = medium.hits.nearest(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), everywhere)
+        dr.eval(found.t, found.absorbed, found.index)
+        t = np.stack([np.array(v) for v in found.t], axis=1)
+        part = wanted[:, group * AT_ONCE : (group + 1) * AT_ONCE]
+        met = np.isfinite(part)
+        assert np.array_equal(np.isfinite(t), met) and np.allclose(t[met], part[met], atol=1e-5)
+        after = LastHit(found.t[-1], found.index[-1])
+        everywhere = everywhere & dr.isfinite(found.t[-1])
+    again = medium.hits.again(ray, found.index[0], dr.isfinite(found.t[0]))
+    first = np.isfinite(t[:, 0])
+    assert np.array_equal(np.array(again[0])[first], t[first, 0])
+    assert np.array_equal(np.array(again[1])[first], np.array(found.absorbed[0])[first])
+
+
+def test_peaks_at_one_place_are_all_met(rgb):
+    count = 2 * AT_ONCE + 3
+    medium = medium_of(stack([1.0] * count, np.full(count, 0.1)))
+    ray = medium.local(rgb.Point3f(0, 0, 0), rgb.Vector3f(0, 0, 1))
+    after, seen = LastHit(rgb.Float(0), rgb.UInt32(0)), []
+    for _ in range(3):
+        found = medium.hits.nearest(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), rgb.Bool(True))
+        dr.eval(found.t, found.absorbed, found.index)
+        seen += [i[0] for i, t in zip(found.index, found.t) if np.isfinite(t[0])]
+        after = LastHit(found.t[-1], found.index[-1])
+    assert sorted(seen) == list(range(count))
+
+
+def test_behind_what_takes_all_light_nothing_is_looked_at(rgb):
+    medium = medium_of(stack(np.arange(1, 65), [0.9999] * 64))
+    ray = medium.local(rgb.Point3f(0, 0, 0), rgb.Vector3f(0, 0, 1))
+    look = lambda stop: medium.hits.nearest(
+        ray, LastHit(rgb.Float(0), rgb.UInt32(0)), ray.t_far, rgb.Float(1), rgb.Float(stop), rgb.Bool(True)
+    )
+    assert look(1e-3).evals[0] <= 2 < look(0).evals[0]
+    assert look(1e-3).t[0][0] == 1
+
+
+# ---- Tree ----
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 1000])
+def test_every_box_is_in_one_leaf_and_in_all_above_it(count):
+    rng = np.random.default_rng(count)
+    lower = rng.normal(size=(count, 3))
+    upper = lower + rng.uniform(0, 0.3, (count, 3))
+    tree = build_tree(lower, upper)
+    assert sorted(tree.order) == list(range(count)) and count <= tree.leaves < 2 * count + (count == 1)
+    leaf = tree.nodes[tree.leaves :]
+    held = leaf[:, 0] < 1e29
+    assert sorted(tree.places[held]) == list(range(count))
+    for node, place in zip(np.flatnonzero(held) + tree.leaves, tree.places[held]):
+        i = tree.order[place]
+        while node:
+            assert (tree.nodes[node, :3] <= lower[i]).all() and (upper[i] <= tree.nodes[node, 3:6]).all()
+            node //= 2
+
+
+def test_boxes_of_one_place_are_no_trouble():
+    tree = build_tree(np.zeros((9, 3)), np.ones((9, 3)))
+    assert sorted(tree.order) == list(range(9)) and tree.nodes[1, :6].round(3).tolist() == [0, 0, 0, 1, 1, 1]
+
+
+def test_what_holds_nothing_is_no_box():
+    tree = build_tree(np.zeros((5, 3)), np.ones((5, 3)))
+    empty = tree.nodes[tree.leaves :][~np.isin(np.arange(8), np.flatnonzero(tree.nodes[tree.leaves :, 0] < 1))]
+    assert len(empty) == 3 and (empty[:, :6] == np.float32(1e30)).all()
+
+
+def test_halves_are_those_along_the_longest_side():
+    x = np.arange(8.0)
+    lower = np.stack([0 * x, x[::-1], 0 * x], axis=1)
+    tree = build_tree(lower, lower)
+    assert tree.nodes[1, 6] == 1 and tree.order.tolist() == list(range(7, -1, -1))

@@ -1,0 +1,139 @@
+"""Tests of `nerg_mi.viewer.scene`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import nerg_mi as nerg
+from nerg_mi.errors import NergError
+from nerg_mi.transport.geometry import Ceiling
+from nerg_mi.viewer.page import Page
+from nerg_mi.viewer.points import Pace, View, refine
+from nerg_mi.viewer.scene import People, Shown, color_of, copied
+from nerg_mi.viewer.serve import viewer
+from nerg_mi.workflows.view import ViewOptions
+from tests.viewer.browser import require
+
+# ---- A copied scene renders as what was viewed ----
+
+
+VIEW = View.of((6.9, 3.0, 2.0), (4.8, 4.2, 1.0), (0, 0, 1), 0.9, 1.5)
+
+
+EYE = np.array([4.6, 3.1, 1.6])
+
+
+@pytest.mark.nightly
+def test01_pictures_are_alike(store, tmp_path):
+    shown = Shown(VIEW, EYE, ("depth", "opacity", "gaze"), 96, 16, 0.05)
+    path = tmp_path / "elsewhere" / "view.xml"
+    path.parent.mkdir()
+    path.write_text(copied(store, shown))
+    copy = nerg.Scene.load(path)
+    rendered = nerg.render(copy, quantities=["color", "gaze", "depth"])
+    assert np.allclose(copy.observer, EYE) and rendered.color.shape == (1, 64, 96, 3)
+    assert copy.integrator.aov_names()[-1].startswith("gaze")
+    steps = refine(nerg.Scene.load(store), VIEW, EYE, ["color", "gaze", "depth", "opacity"], 96, 16, Pace())
+    viewed = [p for p in steps if p is not None][-1].values
+    for name in ("color", "gaze", "depth"):
+        off = np.abs(rendered[name][0] - viewed[name]).mean() / viewed[name].mean()
+        assert off < 0.05, name
+    # And not of any view: another one is off by far.
+    other = nerg.render(
+        copy, quantities=["color"], camera=View.of((4, 3, 2), (2, 3, 1), (0, 0, 1), 0.9, 1.5).camera(96)
+    )
+    assert np.abs(other.color[0] - viewed["color"]).mean() / viewed["color"].mean() > 0.2
+
+
+def test02_the_settings_are_those_that_were_viewed(store, tmp_path):
+    path = tmp_path / "view.xml"
+    path.write_text(copied(store, Shown(VIEW, EYE, ("depth",), 48, 3, 0.25)))
+    scene = nerg.Scene.load(path, view_camera="1, 2, 1.5", view_observer="2, 2, 1.7")
+    assert float(np.ravel(np.array(scene.integrator.falloff))[0]) == pytest.approx(0.25)
+    assert scene.sensor(0).sampler().sample_count() == 3 and len(scene.mitsuba.sensors()) == 4
+    assert np.allclose(scene.observer, [2, 2, 1.7])
+    assert np.allclose(View.of_sensor(scene.sensor(0)).origin, [1, 2, 1.5])
+
+
+def test03_shapes_and_no_observer(room, tmp_path):
+    path = tmp_path / "view.xml"
+    path.write_text(copied(room, Shown(VIEW, None, ("depth", "visibility"), 48, 1, 0.0)))
+    scene = nerg.Scene.load(path)
+    assert len(scene.mitsuba.shapes()) == 2 and np.allclose(scene.observer, [0, 0, 0.5])
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0.1, -0.2, 2)])
+def test04_what_is_cut_off_from_above(room, tmp_path, up):
+    view, up = View.of((1.5, 0, 5), (1.5, 0.01, 0), (0, 0, 1), 0.3, 1.0), np.array(up, float)
+    path = tmp_path / "view.xml"
+    path.write_text(copied(room, Shown(view, None, ("depth",), 32, 1, 0.0, (0.5, up))))
+    rendered = nerg.render(nerg.Scene.load(path), quantities=["depth"]).depth[0]
+    steps = refine(nerg.Scene.load(room), view, None, ["depth"], 32, 1, Pace(), ceiling=Ceiling(0.5, up))
+    viewed = [p for p in steps if p is not None][-1].values["depth"]
+    # The floor, 5 below the camera, in place of the top of a box that is cut through; rays vary within a
+    # pixel, which tells at its edges.
+    assert (np.abs(rendered - viewed) < 0.03).mean() > 0.8 and rendered[16, 16] == pytest.approx(5, abs=0.02)
+    # A copy of the copy that cuts nothing off shows the top again.
+    again = tmp_path / "again.xml"
+    again.write_text(copied(path, Shown(view, None, ("depth",), 32, 1, 0.0)))
+    assert nerg.render(nerg.Scene.load(again), quantities=["depth"]).depth[0, 16, 16] == pytest.approx(4, abs=0.02)
+
+
+def test05_without_an_integrator_there_is_nothing_to_copy(tmp_path, rgb):
+    path = tmp_path / "a.xml"
+    path.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
+    with pytest.raises(NergError, match="0 integrators"):
+        copied(path, Shown(VIEW, None, ("depth",), 48, 1, 0.0))
+
+
+# ---- People in a page: their paths, a moment, and whose eye the observer follows ----
+
+
+def test01_a_colour_for_each_person():
+    colors = color_of(np.array([0, 1, 0, 11]))
+    assert colors.shape == (4, 3) and colors.dtype == np.uint8
+    assert np.array_equal(colors[0], colors[2]) and np.array_equal(colors[1], colors[3])
+    assert not np.array_equal(colors[0], colors[1])
+
+
+@pytest.fixture
+def running(room, tmp_path):
+    require("viser")
+    t = np.arange(0, 4, 0.01)
+    origin = np.stack([-2 + 0 * t, -1 + 0.5 * t, np.full(400, 1.6)], axis=1)
+    rays = nerg.Rays(t, np.zeros(400, int), ("Ada",), origin, np.tile([0.0, 1, 0], (400, 1)), np.ones(400))
+    rays.save(tmp_path / "rays.npz")
+    with viewer([room, tmp_path / "rays.npz"], ViewOptions(port=0)) as found:
+        yield found
+
+
+def test02_the_observer_follows_somebody(running):
+    page: Page = running.page
+    people = People(page, page.session.tracks)
+    # Paths of all are drawn where they are wanted: many people's hide the place.
+    assert len(people._shown) == 2 and people._paths is None
+    people._drawn.value = True
+    people._changed()
+    assert people._paths is not None
+    people._time.value = 2.0
+    people._eye.value = "Ada"
+    people._moment()
+    assert np.allclose(page.session.observer, [-2, 0, 1.6], atol=0.03)
+    assert np.allclose(page.session.heading[:, 0], [0, 1, 0], atol=1e-6)
+    people._rays.value = people._probes.value = True
+    people._changed()
+    page.session.worker.wait_idle(60)
+    lines, probes = people._recorded["rays"].points, people._recorded["probes"].points
+    # The room's end is ahead of her, which the integrator knows.
+    assert lines.shape == (400, 2, 3) and np.allclose(lines[:, 0], page.session.tracks.at, atol=1e-5)
+    seen = nerg.trace(page.session.scene, lines[:, 0], [0.0, 1, 0], ["depth"]).depth
+    assert np.allclose(lines[:, 1, 1] - lines[:, 0, 1], np.where(np.isfinite(seen) & (seen > 0), seen, 1), atol=1e-4)
+    assert len(probes) and (np.abs(probes[:, 0] + 2) < 1e-3).all() and page.problem == ""
+    people._rays.value = people._probes.value = False
+    people._changed()
+    page.session.worker.wait_idle(60)
+    assert not people._recorded
+    people._drawn.value = False
+    people._changed()
+    assert people._paths is None

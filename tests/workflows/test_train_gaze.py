@@ -1,0 +1,396 @@
+"""Tests of `nerg_mi.workflows.train_gaze`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.cli import main
+from nerg_mi.errors import NergError
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig
+from nerg_mi.files.atomic import reserving
+from nerg_mi.formats.fields import load_gaze
+from nerg_mi.train import gaze_recipes
+from nerg_mi.train.gaze_data import surface_distances
+from nerg_mi.train.gaze_log_density import LikelihoodTrainer, surroundings
+from nerg_mi.train.gaze_recipes import Recipe, register
+from nerg_mi.train.geometry import GazePlace, place_of_scene
+from nerg_mi.workflows.train_gaze import GazeOptions, check_plan, plan_gaze, train_gaze
+from nerg_mi.workflows.train_radiance import train_radiance
+from tests.train.gaze.looks import BOX, RAYS, looking_at
+
+# ---- Gaze ----
+#
+# The training of a gaze field as a job, and by its command: places, recipes, hold-out, resumption, what is told.
+
+
+QUICK = GazeOptions(geometry="none", radius=0.5, probes=6, min_rays=8, steps=3, directions=64, zones=0)
+
+
+WALL = """<scene version="3.0.0"><shape type="rectangle"><transform name="to_world">
+    <scale value="2"/><lookat origin="1.5, 0, 1.5" target="0, 0, 1.5" up="0, 0, 1"/></transform></shape></scene>"""
+
+
+class Listener:
+    """A reporter that keeps what it is told, and ends a job at a share of its progress."""
+
+    def __init__(self, ends_at: float = 2.0):
+        self.messages, self.shares, self.texts, self.ends_at = [], [], [], ends_at
+
+    def message(self, text):
+        self.messages.append(text)
+
+    warn = message
+
+    def progress(self, share, text=""):
+        self.shares.append(share)
+        self.texts.append(text)
+        if share >= self.ends_at:
+            self.ends_at = 2.0
+            raise KeyboardInterrupt
+
+
+@pytest.fixture
+def rays():
+    return looking_at((1.5, 0.4, 1.2))
+
+
+def nerg(capsys, *arguments):
+    """Exit code of a command, and what it said on the standard output and on the standard error."""
+    with pytest.raises(SystemExit) as end:
+        main(["train", "gaze", *map(str, arguments)])
+    said = capsys.readouterr()
+    return end.value.code or 0, said.out, " ".join(said.err.split())
+
+
+def arrays(field):
+    return {name: np.array(value) for name, value in field.parameters().items()}
+
+
+def test_a_job_returns_the_field_and_says_how_it_went(rays):
+    """Of rays in memory, without any file."""
+    heard = Listener()
+    result = train_gaze(rays, options=replace(QUICK, variant="capture"), reporter=heard)
+    assert result.output is None and not result.interrupted and result.field.config.geometry == "none"
+    about = result.provenance
+    assert about["recipe"] == "default" and about["steps"] == 3 and about["geometry"] == "none"
+    assert "rays_file" not in about and about["rays"] == len(rays)
+    assert heard.shares[-1] == 1 and heard.texts[0].startswith("placing probes") and "fit: step 3" in heard.texts
+    assert heard.texts[-1] == "folds: step 2" and about["mix"]["folds"] == 1
+    told = [m.split(";")[0].split(":")[0] for m in heard.messages]
+    assert told[:3] == [f"{about['probes_made']} probes", "3 steps", "held out in 1 fold"]
+    assert told[3] == f"regions of {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze held 80 % of theirs"
+
+
+def test_folds_choose_the_variant_where_no_surfaces_are_known(rays):
+    """Before the fit; what they chose is told, and is what was trained."""
+    heard = Listener()
+    result = train_gaze(rays, options=QUICK, reporter=heard)
+    mix = result.provenance["mix"]
+    assert set(mix["variants"]) == {"capture", "emit_capture"} and mix["variant"] == result.field.config.variant
+    assert mix["mix"] == result.field.config.mix
+    order = [text.split(":")[0] for text in heard.texts if "fold" in text or "fit" in text]
+    assert list(dict.fromkeys(order))[-1] == "fit" and order[0].startswith("fold 1 of capture")
+    assert heard.messages[0].startswith("no surfaces are known: folds choose")
+    assert any(m.endswith(f"{mix['variant']} is trained") for m in heard.messages)
+    # Without folds nothing chooses.
+    heard = Listener()
+    result = train_gaze(rays, options=replace(QUICK, mix_folds=0), reporter=heard)
+    assert result.field.config.variant == "capture" and "mix" not in result.provenance
+    assert heard.messages[0] == "no surfaces are known: capture alone is trained"
+
+
+def test_a_job_writes_what_the_command_writes(rays, tmp_path, capsys):
+    rays.save(tmp_path / "rays.npz")
+    options = replace(QUICK, geometry="hits", voxel=0.2, half=True, threads=1)
+    train_gaze(tmp_path / "rays.npz", tmp_path / "job" / "gaze.safetensors", options)
+    line = "--geometry hits --voxel 0.2 --radius 0.5 --probes 6 --min-rays 8 --steps 3 --directions 64 --zones 0 --half"
+    code, said, _ = nerg(
+        capsys, tmp_path / "rays.npz", "-o", tmp_path / "command" / "gaze.safetensors", *line.split(), "--threads", 1
+    )
+    assert code == 0 and "meet no surface" in said and "gaze.vol: " in said and "MB)" in said
+    fields, provenance = [], []
+    for name in ("job", "command"):
+        assert {p.name for p in (tmp_path / name).iterdir()} == {"gaze.safetensors", "gaze.vol"}
+        field, meta = load_gaze(tmp_path / name / "gaze.safetensors", ns)
+        fields.append(arrays(field))
+        provenance.append(meta["provenance"])
+    for name, value in fields[0].items():
+        np.testing.assert_array_equal(value, fields[1][name], err_msg=name)
+    for about in provenance:
+        assert about["steps"] == 3 and len(about["rays_file"]["sha256"]) == len(about["geometry_file"]["sha256"]) == 64
+        for name in ("made", "seconds", "seconds_preparing"):
+            about.pop(name)
+    assert provenance[0] == provenance[1]
+
+
+@pytest.mark.parametrize("recipe", ["default", "small", "paper"])
+def test_recipes_in_a_scene_of_shapes(rays, tmp_path, recipe):
+    """The wall as a shape: its exact distance, and what looks past it escapes."""
+    (tmp_path / "scene.xml").write_text(WALL)
+    size = "small" if recipe == "paper" else None
+    options = replace(QUICK, geometry=None, scene=tmp_path / "scene.xml", recipe=recipe, size=size, steps=2)
+    result = train_gaze(rays, tmp_path / "gaze.safetensors", options)
+    field, meta = load_gaze(tmp_path / "gaze.safetensors", ns)
+    assert meta["provenance"] == result.provenance and 0.3 < result.provenance["escaped_directions"] < 0.9
+    assert meta["output"] == {
+        "activation": {"default": "log", "small": "softplus", "paper": "linear"}[recipe],
+        "normalized": recipe == "default",
+    }
+    place = place_of_scene(tmp_path / "scene.xml")
+    o, d = np.array([[-0.5, 0.2, 1.6]]), np.array([[[1.0, 0, 0], [0.8, 0.6, 0], [-1.0, 0, 0]]])
+    distance, escaped = surface_distances(place, o, d)
+    np.testing.assert_allclose(distance[0, :2], [2.0, 2.5], rtol=1e-5)
+    assert escaped.tolist() == [[False, False, True]]
+
+
+def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, monkeypatch, capsys):
+    """A second log density, which is one entry: hold-out, ensembles and ablation know it by that."""
+    from nerg_mi.workflows.ablation import AblationOptions, ablate
+
+    monkeypatch.setattr(gaze_recipes, "RECIPES", dict(gaze_recipes.RECIPES))
+    grid = HashGridConfig(levels=2, log2_rows=8, base=2, finest=4)
+    register(
+        Recipe(
+            name="coarse",
+            summary="a log density on two levels",
+            config=lambda c: LogGazeConfig(grid, c.variant, width=8, **surroundings(c.place)),
+            trainer=LikelihoodTrainer,
+            losses=("likelihood",),
+            settings={"steps": 3, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 4, "directions": 32},
+            probes={"radius": 0.5, "count": 6, "min_rays": 8, "directions": 64},
+            quick=True,
+        )
+    )
+    result = train_gaze(rays, options=GazeOptions(geometry="none", recipe="coarse", variant="emit", threads=1))
+    assert result.field.config.grid == grid and result.field.config.geometry == "none"
+    assert result.provenance["recipe"] == "coarse" and result.provenance["steps"] == 3
+    RAYS.save(tmp_path / "rays.npz")
+    out = tmp_path / "gaze.safetensors"
+    code, _, said = nerg(
+        capsys,
+        tmp_path / "rays.npz",
+        "-o",
+        out,
+        "--geometry",
+        "hits",
+        "--voxel",
+        0.3,
+        "--recipe",
+        "coarse",
+        "--test-zones",
+        1,
+        "--test-positions",
+        4,
+        "--min-rays",
+        8,
+    )
+    assert code == 0, said
+    field, meta = load_gaze(out, ns)
+    assert field.config.escaped == "nearest" and len(meta["provenance"]["test"]["centres"]) == 4
+    code, _, said = nerg(
+        capsys, tmp_path / "rays.npz", "-o", out, "--geometry", "none", "--recipe", "coarse", "--loss", "paper"
+    )
+    assert code == 1 and "the recipe coarse has no choice of --loss" in said and "add --recipe small" in said
+    options = AblationOptions(
+        geometry="none",
+        recipes="coarse",
+        variant=("emit",),
+        seeds=2,
+        zones=1,
+        positions=4,
+        min_rays=8,
+        radius=0.5,
+        cameras=0,
+    )
+    rows = ablate(RAYS, tmp_path / "rows", options).rows
+    assert [(r["recipe"], r["variant"], r["seed"], r["steps"]) for r in rows] == [
+        ("coarse", "emit", 0, 3),
+        ("coarse", "emit", 1, 3),
+    ]
+
+
+def test_positions_and_people_are_held_out_and_told(tmp_path):
+    heard = Listener()
+    options = replace(QUICK, test_zones=2, test_positions=6, test_people=0.5)
+    result = train_gaze(RAYS, options=replace(options, min_rays=8), reporter=heard)
+    test = result.provenance["test"]
+    assert result.provenance["rays"] == test["rays_to_train"] < test["rays"] == len(RAYS) and len(test["people"]) == 1
+    assert heard.messages[0] == f"6 test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays left"
+
+
+def test_an_interrupted_job_returns_what_there_is_or_says_how_to_go_on(rays, tmp_path):
+    """Without a file it is all that can be had; with one, a script must not go on as if it were done."""
+    options = replace(QUICK, steps=8, fresh=True, threads=1, variant="capture")
+    result = train_gaze(rays, options=options, reporter=Listener(0.5))
+    assert result.interrupted and result.provenance["steps"] == 4
+    out = tmp_path / "gaze.safetensors"
+    with pytest.raises(KeyboardInterrupt, match="go on with --resume"):
+        train_gaze(rays, out, options, Listener(0.5))
+    assert {p.name for p in tmp_path.iterdir()} == {"gaze.safetensors", "gaze.run"}
+    assert load_gaze(out, ns)[1]["provenance"]["interrupted"]
+    whole = train_gaze(rays, options=options)
+    resumed = train_gaze(rays, out, replace(options, resume=True))
+    assert not out.with_suffix(".run").exists() and not resumed.interrupted and resumed.provenance["steps"] == 8
+    for name, value in arrays(whole.field).items():
+        np.testing.assert_array_equal(value, arrays(resumed.field)[name], err_msg=name)
+    with pytest.raises(NergError, match="nothing to resume"):
+        train_gaze(rays, out, replace(options, resume=True))
+
+
+def test_the_command_goes_on(tmp_path, monkeypatch, capsys):
+    from nerg_mi.train.gaze_trainer import GazeTrainer
+
+    RAYS.save(tmp_path / "rays.npz")
+    out = tmp_path / "gaze.safetensors"
+    line = [tmp_path / "rays.npz", "-o", out, *"--geometry none --radius 0.5 --probes 6 --steps 8".split()]
+    line += "--directions 64 --zones 0 --fresh-directions".split()
+    code, _, said = nerg(capsys, *line, "--resume")
+    assert code == 1 and "nothing to resume" in said
+    step = GazeTrainer.step
+
+    def interrupted(trainer):
+        import signal
+
+        step(trainer)
+        if trainer.steps == 5:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as change:
+        change.setattr(GazeTrainer, "step", interrupted)
+        code, _, said = nerg(capsys, *line)
+    assert code == 130 and "go on with --resume" in said and out.is_file() and out.with_suffix(".run").is_file()
+    code, _, said = nerg(capsys, *line, "--resume")
+    about = load_gaze(out, ns)[1]["provenance"]
+    assert about["steps"] == 8 and not about["interrupted"] and about["probes"]["fresh"]
+    assert code == 0 and "go on" not in said and not out.with_suffix(".run").exists()
+
+
+def test_an_ensemble_is_one_option(tmp_path):
+    from tests.train.gaze.test_ensemble import crowd
+
+    out = tmp_path / "gaze.safetensors"
+    options = replace(QUICK, steps=2, zones=1, ensemble=2, half=True)
+    heard = Listener()
+    train_gaze(crowd(), out, options, heard)
+    field, meta = load_gaze(out, ns)
+    about = meta["provenance"]["ensemble"]
+    assert len(field.members) == 2 and about["members"] == 2 and len(about["validation"]) == 2
+    assert any("held-out positions" in m for m in heard.messages)
+    assert field.support.cells[:, 3].sum() == 1200 and [p.name for p in tmp_path.iterdir()] == ["gaze.safetensors"]
+
+
+def test_a_place_of_hits_needs_a_file(rays):
+    with pytest.raises(NergError, match="need a file"):
+        train_gaze(rays, options=replace(QUICK, geometry="hits"))
+
+
+@pytest.mark.parametrize("train", [train_gaze, train_radiance])
+def test_an_output_is_trained_once_at_a_time(tmp_path, train):
+    with reserving(tmp_path / "a.safetensors"), pytest.raises(NergError, match="made by another process"):
+        train(tmp_path / "nothing", tmp_path / "a.safetensors")
+
+
+# ---- Options of a gaze training: what goes together, and what of it arrives in the plan ----
+
+
+HITS = GazeOptions(geometry="hits")
+
+
+FIELD = GazeOptions(field=Path("field.safetensors"), recipe="small")
+
+
+VIEWS = GazeOptions(geometry="none", views=Path("photos"), salience="maps")
+
+
+SCENE = GazePlace(None, BOX, "scene")
+
+
+@pytest.mark.parametrize(
+    "options, alone, said",
+    [
+        (GazeOptions(), False, "--field FILE.*--scene FILE.*--geometry"),
+        (replace(HITS, scene=Path("a.xml")), False, "one of --field FILE"),
+        (GazeOptions(geometry="hit"), False, '"hits".*"none".*"hit"'),
+        (GazeOptions(geometry="none"), True, "say what to learn from"),
+        (replace(VIEWS, geometry="hits"), True, "--geometry.*--align.*--semantic.*--mix-folds"),
+        (replace(VIEWS, mix_kappa=20.0), True, "--mix-kappa"),
+        (replace(VIEWS, mix_folds=2), True, "--mix-folds.*--mix-kappa"),
+        (replace(VIEWS, test_zones=1), True, "belong to rays"),
+        (replace(VIEWS, salience=None), False, "salience needs both"),
+        (replace(HITS, align_views=Path("a.json")), False, "salience needs both"),
+        (replace(HITS, align=Path("a.json")), False, "--align.*--field.*--scene"),
+        (replace(HITS, test_people=0.5), False, "say where, with --test-zones"),
+        (replace(FIELD, begin="nerf"), False, '"random".*"field"'),
+        (replace(FIELD, freeze=True), False, "--freeze"),
+        (replace(HITS, recipe="small", begin="field"), False, "--begin"),
+        (replace(HITS, recipe="small", semantic="snapshot"), False, "--semantic"),
+        (replace(HITS, loss="paper"), False, "add --recipe small"),
+        (replace(HITS, integral=1.0), False, "no choice of --integral"),
+        (replace(HITS, recipe="small", mix_kappa=20.0), False, "--mix-kappa.*--recipe"),
+        (replace(HITS, recipe="small", mix_folds=2), False, "--mix-folds.*--recipe"),
+        (replace(HITS, mix_kappa=2000.0), False, "concentration of 2000 vanish; let it be at most 1660"),
+        (replace(HITS, activation="exp"), False, "no choice of --activation"),
+        (replace(FIELD, loss="likelihood"), False, '"likelihood"'),
+        (replace(HITS, recipe="large"), False, "one of default, small, paper"),
+        (replace(HITS, variant="both"), False, "--variant.*--activation"),
+        (replace(FIELD, semantic="glance"), False, "--semantic.*--variant.*--begin"),
+        (GazeOptions(geometry="none", recipe="small"), False, "needs surfaces"),
+    ],
+)
+def test_what_does_not_go_together_is_told_in_a_sentence(options, alone, said):
+    with pytest.raises(NergError, match=said):
+        check_plan(options, alone)
+
+
+@pytest.mark.parametrize("options, alone", [(HITS, False), (FIELD, False), (VIEWS, True), (VIEWS, False)])
+def test_what_goes_together_is_not_refused(options, alone):
+    assert check_plan(options, alone).radius == 0.25
+
+
+def test_every_option_of_settings_and_probes_arrives():
+    options = GazeOptions(
+        scene=Path("a.xml"),
+        recipe="small",
+        steps=7,
+        seed=3,
+        loss="code",
+        zones=1,
+        refit=False,
+        learning_rate=0.5,
+        weight_decay=0.25,
+        integral=2.0,
+        radius=0.4,
+        probes=9,
+        placement="grid",
+        cap=32,
+        min_rays=4,
+        kappa_rule="silverman",
+        kappa=11.0,
+        weights="person",
+        directions=33,
+        fresh=True,
+        variant="emit",
+        activation="exp",
+        size="paper",
+        normalized=True,
+    )
+    plan = plan_gaze(options, SCENE)
+    s, p, c = plan.settings, plan.probes, plan.config
+    assert (s.steps, s.seed, s.loss, s.zones, s.refit, s.learning_rate) == (7, 3, "code", 1, False, 0.5)
+    assert (s.weight_decay, s.integral, s.frozen) == (0.25, 2.0, False)
+    assert (p.radius, p.count, p.placement, p.cap, p.min_rays) == (0.4, 9, "grid", 32, 4)
+    assert (p.kappa_rule, p.kappa, p.weights, p.directions, p.fresh) == ("silverman", 11.0, "person", 33, True)
+    assert (c.variant, c.activation, c.grid.levels, c.normalized) == ("emit", "exp", 16, True)
+
+
+def test_views_alone_make_a_normalised_field():
+    """They do not say how much is looked altogether."""
+    options = GazeOptions(scene=Path("a.xml"), recipe="small")
+    assert plan_gaze(options, SCENE, views_alone=True).config.normalized
+    assert not plan_gaze(options, SCENE).config.normalized
