@@ -281,7 +281,7 @@ import resource, sys
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 from nerg_mi.files.images import write_png
-from tests.files.test_png import picture
+from tests.files.test_images import picture
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
 write_png(sys.argv[1], picture(mi))
 """
