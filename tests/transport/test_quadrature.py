@@ -458,7 +458,7 @@ def test07_every_march_ends(kind):
 import nerg_mi, numpy as np, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 from nerg_mi.fields.occupancy import OccupancyGrid
-from nerg_mi.transport import march
+from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.medium import LocalRay
 from nerg_mi.transport.volume_medium import VolumeMedium
