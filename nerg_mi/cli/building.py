@@ -25,7 +25,7 @@ from nerg_mi.workflows.base import COMMANDS, Command, Parameter
 from .ending import shorten_values
 from .progress import TerminalReporter
 
-PACKAGES = ("nerg_mi.workflows", "nerg_mi.cli")
+PACKAGES = ("nerg_mi.workflows", "nerg_mi.viewer", "nerg_mi.cli")
 """Packages whose modules, and those below them, may be commands."""
 
 GROUPS = {

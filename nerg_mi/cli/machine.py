@@ -1,5 +1,4 @@
 """``nerg doctor``: Say what works on this machine, and how to repair what does not.
-``nerg view``: Show a place with its gaze in the browser, where the observer is dragged.
 ``nerg worker``: Run parts of long jobs for a cluster (dask).
 
 What these commands run is imported when they run: the doctor has to work where Mitsuba does not.
@@ -9,14 +8,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import typer
 
 from nerg_mi.ranges import SECONDS, Checked, Range
 from nerg_mi.workflows.base import Reporter, argument, command
 from nerg_mi.workflows.options import option
-from nerg_mi.workflows.view import ViewOptions
 
 
 @command("doctor", more="Ends with exit code 0 if some compiled variant of Mitsuba works, else with 1.")
@@ -27,24 +24,6 @@ def diagnose(reporter: Reporter) -> None:
     diagnosis = examine()
     reporter.message(str(diagnosis))
     raise typer.Exit(0 if diagnosis.usable else 1)
-
-
-@command(
-    "view",
-    more="The page is served to this machine alone, until Ctrl-C; nothing is fetched from anywhere else. At another "
-    "--host its address has a token.",
-    options=ViewOptions,
-    files=argument(
-        "A scene, or a place (radiance field, splats, mesh, .vol), a gaze field, rays; a folder.",
-        list[Path],
-        metavar="FILES",
-    ),
-)
-def view(files: list[Path], options: ViewOptions, reporter: Reporter) -> None:
-    """Serve the viewer's page."""
-    from nerg_mi.viewer import serve
-
-    serve.view_files(files, options, reporter)
 
 
 @dataclass(frozen=True, kw_only=True)
