@@ -224,6 +224,8 @@ def test_errors_of_processes_are_those_of_this_one(store):
 
 
 def test_ctrl_c_ends_the_processes_at_once(store):
+    # Pictures of other tests may have left Mitsuba's handler, which Python does not know of.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     timer = threading.Timer(6.0, os.kill, (os.getpid(), signal.SIGINT))
     start = time.monotonic()
     timer.start()
