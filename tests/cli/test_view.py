@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 import nerg_mi.cli
@@ -15,9 +17,12 @@ def nerg(*arguments):
 
 def test01_options_come_through(monkeypatch, tmp_path):
     from nerg_mi.viewer import serve
+    from nerg_mi.workflows.base import COMMANDS
 
     given = []
-    monkeypatch.setattr(serve, "view_files", lambda files, options, reporter: given.append((files, options)))
+    view = lambda files, options, reporter: given.append((files, options))
+    monkeypatch.setitem(COMMANDS, "view", replace(COMMANDS["view"], run=view))
+    assert COMMANDS["view"].options is serve.ViewOptions
     line = ["view", "a.xml", "b.npz", "--port", 0, "--observer=1,2,3", "--host", "::1", "--name", "lab", "--width", 320]
     assert nerg(*line) == 0
     ((files, options),) = given

@@ -22,7 +22,7 @@ from nerg_mi.workflows.rays import (
     split_rays,
 )
 from tests.cli.rays.running import write_walk
-from tests.rays.dataset.test_writing import crowd
+from tests.rays.dataset.making import crowd
 from tests.rays.readers.examples import EXAMPLES
 
 # ---- The steps of a filter, of rays that nobody else holds and of those that somebody does ----

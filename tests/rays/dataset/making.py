@@ -63,3 +63,13 @@ def assert_same(one: Rays, two: Rays) -> None:
         assert np.allclose(getattr(one, name), getattr(two, name), rtol=1e-6, atol=1e-7, equal_nan=True), name
     if one.cohort is not None and two.cohort is not None:
         assert (np.array(one.cohorts)[one.cohort] == np.array(two.cohorts)[two.cohort]).all()
+
+
+def crowd(count: int = 1000, start: float = 0.0, seed: int = 0) -> Rays:
+    rng = np.random.default_rng(seed)
+    d = rng.normal(size=(count, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    names = ("zoe", "ann", "bo", "名")
+    return Rays(
+        start + np.arange(count) * 0.1, rng.integers(0, 4, count), names, rng.random((count, 3)), d, np.ones(count)
+    )

@@ -27,7 +27,7 @@ from nerg_mi.rays.dataset import (
 )
 from nerg_mi.rays.rays import FRAME, Rays
 
-from .test_writing import crowd
+from .making import crowd
 
 # ---- Samples: each row as likely as any other, without room for all ----
 

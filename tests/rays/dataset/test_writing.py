@@ -11,21 +11,11 @@ from nerg_mi.rays.dataset import Head, read_sources, write_head
 from nerg_mi.rays.dataset_write import SourceWriter
 from nerg_mi.rays.rays import FRAME, Rays
 
-from .making import DAY
+from .making import DAY, crowd
 
 pq = pytest.importorskip("pyarrow.parquet")
 ID = "0" * 32
 ABOUT = {"file": "a.csv", "where": "w", "stamp": None, "recipe": "r", "generation": 0}
-
-
-def crowd(count: int = 1000, start: float = 0.0, seed: int = 0) -> Rays:
-    rng = np.random.default_rng(seed)
-    d = rng.normal(size=(count, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    names = ("zoe", "ann", "bo", "名")
-    return Rays(
-        start + np.arange(count) * 0.1, rng.integers(0, 4, count), names, rng.random((count, 3)), d, np.ones(count)
-    )
 
 
 def test_parts_by_day_and_bucket_in_the_order_of_people_and_times(tmp_path):
