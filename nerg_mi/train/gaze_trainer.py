@@ -88,12 +88,12 @@ class GazeTrainer(ABC):
     @classmethod
     def begin_as(cls, radiance: RadianceField, config: Any) -> tuple[Any, dict]:
         """``config`` with the sizes of the field ``radiance``, and the arrays of it that a training begins with."""
-        raise NotImplementedError(f"a {config.kind} gaze field does not begin as a radiance field")
+        raise NergError(f"a {config.kind} gaze field does not begin as a radiance field; leave out --begin field")
 
     @classmethod
     def with_features(cls, radiance: RadianceField, config: Any) -> Any:
         """``config``, which has semantic features, with as many as ``radiance`` gives."""
-        raise NotImplementedError(f"a {config.kind} gaze field has no semantic features")
+        raise NergError(f"a {config.kind} gaze field has no semantic features; leave out --semantic")
 
     @abstractmethod
     def untrained(self) -> GazeDensity:
