@@ -2,7 +2,7 @@
 
 Along a ray a Gaussian absorbs ``opacity exp(-r^2 / 2)`` of the light where it is densest, r its least distance from the
 centre in standard deviations (Kerbl et al. 2023; the peak along the ray as in Moenne-Loccoz et al. 2024, "3D Gaussian
-Ray Tracing"). Held as NumPy arrays: what rays meet of them is `nerg_mi.transport.splats`'.
+Ray Tracing"). Held as NumPy arrays: what rays meet of them is `nerg_mi.transport.splat_medium`'.
 """
 
 from __future__ import annotations

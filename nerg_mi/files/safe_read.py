@@ -30,8 +30,7 @@ from nerg_mi.errors import MissingFile, NergError, plain, sentence
 # What every reader of a file needs against a damaged or hostile one: limits before allocation, and one sentence after.
 #
 # A reader asks first how large things are, by the bytes that are there and by the limits stated here, and only then
-# makes room for them. Compressed files: `inflating`; NumPy's: `npy`; pictures: `image_header`.
-
+# makes room for them. Compressed files and NumPy's follow below; headers of pictures: `nerg_mi.files.images`.
 
 JSON_BYTES = 64 << 20
 """A JSON file may have so many bytes: the poses of some 80,000 frames."""

@@ -122,7 +122,7 @@ def ahead_of(scene: Scene) -> np.ndarray:
 # A picture that is refined in steps: small at once, then in full, then with more samples a pixel.
 #
 # It is a generator, so that whoever drives it can stop between two bands of rays. Its values are those of the
-# integrator `nerg` (`nerg_mi.api.trace`).
+# integrator `nerg` (`nerg_mi.api.query.trace`).
 
 
 BAND_SECONDS = 0.35
