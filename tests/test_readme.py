@@ -75,3 +75,13 @@ def test04_what_it_names_is_there():
     for path in ("scenes/store/twin.xml", "benchmarks/store_visibility.py", "LICENSE"):
         assert path in text or path == "scenes/store/twin.xml"
         assert (root / path).is_file(), path
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/rays.md", "docs/trust.md"])
+def test05_every_way_to_another_machine_is_named(page):
+    """A page that says what leaves the machine names the commands that connect (`tests/cli/test_outputs.py` has the
+    others open none)."""
+    text = (README.parent / page).read_text()
+    assert "Nothing leaves the machine unless" in text
+    for name in ("--scheduler tcp://", "nerg worker", "nerg view"):
+        assert name in text, name

@@ -8,6 +8,7 @@ import os
 import pkgutil
 import resource
 import signal
+import socket
 from contextlib import contextmanager
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -84,8 +85,24 @@ def remember(monkeypatch, name: str) -> None:
     )
 
 
+@pytest.fixture
+def offline(monkeypatch):
+    """No connection to another machine can be opened, and no port listened at."""
+
+    def refuse(name):
+        original = getattr(socket.socket, name)
+
+        def guarded(self, *arguments):
+            assert self.family not in (socket.AF_INET, socket.AF_INET6), f"{name}{arguments}"
+            return original(self, *arguments)
+
+        monkeypatch.setattr(socket.socket, name, guarded)
+
+    refuse("connect"), refuse("connect_ex"), refuse("bind"), refuse("sendto")
+
+
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.name} {Path(c.files[0]).suffix}")
-def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb):
+def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb, offline):
     if case.name in OF_TORCH:
         pytest.importorskip("torch")
     if case.name == "export mesh":
