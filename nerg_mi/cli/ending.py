@@ -98,11 +98,19 @@ def quiet_ctrl_c() -> Iterator[None]:
         sys.exit(INTERRUPTED)
 
 
+_AGAIN = 0.02  # seconds
+
+
 class CtrlC:
-    """A context in which Ctrl-C raises `KeyboardInterrupt`, and that knows afterwards whether it ended a command."""
+    """A context in which Ctrl-C raises `KeyboardInterrupt`, and that knows afterwards whether it ended a command.
+
+    Python drops an exception that is raised in a finalizer or in the callback of a weak reference: such a Ctrl-C is
+    sent again.
+    """
 
     def __enter__(self) -> CtrlC:
         self._heard = False
+        self._report_unraisable, sys.unraisablehook = sys.unraisablehook, self._send_again
         # Only where Python's own handler is at work: elsewhere Ctrl-C is somebody else's business.
         self._mine = (
             threading.current_thread() is threading.main_thread()
@@ -115,6 +123,13 @@ class CtrlC:
     def _hear(self, *_) -> None:
         self._heard = True
         raise KeyboardInterrupt
+
+    def _send_again(self, unraisable: sys.UnraisableHookArgs, /) -> None:
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):
+            # From another thread and later: here it would be dropped as well.
+            threading.Timer(_AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
+        else:
+            self._report_unraisable(unraisable)
 
     def behind(self, end: BaseException) -> KeyboardInterrupt | None:
         """The interrupt that led to ``end``; None where it is another error, or the command was done.
@@ -129,5 +144,6 @@ class CtrlC:
         return link if link is not None or not self._heard or done else KeyboardInterrupt()
 
     def __exit__(self, *_) -> None:
+        sys.unraisablehook = self._report_unraisable
         if self._mine:
             signal.signal(signal.SIGINT, signal.default_int_handler)

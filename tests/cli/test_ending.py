@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -32,6 +33,24 @@ def test_ctrl_c_is_found_behind_what_others_made_of_it():
         assert isinstance(ctrl_c.behind(RuntimeError("of Mitsuba")), KeyboardInterrupt)
         assert ctrl_c.behind(SystemExit(0)) is None
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_within_a_finalizer_is_not_lost(monkeypatch):
+    """Python drops what is raised there."""
+
+    class Interrupted:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    others = []
+    monkeypatch.setattr(sys, "unraisablehook", others.append)
+    thing = Interrupted()
+    with CtrlC() as ctrl_c:
+        with pytest.raises(KeyboardInterrupt):
+            del thing
+            time.sleep(10)
+        assert not others
+    assert ctrl_c.behind(RuntimeError()) is not None and sys.unraisablehook == others.append
 
 
 @pytest.mark.parametrize("name", ["stdout", "stderr"])
