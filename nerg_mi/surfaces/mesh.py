@@ -3,7 +3,7 @@ cast at."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -361,6 +361,9 @@ def mitsuba_mesh(vertices: np.ndarray, faces: np.ndarray, name: str, bsdf: Mappi
 GUTTER = 4
 """Pixels by which colours go on beyond the border of a chart, for filters that look there."""
 
+TEXTURE_ROWS = 256
+"""Rows of a texture that are computed at once."""
+
 MOST_CHART_FACES = 400_000
 """A mesh of more triangles is not unrolled."""
 
@@ -415,10 +418,15 @@ def unroll(mesh: Mesh, pixels: int) -> Charts:
     return Charts(vertex.astype(np.int64), uv.astype(np.float64) * size / pixels, faces.astype(np.int64))
 
 
-def texture(charts: Charts, refined: Refined, values: np.ndarray, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """``(values (pixels, pixels), known (pixels, pixels) bool)`` of ``values`` (V,) on the vertices of ``refined``, of
-    whose whole mesh ``charts`` are; linear in every triangle, and carried on over a gutter around charts."""
-    import drjit as dr
+def texture_rows(
+    charts: Charts, refined: Refined, values: np.ndarray, pixels: int
+) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """``values`` (V,) on the vertices of ``refined``, of whose whole mesh ``charts`` are, as a square texture.
+
+    Yields ``(rows, values (n, pixels), known (n, pixels) bool)``, some rows at a time: the memory of a whole texture of
+    8192 x 8192 would be 5 GB. Values are linear in every triangle, and carried on over a gutter around charts. Raises
+    `NergError`, at the end, where no texel shows the surface.
+    """
     import mitsuba as mi
     from scipy.ndimage import distance_transform_edt
 
@@ -428,20 +436,28 @@ def texture(charts: Charts, refined: Refined, values: np.ndarray, pixels: int) -
     sheet = mitsuba_mesh(flat, np.arange(len(flat)).reshape(-1, 3), "charts")
     scene: Any = mi.load_dict({"type": "scene", "charts": sheet})
     center = (np.arange(pixels) + 0.5) / pixels
-    u, v = (c.ravel() for c in np.meshgrid(center, center))
-    above = mi.Point3f(np.stack([u, v, np.ones_like(u)]).astype(np.float32))
-    with dr.suspend_grad():
-        found = scene.ray_intersect_preliminary(mi.Ray3f(above, mi.Vector3f(0, 0, -1)), coherent=True)
-        hit, face = np.array(found.is_valid()).astype(bool), np.array(found.prim_index).astype(np.int64)
-        b, c = (np.array(x, np.float64) for x in (found.prim_uv.x, found.prim_uv.y))
-    face = np.where(hit, face, 0)
-    of_corners = values[refined.mesh.faces[face]]
-    out = np.where(hit, of_corners[:, 0] * (1 - b - c) + of_corners[:, 1] * b + of_corners[:, 2] * c, 0.0)
-    out, hit = out.reshape(pixels, pixels), hit.reshape(pixels, pixels)
-    if not hit.any():
+    is_empty = True
+    for start in range(0, pixels, TEXTURE_ROWS):
+        stop = min(start + TEXTURE_ROWS, pixels)
+        # The rows around them too, from which a gutter may reach in.
+        first, last = max(start - GUTTER, 0), min(stop + GUTTER, pixels)
+        u, v = (c.ravel() for c in np.meshgrid(center, center[first:last]))
+        above = mi.Point3f(np.stack([u, v, np.ones_like(u)]).astype(np.float32))
+        with dr.suspend_grad():
+            found = scene.ray_intersect_preliminary(mi.Ray3f(above, mi.Vector3f(0, 0, -1)), coherent=True)
+            hit, face = np.array(found.is_valid()).astype(bool), np.array(found.prim_index).astype(np.int64)
+            b, c = (np.array(x, np.float64) for x in (found.prim_uv.x, found.prim_uv.y))
+        of_corners = values[refined.mesh.faces[np.where(hit, face, 0)]]
+        out = np.where(hit, of_corners[:, 0] * (1 - b - c) + of_corners[:, 1] * b + of_corners[:, 2] * c, 0.0)
+        out, hit = out.reshape(-1, pixels), hit.reshape(-1, pixels)
+        if hit.any():
+            is_empty = False
+            nearest = distance_transform_edt(~hit, return_indices=True)
+            assert nearest is not None, "both were asked for"
+            distance, index = nearest
+            out, hit = out[index[0], index[1]], np.asarray(distance) <= GUTTER
+        rows = slice(start, stop)
+        inside = slice(start - first, stop - first)
+        yield rows, out[inside], hit[inside]
+    if is_empty:
         raise NergError(f"no pixel of a texture of {pixels} x {pixels} shows the surface; give a larger --texture")
-    nearest = distance_transform_edt(~hit, return_indices=True)
-    assert nearest is not None, "both were asked for"
-    apart, near = nearest
-    out = out[near[0], near[1]]
-    return out, np.asarray(apart) <= GUTTER

@@ -28,7 +28,7 @@ from nerg_mi.formats.splats import is_splats
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import Smoother, Sums, merge
-from nerg_mi.surfaces.mesh import Mesh, Refined, texture, unroll, unroller
+from nerg_mi.surfaces.mesh import Mesh, Refined, texture_rows, unroll, unroller
 from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays, ray_seconds
 
 from .bake_chunks import (
@@ -114,9 +114,10 @@ def _glb(baked: Baked, path: Path, pixels: int | None) -> None:
 
     whole = baked.receivers.mesh
     charts = unroll(whole, pixels)
-    values, known = texture(charts, baked.refined, baked.density, pixels)
-    picture = np.where(known[..., None], _shown(baked.heat, values), 0.0)
-    image = encode_png(mi.Bitmap(np.rint(255 * picture).astype(np.uint8)), {"Comment": baked.about.json()})
+    picture = np.zeros((pixels, pixels, 3), np.uint8)
+    for rows, values, known in texture_rows(charts, baked.refined, baked.density, pixels):
+        picture[rows][known] = np.rint(255 * _shown(baked.heat, values[known]))
+    image = encode_png(mi.Bitmap(picture), {"Comment": baked.about.json()})
     attributes = [
         ("POSITION", whole.vertices[charts.vertex].astype("<f4"), False),
         ("NORMAL", vertex_normals(whole)[charts.vertex].astype("<f4"), False),
