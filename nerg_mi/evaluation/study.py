@@ -299,8 +299,8 @@ def _met(some) -> list[Setting]:
     rows = [Setting("default", "default")]
     rows += [Setting(f"stop {s:g}", "stop", {"stop": s}) for s in some(study_truth.STOPS)]
     rows += [Setting(f"extent {e:g}", "extent", {"extent": e}) for e in some(study_truth.EXTENTS)]
-    # The others are the median here.
-    rows += [Setting(f"depth {k}", "depth", {"depth": k}) for k in ("expected", "median")]
+    # What finds the depth of another kind, finds the same here.
+    rows += [Setting(f"depth {d.name}", "depth", {"depth": d.name}) for d in DEPTHS if d.finds == d.name]
     loose = [(2.0, 1e-2), (2.5, 1e-2), (2.5, 1e-3)]
     return rows + [Setting(f"extent {e:g}, stop {s:g}", "together", {"extent": e, "stop": s}) for e, s in some(loose)]
 

@@ -12,6 +12,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.aovs import is_nerg
 from nerg_mi.rendering.scene import load_scene
+from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import center
 from nerg_mi.transport.occlusion import EXACT
@@ -198,9 +199,10 @@ class Subject:
         return out | {"color": np.broadcast_to(picture[:, :first][:, :3], (len(picture), 3))}
 
     def truth(self, seed: int, depth: str, visibility: str) -> Truth:
-        """The reference for the rays of ``seed``, for kinds of depth and visibility as the integrator names them."""
+        """The reference for the rays of ``seed``, for kinds of depth (where something is marched) and visibility as the
+        integrator names them."""
         # Refined depths and maps are ways to find the same answers.
-        depth = "expected" if depth == "expected" else "median"
+        depth = DEPTHS.find(depth).finds if self.marched else ""
         visibility = "transmittance" if visibility == "transmittance" else "depth"
         key = seed, depth, visibility
         if key not in self._truths:

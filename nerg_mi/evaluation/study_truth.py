@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.color import decibels
 from nerg_mi.maths.geometry import box_interval
 from nerg_mi.maths.types import variant_types
+from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer_gaze import ObservedGaze
 
@@ -37,12 +38,12 @@ FUZZ = 1 / 64
 
 @dataclass(frozen=True)
 class Seen:
-    """Along rays (N,): optical depth, first moment ∫ t σ T dt, the median's distance (0 where nothing absorbs), and the
-    mean free path 1/σ where T = 1/2 (0 where that is not reached)."""
+    """Along rays (N,): optical depth, first moment ∫ t σ T dt, the distances at which optical depths up to ``tau`` are
+    reached, and the mean free path 1/σ where T = 1/2 (0 where that is not reached)."""
 
     tau: np.ndarray
     moment: np.ndarray
-    median: np.ndarray
+    crossing: Callable[[np.ndarray], np.ndarray]
     free_path: np.ndarray
 
     @property
@@ -55,9 +56,13 @@ class Seen:
         some = self.opacity > 0
         return np.where(some, self.moment / np.where(some, self.opacity, 1), 0)
 
+    def quantile(self, fraction: float) -> np.ndarray:
+        """Distance at which this fraction of the ray's own opacity is reached, 0 where nothing absorbs."""
+        return np.where(self.tau > 0, self.crossing(-np.log1p(fraction * np.expm1(-self.tau))), 0)
+
     def depth(self, kind: str) -> np.ndarray:
-        """Of the kinds that the integrator knows; the refined depth is the median, found better."""
-        return self.expected if kind == "expected" else self.median
+        """Of a kind that the integrator knows."""
+        return DEPTHS.find(kind).exact(self)
 
     def color(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """Linear radiance (N, 3) of the scenes' affine colour, black behind."""
@@ -114,14 +119,8 @@ def _pieces(scene, o, d, near, far) -> Seen:
         slope = length[row, i] / np.where(tau[row, i] > 0, tau[row, i], 1)
         return start[row, i] + slope * (goal - before[row, i]), slope
 
-    median = crossing(_half_of_opacity(total))[0]
     free_path = crossing(np.full(len(o), np.log(2)))[1]
-    return Seen(total, moment, np.where(total > 0, median, 0), np.where(total >= np.log(2), free_path, 0))
-
-
-def _half_of_opacity(tau: np.ndarray) -> np.ndarray:
-    """Optical depth at which half of the opacity of ``tau`` is reached."""
-    return -np.log1p(0.5 * np.expm1(-tau))
+    return Seen(total, moment, lambda goal: crossing(goal)[0], np.where(total >= np.log(2), free_path, 0))
 
 
 def mean_share(x: np.ndarray) -> np.ndarray:
@@ -156,9 +155,7 @@ def _profile(scene, o, d, near, far) -> Seen:
     p = o + d * crossing(np.log(2))[:, None]
     reached = total >= np.log(2)
     sigma = np.where(reached, scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY), 1)
-    return Seen(
-        total, moment, np.where(total > 0, crossing(_half_of_opacity(total)), 0), np.where(reached, 1 / sigma, 0)
-    )
+    return Seen(total, moment, crossing, np.where(reached, 1 / sigma, 0))
 
 
 @dataclass(frozen=True)
@@ -200,10 +197,8 @@ def compute_truth(
     surface = seen.opacity >= surface_opacity
     p_d = o + d * t[:, None]
     p_o = np.asarray(scene.observer, float)
-    # The point looked for lies in front of the surface, by the tolerance and by how far light goes into it: one mean
-    # free path to the expected depth of thick matter, ln 2 of it to the median.
-    paths = 1 if depth == "expected" else np.log(2)
-    in_front = tolerance + np.minimum(paths * seen.free_path, t * FUZZ)
+    # The point looked for lies in front of the surface, by the tolerance and by how far light goes into it.
+    in_front = tolerance + np.minimum(DEPTHS.find(depth).mean_free_paths * seen.free_path, t * FUZZ)
     distance, r_o = towards(p_o, p_d - d * in_front[:, None])
     start = np.broadcast_to(p_o, o.shape)
     p_od = p_d

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import drjit as dr
+import numpy as np
 
 from nerg_mi.maths.arrays import log1p
 from nerg_mi.maths.types import Bool, Float
@@ -36,6 +37,22 @@ class Marched:
     backed: Bool | None = None
 
 
+class Profile(Protocol):
+    """What closed forms say of the density along rays (N,), for what `Depth.exact` makes of it."""
+
+    @property
+    def opacity(self) -> np.ndarray: ...
+
+    @property
+    def expected(self) -> np.ndarray:
+        """Mean distance of absorption (N,), 0 where nothing absorbs."""
+        ...
+
+    def quantile(self, fraction: float) -> np.ndarray:
+        """Distance (N,) at which this fraction of the ray's own opacity is reached, 0 where nothing absorbs."""
+        ...
+
+
 class Depth(Protocol):
     """A kind of depth. It holds no state: one object serves every march."""
 
@@ -57,6 +74,16 @@ class Depth(Protocol):
     @property
     def at_half(self) -> bool:
         """Whether it lies in the step in which half of the ray's own opacity is reached."""
+        ...
+
+    @property
+    def finds(self) -> str:
+        """Name of the kind whose surface it finds: its own, unless it finds that of another kind better. `nerg study`
+        compares with that kind."""
+        ...
+
+    def exact(self, profile: Profile) -> np.ndarray:
+        """Distance (N,) of the surface where the density is in closed form, for `nerg study`."""
         ...
 
     def inside(self, marched: Marched) -> Float:
@@ -87,6 +114,10 @@ class Expected:
     summary = "mean distance of absorption"
     mean_free_paths = 1.0
     at_half = False
+    finds = "expected"
+
+    def exact(self, profile: Profile) -> np.ndarray:
+        return profile.expected
 
     def inside(self, marched: Marched) -> Float:
         return marched.result.expected_depth
@@ -103,6 +134,10 @@ class Median:
     summary = "where half of the ray's own opacity is reached"
     mean_free_paths = LOG2
     at_half = True
+    finds = "median"
+
+    def exact(self, profile: Profile) -> np.ndarray:
+        return profile.quantile(0.5)
 
     def inside(self, marched: Marched) -> Float:
         return _Half(marched).depth

@@ -1,10 +1,14 @@
-"""Another kind of depth is one object: registered, it is traced and rendered, with and without shapes, and stands in
-the manual."""
+"""Another kind of depth is one object: registered, it is traced and rendered, with and without shapes, studied, and
+stands in the manual."""
+
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
 import pytest
 
+from nerg_mi.evaluation import study
+from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.transport.depth import DEPTHS, Expected
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.volume_medium import VolumeMedium
@@ -17,6 +21,11 @@ class Entered:
     name = "entered"
     summary = "where the march begins"
     mean_free_paths = 0.0
+    at_half = False
+    finds = "entered"
+
+    def exact(self, profile):
+        return profile.quantile(0)
 
     def inside(self, marched):
         return dr.select(marched.result.tau > 0, marched.t0, 0)
@@ -67,3 +76,18 @@ def test04_the_surface_lies_as_deep_as_light_goes(rgb):
         depth, _ = trace_depth(slab, [[0.5, 0.5, 0.0]], [[0, 0, 1]], kind=kind.name)
         assert np.isclose(depth[0] * sigma, kind.mean_free_paths, rtol=1e-3), kind.name
     assert Expected().mean_free_paths == 1
+
+
+@pytest.mark.parametrize("hits", [False, True], ids=["marched", "splats"])
+def test05_a_study_has_it(entered, hits):
+    """Among its settings, but for splats not what finds the depth of another kind."""
+    subject = SimpleNamespace(marched=True, hits=hits, extent=1.0, has_gaze=True, normalized=False, resampled=True)
+    kinds = {s.params["depth"] for s in study.settings(subject) if s.group == "depth"}
+    assert kinds == {"expected", "median", "entered"} | (set() if hits else {"refined"})
+
+
+def test06_a_study_compares_it_with_its_own_exact_value(rgb, entered):
+    subject = open_subject("slab", "auto", 8, 8)
+    entry, median, refined = (subject.truth(1, kind, "depth") for kind in ("entered", "median", "refined"))
+    rendered = subject.channels(subject.integrator({"depth": "entered"}), 1, 1)["depth"]
+    assert np.allclose(entry.depth, rendered, rtol=1e-4) and (entry.depth < median.depth).any() and refined is median
