@@ -431,7 +431,7 @@ def table(path, head):
 )
 def test_columns(tmp_path, head, preset):
     found = preset_of_columns(table(tmp_path / "a.csv", head))
-    assert found is not None and found[0] == preset
+    assert found is not None and found[0].name == preset
     assert preset_of_columns(table(tmp_path / "a.csv", head.partition(",")[0])) is None
 
 
@@ -446,7 +446,7 @@ def test_files_and_first_lines(tmp_path):
     (tmp_path / "x_head_hand_eye.csv").write_text("0\n")
     (tmp_path / "day.csv").write_text("ann|3|[1, 2]\n")
     found = preset_of_files(tmp_path / "x_head_hand_eye.csv"), preset_of_text(tmp_path / "day.csv")
-    assert found[0] and found[0][0] == "hololens" and found[1] and found[1][0] == "skeleton"
+    assert found[0] and found[0][0].name == "hololens" and found[1] and found[1][0].name == "skeleton"
     (tmp_path / "a.csv").write_text("a|b|c\n")
     assert preset_of_text(tmp_path / "a.csv") is None and preset_of_files(tmp_path / "a.csv") is None
     check_is_table(tmp_path / "a.csv")

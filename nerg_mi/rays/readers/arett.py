@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .base import DESCRIPTION, UNITY, Frame, NoOptions, RaysBuilder
+from .base import DESCRIPTION, UNITY, Frame, NoOptions, RaysBuilder, Signature
 from .table import person_from_filename
 
 _MILLISECOND = 1e-3
@@ -27,6 +27,9 @@ class Arett:
     files = "gaze data of ARETT on HoloLens 2"
     world = "Unity"
     checked_on = DESCRIPTION
+    signature = Signature(
+        columns=(("eyeDataTimestamp", "gazeHasValue", "isCalibrationValid", "gazeOrigin_x", "gazeDirection_x"),)
+    )
     Options = NoOptions
 
     def frame(self, files: Sequence[Path], options: NoOptions) -> Frame:

@@ -15,7 +15,7 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import OnBadLine
 
 from . import poses
-from .base import RECORDINGS, Frame, RaysBuilder, option
+from .base import RECORDINGS, Frame, RaysBuilder, Signature, option
 from .poses import PoseTrack
 from .tables import TableBlock, iterate_table, table_columns
 
@@ -309,6 +309,7 @@ class Aria:
     )
     world = "right-handed, m, up by the trajectory's gravity"
     checked_on = f"{RECORDINGS}; of the second generation gaze alone"
+    signature = Signature(columns=(("tracking_timestamp_us", "pitch_rads_cpf"),))
     Options = AriaOptions
 
     def frame(self, files: Sequence[Path], options: AriaOptions) -> Frame:

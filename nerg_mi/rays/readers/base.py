@@ -21,7 +21,7 @@ from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, TICKS, Checked, Range
 from nerg_mi.rays.rays import COLUMNS, FRAME, Rays
 
-from .columns import looks_like_validity
+from .columns import ColumnFinder, looks_like_validity
 from .tables import TableBlock, iterate_table, table_columns
 from .values import FilledOrigins, fill_values, is_aimed
 
@@ -601,6 +601,32 @@ DESCRIPTION = "generated files"
 """Of one that was checked on files made after the source or manual of the program that writes them."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Signature:
+    """By what `nerg rays guess` tells files of a format from others: any of these. Without any it is not proposed."""
+
+    files: tuple[tuple[str, str], ...] = ()
+    """Names of a file and of one beside it, which make a folder of both a recording."""
+
+    ending: str = ""
+    """How the name of a file ends, in lower case."""
+
+    columns: tuple[tuple[str, ...], ...] = ()
+    """Columns that a table has, all of them; where those of several formats are there, the largest set counts."""
+
+    line: Callable[[str], str | None] = lambda line: None
+    """What in the first line of a file tells, or None."""
+
+    table: Callable[[ColumnFinder], str | None] = lambda table: None
+    """What in a table's columns tells where a reader looks for them by several names, or None. Asked last."""
+
+    options: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Flags of what no file says, with a word in place of the value."""
+
+    question: str = ""
+    """What these are."""
+
+
 class Reader(Protocol[O]):
     """A format of tracking files."""
 
@@ -615,6 +641,9 @@ class Reader(Protocol[O]):
 
     checked_on: str
     """What it was checked on: `RECORDINGS`, `DESCRIPTION`, or words of its own."""
+
+    signature: Signature
+    """By what its files are told from others."""
 
     Options: type[O]
     """Its options; `nerg_mi.rays.readers.base.NoOptions` where it has none."""

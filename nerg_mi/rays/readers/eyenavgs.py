@@ -12,7 +12,7 @@ import numpy as np
 from nerg_mi.errors import NergError, plain
 
 from . import poses
-from .base import OPENGL, RECORDINGS, Frame, RaysBuilder, option
+from .base import OPENGL, RECORDINGS, Frame, RaysBuilder, Signature, option
 from .poses import rotations_from_quaternions
 from .tables import TableBlock, iterate_table, table_columns
 
@@ -136,6 +136,7 @@ class EyeNavGS:
     files = "`userN_PLACE.csv` of EyeNavGS (or folders of them), of one place; `scene_setting.csv` beside them or above"
     world = "right-handed, y up and in metres after the place's rotation and scale"
     checked_on = f"{RECORDINGS} of Rutgers; of NTHU generated files"
+    signature = Signature(columns=(("ViewIndex", "PositionX", "QuaternionX", "GazeQX"),))
     Options = EyeNavGSOptions
 
     def frame(self, files: Sequence[Path], options: EyeNavGSOptions) -> Frame:

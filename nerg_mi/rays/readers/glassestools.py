@@ -13,8 +13,8 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import read_bytes
 
-from .base import DESCRIPTION, RaysBuilder
-from .scene_glasses import GazeBlock, Recording, SceneCamera, SceneReader
+from .base import DESCRIPTION, RaysBuilder, Signature
+from .scene_glasses import POSES, WHERE_CAMERA, GazeBlock, Recording, SceneCamera, SceneReader
 
 _MILLISECOND = 1e-3
 _XML = 1 << 20  # bytes of a calibration, at most
@@ -41,6 +41,12 @@ class GlassesTools(SceneReader[_Glasses]):
     )
     checked_on = DESCRIPTION
     gaze_file = "gazeData.tsv"
+    signature = Signature(
+        files=(("gazeData.tsv", "calibration.xml"),),
+        columns=(("timestamp", "frame_idx", "gaze_pos_vid_x", "gaze_pos_vid_y"),),
+        options=POSES,
+        question=WHERE_CAMERA,
+    )
 
     def open(self, folder: Path, builder: RaysBuilder) -> _Glasses:
         name = folder.resolve().name

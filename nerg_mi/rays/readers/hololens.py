@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .base import DESCRIPTION, OPENGL, Frame, NoOptions, RaysBuilder
+from .base import DESCRIPTION, OPENGL, Frame, NoOptions, RaysBuilder, Signature
 from .table import person_from_filename
 from .tables import iterate_table
 
@@ -34,6 +34,7 @@ class HoloLens:
     files = "`*_head_hand_eye.csv` of HoloLens 2's StreamRecorder"
     world = "y up, right, m"
     checked_on = DESCRIPTION
+    signature = Signature(ending="_head_hand_eye.csv")
     Options = NoOptions
 
     def frame(self, files: Sequence[Path], options: NoOptions) -> Frame:

@@ -17,7 +17,7 @@ from nerg_mi.files.safe_read import reading, size_of
 from nerg_mi.ranges import ANGLES, Checked
 
 from . import poses
-from .base import DESCRIPTION, UNITS, UPS, Frame, RaysBuilder, option
+from .base import DESCRIPTION, UNITS, UPS, Frame, RaysBuilder, Signature, option
 from .skeleton import FACE, MISSING, PITCH, PlaceChecks, Places, head_poses, median_of, parse_keypoints
 from .table import person_from_filename
 from .values import fill_values
@@ -153,6 +153,7 @@ class C3d:
     files = "`*.c3d` of motion capture with markers on the head (`pip install 'nerg-mi[mocap]'`)"
     world = "the laboratory's, right-handed, in the file's unit, whose `POINT:Y_SCREEN` or `--up` points up"
     checked_on = DESCRIPTION
+    signature = Signature(ending=".c3d")
     Options = MarkerOptions
 
     def frame(self, files: Sequence[Path], options: MarkerOptions) -> Frame:

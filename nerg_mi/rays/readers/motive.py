@@ -15,7 +15,7 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import line_blocks
 
 from . import poses
-from .base import DESCRIPTION, Frame, RaysBuilder, option
+from .base import DESCRIPTION, Frame, RaysBuilder, Signature, option
 from .table import person_from_filename
 
 _HEAD_LINES = 40
@@ -63,6 +63,12 @@ class Motive:
     files = "CSV export of OptiTrack's Motive with header and rigid bodies (rotation type quaternion): heads"
     world = "right-handed, `--up` (y in Motive), unit of the file"
     checked_on = DESCRIPTION
+    signature = Signature(
+        line=lambda line: (
+            "its first line is that of Motive's export" if line.lstrip("\ufeff").startswith("Format Version,") else None
+        ),
+        question="the axis along which the head's rigid body looks (--forward; -z if nothing is said)",
+    )
     Options = MotiveOptions
 
     def frame(self, files: Sequence[Path], options: MotiveOptions) -> Frame:

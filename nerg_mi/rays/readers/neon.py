@@ -14,8 +14,8 @@ import numpy as np
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import read_json
 
-from .base import DESCRIPTION, RaysBuilder
-from .scene_glasses import GazeBlock, Recording, SceneCamera, SceneReader, directions_from_angles
+from .base import DESCRIPTION, RaysBuilder, Signature
+from .scene_glasses import POSES, WHERE_CAMERA, GazeBlock, Recording, SceneCamera, SceneReader, directions_from_angles
 from .tables import table_columns
 
 _TIME = "timestamp [ns]"
@@ -61,6 +61,12 @@ class Neon(SceneReader[_Neon]):
     )
     checked_on = DESCRIPTION
     gaze_file = "gaze.csv"
+    signature = Signature(
+        files=(("gaze.csv", "info.json"), ("gaze.csv", "world_timestamps.csv")),
+        columns=(("timestamp [ns]", "gaze x [px]", "gaze y [px]"),),
+        options=POSES,
+        question=WHERE_CAMERA,
+    )
     accounts = "pixels and angles"
 
     def open(self, folder: Path, builder: RaysBuilder) -> _Neon:

@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError
 
 from . import columns as names
 from . import poses
-from .base import DESCRIPTION, OPENGL, Frame, RaysBuilder, TickOption, tick_option
+from .base import DESCRIPTION, OPENGL, Frame, RaysBuilder, Signature, TickOption, tick_option
 from .columns import ColumnFinder, mark_valid, require_valid_values
 from .table import find_person, person_from_filename
 
@@ -38,6 +38,11 @@ class OpenXrOptions(TickOption):
     tick: float = tick_option(1e-9)
 
 
+def _recognize(table: ColumnFinder) -> str | None:
+    turn = table.find_vector("gaze_orientation", "gaze_pose_orientation", axes="xyzw")
+    return "it has gaze_orientation and location_flags" if turn and table.find("location_flags") else None
+
+
 class OpenXr:
     """Tables of the gaze's pose: right-handed, y up, metres, looking along -z.
 
@@ -55,6 +60,7 @@ class OpenXr:
     )
     world = "OpenXR: y up, right, m, forward -z"
     checked_on = DESCRIPTION
+    signature = Signature(table=_recognize)
     Options = OpenXrOptions
 
     def frame(self, files: Sequence[Path], options: OpenXrOptions) -> Frame:

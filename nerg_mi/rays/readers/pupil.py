@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.ranges import LENGTHS, Checked, Range
 
 from . import poses
-from .base import DESCRIPTION, Frame, RaysBuilder, option
+from .base import DESCRIPTION, Frame, RaysBuilder, Signature, option
 from .poses import PoseTrack
 
 _GAP = 0.1  # seconds: between head poses farther apart than this nothing is interpolated
@@ -44,6 +44,12 @@ class Pupil:
     files = "folders exported from Pupil Player with the head pose tracker (or the `gaze_positions.csv` in them)"
     world = "that of the markers, right-handed, whose axis `--up` points up; gaze in an OpenCV camera's"
     checked_on = DESCRIPTION
+    signature = Signature(
+        files=(("gaze_positions.csv", "head_pose_tracker_poses.csv"),),
+        columns=(("gaze_timestamp", "gaze_normal0_x", "eye_center0_3d_x"),),
+        options={"--marker": "METRES"},
+        question="the edge of a tracking marker in metres (--marker) and the up axis of the markers (--up)",
+    )
     Options = PupilOptions
 
     def frame(self, files: Sequence[Path], options: PupilOptions) -> Frame:

@@ -11,7 +11,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, plain
 
-from .base import DESCRIPTION, Frame, RaysBuilder, option
+from .base import DESCRIPTION, Frame, RaysBuilder, Signature, option
 from .columns import ColumnFinder
 from .poses import iterate_gaze_vectors
 from .table import person_from_filename
@@ -40,6 +40,9 @@ class Qualisys:
     files = "gaze vectors of Qualisys Track Manager, `*_g.tsv` or `*_g_1.tsv` and `*_g_2.tsv`, or folders of them"
     world = "the laboratory's, right-handed, mm, whose axis `--up` points up"
     checked_on = DESCRIPTION
+    signature = Signature(
+        line=lambda line: "its first line names a gaze vector" if line.startswith("GAZE_VECTOR_NAME\t") else None
+    )
     Options = QualisysOptions
 
     def frame(self, files: Sequence[Path], options: QualisysOptions) -> Frame:
@@ -120,6 +123,11 @@ class NeonMocap:
     files = "`gaze_in_mocap_space.csv` of Pupil Labs' neon_mocap_localization"
     world = "the motion capture's, right-handed: `--up`, `--units`"
     checked_on = DESCRIPTION
+    signature = Signature(
+        columns=(("timestamp [ns]", "gaze_origin_X", "gaze_origin_Y", "gaze_origin_Z", "gaze_dir_X"),),
+        options={"--up": "UP"},
+        question="the up axis of the motion capture (--up)",
+    )
     Options = NeonMocapOptions
 
     def frame(self, files: Sequence[Path], options: NeonMocapOptions) -> Frame:

@@ -13,7 +13,7 @@ from nerg_mi.ranges import Range
 
 from . import columns as names
 from . import poses
-from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, TickOption, option
+from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, Signature, TickOption, option
 from .columns import ColumnFinder
 from .table import find_person, person_from_filename
 from .values import fill_values
@@ -28,6 +28,11 @@ class QuestOptions(TickOption):
     """What is kept."""
 
     min_confidence: float = option(0.5, "Drop rows below this confidence.", within=Range(0, 1))
+
+
+def _recognize(table: ColumnFinder) -> str | None:
+    left = table.find_vector(*(f"left_eye_{word}" for word in (*_ROTATION, "gaze_rotation")), axes="xyzw")
+    return f"it has a pose of each eye ({left[0]})" if left else None
 
 
 class Quest:
@@ -46,6 +51,7 @@ class Quest:
     )
     world = "Unity"
     checked_on = DESCRIPTION
+    signature = Signature(table=_recognize)
     Options = QuestOptions
 
     def frame(self, files: Sequence[Path], options: QuestOptions) -> Frame:

@@ -6,7 +6,7 @@ import importlib
 import os
 import pkgutil
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,11 @@ def unregister(name: str) -> None:
 def reader_names() -> tuple[str, ...]:
     """Names of all readers, in the order in which they were registered."""
     return tuple(_READERS)
+
+
+def readers() -> Iterable[Reader[Any]]:
+    """All readers, in the order in which they were registered."""
+    return _READERS.values()
 
 
 def preset_names() -> tuple[str, ...]:

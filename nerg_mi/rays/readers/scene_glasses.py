@@ -554,6 +554,16 @@ R = TypeVar("R", bound=Recording)
 """What a reader knows of a recording."""
 
 
+POSES = {"--poses": "MODEL", "--frames": "frame_{frame1}"}
+"""Options of its readers that no file says, with a word in place of the value."""
+
+WHERE_CAMERA = (
+    "where the scene camera was: --poses names the model that holds its frames and the place's photos, --frames how "
+    "they are called; --place the place that was trained on it"
+)
+"""What these are."""
+
+
 class SceneReader(ABC, Generic[R]):
     """A reader of folders, each a recording of glasses whose scene camera's poses are known in the place.
 

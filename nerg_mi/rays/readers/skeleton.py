@@ -20,7 +20,7 @@ from nerg_mi.files.atomic import replacing
 from nerg_mi.files.safe_read import OnBadLine, line_blocks
 from nerg_mi.ranges import ANGLES
 
-from .base import DESCRIPTION, UNITS, Frame, RaysBuilder, TickOption, option
+from .base import DESCRIPTION, UNITS, Frame, RaysBuilder, Signature, TickOption, option
 from .values import fill_values
 
 # ---- Skeleton file ----
@@ -485,6 +485,11 @@ class SkeletonOptions(TickOption):
             raise NergError(f'there is no skeleton "{self.skeleton}"; --skeleton is one of {", ".join(SKELETONS)}')
 
 
+def _recognize(line: str) -> str | None:
+    words = line.split("|")
+    return "its lines are id|time|[keypoints]" if len(words) == 3 and words[2].lstrip().startswith("[") else None
+
+
 class SkeletonFile:
     """One ray a pose: from the midpoint of the ears through the nose (NeRG, Section 5.1).
 
@@ -501,6 +506,9 @@ class SkeletonFile:
     )
     world = "declared: `--up`, `--hand`, `--units`"
     checked_on = DESCRIPTION
+    signature = Signature(
+        line=_recognize, question="the unit of the time (--tick); the card tells which would give a device's rate"
+    )
     Options = SkeletonOptions
 
     def frame(self, files: Sequence[Path], options: SkeletonOptions) -> Frame:

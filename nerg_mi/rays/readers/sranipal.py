@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 
 from . import columns as names
 from . import poses
-from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, TickOption, tick_option
+from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, Signature, TickOption, tick_option
 from .columns import ColumnFinder
 from .table import find_person, person_from_filename
 from .values import fill_values
@@ -49,6 +49,19 @@ class _Columns:
     person: str | None
 
 
+# By which the SDK's own values are known.
+_NAMES = (
+    *("gaze_origin_mm", "combined_gaze_origin_mm", "verbose_data_combined_eye_data_gaze_origin_mm"),
+    *("combined_eye_data_gaze_origin_mm", "left_gaze_origin_mm", "gaze_origin_l", "gaze_origin_c"),
+    "verbose_data_left_gaze_origin_mm",
+)
+
+
+def _recognize(table: ColumnFinder) -> str | None:
+    origin, head = table.find_vector(*_NAMES), table.find_vector(*names.MORE_HEADS)
+    return f"it has {origin[0]} beside {head[0]}" if origin and head else None
+
+
 class Sranipal:
     """Tables with the SDK's own values beside the head's pose in Unity's world.
 
@@ -66,6 +79,7 @@ class Sranipal:
     )
     world = "Unity; gaze in the right-handed head frame of the SDK"
     checked_on = DESCRIPTION
+    signature = Signature(table=_recognize)
     Options = SranipalOptions
 
     def frame(self, files: Sequence[Path], options: SranipalOptions) -> Frame:

@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.ranges import Checked, Range
 
 from . import poses
-from .base import RECORDINGS, Frame, RaysBuilder, option, tick_option, valid_option
+from .base import RECORDINGS, Frame, RaysBuilder, Signature, option, tick_option, valid_option
 from .columns import PERSONS, ColumnFinder, ColumnMap, is_counter, mark_valid, parse_valid, require_valid_values
 from .tables import TableBlock, iterate_table
 
@@ -79,6 +79,7 @@ class Table:
     files = "CSV (comma, semicolon or tab; `.gz` too) or Parquet tables, whose columns are named by `--map`"
     world = "declared: `--up`, `--hand`, `--units`"
     checked_on = RECORDINGS
+    signature = Signature()
     Options = TableOptions
 
     def frame(self, files: Sequence[Path], options: TableOptions) -> Frame:

@@ -13,8 +13,8 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import OnBadLine, line_blocks, parse_json, read_json
 from nerg_mi.files.video import frame_times
 
-from .base import DESCRIPTION, RaysBuilder
-from .scene_glasses import GazeBlock, Recording, SceneCamera, SceneReader, angles_between
+from .base import DESCRIPTION, RaysBuilder, Signature
+from .scene_glasses import POSES, WHERE_CAMERA, GazeBlock, Recording, SceneCamera, SceneReader, angles_between
 
 _RECORDING, _VIDEO = "recording.g3", "scenevideo.mp4"
 _UNUSED = 100  # parts of samples that are not used and named
@@ -53,6 +53,7 @@ class Tobii3(SceneReader[_Tobii]):
     )
     checked_on = DESCRIPTION
     gaze_file = "gazedata.gz"
+    signature = Signature(files=(("gazedata.gz", "recording.g3"),), options=POSES, question=WHERE_CAMERA)
     accounts = "gaze2d and gaze3d"
 
     def open(self, folder: Path, builder: RaysBuilder) -> _Tobii:

@@ -9,7 +9,7 @@ from pathlib import Path
 from nerg_mi.errors import NergError, plain
 
 from . import columns as names
-from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, TickOption, valid_option
+from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, Signature, TickOption, valid_option
 from .columns import ColumnFinder, ColumnMap, is_validity, parse_valid
 from .table import TableOptions, add_tables, find_person
 
@@ -35,6 +35,8 @@ class UnityReader:
 
     world = "Unity: y up, left, m"
     checked_on = DESCRIPTION
+    # What projects call the gaze does not say of which frame it is: a column map is proposed.
+    signature = Signature()
     Options = UnityOptions
 
     def __init__(self, name: str, files: str, columns_of: Callable[[ColumnFinder], dict]) -> None:

@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import OnBadLine
 
 from . import poses
-from .base import DESCRIPTION, UNITY, Frame, NoOptions, RaysBuilder
+from .base import DESCRIPTION, UNITY, Frame, NoOptions, RaysBuilder, Signature
 from .table import person_from_filename
 
 _TICK = 1e-9  # seconds: what CaptureTime counts
@@ -32,6 +32,7 @@ class Varjo:
     files = "the log of Varjo's eye tracking example for Unity"
     world = "Unity"
     checked_on = DESCRIPTION
+    signature = Signature(columns=(("CaptureTime", "HMDPosition", "HMDRotation", "CombinedGazeForward", "GazeStatus"),))
     Options = NoOptions
 
     def frame(self, files: Sequence[Path], options: NoOptions) -> Frame:

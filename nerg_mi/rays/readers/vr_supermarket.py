@@ -15,7 +15,7 @@ import numpy as np
 from nerg_mi.ranges import Checked, Range
 
 from . import poses
-from .base import RECORDINGS, UNITY, Frame, RaysBuilder, option
+from .base import RECORDINGS, UNITY, Frame, RaysBuilder, Signature, option
 from .table import person_from_filename
 
 _MATRIX = [f"ctw_{i}{j}" for i in range(3) for j in range(4)]
@@ -51,6 +51,7 @@ class VrSupermarket:
     files = "one CSV a person of the VR supermarket (github: ryuryu0226)"
     world = "Unity"
     checked_on = RECORDINGS
+    signature = Signature(columns=(("ctw_00", "ctw_23", "ray_x", "eye_x", "opennessl", "opennessr", "xc"),))
     Options = SupermarketOptions
 
     def frame(self, files: Sequence[Path], options: SupermarketOptions) -> Frame:

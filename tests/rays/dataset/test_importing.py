@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.rays.dataset import Head, RayDataset, read_sources, write_head
 from nerg_mi.rays.dataset_write import Marks, Task, has_parts, import_source
-from nerg_mi.rays.readers.base import Frame, NoOptions
+from nerg_mi.rays.readers.base import Frame, NoOptions, Signature
 from nerg_mi.rays.readers.registry import read_rays
 
 from .making import assert_same, recipe, settings, write_source
@@ -50,6 +50,7 @@ class Headset:
     """A reader of heads and distances of eyes, in cm, that makes its rays itself."""
 
     name, files, world, checked_on, Options = "headset", "", "", "", NoOptions
+    signature = Signature()
 
     def frame(self, files, options):
         return Frame(units="cm")

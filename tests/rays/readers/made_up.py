@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.base import Frame, RaysBuilder, TickOption, option
+from nerg_mi.rays.readers.base import Frame, RaysBuilder, Signature, TickOption, option
 from nerg_mi.rays.readers.tables import iterate_table
 
 
@@ -27,6 +27,11 @@ class MadeUp:
     files = "directions, with the file of the heads in `--heads`"
     world = "y up, right, m"
     checked_on = "itself"
+    signature = Signature(
+        columns=(("t", "a", "b", "c", "open"),),
+        options={"--heads": "HEADS"},
+        question="the file of the heads (--heads)",
+    )
     Options = MadeUpOptions
 
     def frame(self, files: Sequence[Path], options: MadeUpOptions) -> Frame:

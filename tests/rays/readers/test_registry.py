@@ -47,6 +47,7 @@ def test_a_format_is_added_by_one_object(tmp_path, made_up):
     assert "leave out --up" in str(run(*command, "--up", "y").exception)
     shown = " ".join(run("import", "--help").output.replace("│", " ").split())
     assert "made_up: What a unit of the heads' places is, in metres." in shown and "made_up" in shown
+    assert run("guess", eyes).output.rstrip().endswith("--preset made_up --heads HEADS")
     assert "| `made_up` | directions, with the file of the heads in `--heads`" in registry.preset_table()
 
 
