@@ -202,8 +202,8 @@ class ProbeSettings(Checked):
 class GazeSettings(Checked):
     """How weights are moved, for how long, and what a validation watches. Of ``steps`` and ``minutes`` one is set."""
 
-    steps: int | None = setting(None, "Or: train for so many steps.", within=STEPS)
-    minutes: float | None = setting(None, "Train for this long, both fits together.", within=MINUTES)
+    steps: int | None = setting(None, "Train for so many steps.", within=STEPS)
+    minutes: float | None = setting(None, "Or: train for so many minutes, both fits together.", within=MINUTES)
     seed: int = setting(0, "Seed of probes, directions, weights, batches and splits.", within=SEEDS)
     # "likelihood" is that of a log density.
     loss: str = setting("paper", "Of small and paper. paper: KLD + (1 - CC) + MAE; code: MAE + 0.1 (1 - CC).")

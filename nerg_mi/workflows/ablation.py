@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,12 +37,13 @@ from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan
 from nerg_mi.train.gaze_data import Supervision, digest_rays, hold_out
 from nerg_mi.train.gaze_recipes import gaze_recipe
+from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan
 from nerg_mi.train.geometry import GazePlace
 
 from .base import SILENT, Reporter, argument, command, out, select_backend
 from .geometry import check_place, make_place, place_kind
-from .options import PartOptions, PlaceOptions, option
+from .options import PartOptions, PlaceOptions, exposed_options, exposes, option
 from .parts import Parts, PlannedScene
 from .train_gaze import GazeOptions, plan_gaze, train_planned
 
@@ -49,8 +51,13 @@ from .train_gaze import GazeOptions, plan_gaze, train_planned
 
 
 @dataclass(frozen=True, kw_only=True)
+@exposes(ProbeSettings, GazeSettings, default="Default: the recipe's.", without=("seed", "freeze", "loss", "mix_folds"))
 class AblationOptions(PlaceOptions, PartOptions):
     """Which variants are trained, on what they are scored, and how a frame is timed. Lengths are metres."""
+
+    if TYPE_CHECKING:
+        # Options that are settings, too.
+        def __init__(self, **options: Any) -> None: ...
 
     recipes: str = option("default,paper", "Recipes to ablate, separated by commas.")
     variant: tuple[str, ...] = option(
@@ -60,7 +67,6 @@ class AblationOptions(PlaceOptions, PartOptions):
     first: int = option(0, "Seed of what is held out, and of the first training.", within=FIRST_SEEDS)
     steps: int | None = option(None, "Steps of every recipe but the default one. Default: the recipe's.", within=STEPS)
     default_steps: int | None = option(None, "Steps of the default recipe. Default: its own.", within=STEPS)
-    probes: int | None = option(None, "Probes of a training at most. Default: the recipe's.", within=Range(1, 10**6))
     zones: int = option(3, "Zones of test positions.", within=Range(1, 1000))
     positions: int = option(60, "Test positions.", within=Range(1, 10**5))
     people: float = option(0.0, "Share of the people who are held out besides.", within=TEST_SHARES)
@@ -135,7 +141,7 @@ def plan_of(variant: Variant, seed: int, bench: Bench) -> GazePlan:
             freeze=variant.frozen,
             loss=variant.loss or None,
             steps=(options.default_steps if quick else options.steps) or None,
-            probes=options.probes or None,
+            **exposed_options(options),
             refit=options.refit or quick,
             # Heads are compared: what is mixed in besides would make them alike.
             mix_folds=0,

@@ -12,7 +12,7 @@ import math
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,17 +38,18 @@ from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.probes.probes import LEVELS, level_name
-from nerg_mi.ranges import DIRECTIONS, FIRST_SEEDS, KAPPAS, LENGTHS, RAYS, STEPS, THREADS, Range
+from nerg_mi.ranges import DIRECTIONS, FIRST_SEEDS, KAPPAS, RAYS, THREADS, Range
 from nerg_mi.rays.dataset import is_dataset
 from nerg_mi.rays.dataset_open import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan
 from nerg_mi.threads import set_thread_count
+from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.geometry import GazePlace
 
 from .base import SILENT, Reporter, argument, command, out, select_backend
 from .geometry import GazeEvaluationOptions, check_place, place_kind, place_of_training
-from .options import PartOptions, PlaceOptions, option
+from .options import PartOptions, PlaceOptions, exposed_options, exposes, option
 from .parts import Parts, PlannedScene
 from .train_gaze import GazeOptions, train_gaze
 from .train_prior import RECIPE as PRIOR
@@ -265,8 +266,13 @@ def _notes(
 
 
 @dataclass(frozen=True, kw_only=True)
+@exposes(ProbeSettings, GazeSettings, default="Default: the recipe's.", without=("seed", "freeze"))
 class FoldOptions(PlaceOptions, PartOptions):
     """How many folds there are, what each holds out, and how its field is trained and scored. Lengths are metres."""
+
+    if TYPE_CHECKING:
+        # Options that are settings, too.
+        def __init__(self, **options: Any) -> None: ...
 
     folds: int = option(5, "Folds: each holds out other people and other zones.", within=Range(2, 10_000))
     first: int = option(0, "Seed of the first fold; the others have those that follow.", within=FIRST_SEEDS)
@@ -284,17 +290,6 @@ class FoldOptions(PlaceOptions, PartOptions):
         0, "Members of each fold's field, whose spread is judged as support is. 0: one field.", within=Range(0, 100)
     )
     align: Path | None = option(None, "JSON file with the 4x4 similarity from the rays' frame to the place's.")
-    radius: float | None = option(None, "Radius R of a probe in metres. Default: the recipe's.", within=LENGTHS)
-    probes: int | None = option(None, "Probes of a training at most. Default: the recipe's.", within=Range(1, 10**6))
-    steps: int | None = option(None, "Steps of a training. Default: the recipe's.", within=STEPS)
-    mix_folds: int | None = option(
-        None,
-        "Folds within each training that choose the share of the blind density. Default: the recipe's.",
-        within=Range(0, 1000),
-    )
-    mix_kappa: float | None = option(
-        None, "Concentration of the kernels of that blind density. Default: the recipe's.", within=KAPPAS
-    )
     most: int = option(10_000_000, "Rays of a dataset at most; of more, a sample by --first.", within=RAYS)
     kappa: float = option(20.0, "Concentration of the kernel of truth and baselines.", within=KAPPAS)
     directions: int = option(2048, "Directions that maps are compared in.", within=DIRECTIONS)
@@ -433,11 +428,7 @@ def train_and_score(common: Folds, seed: int, output: Path) -> None:
         align=o.align,
         recipe=o.recipe,
         variant=o.variant,
-        radius=o.radius,
-        probes=o.probes,
-        steps=o.steps,
-        mix_folds=o.mix_folds,
-        mix_kappa=o.mix_kappa,
+        **exposed_options(o),
         ensemble=o.ensemble,
         test_zones=o.zones,
         test_positions=o.positions,

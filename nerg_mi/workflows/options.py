@@ -6,7 +6,7 @@ and the command line makes its option of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -35,6 +35,9 @@ from nerg_mi.ranges import (
 # (``nerg_mi.cli.building``).
 
 
+# Key in the metadata of a field that `exposes` made.
+_EXPOSED = "nerg_mi.exposed"
+
 Base = TypeVar("Base")
 Class = TypeVar("Class", bound=type)
 
@@ -61,8 +64,9 @@ def option(
     return field(default=default, metadata={**about, RANGE: within, FLAG: names[-1] if names else ""})
 
 
-def exposes(*kinds: type, default: str = "") -> Callable[[Class], Class]:
+def exposes(*kinds: type, default: str = "", without: Collection[str] = ()) -> Callable[[Class], Class]:
     """Decorator of a class, under ``dataclass``: gives it an option for each `nerg_mi.ranges.setting` of ``kinds``.
+    `exposed_options` reads those that it gave.
 
     Parameters
     ----------
@@ -72,12 +76,14 @@ def exposes(*kinds: type, default: str = "") -> Callable[[Class], Class]:
     default
         Ends the help of options that are None until they are set, where something else decides. Without it an option
         has the default of its setting.
+    without
+        Options that it leaves out.
     """
 
     def decorate(kind: Class) -> Class:
         for setting in (f for settings in kinds for f in fields(settings) if "help" in f.metadata):
             about, name, hint = setting.metadata, setting.metadata["option"] or setting.name, str(setting.type)
-            if name in kind.__annotations__:
+            if name in kind.__annotations__ or name in without:
                 continue
             names, value = about["names"], setting.default
             if default:
@@ -86,7 +92,8 @@ def exposes(*kinds: type, default: str = "") -> Callable[[Class], Class]:
                     flag = (names[-1] if names else f"--{name.replace('_', '-')}").removeprefix("--")
                     names = (f"--{flag}/--no-{flag}",)
             kind.__annotations__[name] = hint
-            setattr(kind, name, option(value, f"{about['help']} {default}".rstrip(), *names, within=about[RANGE]))
+            exposed = option(value, f"{about['help']} {default}".rstrip(), *names, within=about[RANGE])
+            setattr(kind, name, field(default=value, metadata={**exposed.metadata, _EXPOSED: True}))
         return kind
 
     return decorate
@@ -97,6 +104,13 @@ def chosen_settings(options: Any, kind: type) -> dict[str, Any]:
     exposed = {f.name: f.metadata["option"] or f.name for f in fields(kind) if "help" in f.metadata}
     values = {name: getattr(options, option) for name, option in exposed.items()}
     return {name: value for name, value in values.items() if value is not None}
+
+
+def exposed_options(options: Any) -> dict[str, Any]:
+    """Those of ``options`` that `exposes` gave their class, and that are set: keywords of other options that expose the
+    same settings."""
+    names = [f.name for f in fields(options) if f.metadata.get(_EXPOSED)]
+    return {name: value for name in names if (value := getattr(options, name)) is not None}
 
 
 def as_base(options: Any, kind: type[Base]) -> Base:
