@@ -92,6 +92,7 @@ def registered() -> str:
     from nerg_mi.fields import encoding as encodings
     from nerg_mi.fields import gaze_base as gaze_fields
     from nerg_mi.rays.readers.registry import reader_names
+    from nerg_mi.statistics.tables import BY_NAME
     from nerg_mi.train import gaze_recipes
     from nerg_mi.transport.aovs import AOVS
     from nerg_mi.transport.depth import DEPTHS
@@ -104,6 +105,7 @@ def registered() -> str:
         ("depth", "nerg_mi/transport/depth.py", DEPTHS.names()),
         ("AOV", "nerg_mi/transport/aovs.py", AOVS),
         ("tracking reader", "nerg_mi/rays/readers/base.py", reader_names()),
+        ("statistic", "nerg_mi/statistics/tables.py", BY_NAME),
         ("gaze recipe", "nerg_mi/train/gaze_recipes.py", gaze_recipes.recipes()),
     )
     cells = [(what, f"`{file}`", ", ".join(f"`{name}`" for name in names)) for what, file, names in rows]
@@ -119,11 +121,20 @@ def _choose_variant() -> None:
         mi.set_variant("llvm_ad_rgb")
 
 
+def measures() -> str:
+    """The numbers of `nerg stats`: how each is defined, and over whom."""
+    from nerg_mi.statistics.tables import MEASURES
+
+    rows = [(m.title.partition(" [")[0], m.definition, m.over, "yes" if m.compared else "") for m in MEASURES]
+    return table(("number", "definition", "over", "differences"), rows)
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "plugins": plugins,
     "presets": presets,
     "checks": checks,
     "commands": command_pages.reference,
+    "measures": measures,
     "recipes": recipes,
     "registered": registered,
 }

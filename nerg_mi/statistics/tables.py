@@ -84,17 +84,21 @@ class People:
 Pair = tuple[np.ndarray, np.ndarray]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Measure:
-    """A number: its ``name`` in tables, a ``title`` with its unit, ``most``: the greatest that it can be, whether it is
-    a share of people (``counts``), and ``pair``: its numerator and denominator (P, A) for each person, None where the
-    people's sums do not tell it."""
+    """A number: its ``name`` in tables, a ``title`` with its unit, its ``definition`` and the people ``over`` whom it
+    is, for the manual; ``pair``: its numerator and denominator (P, A) for each person, None where the people's sums do
+    not tell it; ``most``: the greatest that it can be; whether it is a share of people (``counts``), and whether its
+    differences between cells are told (``compared``)."""
 
     name: str
     title: str
-    most: float
-    counts: bool
+    definition: str
+    over: str
     pair: Callable[[People], Pair | None]
+    most: float = np.inf
+    counts: bool = False
+    compared: bool = False
 
     def estimate(self, people: People, resamples: int, seed: int) -> Estimates | None:
         """The number of each area, with its interval."""
@@ -139,26 +143,89 @@ def _unseen(p: People) -> Pair | None:
 
 
 MEASURES = (
-    Measure("share", "share of time", 1.0, False, _share),
-    Measure("dwell", "dwell [s]", np.inf, False, lambda p: (p.on_time, p.everybody)),
-    Measure("reach", "reach", 1.0, True, lambda p: (p.reached * p.everybody, p.everybody)),
-    Measure("first_look", "first look [s]", np.inf, False, _first),
-    Measure("looks", "looks", np.inf, False, lambda p: None if p.looks is None else (p.looks, p.everybody)),
-    Measure("returns", "returns", np.inf, False, _returns),
-    Measure("distance", "distance [m]", np.inf, False, lambda p: (p.distance, p.on_time)),
-    Measure("visible", "visible share", 1.0, False, _visible_share),
     Measure(
-        "given_visible",
-        "looked at, given visible",
-        1.0,
-        False,
-        lambda p: None if p.visible is None else (p.on_time, p.visible),
+        name="share",
+        title="share of time",
+        definition="mean of D_pk / T_p",
+        over="people with time",
+        pair=_share,
+        most=1.0,
+        compared=True,
     ),
-    Measure("unseen", "visible but unseen", 1.0, True, _unseen),
+    Measure(
+        name="dwell",
+        title="dwell [s]",
+        definition="mean of D_pk",
+        over="all people",
+        pair=lambda p: (p.on_time, p.everybody),
+        compared=True,
+    ),
+    Measure(
+        name="reach",
+        title="reach",
+        definition="mean of [L_pk > 0]",
+        over="all people",
+        pair=lambda p: (p.reached * p.everybody, p.everybody),
+        most=1.0,
+        counts=True,
+        compared=True,
+    ),
+    Measure(
+        name="first_look",
+        title="first look [s]",
+        definition="mean over people, and over each one's sittings with a look, of seconds from its first ray to the "
+        "look",
+        over="who looked",
+        pair=_first,
+    ),
+    Measure(
+        name="looks",
+        title="looks",
+        definition="mean of L_pk",
+        over="all people",
+        pair=lambda p: None if p.looks is None else (p.looks, p.everybody),
+        compared=True,
+    ),
+    Measure(name="returns", title="returns", definition="mean of L_pk - 1", over="who looked", pair=_returns),
+    Measure(
+        name="distance",
+        title="distance [m]",
+        definition="Σ w_i d_i / Σ w_i, from the eye to where the ray enters the thing",
+        over="rays on it",
+        pair=lambda p: (p.distance, p.on_time),
+    ),
+    Measure(
+        name="visible",
+        title="visible share",
+        definition="mean of V_pk / T_p",
+        over="people with time",
+        pair=_visible_share,
+        most=1.0,
+    ),
+    Measure(
+        name="given_visible",
+        title="looked at, given visible",
+        definition="Σ_p D_pk / Σ_p V_pk",
+        over="who could see it",
+        pair=lambda p: None if p.visible is None else (p.on_time, p.visible),
+        most=1.0,
+        compared=True,
+    ),
+    Measure(
+        name="unseen",
+        title="visible but unseen",
+        definition="mean of [L_pk = 0]",
+        over="who could see it",
+        pair=_unseen,
+        most=1.0,
+        counts=True,
+    ),
 )
 """All, in the order of tables."""
 
 BY_NAME = {measure.name: measure for measure in MEASURES}
+
+COMPARED = tuple(measure.name for measure in MEASURES if measure.compared)
 
 
 # ---- Tables ----
@@ -171,9 +238,6 @@ TRACKED, FIELD = "tracked", "field"
 
 PLACES = 16
 """From so many places a person a field should be asked for their reach: from fewer it comes out too low."""
-
-COMPARED = ("share", "dwell", "reach", "looks", "given_visible")
-"""Measures of which differences are told."""
 
 MOST_VALUES = 12
 """So many values of a dimension are compared with each other."""
