@@ -212,45 +212,23 @@ CASES = (
 MAKES_A_FOLDER = {"poses": "tests/cli/test_poses.py"}
 """Commands that make a folder as a whole, which must not be there before -> where their output is tried."""
 
-READS_ONLY = {"doctor", "jobs", "view", "worker", "rays guess", "rays show"}
-"""Commands that write no file."""
 INPUTS = {
-    "scene": {"files", "photos", "align"},
-    "view": {"files", "regions", "align"},
-    "render": {"scene", "frames"},
-    "stats": {"files", "areas", "align", "zones", "cohorts", "what_if", "salt"},
-    "draw sphere": {"files"},
-    "draw triptych": {"files"},
-    "draw floor": {"files", "scene"},
-    "draw sheet": {"files"},
-    "draw difference": {"files"},
-    "draw surface": {"files"},
-    "align": {"rays", "field", "scene", "surface", "pairs", "twin", "cameras", "place_cameras", "start"},
-    "rays import": {"files", "salt", "poses", "place"},
-    "rays guess": {"files"},
-    "rays show": {"rays"},
-    "rays filter": {"rays"},
-    "rays split": {"rays"},
-    "rays plot": {"rays", "test"},
-    "train radiance": {"dataset"},
-    "train gaze": {"rays", "views", "align_views", "field", "scene", "align"},
-    "train prior": {"rays"},
-    "eval radiance": {"field", "dataset"},
-    "eval folds": {"rays", "field", "scene", "align"},
-    "eval gaze": {"gaze", "rays", "field", "scene", "geometry"},
-    "import": {"file"},
-    "refine": {"field"},
-    "export mesh": {"field"},
-    "export points": {"field"},
-    "export splats": {"field"},
-    "export volume": {"field"},
-    "export torch-ngp": {"field"},
-    "ablate": {"rays", "field", "scene"},
-    "jobs": {"folder"},
-    "report": {"files", "objects"},
-    "bake": {"surface", "gaze", "rays", "path", "align"},
+    "scene": {"photos", "align"},
+    "view": {"regions", "align"},
+    "render": {"frames"},
+    "stats": {"areas", "align", "zones", "cohorts", "what_if", "salt"},
+    "draw floor": {"scene"},
+    "align": {"field", "scene", "surface", "pairs", "twin", "cameras", "place_cameras", "start"},
+    "rays import": {"salt", "poses", "place"},
+    "rays plot": {"test"},
+    "train gaze": {"views", "align_views", "field", "scene", "align"},
+    "eval folds": {"field", "scene", "align"},
+    "eval gaze": {"field", "scene", "geometry"},
+    "ablate": {"field", "scene"},
+    "report": {"objects"},
+    "bake": {"gaze", "rays", "path", "align"},
 }
-"""Parameters of commands that name what is read; all others that are paths are written."""
+"""Options of commands that name what is read, as arguments do; all others that are paths are written."""
 
 
 def make_inputs(folder: Path) -> Path:
