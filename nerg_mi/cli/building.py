@@ -125,10 +125,16 @@ def _group(
     lines: dict[str, str] = {}
     for name, entry in entries.items():
         first, below, _ = name.removeprefix(prefix).partition(" ")
-        lines[first] = GROUPS.get(prefix + first, "") if below else entry.line
+        lines[first] = _about_group(prefix + first, entries) if below else entry.line
     for word, line in lines.items():
         app.command(word, help=line)(_listed)
     return app
+
+
+def _about_group(name: str, entries: Mapping[str, Entry]) -> str:
+    """The line about the commands that begin with ``name``: of a group that `GROUPS` has not, what they are called."""
+    below = [other.removeprefix(f"{name} ") for other in entries if other.startswith(f"{name} ")]
+    return GROUPS.get(name) or f"Commands: {', '.join(below)}."
 
 
 def _listed() -> None:
@@ -150,7 +156,7 @@ def _build(name: str, entries: Mapping[str, Entry]) -> Any:
         } | below
         if not below:
             raise LookupError(f'{entry.module} names a command "{name}" and declares none')
-    help = entries[name].line if name in entries else GROUPS.get(name, "")
+    help = entries[name].line if name in entries else _about_group(name, below)
     return typer.main.get_command(_group(f"{name} ", below, name=name, help=help, add_completion=False))
 
 

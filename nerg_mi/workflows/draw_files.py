@@ -131,7 +131,7 @@ class SheetOptions(ScaleOptions):
     """How pictures are put together."""
 
     overlay: str | None = option(
-        None, "Lay this channel of .exr files over their colour, with one scale: gaze, kde, gaze_std, ..."
+        None, "AOV of .exr files to lay over their colour, with one scale: gaze, kde, depth or any other."
     )
     columns: int | None = option(None, "Pictures in a row.  [default: about as many as rows]", within=Range(1, 1000))
     width: int = option(480, "Pixels that a picture is wide at most; larger ones are shrunk.", within=Range(16, 4096))

@@ -178,7 +178,7 @@ class PictureOptions(Checked):
         1.0, "GB that rendering may take; larger pictures are made in bands.", within=Range(1e-6, 10**6)
     )
     overlay: str | None = option(
-        None, "Lay this over the colour, with its scale (.png, .svg, .mp4): gaze, kde, visibility, depth, support, ..."
+        None, "AOV to lay over the colour, with its scale (.png, .svg, .mp4): gaze, kde, depth or any other."
     )
     top: float | None = option(
         None, "Upper end of the overlay's scale, for gaze in 1/sr.  [default: the 99.5th percentile]", within=VALUES
