@@ -70,9 +70,8 @@ from __future__ import annotations
 import mitsuba as mi
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.constant_weights import set_constant_weights
 from nerg_mi.fields.gaze_base import AnyGazeField, kinds
-from nerg_mi.fields.mlp import namespace
+from nerg_mi.fields.mlp import namespace, set_constant_weights
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.properties import boolean, trained, transform, volume_class

@@ -67,8 +67,7 @@ import drjit as dr
 import mitsuba as mi
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.constant_weights import set_constant_weights
-from nerg_mi.fields.mlp import namespace
+from nerg_mi.fields.mlp import namespace, set_constant_weights
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.maths.geometry import Similarity

@@ -450,7 +450,7 @@ class Scene:
         """Write the weights of its trained fields into the kernels, for many pictures or rays of one scene: the same
         results to the bit in less time, after some seconds of compilation (the page on performance, "Weights as
         constants"). ``constant`` false takes it back."""
-        from nerg_mi.fields.constant_weights import set_constant_weights
+        from nerg_mi.fields.mlp import set_constant_weights
         from nerg_mi.rendering.aovs import fields_of
 
         for trained in fields_of(self.integrator):

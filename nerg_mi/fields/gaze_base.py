@@ -1,5 +1,5 @@
-"""What gaze fields have in common: the protocol, the registry of their kinds, base classes, the table of the density
-that does not depend on the position, and where training data supports them."""
+"""What gaze fields have in common: base classes, the registry of their kinds, ensembles, the table of the density that
+does not depend on the position, and where training data supports them."""
 
 from __future__ import annotations
 
@@ -139,73 +139,11 @@ SIZE_LIMITS = {"width": 4096, "geometry": 4096, "hidden": 64, "layers": 64, "sh_
 # ---- What every gaze field answers, whatever it is made of ----
 #
 # A gaze field is a density over the directions around an observer (1/sr): a product of two factors (``product``), a
-# normalised log density (``log_density``), or any other class that fulfils ``GazeDensity`` and is registered
-# (``registry``); or the mean of several of these (``ensemble``). Nothing outside of this package asks which of them it
-# has.
+# normalised log density (``log_density``), or any other `GazeHead` that is registered; or the mean of several of these
+# (``ensemble``). Nothing outside of this package asks which of them it has.
 #
 # Positions and directions are Dr.Jit 3-arrays of the field's backend, in the field's own frame and units; directions
 # are unit vectors, and ``r_o`` points from the observer to the surface. Densities do not change with scale.
-
-
-class GazeFieldConfig(Protocol):
-    """Sizes and conventions of a gaze field: a frozen dataclass that a checkpoint keeps as JSON."""
-
-    kind: ClassVar[str]
-    """The name under which a checkpoint knows the field's class."""
-
-    @property
-    def variant(self) -> str:
-        """``emit``, ``capture`` or ``emit_capture``: which of the two factors there are."""
-        ...
-
-    @property
-    def activation(self) -> str:
-        """What the network's output goes through to become a density; for people, not for code."""
-        ...
-
-    @property
-    def normalized(self) -> bool:
-        """Whether ``evaluate`` divides by the integral over the observer's sphere, which it then must be given."""
-        ...
-
-    @property
-    def semantic(self) -> str:
-        """Which features of a radiance field emit takes: ``accumulated``, ``snapshot`` or none ("")."""
-        ...
-
-    @property
-    def features(self) -> int:
-        """How many such features of a point; 0 without."""
-        ...
-
-    @property
-    def prior(self) -> int:
-        """Rows of the table of the density that does not depend on the position; 0 for a field that has none."""
-        ...
-
-    @property
-    def mix(self) -> float:
-        """The share of that density."""
-        ...
-
-    @property
-    def needs_surfaces(self) -> bool:
-        """Whether it matters where the observer's rays meet a surface."""
-        ...
-
-    @property
-    def fills_escaped(self) -> bool:
-        """Whether a direction in which no surface is met takes the depth of the nearest ones that do; otherwise it ends
-        on the field's box."""
-        ...
-
-    def conventions(self) -> tuple:
-        """What fields must have in common for their densities to be averaged."""
-        ...
-
-    def to_dict(self) -> dict:
-        """As JSON; with ``kind`` unless that is ``product``, which older checkpoints do not name."""
-        ...
 
 
 LARGEST = 1e6
@@ -235,73 +173,165 @@ class Arrays(Protocol):
         ...
 
 
-class AnyGazeField(Protocol):
-    """A gaze field on one backend: one density or the mean of several, which are its ``members``."""
+class AnyGazeField:
+    """Base of gaze fields on one backend: of one density (`GazeHead`), and of the mean of several (`GazeEnsemble`).
 
+    ``config``: sizes and conventions; ``box``: where the field lives, positions outside of it are the encoding's to
+    deal with; ``ns``: array types of the backend (``fields.mlp.namespace``); ``members``: the densities whose mean it
+    is; ``networks``: how many one evaluation of gaze evaluates; ``mlps``: the networks of all members.
+    """
+
+    # The name under which a checkpoint knows the class.
     kind: ClassVar[str]
-    limits: ClassVar[Mapping[str, int]]
-    """The largest whole numbers that a checkpoint may claim for its sizes, by name."""
-    fixed: ClassVar[tuple[str, ...]]
-    """Parameters that no training changes."""
-    support: RaySupport | None
-    """How many rays it learnt from around a position, where that is known."""
-    basis: Basis | None
-    """How many rays and people it learnt from in all, where that is known."""
+    # The largest whole numbers that a checkpoint may claim for its sizes, by name.
+    limits: ClassVar[Mapping[str, int]] = SIZE_LIMITS
+    # Parameters that no training changes.
+    fixed: ClassVar[tuple[str, ...]] = ()
 
-    @property
-    def config(self) -> GazeFieldConfig:
-        """Sizes and conventions."""
-        ...
-
-    @property
-    def box(self) -> AnyBox:
-        """Where the field lives; positions outside of it are the encoding's to deal with."""
-        ...
+    config: Any
+    box: AnyBox
+    # How many rays it learnt from around a position, where that is known.
+    support: RaySupport | None = None
+    # How many rays and people it learnt from in all, where that is known.
+    basis: Basis | None = None
 
     @property
     def ns(self) -> ModuleType:
-        """Array types of the field's backend (``fields.mlp.namespace``)."""
-        ...
+        return namespace(self.mlps[0].weights[0])
 
     @property
-    def members(self) -> Sequence[GazeDensity]:
-        """The densities whose mean it is; itself alone where it is one."""
-        ...
+    def members(self) -> Sequence[GazeHead]:
+        raise NotImplementedError
 
     @property
     def networks(self) -> int:
-        """Networks that one evaluation of gaze evaluates."""
-        ...
+        raise NotImplementedError
 
     @property
     def mlps(self) -> list[MLP]:
-        """All of its networks, those of all members."""
-        ...
+        raise NotImplementedError
 
     def architecture(self) -> dict:
         """What ``from_arrays`` needs besides the arrays (JSON)."""
-        ...
+        raise NotImplementedError
 
     @classmethod
     def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
         """The field of ``architecture() == about`` with the ``arrays`` of a checkpoint."""
-        ...
+        raise NotImplementedError
 
     def parameters(self) -> dict:
         """Arrays that gaze depends on, by the names that checkpoints and ``mi.traverse`` give them."""
-        ...
+        raise NotImplementedError
 
     def set_parameters(self, values: dict) -> None:
-        """Replace arrays by name (any subset of ``parameters()``)."""
-        ...
+        """Replace arrays by name (any subset of ``parameters()``) and `pack`."""
+        raise NotImplementedError
 
     def pack(self) -> None:
         """Refresh what the kernels read; call after any change of the weights."""
-        ...
+        raise NotImplementedError
 
 
-class GazeDensity(AnyGazeField, Protocol):
-    """A gaze field that is one density."""
+class GazeHeadConfig:
+    """Base of the configuration of a gaze field that is one density: a frozen dataclass that a checkpoint keeps as
+    JSON. The defaults are those of a density that is normalised over the sphere, of both factors."""
+
+    # The name under which a checkpoint knows the field's class.
+    kind: ClassVar[str]
+    # The encoding of positions.
+    grid: Any
+    # emit, capture or emit_capture: which of the two factors there are.
+    variant: Any = "emit_capture"
+    # What the network's output goes through to become a density; for people, not for code.
+    activation: Any = "log"
+    # Whether ``evaluate`` divides by the integral over the observer's sphere, which it then must be given.
+    normalized: Any = True
+    # Which features of a radiance field emit takes: accumulated, snapshot or none ("").
+    semantic: Any = ""
+    # Rows of the table of the density that does not depend on the position; 0 for a field that has none.
+    prior: Any = 0
+    # The share of that density.
+    mix: Any = 0.0
+
+    @property
+    def features(self) -> int:
+        """How many features of a radiance field emit is given."""
+        return 0
+
+    @property
+    def needs_surfaces(self) -> bool:
+        """Whether it matters where the observer's rays meet a surface."""
+        return True
+
+    @property
+    def fills_escaped(self) -> bool:
+        """Whether a direction in which no surface is met takes the depth of the nearest ones that do; otherwise it ends
+        on the field's box."""
+        return False
+
+    def conventions(self) -> tuple:
+        """What fields must have in common for their densities to be averaged."""
+        return self.kind, self.variant
+
+    def to_dict(self) -> dict:
+        """As JSON."""
+        return {"kind": self.kind, **asdict(self), "grid": self.grid.to_dict()}  # pyright: ignore[reportArgumentType]
+
+    @classmethod
+    def from_dict(cls, d: dict) -> Self:
+        """The configuration of which `to_dict` was kept."""
+        return cls(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": encoding_config(d["grid"])})
+
+
+class GazeHead(AnyGazeField):
+    """Base of a gaze field that is one density: an encoding ``grid``, bare ``ARRAYS`` and networks ``NETS``, attributes
+    of these names. A kind says how it is made and what its ``unnormalized`` density is."""
+
+    ARRAYS: ClassVar[tuple[str, ...]] = ()
+    NETS: ClassVar[tuple[str, ...]] = ()
+    DRJIT_STRUCT: ClassVar[dict]
+
+    grid: Any
+    # Log of the density that does not depend on the position, of fields whose configuration has a ``prior``.
+    prior: Any
+
+    def __init_subclass__(cls, **kwargs: Any):
+        super().__init_subclass__(**kwargs)
+        cls.DRJIT_STRUCT = dict.fromkeys(("grid", *cls.NETS, *cls.ARRAYS))
+
+    def architecture(self) -> dict:
+        return self.config.to_dict()
+
+    @property
+    def members(self) -> Sequence[Self]:
+        return [self]
+
+    @property
+    def networks(self) -> int:
+        return 2 if self.config.variant == "emit_capture" else 1
+
+    @property
+    def mlps(self) -> list[MLP]:
+        return [getattr(self, name) for name in self.NETS]
+
+    def parameters(self) -> dict:
+        out = {f"grid.{key}": value for key, value in self.grid.named().items()}
+        out |= {name: getattr(self, name) for name in self.ARRAYS}
+        for name in self.NETS:
+            out |= {f"{name}.{key}": value for key, value in getattr(self, name).named().items()}
+        return out
+
+    def set_parameters(self, values: dict) -> None:
+        for name in self.ARRAYS:
+            if name in values:
+                setattr(self, name, values[name])
+        assign(self, {k: v for k, v in values.items() if k not in self.ARRAYS})
+        self.pack()
+
+    def pack(self) -> None:
+        for name in ("grid", *self.NETS):
+            getattr(self, name).pack()
 
     def unnormalized(
         self,
@@ -318,7 +348,7 @@ class GazeDensity(AnyGazeField, Protocol):
         ``semantic``: ``config.features`` Floats where the configuration asks for them, else None; ``escaped``: mask of
         directions in which no surface is met. Differentiable in the parameters, positions and directions.
         """
-        ...
+        raise NotImplementedError(f"{type(self).__name__} does not say what its density is")
 
     def evaluate(
         self,
@@ -330,21 +360,32 @@ class GazeDensity(AnyGazeField, Protocol):
         integral: Float | None = None,
         escaped: Bool | bool = False,
     ) -> tuple[Float, Float, Float]:
-        """``(gaze, emit, capture)`` in 1/sr of the observer at ``p_o`` attending ``p_od`` along ``r_o``.
+        """``(gaze, emit, capture)`` in 1/sr of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``;
+        ``active``, ``semantic`` and ``escaped`` as for ``unnormalized``.
 
-        ``integral``: of a normalised field over the sphere at ``p_o``, by which ``emit`` is divided (``ValueError``
-        without it); the others as for ``unnormalized``.
+        ``integral``: of a normalised field over the sphere at ``p_o`` (``transport.observer_gaze``), by which ``emit``
+        is divided; ``ValueError`` without it. With a share m of the density that does not depend on the position, gaze
+        = (1 - m) emit * capture + m blind.
         """
-        ...
+        if self.config.normalized and integral is None:
+            raise ValueError(
+                "this gaze field is normalised over the observer's sphere: evaluating it needs its integral there"
+            )
+        emit, capture = self.unnormalized(p_od, p_o, r_o, active, semantic, escaped)
+        if integral is not None and self.config.normalized:
+            emit = emit / integral
+        gaze = emit * capture
+        if self.config.mix:
+            gaze = (1 - self.config.mix) * gaze + self.config.mix * dr.exp(self.log_blind(r_o))
+        return gaze, emit, capture
 
     def log_blind(self, r_o: Vector3f) -> Float:
-        """Log of the density (1/sr) that does not depend on the position in direction ``r_o``; of fields whose
-        configuration has a ``prior``."""
-        ...
+        """Log of the blind density (1/sr) in direction ``r_o``, interpolated in its table, the array ``prior``."""
+        return look_up(self.prior.array, self.config.prior, r_o)
 
     def set_mix(self, mix: float) -> None:
-        """Let the share of that density be ``mix``."""
-        ...
+        """Let the share of the blind density be ``mix``."""
+        self.config = replace(self.config, mix=mix)
 
 
 # ---- The kinds of gaze fields by the names that checkpoints give them ----
@@ -380,156 +421,6 @@ def limits_of(about: object) -> Mapping[str, int]:
     that is not registered, of which nothing is built."""
     kind = about.get("kind", "product") if isinstance(about, dict) else None
     return _KINDS[kind].limits if isinstance(kind, str) and kind in _KINDS else {}
-
-
-# ---- Base classes: what a kind need not write again ----
-
-
-class GazeHeadConfig:
-    """Base of the configuration of a gaze field that is one density, a frozen dataclass with the encoding ``grid``: its
-    defaults are those of a density that is normalised over the sphere, of both factors."""
-
-    kind: ClassVar[str]
-    variant: Any = "emit_capture"
-    activation: Any = "log"
-    normalized: Any = True
-    semantic: Any = ""
-    prior: Any = 0
-    mix: Any = 0.0
-    grid: Any
-
-    @property
-    def features(self) -> int:
-        """Features of a radiance field that emit is given."""
-        return 0
-
-    @property
-    def needs_surfaces(self) -> bool:
-        """Whether it matters where the observer's rays meet a surface."""
-        return True
-
-    @property
-    def fills_escaped(self) -> bool:
-        """Whether what escapes takes the depth of the nearest directions that do not."""
-        return False
-
-    def conventions(self) -> tuple:
-        """What fields must have in common for their densities to be averaged."""
-        return self.kind, self.variant
-
-    def to_dict(self) -> dict:
-        """As JSON."""
-        return {"kind": self.kind, **asdict(self), "grid": self.grid.to_dict()}  # pyright: ignore[reportArgumentType]
-
-    @classmethod
-    def from_dict(cls, d: dict) -> Self:
-        """The configuration of which `to_dict` was kept."""
-        return cls(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": encoding_config(d["grid"])})
-
-
-class GazeHead:
-    """Base of a gaze field that is one density: an encoding ``grid``, bare ``ARRAYS`` and networks ``NETS``, attributes
-    of these names. A kind says how it is made and what its ``unnormalized`` density is."""
-
-    kind: ClassVar[str]
-    limits: ClassVar[Mapping[str, int]] = SIZE_LIMITS
-    ARRAYS: ClassVar[tuple[str, ...]] = ()
-    NETS: ClassVar[tuple[str, ...]] = ()
-    fixed: ClassVar[tuple[str, ...]] = ()
-    DRJIT_STRUCT: ClassVar[dict]
-
-    config: Any
-    box: AnyBox
-    grid: Any
-    # Log of the density that does not depend on the position, of fields whose configuration has a ``prior``.
-    prior: Any
-    # How many rays it learnt from around a position, where that is known.
-    support: RaySupport | None = None
-    # How many rays and people it learnt from in all.
-    basis: Basis | None = None
-
-    def __init_subclass__(cls, **kwargs: Any):
-        super().__init_subclass__(**kwargs)
-        cls.DRJIT_STRUCT = dict.fromkeys(("grid", *cls.NETS, *cls.ARRAYS))
-
-    def architecture(self) -> dict:
-        """What ``from_arrays`` needs besides the arrays."""
-        return self.config.to_dict()
-
-    @property
-    def members(self) -> list[Self]:
-        """The field alone."""
-        return [self]
-
-    @property
-    def networks(self) -> int:
-        """Networks that one evaluation of gaze evaluates: emit's, capture's, or both."""
-        return 2 if self.config.variant == "emit_capture" else 1
-
-    @property
-    def mlps(self) -> list[MLP]:
-        """All of its networks."""
-        return [getattr(self, name) for name in self.NETS]
-
-    @property
-    def ns(self) -> ModuleType:
-        """Array types of the field's backend; see ``fields.mlp.namespace``."""
-        return namespace(self.mlps[0].weights[0])
-
-    def parameters(self) -> dict:
-        """Arrays by name, as checkpoints and ``mi.traverse`` spell them."""
-        out = {f"grid.{key}": value for key, value in self.grid.named().items()}
-        out |= {name: getattr(self, name) for name in self.ARRAYS}
-        for name in self.NETS:
-            out |= {f"{name}.{key}": value for key, value in getattr(self, name).named().items()}
-        return out
-
-    def set_parameters(self, values: dict) -> None:
-        """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
-        for name in self.ARRAYS:
-            if name in values:
-                setattr(self, name, values[name])
-        assign(self, {k: v for k, v in values.items() if k not in self.ARRAYS})
-        self.pack()
-
-    def pack(self) -> None:
-        """Refresh what the kernels read; call after any change of the weights."""
-        for name in ("grid", *self.NETS):
-            getattr(self, name).pack()
-
-    def unnormalized(self, p_od, p_o, r_o, active: Bool | bool = True, semantic=None, escaped: Bool | bool = False):
-        """See ``GazeDensity``."""
-        raise NotImplementedError(f"{type(self).__name__} does not say what its density is")
-
-    def evaluate(
-        self, p_od, p_o, r_o, active: Bool | bool = True, semantic=None, integral=None, escaped: Bool | bool = False
-    ):
-        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr; ``active``,
-        ``semantic`` and ``escaped`` as for ``unnormalized``.
-
-        ``integral``: of a normalised field over the sphere at ``p_o`` (``transport.observer_gaze``), by which ``emit``
-        is divided; ``ValueError`` without it. With a share m of the density that does not depend on the position, gaze
-        = (1 - m) emit * capture + m blind.
-        """
-        if self.config.normalized and integral is None:
-            raise ValueError(
-                "this gaze field is normalised over the observer's sphere: evaluating it needs its integral there"
-            )
-        emit, capture = self.unnormalized(p_od, p_o, r_o, active, semantic, escaped)
-        if self.config.normalized:
-            emit = emit / integral
-        gaze = emit * capture
-        if self.config.mix:
-            gaze = (1 - self.config.mix) * gaze + self.config.mix * dr.exp(self.log_blind(r_o))
-        return gaze, emit, capture
-
-    def log_blind(self, r_o):
-        """Log of the blind density (1/sr) in direction ``r_o``, interpolated in its table, the array ``prior``."""
-        return look_up(self.prior.array, self.config.prior, r_o)
-
-    def set_mix(self, mix: float) -> None:
-        """Let the share of the blind density be ``mix``."""
-        self.config = replace(self.config, mix=mix)
 
 
 # ---- Density that does not depend on the position ----
@@ -577,3 +468,87 @@ def blind_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.n
     d = vector_of(ns.Array3f, directions)
     found = np.asarray(dr.exp(look_up(ns.Float(log.astype(np.float32)), rows, d)), np.float64)
     return (log - np.log(4 * np.pi * found.mean())).reshape(rows, 2 * rows).astype(np.float32)
+
+
+# ---- Ensembles ----
+#
+# Several gaze fields for one: their mean is the gaze, their spread says how far the data decides it. Members are
+# trained alike on resamples of the people (bagging, Breiman 1996; deep ensembles, Lakshminarayanan et al. 2017).
+
+
+@register
+class GazeEnsemble(AnyGazeField):
+    """``members``: two or more fields of one kind, variant and box. Raises ``ValueError`` where they differ in these.
+
+    ``config`` and ``box`` are those of the first member; ``support``: of the rays that all members' were drawn from.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict] = {"_members": None}
+    kind: ClassVar[str] = "ensemble"
+
+    def __init__(self, members: Sequence[GazeHead], support: RaySupport | None = None):
+        self._members, self.support = list(members), support
+        if len(self.members) < 2:
+            raise ValueError(f"an ensemble of gaze fields needs at least two members, got {len(self.members)}")
+        if any(len(m.members) > 1 for m in self.members):
+            raise ValueError("a member of an ensemble of gaze fields is an ensemble itself; give its members instead")
+        if any(_common(m) != _common(self.members[0]) for m in self.members):
+            raise ValueError(
+                "the members of an ensemble of gaze fields differ in kind, variant, output or box; train them alike"
+            )
+        self.config, self.box = self.members[0].config, self.members[0].box
+
+    @property
+    def members(self) -> Sequence[GazeHead]:
+        return self._members
+
+    @classmethod
+    def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> GazeEnsemble:
+        members = [arrays.member(i, member) for i, member in enumerate(about["members"])]
+        # Before any is built: a file may hold them one inside of another, without end.
+        if any("members" in member for member, _ in members):
+            raise ValueError("a member of its ensemble is an ensemble itself, which this version does not read")
+        return cls([density for member, own in members for density in build(member, box, own).members])
+
+    def architecture(self) -> dict:
+        return {"kind": self.kind, "members": [m.architecture() for m in self.members]}
+
+    @property
+    def networks(self) -> int:
+        return sum(m.networks for m in self.members)
+
+    @property
+    def mlps(self) -> list[MLP]:
+        return [net for member in self.members for net in member.mlps]
+
+    def parameters(self) -> dict:
+        return {f"{i}.{name}": value for i, m in enumerate(self.members) for name, value in m.parameters().items()}
+
+    def set_parameters(self, values: dict) -> None:
+        for i, member in enumerate(self.members):
+            member.set_parameters({k.removeprefix(f"{i}."): v for k, v in values.items() if k.startswith(f"{i}.")})
+
+    def pack(self) -> None:
+        for member in self.members:
+            member.pack()
+
+
+def mean(found: list[tuple]) -> tuple:
+    """Means of the ``(gaze, emit, capture)`` of one or more members; that of gaze is not the product of the others."""
+    if len(found) == 1:
+        return found[0]
+    return tuple(sum(parts[1:], parts[0]) / len(found) for parts in zip(*found))
+
+
+def spread(found: list[tuple]) -> Float:
+    """Standard deviation of gaze over the ``(gaze, emit, capture)`` of two or more members (1/sr, of N - 1 degrees of
+    freedom)."""
+    gaze = mean(found)[0]
+    variance: Any = sum(dr.square(g - gaze) for g, _, _ in found) / (len(found) - 1)
+    # Where members agree, the root's derivative would not be finite.
+    apart = variance > 1e-30
+    return dr.select(apart, dr.sqrt(dr.select(apart, variance, 1)), 0)
+
+
+def _common(field: GazeHead) -> tuple:
+    return field.config.conventions(), tuple(field.box.lower), tuple(field.box.upper)

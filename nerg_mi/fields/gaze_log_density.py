@@ -87,16 +87,13 @@ class LogGazeConfig(GazeHeadConfig):
 
     @property
     def needs_surfaces(self) -> bool:
-        """Whether it matters where the observer's rays meet a surface."""
         return self.geometry != "none"
 
     @property
     def fills_escaped(self) -> bool:
-        """Whether what escapes takes the depth of the nearest directions that do not."""
         return self.escaped == "nearest"
 
     def conventions(self) -> tuple:
-        """What fields must have in common for their densities to be averaged."""
         return self.kind, self.variant, self.geometry, self.escaped, self.reach
 
     @property
@@ -156,7 +153,6 @@ class LogGazeField(GazeHead):
 
     @classmethod
     def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> LogGazeField:
-        """The field of a checkpoint."""
         config = LogGazeConfig.from_dict(about)
         return cls(
             config,

@@ -108,11 +108,9 @@ class GazeConfig(GazeHeadConfig):
 
     @property
     def features(self) -> int:
-        """Features of a radiance field that emit is given; 0 without."""
         return self.geometry if self.semantic else 0
 
     def conventions(self) -> tuple:
-        """What fields must have in common for their densities to be averaged."""
         return self.kind, self.variant, self.activation, self.normalized, self.semantic, self.geometry
 
     @property
@@ -181,7 +179,6 @@ class GazeField(GazeHead):
 
     @classmethod
     def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> GazeField:
-        """The field of a checkpoint."""
         config = GazeConfig.from_dict(about)
         nets = {
             name: arrays.net(name, sizes, cls._is_normalized(config, name))

@@ -283,3 +283,14 @@ def _products(x: Any, w: Any) -> Any:
 def _folded(w, norm: dict[str, Any]) -> tuple:
     """Weights and bias of a layer with the gain and shift of its inputs in them."""
     return w * norm["gain"], norm["bias"] + dr.sum(w * norm["shift"], axis=1)
+
+
+def set_constant_weights(field: Any, constant: bool = True) -> None:
+    """Whether the networks of ``field`` (its ``mlps``; of an ensemble all members') are evaluated with their weights as
+    constants of the kernel.
+
+    It holds for processors, where nothing is differentiated and no function is recorded by ``dr.freeze``; elsewhere,
+    and of networks with normalised layers, evaluations are as before. New weights take a new compilation.
+    """
+    for net in field.mlps:
+        net.constant = constant

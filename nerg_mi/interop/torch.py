@@ -29,8 +29,7 @@ except ImportError:
     ) from None
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import AnyGazeField
-from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_base import AnyGazeField, GazeEnsemble
 from nerg_mi.fields.mlp import is_cuda
 from nerg_mi.fields.radiance import RadianceField
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.constant_weights import set_constant_weights
 from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.mlp import set_constant_weights
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.transport.field_medium import FieldMedium
 

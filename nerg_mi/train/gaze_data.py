@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import GazeFieldConfig, RaySupport, blind_table, table_directions
+from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, blind_table, table_directions
 from nerg_mi.maths.geometry import AnyBox, box_interval
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.types import variant_types
@@ -385,7 +385,7 @@ class TargetNeeds:
     blind_rows: int = 0
 
     @staticmethod
-    def of(config: GazeFieldConfig) -> TargetNeeds:
+    def of(config: GazeHeadConfig) -> TargetNeeds:
         """What a field of the configuration ``config`` needs."""
         return TargetNeeds(config.semantic, config.fills_escaped, config.prior)
 

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import AnyGazeField, GazeDensity, basis_of
-from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_base import AnyGazeField, GazeEnsemble, GazeHead, basis_of
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.photos.salience import SalienceView
@@ -215,10 +214,10 @@ def _finished(part: Path, identity: dict, state: StateSettings, ns: ModuleType) 
     return field, kept["trained"]
 
 
-def _writer(part: Path, identity: dict) -> Callable[[GazeDensity, dict], None]:
+def _writer(part: Path, identity: dict) -> Callable[[GazeHead, dict], None]:
     """Writes a member into ``part``; one that was interrupted has its state, and is none yet."""
 
-    def write(field: GazeDensity, provenance: dict) -> None:
+    def write(field: GazeHead, provenance: dict) -> None:
         if not provenance["interrupted"]:
             save_gaze(field, part, {"trained": provenance, "about": identity})
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import GazeFieldConfig
+from nerg_mi.fields.gaze_base import GazeHeadConfig
 from nerg_mi.interruption import Interruption
 from nerg_mi.probes.probes import Probes, calibrated_levels, region_levels
 from nerg_mi.rays.filters import purge, split_by_position
@@ -297,7 +297,7 @@ def choose_variant(
     return _best(plan, configs, each)
 
 
-def _kept(plan: GazePlan, configs: tuple[GazeFieldConfig, ...], kept: dict) -> tuple[GazePlan, MixChoice | None]:
+def _kept(plan: GazePlan, configs: tuple[GazeHeadConfig, ...], kept: dict) -> tuple[GazePlan, MixChoice | None]:
     """What was chosen among ``configs``; that of another run is found out when the two are compared."""
     started = [c for c in configs if json.loads(json.dumps(c.to_dict())) == kept.get("architecture")]
     plan = replace(plan, config=started[0]) if started else plan
@@ -310,7 +310,7 @@ def _kept(plan: GazePlan, configs: tuple[GazeFieldConfig, ...], kept: dict) -> t
 
 
 def _best(
-    plan: GazePlan, configs: tuple[GazeFieldConfig, ...], each: list[JudgedFolds]
+    plan: GazePlan, configs: tuple[GazeHeadConfig, ...], each: list[JudgedFolds]
 ) -> tuple[GazePlan, MixChoice | None]:
     """The plan with the best of ``configs``, which were judged as ``each`` says, and its share."""
     choices = [judged.choose() for judged in each]
@@ -325,7 +325,7 @@ def _best(
     return replace(plan, config=configs[k]), replace(choices[k], variant=configs[k].variant, variants=variants)
 
 
-def _of_variant(tell: Listener, config: GazeFieldConfig, k: int, count: int) -> Listener:
+def _of_variant(tell: Listener, config: GazeHeadConfig, k: int, count: int) -> Listener:
     """Tells how the folds of ``config``, number ``k`` of ``count``, go."""
 
     def told(progress: GazeProgress) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import GazeFieldConfig, kinds
+from nerg_mi.fields.gaze_base import GazeHeadConfig, kinds
 
 from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazePlan, GazeTrainer
@@ -52,7 +52,7 @@ class Recipe:
     summary: str
     # Makes the architecture of what is chosen, a variant among it. Raises `NergError` for a place that such a field
     # cannot be trained in.
-    config: Callable[[FieldChoices], GazeFieldConfig]
+    config: Callable[[FieldChoices], GazeHeadConfig]
     # Moves the weights of such a field.
     trainer: type[GazeTrainer]
     # Losses that it can be trained on (`gaze_settings.LOSSES`).
@@ -107,7 +107,7 @@ class Recipe:
             initial=initial,
         )
 
-    def architectures(self, choices: FieldChoices) -> tuple[GazeFieldConfig, ...]:
+    def architectures(self, choices: FieldChoices) -> tuple[GazeHeadConfig, ...]:
         """That of ``choices``; without a variant those of `default_variants`, the one that is taken where nothing
         chooses first. Raises as ``config`` does."""
         variants = (choices.variant,) if choices.variant else default_variants(choices.place)

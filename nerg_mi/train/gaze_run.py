@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.fields.gaze_base import GazeDensity, basis_of
+from nerg_mi.fields.gaze_base import GazeHead, basis_of
 
 from .checkpointing import kept_unless
 from .gaze_data import (
@@ -49,7 +49,7 @@ from .geometry import GazePlace
 class TrainedGaze(NamedTuple):
     """What a training came to: the field, and its provenance (JSON)."""
 
-    field: GazeDensity
+    field: GazeHead
     provenance: dict
 
 
@@ -61,7 +61,7 @@ def train_gaze(
     *,
     state: StateSettings | None = None,
     tell: Listener | None = None,
-    write: Callable[[GazeDensity, dict], None] | None = None,
+    write: Callable[[GazeHead, dict], None] | None = None,
 ) -> TrainedGaze:
     """Train a gaze field on ``supervision`` in ``place``, with arrays of the backend ``ns``.
 

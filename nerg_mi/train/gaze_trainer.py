@@ -15,7 +15,7 @@ import numpy as np
 from drjit.opt import AdamW
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.fields.gaze_base import GazeDensity, GazeFieldConfig
+from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
@@ -96,7 +96,7 @@ class GazeTrainer(ABC):
         raise NergError(f"a {config.kind} gaze field has no semantic features; leave out --semantic")
 
     @abstractmethod
-    def untrained(self) -> GazeDensity:
+    def untrained(self) -> GazeHead:
         """The field with its random weights."""
 
     def trainable(self, parameters: dict) -> dict:
@@ -206,7 +206,7 @@ class GazeTrainer(ABC):
         """A copy of the averaged weights."""
         return {k: type(v)(v) for k, v in self.averaged.items()}
 
-    def field(self, weights: dict | None = None) -> GazeDensity:
+    def field(self, weights: dict | None = None) -> GazeHead:
         """The field with the averaged weights (or ``weights``)."""
         out = self.untrained()
         out.set_parameters({**self.constant, **(weights or self.weights())})
@@ -327,9 +327,9 @@ class GazePlan:
     """All that decides a training but for what it learns from and where."""
 
     # Architecture of the field.
-    config: GazeFieldConfig
+    config: GazeHeadConfig
     # Others that folds may choose in its place (`gaze_folds.choose_variant`).
-    alternatives: tuple[GazeFieldConfig, ...] = ()
+    alternatives: tuple[GazeHeadConfig, ...] = ()
     # How weights are moved, and for how long.
     settings: GazeSettings
     # How rays become probes.

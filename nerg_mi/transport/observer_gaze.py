@@ -10,8 +10,7 @@ from typing import cast
 import drjit as dr
 import numpy as np
 
-from nerg_mi.fields.gaze_base import AnyGazeField, GazeDensity
-from nerg_mi.fields.gaze_ensemble import mean, spread
+from nerg_mi.fields.gaze_base import AnyGazeField, GazeHead, mean, spread
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.sphere import fibonacci_vectors, neighbourly_order
@@ -287,7 +286,7 @@ class PlacedGaze:
 
     def unnormalized(
         self,
-        member: GazeDensity,
+        member: GazeHead,
         p_od: Point3f,
         p_o: Point3f,
         r_o: Vector3f,
@@ -311,7 +310,7 @@ class _SphereIntegral:
     their ``AllAround``) in ``place``."""
 
     placed: PlacedGaze
-    member: GazeDensity
+    member: GazeHead
     place: Place
     settings: ObserverSettings
 

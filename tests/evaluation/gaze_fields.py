@@ -6,8 +6,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_base import blind_table
-from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_base import GazeEnsemble, blind_table
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields import mlp
-from nerg_mi.fields.constant_weights import set_constant_weights
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
-from nerg_mi.fields.mlp import MLP, evaluate
+from nerg_mi.fields.mlp import MLP, evaluate, set_constant_weights
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.jit import no_collection

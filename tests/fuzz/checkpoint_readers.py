@@ -49,8 +49,7 @@ def _read_radiance(folder: Path) -> object:
 
 
 def _gaze(kind: str):
-    from nerg_mi.fields.gaze_base import RaySupport
-    from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+    from nerg_mi.fields.gaze_base import GazeEnsemble, RaySupport
     from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
     from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 

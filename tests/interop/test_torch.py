@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze

@@ -10,7 +10,7 @@ import pytest
 
 from nerg_mi.evaluation.gaze import gaze_field
 from nerg_mi.fields import gaze_base
-from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.geometry import Place

@@ -6,8 +6,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.fields.gaze_base import REACH, RaySupport
-from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_base import REACH, GazeEnsemble, RaySupport
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from tests.reference import fields_numpy
 

@@ -167,8 +167,7 @@ def test06_gaze_and_its_spread_fade_with_visibility(rgb, files, tmp_path):
     """By transmittance the point stays the same, so that hidden and open differ by that share alone, whatever it is."""
     import drjit.llvm.ad as ns
 
-    from nerg_mi.fields.gaze_base import RaySupport
-    from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+    from nerg_mi.fields.gaze_base import GazeEnsemble, RaySupport
     from nerg_mi.formats.fields import load_gaze, save_gaze
     from nerg_mi.rays.rays import Rays
 

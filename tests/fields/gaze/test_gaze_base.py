@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import inspect
+from dataclasses import replace
 
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
 from nerg_mi.fields import gaze_base
-from nerg_mi.fields.gaze_base import REACH, Basis, RaySupport, basis_of
-from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_base import REACH, Basis, GazeEnsemble, RaySupport, basis_of
 from nerg_mi.fields.gaze_log_density import LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
-from tests.fields.gaze.test_log_density import BOX, GRID, SMALL
+from nerg_mi.formats.fields import load_gaze, save_gaze
+from nerg_mi.maths.geometry import Box
+from tests.fields.gaze.test_log_density import BOX, GRID, SMALL, made
 
 # ---- What a field rests on, in words, and as a checkpoint has it ----
 
@@ -47,14 +48,7 @@ def test_what_is_no_count_is_not_shown(value):
     assert basis_of({"rays": value}) is None and basis_of({"rays": 7, "people": value}) == Basis(7)
 
 
-# ---- What every gaze field answers: each kind that the library has answers all of it ----
-
-
-def asked(of) -> set:
-    """Names of what a protocol asks for."""
-    inherited = set().union(*(vars(c) for c in of.__mro__ if c.__module__ == of.__module__))
-    annotated = set().union(*(inspect.get_annotations(c) for c in of.__mro__ if c.__module__ == of.__module__))
-    return {n for n in inherited | annotated if not n.startswith("_")}
+# ---- Kinds of gaze fields by the names that checkpoints give them ----
 
 
 def fields():
@@ -68,24 +62,12 @@ def fields():
 
 
 @pytest.mark.parametrize("kind", ["product", "log_density", "ensemble"])
-def test_every_kind_answers_what_the_protocol_asks(kind):
+def test_kinds_of_the_library(kind):
+    """Registered whichever module is imported first; what each says of itself is what it is built of."""
     field = fields()[kind]
-    assert field.kind == kind in gaze_base.kinds()
-    one = len(field.members) == 1
-    assert all(hasattr(field, n) for n in asked(gaze_base.GazeDensity if one else gaze_base.AnyGazeField))
-    assert all(hasattr(field.config, n) for n in asked(gaze_base.GazeFieldConfig))
-    assert one == (field.members[0] is field)
+    assert field.kind == kind in gaze_base.kinds() and field.architecture().get("kind", "product") == kind
+    assert (len(field.members) == 1) == (field.members[0] is field) == (kind != "ensemble")
     assert field.networks == (4 if kind == "ensemble" else 2)
-    # What it says of itself is what it is built of.
-    assert field.architecture().get("kind", "product") == kind
-
-
-# ---- Kinds of gaze fields by the names that checkpoints give them ----
-
-
-def test_the_kinds_of_the_library_are_known():
-    """Whichever module is imported first: they register themselves."""
-    assert {"product", "log_density", "ensemble"} <= set(gaze_base.kinds())
 
 
 def test_a_kind_builds_its_checkpoints(monkeypatch):
@@ -183,3 +165,75 @@ def test_a_cube_of_the_radius_has_eight_cells():
     axis = np.arange(4) / 4
     origins = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     assert RaySupport.of(origins, 1.0).cells[:, 3].tolist() == [8] * 8
+
+
+# ---- Ensembles of gaze fields: what fits together, their arrays, their file ----
+
+
+def test_members_are_alike():
+    with pytest.raises(ValueError, match="at least two"):
+        GazeEnsemble([made()])
+    other_box = LogGazeField.random(SMALL, Box((0, 0, 0), (1, 1, 1)), namespace("llvm"))
+    for other in (made(replace(SMALL, variant="emit")), made(replace(SMALL, escaped="nearest")), other_box):
+        with pytest.raises(ValueError, match="train them alike"):
+            GazeEnsemble([made(), other])
+    # Where people's heads were is each member's own.
+    GazeEnsemble([made(), made(replace(SMALL, heads=((0, 0, 1), (1, 1, 2))))])
+
+
+def test_arrays_are_the_members():
+    ensemble = GazeEnsemble([made(seed=1), made(seed=2)])
+    before = {k: np.array(v) for k, v in ensemble.parameters().items()}
+    assert len(before) == 2 * len(made().parameters()) and not np.array_equal(
+        before["0.grid.table"], before["1.grid.table"]
+    )
+    ensemble.set_parameters({"1.grid.table": ensemble.parameters()["1.grid.table"] * 0})
+    after = {k: np.array(v) for k, v in ensemble.parameters().items()}
+    assert not after["1.grid.table"].any()
+    assert all(np.array_equal(before[k], after[k]) for k in before if k != "1.grid.table")
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_a_file_holds_all_members_and_the_support(half, tmp_path):
+    """Counts and places are never rounded to fp16."""
+    members = [made(seed=1), made(replace(SMALL, heads=((0, 0, 1), (1, 1, 2))), seed=2)]
+    support = RaySupport.of(np.random.default_rng(0).uniform(0, 9, (5000, 3)), 0.25)
+    save_gaze(GazeEnsemble(members, support), tmp_path / "g.safetensors", {"made": "here"}, half)
+    again, meta = load_gaze(tmp_path / "g.safetensors", namespace("llvm"))
+    assert meta["provenance"] == {"made": "here"} and meta["output"] == {"activation": "log", "normalized": True}
+    assert [m.config for m in again.members] == [m.config for m in members] and again.box == members[0].box
+    for name, value in GazeEnsemble(members).parameters().items():
+        np.testing.assert_allclose(
+            np.array(again.parameters()[name]), np.array(value), rtol=1e-3 if half else 0, atol=1e-3 if half else 0
+        )
+    np.testing.assert_array_equal(again.support.cells, support.cells)
+    assert again.support.radius == 0.25
+
+
+def test_a_single_field_keeps_its_support_too(tmp_path):
+    field = made()
+    save_gaze(field, tmp_path / "plain.safetensors", {})
+    field.support = RaySupport.of([[1.0, 2, 3]], 0.5)
+    save_gaze(field, tmp_path / "g.safetensors", {})
+    assert load_gaze(tmp_path / "plain.safetensors", namespace("llvm"))[0].support is None
+    assert load_gaze(tmp_path / "g.safetensors", namespace("llvm"))[0].support.cells.shape == (1, 5)
+
+
+def test_ensembles_of_ensembles_are_refused(tmp_path):
+    """When they are made, and in a file, however deep they lie in one another."""
+    pair = GazeEnsemble([made(seed=1), made(seed=2)])
+    for members in ([pair, pair], [made(), pair]):
+        with pytest.raises(ValueError, match="give its members instead"):
+            GazeEnsemble(members)
+    about = pair.architecture()
+    for _ in range(500):
+        about = {"kind": "ensemble", "members": [about, about]}
+    with pytest.raises(ValueError, match="is an ensemble itself, which this version does not read"):
+        gaze_base.build(about, pair.box, NoArrays())
+
+
+class NoArrays:
+    """Arrays of a file that has none."""
+
+    def member(self, index, about):
+        return about, self

@@ -13,7 +13,7 @@ import pytest
 import nerg_mi.fields
 import nerg_mi.train
 from nerg_mi.fields import gaze_base
-from nerg_mi.fields.gaze_ensemble import GazeEnsemble
+from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.train import gaze_recipes
 from nerg_mi.workflows.ablation import AblationOptions, ablate
