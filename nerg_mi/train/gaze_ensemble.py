@@ -18,7 +18,6 @@ from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.rays.rays import Rays
 
-from .checkpointing import kept_unless, require_same
 from .gaze_data import Supervision
 from .gaze_folds import CHOICE, MINUTES, choose_mix, choose_variant, mixes
 from .gaze_run import train_gaze
@@ -26,6 +25,7 @@ from .gaze_settings import GazeSettings
 from .gaze_trainer import KIND as RUN
 from .gaze_trainer import GazePlan, GazeProgress, Listener, StateSettings, kept_identity
 from .geometry import GazePlace
+from .trainer import kept_unless, require_same
 
 FEW = 5
 """Blocks that a resample needs at least; people are the blocks where there are as many of them."""

@@ -12,7 +12,6 @@ import numpy as np
 
 from nerg_mi.fields.gaze_base import GazeHead, basis_of
 
-from .checkpointing import kept_unless
 from .gaze_data import (
     Supervision,
     TargetNeeds,
@@ -37,6 +36,7 @@ from .gaze_trainer import (
     rounded,
 )
 from .geometry import GazePlace
+from .trainer import kept_unless
 
 # ---- Run ----
 #

@@ -24,6 +24,8 @@ from nerg_mi.ranges import (
     setting,
 )
 
+from .trainer import RunSettings
+
 # ---- Losses between predicted and true gaze densities of probes, in Dr.Jit ----
 #
 # Densities are flat arrays, probe after probe with the same D directions each
@@ -199,7 +201,7 @@ class ProbeSettings(Checked):
 
 
 @dataclass(frozen=True)
-class GazeSettings(Checked):
+class GazeSettings(RunSettings):
     """How weights are moved, for how long, and what a validation watches. Of ``steps`` and ``minutes`` one is set."""
 
     steps: int | None = setting(None, "Train for so many steps.", within=STEPS)
@@ -245,16 +247,5 @@ class GazeSettings(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if (self.steps is None) == (self.minutes is None):
-            raise NergError("give the length of the training either in steps or in minutes")
         if self.loss not in LOSSES:
             raise NergError(f'the loss must be one of {", ".join(LOSSES)}, got "{self.loss}"')
-
-    def rate(self, progress: float) -> float:
-        """Learning rate at ``progress`` in 0..1 of the run."""
-        late = max(0.0, progress - self.hold) / (1 - self.hold)
-        return self.learning_rate * self.final_rate ** min(late, 1.0)
-
-    def to_dict(self) -> dict:
-        """As JSON, for the provenance."""
-        return asdict(self)

@@ -21,10 +21,10 @@ from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
 
-from .checkpointing import count_of, optimiser_state, require_same, require_shape, restore_optimiser, restoring
 from .gaze_data import Batch, Supervision, TargetArrays, Targets
 from .gaze_settings import GazeSettings, ProbeSettings, gaze_loss
 from .geometry import GazePlace
+from .trainer import Trainer, count_of, require_same, require_shape, restoring
 
 # ---- Trainer ----
 #
@@ -45,11 +45,10 @@ class Scores(NamedTuple):
     integral: float
 
 
-class GazeTrainer(ABC):
+class GazeTrainer(Trainer, ABC):
     """One run: state, ``step()``, ``measure()``, and ``field()`` for what it has come to.
 
     ``targets``: what to learn from; ``box``: where the field lives, in the same frame; ``config``: of the field;
-    ``schedule``: steps that the learning rate's schedule spans, where that is not ``settings``' own length;
     ``initial``: arrays to begin with in place of random ones, which with ``settings.frozen`` stay as they are. Equal
     seeds draw equal batches; sums over threads are not ordered, so that weights agree between runs to rounding (and bit
     for bit only with one thread).
@@ -69,21 +68,17 @@ class GazeTrainer(ABC):
     ):
         # A field's class knows its configuration's, and so does its trainer.
         self.config: Any = config
-        self.settings, self.box, self.ns = settings, box, ns
-        self.rng = np.random.default_rng(settings.seed)
-        self._schedule, self._targets = schedule, targets
+        super().__init__(settings, ns, schedule)
+        self.box, self._targets = box, targets
         self.learn_from(targets, 0)
         self.initial: Any = self.untrained()
         if initial:
             self.initial.set_parameters(initial)
         self.constant = dict(initial or {}) if settings.frozen else {}
         trained = {k: v for k, v in self.trainable(self.initial.parameters()).items() if k not in self.constant}
-        self.optimiser = AdamW(
-            settings.learning_rate, trained, beta_2=0.99, epsilon=1e-15, weight_decay=settings.weight_decay
-        )
-        self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.optimiser.items()}
-        self.steps, self.loss = 0, None
-        self._started = time.perf_counter()
+        self.loss: Any = None
+        decay = settings.weight_decay
+        self.start(AdamW(settings.learning_rate, trained, beta_2=0.99, epsilon=1e-15, weight_decay=decay))
 
     @classmethod
     def begin_as(cls, radiance: RadianceField, config: Any) -> tuple[Any, dict]:
@@ -116,24 +111,6 @@ class GazeTrainer(ABC):
     def judge(self, kld: float, cc: float, mae: float, off: float) -> float:
         """What a validation is judged by, from its means over probes; ``off``: squared error of the integral."""
 
-    @property
-    def seconds(self) -> float:
-        """Wall time of the run, without that between an interruption and its resumption."""
-        return time.perf_counter() - self._started
-
-    @property
-    def progress(self) -> float:
-        """Share of the schedule that is done, 0..1."""
-        steps, minutes = self._schedule or self.settings.steps, self.settings.minutes
-        if not steps and minutes is not None:
-            return min(1.0, self.seconds / (60 * minutes))
-        return min(1.0, self.steps / (steps or 1))
-
-    def restore(self, steps: int, seconds: float, random: dict) -> None:
-        """Go on from stored numbers; see ``state``."""
-        self.steps, self._started = steps, time.perf_counter() - seconds
-        self.rng.bit_generator.state = random
-
     def learn_from(self, targets: Targets, epoch: int) -> None:
         """Take ``targets``, which are those of ``epoch``, in place of the ones before."""
         self.data, self._epoch = TargetArrays(targets, self.ns), epoch
@@ -149,14 +126,9 @@ class GazeTrainer(ABC):
             if epoch != self._epoch:
                 self.learn_from(self._targets.renew(epoch), epoch)
         self.backward()
-        self.optimiser.set_learning_rate(self.settings.rate(self.progress))
-        self.optimiser.step()
+        self.move_weights()
         self.steps += 1
-        # A short memory at first: the start of a run is not worth remembering.
-        decay = min(self.settings.average, (1 + self.steps) / (10 + self.steps))
-        for k, old in self.averaged.items():
-            self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * dr.opaque(self.ns.Float, 1 - decay)
-        dr.eval(self.averaged)
+        self.average_weights()
         # Steps are only queued otherwise: their time would count as none, and a run of minutes would go on long after
         # them.
         dr.sync_thread()
@@ -288,9 +260,7 @@ class GazeRunFile:
         if self.path is None or stage != self.stage or "random" not in self._meta:
             return {}
         with restoring(self.path):
-            restore_optimiser(trainer, self._tensors, self._meta["taken"])
-            steps, seconds = (count_of(self._meta, name) for name in ("steps", "seconds"))
-            trainer.restore(int(steps), seconds, self._meta["random"])
+            trainer.restore(self._tensors, self._meta)
             best = {k: v for k, v in trainer.averaged.items() if f"best.{k}" in self._tensors}
             for k, v in best.items():
                 require_shape(self._tensors, f"best.{k}", v)
@@ -303,14 +273,8 @@ class GazeRunFile:
             return
         tensors, meta = {f"best.{k}": v.numpy() for k, v in weights.items()}, {}
         if trainer is not None:
-            state, taken = optimiser_state(trainer)
+            state, meta = trainer.state()
             tensors |= state
-            meta = {
-                "taken": taken,
-                "steps": trainer.steps,
-                "seconds": trainer.seconds,
-                "random": trainer.rng.bit_generator.state,
-            }
         write_checkpoint(
             self.path, KIND, tensors, {"about": self.about, "stage": stage, "found": found, "spent": self.spent, **meta}
         )

@@ -18,6 +18,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.figures.style import provenance
 from nerg_mi.files.images import write_png
+from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.color import mean_score, psnr, psnr_of_fitted_half
 from nerg_mi.maths.geometry import Box
@@ -25,10 +26,10 @@ from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.dataset import Dataset
 from nerg_mi.photos.images import View
 
-from .checkpointing import StepClock, kept_unless, load_run, save_run
 from .radiance_losses import PHOTOS
 from .radiance_settings import RadianceSettings
 from .radiance_trainer import Preview, RadianceTrainer
+from .trainer import StepClock, kept_unless, require_same, restoring
 
 # ---- How much of what photos show lies beyond the part of a place that its field resolves best ----
 
@@ -183,6 +184,7 @@ def _forgotten(trainer):
 # A whole radiance training: from a data set to a checkpoint, with its held-out error on the way.
 
 
+KIND = "radiance run"
 # Shares of the run at which the held-out error is looked at.
 _LOOKS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
 _LOOK_VIEWS = 4
@@ -243,7 +245,7 @@ def train_field(
         "box": dataset.box.to_dict(),
         "depth": depth,
     }
-    history = _resumed(trainer, state, about) if resume else []
+    history = load_run(trainer, state, about) if resume else []
     last = history[-1]["psnr"] if history else None
     looks = [x for x in _LOOKS if x > trainer.progress] if watched else []
     looked, saved, interrupted = history[-1]["steps"] if history else 0, trainer.seconds, False
@@ -288,11 +290,25 @@ def train_field(
     return field, provenance
 
 
-def _resumed(trainer: RadianceTrainer, state: Path | None, about: dict) -> list:
-    """The history of the run in the file ``state``, which ``trainer`` then goes on with."""
-    if state is None:
+def save_run(trainer: RadianceTrainer, path: Path, about: dict, history: list) -> None:
+    """Write the state of ``trainer`` atomically. ``about``: what the run must agree on to be resumed (JSON);
+    ``history``: of its held-out error so far."""
+    tensors, metadata = trainer.state()
+    write_checkpoint(path, KIND, tensors, {"about": about, "history": history, **metadata})
+
+
+def load_run(trainer: RadianceTrainer, path: Path | None, about: dict) -> list:
+    """Set ``trainer`` to the state in ``path``; returns the history.
+
+    Raises `NergError` unless the state is one of a run with the same ``about``.
+    """
+    if path is None:
         raise NergError("there is nothing to resume: name the file that holds the state of the run")
-    return load_run(trainer, state, about)
+    tensors, meta = read_checkpoint(path, KIND)
+    with restoring(path):
+        require_same(path, meta["about"], about)
+        trainer.restore(tensors, meta)
+        return list(meta["history"])
 
 
 def _result(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.radiance import RadianceConfig
 from nerg_mi.maths.geometry import AnyBox
-from nerg_mi.ranges import LEARNING_RATES, LOSS_WEIGHTS, MINUTES, SEEDS, STEPS, Checked, Range, ranged, setting
+from nerg_mi.ranges import LEARNING_RATES, LOSS_WEIGHTS, MINUTES, SEEDS, STEPS, Range, ranged, setting
+
+from .trainer import RunSettings
 
 # ---- How much one step of a radiance training takes on, from what the last one found ----
 #
@@ -84,7 +86,7 @@ def sized_config(size: str, box: AnyBox, deferred: bool = False) -> RadianceConf
 
 
 @dataclass(frozen=True)
-class RadianceSettings(Checked):
+class RadianceSettings(RunSettings):
     """Controls of a training run; lengths are shares of the scene box's side. Exactly one of ``steps`` and ``minutes``
     says how long it takes."""
 
@@ -157,8 +159,6 @@ class RadianceSettings(Checked):
 
     def __post_init__(self):
         super().__post_init__()
-        if (self.steps is None) == (self.minutes is None):
-            raise NergError("give the length of the training either in steps or in minutes")
         if self.resolution % 8:
             raise NergError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
 
@@ -166,11 +166,6 @@ class RadianceSettings(Checked):
     def most_looked(self) -> int:
         """Samples at most of a step's density-only pass."""
         return int(self.look_most * self.batch)
-
-    def rate(self, progress: float) -> float:
-        """Learning rate at ``progress`` in 0..1 of the run."""
-        late = max(0.0, progress - self.hold) / (1 - self.hold)
-        return self.learning_rate * self.final_rate ** min(late, 1.0)
 
     def damped_within(self, progress: float) -> float:
         """Distance within which derivatives are damped at ``progress`` in 0..1 of the run, a share of the side."""
@@ -180,6 +175,3 @@ class RadianceSettings(Checked):
         """How many times coarser than ``march_step`` the run marches at ``progress`` in 0..1."""
         stage = int(progress / self.stride_share * len(self.strides)) if self.stride_share > 0 else len(self.strides)
         return self.strides[stage] if stage < len(self.strides) else 1
-
-    def to_dict(self) -> dict:
-        return asdict(self)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -15,15 +14,15 @@ from nerg_mi.fields.encoding import encoding_of
 from nerg_mi.fields.mlp import aligned
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
 from nerg_mi.fields.refinement import refine
+from nerg_mi.formats.fields import number
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Float
 from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.images import View
 from nerg_mi.transport.quadrature import mean_depth_share
 
-from .checkpointing import StepClock
 from .radiance_data import PixelBank
-from .radiance_grid import DensityGrid, Settling
+from .radiance_grid import GRID_STATE, DensityGrid, Settling
 from .radiance_losses import (
     PHOTOS,
     PhotoColors,
@@ -39,6 +38,7 @@ from .radiance_losses import (
 )
 from .radiance_sampling import StepTable, Thinning, damp_near, ray_sum, rays_in_box, visible_samples, weights
 from .radiance_settings import RadianceSettings, adapted_rays, affordable_rays, refined
+from .trainer import StepClock, Trainer, count_of, require_shape
 
 # ---- Pictures of a field by the trainer's own marcher, for the error that is watched while it trains ----
 
@@ -112,17 +112,17 @@ def _march(field, occupied, table, center, d, near: float, stop: float, ns):
 # networks run as tensor products.
 
 
-# The average is taken of every fourth step.
-_AVERAGE_EVERY = 4
 # Training rays that decide, at the end, which cells matter, and their samples at most: in fog each ray has hundreds.
 _LOOKS, _LOOK_RAYS, _LOOK_SAMPLES = 64, 2**12, 2**25
 # Steps of rays that the marching kernel goes through, in batches: they cost a fiftieth of a sample of the density pass.
 _CANDIDATES = 128
 # Rays whose depth loss exceeds this are drawn again; so many are kept.
 _WRONG, _HARD = 0.3, 2**14
+# Attributes that the state of a run keeps as numbers.
+_NUMBERS = ("rays", "samples", "stride", "looked")
 
 
-class RadianceTrainer:
+class RadianceTrainer(Trainer):
     """One run: state, ``step()``, and ``field()`` for what it has come to.
 
     ``views``: the training pictures; ``box``: where density may be, in their coordinates; ``depth``: supervise with
@@ -130,21 +130,22 @@ class RadianceTrainer:
     between runs to rounding (and bit for bit only with one thread).
     """
 
+    AVERAGE_EVERY = 4
+
     def __init__(
         self, views: list[View], box: AnyBox, config: RadianceConfig, settings: RadianceSettings, ns, depth: bool = True
     ):
         if not views:
             raise NergError("there are no pictures to train on")
-        self.config, self.settings, self.box, self.ns = config, settings, box, ns
-        self.rng, self.clock = np.random.default_rng(settings.seed), StepClock()
+        super().__init__(settings, ns)
+        self.config, self.box, self.clock = config, box, StepClock()
         self.pixels = PixelBank(ns, views)
         self.use_depth = depth and self.pixels.has_depth
         self.live = RadianceField.random(config, box, ns, settings.seed)
         # One photo has nothing to differ from.
         self.photos = PhotoColors(ns, len(views)) if settings.photo_colors and len(views) > 1 else None
         start = self.live.parameters() | ({} if self.photos is None else {PHOTOS: self.photos.start()})
-        self.optimiser = Adam(settings.learning_rate, start, beta_2=0.99, epsilon=1e-15)
-        self.averaged = {k: type(v)(dr.detach(v)) for k, v in start.items()}
+        self.start(Adam(settings.learning_rate, start, beta_2=0.99, epsilon=1e-15))
         self.march_step = settings.march_step * box.side
         self.grid = DensityGrid(
             ns,
@@ -164,32 +165,34 @@ class RadianceTrainer:
         self._tables: dict[int, StepTable] = {}
         self.settling = Settling(self.grid)
         self.hard = np.zeros(0, np.uint32)
-        self.steps, self.rays, self.loss, self.samples = 0, 256, 0.0, 0
+        self.rays, self.loss, self.samples = 256, 0.0, 0
         # Of the marching: how many times coarser than `march_step`, and samples a ray of the last density-only pass.
         self.stride, self.looked = 1 if self.carved else max(settings.strides, default=1), 0.0
         self.start()
 
-    def start(self) -> None:
-        """Start the clock of the run."""
-        self._started = time.perf_counter()
+    def state(self) -> tuple[dict, dict]:
+        tensors, meta = super().state()
+        tensors |= {f"grid.{name}": getattr(self.grid, name).numpy() for name in GRID_STATE}
+        settling = self.settling
+        tensors |= {"settling.found": settling.found.numpy(), "settling.shown": settling.shown.numpy()}
+        meta |= {name: getattr(self, name) for name in _NUMBERS}
+        meta |= {"settling": settling.at, "turn": self.grid.turn, "clock": self.clock.to_dict()}
+        return {**tensors, "hard": self.hard}, meta
 
-    def restore(self, seconds: float, hard: np.ndarray, **numbers) -> None:
-        """Go on from stored numbers (of the attributes of these names); see ``run_state``."""
-        self.hard = hard
-        for name, value in numbers.items():
+    def restore(self, tensors: dict, meta: dict) -> None:
+        counts = {name: count_of(meta, name) for name in _NUMBERS}
+        for name in GRID_STATE:
+            require_shape(tensors, f"grid.{name}", getattr(self.grid, name))
+        found, shown = (tensors[f"settling.{name}"] for name in ("found", "shown"))
+        for name in ("found", "shown"):
+            require_shape(tensors, f"settling.{name}", getattr(self.settling, name))
+        super().restore(tensors, meta)
+        self.grid.restore(*[tensors[f"grid.{name}"] for name in GRID_STATE], int(count_of(meta, "turn")))
+        self.settling.restore(int(number(meta, "settling", "state")), found, shown)
+        self.clock.restore(meta["clock"])
+        self.hard = tensors["hard"]
+        for name, value in counts.items():
             setattr(self, name, value)
-        self._started = time.perf_counter() - seconds
-
-    @property
-    def seconds(self) -> float:
-        """Wall time of the run, without that between an interruption and its resumption."""
-        return time.perf_counter() - self._started
-
-    @property
-    def progress(self) -> float:
-        """Share of the run that is done, 0..1."""
-        s = self.settings
-        return min(1.0, self.steps / s.steps if s.steps is not None else self.seconds / (60 * cast("float", s.minutes)))
 
     def table(self, stride: int = 1) -> StepTable:
         """Step edges ``stride`` times as coarse as the finest."""
@@ -337,17 +340,10 @@ class RadianceTrainer:
             if name.startswith("grid."):
                 total = total + s.grid_decay * feature_decay(value.array if dr.is_tensor_v(value) else value)
         dr.backward(total)
-        self.optimiser.set_learning_rate(s.rate(self.progress))
-        self.optimiser.step()
+        self.move_weights()
         self.loss, self.samples = loss, samples.count
-        if self.steps % _AVERAGE_EVERY == 0:
-            # A short memory at first: the start of a run is not worth remembering.
-            decay = min(s.average, (1 + self.steps) / (10 + self.steps)) ** _AVERAGE_EVERY
-            # As a literal it would compile a kernel each time.
-            part = dr.opaque(ns.Float, 1 - decay)
-            for k, old in self.averaged.items():
-                self.averaged[k] = type(old)(old + (dr.detach(self.optimiser[k]) - old) * part)
-            dr.eval(self.averaged)
+        if self.steps % self.AVERAGE_EVERY == 0:
+            self.average_weights()
         return misplaced
 
     def _clear(self, parameters: dict):

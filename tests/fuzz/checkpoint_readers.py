@@ -94,18 +94,19 @@ class _Grid:
         assert len(value) == len(bits) == len(seen) == len(always) == 8 and isinstance(turn, int)
 
 
-def _trainer():
-    """What of a trainer its state consists of."""
+def _trainer(kind):
+    """A trainer of ``kind`` that has no more than what its state consists of."""
     import mitsuba as mi
 
-    from nerg_mi.train.checkpointing import StepClock
+    from nerg_mi.train.trainer import StepClock
 
     ns = _parts()[0]
     optimiser = mi.ad.Adam(lr=0.1)
     optimiser["grid.table"] = ns.Float([1.0] * 6)
     optimiser["net.0"] = ns.TensorXf(np.ones((2, 3), np.float32))
     averaged = {k: type(v)(v) for k, v in optimiser.items()}
-    return SimpleNamespace(
+    trainer = kind.__new__(kind)
+    vars(trainer).update(
         optimiser=optimiser,
         averaged=averaged,
         grid=_Grid(ns),
@@ -114,39 +115,43 @@ def _trainer():
         steps=7,
         rays=100,
         samples=1000,
-        seconds=2.5,
+        _started=0.0,
         stride=4,
         looked=10.0,
         settling=SimpleNamespace(at=0, found=ns.UInt8([0] * 8), shown=ns.UInt8([0] * 8), restore=lambda *state: None),
         clock=StepClock(),
-        restore=lambda *numbers, **named: None,
     )
+    return trainer
 
 
 def _make_radiance_run(folder: Path) -> None:
-    from nerg_mi.train.checkpointing import save_run
+    from nerg_mi.train.radiance_run import save_run
+    from nerg_mi.train.radiance_trainer import RadianceTrainer
 
-    save_run(_trainer(), folder / "field.run", _ABOUT, [{"psnr": 20.0}])
+    save_run(_trainer(RadianceTrainer), folder / "field.run", _ABOUT, [{"psnr": 20.0}])
 
 
 def _read_radiance_run(folder: Path) -> object:
-    from nerg_mi.train.checkpointing import load_run
+    from nerg_mi.train.radiance_run import load_run
+    from nerg_mi.train.radiance_trainer import RadianceTrainer
 
-    return load_run(_trainer(), folder / "field.run", _ABOUT)
+    return load_run(_trainer(RadianceTrainer), folder / "field.run", _ABOUT)
 
 
 def _make_gaze_run(folder: Path) -> None:
     from nerg_mi.train.gaze_trainer import GazeRunFile
+    from nerg_mi.train.trainer import Trainer
 
-    trainer = _trainer()
+    trainer = _trainer(Trainer)
     GazeRunFile(folder / "gaze.run", _ABOUT).keep("fit", trainer, {"best": 1.5}, trainer.averaged, now=True)
 
 
 def _read_gaze_run(folder: Path) -> object:
     from nerg_mi.train.gaze_trainer import GazeRunFile
+    from nerg_mi.train.trainer import Trainer
 
     file = GazeRunFile(folder / "gaze.run", _ABOUT, resume=True)
-    return file.restore("fit", _trainer())
+    return file.restore("fit", _trainer(Trainer))
 
 
 # --- torch's ----------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.train.checkpointing`."""
+"""Tests of `nerg_mi.train.trainer`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
-from nerg_mi.train import checkpointing
-from nerg_mi.train.checkpointing import StepClock, load_run, save_run
-from nerg_mi.train.radiance_run import train_field
+from nerg_mi.train import trainer as shared
+from nerg_mi.train.radiance_run import load_run, save_run, train_field
 from nerg_mi.train.radiance_trainer import RadianceTrainer
+from nerg_mi.train.trainer import StepClock
 from tests.train.radiance.ball import TINY, settings, state, trainer
 
 # ---- A training that is killed and resumed comes to what an uninterrupted one comes to ----
@@ -195,7 +195,7 @@ def test_a_state_is_restored_with_and_without_steps(seconds):
 
 
 def test_durations_are_kept_of_steps_that_are_equally_far_apart(monkeypatch):
-    monkeypatch.setattr(checkpointing, "KEPT", 4)
+    monkeypatch.setattr(shared, "KEPT", 4)
     for steps, each in ((4, 1), (5, 2), (9, 4), (30, 8)):
         clock = timed(*range(steps))
         assert clock.each == each and clock.durations == list(range(0, steps, each))

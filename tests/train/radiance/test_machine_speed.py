@@ -6,9 +6,9 @@ import time
 import drjit as dr
 import numpy as np
 
-from nerg_mi.train.checkpointing import StepClock
 from nerg_mi.train.radiance_run import train_field
 from nerg_mi.train.radiance_trainer import RadianceTrainer
+from nerg_mi.train.trainer import StepClock
 
 from .ball import BOX, TINY, ns, settings, state, trainer
 

@@ -1,4 +1,5 @@
-"""The state of a training on disk, from which it resumes, and the clock of its steps."""
+"""What trainings of radiance and of gaze share: length, learning rate, averaged weights, the state on disk from which
+they resume, and the clock of their steps."""
 
 from __future__ import annotations
 
@@ -6,74 +7,133 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import reading
-from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.formats.fields import number
+from nerg_mi.ranges import Checked
 
-# ---- The whole state of a training in a file, so that an interrupted run goes on as if it had not been ----
+# ---- Settings and trainer ----
+
+
+class RunSettings(Checked):
+    """Base of the settings of a training, a dataclass with these fields."""
+
+    # Of both one is set.
+    steps: int | None
+    minutes: float | None
+    # Held for the share ``hold`` of the run; then it decays exponentially to ``final_rate`` times itself.
+    learning_rate: float
+    final_rate: float
+    hold: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.steps is None) == (self.minutes is None):
+            raise NergError("give the length of the training either in steps or in minutes")
+
+    def rate(self, progress: float) -> float:
+        """Learning rate at ``progress`` in 0..1 of the run."""
+        late = max(0.0, progress - self.hold) / (1 - self.hold)
+        return self.learning_rate * self.final_rate ** min(late, 1.0)
+
+    def to_dict(self) -> dict:
+        """As JSON, for the provenance."""
+        return asdict(self)  # pyright: ignore[reportArgumentType] it is a dataclass
+
+
+class Trainer:
+    """Base of one run: an optimiser, the moving averages of its weights, which are the result, and the clock.
+
+    ``schedule``: steps that the learning rate's schedule spans, where that is not ``settings``' own length.
+    """
+
+    # The average is taken of every so many steps.
+    AVERAGE_EVERY: ClassVar[int] = 1
+
+    def __init__(self, settings: Any, ns: ModuleType, schedule: int | None = None):
+        self.settings, self.ns, self._schedule = settings, ns, schedule
+        self.rng = np.random.default_rng(settings.seed)
+        self.steps = 0
+        self.optimiser: Any = None
+        self.averaged: dict[str, Any] = {}
+
+    def start(self, optimiser: Any = None) -> None:
+        """Start the clock of the run; with an ``optimiser`` (Adam or AdamW), of whose weights."""
+        if optimiser is not None:
+            self.optimiser = optimiser
+            self.averaged = {k: type(v)(dr.detach(v)) for k, v in optimiser.items()}
+        self._started = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the run, without that between an interruption and its resumption."""
+        return time.perf_counter() - self._started
+
+    @property
+    def progress(self) -> float:
+        """Share of the schedule that is done, 0..1."""
+        steps, minutes = self._schedule or self.settings.steps, self.settings.minutes
+        return min(1.0, self.steps / steps if steps else self.seconds / (60 * minutes))
+
+    def move_weights(self) -> None:
+        """Move the weights along the gradients that are in them."""
+        self.optimiser.set_learning_rate(self.settings.rate(self.progress))
+        self.optimiser.step()
+
+    def average_weights(self) -> None:
+        """Move the averages towards the weights of this step."""
+        # A short memory at first: the start of a run is not worth remembering.
+        decay = min(self.settings.average, (1 + self.steps) / (10 + self.steps)) ** self.AVERAGE_EVERY
+        # As a literal it would compile a kernel each time.
+        part = dr.opaque(self.ns.Float, 1 - decay)
+        for k, old in self.averaged.items():
+            self.averaged[k] = type(old)(old + (dr.detach(self.optimiser[k]) - old) * part)
+        dr.eval(self.averaged)
+
+    def state(self) -> tuple[dict, dict]:
+        """``(tensors, metadata)`` for `restore`: weights, moments and averages by name, and all that a run counts."""
+        tensors, taken = {}, {}
+        for name, (value, _, _, (count, first, second, _)) in self.optimiser.state.items():
+            taken[name] = int(count.numpy()[0])
+            parts = {"weights": value, "first": first, "second": second, "averaged": self.averaged[name]}
+            tensors |= {f"{part}.{name}": x.numpy() for part, x in parts.items()}
+        random = self.rng.bit_generator.state
+        return tensors, {"taken": taken, "steps": self.steps, "seconds": self.seconds, "random": random}
+
+    def restore(self, tensors: dict, meta: dict) -> None:
+        """Go on from what `state` gave. Raises ``ValueError`` or `KeyError` where that does not fit."""
+        taken, optimiser = meta["taken"], self.optimiser
+        for name, (value, promoted, rate, (count, first, second, largest)) in optimiser.state.items():
+            old = {"weights": value, "first": first, "second": second, "averaged": self.averaged[name]}
+            for part, x in old.items():
+                require_shape(tensors, f"{part}.{name}", x)
+            new = {part: type(x)(tensors[f"{part}.{name}"]) for part, x in old.items()}
+            dr.enable_grad(new["weights"])
+            count = dr.opaque(type(count), int(count_of(taken, name)))
+            optimiser.state[name] = new["weights"], promoted, rate, (count, new["first"], new["second"], largest)
+            self.averaged[name] = new["averaged"]
+        dr.eval(optimiser.state, self.averaged)
+        self.steps = int(count_of(meta, "steps"))
+        self._started = time.perf_counter() - count_of(meta, "seconds")
+        self.rng.bit_generator.state = meta["random"]
+
+
+# ---- The state of a training in a file, so that an interrupted run goes on as if it had not been ----
 #
 # With one thread the weights then equal those of a run without interruption bit for bit; with more, sums over threads
 # come in no fixed order in either.
 
 
-KIND = "radiance run"
 # The least and the most of what a run counts; arrays count steps in 32 bits.
 _COUNTS = {"rays": (0, 2**60), "samples": (0, 2**60), "looked": (0, 2**60), "stride": (1, 2**20)}
-_GRID = ("value", "bits", "seen", "always")
-_NUMBERS = ("steps", "rays", "samples", "stride", "looked")
-
-
-def save_run(trainer, path: str | Path, about: dict, history: list) -> None:
-    """Write the state of ``trainer`` (`RadianceTrainer`) atomically. ``about``: what the run must agree on to be
-    resumed (JSON); ``history``: of its held-out error so far."""
-    tensors, taken = optimiser_state(trainer)
-    for name in _GRID:
-        tensors[f"grid.{name}"] = getattr(trainer.grid, name).numpy()
-    tensors["hard"] = trainer.hard
-    settling = trainer.settling
-    tensors |= {"settling.found": settling.found.numpy(), "settling.shown": settling.shown.numpy()}
-    metadata = {
-        "about": about,
-        "history": history,
-        "taken": taken,
-        **{name: getattr(trainer, name) for name in _NUMBERS},
-        "seconds": trainer.seconds,
-        "settling": settling.at,
-        "turn": trainer.grid.turn,
-        "clock": trainer.clock.to_dict(),
-        "random": trainer.rng.bit_generator.state,
-    }
-    write_checkpoint(path, KIND, tensors, metadata)
-
-
-def load_run(trainer, path: str | Path, about: dict) -> list:
-    """Set ``trainer`` to the state in ``path``; returns the history.
-
-    Raises `NergError` unless the state is one of a run with the same ``about``.
-    """
-    tensors, meta = read_checkpoint(path, KIND)
-    with restoring(path):
-        require_same(path, meta["about"], about)
-        counts = {name: count_of(meta, name) for name in (*_NUMBERS, "seconds")}
-        for name in _GRID:
-            require_shape(tensors, f"grid.{name}", getattr(trainer.grid, name))
-        for name in ("found", "shown"):
-            require_shape(tensors, f"settling.{name}", getattr(trainer.settling, name))
-        restore_optimiser(trainer, tensors, meta["taken"])
-        trainer.grid.restore(*[tensors[f"grid.{name}"] for name in _GRID], int(count_of(meta, "turn")))
-        trainer.rng.bit_generator.state = meta["random"]
-        trainer.settling.restore(
-            int(number(meta, "settling", "state")), tensors["settling.found"], tensors["settling.shown"]
-        )
-        trainer.clock.restore(meta["clock"])
-        trainer.restore(hard=tensors["hard"], **counts)
-        return list(meta["history"])
 
 
 @contextmanager
@@ -124,36 +184,6 @@ def kept_unless(path: Path | None, keep: Callable[[], None], done: bool) -> Iter
         raise
     if path is not None and done:
         path.unlink(missing_ok=True)
-
-
-def optimiser_state(trainer) -> tuple[dict, dict]:
-    """``(tensors, taken)``: weights, moments and averages of ``trainer`` by name, and the steps that each array has
-    taken.
-
-    ``trainer``: has an ``optimiser`` (Adam or AdamW) and the dictionary ``averaged`` of its weights.
-    """
-    tensors, taken = {}, {}
-    for name, (value, _, _, (count, first, second, _)) in trainer.optimiser.state.items():
-        taken[name] = int(count.numpy()[0])
-        parts = {"weights": value, "first": first, "second": second, "averaged": trainer.averaged[name]}
-        tensors |= {f"{part}.{name}": x.numpy() for part, x in parts.items()}
-    return tensors, taken
-
-
-def restore_optimiser(trainer, tensors: dict, taken: dict) -> None:
-    """Set ``trainer`` to what ``optimiser_state`` gave. Raises ``ValueError`` or `KeyError` where that does not fit
-    it."""
-    optimiser = trainer.optimiser
-    for name, (value, promoted, rate, (count, first, second, largest)) in optimiser.state.items():
-        old = {"weights": value, "first": first, "second": second, "averaged": trainer.averaged[name]}
-        for part, x in old.items():
-            require_shape(tensors, f"{part}.{name}", x)
-        new = {part: type(x)(tensors[f"{part}.{name}"]) for part, x in old.items()}
-        dr.enable_grad(new["weights"])
-        count = dr.opaque(type(count), int(count_of(taken, name)))
-        optimiser.state[name] = new["weights"], promoted, rate, (count, new["first"], new["second"], largest)
-        trainer.averaged[name] = new["averaged"]
-    dr.eval(optimiser.state, trainer.averaged)
 
 
 def require_same(path: str | Path, then: dict, now: dict) -> None:
