@@ -46,10 +46,10 @@ def main(argv=None) -> None:
     from nerg_mi.evaluation.gaze import (
         EPS,
         gaze_field,
+        map_scores,
         nearest_probes,
         nearest_rays,
         position_blind,
-        score_rows,
         score_table,
     )
     from nerg_mi.fields.mlp import namespace
@@ -105,7 +105,10 @@ def main(argv=None) -> None:
     methods[f"law, seen by {probe_settings['cap']:,} rays, kappa {narrow:g}"] = fresh_draws(
         law, probe_settings["cap"], narrow
     )
-    rows = score_rows(truth, positions, directions, methods)
+    rows = []
+    for name, method in methods.items():
+        maps = method(positions, directions)
+        rows.append({"method": name, **map_scores(truth, maps), "integral": float(4 * np.pi * np.mean(maps))})
     title = f"{len(positions)} held-out positions against the law ({len(train):,} of {len(rays):,} rays trained on)"
     print(score_table(rows, title))
     integral = 4 * np.pi * methods["gaze field"](positions, directions).mean(axis=1)

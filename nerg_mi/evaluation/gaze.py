@@ -254,29 +254,6 @@ def gaze_field(
     return FieldDensity(field, place, align or Similarity(), settings, on_position)
 
 
-def scores(truth: np.ndarray, prediction: np.ndarray, eps: float = EPS) -> dict[str, float]:
-    """Means over positions of KLD (nats, both normalised over the sphere), CC, SIM, MAE (1/sr) and the prediction's
-    integral.
-
-    ``truth``, ``prediction``: (P, D) in 1/sr, directions of equal area; ``eps`` as in ``metrics.kld``. MAE and the
-    integral are of the prediction as it is, not normalised.
-    """
-    return {
-        "KLD": float(metrics.kld(truth, prediction, eps=eps).mean()),
-        "CC": float(metrics.cc(truth, prediction).mean()),
-        "SIM": float(metrics.sim(truth, prediction).mean()),
-        "MAE": float(metrics.mae(truth, prediction).mean()),
-        "integral": float(4 * np.pi * np.mean(prediction)),
-    }
-
-
-def score_rows(
-    truth: np.ndarray, positions: np.ndarray, directions: np.ndarray, methods: dict[str, Callable]
-) -> list[dict]:
-    """One row of ``scores`` for each of ``methods`` (name: density function), in order; ``method`` holds the name."""
-    return [{"method": name, **scores(truth, density(positions, directions))} for name, density in methods.items()]
-
-
 def score_table(rows: list[dict], title: str) -> str:
     """``rows`` as a table for the terminal."""
     from rich.console import Console

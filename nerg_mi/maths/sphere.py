@@ -105,14 +105,6 @@ def latlong_to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.stack([np.sin(phi) * sin, np.cos(theta) * np.ones_like(phi), -np.cos(phi) * sin], axis=-1)
 
 
-def direction_to_latlong(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Texture position (u, v) in [0, 1) x [0, 1] of unit directions (..., 3);
-    the inverse of :func:`latlong_to_direction` (u is arbitrary at the poles)."""
-    x, y, z = np.moveaxis(np.asarray(direction), -1, 0)
-    # The angle from +y by atan2: acos loses half the digits at the poles.
-    return np.arctan2(x, -z) / (2.0 * np.pi) % 1.0, np.arctan2(np.hypot(x, z), y) / np.pi
-
-
 def latlong_grid(width: int, height: int, to_world: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Pixel-centre directions and exact pixel solid angles of a panorama.
 

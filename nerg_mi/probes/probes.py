@@ -318,14 +318,6 @@ def entropy(probes: Probes, count: int | None = None, backend: Backend = None) -
     return -_average(probes, count, backend, lambda p: p * np.log(np.where(p > 0, p, 1.0)))
 
 
-def effective_rays(probes: Probes) -> np.ndarray:
-    """Rays that count, (P,): (Σw)²/Σw² (Kish 1965); the number of rays where their weights are equal."""
-    if probes.weights is None:
-        return probes.counts.astype(np.float64)
-    sums = [np.add.reduceat(v, probes.offsets[:-1]) for v in (probes.weights, probes.weights**2)]
-    return sums[0] ** 2 / sums[1]
-
-
 def effective_persons(probes: Probes, rays: Rays) -> np.ndarray:
     """People who count, (P,): the same of the people's summed weights.
 

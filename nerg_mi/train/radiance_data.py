@@ -190,12 +190,6 @@ class PixelBank:
         self.depth_everywhere = np.count_nonzero(table) >= 0.999 * self.size
         self._depth, self._depth_unit = self.ns.UInt8(table.view(np.uint8)), self.ns.Float(unit)
 
-    @property
-    def bytes_per_pixel(self) -> float:
-        """Device memory of what is kept for each pixel."""
-        kept = [self._colors, *(a for a in (self._where, self._depth) if a is not None)]
-        return sum(dr.width(a) * dr.itemsize_v(a) for a in kept) / self.size
-
     def batch(self, index) -> PixelBatch:
         """Rays and colours of the pixels at ``index`` (UInt32)."""
         ns = self.ns

@@ -5,7 +5,6 @@ import json
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
-from scipy.integrate import trapezoid
 
 from nerg_mi.evaluation import metrics
 from nerg_mi.evaluation.metrics import Renderer, depth_score, score_views, ssim
@@ -14,7 +13,7 @@ from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Box
-from nerg_mi.maths.sphere import fibonacci_directions, latlong_grid
+from nerg_mi.maths.sphere import latlong_grid
 from nerg_mi.photos.cameras import Camera, Intrinsics
 from nerg_mi.photos.images import View
 
@@ -275,13 +274,6 @@ def test_correlation_of_maps_of_any_scale(scale):
     assert metrics.cc(np.full(500, scale), b) == 0
 
 
-def test_log_score_and_information():
-    density = np.array([[0.2, 0.4], [0.1, 0.1]])
-    assert np.allclose(metrics.log_score(density), np.log(density).mean(axis=1))
-    assert np.isclose(metrics.information_gain(np.full(5, 0.4), np.full(5, 0.1)), 2.0)
-    assert np.isfinite(metrics.log_score(np.array([0.0, -1.0])))
-
-
 def test_epsilon_bounds_the_cost_of_a_zero():
     truth, guess = np.eye(100)[3], np.eye(100)[4]
     assert metrics.kld(truth, guess) > 40 > 8 > metrics.kld(truth, guess, eps=0.1) > 1
@@ -292,37 +284,3 @@ def test_refusals():
         metrics.cc(np.zeros(4), np.zeros(5))
     with pytest.raises(ValueError, match="solid angles"):
         metrics.cc(np.zeros(4), np.zeros(4), -np.ones(4))
-
-
-def test_auc_of_each_fixation_against_all_pixels():
-    """pysaliency's constants; its AUC takes all pixels for what was not looked at."""
-    expected = [0.099375, 0.158125, 0.241875, 0.241875, 0.241875, 0.291875, 0.509375, 0.138125]
-    np.testing.assert_allclose(metrics.sauc(AT_GAZE[:, None], MODEL), expected, atol=1e-12)
-    np.testing.assert_allclose(metrics.sauc(AT_GAZE, MODEL), 0.2403125, atol=1e-12)
-
-
-def test_auc_judd_of_a_picture():
-    """Threshold by threshold, as the original counts pixels."""
-    fixated = np.zeros(1600, bool)
-    fixated[[fy * 40 + fx for fx, fy in FIXATIONS]] = True
-    at = np.sort(MODEL[fixated])[::-1]
-    hits, false = [0.0], [0.0]
-    for k, threshold in enumerate(at):
-        hits.append((k + 1) / len(at))
-        false.append(((MODEL >= threshold).sum() - k - 1) / (1600 - len(at)))
-    expected = trapezoid([*hits, 1.0], [*false, 1.0])
-    assert metrics.auc_judd(MODEL, at, fixated=fixated) == pytest.approx(expected)
-
-
-def test_auc_of_densities_on_the_sphere():
-    """A map that knows the cap that everybody looks at: the area of the cap is what is left to be wrong about."""
-    d = fibonacci_directions(4000)
-    cap = (d[:, 2] > 0.5).astype(float)
-    assert metrics.auc_judd(cap, np.ones(7)) == pytest.approx(1 - 0.25 / 2, abs=1e-3)
-    assert metrics.auc_judd(np.ones(4000), np.ones(7)) == pytest.approx(0.5)
-    rng = np.random.default_rng(0)
-    values = np.exp(3 * d[:, 2])
-    gaze = rng.choice(values, 500, p=values / values.sum())
-    assert metrics.auc_judd(values, gaze) == pytest.approx(float(metrics.sauc(gaze, values)), abs=5e-3)
-    assert metrics.sauc(gaze, gaze) == pytest.approx(0.5)
-    np.testing.assert_allclose(metrics.sauc([[1.0], [3.0]], [2.0, 2.0]), [0, 1])

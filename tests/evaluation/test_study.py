@@ -14,7 +14,7 @@ import pytest
 from nerg_mi.evaluation import study as study_measure
 from nerg_mi.evaluation import study as study_paper
 from nerg_mi.evaluation import study_scenes
-from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, Setting, settings, traced_operations
+from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, settings, traced_operations
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.transport.medium import LocalRay
@@ -53,13 +53,6 @@ class Recorded:
         return {n: np.full(4, 3.0) for n in study_measure.COUNTS}
 
 
-def test_a_render_has_one_sample_a_pixel_unless_told():
-    subject = Recorded()
-    study_measure.timed(subject, subject.integrator())
-    study_measure.timed(subject, subject.integrator(), 4)
-    assert [spp for _, spp, _ in subject.renders] == [1, 4]
-
-
 @pytest.mark.parametrize("quick", [True, False])
 def test_cost_is_taken_along_doublings_from_the_scene_itself(quick):
     subject, said = Recorded(), []
@@ -75,14 +68,6 @@ def test_cost_is_taken_along_doublings_from_the_scene_itself(quick):
     renders = [r for r in subject.renders if r[2] is not None]
     assert renders == [((12, 8), 1, 0.5 / k) for k in of("extent") for _ in range(3)]
     assert all(r["density_evals"] == 3.0 * (r["value"] if r["axis"] == "samples" else 1) for r in rows)
-
-
-def test_every_row_is_announced_before_it_is_rendered_and_before_its_times():
-    subject, said = open_subject("slab", "auto", 6, 4), []
-    less = {"aovs": "depth,opacity", "radiance": False}
-    rows = [Setting("default", "default"), Setting("depth only", "leave out", less)]
-    study_measure.measure(subject, rows, 2, on_step=said.append)
-    assert said == ["default", "depth only", "time of default", "time of depth only"]
 
 
 # ---- What is counted: operations that are traced, whatever the machine ----
@@ -250,12 +235,6 @@ def test_sweeps_are_even_on_a_log_axis(rows):
         ratios = np.divide(values[1:], values[:-1])
         assert len(values) >= 3 and np.allclose(ratios, ratios[0]) and ratios[0] in (2, 4), (name, values)
     assert tuple(sweeps["steps"]) == STEP_COUNTS and tuple(sweeps["resolutions"]) == RESOLUTIONS
-
-
-def test_a_sweep_ends_before_what_the_factor_is_without(rows):
-    """The default stands for them: steps that do not grow, and nothing coarser than a step."""
-    assert min(r.params["coarse"] for r in rows if r.group == "coarse") > 1
-    assert min(r.params["dt_gamma"] for r in rows if r.group == "dt_gamma") > 0
 
 
 def test_rows_do_what_their_names_say(rows):

@@ -88,22 +88,6 @@ def test_cost_is_drawn_over_named_axes_with_the_exponent(drawn):
     assert [a.get_title() for a in drawn[1].axes] == [a.get_title() for a in panels]
 
 
-def test_both_pictures_are_as_wide_and_their_lines_as_thin(drawn):
-    """They stand below each other on a page."""
-    study_plots.plot_errors("a.png", ROWS, "title")
-    study_plots.plot_scaling("b.png", SCALING, "title")
-    errors, cost = drawn
-    pixels = [f.get_size_inches()[0] * f.dpi for f in drawn]
-    assert pixels[0] == pixels[1] and errors.get_size_inches()[1] > cost.get_size_inches()[1]
-    widths = {line.get_linewidth() for f in drawn for a in f.axes for line in a.lines}
-    assert widths == {cost.axes[0].lines[0].get_linewidth()}
-
-
-def test_exponent():
-    x = np.array([1.0, 2, 8, 64])
-    assert math.isclose(study_plots.exponent(x, 3 * x**1.5), 1.5)
-
-
 # ---- What follows from a study's rows: Pareto fronts, and the comparison with the paper's marching ----
 
 

@@ -40,17 +40,6 @@ def test01_values(degree):
         assert np.allclose(got, e, atol=1e-6), i
 
 
-def test02_orthonormal_on_the_sphere():
-    # Reference of the reference: ∫ Y_i Y_j dω = δ_ij, by Gauss-Legendre in z and the trapezoid rule in φ.
-    z, w = np.polynomial.legendre.leggauss(16)
-    φ = 2 * np.pi * np.arange(16) / 16
-    z, φ = (a.ravel() for a in np.meshgrid(z, φ))
-    s = np.sqrt(1 - z**2)
-    y = reference.harmonics(np.stack([s * np.cos(φ), s * np.sin(φ), z], -1))
-    gram = (y * np.tile(w, 16)[:, None] * 2 * np.pi / 16).T @ y
-    assert np.allclose(gram, np.eye(16), atol=1e-12)
-
-
 @pytest.mark.parametrize("degree", [0, -1, 11])
 def test03_degree_out_of_range(degree):
     with pytest.raises(ValueError, match="1..10"):
@@ -250,14 +239,6 @@ def test13_an_evaluation_leaves_no_cycles():
         assert gc.collect() == 0
     finally:
         gc.enable()
-
-
-def test14_the_smallest_grid_has_one_vertex_a_corner():
-    config = HashGridConfig(levels=1, log2_rows=3, base=1, finest=1)
-    assert list(config.offsets()) == [0, 8] and config.level_scales().tolist() == [0]
-    for wrong in ({"levels": 0}, {"base": 0}, {"base": 2}):
-        with pytest.raises(ValueError, match="finest >= base >= 1"):
-            HashGridConfig(**{**config.to_dict(), **wrong})
 
 
 # ---- The register of encodings: kinds in files, and what is no encoding ----

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.mlp import MLP, aligned, evaluate, is_cuda, namespace
+from nerg_mi.fields import mlp
+from nerg_mi.fields.encoding import HashGridConfig, encode_direction
+from nerg_mi.fields.gaze_base import GazeEnsemble
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.gaze_product import GazeConfig, GazeField
+from nerg_mi.fields.mlp import MLP, aligned, evaluate, is_cuda, namespace, set_constant_weights
+from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
+from nerg_mi.maths.geometry import Box
+from nerg_mi.transport.jit import no_collection
 from tests.reference import fields_numpy as reference
 
 # ---- The array types of a backend, and arrays at addresses that Dr.Jit reads fast ----
@@ -76,31 +84,6 @@ def test01_three_ways_agree(sizes):
     assert coop.shape == expected.shape == tensor.shape
     assert np.allclose(coop, expected, atol=1e-6) and np.allclose(tensor, expected, atol=1e-6)
     assert (net.inputs, net.outputs) == (sizes[0], sizes[-1])
-
-
-@pytest.mark.parametrize("mode", ["coop", "tensor"])
-def test02_gradients_equal_central_differences(mode):
-    net, weights, x = make([4, 16, 16, 2], n=20)
-    mix = np.random.default_rng(1).normal(size=(20, 2))
-    for w in net.weights:
-        dr.enable_grad(w)
-    net.pack()
-    if mode == "coop":
-        out = net([ns.Float(c) for c in x.T])
-        loss = dr.sum(sum(o * ns.Float(m) for o, m in zip(out, mix.T)))
-    else:
-        out = net.tensor(ns.TensorXf(x))
-        loss = dr.sum(out * ns.TensorXf(mix.astype(np.float32)), axis=None)
-    dr.backward(loss)
-    for layer, w in enumerate(weights):
-        gradient = dr.grad(net.weights[layer]).numpy()
-        for i, j in [(0, 0), (w.shape[0] - 1, w.shape[1] // 2)]:
-            values = []
-            for h in (1e-5, -1e-5):
-                moved = [v.astype(np.float64) for v in weights]
-                moved[layer][i, j] += h
-                values.append((reference.mlp(x, moved) * mix).sum())
-            assert np.isclose(gradient[i, j], (values[0] - values[1]) / 2e-5, rtol=1e-3, atol=1e-4)
 
 
 def test03_pack_takes_up_changed_weights():
@@ -196,3 +179,182 @@ def test02_in_loops_and_branches(sizes):
 
     found = summed(lambda x: evaluate(layers, x))
     assert np.ptp(found) > 0 and np.array_equal(found, summed(net))
+
+
+# ---- Fields with constant weights, and when these are in the way ----
+
+
+GRID = HashGridConfig(levels=2, log2_rows=8, base=2, finest=8)
+BOX = Box((0, 0, 0), (1, 1, 1))
+
+
+def points(n=64):
+    return ns.Array3f(np.random.default_rng(1).uniform(0, 1, (3, n)).astype(np.float32))
+
+
+def directions(n=64):
+    return dr.normalize(ns.Array3f(np.random.default_rng(2).normal(size=(3, n)).astype(np.float32)))
+
+
+def gaze_log(seed=0):
+    return LogGazeField.random(LogGazeConfig(grid=GRID), BOX, ns, seed)
+
+
+def radiance():
+    return RadianceField.random(RadianceConfig(grid=GRID, width=16), BOX, ns)
+
+
+def said_by(field):
+    """All that evaluations return (rows of numbers)."""
+    p, d = points(), directions()
+    if isinstance(field, RadianceField):
+        sigma, features = field.density_features(p)
+        return np.array([sigma, field.density(p), *features, *field.color(features, d)])
+    return np.array(field.unnormalized(p, p * 0.5, d) if field.config.normalized else field.evaluate(p, p * 0.5, d))
+
+
+@pytest.fixture
+def unrolled(monkeypatch):
+    """Networks that were evaluated with constant weights, one entry each."""
+    found = []
+    monkeypatch.setattr(mlp, "evaluate", lambda layers, x: found.append(len(layers)) or evaluate(layers, x))
+    return found
+
+
+@pytest.mark.parametrize("make", [radiance, gaze_log, lambda: GazeField.random(GazeConfig(grid=GRID), BOX, ns)])
+def test01_fields_say_the_same_to_the_bit(make, unrolled):
+    field = make()
+    before = said_by(field)
+    set_constant_weights(field)
+    assert not unrolled
+    assert np.ptp(before, axis=1).max() > 0 and np.array_equal(said_by(field), before)
+    assert len(unrolled) >= len(field.mlps)
+
+
+def test02_all_networks_of_all_members_and_back():
+    ensemble = GazeEnsemble([gaze_log(0), gaze_log(1)])
+    for constant in (True, False):
+        set_constant_weights(ensemble, constant)
+        assert [net.constant for m in ensemble.members for net in (m.emit_net, m.capture_net)] == [constant] * 4
+
+
+def test03_weights_that_are_replaced_count():
+    field = radiance()
+    set_constant_weights(field)
+    before = said_by(field)
+    field.set_parameters({k: v * 2 for k, v in field.parameters().items() if "net" in k})
+    assert field.density_net.constant and field.color_net.constant
+    other = radiance()
+    other.set_parameters({k: v * 2 for k, v in other.parameters().items() if "net" in k})
+    after = said_by(field)
+    assert not np.array_equal(after, before) and np.array_equal(after, said_by(other))
+
+
+def slope_of_weights(field):
+    weights = field.parameters()["density_net.0"]
+    dr.enable_grad(weights)
+    field.set_parameters({"density_net.0": weights})
+    dr.backward(dr.sum(field.density(points())))
+    return weights.grad.numpy()
+
+
+def slope_of_points(field):
+    p = points()
+    dr.enable_grad(p)
+    dr.backward(dr.sum(field.density(p)))
+    return np.array(p.grad)
+
+
+@pytest.mark.parametrize("slope", [slope_of_weights, slope_of_points])
+def test04_derivatives_are_as_without(slope, unrolled):
+    plain, field = radiance(), radiance()
+    set_constant_weights(field)
+    expected = slope(plain)
+    assert np.abs(expected).max() > 0 and np.allclose(slope(field), expected, rtol=1e-5, atol=1e-9)
+    assert not unrolled
+
+
+def test05_a_recorded_function_sees_weights_that_change(unrolled):
+    field = radiance()
+    set_constant_weights(field)
+
+    @dr.freeze
+    def recorded(field, p):
+        with no_collection():
+            return field.density(p)
+
+    p = points()
+    first = recorded(field, p).numpy()
+    field.set_parameters({"density_net.1": field.parameters()["density_net.1"] * 2})
+    second = recorded(field, p).numpy()
+    assert not unrolled
+    assert np.allclose(first, radiance().density(p).numpy(), rtol=1e-6)
+    assert np.allclose(second, field.density(p).numpy(), rtol=1e-6) and not np.allclose(first, second)
+
+
+def test06_a_background_is_part_of_its_field():
+    flat = HashGridConfig(levels=2, log2_rows=8, base=2, finest=8, dimensions=2)
+    behind = Background.random(BackgroundConfig(radius=2.0, grid=flat), ns, np.random.default_rng(0))
+    field = radiance()
+    field.background = behind
+    set_constant_weights(field)
+    assert behind.net.constant
+
+
+def test07_normalised_layers_stay_as_they_are():
+    net = MLP.random([8, 16, 3], ns, np.random.default_rng(5), normalized=True)
+    x = [ns.Float(c) for c in np.random.default_rng(6).normal(size=(8, 20)).astype(np.float32)]
+    before = np.array(net(x))
+    net.constant = True
+    assert np.ptp(before) > 0 and np.array_equal(np.array(net(x)), before)
+
+
+# ---- Networks, their gradients and one gaze field against torch ----
+
+
+RNG = np.random.default_rng(0)
+
+
+def forward(torch, weights, x):
+    for i, w in enumerate(weights):
+        x = torch.nn.functional.linear(x, w)
+        x = torch.relu(x) if i + 1 < len(weights) else x
+    return x
+
+
+def test01_values_and_weight_gradients_of_both_modes(torch):
+    net = MLP.random([5, 16, 8, 3], ns, RNG)
+    x = RNG.normal(size=(40, 5)).astype(np.float32)
+    mix = RNG.normal(size=(40, 3)).astype(np.float32)
+    theirs = [torch.tensor(w.numpy(), requires_grad=True) for w in net.weights]
+    out = forward(torch, theirs, torch.tensor(x))
+    (out * torch.tensor(mix)).sum().backward()
+
+    for mode in ("coop", "tensor"):
+        value = evaluated_backwards(net, x, mix, mode)
+        assert np.allclose(value, out.detach().numpy(), rtol=1e-5, atol=1e-6), mode
+        for a, b in zip(net.weights, theirs):
+            assert np.allclose(dr.grad(a).numpy(), b.grad.numpy(), rtol=1e-4, atol=1e-5), mode
+        dr.clear_grad(net.weights)
+
+
+def test02_equation_1_of_a_gaze_field(torch):
+    config = GazeConfig(HashGridConfig(levels=2, log2_rows=10, base=4, finest=16), width=16, geometry=7, sh_degree=2)
+    field = GazeField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns)
+    field.set_parameters({"grid.table": ns.Float(RNG.normal(size=len(field.grid.table)).astype(np.float32))})
+    p_o = RNG.uniform(-0.9, 0.9, (30, 3)).astype(np.float32)
+    p_od = RNG.uniform(-0.9, 0.9, (30, 3)).astype(np.float32)
+    r_o = (p_od - p_o) / np.linalg.norm(p_od - p_o, axis=1, keepdims=True)
+
+    def head(p, d, name):
+        features = np.array([f.numpy() for f in field.grid(field.box.to_unit(ns.Array3f(p.T)))]).T
+        harmonics = np.array([np.broadcast_to(h.numpy(), 30) for h in encode_direction(ns.Array3f(d.T), 2)]).T
+        nets = {k: [torch.tensor(w.numpy()) for w in getattr(field, k).weights] for k in field.NETS}
+        geometry = forward(torch, nets["position_net"], torch.tensor(features))
+        hidden = forward(torch, nets["direction_net"], torch.cat([torch.tensor(harmonics.copy()), geometry], 1))
+        return forward(torch, nets[name], torch.relu(hidden))[:, 0]
+
+    emit = torch.nn.functional.softplus(head(p_od, -r_o, "emit_head")) * getattr(config, "emit_scale", 1.0)
+    gaze = emit * torch.sigmoid(head(p_o, r_o, "capture_head"))
+    ours = field.evaluate(ns.Array3f(p_od.T), ns.Array3f(p_o.T), ns.Array3f(r_o.T))[0]
+    assert np.allclose(ours.numpy(), gaze.numpy(), rtol=1e-4)

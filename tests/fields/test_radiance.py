@@ -199,13 +199,6 @@ def test01_equals_numpy():
     assert np.allclose(rgb[~outside], c[~outside], atol=2e-6)
 
 
-def test02_density_head_equals_the_full_net():
-    field, (p, _) = make(), points()
-    assert np.allclose(
-        field.density(ns.Array3f(p.T)).numpy(), field.density_features(ns.Array3f(p.T))[0].numpy(), rtol=1e-6
-    )
-
-
 def test03_the_mask_is_honoured():
     field = make()
     p = ns.Array3f(ns.Float([1, 1]), 1, 3)
@@ -277,12 +270,6 @@ def test08_gradients_reach_every_parameter(name):
         assert np.isclose(gradient[i], difference, rtol=2e-3, atol=1e-4)
 
 
-def test09_equal_seeds_give_equal_fields():
-    a, b, c = (arrays(RadianceField.random(RADIANCE_CONFIG, BOX, ns, s)) for s in (1, 1, 2))
-    assert all(np.array_equal(a[k], b[k]) for k in a) and not np.array_equal(a["grid.table"], c["grid.table"])
-    assert list(a) == ["grid.table", "density_net.0", "density_net.1", "color_net.0", "color_net.1", "color_net.2"]
-
-
 def test10_defaults_are_the_papers():
     config = RadianceConfig()
     assert config.density_sizes == [32, 64, 16] and config.color_sizes == [31, 64, 64, 3]
@@ -310,13 +297,6 @@ def test12_wrong_color_space():
         make(color_space="aces")
 
 
-def test13_a_table_of_another_length_is_refused():
-    # Gathers beyond the end of a table would read foreign memory.
-    field = make()
-    with pytest.raises(ValueError, match="grid.table"):
-        field.set_parameters({"grid.table": dr.zeros(ns.Float, 8)})
-
-
 def test14_a_matrix_of_another_shape_is_refused():
     field = make()
     with pytest.raises(ValueError, match="density_net.0"):
@@ -330,11 +310,6 @@ def test15_networks_that_do_not_fit_the_grid_are_refused():
     )
     with pytest.raises(ValueError):
         RadianceField(RADIANCE_CONFIG, BOX, a.grid, b.density_net, a.color_net)
-
-
-def test16_the_grid_belongs_to_one_configuration():
-    grid = HashGrid.random(HashGridConfig(**RADIANCE_GRID), ns, np.random.default_rng(0))
-    assert grid.config == RADIANCE_CONFIG.grid and make().config.grid == RADIANCE_CONFIG.grid
 
 
 def test17_a_deferred_field():

@@ -1,10 +1,21 @@
 """Tests of `nerg_mi.maths.geometry`."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.alignment.constraints import read_surface
+from nerg_mi.errors import NergError
+from nerg_mi.formats.ply import write_columns
+from nerg_mi.formats.splats import read_splats
+from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.maths.geometry import Box, ContractedBox, Similarity, box_interval, box_of, intersect_box
+from nerg_mi.photos.posed import Frame, settled
+from nerg_mi.rays.readers.base import UNITY, RaysBuilder
+from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos
 from tests.reference import march_numpy as reference
 
 # ---- The box of a field and its map to the unit cube ----
@@ -249,47 +260,22 @@ def test02_bounds_hold_the_corners():
     assert np.allclose(lower, corners.min(0)) and np.allclose(upper, corners.max(0))
 
 
-SHEAR, UNEVEN, MIRROR, FLAT = (np.eye(4) for _ in range(4))
-
-
-SHEAR[0, 1] = 0.3
-
-
-UNEVEN[2, 2] = 1.5
-
-
-MIRROR[0, 0] = -1
-
-
-FLAT[1, 1] = 0
-
-
-NAN = np.eye(4)
-
-
-NAN[0, 0] = np.nan
-
-
-PROJECTIVE = np.eye(4)
-
-
-PROJECTIVE[3, 0] = 0.5
-
-
-MOVED_TO_NAN = np.eye(4)
-
-
-MOVED_TO_NAN[0, 3] = np.nan
-
-
-FAR_AWAY = np.eye(4)
-
-
-FAR_AWAY[1, 3] = -1.1e7
-
-
-@pytest.mark.parametrize("matrix", [SHEAR, UNEVEN, MIRROR, FLAT, NAN, PROJECTIVE, MOVED_TO_NAN, FAR_AWAY])
-def test03_other_transforms_are_refused(matrix):
+@pytest.mark.parametrize(
+    "row, column, value",
+    [
+        (0, 1, 0.3),  # a shear
+        (2, 2, 1.5),  # uneven
+        (0, 0, -1),  # a mirror
+        (1, 1, 0),  # flat
+        (0, 0, np.nan),
+        (3, 0, 0.5),  # projective
+        (0, 3, np.nan),
+        (1, 3, -1.1e7),
+    ],
+)
+def test03_other_transforms_are_refused(row, column, value):
+    matrix = np.eye(4)
+    matrix[row, column] = value
     with pytest.raises(ValueError, match='"to_world"'):
         Similarity(matrix)
 
@@ -300,6 +286,81 @@ def test04_the_identity_returns_what_it_is_given(rgb):
     assert s.identity and s.scale == 1 and s.point_to_local(p) is p and s.direction_to_local(p) is p
 
 
-def test05_the_inverse_leads_back():
-    s = Similarity(turn(3.0))
-    assert np.allclose(s.inverse @ s.matrix, np.eye(4), atol=1e-12)
+# ---- Coordinates of surveys are refused by every reader, with the offset to subtract ----
+
+
+ROOM = np.random.default_rng(0).uniform((0, 0, 0), (6, 4, 3), (200, 3))
+UTM = (500_000.0, 5_600_000.0, 0.0)
+
+
+def read_points(path: Path, points: np.ndarray) -> None:
+    np.save(path / "a.npy", points)
+    read_surface(path / "a.npy")
+
+
+def read_cloud(path: Path, points: np.ndarray) -> None:
+    write_columns(path / "a.ply", dict(zip("xyz", points.T)))
+    read_surface(path / "a.ply")
+
+
+def read_rays(path: Path, points: np.ndarray) -> None:
+    builder = RaysBuilder(UNITY)
+    builder.source(Path(__file__))
+    # Unity: y up, left-handed; the offset is named in the file's own coordinates.
+    builder.add(
+        np.arange(len(points)), "ann", points, np.tile([1.0, 0, 0], (len(points), 1)), rows=np.arange(len(points))
+    )
+    builder.build()
+
+
+def read_cameras(path: Path, points: np.ndarray) -> None:
+    poses = np.tile(np.eye(4), (len(points), 1, 1))
+    poses[:, :3, 3] = points
+    settled(path / "a.json", [Frame(f"{k}", path / f"{k}", pose, {}) for k, pose in enumerate(poses)], [])
+
+
+def splats_by(name, write):
+    def read(path: Path, points: np.ndarray) -> None:
+        write(path / name, replace(random_splats(200, 0), centers=points))
+        read_splats(path / name)
+
+    return read
+
+
+READERS = {
+    "points": read_points,
+    "cloud": read_cloud,
+    "rays": read_rays,
+    "cameras": read_cameras,
+    "splats .ply": splats_by("a.ply", write_inria),
+    "splats .splat": splats_by("a.splat", write_antimatter),
+    "splats .glb": splats_by("a.glb", write_khronos),
+}
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_every_reader_refuses_them(tmp_path, kind):
+    READERS[kind](tmp_path, ROOM)
+    with pytest.raises(NergError, match="subtract 500000,5600000,0 from it"):
+        READERS[kind](tmp_path, ROOM + UTM)
+
+
+@pytest.mark.parametrize(
+    "points, refused",
+    [
+        (ROOM + (19_000, 0, 0), False),
+        (ROOM + (0, -21_000, 0), True),
+        (1000 * ROOM + 30_000, False),
+        (1e6 * ROOM, False),
+        (1e-4 * ROOM, False),
+        (ROOM[:1] + (4_027_000, 307_000, 4_919_000), True),
+        (np.vstack([ROOM, np.full((1, 3), np.nan), np.full((1, 3), 1e9)]), False),
+        (np.zeros((0, 3)), False),
+    ],
+)
+def test_what_is_small_beside_its_distance(points, refused):
+    if not refused:
+        check_near_origin(points, "it")
+        return
+    with pytest.raises(NergError, match="single precision"):
+        check_near_origin(points, "it")

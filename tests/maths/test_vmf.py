@@ -97,21 +97,8 @@ def test_kappa_of_a_resultant_length_is_its_root():
     assert np.allclose(vmf.kappa_from_resultant(1 / np.tanh(kappa) - 1 / kappa), kappa, rtol=1e-10, atol=0)
 
 
-def test_bandwidth_of_rays_that_agree_is_limited():
-    # 1/h² of rays without any spread would be above what all else is limited to.
-    assert vmf.silverman_kappa(1.0, 50) == vmf.KAPPA_MAX
-    assert np.array_equal(vmf.silverman_kappa([1.0, 1.0], [1000, 1]), [vmf.KAPPA_MAX, 1 / 1.06**2])
-
-
 def test_samples_of_no_concentration_are_uniform():
     x = vmf.sample(np.tile([0.48, -0.6, -0.64], (20_000, 1)), 0.0, np.random.default_rng(5))
     assert np.allclose(x.mean(axis=0), 0, atol=0.02) and np.allclose(x.T @ x / len(x), np.eye(3) / 3, atol=0.02)
     with pytest.raises(ValueError, match="negative or NaN"):
         vmf.sample(np.array([[0.0, 0.0, 1.0]]), -1.0, np.random.default_rng(5))
-
-
-def test_single_precision_is_widened():
-    """Concentrations of a file in fp32 give the same digits as in fp64."""
-    kappa = np.geomspace(1e-6, 1e7, 50).astype(np.float32)
-    for of in (vmf.log_normaliser, vmf.mean_resultant_length):
-        assert np.array_equal(of(kappa), of(kappa.astype(np.float64)))

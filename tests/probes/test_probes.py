@@ -10,10 +10,8 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.kde import kappa_grid, leave_one_out_kappa, leave_one_out_scores
 from nerg_mi.probes.probes import (
     LEVELS,
-    asked_level,
     calibrated_levels,
     effective_persons,
-    effective_rays,
     entropy,
     integral,
     level_name,
@@ -78,21 +76,12 @@ def test_samples_follow_the_density(rays_measures):
         assert np.isclose(-log.mean(), entropy(probes, backend="llvm")[p], atol=0.02)
 
 
-def test_effective_numbers(rays_measures):
+def test_people_who_count(rays_measures):
     probes = place_probes(rays_measures, 0.3, count=20)
-    assert np.array_equal(effective_rays(probes), probes.counts)
     people = effective_persons(probes, rays_measures)
     assert ((people > 2.5) & (people < 4)).all()
     even = place_probes(rays_measures, 0.3, queries=probes.queries, ray_weights=person_weights(rays_measures))
-    assert (effective_rays(even) < even.counts).all() and effective_persons(
-        even, rays_measures
-    ).mean() > people.mean() + 0.1
-    assert np.isclose(person_weights(rays_measures).mean(), 1)
-    counts = np.bincount(rays_measures.person)
-    assert (
-        np.allclose(np.bincount(rays_measures.person, weights=person_weights(rays_measures)), len(rays_measures) / 4)
-        and counts[0] > 1.5 * counts[1]
-    )
+    assert effective_persons(even, rays_measures).mean() > people.mean() + 0.1
 
 
 def test_weights_of_rays_and_distance(rays_measures):
@@ -244,17 +233,6 @@ def test_centre_seed_and_queries(rays_probes):
     assert np.allclose(steps, 0.5)
 
 
-def test_kappa_rules(rays_probes):
-    silverman = place_probes(rays_probes, 0.25, count=8)
-    R = [
-        np.linalg.norm(rays_probes.direction[silverman.indices[a:b]].mean(axis=0))
-        for a, b in zip(silverman.offsets, silverman.offsets[1:])
-    ]
-    assert np.allclose(silverman.kappa, vmf.silverman_kappa(R, silverman.counts))
-    loo = place_probes(rays_probes, 0.25, count=8, kappa_rule="loo")
-    assert ((loo.kappa > 20) & (loo.kappa < 1000)).all()
-
-
 def test_leave_one_out_sees_through_repetition():
     # Each person's rays repeat one direction: leaving out the ray alone would
     # choose the sharpest kernel there is.
@@ -346,7 +324,3 @@ def test_calibrated_levels_are_weighted_quantiles():
         np.repeat(some, times), np.ones(times.sum())
     )
     assert calibrated_levels(np.array([0.3]), np.ones(1)) == {"50%": 0.3, "80%": 0.3, "95%": 0.3}
-
-
-def test_nothing_calibrated_is_asked_for_as_it_is():
-    assert asked_level(0.8, None) == 0.8 and asked_level(0.8, {"80%": 0.7}) == 0.7

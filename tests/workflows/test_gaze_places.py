@@ -14,8 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.workflows.geometry import GazeEvaluationOptions, make_place, place_of_training
 from nerg_mi.workflows.options import PlaceOptions
 from tests.plugins import fields
-from tests.train.gaze.looks import BOX, looking_at
-from tests.train.gaze.views import around
+from tests.train.gaze.looks import BOX, around, looking_at
 
 WALL = '<scene version="3.0.0"><shape type="cube"/></scene>'
 

@@ -65,13 +65,6 @@ def test02_equation_1_is_not_symmetric():
     assert np.allclose(field.capture(ns.Array3f(p_o.T), ns.Array3f(r_o.T)).numpy(), capture)
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test03_a_part_that_the_variant_lacks_is_one(variant):
-    gaze, emit, capture = evaluate(make(variant), *queries())
-    assert np.all(emit == 1) == (variant == "capture") and np.all(capture == 1) == (variant == "emit")
-    assert np.all((capture >= 0) & (capture <= 1)) and np.allclose(gaze, emit * capture)
-
-
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test04_densities_are_not_negative(activation):
     lowest = []

@@ -18,8 +18,7 @@ from nerg_mi.train.gaze_data import Supervision
 from nerg_mi.train.gaze_ensemble import blocks_of, resample, resample_views, train_ensemble
 from nerg_mi.train.gaze_trainer import StateSettings
 
-from .looks import LIKELIHOOD, LOG, NOWHERE, PROBES, looking_at, planned, train
-from .views import around
+from .looks import LIKELIHOOD, LOG, NOWHERE, PROBES, around, looking_at, planned, train
 
 PLACE = replace(LOG, geometry="none")
 SHORT = replace(LIKELIHOOD, steps=4, zones=0)

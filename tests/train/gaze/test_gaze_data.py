@@ -29,6 +29,7 @@ from nerg_mi.train.gaze_data import (
     Targets,
     blind_of_rays,
     blind_of_views,
+    box_exit,
     concatenate,
     digest_rays,
     digest_views,
@@ -40,6 +41,7 @@ from nerg_mi.train.gaze_data import (
     semantic_features,
     split_validation,
     split_views,
+    surface_distances,
     targets_of_probes,
     targets_of_rays,
     targets_of_views,
@@ -47,15 +49,15 @@ from nerg_mi.train.gaze_data import (
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer
 from nerg_mi.train.gaze_product import ProductTrainer, gaze_density, initial_weights, sized_gaze_config, trunk_config
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
+from nerg_mi.train.geometry import NOWHERE as NOWHERE_FAR
 from nerg_mi.train.geometry import GazePlace, place_of_field
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import default_settings
 from tests.fields.gaze.test_log_density import BOX as VIEW_TARGETS_BOX
 from tests.fields.gaze.test_log_density import SMALL as VIEW_TARGETS_SMALL
 
-from .looks import BOX, LOG, NOWHERE, PROBES, RAYS, SMALL, looking_at, train
+from .looks import BOX, LENS, LOG, NOWHERE, PROBES, RAYS, SMALL, around, lobe, looking_at, train, view
 from .looks import SMALL as PLAIN
-from .views import LENS, around, lobe, view
 
 # ---- Batches: what is gathered of which probe, integrals, and densities given a view ----
 
@@ -88,12 +90,6 @@ def test_a_batch_is_of_its_probes_and_their_directions(drawn):
     np.testing.assert_allclose(batch.extent.numpy(), data.extent[probe], rtol=1e-6)
     features = np.stack([f.numpy() for f in batch.semantic], axis=-1)
     np.testing.assert_array_equal(features, data.semantic[probe[:, None], which].reshape(-1, 2))
-
-
-def test_an_integral_is_over_what_each_observer_is_known_in(drawn):
-    data, arrays = drawn
-    batch = arrays.batch(np.arange(3), np.tile(np.arange(4), (3, 1)))
-    np.testing.assert_allclose(batch.integral(batch.truth).numpy(), data.truth.mean(axis=1) * data.extent, rtol=1e-6)
 
 
 @pytest.mark.parametrize("known", [False, True])
@@ -482,15 +478,6 @@ def test_zones_lie_far_from_one_another(seed):
     assert far(apart[0], groups[1]) or far(apart[1], groups[0])
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_of_few_views_the_farthest_is_the_second_zone(seed):
-    learn, watched = split_views(in_a_row(7), 2, 0.5, seed)
-    at = sorted(int(v.name[1:]) for v in watched)
-    assert len(at) == 2 and len(learn) == 5 and (at[0] == 0 or at[1] == 6)
-    # From either one the other is the farthest, or the other way round.
-    assert at[1] - at[0] == max(at[0], 6 - at[0]) or at[1] - at[0] == max(at[1], 6 - at[1])
-
-
 def test_as_many_views_must_be_left_as_a_quarter():
     views = in_a_row(12)
     for distance in np.arange(0.5, 12.0):
@@ -501,12 +488,6 @@ def test_as_many_views_must_be_left_as_a_quarter():
         assert len(learn) >= 3
     left = len(far_views(views, np.array([v.camera.center for v in split_views(views, 1, 0.5, 3)[1]]), distance))
     assert left < 3
-
-
-def test_without_zones_everything_is_learnt_from():
-    supervision = Supervision(RAYS)
-    split = split_validation(supervision, NOWHERE, GazeSettings(steps=1, zones=0), PROBES)
-    assert split.learn is supervision and split.watched is None and split.rays_held_out == 0
 
 
 def test_zones_of_rays_are_watched_with_all_rays_around_them():
@@ -536,12 +517,6 @@ def test_of_views_alone_some_are_watched():
 
 
 # ---- What is learnt from: at least something, told apart by digests, and its support ----
-
-
-def test_there_is_something_to_learn_from():
-    assert Supervision(None, around(1)).views[0].name == "v0"
-    with pytest.raises(ValueError, match="rays, from views"):
-        Supervision(None)
 
 
 def test_digests_tell_rays_and_views_apart():
@@ -740,3 +715,40 @@ def test_rays_and_views_train_one_field():
         field, about = train(PLACE, replace(settings, **more), config, probes, both)
         assert about["rays"] == 400 and about["salience_views"] == 6 and about["probes_made"] == 14
         assert all(np.isfinite(np.array(v)).all() for v in field.parameters().values())
+
+
+# ---- Where observers meet surfaces: what escapes ends on the box, or at the depth around it ----
+
+
+def test_what_meets_nothing_ends_where_the_box_ends(wall):
+    positions = np.array([[-0.5, 0, 1.6], [0.2, -0.4, 1.5]])
+    directions = np.tile(fibonacci_directions(256), (2, 1, 1))
+    distance, escaped = surface_distances(wall, positions, directions)
+    p = positions[:, None] + directions * distance[..., None]
+    # The wall is met from x = 1.5 on, everything else ends on the box.
+    assert np.abs(p[~escaped][:, 0] - 1.5).max() < 0.02
+    on_box = np.minimum(np.abs(p - BOX.lower), np.abs(p - BOX.upper)).min(axis=-1)
+    assert on_box[escaped].max() < 1e-5 and 0.5 < escaped.mean() < 0.95
+
+
+def test_holes_are_filled_with_the_depth_around_them(wall):
+    """Of directions that look past the wall, the ones beside it are as far as it is."""
+    positions, directions = np.array([[-0.5, 0, 1.6]]), fibonacci_directions(1024)[None]
+    plain, escaped = surface_distances(wall, positions, directions)
+    filled, same = surface_distances(wall, positions, directions, fill=True)
+    np.testing.assert_array_equal(escaped, same)
+    np.testing.assert_array_equal(filled[~escaped], plain[~escaped])
+    assert plain[~escaped].min() <= filled[escaped].min() and filled[escaped].max() <= plain[~escaped].max()
+    nothing = np.array([[[-1.0, 0, 0], [-0.8, 0.6, 0]]])
+    np.testing.assert_array_equal(*(surface_distances(wall, positions, nothing, fill=f)[0] for f in (True, False)))
+
+
+def test_without_geometry_everything_is_equally_far():
+    distance, escaped = surface_distances(NOWHERE, np.zeros((3, 3)), np.ones((3, 5, 3)))
+    assert distance.shape == (3, 5) and (distance == NOWHERE_FAR).all() and not escaped.any()
+
+
+def test_exits_of_a_box():
+    o = np.array([[0, 0, 1.0], [0, 0, 1], [5, 0, 1], [5, 0, 1], [0, 2, 1]])
+    d = np.array([[1.0, 0, 0], [0, 0, -1], [-1, 0, 0], [1, 0, 0], [1, 0, 0]])
+    np.testing.assert_allclose(box_exit(BOX, o, d), [2, 1, 7, BOX.diagonal, 2])

@@ -20,18 +20,15 @@ from nerg_mi.train.gaze_folds import (
     _best,
     _choose,
     _Judgement,
-    _kld,
     _regions,
     choose_mix,
-    choose_variant,
     inner_folds,
-    mixes,
 )
 from nerg_mi.train.gaze_run import train_gaze
 from nerg_mi.train.gaze_settings import ProbeSettings
 from nerg_mi.train.gaze_trainer import KIND, StateSettings
 
-from .looks import LIKELIHOOD, LOG, NOWHERE, PRODUCT, SMALL, planned
+from .looks import LIKELIHOOD, LOG, NOWHERE, planned
 
 # ---- The share of the blind density: chosen by people and places that are held out ----
 
@@ -92,13 +89,6 @@ def test02_of_shares_that_cannot_be_told_apart_the_largest():
         assert _choose(curves).mix == mix
 
 
-def test03_divergence_of_densities():
-    truth = np.array([[1.0, 3.0], [2.0, 2.0]])
-    field = np.array([[2.0, 2.0], [1.0, 3.0]])
-    expected = np.mean([0.25 * np.log(0.5) + 0.75 * np.log(1.5), 0.5 * np.log(2) + 0.5 * np.log(2 / 3)])
-    assert np.isclose(_kld(truth, field), expected)
-
-
 @pytest.mark.parametrize(("law", "kept"), [(1.0, True), (0.0, False)])
 def test04_a_field_counts_where_position_tells(law, kept, rgb):
     """Where all look at one point the field stays as it is; where each person has a way of their own, position tells
@@ -138,11 +128,6 @@ def test05_of_a_training_and_of_an_ensemble(rgb):
 
     field, about = train_gaze(Supervision(rays), NOWHERE, plan, ns, tell=stop)
     assert about["interrupted"] and "mix" not in about and field.config.mix == LOG.mix
-
-
-def test06_only_log_densities_have_a_share():
-    assert mixes(plan_of()) and not mixes(plan_of(mix_folds=0))
-    assert not mixes(planned(SMALL, replace(PRODUCT, mix_folds=3)))
 
 
 def test07_regions_are_those_of_the_mixture():
@@ -212,16 +197,6 @@ def test02_what_foretells_those_who_are_held_out_is_trained(rgb):
     assert {"fold 1 of capture", "fold 1 of emit_capture"} <= set(stages)
     ensemble, about = train_ensemble(2, Supervision(people(1.0)), NOWHERE, plan, ns)
     assert {(f.config.variant, f.config.mix) for f in ensemble.members} == {("emit_capture", about["mix"]["mix"])}
-
-
-def test03_nothing_is_chosen_without_folds_or_others(rgb):
-    from nerg_mi.fields.mlp import namespace
-
-    ns, supervision = namespace(rgb.Float(0)), Supervision(people(1.0, each=40))
-    for plan in (two(mix_folds=0), replace(two(), alternatives=())):
-        assert choose_variant(supervision, NOWHERE, plan, ns) == (replace(plan, alternatives=()), None)
-    views = Supervision(None, (object(),))  # which nothing looks at
-    assert choose_variant(views, NOWHERE, two(), ns) == (replace(two(), alternatives=()), None)
 
 
 @pytest.mark.parametrize("members", [0, 2])

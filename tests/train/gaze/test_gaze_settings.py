@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import drjit as dr
@@ -16,9 +15,11 @@ from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import latlong_grid
 from nerg_mi.train.gaze_product import sized_gaze_config
-from nerg_mi.train.gaze_settings import CODE, KLD_EPS, PAPER, GazeSettings, ProbeSettings, gaze_loss
+from nerg_mi.train.gaze_recipes import DEFAULT, FieldChoices, gaze_recipe, recipes, register
+from nerg_mi.train.gaze_settings import CODE, KLD_EPS, LOSSES, PAPER, GazeSettings, gaze_loss
+from nerg_mi.train.geometry import GazePlace
 
-from .looks import BOX
+from .looks import BOX, NOWHERE
 
 # ---- Losses ----
 
@@ -106,31 +107,6 @@ def test_negative_predictions_count_as_zero_in_the_divergence(densities, Float):
     assert np.isfinite(slope).all() and not slope[guess < 0].any() and slope[0][guess[0] > 0].all()
 
 
-def test_float32_is_good_enough(densities):
-    truth, guess = densities
-    assert np.isclose(loss(ns.Float32, guess, truth).total[0], loss(ns.Float64, guess, truth).total[0], rtol=1e-5)
-
-
-def test_no_gradient_to_the_truth(densities):
-    truth, guess = densities
-    t = ns.Float64(truth.ravel())
-    dr.enable_grad(t)
-    assert not dr.grad_enabled(gaze_loss(ns.Float64(guess.ravel()), t, D).total)
-
-
-def test_descent_finds_the_truth(densities):
-    truth, _ = densities
-    goal, x = ns.Float(truth.ravel()), ns.Float(np.full(P * D, 0.2))
-    from drjit.opt import Adam
-
-    opt = Adam(lr=0.05, params={"x": dr.log(x)})
-    for _ in range(300):
-        now = gaze_loss(dr.exp(opt["x"]), goal, D, ns.Float(W))
-        dr.backward(now.total)
-        opt.step()
-    assert now.cc[0] > 0.79 and now.kld[0] < 0.02  # four of five truths have a shape to find
-
-
 def test_refusals():
     x = ns.Float(np.ones(12))
     with pytest.raises(ValueError, match="do not fit"):
@@ -156,11 +132,6 @@ def test_settings_that_make_no_sense_are_refused(wrong):
         GazeSettings(**wrong)
 
 
-def test_settings_are_kept_as_json():
-    for settings in (GazeSettings(steps=3, loss="code"), ProbeSettings(radius=0.3, spacing=0.1)):
-        assert type(settings)(**json.loads(json.dumps(settings.to_dict()))) == settings
-
-
 # ---- Architectures of a size, and the scale that makes weights of zero the uniform density ----
 
 
@@ -177,16 +148,104 @@ def test_weights_of_zero_are_the_uniform_density(variant, activation):
         replace(config, emit_scale=0.0)
 
 
-def test_a_larger_field_has_more_of_everything():
-    small, paper = sized_gaze_config("small"), sized_gaze_config("paper")
-    assert (
-        small.grid.size < paper.grid.size
-        and small.grid.levels < paper.grid.levels
-        and small.grid.log2_rows < paper.grid.log2_rows
-    )
-
-
 def test_the_papers_size_is_the_papers():
     assert sized_gaze_config("paper").grid == GazeConfig().grid
     with pytest.raises(NergError, match="one of small, paper"):
         sized_gaze_config("huge")
+
+
+# ---- Recipes: what they make of choices and places, and what they take ----
+
+
+HITS = GazePlace(None, BOX, "hits")
+SCENE = GazePlace(None, BOX, "scene")
+
+
+def test_there_are_three():
+    assert tuple(recipes())[:3] == ("default", "small", "paper") and gaze_recipe().name == DEFAULT == "default"
+    with pytest.raises(NergError, match='one of default, small, paper.*, got "best"'):
+        gaze_recipe("best")
+    with pytest.raises(ValueError, match="already"):
+        register(gaze_recipe())
+
+
+@pytest.mark.parametrize("name", recipes())
+def test_each_is_whole(name):
+    recipe = gaze_recipe(name)
+    plan = recipe.plan(SCENE, FieldChoices(variant="emit"))
+    assert plan.config.variant == "emit" and plan.trainer is recipe.trainer and plan.initial is None
+    assert plan.settings.loss == recipe.losses[0] and set(recipe.losses) <= set(LOSSES)
+    assert plan.settings.steps and recipe.summary
+    assert recipe.plan(SCENE, views_alone=True).settings.patience == 10
+
+
+def test_the_default_one_looks_longer_where_there_are_views_alone():
+    plain, alone = (gaze_recipe().plan(SCENE, views_alone=alone).settings for alone in (False, True))
+    assert plain.zones == 0 and alone.zones == 3 and alone.steps > plain.steps
+    # The others' lengths stay their own.
+    assert all("steps" not in gaze_recipe(name).views_alone for name in ("small", "paper"))
+
+
+def test_a_log_density_is_told_of_its_place():
+    told = lambda place: (c := gaze_recipe().plan(place).config) and (c.geometry, c.escaped)
+    assert told(SCENE) == ("surface", "constant") and told(HITS) == ("surface", "nearest")
+    assert told(NOWHERE) == ("none", "constant")
+    with pytest.raises(NergError, match="needs surfaces"):
+        gaze_recipe("small").plan(NOWHERE)
+
+
+def test_without_surfaces_folds_choose_between_capture_and_both_unless_told_otherwise():
+    def variants(place, *choices, recipe="default"):
+        plan = gaze_recipe(recipe).plan(place, *choices)
+        return [c.variant for c in (plan.config, *plan.alternatives)]
+
+    assert [variants(place) for place in (SCENE, HITS)] == [["emit_capture"]] * 2
+    assert variants(NOWHERE) == ["capture", "emit_capture"]
+    for v in ("emit_capture", "emit", "capture"):
+        assert variants(NOWHERE, FieldChoices(variant=v)) == [v]
+    assert variants(SCENE, recipe="small") == ["emit_capture"]
+
+
+def test_what_is_chosen_arrives():
+    choices = FieldChoices(activation="exp", size="small", normalized=True)
+    config = gaze_recipe("paper").plan(SCENE, choices).config
+    assert (
+        config.activation == "exp" and config.normalized and config == gaze_recipe("small").plan(SCENE, choices).config
+    )
+    assert gaze_recipe("paper").plan(SCENE).config.activation == "linear"
+    plan = gaze_recipe("small").plan(SCENE, settings={"seed": 4, "loss": "code"}, probes={"radius": 0.5})
+    assert (plan.settings.seed, plan.settings.loss, plan.settings.steps, plan.probes.radius) == (4, "code", 600, 0.5)
+
+
+@pytest.mark.parametrize(
+    "given, steps, minutes", [({}, 600, None), ({"minutes": 2.0}, None, 2.0), ({"steps": 5}, 5, None)]
+)
+def test_of_minutes_and_steps_the_one_that_is_given_counts(given, steps, minutes):
+    settings = gaze_recipe("small").gaze_settings(given)
+    assert (settings.steps, settings.minutes) == (steps, minutes)
+
+
+@pytest.mark.parametrize("name, takes", [(DEFAULT, False), ("small", True), ("paper", True)])
+def test_what_a_recipe_does_not_take_is_refused(name, takes):
+    recipe = gaze_recipe(name)
+    recipe.require([])
+    if takes:
+        recipe.require(["loss", "semantic", "begin"])
+        return
+    with pytest.raises(NergError, match="no choice of --loss, --begin field, but ways of its own; add --recipe small"):
+        recipe.require(["loss", "begin"])
+
+
+def test_features_and_weights_are_those_of_a_radiance_field():
+    for wrong in ({"begin": True}, {"choices": FieldChoices(semantic="snapshot")}):
+        with pytest.raises(NergError, match="needs a radiance field: give it with --field"):
+            gaze_recipe("small").plan(SCENE, **wrong)
+
+
+def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start():
+    """Each probe is drawn fifty times; the rate is lower with every step, down to a tenth."""
+    recipe = gaze_recipe("paper")
+    assert recipe.settings["steps"] * recipe.settings["probes"] == 50 * recipe.probes["count"]
+    settings = GazeSettings(**recipe.settings)
+    assert settings.rate(0) == 1e-3 and settings.rate(0.01) < 1e-3
+    assert settings.rate(0.5) == pytest.approx(1e-3 * 0.1**0.5) and settings.rate(1) == pytest.approx(1e-4)

@@ -219,25 +219,6 @@ def test_the_bound_finds_what_fills_a_small_part_of_a_cell():
         assert np.array_equal(grid.bound(inside, np.random.default_rng(seed), everything).bits, grown(held))
 
 
-def test_density_at_the_threshold_is_what_a_step_absorbs():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1, threshold=0.02)
-    for sigma, on in ((0.19, False), (0.21, True)):
-        assert (
-            grid.bound(lambda p, a, sigma=sigma: dr.full(ns.Float, sigma, dr.width(p)), rng(), everything).bits.all()
-            == on
-        )
-
-
-def test_what_is_kept_stays():
-    grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
-    point = centres()[3, 4, 2]
-    grid.keep(grid.bound(around(point, 0.1), rng(), everything).bits)
-    grid.update(lambda p, active: dr.zeros(ns.Float, dr.width(p)), rng(), everywhere=True)
-    held = np.zeros((R, R, R), bool)
-    held[3, 4, 2] = True
-    assert np.array_equal(cube(grid.bits) > 0, grown(held))
-
-
 def test_cells_and_steps_of_a_contracted_box_grow_outwards():
     """Its inner cube, 2 units wide, has half of the cells along each edge."""
     box = ContractedBox(BOX, 16)
