@@ -43,7 +43,7 @@ UNIFORM = 1.0 / (4.0 * np.pi)  # 1/sr
 _LEAF = 16
 
 
-class Remembered:
+class CachedBaseline:
     """A function of positions and directions that is not asked twice for the same two arrays: its answers are kept, and
     cannot be written to. Neither may the arrays change."""
 

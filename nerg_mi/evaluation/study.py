@@ -221,7 +221,7 @@ PAPER = "paper"
 
 
 @dataclass(frozen=True)
-class Setting:
+class StudyRow:
     """One row of a study."""
 
     # As the tables have it.
@@ -245,11 +245,11 @@ class Setting:
         return made if self.paper is None else as_in_the_paper(made, subject.sensor, subject.tolerance, *self.paper)
 
 
-def settings(subject, quick: bool = False) -> list[Setting]:
+def settings(subject, quick: bool = False) -> list[StudyRow]:
     """All rows for ``subject``; ``quick``: one or two of each factor."""
 
     if not subject.marched:
-        return [Setting("default", "default"), *_observer(subject, quick), *_left_out(subject), *_samples(quick)]
+        return [StudyRow("default", "default"), *_observer(subject, quick), *_left_out(subject), *_samples(quick)]
 
     def some(values):
         return values[:: max(len(values) - 1, 1)] if quick else values
@@ -260,33 +260,33 @@ def settings(subject, quick: bool = False) -> list[Setting]:
     def steps(n):
         return {"step": subject.extent / n}
 
-    rows = [Setting("default", "default")]
+    rows = [StudyRow("default", "default")]
     for rule in (r.name for r in RULES if not r.in_cells):
         for n in (64, 512) if quick else STEP_COUNTS:
-            rows.append(Setting(f"{rule}, {n} steps", f"steps, {rule}", {"quadrature": rule, **steps(n)}))
+            rows.append(StudyRow(f"{rule}, {n} steps", f"steps, {rule}", {"quadrature": rule, **steps(n)}))
     for g in some((1 / 1024, 1 / 512, 1 / 256, 1 / 128)):
-        rows.append(Setting(f"dt_gamma 1/{round(1 / g)}", "dt_gamma", {"dt_gamma": g}))
+        rows.append(StudyRow(f"dt_gamma 1/{round(1 / g)}", "dt_gamma", {"dt_gamma": g}))
     for c in some((2, 4, 8, 16)):
-        rows.append(Setting(f"coarse {c}", "coarse", {"coarse": float(c)}))
+        rows.append(StudyRow(f"coarse {c}", "coarse", {"coarse": float(c)}))
     for s in some((1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8)):
-        rows.append(Setting(f"stop {s:g}", "stop", {"stop": s}))
+        rows.append(StudyRow(f"stop {s:g}", "stop", {"stop": s}))
     for c in some((0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2)):
-        rows.append(Setting(f"color_cutoff {c:g}", "color_cutoff", {"color_cutoff": c}))
+        rows.append(StudyRow(f"color_cutoff {c:g}", "color_cutoff", {"color_cutoff": c}))
     for k in DEPTHS.names():
-        rows.append(Setting(f"depth {k}", "depth", {"depth": k}))
+        rows.append(StudyRow(f"depth {k}", "depth", {"depth": k}))
         for n in () if quick else (128, 256, 512, 1024):
-            rows.append(Setting(f"depth {k}, {n} steps", "depth", {"depth": k, **steps(n)}))
-    rows.append(Setting("unrefined", "refined", {"refined": False}))
-    rows.append(Setting("jitter", "jitter", {"jitter": True}))
+            rows.append(StudyRow(f"depth {k}, {n} steps", "depth", {"depth": k, **steps(n)}))
+    rows.append(StudyRow("unrefined", "refined", {"refined": False}))
+    rows.append(StudyRow("jitter", "jitter", {"jitter": True}))
     rows += _observer(subject, quick) + _left_out(subject) + _samples(quick)
     if subject.resampled:
         for r in RESOLUTIONS[:1] if quick else RESOLUTIONS:
             for rule in RULES.names():
-                rows.append(Setting(f"grid {r}, {rule}", "resolution", {"quadrature": rule}, resolution=r))
+                rows.append(StudyRow(f"grid {r}, {rule}", "resolution", {"quadrature": rule}, resolution=r))
         for n in () if quick else (16, 64, 256):
             for rule in RULES.names():
                 rows.append(
-                    Setting(
+                    StudyRow(
                         f"grid 64, {rule}, {n} steps", "resolution", {"quadrature": rule, **steps(n)}, resolution=64
                     )
                 )
@@ -294,73 +294,73 @@ def settings(subject, quick: bool = False) -> list[Setting]:
     return rows + _paper(quick)
 
 
-def _met(some) -> list[Setting]:
+def _met(some) -> list[StudyRow]:
     """Of Gaussian splats, which are met one by one and not marched."""
-    rows = [Setting("default", "default")]
-    rows += [Setting(f"stop {s:g}", "stop", {"stop": s}) for s in some(study_truth.STOPS)]
-    rows += [Setting(f"extent {e:g}", "extent", {"extent": e}) for e in some(study_truth.EXTENTS)]
+    rows = [StudyRow("default", "default")]
+    rows += [StudyRow(f"stop {s:g}", "stop", {"stop": s}) for s in some(study_truth.STOPS)]
+    rows += [StudyRow(f"extent {e:g}", "extent", {"extent": e}) for e in some(study_truth.EXTENTS)]
     # What finds the depth of another kind, finds the same here.
-    rows += [Setting(f"depth {d.name}", "depth", {"depth": d.name}) for d in DEPTHS if d.finds == d.name]
+    rows += [StudyRow(f"depth {d.name}", "depth", {"depth": d.name}) for d in DEPTHS if d.finds == d.name]
     loose = [(2.0, 1e-2), (2.5, 1e-2), (2.5, 1e-3)]
-    return rows + [Setting(f"extent {e:g}, stop {s:g}", "together", {"extent": e, "stop": s}) for e, s in some(loose)]
+    return rows + [StudyRow(f"extent {e:g}, stop {s:g}", "together", {"extent": e, "stop": s}) for e, s in some(loose)]
 
 
-def _visibility(quick: bool) -> list[Setting]:
-    rows = [Setting(f"visibility {k}", "visibility", {"visibility": k}) for k in ("depth", "transmittance")]
+def _visibility(quick: bool) -> list[StudyRow]:
+    rows = [StudyRow(f"visibility {k}", "visibility", {"visibility": k}) for k in ("depth", "transmittance")]
     for h in (16,) if quick else (64, 128, 256, 512, 1024):
         params = {"visibility": "map", "map_height": h}
-        rows.append(Setting(f"visibility map {h}", "visibility", params))
-        rows.append(Setting(f"visibility map {h}, first frame", "visibility", params, first_frame=True))
+        rows.append(StudyRow(f"visibility map {h}", "visibility", params))
+        rows.append(StudyRow(f"visibility map {h}, first frame", "visibility", params, first_frame=True))
     return rows
 
 
-def _observer(subject, quick: bool) -> list[Setting]:
+def _observer(subject, quick: bool) -> list[StudyRow]:
     """What is found out for each observer: visibility, and the integral of a gaze that is divided by one."""
     if not subject.normalized:
         return _visibility(quick)
     return _visibility(quick) + [
-        Setting(f"integral_tolerance {t:g}, first frame", "integral", {"integral_tolerance": t}, first_frame=True)
+        StudyRow(f"integral_tolerance {t:g}, first frame", "integral", {"integral_tolerance": t}, first_frame=True)
         for t in ((0.0, 5e-3) if quick else (0.0, 3.125e-4, 1.25e-3, 5e-3, 2e-2))
     ]
 
 
-def _samples(quick: bool) -> list[Setting]:
-    return [Setting(f"spp {k}", "spp", spp=k) for k in ((2,) if quick else (4, 16, 64))]
+def _samples(quick: bool) -> list[StudyRow]:
+    return [StudyRow(f"spp {k}", "spp", spp=k) for k in ((2,) if quick else (4, 16, 64))]
 
 
-def _left_out(subject) -> list[Setting]:
+def _left_out(subject) -> list[StudyRow]:
     """What a scene does not need, taken away piece by piece."""
     rows = [
-        Setting("no colour", "leave out", {"radiance": False}),
-        Setting("no observer", "leave out", {"aovs": "depth,opacity"}),
-        Setting("depth only", "leave out", {"aovs": "depth,opacity", "radiance": False}),
+        StudyRow("no colour", "leave out", {"radiance": False}),
+        StudyRow("no observer", "leave out", {"aovs": "depth,opacity"}),
+        StudyRow("depth only", "leave out", {"aovs": "depth,opacity", "radiance": False}),
     ]
     if subject.has_gaze:
-        rows.insert(1, Setting("no gaze", "leave out", {"aovs": "depth,opacity,visibility"}))
+        rows.insert(1, StudyRow("no gaze", "leave out", {"aovs": "depth,opacity,visibility"}))
     return rows
 
 
-def _together(subject) -> list[Setting]:
+def _together(subject) -> list[StudyRow]:
     """Several factors at once, to find the front."""
     rows = []
     for n in (128, 256, 512, 1024, 2048):
         step = {"step": subject.extent / n}
-        rows.append(Setting(f"{n} steps, coarse 4", "together", {**step, "coarse": 4.0}))
+        rows.append(StudyRow(f"{n} steps, coarse 4", "together", {**step, "coarse": 4.0}))
         loose = {**step, "stop": 1e-4, "color_cutoff": 1e-2}
-        rows.append(Setting(f"{n} steps, stop 1e-4, cutoff 1e-2", "together", loose))
+        rows.append(StudyRow(f"{n} steps, stop 1e-4, cutoff 1e-2", "together", loose))
         rows.append(
-            Setting(f"{n} steps, stop 1e-4, cutoff 1e-2, linear", "together", {**loose, "quadrature": "linear"})
+            StudyRow(f"{n} steps, stop 1e-4, cutoff 1e-2, linear", "together", {**loose, "quadrature": "linear"})
         )
-        rows.append(Setting(f"{n} steps, stop 1e-4, cutoff 1e-2, refined", "together", {**loose, "depth": "refined"}))
+        rows.append(StudyRow(f"{n} steps, stop 1e-4, cutoff 1e-2, refined", "together", {**loose, "depth": "refined"}))
     return rows
 
 
-def _paper(quick: bool) -> list[Setting]:
+def _paper(quick: bool) -> list[StudyRow]:
     counts = (64, STEPS) if quick else (128, 256, 512, STEPS, 2048, 4096)
     # The rule is one of depth comparison and of expected depth, whatever the scene prefers.
     params = {"depth": "expected", "visibility": "depth"}
-    rows = [Setting(f"paper, {n} steps", PAPER, params, paper=(n, 0.0)) for n in counts]
-    return rows + [Setting(f"paper, {STEPS} steps, dt_gamma 1/128", PAPER, params, paper=(STEPS, DT_GAMMA))]
+    rows = [StudyRow(f"paper, {n} steps", PAPER, params, paper=(n, 0.0)) for n in counts]
+    return rows + [StudyRow(f"paper, {STEPS} steps, dt_gamma 1/128", PAPER, params, paper=(STEPS, DT_GAMMA))]
 
 
 # ---- Measure ----
@@ -416,7 +416,7 @@ PIXEL_SPP = 256
 
 def measure(
     subject,
-    rows: list[Setting],
+    rows: list[StudyRow],
     repeats: int,
     pixel_spp: int = PIXEL_SPP,
     on_step: Callable[[str], None] = lambda name: None,
@@ -440,7 +440,7 @@ def measure(
     return table
 
 
-def _parameters(subject, row: Setting, integrator) -> dict:
+def _parameters(subject, row: StudyRow, integrator) -> dict:
     values = parameters(integrator)
     if row.paper is not None:
         steps, dt_gamma = row.paper
@@ -463,7 +463,7 @@ def _parameters(subject, row: Setting, integrator) -> dict:
     }
 
 
-def _quality(subject, row: Setting, integrator, values: dict, exact, pixels: dict, pixel_spp: int) -> dict:
+def _quality(subject, row: StudyRow, integrator, values: dict, exact, pixels: dict, pixel_spp: int) -> dict:
     import drjit as dr
 
     backend = dr.JitBackend.CUDA if _on_cuda() else dr.JitBackend.LLVM
@@ -497,7 +497,7 @@ def _pixel_truth(subject, spp: int) -> Truth:
     )
 
 
-def _counts(subject, row: Setting) -> dict:
+def _counts(subject, row: StudyRow) -> dict:
     """Mean evaluations a pixel. The count keeps what the setting asks for, so that the same passes are made."""
     names = row.params.get("aovs", subject.aovs()).split(",")
     counted = [n for n in COUNTS if n != "gaze_evals" or "gaze" in names]
@@ -562,7 +562,7 @@ def scaling(
         on_step(f"{axis} {value}")
         if axis == "pixels":
             subject.resize(value, 2 * value // 3)
-        setting = Setting("", axis, params, spp=value if axis == "samples" else 1)
+        setting = StudyRow("", axis, params, spp=value if axis == "samples" else 1)
         integrator = setting.integrator(subject)
         timed(subject, integrator, setting.spp)
         seconds = statistics.median(timed(subject, integrator, setting.spp)[0] for _ in range(repeats))

@@ -37,7 +37,7 @@ FUZZ = 1 / 64
 
 
 @dataclass(frozen=True)
-class Seen:
+class RayTruth:
     """Along rays (N,): optical depth, first moment ∫ t σ T dt, the distances at which optical depths up to ``tau`` are
     reached, and the mean free path 1/σ where T = 1/2 (0 where that is not reached)."""
 
@@ -78,7 +78,7 @@ def box_distances(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.where(miss, 0, near), np.where(miss, 0, far)
 
 
-def trace(scene: AnalyticScene, o: np.ndarray, d: np.ndarray, end: np.ndarray | None = None) -> Seen:
+def trace(scene: AnalyticScene, o: np.ndarray, d: np.ndarray, end: np.ndarray | None = None) -> RayTruth:
     """What float64 rays ``o + t d`` (N, 3) see of ``scene``, up to the distances ``end`` (N,)."""
     near, far = box_distances(o, d)
     if end is not None:
@@ -103,7 +103,7 @@ def _intervals(scene, o, d, near, far):
     return start, length, scene.density(p[..., 0], p[..., 1], p[..., 2], NUMPY)
 
 
-def _pieces(scene, o, d, near, far) -> Seen:
+def _pieces(scene, o, d, near, far) -> RayTruth:
     start, length, sigma = _intervals(scene, o, d, near, far)
     tau = sigma * length
     before = np.cumsum(tau, -1) - tau
@@ -120,7 +120,7 @@ def _pieces(scene, o, d, near, far) -> Seen:
         return start[row, i] + slope * (goal - before[row, i]), slope
 
     free_path = crossing(np.full(len(o), np.log(2)))[1]
-    return Seen(total, moment, lambda goal: crossing(goal)[0], np.where(total >= np.log(2), free_path, 0))
+    return RayTruth(total, moment, lambda goal: crossing(goal)[0], np.where(total >= np.log(2), free_path, 0))
 
 
 def mean_share(x: np.ndarray) -> np.ndarray:
@@ -131,7 +131,7 @@ def mean_share(x: np.ndarray) -> np.ndarray:
     return np.where(small, 0.5 - x / 12 + x**3 / 720, large)
 
 
-def _profile(scene, o, d, near, far) -> Seen:
+def _profile(scene, o, d, near, far) -> RayTruth:
     x, w = np.polynomial.legendre.leggauss(NODES)
     edges = (np.arange(PANELS)[:, None] + 0.5 + 0.5 * x) / PANELS
     length = far - near
@@ -155,7 +155,7 @@ def _profile(scene, o, d, near, far) -> Seen:
     p = o + d * crossing(np.log(2))[:, None]
     reached = total >= np.log(2)
     sigma = np.where(reached, scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY), 1)
-    return Seen(total, moment, crossing, np.where(reached, 1 / sigma, 0))
+    return RayTruth(total, moment, crossing, np.where(reached, 1 / sigma, 0))
 
 
 @dataclass(frozen=True)

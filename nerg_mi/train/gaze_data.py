@@ -391,7 +391,7 @@ class TargetNeeds:
 
 
 @dataclass(frozen=True, eq=False)
-class Targets:
+class GazeTargets:
     """P observers with D directions each, parts of equal solid angle, in the field's frame and units; float32."""
 
     # Positions (P, 3) of the observers, p_o.
@@ -409,7 +409,7 @@ class Targets:
     # Table of the log of the density of all rays whatever their position (`fields.gaze_base.blind_table`).
     blind: np.ndarray | None = None
     # The same observers in other directions, for the epoch that is given, where each epoch has its own.
-    renew: Callable[[int], Targets] | None = None
+    renew: Callable[[int], GazeTargets] | None = None
     # Corners of the box of observers that capture's encoding spans; None: that of the positions.
     heads: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     # Solid angle (P,), sr, of which the D directions are parts and over which the truth integrates to one; None: 4π.
@@ -434,7 +434,7 @@ def observe(
     place: GazePlace,
     depth: str = "median",
     needs: TargetNeeds | None = None,
-) -> Targets:
+) -> GazeTargets:
     """Targets of observers (P, 3) whose density in ``directions`` (P, D, 3) is ``truth`` (P, D), all in the frame of
     ``place``, with the surfaces that they see there; ``depth``: kind of depth that is the surface.
 
@@ -448,10 +448,10 @@ def observe(
         features = semantic_features(place, origins, directions.reshape(-1, 3), distance.ravel(), needs.semantic)
         features = features.reshape(*directions.shape[:2], -1)
     narrow = lambda v: v.astype(np.float32, copy=False)
-    return Targets(narrow(positions), narrow(directions), narrow(truth), distance, escaped, features)
+    return GazeTargets(narrow(positions), narrow(directions), narrow(truth), distance, escaped, features)
 
 
-def concatenate(a: Targets, b: Targets) -> Targets:
+def concatenate(a: GazeTargets, b: GazeTargets) -> GazeTargets:
     """The observers of both, with as many directions each; the blind density is that of ``a``."""
     rows = lambda name: np.concatenate([getattr(a, name), getattr(b, name)])
     out: dict[str, Any] = {k: rows(k) for k in ("positions", "directions", "truth", "distance", "escaped")}
@@ -460,7 +460,7 @@ def concatenate(a: Targets, b: Targets) -> Targets:
     renew, of_a, of_b = None, a.renew, b.renew
     if of_a is not None and of_b is not None:
         renew = lambda epoch: concatenate(of_a(epoch), of_b(epoch))
-    return Targets(**out, semantic=semantic, blind=a.blind, renew=renew, extent=np.concatenate(extent))
+    return GazeTargets(**out, semantic=semantic, blind=a.blind, renew=renew, extent=np.concatenate(extent))
 
 
 # ---- Targets as arrays of a backend, and the batches that are gathered from them ----
@@ -512,7 +512,7 @@ class TargetArrays:
     """``targets`` as arrays of the backend ``ns``: ``count`` observers with ``directions`` each. Raises `NergError`
     without any observer."""
 
-    def __init__(self, targets: Targets, ns: ModuleType):
+    def __init__(self, targets: GazeTargets, ns: ModuleType):
         self.ns, self.count, self.directions = ns, *targets.truth.shape
         if self.count == 0:
             raise NergError("there are no probes to train on")
@@ -588,7 +588,7 @@ def targets_of_probes(
     depth: str = "median",
     needs: TargetNeeds | None = None,
     seed: int | tuple[int, ...] = 0,
-) -> Targets:
+) -> GazeTargets:
     """Targets of ``probes`` in as many ``directions`` each; ``depth``: kind of depth that is the surface; ``seed``: of
     the rotations. Raises `NergError` where all kernels are so narrow that they vanish between the directions."""
     turned = rotated_sets(directions, len(probes), np.random.default_rng(seed))
@@ -610,7 +610,7 @@ def targets_of_rays(
     needs: TargetNeeds | None = None,
     queries: np.ndarray | None = None,
     seed: int = 0,
-) -> Targets:
+) -> GazeTargets:
     """Targets of the probes on ``rays``, at ``queries`` (P, 3) metres where given. With ``settings.fresh`` they can
     ``renew`` their directions. Raises `NergError` when no probe holds enough rays."""
     needs = needs or TargetNeeds()
@@ -652,7 +652,7 @@ def targets_of_views(
     settings: ProbeSettings,
     needs: TargetNeeds | None = None,
     seed: int = 0,
-) -> Targets:
+) -> GazeTargets:
     """Targets of ``views`` in the frame of ``place``.
 
     ``settings.directions`` directions a view, each with the density of the pixel that it lies in; pixels are joined
@@ -661,7 +661,7 @@ def targets_of_views(
     needs, count = needs or TargetNeeds(), settings.directions
     small = [v.reduced(max(1, count // _PER_PIXEL)) for v in views]
 
-    def drawn(seed: int | tuple[int, int]) -> Targets:
+    def drawn(seed: int | tuple[int, int]) -> GazeTargets:
         rng = np.random.default_rng(seed)
         directions, truth = np.empty((len(views), count, 3)), np.empty((len(views), count))
         for k, view in enumerate(small):

@@ -19,11 +19,10 @@ from nerg_mi.photos.salience import SalienceView
 from nerg_mi.rays.rays import Rays
 
 from .gaze_data import Supervision
-from .gaze_folds import CHOICE, MINUTES, choose_mix, choose_variant, mixes
-from .gaze_run import train_gaze
+from .gaze_run import CHOICE, MINUTES, choose_variant, judge_folds, mixes, part_of, train_gaze
 from .gaze_settings import GazeSettings
 from .gaze_trainer import KIND as RUN
-from .gaze_trainer import GazePlan, GazeProgress, Listener, StateSettings, kept_identity
+from .gaze_trainer import GazePlan, Listener, StateSettings, kept_identity
 from .geometry import GazePlace
 from .trainer import kept_unless, require_same
 
@@ -134,7 +133,7 @@ def train_ensemble(
                 member_plan,
                 ns,
                 state=replace(own, resume=state.resume and is_file(path)),
-                tell=_of_member(tell, k, members),
+                tell=part_of(tell, k, members, f"{k + 1}/{members} {{}}"),
                 write=None if part is None else _writer(part, identity),
             )
             if provenance["interrupted"]:
@@ -143,7 +142,7 @@ def train_ensemble(
         fields.append(field)
         each.append(provenance)
     if mixed and choice is None:
-        choice = choose_mix(supervision, place, whole, ns, tell)
+        choice = judge_folds(supervision, place, whole, ns, tell).choose()
     if choice is not None:
         for field in fields:
             field.set_mix(choice.mix)
@@ -186,16 +185,6 @@ def _resampled(supervision: Supervision, seed: tuple[int, int]) -> Supervision:
     """What a member is trained on."""
     rays, views = supervision.rays, supervision.views
     return Supervision(None if rays is None else resample(rays, seed), resample_views(views, seed) if views else ())
-
-
-def _of_member(tell: Listener, k: int, members: int) -> Listener:
-    """Tells how an ensemble goes by how its member ``k`` does."""
-
-    def told(progress: GazeProgress) -> None:
-        done = (k + progress.done) / members
-        tell(replace(progress, stage=f"{k + 1}/{members} {progress.stage}", done=done))
-
-    return told
 
 
 def _finished(part: Path, identity: dict, state: StateSettings, ns: ModuleType) -> tuple[AnyGazeField, dict]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from types import ModuleType
-from typing import Any, TypedDict
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -21,7 +21,7 @@ from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.probes.probes import person_weights
 from nerg_mi.rays.rays import Rays
 
-from .gaze_data import Batch, Targets, heads_box
+from .gaze_data import Batch, GazeTargets, heads_box
 from .gaze_recipes import DEFAULT, FieldChoices, Recipe, register
 from .gaze_settings import GazeSettings
 from .gaze_trainer import GazeTrainer
@@ -102,7 +102,7 @@ class LikelihoodTrainer(GazeTrainer):
 
     def __init__(
         self,
-        targets: Targets,
+        targets: GazeTargets,
         box: AnyBox,
         config: LogGazeConfig,
         settings: GazeSettings,
@@ -117,7 +117,7 @@ class LikelihoodTrainer(GazeTrainer):
         trained = set(self.optimiser.keys())
         self.constant = {k: v for k, v in self.initial.parameters().items() if k not in trained}
 
-    def learn_from(self, targets: Targets, epoch: int) -> None:
+    def learn_from(self, targets: GazeTargets, epoch: int) -> None:
         super().learn_from(targets, epoch)
         # Inverse transform sampling: each probe's distribution function over its directions of equal area.
         self._steps = np.cumsum(targets.truth, axis=1, dtype=np.float64)
@@ -224,18 +224,9 @@ def _log_density(choices: FieldChoices) -> LogGazeConfig:
     )
 
 
-class Surroundings(TypedDict):
-    """What a log density is told of where it is."""
-
-    # What its directions without a surface are (`LogGazeConfig.escaped`).
-    escaped: str
-    # Whether there are surfaces (`LogGazeConfig.geometry`).
-    geometry: str
-
-
-def surroundings(place: str) -> Surroundings:
-    """What a log density is told of a kind of ``place``: one of hit points has holes, through which nobody saw whom it
-    was made from; no place has no surfaces."""
+def surroundings(place: str) -> dict[str, Any]:
+    """What `LogGazeConfig` is told of a kind of ``place``: one of hit points has holes, through which nobody saw whom
+    it was made from; no place has no surfaces."""
     return {
         "escaped": "nearest" if place == "hits" else "constant",
         "geometry": "none" if place == "none" else "surface",

@@ -1,29 +1,39 @@
-"""A training of a gaze field from its data to its checkpoint."""
+"""A training of a gaze field from its data to its checkpoint, and the folds that choose its architecture and its share
+of the blind density."""
 
 from __future__ import annotations
 
+import json
+import math
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.fields.gaze_base import GazeHead, basis_of
+from nerg_mi.errors import NergError
+from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, basis_of
+from nerg_mi.interruption import Interruption
+from nerg_mi.probes.probes import Probes, calibrated_levels, region_levels
+from nerg_mi.rays.filters import purge, split_by_position
+from nerg_mi.rays.rays import Rays
 
 from .gaze_data import (
+    GazeTargets,
     Supervision,
     TargetNeeds,
-    Targets,
     concatenate,
+    heads_box,
+    probes_of_rays,
     split_validation,
+    targets_of_probes,
     targets_of_rays,
     targets_of_views,
 )
-from .gaze_folds import CHOICE, MINUTES, choose_mix, choose_variant, mixes
 from .gaze_trainer import (
-    Fit,
+    GazeFit,
     GazePlan,
     GazeProgress,
     GazeRunFile,
@@ -37,6 +47,310 @@ from .gaze_trainer import (
 )
 from .geometry import GazePlace
 from .trainer import kept_unless
+
+# ---- Mixing ----
+#
+# How much of the blind density a gaze field is given, so that it is not worse than one that knows no position.
+#
+# Where few people were tracked, or hardly moved, a field follows those whom it has seen, and is worse for others than
+# where people look wherever they stand. Folds of the training rays tell: in each some people are held out, at places
+# that are held out too, and a field is trained on the others. The share of the blind density is that which foretells
+# those who were held out best, by a mixture of both densities (stacking, Wolpert 1992; Smyth and Wolpert 1999). Of
+# shares that are alike the largest is taken: the simpler density unless the field is better by half a standard error,
+# in place of the whole one of Breiman et al. (1984), which costs places that are sure of their field. Where the field
+# needs none of it in the first folds, the others are left out. The same looks that were held out tell which regions of
+# the mixture hold 80 % of the gaze of others.
+
+
+SHARES = np.linspace(0.05, 1.0, 20)
+"""Shares of the blind density that are tried: never none, so that no density is zero."""
+MINUTES = 0.5
+"""Share of the minutes of a training that the folds take."""
+# Zones, positions in all of them and rays at each, of what a fold holds out; and directions that it is judged in.
+_ZONES, _POSITIONS, _RAYS, _DIRECTIONS = 3, 48, 16, 1024
+# Folds after which a field that needs no more than the least share in any is believed; probes of a fold at most, and
+# its steps as a share of the training's: both end alike for this question.
+_ENOUGH, _PROBES, _STEPS = 2, 512, 0.5
+# Standard errors by which a share may be worse than the best.
+_DOUBT = 0.5
+# Of a density (1/sr), so that its logarithm is finite.
+_LEAST = 1e-9
+
+
+@dataclass(frozen=True)
+class MixChoice:
+    """The share of the blind density that was chosen, and why; of no folds the share that was given, no KLD and no
+    regions."""
+
+    # The share.
+    mix: float
+    # How many folds had people and positions enough to be judged by.
+    folds: int
+    # KLD (nats) of what was held out, means over folds: with this share, of the field as it is (with the least share
+    # that is tried), and of the blind density alone; of kernel densities, so that none reaches zero.
+    kld: float | None = None
+    kld_field: float | None = None
+    kld_blind: float | None = None
+    # Shares that are to be asked for so that regions hold those of ``probes.probes.LEVELS``, by their names.
+    regions: dict[str, float] | None = None
+    # Of several variants (``gaze_folds.choose_variant``) the one that was chosen, and the KLD of each, with its share,
+    # in the folds that all have.
+    variant: str | None = None
+    variants: dict[str, float] | None = None
+
+    def to_dict(self) -> dict:
+        """As JSON, for the provenance."""
+        return {k: _rounded(v) for k, v in asdict(self).items()}
+
+    @staticmethod
+    def of(found: dict) -> MixChoice:
+        """The one of which `to_dict` was kept. Raises ``TypeError`` and ``ValueError`` for what is none."""
+        choice = MixChoice(**found)
+        if not 0 <= choice.mix <= 1:
+            raise ValueError(f'the share "mix" must be from 0 to 1, got {choice.mix}')
+        return choice
+
+
+def mixes(plan: GazePlan) -> bool:
+    """Whether ``plan`` asks for a share that folds choose."""
+    return plan.settings.mix_folds > 0 and plan.config.prior > 0
+
+
+class _Judgement(NamedTuple):
+    """What a fold tells of regions: densities (P, D) of the field and of the blind density, and the directions (n,)
+    that the rays of those who are held out are nearest to, probe after probe by ``offsets`` (P + 1,)."""
+
+    field: np.ndarray
+    blind: np.ndarray
+    bins: np.ndarray
+    offsets: np.ndarray
+
+
+@dataclass(frozen=True)
+class JudgedFolds:
+    """What folds tell of one architecture."""
+
+    # The share that it has of itself.
+    mix: float
+    # KLD (F, S) in each fold with each of ``SHARES``.
+    curves: np.ndarray
+    # Of each fold.
+    judgements: list[_Judgement]
+
+    def choose(self) -> MixChoice:
+        """The share that it is given: its own where there is no fold."""
+        if not len(self.curves):
+            return MixChoice(self.mix, 0)
+        choice = _choose(self.curves)
+        return replace(choice, regions=_regions(self.judgements, choice.mix))
+
+
+def judge_folds(
+    supervision: Supervision, place: GazePlace, plan: GazePlan, ns: ModuleType, tell: Listener = lambda progress: None
+) -> JudgedFolds:
+    """How well fields that ``plan`` trains on ``supervision``, which has rays, in ``place`` foretell people and
+    positions that are held out, with each share of the blind density.
+
+    ``tell`` is told how it goes. Raises ``KeyboardInterrupt`` after Ctrl-C, or where ``tell`` does. The place is that
+    of all rays in each fold: one of hit points knows the surfaces that those who are held out have met, not who looked
+    there.
+    """
+    rays, config, curves, judgements = supervision.rays, plan.config, [], []
+    if rays is None or not config.prior:
+        raise ValueError("folds are of rays, and of fields that have a density that does not depend on the position")
+    if plan.settings.minutes is not None:
+        plan = plan.with_settings(minutes=MINUTES * plan.settings.minutes / plan.settings.mix_folds)
+    settings, needs = plan.settings, TargetNeeds.of(plan.config)
+    probes = replace(plan.probes, count=min(plan.probes.count, _PROBES), fresh=False)
+    if settings.steps is not None:
+        settings = replace(settings, steps=math.ceil(_STEPS * settings.steps))
+    box = heads_box(place.points_from_rays(rays.origin), place.box)
+    for k, (learn, held, centres) in enumerate(inner_folds(rays, plan)):
+        try:
+            targets = targets_of_rays(learn, place, probes, needs, seed=settings.seed)
+        except NergError:
+            # Those who are left make no probe: this fold says nothing.
+            continue
+        judged = replace(probes, directions=_DIRECTIONS, min_rays=1)
+        probes_held = probes_of_rays(held, judged, centres, settings.seed + 3)
+        truth = targets_of_probes(probes_held, place, _DIRECTIONS, judged.depth, needs, settings.seed + 3)
+        trainer = plan.trainer(replace(targets, heads=box), place.box, config, settings, ns)
+        with Interruption() as stop:
+            while trainer.progress < 1:
+                trainer.step()
+                done = (k + trainer.progress) / settings.mix_folds
+                tell(GazeProgress(f"fold {k + 1}", done, trainer.steps, trainer.seconds, None))
+                stop.check()
+        field, blind = trainer.densities(truth)
+        curves.append([_kld(truth.truth, (1 - m) * field + m * blind) for m in SHARES])
+        judgements.append(_Judgement(field, blind, _bins(probes_held, place, truth.directions), probes_held.offsets))
+        if len(curves) == _ENOUGH and all(int(np.argmin(curve)) == 0 for curve in curves):
+            break
+    tell(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
+    return JudgedFolds(config.mix, np.array(curves), judgements)
+
+
+def inner_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.ndarray]]:
+    """``(learn, held, centres)`` of each fold: the rays of some people away from ``centres`` (T, 3), and those of the
+    others, who are judged there. One person alone is held out at places only. A fold without such places is left out.
+    """
+    settings, radius = plan.settings, plan.probes.radius
+    rng = np.random.default_rng(settings.seed + 7)
+    people = rng.permutation(np.unique(rays.person))
+    alone = len(people) == 1
+    groups = [people] * settings.mix_folds if alone else np.array_split(people, min(settings.mix_folds, len(people)))
+    for k, group in enumerate(groups):
+        mask = np.isin(rays.person, group)
+        held = rays.select(mask)
+        try:
+            # Those who hardly moved leave nothing of their own to learn from: the others are learnt from.
+            split = split_by_position(
+                held,
+                radius,
+                zones=_ZONES,
+                test_probes=_POSITIONS,
+                min_rays=_RAYS,
+                min_train=0,
+                seed=1000 * settings.seed + k,
+            )
+        except NergError:
+            # These people have no zones with rays enough.
+            continue
+        learn = purge(rays, split.test_centres, 2 * radius)
+        if not alone:
+            learn &= ~mask
+        if learn.any():
+            yield rays.select(learn), held, split.test_centres
+
+
+def _rounded(value):
+    """``value`` with its numbers to four digits."""
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    return round(value, 4) if isinstance(value, float) else value
+
+
+def _kld(truth: np.ndarray, density: np.ndarray) -> float:
+    """Mean over observers of KLD (nats) of densities (P, D) in directions of equal area, each normalised."""
+    p = truth / truth.sum(axis=1, keepdims=True, dtype=np.float64)
+    q = np.maximum(density, _LEAST)
+    q = q / q.sum(axis=1, keepdims=True, dtype=np.float64)
+    return float((p * np.log(np.maximum(p, _LEAST / p.shape[1]) / q)).sum(axis=1).mean())
+
+
+def _bins(probes: Probes, place: GazePlace, directions: np.ndarray) -> np.ndarray:
+    """Which of the ``directions`` (P, D, 3), those of its probe, each ray of ``probes`` is nearest to, (n,)."""
+    along, o = place.directions_from_rays(probes.directions), probes.offsets
+    return np.concatenate([np.argmax(along[a:b] @ d.T, axis=1) for a, b, d in zip(o[:-1], o[1:], directions)])
+
+
+def _regions(judgements: Sequence[_Judgement], mix: float) -> dict[str, float]:
+    """Shares to ask for so that regions hold `probes.probes.LEVELS` of the looks in all folds, in which positions
+    count alike."""
+    levels, weights = [], []
+    for of in judgements:
+        density = (1 - mix) * of.field + mix * of.blind
+        for p, (a, b) in enumerate(zip(of.offsets[:-1], of.offsets[1:])):
+            levels.append(region_levels(density[p : p + 1], density[p : p + 1, of.bins[a:b]])[0])
+            weights.append(np.full(b - a, 1 / (b - a)))
+    return calibrated_levels(np.concatenate(levels), np.concatenate(weights))
+
+
+def nearly_best(curves: np.ndarray) -> np.ndarray:
+    """Indices of the columns of ``curves`` (F, S), a row a fold, that are worse than the one of the least mean by no
+    more than half a standard error over folds."""
+    more = curves - curves[:, [int(curves.mean(axis=0).argmin())]]
+    error = more.std(axis=0, ddof=1) / np.sqrt(len(curves)) if len(curves) > 1 else np.zeros(curves.shape[1])
+    return np.flatnonzero(more.mean(axis=0) <= _DOUBT * error)
+
+
+def _choose(curves: np.ndarray) -> MixChoice:
+    """The largest of `SHARES` that is nearly the best over folds (F, S)."""
+    mean, chosen = curves.mean(axis=0), int(nearly_best(curves)[-1])
+    return MixChoice(float(SHARES[chosen]), len(curves), float(mean[chosen]), float(mean[0]), float(mean[-1]))
+
+
+# ---- Variants ----
+#
+# Which of several architectures a place gets, by the folds that choose its share of the blind density.
+#
+# Where no surfaces are known, emit is told of points at one distance whatever is there. In some places it tells where
+# others look from elsewhere all the same, in others it follows whom it has seen: those who are held out tell which.
+
+
+CHOICE = "choice"
+"""Entry of what a run must agree on (``GazePlan.identity``): what was chosen before it began."""
+
+
+def choose_variant(
+    supervision: Supervision,
+    place: GazePlace,
+    plan: GazePlan,
+    ns: ModuleType,
+    tell: Listener = lambda progress: None,
+    kept: dict | None = None,
+) -> tuple[GazePlan, MixChoice | None]:
+    """``plan`` with one architecture, and the share of the blind density where folds have chosen both.
+
+    That of `GazePlan.config` stays, unless one of the ``alternatives`` foretells those who are held out better by half
+    a standard error over folds, each with its own share. Without alternatives, rays or folds nothing is chosen.
+    ``kept``: what a run that is gone on with has been started as; its choice stands. ``tell``: is told how it goes.
+    Raises ``KeyboardInterrupt`` after Ctrl-C, or where ``tell`` does.
+    """
+    configs, plan = (plan.config, *plan.alternatives), replace(plan, alternatives=())
+    if len(configs) == 1 or not mixes(plan) or supervision.rays is None:
+        return plan, None
+    if kept is not None:
+        return _kept(plan, configs, kept)
+    each, judging = [], plan
+    if plan.settings.minutes is not None:
+        judging = plan.with_settings(minutes=plan.settings.minutes / len(configs))
+    try:
+        for k, config in enumerate(configs):
+            told = part_of(tell, k, len(configs), f"{{}} of {config.variant}")
+            each.append(judge_folds(supervision, place, replace(judging, config=config), ns, told))
+    except KeyboardInterrupt as error:
+        names = " and ".join(config.variant for config in configs)
+        raise KeyboardInterrupt(f"interrupted while folds chose between {names}; nothing was kept") from error
+    return _best(plan, configs, each)
+
+
+def _kept(plan: GazePlan, configs: tuple[GazeHeadConfig, ...], kept: dict) -> tuple[GazePlan, MixChoice | None]:
+    """What was chosen among ``configs``; that of another run is found out when the two are compared."""
+    started = [c for c in configs if json.loads(json.dumps(c.to_dict())) == kept.get("architecture")]
+    plan = replace(plan, config=started[0]) if started else plan
+    if CHOICE not in kept:
+        return plan, None
+    try:
+        return plan, MixChoice.of(kept[CHOICE])
+    except (TypeError, ValueError) as error:
+        raise NergError(f"what the run had chosen is damaged ({error}); start anew without --resume") from error
+
+
+def _best(
+    plan: GazePlan, configs: tuple[GazeHeadConfig, ...], each: list[JudgedFolds]
+) -> tuple[GazePlan, MixChoice | None]:
+    """The plan with the best of ``configs``, which were judged as ``each`` says, and its share."""
+    choices = [judged.choose() for judged in each]
+    # Folds end early for a field that needs none of the blind density.
+    folds = min(len(judged.curves) for judged in each)
+    if not folds:
+        return plan, choices[0]
+    shares = [int(np.abs(SHARES - choice.mix).argmin()) for choice in choices]
+    curves = np.stack([judged.curves[:folds, s] for judged, s in zip(each, shares)], axis=1)
+    k = int(nearly_best(curves)[0])
+    variants = {config.variant: float(kld) for config, kld in zip(configs, curves.mean(axis=0))}
+    return replace(plan, config=configs[k]), replace(choices[k], variant=configs[k].variant, variants=variants)
+
+
+def part_of(tell: Listener, k: int, count: int, stage: str) -> Listener:
+    """Tells how the whole of ``count`` parts goes by how number ``k`` does; its stages are named as ``stage`` says."""
+
+    def told(progress: GazeProgress) -> None:
+        tell(replace(progress, stage=stage.format(progress.stage), done=(k + progress.done) / count))
+
+    return told
+
 
 # ---- Run ----
 #
@@ -94,7 +408,7 @@ def train_gaze(
     used = supervision if again else split.learn
     targets = make_targets(used, place, plan, needs, settings.seed)
     if again:
-        first = Fit.of(file.found)
+        first = GazeFit.of(file.found)
     else:
         prepared = time.perf_counter() - started
         first = fit_watched(targets, watched, place.box, plan, ns, share, file, tell)
@@ -108,7 +422,7 @@ def train_gaze(
     interrupted = first.interrupted or last.interrupted
     if mixed and choice is None and not interrupted:
         try:
-            choice = choose_mix(supervision, place, plan, ns, tell)
+            choice = judge_folds(supervision, place, plan, ns, tell).choose()
         except KeyboardInterrupt:
             interrupted = True
     field = trainer.field(last.weights)
@@ -150,7 +464,7 @@ def make_targets(
     needs: TargetNeeds,
     seed: int,
     centres: np.ndarray | None = None,
-) -> Targets:
+) -> GazeTargets:
     """Targets of the rays and the views of ``supervision``; ``centres`` (T, 3): where its rays make probes, in their
     frame; None: where the plan places them."""
     rays, views, probes = supervision.rays, supervision.views, plan.probes
@@ -164,7 +478,7 @@ def make_targets(
     return concatenate(targets, targets_of_views(views, place, probes, needs, seed))
 
 
-def _provenance(supervision: Supervision, place: GazePlace, plan: GazePlan, targets: Targets) -> dict:
+def _provenance(supervision: Supervision, place: GazePlace, plan: GazePlan, targets: GazeTargets) -> dict:
     """What the field was trained with and on (JSON)."""
     return {
         "settings": plan.settings.to_dict(),

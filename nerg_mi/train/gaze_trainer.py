@@ -21,7 +21,7 @@ from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
 
-from .gaze_data import Batch, Supervision, TargetArrays, Targets
+from .gaze_data import Batch, GazeTargets, Supervision, TargetArrays
 from .gaze_settings import GazeSettings, ProbeSettings, gaze_loss
 from .geometry import GazePlace
 from .trainer import Trainer, count_of, require_same, require_shape, restoring
@@ -58,7 +58,7 @@ class GazeTrainer(Trainer, ABC):
 
     def __init__(
         self,
-        targets: Targets,
+        targets: GazeTargets,
         box: AnyBox,
         config: Any,
         settings: GazeSettings,
@@ -111,7 +111,7 @@ class GazeTrainer(Trainer, ABC):
     def judge(self, kld: float, cc: float, mae: float, off: float) -> float:
         """What a validation is judged by, from its means over probes; ``off``: squared error of the integral."""
 
-    def learn_from(self, targets: Targets, epoch: int) -> None:
+    def learn_from(self, targets: GazeTargets, epoch: int) -> None:
         """Take ``targets``, which are those of ``epoch``, in place of the ones before."""
         self.data, self._epoch = TargetArrays(targets, self.ns), epoch
 
@@ -133,7 +133,7 @@ class GazeTrainer(Trainer, ABC):
         # them.
         dr.sync_thread()
 
-    def measure(self, targets: Targets, weights: dict | None = None) -> Scores:
+    def measure(self, targets: GazeTargets, weights: dict | None = None) -> Scores:
         """Scores of the averaged weights (or of ``weights``) on other targets, all of their directions."""
         rows = []
         with dr.suspend_grad():
@@ -154,7 +154,7 @@ class GazeTrainer(Trainer, ABC):
             density = (1 - mix) * density + mix * batch.given_view(dr.exp(self.initial.log_blind(batch.r_o)))
         return density
 
-    def densities(self, targets: Targets) -> tuple[np.ndarray, np.ndarray]:
+    def densities(self, targets: GazeTargets) -> tuple[np.ndarray, np.ndarray]:
         """Densities (P, D) of the averaged weights in the directions of ``targets``, as the field is without its share
         of the blind density; and the blind density there."""
         parts, D = [], targets.truth.shape[1]
@@ -166,7 +166,7 @@ class GazeTrainer(Trainer, ABC):
         field, blind = (np.concatenate(v) for v in zip(*parts))
         return field, blind
 
-    def batches(self, targets: Targets) -> Iterator[Batch]:
+    def batches(self, targets: GazeTargets) -> Iterator[Batch]:
         """All of ``targets`` in all of their directions, some observers at a time."""
         data = TargetArrays(targets, self.ns)
         block, every = max(1, _CHUNK // data.directions), np.arange(data.directions)[None]
@@ -352,7 +352,7 @@ Listener = Callable[[GazeProgress], object]
 
 
 @dataclass
-class Fit:
+class GazeFit:
     """What a fit has come to."""
 
     # The `GazeTrainer`; None: of an earlier process, which kept no more than what was found.
@@ -383,29 +383,29 @@ class Fit:
         }
 
     @staticmethod
-    def of(found: dict, trainer: GazeTrainer | None = None, weights: dict | None = None) -> Fit:
+    def of(found: dict, trainer: GazeTrainer | None = None, weights: dict | None = None) -> GazeFit:
         """The fit of which ``found`` was kept."""
         scores = found.get("scores")
-        return Fit(trainer, weights or {}, **{**found, "scores": None if scores is None else Scores(*scores)})
+        return GazeFit(trainer, weights or {}, **{**found, "scores": None if scores is None else Scores(*scores)})
 
 
 def fit_watched(
-    targets: Targets,
-    watched: Targets | None,
+    targets: GazeTargets,
+    watched: GazeTargets | None,
     box: AnyBox,
     plan: GazePlan,
     ns: ModuleType,
     share: float,
     file: GazeRunFile,
     tell: Listener,
-) -> Fit:
+) -> GazeFit:
     """Train until the schedule ends, or validation on ``watched`` has not improved for ``patience`` looks. ``share``:
     of the minutes."""
     settings = plan.settings
     if settings.minutes is not None:
         settings = replace(settings, minutes=settings.minutes * share)
     trainer = plan.trainer(targets, box, plan.config, settings, ns, initial=plan.initial)
-    out = Fit.of(file.found, trainer, file.restore("fit", trainer))
+    out = GazeFit.of(file.found, trainer, file.restore("fit", trainer))
     out.schedule = settings.steps or 0
     looks, recent = np.arange(1, settings.looks + 1) / settings.looks, out.scores
     with Interruption() as stop:
@@ -437,8 +437,8 @@ def fit_watched(
 
 
 def fit_again(
-    targets: Targets, first: Fit, box: AnyBox, plan: GazePlan, ns: ModuleType, file: GazeRunFile, tell: Listener
-) -> Fit:
+    targets: GazeTargets, first: GazeFit, box: AnyBox, plan: GazePlan, ns: ModuleType, file: GazeRunFile, tell: Listener
+) -> GazeFit:
     """Train for as many steps as were best in the ``first`` fit, along the same schedule."""
     settings = replace(plan.settings, steps=first.best_step, minutes=None)
     trainer = plan.trainer(targets, box, plan.config, settings, ns, first.schedule, plan.initial)
@@ -454,7 +454,7 @@ def fit_again(
             )
     if interrupted:
         file.keep("refit", trainer, first.found(), {}, now=True)
-    return Fit(trainer, trainer.weights(), trainer.steps, first.schedule, first.scores, [], interrupted)
+    return GazeFit(trainer, trainer.weights(), trainer.steps, first.schedule, first.scores, [], interrupted)
 
 
 def _stopped(stop: Interruption, tell: Listener, progress: GazeProgress) -> bool:

@@ -22,7 +22,7 @@ from nerg_mi.maths.types import Float, UInt32
 from nerg_mi.transport.quadrature import mean_depth_share
 
 from .radiance_data import PixelBatch
-from .radiance_sampling import Samples, ray_sum, weights
+from .radiance_sampling import RaySamples, ray_sum, weights
 
 # ---- Losses ----
 #
@@ -50,7 +50,7 @@ def color_loss(color, opacity, pixels: PixelBatch, background, delta: float):
     return loss / 3
 
 
-def depth_loss(weight: Float, tau: Float, samples: Samples, depth: Float, margin: float | Float, scale: Float):
+def depth_loss(weight: Float, tau: Float, samples: RaySamples, depth: Float, margin: float | Float, scale: Float):
     """Loss a ray of the absorption's place against the true ``depth`` (as in `PixelBatch`); 0 where that is unknown.
 
     Two terms: the share of the light that is not absorbed within ``margin`` (scene units; a number, or a ray each) of
@@ -81,18 +81,18 @@ def feature_decay(features):
     return dr.mean(dr.square(features))
 
 
-def distortion_loss(weight, samples: Samples, scale: float):
+def distortion_loss(weight, samples: RaySamples, scale: float):
     """Loss a ray that draws its weight together: Σ_ij w_i w_j |m_i - m_j| + Σ_i w_i² δ_i / 3 with midpoints m and
     lengths δ of the samples, in units of ``scale`` (Barron et al. 2022, mip-NeRF 360, eq. 15; summed in O(n) as samples
     are in order). The samples' places have no derivative. Samples that stand for others count as one: the second term
     is then too large by 1/p of each."""
     length = samples.length / scale
     return ray_sum(
-        dr.custom(_Spread, weight, samples.t / scale + 0.5 * length, length, samples.segments), samples.segments
+        dr.custom(_Distortion, weight, samples.t / scale + 0.5 * length, length, samples.segments), samples.segments
     )
 
 
-class _Spread(dr.CustomOp):
+class _Distortion(dr.CustomOp):
     """Each sample's part of the distortion: 2 w_i (m_i Σ_{j<i} w_j - Σ_{j<i} w_j m_j) + w_i² δ_i / 3."""
 
     def eval(self, weight, middle, length, segments):
@@ -123,7 +123,7 @@ class _Spread(dr.CustomOp):
         return "distortion of a ray"
 
 
-def composite(sigma: Float, parts: list, samples: Samples) -> tuple[Float, Float, list[Float], Float]:
+def composite(sigma: Float, parts: list, samples: RaySamples) -> tuple[Float, Float, list[Float], Float]:
     """Weights, optical depths, sums of the ``parts`` of samples (colours, as a rule) and opacity of every ray.
 
     Of thinned samples the opacity is that of all, and a sum their mean times it: both without the noise of the

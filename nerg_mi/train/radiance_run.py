@@ -195,7 +195,7 @@ _LOOK_SAMPLES, _FINAL_SAMPLES = 2**20, 2**24
 
 
 @dataclass(frozen=True)
-class Progress:
+class RadianceProgress:
     """State of a run. ``done``: share 0..1; ``seconds``: so far; ``psnr``: the last held-out error in dB, or None;
     ``rays``, ``samples``: of the last step."""
 
@@ -213,7 +213,7 @@ def train_field(
     settings: RadianceSettings,
     ns: ModuleType,
     depth: bool = True,
-    on_progress: Callable[[Progress], None] | None = None,
+    on_progress: Callable[[RadianceProgress], None] | None = None,
     *,
     state: Path | None = None,
     resume: bool = False,
@@ -269,7 +269,9 @@ def train_field(
             try:
                 if on_progress is not None:
                     on_progress(
-                        Progress(trainer.progress, trainer.steps, trainer.seconds, trainer.rays, trainer.samples, last)
+                        RadianceProgress(
+                            trainer.progress, trainer.steps, trainer.seconds, trainer.rays, trainer.samples, last
+                        )
                     )
                 stop.check()
             except KeyboardInterrupt:

@@ -210,7 +210,7 @@ class StepTable:
 
 
 @dataclass
-class Rays:
+class CameraRays:
     """``o``, ``d``: Array3f origins and unit directions, world frame; ``t0``, ``t1``: where each crosses
     the box (empty where t1 <= t0); ``count``: how many."""
 
@@ -221,7 +221,7 @@ class Rays:
     count: int
 
 
-def rays_in_box(o, d, box: AnyBox, near: float) -> Rays:
+def rays_in_box(o, d, box: AnyBox, near: float) -> CameraRays:
     """Rays clipped to ``box``, from ``near`` on."""
     # Not maths.ray_box: of rays along a face a training may lose some, and is spared the selects that keep them.
     Float = type(d.x)
@@ -233,11 +233,11 @@ def rays_in_box(o, d, box: AnyBox, near: float) -> Rays:
         # fmin/fmax pass over the NaN of a ray that runs within a face.
         t0, t1 = dr.fmax(t0, dr.fmin(a, b)), dr.fmin(t1, dr.fmax(a, b))
     dr.eval(o, d, t0, t1)
-    return Rays(o, d, t0, t1, dr.width(o))
+    return CameraRays(o, d, t0, t1, dr.width(o))
 
 
 @dataclass
-class Samples:
+class RaySamples:
     """Packed steps of rays: ``ray`` index, ``t`` start and ``length`` (scene units), ``p`` midpoint
     (Array3f, world), and the rays' ``segments``. ``count``: real ones, the rest being padding; ``features``: what the
     density pass knew of them, or None; ``thinned``: of samples that stand for others; ``looked``: samples a ray of the
@@ -265,7 +265,7 @@ class Thinning:
     seed: int
 
 
-def occupied_steps(rays: Rays, table: StepTable, offset, occupied, most: int | None = None) -> tuple | None:
+def occupied_steps(rays: CameraRays, table: StepTable, offset, occupied, most: int | None = None) -> tuple | None:
     """Steps whose midpoints lie in the box and in an occupied cell: (ray, t, length, p), evaluated, and the rays
     covered.
 
@@ -296,7 +296,7 @@ def occupied_steps(rays: Rays, table: StepTable, offset, occupied, most: int | N
     return ray, t, length, p, covered
 
 
-def _step(rays: Rays, table: StepTable, offset, ray, k):
+def _step(rays: CameraRays, table: StepTable, offset, ray, k):
     Float = type(offset)
     t, length = table.interval(k, dr.gather(Float, offset, ray))
     middle = t + 0.5 * length
@@ -306,7 +306,7 @@ def _step(rays: Rays, table: StepTable, offset, ray, k):
 
 
 def visible_samples(
-    rays: Rays,
+    rays: CameraRays,
     table: StepTable,
     offset,
     occupied,
@@ -316,7 +316,7 @@ def visible_samples(
     thinning: Thinning | None = None,
     most: int | None = None,
     with_features: bool = False,
-) -> tuple[Samples | None, int]:
+) -> tuple[RaySamples | None, int]:
     """Samples that may matter, and the number of leading rays that they cover completely.
 
     ``density``: function of points and a mask giving σ without a gradient, and with ``with_features`` also a list of
@@ -368,4 +368,4 @@ def visible_samples(
         dr.eval(thinned.copies, thinned.before)
     dr.eval(ray, active, t, length, p, features)
     segments = Segments(ray, active, rays.count)
-    return Samples(ray, t, length, p, segments, min(count, pad or count), features, thinned, looked), covered
+    return RaySamples(ray, t, length, p, segments, min(count, pad or count), features, thinned, looked), covered

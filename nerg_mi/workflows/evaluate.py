@@ -18,19 +18,18 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze as evaluation
-from nerg_mi.evaluation.folds import mean_rows, means
 from nerg_mi.evaluation.gaze import (
     EPS,
     SCORES,
     SPLITS,
     Baseline,
-    Remembered,
+    CachedBaseline,
     gaze_field,
     score_table,
     standard_baselines,
 )
 from nerg_mi.evaluation.gaze_report import markdown, side_by_side, uncertainty_text, write_report
-from nerg_mi.evaluation.uncertainty import calibration_rows, position_rows, rank_rows
+from nerg_mi.evaluation.uncertainty import calibration_rows, mean_rows, means, position_rows, rank_rows
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_folder, file_sha256, write_text
@@ -131,10 +130,10 @@ def evaluate_gaze(
     # Most of the time goes to the densities of the field.
     known = lambda number: reporter.progress(0.05 + 0.6 * min(number / count, 1), f"position {number} of {count}")
     # Each table asks for the same densities.
-    members = Remembered(gaze_field(loaded, place.medium, place.align, depth, known).members)
+    members = CachedBaseline(gaze_field(loaded, place.medium, place.align, depth, known).members)
     field_density = lambda positions, directions: members(positions, directions).mean(axis=0)
-    kept = Remembered(blind)
-    methods = {"gaze field": field_density} | {k: kept if m is blind else Remembered(m) for k, m in others.items()}
+    kept = CachedBaseline(blind)
+    methods = {"gaze field": field_density} | {k: kept if m is blind else CachedBaseline(m) for k, m in others.items()}
     reporter.progress(0.05, "scores")
     told = lambda share: reporter.progress(0.65 + 0.2 * share, "scores") if share > 0 else None
     rows = evaluation.evaluate_gaze(test, methods, kept, options.resamples, seed, told)
@@ -319,7 +318,7 @@ _LEVELS = tuple(level_name(level) for level in LEVELS)
 
 @dataclass(frozen=True)
 class FoldResult:
-    """``rows``: a row a split and method, means over folds (`evaluation.folds.mean_rows`); ``each``: a row a fold,
+    """``rows``: a row a split and method, means over folds (`uncertainty.mean_rows`); ``each``: a row a fold,
     split and method; ``fields``: the checkpoint of each fold, where the store keeps it; ``files`` written;
     ``by_position``: a row a fold, split and position; ``uncertainty``: how well a signal ranks the errors of all folds'
     positions, in each split and in all of them ("anywhere"); ``calibration``: a row a split and method, means over

@@ -16,7 +16,7 @@ from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import study, study_tables, study_truth
-from nerg_mi.evaluation.study import Setting, settings
+from nerg_mi.evaluation.study import StudyRow, settings
 from nerg_mi.evaluation.study_subject import ExactSurfaces, FileSubject, Subject, open_subject
 from nerg_mi.figures.style import Provenance, files_among, provenance
 from nerg_mi.files.atomic import check_folder
@@ -163,7 +163,7 @@ def _expression(only: str) -> re.Pattern:
         raise NergError(f'"{only}" is no regular expression ({error}): name settings as in "depth|paper"') from error
 
 
-def _chosen(all_settings: list[Setting], wanted: re.Pattern, only: str) -> list[Setting]:
+def _chosen(all_settings: list[StudyRow], wanted: re.Pattern, only: str) -> list[StudyRow]:
     """The first of the settings, which is the default, and those whose names match."""
     default, *others = all_settings
     rows = [default, *(row for row in others if wanted.search(row.name))]
@@ -227,7 +227,7 @@ def planned_study(subject: Subject, scene: str | Path, options: StudyOptions) ->
 
 
 def _measured_in_parts(
-    common: PlannedStudy, subject: Subject, rows: Sequence[Setting], parts: Parts, out: Path
+    common: PlannedStudy, subject: Subject, rows: Sequence[StudyRow], parts: Parts, out: Path
 ) -> tuple[list[dict], list[dict], list[dict]]:
     """What `study.measure` finds of ``rows`` (the default first) and `study.scaling`, in parts; and who timed what:
     of each process its ``processor``, ``threads``, ``rows`` and, of the default there, the least and most ``seconds``.

@@ -28,8 +28,8 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.train import gaze_run
 from nerg_mi.train.gaze_data import Supervision, TargetNeeds, check_kernels, far_views, hold_out
 from nerg_mi.train.gaze_ensemble import train_ensemble
-from nerg_mi.train.gaze_folds import mixes
 from nerg_mi.train.gaze_recipes import FieldChoices, Recipe, gaze_recipe
+from nerg_mi.train.gaze_run import mixes
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan, GazeProgress, StateSettings
 from nerg_mi.train.geometry import GazePlace

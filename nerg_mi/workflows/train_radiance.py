@@ -224,7 +224,7 @@ def _tell_about(data: Dataset, reporter: Reporter) -> None:
     )
 
 
-def _progress(now: radiance_run.Progress) -> str:
+def _progress(now: radiance_run.RadianceProgress) -> str:
     left = now.seconds * (1 - now.done) / max(now.done, 1e-6)
     error = f", held out {now.psnr:.2f} dB" if now.psnr is not None else ""
     return f"{left:.0f} s left, step {now.steps}{error}"

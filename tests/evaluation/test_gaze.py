@@ -110,7 +110,7 @@ def test_probes_keep_their_weights(rays_baselines, weights):
 
 def test_a_remembered_density_is_asked_once_for_the_same_arrays():
     asked = []
-    method = gaze.Remembered(lambda *given: asked.append(1) or gaze.uniform()(*given))
+    method = gaze.CachedBaseline(lambda *given: asked.append(1) or gaze.uniform()(*given))
     positions, directions = np.zeros((2, 3)), fibonacci_directions(8)
     first = method(positions, directions)
     assert method(positions, directions) is first and len(asked) == 1

@@ -14,7 +14,6 @@ from scipy.stats import spearmanr
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, gaze_report, metrics, uncertainty
-from nerg_mi.evaluation.folds import mean_rows
 from nerg_mi.evaluation.gaze_report import (
     BETTER,
     UNDECIDED,
@@ -29,6 +28,7 @@ from nerg_mi.evaluation.gaze_report import (
     widening,
     write_report,
 )
+from nerg_mi.evaluation.uncertainty import mean_rows
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.probes import LEVELS, calibrated_levels, level_name, region_levels
 from tests.evaluation.test_gaze import crowd

@@ -152,7 +152,7 @@ def test_forward_mode_agrees_with_reverse_mode_of_samples_that_stand_for_others(
 def test_distortion_equals_its_double_sum_and_its_derivative_finite_differences():
     """Barron et al. 2022, eq. 15, over all pairs in float64; rays of 0, 1 and many samples, and padding."""
     from nerg_mi.train.radiance_losses import distortion_loss
-    from nerg_mi.train.radiance_sampling import Samples
+    from nerg_mi.train.radiance_sampling import RaySamples
 
     rng = np.random.default_rng(3)
     counts = [5, 0, 1, 17]
@@ -162,7 +162,7 @@ def test_distortion_equals_its_double_sum_and_its_derivative_finite_differences(
     t = np.concatenate([np.cumsum(length[ray == r]) for r in range(4)]).astype(np.float32)
     w = (rng.random(25) * active).astype(np.float32)
     segments = Segments(ns.UInt32(ray), ns.Bool(active), 4)
-    samples = Samples(ns.UInt32(ray), ns.Float(t), ns.Float(length), None, segments, 23)
+    samples = RaySamples(ns.UInt32(ray), ns.Float(t), ns.Float(length), None, segments, 23)
 
     def reference(w):
         out = np.zeros(4)

@@ -23,10 +23,10 @@ from nerg_mi.photos.salience import pixel_solid_angles
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import (
+    GazeTargets,
     Supervision,
     TargetArrays,
     TargetNeeds,
-    Targets,
     blind_of_rays,
     blind_of_views,
     box_exit,
@@ -72,7 +72,7 @@ def drawn():
     positions, truth, distance = rng.uniform(-1, 1, (3, 3)), rng.random((3, 4)), rng.uniform(1, 2, (3, 4))
     extent = np.array([4 * np.pi, 1.5, 0.5], np.float32)
     escaped, semantic = rng.random((3, 4)) < 0.5, rng.normal(size=(3, 4, 2)).astype(np.float16)
-    data = Targets(positions, directions, truth, distance, escaped, semantic, extent=extent)
+    data = GazeTargets(positions, directions, truth, distance, escaped, semantic, extent=extent)
     return data, TargetArrays(data, ns)
 
 
@@ -107,7 +107,7 @@ def test_only_views_are_given_what_they_show(drawn, known):
 def test_without_an_observer_there_is_nothing_to_gather():
     none = np.zeros((0, 4), np.float32)
     with pytest.raises(NergError, match="no probes to train on"):
-        TargetArrays(Targets(np.zeros((0, 3)), np.zeros((0, 4, 3)), none, none, none.astype(bool)), ns)
+        TargetArrays(GazeTargets(np.zeros((0, 3)), np.zeros((0, 4, 3)), none, none, none.astype(bool)), ns)
 
 
 # ---- The blind density: of rays by person or by ray, and put together from views ----
@@ -549,7 +549,7 @@ def made(count, seed=0, **more):
     directions = rng.normal(size=(count, 5, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
     truth, distance = rng.random((2, count, 5)).astype(np.float32)
-    return Targets(
+    return GazeTargets(
         rng.normal(size=(count, 3)).astype(np.float32),
         directions,
         truth,
@@ -653,7 +653,7 @@ def test_the_likelihood_is_given_the_view():
 def test_the_losses_of_a_density_do_not_see_its_scale_through_views():
     """But do for probes of rays that are beside them."""
     data = targets_of_views(around(3), PLACE, VIEW_TARGETS_PROBES)
-    sphere = Targets(
+    sphere = GazeTargets(
         data.positions,
         np.broadcast_to(fibonacci_directions(512), (3, 512, 3)).astype(np.float32),
         np.full((3, 512), 1 / (4 * np.pi), np.float32),

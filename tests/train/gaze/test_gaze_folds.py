@@ -1,9 +1,10 @@
-"""Tests of `nerg_mi.train.gaze_folds`."""
+"""Tests of `nerg_mi.train.gaze_run`."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
 from nerg_mi.train.gaze_ensemble import train_ensemble
-from nerg_mi.train.gaze_folds import (
+from nerg_mi.train.gaze_run import (
     CHOICE,
     SHARES,
     JudgedFolds,
@@ -21,10 +22,10 @@ from nerg_mi.train.gaze_folds import (
     _choose,
     _Judgement,
     _regions,
-    choose_mix,
     inner_folds,
+    judge_folds,
+    train_gaze,
 )
-from nerg_mi.train.gaze_run import train_gaze
 from nerg_mi.train.gaze_settings import ProbeSettings
 from nerg_mi.train.gaze_trainer import KIND, StateSettings
 
@@ -93,11 +94,8 @@ def test02_of_shares_that_cannot_be_told_apart_the_largest():
 def test04_a_field_counts_where_position_tells(law, kept, rgb):
     """Where all look at one point the field stays as it is; where each person has a way of their own, position tells
     nothing of others."""
-    from nerg_mi.fields.mlp import namespace
-
-    ns = namespace(rgb.Float(0))
     told = []
-    found = choose_mix(Supervision(people(law)), NOWHERE, plan_of(), ns, told.append)
+    found = judge_folds(Supervision(people(law)), NOWHERE, plan_of(), ns, told.append).choose()
     assert found is not None and told[-1].stage.startswith("fold") and 0 < told[-1].done <= 1
     assert found.regions is not None and 0 < found.regions["50%"] < found.regions["80%"] < found.regions["95%"] < 1
     if kept:
@@ -107,9 +105,7 @@ def test04_a_field_counts_where_position_tells(law, kept, rgb):
 
 
 def test05_of_a_training_and_of_an_ensemble(rgb):
-    from nerg_mi.fields.mlp import namespace
-
-    ns, rays = namespace(rgb.Float(0)), people(0.0)
+    rays = people(0.0)
     plan = plan_of(steps=20)
     field, about = train_gaze(Supervision(rays), NOWHERE, plan, ns)
     assert field.config.mix == about["mix"]["mix"] == SHARES[np.isclose(SHARES, about["mix"]["mix"])][0]
@@ -183,9 +179,7 @@ def test01_the_first_counts_unless_another_is_better_by_half_a_standard_error():
 def test02_what_foretells_those_who_are_held_out_is_trained(rgb):
     """A direction that all people share wherever they stand is in the blind density; one point that all look at, in
     the middle of a floor, needs emit where capture has one harmonic."""
-    from nerg_mi.fields.mlp import namespace
-
-    ns, told = namespace(rgb.Float(0)), []
+    told = []
     flat = replace(CAPTURE, sh_degree=1)
     plan = replace(two(), config=flat, alternatives=(replace(BOTH, reach=1.9, sh_degree=1),))
     field, about = train_gaze(Supervision(people(1.0)), NOWHERE, plan, ns, tell=told.append)
@@ -201,9 +195,7 @@ def test02_what_foretells_those_who_are_held_out_is_trained(rgb):
 
 @pytest.mark.parametrize("members", [0, 2])
 def test04_a_run_that_goes_on_keeps_what_was_chosen(members, tmp_path, rgb, monkeypatch):
-    from nerg_mi.fields.mlp import namespace
-
-    ns, supervision = namespace(rgb.Float(0)), Supervision(people(1.0))
+    supervision = Supervision(people(1.0))
     path, plan, steps = tmp_path / "a.run", two(steps=8), []
 
     def stop(progress):
@@ -224,7 +216,7 @@ def test04_a_run_that_goes_on_keeps_what_was_chosen(members, tmp_path, rgb, monk
         assert trained(state=state, tell=stop).provenance["interrupted"]
     chosen = read_checkpoint(path, KIND)[1]["about"][CHOICE]
     # Folds do not choose again.
-    monkeypatch.setattr("nerg_mi.train.gaze_folds.judge_folds", None)
+    monkeypatch.setattr("nerg_mi.train.gaze_run.judge_folds", None)
     tensors, meta = read_checkpoint(path, KIND)
     for wrong in ({"mix": 2.0, "folds": 1}, {"colour": 1}, "capture"):
         write_checkpoint(path, KIND, tensors, {**meta, "about": {**meta["about"], CHOICE: wrong}})
@@ -238,11 +230,9 @@ def test04_a_run_that_goes_on_keeps_what_was_chosen(members, tmp_path, rgb, monk
 
 
 def test05_ctrl_c_while_folds_choose_says_that_nothing_was_kept(rgb):
-    from nerg_mi.fields.mlp import namespace
-
     def stop(progress):
         if progress.stage.startswith("fold"):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt, match="emit_capture"):
-        train_gaze(Supervision(people(1.0)), NOWHERE, two(), namespace(rgb.Float(0)), tell=stop)
+        train_gaze(Supervision(people(1.0)), NOWHERE, two(), ns, tell=stop)

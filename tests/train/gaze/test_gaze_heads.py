@@ -16,7 +16,7 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.train import gaze_log_density, gaze_product
-from nerg_mi.train.gaze_data import Targets, targets_of_probes
+from nerg_mi.train.gaze_data import GazeTargets, targets_of_probes
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer, log_gaze, log_mean_exp
 from nerg_mi.train.gaze_product import ProductTrainer, gaze_density
 from nerg_mi.train.gaze_settings import KLD_EPS, GazeSettings
@@ -55,7 +55,7 @@ def targets(probes=6, count=512, seed=0):
     with np.errstate(divide="ignore"):
         t = (1.5 - positions[:, None, 0]) / d[..., 0]
     escaped = ~((t > 0) & (t < 10))
-    return Targets(
+    return GazeTargets(
         positions.astype(np.float32),
         d.astype(np.float32),
         truth.astype(np.float32),

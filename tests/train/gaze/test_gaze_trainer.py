@@ -27,7 +27,7 @@ from nerg_mi.train.gaze_product import ProductTrainer
 from nerg_mi.train.gaze_run import make_targets
 from nerg_mi.train.gaze_settings import GazeSettings
 from nerg_mi.train.gaze_trainer import (
-    Fit,
+    GazeFit,
     GazeRunFile,
     GazeTrainer,
     Scores,
@@ -67,9 +67,9 @@ def targets_fit():
 
 
 def test_what_was_found_is_kept_as_json():
-    fit = Fit(None, {}, 4, 9, Scores(1.0, 2.0, 0.5, 0.1, 1.0), [{"steps": 4, "kld": 2.0}], False, 2, 3)
-    assert Fit.of(json.loads(json.dumps(fit.found()))) == fit
-    assert Fit.of(Fit(None).found()).scores is None
+    fit = GazeFit(None, {}, 4, 9, Scores(1.0, 2.0, 0.5, 0.1, 1.0), [{"steps": 4, "kld": 2.0}], False, 2, 3)
+    assert GazeFit.of(json.loads(json.dumps(fit.found()))) == fit
+    assert GazeFit.of(GazeFit(None).found()).scores is None
     assert rounded(Scores(1 / 3, 2, 0.5, 0.1, 1)) == {"loss": 0.33333, "kld": 2, "cc": 0.5, "mae": 0.1, "integral": 1}
 
 

@@ -22,7 +22,7 @@ from nerg_mi.train.radiance_losses import (
     stack,
     unstack,
 )
-from nerg_mi.train.radiance_sampling import Samples, Segments
+from nerg_mi.train.radiance_sampling import RaySamples, Segments
 from nerg_mi.train.radiance_trainer import RadianceTrainer
 from tests.tiny import ball_pose
 
@@ -45,7 +45,7 @@ TAU = np.array([0.1, 0.7, 2.0, 3.0, 0.2, 40.0, 0.5, 0.3, 1.0])
 
 def samples():
     segments = Segments(ns.UInt32(RAY), dr.full(ns.Bool, True, len(RAY)), 3)
-    return Samples(ns.UInt32(RAY), ns.Float(T), ns.Float(LENGTH), None, segments, len(RAY))
+    return RaySamples(ns.UInt32(RAY), ns.Float(T), ns.Float(LENGTH), None, segments, len(RAY))
 
 
 def absorbed():
