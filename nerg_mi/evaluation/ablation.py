@@ -30,7 +30,6 @@ from .gaze import Baseline, GazeTest, make_test, map_scores
 # and on positions that were held out; normalised by the product of emit and capture of the same recipe. A frame is a
 # render of the gaze by the integrator, observer and camera in one place.
 
-
 COLUMNS = (
     "recipe",
     "variant",

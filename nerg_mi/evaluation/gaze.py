@@ -34,7 +34,6 @@ from . import metrics
 # densities in 1/sr that integrate to one; ``directions`` is (D, 3) for all
 # positions or (P, D, 3). All share the kernels of :mod:`nerg_mi.probes.kde`.
 
-
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Densities (P, D), 1/sr, of positions (P, 3) in directions (D, 3) or (P, D, 3)."""
 
@@ -276,7 +275,6 @@ def score_table(rows: list[dict], title: str) -> str:
 # Truth at a test position is the kernel density of the rays within R of it. Maps are compared over directions of equal
 # area, rays one by one as they are. What is uncertain is which people came: intervals are a bootstrap over persons, who
 # are drawn whole, with all of their rays (Efron & Tibshirani 1993).
-
 
 SPLITS = ("both", "pos", "people")
 """What may be new to a field: positions and people, positions, or people."""

@@ -141,7 +141,6 @@ def side_by_side(
 #
 # What `nerg eval gaze` has written, read again: the file ``gaze.json`` of its folder.
 
-
 MOST = 4 << 20
 """So many bytes of such a file are read at most."""
 
@@ -232,7 +231,6 @@ def _damaged(path: str | Path, why: str) -> NergError:
 # 1)), since a bootstrap of n people is too narrow by as much, and by Student's quantile of n - 1 degrees of freedom in
 # place of 1.96 (Hesterberg, What Teachers Should Know About the Bootstrap, 2015). Where only the two methods' own
 # intervals are known, the reach of the lead is the sum of theirs, which is never too small.
-
 
 LEAST_PEOPLE, LEAST_POSITIONS = 5, 10
 """Below these there is no verdict."""

@@ -57,7 +57,6 @@ def traced_operations(render) -> int:
 # comparison tolerance of 1e-5 (ours is the study's), gaze without a surface, and a sign of the shadow that shows what
 # is hidden. A normalised gaze field is divided by the integral that ``nerg`` finds: the paper has none.
 
-
 STEPS = 1024
 DT_GAMMA = 1 / 128
 """The step growth that the paper's code has by default for scenes larger than its unit cube."""
@@ -214,7 +213,6 @@ def march(medium, ray, t0, t1, active, painter, *, steps, shortest, longest, dt_
 # Which settings a study renders: sweeps of one factor around the scene's own, steps x quadrature, the paper's
 # marching.
 
-
 STEP_COUNTS = (16, 32, 64, 128, 256, 512, 1024, 2048, 4096)
 RESOLUTIONS = (16, 32, 64, 128)
 PAPER = "paper"
@@ -370,7 +368,6 @@ def _paper(quick: bool) -> list[StudyRow]:
 # Time is the median of several renders of a finished kernel; the rounds go over all settings in turn, so that a busy
 # moment of the machine falls on all of them alike. Evaluations are counted in a render of their own, since counting
 # costs time.
-
 
 COLUMNS = (
     "setting",

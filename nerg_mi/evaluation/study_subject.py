@@ -63,7 +63,6 @@ def extent(integrator) -> float | None:
 # Three kinds: analytic scenes and scenes of shapes, with float64 references, and scene files with a field, whose
 # reference is a render with much smaller steps.
 
-
 KINDS = ("auto", "analytic", "file")
 AOVS = "depth,opacity,visibility,gaze"
 FALLOFF = 0.1

@@ -17,7 +17,6 @@ from .study import COLUMNS, PAPER
 #
 # What follows from a study's rows: the Pareto front, the comparison with the paper's marching, and the files.
 
-
 FRONTS = ("color_rmse", "depth_mae", "visibility_mae", "gaze_mae")
 """The errors that are set against time; a row's ``pareto`` names those for which it is on the front."""
 
@@ -203,7 +202,6 @@ def _timed_by(who: list[dict]) -> str:
 # ---- Plots ----
 #
 # Pictures of a study: error against time with the Pareto front, and cost against size on log axes.
-
 
 PANELS = (
     ("color_rmse", "colour RMSE [linear radiance]"),

@@ -28,7 +28,6 @@ from .study_scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene
 # and a moment by composite Gauss-Legendre quadrature (32 panels of 16 nodes: the integrands are analytic, so it is
 # exact to rounding).
 
-
 PANELS, NODES = 32, 16
 SOLID = 1.0
 """Density (1/unit) that counts as a solid in a scene of hard surfaces; the vacuum between has 1e-4."""
@@ -241,7 +240,6 @@ def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
 #
 # How far a picture is from the truth: the errors that a study reports.
 
-
 SURFACE = 0.5
 """Opacity from which on a ray meets a surface."""
 TRACE = 1e-3
@@ -396,7 +394,6 @@ def compute_truth_of_shapes(subject, seed: int, visibility: str, color: np.ndarr
 #
 # What can be set of Gaussian splats: they are not marched, but cut off, each at so many standard deviations, and rays
 # end where little light is left.
-
 
 EXTENTS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
 STOPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)

@@ -168,7 +168,6 @@ def _risk(doubt: np.ndarray, error: np.ndarray, share: float) -> float:
 # Y. Grandvalet 2004): the interval tells the spread over people and zones that were held out, and not what a new shop
 # would give. Differences are taken fold by fold, where most of that spread is the same for both methods.
 
-
 SPLIT_HALF = "split half"
 """A reference and no method: what half of the people tell of the other half."""
 _SCORES = (*SCORES, "integral")

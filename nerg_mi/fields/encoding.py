@@ -133,7 +133,6 @@ class Encoding(Protocol):
 #
 # The encodings of positions that there are, by the kind that a file names and by the type of their configuration.
 
-
 DEFAULT_KIND = "hashgrid"
 """What a configuration in a file is of that names no kind, as no file did when there was no other."""
 
@@ -194,7 +193,6 @@ def encoding_of(
 # rows rounded up to a multiple of 8, scales in float32, and zero outside of the
 # unit cube. A level whose (resolution + 1)^3 vertices do not fit in the table is
 # hashed with the primes of the paper.
-
 
 _PRIMES = (1, 2654435761, 805459861)
 

@@ -23,7 +23,6 @@ _BISECTIONS = 8
 # Tilted directions beside the head-on one that a surface's colour is the mean of.
 _TILTED = 4
 
-
 # Densities of a lattice are held in single precision, all at once.
 _MOST_CELLS = 1 << 30
 

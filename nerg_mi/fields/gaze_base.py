@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 #
 # What a picture of gaze rests on: how many rays, of how many people.
 
-
 _MOST = 1 << 60
 
 
@@ -75,7 +74,6 @@ def _count(number: int, one: str, several: str) -> str:
 #
 # Rays are kept as cells of R/2 with their number, mean origin and variance. The sum over a cell within reach follows
 # from these exactly. In one that the reach cuts, the squared distances are taken to be spread uniformly.
-
 
 CELLS = 2
 """Cells along R."""
@@ -144,7 +142,6 @@ SIZE_LIMITS = {"width": 4096, "geometry": 4096, "hidden": 64, "layers": 64, "sh_
 #
 # Positions and directions are Dr.Jit 3-arrays of the field's backend, in the field's own frame and units; directions
 # are unit vectors, and ``r_o`` points from the observer to the surface. Densities do not change with scale.
-
 
 LARGEST = 1e6
 """No stored weight is larger; products of a network's layers then stay in single precision."""

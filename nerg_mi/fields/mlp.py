@@ -69,7 +69,6 @@ def aligned(array: np.ndarray, dtype: type = np.float32) -> np.ndarray:
 # registers. The products and their order are the same, and so are the results, to the bit. The price is compilation:
 # some seconds once for each kernel and each set of weights.
 
-
 _APART = 2048
 """Products from which on a network becomes a function of its own within a kernel: compilers take more than
 proportionally long over long functions."""

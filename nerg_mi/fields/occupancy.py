@@ -18,7 +18,6 @@ from nerg_mi.maths.types import Array3f, Bool, UInt32
 # to the nearest occupied cell (chessboard metric) lets a ray leap over many empty
 # cells with one look-up.
 
-
 _FAR = 255
 
 
@@ -354,7 +353,6 @@ def _mark(cells: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
 # The cells that training leaves on hold a wall and the air on both sides of it, and a ray pays for each step in them.
 # Of their parts those stay that were found to hold something (``refinement``). Distances are kept a cell, parts are
 # looked up in occupied cells only: two tables of a byte a cell, where a grid of parts would take eight.
-
 
 PARTS = 2
 """Parts of a cell along each axis."""

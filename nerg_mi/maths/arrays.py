@@ -17,7 +17,6 @@ from .types import Float
 # kernel, as the distance of its components, and an array that begins anywhere has a kernel of its own, too, whose loads
 # expect no alignment: both are compiled anew where another number of rays is traced.
 
-
 ALIGNMENT = 64
 """Bytes: the widest packet's."""
 

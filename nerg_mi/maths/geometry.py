@@ -133,7 +133,6 @@ class Box:
 # which fills the cube [-2, 2]^3 as m grows without bound. Only where a field is *encoded* is anything contracted:
 # positions, distances and densities are those of the scene everywhere, and rays are straight.
 
-
 REACH = 64.0
 """Half edges of the inner cube at which a place ends that knows no end: what lies farther away moves by less than a
 pixel as cameras within the cube walk about, and may as well stand there."""

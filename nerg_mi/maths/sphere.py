@@ -14,7 +14,6 @@ from .types import UInt32, Vector3f, variant_types
 # Directions are (N, 3) float64, unit. Solid angles are in steradian and sum to
 # 4π, so that ``sum(density * solid_angle)`` is the integral of a density.
 
-
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -160,7 +159,6 @@ def _from_height(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
 #
 # Order and signs are those of Gaussian splats, of instant-ngp and of Dr.Jit's ``sh_eval``: l = 0..3, m = -l..l, with
 # the Condon-Shortley phase.
-
 
 C0 = 0.28209479177387814
 """The harmonic of degree 0, a constant: 1 / (2 sqrt(pi))."""

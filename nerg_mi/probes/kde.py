@@ -25,7 +25,6 @@ from nerg_mi.maths.vmf import log_normaliser
 # ``silverman``: the published code's rule (:func:`nerg_mi.maths.vmf.silverman_kappa`). ``loo``: the κ under which each
 # ray is best predicted by the others. Each for every probe, or one for all of them.
 
-
 KAPPA_MIN = 1.0
 PROBES = 256  # probes that speak for all where one κ is sought
 
@@ -121,7 +120,6 @@ def silverman_kappas(
 # A probe p holds a run of ray directions μ_i with weights w_i that sum to one, and one concentration:
 # p(x) = Σ_i w_i f(x; μ_i, κ_p), f von Mises-Fisher (NeRG, Section 5.1). It integrates to one over the sphere whatever κ
 # is.
-
 
 Backend = str | ModuleType | dr.ArrayBase | None
 """Where a density is evaluated: a name such as ``"llvm"``, a namespace of Dr.Jit's arrays, an array, or None for that
@@ -278,7 +276,6 @@ class SphericalKde:
 # A density of kernels is smooth on the scale 1/sqrt(κ). So it is evaluated exactly at the texels of a cube map whose
 # spacing is a fraction of that, and in between by cubic interpolation: a lookup costs sixteen values, however many rays
 # the probe holds.
-
 
 SPACING = 0.15
 """Texels' distance in units of 1/sqrt(κ). The error of the cubic interpolation goes with its fourth power; at 0.15 it

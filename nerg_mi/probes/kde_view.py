@@ -23,7 +23,6 @@ from .probes import Probes, place_probes
 #
 # What the paper shows beside its field (Section 5.3), there in five seconds a frame and more.
 
-
 METHODS = ("auto", "exact", "table")
 WORTH = 4096  # directions from which on a table is quicker
 

@@ -105,7 +105,6 @@ def _darts(origin: np.ndarray, spacing: float, rng: np.random.Generator) -> np.n
 # A probe gathers the rays whose origins lie within R of a position and turns
 # their directions into a density on the sphere (NeRG, Section 5.1).
 
-
 KAPPA_RULES = ("silverman", "loo", "fixed")
 WEIGHTS = ("equal", "distance", "person")
 CENTRES = ("mean", "query")
@@ -294,7 +293,6 @@ def _weighted_means(values: np.ndarray, weights: np.ndarray | None, offsets: np.
 # What a probe's density is like: its integral, its entropy, how many rays and people it rests on, and samples of
 # it.
 
-
 _LEAST, _MOST = 2048, 1 << 17
 
 
@@ -364,7 +362,6 @@ def _average(probes: Probes, count: int | None, backend: Backend, of: Callable[[
 # gaze holds more or less of theirs. Looks that were held out tell by how much: the share that has to be asked for is
 # the quantile of the shares in which they lie (split conformal prediction, Vovk et al. 2005, with highest-density
 # regions, Izbicki et al. 2022).
-
 
 LEVELS = (0.5, 0.8, 0.95)
 """Shares of the gaze whose smallest regions are looked at."""

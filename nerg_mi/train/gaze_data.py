@@ -116,7 +116,6 @@ def heads_box(positions: np.ndarray, box: AnyBox) -> tuple[tuple[float, ...], tu
 # What a gaze field takes over from a radiance field: its features along the observers' rays, the paper's semantic
 # variants.
 
-
 BATCH = 1 << 18
 """Rays whose features are computed in one launch."""
 

@@ -61,7 +61,6 @@ from .trainer import kept_unless
 # needs none of it in the first folds, the others are left out. The same looks that were held out tell which regions of
 # the mixture hold 80 % of the gaze of others.
 
-
 SHARES = np.linspace(0.05, 1.0, 20)
 """Shares of the blind density that are tried: never none, so that no density is zero."""
 MINUTES = 0.5
@@ -276,7 +275,6 @@ def _choose(curves: np.ndarray) -> MixChoice:
 #
 # Where no surfaces are known, emit is told of points at one distance whatever is there. In some places it tells where
 # others look from elsewhere all the same, in others it follows whom it has seen: those who are held out tell which.
-
 
 CHOICE = "choice"
 """Entry of what a run must agree on (``GazePlan.identity``): what was chosen before it began."""

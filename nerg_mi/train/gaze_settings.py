@@ -163,7 +163,6 @@ def _shares(Float: type, directions: int, n: int, solid_angle: Any) -> Any:
 #
 # What a gaze field is trained with: how rays become probes, and how the weights are moved.
 
-
 LOSSES = {"paper": PAPER, "code": CODE, "likelihood": {"kld": 1.0, "cc": 0.0, "mae": 0.0}}
 """Weights of the parts of each loss; of the likelihood, which rays give, those by which a validation is judged."""
 

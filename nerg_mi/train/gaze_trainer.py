@@ -189,7 +189,6 @@ class GazeTrainer(Trainer, ABC):
 #
 # The whole state of a gaze training in a file: of both of its fits, and of what validation has found so far.
 
-
 KIND = "gaze run"
 STAGES = ("fit", "refit")
 

@@ -36,7 +36,6 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 # spend nearly every voxel on air. So the box gives up hit points where that saves most voxels for each of them; those
 # beyond it are drawn where their rays leave it (its shell), in their true directions at too short a distance.
 
-
 VOXEL = 0.08
 """Edge of a voxel in metres where none is asked for and the place is not too large for it."""
 
@@ -305,10 +304,8 @@ def shade_hits(density: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tup
 #
 # Where people looked around: what a gaze field's depths are traced in, and the frame that it lives in.
 
-
 NOWHERE = 2.0
 """How far away everything is taken to be where no geometry is known, in the field's units."""
-
 
 _STRAY, _AROUND = 0.002, 0.02
 """Share of Gaussians that may lie beyond each side of the box of splats, and what is added around the others."""

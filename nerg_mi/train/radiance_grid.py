@@ -19,7 +19,6 @@ from nerg_mi.photos.cameras import Camera, view_tangents
 # A cubic grid over the field's unit cube, x varying fastest, as instant-ngp keeps it: each cell
 # remembers a decaying maximum of the optical depth that one step finds in it.
 
-
 _DECAY = 0.6
 # A share of the cells is refreshed at a time; the strides walk over all of them.
 _PARTS = 8

@@ -183,7 +183,6 @@ def _forgotten(trainer):
 #
 # A whole radiance training: from a data set to a checkpoint, with its held-out error on the way.
 
-
 KIND = "radiance run"
 # Shares of the run at which the held-out error is looked at.
 _LOOKS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)

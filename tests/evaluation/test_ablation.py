@@ -129,13 +129,8 @@ def test_the_loss_is_the_papers():
 
 # ---- The time of a frame: of what there is to render, and without the first one, which compiles ----
 
-
 BOX = Box((-1, -1, -1), (1, 1, 1))
-
-
 CENTRES = np.array([[0.1, 0, 0.2], [-0.2, 0.1, 0]])
-
-
 ROOM = '<scene version="3.0.0"><shape type="cube"><boolean name="flip_normals" value="true"/></shape></scene>'
 
 

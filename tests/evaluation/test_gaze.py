@@ -25,7 +25,6 @@ from tests.reference.kde import kde as reference
 
 # ---- Baselines ----
 
-
 X = fibonacci_directions(1024)
 
 
@@ -317,12 +316,8 @@ def test_halves_of_the_people_are_compared_where_both_were(rays_evaluation, test
 # What is scored is what is rendered: the field's densities at positions against the integrator's pictures, for every
 # kind of field.
 
-
 BOX = Box((-1, -1, -1), (1, 1, 1))
-
-
 EYES = [(0.1, -0.2, 0.3), (-0.4, 0.3, -0.1)]
-
 
 ROOM = """<scene version="3.0.0">
   <shape type="cube"><boolean name="flip_normals" value="true"/>

@@ -37,7 +37,6 @@ from tests.evaluation.test_gaze import crowd
 #
 # What an evaluation of gaze writes: cells by hand, files that are valid, and pictures of what was asked for.
 
-
 ROWS = [
     {
         "method": "field",
@@ -117,16 +116,12 @@ def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
 
 # ---- Results are read as they were written, and what is none is a sentence ----
 
-
 RESULTS_ROWS = [
     {"method": "gaze field", "bits": 0.5, "KLD": float("nan")},
     {"method": "uniform", "bits": 0.0, "KLD": 1.0},
 ]
 
-
 PERSONS = [{"method": "gaze field", "person": "Ada", "rays": 4, "bits": 0.1}]
-
-
 ABOUT = {"gaze": "g.safetensors", "split": "both", "kappa": 20.0, "positions": 12}
 
 

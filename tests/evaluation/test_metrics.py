@@ -163,19 +163,10 @@ def test_a_picture_smaller_than_the_window_has_no_similarity(size):
 
 # ---- Metrics against the constants of pysaliency's tests and a closed form on the sphere ----
 
-
 y, x = np.mgrid[0:40, 0:40]
-
-
 MODEL = np.exp(-0.5 * ((x - 20.0) ** 2 + (y - 20.0) ** 2) / np.sqrt(40**2 + 40**2)).ravel()
-
-
 GOLD = np.exp(-0.5 * ((x - 10.0) ** 2 + (y - 25.0) ** 2) / 30).ravel()
-
-
 FIXATIONS = [(0, 10), (1, 11), (2, 12), (2, 12), (2, 12), (1, 21), (5, 25), (3, 33)]  # x, y
-
-
 AT_GAZE = np.array([MODEL[fy * 40 + fx] for fx, fy in FIXATIONS])
 
 

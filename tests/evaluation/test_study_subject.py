@@ -19,7 +19,6 @@ from tests.reference import march_numpy
 
 # ---- The settings of an integrator as they are read back ----
 
-
 NONE_OF_A_STUDY = {"aovs", "ceiling", "up"}
 
 
@@ -60,7 +59,6 @@ def test_all_settings_are_read_back_and_make_the_same_integrator(rgb):
 #
 # What a study knows of its subjects: where surfaces are, and the limit that a scene file is compared with.
 
-
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="40"/></volume>
     <sensor name="observer" type="perspective">
@@ -70,7 +68,6 @@ SCENE = """<scene version="3.0.0">
     <transform name="to_world"><lookat origin="2.5, -1.5, 1.8" target="0.5, 0.5, 0.5" up="0, 0, 1"/></transform>
     <film type="hdrfilm"><rfilter type="box"/><string name="component_format" value="float32"/></film></sensor>
 </scene>"""
-
 
 # The unit cube, which the medium fills.
 TWIN = """<scene version="3.0.0"><shape type="cube">
@@ -145,7 +142,6 @@ def test_a_scene_file_is_compared_with_its_own_limit(rgb, tmp_path):
 
 
 # ---- Scenes with gaze fields of every kind ----
-
 
 BOX = Box((-3, -3, -3), (3, 3, 3))
 SCENE_GAZE = """<scene version="3.0.0">

@@ -29,14 +29,12 @@ def row(group, seconds, error, pareto=""):
 
 ALL = "color depth visibility gaze"
 
-
 ROWS = [
     row("default", 0.02, 1e-3, ALL),
     row("steps", 0.01, 2e-3, ALL),
     row("steps", 0.16, 0.0, ALL),
     row("paper", 0.08, 5e-3),
 ]
-
 
 SCALING = [
     {"axis": axis, "value": v, "seconds": 0.1 * v**p}

@@ -51,7 +51,6 @@ def test_errors_of_known_pictures():
 
 # ---- References against closed forms and brute force ----
 
-
 NAMES = list(study_scenes.SCENES)
 
 
@@ -174,7 +173,6 @@ def test_a_grid_tends_to_its_density():
 
 # ---- The study of a scene of shapes alone: its reference, and what it finds ----
 
-
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg">
     <sensor name="observer" type="perspective">
@@ -289,7 +287,6 @@ def test06_a_normalised_gaze_is_divided_by_the_integral_of_all_directions(rgb):
 
 
 # ---- Gaussian splats as a subject of a study: what is set of them, and what they are compared with ----
-
 
 SPLATS_SCENE = """<scene version="3.0.0"><integrator type="nerg"><volume name="field" type="splats">
     <string name="filename" value="a.ply"/><string name="color_space" value="linear"/>

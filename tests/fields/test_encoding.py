@@ -50,7 +50,6 @@ def test03_degree_out_of_range(degree):
 #
 # The hash grid against a restatement of torch-ngp's kernel, its published sizes, and central differences.
 
-
 SMALL = HashGridConfig(levels=4, log2_rows=12, base=4, finest=64)
 
 
@@ -242,7 +241,6 @@ def test13_an_evaluation_leaves_no_cycles():
 
 
 # ---- The register of encodings: kinds in files, and what is no encoding ----
-
 
 CONFIG = HashGridConfig(levels=2, log2_rows=6, base=2, finest=4)
 

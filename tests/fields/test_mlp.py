@@ -49,7 +49,6 @@ def test_arrays_are_aligned_copies(dtype):
 
 # ---- Networks: cooperative vectors, tensor products and NumPy agree, with their gradients ----
 
-
 SIZES = [[3, 1], [8, 16, 5], [6, 16, 16, 3]]
 
 
@@ -183,7 +182,6 @@ def test02_in_loops_and_branches(sizes):
 
 # ---- Fields with constant weights, and when these are in the way ----
 
-
 GRID = HashGridConfig(levels=2, log2_rows=8, base=2, finest=8)
 BOX = Box((0, 0, 0), (1, 1, 1))
 
@@ -310,7 +308,6 @@ def test07_normalised_layers_stay_as_they_are():
 
 
 # ---- Networks, their gradients and one gaze field against torch ----
-
 
 RNG = np.random.default_rng(0)
 

@@ -14,7 +14,6 @@ from nerg_mi.maths.geometry import Box, ContractedBox
 
 # ---- Cascades of occupancy against all cells of the finest size, one by one ----
 
-
 R = 4
 
 
@@ -231,7 +230,6 @@ def test_bytes_that_do_not_fit():
 
 
 # ---- Refinement: what a finer bound keeps of analytic densities ----
-
 
 BOX = Box((-1, -2, 0), (3, 2, 2))
 R_REFINEMENT = 16

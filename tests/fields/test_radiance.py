@@ -27,10 +27,7 @@ from tests.reference import fields_numpy as reference
 #
 # What lies behind a field: where a ray leaves the sphere about it, whatever it comes from, and sizes that must fit.
 
-
 GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8, dimensions=2)
-
-
 CONFIG = BackgroundConfig(2.5, GRID, width=16)
 
 
@@ -98,7 +95,6 @@ def test_what_does_not_belong_together_is_refused():
 
 # ---- How a deferred field makes colours of features, against NumPy, and where rays meet next to nothing ----
 
-
 RNG = np.random.default_rng(0)
 
 
@@ -159,13 +155,8 @@ def test_nothing_is_infinite_however_little_a_ray_meets(opacity):
 
 # ---- The radiance field against its NumPy version, and its handling of parameters ----
 
-
 RADIANCE_GRID = dict(levels=4, features=2, log2_rows=12, base=4, finest=32)
-
-
 RADIANCE_CONFIG = RadianceConfig(grid=HashGridConfig(**RADIANCE_GRID), width=16, geometry=7, density_scale=2.5)
-
-
 BOX = Box((-1, 0, 2), (3, 2, 4))
 
 

@@ -45,7 +45,6 @@ def test03_another_number_is_no_other_kernel(rgb):
 
 # ---- 1 - exp(-x) and log(1 + x) against the C library's expm1 and log1p in double precision ----
 
-
 EPS = np.finfo(np.float32).eps
 
 

@@ -98,10 +98,7 @@ def test06_numpy_values_there_and_back(dtype):
 #
 # Colours fitted from one picture to another: known corrections are found, and the scored half is never looked at.
 
-
 A = np.array([[0.8, 0.05, 0.0], [0.0, 0.9, -0.04], [0.02, 0.0, 1.1]])
-
-
 B = np.array([0.05, -0.02, 0.01])
 
 

@@ -20,7 +20,6 @@ from tests.reference import march_numpy as reference
 
 # ---- The box of a field and its map to the unit cube ----
 
-
 BOX = Box((-1, 0, 2), (3, 2, 3))
 
 
@@ -69,7 +68,6 @@ def test05_wrong_corners(lower, upper, words):
 
 
 # ---- The contraction against its formula in float64, and the way back ----
-
 
 CORE = Box((-1.0, 2.0, -0.5), (3.0, 5.0, 1.5))
 
@@ -140,7 +138,6 @@ def test_the_core_is_bounded_by_its_corners():
 
 
 # ---- The slab tests against the same in float64, on ordinary and on awkward rays ----
-
 
 LOWER, UPPER = (-1, 0, 2), (3, 2, 4)
 
@@ -287,7 +284,6 @@ def test04_the_identity_returns_what_it_is_given(rgb):
 
 
 # ---- Coordinates of surveys are refused by every reader, with the offset to subtract ----
-
 
 ROOM = np.random.default_rng(0).uniform((0, 0, 0), (6, 4, 3), (200, 3))
 UTM = (500_000.0, 5_600_000.0, 0.0)

@@ -14,7 +14,6 @@ from tests.reference.kde import kde as reference
 
 # ---- Frame ----
 
-
 OBSERVER = np.array([1.0, 1.0, 1.6])
 
 
@@ -76,7 +75,6 @@ def test_refusals(rays_frame):
 #
 # The density of the rays nearest to an observer, in the scene's frame: exact sums for few directions, a table for
 # many.
-
 
 COUNT, KAPPA = 40, 15.0
 

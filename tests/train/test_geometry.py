@@ -38,7 +38,6 @@ from tests.train.gaze.looks import looking_at
 
 # ---- Places of hit points that reach far: an office with windows, in closed form ----
 
-
 ROOM = np.array([[0.0, 0.0, 0.0], [8.0, 6.0, 3.0]])
 WINDOW = np.array([[1.0, 0.8], [5.0, 2.4]])
 """In the wall x = 8: y and z of two corners."""

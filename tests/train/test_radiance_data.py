@@ -14,9 +14,7 @@ from tests.reference import opencv
 
 # ---- The pixel bank against the views that it was made of ----
 
-
 PLAIN = Intrinsics(24, 18, 20.0, 21.0, 11.0, 9.5)
-
 
 LENSES = [
     PLAIN,
@@ -176,7 +174,6 @@ STRONG = {
     "rational": replace(PLAIN, k1=0.9, k2=0.6, k3=0.3, k4=0.5, k5=0.3, k6=0.2),
     "denominator": replace(PLAIN, k4=-0.35, k5=-0.2, k6=-0.1),
 }
-
 
 FISHEYES = {
     "rising": replace(PLAIN, fx=9.0, fy=8.5, k1=0.05, k2=0.02, k3=0.01, k4=0.002, fisheye=True),

@@ -195,7 +195,6 @@ def test_distortion_equals_its_double_sum_and_its_derivative_finite_differences(
 
 # ---- Marching: each candidate has its ray and step, and no step of a training takes on more than it may ----
 
-
 BOX = Box((-1, -1, -1), (1, 1, 1))
 
 

@@ -73,7 +73,6 @@ def stopping(stage, step):
 
 # ---- Views of a law: what an observer sees of it through a lens ----
 
-
 LENS = Intrinsics(24, 18, 14.0, 14.0, 12.0, 9.0, k1=-0.08)
 TARGET = np.array([1.9, 0.5, 1.6])
 

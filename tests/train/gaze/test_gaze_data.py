@@ -247,10 +247,7 @@ def test_the_blind_density_is_made_for_whoever_needs_it(rays, wall):
 
 # ---- Gaze fields that learn on a radiance field's features, and such that begin as its trunk ----
 
-
 SEMANTICS_BOX = Box((-2, -2, 0), (2, 2, 3))
-
-
 SEMANTICS_PROBES = ProbeSettings(radius=0.5, count=12, cap=64, min_rays=8, kappa=20.0, directions=64)
 
 
@@ -606,10 +603,7 @@ def test_features_are_those_of_a_radiance_field():
 
 # ---- Views as targets: what they hold, likelihood and losses given a view, a law learnt from views ----
 
-
 PLACE = GazePlace(None, VIEW_TARGETS_BOX, "none")
-
-
 VIEW_TARGETS_PROBES = ProbeSettings(directions=512, radius=0.25, min_rays=1)
 
 

@@ -33,7 +33,6 @@ from .looks import LIKELIHOOD, LOG, NOWHERE, planned
 
 # ---- The share of the blind density: chosen by people and places that are held out ----
 
-
 PROBES_HERE = ProbeSettings(radius=0.3, count=48, min_rays=1, kappa=20.0, directions=128, weights="person")
 
 
@@ -141,7 +140,6 @@ def test07_regions_are_those_of_the_mixture():
 # ---- Variants ----
 #
 # Which architecture a place gets: by people and positions that are held out, once, and kept for a run that goes on.
-
 
 CAPTURE, BOTH = replace(LOG, variant="capture", geometry="none"), replace(LOG, geometry="none")
 

@@ -28,7 +28,6 @@ from .looks import SMALL as PRODUCT
 #
 # Likelihood training: the loss is the divergence, a validation sees the field's density, a law is learnt.
 
-
 FAST = GazeSettings(
     steps=150,
     loss="likelihood",

@@ -23,10 +23,7 @@ from .looks import BOX, NOWHERE
 
 # ---- Losses ----
 
-
 P, D = 5, 128
-
-
 W = latlong_grid(16, 8)[1]
 
 
@@ -155,7 +152,6 @@ def test_the_papers_size_is_the_papers():
 
 
 # ---- Recipes: what they make of choices and places, and what they take ----
-
 
 HITS = GazePlace(None, BOX, "hits")
 SCENE = GazePlace(None, BOX, "scene")

@@ -57,7 +57,6 @@ from .looks import (
 
 # ---- Fits: what is kept of them, when they end, how long the second one is ----
 
-
 NO_FILE = GazeRunFile(None, {})
 
 
@@ -151,7 +150,6 @@ def test_minutes_are_those_of_both_fits(wall, monkeypatch):
 
 
 # ---- Plans: what a run must agree on to be gone on with ----
-
 
 MOVED = replace(NOWHERE, align=Similarity(np.diag([2.0, 2, 2, 1])))
 

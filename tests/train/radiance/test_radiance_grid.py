@@ -13,10 +13,7 @@ from nerg_mi.train.radiance_grid import DensityGrid, Settling
 #
 # Which cells a training samples: what cameras see, what has density, what surface points hold, and what is stored.
 
-
 BOX = Box((-1, -1, -1), (1, 1, 1))
-
-
 R = 8
 
 

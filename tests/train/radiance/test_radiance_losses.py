@@ -30,16 +30,9 @@ from .ball import BOX, TINY, ball, settings
 
 # ---- What radiance training is fitted to, against NumPy: colours and the place of absorption ----
 
-
 RAY = np.array([0, 0, 0, 0, 1, 1, 1, 2, 2])
-
-
 T = np.array([0.5, 1.0, 1.5, 2.0, 0.2, 0.4, 3.0, 1.0, 1.2])
-
-
 LENGTH = np.array([0.5, 0.5, 0.5, 0.25, 0.2, 0.1, 1.0, 0.2, 0.4])
-
-
 TAU = np.array([0.1, 0.7, 2.0, 3.0, 0.2, 40.0, 0.5, 0.3, 1.0])
 
 

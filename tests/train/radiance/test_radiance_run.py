@@ -25,7 +25,6 @@ from .ball import BOX, LENS, RADIUS, TINY, ball, settings, state, trainer
 
 # ---- The share of pixels beyond a box, where depths are known in closed form ----
 
-
 WIDE = Intrinsics(40, 20, 40.0, 40.0, 20.0, 10.0)
 
 
@@ -221,7 +220,6 @@ def test_nothing_is_compiled_once_fog_has_cleared(dataset):
 
 
 # ---- A place without an end: a ball before a far wall ----
-
 
 FAR = 6.0
 

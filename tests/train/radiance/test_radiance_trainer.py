@@ -31,10 +31,7 @@ from .ball import BOX, TINY, settings
 
 # ---- The trainer's own pictures against a march in NumPy, pixel by pixel, and PSNR by its definition ----
 
-
 LENS = Intrinsics(13, 9, 12.0, 12.0, 6.5, 4.5)
-
-
 STEP, NEAR = 0.1, 0.3
 
 
@@ -121,7 +118,6 @@ def test_empty_cells_and_pictures_of_nothing():
 
 
 # ---- The radiance trainer on a tiny place: it repeats itself, and its gradients are right ----
-
 
 DEFERRED = replace(TINY, deferred=True)
 
@@ -355,7 +351,6 @@ def test_rays_that_do_not_fit_into_a_batch_do_not_count(dataset, monkeypatch):
 
 
 # ---- How much a training step takes on follows samples, within its bounds ----
-
 
 STRIDES = (16, 8, 4, 2)
 
