@@ -21,6 +21,7 @@ from nerg_mi.train.geometry import GazePlace, volume_dict
 from nerg_mi.transport.geometry import Place
 
 from .gaze import Baseline, GazeTest, make_test, map_scores
+from .study_scenes import make_sensor
 
 # ---- Ablation ----
 #
@@ -30,23 +31,11 @@ from .gaze import Baseline, GazeTest, make_test, map_scores
 # and on positions that were held out; normalised by the product of emit and capture of the same recipe. A frame is a
 # render of the gaze by the integrator, observer and camera in one place.
 
-COLUMNS = (
-    "recipe",
-    "variant",
-    "seed",
-    "steps",
-    "train_loss",
-    "test_loss",
-    "train_relative",
-    "test_relative",
-    "train_KLD",
-    "test_KLD",
-    "train_CC",
-    "test_CC",
-    "train_MAE",
-    "test_MAE",
-    "train_seconds",
-    "frame_seconds",
+COLUMNS = tuple(
+    """
+    recipe variant seed steps train_loss test_loss train_relative test_relative train_KLD test_KLD train_CC
+    test_CC train_MAE test_MAE train_seconds frame_seconds
+    """.split()
 )
 
 
@@ -163,17 +152,8 @@ def summarise(rows: list[dict]) -> list[dict]:
 def table(summary: list[dict]) -> str:
     """``summary`` as Markdown: losses relative to emit_capture of the same recipe and as they are, scores on held-out
     positions, seconds."""
-    shown = (
-        "train_relative",
-        "test_relative",
-        "train_loss",
-        "test_loss",
-        "test_KLD",
-        "test_CC",
-        "test_MAE",
-        "train_seconds",
-        "frame_seconds",
-    )
+    shown = [f"{side}_{kind}" for kind in ("relative", "loss") for side in ("train", "test")]
+    shown += ["test_KLD", "test_CC", "test_MAE", "train_seconds", "frame_seconds"]
     head, lines = ["recipe", "variant", "seeds", "steps", *(k.replace("_", " ") for k in shown)], []
     for r in summary:
         cells = []
@@ -247,15 +227,7 @@ def frame_timer(
         times = []
         for eye, angle in [(eyes[0], angles[0]), *zip(eyes, angles)]:
             target = eye + (np.cos(angle), np.sin(angle), -0.1)
-            sensor = mi.load_dict(
-                {
-                    "type": "perspective",
-                    "fov": 70,
-                    "to_world": mi.ScalarTransform4f().look_at(eye.tolist(), target.tolist(), [0, 0, 1]),
-                    "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
-                    "sampler": {"type": "independent", "sample_count": 1},
-                }
-            )
+            sensor = mi.load_dict(make_sensor(eye.tolist(), target.tolist(), 70, width, height))
             started = time.perf_counter()
             np.array(mi.render(scene, sensor=sensor))
             times.append(time.perf_counter() - started)

@@ -264,12 +264,12 @@ def settings(subject, quick: bool = False) -> list[StudyRow]:
             rows.append(StudyRow(f"{rule}, {n} steps", f"steps, {rule}", {"quadrature": rule, **steps(n)}))
     for g in some((1 / 1024, 1 / 512, 1 / 256, 1 / 128)):
         rows.append(StudyRow(f"dt_gamma 1/{round(1 / g)}", "dt_gamma", {"dt_gamma": g}))
-    for c in some((2, 4, 8, 16)):
-        rows.append(StudyRow(f"coarse {c}", "coarse", {"coarse": float(c)}))
-    for s in some((1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8)):
-        rows.append(StudyRow(f"stop {s:g}", "stop", {"stop": s}))
-    for c in some((0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2)):
-        rows.append(StudyRow(f"color_cutoff {c:g}", "color_cutoff", {"color_cutoff": c}))
+    sweeps = {
+        "coarse": (2.0, 4.0, 8.0, 16.0),
+        "stop": (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8),
+        "color_cutoff": (0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2),
+    }
+    rows += [StudyRow(f"{name} {v:g}", name, {name: v}) for name, values in sweeps.items() for v in some(values)]
     for k in DEPTHS.names():
         rows.append(StudyRow(f"depth {k}", "depth", {"depth": k}))
         for n in () if quick else (128, 256, 512, 1024):
@@ -345,11 +345,8 @@ def _together(subject) -> list[StudyRow]:
         step = {"step": subject.extent / n}
         rows.append(StudyRow(f"{n} steps, coarse 4", "together", {**step, "coarse": 4.0}))
         loose = {**step, "stop": 1e-4, "color_cutoff": 1e-2}
-        rows.append(StudyRow(f"{n} steps, stop 1e-4, cutoff 1e-2", "together", loose))
-        rows.append(
-            StudyRow(f"{n} steps, stop 1e-4, cutoff 1e-2, linear", "together", {**loose, "quadrature": "linear"})
-        )
-        rows.append(StudyRow(f"{n} steps, stop 1e-4, cutoff 1e-2, refined", "together", {**loose, "depth": "refined"}))
+        for name, more in (("", {}), (", linear", {"quadrature": "linear"}), (", refined", {"depth": "refined"})):
+            rows.append(StudyRow(f"{n} steps, stop 1e-4, cutoff 1e-2{name}", "together", {**loose, **more}))
     return rows
 
 
@@ -370,36 +367,12 @@ def _paper(quick: bool) -> list[StudyRow]:
 # costs time.
 
 COLUMNS = (
-    "setting",
-    "group",
-    "seconds",
-    "cpu_seconds",
-    "density_evals",
-    "color_evals",
-    "gaze_evals",
+    *"setting group seconds cpu_seconds density_evals color_evals gaze_evals".split(),
     *NAMES,
-    "peak_mb",
-    "pareto",
-    "reference",
-    "quadrature",
-    "step",
-    "steps",
-    "coarse",
-    "dt_gamma",
-    "stop",
-    "extent",
-    "color_cutoff",
-    "refined",
-    "depth",
-    "visibility",
-    "map_height",
-    "integral_tolerance",
-    "jitter",
-    "radiance",
-    "aovs",
-    "spp",
-    "resolution",
-    "precision",
+    *"""
+        peak_mb pareto reference quadrature step steps coarse dt_gamma stop extent color_cutoff refined
+        depth visibility map_height integral_tolerance jitter radiance aovs spp resolution precision
+    """.split(),
 )
 MARCHING = ("quadrature", "step", "coarse", "dt_gamma", "stop", "color_cutoff", "refined", "depth", "jitter")
 """The parameters that mean nothing where nothing is marched."""

@@ -80,15 +80,7 @@ def against_paper(rows: list[dict], clock: str = "seconds") -> list[dict]:
 
 def _brief(row: dict) -> dict:
     names = (
-        "setting",
-        "seconds",
-        "cpu_seconds",
-        "density_evals",
-        "color_evals",
-        "depth_mae",
-        "depth_p99",
-        "surface_mae",
-        "visibility_wrong",
+        "setting seconds cpu_seconds density_evals color_evals depth_mae depth_p99 surface_mae visibility_wrong".split()
     )
     return {n: row[n] for n in names if n in row}
 

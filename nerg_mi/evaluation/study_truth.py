@@ -206,13 +206,19 @@ def compute_truth(
     else:
         met = trace(scene, start, r_o)
         d_o = np.where(met.opacity >= surface_opacity, met.depth(depth), np.inf)
-        excess = distance - d_o - tolerance
-        share = 1 - (np.clip(excess / falloff, 0, 1) if falloff > 0 else (excess > 0))
-        blocked = excess > 0
-        p_od = np.where(blocked[:, None], p_o + r_o * np.where(blocked, d_o, 0)[:, None], p_d)
+        share, p_od = _hidden(distance, d_o, tolerance, falloff, p_d, p_o, r_o)
     share = np.where(surface, share, 0)
     density = np.zeros(len(o)) if gaze is None else evaluate_gaze(gaze, p_od, p_o, towards(p_o, p_d)[1]) * share
     return Truth(seen.color(o, d), seen.opacity, t, share, density, "float64 closed form", {})
+
+
+def _hidden(distance, d_o, tolerance: float, falloff: float, p_d, p_o, r_o) -> tuple[np.ndarray, np.ndarray]:
+    """Visibility (N,) by comparing the ``distance`` (N,) to the points ``p_d`` with that to what is met first, ``d_o``
+    (N,), and the points (N, 3) that the observer at ``p_o`` sees along ``r_o`` (N, 3)."""
+    excess = distance - d_o - tolerance
+    share = 1 - (np.clip(excess / falloff, 0, 1) if falloff > 0 else (excess > 0))
+    blocked = excess > 0
+    return share, np.where(blocked[:, None], p_o + r_o * np.where(blocked, d_o, 0)[:, None], p_d)
 
 
 def towards(p_o, p):
@@ -247,18 +253,11 @@ TRACE = 1e-3
 KLD_EPS = 1e-6
 """Of the mean: what a gaze of zero costs where the truth is not zero is bounded by it (13.8 nats)."""
 
-NAMES = (
-    "color_rmse",
-    "color_psnr",
-    "opacity_mae",
-    "depth_mae",
-    "depth_p99",
-    "visibility_mae",
-    "visibility_wrong",
-    "gaze_mae",
-    "gaze_kld",
-    "surface_mae",
-    "surface_p99",
+NAMES = tuple(
+    """
+    color_rmse color_psnr opacity_mae depth_mae depth_p99 visibility_mae visibility_wrong gaze_mae gaze_kld
+    surface_mae surface_p99
+    """.split()
 )
 
 
@@ -378,10 +377,7 @@ def compute_truth_of_shapes(subject, seed: int, visibility: str, color: np.ndarr
         share = (met >= distance).astype(float)
     else:
         falloff = float(subject.base["falloff"])
-        excess = distance - met - subject.tolerance
-        share = 1 - (np.clip(excess / falloff, 0, 1) if falloff > 0 else (excess > 0))
-        blocked = excess > 0
-        p_od = np.where(blocked[:, None], p_o + r_o * np.where(blocked, met, 0)[:, None], p_d)
+        share, p_od = _hidden(distance, met, subject.tolerance, falloff, p_d, p_o, r_o)
     share = np.where(hit, share, 0)
     gaze = np.zeros(len(o))
     if subject.has_gaze:

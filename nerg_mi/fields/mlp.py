@@ -48,20 +48,6 @@ def is_cuda(ns: ModuleType) -> bool:
     return ns.__name__.startswith("drjit.cuda")
 
 
-def aligned(array: np.ndarray, dtype: type = np.float32) -> np.ndarray:
-    """A copy of ``array``, of type ``dtype``, that begins at a multiple of 64 bytes.
-
-    Dr.Jit reads NumPy memory in place, and gathers several features in one load only from aligned memory. The alignment
-    is also part of a kernel: each combination of those of its inputs is compiled anew.
-    """
-    array = np.asarray(array, dtype)
-    memory = np.empty(array.nbytes + 64, np.uint8)
-    start = -memory.ctypes.data % 64
-    out = memory[start : start + array.nbytes].view(dtype).reshape(array.shape)
-    out[...] = array
-    return out
-
-
 # ---- A network whose weights are constants of the kernel that evaluates it ----
 #
 # Dr.Jit's cooperative vectors keep a layer's sums in memory while they read its weights, which on processors takes two

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -18,6 +18,9 @@ from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction
 from .mlp import MLP, namespace
 from .occupancy import CascadeGrid, OccupancyGrid, RefinedGrid
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 # ---- Background ----
 #
 # Colour behind everything, on a sphere around the scene: torch-ngp's background network.
@@ -26,8 +29,22 @@ from .occupancy import CascadeGrid, OccupancyGrid, RefinedGrid
 # and the harmonics of the direction go through a small network to a colour (``NeRFNetwork.background`` there).
 
 
+class GridConfig:
+    """Base of frozen dataclasses of sizes with an encoding ``grid``, which a checkpoint keeps as a JSON object."""
+
+    grid: EncodingConfig
+
+    def to_dict(self) -> dict[str, Any]:
+        return {**asdict(self), "grid": self.grid.to_dict()}  # pyright: ignore[reportArgumentType] it is a dataclass
+
+    @classmethod
+    def from_dict(cls, d: dict[str, Any]) -> Self:
+        """The configuration that ``to_dict`` made ``d`` of. Raises ``KeyError``, ``TypeError`` or ``ValueError``."""
+        return cls(**{**d, "grid": encoding_config(d["grid"])})
+
+
 @dataclass(frozen=True)
-class BackgroundConfig:
+class BackgroundConfig(GridConfig):
     """Sizes of a background. The defaults are torch-ngp's. Raises ``ValueError`` for sizes that none has."""
 
     # Of the sphere about the field's origin, in the field's units.
@@ -51,15 +68,6 @@ class BackgroundConfig:
     def sizes(self) -> list[int]:
         """Sizes of the network's layers, [inputs, ..., 3]."""
         return [self.sh_degree**2 + self.grid.size] + [self.width] * self.hidden + [3]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON object that stands in a checkpoint."""
-        return {**asdict(self), "grid": self.grid.to_dict()}
-
-    @staticmethod
-    def from_dict(d: dict[str, Any]) -> BackgroundConfig:
-        """The configuration that ``to_dict`` made ``d`` of. Raises ``KeyError``, ``TypeError`` or ``ValueError``."""
-        return BackgroundConfig(**{**d, "grid": encoding_config(d["grid"])})
 
 
 class Background:
@@ -158,7 +166,7 @@ _MAX_LOG_DENSITY = 30.0
 
 
 @dataclass(frozen=True)
-class RadianceConfig:
+class RadianceConfig(GridConfig):
     """Sizes of the networks. The defaults are the paper's. Raises ``ValueError`` for sizes that no field has."""
 
     # The encoding of positions.
@@ -203,15 +211,10 @@ class RadianceConfig:
     def to_dict(self) -> dict[str, Any]:
         """The JSON object that stands in a checkpoint. Where colour is not deferred it says nothing of it, so that
         releases that know no deferred fields read it."""
-        out = {**asdict(self), "grid": self.grid.to_dict()}
+        out = super().to_dict()
         if not self.deferred:
             del out["deferred"]
         return out
-
-    @staticmethod
-    def from_dict(d: dict[str, Any]) -> RadianceConfig:
-        """The configuration that ``to_dict`` made ``d`` of. Raises ``KeyError``, ``TypeError`` or ``ValueError``."""
-        return RadianceConfig(**{**d, "grid": encoding_config(d["grid"])})
 
 
 def assign(field, values: dict) -> None:

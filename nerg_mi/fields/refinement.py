@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, cast
 import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.arrays import aligned
 from nerg_mi.maths.types import Array3f, Float, UInt32
 
-from .mlp import aligned
 from .occupancy import PARTS, OccupancyGrid, RefinedGrid, grown
 
 if TYPE_CHECKING:

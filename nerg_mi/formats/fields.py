@@ -15,10 +15,11 @@ import numpy as np
 from nerg_mi.errors import NergError, plain
 from nerg_mi.fields.encoding import Encoding, EncodingConfig, config_type, encoding_of
 from nerg_mi.fields.gaze_base import LARGEST, AnyGazeField, RaySupport, basis_of, build, limits_of
-from nerg_mi.fields.mlp import MLP, aligned
+from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpacked
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.files.atomic import file_sha256
+from nerg_mi.maths.arrays import aligned
 from nerg_mi.maths.geometry import box_of
 from nerg_mi.ranges import VALUES
 

@@ -22,8 +22,9 @@ ALIGNMENT = 64
 
 
 def aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> np.ndarray:
-    """A copy (N,) of ``values`` that begins at a whole packet."""
-    return _columns(np.ravel(np.asarray(values))[:, None], np.dtype(dtype))[0]
+    """A copy of ``values``, of any shape, that begins at a whole packet."""
+    array = np.asarray(values)
+    return _columns(array.reshape(-1, 1), np.dtype(dtype))[0].reshape(array.shape)
 
 
 def vector_of(kind: Any, rows: ArrayLike, dtype: DTypeLike = np.float32) -> Any:

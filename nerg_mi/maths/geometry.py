@@ -218,9 +218,7 @@ class ContractedBox:
         """``p`` (Array3f) in coordinates in which the outer cube is the unit cube: straight lines stay straight."""
         return (p - type(p)(*self.center)) / self.cube_side + 0.5
 
-    def contains(self, p: Array3f) -> Bool:
-        """Mask of the points ``p`` (Array3f) inside the outer cube."""
-        return dr.all((p >= type(p)(*self.lower)) & (p <= type(p)(*self.upper)))
+    contains = Box.contains
 
     def to_dict(self) -> dict:
         return {**self.core.to_dict(), "reach": self.reach}

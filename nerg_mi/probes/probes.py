@@ -29,43 +29,13 @@ def place_queries(
     than ``spacing``; without one, than the smallest distance from R on at which they are no more. Raises `NergError`
     for another word.
     """
-    if placement not in PLACEMENTS:
-        raise NergError(f'placement is "{placement}"; it is one of {", ".join(PLACEMENTS)}')
-    return PLACEMENTS[placement](origin, count, spacing, radius, rng)
-
-
-def _origins(
-    origin: np.ndarray, count: int, spacing: float | None, radius: float, rng: np.random.Generator
-) -> np.ndarray:
-    return origin[rng.choice(len(origin), min(count, len(origin)), replace=False)]
-
-
-def _lattice(
-    origin: np.ndarray, count: int, spacing: float | None, radius: float, rng: np.random.Generator
-) -> np.ndarray:
-    # Centred in the box, so that it does not favour one wall.
-    spacing = spacing or 2.0 * radius
-    axes = []
-    for a, b in zip(origin.min(axis=0), origin.max(axis=0)):
-        n = max(1, int(np.floor((b - a) / spacing)) + 1)
-        axes.append(0.5 * (a + b) + spacing * (np.arange(n) - 0.5 * (n - 1)))
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _uniform(
-    origin: np.ndarray, count: int, spacing: float | None, radius: float, rng: np.random.Generator
-) -> np.ndarray:
-    return rng.uniform(origin.min(axis=0), origin.max(axis=0), (count, 3))
-
-
-def blue_noise(
-    origin: np.ndarray, count: int, spacing: float | None, radius: float, rng: np.random.Generator
-) -> np.ndarray:
-    """Ray origins in random order, each taken if none taken before is within ``spacing`` (Poisson discs by dart
-    throwing).
-
-    Without a ``spacing``: from ``radius`` on, ever wider until no more than ``count`` are left.
-    """
+    if placement == "data":
+        return origin[rng.choice(len(origin), min(count, len(origin)), replace=False)]
+    if placement == "grid":
+        return _lattice(origin, spacing or 2.0 * radius)
+    if placement == "random":
+        return rng.uniform(origin.min(axis=0), origin.max(axis=0), (count, 3))
+    _check_one_of("placement", placement, PLACEMENTS)
     if spacing is not None:
         found = _darts(origin, spacing, rng)
         return found[rng.permutation(len(found))[:count]]
@@ -75,11 +45,21 @@ def blue_noise(
     return found
 
 
-PLACEMENTS = {"data": _origins, "grid": _lattice, "random": _uniform, "blue": blue_noise}
-"""How queries are placed, by name: functions of the arguments of `place_queries` without the name."""
+def _lattice(origin: np.ndarray, spacing: float) -> np.ndarray:
+    # Centred in the box, so that it does not favour one wall.
+    axes = []
+    for a, b in zip(origin.min(axis=0), origin.max(axis=0)):
+        n = max(1, int(np.floor((b - a) / spacing)) + 1)
+        axes.append(0.5 * (a + b) + spacing * (np.arange(n) - 0.5 * (n - 1)))
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+PLACEMENTS = ("data", "grid", "random", "blue")
 
 
 def _darts(origin: np.ndarray, spacing: float, rng: np.random.Generator) -> np.ndarray:
+    """Ray origins in random order, each taken if none taken before is within ``spacing`` (Poisson discs by dart
+    throwing)."""
     from scipy.spatial import KDTree
 
     # One candidate for each cell much smaller than the discs: of millions of origins some ten thousand.

@@ -23,7 +23,6 @@ from nerg_mi.rays.rays import Rays
 
 from .gaze_data import Batch, GazeTargets, heads_box
 from .gaze_recipes import DEFAULT, FieldChoices, Recipe, register
-from .gaze_settings import GazeSettings
 from .gaze_trainer import GazeTrainer
 from .radiance_losses import stack
 
@@ -100,22 +99,10 @@ def used_parameters(config: LogGazeConfig, parameters: dict) -> dict:
 class LikelihoodTrainer(GazeTrainer):
     """A run of a ``LogGazeField``; see ``GazeTrainer``. ``targets.blind``: its table of the blind density."""
 
-    def __init__(
-        self,
-        targets: GazeTargets,
-        box: AnyBox,
-        config: LogGazeConfig,
-        settings: GazeSettings,
-        ns: ModuleType,
-        schedule: int | None = None,
-        initial: dict | None = None,
-    ):
+    def completed(self, config: LogGazeConfig, targets: GazeTargets) -> LogGazeConfig:
         self._blind = targets.blind
         # Capture's encoding spans where people's heads were.
-        config = replace(config, heads=targets.heads or heads_box(targets.positions, box))
-        super().__init__(targets, box, config, settings, ns, schedule, initial)
-        trained = set(self.optimiser.keys())
-        self.constant = {k: v for k, v in self.initial.parameters().items() if k not in trained}
+        return replace(config, heads=targets.heads or heads_box(targets.positions, self.box))
 
     def learn_from(self, targets: GazeTargets, epoch: int) -> None:
         super().learn_from(targets, epoch)

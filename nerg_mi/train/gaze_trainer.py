@@ -66,16 +66,17 @@ class GazeTrainer(Trainer, ABC):
         schedule: int | None = None,
         initial: dict | None = None,
     ):
-        # A field's class knows its configuration's, and so does its trainer.
-        self.config: Any = config
         super().__init__(settings, ns, schedule)
         self.box, self._targets = box, targets
+        # A field's class knows its configuration's, and so does its trainer.
+        self.config: Any = self.completed(config, targets)
         self.learn_from(targets, 0)
         self.initial: Any = self.untrained()
         if initial:
             self.initial.set_parameters(initial)
-        self.constant = dict(initial or {}) if settings.frozen else {}
-        trained = {k: v for k, v in self.trainable(self.initial.parameters()).items() if k not in self.constant}
+        parameters, frozen = self.initial.parameters(), (initial or {}) if settings.frozen else {}
+        trained = {k: v for k, v in self.trainable(parameters).items() if k not in frozen}
+        self.constant = {k: v for k, v in parameters.items() if k not in trained}
         self.loss: Any = None
         decay = settings.weight_decay
         self.start(AdamW(settings.learning_rate, trained, beta_2=0.99, epsilon=1e-15, weight_decay=decay))
@@ -89,6 +90,10 @@ class GazeTrainer(Trainer, ABC):
     def with_features(cls, radiance: RadianceField, config: Any) -> Any:
         """``config``, which has semantic features, with as many as ``radiance`` gives."""
         raise NergError(f"a {config.kind} gaze field has no semantic features; leave out --semantic")
+
+    def completed(self, config: Any, targets: GazeTargets) -> Any:
+        """``config`` with what only the ``targets`` tell."""
+        return config
 
     @abstractmethod
     def untrained(self) -> GazeHead:

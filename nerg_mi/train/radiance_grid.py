@@ -8,8 +8,8 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.mlp import aligned
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, contracted_cascades, grown
+from nerg_mi.maths.arrays import aligned
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f
 from nerg_mi.photos.cameras import Camera, view_tangents

@@ -9,7 +9,8 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.mlp import aligned, namespace
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.maths.arrays import aligned
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.transport.quadrature import absorbed_share

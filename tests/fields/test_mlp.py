@@ -14,7 +14,7 @@ from nerg_mi.fields.encoding import HashGridConfig, encode_direction
 from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
-from nerg_mi.fields.mlp import MLP, aligned, evaluate, is_cuda, namespace, set_constant_weights
+from nerg_mi.fields.mlp import MLP, evaluate, is_cuda, namespace, set_constant_weights
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.jit import no_collection
@@ -35,16 +35,6 @@ def test_types_of_a_variant_or_an_array(rgb):
 def test_scalar_variants_have_none(source):
     with pytest.raises(NergError, match='"llvm_ad_rgb"'):
         namespace(source)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.uint32])
-def test_arrays_are_aligned_copies(dtype):
-    source = np.arange(24).reshape(2, 3, 4)[:, ::2]
-    for _ in range(8):
-        copy = aligned(source, dtype)
-        assert copy.ctypes.data % 64 == 0 and copy.dtype == dtype and np.array_equal(copy, source)
-        assert not np.shares_memory(copy, source)
-    assert aligned(np.zeros((0, 3))).shape == (0, 3)
 
 
 # ---- Networks: cooperative vectors, tensor products and NumPy agree, with their gradients ----

@@ -20,6 +20,7 @@ def test01_values_are_those_given_and_begin_at_packets(rgb, count):
         # Nothing begins nowhere.
         assert values.dtype == dtype and (count == 0 or values.ctypes.data % ALIGNMENT == 0)
         assert np.array_equal(values, np.arange(count))
+    assert np.array_equal(aligned(rows[:, ::-1]), rows[:, ::-1].astype(np.float32))
 
 
 def test02_what_is_given_may_change_afterwards(rgb):
