@@ -57,14 +57,7 @@ class Preview:
 
 
 def render_view(
-    field: RadianceField,
-    occupied,
-    table: StepTable,
-    view: View,
-    near: float,
-    background: float = 0.0,
-    every: int = 1,
-    stop: float = 1e-3,
+    field: RadianceField, occupied, table: StepTable, view: View, near: float, every: int = 1, stop: float = 1e-3
 ) -> Preview:
     """March every ``every``-th pixel of ``view`` through ``field``.
 
@@ -81,7 +74,6 @@ def render_view(
         for first in range(0, len(d), size):
             parts.append(_march(field, occupied, table, view.camera.center, d[first : first + size], near, stop, ns))
     color, opacity, moment = (np.concatenate([p[k] for p in parts]) for k in range(3))
-    color = color + (1 - opacity[:, None]) * background
     depth = np.where(opacity > 0, moment / np.where(opacity > 0, opacity, 1), 0)
     return Preview(color.reshape(*shape, 3), opacity.reshape(shape), depth.reshape(shape))
 

@@ -97,25 +97,6 @@ def test_files(tmp_path):
     assert len(json.loads(files[2].read_text())["summary"]) == 3
 
 
-def test_the_plot_has_as_much_room_for_each_variant_however_many_there_are(tmp_path, monkeypatch):
-    from nerg_mi.evaluation import ablation
-
-    drawn = []
-    monkeypatch.setattr(ablation, "save", lambda figure, path, about: drawn.append(figure))
-    many = [dict(rows()[1], variant=f"v{k}") for k in range(9)]
-    for count in (3, 6, 9):
-        write_ablation(tmp_path, many[:count], "notes")
-    widths, heights = np.round(np.array([f.get_size_inches() for f in drawn]).T, 6)
-    assert (
-        widths[1] - widths[0] == pytest.approx(widths[2] - widths[1]) and widths[1] > widths[0] and np.ptp(heights) == 0
-    )
-    # Two bars a variant, of training and of test probes, and their names below.
-    (axis,) = drawn[1].axes
-    assert len(axis.patches) == 12
-    assert [t.get_text() for t in axis.get_xticklabels()] == [f"v{k}\n(default)" for k in range(6)]
-    assert np.allclose([b.get_height() for b in axis.patches], [1.0] * 6 + [1.0 / 1.1] * 6)
-
-
 def test_the_loss_is_the_papers():
     from types import SimpleNamespace
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 
 import numpy as np
@@ -16,8 +15,6 @@ from nerg_mi.evaluation.study import measure, settings
 from nerg_mi.evaluation.study_subject import extent, open_subject
 from nerg_mi.evaluation.study_truth import errors
 from nerg_mi.formats.splats import write_ply_splats
-from nerg_mi.transport.geometry import Place
-from nerg_mi.workflows.demo import store_scene
 from tests.formats.splats.writers import random_splats
 from tests.reference import march_numpy
 
@@ -210,20 +207,6 @@ def test01_first_hits_are_those_of_a_ray_caster(rgb, scene):
     assert np.allclose(found[hit], expected[hit], rtol=1e-5)
 
 
-def test01b_visibility_is_told_to_a_share_of_the_scenes_diagonal(rgb, scene):
-    subject = study_subject.open_subject(str(scene), "auto", 24, 16)
-    assert subject.extent > 8 and subject.tolerance == study_subject.EXACT * subject.extent
-    assert subject.integrator().observer_settings.tolerance == pytest.approx(subject.tolerance)
-
-
-def test01c_noise_of_the_true_colour_is_not_that_of_a_picture(rgb, scene, monkeypatch):
-    subject, asked = study_subject.open_subject(str(scene), "auto", 12, 8), []
-    channels = subject.channels
-    monkeypatch.setattr(subject, "channels", lambda made, spp, seed: (asked.append(seed), channels(made, 1, seed))[1])
-    subject.truth(1, "median", "depth")
-    assert len(asked) == 1 and asked != [1]
-
-
 def test02_rays_do_not_slip_between_triangles():
     corners = np.array([[[0, 0, 1], [1, 0, 1], [1, 1, 1]], [[0, 0, 1], [1, 1, 1], [0, 1, 1]]], float)
     s = np.linspace(0.01, 0.99, 99)
@@ -251,39 +234,11 @@ def test03_the_integrator_agrees_with_the_reference(rgb, scene, falloff, visibil
         assert np.mean(shown != visible) < 0.02 and 0.1 < visible[np.isfinite(distance)].mean() < 0.95
 
 
-@pytest.mark.nightly
-def test04_quick_run(tmp_path, scene, capsys):
-    out = tmp_path / "out"
-    with pytest.raises(SystemExit) as end:
-        main(
-            ["study", str(scene), "--out", str(out), "--quick", "--width", "24", "--height", "16", "-m", "llvm_ad_rgb"]
-        )
-    assert not end.value.code
-    rows = {r["setting"]: r for r in csv.DictReader((out / "study.csv").open())}
-    assert {"default", "visibility transmittance", "visibility map 16", "no colour", "spp 2"} <= set(rows)
-    assert not any(name.startswith("paper") or "steps" in name for name in rows)
-    default = rows["default"]
-    assert float(default["depth_mae"]) < 1e-5 and float(default["density_evals"]) == 0 and default["step"] == ""
-    assert float(rows["visibility map 16"]["visibility_mae"]) > float(default["visibility_mae"])
-
-
 def test05_shapes_without_triangles_are_refused(tmp_path, scene, capsys):
     scene.write_text(SCENE.format(falloff=0.0, more='<shape type="sphere"/>'))
     with pytest.raises(SystemExit):
         main(["study", str(scene), "--out", str(tmp_path / "out"), "--quick", "-m", "llvm_ad_rgb"])
     assert "a study of shapes needs meshes, and this scene has a Sphere" in " ".join(capsys.readouterr().err.split())
-
-
-def test06_a_normalised_gaze_is_divided_by_the_integral_of_all_directions(rgb):
-    subject = study_subject.open_subject(str(store_scene().with_name("shapes.xml")), "auto", 12, 8)
-    p_o = rgb.Point3f(*subject.eye().tolist())
-
-    def integral(tolerance):
-        made = subject.integrator({"integral_tolerance": tolerance})
-        return made.gaze.at([p_o], Place(None, subject.scene), made.observer_settings).integrals(p_o)[0][0]
-
-    found = study_shapes.observed_gaze(subject, subject.eye()).integrals(p_o)[0][0]
-    assert found == integral(0.0) != integral(2e-3)
 
 
 # ---- Gaussian splats as a subject of a study: what is set of them, and what they are compared with ----

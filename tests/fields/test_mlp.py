@@ -15,7 +15,7 @@ from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import MLP, evaluate, is_cuda, namespace, set_constant_weights
-from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.jit import no_collection
 from tests.reference import fields_numpy as reference
@@ -82,12 +82,6 @@ def test03_pack_takes_up_changed_weights():
     net.weights[1] = net.weights[1] * 2
     net.pack()
     assert np.allclose(net(inputs)[0].numpy(), 2 * before, rtol=1e-6)
-
-
-def test04_random_weights_are_bounded_and_seeded():
-    a, b = (MLP.random([9, 4, 2], ns, np.random.default_rng(3)) for _ in range(2))
-    assert all(np.array_equal(u.numpy(), v.numpy()) for u, v in zip(a.weights, b.weights))
-    assert np.abs(a.weights[0].numpy()).max() <= 1 / 3 and a.weights[0].shape == (4, 9)
 
 
 def test05_layers_that_do_not_fit():
@@ -278,15 +272,6 @@ def test05_a_recorded_function_sees_weights_that_change(unrolled):
     assert not unrolled
     assert np.allclose(first, radiance().density(p).numpy(), rtol=1e-6)
     assert np.allclose(second, field.density(p).numpy(), rtol=1e-6) and not np.allclose(first, second)
-
-
-def test06_a_background_is_part_of_its_field():
-    flat = HashGridConfig(levels=2, log2_rows=8, base=2, finest=8, dimensions=2)
-    behind = Background.random(BackgroundConfig(radius=2.0, grid=flat), ns, np.random.default_rng(0))
-    field = radiance()
-    field.background = behind
-    set_constant_weights(field)
-    assert behind.net.constant
 
 
 def test07_normalised_layers_stay_as_they_are():

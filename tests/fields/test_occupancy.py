@@ -140,19 +140,6 @@ def test02_lookup_is_indexed_zyx_and_clamped():
     assert grid.empty_cells(ns.Array3f(points.T)).numpy().tolist() == [0, 1, 3, 0, 0, 0, 3]
 
 
-def test03_empty_full_and_far():
-    assert np.all(OccupancyGrid(np.zeros((3, 3, 3), bool), ns, 1).distance.numpy() == 255)
-    assert np.all(OccupancyGrid(np.ones((3, 3, 3), bool), ns, 1).distance.numpy() == 0)
-
-
-def test04_distances_beyond_a_byte_do_not_wrap():
-    bits = np.zeros((260, 260, 260), bool)
-    bits[0, 0, 0] = True
-    grid = OccupancyGrid(bits, ns, 1)
-    assert grid.empty_cells(ns.Array3f(0.9999, 0.5, 0.5)).numpy()[0] == 255
-    assert grid.empty_cells(ns.Array3f(254.5 / 260, 0.5, 0.5)).numpy()[0] == 254
-
-
 @pytest.mark.parametrize("resolution", [1, 3, 8, 13])
 def test05_packed_round_trip(resolution):
     bits = np.random.default_rng(1).random((resolution,) * 3) < 0.3

@@ -110,12 +110,6 @@ def logistic(x):
     return 0.5 + 0.5 * np.tanh(0.5 * x)
 
 
-def test_a_network_at_every_sample_is_asked_with_the_features_as_they_are():
-    outputs = floats(RNG.normal(size=(5, 8)))
-    assert point_features(outputs, False) is outputs and network_inputs(outputs, False) is outputs
-    assert np.allclose(values(network_color(outputs[:3], outputs, False)), logistic(values(outputs[:3])), atol=1e-6)
-
-
 def test_what_the_network_leaves_alone_is_the_diffuse_colour():
     outputs = 2 * RNG.normal(size=(5, 40))
     features = point_features(floats(outputs), True)
@@ -292,15 +286,6 @@ def test14_a_matrix_of_another_shape_is_refused():
     field = make()
     with pytest.raises(ValueError, match="density_net.0"):
         field.set_parameters({"density_net.0": dr.zeros(ns.TensorXf, (3, 3))})
-
-
-def test15_networks_that_do_not_fit_the_grid_are_refused():
-    a, b = (
-        make(),
-        make(config=RadianceConfig(grid=HashGridConfig(**{**RADIANCE_GRID, "levels": 3}), width=16, geometry=7)),
-    )
-    with pytest.raises(ValueError):
-        RadianceField(RADIANCE_CONFIG, BOX, a.grid, b.density_net, a.color_net)
 
 
 def test17_a_deferred_field():

@@ -37,15 +37,6 @@ def test_agrees_with_float64():
     assert np.allclose(got, reference(x, rays, offsets, kappa, weights), rtol=2e-4, atol=1e-6)
 
 
-def test_own_directions_for_each_probe():
-    rays, offsets, kappa, rng = ragged()
-    kde = SphericalKde(rays, offsets, kappa, backend="llvm")
-    x = uniform_directions(4 * 50, rng).reshape(4, 50, 3)
-    got = kde.evaluate(x)
-    for p in range(4):
-        assert np.allclose(got[p], kde.evaluate(x[p])[p], rtol=1e-6)
-
-
 @pytest.mark.parametrize("kappa", [1e-8, 1e-3, 1.0, 100.0])
 def test_integrates_to_one(kappa):
     rays, offsets, _, _ = ragged()
@@ -198,19 +189,6 @@ def test_the_score_is_the_log_likelihood_under_the_others(groups):
     assert np.allclose(leave_one_out_scores(x, None if groups is None else g, grid), want, rtol=1e-5)
     # Of one person alone, the ray itself is left out.
     assert np.allclose(leave_one_out_scores(x, np.zeros(12), grid), leave_one_out_scores(x, None, grid))
-
-
-def test_of_many_rays_some_are_drawn_by_the_chance_that_is_given():
-    x, person, grid = gazes(600), np.arange(600) % 7, kappa_grid(300.0)
-    given = leave_one_out_scores(x, person, grid, most=100, rng=np.random.default_rng(5))
-    chosen = np.random.default_rng(5).choice(600, 100, replace=False)
-    assert np.allclose(given, leave_one_out_scores(x[chosen], person[chosen], grid, most=100))
-    for shared in (False, True):
-        found = [
-            loo_kappas(x, person, np.array([0, 600]), 300.0, shared, np.random.default_rng(seed))[0]
-            for seed in (*range(8), 3)
-        ]
-        assert len(set(found)) > 1 and found[3] == found[8]
 
 
 def test_one_width_for_all_is_that_of_the_sum_of_the_scores():

@@ -112,10 +112,6 @@ def test_the_rays_are_the_nearest(rays_view):
         KdeView(rays_view.select(np.zeros(300, bool)))
 
 
-def test_it_says_of_how_many_rays_it_is(rays_view):
-    assert KdeView(rays_view, COUNT).basis.words() == "300 rays of 1 person"
-
-
 def test_each_lane_has_the_density_of_its_observer(rgb, rays_view):
     """Two observers, in a scene that is turned, twice the size and elsewhere."""
     turn = np.array([[0, -2.0, 0, 5], [2, 0, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]])

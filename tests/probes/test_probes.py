@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.kde import kappa_grid, leave_one_out_kappa, leave_one_out_scores
+from nerg_mi.probes.kde import leave_one_out_kappa
 from nerg_mi.probes.probes import (
     LEVELS,
     calibrated_levels,
@@ -84,56 +84,6 @@ def test_people_who_count(rays_measures):
     assert effective_persons(even, rays_measures).mean() > people.mean() + 0.1
 
 
-def test_weights_of_rays_and_distance(rays_measures):
-    q = np.array([[1.5, 1.0, 1.6]])
-    plain = place_probes(rays_measures, 0.3, queries=q, cap=5000)
-    near = place_probes(rays_measures, 0.3, queries=q, cap=5000, weights="distance", centre="query")
-    d = np.linalg.norm(rays_measures.origin[near.indices] - q, axis=1)
-    assert np.array_equal(near.indices, plain.indices) and np.allclose(near.weights, 1 - d / 0.3, atol=1e-6)
-    only = place_probes(rays_measures, 0.3, queries=q, cap=5000, ray_weights=(rays_measures.person == 2).astype(float))
-    assert (rays_measures.person[only.indices] == 2).all() and np.array_equal(
-        np.sort(only.indices), np.sort(plain.indices[rays_measures.person[plain.indices] == 2])
-    )
-    assert np.array_equal(only.directions, rays_measures.direction[only.indices])
-    with pytest.raises(ValueError, match="ray_weights"):
-        place_probes(rays_measures, 0.3, ray_weights=np.ones(3))
-
-
-def test_one_kappa_for_all(rays_measures):
-    for rule in ("silverman", "loo"):
-        each = place_probes(rays_measures, 0.25, count=12, kappa_rule=rule)
-        shared = place_probes(rays_measures, 0.25, count=12, kappa_rule=rule, kappa_shared=True)
-        assert (
-            len(set(shared.kappa)) == 1
-            and each.kappa.min() <= shared.kappa[0] <= each.kappa.max()
-            and len(set(each.kappa)) > 1
-        )
-
-
-def test_leave_one_out_finds_the_true_width():
-    # Many groups, one ray each: the best kernel is narrower than the law, and the likelihood near that of the law
-    # itself.
-    rng = np.random.default_rng(0)
-    x = vmf.sample(np.tile([0, 0, 1.0], (256, 1)), 60.0, rng)
-    scores = leave_one_out_scores(x, None, kappa_grid(1000.0))
-    truth = np.mean(vmf.log_density(x, np.array([0, 0, 1.0]), 60.0))
-    assert truth - 0.15 < scores.max() < truth + 0.02 and 60 < kappa_grid(1000.0)[scores.argmax()] < 600
-
-
-def test_heads_widened_to_gaze(rays_measures):
-    heads = place_probes(rays_measures, 0.25, count=4, kappa_rule="fixed", kappa=200.0)
-    gaze = place_probes(rays_measures, 0.25, count=4, kappa_rule="fixed", kappa=200.0, widen=37.0)
-    assert np.allclose(gaze.kappa, vmf.convolved_kappa(200.0, 37.0)) and (gaze.kappa < 37).all()
-    # Against what eyes do: turn each sample of the heads' density by a law of κ = 37.
-    rng = np.random.default_rng(1)
-    x = sample(heads, 20_000, rng)
-    eyes = vmf.sample(x.reshape(-1, 3), 37.0, rng).reshape(x.shape)
-    y = sample(gaze, 20_000, rng)
-    assert np.allclose(eyes.mean(axis=1), y.mean(axis=1), atol=0.01)
-    second = lambda v: np.einsum("pni,pnj->pij", v, v) / v.shape[1]
-    assert np.allclose(second(eyes), second(y), atol=0.01)
-
-
 # ---- Placement ----
 
 
@@ -200,17 +150,6 @@ def rays_probes():
     return Rays(np.arange(n) * 0.1, rng.integers(0, 4, n), tuple("abcd"), origin, vmf.sample(mu, 60.0, rng), np.ones(n))
 
 
-@pytest.mark.parametrize("placement", ["data", "grid", "random"])
-@pytest.mark.parametrize("rule", ["silverman", "fixed"])
-def test_density_integrates_to_one(rays_probes, placement, rule):
-    probes = place_probes(
-        rays_probes, 0.25, placement=placement, count=30, min_rays=16, kappa_rule=rule, kappa=100.0, kappa_max=100.0
-    )
-    density = probes.density(fibonacci_directions(8192), "llvm")
-    assert density.shape == (len(probes), 8192) and (probes.kappa <= 100).all()
-    assert np.abs(density.mean(axis=1, dtype=np.float64) * 4 * np.pi - 1).max() < 1e-3
-
-
 def test_holds_the_nearest_rays_within_the_radius(rays_probes):
     probes = place_probes(rays_probes, 0.2, count=20, cap=40, min_rays=10)
     for p in range(len(probes)):
@@ -221,16 +160,6 @@ def test_holds_the_nearest_rays_within_the_radius(rays_probes):
         assert np.all(np.diff(far[held]) >= 0) and np.isclose(far[held].max(), np.sort(far)[len(held) - 1])
         assert np.allclose(probes.positions[p], rays_probes.origin[held].mean(axis=0))
         assert np.array_equal(probes.directions[probes.offsets[p] : probes.offsets[p + 1]], rays_probes.direction[held])
-
-
-def test_centre_seed_and_queries(rays_probes):
-    a, b = (place_probes(rays_probes, 0.25, count=10, seed=3) for _ in range(2))
-    assert np.array_equal(a.queries, b.queries) and np.array_equal(a.indices, b.indices)
-    c = place_probes(rays_probes, 0.25, queries=a.queries, centre="query")
-    assert np.array_equal(c.positions, a.queries) and not np.array_equal(a.positions, a.queries)
-    grid = place_probes(rays_probes, 0.25, placement="grid", spacing=0.5, min_rays=8)
-    steps = np.unique(np.round(np.diff(np.unique(np.round(grid.queries[:, 0], 9))), 9))
-    assert np.allclose(steps, 0.5)
 
 
 def test_leave_one_out_sees_through_repetition():

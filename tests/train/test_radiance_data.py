@@ -114,16 +114,6 @@ def test_colours_alpha_depth_and_masks(dtype, channels, depth, mask):
         assert not bank.depth_everywhere
 
 
-def test_views_without_alpha_or_depth_among_others():
-    rng = np.random.default_rng(3)
-    views = [view(PLAIN, rng, channels=4), view(PLAIN, rng, np.uint16, depth=True), view(PLAIN, rng, mask=True)]
-    bank = PixelBank(ns, views)
-    batch = bank.batch(dr.arange(ns.UInt32, bank.size))
-    _, d, rgb, alpha, depth = expected(views)
-    assert np.allclose(batch.alpha.numpy(), alpha, atol=5e-4) and np.allclose(batch.rgb.numpy().T, rgb, atol=5e-4)
-    assert np.allclose(batch.depth.numpy(), depth, atol=9 / 65535)
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_what_has_no_alpha_is_opaque_among_what_has(dtype):
     rng = np.random.default_rng(3)
@@ -218,18 +208,6 @@ def test_fisheyes(name):
     d = directions([lens], 0)
     assert np.allclose(np.linalg.norm(d, axis=1), 1, atol=1e-6) and d[:, 2].min() < 0.3
     assert np.abs(projected(lens, d) - np.stack(pixels(lens), axis=1)).max() < 5e-5
-
-
-@pytest.mark.parametrize("name", FISHEYES)
-def test_angles_of_fisheyes_are_right_to_rounding(name):
-    """The polynomial of the angle is the pixel's radius, in the median to a unit in the last place."""
-    lens = FISHEYES[name]
-    column, row = pixels(lens)
-    d = directions([lens], 0)
-    t = np.arctan2(np.hypot(d[:, 0], d[:, 1]), d[:, 2])
-    radius = t * (1 + lens.k1 * t**2 + lens.k2 * t**4 + lens.k3 * t**6 + lens.k4 * t**8)
-    error = np.abs(radius - np.hypot((column + 0.5 - lens.cx) / lens.fx, (row + 0.5 - lens.cy) / lens.fy))
-    assert np.median(error) < 2.0**-23 and error.max() < 1e-6
 
 
 def test_the_pixel_on_the_axis_looks_along_it():

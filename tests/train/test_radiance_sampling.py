@@ -76,12 +76,6 @@ def test_the_ends_of_a_ray_are_written_once(packed, monkeypatch):
     assert [w.tolist() for w in written] == [np.unique(ray).tolist()] * 2
 
 
-def test_opacity_is_the_absorbed_share(packed):
-    ray, tau, padded_tau, segments = packed
-    opacity = ray_sum(weights(ns.Float(padded_tau), segments), segments).numpy()
-    assert np.allclose(opacity, -np.expm1(-ray_sum_numpy(tau, ray, RAYS)), atol=1e-6)
-
-
 def test_opaque_samples_leave_the_other_rays_alone():
     """An astronomically dense sample must not cost the rays after it their precision."""
     tau = np.array([1e12, 1e12, 0.1, 0.2])

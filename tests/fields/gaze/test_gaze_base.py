@@ -160,13 +160,6 @@ def test_what_is_no_support_is_refused():
             RaySupport(np.array(cells), radius)
 
 
-def test_a_cube_of_the_radius_has_eight_cells():
-    """However its lowest rays lie on their borders."""
-    axis = np.arange(4) / 4
-    origins = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    assert RaySupport.of(origins, 1.0).cells[:, 3].tolist() == [8] * 8
-
-
 # ---- Ensembles of gaze fields: what fits together, their arrays, their file ----
 
 
@@ -208,15 +201,6 @@ def test_a_file_holds_all_members_and_the_support(half, tmp_path):
         )
     np.testing.assert_array_equal(again.support.cells, support.cells)
     assert again.support.radius == 0.25
-
-
-def test_a_single_field_keeps_its_support_too(tmp_path):
-    field = made()
-    save_gaze(field, tmp_path / "plain.safetensors", {})
-    field.support = RaySupport.of([[1.0, 2, 3]], 0.5)
-    save_gaze(field, tmp_path / "g.safetensors", {})
-    assert load_gaze(tmp_path / "plain.safetensors", namespace("llvm"))[0].support is None
-    assert load_gaze(tmp_path / "g.safetensors", namespace("llvm"))[0].support.cells.shape == (1, 5)
 
 
 def test_ensembles_of_ensembles_are_refused(tmp_path):

@@ -31,8 +31,6 @@ from nerg_mi.train.gaze_data import (
     blind_of_views,
     box_exit,
     concatenate,
-    digest_rays,
-    digest_views,
     far_views,
     hold_out,
     observe,
@@ -56,7 +54,7 @@ from nerg_mi.transport.geometry import default_settings
 from tests.fields.gaze.test_log_density import BOX as VIEW_TARGETS_BOX
 from tests.fields.gaze.test_log_density import SMALL as VIEW_TARGETS_SMALL
 
-from .looks import BOX, LENS, LOG, NOWHERE, PROBES, RAYS, SMALL, around, lobe, looking_at, train, view
+from .looks import BOX, LENS, NOWHERE, PROBES, RAYS, around, lobe, looking_at, train, view
 from .looks import SMALL as PLAIN
 
 # ---- Batches: what is gathered of which probe, integrals, and densities given a view ----
@@ -459,22 +457,6 @@ def in_a_row(count):
     return [view(lobe, (float(k), 0, 1.6), (0, 1, 0), name=f"v{k}") for k in range(count)]
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_zones_lie_far_from_one_another(seed):
-    """Of two, the second is around one of the quarter of the views that is farthest from the first; an eighth is
-    watched."""
-    views = in_a_row(40)
-    learn, watched = split_views(views, 2, 0.5, seed)
-    at = sorted(int(v.name[1:]) for v in watched)
-    assert {int(v.name[1:]) for v in learn} == set(range(40)) - set(at)
-    gap = int(np.argmax(np.diff(at)))
-    groups = [at[: gap + 1], at[gap + 1 :]]
-    assert [len(g) for g in groups] == [2, 2] and all(np.ptp(g) == 1 for g in groups)
-    apart = [abs(k - groups[0][0]) for k in range(40)], [abs(k - groups[1][0]) for k in range(40)]
-    far = lambda of, group: max(of[k] for k in group) >= sorted(of)[-10] - 1
-    assert far(apart[0], groups[1]) or far(apart[1], groups[0])
-
-
 def test_as_many_views_must_be_left_as_a_quarter():
     views = in_a_row(12)
     for distance in np.arange(0.5, 12.0):
@@ -516,17 +498,6 @@ def test_of_views_alone_some_are_watched():
 # ---- What is learnt from: at least something, told apart by digests, and its support ----
 
 
-def test_digests_tell_rays_and_views_apart():
-    assert digest_views(around(3)) == digest_views(around(3)) != digest_views(around(3, seed=1))
-    assert digest_views([]) is None
-    moved = replace(RAYS, origin=RAYS.origin + 1e-6)
-    later = replace(RAYS, t=RAYS.t + 1)
-    assert digest_rays(RAYS) == digest_rays(later) != digest_rays(moved)
-    both = Supervision(RAYS, around(3)).digest()
-    assert both == {"rays": digest_rays(RAYS), "views": digest_views(around(3))}
-    assert Supervision(None, around(3)).digest()["rays"] is None
-
-
 def test_the_support_is_of_all_rays_in_the_frame_of_the_place():
     rays = looking_at((1.5, 0, 1.2))
     double = GazePlace(None, BOX, "none", align=Similarity([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]))
@@ -554,19 +525,6 @@ def made(count, seed=0, **more):
         rng.random((count, 5)) < 0.4,
         **more,
     )
-
-
-@pytest.mark.parametrize(
-    "config, needs",
-    [
-        (SMALL, TargetNeeds()),
-        (replace(SMALL, semantic="snapshot"), TargetNeeds(semantic="snapshot")),
-        (LOG, TargetNeeds(blind_rows=16)),
-        (replace(LOG, escaped="nearest"), TargetNeeds(fill=True, blind_rows=16)),
-    ],
-)
-def test_a_field_says_what_it_needs(config, needs):
-    assert TargetNeeds.of(config) == needs
 
 
 def test_what_escapes_is_counted_by_directions_and_by_gaze():

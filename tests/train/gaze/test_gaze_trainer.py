@@ -26,16 +26,7 @@ from nerg_mi.train.gaze_log_density import elevation_density, prior_field
 from nerg_mi.train.gaze_product import ProductTrainer
 from nerg_mi.train.gaze_run import make_targets
 from nerg_mi.train.gaze_settings import GazeSettings
-from nerg_mi.train.gaze_trainer import (
-    GazeFit,
-    GazeRunFile,
-    GazeTrainer,
-    Scores,
-    StateSettings,
-    fit_again,
-    fit_watched,
-    rounded,
-)
+from nerg_mi.train.gaze_trainer import GazeRunFile, GazeTrainer, StateSettings, fit_again, fit_watched
 from nerg_mi.train.geometry import GazePlace, voxelise_hits
 from nerg_mi.transport.volume_medium import VolumeMedium
 
@@ -63,13 +54,6 @@ NO_FILE = GazeRunFile(None, {})
 @pytest.fixture(scope="module")
 def targets_fit():
     return targets_of_rays(looking_at((1.5, 0.4, 1.2)), NOWHERE, PROBES)
-
-
-def test_what_was_found_is_kept_as_json():
-    fit = GazeFit(None, {}, 4, 9, Scores(1.0, 2.0, 0.5, 0.1, 1.0), [{"steps": 4, "kld": 2.0}], False, 2, 3)
-    assert GazeFit.of(json.loads(json.dumps(fit.found()))) == fit
-    assert GazeFit.of(GazeFit(None).found()).scores is None
-    assert rounded(Scores(1 / 3, 2, 0.5, 0.1, 1)) == {"loss": 0.33333, "kld": 2, "cc": 0.5, "mae": 0.1, "integral": 1}
 
 
 @pytest.mark.parametrize("patience, looks", [(3, 4), (1, 2), (0, 10)])
@@ -113,15 +97,6 @@ def test_the_second_fit_has_as_many_steps_as_were_best_along_the_same_schedule(t
         trainer.step()
     for name, value in trainer.weights().items():
         np.testing.assert_allclose(second.weights[name].numpy(), value.numpy(), atol=1e-6, err_msg=name)
-
-
-def test_an_interrupted_fit_ends_after_its_step(targets_fit):
-    def stop(progress):
-        if progress.steps == 3:
-            raise KeyboardInterrupt
-
-    fit = fit_watched(targets_fit, None, BOX, planned(SMALL, replace(PRODUCT, zones=0)), ns, 1.0, NO_FILE, stop)
-    assert fit.interrupted and fit.trainer.steps == fit.best_step == 3 and fit.weights
 
 
 @pytest.mark.parametrize("stopped", [2, 99])
@@ -371,13 +346,6 @@ def test_equal_seeds_draw_equal_batches(targets_trainer):
     for name, value in first.items():
         np.testing.assert_allclose(value, second[name], atol=1e-6)
     assert np.abs(first["emit_head.0"] - other["emit_head.0"]).max() > 1e-3
-
-
-def test_the_schedule_may_be_longer_than_the_run(targets_trainer):
-    """As that of a second fit is, which ends where the first one was best."""
-    trainer = ProductTrainer(targets_trainer, BOX, SMALL, GazeSettings(steps=2, zones=0), ns, schedule=10)
-    trainer.step()
-    assert trainer.progress == pytest.approx(0.1) and trainer.steps == 1
 
 
 def test_weights_that_are_given_and_frozen_stay(targets_trainer):

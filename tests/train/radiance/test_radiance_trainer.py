@@ -104,13 +104,6 @@ def test_a_deferred_field_has_the_colour_of_its_mean_features():
     assert np.allclose(squares, opacity * mean**2, atol=2e-5)
 
 
-def test_a_background_shows_through():
-    table = StepTable(ns, 0.0, 4.4, STEP, 0.0)
-    color, opacity, _ = expected()
-    seen = render_view(Lump(), lambda p, active: active, table, view(), NEAR, background=0.8, stop=0.0)
-    assert np.allclose(seen.color, color + 0.8 * (1 - opacity[..., None]), atol=2e-5)
-
-
 def test_empty_cells_and_pictures_of_nothing():
     table = StepTable(ns, 0.0, 4.4, STEP, 0.0)
     seen = render_view(Lump(), lambda p, active: active & False, table, view(), NEAR)
@@ -137,25 +130,6 @@ def test_what_is_kept_is_the_average_of_every_fourth_steps_weights(dataset, aver
     for name, value in trainer.averaged.items():
         assert np.allclose(value.numpy(), expected[name], atol=1e-6)
     assert average == 0 or np.abs(expected["density_net.0"] - trainer.optimiser["density_net.0"].numpy()).max() > 1e-4
-
-
-@pytest.mark.nightly
-@pytest.mark.slow
-def test_stored_occupancy_leaves_nothing_out_that_shows(dataset):
-    """Held-out views through the occupied cells and through the whole box; free space is empty."""
-    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns)
-    while trainer.progress < 1:
-        trainer.step()
-    field = trainer.field()
-    assert 0 < field.occupancy.fraction < 0.5
-    bounded = lambda p, active: active & (field.occupancy.empty_cells(BOX.to_unit(p)) == 0)
-    for view in dataset.held_out:
-        with_grid, without = (
-            render_view(field, occupied, trainer.table(), view, 0.01)
-            for occupied in (bounded, lambda p, active: active)
-        )
-        assert np.mean(np.abs(with_grid.opacity - without.opacity)) < 0.02
-        assert np.mean(np.abs(with_grid.color - without.color)) < 0.02
 
 
 @pytest.mark.parametrize("config", [TINY, DEFERRED])
@@ -314,19 +288,6 @@ def test_places_count_first_and_colours_later(dataset, monkeypatch):
         trainer.steps = steps
         trainer.step()
         assert float(trainer.loss[0]) == pytest.approx(0.3 * 0.04 ** ((steps + 1) / 100), rel=1e-4)
-
-
-def test_weights_move_however_faint_their_gradient(dataset):
-    """Entries of the grid that few rays see are not left behind: steps do not depend on the gradient's scale."""
-    moved = []
-    for scale in (1.0, 1e-13):
-        optimiser = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns).optimiser
-        name = "grid.table"
-        before = optimiser[name].numpy().astype(float)
-        dr.set_grad(optimiser[name], dr.full(type(optimiser[name]), scale, dr.width(optimiser[name])))
-        optimiser.step()
-        moved.append(np.abs(optimiser[name].numpy() - before))
-    assert moved[0].min() > 0 and np.allclose(moved[1], moved[0], rtol=0.05)
 
 
 def test_rays_that_do_not_fit_into_a_batch_do_not_count(dataset, monkeypatch):
