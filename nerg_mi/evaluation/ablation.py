@@ -43,22 +43,14 @@ COLUMNS = tuple(
 class Variant:
     """One way to train a gaze field that an ablation compares with others."""
 
-    # What it is called in tables.
-    name: str
-    # Of `train.gaze_recipes`.
-    recipe: str
-    # Factors: "emit", "capture" or "emit_capture".
-    gaze: str = "emit_capture"
-    # Features of a radiance field that emit is given (`train.gaze_recipes.FieldChoices`).
-    semantic: str = ""
-    # Whether emit has the field's own features besides.
-    semantic_own: bool = False
-    # Whether the trunk begins as the radiance field's,
-    begin: bool = False
-    # and stays so.
-    frozen: bool = False
-    # What it is trained on (`train.gaze_settings.LOSSES`); "": the recipe's.
-    loss: str = ""
+    name: str  # What it is called in tables
+    recipe: str  # Of `train.gaze_recipes`
+    gaze: str = "emit_capture"  # Factors: "emit", "capture" or "emit_capture"
+    semantic: str = ""  # Features of a radiance field that emit is given (`train.gaze_recipes.FieldChoices`)
+    semantic_own: bool = False  # Whether emit has the field's own features besides
+    begin: bool = False  # Whether the trunk begins as the radiance field's,
+    frozen: bool = False  # and stays so
+    loss: str = ""  # What it is trained on (`train.gaze_settings.LOSSES`); "": the recipe's
 
     def file_name(self, seed: int) -> str:
         """Name of the checkpoint of its training with a ``seed``."""

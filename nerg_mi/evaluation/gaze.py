@@ -172,9 +172,7 @@ def _mean_rows(density: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.stack([density[r].mean(axis=0, dtype=np.float64) for r in rows])
 
 
-# ---- Scores ----
-#
-# A trained gaze field beside its baselines: densities over the sphere at positions, and a table of scores.
+# ---- A trained gaze field beside its baselines: densities over the sphere at positions, and a table of scores ----
 
 
 # Of the uniform density: what a density of zero counts as in KLD. A truth that is a kernel density has
@@ -285,32 +283,22 @@ sAUC against rays of other test positions; bits a ray beyond the blind density; 
 ray."""
 # Share of an evaluation's time that goes to the densities of methods that are quick; the rest goes to resamples.
 _ANSWERS = 0.2
-# Rays that are drawn at each test position, and scored one by one.
-_PER_POSITION = 128
+_PER_POSITION = 128  # Rays that are drawn at each test position, and scored one by one
 
 
 @dataclass(frozen=True, eq=False)
 class GazeTest:
     """What a density is scored on at P positions, of N persons, in D directions and by K rays each."""
 
-    # Positions (P, 3), metres, in the rays' frame.
-    centres: np.ndarray
-    # Directions (D, 3) of equal area, in which maps are compared.
-    directions: np.ndarray
-    # True densities (P, D), 1/sr.
-    truth: np.ndarray
-    # Those of each person alone (P, N, D).
-    parts: np.ndarray
-    # Rays of each person at each position (P, N).
-    counts: np.ndarray
-    # Names of the persons.
-    persons: tuple[str, ...]
-    # Rays drawn at each position (P, K, 3).
-    at: np.ndarray
-    # Whose they are (P, K), indices of the persons.
-    who: np.ndarray
-    # Rays drawn at other positions (P, K, 3).
-    others: np.ndarray
+    centres: np.ndarray  # Positions (P, 3), metres, in the rays' frame
+    directions: np.ndarray  # Directions (D, 3) of equal area, in which maps are compared
+    truth: np.ndarray  # True densities (P, D), 1/sr
+    parts: np.ndarray  # Those of each person alone (P, N, D)
+    counts: np.ndarray  # Rays of each person at each position (P, N)
+    persons: tuple[str, ...]  # Names of the persons
+    at: np.ndarray  # Rays drawn at each position (P, K, 3)
+    who: np.ndarray  # Whose they are (P, K), indices of the persons
+    others: np.ndarray  # Rays drawn at other positions (P, K, 3)
 
     @cached_property
     def drawn(self) -> np.ndarray:

@@ -21,15 +21,11 @@ from nerg_mi.probes.probes import LEVELS, level_name
 from .gaze import SCORES, Baseline, GazeTest
 from .uncertainty import KEPT
 
-# ---- Report ----
-#
-# What an evaluation of gaze writes: tables as Markdown, CSV and JSON, and pictures of truth and prediction.
+# ---- What an evaluation of gaze writes: tables as Markdown, CSV and JSON, and pictures of truth and prediction ----
 
 
-# Digits of the scores that have others than three.
-_DIGITS = {"MAE": 4}
-# Columns that hold words.
-_WORDS = ("method", "person", "signal", "error")
+_DIGITS = {"MAE": 4}  # Digits of the scores that have others than three
+_WORDS = ("method", "person", "signal", "error")  # Columns that hold words
 
 
 def markdown(rows: list[dict], columns: tuple[str, ...] = ("method", *SCORES, "integral")) -> str:
@@ -137,9 +133,7 @@ def side_by_side(
     save(figure, path, about)
 
 
-# ---- Results ----
-#
-# What `nerg eval gaze` has written, read again: the file ``gaze.json`` of its folder.
+# ---- What `nerg eval gaze` has written, read again: the file ``gaze.json`` of its folder ----
 
 MOST = 4 << 20
 """So many bytes of such a file are read at most."""

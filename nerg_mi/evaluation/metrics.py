@@ -94,8 +94,7 @@ class Rendered:
     mask: np.ndarray
 
 
-# Samples that are rendered at once: the memory for those of a whole picture may not be there.
-_LAUNCH = 1 << 23
+_LAUNCH = 1 << 23  # Samples that are rendered at once: the memory for those of a whole picture may not be there
 
 
 class Renderer:
@@ -154,21 +153,15 @@ class Renderer:
 class ViewScores:
     """Scores of a field on posed pictures."""
 
-    # Names of the views; the lists below are in their order.
-    views: list[str]
-    # Of the first view's picture, in pixels.
-    width: int
+    views: list[str]  # Names of the views; the lists below are in their order
+    width: int  # Of the first view's picture, in pixels
     height: int
-    # Rays a pixel.
-    spp: int
-    # Of each view, in dB; NaN of one that its mask leaves nothing of.
-    psnr: list[float]
-    # Of each view; NaN of one that holds no window of 11 x 11 pixels.
-    ssim: list[float]
+    spp: int  # Rays a pixel
+    psnr: list[float]  # Of each view, in dB; NaN of one that its mask leaves nothing of
+    ssim: list[float]  # Of each view; NaN of one that holds no window of 11 x 11 pixels
     # Of the right half of each view in dB, its colours fitted on the left half; NaN where it has no pixel.
     psnr_fitted: list[float]
-    # Means over the views with true depth; None where there are none.
-    depth: DepthScore | None
+    depth: DepthScore | None  # Means over the views with true depth; None where there are none
 
     @property
     def psnr_mean(self) -> float:
@@ -250,8 +243,7 @@ def _mean_depth_score(scores: list[DepthScore]) -> DepthScore:
 # defined: maps that are constant or zero give a number, not NaN.
 
 
-# Of a map's mean: far below any density that matters, far above underflow.
-EPS = 1e-20
+EPS = 1e-20  # Of a map's mean: far below any density that matters, far above underflow
 
 
 def kld(

@@ -25,9 +25,7 @@ from . import study_truth
 from .study_subject import extent, parameters
 from .study_truth import NAMES, Truth, errors
 
-# ---- Operations ----
-#
-# How much work a render is, counted: operations traced into its kernels, and evaluations made.
+# ---- How much work a render is, counted: operations traced into its kernels, and evaluations made ----
 
 
 def traced_operations(render) -> int:
@@ -222,20 +220,13 @@ PAPER = "paper"
 class StudyRow:
     """One row of a study."""
 
-    # As the tables have it.
-    name: str
-    # The factor that it belongs to.
-    group: str
-    # Of the integrator, over the scene's own.
-    params: Mapping = field(default_factory=dict)
-    # Samples a pixel.
-    spp: int = 1
-    # Of the density as a grid; 0: the scene's own.
-    resolution: int = 0
-    # (steps, γ) of the paper's marching; None: ours.
-    paper: tuple[int, float] | None = None
-    # What is kept from frame to frame is made anew in each.
-    first_frame: bool = False
+    name: str  # As the tables have it
+    group: str  # The factor that it belongs to
+    params: Mapping = field(default_factory=dict)  # Of the integrator, over the scene's own
+    spp: int = 1  # Samples a pixel
+    resolution: int = 0  # Of the density as a grid; 0: the scene's own
+    paper: tuple[int, float] | None = None  # (steps, γ) of the paper's marching; None: ours
+    first_frame: bool = False  # What is kept from frame to frame is made anew in each
 
     def integrator(self, subject, **more):
         """The integrator that renders this row; ``more``: further parameters, such as AOVs that count."""
@@ -380,8 +371,7 @@ OF_HITS = ("stop", "depth")
 """Those of them that mean something where Gaussians are met."""
 COUNTS = ("density_evals", "color_evals", "gaze_evals")
 SEED = 1
-# Samples a pixel of the picture that settings with several are compared with.
-PIXEL_SPP = 256
+PIXEL_SPP = 256  # Samples a pixel of the picture that settings with several are compared with
 
 
 def measure(

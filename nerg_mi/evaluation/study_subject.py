@@ -66,8 +66,7 @@ def extent(integrator) -> float | None:
 KINDS = ("auto", "analytic", "file")
 AOVS = "depth,opacity,visibility,gaze"
 FALLOFF = 0.1
-# The reference of a scene file has steps this many times shorter than the scene's own.
-FINER = 32
+FINER = 32  # The reference of a scene file has steps this many times shorter than the scene's own
 # Nothing is skipped, merged or cut short in a reference.
 _CONVERGED = {"coarse": 1.0, "dt_gamma": 0.0, "jitter": False, "color_cutoff": 0.0, "stop": 1e-9} | {
     "quadrature": "constant",

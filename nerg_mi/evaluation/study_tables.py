@@ -191,9 +191,7 @@ def _timed_by(who: list[dict]) -> str:
     return f"Times are those of whoever measured a setting: {'; '.join(of_each)}."
 
 
-# ---- Plots ----
-#
-# Pictures of a study: error against time with the Pareto front, and cost against size on log axes.
+# ---- Pictures of a study: error against time with the Pareto front, and cost against size on log axes ----
 
 PANELS = (
     ("color_rmse", "colour RMSE [linear radiance]"),
@@ -201,8 +199,7 @@ PANELS = (
     ("visibility_mae", "visibility MAE"),
     ("gaze_mae", "gaze MAE [1/sr]"),
 )
-# Errors below it are shown on the axis' lower end: single precision has nothing to say there.
-FLOOR = 1e-9
+FLOOR = 1e-9  # Errors below it are shown on the axis' lower end: single precision has nothing to say there
 
 
 def plot_errors(path: Path, rows: list[dict], title: str, about: Provenance | None = None) -> None:

@@ -242,9 +242,7 @@ def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
     )
 
 
-# ---- Errors ----
-#
-# How far a picture is from the truth: the errors that a study reports.
+# ---- How far a picture is from the truth: the errors that a study reports ----
 
 SURFACE = 0.5
 """Opacity from which on a ray meets a surface."""
@@ -300,15 +298,11 @@ def errors(
     return out
 
 
-# ---- Shapes ----
-#
-# A scene of shapes alone as the subject of a study: its truth is float64 ray casts at their triangles.
+# ---- A scene of shapes alone as the subject of a study: its truth is float64 ray casts at their triangles ----
 
 
-# Rays tested against all triangles at once.
-CHUNK = 64
-# The mean of so many samples a pixel is the colour that pictures are compared with.
-COLOR_SPP = 256
+CHUNK = 64  # Rays tested against all triangles at once
+COLOR_SPP = 256  # The mean of so many samples a pixel is the colour that pictures are compared with
 
 
 def triangles(scene) -> np.ndarray:

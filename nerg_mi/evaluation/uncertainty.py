@@ -22,8 +22,7 @@ KEPT = (1.0, 0.75, 0.5, 0.25)
 # Halves of the people that are drawn, rays that each half has at a position at least, and the blind density's share of
 # what one half tells of the other, so that where it never looked is not impossible.
 _HALVES, _RAYS, _BLIND = 8, 32, 0.2
-# Groups of positions from which on there is an interval.
-_GROUPS = 5
+_GROUPS = 5  # Groups of positions from which on there is an interval
 
 
 def position_rows(

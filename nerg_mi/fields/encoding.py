@@ -44,8 +44,7 @@ class EncodingConfig(Protocol):
     Encodings of equal configurations are interchangeable.
     """
 
-    # What a checkpoint calls this kind of encoding.
-    kind: ClassVar[str]
+    kind: ClassVar[str]  # What a checkpoint calls this kind of encoding
     # By name of a size that is a whole number: the largest that is read from a file.
     limits: ClassVar[Mapping[str, int]]
 
@@ -210,18 +209,12 @@ class HashGridConfig(EncodingConfig):
         "dimensions": 3,
     }
 
-    # Grids of different resolution, whose features are concatenated.
-    levels: int = 16
-    # Numbers at a vertex of a level: 2 or 4.
-    features: int = 2
-    # Base 2 logarithm of the rows that a level has at most.
-    log2_rows: int = 19
-    # Cells along an edge of the coarsest level.
-    base: int = 16
-    # Cells along an edge of the finest level.
-    finest: int | float = 2048
-    # 3 for a grid over the unit cube, 2 for one over the unit square.
-    dimensions: int = 3
+    levels: int = 16  # Grids of different resolution, whose features are concatenated
+    features: int = 2  # Numbers at a vertex of a level: 2 or 4
+    log2_rows: int = 19  # Base 2 logarithm of the rows that a level has at most
+    base: int = 16  # Cells along an edge of the coarsest level
+    finest: int | float = 2048  # Cells along an edge of the finest level
+    dimensions: int = 3  # 3 for a grid over the unit cube, 2 for one over the unit square
 
     def __post_init__(self):
         if self.levels < 1 or self.base < 1 or self.finest < self.base:

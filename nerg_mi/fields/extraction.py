@@ -20,11 +20,9 @@ from .radiance import RadianceField
 # Points a kernel launch: some hundred megabytes of intermediate values at most.
 _BATCH = 1 << 21
 _BISECTIONS = 8
-# Tilted directions beside the head-on one that a surface's colour is the mean of.
-_TILTED = 4
+_TILTED = 4  # Tilted directions beside the head-on one that a surface's colour is the mean of
 
-# Densities of a lattice are held in single precision, all at once.
-_MOST_CELLS = 1 << 30
+_MOST_CELLS = 1 << 30  # Densities of a lattice are held in single precision, all at once
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,7 @@ from .radiance import assign
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# ---- Basis ----
-#
-# What a picture of gaze rests on: how many rays, of how many people.
+# ---- What a picture of gaze rests on: how many rays, of how many people ----
 
 _MOST = 1 << 60
 
@@ -80,8 +78,7 @@ CELLS = 2
 REACH = 5.0
 """Radii R from which a ray still counts."""
 
-# Cells that are looked at for the one with the greatest support.
-_DENSE = 64
+_DENSE = 64  # Cells that are looked at for the one with the greatest support
 
 
 class RaySupport:
@@ -178,19 +175,15 @@ class AnyGazeField:
     is; ``networks``: how many one evaluation of gaze evaluates; ``mlps``: the networks of all members.
     """
 
-    # The name under which a checkpoint knows the class.
-    kind: ClassVar[str]
+    kind: ClassVar[str]  # The name under which a checkpoint knows the class
     # The largest whole numbers that a checkpoint may claim for its sizes, by name.
     limits: ClassVar[Mapping[str, int]] = SIZE_LIMITS
-    # Parameters that no training changes.
-    fixed: ClassVar[tuple[str, ...]] = ()
+    fixed: ClassVar[tuple[str, ...]] = ()  # Parameters that no training changes
 
     config: Any
     box: AnyBox
-    # How many rays it learnt from around a position, where that is known.
-    support: RaySupport | None = None
-    # How many rays and people it learnt from in all, where that is known.
-    basis: Basis | None = None
+    support: RaySupport | None = None  # How many rays it learnt from around a position, where that is known
+    basis: Basis | None = None  # How many rays and people it learnt from in all, where that is known
 
     @property
     def ns(self) -> ModuleType:
@@ -234,22 +227,15 @@ class GazeHeadConfig:
     """Base of the configuration of a gaze field that is one density: a frozen dataclass that a checkpoint keeps as
     JSON. The defaults are those of a density that is normalised over the sphere, of both factors."""
 
-    # The name under which a checkpoint knows the field's class.
-    kind: ClassVar[str]
-    # The encoding of positions.
-    grid: Any
-    # emit, capture or emit_capture: which of the two factors there are.
-    variant: Any = "emit_capture"
-    # What the network's output goes through to become a density; for people, not for code.
-    activation: Any = "log"
+    kind: ClassVar[str]  # The name under which a checkpoint knows the field's class
+    grid: Any  # The encoding of positions
+    variant: Any = "emit_capture"  # emit, capture or emit_capture: which of the two factors there are
+    activation: Any = "log"  # What the network's output goes through to become a density; for people, not for code
     # Whether ``evaluate`` divides by the integral over the observer's sphere, which it then must be given.
     normalized: Any = True
-    # Which features of a radiance field emit takes: accumulated, snapshot or none ("").
-    semantic: Any = ""
-    # Rows of the table of the density that does not depend on the position; 0 for a field that has none.
-    prior: Any = 0
-    # The share of that density.
-    mix: Any = 0.0
+    semantic: Any = ""  # Which features of a radiance field emit takes: accumulated, snapshot or none ("")
+    prior: Any = 0  # Rows of the table of the density that does not depend on the position; 0 for a field that has none
+    mix: Any = 0.0  # The share of that density
 
     @property
     def features(self) -> int:
@@ -290,8 +276,7 @@ class GazeHead(AnyGazeField):
     DRJIT_STRUCT: ClassVar[dict]
 
     grid: Any
-    # Log of the density that does not depend on the position, of fields whose configuration has a ``prior``.
-    prior: Any
+    prior: Any  # Log of the density that does not depend on the position, of fields whose configuration has a ``prior``
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
@@ -420,13 +405,10 @@ def limits_of(about: object) -> Mapping[str, int]:
     return _KINDS[kind].limits if isinstance(kind, str) and kind in _KINDS else {}
 
 
-# ---- Density that does not depend on the position ----
-#
-# What people look at wherever they stand, the blind density, as a latitude-longitude table of its logarithm.
+# ---- What people look at wherever they stand, the blind density, as a latitude-longitude table of its logarithm ----
 
 
-# Of the blind density that is uniform, so that its logarithm is finite.
-_FLOOR = 1e-3
+_FLOOR = 1e-3  # Of the blind density that is uniform, so that its logarithm is finite
 
 
 def look_up(table, rows: int, d):

@@ -31,12 +31,9 @@ from .mlp import MLP
 
 GEOMETRIES = ("surface", "none")
 ESCAPES = ("constant", "nearest")
-# Logits beyond this leave float32 as densities.
-_HIGHEST = 30.0
-# Logarithms of the blind density beyond this do so, too.
-_LARGEST_LOG = 80.0
-# A surface nearer than this share of the box counts as this far: the logarithm is an input of emit.
-_NEAREST = 1e-3
+_HIGHEST = 30.0  # Logits beyond this leave float32 as densities
+_LARGEST_LOG = 80.0  # Logarithms of the blind density beyond this do so, too
+_NEAREST = 1e-3  # A surface nearer than this share of the box counts as this far: the logarithm is an input of emit
 
 
 @dataclass(frozen=True)
@@ -47,27 +44,20 @@ class LogGazeConfig(GazeHeadConfig):
 
     # Of emit, over the field's box; coarse levels generalise to positions where nobody stood.
     grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=3, log2_rows=14, base=2, finest=8))
-    # As in ``GazeConfig``.
-    variant: str = "emit_capture"
-    # Of both networks' hidden layers.
-    width: int = 64
-    # Hidden layers of both networks.
-    layers: int = 2
-    # Degrees of spherical harmonics of directions.
-    sh_degree: int = 4
+    variant: str = "emit_capture"  # As in ``GazeConfig``
+    width: int = 64  # Of both networks' hidden layers
+    layers: int = 2  # Hidden layers of both networks
+    sh_degree: int = 4  # Degrees of spherical harmonics of directions
     # Corners of the box of observers that capture's encoding spans; positions beyond count as its nearest point.
     heads: tuple = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    # The share m of the blind density.
-    mix: float = 0.0
-    # Rows of the blind density's latitude-longitude table.
-    prior: int = 64
+    mix: float = 0.0  # The share m of the blind density
+    prior: int = 64  # Rows of the blind density's latitude-longitude table
     # surface, or none where no geometry was known: p_od then is ``reach`` from p_o whatever is there.
     geometry: str = "surface"
     # What emit is where the observer meets no surface: a learnt constant, or (where the geometry has holes, as one made
     # of hit points has) emit at the depth of the nearest directions that do.
     escaped: str = "constant"
-    # Distance of p_od where no geometry was known, in the field's units.
-    reach: float = 2.0
+    reach: float = 2.0  # Distance of p_od where no geometry was known, in the field's units
 
     def __post_init__(self):
         object.__setattr__(self, "heads", tuple(tuple(float(x) for x in corner) for corner in self.heads))

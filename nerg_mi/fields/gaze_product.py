@@ -63,21 +63,16 @@ class GazeConfig(GazeHeadConfig):
     variant: str = "emit_capture"
     # Of the emit head: softplus and exp give densities, linear is the paper's and may be negative.
     activation: str = "softplus"
-    # Of the hidden layers.
-    width: int = 64
-    # Features that the position net hands to the direction net.
-    geometry: int = 15
-    # Degrees of spherical harmonics of directions.
-    sh_degree: int = 4
+    width: int = 64  # Of the hidden layers
+    geometry: int = 15  # Features that the position net hands to the direction net
+    sh_degree: int = 4  # Degrees of spherical harmonics of directions
     # Multiplies what emit returns: what the untrained field comes to, and what weight decay draws a field towards.
     emit_scale: float = 1.0
     # relu: a ReLU behind the direction net; layernorm: every layer's inputs normalised, biases, and a ReLU behind the
     # position net too (what the paper's authors train by default); linear: a ReLU behind neither (their other choice).
     trunk: str = "relu"
-    # Features of a radiance field that emit is given: accumulated, snapshot or none.
-    semantic: str = ""
-    # Added to the field's own features, in place of taking their place.
-    semantic_own: bool = False
+    semantic: str = ""  # Features of a radiance field that emit is given: accumulated, snapshot or none
+    semantic_own: bool = False  # Added to the field's own features, in place of taking their place
     # Divide by the integral over the observer's sphere, so that the density integrates to one whatever the weights are.
     normalized: bool = False
 

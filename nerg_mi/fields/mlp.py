@@ -93,8 +93,7 @@ def _unrolled(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
 # atomically accumulated outer products of cooperative vectors; best for training).
 
 
-# torch's LayerNorm (Ba et al. 2016) adds it to the variance.
-_NORM_EPSILON = 1e-5
+_NORM_EPSILON = 1e-5  # torch's LayerNorm (Ba et al. 2016) adds it to the variance.
 
 
 class MLP:

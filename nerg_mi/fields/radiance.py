@@ -47,16 +47,12 @@ class GridConfig:
 class BackgroundConfig(GridConfig):
     """Sizes of a background. The defaults are torch-ngp's. Raises ``ValueError`` for sizes that none has."""
 
-    # Of the sphere about the field's origin, in the field's units.
-    radius: float
+    radius: float  # Of the sphere about the field's origin, in the field's units
     # The encoding of the two angles.
     grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=4, dimensions=2))
-    # Neurons of every hidden layer.
-    width: int = 64
-    # Hidden layers.
-    hidden: int = 1
-    # Degree of the encoding of directions.
-    sh_degree: int = 4
+    width: int = 64  # Neurons of every hidden layer
+    hidden: int = 1  # Hidden layers
+    sh_degree: int = 4  # Degree of the encoding of directions
 
     def __post_init__(self):
         if not 0 < self.radius <= FARTHEST:
@@ -119,8 +115,7 @@ class Background:
 # here their logits, so that the sum stays in 0..1.
 
 
-# How near to 0 and 1 a diffuse colour is taken before its logit.
-_MARGIN = 1e-3
+_MARGIN = 1e-3  # How near to 0 and 1 a diffuse colour is taken before its logit
 
 
 def point_features(outputs: list[Float], deferred: bool) -> list[Float]:
@@ -161,28 +156,20 @@ def network_color(outputs: list[Float], inputs: list[Float], deferred: bool) -> 
 # sample of a ray, or once a ray of a deferred field: see ``color_head``.
 
 
-# exp(30) is 1e13 per unit: opaque at any scale, and far from the overflow of fp32 (exp(88)).
-_MAX_LOG_DENSITY = 30.0
+_MAX_LOG_DENSITY = 30.0  # exp(30) is 1e13 per unit: opaque at any scale, and far from the overflow of fp32 (exp(88))
 
 
 @dataclass(frozen=True)
 class RadianceConfig(GridConfig):
     """Sizes of the networks. The defaults are the paper's. Raises ``ValueError`` for sizes that no field has."""
 
-    # The encoding of positions.
-    grid: EncodingConfig = field(default_factory=HashGridConfig)
-    # Neurons of every hidden layer.
-    width: int = 64
-    # Hidden layers of the density net.
-    density_hidden: int = 1
-    # Hidden layers of the colour net.
-    color_hidden: int = 2
-    # Features handed from the density net to the colour net.
-    geometry: int = 15
-    # Degree of the encoding of directions, which has sh_degree**2 numbers.
-    sh_degree: int = 4
-    # Density, in 1/unit, where the density net returns 0.
-    density_scale: float = 1.0
+    grid: EncodingConfig = field(default_factory=HashGridConfig)  # The encoding of positions
+    width: int = 64  # Neurons of every hidden layer
+    density_hidden: int = 1  # Hidden layers of the density net
+    color_hidden: int = 2  # Hidden layers of the colour net
+    geometry: int = 15  # Features handed from the density net to the colour net
+    sh_degree: int = 4  # Degree of the encoding of directions, which has sh_degree**2 numbers
+    density_scale: float = 1.0  # Density, in 1/unit, where the density net returns 0
     # Whether the colour net is asked once a ray, with the features composited along it, of which three are a colour.
     deferred: bool = False
 

@@ -29,21 +29,15 @@ class Splats:
     normalised, opacities clipped to [0, 1], scales to at least 1e-9.
     """
 
-    # (N, 3).
-    centers: np.ndarray
-    # Standard deviations along the Gaussian's own axes, (N, 3).
-    scales: np.ndarray
-    # Unit quaternions (N, 4), w first: from the Gaussian's own axes to the frame of the centres.
-    rotations: np.ndarray
-    # Share of light that is absorbed on a ray through the centre, (N,).
-    opacities: np.ndarray
+    centers: np.ndarray  # (N, 3)
+    scales: np.ndarray  # Standard deviations along the Gaussian's own axes, (N, 3)
+    rotations: np.ndarray  # Unit quaternions (N, 4), w first: from the Gaussian's own axes to the frame of the centres
+    opacities: np.ndarray  # Share of light that is absorbed on a ray through the centre, (N,)
     # Coefficients of real spherical harmonics (`maths.sphere`), (N, K, 3) with K = 1, 4, 9 or 16: the colour seen
     # along a unit direction d of the ray is max(0, 1/2 + sum_k c_k Y_k(d)), in the colour space of the training.
     harmonics: np.ndarray
-    # Further columns of the file, (N,) each, by name.
-    extra: Mapping[str, np.ndarray] = field(default_factory=dict)
-    # Of the colours: "srgb" or "linear".
-    color_space: str = "srgb"
+    extra: Mapping[str, np.ndarray] = field(default_factory=dict)  # Further columns of the file, (N,) each, by name
+    color_space: str = "srgb"  # Of the colours: "srgb" or "linear"
     # What a reader had to guess, and what the file holds that is not used: a sentence each.
     guesses: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()

@@ -29,11 +29,9 @@ class Box:
     (p + bound) / (2 bound), rounded as there: in a fine hash grid the last bit of a coordinate can be seen.
     """
 
-    # The three coordinates of either corner; any sequences of numbers become tuples.
-    lower: tuple[float, ...]
+    lower: tuple[float, ...]  # The three coordinates of either corner; any sequences of numbers become tuples
     upper: tuple[float, ...]
-    # Half the edge of the unit cube, where that is not the box's longest.
-    bound: float | None = None
+    bound: float | None = None  # Half the edge of the unit cube, where that is not the box's longest
 
     # Whether positions are contracted before they are encoded, and how far then (`geometry.ContractedBox`).
     contracted: ClassVar[bool] = False
@@ -151,8 +149,7 @@ class ContractedBox:
     reach: float = REACH
 
     contracted: ClassVar[bool] = True
-    # The unit cube is not the box's own (`Box.bound`).
-    bound: ClassVar[float | None] = None
+    bound: ClassVar[float | None] = None  # The unit cube is not the box's own (`Box.bound`)
 
     def __post_init__(self):
         if not (2 <= self.reach <= 2**12 and np.frexp(self.reach)[0] == 0.5):
@@ -275,9 +272,7 @@ def box_interval(o: ArrayLike, d: ArrayLike, lower: ArrayLike, upper: ArrayLike)
     return np.asarray(near), np.asarray(far)
 
 
-# ---- Similarity ----
-#
-# Rotations, uniform scales and translations: what places a field in a scene.
+# ---- Rotations, uniform scales and translations: what places a field in a scene ----
 
 
 class Similarity:

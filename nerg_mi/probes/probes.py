@@ -14,9 +14,7 @@ from nerg_mi.rays.rays import Neighbours, RayIndex, Rays
 
 from .kde import Backend, SphericalKde, loo_kappas, silverman_kappas
 
-# ---- Placement ----
-#
-# Where probes stand: on a lattice, at random, where people were, or there and evenly (blue noise).
+# ---- Where probes stand: on a lattice, at random, where people were, or there and evenly (blue noise) ----
 
 
 def place_queries(

@@ -29,21 +29,14 @@ from nerg_mi.transport.observer_gaze import nearest_depth
 from .gaze_settings import VANISHED, GazeSettings, ProbeSettings
 from .geometry import NOWHERE, GazePlace
 
-# ---- Blind ----
-#
-# The blind density that a log-density gaze field begins with: what people look at wherever they stand.
+# ---- The blind density that a log-density gaze field begins with: what people look at wherever they stand ----
 
 
-# Rays that it is made of at most.
-_MOST_RAYS = 1 << 16
-# Concentration of the kernels that smooth the density of views.
-_VIEWS_KAPPA = 50.0
-# Points in a leaf of a KD-tree, which decides between directions that are equally far.
-_LEAF = 16
-# Rounds of the iteration that puts it together from them.
-_ROUNDS = 100
-# Directions over which the table is scaled to integrate to one.
-_SCALED_OVER = 1 << 16
+_MOST_RAYS = 1 << 16  # Rays that it is made of at most
+_VIEWS_KAPPA = 50.0  # Concentration of the kernels that smooth the density of views
+_LEAF = 16  # Points in a leaf of a KD-tree, which decides between directions that are equally far
+_ROUNDS = 100  # Rounds of the iteration that puts it together from them
+_SCALED_OVER = 1 << 16  # Directions over which the table is scaled to integrate to one
 
 
 def check_kernels(rows: int, kappa: float) -> None:
@@ -150,19 +143,15 @@ def semantic_features(
     return out
 
 
-# ---- Supervision ----
-#
-# What a gaze field learns from: rays of attention, salience images, or both.
+# ---- What a gaze field learns from: rays of attention, salience images, or both ----
 
 
 @dataclass(frozen=True, eq=False)
 class Supervision:
     """Rays and views, of which one may be missing."""
 
-    # Rays of attention, in a frame of their own in metres; None: views alone.
-    rays: Rays | None = None
-    # Salience images, in the gaze field's frame.
-    views: tuple[SalienceView, ...] = ()
+    rays: Rays | None = None  # Rays of attention, in a frame of their own in metres; None: views alone
+    views: tuple[SalienceView, ...] = ()  # Salience images, in the gaze field's frame
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "views", tuple(self.views))
@@ -206,22 +195,17 @@ def _sha256(arrays: list[np.ndarray]) -> str:
 # What a training does not learn from: positions and people that a test holds out, and what a validation watches.
 
 
-# Share of the views that a validation watches.
-_WATCHED = 0.12
+_WATCHED = 0.12  # Share of the views that a validation watches
 
 
 @dataclass(frozen=True, eq=False)
 class ValidationSplit:
     """What the first of a training's fits learns from, and what it is scored on."""
 
-    # What is learnt from.
-    learn: Supervision
-    # What is scored; None: nothing is watched.
-    watched: Supervision | None = None
-    # Where its rays are scored (T, 3), in their frame; None: at its views.
-    centres: np.ndarray | None = None
-    # Rays and views that are not learnt from.
-    rays_held_out: int = 0
+    learn: Supervision  # What is learnt from
+    watched: Supervision | None = None  # What is scored; None: nothing is watched
+    centres: np.ndarray | None = None  # Where its rays are scored (T, 3), in their frame; None: at its views
+    rays_held_out: int = 0  # Rays and views that are not learnt from
     views_held_out: int = 0
 
 
@@ -376,12 +360,9 @@ def box_exit(box: AnyBox, origins: np.ndarray, directions: np.ndarray) -> np.nda
 class TargetNeeds:
     """What a kind of gaze field is shown besides directions, densities and distances."""
 
-    # Features of a radiance field (`fields.gaze_product.SEMANTICS`); "": none.
-    semantic: str = ""
-    # Whether directions that meet no surface end at the depth of those around them, not on the box.
-    fill: bool = False
-    # Rows of the table of the blind density that the field begins with; 0: it needs none.
-    blind_rows: int = 0
+    semantic: str = ""  # Features of a radiance field (`fields.gaze_product.SEMANTICS`); "": none
+    fill: bool = False  # Whether directions that meet no surface end at the depth of those around them, not on the box
+    blind_rows: int = 0  # Rows of the table of the blind density that the field begins with; 0: it needs none
 
     @staticmethod
     def of(config: GazeHeadConfig) -> TargetNeeds:
@@ -393,16 +374,11 @@ class TargetNeeds:
 class GazeTargets:
     """P observers with D directions each, parts of equal solid angle, in the field's frame and units; float32."""
 
-    # Positions (P, 3) of the observers, p_o.
-    positions: np.ndarray
-    # Unit directions (P, D, 3), r_o.
-    directions: np.ndarray
-    # True densities (P, D), 1/sr.
-    truth: np.ndarray
-    # Distances (P, D) from p_o to p_od.
-    distance: np.ndarray
-    # Where no surface was met (P, D), bool.
-    escaped: np.ndarray
+    positions: np.ndarray  # Positions (P, 3) of the observers, p_o
+    directions: np.ndarray  # Unit directions (P, D, 3), r_o
+    truth: np.ndarray  # True densities (P, D), 1/sr
+    distance: np.ndarray  # Distances (P, D) from p_o to p_od
+    escaped: np.ndarray  # Where no surface was met (P, D), bool
     # Features (P, D, F) of a radiance field, float16, for a gaze field that wants them.
     semantic: np.ndarray | None = None
     # Table of the log of the density of all rays whatever their position (`fields.gaze_base.blind_table`).
@@ -464,30 +440,21 @@ def concatenate(a: GazeTargets, b: GazeTargets) -> GazeTargets:
 
 # ---- Targets as arrays of a backend, and the batches that are gathered from them ----
 
-# Below 4π by more than this share, directions are those of a view.
-_WHOLE = 1 - 1e-6
+_WHOLE = 1 - 1e-6  # Below 4π by more than this share, directions are those of a view
 
 
 @dataclass(frozen=True)
 class Batch:
     """B observers with D directions each, flat: value b * D + d is observer b in direction d."""
 
-    # Observers (Array3f, B lanes).
-    p_o: Any
-    # Directions (Array3f, B * D lanes), unit.
-    r_o: Any
-    # What they end at (Array3f, B * D lanes).
-    p_od: Any
-    # True densities (Float, B * D lanes), 1/sr.
-    truth: Any
-    # Where no surface is met (Bool, B * D lanes).
-    escaped: Any
-    # Solid angle in sr (Float, B lanes) that the directions of an observer are equal parts of.
-    extent: Any
-    # Features of a radiance field (F Floats, B * D lanes); None without any.
-    semantic: list | None = None
-    # Whether some of the observers are views, who are known in part.
-    views: bool = False
+    p_o: Any  # Observers (Array3f, B lanes)
+    r_o: Any  # Directions (Array3f, B * D lanes), unit
+    p_od: Any  # What they end at (Array3f, B * D lanes)
+    truth: Any  # True densities (Float, B * D lanes), 1/sr
+    escaped: Any  # Where no surface is met (Bool, B * D lanes)
+    extent: Any  # Solid angle in sr (Float, B lanes) that the directions of an observer are equal parts of
+    semantic: list | None = None  # Features of a radiance field (F Floats, B * D lanes); None without any
+    views: bool = False  # Whether some of the observers are views, who are known in part
 
     def integral(self, density: Any) -> Any:
         """Integral (Float, B lanes) of the ``density`` (Float, B * D lanes, 1/sr) of each observer over its extent."""
@@ -641,8 +608,7 @@ def rotated_sets(count: int, sets: int, rng: np.random.Generator) -> np.ndarray:
 # them.
 
 
-# Directions a pixel of a view, so that hardly any is left out.
-_PER_PIXEL = 4
+_PER_PIXEL = 4  # Directions a pixel of a view, so that hardly any is left out
 
 
 def targets_of_views(

@@ -26,9 +26,7 @@ from .gaze_recipes import DEFAULT, FieldChoices, Recipe, register
 from .gaze_trainer import GazeTrainer
 from .radiance_losses import stack
 
-# ---- Log density model ----
-#
-# The log-density gaze field's forward pass in the form that trains fastest: networks as tensor products.
+# ---- The log-density gaze field's forward pass in the form that trains fastest: networks as tensor products ----
 
 
 def log_gaze(

@@ -132,9 +132,7 @@ class ProductTrainer(GazeTrainer):
         return w["kld"] * kld + w["cc"] * (1 - cc) + w["mae"] * mae + self.settings.integral * off
 
 
-# ---- Beginning as a radiance field ----
-#
-# The paper's two initialisations: a trunk that starts as the radiance field's, frozen or fine-tuned.
+# ---- The paper's two initialisations: a trunk that starts as the radiance field's, frozen or fine-tuned ----
 
 
 def trunk_config(config: GazeConfig, radiance: RadianceConfig) -> GazeConfig:

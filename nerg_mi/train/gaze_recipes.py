@@ -26,48 +26,34 @@ DEFAULT = "default"
 class FieldChoices:
     """What of a gaze field is chosen besides its recipe, which heeds the variant, the place and what it ``takes``."""
 
-    # "emit", "capture" or "emit_capture"; "": one of `default_variants`.
-    variant: str = ""
-    # Of the emit head (`fields.gaze_product.ACTIVATIONS`); None: the recipe's.
-    activation: str | None = None
-    # Of the networks, a word; None: the recipe's.
-    size: str | None = None
-    # Whether the density is divided by its integral over the sphere.
-    normalized: bool = False
-    # Features of a radiance field that emit is given (`fields.gaze_product.SEMANTICS`); "": none.
-    semantic: str = ""
-    # Whether emit has the field's own features besides.
-    semantic_own: bool = False
-    # Kind of the place that it is trained in (`GazePlace.kind`).
-    place: str = "field"
+    variant: str = ""  # "emit", "capture" or "emit_capture"; "": one of `default_variants`
+    activation: str | None = None  # Of the emit head (`fields.gaze_product.ACTIVATIONS`); None: the recipe's
+    size: str | None = None  # Of the networks, a word; None: the recipe's
+    normalized: bool = False  # Whether the density is divided by its integral over the sphere
+    semantic: str = ""  # Features of a radiance field that emit is given (`fields.gaze_product.SEMANTICS`); "": none
+    semantic_own: bool = False  # Whether emit has the field's own features besides
+    place: str = "field"  # Kind of the place that it is trained in (`GazePlace.kind`)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
     """One way to train a gaze field."""
 
-    # The word it is called by.
-    name: str
-    # What it is, in a clause.
-    summary: str
+    name: str  # The word it is called by
+    summary: str  # What it is, in a clause
     # Makes the architecture of what is chosen, a variant among it. Raises `NergError` for a place that such a field
     # cannot be trained in.
     config: Callable[[FieldChoices], GazeHeadConfig]
-    # Moves the weights of such a field.
-    trainer: type[GazeTrainer]
-    # Losses that it can be trained on (`gaze_settings.LOSSES`).
-    losses: tuple[str, ...]
-    # Keywords of `GazeSettings`, its length among them.
-    settings: Mapping[str, Any]
-    # Keywords of `ProbeSettings`.
-    probes: Mapping[str, Any]
+    trainer: type[GazeTrainer]  # Moves the weights of such a field
+    losses: tuple[str, ...]  # Losses that it can be trained on (`gaze_settings.LOSSES`)
+    settings: Mapping[str, Any]  # Keywords of `GazeSettings`, its length among them
+    probes: Mapping[str, Any]  # Keywords of `ProbeSettings`
     # Those of ``settings`` that differ where views are all there is: what they share comes late, after a plateau.
     views_alone: Mapping[str, Any] = field(default_factory=lambda: {"patience": 10})
     # What may be chosen of it: of "activation", "size", "normalized", "semantic", "begin", "loss", "integral",
     # "mix-folds", "mix-kappa".
     takes: frozenset[str] = frozenset()
-    # Whether a training is so short that an ablation repeats it with several seeds.
-    quick: bool = False
+    quick: bool = False  # Whether a training is so short that an ablation repeats it with several seeds
 
     def plan(
         self,

@@ -70,10 +70,8 @@ _ZONES, _POSITIONS, _RAYS, _DIRECTIONS = 3, 48, 16, 1024
 # Folds after which a field that needs no more than the least share in any is believed; probes of a fold at most, and
 # its steps as a share of the training's: both end alike for this question.
 _ENOUGH, _PROBES, _STEPS = 2, 512, 0.5
-# Standard errors by which a share may be worse than the best.
-_DOUBT = 0.5
-# Of a density (1/sr), so that its logarithm is finite.
-_LEAST = 1e-9
+_DOUBT = 0.5  # Standard errors by which a share may be worse than the best
+_LEAST = 1e-9  # Of a density (1/sr), so that its logarithm is finite
 
 
 @dataclass(frozen=True)
@@ -81,10 +79,8 @@ class MixChoice:
     """The share of the blind density that was chosen, and why; of no folds the share that was given, no KLD and no
     regions."""
 
-    # The share.
-    mix: float
-    # How many folds had people and positions enough to be judged by.
-    folds: int
+    mix: float  # The share
+    folds: int  # How many folds had people and positions enough to be judged by
     # KLD (nats) of what was held out, means over folds: with this share, of the field as it is (with the least share
     # that is tried), and of the blind density alone; of kernel densities, so that none reaches zero.
     kld: float | None = None
@@ -129,12 +125,9 @@ class _Judgement(NamedTuple):
 class JudgedFolds:
     """What folds tell of one architecture."""
 
-    # The share that it has of itself.
-    mix: float
-    # KLD (F, S) in each fold with each of ``SHARES``.
-    curves: np.ndarray
-    # Of each fold.
-    judgements: list[_Judgement]
+    mix: float  # The share that it has of itself
+    curves: np.ndarray  # KLD (F, S) in each fold with each of ``SHARES``
+    judgements: list[_Judgement]  # Of each fold
 
     def choose(self) -> MixChoice:
         """The share that it is given: its own where there is no fold."""

@@ -35,13 +35,11 @@ from .trainer import RunSettings
 # correlation itself; it is 1 - CC that is minimised).
 
 
-# Of the uniform density: what a density of zero counts as inside a logarithm.
-KLD_EPS = 1e-6
+KLD_EPS = 1e-6  # Of the uniform density: what a density of zero counts as inside a logarithm
 # 1/sr (uniform is 0.08): a density whose mean is lower is a map of zeros. Its gradient
 # grows as one over the mean, and would leave float32 before the mean does.
 VANISHED = 1e-12
-# A probe whose spread is below this fraction of its mean is constant: no correlation.
-FLAT = 1e-5
+FLAT = 1e-5  # A probe whose spread is below this fraction of its mean is constant: no correlation
 
 PAPER = {"kld": 1.0, "cc": 1.0, "mae": 1.0}  # KLD + (1 - CC) + MAE
 CODE = {"kld": 0.0, "cc": 0.1, "mae": 1.0}  # the published code's: MAE + 0.1 (1 - CC)
@@ -159,9 +157,7 @@ def _shares(Float: type, directions: int, n: int, solid_angle: Any) -> Any:
     return w / dr.repeat(dr.block_sum(w, directions), directions)
 
 
-# ---- Settings ----
-#
-# What a gaze field is trained with: how rays become probes, and how the weights are moved.
+# ---- What a gaze field is trained with: how rays become probes, and how the weights are moved ----
 
 LOSSES = {"paper": PAPER, "code": CODE, "likelihood": {"kld": 1.0, "cc": 0.0, "mae": 0.0}}
 """Weights of the parts of each loss; of the likelihood, which rays give, those by which a validation is judged."""
@@ -179,11 +175,9 @@ class ProbeSettings(Checked):
     kappa: float = setting(50.0, "That of the rule fixed.", within=KAPPAS)
     # Of equal area, turned at random and fixed, so that depths are traced once.
     directions: int = setting(1024, "Directions of a probe.", within=DIRECTIONS)
-    # Kind of depth that is the surface (`transport.depth`).
-    depth: str = "median"
+    depth: str = "median"  # Kind of depth that is the surface (`transport.depth`)
     placement: str = setting("data", "Of probes: data, grid, random or blue.")
-    # Distance between probes, of placements that have one.
-    spacing: float | None = ranged(None, LENGTHS)
+    spacing: float | None = ranged(None, LENGTHS)  # Distance between probes, of placements that have one
     fresh: bool = setting(False, "Draw the directions again for every epoch, not once a probe.", "--fresh-directions")
     weights: str = setting(
         "equal", "Of a probe's rays: equal, distance (1 - d/R), or person (all people of a probe count alike)."
@@ -210,30 +204,23 @@ class GazeSettings(RunSettings):
     loss: str = setting("paper", "Of small and paper. paper: KLD + (1 - CC) + MAE; code: MAE + 0.1 (1 - CC).")
     # KLD and CC do not see the integral; MAE alone pulls it to the median.
     integral: float = setting(1.0, "Weight of the squared error of the integral over the sphere.", within=LOSS_WEIGHTS)
-    # Probes of a step, drawn at random.
-    probes: int = ranged(16, Range(1, 10**6))
-    # Directions of each, drawn at random.
-    directions: int = ranged(256, Range(1, 1 << 20))
-    # Rays of each, drawn from its density, for the likelihood.
-    rays: int = ranged(64, Range(1, 10**6))
+    probes: int = ranged(16, Range(1, 10**6))  # Probes of a step, drawn at random
+    directions: int = ranged(256, Range(1, 1 << 20))  # Directions of each, drawn at random
+    rays: int = ranged(64, Range(1, 10**6))  # Rays of each, drawn from its density, for the likelihood
     learning_rate: float = setting(1e-2, "Learning rate at the start.", within=LEARNING_RATES)
     # What it comes to at the end, a share of that at the start; it decays exponentially.
     final_rate: float = ranged(0.03, Range(0, 1))
-    # Share of the run for which the rate is held before it decays.
-    hold: float = ranged(0.3, Range(0, 0.999))
+    hold: float = ranged(0.3, Range(0, 0.999))  # Share of the run for which the rate is held before it decays
     # AdamW: share of the weights a step, a unit of learning rate.
     weight_decay: float = setting(0.3, "Decoupled weight decay.", within=WEIGHT_DECAYS)
-    # Decay a step of the averaged weights, which are the result.
-    average: float = ranged(0.98, Range(0, 1))
-    # How often in a run the validation is looked at.
-    looks: int = ranged(20, Range(1, 10**6))
+    average: float = ranged(0.98, Range(0, 1))  # Decay a step of the averaged weights, which are the result
+    looks: int = ranged(20, Range(1, 10**6))  # How often in a run the validation is looked at
     # Looks without an improvement after which the run ends; 0: it never ends early.
     patience: int = ranged(6, Range(0, 10**6))
     zones: int = setting(
         3, "Zones of positions watched as validation, whose best weights count; 0: none.", within=Range(0, 1000)
     )
-    # Probes in all of them.
-    watched: int = ranged(60, Range(1, 10**6))
+    watched: int = ranged(60, Range(1, 10**6))  # Probes in all of them
     # Rays that each of these has at least; None: as many as those of the training.
     watched_rays: int | None = ranged(None, Range(1, 10**6))
     refit: bool = setting(True, "Train again on all rays once the best number of steps is known.")

@@ -26,13 +26,10 @@ from .gaze_settings import GazeSettings, ProbeSettings, gaze_loss
 from .geometry import GazePlace
 from .trainer import Trainer, count_of, require_same, require_shape, restoring
 
-# ---- Trainer ----
-#
-# Training a gaze field on targets (NeRG, Section 4.3): what every kind of field's training has in common.
+# ---- Training a gaze field on targets (NeRG, Section 4.3): what every kind of field's training has in common ----
 
 
-# Samples of one launch of a validation.
-_CHUNK = 1 << 16
+_CHUNK = 1 << 16  # Samples of one launch of a validation
 
 
 class Scores(NamedTuple):
@@ -190,9 +187,7 @@ class GazeTrainer(Trainer, ABC):
         return out
 
 
-# ---- State ----
-#
-# The whole state of a gaze training in a file: of both of its fits, and of what validation has found so far.
+# ---- The whole state of a gaze training in a file: of both of its fits, and of what validation has found so far ----
 
 KIND = "gaze run"
 STAGES = ("fit", "refit")
@@ -202,12 +197,9 @@ STAGES = ("fit", "refit")
 class StateSettings:
     """Whether a run can be gone on with, and from where."""
 
-    # File that holds the whole state of the run; None: none is kept.
-    path: Path | None = None
-    # Go on from the state in that file; probes and depths are made again.
-    resume: bool = False
-    # Seconds between two states; it is also written when the run is interrupted.
-    every: float = 60.0
+    path: Path | None = None  # File that holds the whole state of the run; None: none is kept
+    resume: bool = False  # Go on from the state in that file; probes and depths are made again
+    every: float = 60.0  # Seconds between two states; it is also written when the run is interrupted
     # What else a run must agree on to be gone on with (JSON), such as the files of its place.
     about: dict = field(default_factory=dict)
 
@@ -285,25 +277,19 @@ class GazeRunFile:
         self._kept = time.perf_counter()
 
 
-# ---- Plan ----
-#
-# How one gaze field is trained: its architecture, the settings, and the trainer of its kind.
+# ---- How one gaze field is trained: its architecture, the settings, and the trainer of its kind ----
 
 
 @dataclass(frozen=True, kw_only=True)
 class GazePlan:
     """All that decides a training but for what it learns from and where."""
 
-    # Architecture of the field.
-    config: GazeHeadConfig
+    config: GazeHeadConfig  # Architecture of the field
     # Others that folds may choose in its place (`gaze_folds.choose_variant`).
     alternatives: tuple[GazeHeadConfig, ...] = ()
-    # How weights are moved, and for how long.
-    settings: GazeSettings
-    # How rays become probes.
-    probes: ProbeSettings
-    # Moves the weights of a field of this kind.
-    trainer: type[GazeTrainer]
+    settings: GazeSettings  # How weights are moved, and for how long
+    probes: ProbeSettings  # How rays become probes
+    trainer: type[GazeTrainer]  # Moves the weights of a field of this kind
     # Arrays to begin with in place of random ones, by name (`GazeTrainer.begin_as`); None: random ones.
     initial: dict[str, Any] | None = None
 
@@ -339,16 +325,11 @@ def alignment(place: GazePlace) -> list[list[float]] | None:
 class GazeProgress:
     """State of a run."""
 
-    # "probes", "fit" or "refit"; of an ensemble with the member before it.
-    stage: str
-    # Share of the stage that is done, 0..1; of an ensemble, of all members.
-    done: float
-    # Steps taken.
-    steps: int
-    # Wall time of the fit.
-    seconds: float
-    # The last validation; None before the first.
-    scores: Scores | None
+    stage: str  # "probes", "fit" or "refit"; of an ensemble with the member before it
+    done: float  # Share of the stage that is done, 0..1; of an ensemble, of all members
+    steps: int  # Steps taken
+    seconds: float  # Wall time of the fit
+    scores: Scores | None  # The last validation; None before the first
 
 
 Listener = Callable[[GazeProgress], object]
@@ -359,24 +340,15 @@ Listener = Callable[[GazeProgress], object]
 class GazeFit:
     """What a fit has come to."""
 
-    # The `GazeTrainer`; None: of an earlier process, which kept no more than what was found.
-    trainer: Any = None
-    # The best weights.
-    weights: dict = field(default_factory=dict)
-    # After how many steps they were.
-    best_step: int = 0
-    # Steps that the schedule spans.
-    schedule: int = 0
-    # Of the best weights.
-    scores: Scores | None = None
-    # Every validation (JSON).
-    history: list[dict] = field(default_factory=list)
-    # Whether it ended by Ctrl-C.
-    interrupted: bool = False
-    # Looks without an improvement.
-    since: int = 0
-    # Which look is due.
-    next_look: int = 0
+    trainer: Any = None  # The `GazeTrainer`; None: of an earlier process, which kept no more than what was found
+    weights: dict = field(default_factory=dict)  # The best weights
+    best_step: int = 0  # After how many steps they were
+    schedule: int = 0  # Steps that the schedule spans
+    scores: Scores | None = None  # Of the best weights
+    history: list[dict] = field(default_factory=list)  # Every validation (JSON)
+    interrupted: bool = False  # Whether it ended by Ctrl-C
+    since: int = 0  # Looks without an improvement
+    next_look: int = 0  # Which look is due
 
     def found(self) -> dict:
         """What a resumed run needs to know besides arrays (JSON)."""

@@ -49,10 +49,8 @@ PAD = 6
 # metres behind the place. The same of the origins, where a box must be cut: a tracker that loses somebody puts them
 # anywhere.
 _OUTLIERS = 0.005
-# Share of the hit points that a box keeps at least, before voxels of a default edge become larger instead.
-_KEPT = 0.75
-# Metres around where people were that a box keeps at least: what is looked at most is near.
-_MARGIN = 1.0
+_KEPT = 0.75  # Share of the hit points that a box keeps at least, before voxels of a default edge become larger instead
+_MARGIN = 1.0  # Metres around where people were that a box keeps at least: what is looked at most is near
 _SAMPLE, _STEPS = 1 << 15, 512
 # A box that is cut goes on being cut while one step, a 512th of the points, saves this share of the most voxels that
 # may be.
@@ -63,16 +61,11 @@ _WORTH = 0.01
 class HitExtent:
     """Voxels of a place of hit points, in the rays' frame."""
 
-    # Lower corner (3,) of the box in metres.
-    lower: np.ndarray
-    # Voxels along x, y and z.
-    shape: tuple[int, int, int]
-    # Their edge in metres.
-    voxel: float
-    # Whether hit points beyond the box stand on its shell.
-    cut: bool = False
-    # Their share of the hit points.
-    beyond: float = 0.0
+    lower: np.ndarray  # Lower corner (3,) of the box in metres
+    shape: tuple[int, int, int]  # Voxels along x, y and z
+    voxel: float  # Their edge in metres
+    cut: bool = False  # Whether hit points beyond the box stand on its shell
+    beyond: float = 0.0  # Their share of the hit points
 
     @property
     def upper(self) -> np.ndarray:
@@ -183,12 +176,9 @@ def _cut(
 # depths are traced in and that the integrator ``nerg`` renders as its ``density``.
 
 
-# Optical depth of a voxel: one is opaque.
-_TAU = 8.0
-# Rounds of closing, each of which closes gaps of two voxels.
-_CLOSING = 4
-# Rays that are walked along to find empty space.
-_WALKED = 1 << 17
+_TAU = 8.0  # Optical depth of a voxel: one is opaque
+_CLOSING = 4  # Rounds of closing, each of which closes gaps of two voxels
+_WALKED = 1 << 17  # Rays that are walked along to find empty space
 
 
 def voxelise_hits(rays: Rays, voxel: float | None = None, extent: HitExtent | None = None) -> tuple[np.ndarray, Box]:
@@ -300,9 +290,7 @@ def shade_hits(density: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tup
     return np.repeat(grey[..., None], 3, axis=-1).astype(np.float32), lower + cells[::-1] * _CELL * edge
 
 
-# ---- Places ----
-#
-# Where people looked around: what a gaze field's depths are traced in, and the frame that it lives in.
+# ---- Where people looked around: what a gaze field's depths are traced in, and the frame that it lives in ----
 
 NOWHERE = 2.0
 """How far away everything is taken to be where no geometry is known, in the field's units."""
@@ -317,16 +305,11 @@ class GazePlace:
 
     # What depths are traced in, in the field's frame (`transport.geometry.trace_depth`); None where nothing is known.
     medium: FieldMedium | VolumeMedium | SplatMedium | Place | None
-    # Where a gaze field lives, in that frame.
-    box: AnyBox
-    # What it was made of: "field", "scene", "hits" or "none".
-    kind: str
-    # For the provenance (JSON): the file, and what it is.
-    about: dict = field(default_factory=dict)
-    # From the rays' frame, in metres, to the field's.
-    align: Similarity = field(default_factory=Similarity)
-    # The radiance field that the medium shows, where it is one.
-    radiance: RadianceField | None = None
+    box: AnyBox  # Where a gaze field lives, in that frame
+    kind: str  # What it was made of: "field", "scene", "hits" or "none"
+    about: dict = field(default_factory=dict)  # For the provenance (JSON): the file, and what it is
+    align: Similarity = field(default_factory=Similarity)  # From the rays' frame, in metres, to the field's
+    radiance: RadianceField | None = None  # The radiance field that the medium shows, where it is one
     # What its file holds that is not used, and what had to be guessed of it: a sentence each.
     notes: tuple[str, ...] = ()
 

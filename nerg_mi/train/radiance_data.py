@@ -13,9 +13,7 @@ from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.photos.cameras import Intrinsics, fisheye_limit
 from nerg_mi.photos.images import View
 
-# ---- Unproject ----
-#
-# Directions that lenses show, on the device: the float32 counterpart of `photos.cameras.rays`.
+# ---- Directions that lenses show, on the device: the float32 counterpart of `photos.cameras.rays` ----
 
 
 # From the image's own coordinates, Newton's iteration reaches float32 in 3 to 5 steps at the corners of usual lenses.

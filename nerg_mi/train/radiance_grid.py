@@ -271,8 +271,7 @@ class DensityGrid:
 
 # Every cell is looked at in alternate corners of its 2 x 2 x 2 parts: each half along each axis has two of them.
 _STRATA = ((0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1))
-# Groups of training rays that decide which cells matter.
-_LOOKS = 32
+_LOOKS = 32  # Groups of training rays that decide which cells matter
 
 
 class Settling:

@@ -24,9 +24,7 @@ from nerg_mi.transport.quadrature import mean_depth_share
 from .radiance_data import PixelBatch
 from .radiance_sampling import RaySamples, ray_sum, weights
 
-# ---- Losses ----
-#
-# What a radiance field is fitted to: the colours of rays and, where it is known, their depth.
+# ---- What a radiance field is fitted to: the colours of rays and, where it is known, their depth ----
 
 
 def huber(error, delta: float):
@@ -140,9 +138,7 @@ def composite(sigma: Float, parts: list, samples: RaySamples) -> tuple[Float, Fl
     return weight, tau, sums, opacity
 
 
-# ---- Model ----
-#
-# The radiance field's forward pass in the form that trains fastest: networks as tensor products.
+# ---- The radiance field's forward pass in the form that trains fastest: networks as tensor products ----
 
 
 def stack(rows: list, ns):

@@ -87,10 +87,8 @@ def measure(
 
 # ---- What a finished radiance training has to say against itself ----
 
-# Looks at a few views differ by some tenths of a dB from one another.
-_FALL = 1.0
-# Fields of photos still gain whole dB with every doubling of their steps below this.
-_FEW_STEPS = 500
+_FALL = 1.0  # Looks at a few views differ by some tenths of a dB from one another
+_FEW_STEPS = 500  # Fields of photos still gain whole dB with every doubling of their steps below this
 
 
 def complaints(history: list[dict], steps: int, stride: int, minutes: float | None, seconds: float = 0.0) -> list[str]:
@@ -179,9 +177,7 @@ def _forgotten(trainer):
         trainer.live.set_parameters(live)
 
 
-# ---- Run ----
-#
-# A whole radiance training: from a data set to a checkpoint, with its held-out error on the way.
+# ---- A whole radiance training: from a data set to a checkpoint, with its held-out error on the way ----
 
 KIND = "radiance run"
 # Shares of the run at which the held-out error is looked at.

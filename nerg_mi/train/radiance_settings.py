@@ -20,8 +20,7 @@ from .trainer import RunSettings
 # Fewer rays a step are too noisy to learn from; marching waits to get finer until so many are affordable.
 FEW_RAYS = 256
 _MOST_RAYS, _LEAST_RAYS = 2**14, 64
-# A batch that is filled to this share seldom overflows, and what overflows is dropped.
-_FILLED = 0.95
+_FILLED = 0.95  # A batch that is filled to this share seldom overflows, and what overflows is dropped
 
 
 def adapted_rays(rays: int, kept: float, looked: float, batch: int, most: int) -> int:
@@ -96,37 +95,25 @@ class RadianceSettings(RunSettings):
     # Samples a step. Not a power of two: arrays that many bytes apart share their place in the caches, which costs a
     # factor of two.
     batch: int = ranged(2**14 + 240, Range(1, 1 << 26))
-    # Held for the share ``hold`` of the run.
-    learning_rate: float = ranged(1.5e-2, LEARNING_RATES)
-    # What it decays to exponentially after that, times itself.
-    final_rate: float = ranged(0.03, Range(0, 1))
-    # Share of the run for which the learning rate is held.
-    hold: float = ranged(0.4, Range(0, 0.999))
-    # Decay a step of the averaged weights, which are the result.
-    average: float = ranged(0.99, Range(0, 1))
-    # Shortest step, as instant-ngp has it.
-    march_step: float = ranged(3**0.5 / 1024, Range(1e-6, 1))
-    # Steps are at least this share of their distance.
-    growth: float = ranged(1 / 128, Range(0, 1))
-    # Where rays start, and distance to every camera within which nothing is.
-    near: float = ranged(0.02, Range(0, 1))
+    learning_rate: float = ranged(1.5e-2, LEARNING_RATES)  # Held for the share ``hold`` of the run
+    final_rate: float = ranged(0.03, Range(0, 1))  # What it decays to exponentially after that, times itself
+    hold: float = ranged(0.4, Range(0, 0.999))  # Share of the run for which the learning rate is held
+    average: float = ranged(0.99, Range(0, 1))  # Decay a step of the averaged weights, which are the result
+    march_step: float = ranged(3**0.5 / 1024, Range(1e-6, 1))  # Shortest step, as instant-ngp has it
+    growth: float = ranged(1 / 128, Range(0, 1))  # Steps are at least this share of their distance
+    near: float = ranged(0.02, Range(0, 1))  # Where rays start, and distance to every camera within which nothing is
     # Derivatives of samples nearer than this are scaled by the square of their share of it (Philip and Deschaintre
     # 2023, "Floaters No More"); 0: none are.
     reach: float = ranged(0.4, Range(0, 1000))
     # Share of the run over which ``reach`` falls to 0, as surfaces come to stand where fog was.
     reach_share: float = ranged(0.5, Range(1e-6, 1e6))
-    # Samples that less light reaches are left out.
-    stop: float = ranged(2e-3, Range(0, 1))
+    stop: float = ranged(2e-3, Range(0, 1))  # Samples that less light reaches are left out
     # Weight from which on a sample is always kept; others are by chance, in proportion to their weight.
     thin_sure: float = ranged(1 / 32, Range(1e-30, 1e30))
-    # Least chance of a sample to be kept; 1: all are.
-    thin_least: float = ranged(1 / 32, Range(1e-30, 1))
-    # Cells of the density grid along an edge.
-    resolution: int = ranged(128, Range(8, 2048))
-    # Steps after which the density grid is looked over.
-    grid_every: int = ranged(16, Range(1, 10**6))
-    # Cells that fewer cameras see stay empty.
-    min_views: int = ranged(2, Range(0, 10**6))
+    thin_least: float = ranged(1 / 32, Range(1e-30, 1))  # Least chance of a sample to be kept; 1: all are
+    resolution: int = ranged(128, Range(8, 2048))  # Cells of the density grid along an edge
+    grid_every: int = ranged(16, Range(1, 10**6))  # Steps after which the density grid is looked over
+    min_views: int = ranged(2, Range(0, 10**6))  # Cells that fewer cameras see stay empty
     # Share of the run from which on the cells that rendering will visit are found, all of which are then sampled.
     settle: float = ranged(0.8, Range(0, 1e6))
     # Samples of the density-only pass, in batches: what it costs is then of the order of the rest of a step.
@@ -134,12 +121,9 @@ class RadianceSettings(RunSettings):
     # How many times coarser the run marches at first, each for a like part of ``stride_share``, which clears early fog
     # cheaply; while the pass has no room for enough rays at the next, it waits, for as long again.
     strides: tuple[int, ...] = ranged((16, 8, 4, 2), Range(1, 10**6))
-    # Share of the run that is marched coarser.
-    stride_share: float = ranged(0.33, Range(0, 1e6))
-    # Error at which the colour loss turns linear; colours are in 0..1.
-    huber: float = ranged(1.0, Range(0, 1e6))
-    # Weight of the penalty on density in cells that are not sampled.
-    empty_weight: float = ranged(0.003, LOSS_WEIGHTS)
+    stride_share: float = ranged(0.33, Range(0, 1e6))  # Share of the run that is marched coarser
+    huber: float = ranged(1.0, Range(0, 1e6))  # Error at which the colour loss turns linear; colours are in 0..1
+    empty_weight: float = ranged(0.003, LOSS_WEIGHTS)  # Weight of the penalty on density in cells that are not sampled
     # Weight of the mean square of the hash grid's features, which lets go of what few rays have shaped (Barron et al.
     # 2023, Zip-NeRF, there level by level).
     grid_decay: float = ranged(0.1, LOSS_WEIGHTS)
@@ -147,12 +131,10 @@ class RadianceSettings(RunSettings):
     # Weight of the squares of how far they are from the average, the mean over the photos.
     photo_decay: float = ranged(0.01, LOSS_WEIGHTS)
     depth_weight: float = setting(0.02, "Weight of the depth's loss, where depth is known.", within=LOSS_WEIGHTS)
-    # What ``depth_weight`` falls to, times itself.
-    final_depth: float = ranged(0.25, Range(0, 1e6))
+    final_depth: float = ranged(0.25, Range(0, 1e6))  # What ``depth_weight`` falls to, times itself
     # Distance from the true surface, in march steps, within which a ray's weight should lie.
     depth_margin: float = ranged(1.5, Range(0, 1e6))
-    # Share of the rays drawn from those whose depth was wrong.
-    replay: float = ranged(0.25, Range(0, 1))
+    replay: float = ranged(0.25, Range(0, 1))  # Share of the rays drawn from those whose depth was wrong
     distortion_weight: float = setting(
         0.0, "Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.", within=LOSS_WEIGHTS
     )

@@ -42,8 +42,7 @@ from .trainer import StepClock, Trainer, count_of, require_shape
 
 # ---- Pictures of a field by the trainer's own marcher, for the error that is watched while it trains ----
 
-# Candidates (rays times steps) in flight at once.
-_CHUNK = 2**22
+_CHUNK = 2**22  # Candidates (rays times steps) in flight at once
 
 
 @dataclass
@@ -108,10 +107,8 @@ def _march(field, occupied, table, center, d, near: float, stop: float, ns):
 _LOOKS, _LOOK_RAYS, _LOOK_SAMPLES = 64, 2**12, 2**25
 # Steps of rays that the marching kernel goes through, in batches: they cost a fiftieth of a sample of the density pass.
 _CANDIDATES = 128
-# Rays whose depth loss exceeds this are drawn again; so many are kept.
-_WRONG, _HARD = 0.3, 2**14
-# Attributes that the state of a run keeps as numbers.
-_NUMBERS = ("rays", "samples", "stride", "looked")
+_WRONG, _HARD = 0.3, 2**14  # Rays whose depth loss exceeds this are drawn again; so many are kept
+_NUMBERS = ("rays", "samples", "stride", "looked")  # Attributes that the state of a run keeps as numbers
 
 
 class RadianceTrainer(Trainer):

@@ -26,8 +26,7 @@ from nerg_mi.ranges import Checked
 class RunSettings(Checked):
     """Base of the settings of a training, a dataclass with these fields."""
 
-    # Of both one is set.
-    steps: int | None
+    steps: int | None  # Of both one is set
     minutes: float | None
     # Held for the share ``hold`` of the run; then it decays exponentially to ``final_rate`` times itself.
     learning_rate: float
@@ -55,8 +54,7 @@ class Trainer:
     ``schedule``: steps that the learning rate's schedule spans, where that is not ``settings``' own length.
     """
 
-    # The average is taken of every so many steps.
-    AVERAGE_EVERY: ClassVar[int] = 1
+    AVERAGE_EVERY: ClassVar[int] = 1  # The average is taken of every so many steps
 
     def __init__(self, settings: Any, ns: ModuleType, schedule: int | None = None):
         self.settings, self.ns, self._schedule = settings, ns, schedule

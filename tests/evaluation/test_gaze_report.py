@@ -33,9 +33,7 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.probes import LEVELS, calibrated_levels, level_name, region_levels
 from tests.evaluation.test_gaze import crowd
 
-# ---- Report ----
-#
-# What an evaluation of gaze writes: cells by hand, files that are valid, and pictures of what was asked for.
+# ---- What an evaluation of gaze writes: cells by hand, files that are valid, and pictures of what was asked for ----
 
 ROWS = [
     {

@@ -55,9 +55,7 @@ def test_all_settings_are_read_back_and_make_the_same_integrator(rgb):
     assert named - NONE_OF_A_STUDY == set(given) and NONE_OF_A_STUDY < named and np.isfinite(found["step"])
 
 
-# ---- Subject ----
-#
-# What a study knows of its subjects: where surfaces are, and the limit that a scene file is compared with.
+# ---- What a study knows of its subjects: where surfaces are, and the limit that a scene file is compared with ----
 
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="40"/></volume>

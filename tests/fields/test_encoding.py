@@ -46,9 +46,7 @@ def test03_degree_out_of_range(degree):
         encode_direction(ns.Array3f(0, 0, 1), degree)
 
 
-# ---- Hashgrid ----
-#
-# The hash grid against a restatement of torch-ngp's kernel, its published sizes, and central differences.
+# ---- The hash grid against a restatement of torch-ngp's kernel, its published sizes, and central differences ----
 
 SMALL = HashGridConfig(levels=4, log2_rows=12, base=4, finest=64)
 

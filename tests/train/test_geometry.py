@@ -65,8 +65,7 @@ def looks_out(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return ((through > WINDOW[0]) & (through < WINDOW[1])).all(axis=1)
 
 
-# A box around everything would be a hundred times as large.
-MOST = 1 << 19
+MOST = 1 << 19  # A box around everything would be a hundred times as large
 
 
 @pytest.fixture(scope="module")

@@ -417,9 +417,7 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
     np.testing.assert_allclose(rendered[met], trained, atol=2e-3 * np.abs(trained).max())
 
 
-# ---- Splits ----
-#
-# What a training leaves out: positions and people of a test, zones of a validation, views near either.
+# ---- What a training leaves out: positions and people of a test, zones of a validation, views near either ----
 
 
 def test_held_out_positions_are_purged():

@@ -24,9 +24,7 @@ from tests.fields.gaze.test_log_density import BOX, SMALL, jit, made, vectors
 
 from .looks import SMALL as PRODUCT
 
-# ---- Likelihood ----
-#
-# Likelihood training: the loss is the divergence, a validation sees the field's density, a law is learnt.
+# ---- Likelihood training: the loss is the divergence, a validation sees the field's density, a law is learnt ----
 
 FAST = GazeSettings(
     steps=150,

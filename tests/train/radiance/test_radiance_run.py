@@ -158,9 +158,7 @@ def test_few_steps_are_named_with_the_machine_s_rate():
     assert complaints([], 500, 1, None) == [] != complaints([], 499, 1, None)
 
 
-# ---- Warm up ----
-#
-# Compiling before a run's clock starts changes nothing of the run, and leaves nothing to be compiled in it.
+# ---- Compiling before a run's clock starts changes nothing of the run, and leaves nothing to be compiled in it ----
 
 
 def kernels_of_a_run(t) -> list[tuple[int, int, int]]:
