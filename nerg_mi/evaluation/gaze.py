@@ -274,8 +274,7 @@ def score_table(rows: list[dict], title: str) -> str:
 # area, rays one by one as they are. What is uncertain is which people came: intervals are a bootstrap over persons, who
 # are drawn whole, with all of their rays (Efron & Tibshirani 1993).
 
-SPLITS = ("both", "pos", "people")
-"""What may be new to a field: positions and people, positions, or people."""
+SPLITS = ("both", "pos", "people")  # What may be new to a field: positions and people, positions, or people
 MAPS, RAYS = ("KLD", "CC", "SIM", "MAE"), ("NSS", "AUC", "sAUC", "bits", "loglik")
 SCORES = MAPS + RAYS
 """KLD in nats and CC, SIM of densities normalised over the sphere; MAE in 1/sr of densities as they are; NSS; AUC-Judd;

@@ -23,7 +23,6 @@ from .uncertainty import KEPT
 
 # ---- What an evaluation of gaze writes: tables as Markdown, CSV and JSON, and pictures of truth and prediction ----
 
-
 _DIGITS = {"MAE": 4}  # Digits of the scores that have others than three
 _WORDS = ("method", "person", "signal", "error")  # Columns that hold words
 
@@ -135,8 +134,7 @@ def side_by_side(
 
 # ---- What `nerg eval gaze` has written, read again: the file ``gaze.json`` of its folder ----
 
-MOST = 4 << 20
-"""So many bytes of such a file are read at most."""
+MOST = 4 << 20  # So many bytes of such a file are read at most
 
 _ROWS = 20_000
 _WORD = 200
@@ -226,11 +224,9 @@ def _damaged(path: str | Path, why: str) -> NergError:
 # place of 1.96 (Hesterberg, What Teachers Should Know About the Bootstrap, 2015). Where only the two methods' own
 # intervals are known, the reach of the lead is the sum of theirs, which is never too small.
 
-LEAST_PEOPLE, LEAST_POSITIONS = 5, 10
-"""Below these there is no verdict."""
+LEAST_PEOPLE, LEAST_POSITIONS = 5, 10  # Below these there is no verdict
 
-DECIDING = {"bits": 1, "CC": 1, "KLD": -1}
-"""The scores that decide, and whether more (1) or less (-1) is better."""
+DECIDING = {"bits": 1, "CC": 1, "KLD": -1}  # The scores that decide, and whether more (1) or less (-1) is better
 
 UNIFORM, BLIND, NEAREST, HALF = "uniform", "position-blind", "4,096 nearest rays", "split half"
 """Names of the methods that a field is compared with."""

@@ -242,7 +242,6 @@ def _mean_depth_score(scores: list[DepthScore]) -> DepthScore:
 # ``None`` says that all directions are of equal area. Everything is float64 and
 # defined: maps that are constant or zero give a number, not NaN.
 
-
 EPS = 1e-20  # Of a map's mean: far below any density that matters, far above underflow
 
 

@@ -56,8 +56,7 @@ def traced_operations(render) -> int:
 # is hidden. A normalised gaze field is divided by the integral that ``nerg`` finds: the paper has none.
 
 STEPS = 1024
-DT_GAMMA = 1 / 128
-"""The step growth that the paper's code has by default for scenes larger than its unit cube."""
+DT_GAMMA = 1 / 128  # The step growth that the paper's code has by default for scenes larger than its unit cube
 STOP = 1e-4
 
 
@@ -367,8 +366,7 @@ COLUMNS = (
 )
 MARCHING = ("quadrature", "step", "coarse", "dt_gamma", "stop", "color_cutoff", "refined", "depth", "jitter")
 """The parameters that mean nothing where nothing is marched."""
-OF_HITS = ("stop", "depth")
-"""Those of them that mean something where Gaussians are met."""
+OF_HITS = ("stop", "depth")  # Those of them that mean something where Gaussians are met
 COUNTS = ("density_evals", "color_evals", "gaze_evals")
 SEED = 1
 PIXEL_SPP = 256  # Samples a pixel of the picture that settings with several are compared with

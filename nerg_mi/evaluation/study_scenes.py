@@ -15,8 +15,7 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.observer_gaze import PlacedGaze
 
-NUMPY = SimpleNamespace(select=np.where, exp=np.exp)
-"""The functions that densities use, as Dr.Jit names them."""
+NUMPY = SimpleNamespace(select=np.where, exp=np.exp)  # The functions that densities use, as Dr.Jit names them
 
 # Linear radiance at the box's lower corner, and what it gains along x, y, z.
 COLOR_BASE = np.array([0.1, 0.2, 0.15])

@@ -29,10 +29,8 @@ from .study_scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene
 # exact to rounding).
 
 PANELS, NODES = 32, 16
-SOLID = 1.0
-"""Density (1/unit) that counts as a solid in a scene of hard surfaces; the vacuum between has 1e-4."""
-FUZZ = 1 / 64
-"""Most that a surface is moved towards the camera for being soft, as a share of its depth."""
+SOLID = 1.0  # Density (1/unit) that counts as a solid in a scene of hard surfaces; the vacuum between has 1e-4
+FUZZ = 1 / 64  # Most that a surface is moved towards the camera for being soft, as a share of its depth
 
 
 @dataclass(frozen=True)
@@ -244,12 +242,9 @@ def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
 
 # ---- How far a picture is from the truth: the errors that a study reports ----
 
-SURFACE = 0.5
-"""Opacity from which on a ray meets a surface."""
-TRACE = 1e-3
-"""Opacity from which on a depth is compared."""
-KLD_EPS = 1e-6
-"""Of the mean: what a gaze of zero costs where the truth is not zero is bounded by it (13.8 nats)."""
+SURFACE = 0.5  # Opacity from which on a ray meets a surface
+TRACE = 1e-3  # Opacity from which on a depth is compared
+KLD_EPS = 1e-6  # Of the mean: what a gaze of zero costs where the truth is not zero is bounded by it (13.8 nats)
 
 NAMES = tuple(
     """
@@ -299,7 +294,6 @@ def errors(
 
 
 # ---- A scene of shapes alone as the subject of a study: its truth is float64 ray casts at their triangles ----
-
 
 CHUNK = 64  # Rays tested against all triangles at once
 COLOR_SPP = 256  # The mean of so many samples a pixel is the colour that pictures are compared with

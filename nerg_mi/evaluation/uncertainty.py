@@ -17,8 +17,7 @@ SIGNALS = {"support": True, "spread": False}
 """What tells how sure a field is, by its name in a row of `position_rows`, and whether more of it is surer."""
 ERRORS = ("KLD", "excess")
 """Errors of a position: KLD (nats), and by how much it is above that of one half of the people under the other."""
-KEPT = (1.0, 0.75, 0.5, 0.25)
-"""Shares of the positions, the surest, whose mean error is told."""
+KEPT = (1.0, 0.75, 0.5, 0.25)  # Shares of the positions, the surest, whose mean error is told
 # Halves of the people that are drawn, rays that each half has at a position at least, and the blind density's share of
 # what one half tells of the other, so that where it never looked is not impossible.
 _HALVES, _RAYS, _BLIND = 8, 32, 0.2
@@ -167,8 +166,7 @@ def _risk(doubt: np.ndarray, error: np.ndarray, share: float) -> float:
 # Y. Grandvalet 2004): the interval tells the spread over people and zones that were held out, and not what a new shop
 # would give. Differences are taken fold by fold, where most of that spread is the same for both methods.
 
-SPLIT_HALF = "split half"
-"""A reference and no method: what half of the people tell of the other half."""
+SPLIT_HALF = "split half"  # A reference and no method: what half of the people tell of the other half
 _SCORES = (*SCORES, "integral")
 
 

@@ -73,10 +73,8 @@ def _count(number: int, one: str, several: str) -> str:
 # Rays are kept as cells of R/2 with their number, mean origin and variance. The sum over a cell within reach follows
 # from these exactly. In one that the reach cuts, the squared distances are taken to be spread uniformly.
 
-CELLS = 2
-"""Cells along R."""
-REACH = 5.0
-"""Radii R from which a ray still counts."""
+CELLS = 2  # Cells along R
+REACH = 5.0  # Radii R from which a ray still counts
 
 _DENSE = 64  # Cells that are looked at for the one with the greatest support
 
@@ -140,8 +138,7 @@ SIZE_LIMITS = {"width": 4096, "geometry": 4096, "hidden": 64, "layers": 64, "sh_
 # Positions and directions are Dr.Jit 3-arrays of the field's backend, in the field's own frame and units; directions
 # are unit vectors, and ``r_o`` points from the observer to the surface. Densities do not change with scale.
 
-LARGEST = 1e6
-"""No stored weight is larger; products of a network's layers then stay in single precision."""
+LARGEST = 1e6  # No stored weight is larger; products of a network's layers then stay in single precision
 
 
 class Arrays(Protocol):
@@ -406,7 +403,6 @@ def limits_of(about: object) -> Mapping[str, int]:
 
 
 # ---- What people look at wherever they stand, the blind density, as a latitude-longitude table of its logarithm ----
-
 
 _FLOOR = 1e-3  # Of the blind density that is uniform, so that its logarithm is finite
 

@@ -92,7 +92,6 @@ def _unrolled(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
 # whose weight gradient on the LLVM backend is several times cheaper than the
 # atomically accumulated outer products of cooperative vectors; best for training).
 
-
 _NORM_EPSILON = 1e-5  # torch's LayerNorm (Ba et al. 2016) adds it to the variance.
 
 

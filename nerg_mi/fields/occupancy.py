@@ -354,8 +354,7 @@ def _mark(cells: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
 # Of their parts those stay that were found to hold something (``refinement``). Distances are kept a cell, parts are
 # looked up in occupied cells only: two tables of a byte a cell, where a grid of parts would take eight.
 
-PARTS = 2
-"""Parts of a cell along each axis."""
+PARTS = 2  # Parts of a cell along each axis
 
 
 class RefinedGrid:

@@ -114,7 +114,6 @@ class Background:
 # composites as any colour does, and to which the network adds what depends on the direction. There colours are added,
 # here their logits, so that the sum stays in 0..1.
 
-
 _MARGIN = 1e-3  # How near to 0 and 1 a diffuse colour is taken before its logit
 
 
@@ -154,7 +153,6 @@ def network_color(outputs: list[Float], inputs: list[Float], deferred: bool) -> 
 # with Y the spherical harmonics of the direction: NeRF (Mildenhall et al. 2020, section 3) in the architecture of
 # instant-ngp (Müller et al. 2022, section 5.4) as torch-ngp and the paper use it. The colour network is asked at every
 # sample of a ray, or once a ray of a deferred field: see ``color_head``.
-
 
 _MAX_LOG_DENSITY = 30.0  # exp(30) is 1e13 per unit: opaque at any scale, and far from the overflow of fp32 (exp(88))
 

@@ -22,13 +22,11 @@ if TYPE_CHECKING:
     from .radiance import RadianceField
 
 
-POINTS = 64
-"""Points that a part is looked at in where it is not plain."""
+POINTS = 64  # Points that a part is looked at in where it is not plain
 _FIRST = 8
 # A part whose densities at the first points are all below this share of the threshold is empty.
 _PLAIN = 1e-4
-STEP_DEPTH = 1e-3
-"""Optical depth of one step from which on a density counts."""
+STEP_DEPTH = 1e-3  # Optical depth of one step from which on a density counts
 # The root of x⁴ = x + 1, whose powers are the steps of the recurrence.
 _GROWTH = 1.2207440846057596
 _SAMPLES = 1 << 17

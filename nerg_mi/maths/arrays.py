@@ -17,8 +17,7 @@ from .types import Float
 # kernel, as the distance of its components, and an array that begins anywhere has a kernel of its own, too, whose loads
 # expect no alignment: both are compiled anew where another number of rays is traced.
 
-ALIGNMENT = 64
-"""Bytes: the widest packet's."""
+ALIGNMENT = 64  # Bytes: the widest packet's
 
 
 def aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> np.ndarray:

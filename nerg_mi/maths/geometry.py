@@ -221,8 +221,7 @@ class ContractedBox:
         return {**self.core.to_dict(), "reach": self.reach}
 
 
-AnyBox = Box | ContractedBox
-"""Where a field lives: both kinds answer the same."""
+AnyBox = Box | ContractedBox  # Where a field lives: both kinds answer the same
 
 
 def box_of(about: dict) -> AnyBox:

@@ -160,11 +160,9 @@ def _from_height(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
 # Order and signs are those of Gaussian splats, of instant-ngp and of Dr.Jit's ``sh_eval``: l = 0..3, m = -l..l, with
 # the Condon-Shortley phase.
 
-C0 = 0.28209479177387814
-"""The harmonic of degree 0, a constant: 1 / (2 sqrt(pi))."""
+C0 = 0.28209479177387814  # The harmonic of degree 0, a constant: 1 / (2 sqrt(pi))
 
-DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
-"""Degree by the number of coefficients."""
+DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}  # Degree by the number of coefficients
 
 
 def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:

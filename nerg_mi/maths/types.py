@@ -45,14 +45,11 @@ if TYPE_CHECKING:
 else:
     Bool = Float = UInt32 = Array3f = Ray3f = Any
 
-Point3f: TypeAlias = Array3f
-"""Position, in the frame that the signature names."""
+Point3f: TypeAlias = Array3f  # Position, in the frame that the signature names
 
-Vector3f: TypeAlias = Array3f
-"""Direction or displacement, in the frame that the signature names."""
+Vector3f: TypeAlias = Array3f  # Direction or displacement, in the frame that the signature names
 
-Color: TypeAlias = Any
-"""Colour a lane: three numbers, or as many as the variant's ``Spectrum`` has."""
+Color: TypeAlias = Any  # Colour a lane: three numbers, or as many as the variant's ``Spectrum`` has
 
 
 def variant_types() -> Any:

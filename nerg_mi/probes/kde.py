@@ -125,8 +125,7 @@ Backend = str | ModuleType | dr.ArrayBase | None
 """Where a density is evaluated: a name such as ``"llvm"``, a namespace of Dr.Jit's arrays, an array, or None for that
 of Mitsuba's variant (:func:`default_backend`)."""
 
-GROUP = 16
-"""Directions that a lane of `SphericalKde.evaluate` takes at once."""
+GROUP = 16  # Directions that a lane of `SphericalKde.evaluate` takes at once
 
 
 def default_backend() -> str:

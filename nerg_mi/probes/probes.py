@@ -341,8 +341,7 @@ def _average(probes: Probes, count: int | None, backend: Backend, of: Callable[[
 # the quantile of the shares in which they lie (split conformal prediction, Vovk et al. 2005, with highest-density
 # regions, Izbicki et al. 2022).
 
-LEVELS = (0.5, 0.8, 0.95)
-"""Shares of the gaze whose smallest regions are looked at."""
+LEVELS = (0.5, 0.8, 0.95)  # Shares of the gaze whose smallest regions are looked at
 
 
 def level_name(level: float) -> str:

@@ -31,7 +31,6 @@ from .geometry import NOWHERE, GazePlace
 
 # ---- The blind density that a log-density gaze field begins with: what people look at wherever they stand ----
 
-
 _MOST_RAYS = 1 << 16  # Rays that it is made of at most
 _VIEWS_KAPPA = 50.0  # Concentration of the kernels that smooth the density of views
 _LEAF = 16  # Points in a leaf of a KD-tree, which decides between directions that are equally far
@@ -109,8 +108,7 @@ def heads_box(positions: np.ndarray, box: AnyBox) -> tuple[tuple[float, ...], tu
 # What a gaze field takes over from a radiance field: its features along the observers' rays, the paper's semantic
 # variants.
 
-BATCH = 1 << 18
-"""Rays whose features are computed in one launch."""
+BATCH = 1 << 18  # Rays whose features are computed in one launch
 
 
 def semantic_features(
@@ -193,7 +191,6 @@ def _sha256(arrays: list[np.ndarray]) -> str:
 # ---- Splits ----
 #
 # What a training does not learn from: positions and people that a test holds out, and what a validation watches.
-
 
 _WATCHED = 0.12  # Share of the views that a validation watches
 
@@ -310,8 +307,7 @@ def far_views(views: Sequence[SalienceView], points: np.ndarray, distance: float
 
 # ---- Where observers in a place meet surfaces ----
 
-SURFACE_OPACITY = 0.5
-"""Opacity from which on a ray has met a surface; the integrator's default."""
+SURFACE_OPACITY = 0.5  # Opacity from which on a ray has met a surface; the integrator's default
 
 
 def surface_distances(
@@ -606,7 +602,6 @@ def rotated_sets(count: int, sets: int, rng: np.random.Generator) -> np.ndarray:
 # given that the picture is looked at, and what is trained is the field's density given the same: normalised over the
 # view, not over the sphere. How much is looked outside of a picture, views say together: each surface is in many of
 # them.
-
 
 _PER_PIXEL = 4  # Directions a pixel of a view, so that hardly any is left out
 

@@ -26,10 +26,8 @@ from .gaze_trainer import GazePlan, Listener, StateSettings, kept_identity
 from .geometry import GazePlace
 from .trainer import kept_unless, require_same
 
-FEW = 5
-"""Blocks that a resample needs at least; people are the blocks where there are as many of them."""
-BLOCK = 30.0
-"""Seconds of a block where there are too few people."""
+FEW = 5  # Blocks that a resample needs at least; people are the blocks where there are as many of them
+BLOCK = 30.0  # Seconds of a block where there are too few people
 VIEWS = "views"
 
 

@@ -158,8 +158,7 @@ def log_mean_exp(logit: Any, count: int) -> Any:
 # Of what was tried, the elevation alone carries over from place to place (docs/gaze-evaluation.md): laws of distance,
 # incidence and the like that were learnt in some places say less in others than it does.
 
-KAPPA = 30.0
-"""Concentration of the kernel of a ray."""
+KAPPA = 30.0  # Concentration of the kernel of a ray
 # Bins of the sine of the elevation; directions over which the table is scaled to integrate to one.
 _BINS, _SCALED_OVER = 2048, 1 << 16
 

@@ -18,8 +18,7 @@ from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazePlan, GazeTrainer
 from .geometry import GazePlace
 
-DEFAULT = "default"
-"""Name of the recipe that is taken where none is named."""
+DEFAULT = "default"  # Name of the recipe that is taken where none is named
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,8 +127,7 @@ def default_variants(place: str) -> tuple[str, ...]:
     return ("capture", "emit_capture") if place == "none" else ("emit_capture",)
 
 
-RECIPES: dict[str, Recipe] = {}
-"""Recipes that are registered so far; see `recipes`."""
+RECIPES: dict[str, Recipe] = {}  # Recipes that are registered so far; see `recipes`
 
 
 def register(recipe: Recipe) -> Recipe:

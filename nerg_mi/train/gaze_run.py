@@ -63,8 +63,7 @@ from .trainer import kept_unless
 
 SHARES = np.linspace(0.05, 1.0, 20)
 """Shares of the blind density that are tried: never none, so that no density is zero."""
-MINUTES = 0.5
-"""Share of the minutes of a training that the folds take."""
+MINUTES = 0.5  # Share of the minutes of a training that the folds take
 # Zones, positions in all of them and rays at each, of what a fold holds out; and directions that it is judged in.
 _ZONES, _POSITIONS, _RAYS, _DIRECTIONS = 3, 48, 16, 1024
 # Folds after which a field that needs no more than the least share in any is believed; probes of a fold at most, and
@@ -269,8 +268,7 @@ def _choose(curves: np.ndarray) -> MixChoice:
 # Where no surfaces are known, emit is told of points at one distance whatever is there. In some places it tells where
 # others look from elsewhere all the same, in others it follows whom it has seen: those who are held out tell which.
 
-CHOICE = "choice"
-"""Entry of what a run must agree on (``GazePlan.identity``): what was chosen before it began."""
+CHOICE = "choice"  # Entry of what a run must agree on (``GazePlan.identity``): what was chosen before it began
 
 
 def choose_variant(

@@ -34,7 +34,6 @@ from .trainer import RunSettings
 # :mod:`nerg_mi.evaluation.metrics`; NeRG, Section 4.3 (whose text adds the
 # correlation itself; it is 1 - CC that is minimised).
 
-
 KLD_EPS = 1e-6  # Of the uniform density: what a density of zero counts as inside a logarithm
 # 1/sr (uniform is 0.08): a density whose mean is lower is a map of zeros. Its gradient
 # grows as one over the mean, and would leave float32 before the mean does.

@@ -28,7 +28,6 @@ from .trainer import Trainer, count_of, require_same, require_shape, restoring
 
 # ---- Training a gaze field on targets (NeRG, Section 4.3): what every kind of field's training has in common ----
 
-
 _CHUNK = 1 << 16  # Samples of one launch of a validation
 
 
@@ -332,8 +331,7 @@ class GazeProgress:
     scores: Scores | None  # The last validation; None before the first
 
 
-Listener = Callable[[GazeProgress], object]
-"""Is told how a run goes; may raise `KeyboardInterrupt` to end it."""
+Listener = Callable[[GazeProgress], object]  # Is told how a run goes; may raise `KeyboardInterrupt` to end it
 
 
 @dataclass

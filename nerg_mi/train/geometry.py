@@ -36,14 +36,11 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 # spend nearly every voxel on air. So the box gives up hit points where that saves most voxels for each of them; those
 # beyond it are drawn where their rays leave it (its shell), in their true directions at too short a distance.
 
-VOXEL = 0.08
-"""Edge of a voxel in metres where none is asked for and the place is not too large for it."""
+VOXEL = 0.08  # Edge of a voxel in metres where none is asked for and the place is not too large for it
 
-MOST = 1 << 24
-"""Voxels of a place: a file of 64 MiB, 8,600 cubic metres in voxels of the default edge."""
+MOST = 1 << 24  # Voxels of a place: a file of 64 MiB, 8,600 cubic metres in voxels of the default edge
 
-PAD = 6
-"""Voxels around the points that a box holds."""
+PAD = 6  # Voxels around the points that a box holds
 
 # Share of the hit points at either end of an axis that the box need not hold: a glance through a gap ends tens of
 # metres behind the place. The same of the origins, where a box must be cut: a tracker that loses somebody puts them
@@ -175,7 +172,6 @@ def _cut(
 # surfaces that are looked at. They become voxels, small holes are closed, and the result is a Mitsuba grid volume that
 # depths are traced in and that the integrator ``nerg`` renders as its ``density``.
 
-
 _TAU = 8.0  # Optical depth of a voxel: one is opaque
 _CLOSING = 4  # Rounds of closing, each of which closes gaps of two voxels
 _WALKED = 1 << 17  # Rays that are walked along to find empty space
@@ -292,8 +288,7 @@ def shade_hits(density: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tup
 
 # ---- Where people looked around: what a gaze field's depths are traced in, and the frame that it lives in ----
 
-NOWHERE = 2.0
-"""How far away everything is taken to be where no geometry is known, in the field's units."""
+NOWHERE = 2.0  # How far away everything is taken to be where no geometry is known, in the field's units
 
 _STRAY, _AROUND = 0.002, 0.02
 """Share of Gaussians that may lie beyond each side of the box of splats, and what is added around the others."""

@@ -22,8 +22,7 @@ from nerg_mi.photos.cameras import Camera, view_tangents
 _DECAY = 0.6
 # A share of the cells is refreshed at a time; the strides walk over all of them.
 _PARTS = 8
-GRID_STATE = ("value", "bits", "seen", "always")
-"""Arrays of the grid that the state of a run keeps."""
+GRID_STATE = ("value", "bits", "seen", "always")  # Arrays of the grid that the state of a run keeps
 
 
 class DensityGrid:

@@ -225,8 +225,7 @@ def _net(parameters: dict, name: str) -> MLP:
 # (Rematas et al. 2022, Urban Radiance Fields, sec. 4.1, there decoded from a latent code). Over the photos their mean
 # is no change at all, so that the scene has the colours of the average photo.
 
-PHOTOS = "photos"
-"""Name of the optimiser's parameter."""
+PHOTOS = "photos"  # Name of the optimiser's parameter
 # The optimiser moves a number by up to its learning rate a step, which is much for a colour.
 _UNIT = 0.01
 _GREY = 0.5

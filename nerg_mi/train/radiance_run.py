@@ -183,8 +183,7 @@ KIND = "radiance run"
 # Shares of the run at which the held-out error is looked at.
 _LOOKS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
 _LOOK_VIEWS = 4
-LOOK_GAP = 50
-"""Steps at least between two looks, one of which takes as long as several."""
+LOOK_GAP = 50  # Steps at least between two looks, one of which takes as long as several
 # Samples at most of a look and of a preview, and of the error at the end: fog has hundreds on each ray.
 _LOOK_SAMPLES, _FINAL_SAMPLES = 2**20, 2**24
 

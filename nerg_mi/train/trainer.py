@@ -199,8 +199,7 @@ def require_same(path: str | Path, then: dict, now: dict) -> None:
 
 # ---- How long the steps of a training take, and how fast the machine evaluates the field in them ----
 
-KEPT = 1 << 12
-"""Durations that are kept at most: the state of a run of days must stay small enough to be read again."""
+KEPT = 1 << 12  # Durations that are kept at most: the state of a run of days must stay small enough to be read again
 
 
 class StepClock:
