@@ -32,29 +32,17 @@ from .gaze_fields import saved
 
 
 def rows():
-    out = []
-    for recipe, variant, seed, loss in (
+    made = (
         ("default", "emit", 0, 2.0),
         ("default", "emit_capture", 0, 1.0),
         ("default", "emit_capture", 1, 1.2),
         ("paper", "emit_capture", 0, 3.0),
-    ):
-        out.append(
-            {
-                "recipe": recipe,
-                "variant": variant,
-                "seed": seed,
-                "steps": 5,
-                "train_seconds": 1.0,
-                "test_loss": loss,
-                "train_loss": loss,
-                "test_KLD": loss,
-                "test_CC": 0.5,
-                "test_MAE": 0.01,
-                "test_relative": loss / 1.1,
-                "train_relative": loss,
-            }
-        )
+    )
+    out = [dict(zip(("recipe", "variant", "seed", "test_loss"), row)) for row in made]
+    for row in out:
+        loss = row["test_loss"]
+        row |= {"steps": 5, "train_seconds": 1.0, "test_CC": 0.5, "test_MAE": 0.01, "test_relative": loss / 1.1}
+        row |= dict.fromkeys(("train_loss", "test_KLD", "train_relative"), loss)
     return out
 
 

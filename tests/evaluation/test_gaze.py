@@ -20,7 +20,7 @@ from nerg_mi.train.gaze_data import hold_out
 from nerg_mi.train.geometry import place_of_field, place_of_scene
 from tests.evaluation.gaze_fields import KINDS, made, saved
 from tests.plugins import fields
-from tests.plugins.scenes import channels
+from tests.plugins.scenes import camera, channels
 from tests.reference.kde import kde as reference
 
 # ---- Baselines ----
@@ -326,25 +326,10 @@ def places(tmp_path_factory):
 def pictured(mi, gaze, children: dict, shapes: dict, eye) -> tuple[np.ndarray, np.ndarray]:
     """Directions (N, 3) in which the observer at ``eye`` meets a surface, and the gaze (N,) that a panorama shows
     there."""
-    sensor = {
-        "type": "panorama",
-        "to_world": mi.ScalarTransform4f().translate(list(eye)),
-        "sampler": {"type": "independent", "sample_count": 1},
-        "film": {
-            "type": "hdrfilm",
-            "width": 32,
-            "height": 16,
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-        },
-    }
-    integrator = {
-        "type": "nerg",
-        "aovs": "opacity,position,gaze",
-        "radiance": False,
-        "gaze": {"type": "gazefield", "filename": str(gaze)},
-        **children,
-    }
+    to_world = mi.ScalarTransform4f().translate(list(eye))
+    sensor = {**camera(mi, kind="panorama", size=32, film={"height": 16}), "to_world": to_world}
+    field = {"type": "gazefield", "filename": str(gaze)}
+    integrator = {"type": "nerg", "aovs": "opacity,position,gaze", "radiance": False, "gaze": field, **children}
     out = channels(mi, integrator, sensor, **shapes)
     met = out["opacity.Y"] >= 0.5
     way = np.stack([out[f"position.{c}"][met] for c in "XYZ"], axis=-1) - np.array(eye)

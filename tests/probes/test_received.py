@@ -7,6 +7,7 @@ import pytest
 from nerg_mi.probes.surface_attention import Patches, contributions, patches, received
 from nerg_mi.transport.geometry import Place, pixel_solid_angles
 from tests.plugins import fields
+from tests.plugins.scenes import camera
 
 
 def uniform(p_od, p_o, r_o, active):
@@ -179,33 +180,16 @@ def test12_the_integrator_sees_the_same_attention(rgb, tmp_path):
     # Pixels of all that the observer could turn to, times their solid angle: the same integral over directions.
     fields.gaze(tmp_path / "gaze.safetensors")
     eye, h = (-0.2, 0.3, 0.8), 96
-    hidden = {"type": "sphere", "center": [0.1, 0.25, 0.3], "radius": 0.12}
+    box = {"type": "cube", "to_world": rgb.ScalarTransform4f().translate([0.3, 0.1, -0.2]).scale([0.3, 0.2, 0.25])}
+    field = {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")}
+    sensor = camera(rgb, kind="panorama", size=2 * h, film={"height": h})
     scene = rgb.load_dict(
         {
             "type": "scene",
-            "hidden": hidden,
-            "box": {
-                "type": "cube",
-                "to_world": rgb.ScalarTransform4f().translate([0.3, 0.1, -0.2]).scale([0.3, 0.2, 0.25]),
-            },
-            "integrator": {
-                "type": "nerg",
-                "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")},
-                "aovs": "gaze,position",
-                "radiance": False,
-            },
-            "sensor": {
-                "type": "panorama",
-                "to_world": rgb.ScalarTransform4f().translate(list(eye)),
-                "sampler": {"type": "independent", "sample_count": 1},
-                "film": {
-                    "type": "hdrfilm",
-                    "width": 2 * h,
-                    "height": h,
-                    "rfilter": {"type": "box"},
-                    "component_format": "float32",
-                },
-            },
+            "hidden": {"type": "sphere", "center": [0.1, 0.25, 0.3], "radius": 0.12},
+            "box": box,
+            "integrator": {"type": "nerg", "gaze": field, "aovs": "gaze,position", "radiance": False},
+            "sensor": {**sensor, "to_world": rgb.ScalarTransform4f().translate(list(eye))},
         }
     )
     picture = np.array(rgb.render(scene, spp=1, sensor=0))

@@ -14,6 +14,7 @@ from nerg_mi.train.gaze_log_density import log_gaze
 from nerg_mi.train.gaze_product import gaze_density
 from nerg_mi.train.radiance_trainer import RadianceTrainer
 from tests.fields.encoding.dense import DenseConfig, DenseGrid
+from tests.plugins.scenes import camera, look_at
 from tests.tiny import ball_pose
 from tests.train.radiance.ball import BOX, ball, settings
 
@@ -55,17 +56,9 @@ def test_a_dense_grid_is_stored_under_its_kind(trained, tmp_path):
 
 def test_a_dense_grid_is_rendered_with_derivatives(rgb, trained, tmp_path):
     save_radiance(trained[0], tmp_path / "dense.safetensors", {})
-    scene = rgb.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "nerg", "field": {"type": "nerf", "filename": str(tmp_path / "dense.safetensors")}},
-            "sensor": {
-                "type": "perspective",
-                "to_world": rgb.ScalarTransform4f().look_at([2, 0, 0.4], [0, 0, 0], [0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
-            },
-        }
-    )
+    integrator = {"type": "nerg", "field": {"type": "nerf", "filename": str(tmp_path / "dense.safetensors")}}
+    sensor = {**camera(rgb, size=16, fov=50), "to_world": look_at(rgb, (2, 0, 0.4), up=(0, 0, 1))}
+    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
     params = rgb.traverse(scene)
     name = next(k for k in params.keys() if k.endswith("grid.values"))
     dr.enable_grad(params[name])

@@ -19,6 +19,7 @@ from nerg_mi.train import gaze_recipes
 from nerg_mi.workflows.ablation import AblationOptions, ablate
 from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
 from tests.evaluation.test_gaze import crowd
+from tests.plugins.scenes import camera, look_at, render
 
 HEADS = Path(__file__).parents[2] / "heads"
 OPTIONS = GazeOptions(recipe="place", geometry="hits", voxel=0.3, threads=1, min_rays=4, seed=1)
@@ -59,12 +60,9 @@ def test_it_is_stored_rendered_and_a_torch_module(rgb, trained, tmp_path):
     again, meta = load_gaze(path, ns)
     assert meta["architecture"]["kind"] == "place" and again.config == trained.field.config
     parts = {"gaze": {"type": "gazefield", "filename": str(path)}, "aovs": "gaze,emit,capture"}
-    camera = rgb.ScalarTransform4f().look_at([0, 0, 1.5], [1.5, 0, 1.2], [0, 0, 1])
-    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
-    sensor = {"type": "perspective", "to_world": camera, "film": film}
+    sensor = {**camera(rgb, size=8, fov=45), "to_world": look_at(rgb, (0, 0, 1.5), (1.5, 0, 1.2), (0, 0, 1))}
     ball = {"type": "sphere", "center": [1.5, 0, 1.2], "radius": 0.5}
-    scene = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg", **parts}, "sensor": sensor, "ball": ball})
-    gaze = np.array(rgb.render(scene, spp=1))[..., 3]
+    gaze = render(rgb, {"type": "nerg", **parts}, sensor, ball=ball)[..., 3]
     assert np.isfinite(gaze).all() and gaze[3:5, 3:5].min() > 0
     torch = pytest.importorskip("torch")
     from nerg_mi.interop.torch import GazeModule

@@ -53,6 +53,7 @@ from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import default_settings
 from tests.fields.gaze.test_log_density import BOX as VIEW_TARGETS_BOX
 from tests.fields.gaze.test_log_density import SMALL as VIEW_TARGETS_SMALL
+from tests.plugins.scenes import camera, look_at, with_gaze
 
 from .looks import BOX, LENS, NOWHERE, PROBES, RAYS, around, lobe, looking_at, train, view
 from .looks import SMALL as PLAIN
@@ -221,17 +222,6 @@ def test_probes_are_placed_as_the_settings_say(rays):
     assert np.diff(np.unique(lattice.queries[:, 1].round(9))) == pytest.approx(0.3)
 
 
-def test_directions_are_turned_anew_where_they_are_to_be(rays, wall):
-    """Of the same probes; the same ones for the same epoch."""
-    targets = targets_of_rays(rays, wall, replace(PROBES, fresh=True), seed=5)
-    first, again, second = targets.renew(1), targets.renew(1), targets.renew(2)
-    np.testing.assert_array_equal(first.directions, again.directions)
-    np.testing.assert_array_equal(first.positions, targets.positions)
-    for a, b in ((first, targets), (first, second)):
-        assert np.abs(a.directions - b.directions).max() > 0.1
-    assert targets_of_rays(rays, wall, PROBES).renew is None
-
-
 def test_the_blind_density_is_made_for_whoever_needs_it(rays, wall):
     assert targets_of_rays(rays, wall, PROBES).blind is None
     wide, narrow = (
@@ -322,31 +312,6 @@ def test02_the_fast_path_is_the_field(radiance, own):
     assert np.allclose(np.array(fast), np.array(slow), rtol=1e-5) and np.ptp(np.array(slow)) > 0
 
 
-def test03_snapshots_and_accumulations(rgb, radiance):
-    """A snapshot is the field at the point; in a single dense slab of equal features both agree."""
-    medium = FieldMedium(radiance)
-    o = np.tile([0.0, 0.0, 1.5], (20, 1))
-    d = np.random.default_rng(4).normal(size=(20, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    t = np.full(20, 0.5)
-    got = semantic_features(place_of(radiance), o, d, t, "snapshot")
-    p = rgb.Point3f((o + d * 0.5).astype(np.float32).T)
-    expected = np.stack([np.array(f) for f in radiance.density_features(p)[1]], -1)
-    assert got.dtype == np.float16 and np.allclose(got, expected, atol=2e-3 * np.abs(expected).max())
-
-    # The same everywhere: what is accumulated is the opacity times it.
-    uniform = namespace("llvm").Float(np.full(len(radiance.grid.table), 0.3, np.float32))
-    radiance.set_parameters({"grid.table": uniform})
-    medium = FieldMedium(radiance)
-    from nerg_mi.transport.geometry import trace_depth
-
-    _, opacity = trace_depth(medium, o, d)
-    here = semantic_features(place_of(radiance), o, d, t, "snapshot").astype(float)
-    along = semantic_features(place_of(radiance), o, d, t, "accumulated").astype(float)
-    assert opacity.min() > 0.2
-    assert np.allclose(along, here * opacity[:, None], atol=3e-3 * np.abs(here).max())
-
-
 @pytest.mark.parametrize("frozen", [True, False])
 def test04_frozen_trunks_stay_and_others_move(rgb, radiance, rays_semantics, frozen):
     ns = namespace("llvm")
@@ -377,21 +342,12 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
     save_radiance(radiance, tmp_path / "field.safetensors", {})
     config = gaze_config(radiance, "emit", semantic=kind)
     save_gaze(GazeField.random(config, SEMANTICS_BOX, namespace("llvm"), 3), tmp_path / "gaze.safetensors", {})
-    integrator = {
-        "type": "nerg",
-        "aovs": "opacity,position,gaze",
-        "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")},
-        "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")},
-    }
+    integrator = with_gaze(tmp_path, "opacity,position,gaze", depth="median")
     if cutoff is not None:
         integrator["color_cutoff"] = cutoff
     eye = np.array([0.1, -1.9, 1.6])
-    sensor = {
-        "type": "perspective",
-        "to_world": rgb.ScalarTransform4f().look_at(eye.tolist(), [0, 0, 1.4], [0, 0, 1]),
-        "near_clip": 1e-4,
-        "film": {"type": "hdrfilm", "width": 8, "height": 8, "component_format": "float32", "rfilter": {"type": "box"}},
-    }
+    to_world = look_at(rgb, eye.tolist(), [0, 0, 1.4], [0, 0, 1])
+    sensor = {**camera(rgb, size=8, near_clip=1e-4), "to_world": to_world}
     scene, given = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor}), []
     made = scene.integrator()
     if cutoff is None:

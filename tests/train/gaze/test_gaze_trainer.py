@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -27,8 +26,6 @@ from nerg_mi.train.gaze_product import ProductTrainer
 from nerg_mi.train.gaze_run import make_targets
 from nerg_mi.train.gaze_settings import GazeSettings
 from nerg_mi.train.gaze_trainer import GazeRunFile, GazeTrainer, StateSettings, fit_again, fit_watched
-from nerg_mi.train.geometry import GazePlace, voxelise_hits
-from nerg_mi.transport.volume_medium import VolumeMedium
 
 from .looks import (
     BOX,
@@ -111,17 +108,6 @@ def test_a_schedule_of_minutes_is_told_in_steps(targets_fit, monkeypatch, stoppe
     plan = planned(SMALL, replace(PRODUCT, steps=None, minutes=1.0, zones=0))
     fit = fit_watched(targets_fit, None, BOX, plan, ns, 0.5, NO_FILE, stop)
     assert fit.schedule == 5 and fit.best_step == min(stopped, 5)
-
-
-def test_minutes_are_those_of_both_fits(wall, monkeypatch):
-    """The first fit has half of them; the second follows its schedule, in steps."""
-    # A clock that goes on by six seconds a step.
-    monkeypatch.setattr(GazeTrainer, "seconds", property(lambda trainer: 6.0 * trainer.steps))
-    settings = replace(PRODUCT, steps=None, minutes=1.0, looks=5)
-    _, about = train(wall, settings, SMALL)
-    v = about["validation"]
-    assert [h["steps"] for h in v["history"]] == [1, 2, 3, 4, 5] and about["refitted"]
-    assert about["steps"] == v["best_step"] <= 5
 
 
 # ---- Plans: what a run must agree on to be gone on with ----
@@ -348,18 +334,6 @@ def test_equal_seeds_draw_equal_batches(targets_trainer):
     assert np.abs(first["emit_head.0"] - other["emit_head.0"]).max() > 1e-3
 
 
-def test_weights_that_are_given_and_frozen_stay(targets_trainer):
-    field = ProductTrainer(targets_trainer, BOX, SMALL, GazeSettings(steps=1, zones=0), ns).initial
-    given = {"grid.table": field.grid.table * 0 + 0.25}
-    for frozen in (True, False):
-        trainer = ProductTrainer(
-            targets_trainer, BOX, SMALL, GazeSettings(steps=1, zones=0, frozen=frozen), ns, initial=given
-        )
-        trainer.step()
-        same = np.array_equal(trainer.field().grid.table.numpy(), given["grid.table"].numpy())
-        assert same == frozen and ("grid.table" in trainer.optimiser.keys()) != frozen
-
-
 # ---- Whole runs ----
 
 
@@ -413,24 +387,6 @@ def test_the_field_is_that_density_wherever_somebody_stands():
 
 
 # ---- Whole runs: validation, the second fit, equal seeds, fresh directions, rays and views in one ----
-
-
-def test_validation_stops_and_the_best_is_fitted_again(rgb):
-    rays = looking_at((1.5, 0, 1.2), 3000, spread=6.0)
-    density, box = voxelise_hits(rays, 0.2)
-    data = rgb.TensorXf(density[..., None])
-    to_world = rgb.ScalarTransform4f().translate(box.lower).scale([float(u - l) for l, u in zip(box.lower, box.upper)])
-    medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "data": data, "to_world": to_world}))
-    settings = GazeSettings(steps=12, looks=4, zones=2, watched=6, probes=4, directions=32)
-    states = []
-    place = GazePlace(medium, box, "hits")
-    field, about = train(place, settings, SMALL, supervision=Supervision(rays), tell=states.append)
-    v = about["validation"]
-    assert v["best_step"] in [h["steps"] for h in v["history"]] and about["refitted"]
-    assert about["steps"] == v["best_step"] and v["loss"] == min(h["loss"] for h in v["history"])
-    assert {s.stage for s in states} == {"probes", "fit", "refit"} and states[-1].done == 1
-    assert 0 < v["rays_held_out"] < len(rays) and json.loads(json.dumps(about, allow_nan=False)) == about
-    assert field.config == SMALL
 
 
 def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):
