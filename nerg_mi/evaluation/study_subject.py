@@ -266,8 +266,7 @@ class AnalyticSubject(Subject):
         offset = o + d * np.where(hit, t, 0)[:, None] - eye
         distance = np.linalg.norm(offset, axis=-1)
         met = first_solid(self.analytic, np.broadcast_to(eye, o.shape), offset / distance[:, None])
-        # Both distances lead to the same point, but for rounding.
-        return t, hit & (met > distance - 1e-6)
+        return t, hit & (met > distance - 1e-6)  # Both distances lead to the same point, but for rounding
 
 
 class FileSubject(Subject):
@@ -352,8 +351,7 @@ class ShapesSubject(FileSubject):
         hit = np.isfinite(t)
         distance, r_o = towards(self.eye(), o + d * np.where(hit, t, 0)[:, None])
         met = first_hit(self.corners, np.broadcast_to(self.eye(), o.shape), r_o)
-        # Both distances lead to the same point, but for rounding.
-        return t, hit & (met > distance - 1e-6)
+        return t, hit & (met > distance - 1e-6)  # Both distances lead to the same point, but for rounding
 
 
 def load_subject(

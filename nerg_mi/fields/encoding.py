@@ -241,8 +241,7 @@ class HashGridConfig(EncodingConfig):
         return f"{self.levels} x {self.features}, 2^{self.log2_rows} rows, {self.base} to {self.finest}"
 
     def to_dict(self) -> dict[str, Any]:
-        # Without a kind: so this version's files of hash grids can be read by all earlier ones.
-        return asdict(self)
+        return asdict(self)  # Without a kind: so this version's files of hash grids can be read by all earlier ones
 
     def level_scales(self) -> np.ndarray:
         """Scale of each level as float32, (levels,): ``exp2(l log2 s) base - 1``."""

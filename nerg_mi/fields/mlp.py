@@ -113,8 +113,7 @@ class MLP:
         self.weights = list(weights)
         self.norms: list[dict[str, Any]] | None = None if norms is None else [dict(n) for n in norms]
         self._views: Any = None
-        # What the kernels read: the packed weights of all layers, attached to ``weights``.
-        self.buffer = None
+        self.buffer = None  # What the kernels read: the packed weights of all layers, attached to ``weights``
         # Whether they are constants of the kernels instead (``unrolled``), and these as numbers.
         self.constant = False
         self._constants: list[list[list[float]]] | None = None

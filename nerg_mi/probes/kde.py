@@ -356,8 +356,7 @@ class SphericalKdeTable:
             for i in range(4):
                 row = dr.fma(dr.gather(self.ns.Float, self._values, first + (j * self.width + i)), ws[i], row)
             total = dr.fma(row, wt[j], total)
-        # Interpolation may fall below zero by the size of its error.
-        return dr.maximum(total, 0)
+        return dr.maximum(total, 0)  # Interpolation may fall below zero by the size of its error
 
     def evaluate(self, directions: np.ndarray) -> np.ndarray:
         """Densities (N,) float32 in ``directions`` (N, 3), 1/sr."""

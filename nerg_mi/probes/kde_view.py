@@ -151,8 +151,7 @@ class ObservedKde:
 
     def __init__(self, kde: SphericalKde, to_world: Similarity) -> None:
         self.kde, self.to_world = kde, to_world
-        # Made when it first pays.
-        self.table: SphericalKdeTable | None = None
+        self.table: SphericalKdeTable | None = None  # Made when it first pays
 
     def value(self, r_o: Vector3f) -> Float:
         """Density (1/sr) in unit scene directions ``r_o``, without derivatives."""

@@ -196,8 +196,7 @@ def _finished(part: Path, identity: dict, state: StateSettings, ns: ModuleType) 
         and run.is_file()
         and read_checkpoint(run, RUN)[1]["about"].get("member") == state.about["member"]
     ):
-        # Killed between the writing of the member and the removal of its state.
-        run.unlink()
+        run.unlink()  # Killed between the writing of the member and the removal of its state
     return field, kept["trained"]
 
 

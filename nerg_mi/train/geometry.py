@@ -120,8 +120,7 @@ def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitE
                 f"people were in {size} m, which is more than {most:,} voxels of {voxel:g} m; "
                 "enlarge the voxel (--voxel) or leave it out"
             )
-        # Half as many voxels.
-        edge *= 2 ** (1 / 3)
+        edge *= 2 ** (1 / 3)  # Half as many voxels
 
 
 def _count(low: np.ndarray, high: np.ndarray, voxel: float) -> np.ndarray:

@@ -274,8 +274,7 @@ def train_field(
         if preview is not None and watched:
             with kept_unless(state, keep, done=False):
                 write_preview(trainer, watched[0], preview)
-        # One that came while the last preview was made.
-        interrupted = interrupted or stop.asked
+        interrupted = interrupted or stop.asked  # One that came while the last preview was made
     seconds = trainer.seconds
     if interrupted:
         keep()

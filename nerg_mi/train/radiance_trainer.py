@@ -280,8 +280,7 @@ class RadianceTrainer(Trainer):
         if self.hard.size and self.progress > self.settings.hold:
             again = int(self.settings.replay * self.rays)
             index[:again] = self.hard[self.rng.integers(0, self.hard.size, again)]
-            # In mixed order, because the last rays of a batch may not fit into it.
-            self.rng.shuffle(index)
+            self.rng.shuffle(index)  # In mixed order, because the last rays of a batch may not fit into it
         return index
 
     def _remember(self, index: np.ndarray, misplaced: Float) -> None:

@@ -232,8 +232,7 @@ def test_a_sheet_has_the_grey_of_its_axis(axis, grey):
 def test_odd_numbers_of_voxels_and_nothing():
     color, upper = shade_hits(np.zeros((5, 4, 3), np.float32), np.array([1.0, 2, 3]), np.array([4.0, 6, 8]))
     assert color.shape == (3, 2, 2, 3) and np.isfinite(color).all()
-    # A voxel is 1 wide.
-    np.testing.assert_allclose(upper, [5, 6, 9])
+    np.testing.assert_allclose(upper, [5, 6, 9])  # A voxel is 1 wide
 
 
 # ---- Places: frames and boxes, and damaged files of hit points (Mitsuba believes their headers) ----

@@ -173,8 +173,7 @@ def kernels_of_a_run(t) -> list[tuple[int, int, int]]:
                 for k in dr.kernel_history([dr.KernelType.JIT])
                 if not k["cache_hit"] or k["cache_disk"]
             ]
-    # Those of a few operations take no longer than a step.
-    return [k for k in found if k[2] > 20]
+    return [k for k in found if k[2] > 20]  # Those of a few operations take no longer than a step
 
 
 @pytest.mark.parametrize("depth", [True, False])
