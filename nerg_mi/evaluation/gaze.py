@@ -30,9 +30,8 @@ from . import metrics
 #
 # What a gaze field must beat: densities without a field.
 #
-# Each baseline is a function ``(positions (P, 3), directions) -> (P, D)`` of
-# densities in 1/sr that integrate to one; ``directions`` is (D, 3) for all
-# positions or (P, D, 3). All share the kernels of :mod:`nerg_mi.probes.kde`.
+# Each baseline is a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr that integrate to one;
+# ``directions`` is (D, 3) for all positions or (P, D, 3). All share the kernels of :mod:`nerg_mi.probes.kde`.
 
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Densities (P, D), 1/sr, of positions (P, 3) in directions (D, 3) or (P, D, 3)."""

@@ -233,14 +233,12 @@ def _mean_depth_score(scores: list[DepthScore]) -> DepthScore:
 
 # ---- Scores of gaze densities, weighted by solid angle ----
 #
-# Definitions of saliency research (pysaliency, Kümmerer et al. 2018), which on a
-# sphere need the solid angle of each direction: on a latitude-longitude picture
-# the unweighted KLD of a known pair is 0.69 where the true one is 1.01.
+# Definitions of saliency research (pysaliency, Kümmerer et al. 2018), which on a sphere need the solid angle of each
+# direction: on a latitude-longitude picture the unweighted KLD of a known pair is 0.69 where the true one is 1.01.
 #
-# Maps are arrays (..., D), directions along the last axis; scores have the
-# leading shape. ``weights`` (D,) or broadcastable: solid angles, in any unit;
-# ``None`` says that all directions are of equal area. Everything is float64 and
-# defined: maps that are constant or zero give a number, not NaN.
+# Maps are arrays (..., D), directions along the last axis; scores have the leading shape. ``weights`` (D,) or
+# broadcastable: solid angles, in any unit; ``None`` says that all directions are of equal area. Everything is float64
+# and defined: maps that are constant or zero give a number, not NaN.
 
 EPS = 1e-20  # Of a map's mean: far below any density that matters, far above underflow
 
@@ -250,10 +248,9 @@ def kld(
 ) -> np.ndarray:
     """Kullback-Leibler divergence KL(truth || prediction) in nats; 0 is best.
 
-    Both are divided by their integral; negative values are lifted to zero by the
-    map's minimum, as pysaliency does. ``eps``, in units of the uniform density,
-    is added to both, and bounds what a prediction of zero costs: a sparse truth
-    makes the score depend on it, so name it where it is not the default.
+    Both are divided by their integral; negative values are lifted to zero by the map's minimum, as pysaliency does.
+    ``eps``, in units of the uniform density, is added to both, and bounds what a prediction of zero costs: a sparse
+    truth makes the score depend on it, so name it where it is not the default.
     """
     w = _shares(truth, prediction, weights)
     p, q = _relative(truth, w) + eps, _relative(prediction, w) + eps
@@ -276,20 +273,18 @@ def sim(truth: np.ndarray, prediction: np.ndarray, weights: np.ndarray | None = 
 
 
 def mae(truth: np.ndarray, prediction: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Mean absolute difference over the sphere in the maps' unit, 1/sr; 4π times
-    it is relative to uniform. Not normalised, so it sees a wrong integral; it
-    grows with κ."""
+    """Mean absolute difference over the sphere in the maps' unit, 1/sr; 4π times it is relative to uniform. Not
+    normalised, so it sees a wrong integral; it grows with κ."""
     w = _shares(truth, prediction, weights)
     return np.sum(w * np.abs(np.asarray(truth, np.float64) - np.asarray(prediction, np.float64)), axis=-1)
 
 
 def nss(density: np.ndarray, at_gaze: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Normalised scanpath saliency of each gaze: (value - mean) / standard
-    deviation of the map (population, weighted). Average it over gazes.
+    """Normalised scanpath saliency of each gaze: (value - mean) / standard deviation of the map (population, weighted).
+    Average it over gazes.
 
-    ``density`` (..., D); ``at_gaze`` (..., K): the map's values where people
-    looked (rays or fixations, not a blurred map). Returns (..., K); 0 for a
-    constant map.
+    ``density`` (..., D); ``at_gaze`` (..., K): the map's values where people looked (rays or fixations, not a blurred
+    map). Returns (..., K); 0 for a constant map.
     """
     w = _shares(density, density, weights)
     density, at_gaze = np.asarray(density, np.float64), np.asarray(at_gaze, np.float64)
@@ -325,8 +320,7 @@ def _relative(density: np.ndarray, w: np.ndarray) -> np.ndarray:
 
 
 def _moments(values: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted mean and population standard deviation, (..., 1); a deviation
-    within rounding of a constant is zero."""
+    """Weighted mean and population standard deviation, (..., 1); a deviation within rounding of a constant is zero."""
     # In units of the largest: squares of the values themselves under- or overflow beyond 1e±154.
     top = _largest(values)
     values = values / top

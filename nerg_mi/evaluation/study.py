@@ -207,8 +207,7 @@ def march(medium, ray, t0, t1, active, painter, *, steps, shortest, longest, dt_
 
 # ---- Settings ----
 #
-# Which settings a study renders: sweeps of one factor around the scene's own, steps x quadrature, the paper's
-# marching.
+# Which settings a study renders: sweeps of one factor around the scene's own, steps x quadrature, the paper's marching.
 
 STEP_COUNTS = (16, 32, 64, 128, 256, 512, 1024, 2048, 4096)
 RESOLUTIONS = (16, 32, 64, 128)

@@ -187,11 +187,10 @@ def encoding_of(
 #
 # 2022, "Instant Neural Graphics Primitives").
 #
-# The memory layout is torch-ngp's, so that its checkpoints load without loss: a
-# vertex stride of resolution + 1 on dense levels (no aliasing at the far faces),
-# rows rounded up to a multiple of 8, scales in float32, and zero outside of the
-# unit cube. A level whose (resolution + 1)^3 vertices do not fit in the table is
-# hashed with the primes of the paper.
+# The memory layout is torch-ngp's, so that its checkpoints load without loss: a vertex stride of resolution + 1 on
+# dense levels (no aliasing at the far faces), rows rounded up to a multiple of 8, scales in float32, and zero outside
+# of the unit cube. A level whose (resolution + 1)^3 vertices do not fit in the table is hashed with the primes of the
+# paper.
 
 _PRIMES = (1, 2654435761, 805459861)
 

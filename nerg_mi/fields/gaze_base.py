@@ -62,8 +62,7 @@ def _count(number: int, one: str, several: str) -> str:
 
 # ---- Support ----
 #
-# How much data a gaze field rests on around a position: where the rays that it learnt from started, in a few
-# kilobytes.
+# How much data a gaze field rests on around a position: where the rays that it learnt from started, in a few kilobytes.
 #
 # Support at p is the sum over rays of Epanechnikov's kernel, Σ_i max(0, 1 - |o_i - p|² / (5R)²), R the radius of a
 # probe: a ray that started at p counts as one, a ray 5R away not at all. A field knows more than its probes: kernels of

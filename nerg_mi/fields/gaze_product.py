@@ -1,11 +1,9 @@
 """The gaze field: how much a surface attracts, and how much an observer gives.
 
-Equation 1 of "Neural Radiance and Gaze Fields for Visual Attention Modeling in
-3D Environments": G(p_od, p_o) = F_e(p_od, -r_o) * sigmoid(F_c(p_o, r_o)), with
-r_o the unit direction from the observer p_o to the surface p_od that the
-observer sees. F_e and F_c share a trunk of the NeRF's shape (hash grid, two
-small networks) and differ in their last layer. G is a density over directions
-around the observer, in 1/sr.
+Equation 1 of "Neural Radiance and Gaze Fields for Visual Attention Modeling in 3D Environments": G(p_od, p_o) =
+F_e(p_od, -r_o) * sigmoid(F_c(p_o, r_o)), with r_o the unit direction from the observer p_o to the surface p_od that the
+observer sees. F_e and F_c share a trunk of the NeRF's shape (hash grid, two small networks) and differ in their last
+layer. G is a density over directions around the observer, in 1/sr.
 """
 
 from __future__ import annotations

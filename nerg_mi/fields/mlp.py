@@ -14,9 +14,8 @@ from nerg_mi.errors import NergError
 
 # ---- The Dr.Jit array types of one backend ----
 #
-# A field belongs to one backend (LLVM or CUDA): its weights are arrays of that
-# backend. Nothing here depends on the Mitsuba variant in use, so that the code
-# survives a change of variant; the types derive from arguments.
+# A field belongs to one backend (LLVM or CUDA): its weights are arrays of that backend. Nothing here depends on the
+# Mitsuba variant in use, so that the code survives a change of variant; the types derive from arguments.
 
 
 def namespace(source: str | dr.ArrayBase | type[dr.ArrayBase] | None) -> ModuleType:
@@ -87,9 +86,8 @@ def _unrolled(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
 
 # ---- Small fully connected networks, evaluated inside kernels or as tensor products ----
 #
-# Two execution modes share one set of weights: cooperative vectors (one fused
-# kernel, best for rendering) and tensor products (``X @ W^T`` on whole batches,
-# whose weight gradient on the LLVM backend is several times cheaper than the
+# Two execution modes share one set of weights: cooperative vectors (one fused kernel, best for rendering) and tensor
+# products (``X @ W^T`` on whole batches, whose weight gradient on the LLVM backend is several times cheaper than the
 # atomically accumulated outer products of cooperative vectors; best for training).
 
 _NORM_EPSILON = 1e-5  # torch's LayerNorm (Ba et al. 2016) adds it to the variance.
@@ -98,13 +96,12 @@ _NORM_EPSILON = 1e-5  # torch's LayerNorm (Ba et al. 2016) adds it to the varian
 class MLP:
     """ReLU network; the last layer is linear.
 
-    ``weights``: one TensorXf of shape (outputs, inputs) a layer, in fp32. On
-    CUDA the cooperative-vector path converts them to fp16, which the hardware's
-    matrix units require; on LLVM fp16 is slower than fp32 and is not used.
+    ``weights``: one TensorXf of shape (outputs, inputs) a layer, in fp32. On CUDA the cooperative-vector path converts
+    them to fp16, which the hardware's matrix units require; on LLVM fp16 is slower than fp32 and is not used.
 
-    ``norms``: None, or for each layer ``{"gain", "shift", "bias"}``, TensorXf of shapes (inputs,), (inputs,)
-    and (outputs,): its inputs go through torch's LayerNorm (gain and shift included) first, and the bias is
-    added to what it returns. Raises ``ValueError`` for layers that do not fit together.
+    ``norms``: None, or for each layer ``{"gain", "shift", "bias"}``, TensorXf of shapes (inputs,), (inputs,) and
+    (outputs,): its inputs go through torch's LayerNorm (gain and shift included) first, and the bias is added to what
+    it returns. Raises ``ValueError`` for layers that do not fit together.
     """
 
     DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"weights": list, "norms": None, "_views": None, "buffer": None}

@@ -14,9 +14,8 @@ from nerg_mi.maths.types import Array3f, Bool, UInt32
 #
 # Where a field may hold density: a bit a cell, and how far away the next one is.
 #
-# Marching skips a step only when its midpoint lies in an empty cell. The distance
-# to the nearest occupied cell (chessboard metric) lets a ray leap over many empty
-# cells with one look-up.
+# Marching skips a step only when its midpoint lies in an empty cell. The distance to the nearest occupied cell
+# (chessboard metric) lets a ray leap over many empty cells with one look-up.
 
 _FAR = 255
 

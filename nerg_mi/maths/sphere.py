@@ -21,10 +21,9 @@ def fibonacci_directions(count: int, which: np.ndarray | None = None) -> np.ndar
     """``count`` directions of equal area on a golden-angle spiral, (count, 3); ``which`` (N,): only those of these
     numbers, (N, 3).
 
-    Each stands for 4π/count sr. The spiral runs from +z to -z: direction i has
-    z = 1 - (2i + 1)/count. Neighbours are about sqrt(4π/count) rad apart, 4.5
-    degrees at 2,048; narrower densities than that are not resolved.
-    (Swinbank & Purser 2006.) Raises ``ValueError`` for a count below 1.
+    Each stands for 4π/count sr. The spiral runs from +z to -z: direction i has z = 1 - (2i + 1)/count. Neighbours are
+    about sqrt(4π/count) rad apart, 4.5 degrees at 2,048; narrower densities than that are not resolved. (Swinbank &
+    Purser 2006.) Raises ``ValueError`` for a count below 1.
     """
     if count < 1:
         raise ValueError(f"count is {count}; a set of directions needs at least one")
@@ -107,12 +106,10 @@ def latlong_to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def latlong_grid(width: int, height: int, to_world: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Pixel-centre directions and exact pixel solid angles of a panorama.
 
-    Pixel (row j, column i) is at u = (i + 1/2)/width, v = (j + 1/2)/height of
-    the mapping of Mitsuba's ``envmap`` (whose bitmap has its columns there too, but
-    its rows at v = j/(height - 1)). ``to_world``: (3, 3) or (4, 4), whose
-    rotation is applied as ``to_world`` of the envmap is; see :data:`Z_UP`.
-    Returns directions (height * width, 3), row by row, and solid angles
-    (height * width,) sr: (2π/width)(cos θ_j - cos θ_{j+1}), summing to 4π.
+    Pixel (row j, column i) is at u = (i + 1/2)/width, v = (j + 1/2)/height of the mapping of Mitsuba's ``envmap``
+    (whose bitmap has its columns there too, but its rows at v = j/(height - 1)). ``to_world``: (3, 3) or (4, 4), whose
+    rotation is applied as ``to_world`` of the envmap is; see :data:`Z_UP`. Returns directions (height * width, 3), row
+    by row, and solid angles (height * width,) sr: (2π/width)(cos θ_j - cos θ_{j+1}), summing to 4π.
     """
     if width < 1 or height < 1:
         raise ValueError(f"a panorama of {width} x {height} pixels has no directions; give at least 1 x 1")

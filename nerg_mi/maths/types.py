@@ -1,9 +1,8 @@
 """Types of the arrays in signatures.
 
 Which class an array has is decided when a program runs: by the backend (LLVM or CUDA) that a field belongs to, or by
-Mitsuba's variant. Functions derive it from their arguments. These classes stand for all of them when types are
-checked, and are `Any` when the program runs. Every array holds one value a lane, and one of a single lane serves all
-of them.
+Mitsuba's variant. Functions derive it from their arguments. These classes stand for all of them when types are checked,
+and are `Any` when the program runs. Every array holds one value a lane, and one of a single lane serves all of them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """The von Mises-Fisher distribution on the unit sphere.
 
-f(x; μ, κ) = C(κ) exp(κ (x·μ - 1)) in 1/sr, C(κ) = κ / (2π (1 - exp(-2κ))):
-the normaliser of NeRG, Section 5.1, with exp(κ) taken out of both factors, so
-that neither overflows. Stable for κ from 1e-8 to 1e8.
+f(x; μ, κ) = C(κ) exp(κ (x·μ - 1)) in 1/sr, C(κ) = κ / (2π (1 - exp(-2κ))): the normaliser of NeRG, Section 5.1, with
+exp(κ) taken out of both factors, so that neither overflows. Stable for κ from 1e-8 to 1e8.
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ def log_normaliser(kappa: np.ndarray | float) -> np.ndarray:
 
 
 def one_minus_cosine(x: np.ndarray, mu: np.ndarray) -> np.ndarray:
-    """1 - x·μ for unit vectors (..., 3) as |x - μ|²/2, which keeps its digits
-    where the two nearly agree."""
+    """1 - x·μ for unit vectors (..., 3) as |x - μ|²/2, which keeps its digits where the two nearly agree."""
     return 0.5 * np.sum((np.asarray(x) - np.asarray(mu)) ** 2, axis=-1)
 
 
@@ -53,9 +51,8 @@ def mean_resultant_length(kappa: np.ndarray | float) -> np.ndarray:
 def kappa_from_resultant(resultant: np.ndarray | float) -> np.ndarray:
     """Maximum-likelihood κ of a mean resultant length R̄: the root of A(κ) = R̄.
 
-    ``resultant``: any shape, in [0, 1]. Limited to [1e-8, 1e8] as in the
-    published code, whose root finder this replaces (it fails for R̄ above
-    1 - 1e-8). Raises ``ValueError`` outside [0, 1].
+    ``resultant``: any shape, in [0, 1]. Limited to [1e-8, 1e8] as in the published code, whose root finder this
+    replaces (it fails for R̄ above 1 - 1e-8). Raises ``ValueError`` outside [0, 1].
     """
     R = np.asarray(resultant, dtype=np.float64)
     if not np.all((R >= 0) & (R <= 1 + 1e-12)):
@@ -109,9 +106,8 @@ def silverman_kappa(resultant: np.ndarray | float, count: np.ndarray | int) -> n
 
 
 def sample(mu: np.ndarray, kappa: np.ndarray | float, rng: np.random.Generator) -> np.ndarray:
-    """One direction from each distribution: ``mu`` (N, 3) unit, ``kappa`` (N,)
-    or a number; returns (N, 3). Exact inversion (Jakob 2012): with u uniform,
-    1 - x·μ = -log(1 + u (exp(-2κ) - 1)) / κ.
+    """One direction from each distribution: ``mu`` (N, 3) unit, ``kappa`` (N,) or a number; returns (N, 3). Exact
+    inversion (Jakob 2012): with u uniform, 1 - x·μ = -log(1 + u (exp(-2κ) - 1)) / κ.
     """
     mu = np.asarray(mu, dtype=np.float64)
     kappa = np.broadcast_to(np.maximum(_checked(kappa), KAPPA_MIN), mu.shape[:-1])

@@ -117,9 +117,8 @@ def silverman_kappas(
 
 # ---- Kernel densities on the sphere, evaluated exactly in one Dr.Jit kernel ----
 #
-# A probe p holds a run of ray directions μ_i with weights w_i that sum to one, and one concentration:
-# p(x) = Σ_i w_i f(x; μ_i, κ_p), f von Mises-Fisher (NeRG, Section 5.1). It integrates to one over the sphere whatever κ
-# is.
+# A probe p holds a run of ray directions μ_i with weights w_i that sum to one, and one concentration: p(x) = Σ_i w_i
+# f(x; μ_i, κ_p), f von Mises-Fisher (NeRG, Section 5.1). It integrates to one over the sphere whatever κ is.
 
 Backend = str | ModuleType | dr.ArrayBase | None
 """Where a density is evaluated: a name such as ``"llvm"``, a namespace of Dr.Jit's arrays, an array, or None for that

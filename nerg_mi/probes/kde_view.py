@@ -95,12 +95,11 @@ def kde_frame(
 
 # ---- View ----
 #
-# The kernel density of tracked rays as an observer's view: the ground truth beside a gaze field, inside the
-# integrator (``transport.observer``).
+# The kernel density of tracked rays as an observer's view: the ground truth beside a gaze field, inside the integrator
+# (``transport.observer``).
 #
-# An observer's density is that of the rays that started nearest (NeRG, Section 5.3, and the baseline of
-# ``nerg eval gaze``). It is gathered once an observer, and summed at every pixel or tabulated
-# (:mod:`nerg_mi.probes.kde`).
+# An observer's density is that of the rays that started nearest (NeRG, Section 5.3, and the baseline of ``nerg eval
+# gaze``). It is gathered once an observer, and summed at every pixel or tabulated (:mod:`nerg_mi.probes.kde`).
 
 
 class KdeView:

@@ -148,29 +148,24 @@ def place_probes(
 ) -> Probes:
     """Probes on a set of rays.
 
-    ``radius``: R in metres (the paper: 0.1 m at 2.6 million rays; with some
-    10^5 rays 0.25 m). ``placement``, ``count``, ``spacing``: see
-    :func:`nerg_mi.probes.probes.place_queries`; or explicit ``queries``
-    (P, 3). A query with fewer than ``min_rays`` rays makes no probe; of more than
-    ``cap`` the nearest are kept (the published code: 8 and 4,096). ``index``: that
-    of these rays, where there is one already.
+    ``radius``: R in metres (the paper: 0.1 m at 2.6 million rays; with some 10^5 rays 0.25 m). ``placement``,
+    ``count``, ``spacing``: see :func:`nerg_mi.probes.probes.place_queries`; or explicit ``queries`` (P, 3). A query
+    with fewer than ``min_rays`` rays makes no probe; of more than ``cap`` the nearest are kept (the published code: 8
+    and 4,096). ``index``: that of these rays, where there is one already.
 
-    ``kappa_rule``: ``silverman`` (the published code's), ``fixed`` (``kappa``)
-    or ``loo`` (likelihood of each ray under those of *other people* where there
-    are any, else under the other rays; unweighted). ``kappa_max`` bounds the first and last:
-    a person who stares makes a spike that no few thousand directions resolve.
-    ``kappa_shared``: one κ for all probes (:mod:`nerg_mi.probes.kde`).
-    ``widen``: κ of the law of the eyes about the heads, see :meth:`Probes.widened`.
+    ``kappa_rule``: ``silverman`` (the published code's), ``fixed`` (``kappa``) or ``loo`` (likelihood of each ray under
+    those of *other people* where there are any, else under the other rays; unweighted). ``kappa_max`` bounds the first
+    and last: a person who stares makes a spike that no few thousand directions resolve. ``kappa_shared``: one κ for all
+    probes (:mod:`nerg_mi.probes.kde`). ``widen``: κ of the law of the eyes about the heads, see :meth:`Probes.widened`.
 
-    ``weights``: of a probe's rays, ``equal``, ``distance`` (1 - d/R, as an option of the
-    published code has it with the farthest ray's distance for R), or ``person``: each person
-    counts as much in a probe, however long they stayed. ``ray_weights`` (N,):
-    non-negative factors besides, such as those of :func:`person_weights`; rays of weight zero are left out.
+    ``weights``: of a probe's rays, ``equal``, ``distance`` (1 - d/R, as an option of the published code has it with the
+    farthest ray's distance for R), or ``person``: each person counts as much in a probe, however long they stayed.
+    ``ray_weights`` (N,): non-negative factors besides, such as those of :func:`person_weights`; rays of weight zero are
+    left out.
 
-    ``centre``: where the density is said to hold. ``mean``, the (weighted) mean of the
-    rays' origins, as in the published code and by default: it is where people
-    stood, also at the edge of where they walk. ``query``: the ball's centre, as
-    in the paper's text. The two differ by less than R.
+    ``centre``: where the density is said to hold. ``mean``, the (weighted) mean of the rays' origins, as in the
+    published code and by default: it is where people stood, also at the edge of where they walk. ``query``: the ball's
+    centre, as in the paper's text. The two differ by less than R.
 
     Raises `NergError` for unknown words, or when no query holds enough rays.
     """
@@ -268,8 +263,7 @@ def _weighted_means(values: np.ndarray, weights: np.ndarray | None, offsets: np.
 
 # ---- Measures ----
 #
-# What a probe's density is like: its integral, its entropy, how many rays and people it rests on, and samples of
-# it.
+# What a probe's density is like: its integral, its entropy, how many rays and people it rests on, and samples of it.
 
 _LEAST, _MOST = 2048, 1 << 17
 

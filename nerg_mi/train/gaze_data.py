@@ -246,10 +246,9 @@ def hold_out(
 ) -> tuple[Rays, dict]:
     """Rays to train on, when ``positions`` test positions in ``zones`` zones are held out; and an account of it (JSON).
 
-    Every ray within 2 ``radius`` metres of a test position is left out (``rays.filters``), so that no probe of
-    training comes within ``radius`` of one. With a share of ``people`` these are left out everywhere, and the test
-    positions are theirs. The account holds the test ``centres`` in the rays' frame, and the names of the ``people``
-    left out.
+    Every ray within 2 ``radius`` metres of a test position is left out (``rays.filters``), so that no probe of training
+    comes within ``radius`` of one. With a share of ``people`` these are left out everywhere, and the test positions are
+    theirs. The account holds the test ``centres`` in the rays' frame, and the names of the ``people`` left out.
     """
     known, names = np.ones(len(rays), bool), []
     looked_at = rays
@@ -316,11 +315,10 @@ def surface_distances(
     """Distances (P, D) from ``positions`` (P, 3) along unit ``directions`` (P, D, 3) to the surface that each meets,
     float32, and which meet none, (P, D) bool; all in the frame and units of the place.
 
-    ``depth``: kind of depth that is the surface (``transport.depth``). Without any geometry everything is
-    ``NOWHERE`` away and nothing counts as escaped. A direction that meets no surface ends where it leaves the place's
-    box (or after the box's diagonal, where it never enters): it still needs a p_od at which the field is evaluated.
-    With ``fill`` it ends at the depth of the directions of its position nearest to it that do meet one: where the
-    geometry has holes.
+    ``depth``: kind of depth that is the surface (``transport.depth``). Without any geometry everything is ``NOWHERE``
+    away and nothing counts as escaped. A direction that meets no surface ends where it leaves the place's box (or after
+    the box's diagonal, where it never enters): it still needs a p_od at which the field is evaluated. With ``fill`` it
+    ends at the depth of the directions of its position nearest to it that do meet one: where the geometry has holes.
     """
     P, D = directions.shape[:2]
     if place.medium is None:

@@ -28,11 +28,10 @@ from .trainer import RunSettings
 
 # ---- Losses between predicted and true gaze densities of probes, in Dr.Jit ----
 #
-# Densities are flat arrays, probe after probe with the same D directions each
-# (P * D values, 1/sr): value p * D + d is probe p in direction d. Sums over a
-# probe are weighted by solid angle. Definitions as in
-# :mod:`nerg_mi.evaluation.metrics`; NeRG, Section 4.3 (whose text adds the
-# correlation itself; it is 1 - CC that is minimised).
+# Densities are flat arrays, probe after probe with the same D directions each (P * D values, 1/sr): value p * D + d is
+# probe p in direction d. Sums over a probe are weighted by solid angle. Definitions as in
+# :mod:`nerg_mi.evaluation.metrics`; NeRG, Section 4.3 (whose text adds the correlation itself; it is 1 - CC that is
+# minimised).
 
 KLD_EPS = 1e-6  # Of the uniform density: what a density of zero counts as inside a logarithm
 # 1/sr (uniform is 0.08): a density whose mean is lower is a map of zeros. Its gradient
@@ -45,9 +44,8 @@ CODE = {"kld": 0.0, "cc": 0.1, "mae": 1.0}  # the published code's: MAE + 0.1 (1
 
 
 class GazeLoss(NamedTuple):
-    """``total``, differentiable, and its unweighted parts ``kld`` (nats),
-    ``cc`` (the correlation itself) and ``mae`` (1/sr): arrays of one value, the
-    mean over the probes. A part of weight zero is ``None``: it is not traced."""
+    """``total``, differentiable, and its unweighted parts ``kld`` (nats), ``cc`` (the correlation itself) and ``mae``
+    (1/sr): arrays of one value, the mean over the probes. A part of weight zero is ``None``: it is not traced."""
 
     total: Any
     kld: Any
@@ -67,14 +65,12 @@ def gaze_loss(
 ) -> GazeLoss:
     """kld · KLD + cc · (1 - CC) + mae · MAE, averaged over the probes.
 
-    ``prediction``, ``truth``: (P * D,) Dr.Jit floats of one type, in 1/sr;
-    gradients flow to the prediction only. ``directions``: D. ``solid_angle``:
-    (D,) for every probe alike, or (P * D,), or ``None`` for equal areas.
+    ``prediction``, ``truth``: (P * D,) Dr.Jit floats of one type, in 1/sr; gradients flow to the prediction only.
+    ``directions``: D. ``solid_angle``: (D,) for every probe alike, or (P * D,), or ``None`` for equal areas.
     :data:`PAPER` and :data:`CODE` are ready weights: ``gaze_loss(..., **CODE)``.
 
-    KLD normalises both densities over the probe's directions, and counts a
-    negative prediction as zero. MAE does not normalise, so that it alone holds
-    the scale. Raises ``ValueError`` for lengths that do not fit, and when every
+    KLD normalises both densities over the probe's directions, and counts a negative prediction as zero. MAE does not
+    normalise, so that it alone holds the scale. Raises ``ValueError`` for lengths that do not fit, and when every
     weight is zero.
     """
     if not (kld or cc or mae):
@@ -106,13 +102,11 @@ def probe_kld(prediction: Any, truth: Any, directions: int, w: Any) -> Any:
 
 
 def probe_cc(prediction: Any, truth: Any, directions: int, w: Any) -> Any:
-    """Pearson's correlation of each probe, (P,); 0 with zero gradient where
-    either density is constant."""
+    """Pearson's correlation of each probe, (P,); 0 with zero gradient where either density is constant."""
     x, spread_x = _centred(prediction, directions, w)
     y, spread_y = _centred(truth, directions, w)
     live = (spread_x > 0) & (spread_y > 0)
-    # The root's argument is replaced before the root: a masked infinite
-    # derivative times zero would still be NaN.
+    # The root's argument is replaced before the root: a masked infinite derivative times zero would still be NaN.
     scale = dr.rsqrt(dr.select(live, spread_x, 1)) * dr.rsqrt(dr.select(live, spread_y, 1))
     return dr.select(live, dr.block_sum(w * x * y, directions) * scale, 0)
 

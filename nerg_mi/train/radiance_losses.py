@@ -52,10 +52,9 @@ def depth_loss(weight: Float, tau: Float, samples: RaySamples, depth: Float, mar
     """Loss a ray of the absorption's place against the true ``depth`` (as in `PixelBatch`); 0 where that is unknown.
 
     Two terms: the share of the light that is not absorbed within ``margin`` (scene units; a number, or a ray each) of
-    the true surface, or within the step that holds it (line-of-sight supervision, Rematas et al. 2022, with a
-    box for its Gaussian), which forbids fog, holes and floaters alike; and the distance of the expected
-    depth from the true one, in units of ``scale`` (of all rays, or a ray each), which places the surface within the
-    step.
+    the true surface, or within the step that holds it (line-of-sight supervision, Rematas et al. 2022, with a box for
+    its Gaussian), which forbids fog, holes and floaters alike; and the distance of the expected depth from the true
+    one, in units of ``scale`` (of all rays, or a ray each), which places the surface within the step.
     """
     s = samples.segments
     truth = dr.gather(type(weight), depth, s.ray, s.active)

@@ -32,9 +32,8 @@ _MAX_TAU = 60.0
 class Segments:
     """Which samples belong to which ray.
 
-    ``ray``: UInt32 index of each sample's ray, ascending; ``active``: False for padding at the end;
-    ``rays``: number of rays. ``start`` and ``stop`` (one entry a ray) bound its samples; both are 0
-    for rays without any.
+    ``ray``: UInt32 index of each sample's ray, ascending; ``active``: False for padding at the end; ``rays``: number of
+    rays. ``start`` and ``stop`` (one entry a ray) bound its samples; both are 0 for rays without any.
     """
 
     def __init__(self, ray, active, rays: int):
@@ -239,10 +238,9 @@ def rays_in_box(o, d, box: AnyBox, near: float) -> CameraRays:
 
 @dataclass
 class RaySamples:
-    """Packed steps of rays: ``ray`` index, ``t`` start and ``length`` (scene units), ``p`` midpoint
-    (Array3f, world), and the rays' ``segments``. ``count``: real ones, the rest being padding; ``features``: what the
-    density pass knew of them, or None; ``thinned``: of samples that stand for others; ``looked``: samples a ray of the
-    density pass."""
+    """Packed steps of rays: ``ray`` index, ``t`` start and ``length`` (scene units), ``p`` midpoint (Array3f, world),
+    and the rays' ``segments``. ``count``: real ones, the rest being padding; ``features``: what the density pass knew
+    of them, or None; ``thinned``: of samples that stand for others; ``looked``: samples a ray of the density pass."""
 
     ray: UInt32
     t: Float

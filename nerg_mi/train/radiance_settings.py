@@ -48,8 +48,7 @@ def refined(stride: int, strides: tuple[int, ...], scheduled: int, looked: float
 
     It is refined when the schedule has come to a finer one (``scheduled``), and free space is cleared far enough that
     the pass has room for ``FEW_RAYS`` rays at it. ``looked``: samples a ray that the pass last looked at, at
-    ``stride``;
-    ``most``: of its samples a step. ``waits``: False refines without regard to what is cleared.
+    ``stride``; ``most``: of its samples a step. ``waits``: False refines without regard to what is cleared.
     """
     if scheduled >= stride:
         return stride

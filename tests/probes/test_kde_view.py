@@ -73,8 +73,7 @@ def test_refusals(rays_frame):
 
 # ---- View ----
 #
-# The density of the rays nearest to an observer, in the scene's frame: exact sums for few directions, a table for
-# many.
+# The density of the rays nearest to an observer, in the scene's frame: exact sums for few directions, a table for many.
 
 COUNT, KAPPA = 40, 15.0
 

@@ -163,8 +163,7 @@ def test_holds_the_nearest_rays_within_the_radius(rays_probes):
 
 
 def test_leave_one_out_sees_through_repetition():
-    # Each person's rays repeat one direction: leaving out the ray alone would
-    # choose the sharpest kernel there is.
+    # Each person's rays repeat one direction: leaving out the ray alone would choose the sharpest kernel there is.
     rng = np.random.default_rng(0)
     centre = vmf.sample(np.tile([0, 0, 1.0], (12, 1)), 20.0, rng)
     rays, person = np.repeat(centre, 20, axis=0), np.repeat(np.arange(12), 20)
