@@ -45,7 +45,7 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.evaluation.gaze import (
         EPS,
-        gaze_field,
+        FieldDensity,
         map_scores,
         nearest_probes,
         nearest_rays,
@@ -86,7 +86,7 @@ def main(argv=None) -> None:
     # Of the silverman and loo rules there is no single kappa; the default stands for them.
     narrow = probe_settings["kappa"]
     methods = {
-        "gaze field": gaze_field(gaze, medium, kind=probe_settings["depth"]),
+        "gaze field": FieldDensity(gaze, medium, kind=probe_settings["depth"]),
         "position-blind, kappa 50": position_blind(train, kappa=50),
     }
     for kappa in (narrow, args.wide):

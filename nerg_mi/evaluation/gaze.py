@@ -180,18 +180,36 @@ EPS = 1e-6
 
 
 class FieldDensity:
-    """A gaze field in a place, as a function as those of `baselines` are; see `gaze_field`."""
+    """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr of the
+    positions' units.
+
+    What the integrator ``nerg`` shows on surfaces for an observer there, by the same functions: its depths, its
+    integral of a normalised field, its mean of an ensemble. Where no surface is met the field is what it was trained to
+    be there.
+
+    ``medium``: what the observer's depth is traced in, in the field's frame (a medium or a ``Place``; None for a field
+    that knows no geometry); ``align``: similarity from the frame of the positions to the field's. The integrals of
+    positions are kept: neither the field nor its place may change. ``on_position`` is told how many positions are
+    known, after each new one. Raises `NergError` for a field that needs surfaces where there is no place.
+    """
 
     def __init__(
         self,
         field: AnyGazeField,
-        place: Place,
-        align: Similarity,
-        settings: ObserverSettings,
-        on_position: Callable[[int], None] | None,
+        medium,
+        align: Similarity | None = None,
+        kind: str = "median",
+        on_position: Callable[[int], None] | None = None,
     ):
-        self._gaze, self._place, self._align, self._settings = PlacedGaze(field), place, align, settings
-        self._on_position = on_position
+        if medium is None and field.config.needs_surfaces:
+            raise NergError(
+                "this gaze field was trained among surfaces, and there is no place that has any: give it the field, "
+                "the scene or the geometry"
+            )
+        self._gaze, self._place = PlacedGaze(field), medium if isinstance(medium, Place) else Place(medium)
+        march = default_settings(self._place)
+        self._settings = ObserverSettings(march=march, depth=kind, surface_opacity=SURFACE_OPACITY)
+        self._align, self._on_position = align or Similarity(), on_position
         self._observed: dict[bytes, ObservedGaze] = {}
 
     def __call__(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -218,36 +236,6 @@ class FieldDensity:
         if new and self._on_position is not None:
             self._on_position(len(self._observed))
         return density
-
-
-def gaze_field(
-    field: AnyGazeField,
-    medium,
-    align: Similarity | None = None,
-    kind: str = "median",
-    on_position: Callable[[int], None] | None = None,
-) -> FieldDensity:
-    """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr of the
-    positions' units.
-
-    What the integrator ``nerg`` shows on surfaces for an observer there, by the same functions: its depths, its
-    integral of a normalised field, its mean of an ensemble. Where no surface is met the field is what it was trained to
-    be there.
-
-    ``medium``: what the observer's depth is traced in, in the field's frame (a medium or a ``Place``; None for a field
-    that knows no geometry); ``align``: similarity from the frame of the positions to the field's; directions (D, 3) for
-    all positions or (P, D, 3), unit. The integrals of positions are kept: neither the field nor its place may change.
-    ``on_position`` is told how many positions are known, after each new one. Raises `NergError` for a field that needs
-    surfaces where there is no place.
-    """
-    if medium is None and field.config.needs_surfaces:
-        raise NergError(
-            "this gaze field was trained among surfaces, and there is no place that has any: give it the field, the "
-            "scene or the geometry"
-        )
-    place = medium if isinstance(medium, Place) else Place(medium)
-    settings = ObserverSettings(march=default_settings(place), depth=kind, surface_opacity=SURFACE_OPACITY)
-    return FieldDensity(field, place, align or Similarity(), settings, on_position)
 
 
 def score_table(rows: list[dict], title: str) -> str:

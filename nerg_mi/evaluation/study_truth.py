@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.color import decibels
 from nerg_mi.maths.geometry import box_interval
 from nerg_mi.maths.types import variant_types
@@ -231,13 +232,9 @@ def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
     ``gaze``."""
     mi = variant_types()
 
-    def points(kind, v):
-        return kind(np.ascontiguousarray(np.broadcast_to(v, p_od.shape).T, np.float32))
-
-    return np.array(
-        gaze.evaluate(points(mi.Point3f, p_od), points(mi.Point3f, p_o), points(mi.Vector3f, r_o), mi.Bool(True))[0],
-        float,
-    )
+    p_od, p_o, r_o = (np.broadcast_to(v, p_od.shape) for v in (p_od, p_o, r_o))
+    points, along = (vector_of(mi.Point3f, v) for v in (p_od, p_o)), vector_of(mi.Vector3f, r_o)
+    return np.array(gaze.evaluate(*points, along, mi.Bool(True))[0], float)
 
 
 # ---- How far a picture is from the truth: the errors that a study reports ----

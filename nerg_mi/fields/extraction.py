@@ -62,9 +62,6 @@ class Sampler:
     def __init__(self, field: RadianceField):
         self.field, self.ns = field, field.ns
 
-    def _point(self, p):
-        return vector_of(self.ns.Array3f, p)
-
     def _density(self, p, masked: bool = True):
         active = self.ns.Bool(True)
         if masked and self.field.occupancy is not None:
@@ -74,7 +71,7 @@ class Sampler:
     def density(self, p: np.ndarray, masked: bool = True) -> np.ndarray:
         """Density (1/unit) at points (N, 3); with ``masked`` False also what the networks say of empty cells."""
         with dr.suspend_grad():
-            return _joined(lambda q: self._density(self._point(q), masked).numpy(), p)
+            return _joined(lambda q: self._density(vector_of(self.ns.Array3f, q), masked).numpy(), p)
 
     def on(self, lattice: Lattice) -> np.ndarray:
         """Density (z, y, x) at the lattice's points."""
@@ -105,8 +102,8 @@ class Sampler:
         """Colour (N, 3) in the field's colour space of points (N, 3), as seen along unit ``directions`` (N, 3)."""
 
         def ask(q):
-            features = self.field.density_features(self._point(q[:, :3]))[1]
-            c = self.field.color(features, self._point(q[:, 3:]))
+            features = self.field.density_features(vector_of(self.ns.Array3f, q[:, :3]))[1]
+            c = self.field.color(features, vector_of(self.ns.Array3f, q[:, 3:]))
             dr.eval(c)
             return np.array(c).T if np.array(c).shape[0] == 3 else np.array(c)
 

@@ -86,6 +86,13 @@ def unpacked(data: np.ndarray, resolution: int) -> np.ndarray:
     return np.unpackbits(data, bitorder="little")[: resolution**3].reshape((resolution,) * 3).astype(bool)
 
 
+def cell_corner(index: UInt32, resolution: int, ns: ModuleType) -> Array3f:
+    """Lower corners of cells of a cubic grid, x fastest, in cells."""
+    z = index // (resolution * resolution)
+    y = index // resolution - z * resolution
+    return ns.Array3f(index - (z * resolution + y) * resolution, y, z)
+
+
 def chessboard(bits: np.ndarray) -> np.ndarray:
     """Chessboard distance in cells to the nearest occupied one, 0..255 (uint8, 0: occupied), of a bool array.
 

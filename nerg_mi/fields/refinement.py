@@ -14,9 +14,9 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.maths.arrays import aligned
-from nerg_mi.maths.types import Array3f, Float, UInt32
+from nerg_mi.maths.types import Float, UInt32
 
-from .occupancy import PARTS, OccupancyGrid, RefinedGrid, grown
+from .occupancy import PARTS, OccupancyGrid, RefinedGrid, cell_corner, grown
 
 if TYPE_CHECKING:
     from .radiance import RadianceField
@@ -53,13 +53,6 @@ def refine(field: RadianceField, points: int = POINTS) -> RefinedGrid | None:
     return RefinedGrid(grid.bits, masks, ns, threshold, grid.threshold, missed)
 
 
-def _corner(index: UInt32, resolution: int, ns) -> Array3f:
-    """Lower corners of cells, in cells."""
-    z = index // (resolution * resolution)
-    y = index // resolution - z * resolution
-    return ns.Array3f(index - (z * resolution + y) * resolution, y, z)
-
-
 def _masks(field: RadianceField, bits: np.ndarray, cells: UInt32, threshold: float, points: int) -> np.ndarray:
     """Masks of the parts of ``bits`` (R, R, R), whose occupied cells are ``cells`` (N), that hold a density above the
     ``threshold`` at one of the ``points``: uint8 (N,)."""
@@ -77,7 +70,7 @@ def _masks(field: RadianceField, bits: np.ndarray, cells: UInt32, threshold: flo
         offset = ns.Array3f(*((0.5 + (k + 1) / _GROWTH ** (axis + 1)) % 1 for axis in range(3)))
         dr.make_opaque(offset)
         shift = ns.Array3f(rest & 1, rest >> 1 & 1, rest >> 2 & 1)
-        cell = _corner(dr.gather(ns.UInt32, cells, rest // count), resolution, ns)
+        cell = cell_corner(dr.gather(ns.UInt32, cells, rest // count), resolution, ns)
         sigma = field.density(field.box.from_unit((cell + (shift + offset) / PARTS) / resolution), True)
         dr.scatter(found, ns.UInt8(1), rest, sigma > threshold)
         dr.scatter(near, ns.UInt8(1), rest, sigma > _PLAIN * threshold)
@@ -113,7 +106,7 @@ def _missed(field: RadianceField, cells: UInt32, masks: UInt32, resolution: int,
     inside = ns.Array3f(*(ns.Float(aligned(rng.random(_SAMPLES, np.float32))) for _ in range(3)))
     part = [ns.UInt32(c >= 0.5) for c in (inside.x, inside.y, inside.z)]
     bit = (dr.gather(ns.UInt32, masks, index) >> (part[0] | part[1] << 1 | part[2] << 2)) & 1
-    u = (_corner(dr.gather(ns.UInt32, cells, index), resolution, ns) + inside) / resolution
+    u = (cell_corner(dr.gather(ns.UInt32, cells, index), resolution, ns) + inside) / resolution
     sigma = field.density(field.box.from_unit(u), bit == 0)
     lost: Float = dr.select(bit == 0, (1 - dr.exp(-sigma * step)) / step, 0)
     volume = dr.width(cells) * (field.box.cube_side / resolution) ** 3

@@ -124,24 +124,6 @@ def latlong_grid(width: int, height: int, to_world: np.ndarray | None = None) ->
     return direction, np.repeat(2.0 * np.pi / width * band, width)
 
 
-def logsumexp(log_density: np.ndarray, solid_angle: np.ndarray | float) -> np.ndarray:
-    """log ∫ exp(f) dω of log densities f over directions along the last axis: log Σ exp(f_i) Δω_i.
-
-    ``log_density`` (..., N) in nats; ``solid_angle`` (N,) or one for all, sr, >= 0. The largest term is taken out
-    first (Blanchard, Higham & Higham 2021), so that logits of any finite size neither over- nor underflow; what
-    normalises a density is ``exp(f - logsumexp(f))``. Directions without a solid angle do not count; -inf is a density
-    of zero, and the result -inf where there is no other.
-    """
-    f, w = np.asarray(log_density, np.float64), np.asarray(solid_angle, np.float64)
-    if not (w >= 0).all():
-        raise ValueError("solid angles must not be negative or NaN")
-    f = np.where(w > 0, f, -np.inf)
-    top = f.max(axis=-1, keepdims=True)
-    top = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):
-        return np.log(np.sum(w * np.exp(f - top), axis=-1)) + top[..., 0]
-
-
 # Turns the envmap's y up into z up: (x, y, z) becomes (x, -z, y), so that the
 # edges of the panorama show +y and its centre column -y.
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

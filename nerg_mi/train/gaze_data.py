@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, blind_table, table_directions
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.geometry import AnyBox, box_interval
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.types import variant_types
@@ -127,9 +128,7 @@ def semantic_features(
     with dr.suspend_grad():
         for a in range(0, len(out), BATCH):
             part = slice(a, a + BATCH)
-            columns = lambda v, part=part: np.ascontiguousarray(np.asarray(v[part], np.float32).T)
-            o: Any = mi.Point3f(columns(origins))
-            d: Any = mi.Vector3f(columns(directions))
+            o, d = vector_of(mi.Point3f, origins[part]), vector_of(mi.Vector3f, directions[part])
             if kind == "snapshot":
                 t = mi.Float(np.ascontiguousarray(distance[part], np.float32))
                 found = snapshot(medium, o + d * t, mi.Bool(True))
@@ -158,7 +157,11 @@ class Supervision:
 
     def digest(self) -> dict[str, str | None]:
         """SHA-256 of what a training takes from ``rays`` and from ``views`` (JSON); None for what there is none of."""
-        return {"rays": None if self.rays is None else digest_rays(self.rays), "views": digest_views(self.views)}
+        views = [a for v in self.views for a in (v.camera.to_world, v.share, v.solid_angle)]
+        return {
+            "rays": None if self.rays is None else digest_rays(self.rays),
+            "views": _sha256(views) if views else None,
+        }
 
     def counts(self) -> dict[str, int]:
         """How many ``rays`` of how many ``people``, and how many salience images there are (JSON)."""
@@ -177,11 +180,6 @@ class Supervision:
 def digest_rays(rays: Rays) -> str:
     """SHA-256 of what a training takes from ``rays``."""
     return _sha256([rays.person, rays.origin, rays.direction])
-
-
-def digest_views(views: tuple[SalienceView, ...] | list[SalienceView]) -> str | None:
-    """SHA-256 of what a training takes from ``views``; None without any."""
-    return _sha256([a for v in views for a in (v.camera.to_world, v.share, v.solid_angle)]) if views else None
 
 
 def _sha256(arrays: list[np.ndarray]) -> str:

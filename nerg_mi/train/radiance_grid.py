@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, contracted_cascades, grown
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cell_corner, contracted_cascades, grown
 from nerg_mi.maths.arrays import aligned
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f
@@ -61,11 +61,7 @@ class DensityGrid:
 
     def _corner(self, index):
         """Lower corner of cells in the unit cube."""
-        r = self.resolution
-        z = index // (r * r)
-        y = index // r - z * r
-        x = index - (z * r + y) * r
-        return self.ns.Array3f(x, y, z) / r
+        return cell_corner(index, self.resolution, self.ns) / self.resolution
 
     def _point(self, index, rng: np.random.Generator, stratum=0, parts: int = 1):
         """A random world point in each cell, in part ``stratum`` of ``parts`` an axis."""

@@ -23,7 +23,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
 from nerg_mi.evaluation.ablation import Variant, frame_timer
-from nerg_mi.evaluation.gaze import Baseline, GazeTest, gaze_field, held_out_rays
+from nerg_mi.evaluation.gaze import Baseline, FieldDensity, GazeTest, held_out_rays
 from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_folder, replacing
 from nerg_mi.files.safe_read import read_json
@@ -162,7 +162,7 @@ def _train(made: dict, plan: GazePlan, path: Path, bench: Bench) -> dict:
         raise KeyboardInterrupt
     seconds = time.perf_counter() - started
     save_gaze(result.field, path, {**bench.place.about, **result.provenance, **made})
-    density = gaze_field(result.field, bench.place.medium, bench.place.align, plan.probes.depth)
+    density = FieldDensity(result.field, bench.place.medium, bench.place.align, plan.probes.depth)
     times = {"steps": result.provenance["steps"], "train_seconds": seconds}
     return {**made, **times, **ablation.score(bench.tests, density)}
 

@@ -24,7 +24,7 @@ from nerg_mi.evaluation.gaze import (
     SPLITS,
     Baseline,
     CachedBaseline,
-    gaze_field,
+    FieldDensity,
     score_table,
     standard_baselines,
 )
@@ -130,7 +130,7 @@ def evaluate_gaze(
     # Most of the time goes to the densities of the field.
     known = lambda number: reporter.progress(0.05 + 0.6 * min(number / count, 1), f"position {number} of {count}")
     # Each table asks for the same densities.
-    members = CachedBaseline(gaze_field(loaded, place.medium, place.align, depth, known).members)
+    members = CachedBaseline(FieldDensity(loaded, place.medium, place.align, depth, known).members)
     field_density = lambda positions, directions: members(positions, directions).mean(axis=0)
     kept = CachedBaseline(blind)
     methods = {"gaze field": field_density} | {k: kept if m is blind else CachedBaseline(m) for k, m in others.items()}

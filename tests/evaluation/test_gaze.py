@@ -10,7 +10,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, metrics
-from nerg_mi.evaluation.gaze import gaze_field, map_scores, position_blind, uniform
+from nerg_mi.evaluation.gaze import FieldDensity, map_scores, position_blind, uniform
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -342,7 +342,7 @@ def test01_is_what_is_rendered(rgb, places, tmp_path, place, kind):
     """To 2e-4 of the largest density: directions are read back from positions in single precision."""
     medium, children, shapes = places[place]
     field = saved(tmp_path / "g.safetensors", kind, BOX)
-    density = gaze_field(field, medium)
+    density = FieldDensity(field, medium)
     for eye in EYES:
         directions, expected = pictured(rgb, tmp_path / "g.safetensors", children, shapes, eye)
         assert len(expected) > 50 and np.ptp(expected) > 0.2 * expected.max()
@@ -355,9 +355,9 @@ def test01_is_what_is_rendered(rgb, places, tmp_path, place, kind):
 def test02_other_positions_have_integrals_of_their_own(rgb, places, kind):
     """As many of them as the first ones: nothing is kept by how many there are."""
     medium, field, d = places["shapes"][0], made(kind, BOX), fibonacci_directions(256)
-    density = gaze_field(field, medium)
+    density = FieldDensity(field, medium)
     first, second = (np.array([eye]) for eye in EYES)
-    alone = gaze_field(field, medium)(second, d)
+    alone = FieldDensity(field, medium)(second, d)
     a = density(first, d)
     np.testing.assert_array_equal(density(second, d), alone)
     # Kept, and in an order of their own.
@@ -372,14 +372,14 @@ def test03_alignment_moves_turns_and_scales(rgb, places, kind):
     scaled = np.array([[0, -0.5, 0, 0.1], [0.5, 0, 0, -0.2], [0, 0, 0.5, 0.05], [0, 0, 0, 1]])
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     at = np.array(EYES)
-    inside = gaze_field(field, medium)(at @ scaled[:3, :3].T + scaled[:3, 3], d @ turn.T)
-    np.testing.assert_allclose(gaze_field(field, medium, Similarity(scaled))(at, d), inside, rtol=2e-4)
+    inside = FieldDensity(field, medium)(at @ scaled[:3, :3].T + scaled[:3, 3], d @ turn.T)
+    np.testing.assert_allclose(FieldDensity(field, medium, Similarity(scaled))(at, d), inside, rtol=2e-4)
     assert np.ptp(inside) > 1e-2
 
 
 def test04_each_position_may_have_its_own_directions(rgb, places):
     medium, field, d = places["shapes"][0], made("default recipe", BOX), fibonacci_directions(64)
-    density, own = gaze_field(field, medium), np.stack([d, d[::-1]])
+    density, own = FieldDensity(field, medium), np.stack([d, d[::-1]])
     common, found = density(np.array(EYES), d), density(np.array(EYES), own)
     np.testing.assert_array_equal(found[0], common[0])
     np.testing.assert_allclose(found[1], common[1][::-1], rtol=1e-5)
@@ -387,10 +387,10 @@ def test04_each_position_may_have_its_own_directions(rgb, places):
 
 def test05_a_field_of_surfaces_needs_a_place(rgb):
     with pytest.raises(NergError, match="there is no place"):
-        gaze_field(made("default recipe", BOX), None)
+        FieldDensity(made("default recipe", BOX), None)
     without = made("default recipe", BOX, geometry="none", reach=1.5)
     d = fibonacci_directions(2048)
-    assert gaze_field(without, None)(np.array(EYES), d).mean() * 4 * np.pi == pytest.approx(1, abs=5e-3)
+    assert FieldDensity(without, None)(np.array(EYES), d).mean() * 4 * np.pi == pytest.approx(1, abs=5e-3)
 
 
 def test06_semantic_features_are_those_of_the_render(rgb, places, tmp_path):
@@ -399,7 +399,7 @@ def test06_semantic_features_are_those_of_the_render(rgb, places, tmp_path):
     for kind in ("snapshot", "accumulated"):
         field = saved(tmp_path / "g.safetensors", "linear", BOX, semantic=kind)
         directions, expected = pictured(rgb, tmp_path / "g.safetensors", children, shapes, EYES[0])
-        found = gaze_field(field, medium)(np.array(EYES[:1]), directions)[0]
+        found = FieldDensity(field, medium)(np.array(EYES[:1]), directions)[0]
         np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())
 
 

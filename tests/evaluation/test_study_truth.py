@@ -60,18 +60,6 @@ def rays(scene, count=24, seed=0):
     return o, d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def test_slab_is_the_closed_form():
-    scene = study_scenes.SCENES["slab"]
-    o, d = rays(scene)
-    seen = study_reference.trace(scene, o, d)
-    medians = seen.quantile(0.5)
-    for i in range(len(o) - 1):
-        near, far = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
-        alpha, expected, median = march_numpy.slab(study_scenes.SLAB_DENSITY, near, far)
-        assert np.allclose((seen.opacity[i], seen.expected[i], medians[i]), (alpha, expected, median), rtol=1e-12)
-    assert seen.opacity[-1] == seen.expected[-1] == medians[-1] == 0
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_references_are_the_limit_of_a_float64_march(name):
     scene = study_scenes.SCENES[name]

@@ -18,7 +18,6 @@ from nerg_mi.fields.radiance import (
     mean_features,
     network_color,
     network_inputs,
-    point_features,
 )
 from nerg_mi.maths.geometry import Box
 from tests.reference import fields_numpy as reference
@@ -108,19 +107,6 @@ def values(rows):
 
 def logistic(x):
     return 0.5 + 0.5 * np.tanh(0.5 * x)
-
-
-def test_what_the_network_leaves_alone_is_the_diffuse_colour():
-    outputs = 2 * RNG.normal(size=(5, 40))
-    features = point_features(floats(outputs), True)
-    assert np.allclose(values(features), [*logistic(outputs[:3]), *outputs[3:]], atol=1e-6)
-    inputs = network_inputs(features, True)
-    assert np.allclose(values(inputs[3:]), outputs[3:], atol=1e-6)
-    nothing, more = (network_color(floats(np.full((3, 40), v)), inputs, True) for v in (0, 0.7))
-    # Its logit is taken a thousandth inside of 0..1.
-    assert np.abs(values(nothing) - values(features[:3])).max() < 1.1e-3
-    inside = 1e-3 + (1 - 2e-3) * logistic(outputs[:3])
-    assert np.allclose(values(more), logistic(np.log(inside / (1 - inside)) + 0.7), atol=1e-5)
 
 
 def test_diffuse_colours_composite_as_colours_do():

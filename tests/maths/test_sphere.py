@@ -87,32 +87,6 @@ def test_latlong_is_the_mapping_of_mitsubas_envmap(rgb):
     assert np.abs(shown - x).max() < 0.01  # bilinear interpolation of 64 columns
 
 
-@pytest.mark.parametrize("offset", [0, 1e4, -1e4, 700, -800])
-def test_logsumexp_of_any_logits(offset):
-    directions, area = sphere.latlong_grid(64, 32)
-    f = 20 * directions[:, 2]
-    # ∫ exp(k z) dω = 4π sinh(k) / k
-    want = np.log(4 * np.pi * np.sinh(20) / 20) + offset
-    assert np.isclose(sphere.logsumexp(f + offset, area), want, rtol=0, atol=0.01)
-    exact = np.log(sum(w * np.exp(np.longdouble(v)) for v, w in zip(f, area))) + offset
-    assert np.isclose(sphere.logsumexp(f + offset, area), float(exact), rtol=1e-15, atol=1e-12)
-    assert np.isclose(np.sum(np.exp(f + offset - sphere.logsumexp(f + offset, area)) * area), 1, rtol=1e-11)
-
-
-def test_logsumexp_at_its_ends():
-    _, area = sphere.latlong_grid(16, 8)
-    f = np.full((3, area.size), -1e4)
-    f[0, 17], f[1], f[2, 1:] = 1e4, 1e4, -np.inf
-    want = [1e4 + np.log(area[17]), 1e4 + np.log(4 * np.pi), -1e4 + np.log(area[0])]
-    assert np.allclose(sphere.logsumexp(f, area), want, rtol=1e-15)
-    assert sphere.logsumexp(np.full(9, -np.inf), 1.0) == -np.inf
-    # A logit that no direction stands for does not count, and NaN is not hidden.
-    assert np.isclose(sphere.logsumexp([1e4, -1e4], [0.0, 2.0]), -1e4 + np.log(2))
-    assert np.isnan(sphere.logsumexp([np.nan, 0.0], 1.0))
-    with pytest.raises(ValueError, match="negative"):
-        sphere.logsumexp([0.0], [-1.0])
-
-
 def test_neighbours_follow_each_other():
     order = sphere.neighbourly_order(2048)
     assert np.array_equal(np.sort(order), np.arange(2048))

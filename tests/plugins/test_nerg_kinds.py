@@ -8,7 +8,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.gaze import gaze_field
+from nerg_mi.evaluation.gaze import FieldDensity
 from nerg_mi.fields import gaze_base
 from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
@@ -142,7 +142,7 @@ def test04_it_is_scored_like_any_other(rgb, tmp_path):
     field, _ = load_gaze(tmp_path / "g.safetensors", ns)
     place = Place(None, rgb.load_dict({"type": "scene", **room(rgb)}))
     d = np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]])
-    found = gaze_field(field, place)(np.array([[0.1, 0.2, 0.3]]), d)[0]
+    found = FieldDensity(field, place)(np.array([[0.1, 0.2, 0.3]]), d)[0]
     np.testing.assert_allclose(found, np.exp(2 * d[:, 2]) / TOTAL, rtol=2e-3)
 
 

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import drjit.llvm.ad as ns
@@ -254,43 +249,6 @@ def test_a_result_that_cannot_be_written_is_kept(wall, refit, threads, tmp_path)
     expected = train(wall, settings, SMALL)[0].parameters()
     for name, value in field.parameters().items():
         np.testing.assert_array_equal(np.array(value), np.array(expected[name]), err_msg=name)
-
-
-_CHILD = """
-import sys
-import drjit as dr, mitsuba as mi
-from pathlib import Path
-import nerg_mi
-from dataclasses import replace
-mi.set_variant("llvm_ad_rgb")
-dr.set_thread_count(1)
-config = replace(LOG, geometry="none")
-train(NOWHERE, replace(LIKELIHOOD, steps=10**6, zones=0), config, path=Path(sys.argv[1]), every=0.0)
-"""
-
-
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(rgb, how, threads, tmp_path):
-    """Killed at any moment, the state is one that an uninterrupted run has been in; Ctrl-C is heard between steps."""
-    from nerg_mi.formats.checkpoint import read_checkpoint
-
-    threads(1)
-    path = tmp_path / "a.run"
-    child = subprocess.Popen([sys.executable, "-c", _CHILD, str(path)], env={**os.environ, "PYTHONPATH": os.getcwd()})
-    until = time.time() + 120
-    while not path.exists() and child.poll() is None and time.time() < until:
-        time.sleep(0.05)
-    time.sleep(0.05)
-    child.send_signal(how)
-    assert child.wait() == (0 if how == signal.SIGINT else -how)
-    tensors, meta = read_checkpoint(path, "gaze run")
-    same = tmp_path / "same.run"
-    settings = replace(LIKELIHOOD, steps=10**6, zones=0)
-    train(NOWHERE, settings, replace(LOG, geometry="none"), path=same, tell=stopping("fit", meta["steps"]))
-    expected, _ = read_checkpoint(same, "gaze run")
-    assert meta["steps"] > 0 and set(tensors) == set(expected)
-    for name, value in expected.items():
-        np.testing.assert_array_equal(tensors[name], value, err_msg=name)
 
 
 # ---- What all trainers share: averaged weights, the schedule, seeds, frozen weights ----
