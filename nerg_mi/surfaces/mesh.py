@@ -312,9 +312,9 @@ class Target:
             view = self.place.trace(mi.Ray3f(o, d), dr.full(mi.Bool, True, count), self.settings.march)
             assert view.cast is not None, "a target has shapes"
             own = (view.cast.shape == mi.ShapePtr(self._shape)) & (
-                view.cast.prim_index == mi.UInt32(aligned(faces, np.uint32))
+                view.cast.prim_index == mi.UInt32(aligned(faces, np.uint32).ravel())
             )
-            seen = ~view.hit | own | (view.distance >= mi.Float(aligned(distance * (1 - NEAR))))
+            seen = ~view.hit | own | (view.distance >= mi.Float(aligned(distance * (1 - NEAR)).ravel()))
         return np.broadcast_to(np.array(seen).astype(bool), (count,)) & (distance > 0)
 
     def ends(self, origins: np.ndarray, directions: np.ndarray) -> Ends:

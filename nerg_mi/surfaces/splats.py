@@ -93,9 +93,9 @@ def _next(hits, origins, directions, after, before, light, stop) -> tuple[np.nda
     mi = variant_types()
     o, d = vector_of(mi.Point3f, origins), vector_of(mi.Vector3f, directions)
     count = len(origins)
-    given = lambda values: mi.Float(aligned(values))
+    given = lambda values: mi.Float(aligned(values).ravel())
     ray = LocalRay(o, d, d, mi.Float(0), mi.Float(dr.inf))
-    last = LastHit(given(after[0]), mi.UInt32(aligned(after[1], np.uint32)))
+    last = LastHit(given(after[0]), mi.UInt32(aligned(after[1], np.uint32).ravel()))
     with dr.suspend_grad():
         found = hits.nearest(
             ray, last, given(before), given(light), dr.opaque(mi.Float, stop), dr.full(mi.Bool, True, count)
@@ -502,6 +502,6 @@ def _seen(
     p, n = vector_of(mi.Point3f, centers), vector_of(mi.Vector3f, normals)
     p_o = looker.center + dr.zeros(mi.Point3f, len(centers))
     uniform = lambda p_od, p_o, r_o, active: type(r_o.x)(1)
-    before = mi.Float(aligned(depth))
+    before = mi.Float(aligned(depth).ravel())
     found = attended(place, uniform, p_o, p, n, falloff, settings, True, penetration=before)
     return np.broadcast_to(np.array(found, np.float64), (len(centers),))

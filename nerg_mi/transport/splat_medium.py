@@ -131,7 +131,7 @@ class SplatArrays:
         # Packets of four are gathered at once.
         self._stride = -(-3 * self.terms // 4) * 4
         for name in _NAMES:
-            setattr(self, name, ns.Float(aligned(getattr(splats, name))))
+            setattr(self, name, ns.Float(aligned(getattr(splats, name)).ravel()))
         self.pack()
 
     def parameters(self) -> dict[str, Any]:
@@ -154,8 +154,11 @@ class SplatArrays:
         self.thickness = float(np.median(scales.min(axis=1)))
         self.leaves = tree.leaves
         # Aligned alike each time: frozen functions tell arrays by it, and would be recorded anew.
-        self.nodes, self.places = ns.Float(aligned(tree.nodes)), ns.UInt32(aligned(tree.places, np.uint32))
-        order = ns.UInt32(aligned(tree.order, np.uint32))
+        self.nodes, self.places = (
+            ns.Float(aligned(tree.nodes).ravel()),
+            ns.UInt32(aligned(tree.places, np.uint32).ravel()),
+        )
+        order = ns.UInt32(aligned(tree.order, np.uint32).ravel())
         take = lambda values, width: [dr.gather(ns.Float, values, order * width + i) for i in range(width)]
         c, s, q = take(self.centers, 3), take(self.scales, 3), take(self.rotations, 4)
         inverse = dr.rcp(dr.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
