@@ -263,6 +263,16 @@ class GazeHeadConfig:
         return cls(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": encoding_config(d["grid"])})
 
 
+def require_words(config: GazeHeadConfig, **words: tuple[str, ...]) -> None:
+    """Raise ``ValueError`` unless each entry of ``config`` that is named is one of its ``words``."""
+    for name, allowed in words.items():
+        if getattr(config, name) not in allowed:
+            raise ValueError(
+                f'"{name}" of a gaze field must be one of {", ".join(filter(None, allowed))}, '
+                f'got "{getattr(config, name)}"'
+            )
+
+
 class GazeHead(AnyGazeField):
     """Base of a gaze field that is one density: an encoding ``grid``, bare ``ARRAYS`` and networks ``NETS``, attributes
     of these names. A kind says how it is made and what its ``unnormalized`` density is."""

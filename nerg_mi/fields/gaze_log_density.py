@@ -25,7 +25,7 @@ from nerg_mi.maths.types import Bool
 from nerg_mi.ranges import FARTHEST, LENGTHS
 
 from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, random_encoding
-from .gaze_base import SIZE_LIMITS, Arrays, GazeHead, GazeHeadConfig, register
+from .gaze_base import SIZE_LIMITS, Arrays, GazeHead, GazeHeadConfig, register, require_words
 from .gaze_product import VARIANTS
 from .mlp import MLP
 
@@ -61,13 +61,7 @@ class LogGazeConfig(GazeHeadConfig):
 
     def __post_init__(self):
         object.__setattr__(self, "heads", tuple(tuple(float(x) for x in corner) for corner in self.heads))
-        for what, value, known in (
-            ("variant", self.variant, VARIANTS),
-            ("geometry", self.geometry, GEOMETRIES),
-            ("escaped", self.escaped, ESCAPES),
-        ):
-            if value not in known:
-                raise ValueError(f'"{what}" of a gaze field must be one of {", ".join(known)}, got "{value}"')
+        require_words(self, variant=VARIANTS, geometry=GEOMETRIES, escaped=ESCAPES)
         if min(self.width, self.layers, self.sh_degree) < 1 or self.prior < 2 or self.reach not in LENGTHS:
             raise ValueError(f"every size of a gaze field must be positive, got {self}")
         if not 0 <= self.mix <= 1:

@@ -20,7 +20,7 @@ from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool
 
 from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, random_encoding
-from .gaze_base import Arrays, GazeHead, GazeHeadConfig, register
+from .gaze_base import Arrays, GazeHead, GazeHeadConfig, register, require_words
 from .mlp import MLP
 
 VARIANTS = ("emit", "capture", "emit_capture")
@@ -75,11 +75,7 @@ class GazeConfig(GazeHeadConfig):
     normalized: bool = False
 
     def __post_init__(self):
-        if self.semantic not in SEMANTICS:
-            raise ValueError(
-                f"the semantics of a gaze field must be one of {', '.join(SEMANTICS[1:])} or none, "
-                f'got "{self.semantic}"'
-            )
+        require_words(self, variant=VARIANTS, activation=ACTIVATIONS, trunk=TRUNKS, semantic=SEMANTICS)
         if self.semantic and self.variant == "capture":
             raise ValueError("a gaze field of the variant capture has no emit that semantic features could go to")
         if self.semantic_own and not self.semantic:
@@ -88,14 +84,8 @@ class GazeConfig(GazeHeadConfig):
             raise ValueError(
                 "a gaze field with semantic features cannot be normalised over the sphere: their integral is not kept"
             )
-        if self.trunk not in TRUNKS:
-            raise ValueError(f'the trunk of a gaze field must be one of {", ".join(TRUNKS)}, got "{self.trunk}"')
         if not 0 < self.emit_scale < float("inf"):
             raise ValueError(f"the scale of the emit head must be positive and finite, got {self.emit_scale}")
-        if self.variant not in VARIANTS:
-            raise ValueError(f'the gaze variant must be one of {", ".join(VARIANTS)}, got "{self.variant}"')
-        if self.activation not in ACTIVATIONS:
-            raise ValueError(f'the activation must be one of {", ".join(ACTIVATIONS)}, got "{self.activation}"')
         if min(self.width, self.geometry, self.sh_degree) < 1:
             raise ValueError(f"every size of a gaze field must be at least 1, got {self}")
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.maths.types import Array3f, Bool, UInt32
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 # ---- Occupancy ----
 #
@@ -20,15 +23,29 @@ from nerg_mi.maths.types import Array3f, Bool, UInt32
 _FAR = 255
 
 
-class OccupancyGrid:
+class _Bits:
+    """Base of grids that keep a bit a cell."""
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"distance": None}
+    bits: np.ndarray
+
+    @property
+    def coarse(self) -> Self:
+        """Itself: it refines no other grid (``occupancy.RefinedGrid.coarse``)."""
+        return self
+
+    def packed(self) -> np.ndarray:
+        """The bits as bytes, level by level where there are some, x fastest, lowest bit first; see ``from_packed``."""
+        return np.packbits(self.bits.ravel(), bitorder="little")
+
+
+class OccupancyGrid(_Bits):
     """Grid over the unit cube, x varying fastest.
 
     ``bits``: bool array, indexed [z, y, x] (a field's has equal edges, R). ``threshold``: the density (1/unit) below
     which a cell counts as empty; it is the bound that skipping rests on and is recorded in checkpoints. Raises
     ``ValueError`` for bits without three axes.
     """
-
-    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"distance": None}
 
     def __init__(self, bits: np.ndarray, ns: ModuleType, threshold: float):
         bits = np.asarray(bits, bool)
@@ -37,11 +54,6 @@ class OccupancyGrid:
         self.bits, self.threshold = bits, float(threshold)
         self.cells = bits.shape[::-1]
         self.distance = ns.UInt8(chessboard(bits).ravel())
-
-    @property
-    def coarse(self) -> OccupancyGrid:
-        """Itself: it refines no other grid (``occupancy.RefinedGrid.coarse``)."""
-        return self
 
     @property
     def resolution(self) -> int:
@@ -64,10 +76,6 @@ class OccupancyGrid:
         c = [uint(dr.clip(x * n, 0, n - 1)) for x, n in zip((u.x, u.y, u.z), self.cells)]
         index = c[0] + self.cells[0] * (c[1] + self.cells[1] * c[2])
         return uint(dr.gather(type(self.distance), self.distance, index, active))
-
-    def packed(self) -> np.ndarray:
-        """The bits as bytes, (R^3 / 8,), x fastest, lowest bit first."""
-        return np.packbits(self.bits.ravel(), bitorder="little")
 
     @staticmethod
     def from_packed(data: np.ndarray, resolution: int, ns: ModuleType, threshold: float) -> OccupancyGrid:
@@ -163,15 +171,13 @@ _MOST_PARTS = 64
 _MOST_CELLS = 1 << 24
 
 
-class CascadeGrid:
+class CascadeGrid(_Bits):
     """Levels of R³ bits over the cubes [-b, b]³, b = min(2^l, ``bound``): a point belongs to the least that holds it.
 
     ``bits``: bool array (levels, R, R, R), indexed [level, z, y, x]. Marching sees one grid of equal cells over
     [-bound, bound]³, so fine that no cell of any level is divided; it is never stored. ``threshold``: as for
     ``OccupancyGrid``.
     """
-
-    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"distance": None}
 
     def __init__(self, bits: np.ndarray, bound: float, ns: ModuleType, threshold: float):
         bits = np.asarray(bits, bool)
@@ -197,11 +203,6 @@ class CascadeGrid:
                 f"float32 tells at most {_MOST_CELLS} apart"
             )
         self.distance = ns.UInt8(np.stack(self._distances()).ravel())
-
-    @property
-    def coarse(self) -> CascadeGrid:
-        """Itself: it refines no other grid (``occupancy.RefinedGrid.coarse``)."""
-        return self
 
     @property
     def resolution(self) -> int:
@@ -275,10 +276,6 @@ class CascadeGrid:
         index = c[0] + r * (c[1] + r * (c[2] + r * level))
         k = uint(dr.gather(type(self.distance), self.distance, index, active))
         return dr.select(k > 1, (k - 1) * ratio + 1, k)
-
-    def packed(self) -> np.ndarray:
-        """The bits as bytes, level by level, x fastest, lowest bit first; see ``from_packed``."""
-        return np.packbits(self.bits.ravel(), bitorder="little")
 
     @staticmethod
     def from_packed(data: np.ndarray, resolution: int, bound: float, ns: ModuleType, threshold: float) -> CascadeGrid:
