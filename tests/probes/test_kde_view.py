@@ -17,18 +17,15 @@ from tests.reference.kde import kde as reference
 OBSERVER = np.array([1.0, 1.0, 1.6])
 
 
+def rays_of(origin, seed, people=1):
+    n, who = len(origin), np.arange(len(origin)) % people
+    d = uniform_directions(n, np.random.default_rng(seed))
+    return Rays(np.arange(n) * 0.1, who, tuple("abcd"[:people]), origin, d, np.ones(n))
+
+
 @pytest.fixture(scope="module")
 def rays_frame():
-    rng = np.random.default_rng(3)
-    n = 4000
-    return Rays(
-        np.arange(n) * 0.1,
-        np.arange(n) % 4,
-        tuple("abcd"),
-        rng.uniform([0, 0, 1.5], [2, 2, 1.7], (n, 3)),
-        uniform_directions(n, rng),
-        np.ones(n),
-    )
+    return rays_of(np.random.default_rng(3).uniform([0, 0, 1.5], [2, 2, 1.7], (4000, 3)), 4, people=4)
 
 
 def wall(h=60, w=90):
@@ -80,15 +77,7 @@ COUNT, KAPPA = 40, 15.0
 
 @pytest.fixture
 def rays_view():
-    rng = np.random.default_rng(0)
-    return Rays(
-        np.arange(300.0),
-        np.zeros(300),
-        ("a",),
-        rng.normal(size=(300, 3)) * (1, 3, 0.2),
-        uniform_directions(300, rng),
-        np.ones(300),
-    )
+    return rays_of(np.random.default_rng(0).normal(size=(300, 3)) * (1, 3, 0.2), 1)
 
 
 def expected(rays, p, d):

@@ -139,27 +139,18 @@ def test_places_that_are_far_enough_apart_all_have_a_probe():
 # ---- Probes ----
 
 
-@pytest.fixture(scope="module")
-def rays_probes():
-    """Four people in a 3 x 2 m room who look at (1.5, 4, 1), give or take κ = 60."""
-    rng = np.random.default_rng(5)
-    n = 6000
-    origin = rng.uniform([0, 0, 1.5], [3, 2, 1.7], (n, 3))
-    to = np.array([1.5, 4, 1]) - origin
-    mu = to / np.linalg.norm(to, axis=1, keepdims=True)
-    return Rays(np.arange(n) * 0.1, rng.integers(0, 4, n), tuple("abcd"), origin, vmf.sample(mu, 60.0, rng), np.ones(n))
-
-
-def test_holds_the_nearest_rays_within_the_radius(rays_probes):
-    probes = place_probes(rays_probes, 0.2, count=20, cap=40, min_rays=10)
+def test_holds_the_nearest_rays_within_the_radius(rays_measures):
+    probes = place_probes(rays_measures, 0.2, count=20, cap=40, min_rays=10)
     for p in range(len(probes)):
         held = probes.indices[probes.offsets[p] : probes.offsets[p + 1]]
-        far = np.linalg.norm(rays_probes.origin - probes.queries[p], axis=1)
+        far = np.linalg.norm(rays_measures.origin - probes.queries[p], axis=1)
         inside = np.flatnonzero(far < 0.2)
         assert 10 <= len(held) <= 40 and len(held) == min(40, len(inside))
         assert np.all(np.diff(far[held]) >= 0) and np.isclose(far[held].max(), np.sort(far)[len(held) - 1])
-        assert np.allclose(probes.positions[p], rays_probes.origin[held].mean(axis=0))
-        assert np.array_equal(probes.directions[probes.offsets[p] : probes.offsets[p + 1]], rays_probes.direction[held])
+        assert np.allclose(probes.positions[p], rays_measures.origin[held].mean(axis=0))
+        assert np.array_equal(
+            probes.directions[probes.offsets[p] : probes.offsets[p + 1]], rays_measures.direction[held]
+        )
 
 
 def test_leave_one_out_sees_through_repetition():
@@ -171,15 +162,15 @@ def test_leave_one_out_sees_through_repetition():
     assert leave_one_out_kappa(rays, person) < 100
 
 
-def test_refusals(rays_probes):
+def test_refusals(rays_measures):
     with pytest.raises(ValueError, match="placement"):
-        place_probes(rays_probes, 0.25, placement="hexagons", queries=np.zeros((1, 3)))
+        place_probes(rays_measures, 0.25, placement="hexagons", queries=np.zeros((1, 3)))
     with pytest.raises(ValueError, match="kappa_rule"):
-        place_probes(rays_probes, 0.25, kappa_rule="magic")
+        place_probes(rays_measures, 0.25, kappa_rule="magic")
     with pytest.raises(ValueError, match="enlarge the radius"):
-        place_probes(rays_probes, 0.001, count=10)
+        place_probes(rays_measures, 0.001, count=10)
     with pytest.raises(ValueError, match="min_rays"):
-        place_probes(rays_probes, 0.25, cap=10, min_rays=20)
+        place_probes(rays_measures, 0.25, cap=10, min_rays=20)
 
 
 def test_people_of_a_probe_can_count_alike():

@@ -17,7 +17,7 @@ from nerg_mi.fields.gaze_product import GazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
-from nerg_mi.maths.geometry import Box, Similarity
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.photos.salience import pixel_solid_angles
 from nerg_mi.probes.probes import place_probes
@@ -51,7 +51,6 @@ from nerg_mi.train.geometry import NOWHERE as NOWHERE_FAR
 from nerg_mi.train.geometry import GazePlace, place_of_field
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import default_settings
-from tests.fields.gaze.test_log_density import BOX as VIEW_TARGETS_BOX
 from tests.fields.gaze.test_log_density import SMALL as VIEW_TARGETS_SMALL
 from tests.plugins.scenes import camera, look_at, with_gaze
 
@@ -235,9 +234,6 @@ def test_the_blind_density_is_made_for_whoever_needs_it(rays, wall):
 
 # ---- Gaze fields that learn on a radiance field's features, and such that begin as its trunk ----
 
-SEMANTICS_BOX = Box((-2, -2, 0), (2, 2, 3))
-SEMANTICS_PROBES = ProbeSettings(radius=0.5, count=12, cap=64, min_rays=8, kappa=20.0, directions=64)
-
 
 def gaze_config(radiance, variant="emit_capture", **more):
     """Of a gaze field that can begin as the radiance field."""
@@ -245,7 +241,7 @@ def gaze_config(radiance, variant="emit_capture", **more):
 
 
 def place_of(field):
-    return GazePlace(FieldMedium(field), SEMANTICS_BOX, "field", radiance=field)
+    return GazePlace(FieldMedium(field), BOX, "field", radiance=field)
 
 
 @pytest.fixture
@@ -255,34 +251,17 @@ def radiance(rgb):
     config = RadianceConfig(
         HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=5, sh_degree=2, density_scale=6.0
     )
-    field = RadianceField.random(config, SEMANTICS_BOX, ns, 0, march_step=0.1)
+    field = RadianceField.random(config, BOX, ns, 0, march_step=0.1)
     table = np.random.default_rng(0).normal(size=len(field.grid.table)).astype(np.float32)
     field.set_parameters({"grid.table": ns.Float(table)})
     return field
 
 
-@pytest.fixture
-def rays_semantics():
-    rng = np.random.default_rng(1)
-    origin = rng.uniform([-1, -1, 1.5], [1, 1, 1.7], (300, 3))
-    direction = np.array([1.5, 0.4, 1.2]) + rng.normal(0, 0.15, (300, 3)) - origin
-    return Rays(
-        np.arange(300),
-        np.arange(300) % 2,
-        ("a", "b"),
-        origin,
-        direction / np.linalg.norm(direction, axis=1, keepdims=True),
-        np.ones(300),
-    )
-
-
 def test01_the_trunk_gives_the_fields_features(radiance):
     ns = namespace("llvm")
-    gaze = GazeField.random(gaze_config(radiance), SEMANTICS_BOX, ns, 3)
+    gaze = GazeField.random(gaze_config(radiance), BOX, ns, 3)
     gaze.set_parameters(initial_weights(radiance, gaze.config))
-    p = ns.Array3f(
-        np.random.default_rng(2).uniform(SEMANTICS_BOX.lower, SEMANTICS_BOX.upper, (50, 3)).astype(np.float32).T
-    )
+    p = ns.Array3f(np.random.default_rng(2).uniform(BOX.lower, BOX.upper, (50, 3)).astype(np.float32).T)
     expected = radiance.density_features(p)[1]
     got = gaze.position_net(gaze.grid(gaze.box.to_unit(p)))
     assert len(got) == 5
@@ -296,35 +275,27 @@ def test01_the_trunk_gives_the_fields_features(radiance):
 def test02_the_fast_path_is_the_field(radiance, own):
     ns, rng = namespace("llvm"), np.random.default_rng(3)
     config = gaze_config(radiance, semantic="snapshot", semantic_own=own)
-    gaze = GazeField.random(config, SEMANTICS_BOX, ns, 3)
+    gaze = GazeField.random(config, BOX, ns, 3)
     gaze.set_parameters({"grid.table": ns.Float(rng.normal(size=len(gaze.grid.table)).astype(np.float32))})
     B, D = 3, 32
-    p_o, p_od = (
-        ns.Array3f(rng.uniform(SEMANTICS_BOX.lower, SEMANTICS_BOX.upper, (n, 3)).astype(np.float32).T)
-        for n in (B, B * D)
-    )
+    p_o, p_od = (ns.Array3f(rng.uniform(BOX.lower, BOX.upper, (n, 3)).astype(np.float32).T) for n in (B, B * D))
     d = rng.normal(size=(B * D, 3))
     r_o = ns.Array3f((d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32).T)
     features = [ns.Float(rng.normal(size=B * D).astype(np.float32)) for _ in range(5)]
-    fast = gaze_density(config, SEMANTICS_BOX, gaze.parameters(), p_od, p_o, r_o, ns, features)
+    fast = gaze_density(config, BOX, gaze.parameters(), p_od, p_o, r_o, ns, features)
     at = dr.arange(ns.UInt32, B * D) // D
     slow = gaze.evaluate(p_od, dr.gather(ns.Array3f, p_o, at), r_o, True, features)[0]
     assert np.allclose(np.array(fast), np.array(slow), rtol=1e-5) and np.ptp(np.array(slow)) > 0
 
 
 @pytest.mark.parametrize("frozen", [True, False])
-def test04_frozen_trunks_stay_and_others_move(rgb, radiance, rays_semantics, frozen):
+def test04_frozen_trunks_stay_and_others_move(rgb, radiance, rays, frozen):
     ns = namespace("llvm")
     config = gaze_config(radiance, semantic="accumulated", semantic_own=True)
-    data = targets_of_rays(rays_semantics, place_of(radiance), SEMANTICS_PROBES, TargetNeeds(semantic="accumulated"))
+    data = targets_of_rays(rays, place_of(radiance), PROBES, TargetNeeds(semantic="accumulated"))
     assert data.semantic.shape == (*data.truth.shape, 5)
     trainer = ProductTrainer(
-        data,
-        SEMANTICS_BOX,
-        config,
-        GazeSettings(steps=30, frozen=frozen),
-        ns,
-        initial=initial_weights(radiance, config),
+        data, BOX, config, GazeSettings(steps=30, frozen=frozen), ns, initial=initial_weights(radiance, config)
     )
     before = trainer.measure(data).loss
     while trainer.progress < 1:
@@ -341,7 +312,7 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
     """Whatever the picture's colours are cut off at: a field must be shown what it was trained on."""
     save_radiance(radiance, tmp_path / "field.safetensors", {})
     config = gaze_config(radiance, "emit", semantic=kind)
-    save_gaze(GazeField.random(config, SEMANTICS_BOX, namespace("llvm"), 3), tmp_path / "gaze.safetensors", {})
+    save_gaze(GazeField.random(config, BOX, namespace("llvm"), 3), tmp_path / "gaze.safetensors", {})
     integrator = with_gaze(tmp_path, "opacity,position,gaze", depth="median")
     if cutoff is not None:
         integrator["color_cutoff"] = cutoff
@@ -487,13 +458,12 @@ def test_features_are_those_of_a_radiance_field():
 
 # ---- Views as targets: what they hold, likelihood and losses given a view, a law learnt from views ----
 
-PLACE = GazePlace(None, VIEW_TARGETS_BOX, "none")
 VIEW_TARGETS_PROBES = ProbeSettings(directions=512, radius=0.25, min_rays=1)
 
 
 def test_directions_and_densities_of_a_view():
     views = around(3)
-    found = targets_of_views(views, PLACE, VIEW_TARGETS_PROBES)
+    found = targets_of_views(views, NOWHERE, VIEW_TARGETS_PROBES)
     assert found.truth.shape == (3, 512) and found.blind is None
     np.testing.assert_allclose(found.truth.mean(axis=1) * found.extent, 1, rtol=1e-5)
     np.testing.assert_allclose(found.extent, pixel_solid_angles(LENS).sum(), rtol=1e-5)
@@ -508,11 +478,9 @@ def test_directions_and_densities_of_a_view():
 
 def test_the_likelihood_is_given_the_view():
     """Drawn loss and validation against the field's own densities, divided by their sum over the view in NumPy."""
-    data = targets_of_views(around(4), PLACE, VIEW_TARGETS_PROBES, TargetNeeds.of(VIEW_TARGETS_SMALL))
+    data = targets_of_views(around(4), NOWHERE, VIEW_TARGETS_PROBES, TargetNeeds.of(VIEW_TARGETS_SMALL))
     settings = GazeSettings(steps=1, loss="likelihood", integral=0.0, probes=4, directions=512, rays=2048, zones=0)
-    trainer = LikelihoodTrainer(
-        data, VIEW_TARGETS_BOX, replace(VIEW_TARGETS_SMALL, mix=0.0, geometry="none"), settings, ns
-    )
+    trainer = LikelihoodTrainer(data, BOX, replace(VIEW_TARGETS_SMALL, mix=0.0, geometry="none"), settings, ns)
     field = trainer.initial
     r_o, p_o = data.directions.reshape(-1, 3), np.repeat(data.positions, 512, axis=0)
     jit = lambda v: ns.Array3f(np.ascontiguousarray(v.T, np.float32))
@@ -530,7 +498,7 @@ def test_the_likelihood_is_given_the_view():
 
 def test_the_losses_of_a_density_do_not_see_its_scale_through_views():
     """But do for probes of rays that are beside them."""
-    data = targets_of_views(around(3), PLACE, VIEW_TARGETS_PROBES)
+    data = targets_of_views(around(3), NOWHERE, VIEW_TARGETS_PROBES)
     sphere = GazeTargets(
         data.positions,
         np.broadcast_to(fibonacci_directions(512), (3, 512, 3)).astype(np.float32),
@@ -539,9 +507,7 @@ def test_the_losses_of_a_density_do_not_see_its_scale_through_views():
         data.escaped,
     )
     settings = GazeSettings(steps=1, zones=0)
-    of = lambda data, scale: ProductTrainer(
-        data, VIEW_TARGETS_BOX, replace(PLAIN, emit_scale=scale), settings, ns
-    ).measure(data)
+    of = lambda data, scale: ProductTrainer(data, BOX, replace(PLAIN, emit_scale=scale), settings, ns).measure(data)
     np.testing.assert_allclose(of(data, 0.1), of(data, 0.7), rtol=1e-4, atol=1e-6)
     assert of(data, 0.1).integral == pytest.approx(1, abs=1e-5)
     both = concatenate(sphere, data)
@@ -569,7 +535,7 @@ def test_a_law_is_learnt_from_views_alone_and_holds_around():
     )
     config = replace(VIEW_TARGETS_SMALL, mix=0.05, geometry="none", prior=16)
     views = Supervision(None, around(90))
-    field, about = train(PLACE, settings, config, replace(VIEW_TARGETS_PROBES, radius=0.1), views)
+    field, about = train(NOWHERE, settings, config, replace(VIEW_TARGETS_PROBES, radius=0.1), views)
     assert about["rays"] == 0 and about["salience_views"] == 90 and about["validation"]["views_held_out"] >= 10
     from nerg_mi.evaluation.gaze import FieldDensity
 
@@ -590,7 +556,7 @@ def test_rays_and_views_train_one_field():
     settings = GazeSettings(steps=4, probes=4, directions=32, zones=1, watched=4, looks=2)
     probes = ProbeSettings(radius=0.25, count=8, cap=64, min_rays=4, directions=64)
     for config, more in ((PLAIN, {}), (VIEW_TARGETS_SMALL, {"loss": "likelihood"})):
-        field, about = train(PLACE, replace(settings, **more), config, probes, both)
+        field, about = train(NOWHERE, replace(settings, **more), config, probes, both)
         assert about["rays"] == 400 and about["salience_views"] == 6 and about["probes_made"] == 14
         assert all(np.isfinite(np.array(v)).all() for v in field.parameters().values())
 
