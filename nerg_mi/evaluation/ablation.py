@@ -125,8 +125,7 @@ def relate(rows: list[dict]) -> None:
 
 
 def summarise(rows: list[dict]) -> list[dict]:
-    """A row a recipe and variant: means over seeds, and the spread (standard deviation) of what differs between
-    them."""
+    """A row a recipe and variant: means over seeds, and the spread (standard deviation) of what differs."""
     out = []
     for key in dict.fromkeys((r["recipe"], r["variant"]) for r in rows):
         found = [r for r in rows if (r["recipe"], r["variant"]) == key]
@@ -158,8 +157,7 @@ def table(summary: list[dict]) -> str:
 
 
 def write_ablation(folder: Path, rows: list[dict], notes: str, about: Provenance | None = None) -> list[Path]:
-    """Write ``ablation.md`` (below ``notes``), ``.csv``, ``.json`` and the plot ``.png`` into ``folder``; returns their
-    paths."""
+    """Write ``ablation.md`` (below ``notes``), ``.csv``, ``.json`` and the plot ``.png`` into ``folder``; the paths."""
     summary, files = summarise(rows), [folder / f"ablation.{e}" for e in ("md", "csv", "json", "png")]
     write_text(files[0], f"{notes}\n\n{table(summary)}")
     write_csv(files[1], rows, COLUMNS)

@@ -136,8 +136,7 @@ def standard_baselines(
     rays: Rays, radius: float, kappa: float = 20.0, blind_kappa: float = 50.0, seed: int = 0, count: int = 2048
 ) -> tuple[Baseline, dict[str, Baseline]]:
     """``(blind, baselines)``: the density that information is counted from, and by name all that a gaze field is shown
-    beside: uniform, position-blind, nearest probes and nearest rays of the training ``rays``, with kernels of
-    ``kappa``."""
+    beside: uniform, position-blind, nearest probes and nearest rays of the training ``rays``, kernels of ``kappa``."""
     probes = place_probes(
         rays, radius, count=count, min_rays=min(64, len(rays)), kappa_rule="fixed", kappa=kappa, seed=seed
     )
@@ -184,8 +183,7 @@ class FieldDensity:
     positions' units.
 
     What the integrator ``nerg`` shows on surfaces for an observer there, by the same functions: its depths, its
-    integral of a normalised field, its mean of an ensemble. Where no surface is met the field is what it was trained to
-    be there.
+    integral of a normalised field, its mean of an ensemble. Where no surface is met the field is as it was trained.
 
     ``medium``: what the observer's depth is traced in, in the field's frame (a medium or a ``Place``; None for a field
     that knows no geometry); ``align``: similarity from the frame of the positions to the field's. The integrals of
@@ -265,8 +263,7 @@ SPLITS = ("both", "pos", "people")  # What may be new to a field: positions and 
 MAPS, RAYS = ("KLD", "CC", "SIM", "MAE"), ("NSS", "AUC", "sAUC", "bits", "loglik")
 SCORES = MAPS + RAYS
 """KLD in nats and CC, SIM of densities normalised over the sphere; MAE in 1/sr of densities as they are; NSS; AUC-Judd;
-sAUC against rays of other test positions; bits a ray beyond the blind density; mean log density (nats of 1/sr) of a
-ray."""
+sAUC against rays of other test positions; bits a ray beyond the blind density; mean log density (nats of 1/sr)."""
 # Share of an evaluation's time that goes to the densities of methods that are quick; the rest goes to resamples.
 _ANSWERS = 0.2
 _PER_POSITION = 128  # Rays that are drawn at each test position, and scored one by one
@@ -329,8 +326,7 @@ def make_test(
     cap: int = 1024,
     seed: int = 0,
 ) -> GazeTest:
-    """Truth around those of ``centres`` that have ``min_rays`` rays within ``radius`` metres, with a kernel of
-    ``kappa``.
+    """Truth around those of ``centres`` that have ``min_rays`` rays within ``radius`` metres, by kernels of ``kappa``.
 
     ``directions``: that maps are compared in; ``cap``: rays that a truth is made of at most, the nearest; ``seed``: of
     the rays that are drawn. Raises `NergError` where none has.
@@ -392,7 +388,7 @@ def evaluate_gaze(
     seed: int = 0,
     on_part: Callable[[float], None] | None = None,
 ) -> list[dict]:
-    """One row a method: the scores of ``SCORES``, each with ``.low`` and ``.high`` of its 95 % interval, and the
+    """One row a method: the scores of ``SCORES``, each with ``.low`` and ``.high`` of a 95 % interval, and the
     integral.
 
     ``blind``: the density that bits are counted from. An interval is 1.96 standard errors of the bootstrap either way;
@@ -463,8 +459,7 @@ def _answers(
 
 
 def person_rows(test: GazeTest, methods: dict[str, Baseline], blind: Baseline, min_rays: int = 64) -> list[dict]:
-    """One row a method and person: the person's rays, scored; map scores at positions where the person has ``min_rays``
-    rays."""
+    """One row a method and person: the person's rays, scored; map scores at positions of ``min_rays`` such rays."""
     rows = []
     for name, maps, values in _answers(test, methods, blind):
         for i, person in enumerate(test.persons):
@@ -529,8 +524,7 @@ def ray_scores(maps: np.ndarray, at: np.ndarray, others: np.ndarray, log_blind: 
 
 
 def _log(at: np.ndarray, maps: np.ndarray) -> np.ndarray:
-    """Log of densities at rays, normalised over the sphere; what is negative or zero counts as the smallest that is
-    known."""
+    """Log of densities at rays, normalised over the sphere; what is negative or zero counts as the smallest."""
     sphere = 4 * np.pi * np.maximum(maps, 0).mean(axis=1, keepdims=True)
     return np.log(np.maximum(at, 0) / np.where(sphere > 0, sphere, 1) + np.finfo(float).eps)
 

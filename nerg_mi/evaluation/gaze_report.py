@@ -57,8 +57,7 @@ def write_report(
     ranks: list[dict] | None = None,
     regions: list[dict] | None = None,
 ) -> list[Path]:
-    """Write ``gaze.md``, ``gaze.csv``, ``persons.csv``, ``gaze.json`` and ``positions.csv`` into ``folder``; returns
-    their paths.
+    """Write ``gaze.md``, ``gaze.csv``, ``persons.csv``, ``gaze.json`` and ``positions.csv`` into ``folder``; the paths.
 
     ``rows``, ``persons``: a row a method, and a method and person; ``about``: what was scored (JSON); ``notes``: what
     the Markdown begins with; ``positions``, ``ranks``, ``regions``: rows of `uncertainty`.

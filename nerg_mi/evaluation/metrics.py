@@ -65,8 +65,8 @@ class DepthScore:
 
 
 def depth_score(depth: np.ndarray, opacity: np.ndarray, truth: np.ndarray) -> DepthScore | None:
-    """Score of ``depth`` (h, w), 0 where there is none, against ``truth`` (h, w), 0 where unknown; None if it is
-    nowhere."""
+    """Score of ``depth`` (h, w), 0 where there is none, against ``truth`` (h, w), 0 where unknown; None if nowhere
+    known."""
     known = truth > 0
     if not known.any():
         return None

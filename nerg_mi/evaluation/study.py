@@ -61,12 +61,12 @@ STOP = 1e-4
 
 
 def as_in_the_paper(integrator, sensor, tolerance: float, steps: int = STEPS, dt_gamma: float = 0.0):
-    """An integrator with the field, gaze, observer and AOVs of ``integrator`` (of type ``nerg``) that marches by the
-    paper's rule.
+    """An integrator with the field, gaze, observer and AOVs of ``integrator`` (a ``nerg``) that marches by the paper's
+    rule.
 
     ``sensor``: the camera, which is the observer where there is no other; ``tolerance`` of visibility in scene units;
-    ``steps``: to the medium's diagonal, and most samples a ray; ``dt_gamma``: growth γ of steps with distance.
-    Its AOVs are depth, opacity, visibility, gaze and the three counts.
+    ``steps``: to the medium's diagonal, and most samples a ray; ``dt_gamma``: growth γ of steps with distance. Its AOVs
+    are depth, opacity, visibility, gaze and the three counts.
     """
     import mitsuba as mi
 
@@ -484,8 +484,7 @@ def timed(subject, integrator, spp: int = 1) -> tuple[float, float]:
 
 
 def precision() -> str:
-    """Of the variant in use: networks are fp16 on CUDA, where matrix units need it; everything else is fp32
-    everywhere."""
+    """Of the variant in use: networks are fp16 on CUDA, where matrix units need it; all else is fp32."""
     return "fp32, networks fp16" if _on_cuda() else "fp32"
 
 

@@ -144,8 +144,7 @@ class Subject:
         self.base = {**base, "tolerance": self.tolerance}
 
     def integrator(self, params: Mapping = {}, resolution: int = 0):
-        """A ``nerg`` integrator with ``params`` over the scene's own; ``resolution``: density as a grid of so many
-        voxels."""
+        """A ``nerg`` integrator with ``params`` over the scene's own; ``resolution``: density as a grid."""
         import mitsuba as mi
 
         if resolution:
@@ -167,8 +166,7 @@ class Subject:
         self._truths.clear()
 
     def rays(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and directions (N, 3) float64 of the rays that a render with one sample a pixel and ``seed``
-        traces."""
+        """Origins and directions (N, 3) float64 of the rays that a render with one sample a pixel traces."""
         import mitsuba as mi
 
         class Recorder(mi.SamplingIntegrator):

@@ -42,8 +42,7 @@ def comparable(row: dict) -> bool:
 
 
 def mark_fronts(rows: list[dict]) -> None:
-    """Set ``pareto`` of each row: the errors of `FRONTS` for which it is on the front, without their suffix,
-    space-separated."""
+    """Set ``pareto`` of each row: the errors of `FRONTS` for which it is on the front, space-separated."""
     for row in rows:
         row["pareto"] = ""
     for error in FRONTS:
@@ -147,8 +146,7 @@ _SHOWN = (
 
 
 def markdown(report: dict) -> str:
-    """A table for each factor, the default first in all of them, and the comparison with the paper's marching, where
-    there is any."""
+    """A table for each factor, the default first in all of them, and the comparison with the paper's marching."""
     rows = report["rows"]
     shown = [c for c in _SHOWN if any(c[0] in r for r in rows)]
     default = rows[0]

@@ -161,8 +161,8 @@ class Truth:
     """A reference picture, a row a ray or pixel: ``color`` (N, 3) linear, the others (N,); ``gaze`` is 0 throughout
     without a gaze field.
 
-    ``source``: what it is; ``convergence``: how much it changed when its step was halved, by name of error (empty for
-    closed forms).
+    ``source``: what it is; ``convergence``: how much it changed when its step was halved, by error (empty for closed
+    forms).
     """
 
     color: np.ndarray
@@ -228,7 +228,7 @@ def towards(p_o, p):
 
 
 def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
-    """Gaze density (N,) in 1/sr at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``, one of the observers of
+    """Gaze density (N,) in 1/sr at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``, an observer of
     ``gaze``."""
     mi = variant_types()
 

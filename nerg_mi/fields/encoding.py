@@ -1,5 +1,4 @@
-"""Encodings of positions and directions, which the networks are given: the protocol, the registry, and the hash
-grid."""
+"""Encodings of positions and directions, which the networks are given: protocol, registry, and the hash grid."""
 
 from __future__ import annotations
 

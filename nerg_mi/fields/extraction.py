@@ -111,8 +111,7 @@ class Sampler:
             return _joined(ask, np.concatenate([p, directions], 1), 3)
 
     def diffuse(self, p: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Colour (N, 3) of surface points seen head on and at 45 degrees, averaged: the field's colour depends on
-        direction."""
+        """Colour (N, 3) of surface points seen head on and at 45 degrees, averaged: a field's colour depends on it."""
         first = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
         u = np.cross(normals, first)
         u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-12)

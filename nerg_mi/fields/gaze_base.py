@@ -102,8 +102,7 @@ class RaySupport:
         return RaySupport(np.concatenate([mean, count[:, None], apart[:, None]], axis=1), radius)
 
     def at(self, p):
-        """Support at ``p`` (Array3f or Point3f of one lane), a Float of one lane: rays that count, without
-        derivatives."""
+        """Support at ``p`` (Array3f or Point3f of one lane), a Float of one lane, without derivatives."""
         Float: Any = dr.float32_array_t(type(p.x))
         p = dr.detach(p)
         x, y, z, count, apart = (Float(np.ascontiguousarray(column)) for column in self.cells.T)
@@ -417,8 +416,7 @@ _FLOOR = 1e-3  # Of the blind density that is uniform, so that its logarithm is 
 
 
 def look_up(table, rows: int, d):
-    """Bilinear value of a flat latitude-longitude ``table`` (rows x 2 rows, texel centres, +z first) in directions
-    ``d``."""
+    """Bilinear value of a flat latitude-longitude ``table`` (rows x 2 rows, texel centres, +z first) along ``d``."""
     Float = type(d.x)
     UInt32 = dr.uint32_array_t(Float)
     step, columns = dr.pi / rows, 2 * rows
@@ -525,7 +523,7 @@ def mean(found: list[tuple]) -> tuple:
 
 
 def spread(found: list[tuple]) -> Float:
-    """Standard deviation of gaze over the ``(gaze, emit, capture)`` of two or more members (1/sr, of N - 1 degrees of
+    """Standard deviation of gaze over the ``(gaze, emit, capture)`` of two or more members (1/sr, N - 1 degrees of
     freedom)."""
     gaze = mean(found)[0]
     variance: Any = sum(dr.square(g - gaze) for g, _, _ in found) / (len(found) - 1)

@@ -120,7 +120,7 @@ class LogGazeField(GazeHead):
     def random(
         config: LogGazeConfig, box: AnyBox, ns: ModuleType, seed: int = 0, prior: np.ndarray | None = None
     ) -> LogGazeField:
-        """An untrained field of backend ``ns``; equal seeds give equal weights. ``prior``: see ``blind_table``;
+        """An untrained field of backend ``ns``; equal seeds give equal weights. ``prior``: a ``blind_table``;
         uniform."""
         rng = np.random.default_rng(seed)
         if prior is None:
@@ -163,7 +163,7 @@ class LogGazeField(GazeHead):
         ]
 
     def capture_position(self, p_o) -> list:
-        """What capture's network is given of the observer's position: coordinates in the box of heads and their first
+        """What capture's network is given of the observer's position: its coordinates in the box of heads and first
         waves."""
         low, high = np.array(self.config.heads)
         scale = 2 / max((high - low).max(), 1e-6)

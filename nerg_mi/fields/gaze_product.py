@@ -197,8 +197,7 @@ class GazeField(GazeHead):
         return sigmoid(self.capture_head(self._trunk(p_o, r_o, active))[0])
 
     def unnormalized(self, p_od, p_o, r_o, active: Bool | bool = True, semantic=None, escaped: Bool | bool = False):
-        """``(emit, capture)``, whose product a normalised field divides by its integral; ``escaped`` makes no
-        difference.
+        """``(emit, capture)``, whose product a normalised field divides by its integral; ``escaped`` is not used.
 
         A variant that lacks a part has 1 in its place and does not evaluate it. ``semantic``: see ``emit``.
         """

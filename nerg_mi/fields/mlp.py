@@ -143,8 +143,7 @@ class MLP:
         return MLP(weights, norms or None)
 
     def require(self, sizes: list[int], name: str, normalized: bool = False) -> None:
-        """Raise ``ValueError`` unless the layers have ``sizes`` [inputs, ..., outputs] and are ``normalized`` or
-        not."""
+        """``ValueError`` unless the layers have ``sizes`` [inputs, ..., outputs] and are ``normalized`` or not."""
         shapes, expected = [tuple(w.shape) for w in self.weights], [(o, i) for i, o in zip(sizes, sizes[1:])]
         if shapes != expected:
             raise ValueError(f'"{name}" has layers of shapes {shapes} where its architecture needs {expected}')
@@ -154,8 +153,8 @@ class MLP:
             )
 
     def named(self) -> dict:
-        """Arrays by name: ``"0"``, ``"1"``, ...: weights; ``"0.gain"``, ``"0.shift"``, ``"0.bias"`` of a normalised
-        layer."""
+        """Arrays by name: ``"0"``, ``"1"``, ...: weights; ``"0.gain"``, ``"0.shift"``, ``"0.bias"`` of normalised
+        ones."""
         out = {}
         for i, w in enumerate(self.weights):
             out[str(i)] = w

@@ -35,8 +35,7 @@ _SAMPLES = 1 << 17
 def refine(field: RadianceField, points: int = POINTS) -> RefinedGrid | None:
     """The refined form of ``field``'s occupancy for its present weights; None where there is no plain grid.
 
-    A density counts from ``STEP_DEPTH`` in a step on, of the field's own length or, where it has none, a 1024th of its
-    box's diagonal.
+    A density counts from ``STEP_DEPTH`` in a step on, of the field's own length or a 1024th of its box's diagonal.
     """
     grid = field.occupancy
     if isinstance(grid, RefinedGrid):

@@ -120,8 +120,7 @@ def joined(parts: Sequence[Splats]) -> Splats:
 def from_trained(
     centers: np.ndarray, log_scales: np.ndarray, rotations: np.ndarray, logits: np.ndarray, harmonics: np.ndarray
 ) -> Splats:
-    """Splats of what a training stores: logarithms of the scales, logits of the opacities; quaternions w first, of any
-    length."""
+    """Splats of what a training stores: logarithms of the scales, logits of the opacities; quaternions w first."""
     return Splats(centers, scales_of(log_scales), rotations, opacities_of(logits), harmonics)
 
 

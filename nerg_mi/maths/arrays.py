@@ -1,4 +1,4 @@
-"""Arrays of Dr.Jit: made from NumPy's without new kernels, and elementary functions of them that neither cancel nor
+"""Arrays of Dr.Jit: made from NumPy's without new kernels, and elementary functions that neither cancel nor
 overflow."""
 
 from __future__ import annotations

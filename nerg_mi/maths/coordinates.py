@@ -15,7 +15,7 @@ _SAMPLE, _STRAY = 100_000, 0.01
 
 
 def check_coordinates(points: np.ndarray, name: str) -> None:
-    """Raise `NergError`, which calls ``points`` (N, 3) by their ``name``, where a coordinate is no number or beyond
+    """Raise `NergError`, which calls ``points`` (N, 3) by their ``name``, for a coordinate that is no number or beyond
     `FARTHEST`."""
     within = np.abs(points) <= FARTHEST
     if not within.all():

@@ -18,8 +18,8 @@ _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
 def fibonacci_directions(count: int, which: np.ndarray | None = None) -> np.ndarray:
-    """``count`` directions of equal area on a golden-angle spiral, (count, 3); ``which`` (N,): only those of these
-    numbers, (N, 3).
+    """``count`` directions of equal area on a golden-angle spiral, (count, 3); ``which`` (N,): of these numbers, (N,
+    3).
 
     Each stands for 4π/count sr. The spiral runs from +z to -z: direction i has z = 1 - (2i + 1)/count. Neighbours are
     about sqrt(4π/count) rad apart, 4.5 degrees at 2,048; narrower densities than that are not resolved. (Swinbank &
@@ -46,8 +46,8 @@ def numbers_in_cone(count: int, axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def fibonacci_vectors(count: int, which: UInt32 | None = None) -> Vector3f:
-    """`fibonacci_directions` as a Vector3f of the Mitsuba variant in use, in its precision; ``which``: only those of
-    these numbers.
+    """`fibonacci_directions` as a Vector3f of the Mitsuba variant in use, in its precision; ``which``: of these
+    numbers.
 
     Made by its kernels, since frozen functions take no arrays from NumPy.
     """

@@ -1,5 +1,5 @@
-"""Kernel densities on the sphere: the bandwidth, the exact estimate in one Dr.Jit kernel, and one density on a
-table."""
+"""Kernel densities on the sphere: the bandwidth, the exact estimate in one Dr.Jit kernel, and a table of one
+density."""
 
 from __future__ import annotations
 
@@ -105,8 +105,7 @@ def silverman_kappas(
     directions: np.ndarray, weights: np.ndarray | None, offsets: np.ndarray, kappa_max: float, shared: bool
 ) -> np.ndarray:
     """κ (P,) by the published code's rule, at most ``kappa_max``; with ``weights`` (n,) from the weighted mean
-    resultant and the effective count (Σw)²/Σw². ``shared``: one for all, 1 over the mean of the squared bandwidths
-    1/κ."""
+    resultant and the effective count (Σw)²/Σw². ``shared``: one for all, 1 over the mean of 1/κ."""
     w = np.ones(len(directions)) if weights is None else weights
     total = np.add.reduceat(w, offsets[:-1])
     count = total**2 / np.add.reduceat(w**2, offsets[:-1])

@@ -1,5 +1,4 @@
-"""Kernel densities of tracked rays in pictures: for a whole picture, and as an observer's view inside the
-integrator."""
+"""Kernel densities of tracked rays in pictures: for a whole picture, and as an observer's view in the integrator."""
 
 from __future__ import annotations
 

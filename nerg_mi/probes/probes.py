@@ -56,8 +56,7 @@ PLACEMENTS = ("data", "grid", "random", "blue")
 
 
 def _darts(origin: np.ndarray, spacing: float, rng: np.random.Generator) -> np.ndarray:
-    """Ray origins in random order, each taken if none taken before is within ``spacing`` (Poisson discs by dart
-    throwing)."""
+    """Ray origins in random order, each taken if none taken before is within ``spacing`` (Poisson discs by darts)."""
     from scipy.spatial import KDTree
 
     # One candidate for each cell much smaller than the discs: of millions of origins some ten thousand.
@@ -160,8 +159,8 @@ def place_probes(
 
     ``weights``: of a probe's rays, ``equal``, ``distance`` (1 - d/R, as an option of the published code has it with the
     farthest ray's distance for R), or ``person``: each person counts as much in a probe, however long they stayed.
-    ``ray_weights`` (N,): non-negative factors besides, such as those of :func:`person_weights`; rays of weight zero are
-    left out.
+    ``ray_weights`` (N,): non-negative factors besides, such as those of :func:`person_weights`; those of zero are left
+    out.
 
     ``centre``: where the density is said to hold. ``mean``, the (weighted) mean of the rays' origins, as in the
     published code and by default: it is where people stood, also at the edge of where they walk. ``query``: the ball's
@@ -239,8 +238,7 @@ def _only(near: Neighbours, places: np.ndarray) -> Neighbours:
 def _weigh(
     near: Neighbours, persons: np.ndarray, radius: float, rule: str, own: np.ndarray | None
 ) -> np.ndarray | None:
-    """Weights (n,) of the rays that are held, whose ``persons`` (n,) and ``own`` weights are given; None where all are
-    equal."""
+    """Weights (n,) of the rays that are held, whose ``persons`` (n,) and ``own`` weights are given; None: all equal."""
     if rule == "distance":
         # Never quite zero: a probe may hold nothing but rays at its rim.
         return np.maximum(1.0 - near.distances / radius, 1e-6) * (1.0 if own is None else own)
@@ -269,8 +267,7 @@ _LEAST, _MOST = 2048, 1 << 17
 
 
 def resolving_count(kappa: float) -> int:
-    """Directions of equal area that resolve kernels of ``kappa``: four in a kernel's width 1/sqrt(κ), 2,048 to
-    131,072."""
+    """Directions of equal area that resolve kernels of ``kappa``: four in a width 1/sqrt(κ), 2,048 to 131,072."""
     return int(np.clip(np.ceil(4.0 * np.pi * 16.0 * kappa), _LEAST, _MOST))
 
 
@@ -283,8 +280,7 @@ def integral(probes: Probes, count: int | None = None, backend: Backend = None) 
 
 
 def entropy(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
-    """Differential entropy -∫ p log p, (P,), natural, by quadrature; at most log 4π = 2.53, that of the uniform
-    density."""
+    """Differential entropy -∫ p log p, (P,), natural, by quadrature; at most log 4π = 2.53, of the uniform one."""
     return -_average(probes, count, backend, lambda p: p * np.log(np.where(p > 0, p, 1.0)))
 
 
@@ -304,8 +300,7 @@ def effective_persons(probes: Probes, rays: Rays) -> np.ndarray:
 
 
 def sample(probes: Probes, count: int, rng: np.random.Generator) -> np.ndarray:
-    """``count`` independent directions from each probe's density, (P, count, 3): a ray by its weight, then its
-    kernel."""
+    """``count`` independent directions from each probe's density, (P, count, 3): a ray by weight, then its kernel."""
     w = np.ones(len(probes.indices)) if probes.weights is None else probes.weights
     up_to = np.concatenate([[0.0], np.cumsum(w)])
     low, high = up_to[probes.offsets[:-1]], up_to[probes.offsets[1:]]

@@ -98,8 +98,7 @@ def blind_of_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
 
 
 def heads_box(positions: np.ndarray, box: AnyBox) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Corners of the box of observers at ``positions`` (N, 3), with some extent along each axis of the place's
-    ``box``."""
+    """Corners of the box of observers at ``positions`` (N, 3), of some extent along each axis of ``box``."""
     low, high = positions.min(axis=0), positions.max(axis=0)
     return tuple(low.tolist()), tuple(np.maximum(high, low + 1e-3 * box.side).tolist())
 
@@ -117,8 +116,8 @@ def semantic_features(
 ) -> np.ndarray:
     """Features (N, F), float16, of what rays see: ``accumulated`` along them, or the ``snapshot`` at ``distance`` (N,).
 
-    ``origins``, ``directions`` (N, 3) in the frame of ``place``, unit. Raises `NergError` for a place that is no
-    radiance field.
+    ``origins``, ``directions`` (N, 3) in the frame of ``place``, unit. `NergError` for a place that is no radiance
+    field.
     """
     mi = variant_types()
     medium = place.medium
@@ -170,7 +169,7 @@ class Supervision:
         return {"rays": 0 if rays is None else len(rays), "people": people, "salience_views": len(self.views)}
 
     def support(self, radius: float, place: GazePlace) -> RaySupport | None:
-        """How many rays start around a position in the frame of ``place``, for probes of ``radius`` metres; None
+        """Rays that start around a position in the frame of ``place``, for probes of ``radius`` metres; None
         without rays."""
         if self.rays is None:
             return None

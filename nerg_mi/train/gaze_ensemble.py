@@ -97,8 +97,7 @@ def train_ensemble(
 
     Minutes are those of all members together. With a file in ``state``, what is done is kept beside it, one file a
     member, and removed once ``write`` has put the ensemble into a file; without ``write`` the members stay. Raises
-    `NergError` for what cannot be resampled, and `KeyboardInterrupt`, whose message says how to go on, where it is
-    interrupted.
+    `NergError` for what cannot be resampled, and `KeyboardInterrupt`, which says how to go on, where it is interrupted.
     """
     state = state or StateSettings()
     kind, path = _kind(members, supervision, plan), state.path
@@ -158,8 +157,7 @@ def train_ensemble(
 
 
 def _kept(state: StateSettings, parts: list[Path | None], ns: ModuleType) -> dict | None:
-    """What an ensemble that is gone on with has been started as, by the first of its files; None where it starts
-    anew."""
+    """What an ensemble that is gone on with has been started as, by the first of its files; None for a new one."""
     if not state.resume or (state.path is not None and state.path.is_file()):
         return kept_identity(state)
     return next((load_gaze(p, ns)[1]["provenance"]["about"] for p in parts if p is not None and p.is_file()), None)

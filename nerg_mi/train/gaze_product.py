@@ -42,7 +42,7 @@ def gaze_density(
     ns: ModuleType,
     semantic: list | None = None,
 ) -> Any:
-    """Gaze (1/sr) of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D for each in turn) at
+    """Gaze (1/sr) of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D for each) at
     ``p_od``.
 
     The same maths as ``GazeField.evaluate`` on ``parameters`` spelt as the field spells them. Gradients reach every
@@ -136,16 +136,15 @@ class ProductTrainer(GazeTrainer):
 
 
 def trunk_config(config: GazeConfig, radiance: RadianceConfig) -> GazeConfig:
-    """``config`` with the sizes that let its trunk begin as that of a radiance field of the configuration
-    ``radiance``."""
+    """``config`` with the sizes that let its trunk begin as that of a field of the configuration ``radiance``."""
     return replace(
         config, grid=radiance.grid, width=radiance.width, geometry=radiance.geometry, sh_degree=radiance.sh_degree
     )
 
 
 def initial_weights(field: RadianceField, config: GazeConfig) -> dict:
-    """Grid and position network of ``field`` by the names of a gaze field: what its features, but not its density, come
-    from.
+    """Grid and position network of ``field`` by the names of a gaze field: what its features come from, not its
+    density.
 
     Raises `NergError` where ``config`` has other sizes.
     """

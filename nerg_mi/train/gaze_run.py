@@ -75,8 +75,7 @@ _LEAST = 1e-9  # Of a density (1/sr), so that its logarithm is finite
 
 @dataclass(frozen=True)
 class MixChoice:
-    """The share of the blind density that was chosen, and why; of no folds the share that was given, no KLD and no
-    regions."""
+    """The share of the blind density that was chosen, and why; of no folds the given share alone."""
 
     mix: float  # The share
     folds: int  # How many folds had people and positions enough to be judged by
@@ -143,8 +142,7 @@ def judge_folds(
     positions that are held out, with each share of the blind density.
 
     ``tell`` is told how it goes. Raises ``KeyboardInterrupt`` after Ctrl-C, or where ``tell`` does. The place is that
-    of all rays in each fold: one of hit points knows the surfaces that those who are held out have met, not who looked
-    there.
+    of all rays in each fold: one of hit points knows the surfaces that held-out people have met, not who looked there.
     """
     rays, config, curves, judgements = supervision.rays, plan.config, [], []
     if rays is None or not config.prior:
@@ -236,8 +234,8 @@ def _bins(probes: Probes, place: GazePlace, directions: np.ndarray) -> np.ndarra
 
 
 def _regions(judgements: Sequence[_Judgement], mix: float) -> dict[str, float]:
-    """Shares to ask for so that regions hold `probes.probes.LEVELS` of the looks in all folds, in which positions
-    count alike."""
+    """Shares to ask for so that regions hold `probes.probes.LEVELS` of the looks in all folds; positions count
+    alike."""
     levels, weights = [], []
     for of in judgements:
         density = (1 - mix) * of.field + mix * of.blind

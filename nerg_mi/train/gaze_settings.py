@@ -70,8 +70,8 @@ def gaze_loss(
     :data:`PAPER` and :data:`CODE` are ready weights: ``gaze_loss(..., **CODE)``.
 
     KLD normalises both densities over the probe's directions, and counts a negative prediction as zero. MAE does not
-    normalise, so that it alone holds the scale. Raises ``ValueError`` for lengths that do not fit, and when every
-    weight is zero.
+    normalise, so that it alone holds the scale. ``ValueError`` for lengths that do not fit, and when every weight is
+    zero.
     """
     if not (kld or cc or mae):
         raise ValueError("every weight of the gaze loss is zero; give kld, cc or mae a weight")

@@ -250,7 +250,7 @@ class GazeRunFile:
         return self.seconds + time.perf_counter() - self._started
 
     def restore(self, stage: str, trainer: GazeTrainer) -> dict:
-        """Set ``trainer`` to the state of ``stage``, where that is what was read; returns the weights that ``keep`` was
+        """Set ``trainer`` to the state of ``stage``, where that was read; returns the weights that ``keep`` was
         given."""
         if self.path is None or stage != self.stage or "random" not in self._meta:
             return {}
@@ -373,8 +373,8 @@ def fit_watched(
     file: GazeRunFile,
     tell: Listener,
 ) -> GazeFit:
-    """Train until the schedule ends, or validation on ``watched`` has not improved for ``patience`` looks. ``share``:
-    of the minutes."""
+    """Train until the schedule ends, or validation on ``watched`` has not improved for ``patience`` looks; ``share``:
+    of minutes."""
     settings = plan.settings
     if settings.minutes is not None:
         settings = replace(settings, minutes=settings.minutes * share)
@@ -432,8 +432,8 @@ def fit_again(
 
 
 def _stopped(stop: Interruption, tell: Listener, progress: GazeProgress) -> bool:
-    """Tell ``progress``; whether there was a Ctrl-C. Heard only here: within a step, weights and random numbers are of
-    different steps."""
+    """Tell ``progress``; whether there was a Ctrl-C. Heard only here: within a step, weights and random numbers do not
+    belong together."""
     try:
         tell(progress)
         stop.check()

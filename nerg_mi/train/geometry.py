@@ -137,8 +137,7 @@ def _cut(
     low: np.ndarray, high: np.ndarray, core: np.ndarray, points: np.ndarray, voxel: float, most: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Corners of a box of at most ``most`` voxels, from ``low`` to ``high`` cut face by face down to ``core`` (2, 3) at
-    the least: each time where giving up a 512th of ``points`` (N, 3) saves most voxels. None where ``core`` is too
-    large."""
+    the least: each time where giving up a 512th of ``points`` (N, 3) saves most. None where ``core`` is too large."""
     box = np.stack([low, high])
     step = max(1, len(points) // _STEPS)
     while True:
@@ -182,8 +181,7 @@ def voxelise_hits(rays: Rays, voxel: float | None = None, extent: HitExtent | No
     A voxel is solid where a ray ended. Gaps of up to eight voxels are closed (morphological closing), but not where a
     ray passed on its way to its hit; then voxels through which people put their heads, and their neighbours, are
     emptied. The box is ``extent``, by default the `hit_extent` of ``rays`` with voxels of edge ``voxel`` metres. Hits
-    outside of it are left out; where it was cut, they stand where their rays leave its shell. Raises as `hit_extent`
-    does.
+    outside of it are left out; where it was cut, they stand where rays leave its shell. Raises as `hit_extent` does.
     """
     from scipy.ndimage import binary_closing, binary_dilation
 

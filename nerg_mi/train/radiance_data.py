@@ -38,8 +38,8 @@ class LensTable:
         self._columns = [ns.Float(c) for c in np.array(rows, np.float32).T]
 
     def directions(self, frame, column, row):
-        """Directions (3 Floats, OpenGL camera frame, of any length) of the pixels ``column``, ``row`` of ``frame``
-        (UInt32)."""
+        """Directions (3 Floats, OpenGL camera frame, of any length) of pixels ``column``, ``row`` of ``frame``,
+        UInt32."""
         ns = self.ns
         get = lambda k: dr.gather(ns.Float, self._columns[k], frame)
         x, y = (ns.Float(column) + get(0)) * get(2), (ns.Float(row) + get(1)) * get(3)

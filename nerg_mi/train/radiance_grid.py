@@ -186,8 +186,7 @@ class DensityGrid:
         self.off = dr.compress(self.seen & (self.bits == 0))
 
     def empty_points(self, count: int, rng: np.random.Generator):
-        """Random points (Array3f, world) in cells that are not sampled though cameras see them; None if there are
-        none."""
+        """Random points (Array3f, world) in cells that cameras see and that are not sampled; None without any."""
         if dr.width(self.off) == 0:
             return None
         pick = self.ns.UInt32(aligned(rng.integers(0, dr.width(self.off), count, np.uint32), np.uint32))
@@ -272,8 +271,7 @@ _LOOKS = 32  # Groups of training rays that decide which cells matter
 class Settling:
     """Which cells the `DensityGrid.bound` of this moment would hold, nearly: by fewer points a cell and fewer rays.
 
-    ``at``: pieces done; ``found``: cells (UInt8 each) with density; ``shown``: cells that absorb some of a training
-    ray's light.
+    ``at``: pieces done; ``found``: cells (UInt8 each) with density; ``shown``: cells that absorb some light.
     """
 
     PROBES = len(_STRATA) * _PARTS

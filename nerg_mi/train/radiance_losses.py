@@ -196,7 +196,7 @@ def density(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns):
 
 
 def density_of(config: RadianceConfig, box: AnyBox, parameters: dict, p, features: list):
-    """Density (1/unit) at ``p`` where the grid returns ``features`` (list of Floats); without weight gradients, as one
+    """Density (1/unit) at ``p`` where the grid returns ``features`` (list of Floats); no weight gradients, one
     kernel."""
     return box.density_along(density_from_log(_head(parameters)(features)[0], config.density_scale), p)
 

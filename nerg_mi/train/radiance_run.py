@@ -127,8 +127,8 @@ def warm_up(trainer) -> None:
     """Run, and forget, what the steps of ``trainer`` (`RadianceTrainer`) consist of.
 
     Compiling takes seconds where the kernels are not in Dr.Jit's cache on the disk: a large share of a run of a minute,
-    in the part that decides how it ends. Weights, random numbers and all else are as they were before; the clock of the
-    run starts.
+    in the part that decides how it ends. Weights, random numbers and all else are as before; the clock of the run
+    starts.
     """
     with _forgotten(trainer):
         every, grid = trainer.settings.grid_every, trainer.grid
@@ -224,8 +224,7 @@ def train_field(
 
     ``state``: file that holds the whole state of the run, written every ``save_every`` seconds and when the run is
     interrupted; ``resume``: go on from there. ``write``: given the result, which it puts into a file. Once it has done
-    so, the state of a run that is done is removed; if it raises, the state is that of the end. Without it the state
-    stays.
+    so, the state of a run that is done is removed; if it raises, it is that of the end. Without it the state stays.
     ``preview``: PNG of the first watched view, its picture beside what is true, rewritten at every look and at the end.
     """
     trainer = RadianceTrainer(dataset.train, dataset.box, config, settings, ns, depth)

@@ -93,8 +93,7 @@ class Thinned:
 
 
 class _Weights(dr.CustomOp):
-    """w of τ; dw_i = c_i T_i exp(-τ_i) dτ_i - w_i Σ_{j<i} c_j dτ_j along one ray, c the copies that a sample stands
-    for."""
+    """w of τ; dw_i = c_i T_i exp(-τ_i) dτ_i - w_i Σ_{j<i} c_j dτ_j along one ray, c the samples' copies."""
 
     def eval(self, tau, segments, thinned):
         self.segments = segments
@@ -154,8 +153,7 @@ def ray_sum(x: Float, segments: Segments) -> Float:
 
 
 def damp_near(values: list, t, reach) -> list:
-    """``values`` of samples at distance ``t``, with derivatives scaled by (t / reach)² where they are nearer than
-    ``reach``.
+    """``values`` of samples at distance ``t``, with derivatives scaled by (t / reach)² within ``reach``.
 
     What is near a camera is sampled by many of its rays, and would turn to fog before far surfaces are found (Philip
     and Deschaintre 2023, "Floaters No More").
@@ -265,12 +263,10 @@ class Thinning:
 
 
 def occupied_steps(rays: CameraRays, table: StepTable, offset, occupied, most: int | None = None) -> tuple | None:
-    """Steps whose midpoints lie in the box and in an occupied cell: (ray, t, length, p), evaluated, and the rays
-    covered.
+    """Steps whose midpoints lie in the box and in an occupied cell: (ray, t, length, p), evaluated; rays covered.
 
-    ``offset``: each ray's jitter, [0, 1); ``occupied``: function of points (Array3f) and a mask,
-    giving a mask. ``most``: bound of their number; the last rays, whose steps do not fit, are dropped. None when there
-    is not one step.
+    ``offset``: each ray's jitter, [0, 1); ``occupied``: function of points (Array3f) and a mask, giving a mask.
+    ``most``: bound of their number; the last rays, whose steps do not fit, are dropped. None without one step.
     """
     UInt32 = dr.uint32_array_t(type(offset))
     total = rays.count * table.steps

@@ -60,8 +60,7 @@ def render_view(
 ) -> Preview:
     """March every ``every``-th pixel of ``view`` through ``field``.
 
-    ``occupied``: mask of points (Array3f, mask) in cells that may hold density; ``near``: where rays start, scene
-    units.
+    ``occupied``: mask of points (Array3f, mask) in cells that may hold density; ``near``: where rays start, in units.
     """
     ns = field.ns
     d = pixel_directions(view.camera.intrinsics)[every // 2 :: every, every // 2 :: every]
@@ -379,8 +378,7 @@ class RadianceTrainer(Trainer):
         return samples, dr.gather(ns.Array3f, samples.p, seen)
 
     def pixels_within(self, views: list[View], samples: int) -> int:
-        """The ``every`` of `render` with which ``views`` take about so many ``samples``, by those of the last step's
-        rays."""
+        """The ``every`` of `render` with which ``views`` take about so many ``samples``, by those of the last step."""
         rays = sum(v.pixels.shape[0] * v.pixels.shape[1] for v in views)
         return max(1, int(np.ceil((rays * max(self.looked * self.stride, 1) / samples) ** 0.5)))
 

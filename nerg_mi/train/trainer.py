@@ -157,12 +157,10 @@ def require_shape(tensors: dict, name: str, like) -> None:
 
 @contextmanager
 def kept_unless(path: Path | None, keep: Callable[[], None], done: bool) -> Iterator[None]:
-    """A block that measures and writes what a training has come to; only when it has ended is the state in ``path``
-    removed.
+    """A block that measures and writes what a training has come to; the state in ``path`` is removed when it has ended.
 
     ``path``: None where no state is kept; ``keep``: brings it up to date, called if the block raises, so that no step
-    is lost to a full disk or to Ctrl-C; ``done``: whether the state goes. A `NergError` of the block then says how to
-    go on.
+    is lost to a full disk or to Ctrl-C; ``done``: whether the state goes. A `NergError` then says how to go on.
     """
     try:
         yield
