@@ -70,27 +70,6 @@ def test_kinds_of_the_library(kind):
     assert field.networks == (4 if kind == "ensemble" else 2)
 
 
-def test_a_kind_builds_its_checkpoints(monkeypatch):
-    """A checkpoint that names none is a product's."""
-    monkeypatch.setattr(gaze_base, "_KINDS", dict(gaze_base._KINDS))
-    built = []
-
-    @gaze_base.register
-    class Other:
-        kind = "other"
-
-        @classmethod
-        def from_arrays(cls, about, box, arrays):
-            built.append((about, box, arrays))
-            return cls()
-
-    about = {"kind": "other", "width": 3}
-    assert isinstance(gaze_base.build(about, BOX, "arrays"), Other) and built == [(about, BOX, "arrays")]
-    for about, cls in (({}, GazeField), ({"kind": "log_density"}, LogGazeField)):
-        monkeypatch.setattr(cls, "from_arrays", classmethod(lambda c, *given: (c, *given)))
-        assert gaze_base.build(about, BOX, "arrays") == (cls, about, BOX, "arrays")
-
-
 @pytest.mark.parametrize("kind", ["wavelet", ["product"], 3])
 def test_an_unknown_kind_is_refused(kind):
     with pytest.raises((ValueError, TypeError), match="wavelet|kind|unhashable"):
