@@ -207,16 +207,13 @@ def _damaged(path: str | Path, why: str) -> NergError:
 # 1. Fewer than `LEAST_PEOPLE` people or `LEAST_POSITIONS` positions give no verdict, whatever the scores are.
 # 2. The field is compared with three references: the uniform density; the position-blind one, of whose kernels that
 #    with the higher log score is taken; and the nearest rays. Where another baseline has a higher log score than all of
-#    these, with that one, too. The scores are the log score (bits a ray), CC and KLD. One of them decides where the 95
-# %
-#    interval of the field's lead leaves out zero.
+#    these, with that one, too. The scores are the log score (bits a ray), CC and KLD. One of them decides where the
+#    95 % interval of the field's lead leaves out zero.
 # 3. The field is better where at least two of the three scores decide for it and none against it, worse where two
-# decide
-#    against it and none for it, and undecided otherwise.
+#    decide against it and none for it, and undecided otherwise.
 # 4. Worse than uniform or than position-blind: do not use it. Undecided beside position-blind: not shown to be of use.
 #    Better than position-blind: of use, and the nearest rays, with whatever is stronger, say whether it is worth a
-# field.
-#    The sentence names the strongest baseline, which is the one with the highest log score.
+#    field. The sentence names the strongest baseline, which is the one with the highest log score.
 #
 # Intervals are those of the bootstrap over people (`workflows.evaluate_gaze`), made wider for few: by sqrt(n / (n -
 # 1)), since a bootstrap of n people is too narrow by as much, and by Student's quantile of n - 1 degrees of freedom in

@@ -48,9 +48,7 @@ def color(p: np.ndarray) -> np.ndarray:
     return COLOR_BASE + p @ COLOR_SLOPE.T
 
 
-# ----------------------------------------------------------------------------
-# Slab, sphere, sheets: constant between breaks
-# ----------------------------------------------------------------------------
+# ---- Slab, sphere, sheets: constant between breaks ----
 
 SLAB_DENSITY = 6.0
 SPHERE_DENSITY, SPHERE_CENTER, SPHERE_RADIUS = 60.0, 0.5, 0.35
@@ -99,9 +97,7 @@ def _no_breaks(o, d):
     return np.empty((len(o), 0))
 
 
-# ----------------------------------------------------------------------------
-# Fog: smooth profiles over height z
-# ----------------------------------------------------------------------------
+# ---- Fog: smooth profiles over height z ----
 
 FOG_DENSITY, FOG_HEIGHT = 20.0, 0.15
 RAMP_DENSITY = 12.0
@@ -141,9 +137,7 @@ SCENES = {
 """Scenes by the name that ``nerg study`` knows them by."""
 
 
-# ----------------------------------------------------------------------------
-# As Mitsuba objects
-# ----------------------------------------------------------------------------
+# ---- As Mitsuba objects ----
 
 
 @functools.cache
