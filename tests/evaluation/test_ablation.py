@@ -50,12 +50,8 @@ def test_variants():
     names = [(v.recipe, v.name) for v in all_variants(True)]
     assert [n for r, n in names if r == "default"] == ["emit", "capture", "emit_capture"]
     paper = [n for r, n in names if r == "paper"]
-    assert (
-        len(paper) == 10
-        and "loss code" in paper
-        and sum("semantic" in n for n in paper) == 4
-        and "begins as the field, frozen" in paper
-    )
+    assert len(paper) == 10 and "loss code" in paper and sum("semantic" in n for n in paper) == 4
+    assert "begins as the field, frozen" in paper
     assert len(all_variants(False)) == 7 and len(all_variants(True, ("small",))) == 10
 
 
@@ -69,9 +65,8 @@ def test_losses_are_related_to_those_of_the_whole_field():
 
 def test_spreads_are_over_seeds():
     emit, both, paper = summarise(rows())
-    assert both["test_loss"] == pytest.approx(1.1) and both["test_loss.spread"] == pytest.approx(
-        np.std([1, 1.2], ddof=1)
-    )
+    assert both["test_loss"] == pytest.approx(1.1)
+    assert both["test_loss.spread"] == pytest.approx(np.std([1, 1.2], ddof=1))
     assert "test_loss.spread" not in emit and both["seeds"] == 2 and paper["recipe"] == "paper"
     assert "1.100 ± 0.141" in table([emit, both]) and len(table([emit, both]).splitlines()) == 4
     assert len({line.count("|") for line in table([emit, both]).splitlines()}) == 1

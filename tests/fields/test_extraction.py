@@ -74,9 +74,8 @@ def test_empty_cells_have_no_density_unless_asked():
     bits[:, :, 1] = True  # the half of larger x
     field.occupancy = OccupancyGrid(bits, ns, 0.0)
     p = np.array([[-0.5, 1, 1], [2.5, 1, 1]])
-    assert np.allclose(Sampler(field).density(p), [0, sigma(p[1])]) and np.allclose(
-        Sampler(field).density(p, masked=False), sigma(p)
-    )
+    assert np.allclose(Sampler(field).density(p), [0, sigma(p[1])])
+    assert np.allclose(Sampler(field).density(p, masked=False), sigma(p))
 
 
 def test_colours_are_those_from_in_front_and_aslant():

@@ -189,9 +189,8 @@ def test_one_width_for_all_is_that_of_the_sum_of_the_scores():
     person, grid = np.arange(261), kappa_grid(500.0)
     each = loo_kappas(x, person, offsets, 500.0, False, np.random.default_rng(0))
     runs = [(0, 60), (61, 261)]
-    assert [each[0], each[2]] == [leave_one_out_kappa(x[a:b], person[a:b], kappa_max=500.0) for a, b in runs] and each[
-        1
-    ] == 1
+    assert [each[0], each[2]] == [leave_one_out_kappa(x[a:b], person[a:b], kappa_max=500.0) for a, b in runs]
+    assert each[1] == 1
     total = sum(leave_one_out_scores(x[a:b], person[a:b], grid) for a, b in runs)
     assert (
         loo_kappas(x, person, offsets, 500.0, True, np.random.default_rng(0)).tolist() == [grid[np.argmax(total)]] * 3

@@ -46,10 +46,8 @@ def test_a_dense_grid_is_stored_under_its_kind(trained, tmp_path):
     field, _ = trained
     save_radiance(field, tmp_path / "dense.safetensors", {})
     again, meta = load_radiance(tmp_path / "dense.safetensors", ns)
-    assert (
-        meta["architecture"]["grid"] == {"kind": "dense_of_the_tests", "finest": 8, "size": 4}
-        and again.config == CONFIG
-    )
+    assert meta["architecture"]["grid"] == {"kind": "dense_of_the_tests", "finest": 8, "size": 4}
+    assert again.config == CONFIG
     p = ns.Array3f(POINTS)
     assert np.array_equal(again.density(p).numpy(), field.density(p).numpy())
 

@@ -100,9 +100,8 @@ def test08_gradients_equal_central_differences(name):
 
 def test09_names_and_sizes():
     config = GazeConfig()
-    assert (
-        config.position_sizes == [32, 64, 15] and config.direction_sizes == [31, 64, 64] and config.grid.finest == 512
-    )
+    assert config.position_sizes == [32, 64, 15] and config.direction_sizes == [31, 64, 64]
+    assert config.grid.finest == 512
     assert GazeConfig.from_dict(make().config.to_dict()) == make().config
     assert list(make().parameters()) == [
         "grid.table",

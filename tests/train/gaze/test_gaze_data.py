@@ -212,9 +212,8 @@ def test_kernels_that_vanish_between_all_directions_are_refused(rays, wall):
 def test_probes_are_placed_as_the_settings_say(rays):
     probes = probes_of_rays(rays, PROBES, seed=3)
     assert 1 <= len(probes) <= PROBES.count and (probes.kappa == PROBES.kappa).all()
-    assert (
-        probes.radius == PROBES.radius and PROBES.min_rays <= probes.counts.min() <= probes.counts.max() <= PROBES.cap
-    )
+    assert probes.radius == PROBES.radius
+    assert PROBES.min_rays <= probes.counts.min() <= probes.counts.max() <= PROBES.cap
     at = np.array([[-0.6, 0, 1.6]])
     np.testing.assert_array_equal(probes_of_rays(rays, PROBES, at).queries, at)
     lattice = probes_of_rays(rays, replace(PROBES, placement="grid", spacing=0.3))

@@ -149,9 +149,6 @@ def test_gradients_reach_what_the_variant_uses(variant):
         assert np.any(np.array(dr.grad(value)) != 0), name
 
 
-# ---- Products: one probe is learnt, and the fast path is the field ----
-
-
 # ---- Trainings of products: one probe is learnt, and a whole run with validation is ----
 
 

@@ -205,9 +205,8 @@ def test_without_surfaces_folds_choose_between_capture_and_both_unless_told_othe
 def test_what_is_chosen_arrives():
     choices = FieldChoices(activation="exp", size="small", normalized=True)
     config = gaze_recipe("paper").plan(SCENE, choices).config
-    assert (
-        config.activation == "exp" and config.normalized and config == gaze_recipe("small").plan(SCENE, choices).config
-    )
+    assert config.activation == "exp" and config.normalized
+    assert config == gaze_recipe("small").plan(SCENE, choices).config
     assert gaze_recipe("paper").plan(SCENE).config.activation == "linear"
     plan = gaze_recipe("small").plan(SCENE, settings={"seed": 4, "loss": "code"}, probes={"radius": 0.5})
     assert (plan.settings.seed, plan.settings.loss, plan.settings.steps, plan.probes.radius) == (4, "code", 600, 0.5)

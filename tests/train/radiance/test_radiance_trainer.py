@@ -308,9 +308,6 @@ def test_rays_that_do_not_fit_into_a_batch_do_not_count(dataset, monkeypatch):
     assert 0 < covered < count and trainer.loss.numpy()[0] == pytest.approx(1, rel=1e-5)
 
 
-# ---- How much a training step takes on, sizes and schedules ----
-
-
 # ---- How much a training step takes on follows samples, within its bounds ----
 
 STRIDES = (16, 8, 4, 2)
