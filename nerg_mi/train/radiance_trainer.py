@@ -11,8 +11,8 @@ from drjit.opt import Adam
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import encoding_of
+from nerg_mi.fields.occupancy import refine
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
-from nerg_mi.fields.refinement import refine
 from nerg_mi.formats.fields import number
 from nerg_mi.maths.arrays import aligned
 from nerg_mi.maths.geometry import AnyBox

@@ -19,9 +19,8 @@ from pathlib import Path
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField
-from nerg_mi.fields.occupancy import RefinedGrid
+from nerg_mi.fields.occupancy import RefinedGrid, refine
 from nerg_mi.fields.radiance import RadianceField
-from nerg_mi.fields.refinement import refine
 from nerg_mi.files.atomic import check_writable, file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.formats.fields import load_radiance, occupancy_arrays, save_gaze, save_radiance

@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_cdt
 
-from nerg_mi.fields.occupancy import PARTS, CascadeGrid, OccupancyGrid, RefinedGrid, chessboard, contracted_cascades
-from nerg_mi.fields.refinement import STEP_DEPTH, refine
+from nerg_mi.fields.occupancy import (
+    PARTS,
+    STEP_DEPTH,
+    CascadeGrid,
+    OccupancyGrid,
+    RefinedGrid,
+    chessboard,
+    contracted_cascades,
+    refine,
+)
 from nerg_mi.maths.geometry import Box, ContractedBox
 
 # ---- Cascades of occupancy against all cells of the finest size, one by one ----
