@@ -145,18 +145,14 @@ def _integrator_class(variant: str):
     return PaperIntegrator
 
 
-def _whole_cells(occupancy: Any) -> Any:
-    """The grid that is as fine as the paper's, which knows no parts of cells; None where there is none."""
-    return None if occupancy is None else occupancy.coarse
-
-
 def march(medium, ray, t0, t1, active, painter, *, steps, shortest, longest, dt_gamma):
     """``(opacity, depth, sum of what samples contribute, samples)`` of ``ray`` (`LocalRay`) between ``t0`` and ``t1``.
 
     ``painter``: what samples contribute (``medium.Painter``), or None for a density-only pass.
     """
     Float = type(ray.t_near)
-    grid = _whole_cells(medium.occupancy)
+    # The paper's grid knows no parts of cells.
+    grid = None if medium.occupancy is None else medium.occupancy.coarse
 
     def length(t):
         return dr.clip(t * dt_gamma, shortest, longest)

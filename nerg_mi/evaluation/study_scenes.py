@@ -146,27 +146,25 @@ def _volumes(variant: str):
     import drjit as dr
     import mitsuba as mi
 
-    class Density(mi.Volume):
+    class UnitVolume(mi.Volume):
+        def bbox(self):
+            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0), mi.ScalarPoint3f(1))
+
+        def to_string(self):
+            return f"{type(self).__name__}[]"
+
+    class Density(UnitVolume):
         """A density function over the unit cube."""
 
         def __init__(self, function):
             super().__init__(mi.Properties())
             self._function = function
 
-        def bbox(self):
-            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0), mi.ScalarPoint3f(1))
-
         def eval_1(self, it, active=True):
             return dr.select(active, self._function(it.p.x, it.p.y, it.p.z, dr), 0)
 
-        def to_string(self):
-            return "Density[]"
-
-    class Affine(mi.Volume):
+    class Affine(UnitVolume):
         """Colour that is affine in position."""
-
-        def bbox(self):
-            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0), mi.ScalarPoint3f(1))
 
         def eval(self, it, active=True):
             rows = [
@@ -176,10 +174,7 @@ def _volumes(variant: str):
             c = mi.Color3f(*rows)
             return mi.Spectrum(mi.luminance(c)) if mi.is_monochromatic else mi.Spectrum(c)
 
-        def to_string(self):
-            return "Affine[]"
-
-    class Gaze(mi.Volume):
+    class Gaze(UnitVolume):
         """A smooth, untrained gaze field over the unit cube, equal in every run."""
 
         def __init__(self, props):
@@ -196,12 +191,6 @@ def _volumes(variant: str):
 
         def placed_gaze(self):
             return self._gaze
-
-        def bbox(self):
-            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0), mi.ScalarPoint3f(1))
-
-        def to_string(self):
-            return "Gaze[]"
 
     return SimpleNamespace(density=Density, color=lambda: Affine(mi.Properties()), gaze=lambda: Gaze(mi.Properties()))
 
