@@ -124,12 +124,12 @@ def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thre
     """Killed at any moment, the state is one that an uninterrupted run has been in; Ctrl-C is heard between steps."""
     path = tmp_path / "a.run"
     child = subprocess.Popen([sys.executable, "-c", _CHILD, str(path)], env={**os.environ, "PYTHONPATH": os.getcwd()})
-    until = time.time() + 120
+    until = time.time() + 600
     while not path.exists() and child.poll() is None and time.time() < until:
         time.sleep(0.05)
     time.sleep(0.3)
     child.send_signal(sent)
-    assert child.wait(120) == (0 if sent == signal.SIGINT else -sent)
+    assert child.wait(600) == (0 if sent == signal.SIGINT else -sent)
     about = dict.fromkeys(("sha256", "training_frames", "width", "height"))
     killed = trainer(dataset, steps=10**6)
     load_run(killed, path, about)
