@@ -231,10 +231,11 @@ def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
     """Gaze density (N,) in 1/sr at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``, an observer of
     ``gaze``."""
     mi = variant_types()
-
-    p_od, p_o, r_o = (np.broadcast_to(v, p_od.shape) for v in (p_od, p_o, r_o))
-    points, along = (vector_of(mi.Point3f, v) for v in (p_od, p_o)), vector_of(mi.Vector3f, r_o)
-    return np.array(gaze.evaluate(*points, along, mi.Bool(True))[0], float)
+    met, eye, along = (
+        vector_of(kind, np.broadcast_to(v, p_od.shape))
+        for kind, v in ((mi.Point3f, p_od), (mi.Point3f, p_o), (mi.Vector3f, r_o))
+    )
+    return np.array(gaze.evaluate(met, eye, along, mi.Bool(True))[0], float)
 
 
 # ---- How far a picture is from the truth: the errors that a study reports ----

@@ -175,7 +175,7 @@ class RadianceTrainer(Trainer):
         for name in ("found", "shown"):
             require_shape(tensors, f"settling.{name}", getattr(self.settling, name))
         super().restore(tensors, meta)
-        self.grid.restore(*[tensors[f"grid.{name}"] for name in GRID_STATE], int(count_of(meta, "turn")))
+        self.grid.restore(**{name: tensors[f"grid.{name}"] for name in GRID_STATE}, turn=int(count_of(meta, "turn")))
         self.settling.restore(int(number(meta, "settling", "state")), found, shown)
         self.clock.restore(meta["clock"])
         self.hard = tensors["hard"]
