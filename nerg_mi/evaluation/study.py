@@ -152,7 +152,7 @@ def march(medium, ray, t0, t1, active, painter, *, steps, shortest, longest, dt_
     """
     Float = type(ray.t_near)
     # The paper's grid knows no parts of cells.
-    grid = None if medium.occupancy is None else medium.occupancy.coarse
+    grid: Any = None if medium.occupancy is None else medium.occupancy.coarse
 
     def length(t):
         return dr.clip(t * dt_gamma, shortest, longest)
