@@ -9,8 +9,6 @@ import pytest
 
 from nerg_mi.cli import main
 from nerg_mi.evaluation import study_scenes, study_subject, study_truth
-from nerg_mi.evaluation import study_truth as study_reference
-from nerg_mi.evaluation import study_truth as study_shapes
 from nerg_mi.evaluation.study import measure, settings
 from nerg_mi.evaluation.study_subject import extent, open_subject
 from nerg_mi.evaluation.study_truth import errors
@@ -24,7 +22,7 @@ from tests.reference import march_numpy
 def test_errors_of_known_pictures():
     n = 1000
     one, none = np.ones(n), np.zeros(n)
-    known = study_reference.Truth(np.full((n, 3), 0.5), one, 2 * one, one, np.linspace(1, 2, n), "", {})
+    known = study_truth.Truth(np.full((n, 3), 0.5), one, 2 * one, one, np.linspace(1, 2, n), "", {})
     seen = {
         "color": np.full((n, 3), 0.6),
         "opacity": one,
@@ -64,7 +62,7 @@ def rays(scene, count=24, seed=0):
 def test_references_are_the_limit_of_a_float64_march(name):
     scene = study_scenes.SCENES[name]
     o, d = rays(scene, 12)
-    seen = study_reference.trace(scene, o, d)
+    seen = study_truth.trace(scene, o, d)
     color, medians = seen.color(o, d), seen.quantile(0.5)
     for i in range(len(o) - 1):
         near, far = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
@@ -82,8 +80,8 @@ def test_references_are_the_limit_of_a_float64_march(name):
 def test_a_trace_that_ends_is_the_front_of_a_whole_one():
     for scene in study_scenes.SCENES.values():
         o, d = rays(scene, 8)
-        seen = study_reference.trace(scene, o, d)
-        half = study_reference.trace(scene, o, d, seen.quantile(0.5))
+        seen = study_truth.trace(scene, o, d)
+        half = study_truth.trace(scene, o, d, seen.quantile(0.5))
         assert np.allclose(half.opacity, seen.opacity / 2, rtol=1e-9)
 
 
@@ -92,10 +90,10 @@ def test_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_depth
     subject = open_subject("sphere", "auto", 96, 64)
     t, visible = subject.exact(1)
     o, d = subject.rays(1)
-    seen = study_reference.trace(subject.analytic, o, d)
+    seen = study_truth.trace(subject.analytic, o, d)
     thick = np.isfinite(t) & (seen.tau > 12)
     for kind in ("expected", "median"):
-        known = study_reference.compute_truth(
+        known = study_truth.compute_truth(
             subject.analytic,
             None,
             o,
@@ -113,7 +111,7 @@ def test_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_depth
 def test_what_is_no_surface_is_not_visible(visibility):
     scene = study_scenes.SCENES["ramp"]
     o, d = rays(scene, 64)
-    known = study_reference.compute_truth(
+    known = study_truth.compute_truth(
         scene, None, o, d, depth="expected", visibility=visibility, falloff=0.1, tolerance=1e-3, surface_opacity=0.9
     )
     thin = known.opacity < 0.9
@@ -123,7 +121,7 @@ def test_what_is_no_surface_is_not_visible(visibility):
 
 @pytest.mark.parametrize("x", [0, 1e-300, 1e-6, 9.9e-3, 1.01e-2, 1, 50, 1e9])
 def test_mean_share(x):
-    value = study_reference.mean_share(np.array([x]))[0]
+    value = study_truth.mean_share(np.array([x]))[0]
     if x < 1e-5:
         assert abs(value - 0.5) < 1e-6
     else:
@@ -199,9 +197,9 @@ def test02_rays_do_not_slip_between_triangles():
     corners = np.array([[[0, 0, 1], [1, 0, 1], [1, 1, 1]], [[0, 0, 1], [1, 1, 1], [0, 1, 1]]], float)
     s = np.linspace(0.01, 0.99, 99)
     o = np.stack([s, s, 0 * s], -1)
-    assert (study_shapes.first_hit(corners, o, np.tile([0, 0, 1.0], (99, 1))) == 1).all()
-    away = study_shapes.first_hit(corners, o, np.tile([0, 0, -1.0], (99, 1)))
-    parallel = study_shapes.first_hit(corners, o, np.tile([1.0, 0, 0], (99, 1)))
+    assert (study_truth.first_hit(corners, o, np.tile([0, 0, 1.0], (99, 1))) == 1).all()
+    away = study_truth.first_hit(corners, o, np.tile([0, 0, -1.0], (99, 1)))
+    parallel = study_truth.first_hit(corners, o, np.tile([1.0, 0, 0], (99, 1)))
     assert np.isinf(away).all() and np.isinf(parallel).all()
 
 
