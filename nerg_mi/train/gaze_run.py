@@ -86,7 +86,7 @@ class MixChoice:
     kld_blind: float | None = None
     # Shares that are to be asked for so that regions hold those of ``probes.probes.LEVELS``, by their names.
     regions: dict[str, float] | None = None
-    # Of several variants (``gaze_folds.choose_variant``) the one that was chosen, and the KLD of each, with its share,
+    # Of several variants (`choose_variant`) the one that was chosen, and the KLD of each, with its share,
     # in the folds that all have.
     variant: str | None = None
     variants: dict[str, float] | None = None

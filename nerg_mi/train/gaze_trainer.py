@@ -284,7 +284,7 @@ class GazePlan:
     """All that decides a training but for what it learns from and where."""
 
     config: GazeHeadConfig  # Architecture of the field
-    # Others that folds may choose in its place (`gaze_folds.choose_variant`).
+    # Others that folds may choose in its place (`gaze_run.choose_variant`).
     alternatives: tuple[GazeHeadConfig, ...] = ()
     settings: GazeSettings  # How weights are moved, and for how long
     probes: ProbeSettings  # How rays become probes
