@@ -15,6 +15,7 @@ import numpy as np
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Areas, Group, read_regions
+from nerg_mi.formats.meshes import MeshFile
 from nerg_mi.statistics.estimates import adjusted, ratio_differences
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.statistics.tables import BY_NAME, FIELD, PLACES, Floor, People, Row
@@ -31,6 +32,7 @@ from .scene import (
     changed_scene,
     read_changes,
     read_cohorts,
+    read_meshes,
     shapes_of,
     surroundings_of_files,
     things_of,
@@ -164,12 +166,18 @@ def isovist_rows(found: Isovists, names: Sequence[str], members: Sequence[tuple[
 @dataclass(frozen=True, eq=False)
 class Setting:
     """``areas`` in what is ``around`` people, and the ``things`` that they consist of; ``options`` of how it is
-    counted (`CountOptions`), asked of a field (`PredictionOptions`), or both."""
+    counted (`CountOptions`), asked of a field (`PredictionOptions`), or both; ``meshes`` that were read, by file."""
 
     around: Surroundings
     areas: Areas
     things: Sequence[Thing]
     options: SettingOptions
+    meshes: Mapping[Path, MeshFile]
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences on what of the meshes is not used."""
+        return [f"of {file}: {note}" for file, mesh in self.meshes.items() for note in mesh.notes]
 
     @cached_property
     def members(self) -> list[tuple[int, ...]]:
@@ -218,10 +226,12 @@ class Setting:
     def changed(self, changes: Changes) -> Setting:
         """The same after ``changes`` of shapes and areas. Raises `NergError` for those that cannot be made."""
         areas, around, shapes = changed_areas(self.areas, changes), self.around, shapes_of(self.around.scene)
+        meshes = {**self.meshes, **read_meshes(file for file in changes.meshes if file not in self.meshes)}
         if changes.of_shapes:
-            scene, shapes = changed_scene(around.scene, changes)
+            scene, shapes = changed_scene(around.scene, changes, meshes)
             around = around.within(scene)
-        return replace(self, around=around, areas=areas, things=things_of(areas.things, shapes))
+        things = things_of(areas.things, shapes, meshes)
+        return replace(self, around=around, areas=areas, things=things, meshes=meshes)
 
     def foretold(self, eyes: Eyes, view: float, reporter: Reporter = SILENT) -> Foretold:
         """What the field says of the gaze of ``eyes`` that see so many degrees (``view``)."""
@@ -257,7 +267,8 @@ def setting_of(
         rules_of(options)
     align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
     around = surroundings_of_files(scene, field, gaze, align, ns)
-    return Setting(around, areas, things_of(areas.things, shapes_of(around.scene)), options)
+    meshes = read_meshes(areas.meshes)
+    return Setting(around, areas, things_of(areas.things, shapes_of(around.scene), meshes), options, meshes)
 
 
 # ---- Trust ----

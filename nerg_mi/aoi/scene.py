@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +28,7 @@ from nerg_mi.formats.areas import (
     parse_box,
 )
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.formats.meshes import read_mesh_file
+from nerg_mi.formats.meshes import MeshFile, read_mesh_file
 from nerg_mi.maths.geometry import Similarity, box_interval
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import COORDINATES
@@ -245,15 +245,22 @@ class ShapeThing:
         return points, np.zeros_like(points)
 
 
-def things_of(areas: Sequence[Region | MeshPart | SceneShape], shapes: Mapping[str, Any]) -> list[Thing]:
-    """``areas`` as things, in their order; ``shapes`` of the scene by name; the variant must be active. Raises
-    `NergError` for shapes that there are not, and for meshes that cannot be read."""
+def read_meshes(files: Iterable[Path]) -> dict[Path, MeshFile]:
+    """The meshes in ``files``, each read once. Raises `NergError` for a file that is missing or damaged."""
+    return {file: read_mesh_file(file) for file in dict.fromkeys(files)}
+
+
+def things_of(
+    areas: Sequence[Region | MeshPart | SceneShape], shapes: Mapping[str, Any], meshes: Mapping[Path, MeshFile]
+) -> list[Thing]:
+    """``areas`` as things, in their order; ``shapes`` of the scene by name, ``meshes`` of parts by file; the variant
+    must be active. Raises `NergError` for shapes and faces that there are not."""
     found: list[Thing] = []
     for area in areas:
         if isinstance(area, Region):
             found.append(Box(area))
         elif isinstance(area, MeshPart):
-            found.append(thing_of_shape(area.name, load_mesh(area)))
+            found.append(thing_of_shape(area.name, _mesh_of_part(area, meshes[area.file])))
         else:
             found.append(thing_of_shape(area.name, shape_named(shapes, area.shape)))
     return found
@@ -290,10 +297,8 @@ def shape_named(shapes: Mapping[str, Any], name: str) -> Any:
     return shapes[name]
 
 
-def load_mesh(part: MeshPart) -> Any:
-    """The mesh of a part, with its faces alone, which are those of the file. Raises `NergError` for a file that is
-    missing or damaged."""
-    mesh = read_mesh_file(part.file)
+def _mesh_of_part(part: MeshPart, mesh: MeshFile) -> Any:
+    """The faces of a part alone, which are numbered as in the file of its ``mesh``."""
     chosen = mesh.faces[part.chosen(int(mesh.polygons.max()) + 1)[mesh.polygons]]
     used, index = np.unique(chosen, return_inverse=True)
     return mitsuba_mesh(mesh.vertices[used], index.reshape(-1, 3), part.name)
@@ -355,6 +360,11 @@ class Changes:
     shift: np.ndarray | None = None
 
     @property
+    def meshes(self) -> list[Path]:
+        """Files of what is added or swapped."""
+        return [put.what for put in (*self.add, *self.swap) if isinstance(put.what, Path)]
+
+    @property
     def of_shapes(self) -> bool:
         """Whether the scene is another one."""
         return bool(self.remove or self.add or self.swap or any(m.is_shape for m in self.move))
@@ -385,8 +395,7 @@ def read_changes(path: str | Path) -> Changes:
 
 def files_of_changes(path: str | Path, changes: Changes) -> list[Path]:
     """The files that ``changes`` were read from: the ``path`` and its meshes."""
-    meshes = [put.what for put in (*changes.add, *changes.swap) if isinstance(put.what, Path)]
-    return list(dict.fromkeys([Path(path), *meshes]))
+    return list(dict.fromkeys([Path(path), *changes.meshes]))
 
 
 def _listed(found: dict[str, Any], key: str) -> list[Any]:
@@ -472,9 +481,12 @@ def _moved(box: Region, move: Move) -> Region:
     return Region.of(box.name, np.array(box.lower) + by, np.array(box.upper) + by, turn)
 
 
-def changed_scene(scene: mi.Scene | None, changes: Changes) -> tuple[mi.Scene, dict[str, Any]]:
+def changed_scene(
+    scene: mi.Scene | None, changes: Changes, meshes: Mapping[Path, MeshFile]
+) -> tuple[mi.Scene, dict[str, Any]]:
     """Another scene with the changed shapes, which has those that stay in common with ``scene``, and all of its shapes
-    by name. Raises `NergError` for shapes that there are not, or cannot be moved."""
+    by name; ``meshes`` of what is added, by file. Raises `NergError` for shapes that there are not, or cannot be
+    moved."""
     if scene is None:
         raise NergError("shapes are changed in a scene; give one (.xml), since a trained field cannot be taken apart")
     kept = shapes_of(scene)
@@ -491,7 +503,7 @@ def changed_scene(scene: mi.Scene | None, changes: Changes) -> tuple[mi.Scene, d
     for put in (*changes.add, *changes.swap):
         if put.name in kept:
             raise NergError(f'there is a shape "{plain(put.name, 40)}" already; "swap" it, or choose another name')
-        kept[put.name] = _made(put)
+        kept[put.name] = _made(put, meshes)
     if not kept:
         raise NergError("no shape is left; leave one at least")
     return scene_of(kept), kept
@@ -510,9 +522,9 @@ def _moved_shape(shape: Any, move: Move) -> Any:
     return mitsuba_mesh(turned, np.array(params["faces"]).reshape(-1, 3), move.name)
 
 
-def _made(put: Put) -> Any:
+def _made(put: Put, meshes: Mapping[Path, MeshFile]) -> Any:
     if isinstance(put.what, Path):
-        mesh = read_mesh_file(put.what)
+        mesh = meshes[put.what]
         return mitsuba_mesh(mesh.vertices, mesh.faces, put.name)
     corner = lambda *bits: sum(b << k for k, b in enumerate(bits))
     faces = []

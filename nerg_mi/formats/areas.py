@@ -323,6 +323,11 @@ class Areas:
         return tuple(a for a in self.areas if not isinstance(a, Group))
 
     @property
+    def meshes(self) -> list[Path]:
+        """Files of those that are parts of meshes."""
+        return [a.file for a in self.areas if isinstance(a, MeshPart)]
+
+    @property
     def solids(self) -> dict[str, tuple[int, ...]]:
         """Those that are boxes, or groups of boxes alone, by name: the numbers of the `boxes` that each consists of."""
         number = {k: n for n, k in enumerate(k for k, thing in enumerate(self.things) if isinstance(thing, Region))}
@@ -524,9 +529,8 @@ def files_of_areas(path: str | Path, areas: Areas) -> list[Path]:
     path = Path(path)
     if path.is_dir():
         return files_of_twin(path)
-    meshes = [area.file for area in areas.areas if isinstance(area, MeshPart)]
     twins = [file for given in areas.others if "adt" in given for file in files_of_twin(path.parent / given["adt"])]
-    return list(dict.fromkeys([path, *meshes, *twins]))
+    return list(dict.fromkeys([path, *areas.meshes, *twins]))
 
 
 def _other(entry: Entry, path: Path) -> list[Area]:

@@ -163,6 +163,8 @@ class _Work:
         self.given, self.areas, self.options, self.reporter = given, areas, options, reporter
         self.setting = setting_of(given.scene, given.field, given.gaze, areas, options, ns)
         self.around, self.things, self.members = self.setting.around, self.setting.things, self.setting.members
+        for note in self.setting.notes:
+            reporter.message(note)
         if options.what_if is not None and self.around.gaze is None:
             raise NergError("--what-if is what a gaze field foretells: give one, or a scene that has one")
         if options.what_if is not None:
@@ -321,6 +323,8 @@ class _Work:
         assert o.what_if is not None and before is not None
 
         def foretell(there: Setting, others: Eyes) -> Foretold:
+            for note in there.notes[len(self.setting.notes) :]:
+                self.reporter.message(note)
             if parts is None:
                 return there.foretold(others, self._view, self.reporter)
             return parts.foretell(others, self._view, o.what_if)

@@ -27,14 +27,15 @@ from nerg_mi.aoi.predicted import (
     tell_support,
     what_if_rows,
 )
-from nerg_mi.aoi.scene import Surroundings, surroundings_of_files, things_of
+from nerg_mi.aoi.scene import Changes, Put, Surroundings, surroundings_of_files, things_of
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.formats.areas import Areas, Region, read_areas
+from nerg_mi.formats.areas import Areas, MeshPart, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.statistics.tables import PLACES, Floor
 from nerg_mi.statistics.visibility import Targets, isovists
 from nerg_mi.statistics.visits import ALL, Box, Cell
+from nerg_mi.transport.geometry import Place
 from nerg_mi.workflows.base import SILENT
 from tests.workflows.recorder import Recorder
 
@@ -277,8 +278,8 @@ def rows_what_if(tmp_path, changes, after, floor=None, members=1):
         return after
 
     before = told([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]], members=members)
-    around, things = Surroundings(None, None, Similarity()), things_of(AREAS.things, {})
-    setting = Setting(around, AREAS, things, StatisticsOptions())
+    around, things = Surroundings(None, None, Similarity()), things_of(AREAS.things, {}, {})
+    setting = Setting(around, AREAS, things, StatisticsOptions(), {})
     found = what_if_rows(tmp_path / "c.json", setting, WHAT_IF_EYES, before, foretell, floor or Floor(), 199, 0)
     return {(r["thing"], r["measure"]): r for r in found}, asked[0]
 
@@ -319,6 +320,23 @@ def test04_members_of_an_ensemble(tmp_path):
         rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5))[0]["a", "share"]["difference_spread"]
         is None
     )
+
+
+def test_what_of_meshes_is_not_used_is_named_once(tmp_path):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    for name, extra in (("one", "usemtl red\n"), ("two", "vp 1 2\n")):
+        (tmp_path / f"{name}.obj").write_text(extra + triangle)
+    one, two = tmp_path / "one.obj", tmp_path / "two.obj"
+    areas = Areas((MeshPart("a", one), MeshPart("b", one, ((0, 0),))))
+    setting = setting_of(None, None, None, areas, StatisticsOptions(), ns)
+    assert setting.notes == [f"of {one}: statements that are not used: usemtl"]
+    scene = mi.load_dict({"type": "scene", "s": {"type": "sphere"}})
+    setting = replace(setting, around=Surroundings(Place(None, scene), None, Similarity(), scene))
+    changes = Changes(add=(Put("c", one), Put("d", two)))
+    assert setting.changed(changes).notes == [*setting.notes, f"of {two}: statements that are not used: vp"]
 
 
 def test05_no_support(tmp_path):
