@@ -19,6 +19,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 import numpy as np
@@ -144,6 +145,16 @@ def size_of(path: str | os.PathLike, what: str = "file", most: int | None = None
             f'the {what} "{path}" has {found.st_size:,} bytes, more than the {most:,} that are read; give a smaller one'
         )
     return found.st_size
+
+
+def is_ordinary(path: Path, what: str = "file") -> bool:
+    """Whether there is an ordinary file ``path``; a folder is none. `NergError` for a device, a pipe or a socket, which
+    is no missing file."""
+    if path.is_file():
+        return True
+    if path.exists() and not path.is_dir():
+        size_of(path, what)
+    return False
 
 
 @contextmanager

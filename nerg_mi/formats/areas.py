@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import is_count, read_bytes, read_json, reading
+from nerg_mi.files.safe_read import is_count, is_ordinary, read_bytes, read_json, reading
 from nerg_mi.ranges import FARTHEST
 
 # ---- Regions ----
@@ -463,7 +463,7 @@ def _rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
 
 def _names(path: Path) -> dict[str, tuple[str, str]]:
     """Name and category of objects; none where there is no such file."""
-    if not path.is_file():
+    if not is_ordinary(path, "file of instances"):
         return {}
     found = read_json(path, "file of instances")
     if not isinstance(found, dict):

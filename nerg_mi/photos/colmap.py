@@ -17,7 +17,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, plain, sentence
 from nerg_mi.files.atomic import file_sha256
-from nerg_mi.files.safe_read import open_file, size_of
+from nerg_mi.files.safe_read import is_ordinary, open_file, size_of
 
 from .posed import FARTHEST, FileFinder, Frame, MaskFile, PosedImages, Unused, name_some, settled
 from .transforms import read_frame_poses
@@ -115,10 +115,10 @@ def model_files(folder: str | Path) -> dict[str, Path] | None:
     none."""
     folder = Path(folder)
     for suffix in (".bin", ".txt"):
-        if all((folder / (n + suffix)).is_file() for n in ("cameras", "images")):
-            return {
-                n: folder / (n + suffix) for n in ("cameras", "images", "points3D") if (folder / (n + suffix)).is_file()
-            }
+        files = {name: folder / (name + suffix) for name in ("cameras", "images", "points3D")}
+        files = {name: path for name, path in files.items() if is_ordinary(path, "COLMAP file")}
+        if {"cameras", "images"} <= files.keys():
+            return files
     return None
 
 
@@ -457,7 +457,7 @@ def find_source(dataset: str | Path) -> Path:
         # A file of a COLMAP model stands for the model.
         return dataset.parent if dataset.suffix in (".bin", ".txt") else dataset
     for name in ("transforms.json", "transforms_train.json"):
-        if (dataset / name).is_file():
+        if is_ordinary(dataset / name, "transforms file"):
             return dataset / name
     for name in _MODEL_FOLDERS:
         models = _list_models(dataset / name)

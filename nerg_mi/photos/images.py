@@ -13,7 +13,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, plain
 from nerg_mi.files.images import check_image, read_exr
-from nerg_mi.files.safe_read import read_npy, reading
+from nerg_mi.files.safe_read import is_ordinary, read_npy, reading
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import LENGTHS, check_number
 
@@ -507,7 +507,7 @@ def _test_file(source: Path) -> Path | None:
         return None
     for name in ("transforms_test.json", "transforms_val.json"):
         path = source.with_name(name)
-        if path.is_file() and path != source:
+        if path != source and is_ordinary(path, "transforms file"):
             return path
     return None
 

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import line_blocks
+from nerg_mi.files.safe_read import is_ordinary, line_blocks
 from nerg_mi.maths.coordinates import check_near_origin
 
 from .cameras import Intrinsics
@@ -84,10 +84,11 @@ class FileFinder:
     def find(self, name: str, what: str) -> Path:
         """The file ``name``; as it is spelled, where there is none.
 
-        Raises `NergError` for one outside of the root, and where several files differ from ``name`` by case alone.
+        Raises `NergError` for one outside of the root, for a device or a pipe, and where several files differ from
+        ``name`` by case alone.
         """
         path = inside(self.root, self.folder / name, what)
-        if path.is_file():
+        if is_ordinary(path, what):
             return path
         slashes = name.replace("\\", "/")
         inside(self.root, self.folder / slashes, what)
@@ -107,7 +108,7 @@ class FileFinder:
                     return None
                 part = names[0]
             path = path / part
-        return path if path.is_file() else None
+        return path if is_ordinary(path, what) else None
 
     def _names(self, folder: Path) -> dict[str, list[str]]:
         if folder not in self._listed:

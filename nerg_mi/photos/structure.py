@@ -223,7 +223,7 @@ def list_photos(folder: str | Path) -> tuple[list[Path], list[Unused]]:
     """Photos directly in ``folder``, by name, and pictures of other kinds. `NergError` where there is no photo."""
     folder = Path(folder)
     with reading(folder, "folder of photos"):
-        files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+        files = sorted(p for p in folder.iterdir() if not (p.is_dir() or p.name.startswith(".")))
     photos = [p for p in files if p.suffix.lower() in SUFFIXES]
     others = [
         Unused(p.name, "only JPEG and PNG photos are read; convert it") for p in files if p.suffix.lower() in _OTHERS

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError, plain, sentence
-from nerg_mi.files.safe_read import JSON_BYTES, parse_json, read_bytes
+from nerg_mi.files.safe_read import JSON_BYTES, is_ordinary, parse_json, read_bytes
 
 from .cameras import OPENGL_FROM_MITSUBA
 from .posed import (
@@ -262,7 +262,7 @@ def _mask(entry: dict, finder: FileFinder, image: Path) -> MaskFile | None:
             )
         return MaskFile(mask)
     dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")
-    return MaskFile(inside(finder.root, dynamic, "mask"), hides=True) if dynamic.is_file() else None
+    return MaskFile(inside(finder.root, dynamic, "mask"), hides=True) if is_ordinary(dynamic, "mask") else None
 
 
 def _depth(data: dict, entry: dict, finder: FileFinder, metre: float) -> DepthFile | None:

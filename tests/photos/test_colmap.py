@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import struct
 import tracemalloc
 
@@ -169,6 +170,25 @@ def test_missing_images_and_masks_are_listed(model):
     assert [f.name for f in posed.frames] == sorted(NAMES[1:3]) and not any(f.mask.hides for f in posed.frames)
     reasons = {u.name: u.reason for u in posed.unused}
     assert "does not exist" in reasons[NAMES[0]] and "mask" in reasons[NAMES[3]]
+
+
+@pytest.mark.parametrize("name", ["images/a.png", "masks/a.png.png", "0/images.bin", "0/points3D.bin"])
+def test_a_pipe_is_no_missing_file(tmp_path, name):
+    for folder in ("0", "images", "masks"):
+        (tmp_path / folder).mkdir()
+    write_bin(tmp_path / "0", ["a.png", "b.png"])
+    for folder in ("images", "masks"):
+        for photo in ("a.png", "b.png"):
+            (tmp_path / folder / (photo if folder == "images" else f"{photo}.png")).touch()
+    (tmp_path / name).unlink()
+    os.mkfifo(tmp_path / name)
+    read = lambda: read_colmap(tmp_path / "0", tmp_path / "images", tmp_path / "masks")
+    if name.startswith("0/"):
+        with pytest.raises(NergError, match=f'{name}" is a pipe'):
+            read()
+    else:
+        found = read()
+        assert [f.name for f in found.frames] == ["b.png"] and f'{name}" is a pipe' in found.unused[0].reason
 
 
 def test_a_zero_quaternion_is_listed(tmp_path):

@@ -310,6 +310,13 @@ def test_others_are_named_and_hidden_ones_are_not(folder):
     assert "JPEG and PNG" in others[0].reason
 
 
+def test_a_pipe_is_no_photo(folder, folders):
+    ramp().save(folder / "a.jpg")
+    os.mkfifo(folder / "b.jpg")
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["a.jpg"] and 'b.jpg" is a pipe' in unused["b.jpg"]
+
+
 def test_a_folder_without_photos_is_told(folder, tmp_path):
     with pytest.raises(NergError, match="name the folder"):
         list_photos(folder)

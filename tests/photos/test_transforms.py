@@ -1,6 +1,7 @@
 """Reading transforms files: what is understood, what is listed, what is refused."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +133,16 @@ def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
 def test_a_missing_depth_file_costs_the_depth_only(write):
     t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", depth_file_path="d.npy")]}))
     assert t.frames[0].depth is None and "a.png" in t.notes[0] and "d.npy" in t.notes[0]
+
+
+@pytest.mark.parametrize("name", ["a.png", "A.png", "mask.png", "depth.png", "dynamic_mask_a.png"])
+def test_a_pipe_is_no_missing_file(write, name):
+    keys = {"mask_path": "mask.png"} if name == "mask.png" else {}
+    entry = frame("A.png" if name == "a.png" else "a.png", depth_file_path="depth.png", **keys)
+    path = write({"fl_x": 1.0, "frames": [entry, frame("b.png")]}, {"a.png", "b.png", "depth.png"} - {name.lower()})
+    os.mkfifo(path.with_name(name))
+    t = read_transforms(path)
+    assert [f.name for f in t.frames] == ["b.png"] and f'{name}" is a pipe' in t.unused[0].reason
 
 
 @pytest.mark.parametrize(
