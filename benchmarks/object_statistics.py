@@ -35,7 +35,7 @@ def made_store():
 
 def counting_of(around, areas, things, seen: bool = True):
     from nerg_mi.aoi.measured import Counting
-    from nerg_mi.statistics.visibility import CellsInView, Targets
+    from nerg_mi.statistics.shares import CellsInView, Targets
     from nerg_mi.statistics.visits import LookRules
 
     in_view = CellsInView(Targets.of(things, 48), around.depth, 0.1, 0.03) if seen else None
@@ -96,8 +96,8 @@ def errors() -> None:
     from nerg_mi.aoi.predicted import foretell
     from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.scenes.store import twin
+    from nerg_mi.statistics.shares import Targets
     from nerg_mi.statistics.tables import People
-    from nerg_mi.statistics.visibility import Targets
     from nerg_mi.statistics.visits import ALL, land
     from nerg_mi.workflows.base import SILENT
 

@@ -67,7 +67,7 @@ def bake(folder: Path, name: str, detail: float, **more) -> tuple[int, bytes]:
 
 def count(folder: Path, name: str, **more) -> tuple[int, bytes]:
     """Rays and the bytes of the table."""
-    from nerg_mi.aoi.options import StatisticsOptions
+    from nerg_mi.aoi.measured import StatisticsOptions
     from nerg_mi.workflows.statistics import statistics as stats
 
     options = StatisticsOptions(areas=folder / "areas.json", resamples=199, names=True, mode="llvm_ad_rgb", **more)

@@ -26,8 +26,16 @@ from nerg_mi.workflows.geometry import file_of_training, place_key
 from nerg_mi.workflows.options import as_base
 from nerg_mi.workflows.parts import Parts, PlannedScene
 
-from .measured import Counting, Eyes, blocks_of, count_block
-from .options import CountOptions, PredictionOptions, SettingOptions, StatisticsOptions
+from .measured import (
+    Counting,
+    CountOptions,
+    Eyes,
+    PredictionOptions,
+    SettingOptions,
+    StatisticsOptions,
+    blocks_of,
+    count_block,
+)
 from .predicted import Foretold, Setting, setting_of
 from .scene import files_of_changes, read_changes
 

@@ -17,14 +17,12 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Areas, Group, read_regions
 from nerg_mi.formats.meshes import MeshFile
 from nerg_mi.statistics.estimates import adjusted, ratio_differences
-from nerg_mi.statistics.shares import ROUGH, gaze_shares
+from nerg_mi.statistics.shares import ROUGH, CellsInView, Isovists, Targets, gaze_shares, in_view, standing, unhidden
 from nerg_mi.statistics.tables import BY_NAME, FIELD, PLACES, Floor, People, Row
-from nerg_mi.statistics.visibility import CellsInView, Isovists, Targets, in_view, standing, unhidden
 from nerg_mi.statistics.visits import ALL, Cell, LookRules, Thing
 from nerg_mi.workflows.base import SILENT, Reporter
 
-from .measured import Counting, Eyes, Window
-from .options import CountOptions, PredictionOptions, SettingOptions, parse_window
+from .measured import Counting, CountOptions, Eyes, PredictionOptions, SettingOptions, Window, parse_window
 from .scene import (
     Changes,
     Surroundings,

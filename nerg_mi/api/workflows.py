@@ -16,6 +16,7 @@ from .scene import FilePath, TrainedField, check_names, checkpoint_of, file_of, 
 
 if TYPE_CHECKING:
     from nerg_mi.alignment.check import Alignment
+    from nerg_mi.aoi.output import StatisticsResult
     from nerg_mi.evaluation.metrics import ViewScores
     from nerg_mi.fields.gaze_base import AnyGazeField
     from nerg_mi.fields.radiance import RadianceField
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from nerg_mi.workflows.bake_options import BakeOptions
     from nerg_mi.workflows.evaluate import GazeEvaluation
     from nerg_mi.workflows.geometry import GazeEvaluationOptions
-    from nerg_mi.workflows.statistics import StatisticsResult
     from nerg_mi.workflows.study import StudyOptions, StudyResult
     from nerg_mi.workflows.train_gaze import GazeOptions
     from nerg_mi.workflows.train_radiance import RadianceOptions, RadianceScoreOptions
@@ -237,8 +237,8 @@ def stats(
 
     ``files``: rays (in memory, or their file, or a dataset), a scene, a gaze field, a radiance field, in any order.
     ``areas``: a JSON file of boxes, meshes, shapes and groups (docs/statistics.md). ``output``: folder for the tables.
-    ``options``: those of `nerg stats` (`nerg_mi.aoi.options.StatisticsOptions`). Gives a
-    `nerg_mi.workflows.statistics.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
+    ``options``: those of `nerg stats` (`nerg_mi.aoi.measured.StatisticsOptions`). Gives a
+    `nerg_mi.aoi.output.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
 
     >>> import json, nerg_mi as nerg
     >>> from nerg_mi.api.workflows import stats
@@ -249,7 +249,7 @@ def stats(
     >>> row["thing"], round(row["share"], 3), row["reach"], row["distance"]
     ('shelf', 0.667, 1.0, 2.0)
     """
-    from nerg_mi.aoi.options import StatisticsOptions
+    from nerg_mi.aoi.measured import StatisticsOptions
     from nerg_mi.workflows.statistics import statistics
 
     given = [files] if isinstance(files, (str, os.PathLike, Rays)) else list(files)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
+from nerg_mi.fields.splats import matrices_of
 from nerg_mi.files.safe_read import is_count, is_ordinary, read_bytes, read_json, reading
 from nerg_mi.ranges import FARTHEST
 
@@ -97,13 +98,7 @@ class Region:
         if self.turn is None:
             return np.eye(3)
         x, y, z, w = np.array(self.turn, float) / math.hypot(*self.turn)
-        return np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        return matrices_of(np.array([[w, x, y, z]]))[0]
 
     def to_own(self, points: np.ndarray) -> np.ndarray:
         """``points`` (..., 3) turned back about the middle, where this is the box between `corners`."""

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import plain
+from nerg_mi.fields.splats import matrices_of
 from nerg_mi.files.safe_read import is_count, parse_json, reading
 
 GLTF_MAGIC = b"glTF"
@@ -253,13 +254,9 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
         out = np.array(node["matrix"], np.float64).reshape(4, 4).T
     else:
         x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
-        rotation = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
         out = np.eye(4)
-        out[:3, :3] = np.array(rotation) * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
+        rotation = matrices_of(np.array([[w, x, y, z]]))[0]
+        out[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
         out[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
     if not np.isfinite(out).all():
         raise ValueError("one of its nodes stands nowhere")

@@ -1,5 +1,5 @@
-"""Structure from motion, as seen from outside: which photos can be used, which are compared, the process that
-reconstructs, and how far its poses are from others."""
+"""Structure from motion, as seen from outside: which photos can be used, which are compared, and the process that
+reconstructs."""
 
 from __future__ import annotations
 
@@ -29,65 +29,6 @@ from nerg_mi.files.safe_read import read_bytes, reading
 
 from .colmap import Up
 from .posed import Unused, inside
-
-# ---- How far poses are from others of the same pictures, whatever coordinates both are in ----
-
-
-@dataclass(frozen=True)
-class PoseErrors:
-    """``rotation``: (N,) degrees; ``scatter``: (N,) degrees that are left without the turn that all cameras have in
-    common, in their own frames, as where one lens has another principal point; ``position``: (N,), as shares of the
-    extent of the reference's cameras, which is their largest distance from their mean; ``similarity``: (4, 4), from
-    the poses' coordinates to the reference's."""
-
-    rotation: np.ndarray
-    scatter: np.ndarray
-    position: np.ndarray
-    similarity: np.ndarray
-
-
-def fit_similarity(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """The similarity (4, 4) that takes ``points`` (N, 3) closest to ``targets`` (N, 3), by least squares.
-
-    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991. Raises
-    ``ValueError`` for less than three points, or points on a line, which leave it open.
-    """
-    if len(points) < 3 or points.shape != targets.shape:
-        raise ValueError(f"a similarity needs 3 pairs of points or more, got {len(points)} and {len(targets)}")
-    a, b = points - points.mean(axis=0), targets - targets.mean(axis=0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    if s[1] <= 1e-9 * s[0]:
-        raise ValueError("the points lie on a line, around which anything can be turned")
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * sign) @ vt
-    scale = float(s @ sign / np.sum(a * a))
-    out = np.eye(4)
-    out[:3, :3] = scale * rotation
-    out[:3, 3] = targets.mean(axis=0) - scale * rotation @ points.mean(axis=0)
-    return out
-
-
-def pose_errors(found: np.ndarray, reference: np.ndarray) -> PoseErrors:
-    """Errors of the camera-to-world poses ``found`` (N, 4, 4) against ``reference`` (N, 4, 4), after the similarity
-    that fits their positions best."""
-    similarity = fit_similarity(found[:, :3, 3], reference[:, :3, 3])
-    scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
-    apart = np.swapaxes(reference[:, :3, :3], 1, 2) @ (similarity[:3, :3] / scale) @ found[:, :3, :3]
-    # The rotation nearest to their mean.
-    u, _, vt = np.linalg.svd(apart.mean(axis=0))
-    common = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    moved = found[:, :3, 3] @ similarity[:3, :3].T + similarity[:3, 3]
-    centers = reference[:, :3, 3]
-    extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    position = np.linalg.norm(moved - centers, axis=1) / extent
-    return PoseErrors(_degrees(apart), _degrees(apart @ common.T), position, similarity)
-
-
-def _degrees(rotations: np.ndarray) -> np.ndarray:
-    """Angles (N,) of ``rotations`` (N, 3, 3): by the sine of the half, which is exact where they are small."""
-    half = np.linalg.norm(rotations - np.eye(3), axis=(1, 2)) / np.sqrt(8)
-    return np.degrees(2 * np.arcsin(np.clip(half, 0, 1)))
-
 
 # ---- Which pictures are compared with which ----
 
@@ -211,10 +152,8 @@ _FOCAL, _FOCAL_AS_35 = 0x920A, 0xA405
 _DIAGONAL_35 = 43.267
 # So many pixels a photo may have that its bytes do not warrant, and so many bytes: those of large panoramas.
 _PIXELS, _BYTES = 1 << 26, 1 << 28
-# EXIF orientation -> what makes it upright, as Pillow calls it.
-_TURNS = dict(
-    zip(range(2, 9), "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90".split())
-)
+# What makes pictures of the EXIF orientations 2 to 8 upright, as Pillow calls it.
+_TURNS = "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90".split()
 # Modes of Pillow whose files other programs read as they are.
 _KEPT = ("L", "RGB", "RGBA", "I;16")
 
@@ -299,6 +238,7 @@ class Photo:
 
 def read_photo(path: Path) -> Photo:
     """The photo ``path``; `NergError` for what is none, is damaged, or claims more pixels than its bytes warrant."""
+    from PIL.Image import Transpose
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.PngImagePlugin import PngImageFile
 
@@ -317,9 +257,9 @@ def read_photo(path: Path) -> Photo:
         image = (JpegImageFile if kind == "jpeg" else PngImageFile)(io.BytesIO(raw))
         image.load()
         orientation, made_by, as_35 = _notes(image)
-        turn = _TURNS.get(orientation)
-        upright = image if turn is None else image.transpose(_transpose(turn))
-    return Photo(raw, upright, turn is None and image.mode in _KEPT, made_by, as_35)
+        is_turned = 2 <= orientation <= 8
+        upright = image.transpose(Transpose[_TURNS[orientation - 2]]) if is_turned else image
+    return Photo(raw, upright, not is_turned and image.mode in _KEPT, made_by, as_35)
 
 
 def _notes(image: Any) -> tuple[int, tuple, float | None]:
@@ -333,12 +273,6 @@ def _notes(image: Any) -> tuple[int, tuple, float | None]:
     except Exception:  # Pillow raises many kinds on damaged notes, without which a photo is as good
         return 1, (), None
     return orientation, made_by, as_35 if 5 <= as_35 <= 2000 else None
-
-
-def _transpose(name: str) -> Any:
-    from PIL import Image
-
-    return Image.Transpose[name]
 
 
 # ---- Reconstruction ----

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import box_interval
+from nerg_mi.maths.vmf import tangents
 from nerg_mi.ranges import SECONDS, check_number
 from nerg_mi.rays.filters import person_order
 from nerg_mi.rays.rays import Rays
@@ -219,12 +220,7 @@ def cone(d: np.ndarray, degrees: float, rings: Sequence[tuple[float, int]] = ((0
     """Unit directions (N, 3) about each of ``d`` (N, 3), itself first, then so many evenly on each of the ``rings``
     (share of the angle ``degrees``, number): 19 directions that leave no hole wider than half of the angle."""
     d = np.asarray(d, float)
-    sign = np.where(d[:, 2] >= 0, 1.0, -1.0)
-    a = -1.0 / (sign + d[:, 2])
-    b = d[:, 0] * d[:, 1] * a
-    # Two unit vectors beside each direction (Duff et al. 2017).
-    u = np.stack([1 + sign * d[:, 0] ** 2 * a, sign * b, -sign * d[:, 0]], axis=1)
-    v = np.stack([b, sign + d[:, 1] ** 2 * a, -d[:, 1]], axis=1)
+    u, v = tangents(d)
     found = [d]
     for share, number in rings:
         angle = np.radians(degrees * share)
@@ -399,11 +395,6 @@ class Sums:
         found["last"] -= np.inf
         lasted, moves = np.zeros((C, A, len(BINS) - 1)), np.zeros((C, A, A))
         return cls(tuple(areas), tuple(cells), tuple(rows), **found, lasted=lasted, moves=moves)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays."""
-        return sum(v.nbytes for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray))
 
     def persons_of(self, cell: Cell) -> tuple[np.ndarray, list[str]]:
         """The rows of a cell, and whose they are, sorted by name."""

@@ -54,11 +54,6 @@ class Mesh:
         return np.bincount(self.faces.ravel(), np.repeat(self.area / 3, 3), len(self.vertices))
 
     @property
-    def longest(self) -> np.ndarray:
-        """Longest edge (F,) of each triangle."""
-        return np.linalg.norm(self.corners - np.roll(self.corners, 1, axis=1), axis=2).max(axis=1)
-
-    @property
     def diagonal(self) -> float:
         """Diagonal of the box around all vertices."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))

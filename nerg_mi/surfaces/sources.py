@@ -15,6 +15,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.types import Point3f, Vector3f, variant_types
+from nerg_mi.maths.vmf import tangents
 from nerg_mi.probes.surface_attention import Density, attended
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
@@ -39,9 +40,6 @@ from .mesh import Mesh, Target
 
 RING = 6
 """Directions around the middle one."""
-
-WIDEST = 30.0
-"""Degrees that a cone may measure: the tangent plane is no picture of the sphere beyond."""
 
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 
@@ -74,19 +72,10 @@ def bundle(directions: np.ndarray, sigma: float, count: int, rng: np.random.Gene
     # The angle of a Gaussian of two dimensions is Rayleigh's.
     angle = np.minimum(sigma * np.sqrt(-2 * np.log1p(-shell)), np.pi)
     turn = 2 * np.pi * rng.random((n, 1)) + _GOLDEN * np.arange(count)
-    side, up = _beside(directions)
+    side, up = tangents(directions)
     around = np.cos(turn)[..., None] * side[:, None] + np.sin(turn)[..., None] * up[:, None]
     out = np.cos(angle)[..., None] * directions[:, None] + np.sin(angle)[..., None] * around
     return out / np.linalg.norm(out, axis=-1, keepdims=True)
-
-
-def _beside(d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors at right angles to each of ``d`` (N, 3) and to each other (Duff et al. 2017)."""
-    sign = np.where(d[:, 2] >= 0, 1.0, -1.0)
-    a = -1.0 / (sign + d[:, 2])
-    b = d[:, 0] * d[:, 1] * a
-    first = np.stack([1 + sign * d[:, 0] ** 2 * a, sign * b, -sign * d[:, 0]], axis=1)
-    return first, np.stack([b, sign + d[:, 1] ** 2 * a, -d[:, 1]], axis=1)
 
 
 # ---- Pieces of faces that are small as an observer sees them, with their exact solid angles ----
@@ -549,15 +538,6 @@ class Looker:
 
 MakeLooker = Callable[[np.ndarray], Looker]
 """Of an observer's position (3,)."""
-
-
-def lookers_of_law(law: Callable[[Vector3f], Any]) -> MakeLooker:
-    """Observers whose density depends on the direction alone: ``law`` of unit directions, in 1/sr."""
-
-    def make(eye: np.ndarray) -> Looker:
-        return Looker(_center(eye), lambda p_od, p_o, r_o, active: law(r_o), law)
-
-    return make
 
 
 def lookers_of_field(gaze: PlacedGaze, place: Place, settings: ObserverSettings) -> MakeLooker:

@@ -6,15 +6,23 @@ Attention on things as numbers: counted in rays, foretold by a field, by cohort,
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.aoi.measured import Counting, EyePicker, Eyes, blocks_of, cohort_names, count_block, ray_count
-from nerg_mi.aoi.options import StatisticsOptions
-from nerg_mi.aoi.output import write_results
+from nerg_mi.aoi.measured import (
+    Counting,
+    EyePicker,
+    Eyes,
+    StatisticsOptions,
+    blocks_of,
+    cohort_names,
+    count_block,
+    ray_count,
+)
+from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.aoi.parts import CountingParts
 from nerg_mi.aoi.predicted import (
     Foretold,
@@ -38,6 +46,7 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.estimates import LEAST_PEOPLE
+from nerg_mi.statistics.shares import Isovists, Targets
 from nerg_mi.statistics.tables import (
     FIELD,
     TRACKED,
@@ -50,31 +59,12 @@ from nerg_mi.statistics.tables import (
     move_rows,
     thing_rows,
 )
-from nerg_mi.statistics.visibility import Isovists, Targets
 from nerg_mi.statistics.visits import ALL, Cell, Sums, Total
 
 from .base import SILENT, Reporter, argument, command, out, select_backend
 from .options import parse_point
 from .parts import Parts
 from .scene_places import kind_of_file
-
-
-@dataclass(frozen=True, eq=False)
-class StatisticsResult:
-    """Rows of tables, each a dict: ``things`` (by cell, thing and source), ``differences``, ``moves``, ``durations``,
-    ``people``, ``what_if``, ``isovists``; ``sums``: what they were made of; ``blanked``: numbers on too few people;
-    ``files`` that were written."""
-
-    things: list[Row] = field(default_factory=list)
-    differences: list[Row] = field(default_factory=list)
-    moves: list[Row] = field(default_factory=list)
-    durations: list[Row] = field(default_factory=list)
-    people: Sequence[Row] = ()
-    what_if: list[Row] = field(default_factory=list)
-    isovists: list[Row] = field(default_factory=list)
-    sums: Sums | None = None
-    blanked: int = 0
-    files: list[Path] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -309,7 +299,7 @@ class _Work:
         return self.parts.foretell(eyes, self._view)
 
     def _isovists(self) -> Isovists:
-        from nerg_mi.statistics.visibility import isovists
+        from nerg_mi.statistics.shares import isovists
 
         o = self.options
         points = look_around(self.around, o.height, o.step, o.floor)

@@ -7,12 +7,11 @@ import csv
 import pytest
 
 from nerg_mi.aoi import output
-from nerg_mi.aoi.options import StatisticsOptions
-from nerg_mi.aoi.output import write_results
+from nerg_mi.aoi.measured import StatisticsOptions
+from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.figures.statistics import things_figure
 from nerg_mi.statistics.tables import PLACES, PersonRows
 from nerg_mi.statistics.visits import ALL, Sums
-from nerg_mi.workflows.statistics import StatisticsResult
 from tests.workflows.recorder import Recorder
 
 # ---- Results as a folder of files ----

@@ -9,8 +9,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.aoi.measured import Eyes
-from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.measured import Eyes, StatisticsOptions
 from nerg_mi.aoi.predicted import (
     Foretold,
     Setting,
@@ -32,8 +31,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.areas import Areas, MeshPart, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.statistics.shares import Targets, isovists
 from nerg_mi.statistics.tables import PLACES, Floor
-from nerg_mi.statistics.visibility import Targets, isovists
 from nerg_mi.statistics.visits import ALL, Box, Cell
 from nerg_mi.transport.geometry import Place
 from nerg_mi.workflows.base import SILENT

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.measured import StatisticsOptions
 from nerg_mi.api.query import ObserverOf, box_shares
 from nerg_mi.api.scene import box_dict
 from nerg_mi.formats.areas import Region

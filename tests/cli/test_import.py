@@ -6,8 +6,8 @@ from typer.testing import CliRunner
 
 from nerg_mi.cli import build_app, main
 from nerg_mi.formats.torch_files import write_torch
-from tests.formats.torch_ngp.test_fields import small_state
-from tests.formats.torch_ngp.test_nerg import save, small_gaze
+from tests.formats.test_torch_ngp import save_nerg as save
+from tests.formats.test_torch_ngp import small_gaze, small_state
 
 pytestmark = pytest.mark.usefixtures("torch")
 

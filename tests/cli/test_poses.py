@@ -14,7 +14,7 @@ from PIL import Image
 
 from nerg_mi.cli import main
 from nerg_mi.workflows import poses as job
-from tests.photos.structure import rendered
+from tests.photos import rendered
 
 
 def nerg(capsys, *arguments) -> tuple[int, str, str]:

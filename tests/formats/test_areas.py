@@ -10,6 +10,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import (
+    MOST,
     Areas,
     Group,
     MeshPart,
@@ -22,6 +23,7 @@ from nerg_mi.formats.areas import (
     to_json,
 )
 from nerg_mi.rays.readers.base import Frame
+from nerg_mi.workflows import demo
 
 # ---- What an area can be, and how groups resolve ----
 
@@ -86,11 +88,12 @@ def test01_one_of_every_kind(tmp_path):
     assert read_areas(tmp_path / "b.json") == areas
 
 
-def test02_old_files_read_alike(tmp_path):
-    for k, value in enumerate(({"a": [[0, 0, 0], [1, 2, 3]]}, {"mesh": {"min": [0, 0, 0], "max": [1, 2, 3]}})):
-        path = tmp_path / f"{k}.json"
-        path.write_text(json.dumps(value))
-        assert list(read_areas(path).areas) == read_regions(path)
+@pytest.mark.parametrize("value", [[[0, 0, 0], [1, 2, 3]], {"min": [0, 0, 0], "max": [1, 2, 3]}])
+@pytest.mark.parametrize("name", ["Käse & Co", "mesh"])
+def test02_old_files_read_alike(tmp_path, name, value):
+    (tmp_path / "a.json").write_text(json.dumps({name: value}))
+    assert list(read_areas(tmp_path / "a.json").areas) == read_regions(tmp_path / "a.json")
+    assert read_regions(tmp_path / "a.json") == [Region.of(name, [0, 0, 0], [1, 2, 3])]
 
 
 def test03_a_turned_box(tmp_path):
@@ -110,6 +113,19 @@ def test03_a_turned_box(tmp_path):
     assert read_regions(tmp_path / "b.json") == [box]
 
 
+def test03b_what_lies_in_a_box():
+    box = Region.of("b", [0, 0, 0], [1, 1, 1])
+    points = np.array([[0.5, 0.5, 0.5], [1.0, 0.0, 1.0], [1.01, 0.5, 0.5], [np.inf, 0, 0], [0.5, 0.5, -0.2]])
+    assert box.holds(points).tolist() == [True, True, False, False, False]
+    assert box.holds(points, 0.02).tolist() == [True, True, True, False, False]
+    assert box.holds(points.reshape(1, 5, 3)).shape == (1, 5)
+
+
+def test03c_those_of_the_store():
+    regions = read_regions(demo.store_scene().parent / "regions.json")
+    assert len(regions) > 20 and all((r.corners[0] < r.corners[1]).all() for r in regions)
+
+
 def test04_groups_of_boxes_are_solids(tmp_path):
     other = {"name": "b", "min": [5, 0, 0], "max": [6, 1, 1]}
     mesh = {"name": "m", "mesh": "m.ply"}
@@ -118,44 +134,76 @@ def test04_groups_of_boxes_are_solids(tmp_path):
     assert areas.solids == {"shelf": (0,), "b": (1,), "g": (0, 1)} and [b.name for b in areas.boxes] == ["shelf", "b"]
 
 
+NO_REGIONS = [
+    [],
+    {},
+    {"regions": 3},
+    {"a": [[0, 0, 0], [1, 1, float("nan")]]},
+    {"a": [0, 1]},
+    {"a": [0, 0, 0, 1, 1, 1]},
+    {"a": None},
+    {"": [[0, 0, 0], [1, 1, 1]]},
+    {"regions": [3]},
+    {"regions": [{"name": "a"}]},
+    {"regions": [BOX | {"min": [0, 0]}]},
+    {"regions": [BOX | {"min": "000"}]},
+    {"regions": [BOX | {"min": [0, 0, "x"]}]},
+    {"regions": [BOX | {"min": [0, 0, True]}]},
+    {"regions": [BOX | {"min": [1, 0, 0]}]},
+    {"regions": [BOX | {"max": [1, 1, 1.1e7]}]},
+    {"regions": [BOX | {"max": [1, 1, 10**400]}]},
+    {"regions": [BOX | {"name": 7}]},
+    {"regions": [BOX | {"name": ""}]},
+    {"regions": [BOX | {"name": "a\n"}]},
+    {"regions": [BOX | {"name": "a" * 81}]},
+    {"regions": [BOX, BOX]},
+    {"regions": [BOX] * (MOST + 1)},
+]
+NO_AREAS = [
+    [{"name": "g", "parts": ["g"]}],
+    [{"name": "g", "parts": ["h"]}, {"name": "h", "parts": ["g"]}],
+    [{"name": "g", "parts": ["nobody"]}],
+    [{"name": "g", "parts": []}],
+    [{"name": "g", "parts": "abc"}],
+    [{"name": "g", "parts": [3]}],
+    [{"parts": ["a"]}],
+    [BOX, {"name": "shelf", "shape": "x"}],
+    [{"name": "s", "shape": 3}],
+    [{"name": "s", "shape": ""}],
+    [{"name": "a\n", "shape": "x"}],
+    [{"name": "m", "mesh": 3}],
+    [{"name": "m", "mesh": "m.stl"}],
+    [{"name": "m", "mesh": "../m.ply"}],
+    [{"name": "m", "mesh": "/m.ply"}],
+    [{"name": "m", "mesh": "m\0.ply"}],
+    [{"name": "m", "mesh": "m.ply", "faces": []}],
+    [{"name": "m", "mesh": "m.ply", "faces": [-1]}],
+    [{"name": "m", "mesh": "m.ply", "faces": [[3, 2]]}],
+    [{"name": "m", "mesh": "m.ply", "faces": [[1, 2, 3]]}],
+    [{"name": "m", "mesh": "m.ply", "faces": [True]}],
+    [{"name": "m", "mesh": "m.ply", "faces": 7}],
+    [{"adt": "nowhere"}],
+    [{"adt": "..", "name": "x"}],
+    [BOX | {"turn": [0, 0, 0, 0]}],
+    [BOX | {"turn": [0, 0, 1]}],
+    [BOX | {"turn": "x"}],
+    [BOX | {"turn": 1e400}],
+]
+
+
 @pytest.mark.parametrize(
-    "entries",
+    "read, value",
     [
-        [{"name": "g", "parts": ["g"]}],
-        [{"name": "g", "parts": ["h"]}, {"name": "h", "parts": ["g"]}],
-        [{"name": "g", "parts": ["nobody"]}],
-        [{"name": "g", "parts": []}],
-        [{"name": "g", "parts": "abc"}],
-        [{"name": "g", "parts": [3]}],
-        [{"parts": ["a"]}],
-        [BOX, {"name": "shelf", "shape": "x"}],
-        [{"name": "s", "shape": 3}],
-        [{"name": "s", "shape": ""}],
-        [{"name": "a\n", "shape": "x"}],
-        [{"name": "m", "mesh": 3}],
-        [{"name": "m", "mesh": "m.stl"}],
-        [{"name": "m", "mesh": "../m.ply"}],
-        [{"name": "m", "mesh": "/m.ply"}],
-        [{"name": "m", "mesh": "m\0.ply"}],
-        [{"name": "m", "mesh": "m.ply", "faces": []}],
-        [{"name": "m", "mesh": "m.ply", "faces": [-1]}],
-        [{"name": "m", "mesh": "m.ply", "faces": [[3, 2]]}],
-        [{"name": "m", "mesh": "m.ply", "faces": [[1, 2, 3]]}],
-        [{"name": "m", "mesh": "m.ply", "faces": [True]}],
-        [{"name": "m", "mesh": "m.ply", "faces": 7}],
-        [{"adt": "nowhere"}],
-        [{"adt": "..", "name": "x"}],
-        [BOX | {"turn": [0, 0, 0, 0]}],
-        [BOX | {"turn": [0, 0, 1]}],
-        [BOX | {"turn": "x"}],
-        [BOX | {"turn": 1e400}],
+        *((read, value) for value in NO_REGIONS for read in (read_regions, read_areas)),
+        *((read_areas, {"regions": entries}) for entries in NO_AREAS),
     ],
 )
-def test05_others_are_told_in_a_sentence(tmp_path, entries):
-    path = written(tmp_path, *entries)
+def test05_others_are_told_in_a_sentence(tmp_path, read, value):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(value))
     with pytest.raises(NergError) as told:
-        read_areas(path)
-    assert str(tmp_path) in str(told.value) and "\n" not in str(told.value)
+        read(path)
+    assert str(path) in str(told.value) and "\n" not in str(told.value)
 
 
 def test06_groups_may_be_nested_so_deep(tmp_path):

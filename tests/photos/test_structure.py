@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import struct
+import subprocess
 import sys
 import zlib
 from pathlib import Path
@@ -17,8 +18,10 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from nerg_mi.alignment.similarity import fit_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.photos import structure
+from nerg_mi.photos.colmap import read_colmap
 from nerg_mi.photos.images import read_image
 from nerg_mi.photos.structure import (
     EXHAUSTIVE,
@@ -30,78 +33,13 @@ from nerg_mi.photos.structure import (
     chosen_pairs,
     copy_photos,
     encoded,
-    fit_similarity,
     list_photos,
-    pose_errors,
     reconstruct,
     shrunk,
     small_name,
     small_size,
 )
-
-# ---- Poses against others: similarities and errors that are known ----
-
-
-def similarity(scale: float, seed: int = 0) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, :3] = scale * Rotation.random(random_state=seed).as_matrix()
-    out[:3, 3] = 1, -2, 3
-    return out
-
-
-def poses(count: int = 12) -> np.ndarray:
-    out = np.tile(np.eye(4), (count, 1, 1))
-    out[:, :3, :3] = Rotation.random(count, random_state=1).as_matrix()
-    out[:, :3, 3] = np.random.default_rng(2).normal(size=(count, 3))
-    return out
-
-
-def moved(all_poses: np.ndarray, by: np.ndarray) -> np.ndarray:
-    out = all_poses.copy()
-    scale = np.cbrt(np.linalg.det(by[:3, :3]))
-    out[:, :3, :3] = by[:3, :3] / scale @ all_poses[:, :3, :3]
-    out[:, :3, 3] = all_poses[:, :3, 3] @ by[:3, :3].T + by[:3, 3]
-    return out
-
-
-@pytest.mark.parametrize("flat", [False, True])
-def test_a_similarity_is_found_again(flat):
-    points = np.random.default_rng(0).normal(size=(9, 3)) * [1, 1, 0 if flat else 1]
-    by = similarity(2.5)
-    assert np.allclose(fit_similarity(points, points @ by[:3, :3].T + by[:3, 3]), by)
-
-
-def test_a_mirror_is_none():
-    points = np.random.default_rng(0).normal(size=(9, 3))
-    assert np.linalg.det(fit_similarity(points, points * [1, 1, -1])[:3, :3]) > 0
-
-
-@pytest.mark.parametrize(
-    "points, said", [(np.eye(3)[:2], "3 pairs"), (np.outer(np.arange(5.0), [1, 2, 3]), "on a line")]
-)
-def test_what_leaves_it_open_is_refused(points, said):
-    with pytest.raises(ValueError, match=said):
-        fit_similarity(points, points)
-
-
-def test_errors_do_not_depend_on_coordinates():
-    errors = pose_errors(poses(), moved(poses(), similarity(0.3)))
-    assert errors.rotation.max() < 1e-6 and errors.position.max() < 1e-12
-
-
-def test_errors_are_those_that_were_made():
-    reference, wrong = poses(), poses()
-    wrong[4, :3, :3] = wrong[4, :3, :3] @ Rotation.from_rotvec([0, np.radians(7), 0]).as_matrix()
-    errors = pose_errors(wrong, reference)
-    assert errors.rotation[4] == pytest.approx(7) and np.delete(errors.rotation, 4).max() < 1e-6
-    wrong = poses()
-    wrong[:, :3, :3] = wrong[:, :3, :3] @ Rotation.from_rotvec([0.02, -0.01, 0]).as_matrix()
-    errors = pose_errors(wrong, reference)
-    assert errors.rotation == pytest.approx(np.degrees(np.hypot(0.02, 0.01))) and errors.scatter.max() < 1e-6
-    wrong = moved(poses(), similarity(5))
-    wrong[0, :3, 3] += 0.01
-    assert 0 < pose_errors(wrong, reference).position.argmax() + 1 == 1
-
+from tests.photos import rendered
 
 # ---- Which pictures are compared ----
 
@@ -443,3 +381,98 @@ def test_it_ends_with_whoever_started_it(installed, monkeypatch, tmp_path):
         reconstruct(PICTURES, tmp_path, Settings(), progress)
     with pytest.raises(ProcessLookupError):
         os.kill(found[0], 0)
+
+
+# ---- Reconstruction of photos whose poses are known, in the process in which it runs ----
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    pytest.importorskip("pycolmap")
+    return rendered.write_photos(tmp_path_factory.mktemp("photos"))
+
+
+def found(photos, work):
+    """A reconstruction, its model as it is read, and what was told on the way."""
+    folders, steps = Folders(work / "images", work / "small"), []
+    folders.images.mkdir()
+    folders.small.mkdir()
+    pictures, _ = copy_photos(list_photos(photos)[0], folders, 320, lambda *now: None)
+    made = reconstruct(pictures, work, Settings(threads=1), lambda *now: steps.append(now))
+    return made, made and read_colmap(work / "sparse" / "0", folders.images), steps
+
+
+def pose_errors(poses, reference):
+    """Degrees between rotations, distances of centres in units of the extent of those of the reference, and the
+    similarity that was taken out of both."""
+    similarity = fit_similarity(poses[:, :3, 3], reference[:, :3, 3])
+    turn = similarity[:3, :3] / np.cbrt(np.linalg.det(similarity[:3, :3]))
+    apart = np.swapaxes(reference[:, :3, :3], 1, 2) @ turn @ poses[:, :3, :3]
+    centers = reference[:, :3, 3]
+    away = poses[:, :3, 3] @ similarity[:3, :3].T + similarity[:3, 3] - centers
+    extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    angles = np.degrees(Rotation.from_matrix(apart).magnitude())
+    return angles, np.linalg.norm(away, axis=1) / extent, similarity
+
+
+@pytest.fixture(scope="module")
+def first(photos, tmp_path_factory):
+    """A folder, and what was found of the photos in it."""
+    work = tmp_path_factory.mktemp("first")
+    return work, found(photos, work)
+
+
+def test_poses_and_lens_are_found(first):
+    made, model, steps = first[1]
+    assert made.parts == [[f"{k}.png" for k in range(8)]] and 0 < made.error < 0.5 and made.points > 300
+    assert list(dict.fromkeys(stage for stage, _, _ in steps)) == ["features", "matching", "mapping"]
+    assert steps[-1] == ("mapping", 8, 8)
+    poses = np.array([f.to_world for f in model.frames])
+    assert np.allclose(poses, made.to_world)
+    angles, apart, similarity = pose_errors(poses, rendered.poses())
+    assert angles.max() < 1 and apart.max() < 0.01
+    # The model stands upright, and its points are those of a floor and a box on it.
+    truth = similarity[:3, :3] / np.cbrt(np.linalg.det(similarity[:3, :3]))
+    assert np.degrees(np.arccos(truth[2, 2])) < 1 and made.up.sure and made.up.plane > 0.3
+    points = model.points @ similarity[:3, :3].T + similarity[:3, 3]
+    low, high = np.quantile(points[:, 2], [0.02, 0.98])
+    assert low == pytest.approx(0, abs=0.03) and high == pytest.approx(0.7, abs=0.05)
+    lens = model.frames[0].intrinsics(320, 240)
+    assert lens.fx == lens.fy == pytest.approx(rendered.FOCAL, rel=0.02) and abs(lens.k1) < 0.05
+    assert len(made.surface) == len(made.colors) and made.colors.dtype == np.uint8
+
+
+def test_equal_photos_give_equal_poses_whatever_their_size(photos, first, tmp_path):
+    """The second time with small copies of the same pixels, of photos that are larger: of the same place."""
+    from PIL import Image
+
+    (tmp_path / "large").mkdir()
+    for path in photos.iterdir():
+        Image.open(path).resize((960, 720), Image.Resampling.NEAREST).save(tmp_path / "large" / path.name)
+    work, models = [first[0], tmp_path / "b", tmp_path / "c"], [first[1][1]]
+    for at, folder in zip(work[1:], (photos, tmp_path / "large")):
+        at.mkdir()
+        models.append(found(folder, at)[1])
+    files = [[(at / "sparse" / "0" / f"{k}.bin").read_bytes() for k in ("images", "points3D")] for at in work[:2]]
+    assert files[0] == files[1]
+    large, small = models[2].frames[0].intrinsics(960, 720), models[0].frames[0].intrinsics(320, 240)
+    assert large.fx == pytest.approx(3 * small.fx, rel=0.02) and large.cx == 480
+    angles, apart, _ = pose_errors(*(np.array([f.to_world for f in m.frames]) for m in (models[2], models[0])))
+    assert angles.max() < 0.5 and apart.max() < 0.01
+
+
+def test_nothing_that_fits_together(tmp_path):
+    pytest.importorskip("pycolmap")
+    from PIL import Image
+
+    (tmp_path / "photos").mkdir()
+    for k in range(3):
+        Image.fromarray(np.full((60, 80, 3), 80 * k, np.uint8)).save(tmp_path / "photos" / f"{k}.png")
+    assert found(tmp_path / "photos", tmp_path)[0] is None
+
+
+def test_it_speaks_lines_of_json_alone(photos, tmp_path):
+    """What libraries print, and why it ends, goes to the standard error."""
+    command = [sys.executable, "-m", "nerg_mi.photos.structure_worker", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1 and done.stdout == "" and "job.json" in done.stderr

@@ -1,12 +1,15 @@
 """Tests of `nerg_mi.surfaces.mesh`."""
 
+import builtins
+
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces import mesh
-from nerg_mi.surfaces.mesh import Target, refine, shape_triangles, weld
+from nerg_mi.surfaces import mesh as module
+from nerg_mi.surfaces.mesh import Target, refine, shape_triangles, texture_rows, unroll, weld
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.surfaces.meshes import box, joined, plate
 
@@ -19,7 +22,7 @@ def test01_a_box_whose_sides_repeat_its_corners_is_one_surface():
     assert (len(mesh.vertices), len(mesh.faces), repairs.merged) == (8, 12, 28)
     assert np.array_equal(index, np.arange(12)) and np.isclose(mesh.area.sum(), 22)
     assert np.allclose(mesh.corners, v[f]) and np.isclose(mesh.vertex_area.sum(), 22)
-    assert np.isclose(mesh.diagonal, np.sqrt(14)) and np.isclose(mesh.longest.max(), np.sqrt(13))
+    assert np.isclose(mesh.diagonal, np.sqrt(14))
     assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1)
 
 
@@ -76,7 +79,8 @@ def test01_a_closed_box_stays_closed_and_its_area_what_it_is(longest):
     whole = joined(box((0, 0, 0), (1, 2, 3)))
     found = refine(whole, longest)
     assert set(edge_counts(found.mesh.faces)) == {2}
-    assert found.mesh.longest.max() <= longest
+    edges = found.mesh.corners - np.roll(found.mesh.corners, 1, axis=1)
+    assert np.linalg.norm(edges, axis=2).max() <= longest
     assert np.allclose(np.bincount(found.parent, found.mesh.area), whole.area, rtol=1e-12)
     # Outwards still: the flux of x is three times the volume, with the sign of the whole's.
     flux = lambda m: np.einsum("fi,fi->", m.corners.mean(1), m.normals * m.area[:, None])
@@ -128,3 +132,52 @@ def test02_a_ray_may_end_in_a_medium_before(rgb):
     origins = np.array([(0.25, 0.25, -1), (1.0, 1.0, -1)])
     found = target.ends(origins, np.broadcast_to([0.0, 0, 1], (2, 3)))
     assert found.elsewhere.tolist() == [True, False] and (found.face >= 0).tolist() == [False, True]
+
+
+# ---- Charts ----
+
+
+xatlas = pytest.importorskip("xatlas", reason="xatlas is not installed")
+
+
+@pytest.mark.parametrize("scale", [1e-5, 1e5])
+@pytest.mark.parametrize("rows", [3, 100, 256])
+def test01_a_texture_has_at_each_point_what_the_surface_has(rgb, scale, rows, monkeypatch):
+    monkeypatch.setattr(module, "TEXTURE_ROWS", rows)
+    mesh, pixels = joined(box((0, 0, 0), (scale, 2 * scale, 0.5 * scale))), 256
+    refined = refine(mesh, 0.2 * scale)
+    charts = unroll(mesh, pixels)
+    assert charts.uv.min() >= 0 and charts.uv.max() <= 1
+    assert np.array_equal(charts.vertex[charts.faces], mesh.faces)
+    values = refined.mesh.vertices @ [1.0, 2, 3] / scale
+    blocks = list(texture_rows(charts, refined, values, pixels))
+    found, known = (np.concatenate([block[k] for block in blocks]) for k in (1, 2))
+    assert [block[0].start for block in blocks] == list(range(0, pixels, rows))
+    assert found.shape == known.shape == (256, 256) and 0.3 < known.mean() < 1
+    # At points drawn on the surface, by the nearest pixel.
+    rng = np.random.default_rng(0)
+    face, b = rng.integers(0, len(mesh.faces), 500), rng.dirichlet((2, 2, 2), 500)
+    uv = np.einsum("ni,nik->nk", b, charts.uv[charts.faces[face]])
+    there = np.einsum("ni,nik->nk", b, mesh.corners[face]) @ [1.0, 2, 3] / scale
+    column, row = np.floor(uv * pixels).astype(int).T
+    assert known[row, column].all() and np.abs(found[row, column] - there).max() < 0.06
+
+
+def test02_what_does_not_fit(rgb, monkeypatch):
+    mesh = joined(box((0, 0, 0), (1, 1, 1)))
+    monkeypatch.setattr(module, "MOST_CHART_FACES", 4)
+    with pytest.raises(NergError, match="leave out --texture"):
+        unroll(mesh, 64)
+
+
+def test03_without_xatlas_the_extra_is_named(monkeypatch):
+    original = builtins.__import__
+
+    def missing(name, *rest, **more):
+        if name == "xatlas":
+            raise ImportError(name)
+        return original(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(ImportError, match=r'pip install "nerg-mi\[bake\]"'):
+        unroll(joined(box((0, 0, 0), (1, 1, 1))), 64)

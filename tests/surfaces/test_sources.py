@@ -20,7 +20,6 @@ from nerg_mi.surfaces.sources import (
     blurred,
     bundle,
     gaze_sums,
-    lookers_of_law,
     pieces_of,
     ray_seconds,
     ray_sums,
@@ -30,7 +29,7 @@ from nerg_mi.surfaces.sources import (
     thin,
     visible_pieces,
 )
-from tests.surfaces.meshes import box, joined, plate, vmf
+from tests.surfaces.meshes import box, joined, lookers_of_law, plate, vmf
 
 # ---- Cones: the rule on the sphere against Legendre polynomials, and bundles against Rayleigh's law ----
 

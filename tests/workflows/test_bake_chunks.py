@@ -31,9 +31,8 @@ from nerg_mi.workflows.bake_chunks import (
 )
 from nerg_mi.workflows.bake_options import BakeOptions
 from tests.plugins import fields
-from tests.surfaces.meshes import box, joined
+from tests.surfaces.meshes import box, joined, wall
 from tests.surfaces.test_splats import falling
-from tests.surfaces.walls import wall
 from tests.workflows.recorder import Recorder
 
 # ---- Parts of a bake: the same wherever and however often they are computed ----

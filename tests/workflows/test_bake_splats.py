@@ -17,7 +17,7 @@ from nerg_mi.workflows.bake_options import BakeOptions
 from nerg_mi.workflows.bake_splats import COLUMN, bake_splats
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.plugins import fields
-from tests.surfaces.walls import wall
+from tests.surfaces.meshes import wall
 from tests.workflows.recorder import Recorder
 
 OPTIONS = {"mode": "llvm_ad_rgb", "observer": (0.0, 0.0, -3.0)}

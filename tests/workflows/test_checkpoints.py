@@ -3,8 +3,8 @@
 import pytest
 
 from nerg_mi.workflows.export import ImportOptions, import_checkpoint
-from tests.formats.torch_ngp.test_fields import small_state
-from tests.formats.torch_ngp.test_nerg import save, small_gaze
+from tests.formats.test_torch_ngp import save_nerg as save
+from tests.formats.test_torch_ngp import small_gaze, small_state
 from tests.workflows.recorder import Recorder
 
 pytestmark = pytest.mark.usefixtures("torch")

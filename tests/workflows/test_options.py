@@ -10,7 +10,7 @@ from typing import get_type_hints
 import pytest
 
 import nerg_mi.workflows
-from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.aoi.measured import StatisticsOptions
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import Checked
 from nerg_mi.workflows import options

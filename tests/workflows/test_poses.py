@@ -1,5 +1,5 @@
 """Photos made a capture: what is written, read again, told and warned of. COLMAP itself is tried in
-tests/photos/structure/test_worker.py; here a model that is known stands for what it finds."""
+tests/photos/test_structure.py; here a model that is known stands for what it finds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.structure import Reconstruction
 from nerg_mi.workflows import poses as job
 from nerg_mi.workflows.poses import STAGES, PoseOptions, find_poses
-from tests.photos.structure import rendered
+from tests.photos import rendered
 
 from .recorder import Recorder
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from nerg_mi.aoi.options import CountOptions, PredictionOptions, StatisticsOptions
+from nerg_mi.aoi.measured import CountOptions, PredictionOptions, StatisticsOptions
 from nerg_mi.surfaces.sources import GazeSettings, RaySettings
 from nerg_mi.tasks.task import Part, Plan, rebuilt
 from nerg_mi.workflows.ablation import AblationOptions, training_options

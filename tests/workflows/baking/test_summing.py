@@ -30,9 +30,8 @@ from nerg_mi.workflows.options import PartOptions
 from nerg_mi.workflows.parts import Parts
 from tests.conftest import ROOT
 from tests.plugins import fields
-from tests.surfaces.meshes import box, joined
+from tests.surfaces.meshes import box, joined, wall
 from tests.surfaces.test_splats import falling
-from tests.surfaces.walls import wall
 from tests.tasks.works import laid_out
 from tests.workflows.recorder import Recorder
 

@@ -13,7 +13,7 @@ from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.workflows.draw import draw
 from nerg_mi.workflows.draw_files import read_baked, read_stored, shared_note
-from tests.surfaces.walls import wall
+from tests.surfaces.meshes import wall
 
 # ---- Quantities in EXR files ----
 
