@@ -17,7 +17,7 @@ from nerg_mi.files.atomic import replacing, write_text
 from nerg_mi.files.tables import markdown_table, write_csv
 from nerg_mi.rays.rays import pyarrow_modules
 from nerg_mi.statistics.tables import BY_NAME, FIELD, MEASURES, PersonRows, Row, shown
-from nerg_mi.statistics.visits import Sums
+from nerg_mi.statistics.visits import VisitSums
 from nerg_mi.workflows.base import Reporter
 
 from .measured import StatisticsOptions
@@ -188,7 +188,7 @@ class StatisticsResult:
     people: Sequence[Row] = ()
     what_if: list[Row] = field(default_factory=list)
     isovists: list[Row] = field(default_factory=list)
-    sums: Sums | None = None
+    sums: VisitSums | None = None
     blanked: int = 0
     files: list[Path] = field(default_factory=list)
 

@@ -17,9 +17,9 @@ from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import with_formula
 from nerg_mi.formats.areas import (
     Area,
-    Areas,
-    Entry,
-    Group,
+    AreaEntry,
+    AreaGroup,
+    AreaSet,
     MeshPart,
     Region,
     SceneShape,
@@ -36,7 +36,7 @@ from nerg_mi.rays.readers.tables import iterate_table
 from nerg_mi.rendering.aovs import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.statistics.shares import Look
-from nerg_mi.statistics.visits import Box, Thing
+from nerg_mi.statistics.visits import Aoi, BoxAoi
 from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.train import geometry
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
@@ -77,7 +77,7 @@ def read_cohorts(path: Path) -> dict[str, str]:
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class GazeScene:
     """``place``: what rays meet, None where nothing is known; ``gaze`` of a field, or None; ``align``: from the rays'
     frame; ``scene``: whose shapes they are, or None; ``observer`` (3,): the scene's own; ``kind`` of depth."""
 
@@ -137,13 +137,13 @@ class Surroundings:
             raise NergError("there is no place whose bounds are known; give a scene or a radiance field")
         return np.array(bounds, float)
 
-    def within(self, scene: mi.Scene) -> Surroundings:
+    def within(self, scene: mi.Scene) -> GazeScene:
         """The same with the shapes of another ``scene``."""
         assert self.place is not None
         return replace(self, place=Place(self.place.medium, scene), scene=scene)
 
 
-def surroundings_of_scene(path: Path, gaze: Path | None, align: Similarity | None, ns: ModuleType) -> Surroundings:
+def surroundings_of_scene(path: Path, gaze: Path | None, align: Similarity | None, ns: ModuleType) -> GazeScene:
     """A scene's shapes, and the field and gaze of its integrator where that is a ``nerg``; ``gaze``: another gaze field
     in their stead. Raises `NergError` for a scene with neither shapes nor a field."""
     from nerg_mi.transport.observer import center
@@ -160,15 +160,15 @@ def surroundings_of_scene(path: Path, gaze: Path | None, align: Similarity | Non
     if gaze is not None:
         field, about = load_gaze(gaze, ns)
         provenance = about.get("provenance", about)
-        return Surroundings(place, PlacedGaze(field), align or align_of_training(provenance), scene, observer=observer)
+        return GazeScene(place, PlacedGaze(field), align or align_of_training(provenance), scene, observer=observer)
     settings = integrator.observer_settings if own and integrator.gaze is not None else None
     found = integrator.gaze if own else None
-    return Surroundings(place, found, align or Similarity(), scene, settings, observer)
+    return GazeScene(place, found, align or Similarity(), scene, settings, observer)
 
 
 def surroundings_of_files(
     scene: Path | None, field: Path | None, gaze: Path | None, align: Similarity | None, ns: ModuleType
-) -> Surroundings:
+) -> GazeScene:
     """What the files that are given say. Raises `NergError` for those that cannot be used together."""
     if scene is not None:
         if field is not None:
@@ -181,13 +181,13 @@ def surroundings_of_files(
         return _of_place(made, PlacedGaze(network), align or made.align)
     if field is not None:
         return _of_place(geometry.place_of_field(field, ns), None, align or Similarity())
-    return Surroundings(None, None, align or Similarity())
+    return GazeScene(None, None, align or Similarity())
 
 
-def _of_place(place: GazePlace, gaze: PlacedGaze | None, align: Similarity) -> Surroundings:
+def _of_place(place: GazePlace, gaze: PlacedGaze | None, align: Similarity) -> GazeScene:
     medium = place.medium
     inside = medium if isinstance(medium, Place) or medium is None else Place(medium)
-    return Surroundings(inside, gaze, align, None if inside is None else inside.scene)
+    return GazeScene(inside, gaze, align, None if inside is None else inside.scene)
 
 
 # ---- Things ----
@@ -199,7 +199,7 @@ _RAYS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
-class ShapeThing:
+class ShapeAoi:
     """A Mitsuba shape, of the scene or by itself."""
 
     name: str
@@ -252,13 +252,13 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, MeshFile]:
 
 def things_of(
     areas: Sequence[Region | MeshPart | SceneShape], shapes: Mapping[str, Any], meshes: Mapping[Path, MeshFile]
-) -> list[Thing]:
+) -> list[Aoi]:
     """``areas`` as things, in their order; ``shapes`` of the scene by name, ``meshes`` of parts by file; the variant
     must be active. Raises `NergError` for shapes and faces that there are not."""
-    found: list[Thing] = []
+    found: list[Aoi] = []
     for area in areas:
         if isinstance(area, Region):
-            found.append(Box(area))
+            found.append(BoxAoi(area))
         elif isinstance(area, MeshPart):
             found.append(thing_of_shape(area.name, _mesh_of_part(area, meshes[area.file])))
         else:
@@ -266,9 +266,9 @@ def things_of(
     return found
 
 
-def thing_of_shape(name: str, shape: Any) -> ShapeThing:
+def thing_of_shape(name: str, shape: Any) -> ShapeAoi:
     """A Mitsuba shape as a thing."""
-    return ShapeThing(name, shape, scene_of({name: shape}))
+    return ShapeAoi(name, shape, scene_of({name: shape}))
 
 
 def scene_of(shapes: Mapping[str, Any]) -> mi.Scene:
@@ -422,7 +422,7 @@ def _put(given: Any, key: str, path: Path) -> Put:
     name = _word(given[key], key)
     check_name(name)
     if "mesh" not in given:
-        return Put(name, parse_box(Entry(name, given, f'"{plain(name, 40)}"')))
+        return Put(name, parse_box(AreaEntry(name, given, f'"{plain(name, 40)}"')))
     mesh = _word(given["mesh"], "mesh")
     folder = os.path.realpath(path.parent)
     if os.path.isabs(mesh) or os.path.commonpath([folder, os.path.realpath(os.path.join(folder, mesh))]) != folder:
@@ -445,7 +445,7 @@ def _three(given: Any, what: str) -> tuple[float, float, float]:
     return float(given[0]), float(given[1]), float(given[2])
 
 
-def changed_areas(areas: Areas, changes: Changes) -> Areas:
+def changed_areas(areas: AreaSet, changes: Changes) -> AreaSet:
     """The areas after the changes: without those of shapes that are gone, boxes moved, and one for each shape that was
     added and has none. Raises `NergError` for an area to be moved that there is not, or is no box."""
     found: dict[str, Area] = {area.name: area for area in areas.areas}
@@ -463,13 +463,13 @@ def changed_areas(areas: Areas, changes: Changes) -> Areas:
     lost = {a.name for a in found.values() if isinstance(a, SceneShape) and a.shape in changes.remove}
     rest: list[Area] = []
     for area in found.values():
-        if isinstance(area, Group):
+        if isinstance(area, AreaGroup):
             parts = tuple(p for p in area.parts if p not in lost)
             lost |= set() if parts else {area.name}
-            area = Group(area.name, parts)
+            area = AreaGroup(area.name, parts)
         if area.name not in lost:
             rest.append(area)
-    return Areas(tuple(rest))
+    return AreaSet(tuple(rest))
 
 
 def _moved(box: Region, move: Move) -> Region:

@@ -166,7 +166,7 @@ def read_regions(path: str | Path) -> list[Region]:
 
 
 @dataclass(frozen=True)
-class Entry:
+class AreaEntry:
     """What a file says of an area: its ``name`` and what it is ``given`` as; ``where``: for errors."""
 
     name: object
@@ -179,7 +179,7 @@ class Entry:
         return not (isinstance(self.given, dict) and any(key in self.given for key in BEYOND_BOXES))
 
 
-def read_entries(path: str | Path) -> list[Entry]:
+def read_entries(path: str | Path) -> list[AreaEntry]:
     """What a file of areas has, not looked at yet. Raises `NergError` for what is no such file, and for names that come
     twice."""
     found = read_json(path, "file of areas", BYTES)
@@ -194,10 +194,10 @@ def read_entries(path: str | Path) -> list[Entry]:
     names = [name for name, _ in listed if isinstance(name, str)]
     if len(set(names)) < len(names):
         raise NergError(f'"{path}" has two areas of one name; rename one of them')
-    return [Entry(name, given, f'"{path}", area {k + 1}') for k, (name, given) in enumerate(listed)]
+    return [AreaEntry(name, given, f'"{path}", area {k + 1}') for k, (name, given) in enumerate(listed)]
 
 
-def parse_box(entry: Entry) -> Region:
+def parse_box(entry: AreaEntry) -> Region:
     """The box of an entry. Raises `NergError` for what is none."""
     name, given, where = entry.name, entry.given, entry.where
     corners: Any = (given.get("min"), given.get("max")) if isinstance(given, dict) else given
@@ -268,18 +268,18 @@ class SceneShape:
 
 
 @dataclass(frozen=True)
-class Group:
+class AreaGroup:
     """Several others, by their names: whoever looks at one of its ``parts`` looks at it."""
 
     name: str
     parts: tuple[str, ...]
 
 
-Area = Region | MeshPart | SceneShape | Group
+Area = Region | MeshPart | SceneShape | AreaGroup
 
 
 @dataclass(frozen=True)
-class Areas:
+class AreaSet:
     """The areas of a file, in its order, whose names are different.
 
     ``others``: those that are no boxes, as they stand in the file. Raises `NergError` for groups of what there is not,
@@ -295,7 +295,7 @@ class Areas:
         if twice is not None:
             raise NergError(f'two areas are called "{twice}"; rename one of them')
         for area in self.areas:
-            if not isinstance(area, Group):
+            if not isinstance(area, AreaGroup):
                 continue
             unknown = next((p for p in area.parts if p not in names), None)
             if unknown is not None:
@@ -315,7 +315,7 @@ class Areas:
     @property
     def things(self) -> tuple[Region | MeshPart | SceneShape, ...]:
         """Those that are no groups."""
-        return tuple(a for a in self.areas if not isinstance(a, Group))
+        return tuple(a for a in self.areas if not isinstance(a, AreaGroup))
 
     @property
     def meshes(self) -> list[Path]:
@@ -343,7 +343,7 @@ def _resolve(area: Area, by_name: dict[str, Area], known: dict[str, frozenset[in
     Raises `NergError` for a group that holds itself."""
     if area.name in above or len(above) > DEEPEST:
         raise NergError(f'the group "{area.name}" holds itself, or groups are nested deeper than {DEEPEST}')
-    if area.name in known or not isinstance(area, Group):
+    if area.name in known or not isinstance(area, AreaGroup):
         return
     for part in area.parts:
         _resolve(by_name[part], by_name, known, (*above, area.name))
@@ -488,7 +488,7 @@ _READING_EXAMPLE = (
 )
 
 
-def read_areas(path: str | Path) -> Areas:
+def read_areas(path: str | Path) -> AreaSet:
     """The areas of a JSON file, or the objects in the folder of a recording of Aria Digital Twin.
 
     Beside boxes (`nerg_mi.formats.areas.read_regions`) an area is a mesh or some of its faces (``mesh``: a .ply or
@@ -498,7 +498,7 @@ def read_areas(path: str | Path) -> Areas:
     """
     path = Path(path)
     if path.is_dir():
-        return Areas(tuple(read_twin_objects(path)))
+        return AreaSet(tuple(read_twin_objects(path)))
     found: list[Area] = []
     others: list[dict[str, Any]] = []
     for entry in read_entries(path):
@@ -514,12 +514,12 @@ def read_areas(path: str | Path) -> Areas:
         if len(found) > MOST:
             raise NergError(f'"{path}" has more than {MOST} areas; choose some of the objects by "categories"')
     try:
-        return Areas(tuple(found), tuple(others))
+        return AreaSet(tuple(found), tuple(others))
     except NergError as error:
         raise NergError(f'"{path}": {error}') from error
 
 
-def files_of_areas(path: str | Path, areas: Areas) -> list[Path]:
+def files_of_areas(path: str | Path, areas: AreaSet) -> list[Path]:
     """The files that `read_areas` and whoever loads the meshes of its ``areas`` read of ``path``."""
     path = Path(path)
     if path.is_dir():
@@ -528,7 +528,7 @@ def files_of_areas(path: str | Path, areas: Areas) -> list[Path]:
     return list(dict.fromkeys([path, *areas.meshes, *twins]))
 
 
-def _other(entry: Entry, path: Path) -> list[Area]:
+def _other(entry: AreaEntry, path: Path) -> list[Area]:
     """The areas of an entry that is no box."""
     given = entry.given
     if "adt" in given:
@@ -548,10 +548,10 @@ def _other(entry: Entry, path: Path) -> list[Area]:
         if not isinstance(given["shape"], str) or not given["shape"]:
             raise NergError('"shape" must be the id of a shape of the scene')
         return [SceneShape(name, given["shape"])]
-    return [Group(name, _words(given["parts"], "parts"))]
+    return [AreaGroup(name, _words(given["parts"], "parts"))]
 
 
-def _objects(entry: Entry, path: Path) -> list[Area]:
+def _objects(entry: AreaEntry, path: Path) -> list[Area]:
     categories = entry.given.get("categories")
     chosen = None if categories is None else _words(categories, "categories")
     objects: list[Area] = list(read_twin_objects(_inside(entry.given["adt"], path), chosen))
@@ -560,7 +560,7 @@ def _objects(entry: Entry, path: Path) -> list[Area]:
     if not isinstance(entry.name, str):
         raise NergError("a name must be a text")
     check_name(entry.name)
-    return [*objects, Group(entry.name, tuple(a.name for a in objects))]
+    return [*objects, AreaGroup(entry.name, tuple(a.name for a in objects))]
 
 
 def _inside(name: object, path: Path) -> Path:

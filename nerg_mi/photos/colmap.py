@@ -19,7 +19,7 @@ from nerg_mi.errors import MissingFile, NergError, plain, sentence
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.safe_read import is_ordinary, open_file, size_of
 
-from .posed import FARTHEST, FileFinder, Frame, MaskFile, PosedImages, Unused, name_some, settled
+from .posed import FARTHEST, FileFinder, MaskFile, PosedFrame, PosedImages, Unused, name_some, settled
 from .transforms import read_frame_poses
 
 # ---- Colmap ----
@@ -208,7 +208,7 @@ def _digest(files: dict[str, Path]) -> str:
     return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
-def _frame(name: str, camera: _Camera | None, number: int, q, t, image: Path, masks: FileFinder | None) -> Frame:
+def _frame(name: str, camera: _Camera | None, number: int, q, t, image: Path, masks: FileFinder | None) -> PosedFrame:
     if camera is None:
         raise NergError(f"the model has no camera {number}")
     if not image.is_file():
@@ -221,7 +221,7 @@ def _frame(name: str, camera: _Camera | None, number: int, q, t, image: Path, ma
         if not existing:
             raise NergError(f'its mask "{plain(paths[0])}" does not exist')
         mask = MaskFile(existing[0])
-    return Frame(name, image, _to_world(q, t), lens, mask=mask, ignores_exif=True)
+    return PosedFrame(name, image, _to_world(q, t), lens, mask=mask, ignores_exif=True)
 
 
 def _to_world(q, t) -> np.ndarray:

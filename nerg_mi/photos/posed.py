@@ -44,7 +44,7 @@ LENS_KEYS = (
     "camera_angle_y",
     "fisheye",
 )
-"""Keys of `Frame.lens`, all floats: pixels, radians, and coefficients as `Intrinsics` has them; "fisheye" is 1 for
+"""Keys of `PosedFrame.lens`, all floats: pixels, radians, and coefficients as `Intrinsics` has them; "fisheye" is 1 for
 fisheye lenses."""
 
 FARTHEST = 1e12
@@ -144,7 +144,7 @@ class MaskFile:
 
 
 @dataclass(frozen=True)
-class Frame:
+class PosedFrame:
     """One posed image. ``name``: its path as the file spells it; ``to_world``: (4, 4) OpenGL camera-to-world;
     ``lens``: its camera keys, see `LENS_KEYS`; ``ignores_exif``: both are of the pixels as they are stored, whatever
     the EXIF orientation."""
@@ -222,7 +222,7 @@ class PosedImages:
 
     # The file.
     path: Path
-    frames: list[Frame]
+    frames: list[PosedFrame]
     # Frames that cannot be used.
     unused: list[Unused]
     # (2, 3) corners of the scene box, from the file, or None.
@@ -313,7 +313,7 @@ def rigid_pose(matrix: object) -> np.ndarray:
     return pose
 
 
-def settled(path: Path, frames: list[Frame], unused: list[Unused]) -> tuple[list[Frame], list[Unused]]:
+def settled(path: Path, frames: list[PosedFrame], unused: list[Unused]) -> tuple[list[PosedFrame], list[Unused]]:
     """Both in order of their names, each image file counting once. Raises `NergError` where no frame is left, and for
     cameras too far from the origin for single precision."""
     frames, repeated = drop_repeated(sorted(frames, key=lambda f: f.name))
@@ -324,9 +324,9 @@ def settled(path: Path, frames: list[Frame], unused: list[Unused]) -> tuple[list
     return frames, unused
 
 
-def drop_repeated(frames: list[Frame]) -> tuple[list[Frame], list[Unused]]:
+def drop_repeated(frames: list[PosedFrame]) -> tuple[list[PosedFrame], list[Unused]]:
     """``frames`` with each image file once, and what was said about it again."""
-    first: dict[Path, Frame] = {}
+    first: dict[Path, PosedFrame] = {}
     kept, unused = [], []
     for frame in frames:
         key = frame.image.resolve()

@@ -67,7 +67,7 @@ _JPEG = dict(format="JPEG", quality=95, subsampling=0)
 
 
 @dataclass(frozen=True)
-class Picture:
+class PhotoCopy:
     """A picture of the capture. ``name``: its file in ``images/``; ``size``, ``small``: width and height of it and of
     the copy that features are found in, in pixels; ``made_by``: what else pictures of one camera have in common (its
     maker, model and focal length, as far as it is told); ``focal``: focal length in pixels of ``size``, None where it
@@ -124,7 +124,7 @@ def shrunk(image: Any, size: tuple[int, int]) -> bytes:
     return out.getvalue()
 
 
-def cameras_of(pictures: Iterable[Picture], share: bool = True) -> list[int]:
+def cameras_of(pictures: Iterable[PhotoCopy], share: bool = True) -> list[int]:
     """Number, from 0, of the camera of each picture: those of equal size, maker, model and focal length ``share`` one.
 
     A telephone held upright and held across has two: each with its principal point at the centre of its pictures.
@@ -185,14 +185,14 @@ def copy_photos(
     longest: int,
     progress: Callable[[int, int], None],
     allow_outside: bool = False,
-) -> tuple[list[Picture], list[Unused]]:
+) -> tuple[list[PhotoCopy], list[Unused]]:
     """Copy each of the ``photos`` to ``folders``, turned as its EXIF orientation says, and those that cannot be used.
 
     A photo that stands upright as it is stored is copied byte for byte; another is stored anew, a JPEG at quality 95, a
     PNG in 8 bits. ``longest``: side of the small copies in pixels. ``progress(done, of)`` is told after each.
     ``allow_outside``: follow links that lead out of the photos' folder.
     """
-    pictures: list[Picture] = []
+    pictures: list[PhotoCopy] = []
     unused: list[Unused] = []
     seen: dict[str, str] = {}
     for k, path in enumerate(photos):
@@ -208,7 +208,7 @@ def copy_photos(
 
 def _copied(
     path: Path, folders: Folders, index: int, longest: int, seen: dict[str, str], allow_outside: bool
-) -> Picture:
+) -> PhotoCopy:
     """``seen``: names of the photos before by their content, to which this one is added."""
     photo = read_photo(path if allow_outside else inside(path.parent, path, "photo"))
     image, name = photo.image, path.name
@@ -220,7 +220,7 @@ def _copied(
     small = small_size(size, longest)
     write_bytes(folders.small / small_name(index), shrunk(image, small))
     focal = photo.as_35 / _DIAGONAL_35 * float((size[0] ** 2 + size[1] ** 2) ** 0.5) if photo.as_35 else None
-    return Picture(name, size, small, photo.made_by, focal)
+    return PhotoCopy(name, size, small, photo.made_by, focal)
 
 
 @dataclass(frozen=True)
@@ -322,7 +322,7 @@ def check_installed() -> None:
 
 
 def reconstruct(
-    pictures: list[Picture], work: Path, settings: Settings, progress: Callable[[str, int, int], None]
+    pictures: list[PhotoCopy], work: Path, settings: Settings, progress: Callable[[str, int, int], None]
 ) -> Reconstruction | None:
     """Find the poses of ``pictures``, whose small copies lie in ``work``/small; None where no three fit together.
 
@@ -352,7 +352,7 @@ def reconstruct(
     )
 
 
-def _job(pictures: list[Picture], settings: Settings) -> dict[str, Any]:
+def _job(pictures: list[PhotoCopy], settings: Settings) -> dict[str, Any]:
     numbers = cameras_of(pictures, settings.share)
     cameras = []
     for number in range(max(numbers) + 1):

@@ -25,7 +25,7 @@ from nerg_mi.maths.sphere import fibonacci_directions, numbers_in_cone
 from nerg_mi.ranges import LENGTHS, check_number
 from nerg_mi.transport.observer_gaze import PARTS, POWER
 
-from .visits import Thing, land, regroup
+from .visits import Aoi, land, regroup
 
 FIRST = 1 << 13
 """Directions over the sphere that are looked along first."""
@@ -85,7 +85,7 @@ ROUGH = SumRule(tolerance=0.02, least=5e-5)
 def gaze_shares(
     look_from: Callable[[np.ndarray], Look],
     eyes: np.ndarray,
-    things: Sequence[Thing],
+    things: Sequence[Aoi],
     members: Sequence[tuple[int, ...]],
     margin: float,
     rule: SumRule | None = None,
@@ -120,7 +120,7 @@ class _Sums:
         self,
         look_from: Callable[[np.ndarray], Look],
         eyes: np.ndarray,
-        things: Sequence[Thing],
+        things: Sequence[Aoi],
         members: Sequence[tuple[int, ...]],
         margin: float,
         rule: SumRule,
@@ -302,7 +302,7 @@ _SIGHTS = 1 << 20
 
 
 @dataclass(frozen=True)
-class Targets:
+class SamplePoints:
     """Sample points of K things: ``points``, ``normals`` (S, 3), and whose they are, ``thing`` (S,)."""
 
     points: np.ndarray
@@ -311,7 +311,7 @@ class Targets:
     count: int
 
     @classmethod
-    def of(cls, things: Sequence[Thing], samples: int = SAMPLES) -> Targets:
+    def of(cls, things: Sequence[Aoi], samples: int = SAMPLES) -> SamplePoints:
         found = [thing.samples(samples) for thing in things]
         who = np.repeat(np.arange(len(things)), [len(points) for points, _ in found])
         nothing = np.zeros((0, 3))
@@ -319,7 +319,7 @@ class Targets:
         return cls(points, normals, who, len(things))
 
 
-def unhidden(targets: Targets, eyes: np.ndarray, depth: Depth, margin: float) -> np.ndarray:
+def unhidden(targets: SamplePoints, eyes: np.ndarray, depth: Depth, margin: float) -> np.ndarray:
     """Which of the S points are seen from each of E ``eyes`` (E, 3), turned to wherever they like: (E, S). A surface
     may stand up to ``margin`` before a point and yet be its own."""
     out = np.zeros((len(eyes), len(targets.points)), bool)
@@ -337,7 +337,7 @@ def unhidden(targets: Targets, eyes: np.ndarray, depth: Depth, margin: float) ->
     return out
 
 
-def in_view(targets: Targets, eyes: np.ndarray, ahead: np.ndarray, seen: np.ndarray, view: float) -> np.ndarray:
+def in_view(targets: SamplePoints, eyes: np.ndarray, ahead: np.ndarray, seen: np.ndarray, view: float) -> np.ndarray:
     """Whether any of the points of each of K things that are ``seen`` (N, S) lies within a ``view`` of so many degrees
     about the unit directions ``ahead`` (N, 3) of ``eyes`` (N, 3): (N, K)."""
     out = np.zeros((len(eyes), targets.count), bool)
@@ -365,7 +365,7 @@ class CellsInView:
     MOST = 1 << 28
     """Bytes of what is known of cells."""
 
-    def __init__(self, targets: Targets, depth: Depth, cell: float, margin: float):
+    def __init__(self, targets: SamplePoints, depth: Depth, cell: float, margin: float):
         check_number(cell, LENGTHS, "--cell")
         self._targets, self._depth, self._cell, self._margin = targets, depth, cell, margin
         self._known: dict[tuple[int, int, int], np.ndarray] = {}
@@ -431,7 +431,7 @@ def standing(
 
 
 def isovists(
-    points: np.ndarray, depth: Depth, targets: Targets, margin: float, reach: float, directions: int = 360
+    points: np.ndarray, depth: Depth, targets: SamplePoints, margin: float, reach: float, directions: int = 360
 ) -> Isovists:
     """Those of ``points`` (G, 3) by so many ``directions`` around; nothing is farther than ``reach``."""
     angle = 2 * np.pi * (np.arange(directions) + 0.5) / directions

@@ -221,7 +221,7 @@ class Smoother:
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
+class SurfaceSums:
     """Attention, weighted by whom it is of, all in float64.
 
     ``face`` (F,): the integral over each face; ``vertex`` (V,): that of the attention times the hat function of each
@@ -238,13 +238,13 @@ class Sums:
     count: int = 0
 
     @classmethod
-    def none(cls, faces: int, vertices: int) -> Sums:
+    def none(cls, faces: int, vertices: int) -> SurfaceSums:
         """Nothing yet."""
         return cls(np.zeros(faces), np.zeros(vertices))
 
-    def plus(self, other: Sums) -> Sums:
+    def plus(self, other: SurfaceSums) -> SurfaceSums:
         """Both; the order in which sums are added decides their last digits."""
-        return Sums(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+        return SurfaceSums(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
     @property
     def on_surface(self) -> float:
@@ -257,7 +257,7 @@ class Sums:
         return self.total - self.on_surface - self.elsewhere - self.escaped
 
 
-def merge(parts: Iterable[Sums]) -> Sums:
+def merge(parts: Iterable[SurfaceSums]) -> SurfaceSums:
     """The sum of ``parts``, of which there is one at least, in their order."""
     parts = iter(parts)
     found = next(parts)

@@ -162,7 +162,7 @@ MOST_REFINED_FACES = 8_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class RefinedMesh:
     """``mesh`` cut of another: ``parent`` (F,) the face of that which each face lies in, and ``place`` (F, 3, 3), of
     each of its corners the barycentric coordinates there."""
 
@@ -171,7 +171,7 @@ class Refined:
     place: np.ndarray
 
 
-def refine(mesh: Mesh, longest: float) -> Refined:
+def refine(mesh: Mesh, longest: float) -> RefinedMesh:
     """``mesh`` with edges of at most ``longest`` scene units. Raises `NergError` for more than `MOST_REFINED_FACES`
     faces."""
     vertices, faces = mesh.vertices, mesh.faces
@@ -181,7 +181,7 @@ def refine(mesh: Mesh, longest: float) -> Refined:
         ends = vertices[edges]
         long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > longest
         if not long.any():
-            return Refined(Mesh(vertices, faces), parent, place)
+            return RefinedMesh(Mesh(vertices, faces), parent, place)
         middle = np.full(len(edges), -1)
         middle[long] = len(vertices) + np.arange(np.count_nonzero(long))
         cut = middle[of_face]
@@ -258,7 +258,7 @@ class Ends:
     elsewhere: np.ndarray
 
 
-class Target:
+class SurfaceTarget:
     """``mesh``, which receives attention, ``others``, meshes that hide it, and a ``medium`` that both stand in, with
     ``place``, in which all of it is traced.
 
@@ -414,7 +414,7 @@ def unroll(mesh: Mesh, pixels: int) -> Charts:
 
 
 def texture_rows(
-    charts: Charts, refined: Refined, values: np.ndarray, pixels: int
+    charts: Charts, refined: RefinedMesh, values: np.ndarray, pixels: int
 ) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
     """``values`` (V,) on the vertices of ``refined``, of whose whole mesh ``charts`` are, as a square texture.
 

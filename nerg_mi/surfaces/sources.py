@@ -23,8 +23,8 @@ from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings
 from nerg_mi.transport.observer_gaze import PlacedGaze
 
-from .laplacian import Sums, deposit, merge
-from .mesh import Mesh, Target
+from .laplacian import SurfaceSums, deposit, merge
+from .mesh import Mesh, SurfaceTarget
 
 # ---- Cones ----
 #
@@ -225,7 +225,7 @@ _LOOKED_AT = np.vstack([_SPREAD, _WITHIN + (1 - 3 * _WITHIN) * np.eye(3)])
 
 
 def visible_pieces(
-    target: Target, pieces: Pieces, density: Callable[[Pieces], np.ndarray], total: float, batch: int
+    target: SurfaceTarget, pieces: Pieces, density: Callable[[Pieces], np.ndarray], total: float, batch: int
 ) -> Iterator[tuple[Pieces, np.ndarray]]:
     """``pieces`` that are seen, cut where outlines pass, with the gaze (P,) that each receives.
 
@@ -249,7 +249,7 @@ def visible_pieces(
             left = left.part(cut).quartered()
 
 
-def _seen(target: Target, pieces: Pieces) -> np.ndarray:
+def _seen(target: SurfaceTarget, pieces: Pieces) -> np.ndarray:
     """Whether each of the points (P, 7) is seen at which pieces are looked at."""
     points = np.matmul(_LOOKED_AT, pieces.relative) + pieces.eye
     count = len(_LOOKED_AT)
@@ -272,7 +272,7 @@ _ROUNDS = 50
 
 
 @dataclass(frozen=True, eq=False)
-class Crowd:
+class WeightedObservers:
     """Observers at ``positions`` (M, 3), places where somebody was, with ``weights`` (M,) that add up to one. ``mean``
     and ``farthest``: distance from there of where people were, the root of its mean square and 95 % of it."""
 
@@ -305,7 +305,7 @@ def ray_weights(rays: Rays, by: str, gap: float = GAP) -> np.ndarray:
     return seconds / seconds.sum()
 
 
-def thin(positions: np.ndarray, weights: np.ndarray, count: int, seed: int = 0) -> Crowd:
+def cluster_observers(positions: np.ndarray, weights: np.ndarray, count: int, seed: int = 0) -> WeightedObservers:
     """At most ``count`` observers that stand for people who were at ``positions`` (N, 3) by ``weights`` (N,).
 
     Weighted k-means (S. Lloyd 1982) from starts that are drawn far apart (k-means++, D. Arthur, S. Vassilvitskii 2007),
@@ -336,7 +336,9 @@ def thin(positions: np.ndarray, weights: np.ndarray, count: int, seed: int = 0) 
     order = np.argsort(apart, kind="stable")
     far = apart[order][np.searchsorted(np.cumsum(weights[order]), 0.95 * weights.sum()).clip(max=len(apart) - 1)]
     kept = total > 0
-    return Crowd(standing[kept], total[kept] / total.sum(), float(np.sqrt((weights * apart**2).sum())), float(far))
+    return WeightedObservers(
+        standing[kept], total[kept] / total.sum(), float(np.sqrt((weights * apart**2).sum())), float(far)
+    )
 
 
 def _cells(positions: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -411,7 +413,7 @@ class TrackedRays:
         return TrackedRays(self.origins[rows], self.directions[rows], self.weights[rows], self.first + start)
 
 
-def ray_sums(target: Target, rays: TrackedRays, settings: RaySettings) -> Sums:
+def ray_sums(target: SurfaceTarget, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
     """What ``rays`` leave on ``target``: partial sums, which `visits.merge` adds up to those of more rays.
 
     The draws depend on the seed and on ``rays.first`` alone, so that parts that are cut alike give the same everywhere.
@@ -432,7 +434,7 @@ def ray_sums(target: Target, rays: TrackedRays, settings: RaySettings) -> Sums:
         elsewhere += float(weights[ends.elsewhere].sum())
         escaped += float(weights[~on & ~ends.elsewhere].sum())
     weight = float(rays.weights.sum())
-    return Sums(on_faces, on_vertices, elsewhere, escaped, weight, weight, len(rays))
+    return SurfaceSums(on_faces, on_vertices, elsewhere, escaped, weight, weight, len(rays))
 
 
 # ---- Sphere rule ----
@@ -517,7 +519,7 @@ FACES = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class GazeSettings:
+class GazeSumSettings:
     """``angle``: radian under which an observer sees a piece at most; ``cone``: standard deviation in radian of the
     cone that gaze is seen through, 0 for none; ``directions`` over the sphere, about."""
 
@@ -527,7 +529,7 @@ class GazeSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Looker:
+class SurfaceObserver:
     """An observer at ``center`` (one lane): their ``density`` where they see a surface, as
     `nerg_mi.probes.surface_attention` wants it, and ``along`` directions, whatever is met there."""
 
@@ -536,18 +538,18 @@ class Looker:
     along: Callable[[Vector3f], Any]
 
 
-MakeLooker = Callable[[np.ndarray], Looker]
+MakeObserver = Callable[[np.ndarray], SurfaceObserver]
 """Of an observer's position (3,)."""
 
 
-def lookers_of_field(gaze: PlacedGaze, place: Place, settings: ObserverSettings) -> MakeLooker:
+def observers_from_field(gaze: PlacedGaze, place: Place, settings: ObserverSettings) -> MakeObserver:
     """Observers whose gaze is the field ``gaze`` in ``place``, traced with ``settings``."""
 
-    def make(eye: np.ndarray) -> Looker:
+    def make(eye: np.ndarray) -> SurfaceObserver:
         center = _center(eye)
         # Nobody is asked for twice, and what is known of all of them would fill the memory.
         observed = gaze.at([center], place, settings, ObserverCache())
-        return Looker(
+        return SurfaceObserver(
             center,
             lambda p_od, p_o, r_o, active: observed.evaluate(p_od, p_o, r_o, active)[0],
             lambda directions: observed.along(center, directions),
@@ -557,16 +559,22 @@ def lookers_of_field(gaze: PlacedGaze, place: Place, settings: ObserverSettings)
 
 
 def gaze_sums(
-    target: Target, make: MakeLooker, eyes: np.ndarray, weights: Sequence[float] | np.ndarray, settings: GazeSettings
-) -> Sums:
+    target: SurfaceTarget,
+    make: MakeObserver,
+    eyes: np.ndarray,
+    weights: Sequence[float] | np.ndarray,
+    settings: GazeSumSettings,
+) -> SurfaceSums:
     """What observers at ``eyes`` (M, 3), who count by ``weights`` (M,), leave on ``target``: partial sums, which
     `merge` adds up to those of more observers."""
-    none = Sums.none(len(target.mesh.faces), len(target.mesh.vertices))
+    none = SurfaceSums.none(len(target.mesh.faces), len(target.mesh.vertices))
     with dr.suspend_grad():
         return merge([none, *(_of_one(target, make(eye), float(w), eye, settings) for eye, w in zip(eyes, weights))])
 
 
-def _of_one(target: Target, looker: Looker, weight: float, eye: np.ndarray, settings: GazeSettings) -> Sums:
+def _of_one(
+    target: SurfaceTarget, looker: SurfaceObserver, weight: float, eye: np.ndarray, settings: GazeSumSettings
+) -> SurfaceSums:
     import mitsuba as mi
 
     mesh, eye = target.mesh, np.asarray(eye, np.float64)
@@ -582,11 +590,11 @@ def _of_one(target: Target, looker: Looker, weight: float, eye: np.ndarray, sett
         for some, received in _received(target, looker, pieces, total / weight if weight else 0.0, settings.cone):
             found = deposit(mesh.faces, len(mesh.vertices), some.face, some.place, weight * received)
             on_faces, on_vertices = on_faces + found[0], on_vertices + found[1]
-    return Sums(on_faces, on_vertices, float(share[ends.elsewhere].sum()), escaped, total, weight, 1)
+    return SurfaceSums(on_faces, on_vertices, float(share[ends.elsewhere].sum()), escaped, total, weight, 1)
 
 
 def _received(
-    target: Target, looker: Looker, pieces: Pieces, total: float, cone: float
+    target: SurfaceTarget, looker: SurfaceObserver, pieces: Pieces, total: float, cone: float
 ) -> Iterator[tuple[Pieces, np.ndarray]]:
     """Pieces, some of which may be cut again, and the gaze (P,) that each receives."""
     density = density_through(looker, cone)
@@ -601,7 +609,7 @@ def _received(
             yield some, some.solid_angle * _launch(target, looker.center, density, some)
 
 
-def unhidden(looker: Looker, density: Density, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def unhidden(looker: SurfaceObserver, density: Density, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """``density`` (N,) of ``looker`` at ``points`` (N, 3), along unit ``directions`` (N, 3), in 1/sr, whatever may
     stand between."""
     mi = variant_types()
@@ -611,19 +619,19 @@ def unhidden(looker: Looker, density: Density, points: np.ndarray, directions: n
     return np.broadcast_to(np.array(found, np.float64), (len(points),))
 
 
-def density_through(looker: Looker, cone: float) -> Density:
+def density_through(looker: SurfaceObserver, cone: float) -> Density:
     """The density of ``looker`` seen through a cone of standard deviation ``cone`` in radian; 0: itself."""
     if cone == 0:
         return looker.density
     return lambda p_od, p_o, r_o, active: blurred(looker.along, r_o, cone)
 
 
-def _of_pieces(looker: Looker, density: Density, pieces: Pieces) -> np.ndarray:
+def _of_pieces(looker: SurfaceObserver, density: Density, pieces: Pieces) -> np.ndarray:
     middle = pieces.relative.mean(axis=1)
     return unhidden(looker, density, pieces.center, middle / np.linalg.norm(middle, axis=1, keepdims=True))
 
 
-def _launch(target: Target, center: Point3f, density: Density, pieces: Pieces) -> np.ndarray:
+def _launch(target: SurfaceTarget, center: Point3f, density: Density, pieces: Pieces) -> np.ndarray:
     """``density`` (P,) after occlusion by what may be a medium, at the centroids of ``pieces``, in 1/sr."""
     mi = variant_types()
     p_o, p = center + dr.zeros(mi.Point3f, len(pieces)), vector_of(mi.Point3f, pieces.center)
@@ -636,7 +644,7 @@ def _uniform(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
     return type(r_o.x)(1)
 
 
-def along_through(looker: Looker, cone: float) -> Callable[[Vector3f], Any]:
+def along_through(looker: SurfaceObserver, cone: float) -> Callable[[Vector3f], Any]:
     """The density of ``looker`` in unit directions, seen through a cone as `density_through` has it."""
     return looker.along if cone == 0 else lambda directions: blurred(looker.along, directions, cone)
 

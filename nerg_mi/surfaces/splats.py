@@ -19,11 +19,11 @@ from nerg_mi.transport.medium import LastHit, LocalRay
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.splat_medium import MOST_ABSORBED, SplatArrays, SplatHits
 
-from .laplacian import Sums
+from .laplacian import SurfaceSums
 from .sources import (
-    Looker,
-    MakeLooker,
+    MakeObserver,
     RaySettings,
+    SurfaceObserver,
     TrackedRays,
     along_through,
     bundle,
@@ -42,7 +42,7 @@ from .sources import (
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class HitGroup:
     """The next hits of the rays numbered ``rows`` (M,), nearest first, K at most: ``index`` (M, K) of the Gaussians in
     the order of the file, ``arriving`` and ``absorbed`` (M, K), the light that reaches each and the share of it that it
     takes, which is 0 where there is no hit. ``left`` (M,): light behind the last; ``through`` (M,): nothing is met of
@@ -62,7 +62,7 @@ def groups_of_hits(
     directions: np.ndarray,
     before: np.ndarray | None = None,
     stop: float = HITS_STOP,
-) -> Generator[Group, np.ndarray | None, None]:
+) -> Generator[HitGroup, np.ndarray | None, None]:
     """What rays with ``origins`` (N, 3) and unit ``directions`` (N, 3), in the frame of ``arrays``, meet of them.
 
     Up to the distances ``before`` (N,), everywhere without them, and until no more than ``stop`` of the light is left.
@@ -82,7 +82,7 @@ def groups_of_hits(
         # A group is cut short where no light is left, too.
         through = ~more & (left > stop)
         index = np.where(met, order[np.where(met, place, 0)], -1)
-        wanted = yield Group(rows, index, arriving, absorbed, left, through)
+        wanted = yield HitGroup(rows, index, arriving, absorbed, left, through)
         if wanted is not None:
             more &= np.isin(rows, wanted)
         rows, light, last, thing = rows[more], left[more], t[more, -1], place[more, -1]
@@ -219,7 +219,7 @@ CASTS = 1 << 17
 """Rays that are cast in one launch: each brings a dozen hits."""
 
 
-def splat_ray_sums(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, settings: RaySettings) -> Sums:
+def splat_ray_sums(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
     """What ``rays``, in the frame of ``arrays``, leave on the Gaussians: partial sums, whose ``face`` (2 N,) are the
     shares on their sides 0, then on their sides 1, and whose ``vertex`` is empty.
 
@@ -242,12 +242,14 @@ def splat_ray_sums(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, set
             shares += np.bincount(side * count + thing, share, 2 * count)
             escaped += float((weights[group.rows] * group.left)[group.through].sum())
     weight = float(rays.weights.sum())
-    return Sums(shares, np.zeros(0), 0.0, escaped, weight, weight, len(rays))
+    return SurfaceSums(shares, np.zeros(0), 0.0, escaped, weight, weight, len(rays))
 
 
-def gaze_and_escaped(arrays: SplatArrays, looker: Looker, eye: np.ndarray, cone: float = 0.0) -> tuple[float, float]:
+def gaze_and_escaped(
+    arrays: SplatArrays, looker: SurfaceObserver, eye: np.ndarray, cone: float = 0.0
+) -> tuple[float, float]:
     """What the gaze of ``looker``, an observer at ``eye`` (3,) in the frame of ``arrays``, adds up to over the sphere,
-    and how much of it meets no Gaussian: what comes through, as of rays. ``cone``: as of `sources.GazeSettings`.
+    and how much of it meets no Gaussian: what comes through, as of rays. ``cone``: as of `sources.GazeSumSettings`.
     """
     import mitsuba as mi
 
@@ -422,7 +424,7 @@ BATCH = 1 << 18
 def splat_densities(
     splats: Splats,
     place: Place,
-    make: MakeLooker,
+    make: MakeObserver,
     eyes: np.ndarray,
     weights: np.ndarray,
     settings: ObserverSettings,
@@ -447,7 +449,7 @@ def splat_densities(
 def _of_one(
     splats: Splats,
     place: Place,
-    looker: Looker,
+    looker: SurfaceObserver,
     eye: np.ndarray,
     settings: ObserverSettings,
     cone: float,
@@ -490,7 +492,7 @@ def _facing(to: np.ndarray, axes: np.ndarray, scales: np.ndarray) -> tuple[np.nd
 
 def _seen(
     place: Place,
-    looker: Looker,
+    looker: SurfaceObserver,
     centers: np.ndarray,
     normals: np.ndarray,
     depth: np.ndarray,

@@ -13,10 +13,10 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.aoi.measured import (
-    Counting,
-    EyePicker,
-    Eyes,
+    AoiContext,
     StatisticsOptions,
+    Viewpoints,
+    ViewpointSampler,
     blocks_of,
     cohort_names,
     count_block,
@@ -25,8 +25,8 @@ from nerg_mi.aoi.measured import (
 from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.aoi.parts import CountingParts
 from nerg_mi.aoi.predicted import (
-    Foretold,
-    Setting,
+    AoiScene,
+    PredictedAttention,
     add_trust,
     eyes_of_some,
     foretold_people,
@@ -41,17 +41,17 @@ from nerg_mi.aoi.predicted import (
 from nerg_mi.aoi.scene import read_changes
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder, make_folder
-from nerg_mi.formats.areas import Areas, read_areas
+from nerg_mi.formats.areas import AreaSet, read_areas
 from nerg_mi.interruption import Interruption
 from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.estimates import LEAST_PEOPLE
-from nerg_mi.statistics.shares import Isovists, Targets
+from nerg_mi.statistics.shares import Isovists, SamplePoints
 from nerg_mi.statistics.tables import (
     FIELD,
     TRACKED,
-    Floor,
-    People,
+    MinParticipantsFilter,
+    Participants,
     PersonRows,
     Row,
     difference_rows,
@@ -59,7 +59,7 @@ from nerg_mi.statistics.tables import (
     move_rows,
     thing_rows,
 )
-from nerg_mi.statistics.visits import ALL, Cell, Sums, Total
+from nerg_mi.statistics.visits import ALL, Cell, Total, VisitSums
 
 from .base import SILENT, Reporter, argument, command, out, select_backend
 from .options import parse_point
@@ -130,10 +130,10 @@ def _sort(files: Sequence[str | Path | Rays]) -> _Given:
     return _Given(**found)  # pyright: ignore[reportArgumentType]
 
 
-def _areas(options: StatisticsOptions) -> Areas:
+def _areas(options: StatisticsOptions) -> AreaSet:
     if options.areas is None:
         if options.visibility:
-            return Areas(())
+            return AreaSet(())
         raise NergError("say which things are asked about: --areas FILE")
     return read_areas(options.areas)
 
@@ -144,7 +144,7 @@ class _Work:
     def __init__(
         self,
         given: _Given,
-        areas: Areas,
+        areas: AreaSet,
         options: StatisticsOptions,
         ns: ModuleType,
         reporter: Reporter,
@@ -164,7 +164,7 @@ class _Work:
 
     def run(self) -> StatisticsResult:
         """All that is asked for."""
-        o, floor = self.options, Floor(self.options.min_people)
+        o, floor = self.options, MinParticipantsFilter(self.options.min_people)
         if o.visibility:
             return StatisticsResult(isovists=isovist_rows(self._isovists(), self.areas.names, self.members))
         counting = None if self.given.rays is None else self._counting(self.given.rays)
@@ -173,11 +173,11 @@ class _Work:
             raise NergError("there is nobody to tell of: give rays, or a gaze field (or --visibility for isovists)")
         cells = [ALL] if counting is None else list(sums.cells) if sums is not None else []
         seen = counting is not None and counting.cells_in_view is not None
-        people: dict[Cell, dict[str, People]] = {cell: {} for cell in cells}
+        people: dict[Cell, dict[str, Participants]] = {cell: {} for cell in cells}
         times: dict[Cell, dict[str, float]] = {cell: {} for cell in cells}
         for cell in cells:
             if sums is not None:
-                people[cell][TRACKED] = tracked = People.of(sums, cell, seen)
+                people[cell][TRACKED] = tracked = Participants.of(sums, cell, seen)
                 times[cell] = dict(zip(tracked.names, tracked.time.tolist()))
             else:
                 times[cell] = dict.fromkeys(eyes.person, 1.0)
@@ -212,7 +212,7 @@ class _Work:
             self.reporter.message(f"{floor.blanked:,} numbers rest on fewer than {floor.least} people and are blank")
         return result
 
-    def _counting(self, rays: Path | Rays) -> Counting:
+    def _counting(self, rays: Path | Rays) -> AoiContext:
         first = next(blocks_of(rays, self.setting.rules))
         hits = self.around.place is None and first.hit is not None and bool(np.isfinite(first.hit).any())
         if self.around.place is None:
@@ -223,10 +223,10 @@ class _Work:
             )
         return self.setting.counting(hits, cohort_names(rays, first))
 
-    def _count(self, counting: Counting) -> tuple[Sums, Eyes]:
+    def _count(self, counting: AoiContext) -> tuple[VisitSums, Viewpoints]:
         assert self.given.rays is not None
         count = ray_count(self.given.rays)
-        picker = EyePicker(max(1, count // self.options.eyes))
+        picker = ViewpointSampler(max(1, count // self.options.eyes))
         total: Total | None = None
 
         def pick(block: Rays) -> None:
@@ -245,14 +245,14 @@ class _Work:
         sums = total.sums()
         self.reporter.message(f"{count:,} rays of {len(sums.persons_of(ALL)[0]):,} people")
         if self.around.gaze is None:
-            return sums, Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ())
+            return sums, Viewpoints(np.zeros((0, 3)), np.zeros((0, 3)), (), ())
         eyes = eyes_of_some(picker.eyes(), self.options.eyes, self.reporter)
         tell_places(eyes, self.reporter)
         return sums, eyes
 
     def _counted(
-        self, rays: Rays | Path, counting: Counting, seen: Callable[[Rays], None] | None, count: int
-    ) -> Iterator[Sums]:
+        self, rays: Rays | Path, counting: AoiContext, seen: Callable[[Rays], None] | None, count: int
+    ) -> Iterator[VisitSums]:
         """The sums of each block, in this process."""
         done = 0
         with Interruption() as stop:
@@ -275,7 +275,7 @@ class _Work:
         what = f"nerg stats {name.absolute()}"
         return CountingParts(parts, what, g.scene, g.field, g.gaze, self.areas, o, str(mi.variant()))
 
-    def _standing(self) -> Eyes:
+    def _standing(self) -> Viewpoints:
         """Observers who were not tracked."""
         o = self.options
         if o.observers:
@@ -292,7 +292,7 @@ class _Work:
         """Degrees that people see. Without rays nobody knows where somebody is turned."""
         return self.options.view if self.given.rays is not None else 360.0
 
-    def _foretold(self, eyes: Eyes) -> Foretold:
+    def _foretold(self, eyes: Viewpoints) -> PredictedAttention:
         """What the field says where people stood."""
         if self.parts is None:
             return self.setting.foretold(eyes, self._view, self.reporter)
@@ -306,13 +306,13 @@ class _Work:
         box = self.around.bounds()
         self.reporter.message(f"{len(points):,} places on the floor")
         reach = float(np.linalg.norm(box[1] - box[0]))
-        return isovists(points, self.around.depth, Targets.of(self.things, o.samples), self.setting.margin, reach)
+        return isovists(points, self.around.depth, SamplePoints.of(self.things, o.samples), self.setting.margin, reach)
 
-    def _what_if(self, eyes: Eyes, before: Foretold | None, floor: Floor) -> list[Row]:
+    def _what_if(self, eyes: Viewpoints, before: PredictedAttention | None, floor: MinParticipantsFilter) -> list[Row]:
         o, parts = self.options, self.parts
         assert o.what_if is not None and before is not None
 
-        def foretell(there: Setting, others: Eyes) -> Foretold:
+        def foretell(there: AoiScene, others: Viewpoints) -> PredictedAttention:
             for note in there.notes[len(self.setting.notes) :]:
                 self.reporter.message(note)
             if parts is None:
@@ -321,7 +321,7 @@ class _Work:
 
         return what_if_rows(o.what_if, self.setting, eyes, before, foretell, floor, o.resamples, o.seed)
 
-    def _people(self, sums: Sums | None, seen: bool) -> Sequence[Row]:
+    def _people(self, sums: VisitSums | None, seen: bool) -> Sequence[Row]:
         o = self.options
         if sums is None:
             return ()
@@ -334,7 +334,7 @@ class _Work:
             named = pseudonyms(persons, None if o.salt is None else read_salt(o.salt))
         return PersonRows(sums, named, seen)
 
-    def _tell(self, people: Mapping[Cell, Mapping[str, People]]) -> None:
+    def _tell(self, people: Mapping[Cell, Mapping[str, Participants]]) -> None:
         for cell in (c for c, found in people.items() if TRACKED in found and not found[TRACKED].names):
             self.reporter.message(f"nobody is in the {cell.dimension} {cell.value}; windows are on the rays' own clock")
         few = [cell for cell, found in people.items() for p in found.values() if 0 < p.there.sum() < LEAST_PEOPLE]

@@ -11,7 +11,7 @@ from nerg_mi.aoi.measured import StatisticsOptions
 from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.figures.statistics import things_figure
 from nerg_mi.statistics.tables import PLACES, PersonRows
-from nerg_mi.statistics.visits import ALL, Sums
+from nerg_mi.statistics.visits import ALL, VisitSums
 from tests.workflows.recorder import Recorder
 
 # ---- Results as a folder of files ----
@@ -133,7 +133,7 @@ def test06_differences_in_their_units():
 
 
 def test07_many_people_are_written_in_parts(tmp_path, monkeypatch):
-    sums = Sums.empty(("x", "y"), (ALL,), [(ALL, f"p{k}") for k in range(5)])
+    sums = VisitSums.empty(("x", "y"), (ALL,), [(ALL, f"p{k}") for k in range(5)])
     # The first part of the file knows no first look.
     sums.looks[3:], sums.first_sum[3:], sums.first_count[3:] = 1, 2.5, 1
     rows = PersonRows(sums, {f"p{k}": f"p{k}" for k in range(5)}, False)

@@ -11,11 +11,11 @@ import pytest
 
 from nerg_mi.aoi import measured
 from nerg_mi.aoi.measured import (
-    Counting,
-    EyePicker,
+    AoiContext,
     PredictionOptions,
     StatisticsOptions,
-    Window,
+    TimeWindow,
+    ViewpointSampler,
     ahead,
     blocks_of,
     count_block,
@@ -30,14 +30,14 @@ from nerg_mi.aoi.parts import (
     read_sums,
     write_sums,
 )
-from nerg_mi.aoi.scene import Surroundings
+from nerg_mi.aoi.scene import GazeScene
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.areas import Region
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.visits import ALL, Box, Cell, LookRules, Sums, merge
+from nerg_mi.statistics.visits import ALL, BoxAoi, Cell, VisitRules, VisitSums, merge
 from nerg_mi.tasks.task import Files
 from nerg_mi.workflows.parts import PlannedScene, account_for_store
 from nerg_mi.workflows.statistics import statistics
@@ -129,12 +129,12 @@ def test_parts_of_a_dataset_are_read_where_they_lie(place):
 
 def test_sums_come_back_one_by_one(tmp_path):
     cells = (ALL, Cell("window", "früh"))
-    one = Sums.empty(("a", "b"), cells, [(cells[0], "p"), (cells[1], "p"), (cells[0], "q")])
+    one = VisitSums.empty(("a", "b"), cells, [(cells[0], "p"), (cells[1], "p"), (cells[0], "q")])
     one.time[:] = (0.1, 1 / 3, 7)
     two = replace(one, time=one.time * 2, moves=one.moves + 1)
     write_sums(tmp_path / "s.npz", [one, two])
     for back, sums in zip(read_sums(tmp_path / "s.npz"), (one, two), strict=True):
-        for f in dataclass_fields(Sums):
+        for f in dataclass_fields(VisitSums):
             assert np.array_equal(getattr(back, f.name), getattr(sums, f.name)), f.name
 
 
@@ -164,13 +164,13 @@ def test_a_gaze_field_brings_the_place_that_it_was_trained_in(tmp_path, rgb):
 # ---- Rays in blocks that hold sittings as a whole, and what they are on ----
 
 
-RULES = LookRules()
+RULES = VisitRules()
 
 
 def counting(**changes):
-    things = [Box(Region.of("sign", *SIGN)), Box(Region.of("stand", *STAND))]
-    around = Surroundings(None, None, Similarity())
-    made = Counting(around, things, ("sign", "stand", "both"), [(0,), (1,), (0, 1)], (0, 1), RULES, 0.0)
+    things = [BoxAoi(Region.of("sign", *SIGN)), BoxAoi(Region.of("stand", *STAND))]
+    around = GazeScene(None, None, Similarity())
+    made = AoiContext(around, things, ("sign", "stand", "both"), [(0,), (1,), (0, 1)], (0, 1), RULES, 0.0)
     return replace(made, **changes)
 
 
@@ -241,8 +241,8 @@ def test04_a_tolerance_lets_rays_pass_by():
 def test05_rays_in_another_frame():
     align = np.diag([2.0, 2, 2, 1])
     align[:3, 3] = 1, 2, 3
-    around = Surroundings(None, None, Similarity(align))
-    moved = [Box(Region.of(n, *(2 * c + (1, 2, 3)))) for n, c in (("sign", SIGN), ("stand", STAND))]
+    around = GazeScene(None, None, Similarity(align))
+    moved = [BoxAoi(Region.of(n, *(2 * c + (1, 2, 3)))) for n, c in (("sign", SIGN), ("stand", STAND))]
     rays = people()
     one, two = counting().land(rays), counting(around=around, things=moved).land(rays)
     for a, b in zip(one.rows, two.rows):
@@ -255,7 +255,7 @@ def test05_rays_in_another_frame():
 def test06_cells():
     rays = people()
     made = counting(
-        windows=[Window("w", 1.0, 2.0)], zones=[Region.of("z", [0, 0, 9], [1, 4, 9.1])], cohort_names=("even", "x")
+        windows=[TimeWindow("w", 1.0, 2.0)], zones=[Region.of("z", [0, 0, 9], [1, 4, 9.1])], cohort_names=("even", "x")
     )
     cells = dict(made.cells(rays, rays.origin))
     assert cells[ALL] is None and not cells[Cell("cohort", "x")].any()
@@ -275,7 +275,7 @@ def test07_heads_tell_where_people_are_turned():
 
 
 def test08_eyes_are_taken_evenly_and_of_everybody():
-    picker = EyePicker(100)
+    picker = ViewpointSampler(100)
     for block in blocks_of(people(5, 80), RULES, 100):
         picker.take(block, counting())
     eyes = picker.eyes()

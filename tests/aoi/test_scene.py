@@ -23,7 +23,7 @@ from nerg_mi.aoi.scene import (
 )
 from nerg_mi.errors import NergError
 from nerg_mi.files.tables import write_csv
-from nerg_mi.formats.areas import Areas, Group, MeshPart, Region, SceneShape
+from nerg_mi.formats.areas import AreaGroup, AreaSet, MeshPart, Region, SceneShape
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.mesh import mitsuba_mesh
@@ -50,7 +50,7 @@ def change(scene, tmp_path, **changes):
 
 
 def things(areas, shapes):
-    return things_of(areas, shapes, read_meshes(Areas(tuple(areas)).meshes))
+    return things_of(areas, shapes, read_meshes(AreaSet(tuple(areas)).meshes))
 
 
 def cast(scene, o, d):
@@ -93,7 +93,9 @@ def test02_removed_added_and_swapped(scene_changes, tmp_path):
 
 def test03_areas_follow(tmp_path):
     box = Region.of("shelf", *SIGN)
-    areas = Areas((box, SceneShape("stand", "stand"), Group("all", ("shelf", "stand")), Group("g", ("stand",))))
+    areas = AreaSet(
+        (box, SceneShape("stand", "stand"), AreaGroup("all", ("shelf", "stand")), AreaGroup("g", ("stand",)))
+    )
     found = changed_areas(
         areas, written(tmp_path, move=[{"area": "shelf", "by": [1, 0, 0], "turn": 90}], remove=["stand"])
     )

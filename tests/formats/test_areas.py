@@ -11,8 +11,8 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import (
     MOST,
-    Areas,
-    Group,
+    AreaGroup,
+    AreaSet,
     MeshPart,
     Region,
     SceneShape,
@@ -32,20 +32,20 @@ A, B = Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1]
 
 
 def test01_members_count_once():
-    areas = Areas((Group("all", ("pair", "a")), A, B, Group("pair", ("a", "b"))))
+    areas = AreaSet((AreaGroup("all", ("pair", "a")), A, B, AreaGroup("pair", ("a", "b"))))
     assert areas.members() == {"all": (0, 1), "a": (0,), "b": (1,), "pair": (0, 1)}
     assert areas.things == (A, B) and areas.names == ("all", "a", "b", "pair")
 
 
 def test02_two_of_one_name():
     with pytest.raises(NergError, match='two areas are called "a"'):
-        Areas((A, A))
+        AreaSet((A, A))
 
 
 def test03_many_groups_of_groups_are_resolved_at_once():
     # Each of the two holds all that came before: without care, two to the power of their number of ways.
-    groups = [Group("g0", ("a", "b"))] + [Group(f"g{k}", (f"g{k - 1}", "a")) for k in range(1, 7)]
-    assert Areas((A, B, *groups)).members()["g6"] == (0, 1)
+    groups = [AreaGroup("g0", ("a", "b"))] + [AreaGroup(f"g{k}", (f"g{k - 1}", "a")) for k in range(1, 7)]
+    assert AreaSet((A, B, *groups)).members()["g6"] == (0, 1)
 
 
 # ---- Areas of interest of every kind as files ----
@@ -74,8 +74,8 @@ def test01_one_of_every_kind(tmp_path):
         Region.of("shelf", [0, 0, 0], [1, 2, 3]),
         MeshPart("sign", tmp_path / "sign.ply", ((0, 0), (4, 9))),
         SceneShape("till", "till_0"),
-        Group("all", ("shelf", "both")),
-        Group("both", ("till", "shelf")),
+        AreaGroup("all", ("shelf", "both")),
+        AreaGroup("both", ("till", "shelf")),
     )
     assert areas.members() == {"shelf": (0,), "sign": (1,), "till": (2,), "all": (0, 2), "both": (0, 2)}
     assert areas.areas[1].chosen(12).nonzero()[0].tolist() == [0, 4, 5, 6, 7, 8, 9]

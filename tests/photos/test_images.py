@@ -13,7 +13,7 @@ from nerg_mi.files.images import write_bitmap_exr, write_exr
 from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.images import (
-    View,
+    PhotoView,
     load_usable,
     load_view,
     pinhole,
@@ -26,7 +26,7 @@ from nerg_mi.photos.images import (
     through_lens,
     undistorted,
 )
-from nerg_mi.photos.posed import DepthFile, Frame, MaskFile
+from nerg_mi.photos.posed import DepthFile, MaskFile, PosedFrame
 from nerg_mi.photos.transforms import read_transforms
 from tests.photos.written_sets import (
     METRES_ALONG_RAYS,
@@ -306,7 +306,7 @@ def save_turned(path, values, orientation):
 
 
 def camera(path, shape, ignores_exif=False):
-    return Frame(path.name, path, np.eye(4), {"w": shape[1], "h": shape[0]}, ignores_exif=ignores_exif)
+    return PosedFrame(path.name, path, np.eye(4), {"w": shape[1], "h": shape[0]}, ignores_exif=ignores_exif)
 
 
 @pytest.mark.parametrize("orientation", range(5, 9))
@@ -328,7 +328,7 @@ def test_a_turned_photo_of_which_nothing_tells_is_refused(tmp_path, rgb, orienta
     with pytest.raises(NergError, match=f"a.png.*EXIF orientation .{orientation}.*nothing tells"):
         read_photo(camera(path, shape))
     with pytest.raises(NergError, match="nothing tells"):
-        read_photo(Frame("a.png", path, np.eye(4), {"fl_x": 3.0}))
+        read_photo(PosedFrame("a.png", path, np.eye(4), {"fl_x": 3.0}))
     assert np.array_equal(read_photo(camera(path, shape, ignores_exif=True)), stored)
 
 
@@ -550,7 +550,7 @@ def picture_undistort(intrinsics):
 def test_an_undistorted_photo_shows_what_its_sensor_renders(name, rgb):
     """The directions are those of the sensor's own rays, not of this module's idea of them."""
     i = LENSES[name]
-    image, mask, sensor = undistorted(View("a", Camera(i, POSE), picture_undistort(i)))
+    image, mask, sensor = undistorted(PhotoView("a", Camera(i, POSE), picture_undistort(i)))
     rays = rgb.load_dict(sensor)
     x, y = np.meshgrid((np.arange(90) + 0.5) / 90, (np.arange(70) + 0.5) / 70)
     ray, _ = rays.sample_ray(0.0, 0.5, rgb.Point2f(x.ravel(), y.ravel()), rgb.Point2f(0.5, 0.5))
@@ -562,14 +562,14 @@ def test_an_undistorted_photo_shows_what_its_sensor_renders(name, rgb):
 
 def test_an_undistorted_photo_of_a_plain_lens_is_the_photo():
     photo = picture_undistort(PLAIN)
-    image, mask, sensor = undistorted(View("a", Camera(PLAIN, POSE), photo))
+    image, mask, sensor = undistorted(PhotoView("a", Camera(PLAIN, POSE), photo))
     assert np.array_equal(image, photo) and mask.all() and sensor["film"]["width"] == 90
 
 
 def test_what_the_photo_does_not_show_is_masked():
     """A pincushion photo holds less than the pinhole picture of its size; the mask says so pixel by pixel."""
     i = replace(PLAIN, k1=0.3)
-    _, mask, _ = undistorted(View("a", Camera(i, POSE), picture_undistort(i)))
+    _, mask, _ = undistorted(PhotoView("a", Camera(i, POSE), picture_undistort(i)))
     d = pixel_directions(PLAIN)
     x, y = d[..., 0] / -d[..., 2], d[..., 1] / d[..., 2]
     grow = 1 + 0.3 * (x * x + y * y)
@@ -582,10 +582,11 @@ def test_transparent_pixels_lend_no_colour():
     i = LENSES["barrel"]
     color = np.concatenate([picture_undistort(i), np.ones((70, 90, 1), np.float32)], axis=2)
     color[:, 45:] = [1, 0, 1, 0]
-    image, mask, _ = undistorted(View("a", Camera(i, POSE), color))
+    image, mask, _ = undistorted(PhotoView("a", Camera(i, POSE), color))
     clear = mask & (image[..., 3] > 0.5)
     assert (
-        np.abs(image[..., :3] - undistorted(View("a", Camera(i, POSE), picture_undistort(i))).image)[clear].max() < 0.15
+        np.abs(image[..., :3] - undistorted(PhotoView("a", Camera(i, POSE), picture_undistort(i))).image)[clear].max()
+        < 0.15
     )
     assert np.all(image[..., 3][:, 50:] < 0.3)
 

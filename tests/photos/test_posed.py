@@ -8,7 +8,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.photos import posed
-from nerg_mi.photos.posed import Frame, drop_repeated, read_semidense, rigid_pose
+from nerg_mi.photos.posed import PosedFrame, drop_repeated, read_semidense, rigid_pose
 from nerg_mi.photos.transforms import read_transforms
 from tests.photos.written_sets import frame
 
@@ -95,8 +95,8 @@ def test_what_is_no_pose(matrix, reason):
 def test_an_image_that_is_listed_again_counts_once(tmp_path):
     (tmp_path / "a.png").touch()
     (tmp_path / "b.png").symlink_to(tmp_path / "a.png")
-    first = Frame("a.png", tmp_path / "a.png", np.eye(4), {})
-    again = Frame("b.png", tmp_path / "b.png", np.diag([1.0, -1, -1, 1]), {})
+    first = PosedFrame("a.png", tmp_path / "a.png", np.eye(4), {})
+    again = PosedFrame("b.png", tmp_path / "b.png", np.diag([1.0, -1, -1, 1]), {})
     kept, unused = drop_repeated([first, again])
     assert kept == [first] and "another pose" in unused[0].reason
 

@@ -26,7 +26,7 @@ from nerg_mi.photos.images import read_image
 from nerg_mi.photos.structure import (
     EXHAUSTIVE,
     Folders,
-    Picture,
+    PhotoCopy,
     Settings,
     cameras_of,
     check_installed,
@@ -295,16 +295,16 @@ def test_files_are_of_their_names_kind(suffix, kind):
 def test_pictures_of_one_size_share_a_camera():
     upright, across = ((3, 4), (3, 4)), ((4, 3), (4, 3))
     sizes = [upright, across, upright, upright]
-    pictures = [Picture(str(k), *size) for k, size in enumerate(sizes)]
+    pictures = [PhotoCopy(str(k), *size) for k, size in enumerate(sizes)]
     assert cameras_of(pictures) == [0, 1, 0, 0] and cameras_of(pictures, share=False) == [0, 1, 2, 3]
-    made = [Picture(str(k), *upright, made_by=("maker", focal)) for k, focal in enumerate(["4.2", "4.2", "9"])]
+    made = [PhotoCopy(str(k), *upright, made_by=("maker", focal)) for k, focal in enumerate(["4.2", "4.2", "9"])]
     assert cameras_of(made) == [0, 0, 1]
 
 
 # ---- The process that finds poses, from outside: what it is given, and how its end is told ----
 
 
-PICTURES = [Picture(f"{k}.jpg", (400, 300), (200, 150), focal=380.0 if k else None) for k in range(4)]
+PICTURES = [PhotoCopy(f"{k}.jpg", (400, 300), (200, 150), focal=380.0 if k else None) for k in range(4)]
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 
 from nerg_mi.fields.splats import Splats
 from nerg_mi.surfaces.mesh import Mesh, weld
-from nerg_mi.surfaces.sources import Looker
+from nerg_mi.surfaces.sources import SurfaceObserver
 
 _QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 
@@ -52,7 +52,7 @@ def lookers_of_law(law):
 
     def make(eye):
         center = mi.Point3f(np.asarray(eye, float).tolist())
-        return Looker(center, lambda p_od, p_o, r_o, active: law(r_o), law)
+        return SurfaceObserver(center, lambda p_od, p_o, r_o, active: law(r_o), law)
 
     return make
 

@@ -9,7 +9,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces import mesh
 from nerg_mi.surfaces import mesh as module
-from nerg_mi.surfaces.mesh import Target, refine, shape_triangles, texture_rows, unroll, weld
+from nerg_mi.surfaces.mesh import SurfaceTarget, refine, shape_triangles, texture_rows, unroll, weld
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.surfaces.meshes import box, joined, plate
 
@@ -107,7 +107,7 @@ def test03_too_many(monkeypatch):
 
 def test01_each_ray_ends_where_it_should(rgb):
     room, inner = joined(box((0, 0, 0), (4, 3, 2), without=1)), box((2, 1, 0.5), (3, 2, 1.5))
-    target = Target(room, [inner])
+    target = SurfaceTarget(room, [inner])
     d = fibonacci_directions(4000)[1:]
     eye = np.array([1.0, 1.5, 1.0])
     found = target.ends(np.broadcast_to(eye, d.shape), d)
@@ -128,7 +128,7 @@ def test01_each_ray_ends_where_it_should(rgb):
 def test02_a_ray_may_end_in_a_medium_before(rgb):
     fog = rgb.load_dict({"type": "constvolume", "value": 100.0, "to_world": rgb.ScalarTransform4f().scale(0.5)})
     sheet = (np.array([(-2.0, -2, 2), (2, -2, 2), (2, 2, 2), (-2, 2, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
-    target = Target(joined(sheet), medium=VolumeMedium(fog))
+    target = SurfaceTarget(joined(sheet), medium=VolumeMedium(fog))
     origins = np.array([(0.25, 0.25, -1), (1.0, 1.0, -1)])
     found = target.ends(origins, np.broadcast_to([0.0, 0, 1], (2, 3)))
     assert found.elsewhere.tolist() == [True, False] and (found.face >= 0).tolist() == [False, True]

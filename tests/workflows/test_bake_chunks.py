@@ -15,7 +15,7 @@ from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import merge
-from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays
+from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings, TrackedRays, WeightedObservers
 from nerg_mi.workflows import bake_chunks
 from nerg_mi.workflows.bake_chunks import (
     BakeScene,
@@ -59,8 +59,8 @@ def test01_parts_are_cut_alike_and_a_pickled_scene_gives_the_same(rgb, monkeypat
 
 
 def test02_observers_of_a_field(rgb):
-    scene = BakeScene(ROOM, gaze=files(store) / "shoppers.safetensors", of_gaze=GazeSettings(angle=0.2))
-    crowd = Crowd(np.array([(4.4, 2.8, 1.6)] * 5), np.full(5, 0.2))
+    scene = BakeScene(ROOM, gaze=files(store) / "shoppers.safetensors", of_gaze=GazeSumSettings(angle=0.2))
+    crowd = WeightedObservers(np.array([(4.4, 2.8, 1.6)] * 5), np.full(5, 0.2))
     parts = list(parts_of(crowd))
     assert [len(p.weights) for p in parts] == [4, 1]
     found = scene.sums(parts[1])
@@ -69,7 +69,7 @@ def test02_observers_of_a_field(rgb):
 
 def test03_without_a_field_nobody_looks(rgb):
     with pytest.raises(NergError, match="there is no gaze field"):
-        BakeScene(ROOM).sums(Crowd(np.ones((1, 3)), np.ones(1)))
+        BakeScene(ROOM).sums(WeightedObservers(np.ones((1, 3)), np.ones(1)))
 
 
 # ---- Who looks ----
@@ -209,7 +209,7 @@ def test01_a_pickled_scene_gives_the_same_and_another_file_is_another_scene(scen
 
 def test02_without_a_field_nobody_looks(scene):
     with pytest.raises(NergError, match="there is no gaze field"):
-        scene.sums(Crowd(np.ones((1, 3)), np.ones(1)))
+        scene.sums(WeightedObservers(np.ones((1, 3)), np.ones(1)))
 
 
 def test03_how_far_apart_two_ideas_of_a_surface_may_be(rgb):

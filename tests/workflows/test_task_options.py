@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from nerg_mi.aoi.measured import CountOptions, PredictionOptions, StatisticsOptions
-from nerg_mi.surfaces.sources import GazeSettings, RaySettings
+from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
 from nerg_mi.tasks.task import Part, Plan, rebuilt
 from nerg_mi.workflows.ablation import AblationOptions, training_options
 from nerg_mi.workflows.evaluate import FoldOptions, fold_options
@@ -39,7 +39,7 @@ AFTER_COUNTS |= {"names", "salt", "resamples", "seed"} | STORE
 OF_COUNTS = {f.name for f in fields(CountOptions)} - {f.name for f in fields(PredictionOptions)}
 COMMANDS["stats, counts"] = (StatisticsOptions, lambda o: as_base(o, CountOptions), AFTER_COUNTS | {"directions"})
 COMMANDS["stats, a field"] = (StatisticsOptions, lambda o: as_base(o, PredictionOptions), AFTER_COUNTS | OF_COUNTS)
-COMMANDS["bake, a field"] = (GazeSettings, lambda o: o, set())
+COMMANDS["bake, a field"] = (GazeSumSettings, lambda o: o, set())
 COMMANDS["bake, rays"] = (RaySettings, lambda o: o, set())
 
 

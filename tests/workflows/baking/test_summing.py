@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays
+from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings, TrackedRays, WeightedObservers
 from nerg_mi.tasks.engines import Output
 from nerg_mi.workflows import bake_chunks
 from nerg_mi.workflows.bake import bake
@@ -49,7 +49,7 @@ def engine(rgb, monkeypatch):
 
 def crowd(n):
     at = np.random.default_rng(1).uniform((3, 2, 1.4), (5, 4, 1.8), (n, 3))
-    return Crowd(at, np.full(n, 1 / n))
+    return WeightedObservers(at, np.full(n, 1 / n))
 
 
 def rays(n, seed=0):
@@ -77,13 +77,13 @@ def equal(one, other):
 
 @pytest.mark.nightly
 def test_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again(tmp_path):
-    scene = BakeScene(ROOM, gaze=GAZE, of_gaze=GazeSettings(angle=0.5, directions=1024), of_rays=RAYS)
+    scene = BakeScene(ROOM, gaze=GAZE, of_gaze=GazeSumSettings(angle=0.5, directions=1024), of_rays=RAYS)
     groups = [crowd(3), rays(500)]
     whole = sums_in_one_go(scene, groups, Recorder())
     assert equal(sums_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake"), whole)
     # Started again with two observers more: one part is another one, and one is new.
     told = Recorder()
-    more = [Crowd(np.r_[groups[0].positions, groups[0].positions[:2]], np.full(5, 1 / 3)), groups[1]]
+    more = [WeightedObservers(np.r_[groups[0].positions, groups[0].positions[:2]], np.full(5, 1 / 3)), groups[1]]
     sums_in_parts(scene, more, parts(tmp_path, told), "a bake")
     assert told.steps[-1][1].startswith("5 of 5 parts") and made(told) == 2
 
@@ -112,7 +112,7 @@ def test_files_that_were_sent_serve_as_those_that_lie_there(tmp_path):
     write_ply_splats(tmp_path / "wall.ply", plain)
     for scene, who in (
         (
-            BakeScene(ROOM, (box((1, 1, 0), (2, 2, 1)),), GAZE, of_gaze=GazeSettings(angle=0.5, directions=1024)),
+            BakeScene(ROOM, (box((1, 1, 0), (2, 2, 1)),), GAZE, of_gaze=GazeSumSettings(angle=0.5, directions=1024)),
             crowd(1),
         ),
         (SplatScene(tmp_path / "wall.ply", len(plain), of_rays=RAYS), falling(100)),
