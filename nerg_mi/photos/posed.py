@@ -25,25 +25,7 @@ from .cameras import Intrinsics
 # coordinates and units; readers do not re-centre, scale or turn them.
 
 
-LENS_KEYS = (
-    "w",
-    "h",
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "k1",
-    "k2",
-    "p1",
-    "p2",
-    "k3",
-    "k4",
-    "k5",
-    "k6",
-    "camera_angle_x",
-    "camera_angle_y",
-    "fisheye",
-)
+LENS_KEYS = tuple("w h fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6 camera_angle_x camera_angle_y fisheye".split())
 """Keys of `PosedFrame.lens`, all floats: pixels, radians, and coefficients as `Intrinsics` has them; "fisheye" is 1 for
 fisheye lenses."""
 

@@ -26,6 +26,10 @@ def joined(*parts) -> Mesh:
     return weld(np.concatenate([v for v, _ in parts]), faces)[0]
 
 
+def longest_edge(mesh: Mesh) -> float:
+    return float(np.linalg.norm(mesh.corners - np.roll(mesh.corners, 1, axis=1), axis=2).max())
+
+
 def plate(n: int, jitter: float = 0.0, side: float = 1.0, z: float = 0.0, seed: int = 0) -> tuple:
     """A square sheet of n x n vertices around the origin, those within moved by ``jitter`` cells at most."""
     x = np.linspace(-side / 2, side / 2, n)

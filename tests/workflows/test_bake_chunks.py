@@ -31,7 +31,7 @@ from nerg_mi.workflows.bake_chunks import (
 )
 from nerg_mi.workflows.bake_options import BakeOptions
 from tests.plugins import fields
-from tests.surfaces.meshes import box, joined, wall
+from tests.surfaces.meshes import box, joined, longest_edge, wall
 from tests.surfaces.test_splats import falling
 from tests.workflows.recorder import Recorder
 
@@ -154,7 +154,7 @@ def test01_a_mesh_is_cut_as_finely_as_asked_in_metres(rgb, tmp_path):
     assert found.names == ("a",) and found.index.tolist() == list(range(12)) and not found.others
     assert told.messages == ["a.ply: 2 faces that repeat others left out"]
     # Two scene units a metre.
-    assert cut(found, 0.25, 2.0).mesh.longest.max() <= 0.5
+    assert longest_edge(cut(found, 0.25, 2.0).mesh) <= 0.5
     assert 50_000 < len(cut(found, None, 1.0).mesh.faces) < 250_000
 
 
