@@ -28,7 +28,7 @@ from nerg_mi.statistics.shares import (
     unhidden,
 )
 from nerg_mi.statistics.tables import BY_NAME, FIELD, PLACES, MinParticipantsFilter, Participants, Row
-from nerg_mi.statistics.visits import ALL, Aoi, Cell, VisitRules
+from nerg_mi.statistics.visits import ALL, Aoi, Cell
 from nerg_mi.workflows.base import SILENT, Reporter
 
 from .measured import AoiContext, CountOptions, PredictionOptions, SettingOptions, TimeWindow, Viewpoints, parse_window
@@ -196,12 +196,6 @@ class AoiScene:
         """In units of the place."""
         return self.options.margin * self.around.scale
 
-    @property
-    def rules(self) -> VisitRules:
-        """What a look is."""
-        assert isinstance(self.options, CountOptions)
-        return rules_of(self.options)
-
     def counting(self, hits: bool, cohorts: tuple[str, ...]) -> AoiContext:
         """How rays are counted which end at their ``hits``, or not, and have these ``cohorts`` where no table does."""
         o = self.options
@@ -218,7 +212,7 @@ class AoiScene:
             self.areas.names,
             self.members,
             leaves,
-            self.rules,
+            o.visit_rules(),
             self.margin,
             o.tolerance,
             hits,
@@ -260,18 +254,10 @@ class AoiScene:
         return reach
 
 
-def rules_of(options: CountOptions) -> VisitRules:
-    """What a look is. Raises `NergError` for options that contradict each other."""
-    return VisitRules(options.gap, options.pause, options.merge, options.least)
-
-
 def setting_of(
     scene: Path | None, field: Path | None, gaze: Path | None, areas: AreaSet, options: SettingOptions, ns: ModuleType
 ) -> AoiScene:
     """The setting of these files. Raises `NergError`; what is plainly wrong is told before anything is loaded."""
-    if isinstance(options, CountOptions):
-        # Before anything is read.
-        rules_of(options)
     align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
     around = surroundings_of_files(scene, field, gaze, align, ns)
     meshes = read_meshes(areas.meshes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,6 +24,7 @@ from nerg_mi.formats.areas import (
     SceneShape,
     check_name,
     is_number,
+    mesh_beside,
     parse_box,
 )
 from nerg_mi.formats.fields import load_gaze
@@ -423,13 +423,7 @@ def _put(given: Any, key: str, path: Path) -> Put:
     check_name(name)
     if "mesh" not in given:
         return Put(name, parse_box(AreaEntry(name, given, f'"{plain(name, 40)}"')))
-    mesh = _word(given["mesh"], "mesh")
-    folder = os.path.realpath(path.parent)
-    if os.path.isabs(mesh) or os.path.commonpath([folder, os.path.realpath(os.path.join(folder, mesh))]) != folder:
-        raise NergError(f'"{plain(mesh, 80)}" lies outside of the folder of the changes; put it, or a copy, there')
-    if Path(mesh).suffix.lower() not in (".ply", ".obj"):
-        raise NergError(f'the mesh "{plain(mesh, 80)}" is no .ply or .obj; convert it')
-    return Put(name, path.parent / mesh)
+    return Put(name, mesh_beside(given["mesh"], path, "changes"))
 
 
 def _word(given: Any, what: str) -> str:

@@ -245,11 +245,7 @@ def write_exr(
     taken = _OF_THE_FORMAT & set(attributes or {})
     if taken:
         raise ValueError(f"the attributes {', '.join(sorted(taken))} belong to the format; give them other names")
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        **(attributes or {}),
-    }
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
     data = {name: np.ascontiguousarray(value) for name, value in channels.items()}
     rows = len(next(iter(data.values())))
     with replacing(path) as temporary:

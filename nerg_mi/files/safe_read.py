@@ -63,7 +63,6 @@ _DAMAGED = (
     pickle.UnpicklingError,
 )
 
-
 _REMEDY = "copy it again, or make it anew"
 
 

@@ -538,11 +538,7 @@ def _other(entry: AreaEntry, path: Path) -> list[Area]:
         raise NergError(f"an area needs a name, as in {_READING_EXAMPLE}")
     check_name(name)
     if "mesh" in given:
-        file = _inside(given["mesh"], path)
-        if file.suffix.lower() not in MESHES:
-            raise NergError(
-                f'the mesh "{plain(file.name, 60)}" is no .ply or .obj; convert it to one of {", ".join(MESHES)}'
-            )
+        file = mesh_beside(given["mesh"], path)
         return [MeshPart(name, file, None if given.get("faces") is None else _ranges(given["faces"]))]
     if "shape" in given:
         if not isinstance(given["shape"], str) or not given["shape"]:
@@ -563,14 +559,25 @@ def _objects(entry: AreaEntry, path: Path) -> list[Area]:
     return [*objects, AreaGroup(entry.name, tuple(a.name for a in objects))]
 
 
-def _inside(name: object, path: Path) -> Path:
-    """The file or folder ``name`` beside the file of areas ``path``, or below."""
-    if not isinstance(name, str) or not name or "\0" in name or len(name) > 1000:
-        raise NergError(f"a file is named by a text, as in {_READING_EXAMPLE}")
+def mesh_beside(name: object, path: Path, what: str = "areas") -> Path:
+    """The mesh ``name`` (.ply, .obj) beside the file ``path`` of ``what``, or below. Raises `NergError` for other
+    names."""
+    file = _inside(name, path, what)
+    if file.suffix.lower() not in MESHES:
+        raise NergError(
+            f'the mesh "{plain(file.name, 60)}" is no .ply or .obj; convert it to one of {", ".join(MESHES)}'
+        )
+    return file
+
+
+def _inside(name: object, path: Path, what: str = "areas") -> Path:
+    """The file or folder ``name`` beside the file ``path`` of ``what``, or below."""
+    if not isinstance(name, str) or not 0 < len(name) <= 1000 or "\0" in name:
+        raise NergError('a file is named by a text, as in {"name": "a", "mesh": "sign.ply"}')
     folder = os.path.realpath(path.parent)
     found = os.path.realpath(os.path.join(folder, name))
     if os.path.isabs(name) or os.path.commonpath([folder, found]) != folder:
-        raise NergError(f'"{plain(name, 80)}" lies outside of the folder of the areas; put it, or a copy, there')
+        raise NergError(f'"{plain(name, 80)}" lies outside of the folder of the {what}; put it, or a copy, there')
     return path.parent / name
 
 

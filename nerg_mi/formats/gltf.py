@@ -44,8 +44,6 @@ _QUANTIZATION, _INSTANCING = "KHR_mesh_quantization", "EXT_mesh_gpu_instancing"
 # Beginnings of extensions that change how triangles look, and not where they are.
 _LOOKS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
 _TRIANGLES = 4
-
-
 Attribute = tuple[str, np.ndarray, bool]
 """Name of a vertex attribute, its values (V,) or (V, components), and whether integers stand for 0 to 1."""
 

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -367,12 +367,10 @@ def _job(pictures: list[PhotoCopy], settings: Settings) -> dict[str, Any]:
             }
         )
     return {
+        **asdict(settings),
         "pictures": [{"name": p.name, "camera": n} for p, n in zip(pictures, numbers)],
         "cameras": cameras,
         "lens": LENSES[settings.lens],
-        "matching": settings.matching,
-        "orient": settings.orient,
-        "seed": settings.seed,
         "threads": settings.threads or -1,
     }
 

@@ -110,16 +110,12 @@ class Measure:
         return proportions(x, y) if binary else ratios(x, y, resamples=resamples, seed=seed, most=self.most)
 
 
-def _share(p: Participants) -> Pair:
-    time = np.where(p.time > 0, p.time, 1)[:, None]
-    return np.where(p.timed, p.on_time / time, 0), np.repeat(p.timed, p.on_time.shape[1], axis=1).astype(float)
-
-
-def _visible_share(p: Participants) -> Pair | None:
-    if p.visible is None:
+def _share(p: Participants, seconds: np.ndarray | None) -> Pair | None:
+    """The share that ``seconds`` (P, A) are of each participant's time."""
+    if seconds is None:
         return None
     time = np.where(p.time > 0, p.time, 1)[:, None]
-    return np.where(p.timed, p.visible / time, 0), np.repeat(p.timed, p.on_time.shape[1], axis=1).astype(float)
+    return np.where(p.timed, seconds / time, 0), np.repeat(p.timed, seconds.shape[1], axis=1).astype(float)
 
 
 def _first(p: Participants) -> Pair | None:
@@ -148,7 +144,7 @@ MEASURES = (
         title="share of time",
         definition="mean of D_pk / T_p",
         over="people with time",
-        pair=_share,
+        pair=lambda p: _share(p, p.on_time),
         most=1.0,
         compared=True,
     ),
@@ -199,7 +195,7 @@ MEASURES = (
         title="visible share",
         definition="mean of V_pk / T_p",
         over="people with time",
-        pair=_visible_share,
+        pair=lambda p: _share(p, p.visible),
         most=1.0,
     ),
     Measure(

@@ -213,7 +213,7 @@ class _Work:
         return result
 
     def _counting(self, rays: Path | Rays) -> AoiContext:
-        first = next(blocks_of(rays, self.setting.rules))
+        first = next(blocks_of(rays, self.options.visit_rules()))
         hits = self.around.place is None and first.hit is not None and bool(np.isfinite(first.hit).any())
         if self.around.place is None:
             self.reporter.message(
@@ -256,7 +256,7 @@ class _Work:
         """The sums of each block, in this process."""
         done = 0
         with Interruption() as stop:
-            for block in blocks_of(rays, self.setting.rules):
+            for block in blocks_of(rays, self.options.visit_rules()):
                 stop.check()
                 yield count_block(block, counting)
                 if seen is not None:

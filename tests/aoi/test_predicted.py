@@ -55,7 +55,6 @@ class Law(GazeScene):
 
 AROUND = Law(None, None, Similarity())
 
-
 EYES = Viewpoints(
     np.array([[0.0, 0, 0], [0, 0, 0.2], [0, 0, 0]]),
     np.tile([1.0, 0, 0], (3, 1)),
@@ -185,14 +184,12 @@ def test_what_is_plainly_wrong_is_told_before_anything_is_loaded(tmp_path, rgb):
 
 ZONE = Cell("zone", "z")
 
-
 TRUST_EYES = Viewpoints(
     np.zeros((3, 3)),
     np.ones((3, 3)),
     ("Ada", "Ada", "Bo"),
     (frozenset([ALL]), frozenset([ALL, ZONE]), frozenset([ALL])),
 )
-
 
 TIMES = {ALL: {"Ada": 2.0, "Bo": 6.0}, ZONE: {"Ada": 1.0}}
 
@@ -256,8 +253,6 @@ def test_few_places_a_person_are_told():
 
 
 AREAS = AreaSet((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])))
-
-
 WHAT_IF_EYES = places_of(np.arange(15.0).reshape(5, 3))
 
 

@@ -23,8 +23,6 @@ def checked(path: Path, *boxes: bytes) -> None:
 
 
 DATA = box(b"mdat", bytes(1000))
-
-
 FILE = "film.mp4"
 
 
@@ -108,8 +106,6 @@ def edits(*entries: tuple[int, int, int], long: bool = False) -> bytes:
 
 
 STEADY = runs(b"stts", (6, 1000))
-
-
 ONCE = 1 << 16  # the speed of an edit
 
 

@@ -223,10 +223,7 @@ BOX_HEAD = (
     "p_local_obj_zmin[m],p_local_obj_zmax[m]"
 )
 
-
 POSE_HEAD = "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m],q_wo_w,q_wo_x,q_wo_y,q_wo_z"
-
-
 HALF = np.sqrt(0.5)
 
 

@@ -174,8 +174,6 @@ def test_what_is_stored_is_finite():
 
 
 FIELDS_GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
-
-
 BOX = Box((-1, 0, 2), (3, 2, 4))
 
 

@@ -72,11 +72,7 @@ def quaternion(matrix):
 
 
 POINTS = np.random.default_rng(2).normal(size=(6, 3))
-
-
 TRACKS, ERRORS = [4, 3, 2, 5, 3, 7], [0.5, 1.0, 0.5, 9.0, 2.0, 0.1]
-
-
 TRUSTED = [0, 1, 4, 5]
 
 

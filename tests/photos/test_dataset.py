@@ -53,8 +53,6 @@ def directions(count, seed=4):
 
 
 AROUND = [looking(np.array([1, 2, 3]) + 4 * d, [1, 2, 3]) for d in directions(20)]
-
-
 INSIDE = [looking(c, c + d) for c, d in zip(np.random.default_rng(4).uniform(0, 4, (20, 3)), directions(20))]
 
 

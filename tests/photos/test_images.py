@@ -481,14 +481,12 @@ def test_files_of_frames_and_of_held_out_frames_are_no_leftovers(ring):
 
 PLAIN = Intrinsics(90, 70, 80.0, 80.0, 44.0, 36.5)
 
-
 LENSES = {
     "barrel": replace(PLAIN, k1=-0.15, k2=0.03, p1=0.002, p2=-0.001),
     "pincushion": replace(PLAIN, k1=0.1),
     "oblong": replace(PLAIN, fy=84.0),
     "fisheye": replace(PLAIN, k1=0.02, k2=-0.004, fisheye=True),
 }
-
 
 POSE = np.array([[0, 0, 1.0, 1], [1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]])
 

@@ -18,11 +18,7 @@ from nerg_mi.photos.salience import open_salience, pixel_solid_angles, read_sali
 
 
 PLAIN = Intrinsics(96, 64, 60.0, 55.0, 44.0, 30.5)
-
-
 BARREL = replace(PLAIN, k1=-0.15, k2=0.03, p1=0.002, p2=-0.001)
-
-
 FISHEYE = Intrinsics(96, 64, 40.0, 41.0, 47.0, 31.0, 0.02, -0.004, fisheye=True)
 
 

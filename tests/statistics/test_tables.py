@@ -36,7 +36,6 @@ PEOPLE = Participants(
     first_count=np.array([[2.0, 0], [1, 1], [0, 0]]),
 )
 
-
 EXPECTED = {
     "share": ([(0.2 + 0.2) / 2, (0 + 0.05) / 2], [2, 2]),
     "dwell": ([6 / 3, 1 / 3], [3, 3]),
@@ -118,8 +117,6 @@ def test02_nobody_knows_what_was_visible():
 
 
 A, B = Cell("cohort", "a"), Cell("cohort", "b")
-
-
 HOW = {"resamples": 299, "seed": 0}
 
 

@@ -256,8 +256,6 @@ def test07_times_on_the_bounds():
 
 
 RULES = VisitRules(gap=0.5, pause=5.0, merge=0.25, least=0.15)
-
-
 AREAS = ("a", "b", "c")
 
 

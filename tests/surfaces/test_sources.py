@@ -81,14 +81,8 @@ def test03_bundles_are_gaussian_unit_and_the_same_for_a_seed():
 
 
 ROOM = box((0, 0, 0), (4, 3, 2.5))
-
-
 SHELF = box((1.5, 2, 0), (3, 2.4, 1.8))
-
-
 SETTINGS = GazeSumSettings()
-
-
 MEAN = np.array([0.84, 0.5, -0.2]) / np.linalg.norm([0.84, 0.5, -0.2])
 
 

@@ -117,8 +117,6 @@ def test02_up_to_a_distance_and_no_farther_than_is_asked_for(rgb):
 
 
 LINE = RaySettings()
-
-
 CONE = RaySettings(cone=np.radians(1.5), bundle=8, seed=5)
 
 
@@ -276,8 +274,6 @@ def test04_many_in_one_cell_have_one_density_and_a_length_has_to_be_positive():
 
 
 EYE = np.array([[0.0, 0, -2]])
-
-
 ALONG = np.array([0.0, 0, 1])
 
 
