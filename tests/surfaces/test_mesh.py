@@ -1,6 +1,6 @@
 """Tests of `nerg_mi.surfaces.mesh`."""
 
-import builtins
+import sys
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces import mesh
-from nerg_mi.surfaces import mesh as module
 from nerg_mi.surfaces.mesh import SurfaceTarget, refine, shape_triangles, texture_rows, unroll, weld
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.surfaces.meshes import box, joined, longest_edge, plate
@@ -136,13 +135,11 @@ def test02_a_ray_may_end_in_a_medium_before(rgb):
 # ---- Charts ----
 
 
-xatlas = pytest.importorskip("xatlas", reason="xatlas is not installed")
-
-
 @pytest.mark.parametrize("scale", [1e-5, 1e5])
 @pytest.mark.parametrize("rows", [3, 100, 256])
 def test01_a_texture_has_at_each_point_what_the_surface_has(rgb, scale, rows, monkeypatch):
-    monkeypatch.setattr(module, "TEXTURE_ROWS", rows)
+    pytest.importorskip("xatlas", reason="xatlas is not installed")
+    monkeypatch.setattr("nerg_mi.surfaces.mesh.TEXTURE_ROWS", rows)
     mesh, pixels = joined(box((0, 0, 0), (scale, 2 * scale, 0.5 * scale))), 256
     refined = refine(mesh, 0.2 * scale)
     charts = unroll(mesh, pixels)
@@ -163,20 +160,14 @@ def test01_a_texture_has_at_each_point_what_the_surface_has(rgb, scale, rows, mo
 
 
 def test02_what_does_not_fit(rgb, monkeypatch):
-    mesh = joined(box((0, 0, 0), (1, 1, 1)))
-    monkeypatch.setattr(module, "MOST_CHART_FACES", 4)
+    pytest.importorskip("xatlas", reason="xatlas is not installed")
+    cube = joined(box((0, 0, 0), (1, 1, 1)))
+    monkeypatch.setattr(mesh, "MOST_CHART_FACES", 4)
     with pytest.raises(NergError, match="leave out --texture"):
-        unroll(mesh, 64)
+        unroll(cube, 64)
 
 
 def test03_without_xatlas_the_extra_is_named(monkeypatch):
-    original = builtins.__import__
-
-    def missing(name, *rest, **more):
-        if name == "xatlas":
-            raise ImportError(name)
-        return original(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
+    monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.raises(ImportError, match=r'pip install "nerg-mi\[bake\]"'):
         unroll(joined(box((0, 0, 0), (1, 1, 1))), 64)
