@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, import_extra, plain
 
 from .atomic import replacing
 from .safe_read import reading, size_of
@@ -311,8 +311,4 @@ def _encoding(path: str | os.PathLike, av: Any) -> Iterator[None]:
 
 
 def _pyav() -> Any:
-    try:
-        import av
-    except ImportError:
-        raise ImportError('a video needs PyAV, which is not installed: pip install "nerg-mi[video]"') from None
-    return av
+    return import_extra("av", "a video needs PyAV", "video")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, plain
+from nerg_mi.errors import MissingFile, NergError, import_extra, plain
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.safe_read import open_zip, read_member, reading, size_of
 
@@ -86,12 +86,7 @@ _STANDINS = [
 
 
 def _import_torch() -> Any:
-    try:
-        import torch
-    except ImportError:
-        raise ImportError(
-            'checkpoints of torch need torch, which is not installed: pip install "nerg-mi[torch]"'
-        ) from None
+    torch = import_extra("torch", "checkpoints of torch need torch", "torch")
     # Before, weights_only could be led to run code (CVE-2025-32434).
     if tuple(int(n) for n in re.findall(r"\d+", torch.__version__)[:2]) < (2, 6):
         raise ImportError(

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, import_extra
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.safe_read import reading, size_of
 from nerg_mi.files.video import check_movie
@@ -119,11 +119,7 @@ def sharpest_frames(video: str | Path, count: int, threads: int | None = None) -
 
 
 def _pyav() -> Any:
-    try:
-        import av
-    except ImportError:
-        raise ImportError('frames of a video need PyAV, which is not installed: pip install "nerg-mi[poses]"') from None
-    return av
+    return import_extra("av", "frames of a video need PyAV", "poses")
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, import_extra
 from nerg_mi.maths.arrays import aligned, vector_of
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.types import variant_types
@@ -375,11 +375,7 @@ class Charts:
 
 def unroller() -> Any:
     """The package xatlas; `ImportError` with the remedy where it is not installed."""
-    try:
-        import xatlas
-    except ImportError:
-        raise ImportError('a texture needs xatlas, which is not installed: pip install "nerg-mi[bake]"') from None
-    return xatlas
+    return import_extra("xatlas", "a texture needs xatlas", "bake")
 
 
 def unroll(mesh: Mesh, pixels: int) -> Charts:
