@@ -194,9 +194,7 @@ def _srgb(field: RadianceField, sampler: Sampler, p, normals) -> np.ndarray:
     return encode_srgb(c) if field.color_space == "linear" else c
 
 
-# ----------------------------------------------------------------------------
-# Files
-# ----------------------------------------------------------------------------
+# ---- Files ----
 
 
 def write_ply(surface: Surface, path: str | Path) -> None:
