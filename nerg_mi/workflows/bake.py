@@ -29,7 +29,7 @@ from nerg_mi.maths.color import decode_srgb
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, merge
 from nerg_mi.surfaces.mesh import Mesh, RefinedMesh, texture_rows, unroll, unroller
-from nerg_mi.surfaces.sources import WeightedObservers, GazeSumSettings, RaySettings, TrackedRays, ray_seconds
+from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings, TrackedRays, WeightedObservers, ray_seconds
 
 from .bake_chunks import (
     BakeScene,
