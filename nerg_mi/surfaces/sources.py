@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.arrays import vector_of
-from nerg_mi.maths.types import Point3f, Vector3f, variant_types
+from nerg_mi.maths.types import Float, Point3f, Vector3f, variant_types
 from nerg_mi.maths.vmf import tangents
 from nerg_mi.probes.surface_attention import Density, attended
 from nerg_mi.rays.filters import find_sessions
@@ -575,11 +575,8 @@ def gaze_sums(
 def _of_one(
     target: SurfaceTarget, looker: SurfaceObserver, weight: float, eye: np.ndarray, settings: GazeSumSettings
 ) -> SurfaceSums:
-    import mitsuba as mi
-
     mesh, eye = target.mesh, np.asarray(eye, np.float64)
-    along = along_through(looker, settings.cone)
-    everywhere = lambda d: np.broadcast_to(np.array(along(vector_of(mi.Vector3f, d)), np.float64), (len(d),))
+    everywhere = along_through(looker, settings.cone)
     directions, angles = sphere_rule(everywhere, settings.directions)
     share = weight * angles * everywhere(directions)
     ends = target.ends(np.broadcast_to(eye, directions.shape), directions)
@@ -604,9 +601,14 @@ def _received(
     for a in range(0, len(pieces), BATCH):
         # Most of a place is hidden from wherever one stands, and gaze costs more than rays.
         some = pieces.part(slice(a, a + BATCH))
-        some = some.part(_launch(target, looker.center, _uniform, some) > 0)
+        some = some.part(_of_seen(target, looker, uniform, some) > 0)
         if len(some):
-            yield some, some.solid_angle * _launch(target, looker.center, density, some)
+            yield some, some.solid_angle * _of_seen(target, looker, density, some)
+
+
+def _of_seen(target: SurfaceTarget, looker: SurfaceObserver, density: Density, pieces: Pieces) -> np.ndarray:
+    normals = target.mesh.normals[pieces.face]
+    return after_occlusion(target.place, looker, density, pieces.center, normals, target.falloff, target.settings)
 
 
 def unhidden(looker: SurfaceObserver, density: Density, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -615,8 +617,7 @@ def unhidden(looker: SurfaceObserver, density: Density, points: np.ndarray, dire
     mi = variant_types()
     r_o, p_od = vector_of(mi.Vector3f, directions), vector_of(mi.Point3f, points)
     p_o = looker.center + dr.zeros(mi.Point3f, len(points))
-    found = density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(points)))
-    return np.broadcast_to(np.array(found, np.float64), (len(points),))
+    return _rows(density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(points))), len(points))
 
 
 def density_through(looker: SurfaceObserver, cone: float) -> Density:
@@ -631,22 +632,39 @@ def _of_pieces(looker: SurfaceObserver, density: Density, pieces: Pieces) -> np.
     return unhidden(looker, density, pieces.center, middle / np.linalg.norm(middle, axis=1, keepdims=True))
 
 
-def _launch(target: SurfaceTarget, center: Point3f, density: Density, pieces: Pieces) -> np.ndarray:
-    """``density`` (P,) after occlusion by what may be a medium, at the centroids of ``pieces``, in 1/sr."""
+def after_occlusion(
+    place: Place,
+    looker: SurfaceObserver,
+    density: Density,
+    points: np.ndarray,
+    normals: np.ndarray,
+    falloff: float,
+    settings: ObserverSettings,
+    penetration: Float | float = 0.0,
+) -> np.ndarray:
+    """``density`` (N,) of ``looker`` after occlusion by what may be a medium, at ``points`` on surfaces with
+    ``normals`` (N, 3), in 1/sr; ``penetration`` as of `nerg_mi.probes.surface_attention.attended`."""
     mi = variant_types()
-    p_o, p = center + dr.zeros(mi.Point3f, len(pieces)), vector_of(mi.Point3f, pieces.center)
-    normals = vector_of(mi.Vector3f, target.mesh.normals[pieces.face])
-    found = attended(target.place, density, p_o, p, normals, target.falloff, target.settings, True)
-    return np.broadcast_to(np.array(found, np.float64), (len(pieces),))
+    p_o, p = looker.center + dr.zeros(mi.Point3f, len(points)), vector_of(mi.Point3f, points)
+    n = vector_of(mi.Vector3f, normals)
+    return _rows(attended(place, density, p_o, p, n, falloff, settings, True, penetration=penetration), len(points))
 
 
-def _uniform(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
+def uniform(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
+    """A density of 1, of which occlusion leaves the visibility."""
     return type(r_o.x)(1)
 
 
-def along_through(looker: SurfaceObserver, cone: float) -> Callable[[Vector3f], Any]:
-    """The density of ``looker`` in unit directions, seen through a cone as `density_through` has it."""
-    return looker.along if cone == 0 else lambda directions: blurred(looker.along, directions, cone)
+def _rows(values: Any, count: int) -> np.ndarray:
+    """What a kernel gives, (count,) float64, also where it is one constant."""
+    return np.broadcast_to(np.array(values, np.float64), (count,))
+
+
+def along_through(looker: SurfaceObserver, cone: float) -> Callable[[np.ndarray], np.ndarray]:
+    """The density (N,) of ``looker`` in unit directions (N, 3), seen through a cone as `density_through` has it."""
+    mi = variant_types()
+    along = looker.along if cone == 0 else lambda directions: blurred(looker.along, directions, cone)
+    return lambda d: _rows(along(vector_of(mi.Vector3f, d)), len(d))
 
 
 def _center(eye: np.ndarray) -> Point3f:

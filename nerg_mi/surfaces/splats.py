@@ -12,7 +12,6 @@ from scipy import sparse
 from nerg_mi.fields.splats import Splats, matrices_of
 from nerg_mi.maths.arrays import aligned, vector_of
 from nerg_mi.maths.types import variant_types
-from nerg_mi.probes.surface_attention import attended
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.march_primal import HITS_STOP
 from nerg_mi.transport.medium import LastHit, LocalRay
@@ -25,11 +24,13 @@ from .sources import (
     RaySettings,
     SurfaceObserver,
     TrackedRays,
+    after_occlusion,
     along_through,
     bundle,
     density_through,
     sphere_rule,
     unhidden,
+    uniform,
 )
 
 # ---- Splat hits ----
@@ -251,10 +252,7 @@ def gaze_and_escaped(
     """What the gaze of ``looker``, an observer at ``eye`` (3,) in the frame of ``arrays``, adds up to over the sphere,
     and how much of it meets no Gaussian: what comes through, as of rays. ``cone``: as of `sources.GazeSumSettings`.
     """
-    import mitsuba as mi
-
-    along = along_through(looker, cone)
-    density = lambda d: np.broadcast_to(np.array(along(vector_of(mi.Vector3f, d)), np.float64), (len(d),))
+    density = along_through(looker, cone)
     with dr.suspend_grad():
         directions, angles = sphere_rule(density, DIRECTIONS)
         share, escaped = angles * density(directions), 0.0
@@ -460,7 +458,8 @@ def _of_one(
         part = slice(a, a + BATCH)
         centers, scales = splats.centers[part].astype(np.float64), splats.scales[part].astype(np.float64)
         facing, normals, depth = _facing(centers - eye, matrices_of(splats.rotations[part]), scales)
-        seen = _seen(place, looker, centers, normals, depth, settings, falloff)
+        before = variant_types().Float(aligned(depth))
+        seen = after_occlusion(place, looker, uniform, centers, normals, falloff, settings, before)
         rows = np.flatnonzero(seen > 0)
         # Most of a place is hidden from wherever one stands, and gaze costs more than rays.
         if len(rows):
@@ -488,22 +487,3 @@ def _facing(to: np.ndarray, axes: np.ndarray, scales: np.ndarray) -> tuple[np.nd
     normals = -np.einsum("nij,nj->ni", axes, across)
     near = np.maximum(distance, widest)
     return np.where(length > 0, area / near**2, 0.0), normals, depth
-
-
-def _seen(
-    place: Place,
-    looker: SurfaceObserver,
-    centers: np.ndarray,
-    normals: np.ndarray,
-    depth: np.ndarray,
-    settings: ObserverSettings,
-    falloff: float,
-) -> np.ndarray:
-    """Visibility (N,) of ``centers`` on surfaces with ``normals``, which begin before them by ``depth``."""
-    mi = variant_types()
-    p, n = vector_of(mi.Point3f, centers), vector_of(mi.Vector3f, normals)
-    p_o = looker.center + dr.zeros(mi.Point3f, len(centers))
-    uniform = lambda p_od, p_o, r_o, active: type(r_o.x)(1)
-    before = mi.Float(aligned(depth).ravel())
-    found = attended(place, uniform, p_o, p, n, falloff, settings, True, penetration=before)
-    return np.broadcast_to(np.array(found, np.float64), (len(centers),))
