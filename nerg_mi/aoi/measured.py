@@ -86,7 +86,6 @@ class CountOptions(SettingOptions):
         super().__post_init__()
         for text in self.windows:
             parse_window(text)
-        self.visit_rules()
 
     def visit_rules(self) -> VisitRules:
         """What a look is. Raises `NergError` for times that contradict each other."""

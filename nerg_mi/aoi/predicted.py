@@ -258,6 +258,9 @@ def setting_of(
     scene: Path | None, field: Path | None, gaze: Path | None, areas: AreaSet, options: SettingOptions, ns: ModuleType
 ) -> AoiScene:
     """The setting of these files. Raises `NergError`; what is plainly wrong is told before anything is loaded."""
+    if isinstance(options, CountOptions):
+        # Before anything is read.
+        options.visit_rules()
     align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
     around = surroundings_of_files(scene, field, gaze, align, ns)
     meshes = read_meshes(areas.meshes)
