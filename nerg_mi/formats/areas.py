@@ -138,15 +138,13 @@ def _turn(turn: Iterable[float] | float | None, name: str) -> Quaternion | None:
         return None
     if isinstance(turn, (int, float)):
         half = math.radians(float(turn)) / 2 if math.isfinite(turn) else math.nan
-        x, y, z, w = 0.0, 0.0, math.sin(half), math.cos(half)
+        numbers = [0.0, 0.0, math.sin(half), math.cos(half)]
     else:
-        given = [float(v) for v in turn]
-        size = math.hypot(*given)
-        if len(given) != 4 or not 1e-6 < size < 1e6:
-            raise NergError(f'the turn of the area "{plain(name, 40)}" is degrees about z, or four numbers x, y, z, w')
-        x, y, z, w = (v / size for v in given)
-    if not math.isfinite(x + y + z + w):
+        numbers = [float(v) for v in turn]
+    size = math.hypot(*numbers)
+    if len(numbers) != 4 or not 1e-6 < size < 1e6:
         raise NergError(f'the turn of the area "{plain(name, 40)}" is degrees about z, or four numbers x, y, z, w')
+    x, y, z, w = numbers if isinstance(turn, (int, float)) else (v / size for v in numbers)
     return (x, y, z, w)
 
 
