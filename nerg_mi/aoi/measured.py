@@ -141,9 +141,7 @@ def parse_window(text: str) -> tuple[str, float, float]:
 
 # ---- Rays as sums ----
 
-BLOCK = 1 << 17
-"""About so many rays are looked at at once."""
-
+BLOCK = 1 << 17  # about so many rays are looked at at once
 _LAND = 1 << 15
 
 

@@ -26,16 +26,11 @@ from .measured import StatisticsOptions
 #
 # Tables of statistics as files: CSV, Markdown and, with pyarrow, Parquet.
 
-
-MOST_LINES = 10_000
-"""Rows of a table in Markdown: more are nobody's to read."""
-
+MOST_LINES = 10_000  # rows of a table in Markdown: more are nobody's to read
 _PART = 1 << 16
-
 SUPPORT = "support [rays]"
 _MEASURES = {"share": "share of gaze", "visible": "visible share"}
 _WORDS = {"cell", "value", "first", "second", "thing", "source", "person", "from", "to", "measure", "found"}
-
 Cells = Callable[[Row], Sequence[Any]]
 
 
@@ -168,10 +163,7 @@ def plain_columns(rows: Sequence[Row], names: Sequence[str] = ()) -> tuple[list[
 #
 # Results of statistics as files: a table each, pictures, and the account of how they were made.
 
-
-LARGEST_MATRIX = 60
-"""Things of which moves are drawn at most."""
-
+LARGEST_MATRIX = 60  # things of which moves are drawn at most
 _COLUMNS = {"things": thing_columns, "differences": difference_columns, "what_if": what_if_columns}
 
 

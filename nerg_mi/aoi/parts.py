@@ -170,10 +170,7 @@ _ARRAYS = tuple(f.name for f in fields(VisitSums) if f.name not in ("areas", "ce
 
 # ---- Parts ----
 
-
-EYES = 32
-"""Places of a part from which a field is asked."""
-
+EYES = 32  # places of a part from which a field is asked
 _COUNTED = 0.6  # of all, where a field is asked too
 _DONE = 0.8
 _TOLD, _CHANGED = 0.9, 0.99  # when intervals are known, and after changes

@@ -272,9 +272,7 @@ def setting_of(
 # How far what a field foretells is to be trusted: the spread of an ensemble's members, and how many rays it learnt
 # from around the eyes.
 
-
-SPREAD = ("share", "dwell", "reach")
-"""Numbers whose spread over members is told."""
+SPREAD = ("share", "dwell", "reach")  # numbers whose spread over members is told
 
 
 def add_trust(

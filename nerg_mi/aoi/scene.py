@@ -52,8 +52,7 @@ if TYPE_CHECKING:
 
 # ---- Which cohort people are of, from a table ----
 
-MOST_PEOPLE = 10_000_000
-"""So many people may have a cohort."""
+MOST_PEOPLE = 10_000_000  # so many people may have a cohort
 
 
 def read_cohorts(path: Path) -> dict[str, str]:
@@ -194,7 +193,6 @@ def _of_place(place: GazePlace, gaze: PlacedGaze | None, align: Similarity) -> G
 #
 # Areas of interest as things that rays meet: boxes in closed form, meshes and shapes by ray casts of Mitsuba.
 
-
 _RAYS = 1 << 20
 
 
@@ -319,13 +317,8 @@ def _mesh_of_part(part: MeshPart, mesh: MeshFile) -> Any:
 # shapes keep the areas that name them; boxes, which name no shape, are moved as areas. The gaze field stays as it was
 # trained: it knows places and what stood there, and says of a thing at its new place what it learnt of surfaces there.
 
-
-BYTES = 1 << 20
-"""A file of changes may have so many bytes."""
-
-MOST_CHANGES = 1000
-"""And so many changes, or observers, of a kind."""
-
+BYTES = 1 << 20  # a file of changes may have so many bytes
+MOST_CHANGES = 1000  # and so many changes, or observers, of a kind
 _KEYS = ("move", "remove", "add", "swap", "observers", "shift")
 _EXAMPLE = '{"move": [{"shape": "sign", "by": [0.5, 0, 0]}], "remove": ["stand"]}'
 

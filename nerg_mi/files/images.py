@@ -23,25 +23,19 @@ from .safe_read import open_file, reading
 
 # ---- What a picture's header says of its size, so that no decoder makes room for more than is read here ----
 
-PIXELS = 1 << 27
-"""A picture may have so many pixels: 16,384 x 8,192."""
-
-DECODED_BYTES = 3 << 27
-"""Its values may take so many bytes: three 8-bit channels of as many pixels."""
+PIXELS = 1 << 27  # a picture may have so many pixels: 16,384 x 8,192
+DECODED_BYTES = 3 << 27  # its values may take so many bytes: three 8-bit channels of as many pixels
 
 WARRANTED = 16
 """So many times its file's bytes a picture may take in any case, in pixels as in bytes: photos of 200 million pixels
 and large environment maps are no attack, where a small file that claims as much is one."""
 
-BYTES = 4 << 30
-"""A file may have so many bytes."""
+BYTES = 4 << 30  # maximum bytes of a file
 
 JPEG_BYTES = 1 << 29
 """And so many as JPEG, which is read whole: a photo of 200 million pixels has a fifth of them."""
 
-SCANS = 100
-"""A progressive JPEG may run over its pixels so many times; encoders make ten."""
-
+SCANS = 100  # a progressive JPEG may run over its pixels so many times; encoders make ten
 _EXR_HEADER_BYTES = 1 << 20
 _EXR_KINDS = {0: 4, 1: 2, 2: 4}
 
@@ -224,7 +218,6 @@ def _exr_pixel_bytes(channels: bytes) -> int:
 #
 # Mitsuba's own reader brings an older copy of that library, in which overflows are known; its own writer shares
 # Dr.Jit's thread pool and waits for ever where that has one thread.
-
 
 _OF_THE_FORMAT = set(
     "compression type channels dataWindow displayWindow lineOrder screenWindowCenter screenWindowWidth".split()

@@ -25,7 +25,6 @@ from .safe_read import reading, size_of
 # FFmpeg writes a line of its index for each sample that a table tells of, and again for each edit: a few bytes of a
 # table can tell of billions.
 
-
 _CONTAINERS = frozenset(
     b"moov trak mdia minf stbl edts moof traf mvex udta wave tref dinf ilst gmhd".split()  # whose boxes FFmpeg reads
 )
@@ -209,9 +208,7 @@ def _look(file: BinaryIO, kind: bytes, start: int, end: int, claims: _Claims) ->
 #
 # Videos that play everywhere, written frame by frame: H.264 in MP4, whole or absent.
 
-
 CODEC = "libx264"
-
 _QUALITY = "17"  # x264's constant rate factor: no difference is seen from about 18 down
 _MOST_FPS = 1000.0
 _LEAST, _MOST = 16, 8192

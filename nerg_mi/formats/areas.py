@@ -27,19 +27,10 @@ from nerg_mi.ranges import FARTHEST
 # What else may stand in such a file (parts of meshes, shapes of a scene, groups, the objects of a recording) is read by
 # `nerg_mi.formats.areas`.
 
-
-BYTES = 4 << 20
-"""A file of areas may have so many bytes."""
-
-MOST = 1000
-"""And so many areas."""
-
-Quaternion = tuple[float, float, float, float]
-"""x, y, z, w."""
-
-BEYOND_BOXES = ("mesh", "shape", "parts", "adt")
-"""Keys of which an area has one that is no box."""
-
+BYTES = 4 << 20  # a file of areas may have so many bytes
+MOST = 1000  # and so many areas
+Quaternion = tuple[float, float, float, float]  # x, y, z, w
+BEYOND_BOXES = ("mesh", "shape", "parts", "adt")  # keys of which an area has one that is no box
 _LETTERS = 80
 _EXAMPLE = '{"shelf": [[0, 0, 0], [1, 2, 3]]}'
 
@@ -231,8 +222,7 @@ def box_json(region: Region) -> dict[str, Any]:
 
 # ---- What an area of interest can be, besides a box (`nerg_mi.formats.areas.Region`) ----
 
-DEEPEST = 100
-"""So deep may groups be nested that stand before their parts."""
+DEEPEST = 100  # so deep may groups be nested that stand before their parts
 
 
 @dataclass(frozen=True)
@@ -357,14 +347,9 @@ def _resolve(area: Area, by_name: dict[str, Area], known: dict[str, frozenset[in
 # twin's world has y up; that of rays z: (x, y, z) becomes (x, -z, y), as `nerg rays import --preset aria` does for its
 # recordings. Poses with a time are those of objects that were carried about: these have no one place, and are left out.
 
-
 BOXES, POSES, NAMES = "3d_bounding_box.csv", "scene_objects.csv", "instances.json"
-
-TABLE_BYTES = 256 << 20
-"""A table may have so many bytes."""
-
+TABLE_BYTES = 256 << 20  # a table may have so many bytes
 _THIN = 1e-3  # metres: a box that is thinner is made so thick
-
 _UID, _TIME = "object_uid", "timestamp[ns]"
 _SIDES = [f"p_local_obj_{axis}{end}[m]" for end in ("min", "max") for axis in "xyz"]
 _PLACE = [f"t_wo_{axis}[m]" for axis in "xyz"]
@@ -474,11 +459,8 @@ def _names(path: Path) -> dict[str, tuple[str, str]]:
 
 # ---- Reading areas of interest from a JSON file, or from the folder of a recording of Aria Digital Twin ----
 
-MESHES = (".ply", ".obj")
-"""Suffixes of meshes that an area can be a part of."""
-
-PARTS = 1000
-"""So many ranges of faces, parts of a group, or categories may an area name."""
+MESHES = (".ply", ".obj")  # suffixes of meshes that an area can be a part of
+PARTS = 1000  # so many ranges of faces, parts of a group, or categories may an area name
 
 _READING_EXAMPLE = (
     '{"name": "a", "min": [0, 0, 0], "max": [1, 2, 3]}, {"name": "b", "mesh": "sign.ply", "faces": [0, [4, 9]]}, '

@@ -19,14 +19,9 @@ from nerg_mi.errors import MissingFile, NergError, plain
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.safe_read import open_file, parse_json, reading
 
-FORMAT = 1
-"""The version of the files, raised when an earlier version of this package could misread them."""
-
-CHECKPOINT_BYTES = 16 << 30
-"""A checkpoint may have so many bytes."""
-
-HEADER_BYTES = 16 << 20
-"""The header, which names every array and holds the metadata, may have so many bytes."""
+FORMAT = 1  # the version of the files, raised when an earlier version of this package could misread them
+CHECKPOINT_BYTES = 16 << 30  # a checkpoint may have so many bytes
+HEADER_BYTES = 16 << 20  # the header, which names every array and holds the metadata, may have so many bytes
 
 
 def write_checkpoint(path: str | Path, kind: str, tensors: dict[str, np.ndarray], metadata: dict) -> None:

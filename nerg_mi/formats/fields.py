@@ -29,18 +29,12 @@ from .checkpoint import read_checkpoint, read_metadata, write_checkpoint
 #
 # The file's arrays bound most sizes, but lists of layers and levels are made from the numbers alone.
 
-
 _MOST = {"width": 4096, "geometry": 4096, "density_hidden": 64, "color_hidden": 64, "hidden": 64, "sh_degree": 10}
 """The largest whole numbers of an architecture, by name; beyond them no field is trained and no kernel compiles."""
 
-FINEST = 1 << 24
-"""The finest resolution of a grid: float32 tells no more cells apart."""
-
-MEMBERS = 64
-"""Members of an ensemble."""
-
-OCCUPANCY_CELLS = 1 << 26
-"""Cells of an occupancy grid, over all of its levels: 400 along each edge."""
+FINEST = 1 << 24  # the finest resolution of a grid: float32 tells no more cells apart
+MEMBERS = 64  # members of an ensemble
+OCCUPANCY_CELLS = 1 << 26  # cells of an occupancy grid, over all of its levels: 400 along each edge
 
 
 @contextmanager

@@ -20,21 +20,11 @@ from nerg_mi.errors import plain
 from nerg_mi.fields.splats import matrices_of
 from nerg_mi.files.safe_read import is_count, parse_json, reading
 
-GLTF_MAGIC = b"glTF"
-"""A file begins with these bytes."""
-
-GLTF_BYTES = 1 << 30
-"""A file may have so many bytes."""
-
-DEPTH = 64
-"""Nodes may be nested so deep."""
-
-INSTANCES = 100_000
-"""So many meshes may stand in a scene."""
-
-TRIANGLES = 20_000_000
-"""So many triangles may be in all of them."""
-
+GLTF_MAGIC = b"glTF"  # beginning of a file
+GLTF_BYTES = 1 << 30  # maximum bytes of a file
+DEPTH = 64  # nodes may be nested so deep
+INSTANCES = 100_000  # so many meshes may stand in a scene
+TRIANGLES = 20_000_000  # so many triangles may be in all of them
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _INDICES = {5121: "u1", 5123: "<u2", 5125: "<u4"}
 _FLOATS = {5126: "<f4"}
@@ -44,6 +34,7 @@ _QUANTIZATION, _INSTANCING = "KHR_mesh_quantization", "EXT_mesh_gpu_instancing"
 # Beginnings of extensions that change how triangles look, and not where they are.
 _LOOKS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
 _TRIANGLES = 4
+
 Attribute = tuple[str, np.ndarray, bool]
 """Name of a vertex attribute, its values (V,) or (V, components), and whether integers stand for 0 to 1."""
 

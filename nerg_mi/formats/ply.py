@@ -20,15 +20,9 @@ import numpy as np
 
 from nerg_mi.files.atomic import write_bytes
 
-PLY_MAGIC = b"ply"
-"""A file begins with these bytes."""
-
-HEADER_BYTES = 1 << 20
-"""The header of a file may be so long."""
-
-TEXT_BYTES = 256 << 20
-"""And the rows, where their numbers are text."""
-
+PLY_MAGIC = b"ply"  # beginning of a file
+HEADER_BYTES = 1 << 20  # the header of a file may be so long
+TEXT_BYTES = 256 << 20  # and the rows, where their numbers are text
 _TYPES = {"<f4": "float", "|u1": "uchar"}
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),

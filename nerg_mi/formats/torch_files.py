@@ -23,15 +23,12 @@ if TYPE_CHECKING:
 PICKLE_BYTES = 8 << 20
 """The pickle may have so many bytes: it holds names and shapes, the numbers are in records of their own."""
 
-OPERATIONS = 1_000_000
-"""So many operations may it have."""
+OPERATIONS = 1_000_000  # so many operations may it have
 
 WORK = 8 * PICKLE_BYTES
 """So many values and characters may its operations take in all, what is repeated counted each time."""
 
-EXPANDED = 1 << 20
-"""So many numbers may a tensor have that repeats those of its storage."""
-
+EXPANDED = 1 << 20  # so many numbers may a tensor have that repeats those of its storage
 _TEXT = 64
 # What torch.load would also make of a file, and no checkpoint of weights has: sparse and quantised tensors, devices,
 # sets, byte arrays of any size, ...

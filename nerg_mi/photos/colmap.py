@@ -29,15 +29,11 @@ from .transforms import read_frame_poses
 # The layout of both is COLMAP's (src/colmap/scene/reconstruction_io): little-endian; world-to-camera poses as a
 # quaternion (w, x, y, z) and a translation; cameras look along +z with y down; the first pixel's centre is (0.5, 0.5).
 
-
 BYTES = 8 << 30
 """A file of a model may have so many bytes: ``images.bin`` of some 30,000 photos, most of it observations."""
 
-IMAGES = 1 << 18
-"""A model may have so many images, and as many cameras."""
-
-POINTS = 12_000_000
-"""And so many points."""
+IMAGES = 1 << 18  # a model may have so many images, and as many cameras
+POINTS = 12_000_000  # and so many points
 
 # COLMAP's numbers of its camera models, and how many parameters each has.
 _MODELS = {
@@ -432,7 +428,6 @@ def _trusted(points: Iterator[_Point]) -> tuple[int, np.ndarray]:
 # ---- Named poses ----
 #
 # Which file describes a posed image set, and its poses by the names of its images, whether or not they are there.
-
 
 _MODEL_FOLDERS = ("", "sparse", "colmap/sparse")
 

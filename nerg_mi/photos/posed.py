@@ -24,7 +24,6 @@ from .cameras import Intrinsics
 # Poses are OpenGL camera-to-world matrices (x right, y up, z back) in the data set's own
 # coordinates and units; readers do not re-centre, scale or turn them.
 
-
 LENS_KEYS = tuple("w h fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6 camera_angle_x camera_angle_y fisheye".split())
 """Keys of `PosedFrame.lens`, all floats: pixels, radians, and coefficients as `Intrinsics` has them; "fisheye" is 1 for
 fisheye lenses."""
@@ -335,7 +334,6 @@ def _none_usable(path: Path, unused: list[Unused]) -> NergError:
 # ---- Semidense ----
 #
 # Semi-dense points of Project Aria: what the glasses saw of a place, in the world of the recording's trajectory.
-
 
 INV_DIST_STD, DIST_STD = 0.005, 0.01
 """Points whose inverse distance (1/m) and distance (m) are known less well are left out, as in Aria's own tools."""

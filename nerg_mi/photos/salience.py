@@ -106,7 +106,6 @@ def spectral_residual(photo: np.ndarray, width: int = WIDTH) -> np.ndarray:
 # what lies outside the picture: with the share s_i of pixel i and its solid angle dω_i, the density there is s_i / dω_i
 # / Σ s, in 1/sr, given that the picture is looked at.
 
-
 SUFFIXES = (".png", ".exr", ".npy")
 PER = ("pixel", "steradian")
 MODELS = {"spectral-residual": spectral_residual}

@@ -58,9 +58,7 @@ def chosen_pairs(count: int, matching: str = "auto") -> list[tuple[int, int]]:
 #
 # Pictures as structure from motion takes them: upright copies for the capture, small ones to find features in.
 
-
-SIDE = 65_500
-"""Longest side of a picture in pixels: that of a JPEG file."""
+SIDE = 65_500  # longest side of a picture in pixels: that of a JPEG file
 
 # As good as telephones write them; colours are not stored more coarsely than brightness.
 _JPEG = dict(format="JPEG", quality=95, subsampling=0)
@@ -140,9 +138,7 @@ def cameras_of(pictures: Iterable[PhotoCopy], share: bool = True) -> list[int]:
 #
 # A folder of photos: which can be used, copied as they are to be looked at.
 
-
-SUFFIXES = (".jpg", ".jpeg", ".png")
-"""Of the files that are taken for photos, in small letters."""
+SUFFIXES = (".jpg", ".jpeg", ".png")  # of the files that are taken for photos, in small letters
 
 # Pictures that a camera writes and that are not read here: to be named, not passed over.
 _OTHERS = (".heic", ".heif", ".tif", ".tiff", ".webp", ".dng", ".raw", ".cr2", ".nef", ".arw", ".avif", ".exr", ".bmp")
@@ -278,7 +274,6 @@ def _notes(image: Any) -> tuple[int, tuple, float | None]:
 # ---- Reconstruction ----
 #
 # Structure from motion, as seen from outside: starts the process of `worker`, listens, and reads what it found.
-
 
 LENSES = {"auto": None, "radial": "SIMPLE_RADIAL", "opencv": "OPENCV"}
 """Names of lenses -> COLMAP's model that is refined; auto: by how many pictures a camera has."""

@@ -27,21 +27,11 @@ from nerg_mi.transport.observer_gaze import PARTS, POWER
 
 from .visits import Aoi, land, regroup
 
-FIRST = 1 << 13
-"""Directions over the sphere that are looked along first."""
-
-MOST = 1 << 20
-"""A spiral has so many directions over the sphere at most, a fifth of a degree apart."""
-
-WHOLE = 1 << 17
-"""And if all of them are looked along."""
-
-LEAST = 64
-"""So many directions cross a thing at least, where a spiral has them."""
-
-ENOUGH = 1 << 14
-"""A thing that so many directions cross is summed over no more."""
-
+FIRST = 1 << 13  # directions over the sphere that are looked along first
+MOST = 1 << 20  # a spiral has so many directions over the sphere at most, a fifth of a degree apart
+WHOLE = 1 << 17  # and if all of them are looked along
+LEAST = 64  # so many directions cross a thing at least, where a spiral has them
+ENOUGH = 1 << 14  # a thing that so many directions cross is summed over no more
 _RAYS = 1 << 17
 _SPHERE = 4 * math.pi
 
@@ -78,8 +68,7 @@ class SumRule:
     first: int = FIRST
 
 
-ROUGH = SumRule(tolerance=0.02, least=5e-5)
-"""For many areas at once, or many eyes over which is averaged."""
+ROUGH = SumRule(tolerance=0.02, least=5e-5)  # for many areas at once, or many eyes over which is averaged
 
 
 def gaze_shares(
@@ -291,13 +280,10 @@ class _Looked:
 # surface stands before it. An isovist is the region that is seen from a point (Benedikt 1979); here its horizontal
 # slice at eye height, whose area is ½ Σ r² Δθ over directions.
 
-
 Depth = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Of origins and unit directions (N, 3): distance to the first surface (N,), infinite where there is none."""
 
-SAMPLES = 48
-"""Points of a thing that are looked for."""
-
+SAMPLES = 48  # points of a thing that are looked for
 _SIGHTS = 1 << 20
 
 

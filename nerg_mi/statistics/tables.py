@@ -220,7 +220,6 @@ MEASURES = (
 """All, in the order of tables."""
 
 BY_NAME = {measure.name: measure for measure in MEASURES}
-
 COMPARED = tuple(measure.name for measure in MEASURES if measure.compared)
 
 
@@ -228,16 +227,13 @@ COMPARED = tuple(measure.name for measure in MEASURES if measure.compared)
 #
 # Tables of numbers: things by cell and source, differences, moves, durations; with a floor on people.
 
-
 TRACKED, FIELD = "tracked", "field"
 """Sources of numbers: rays that were recorded, and what the gaze field foretells."""
 
 PLACES = 16
 """From so many places a person a field should be asked for their reach: from fewer it comes out too low."""
 
-MOST_VALUES = 12
-"""So many values of a dimension are compared with each other."""
-
+MOST_VALUES = 12  # so many values of a dimension are compared with each other
 Row = dict[str, Any]
 
 

@@ -27,9 +27,7 @@ from nerg_mi.rays.rays import Rays
 # depth + margin. Where no surfaces are known, things are solid: one hides another that the ray enters after it has left
 # the first; things that overlap along the ray both have the look.
 
-
-MARGIN = 0.03
-"""In metres: of surfaces that are known as exactly as a radiance field has them."""
+MARGIN = 0.03  # in metres: of surfaces that are known as exactly as a radiance field has them
 
 
 class Aoi(Protocol):
@@ -338,7 +336,6 @@ def looks_at(rows: np.ndarray, line: Timeline, rules: VisitRules) -> Visits:
 # floor. A ray may be of several. `partial_sums` takes any block of rays, in any order, that holds sittings as a whole;
 # `merge` adds such sums. Added up in the same order they are the same to the bit, however the blocks were shared out;
 # memory is that of people x cells x areas, and not of rays.
-
 
 BINS = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, np.inf])
 """Edges of the histogram of how long looks last, in seconds."""

@@ -21,10 +21,7 @@ from .mesh import Mesh
 # degrees together, so that no weight of the cotangent Laplacian is negative, however long and thin triangles were.
 # Edges of one triangle, or of more than two, stay.
 
-
-ROUNDS = 2000
-"""Flips that do not touch each other are made in one round; more rounds than these are not made."""
-
+ROUNDS = 2000  # flips that do not touch each other are made in one round; more rounds than these are not made
 _WORTH = -1e-9
 
 
@@ -138,9 +135,7 @@ def _is_triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 # negative then all the same, across edges of more or fewer than two triangles, counts as 0: heat never becomes
 # negative, and nothing of it is lost, since L stays symmetric with rows that add up to 0.
 
-
-MOLLIFY = 1e-5
-"""Share of the mean length of edges by which two edges of a triangle exceed the third at least."""
+MOLLIFY = 1e-5  # share of the mean length of edges by which two edges of a triangle exceed the third at least
 
 
 def laplacian(mesh: Mesh) -> sparse.csr_array:
@@ -184,9 +179,7 @@ def _cotangents(lengths: np.ndarray) -> np.ndarray:
 # where no edge leads nothing arrives, exactly. Backwards in time a Gaussian comes out with the right variance and, to
 # the order 1/n, with longer tails.
 
-
-STEPS = 8
-"""Steps in time."""
+STEPS = 8  # steps in time
 
 
 class Smoother:

@@ -138,8 +138,7 @@ def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 # ---- Shapes of Mitsuba scenes as triangles ----
 
-Triangles = tuple[np.ndarray, np.ndarray]
-"""Vertices (V, 3) float64 and faces (F, 3) int64."""
+Triangles = tuple[np.ndarray, np.ndarray]  # vertices (V, 3) float64 and faces (F, 3) int64
 
 
 def shape_triangles(shape: Any) -> Triangles | None:
@@ -156,9 +155,7 @@ def shape_triangles(shape: Any) -> Triangles | None:
 # edge of a neighbour: a surface stays as connected as it was. Triangles of one, two or three such edges become two,
 # three or four (Bank, Sherman, Weiser 1983, "red" and "green").
 
-
-MOST_REFINED_FACES = 8_000_000
-"""A refined mesh has so many faces at most."""
+MOST_REFINED_FACES = 8_000_000  # a refined mesh has so many faces at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,8 +238,7 @@ def _taken(rows: np.ndarray, triangles) -> tuple[np.ndarray, np.ndarray]:
 
 # ---- A surface among all that may hide it, as rays are cast at it ----
 
-SURFACE_OPACITY = 0.5
-"""Opacity of a medium from which on a ray ends in it."""
+SURFACE_OPACITY = 0.5  # opacity of a medium from which on a ray ends in it
 
 NEAR = 1e-5
 """What a ray meets so near before a point, as a share of the distance, does not hide it: its own face, a neighbour."""
@@ -352,15 +348,9 @@ def mitsuba_mesh(vertices: np.ndarray, faces: np.ndarray, name: str, bsdf: Mappi
 #
 # A surface unrolled into a square, and values on it as a texture: charts by xatlas, an optional extra.
 
-
-GUTTER = 4
-"""Pixels by which colours go on beyond the border of a chart, for filters that look there."""
-
-TEXTURE_ROWS = 256
-"""Rows of a texture that are computed at once."""
-
-MOST_CHART_FACES = 400_000
-"""A mesh of more triangles is not unrolled."""
+GUTTER = 4  # pixels by which colours go on beyond the border of a chart, for filters that look there
+TEXTURE_ROWS = 256  # rows of a texture that are computed at once
+MOST_CHART_FACES = 400_000  # a mesh of more triangles is not unrolled
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,10 +37,7 @@ from .mesh import Mesh, SurfaceTarget
 # degree l into itself times (1 + P_l(cos 2σ)) / 2, and so keeps the integral over the sphere. Of a ray, which is a
 # point among directions, it is a bundle of rays, each of which ends at what it meets itself.
 
-
-RING = 6
-"""Directions around the middle one."""
-
+RING = 6  # directions around the middle one
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 
 
@@ -85,12 +82,8 @@ def bundle(directions: np.ndarray, sigma: float, count: int, rng: np.random.Gene
 # has room for so many of them only. The solid angle of a triangle is that of A. van Oosterom and J. Strackee, "The
 # Solid Angle of a Plane Triangle" (1983); no Jacobian has to be evaluated where it is steep.
 
-
-LEVELS = 40
-"""A face is cut in four so many times at most: to 10^-12 of its size."""
-
-MOST_PIECES = 1 << 25
-"""Pieces of a mesh at most, as one observer sees it: five gigabytes."""
+LEVELS = 40  # a face is cut in four so many times at most: to 10^-12 of its size
+MOST_PIECES = 1 << 25  # pieces of a mesh at most, as one observer sees it: five gigabytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,15 +199,12 @@ def solid_angles(corners: np.ndarray) -> np.ndarray:
 # of a face, as those of shelves on walls do, falls between the same two rows of pieces everywhere, and loses up to a
 # third of a piece along all its length; halving the pieces keeps the cuts parallel to it, and the loss often as large.
 
-
-MIXED = 1e-6
-"""Of all gaze, what a piece may have at most that is seen in part."""
+MIXED = 1e-6  # of all gaze, what a piece may have at most that is seen in part
 
 WHOLE = 2e-5
 """Of all gaze, what a piece may have at most: densities narrower than a piece is are integrated too."""
 
-CUTS = 12
-"""A piece is cut so many times at most."""
+CUTS = 12  # a piece is cut so many times at most
 
 # Four points spread over a piece tell which share of it is seen. Its corners tell whether an outline passes, and
 # nothing else: those of a hidden side reach into sight wherever it meets an edge that is seen. They are looked at a
@@ -260,9 +250,7 @@ def _seen(target: SurfaceTarget, pieces: Pieces) -> np.ndarray:
 #
 # Where people were, by how long: the time of each tracked ray, and a few observers that stand for all of them.
 
-
-GAP = 0.5
-"""Seconds that a ray stands for at most: nobody knows where people were while they were not tracked."""
+GAP = 0.5  # seconds that a ray stands for at most: nobody knows where people were while they were not tracked
 
 WEIGHTS = ("time", "person", "equal")
 """Whom rays count by: each by its time; so that all people count alike; each alike."""
@@ -375,9 +363,7 @@ def _spread(place: np.ndarray, mass: np.ndarray, count: int, rng: np.random.Gene
 # A line ends at one point of a mesh: a thin edge loses it, and a gap lets all of it through. A cone as wide as the
 # tracker errs and the fovea sees is divided among what it meets (Martin et al., view-cone sampling, arXiv 2601.02721).
 
-
-CASTS = 1 << 20
-"""Rays that are cast in one launch."""
+CASTS = 1 << 20  # rays that are cast in one launch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -447,10 +433,7 @@ def ray_sums(target: SurfaceTarget, rays: TrackedRays, settings: RaySettings) ->
 # axes they would be parallel to the outlines of upright things, which would fall between the same two directions
 # everywhere.
 
-
-CELLS = 1 << 14
-"""Cells of the first cut, 1.6 degrees wide: narrower densities may be missed."""
-
+CELLS = 1 << 14  # cells of the first cut, 1.6 degrees wide: narrower densities may be missed
 _FINEST = 64
 # Any turn that makes no axis of the scene lie along a ring.
 _ASKEW = np.linalg.qr(np.array([[0.61, -0.37, 0.42], [0.29, 0.83, -0.31], [-0.53, 0.17, 0.71]]))[0]
@@ -510,12 +493,8 @@ def _directions(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
 # (`sphere_rule`) tell what g adds up to and how much of it meets something else, or nothing. Both sums use other
 # points, and what they lack of each other is the error that is told.
 
-
-BATCH = 1 << 18
-"""Pieces in one launch."""
-
-FACES = 1 << 16
-"""Faces that are cut into pieces together."""
+BATCH = 1 << 18  # pieces in one launch
+FACES = 1 << 16  # faces that are cut into pieces together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -538,8 +517,7 @@ class SurfaceObserver:
     along: Callable[[Vector3f], Any]
 
 
-MakeObserver = Callable[[np.ndarray], SurfaceObserver]
-"""Of an observer's position (3,)."""
+MakeObserver = Callable[[np.ndarray], SurfaceObserver]  # of an observer's position (3,)
 
 
 def observers_from_field(gaze: PlacedGaze, place: Place, settings: ObserverSettings) -> MakeObserver:

@@ -118,16 +118,9 @@ def _next(hits, origins, directions, after, before, light, stop) -> tuple[np.nda
 # plane would then be that of their numbers. They start as far before it as a point may lie
 # behind a surface and still be seen: a place that stands before it hides it, and takes nothing of its area.
 
-
-RAYS = 8
-"""To a side of a Gaussian."""
-
-HIDDEN = 0.05
-"""Of its whole area: a side of which less is seen counts as hidden."""
-
-TILT = np.radians(25)
-"""Of the rays."""
-
+RAYS = 8  # to a side of a Gaussian
+HIDDEN = 0.05  # of its whole area: a side of which less is seen counts as hidden
+TILT = np.radians(25)  # of the rays
 _BATCH = 1 << 17
 # Multiples of both together fill a square evenly (the plastic number).
 _SPREAD = 0.7548776662466927, 0.5698402909980532
@@ -212,12 +205,8 @@ def _light(arrays: SplatArrays, o: np.ndarray, d: np.ndarray, distance: np.ndarr
 # Gaze per area is that share by the area that a Gaussian takes of what is seen (`splat_areas`): of rays that fall on a
 # surface with the density D, a Gaussian receives D ∫ T_i α_i dA, whatever else is around.
 
-
-DIRECTIONS = 1 << 14
-"""In which an observer's gaze is looked at, about."""
-
-CASTS = 1 << 17
-"""Rays that are cast in one launch: each brings a dozen hits."""
+DIRECTIONS = 1 << 14  # in which an observer's gaze is looked at, about
+CASTS = 1 << 17  # rays that are cast in one launch: each brings a dozen hits
 
 
 def splat_ray_sums(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
@@ -282,24 +271,12 @@ def gaze_and_escaped(
 #
 # Gaussians closer than half a step, which face the same way, are one cell, whose density all of them have.
 
-
-FACING = np.cos(np.radians(30))
-"""Cosine between the normals of neighbours at least."""
-
-RISE = np.sin(np.radians(15))
-"""Sine of the angle at which a neighbour may lie out of the plane."""
-
-STEPS = 100
-"""Steps at most, where all of a kernel's reach is covered."""
-
-MOST = 400
-"""Steps at most, where many Gaussians lie at borders."""
-
-CLOSE = 0.7
-"""Standard deviation of a step at least, as a share of the edge of a square of a Gaussian's area."""
-
-REACH = 3.0
-"""Standard deviations of a step after which it is cut off."""
+FACING = np.cos(np.radians(30))  # cosine between the normals of neighbours at least
+RISE = np.sin(np.radians(15))  # sine of the angle at which a neighbour may lie out of the plane
+STEPS = 100  # steps at most, where all of a kernel's reach is covered
+MOST = 400  # steps at most, where many Gaussians lie at borders
+CLOSE = 0.7  # standard deviation of a step at least, as a share of the edge of a square of a Gaussian's area
+REACH = 3.0  # standard deviations of a step after which it is cut off
 
 
 class SplatSmoother:
@@ -414,9 +391,7 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 # `nerg_mi.probes.surface_attention.attended`, of a point that lies before the centre by the thickness of the Gaussian
 # too. Such densities are colours: rendered in place of them, they mix by the light that reaches the eye.
 
-
-BATCH = 1 << 18
-"""Gaussians in one launch."""
+BATCH = 1 << 18  # Gaussians in one launch
 
 
 def splat_densities(

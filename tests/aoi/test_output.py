@@ -16,7 +16,6 @@ from tests.workflows.recorder import Recorder
 
 # ---- Results as a folder of files ----
 
-
 THING = {
     "cell": "all",
     "value": "",
@@ -51,7 +50,6 @@ def test02_equal_results_are_equal_files(tmp_path):
 
 
 # ---- Tables as CSV, Markdown and Parquet ----
-
 
 ROWS = [
     {"cell": "all", "value": "", "thing": "a|b", "n": 3, "x": 0.125},

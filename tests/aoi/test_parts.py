@@ -163,7 +163,6 @@ def test_a_gaze_field_brings_the_place_that_it_was_trained_in(tmp_path, rgb):
 
 # ---- Rays in blocks that hold sittings as a whole, and what they are on ----
 
-
 RULES = VisitRules()
 
 

@@ -181,7 +181,6 @@ def test_what_is_plainly_wrong_is_told_before_anything_is_loaded(tmp_path, rgb):
 
 # ---- Support and the spread of an ensemble, from foretold numbers that are known ----
 
-
 ZONE = Cell("zone", "z")
 
 TRUST_EYES = Viewpoints(
@@ -250,7 +249,6 @@ def test_few_places_a_person_are_told():
 
 
 # ---- The table of a change, from foretold numbers that are known ----
-
 
 AREAS = AreaSet((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])))
 WHAT_IF_EYES = places_of(np.arange(15.0).reshape(5, 3))

@@ -244,7 +244,6 @@ def test05_two_places(folder):
 
 # ---- Areas as things: meshes, some of their faces, shapes of a scene ----
 
-
 TWO = "v 1 0 0\nv 1 1 0\nv 1 0 1\nv 3 0 0\nv 3 1 0\nv 3 0 1\nf 1 2 3\nf 4 5 6\n"
 
 

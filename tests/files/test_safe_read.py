@@ -405,7 +405,6 @@ def test_line_blocks_limits_themselves_are_within(tmp_path, monkeypatch):
 
 # ---- Arrays are made only of bytes that are there ----
 
-
 _ARRAYS = [
     np.arange(12.0).reshape(3, 4),
     np.asfortranarray(np.arange(12, dtype="<u2").reshape(3, 4)),

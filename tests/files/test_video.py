@@ -180,7 +180,6 @@ def test_times_are_those_that_ffmpeg_shows(tmp_path):
 
 # ---- Videos read back by FFmpeg: every frame, its colours, the rate and what the header says ----
 
-
 HEIGHT, WIDTH = 48, 80
 
 

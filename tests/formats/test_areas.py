@@ -27,7 +27,6 @@ from nerg_mi.workflows import demo
 
 # ---- What an area can be, and how groups resolve ----
 
-
 A, B = Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])
 
 
@@ -49,7 +48,6 @@ def test03_many_groups_of_groups_are_resolved_at_once():
 
 
 # ---- Areas of interest of every kind as files ----
-
 
 BOX = {"name": "shelf", "min": [0, 0, 0], "max": [1, 2, 3]}
 
@@ -216,7 +214,6 @@ def test06_groups_may_be_nested_so_deep(tmp_path):
 
 
 # ---- The objects of Aria Digital Twin as boxes in the frame of rays ----
-
 
 BOX_HEAD = (
     "object_uid,timestamp[ns],p_local_obj_xmin[m],p_local_obj_xmax[m],p_local_obj_ymin[m],p_local_obj_ymax[m],"

@@ -35,7 +35,6 @@ from nerg_mi.maths.geometry import Box, ContractedBox
 
 # ---- Sizes that checkpoints claim: in bounds, or said in a sentence that names the file ----
 
-
 GRID = {"levels": 2, "features": 2, "log2_rows": 8, "base": 4, "finest": 16, "dimensions": 3}
 
 
@@ -110,7 +109,6 @@ def test_finished_sentences_and_faults_of_the_program_pass():
 
 # ---- Arrays of checkpoints as parts of fields, and the other way ----
 
-
 ARRAYS_GRID = HashGridConfig(levels=1, log2_rows=3, base=1, finest=1)
 
 
@@ -171,7 +169,6 @@ def test_what_is_stored_is_finite():
 
 
 # ---- Fields in and out of files: exact in fp32, rounded in fp16, and a sentence for what does not fit ----
-
 
 FIELDS_GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
 BOX = Box((-1, 0, 2), (3, 2, 4))

@@ -359,7 +359,6 @@ def test_what_of_a_gltf_is_not_used_takes_no_memory(tmp_path):
 
 # ---- PLY files with columns of their own, as trimesh and Mitsuba read them ----
 
-
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
 TWO_FACES = np.array([[0, 1, 2], [0, 3, 1]])
 

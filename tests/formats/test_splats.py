@@ -74,7 +74,6 @@ def test_memory_is_a_small_multiple_of_the_file(tmp_path):
 
 # ---- Files ----
 
-
 WRITERS = {".ply": write_inria, ".splat": write_antimatter, ".spz": write_spz, ".glb": write_khronos}
 
 
@@ -130,7 +129,6 @@ def test_a_reader_names_its_file(tmp_path, suffix):
 
 
 # ---- Ply ----
-
 
 NAMES = ("centers", "scales", "rotations", "opacities", "harmonics")
 

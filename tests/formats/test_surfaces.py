@@ -19,7 +19,6 @@ from nerg_mi.maths.geometry import Box
 
 # ---- The ball ----
 
-
 CENTER, RADIUS = np.array([1.2, 1.0, 0.9]), 0.6
 
 

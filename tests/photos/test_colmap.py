@@ -487,7 +487,6 @@ def test_notes_on_a_model_come_with_its_poses(tmp_path):
 
 # ---- Up, of cameras and points whose up is known ----
 
-
 SOME = Rotation.from_euler("xyz", [40, -70, 110], degrees=True).as_matrix()
 
 

@@ -34,7 +34,6 @@ from tests.reference import opencv
 #
 # The scene box around an object, in a room and around points; and cameras that see what no other does.
 
-
 LENS = Intrinsics(10, 10, 10.0, 10.0, 5.0, 5.0)
 
 

@@ -478,7 +478,6 @@ def test_files_of_frames_and_of_held_out_frames_are_no_leftovers(ring):
 #
 # Photos made pinhole and renderings bent to a lens, against a smooth picture of the sky known in every direction.
 
-
 PLAIN = Intrinsics(90, 70, 80.0, 80.0, 44.0, 36.5)
 
 LENSES = {

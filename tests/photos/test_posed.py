@@ -91,7 +91,6 @@ def test_an_image_that_is_listed_again_counts_once(tmp_path):
 
 # ---- Semi-dense points of Aria's glasses ----
 
-
 HEAD = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std"
 
 

@@ -16,7 +16,6 @@ from nerg_mi.photos.salience import open_salience, pixel_solid_angles, read_sali
 #
 # Solid angles of pixels against closed forms of whole pictures, and against the Jacobian of each lens.
 
-
 PLAIN = Intrinsics(96, 64, 60.0, 55.0, 44.0, 30.5)
 BARREL = replace(PLAIN, k1=-0.15, k2=0.03, p1=0.002, p2=-0.001)
 FISHEYE = Intrinsics(96, 64, 40.0, 41.0, 47.0, 31.0, 0.02, -0.004, fisheye=True)
@@ -116,7 +115,6 @@ def test_the_odd_one_out_is_salient():
 
 
 # ---- Salience images: what is read and refused, whose they are, and the densities they mean ----
-
 
 LENSES = {
     "pinhole": {"fl_x": 40.0, "fl_y": 40.0},

@@ -290,7 +290,6 @@ def test_pictures_of_one_size_share_a_camera():
 
 # ---- The process that finds poses, from outside: what it is given, and how its end is told ----
 
-
 PICTURES = [PhotoCopy(f"{k}.jpg", (400, 300), (200, 150), focal=380.0 if k else None) for k in range(4)]
 
 

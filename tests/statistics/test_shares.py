@@ -121,7 +121,6 @@ def test04_without_areas_eyes_or_gaze():
 
 # ---- What could be seen, and isovists, where both are known in closed form ----
 
-
 ROOM = np.array([[0.0, 0, 0], [6, 4, 3]])
 PILLAR = np.array([[2.0, 1.5, 0], [3, 2.5, 2.0]])
 

@@ -115,7 +115,6 @@ def test02_nobody_knows_what_was_visible():
 
 # ---- Tables of numbers, and the floor on people ----
 
-
 A, B = Cell("cohort", "a"), Cell("cohort", "b")
 HOW = {"resamples": 299, "seed": 0}
 

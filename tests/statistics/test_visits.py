@@ -254,7 +254,6 @@ def test07_times_on_the_bounds():
 
 # ---- Sums of blocks, against dictionaries filled ray by ray, and in any number of parts ----
 
-
 RULES = VisitRules(gap=0.5, pause=5.0, merge=0.25, least=0.15)
 AREAS = ("a", "b", "c")
 

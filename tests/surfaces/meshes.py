@@ -63,7 +63,6 @@ def lookers_of_law(law):
 
 # ---- Walls of flat Gaussians that overlap ----
 
-
 TURN_X = (0.0, 1.0, 0.0, 0.0)
 """By half a turn around x: what points along z points against it."""
 

@@ -79,7 +79,6 @@ def test03_bundles_are_gaussian_unit_and_the_same_for_a_seed():
 
 # ---- Gaze on surfaces: conserved, and what `nerg.attention` says of the same ----
 
-
 ROOM = box((0, 0, 0), (4, 3, 2.5))
 SHELF = box((1.5, 2, 0), (3, 2.4, 1.8))
 SETTINGS = GazeSumSettings()
@@ -201,7 +200,6 @@ def test06_parts_add_up_to_the_whole_bit_by_bit(rgb):
 
 # ---- Pieces that an outline crosses are cut until what is left out is little ----
 
-
 FLOOR = (np.array([(-1.0, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]), np.array([(0, 1, 2), (0, 2, 3)]))
 
 
@@ -236,7 +234,6 @@ def test02_a_narrow_density_is_integrated(rgb):
 
 
 # ---- Solid angles of pieces, however near the observer stands ----
-
 
 PIECES_ROOM = joined(box((0, 0, 0), (1.0, 1.0, 1.0)))
 
@@ -333,7 +330,6 @@ def test04_more_observers_are_nearer_and_fewer_places_than_observers_are_all_tak
 
 # ---- Tracked rays as cones: what passes a gap, and what parts of them add up to ----
 
-
 SIGMA = np.radians(1.5)
 
 
@@ -399,7 +395,6 @@ def test04_on_elsewhere_and_escaped_add_up_where_something_hides_the_surface(rgb
 
 
 # ---- Directions over the sphere: all of it, and as exact for narrow densities as for wide ones ----
-
 
 SPHERE_RULE_MEAN = np.array([0.3, -0.5, 0.81]) / np.linalg.norm([0.3, -0.5, 0.81])
 

@@ -115,7 +115,6 @@ def test02_up_to_a_distance_and_no_farther_than_is_asked_for(rgb):
 
 # ---- Tracked rays on Gaussians: what is left where, to whom it adds up, and per area ----
 
-
 LINE = RaySettings()
 CONE = RaySettings(cone=np.radians(1.5), bundle=8, seed=5)
 
@@ -183,7 +182,6 @@ def test04_of_gaze_meets_none_what_comes_through(rgb, cone):
 # ---- Splat smoothing ----
 #
 # Smoothing over Gaussians: as wide as is said, nothing lost, nothing through the air, around an edge or a board.
-
 
 TOLERANCE = 0.002
 
@@ -271,7 +269,6 @@ def test04_many_in_one_cell_have_one_density_and_a_length_has_to_be_positive():
 
 
 # ---- Gaze on Gaussian splats: closed forms, and the sum that looks at all Gaussians in double precision ----
-
 
 EYE = np.array([[0.0, 0, -2]])
 ALONG = np.array([0.0, 0, 1])
