@@ -121,7 +121,13 @@ class RadianceTrainer(Trainer):
     AVERAGE_EVERY = 4
 
     def __init__(
-        self, views: list[PhotoView], box: AnyBox, config: RadianceConfig, settings: RadianceSettings, ns, depth: bool = True
+        self,
+        views: list[PhotoView],
+        box: AnyBox,
+        config: RadianceConfig,
+        settings: RadianceSettings,
+        ns,
+        depth: bool = True,
     ):
         if not views:
             raise NergError("there are no pictures to train on")
