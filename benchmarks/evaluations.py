@@ -1,7 +1,7 @@
 """How many evaluations of density a frame takes, and what each way of saving them costs in time and in error.
 
     python benchmarks/evaluations.py SCENE.xml [-D KEY=VALUE] [--width 640] [--height 360] [--repeats 7]
-    [--out out/benchmarks/evaluations.csv] [--page docs/error-and-time.md]
+    [--out out/benchmarks/evaluations.csv] [--update docs/error-and-time.md]
 
 Each row is the scene with some parameters, against the first row: all occupied cells are marched, and each observer's
 ray to its end. Times are processor time of both passes, colour and gaze, medians of rounds over all rows in turn.
@@ -51,7 +51,7 @@ def main(argv=None) -> None:
     parser.add_argument("--height", type=int, default=360)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/evaluations.csv"))
-    parser.add_argument("--page", type=Path)
+    parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
     args = parser.parse_args(argv)
     defaults = dict(word.split("=", 1) for word in args.define)
     subject = load_subject(args.scene, args.width, args.height, defaults)
@@ -104,7 +104,7 @@ def main(argv=None) -> None:
         ]
         for r in rows
     ]
-    print_table(f"Evaluations, {subject.name}", HEAD, shown, args.page)
+    print_table(f"Evaluations, {subject.name}", HEAD, shown, args.update)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import time
 from importlib.resources import files
 from pathlib import Path
 
-from timing import write_rows
+from timing import print_table, write_rows
 
 import numpy as np
 
@@ -91,9 +91,13 @@ def main() -> None:
         folder = Path(temporary)
         room(folder, args.observers, args.rays)
         works = {
-            f"bake, detail {d:g}": (args.observers, lambda name, d=d, **m: bake(folder, name, d, **m)) for d in DETAILS
+            f"bake of {args.observers} observers, detail {d:g}": (
+                args.observers,
+                lambda name, d=d, **m: bake(folder, name, d, **m),
+            )
+            for d in DETAILS
         }
-        works["stats"] = (args.rays, lambda name, **more: count(folder, name, **more))
+        works[f"counts of {args.rays:,} rays"] = (args.rays, lambda name, **more: count(folder, name, **more))
         whole = {what: work(f"whole {what}", threads=1) for what, (_, work) in works.items()}
         with ClusterOfProcesses(folder) as cluster:
             for workers in (1, 2):
@@ -109,20 +113,23 @@ def main() -> None:
                     each = [r.seconds for r in receipts]
                     size = sum(r.size for r in receipts) / len(receipts)
                     row = {
-                        "what": what,
+                        "what": f"{what}, {faces:,} triangles" if faces else what,
                         "workers": workers,
-                        "units": units,
-                        "faces": faces,
                         "parts": len(each),
-                        "seconds": round(seconds, 2),
-                        "units_a_second": round(units / seconds, 2),
-                        "computed_a_part": round(statistics.median(each), 3),
-                        "besides_a_part": round((workers * seconds - sum(each)) / len(each), 3),
-                        "bytes_a_part": round(size),
+                        "seconds": seconds,
+                        "computed_a_part": statistics.median(each),
+                        "besides_a_part": (workers * seconds - sum(each)) / len(each),
+                        "bytes_a_part": size,
+                        "units_a_second": units / seconds,
                         "equal": made == whole[what][1],
                     }
                     rows.append(row)
                     print(json.dumps(row), flush=True)
+    head = "work|workers|parts|waited|computed a part|besides a part|output of a part|throughput a second|equal"
+    formats = ("", "", "", ".1f", ".2f", ".2f", ",.0f", ",.2f", "")
+    suffixes = ("", "", "", " s", " s", " s", " B", "", "")
+    table = [[f"{v:{f}}{suffix}" for v, f, suffix in zip(row.values(), formats, suffixes)] for row in rows]
+    print_table("Measured", head.split("|"), table)
     args.out.mkdir(parents=True, exist_ok=True)
     write_rows(args.out / "scaling.csv", rows)
 
