@@ -5,10 +5,10 @@
 Same grid, networks, initial weights, rays, step table, occupancy grid, density pass, losses, optimiser and schedule, on
 the same machine in the same run, one after the other; the peer is eager PyTorch, gathers and sums, autograd. Before
 they start, both evaluate the same random points, and the program stops if they differ. Without our trainer's extras:
-thinned samples, damped derivatives near cameras, cleared cells, and the settling of the grid, which are switched off in
-both. Both fields are scored by the integrator, under the occupancy found in the same way. ``--turns``: instead, both
-take 8 steps in turns, so often, after 100 that clear the first fog, marching finely from the start, and what a step
-takes is printed.
+thinned samples, damped derivatives near cameras, cleared cells, colours of each photo, and the settling of the grid,
+which are switched off in both. Both fields are scored by the integrator, under the occupancy found in the same way.
+``--turns``: instead, both take 8 steps in turns, so often, after 100 that clear the first fog, marching finely from the
+start, and what a step takes is printed.
 """
 
 from __future__ import annotations
@@ -49,6 +49,9 @@ def take_turns(ours, peer, turns: int, steps: int = 8, before: int = 100) -> Non
 
 
 _PRIMES = (1, 2654435761, 805459861)
+
+OFF = {"settle": 2.0, "empty_weight": 0.0, "grid_decay": 0.0, "thin_least": 1.0, "reach": 0.0, "photo_colors": False}
+"""Settings without what the peer does not have."""
 
 
 class TorchModel:
@@ -309,9 +312,7 @@ def main(argv=None) -> None:
     if any(v.has_alpha or v.mask is not None for v in data.train):
         raise SystemExit("the peer knows neither alpha nor masks; give a set of plain photos")
     fine = {"strides": ()} if args.turns else {}
-    settings = RadianceSettings(
-        minutes=args.minutes, settle=2.0, empty_weight=0.0, grid_decay=0.0, thin_least=1.0, reach=0.0, **fine
-    )
+    settings = RadianceSettings(minutes=args.minutes, **OFF, **fine)
     make = lambda: RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
     args.out.mkdir(parents=True, exist_ok=True)
     ours, judge = make(), make()
