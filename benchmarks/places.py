@@ -249,11 +249,10 @@ def show(rows: list[dict]) -> None:
                 f"{r[s]:.3f}",
                 f"{r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}",
                 "" if isnan(r[f"{s} half"]) else f"{r[f'{s} half']:.2f}",
-                r[f"{s} best is"],
             ]
             for r in rows
         ]
-        print_table(f"{s} in all places", (s, "blind", "field", "less best", "split half", "best"), table)
+        print_table(f"{s} in all places", (s, "blind", "field", "less best", "split half"), table)
     print("means over places: " + ", ".join(f"{s} {sum(r[s] for r in rows) / len(rows):.3f}" for s in SCORES))
     ranks = [r[f"{s} rank"] for r in rows for s in SCORES]
     worst = max(rows, key=lambda r: r["KLD less"])

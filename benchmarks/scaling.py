@@ -11,12 +11,13 @@ of the time that was waited.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
@@ -52,7 +53,7 @@ def room(folder: Path, observers: int, count: int) -> None:
     Rays(t, person, names, origin, d, np.ones(len(person))).save(folder / "rays.npz")
 
 
-def bake(folder: Path, name: str, detail: float, **more) -> tuple[int, bytes]:
+def bake(folder: Path, detail: float, name: str, **more) -> tuple[int, bytes]:
     """Observers and the bytes of what is made of them."""
     from nerg_mi.scenes import store
     from nerg_mi.workflows.bake import bake
@@ -90,19 +91,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         room(folder, args.observers, args.rays)
-        works = {
-            f"bake of {args.observers} observers, detail {d:g}": (
-                args.observers,
-                lambda name, d=d, **m: bake(folder, name, d, **m),
-            )
+        works: dict[str, tuple[int, str, Callable]] = {
+            f"bake of {args.observers} observers, detail {d:g}": (args.observers, "observers", partial(bake, folder, d))
             for d in DETAILS
         }
-        works[f"counts of {args.rays:,} rays"] = (args.rays, lambda name, **more: count(folder, name, **more))
-        whole = {what: work(f"whole {what}", threads=1) for what, (_, work) in works.items()}
+        works[f"counts of {args.rays:,} rays"] = (args.rays, "rays", partial(count, folder))
+        whole = {what: work(f"whole {what}", threads=1) for what, (_, _, work) in works.items()}
         with ClusterOfProcesses(folder) as cluster:
             for workers in (1, 2):
                 cluster.start_worker()
-                for what, (units, work) in works.items():
+                for what, (units, unit, work) in works.items():
                     given = {"scheduler": cluster.address, "threads": 1}
                     work(f"warm {what}", **given, store=folder / f"warm {what} {workers}")
                     store = folder / f"{what} {workers}"
@@ -112,25 +110,21 @@ def main() -> None:
                     receipts = list(Store(store).receipts())
                     each = [r.seconds for r in receipts]
                     size = sum(r.size for r in receipts) / len(receipts)
+                    if made != whole[what][1]:
+                        raise SystemExit(f"{what}: {workers} workers make something else than one process")
                     row = {
-                        "what": f"{what}, {faces:,} triangles" if faces else what,
+                        "work": f"{what}, {faces:,} triangles" if faces else what,
                         "workers": workers,
                         "parts": len(each),
-                        "seconds": seconds,
-                        "computed_a_part": statistics.median(each),
-                        "besides_a_part": (workers * seconds - sum(each)) / len(each),
-                        "bytes_a_part": size,
-                        "units_a_second": units / seconds,
-                        "equal": made == whole[what][1],
+                        "waited": f"{seconds:.1f} s",
+                        "computed a part": f"{statistics.median(each):.2f} s",
+                        "besides a part": f"{(workers * seconds - sum(each)) / len(each):.2f} s",
+                        "output of a part": f"{size / 1000:,.0f} kB",
+                        "throughput": f"{units / seconds:,.{2 if units / seconds < 1000 else 0}f} {unit} a second",
                     }
                     rows.append(row)
-                    print(json.dumps(row), flush=True)
-    head = "work|workers|parts|waited|computed a part|besides a part|output of a part|throughput a second|equal"
-    formats = ("", "", "", ".1f", ".2f", ".2f", ",.0f", ",.2f", "")
-    suffixes = ("", "", "", " s", " s", " s", " B", "", "")
-    table = [[f"{v:{f}}{suffix}" for v, f, suffix in zip(row.values(), formats, suffixes)] for row in rows]
-    print_table("Measured", head.split("|"), table)
-    args.out.mkdir(parents=True, exist_ok=True)
+                    print(row, flush=True)
+    print_table("Measured", list(rows[0]), [list(row.values()) for row in rows])
     write_rows(args.out / "scaling.csv", rows)
 
 
