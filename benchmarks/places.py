@@ -278,7 +278,9 @@ def show_uncertainty(rows: list[dict]) -> None:
 
     def rho(place: str, split: str, error: str) -> str:
         r = by.get((place, "support", split, error))
-        return "too few" if r is None else f"{r['rho']:+.2f} [{r['rho.low']:+.2f}, {r['rho.high']:+.2f}]"
+        if r is None or isnan(r["rho"]):
+            return "too few"
+        return f"{r['rho']:+.2f} [{r['rho.low']:+.2f}, {r['rho.high']:+.2f}]"
 
     table = []
     for place in places:
