@@ -29,7 +29,6 @@ ROWS = (
     ("parts, stop 1e-4", AOVS, {"stop": 1e-4}),
     ("parts, stop 1e-3", AOVS, {"stop": 1e-3}),
     ("parts, color_cutoff 1e-2", AOVS, {"color_cutoff": 1e-2}),
-    ("parts, stop 1e-3, color_cutoff 1e-2", AOVS, {"stop": 1e-3, "color_cutoff": 1e-2}),
     ("parts, dt_gamma 1/256", AOVS, {"dt_gamma": 1 / 256}),
     ("parts, map of the observer", AOVS, {"visibility": "map"}),
 )
