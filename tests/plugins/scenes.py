@@ -1,5 +1,6 @@
 """Small scenes, and how to render them, for the tests of the integrator."""
 
+import drjit as dr
 import numpy as np
 
 from nerg_mi.transport.geometry import Place
@@ -7,6 +8,29 @@ from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverSettings
 
 SIZE = 12
+
+
+def plugin(kind, **more):
+    """The description of a plugin, as ``mi.load_dict`` takes it."""
+    return {"type": kind, **more}
+
+
+def stored(kind, path, **more):
+    """A volume that reads a file."""
+    return {"type": kind, "filename": str(path), **more}
+
+
+def still(sensor):
+    """``sensor`` with one ray through the centre of each pixel."""
+    return {**sensor, "sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}
+
+
+def center_rays(mi, sensor):
+    """Rays through the centres of the pixels of the description ``sensor``, row by row."""
+    sensor = mi.load_dict(sensor)
+    w, h = sensor.film().crop_size()
+    y, x = (np.mgrid[:h, :w].reshape(2, -1) + 0.5).astype(np.float32)
+    return sensor.sample_ray(0, 0.5, mi.Point2f(x / w, y / h), mi.Point2f(0.5))[0]
 
 
 def look_at(mi, origin, target=(0, 0, 0), up=(0, 1, 0)):
@@ -18,51 +42,70 @@ def camera(
 ):
     if kind == "perspective":
         kwargs = {"fov": 35, **kwargs}
-    return {
-        "type": kind,
-        "to_world": look_at(mi, origin, target),
+    return plugin(
+        kind,
+        to_world=look_at(mi, origin, target),
         **kwargs,
-        "sampler": {"type": "independent", "sample_count": 1},
-        "film": {
-            "type": "hdrfilm",
-            "width": size,
-            "height": size,
-            "component_format": "float32",
-            "rfilter": {"type": rfilter},
-            "pixel_format": "luminance" if "mono" in mi.variant() else "rgb",
-            **dict(film),
-        },
-    }
+        sampler={"type": "independent", "sample_count": 1},
+        film=plugin(
+            "hdrfilm",
+            width=size,
+            height=size,
+            component_format="float32",
+            rfilter={"type": rfilter},
+            pixel_format="luminance" if "mono" in mi.variant() else "rgb",
+        )
+        | dict(film),
+    )
 
 
 # Expected depths have closed forms also where matter is thin, unlike the medians of the default.
 def with_field(files, **kwargs):
-    return {
-        "type": "nerg",
-        "depth": "expected",
-        "field": {"type": "nerf", "filename": str(files / "field.safetensors")},
-        **kwargs,
-    }
+    return {"type": "nerg", "depth": "expected", "field": stored("nerf", files / "field.safetensors"), **kwargs}
 
 
 def with_gaze(files, aovs="depth,opacity,gaze,visibility", **kwargs):
-    gaze = {"type": "gazefield", "filename": str(files / "gaze.safetensors")}
-    return with_field(files, gaze=gaze, aovs=aovs, **kwargs)
+    return with_field(files, **({"gaze": stored("gazefield", files / "gaze.safetensors"), "aovs": aovs} | kwargs))
 
 
 def constant(sigma=3.0, **kwargs):
     return {"type": "nerg", "depth": "expected", "density": {"type": "constvolume", "value": sigma}, **kwargs}
 
 
+def scene_with(mi, integrator, sensor=None, **more):
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor or camera(mi), **more})
+
+
+def picture(mi, scene):
+    return np.array(mi.render(scene, spp=1))
+
+
 def render(mi, integrator, sensor=None, spp=1, seed=0, **more):
-    scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor or camera(mi), **more})
-    return np.array(mi.render(scene, spp=spp, seed=seed))
+    return np.array(mi.render(scene_with(mi, integrator, sensor, **more), spp=spp, seed=seed))
+
+
+def put(params, key, value):
+    """Set one parameter of ``mi.traverse``."""
+    params[key] = value
+    params.update()
+
+
+def attach(params, *keys):
+    """Track derivatives of parameters."""
+    for key in keys:
+        dr.enable_grad(params[key])
+    params.update()
 
 
 def named(mi, image, integrator):
     """The channels of ``image`` behind the colour, by name."""
     names = mi.load_dict(integrator).aov_names()
     return dict(zip(names, np.moveaxis(image[..., image.shape[-1] - len(names) :], -1, 0)))
+
+
+def points(out):
+    """Positions of the channels ``out``, in a last axis."""
+    return np.stack([out[f"position.{c}"] for c in "XYZ"], axis=-1)
 
 
 def channels(mi, integrator, sensor=None, **kwargs):
@@ -77,6 +120,28 @@ def straight(mi, kind):
     return camera(mi, (0.5, 0.5, -2), (0.5, 0.5, 0), fov=1e-3, size=1, near_clip=0.01)
 
 
+def sphere(mi, *center, radius=0.5, color=(0.2, 0.5, 0.8)):
+    reflectance = {"type": "rgb", "value": list(color)}
+    return plugin("sphere", center=list(center), radius=radius, bsdf=plugin("diffuse", reflectance=reflectance))
+
+
+def square(mi, z, size=1.0, x=0.0):
+    to_world = mi.ScalarTransform4f().translate([x, 0, z]).scale([size, size, 1])
+    return plugin("rectangle", to_world=to_world, bsdf={"type": "twosided", "b": {"type": "diffuse"}})
+
+
+def room(mi, open_side=False):
+    """A cube to look at from within, one side of which may be missing."""
+    walls = {}
+    for axis in range(3):
+        for side in (-1, 1):
+            at = [0.9 * side if a == axis else 0 for a in range(3)]
+            to_world = look_at(mi, at, up=(0, 0, 1) if axis != 2 else (0, 1, 0)).scale([0.9, 0.9, 1])
+            if not (open_side and (axis, side) == (1, 1)):
+                walls[f"w{axis}{side + 1}"] = {"type": "rectangle", "to_world": to_world}
+    return walls
+
+
 def observer_at(mi, *origin, **kwargs):
     return {"type": "perspective", "to_world": look_at(mi, origin, (0.1, 0.2, 0.3)), **kwargs}
 
@@ -88,26 +153,19 @@ def wall(mi, gap=0.3):
     x = (np.arange(n) + 0.5) / n * 2 - 1
     data[19:21, :, x < gap] = 1e4
     data[36:] = 1e4
-    return {
-        "type": "gridvolume",
-        "grid": mi.VolumeGrid(data),
-        "filter_type": "nearest",
-        "to_world": mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2),
-    }
+    return plugin(
+        "gridvolume",
+        grid=mi.VolumeGrid(data),
+        filter_type="nearest",
+        to_world=mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2),
+    )
 
 
 def hidden_scene(mi, **kwargs):
     # The camera is behind the wall and sees the back wall; the observer is in front of it.
     sensor = camera(mi, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
-    integrator = {
-        "type": "nerg",
-        "density": wall(mi),
-        "aovs": "visibility,position,observer_depth",
-        "step": 0.01,
-        "observer": observer_at(mi, 0, 0, -0.9),
-        **kwargs,
-    }
-    return channels(mi, integrator, sensor)
+    how = {"aovs": "visibility,position,observer_depth", "step": 0.01, "observer": observer_at(mi, 0, 0, -0.9)} | kwargs
+    return channels(mi, plugin("nerg", density=wall(mi), **how), sensor)
 
 
 GAZE = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth"
@@ -115,6 +173,5 @@ GAZE = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth"
 
 def observed(mi, gaze, p_o, place=None):
     """The gaze field that the dict ``gaze`` describes, for the observer at ``p_o``."""
-    return (
-        mi.load_dict(gaze).placed_gaze().at([p_o], place or Place(None), ObserverSettings(march=MarchSettings(step=1)))
-    )
+    settings = ObserverSettings(march=MarchSettings(step=1))
+    return mi.load_dict(gaze).placed_gaze().at([p_o], place or Place(None), settings)

@@ -1,5 +1,6 @@
-"""The table of AOVs: one entry is all that an AOV is."""
+"""The table of AOVs, features among them, and that what a scene does not need is not computed."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from nerg_mi.api.scene import Scene
 from nerg_mi.errors import NergError
+from nerg_mi.evaluation.study import traced_operations
 from nerg_mi.figures.overlay import find_overlay, to_bytes
 from nerg_mi.files.images import write_exr
 from nerg_mi.transport import aovs
@@ -16,8 +18,29 @@ from nerg_mi.viewer.layers import automatic, available, colored, legend, usual_s
 from nerg_mi.workflows.draw import draw
 from nerg_mi.workflows.render import layers_of
 
-from .scenes import camera, channels, constant, named, with_field, with_gaze
-from .test_nerg_leaves_out import operations
+from . import fields
+from .scenes import (
+    camera,
+    center_rays,
+    channels,
+    constant,
+    look_at,
+    named,
+    observer_at,
+    picture,
+    plugin,
+    points,
+    put,
+    render,
+    scene_with,
+    still,
+    stored,
+    straight,
+    with_field,
+    with_gaze,
+)
+
+# ---- The table of AOVs: one entry is all that an AOV is ----
 
 
 @pytest.fixture
@@ -61,13 +84,16 @@ def test02_the_manual_lists_the_table(rgb, table):
 
 def test03_every_aov_renders(rgb, files, table, tmp_path):
     """All that need nothing but a field and a gaze field, at once, with as many channels as they are said to have."""
-    given = rgb.load_dict(with_gaze(files))
+    eye = observer_at(rgb, -2, 0.3, -2)
+    given = rgb.load_dict(with_gaze(files, observer=eye))
     names = [n for n, aov in table.AOVS.items() if all(need.is_met(given) for need in aov.needs)]
     assert {"features", "gaze", "density_evals"} < set(names) and "gaze_std" not in names
-    integrator = with_gaze(files, ",".join(names))
-    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb)})
-    out = named(rgb, np.array(rgb.render(scene, spp=1)), integrator)
+    integrator = with_gaze(files, ",".join(names), observer=eye)
+    scene = scene_with(rgb, integrator)
+    out = named(rgb, picture(rgb, scene), integrator)
     assert all(np.isfinite(v).all() and v.any() for v in out.values()), [k for k, v in out.items() if not v.any()]
+    factors = out["emit.Y"] * out["capture.Y"] * out["visibility.Y"]
+    np.testing.assert_allclose(out["gaze.Y"], factors, rtol=1e-5)
     # Each alone is what it is beside the others.
     for name in names:
         alone = channels(rgb, {**integrator, "aovs": name})
@@ -102,7 +128,7 @@ def test05_an_entry_is_shown_everywhere(rgb, table, tmp_path, kind):
         summary="number of the row in which the surface lies",
         compute=lambda p: [dr.select(p.surface, dr.floor(p.p_d.z * 2 + 3), 0)],
     )
-    scene = rgb.load_dict({"type": "scene", "integrator": constant(), "sensor": camera(rgb)})
+    scene = scene_with(rgb, constant())
     # Overlays, with the title, the label and the unit of the table.
     overlay = find_overlay("rows")
     layers = layers_of(Path("scene.xml"), scene, scene.sensors()[0], overlay)
@@ -130,3 +156,166 @@ def test05_an_entry_is_shown_everywhere(rgb, table, tmp_path, kind):
     else:
         said = [axes.get_ylabel() for axes in draw("difference", [file, file], channel="rows").axes]
         assert any("difference of rows [rows]" in text.replace("\n", " ") for text in said)
+
+
+# ---- Geometry features as AOVs: accumulated along the ray, and at the surface ----
+
+STEP = 0.05
+
+
+def block(out, name):
+    keys = sorted((k for k in out if k.startswith(name + ".")), key=lambda k: int(k.split(".")[1]))
+    return np.stack([out[k] for k in keys], -1)
+
+
+def test01_accumulated_features_are_the_sum_of_weights_times_features(rgb, files):
+    """Against a float64 sum over the same steps of the field's own densities and features."""
+    integrator = with_field(files, aovs="features,opacity,depth", step=STEP, color_cutoff=0.0, stop=0.0)
+    sensor = still(camera(rgb, size=4))
+    features = block(channels(rgb, integrator, sensor), "features").reshape(16, -1)
+    medium = rgb.load_dict(integrator["field"]).medium()
+    assert features.shape[-1] == medium.feature_count
+    ray = center_rays(rgb, sensor)
+    local = medium.local(ray.o, ray.d)
+    near, far = np.maximum(np.array(local.t_near, float), 0), np.array(local.t_far, float)
+    T, total, t = np.ones(16), np.zeros_like(features, float), near.copy()
+    while (t < far).any():
+        inside, end = t < far, np.minimum(t + STEP, far)
+        p = local.o + local.d * rgb.Float(np.where(inside, (t + end) / 2, 0).astype(np.float32))
+        sigma, f = medium.density_features(p, rgb.Bool(inside))
+        alpha = np.where(inside, -np.expm1(-np.array(sigma, float) * (end - t)), 0)
+        total += (T * alpha)[:, None] * np.stack([np.array(v, float) for v in f], -1)
+        T *= 1 - alpha
+        t = end
+    assert medium.occupancy is None and np.abs(total).max() > 0.05
+    assert np.median(np.abs(features - total)) < 2e-4 * np.abs(total).max()
+    assert np.abs(features - total).max() < 0.05 * np.abs(total).max()
+
+
+def test02_colour_is_the_same_with_and_without_features(rgb, files):
+    plain, both, dark = (
+        render(rgb, with_field(files, aovs=f"opacity,depth{more}", radiance=lit))
+        for more, lit in (("", True), (",features", True), (",features", False))
+    )
+    assert np.allclose(both[..., :5], plain[..., :5], atol=1e-6)
+    assert not dark[..., :3].any() and np.allclose(dark[..., 5:], both[..., 5:], atol=1e-6)
+
+
+def test03_the_snapshot_is_the_field_at_the_surface(rgb, files):
+    out = channels(rgb, with_field(files, aovs="position,features_at,opacity"))
+    surface = out["opacity.Y"] >= 0.5
+    medium = rgb.load_dict(with_field(files)["field"]).medium()
+    p = rgb.Point3f(np.ascontiguousarray(points(out)[surface].T))
+    expected = np.stack([np.array(f) for f in medium.density_features(p, True)[1]], -1)
+    got = block(out, "features_at")
+    assert surface.sum() > 10 and np.allclose(got[surface], expected, atol=2e-3 * np.abs(expected).max())
+    assert not got[~surface].any()
+
+
+def test04_a_shape_has_none_and_hides_those_behind(rgb, files):
+    wall = plugin("rectangle", to_world=look_at(rgb, (0.5, 0.4, -2), (0.5, 0.4, -3)).scale(9))
+    out = channels(rgb, with_field(files, aovs="features,features_at,opacity"), w=wall)
+    assert (out["opacity.Y"] == 1).all() and not block(out, "features").any() and not block(out, "features_at").any()
+
+
+def test05_derivatives_reach_the_field(rgb, files):
+    integrator = with_field(files, aovs="features,features_at", radiance=False, step=STEP, color_cutoff=0.0)
+    # Primal and gradient must look through the same points of the pixels.
+    scene = scene_with(rgb, integrator, still(camera(rgb, size=4)))
+    params, key = rgb.traverse(scene), "integrator.field.density_net.1"
+    start = rgb.TensorXf(params[key])
+
+    def loss(value):
+        put(params, key, value)
+        image = rgb.render(scene, params, spp=1)
+        return dr.sum(image[..., 3:] * image[..., 3:], axis=None)
+
+    value, h = rgb.TensorXf(start), 1e-3
+    dr.enable_grad(value)
+    dr.backward(loss(value))
+    gradient = np.array(dr.grad(value))
+    size = np.linalg.norm(gradient)
+    direction = rgb.TensorXf((gradient / size).astype(np.float32))
+    ends = [loss(start + s * h * direction).numpy().item() for s in (1, -1)]
+    assert size > 0 and (ends[0] - ends[1]) / (2 * h) == pytest.approx(size, rel=0.03)
+
+
+# ---- What a scene does not need is not computed: counted in operations traced and evaluations made, not in time ----
+
+
+def operations(mi, integrator, sensor=None):
+    scene = scene_with(mi, integrator, sensor)
+    mi.render(scene, spp=1)  # set-up that happens once is not counted
+    return traced_operations(lambda: mi.render(scene, spp=1))
+
+
+def test01_no_colour(rgb, files):
+    dark, lit = (with_field(files, radiance=r, aovs="depth,opacity") for r in (False, True))
+    assert operations(rgb, dark) < 0.75 * operations(rgb, lit)
+    evals = channels(rgb, with_field(files, radiance=False, aovs="density_evals,color_evals"))
+    assert evals["density_evals.Y"].max() > 5 and not evals["color_evals.Y"].any()
+
+
+def test02_nothing_asked_nothing_marched(rgb, files):
+    nothing, depth = (operations(rgb, with_field(files, radiance=False, aovs=a)) for a in ("", "depth"))
+    assert nothing < 0.1 * depth
+
+
+def test03_no_gaze_unless_asked(rgb, files):
+    unasked, asked = (operations(rgb, with_gaze(files, aovs)) for aovs in ("depth,opacity", "depth,opacity,gaze"))
+    assert unasked == operations(rgb, with_field(files, aovs="depth,opacity")) and asked > unasked + 300
+
+
+def test04_an_aligned_observer_needs_no_second_march(rgb, files):
+    sensor, none = camera(rgb, (0.5, 0.4, -3)), with_gaze(files, "gaze,density_evals")
+    here, there = (none | {"observer": observer_at(rgb, *o)} for o in ((0.5, 0.4, -3), (-2, 0.3, -2)))
+    a, b, c = (channels(rgb, i, sensor)["density_evals.Y"] for i in (none, here, there))
+    assert np.array_equal(a, b) and c.sum() > 1.3 * a.sum()
+    first, second, third = (operations(rgb, i, sensor) for i in (none, here, there))
+    assert second < first + 60 and third > second + 300
+
+
+def test05_without_occlusion_no_observer_march(rgb, files):
+    aligned = with_gaze(files, "gaze,density_evals")
+    off = aligned | {"observer": observer_at(rgb, -2, 0.3, -2), "occlusion": False}
+    assert np.array_equal(*(channels(rgb, i)["density_evals.Y"] for i in (off, aligned)))
+    assert operations(rgb, off) + 300 < operations(rgb, {**off, "occlusion": True})
+
+
+def test06_half_a_gaze_field_for_half_a_variant(rgb, files, tmp_path):
+    fields.gaze(tmp_path / "emit.safetensors", "emit")
+    both = with_gaze(files, "gaze,gaze_evals")
+    emit = {**both, "gaze": stored("gazefield", tmp_path / "emit.safetensors")}
+    assert operations(rgb, emit) + 100 < operations(rgb, both)
+    assert channels(rgb, emit)["gaze_evals.Y"].max() == 1 and channels(rgb, both)["gaze_evals.Y"].max() == 2
+
+
+@pytest.mark.parametrize("thickness", [1, 4])
+def test08_empty_space_is_passed_over(rgb, thickness):
+    # A sheet of some voxels in an empty grid of 64: what is marched is the sheet and a voxel on either side.
+    data = np.zeros((64, 64, 64), np.float32)
+    data[30 : 30 + thickness] = 0.01
+    density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data)}
+    integrator = {"type": "nerg", "density": density, "step": 1 / 256, "aovs": "density_evals"}
+    evals = channels(rgb, integrator, straight(rgb, "perspective"))["density_evals.Y"].item()
+    assert 4 * thickness <= evals <= 4 * (thickness + 2) + 2
+
+
+def test10_rays_that_miss_cost_nothing(rgb, files):
+    out = channels(rgb, with_gaze(files, "density_evals,color_evals,gaze_evals"), camera(rgb, (0, 0, -3), (0, 5, -3)))
+    assert not any(c.any() for c in out.values())
+
+
+def test11_rendering_imports_neither_torch_nor_matplotlib_nor_scipy_stats(files):
+    code = f"""
+import sys, nerg_mi, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+scene = mi.load_dict({{"type": "scene", "integrator": {{"type": "nerg", "aovs": "depth,gaze",
+    "field": {{"type": "nerf", "filename": r"{files / "field.safetensors"}"}},
+    "gaze": {{"type": "gazefield", "filename": r"{files / "gaze.safetensors"}"}}}},
+    "sensor": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 4, "height": 4}}}}}})
+mi.render(scene, spp=1).numpy()
+print([m for m in ("torch", "matplotlib", "scipy.stats") if m in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

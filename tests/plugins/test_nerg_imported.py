@@ -7,19 +7,16 @@ import pytest
 
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.formats.torch_ngp import read_nerg
+from nerg_mi.maths.color import decode_srgb
 from tests.formats.test_torch_ngp import save_nerg as save
 from tests.reference import march_numpy
 from tests.reference import torch_ngp_numpy as reference
 
-from .scenes import camera, named, render
+from .scenes import camera, center_rays, named, plugin, render, still, stored
 
 pytestmark = pytest.mark.usefixtures("torch")
 
 SIZE, STEP = 6, 0.02
-
-
-def srgb_to_linear(c):
-    return np.where(c <= 0.04045, c / 12.92, ((np.maximum(c, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def expected(state, nerf, bound, origins, directions, eye):
@@ -40,7 +37,7 @@ def expected(state, nerf, bound, origins, directions, eye):
         p_d = o + d * depth
         r_o = (p_d - eye) / np.linalg.norm(p_d - eye)
         g = reference.gaze(state, bound, *(np.float32(x)[None] for x in (p_d, eye, r_o)))
-        out.append(np.concatenate([alpha * srgb_to_linear(total / alpha), [depth, alpha], [x.item() for x in g]]))
+        out.append(np.concatenate([alpha * decode_srgb(total / alpha), [depth, alpha], [x.item() for x in g]]))
     return np.array(out)
 
 
@@ -64,29 +61,15 @@ def test01_a_picture_of_a_checkpoint(rgb, tmp_path, bound, aligned):
     save_gaze(gaze, tmp_path / "gaze.safetensors", origin)
 
     eye = np.array([0.4, 0.3, -1.5]) if aligned else np.array([1.1, -0.7, 0.6])
-    integrator = {
-        "type": "nerg",
-        "depth": "expected",
-        "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")},
-        "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")},
-        "step": STEP,
-        "aovs": "depth,opacity,gaze,emit,capture",
-        "surface_opacity": 0.0,
-        "color_cutoff": 0.0,
-        "stop": 0.0,
-    }
+    how = {"step": STEP, "surface_opacity": 0.0, "color_cutoff": 0.0, "stop": 0.0}
     if not aligned:
-        integrator |= {
-            "observer": {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate(eye.tolist())},
-            "occlusion": False,
-        }
-    sensor = {
-        **camera(rgb, (0.4, 0.3, -1.5), (0.1, 0, 0.4), size=SIZE, fov=60, near_clip=0.01),
-        "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
-    }
-    loaded = rgb.load_dict(sensor)
-    grid = (np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE)), -1).reshape(-1, 2) + 0.5) / SIZE
-    ray, _ = loaded.sample_ray(0, 0.5, rgb.Point2f(grid.T.astype(np.float32)), rgb.Point2f(0.5))
+        place = rgb.ScalarTransform4f().translate(eye.tolist())
+        how |= {"observer": {"type": "perspective", "to_world": place}, "occlusion": False}
+    volumes = {"field": stored("nerf", tmp_path / "field.safetensors")}
+    volumes["gaze"] = stored("gazefield", tmp_path / "gaze.safetensors")
+    integrator = plugin("nerg", depth="expected", aovs="depth,opacity,gaze,emit,capture", **volumes, **how)
+    sensor = still(camera(rgb, (0.4, 0.3, -1.5), (0.1, 0, 0.4), size=SIZE, fov=60, near_clip=0.01))
+    ray = center_rays(rgb, sensor)
     origins, directions = (np.array(v, np.float64).T for v in (ray.o, ray.d))
 
     image = render(rgb, integrator, sensor)

@@ -1,9 +1,37 @@
-"""Observers: where they are, what is hidden from them, and how that is decided."""
+"""Observers and shapes: what is hidden from whom, how that is decided, and what a field and shapes show together."""
 
+import drjit as dr
 import numpy as np
 import pytest
 
-from .scenes import GAZE, camera, channels, hidden_scene, look_at, named, observer_at, render, with_gaze
+from nerg_mi.evaluation.study import traced_operations
+
+from .scenes import (
+    GAZE,
+    attach,
+    camera,
+    channels,
+    constant,
+    hidden_scene,
+    look_at,
+    named,
+    observed,
+    observer_at,
+    picture,
+    plugin,
+    points,
+    put,
+    render,
+    scene_with,
+    sphere,
+    square,
+    still,
+    stored,
+    straight,
+    with_gaze,
+)
+
+# ---- What is hidden from observers, and how that is decided ----
 
 
 @pytest.mark.parametrize("near_clip", [0.01, 1.0])
@@ -16,18 +44,9 @@ def test01_an_observer_at_the_camera_is_none(rgb, files, near_clip):
     assert set(np.unique(out["visibility.Y"])) <= {0, 0.5, 1} and out["gaze.Y"].max() > 0
 
 
-def test02_near_clip_does_not_move_the_observer(rgb, files):
-    near, far = (channels(rgb, with_gaze(files, GAZE), camera(rgb, near_clip=n)) for n in (0.01, 1.0))
-    seen = near["gaze.Y"] > 0
-    assert seen.any() and np.allclose(near["position.X"], far["position.X"], atol=2e-2)
-    # Depth is measured from the near plane, gaze and observer depth from the centre.
-    assert (near["depth.T"][seen] - far["depth.T"][seen] > 0.9).all()
-    assert np.allclose(near["observer_depth.T"][seen], far["observer_depth.T"][seen], rtol=2e-2)
-
-
 def test03_cameras_without_a_centre_need_an_observer(rgb, files):
     sensor = {**camera(rgb, kind="orthographic"), "near_clip": 0.1}
-    scene = rgb.load_dict({"type": "scene", "integrator": with_gaze(files, "gaze"), "sensor": sensor})
+    scene = scene_with(rgb, with_gaze(files, "gaze"), sensor)
     with pytest.raises(ValueError, match="no centre to look from.*observer"):
         scene.integrator().render(scene, scene.sensors()[0])
     out = channels(rgb, with_gaze(files, "gaze", observer=observer_at(rgb, 1, 0, -3)), sensor)
@@ -35,26 +54,33 @@ def test03_cameras_without_a_centre_need_an_observer(rgb, files):
     assert render(rgb, with_gaze(files, "depth"), sensor).shape[-1] == 4
 
 
-@pytest.mark.parametrize("depth", ["expected", "median"])
-def test04_behind_an_opaque_wall(rgb, depth):
-    out = hidden_scene(rgb, depth=depth, falloff=0.0)
-    x, z = out["position.X"], out["position.Z"]
-    assert np.allclose(z, 0.8, atol=0.02)
+def sides(out, margin=0.06):
+    """Which points of the back wall the gap's wall hides from the observer, and which it certainly does not."""
     # The observer's line to (x, y, 0.8) passes z = -0.05 .. 0.05 at x (0.85 .. 0.95) / 1.7.
-    hidden, visible = x * 0.95 / 1.7 < 0.3 - 0.06, x * 0.85 / 1.7 > 0.3 + 0.06
+    x = out["position.X"]
+    hidden, visible = x * 0.95 / 1.7 < 0.3 - margin, x * 0.85 / 1.7 > 0.3 + margin
     assert hidden.sum() > 20 and visible.sum() > 5
-    assert not out["visibility.Y"][hidden].any() and (out["visibility.Y"][visible] == 1).all()
-    ray = np.sqrt(x**2 + out["position.Y"] ** 2 + 1.7**2)
-    assert np.allclose(out["observer_depth.T"][visible], ray[visible], atol=0.03)
-    assert np.allclose(out["observer_depth.T"][hidden], (ray * 0.85 / 1.7)[hidden], atol=0.03)
+    return hidden, visible, np.linalg.norm(points(out) - (0, 0, -0.9), axis=-1)
+
+
+@pytest.mark.parametrize(
+    "kind, depth", [("depth", "expected"), ("depth", "median"), ("map", "median"), ("transmittance", "median")]
+)
+def test04_behind_an_opaque_wall(rgb, kind, depth):
+    out = hidden_scene(rgb, depth=depth, visibility=kind, falloff=0.0, map_height=256)
+    assert np.allclose(out["position.Z"], 0.8, atol=0.02)
+    hidden, visible, ray = sides(out, 0.06 if kind == "depth" else 0.08)
+    assert np.allclose(out["visibility.Y"][hidden], 0, atol=1e-6)
+    assert np.allclose(out["visibility.Y"][visible], 1, atol=1e-6)
+    if kind == "depth":
+        assert np.allclose(out["observer_depth.T"][visible], ray[visible], atol=0.03)
+        assert np.allclose(out["observer_depth.T"][hidden], (ray * 0.85 / 1.7)[hidden], atol=0.03)
 
 
 def test05_falloff_is_a_ramp(rgb):
     # Hidden surfaces lie 1.7 / 0.85 times as far as what the observer meets.
     out = hidden_scene(rgb, falloff=2.0, tolerance=0.05)
-    x = out["position.X"]
-    hidden = x * 0.95 / 1.7 < 0.3 - 0.06
-    ray = np.sqrt(x**2 + out["position.Y"] ** 2 + 1.7**2)
+    hidden, _, ray = sides(out)
     expected = 1 - np.clip((ray - out["observer_depth.T"] - 0.05) / 2, 0, 1)
     # The point looked for lies the tolerance and a little more in front of the surface.
     assert np.allclose(out["visibility.Y"][hidden], expected[hidden], atol=0.04)
@@ -64,81 +90,32 @@ def test05_falloff_is_a_ramp(rgb):
 def test06_without_occlusion_all_is_visible(rgb):
     out = hidden_scene(rgb, occlusion=False)
     assert (out["visibility.Y"] == 1).all()
-    ray = np.sqrt(out["position.X"] ** 2 + out["position.Y"] ** 2 + (out["position.Z"] + 0.9) ** 2)
-    assert np.allclose(out["observer_depth.T"], ray, rtol=1e-5)
-
-
-def test07_no_shadow_acne_on_what_the_observer_sees(rgb):
-    # Observer and camera on the same side of one flat wall, near each other and far apart.
-    data = np.zeros((40, 2, 2), np.float32)
-    data[30:] = 1e4
-    density = {
-        "type": "gridvolume",
-        "grid": rgb.VolumeGrid(data),
-        "filter_type": "nearest",
-        "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2),
-    }
-    for x in (0.01, 0.3, 0.9):
-        integrator = {
-            "type": "nerg",
-            "density": density,
-            "aovs": "visibility",
-            "falloff": 0.0,
-            "observer": observer_at(rgb, x, 0.1, -0.9),
-        }
-        out = channels(rgb, integrator, camera(rgb, (0, 0, -0.95), (0, 0, 1), fov=60, near_clip=1e-3))
-        assert (out["visibility.Y"] == 1).all()
-
-
-@pytest.mark.parametrize("origin", [(0.5, 0.4, -3), (0, 0, 0), (0.1, 0.2, 5), (1e4, 0, 0)])
-def test08_observers_anywhere_give_finite_pictures(rgb, files, origin):
-    for falloff in (0.0, 1e-30, 0.3, 1e30):
-        out = render(rgb, with_gaze(files, GAZE, observer=observer_at(rgb, *origin), falloff=falloff))
-        assert np.all(np.isfinite(out))
-
-
-@pytest.mark.parametrize("visibility", ["depth", "map", "transmittance"])
-def test09_kinds_of_visibility_agree_on_opaque_walls(rgb, visibility):
-    out = hidden_scene(rgb, visibility=visibility, falloff=0.0, map_height=256)
-    x = out["position.X"]
-    hidden, visible = x * 0.95 / 1.7 < 0.3 - 0.08, x * 0.85 / 1.7 > 0.3 + 0.08
-    assert hidden.sum() > 20 and visible.sum() > 5
-    assert np.allclose(out["visibility.Y"][hidden], 0, atol=1e-6) and np.allclose(
-        out["visibility.Y"][visible], 1, atol=1e-6
-    )
+    assert np.allclose(out["observer_depth.T"], sides(out)[2], rtol=1e-5)
 
 
 def test10_coarse_steps_in_front_of_matter_change_nothing_behind(rgb):
-    a, b = (
-        hidden_scene(rgb, coarse=c, falloff=0.0, aovs="depth,opacity,visibility,position,observer_depth")
-        for c in (1.0, 4.0)
-    )
+    aovs = "depth,opacity,visibility,position,observer_depth"
+    a, b = (hidden_scene(rgb, coarse=c, falloff=0.0, aovs=aovs) for c in (1.0, 4.0))
     # Steps end elsewhere: a pixel at the shadow's edge may change sides.
-    assert np.mean(a["visibility.Y"] != b["visibility.Y"]) < 0.06
     same = a["visibility.Y"] == b["visibility.Y"]
+    assert np.mean(~same) < 0.06
     for c in ("depth.T", "opacity.Y", "observer_depth.T"):
         assert np.allclose(a[c][same], b[c][same], rtol=1e-2, atol=5e-3), c
 
 
-@pytest.mark.parametrize("sigma", [1e4, 50.0])
+# σ = 50: the observer's light goes two steps deep, and by 1/cos less so in depth. None: a shape.
+@pytest.mark.parametrize("sigma", [1e4, 50.0, None])
 @pytest.mark.parametrize("kind", ["depth", "map", "transmittance"])
 @pytest.mark.parametrize("angle", [0, 70, 85, 89])
 def test30_no_wall_hides_itself_from_an_oblique_observer(rgb, kind, sigma, angle):
-    # σ = 50: the observer's light goes two steps deep, and by 1/cos less so in depth.
-    to_world = rgb.ScalarTransform4f().translate([-10, -10, 2]).scale([20, 20, 0.5])
     eye = [2 * np.sin(np.deg2rad(angle)), 0.0, 2 - 2 * np.cos(np.deg2rad(angle))]
-    integrator = {
-        "type": "nerg",
-        "density": {"type": "constvolume", "value": sigma, "to_world": to_world},
-        "step": 0.01,
-        "aovs": "visibility",
-        "visibility": kind,
-        "falloff": 0.0,
-        "radiance": False,
-        "map_height": 256,
-        "observer": {"type": "perspective", "to_world": look_at(rgb, eye, (0, 0, 2))},
-    }
-    out = channels(rgb, integrator, camera(rgb, (0, 0.1, 0), (0, 0, 2), fov=20, size=12))
+    observer = {"type": "perspective", "to_world": look_at(rgb, eye, (0, 0, 2))}
+    how = {"aovs": "visibility", "visibility": kind, "falloff": 0.0, "radiance": False, "map_height": 256}
+    shapes = {"wall": square(rgb, 2.0, 10.0)} if sigma is None else {}
+    if sigma is not None:
+        to_world = rgb.ScalarTransform4f().translate([-10, -10, 2]).scale([20, 20, 0.5])
+        how |= {"density": {"type": "constvolume", "value": sigma, "to_world": to_world}, "step": 0.01}
+    out = channels(rgb, plugin("nerg", observer=observer, **how), camera(rgb, (0, 0.1, 0), (0, 0, 2), fov=20), **shapes)
     assert out["visibility.Y"].min() > 0.999
 
 
@@ -146,14 +123,158 @@ def test30_no_wall_hides_itself_from_an_oblique_observer(rgb, kind, sigma, angle
 def test31_an_observer_who_meets_nothing_is_not_blocked_by_it(rgb, kind):
     """Also where any opacity counts as a surface: rays that pass a ball by a hair find the point in front of it in the
     open."""
-    integrator = {
-        "type": "nerg",
-        "aovs": "visibility,observer_depth,position",
-        "surface_opacity": 0.0,
-        "visibility": kind,
-        "observer": observer_at(rgb, -2, 0.5, -2.5),
-    }
+    eye = (-2, 0.5, -2.5)
+    how = {"aovs": "visibility,observer_depth,position", "surface_opacity": 0.0, "visibility": kind}
+    integrator = plugin("nerg", observer=observer_at(rgb, *eye), **how)
     out = channels(rgb, integrator, camera(rgb, (0.3, 0.2, -3), fov=12), ball={"type": "sphere", "radius": 0.8})
-    p = np.stack([out[f"position.{c}"] for c in "XYZ"], -1)
-    faces = (p * ((-2, 0.5, -2.5) - p)).sum(-1) > 0
-    assert faces.all() and (out["visibility.Y"] > 0.999).all() and (out["observer_depth.T"] > 2).all()
+    p = points(out)
+    assert ((p * (eye - p)).sum(-1) > 0).all()
+    assert (out["visibility.Y"] > 0.999).all() and (out["observer_depth.T"] > 2).all()
+
+
+@pytest.mark.parametrize("kind", ["depth", "transmittance", "map"])
+@pytest.mark.parametrize("veiled", [False, True])
+def test06_shapes_hide_from_the_observer(rgb, kind, veiled):
+    """A square at z = 0 between an observer in front and a wall at z = 1, seen from the side; also through a veil that
+    is far too thin to hide anything."""
+    how = {"aovs": "position,visibility,observer_depth", "visibility": kind, "falloff": 0.0}
+    if veiled:
+        box = rgb.ScalarTransform4f().translate([-4, -4, -0.9]).scale([8, 8, 0.5])
+        how["density"] = {"type": "constvolume", "value": 1e-4, "to_world": box}
+    integrator = plugin("nerg", observer=observer_at(rgb, 0, 0, -1), **how)
+    shapes = {"wall": square(rgb, 1.0, 3.0), "lid": square(rgb, 0.0, 0.5)}
+    out = channels(rgb, integrator, camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24), **shapes)
+    on_wall = np.abs(out["position.Z"] - 1) < 1e-3
+    # Its shadow is twice its size. A map knows edges to about a row.
+    reach = np.maximum(np.abs(out["position.X"]), np.abs(out["position.Y"]))
+    hidden, seen = on_wall & (reach < 0.95), on_wall & (reach > 1.05)
+    assert hidden.sum() > 10 and seen.sum() > 50
+    assert (out["visibility.Y"][hidden] < 1e-3).all()
+    assert (out["visibility.Y"][seen] > (0.95 if kind == "map" else 0.999)).all()
+    if kind == "depth":
+        distance = np.linalg.norm(points(out) - (0, 0, -1), axis=-1)
+        assert np.allclose(out["observer_depth.T"][hidden], distance[hidden] / 2, atol=1e-2)
+
+
+# ---- Shapes, alone and together with a field: exact depths, compositing, and gaze on surfaces ----
+
+
+def gaze_only(files, aovs, **kwargs):
+    return plugin("nerg", gaze=stored("gazefield", files / "gaze.safetensors"), aovs=aovs, falloff=0.0, **kwargs)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 3.0])
+def test04_the_field_in_front_attenuates_a_shape(rgb, sigma):
+    """Closed forms: unit cube of constant density with a wall through its middle."""
+    blue, red = ({"type": "rgb", "value": value} for value in ([0, 0, 1], [1, 0, 0]))
+    integrator = constant(sigma, aovs="depth,opacity", color={"type": "constvolume", "value": blue})
+    bsdf = {"type": "twosided", "b": {"type": "diffuse", "reflectance": red}}
+    T, near = np.exp(-sigma * 0.5), 2 - 0.01
+    first = near * (1 - T) + (1 - T) / sigma - 0.5 * T
+    median = near + np.log(2) / sigma if T < 0.5 else near + 0.5
+    for kind, depth in (("expected", first + T * (near + 0.5)), ("median", median), ("refined", median)):
+        wall = square(rgb, 0.5, 2.0) | {"bsdf": bsdf}
+        image = render(rgb, {**integrator, "depth": kind}, straight(rgb, "perspective"), w=wall)
+        assert image[0, 0] == pytest.approx([T, 0, 1 - T, depth, 1], rel=1e-5, abs=1e-5)
+
+
+def test05_a_shape_hides_the_field_and_the_field_a_shape(rgb):
+    field = constant(1e6, aovs="depth,opacity,density_evals")
+    front, behind = (channels(rgb, field, straight(rgb, "perspective"), w=square(rgb, z, 2.0)) for z in (-0.5, 1.5))
+    assert front["depth.T"][0, 0] == pytest.approx(1.49) and front["density_evals.Y"][0, 0] == 0
+    assert behind["depth.T"][0, 0] == pytest.approx(1.99, abs=1e-4)
+
+
+def test08_gaze_on_a_shape_is_equation_1(rgb, files):
+    eye = (-2, 0.3, -2)
+    integrator = gaze_only(files, "gaze,emit,capture,visibility,position", observer=observer_at(rgb, *eye))
+    out = channels(rgb, integrator, s=sphere(rgb, 0, 0, 0))
+    seen = out["visibility.Y"] == 1
+    p, p_o = rgb.Point3f(np.ascontiguousarray(points(out)[seen].T)), rgb.Point3f(*eye)
+    expected = observed(rgb, integrator["gaze"], p_o).evaluate(p, p_o, dr.normalize(p - p_o), True)
+    assert seen.sum() > 10
+    for name, value in zip(("gaze.Y", "emit.Y", "capture.Y"), expected):
+        assert np.allclose(out[name][seen], np.array(value), rtol=2e-4)
+
+
+def test09_without_a_volume_no_march_without_shapes_no_cast(rgb):
+    def operations(integrator, **more):
+        scene = scene_with(rgb, integrator, **more)
+        rgb.render(scene, spp=1)
+        return traced_operations(lambda: rgb.render(scene, spp=1))
+
+    shape = {"s": sphere(rgb, 0, 0, 0)}
+    shapes = operations({"type": "nerg"}, **shape)
+    field, both = operations(constant()), operations(constant(), **shape)
+    out = channels(rgb, {"type": "nerg", "aovs": "depth,density_evals,color_evals"}, **shape)
+    assert not out["density_evals.Y"].any() and not out["color_evals.Y"].any()
+    # Both cost what each costs, but for the pixel filter and the camera.
+    assert shapes < field < both and both < field + shapes
+
+
+def test11_a_map_keeps_gaze(rgb, files):
+    """Looked up, gaze is that of the network but for interpolation, and costs no evaluation; weights are still
+    differentiable."""
+    network, table = (
+        gaze_only(files, "gaze,visibility,gaze_evals", visibility=kind, observer=observer_at(rgb, -2, 0.3, -2))
+        for kind in ("depth", "map")
+    )
+    scene = scene_with(rgb, table, s=sphere(rgb, 0, 0, 0))
+    before = picture(rgb, scene)
+    exact, kept = channels(rgb, network, s=sphere(rgb, 0, 0, 0)), named(rgb, before, table)
+    assert exact["gaze_evals.Y"].max() == 2 and kept["gaze_evals.Y"].max() == 2
+    # Where entries look past the ball, the network is asked.
+    assert 0 < kept["gaze_evals.Y"].sum() < 0.3 * exact["gaze_evals.Y"].sum()
+    both = (exact["visibility.Y"] == 1) & (kept["visibility.Y"] > 0.999)
+    assert both.sum() > 10
+    assert np.allclose(kept["gaze.Y"][both], exact["gaze.Y"][both], rtol=0.02, atol=1e-5)
+
+    params, key = rgb.traverse(scene), "integrator.gaze.emit_head.0"
+    attach(params, key)
+    dr.backward(dr.sum(rgb.render(scene, params, spp=1)[..., 3], axis=None))
+    assert dr.any(params[key].grad != 0, axis=None)
+    # New weights are noticed.
+    put(params, key, dr.detach(params[key]) * 200)
+    assert np.abs(picture(rgb, scene)[..., 3] - before[..., 3]).max() > 0.1
+
+
+@pytest.mark.parametrize("veiled", [False, True])
+@pytest.mark.parametrize("depth", ["expected", "median"])
+def test12_depth_follows_a_moving_shape(rgb, depth, veiled):
+    """Derivative of depth with respect to a mesh's position, against central differences; also through a veil."""
+    mesh = rgb.load_dict({"type": "cube", "to_world": rgb.ScalarTransform4f().rotate([0.3, 1, 0.2], 30).scale(0.4)})
+    how = {"aovs": "depth", "depth": depth}
+    integrator = constant(0.2, **how) if veiled else plugin("nerg", **how)
+    scene = scene_with(rgb, integrator, still(camera(rgb, size=6, fov=8)), cube=mesh)
+    params, key = rgb.traverse(scene), "cube.vertex_positions"
+    start = rgb.Point3f(dr.unravel(rgb.Point3f, rgb.Float(params[key])))
+
+    def image(z):
+        put(params, key, dr.ravel(start + rgb.Vector3f(0, 0, z)))
+        return rgb.render(scene, params, spp=1)[..., 3]
+
+    z, h = rgb.Float(0), 1e-2
+    dr.enable_grad(z)
+    value = image(z)
+    dr.forward(z)
+    forward = np.array(dr.grad(value))
+    z = rgb.Float(0)
+    dr.enable_grad(z)
+    dr.backward(dr.sum(image(z), axis=None))
+    differences = (np.array(image(rgb.Float(h)), float) - np.array(image(rgb.Float(-h)), float)) / (2 * h)
+    assert np.abs(differences).max() > 0.2
+    assert np.allclose(forward, differences, rtol=0.03, atol=3e-3)
+    assert float(dr.grad(z)[0]) == pytest.approx(differences.sum(), rel=0.02)
+
+
+def test14_a_gaze_field_over_a_field_and_a_shape_in_it(rgb, files):
+    """A ball put into a trained field hides what is behind it and carries gaze itself."""
+    aovs, center = "depth,opacity,gaze,visibility,position", (0.5, 0.4, -1.6)
+    integrator = with_gaze(files, aovs, falloff=0.0, observer=observer_at(rgb, -2, 0.3, -2))
+    bare, ball = channels(rgb, integrator), channels(rgb, integrator, s=sphere(rgb, *center, radius=0.2))
+    on_ball = np.abs(np.linalg.norm(points(ball) - center, axis=-1) - 0.2) < 1e-3
+    assert on_ball.sum() > 5 and (ball["opacity.Y"][on_ball] == 1).all()
+    assert (ball["depth.T"][on_ball] < 1.5).all()
+    untouched = ~on_ball & (ball["visibility.Y"] == bare["visibility.Y"])
+    assert np.allclose(ball["depth.T"][~on_ball], bare["depth.T"][~on_ball], atol=1e-5) and untouched.any()
+    assert (ball["gaze.Y"][on_ball & (ball["visibility.Y"] > 0)] > 0).all()

@@ -1,4 +1,4 @@
-"""What is found along one camera ray, and when."""
+"""What is found along one camera ray, and when; for other AOVs, and for several observers of the same rays."""
 
 from functools import cached_property
 
@@ -6,9 +6,13 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from nerg_mi.transport import observer_gaze
 from nerg_mi.transport.geometry import Place
 
-from .scenes import camera, named, observer_at, with_gaze
+from . import fields
+from .scenes import camera, look_at, named, observer_at, picture, plugin, scene_with, stored, with_gaze
+
+# ---- What is found along one camera ray, and when ----
 
 
 @pytest.fixture
@@ -21,7 +25,7 @@ def traced(monkeypatch):
 
 def pixel(mi, integrator, eye=(0.5, 0.4, -3), **more):
     """Of rays from a camera at ``eye`` to and past the field."""
-    scene = mi.load_dict({"type": "scene", "integrator": {**integrator, **more}, "sensor": camera(mi, eye)})
+    scene = scene_with(mi, {**integrator, **more}, camera(mi, eye))
     o = mi.Point3f(*map(float, eye))
     target = mi.Point3f([0, 0.1, 9], [0, 0.1, 9], 0)
     ray = mi.Ray3f(o + dr.zeros(mi.Point3f, 3), dr.normalize(target - o))
@@ -61,12 +65,12 @@ def test03b_networks_are_evaluated_where_gaze_is_seen(rgb, files):
 
     def attention(aovs, attached):
         integrator = with_gaze(files, aovs, observer=observer_at(rgb, -0.2, 3, 0.1), falloff=0.0)
-        scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, (0.5, 0.4, -3))})
+        scene = scene_with(rgb, integrator, camera(rgb, (0.5, 0.4, -3)))
         if attached:
             params = rgb.traverse(scene)
             dr.enable_grad(params["integrator.gaze.emit_head.0"])
             params.update()
-        found = named(rgb, np.array(rgb.render(scene, spp=1)), integrator)
+        found = named(rgb, picture(rgb, scene), integrator)
         return {name.split(".")[0]: values for name, values in found.items()}
 
     aovs = "gaze,gaze_evals,visibility,opacity"
@@ -100,15 +104,6 @@ def test05_a_map_stands_in_for_gaze_alone(rgb, files, aovs, looked_up):
     assert len(found.context.cache.peek("map")) == 1
 
 
-def test06_colour_is_found_where_it_is_wanted(rgb, files):
-    integrator = with_gaze(files, "features")
-    lit, dark = (pixel(rgb, {**integrator, "radiance": r}).camera for r in (True, False))
-    assert lit.lit and not dark.lit and dark.color is None
-    assert np.array(lit.color).shape[0] == 3
-    for a, b in zip(lit.accumulated_features, dark.accumulated_features):
-        np.testing.assert_allclose(a.numpy(), b.numpy(), rtol=1e-5, atol=1e-6)
-
-
 def test07_another_observer_is_another_object(rgb, files):
     """All that a pixel computes follows its observer; the camera's part is one object that knows of none."""
     first = pixel(rgb, with_gaze(files, "gaze,visibility,density_evals", observer=observer_at(rgb, -2, 0.3, -2)))
@@ -118,3 +113,98 @@ def test07_another_observer_is_another_object(rgb, files):
     assert other.camera is first.camera and not set(vars(other)) & {"observer", "sight", "gaze", "attention"}
     assert not np.allclose(np.array(other.r_o), np.array(first.r_o))
     assert not np.allclose(other.attention.gaze.numpy(), first.attention.gaze.numpy())
+
+
+# ---- The integrator's context for other AOVs, along any rays, and for several observers of the same rays ----
+
+
+EYES = [(0.3, -3, 0.4), (2.5, -1, 0.5), (-1.5, -2.0, 1.0)]
+
+
+@pytest.fixture
+def scene(rgb, files):
+    field, gaze = stored("nerf", files / "field.safetensors"), stored("gazefield", files / "gaze.safetensors")
+    return rgb.load_dict({"type": "scene", "integrator": plugin("nerg", field=field, gaze=gaze)})
+
+
+@pytest.fixture
+def ray(rgb):
+    o, d = np.float32([(0, -3, 0), (0.2, -3, 0.3)]), np.float32([(0, 1, 0), (0, 1, -0.1)])
+    return rgb.RayDifferential3f(rgb.Point3f(o.T.copy()), dr.normalize(rgb.Vector3f(d.T.copy())))
+
+
+def sampler(mi):
+    made = mi.load_dict({"type": "independent"})
+    made.seed(0, 2)
+    return made
+
+
+def traced_for(mi, scene, aovs, ray, sensors=()):
+    """``(context for these AOVs, what the camera's ray meets)``."""
+    context = scene.integrator().for_aovs(aovs, False)
+    return context, context.trace(scene, sensors, sampler(mi), ray, mi.Bool(True))
+
+
+def test01_what_depends_on_the_observer(scene):
+    context = scene.integrator().for_aovs(["depth", "gaze", "position", "visibility"], True)
+    assert context.shared == ["depth", "position"] and context.own == ["gaze", "visibility"]
+    assert context.channels(context.shared) == ["depth.T", "position.X", "position.Y", "position.Z"]
+    # All else is the integrator's, which is left as it was.
+    assert context.settings is scene.integrator().settings
+    assert scene.integrator().aov_names() == ["depth.T", "opacity.Y"]
+
+
+def test03_the_values_of_a_render(rgb, scene, ray):
+    names = ["gaze", "visibility", "gaze_evals"]
+    context, camera = traced_for(rgb, scene, ["depth", *names], ray)
+    camera.settle()
+    for eye in EYES:
+        found = camera.for_observer(context.observer_at(eye)).channels(names)
+        observer = {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate(list(eye))}
+        alone = plugin("nerg", aovs=",".join(names), observer=observer, **scene.integrator().children)
+        expected = rgb.load_dict(alone).sample(scene, sampler(rgb), ray)[2]
+        for mine, theirs in zip(found, expected):
+            assert np.array_equal(np.array(mine), np.array(theirs))
+
+
+def test05_the_cameras_ray_is_traced_once_and_kernels_are_those_of_one_observer(rgb, scene, ray, traced):
+    context, camera = traced_for(rgb, scene, ["depth", "gaze", "visibility"], ray)
+    camera.settle()
+    kernels = []
+    for eye in EYES:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(camera.for_observer(context.observer_at(eye)).channels(["gaze", "visibility"]))
+            kernels.append({k["hash"] for k in dr.kernel_history() if "hash" in k})
+    assert kernels[0] and kernels[0] == kernels[1] == kernels[2] and len(traced) == 1 + len(EYES)
+
+
+def test06_an_observer_where_the_camera_stands(rgb, scene):
+    to_world = look_at(rgb, (0, -3, 0), up=(0, 0, 1))
+    sensor = rgb.load_dict({"type": "perspective", "to_world": to_world})
+    ray, _ = sensor.sample_ray_differential(0, 0, rgb.Point2f([0.4, 0.5], [0.5, 0.6]), rgb.Point2f(0.5))
+    context, camera = traced_for(rgb, scene, ["gaze", "visibility", "density_evals"], ray, [sensor])
+    there, elsewhere = (camera.for_observer(context.observer_at(eye)) for eye in ((0, -3, 0), EYES[1]))
+    assert there.aligned and not elsewhere.aligned
+    # For the others a second march decides what they see.
+    evaluations = lambda pixel: np.array(pixel.channels(["visibility", "density_evals"])[1])
+    assert np.all(evaluations(there) < evaluations(elsewhere))
+    own = camera.for_origins()
+    assert own.aligned and np.allclose(*(np.array(p.channels(["gaze"])[0]) for p in (own, there)), rtol=1e-3)
+
+
+def test08_integrals_of_several_observers_are_kept(rgb, files, tmp_path, ray, monkeypatch):
+    """Two observers in turns: each has an integral of their own, which is found once."""
+    fields.gaze(tmp_path / "gaze.safetensors", normalized=True)
+    field, gaze = stored("nerf", files / "field.safetensors"), stored("gazefield", tmp_path / "gaze.safetensors")
+    scene = rgb.load_dict({"type": "scene", "integrator": plugin("nerg", field=field, gaze=gaze)})
+    found, integrate = [], observer_gaze.integrate
+    monkeypatch.setattr(observer_gaze, "integrate", lambda *a: found.append(1) or integrate(*a))
+
+    def values():
+        context, camera = traced_for(rgb, scene, ["gaze"], ray)
+        pixels = (camera.for_observer(context.observer_at(eye)) for eye in EYES[:2])
+        return [np.array(pixel.channels(["gaze"])[0]) for pixel in pixels]
+
+    np.testing.assert_array_equal(values(), values())
+    assert len(found) == 2

@@ -1,12 +1,37 @@
-"""Seeds, films, batches, nesting and variants."""
+"""Pictures of the integrator: seeds, films and variants, closed forms, and a roof that cameras look through."""
 
+import math
 import subprocess
 import sys
 
+import drjit as dr
 import numpy as np
 import pytest
 
-from .scenes import GAZE, SIZE, camera, constant, render, straight, with_field, with_gaze
+from nerg_mi.transport.quadrature import RULES
+
+from .scenes import (
+    GAZE,
+    camera,
+    center_rays,
+    channels,
+    constant,
+    look_at,
+    observer_at,
+    plugin,
+    points,
+    put,
+    render,
+    scene_with,
+    sphere,
+    square,
+    still,
+    straight,
+    with_field,
+    with_gaze,
+)
+
+# ---- Seeds, films, batches, nesting and variants ----
 
 
 @pytest.mark.parametrize("rfilter, tolerance", [("box", 0), ("gaussian", 1e-6)])
@@ -19,130 +44,45 @@ def test01_equal_seeds(rgb, files, rfilter, tolerance):
 
 
 def test01b_the_integrators_own_render_has_the_seed_of_mitsubas(rgb, files):
-    scene = rgb.load_dict({"type": "scene", "integrator": with_field(files), "sensor": camera(rgb)})
-    own, same, other = (
-        scene.integrator().render(scene, spp=1),
-        rgb.render(scene, spp=1),
-        rgb.render(scene, spp=1, seed=1),
-    )
-    assert np.array_equal(own, same) and not np.array_equal(own, other)
+    scene = scene_with(rgb, with_field(files))
+    own, other = scene.integrator().render(scene, spp=1), rgb.render(scene, spp=1, seed=1)
+    assert np.array_equal(own, rgb.render(scene, spp=1)) and not np.array_equal(own, other)
 
 
-def test02_jitter_alone_makes_seeds_differ(rgb, files):
-    # One sample in the middle of each pixel: nothing but the jitter depends on the seed.
-    still = {"type": "stratified", "jitter": False, "sample_count": 1}
+def test02_jitter_alone_makes_seeds_differ(rgb):
+    # One ray in the middle of the pixel: nothing but the jitter depends on the seed.
+    data = np.random.default_rng(0).exponential(3, (6, 6, 6)).astype(np.float32)
+    grid = {"type": "gridvolume", "grid": rgb.VolumeGrid(data)}
 
-    def picture(seed, jitter):
-        return render(
-            rgb, with_field(files, jitter=jitter, aovs="opacity"), {**camera(rgb), "sampler": still}, seed=seed
-        )
+    def of_seeds(jitter):
+        integrator = constant(density=grid, jitter=jitter, step=0.2)
+        return [render(rgb, integrator, straight(rgb, "perspective"), seed=seed) for seed in (1, 2)]
 
-    def random(seed, jitter):
-        return render(
-            rgb,
-            constant(
-                3.0,
-                density={
-                    "type": "gridvolume",
-                    "grid": rgb.VolumeGrid(np.random.default_rng(0).exponential(3, (6, 6, 6)).astype(np.float32)),
-                },
-                jitter=jitter,
-                step=0.2,
-            ),
-            straight(rgb, "perspective"),
-            seed=seed,
-        )
-
-    assert not np.array_equal(random(1, True), random(2, True)) and np.allclose(
-        random(1, False), random(2, False), rtol=1e-3
-    )
-    assert picture(1, True).shape == picture(1, False).shape
+    assert not np.array_equal(*of_seeds(True)) and np.allclose(*of_seeds(False), rtol=1e-3)
 
 
-def test03_more_samples_converge(rgb, files):
-    integrator = with_field(files, aovs="opacity", jitter=True)
-    reference = render(rgb, integrator, spp=512, seed=1)
-    errors = [np.abs(render(rgb, integrator, spp=n, seed=2) - reference).mean() for n in (4, 64)]
-    assert errors[1] < 0.5 * errors[0]
-
-
-def test04_crop_is_the_crop_of_the_whole(rgb, files):
-    # Equal subpixel positions in both: one sample in the middle of each pixel.
-    still = {"type": "stratified", "jitter": False, "sample_count": 1}
+def test07_an_integrator_and_a_sensor_may_be_given_to_render(rgb, files):
+    """The observer is the camera that renders, not the scene's own."""
     integrator = with_gaze(files, GAZE)
-    whole = render(rgb, integrator, {**camera(rgb), "sampler": still})
-    crop = dict(crop_offset_x=3, crop_offset_y=5, crop_width=6, crop_height=4)
-    part = render(rgb, integrator, {**camera(rgb, film=crop), "sampler": still})
-    assert part.shape == (4, 6, whole.shape[-1]) and np.allclose(part, whole[5:9, 3:9], atol=2e-4)
-
-
-@pytest.mark.parametrize("near_clip", [0.01, 1.0])
-def test05_a_batch_equals_its_members(rgb, files, near_clip):
-    still = {"type": "stratified", "jitter": False, "sample_count": 1}
-    origins = [(0.5, 0.4, -3), (-2.5, 0.2, -1), (0, 0.5, 3)]
-    cameras = [{**camera(rgb, o, near_clip=near_clip), "sampler": still} for o in origins]
-    integrator = with_gaze(files, GAZE)
-    batch = {
-        "type": "batch",
-        "sampler": still,
-        "film": {**cameras[0]["film"], "width": SIZE * 3},
-        **{f"c{i}": c for i, c in enumerate(cameras)},
-    }
-    whole = render(rgb, integrator, batch)
-    for i, c in enumerate(cameras):
-        alone = render(rgb, integrator, c)
-        got = whole[:, SIZE * i : SIZE * (i + 1)]
-        assert np.mean(np.abs(got - alone) < 2e-3) > 0.99 and np.abs(got - alone).mean() < 1e-3
-
-
-def test06_nested(rgb, files):
-    inner = with_gaze(files, GAZE)
-    plain = render(rgb, inner)
-    # `aov` puts the inner picture first.
-    assert np.allclose(render(rgb, {"type": "aov", "aovs": "pos:position", "nerg": inner})[..., :13], plain, atol=1e-6)
-    moment = {"type": "moment", "nested": inner}
-    names, image = rgb.load_dict(moment).aov_names(), render(rgb, moment)
-    for i, name in enumerate(rgb.load_dict(inner).aov_names()):
-        assert np.allclose(image[..., 3 + names.index(f"nested.{name}")], plain[..., 3 + i], atol=1e-6), name
-
-
-def test06b_rays_are_active_unless_told(rgb, files):
-    """As for integrators in Python that ask another one for the radiance along a ray."""
-    scene = rgb.load_dict({"type": "scene", "integrator": with_field(files), "sensor": camera(rgb)})
-    sampler, ray = rgb.load_dict({"type": "independent"}), rgb.Ray3f([0.5, 0.4, -3], [0, 0, 1])
-    sampler.seed(0, 1)
-    (plain, *_), (told, *_) = (scene.integrator().sample(scene, sampler, ray, **k) for k in ({}, {"active": True}))
-    assert np.array_equal(plain, told) and np.array(plain).max() > 0
-
-
-def test07_integrator_given_to_render(rgb, files):
-    scene = rgb.load_dict({"type": "scene", "sensor": camera(rgb)})
-    integrator = rgb.load_dict(with_gaze(files, GAZE))
-    assert np.array_equal(
-        np.array(rgb.render(scene, integrator=integrator, spp=1)), render(rgb, with_gaze(files, GAZE))
-    )
-
-
-def test08_a_sensor_outside_of_the_scene(rgb, files):
-    # The observer is the camera that renders, not the scene's own.
-    scene = rgb.load_dict({"type": "scene", "integrator": with_gaze(files, GAZE), "sensor": camera(rgb, (2, 1, 2))})
-    other = rgb.load_dict(camera(rgb))
-    assert np.array_equal(np.array(rgb.render(scene, sensor=other, spp=1)), render(rgb, with_gaze(files, GAZE)))
+    expected, elsewhere = render(rgb, integrator), camera(rgb, (2, 1, 2))
+    without = rgb.load_dict({"type": "scene", "sensor": camera(rgb)})
+    assert np.array_equal(np.array(rgb.render(without, integrator=rgb.load_dict(integrator), spp=1)), expected)
+    scene = scene_with(rgb, integrator, elsewhere)
+    assert np.array_equal(np.array(rgb.render(scene, sensor=rgb.load_dict(camera(rgb)), spp=1)), expected)
 
 
 def test09_film_channels_by_name(rgb, files):
-    scene = rgb.load_dict({"type": "scene", "integrator": with_gaze(files, "depth,gaze"), "sensor": camera(rgb)})
+    scene = scene_with(rgb, with_gaze(files, "depth,gaze"))
     rgb.render(scene, spp=1)
     layers = [name for name, _ in scene.sensors()[0].film().bitmap().split()]
     assert layers == ["<root>", "depth", "gaze"]
 
 
 def test10_mono_is_the_luminance_of_rgb(rgb, files):
-    still = {"type": "stratified", "jitter": False, "sample_count": 1}
     integrator = with_gaze(files, GAZE, background={"type": "rgb", "value": [0.1, 0.3, 0.2]})
-    a = render(rgb, integrator, {**camera(rgb), "sampler": still})
+    a = render(rgb, integrator, still(camera(rgb)))
     rgb.set_variant("llvm_ad_mono")
-    b = render(rgb, integrator, {**camera(rgb), "sampler": still})
+    b = render(rgb, integrator, still(camera(rgb)))
     assert b.shape[-1] == a.shape[-1] - 2
     assert np.allclose(b[..., 0], a[..., :3] @ [0.212671, 0.715160, 0.072169], atol=1e-4)
     assert np.allclose(b[..., 1:], a[..., 3:], atol=1e-4)
@@ -177,3 +117,154 @@ mi.load_dict({{"type": "nerg", "field": {{"type": "nerf", "filename": r"{files /
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr[-2000:]
+
+
+# ---- Pictures of the integrator against closed forms, and of grids that are skipped through ----
+
+
+@pytest.mark.parametrize("kind", ["orthographic", "perspective"])
+@pytest.mark.parametrize("depth", ["expected", "median"])
+def test01_unit_cube(rgb_and_mono, kind, depth):
+    mi = rgb_and_mono
+    out = channels(mi, constant(3.0, depth=depth), straight(mi, kind))
+    assert np.isclose(out["opacity.Y"].item(), 1 - math.exp(-3), rtol=1e-5)
+    inside = {"expected": 1 / 3 - 1 / math.expm1(3), "median": -math.log((1 + math.exp(-3)) / 2) / 3}[depth]
+    # Distance from the ray's own origin, which lies on the near plane.
+    assert abs(out["depth.T"].item() - (2 - 0.01 + inside)) < 1e-4
+
+
+@pytest.mark.parametrize("sigma", [0.05, 3.0])
+def test03_colour_of_a_homogeneous_volume(rgb_and_mono, sigma):
+    # α C + (1 - α) L_behind, also where every single step weighs less than color_cutoff.
+    mi = rgb_and_mono
+    color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.9, 0.5, 0.2]}}
+    background = {"type": "rgb", "value": [0.1, 0.2, 0.4]}
+    integrator = constant(sigma, color=color, background=background, aovs="")
+    image = render(mi, integrator, straight(mi, "perspective")).ravel()
+    α = -math.expm1(-sigma)
+    expected = α * np.array([0.9, 0.5, 0.2]) + (1 - α) * np.array([0.1, 0.2, 0.4])
+    if "mono" in mi.variant():
+        expected = expected @ [0.212671, 0.715160, 0.072169]
+    assert np.allclose(image, expected, rtol=2e-3)
+
+
+def test04_environment_takes_the_place_of_the_background(rgb):
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.4, 0.8]}}
+    image = render(rgb, constant(3.0, background=9.0, aovs=""), straight(rgb, "perspective"), sky=sky).ravel()
+    assert np.allclose(image, math.exp(-3) * np.array([0.2, 0.4, 0.8]), rtol=1e-4)
+    hidden = render(rgb, constant(3.0, hide_emitters=True, aovs=""), straight(rgb, "perspective"), sky=sky).ravel()
+    assert not hidden.any()
+
+
+def test05_an_envmap_is_seen_where_it_belongs(rgb):
+    data = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
+    sky = {"type": "envmap", "bitmap": rgb.Bitmap(data)}
+    path, nerg = (render(rgb, i, seed=1, sky=sky) for i in ({"type": "path"}, constant(0.0, aovs="")))
+    assert np.allclose(path, nerg, atol=1e-5) and path.std() > 0.01
+
+
+@pytest.mark.parametrize("angle", [45, 90, 180])
+def test06_a_turned_grid_is_not_skipped_by_its_own_voxels(rgb, angle):
+    # A small dense block of a large empty grid, turned: its place is elsewhere than its indices say.
+    data = np.zeros((32, 32, 32), np.float32)
+    data[14:18, 2:6, 2:6] = 50
+    turn = rgb.ScalarTransform4f().rotate([0, 0, 1], angle).translate([-0.5, -0.5, -0.5])
+    density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data), "to_world": turn}
+    x, y = (np.array(turn.matrix) @ [4 / 32, 4 / 32, 0.5, 1])[:2].tolist()
+    sensor = camera(rgb, (x, y, -2), (x, y, 0), fov=1e-3, size=1)
+    out = channels(rgb, {"type": "nerg", "density": density, "aovs": "opacity"}, sensor)
+    assert out["opacity.Y"].item() > 0.9
+
+
+def test07_a_grid_that_repeats_is_bounded_as_it_repeats(rgb):
+    # The last half voxel interpolates with the first voxel of the next repetition.
+    data = np.zeros((8, 8, 8), np.float32)
+    data[0] = 40
+    opacity = {}
+    for wrap in ("clamp", "repeat"):
+        density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data), "wrap_mode": wrap}
+        sensor = camera(rgb, (-2, 0.5, 0.99), (0, 0.5, 0.99), fov=1e-3, size=1)
+        out = channels(rgb, {"type": "nerg", "density": density, "aovs": "opacity"}, sensor)
+        opacity[wrap] = out["opacity.Y"].item()
+    assert opacity["clamp"] == 0
+    assert np.isclose(opacity["repeat"], 1 - math.exp(-40 * (0.5 - 0.01 * 8)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("quadrature", RULES.names())
+def test08_quadratures_converge_to_one_picture(rgb, quadrature):
+    data = np.random.default_rng(0).exponential(2, (4, 5, 6)).astype(np.float32)
+    place = rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
+    density = plugin("gridvolume", grid=rgb.VolumeGrid(data), to_world=place)
+    of = lambda **more: channels(rgb, plugin("nerg", density=density, stop=1e-9, **more), still(camera(rgb, size=6)))
+    fine, got = of(step=1e-3), of(step=2e-3 if quadrature == "constant" else 0.02, quadrature=quadrature)
+    for c in fine:
+        assert np.allclose(got[c], fine[c], rtol=1e-3, atol=1e-4), c
+
+
+# ---- A roof that cameras above it look through ----
+
+
+SIGMA, HEIGHT = 3.0, 0.6
+
+
+def above(mi):
+    """A camera over the unit cube, y up."""
+    to_world = look_at(mi, (0.4, 3.0, 0.5), (0.5, 0.0, 0.5), (0, 0, 1))
+    return still(camera(mi, fov=12) | {"to_world": to_world})
+
+
+def cut(**more):
+    return constant(SIGMA, ceiling=HEIGHT, up=[0.0, 2.0, 0.0], aovs="depth,opacity,position", **more)
+
+
+def test01_matter_above_is_left_out_and_depths_count_from_the_camera(rgb):
+    out = channels(rgb, cut(depth="median", step=1e-3), above(rgb))
+    ray = center_rays(rgb, above(rgb))
+    o, d = np.array(ray.o, float).T, np.array(ray.d, float).T
+    t0, t1 = ((o[:, 1] - y) / -d[:, 1] for y in (HEIGHT, 0.0))
+    opacity = (1 - np.exp(-SIGMA * (t1 - t0))).reshape(12, 12)
+    # Where half of what is absorbed below the plane is.
+    depth = t0.reshape(12, 12) - np.log1p(-opacity / 2) / SIGMA
+    assert np.allclose(out["opacity.Y"], opacity, atol=1e-4) and np.allclose(out["depth.T"], depth, atol=1e-4)
+    assert np.allclose(points(out).reshape(-1, 3), o + d * depth.reshape(-1, 1), atol=2e-4)
+
+
+def test02_who_stands_below_sees_all(rgb):
+    sensor = camera(rgb, origin=(0.5, 0.3, -3), target=(0.5, 0.8, 0.5))
+    whole = channels(rgb, constant(SIGMA, aovs="depth,opacity"), sensor)
+    same = channels(rgb, constant(SIGMA, aovs="depth,opacity", ceiling=HEIGHT, up=[0.0, 1.0, 0.0]), sensor)
+    assert all(np.array_equal(whole[k], same[k]) for k in whole) and whole["opacity.Y"].max() > 0.5
+
+
+def test03_shapes_above_hide_nothing_from_the_camera_but_all_from_the_observer(rgb):
+    sensor = camera(rgb, origin=(0.1, 0, -3), target=(0, 0, 0))
+    lid, floor = sphere(rgb, 0, 0, -1, radius=0.4), square(rgb, 1.0, size=5.0)
+    given = {"type": "nerg", "aovs": "depth,visibility", "observer": observer_at(rgb, 0, 0, -3), "up": [0.0, 0.0, -1.0]}
+    middle = lambda out, name: out[name][6, 6]
+    whole = channels(rgb, given, sensor, lid=lid, floor=floor)
+    out = channels(rgb, {**given, "ceiling": 0.5}, sensor, lid=lid, floor=floor)
+    assert middle(whole, "depth.T") < 2 and middle(whole, "visibility.Y") == 1
+    assert middle(out, "depth.T") == pytest.approx(4, abs=0.02) and middle(out, "visibility.Y") == 0
+
+
+def test04_depths_have_the_derivatives_of_the_cameras_ray(rgb):
+    sensor = above(rgb)
+    scene = scene_with(rgb, cut(step=1e-3), sensor)
+    params = rgb.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("sensor.to_world"))
+    # Straight up by h, all depths grow as those to any fixed plane do.
+    h = rgb.Float(0)
+    dr.enable_grad(h)
+    put(params, key, rgb.Transform4f().translate(rgb.Vector3f(0, h, 0)) @ rgb.Transform4f(sensor["to_world"]))
+    depth = rgb.render(scene, params, spp=1)[:, :, 3]
+    dr.forward(h)
+    # Matter begins at the plane, so that its expected depth moves by the ray's length a unit of height.
+    assert np.allclose(np.ravel(dr.grad(depth)), 1 / -np.array(center_rays(rgb, sensor).d)[1], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "given, why", [({"ceiling": "high"}, "ceiling"), ({"up": [0.0] * 3, "ceiling": 1.0}, "up"), ({"up": 1.0}, "three")]
+)
+def test05_what_is_no_plane_is_refused(rgb, given, why):
+    with pytest.raises(RuntimeError, match=why):
+        rgb.load_dict({"type": "nerg", **given})

@@ -1,34 +1,44 @@
-"""Updates of parameters: what they make anew, and what they leave as it is."""
-
-from __future__ import annotations
+"""Updates of parameters: what they make anew; and functions frozen by ``dr.freeze``."""
 
 import drjit as dr
 import numpy as np
 import pytest
 
+from nerg_mi.fields.gaze_base import GazeEnsemble, RaySupport
+from nerg_mi.formats.fields import save_gaze
+from nerg_mi.rays.rays import Rays
+from nerg_mi.registration import plugin_class
 from nerg_mi.transport import observer, volume_medium
+from tests.formats.splats.writers import random_splats
 
-from .scenes import camera, channels, observer_at, wall, with_field
+from . import fields
+from .scenes import (
+    camera,
+    channels,
+    observer_at,
+    picture,
+    plugin,
+    put,
+    scene_with,
+    still,
+    stored,
+    wall,
+    with_field,
+    with_gaze,
+)
+
+# ---- Updates of parameters: what they make anew, and what they leave as it is ----
 
 
 def behind_a_wall(mi, **more):
     """An observer before a wall with a gap, and a camera that sees what lies behind it."""
     sensor = camera(mi, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
-    integrator = {
-        "type": "nerg",
-        "density": wall(mi),
-        "aovs": "visibility",
-        "step": 0.01,
-        "falloff": 0.0,
-        "radiance": False,
-        "observer": observer_at(mi, 0, 0, -0.9),
-        **more,
-    }
-    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+    how = {"aovs": "visibility", "step": 0.01, "falloff": 0.0, "radiance": False, **more}
+    return scene_with(mi, plugin("nerg", density=wall(mi), observer=observer_at(mi, 0, 0, -0.9), **how), sensor)
 
 
 def seen(mi, scene) -> np.ndarray:
-    return np.array(mi.render(scene, spp=1))[..., -1]
+    return picture(mi, scene)[..., -1]
 
 
 @pytest.fixture
@@ -44,14 +54,11 @@ def test01_voxels_are_read_when_they_change_and_not_otherwise(rgb, reads):
     assert len(reads) == 1
     params = rgb.traverse(scene)
     for i in range(3):
-        params["integrator.observer.to_world"] = rgb.ScalarTransform4f().translate([0.1 * i, 0, -0.9])
-        params.update()
-        params["integrator.falloff"] = rgb.Float(0.1 * i)
-        params.update()
+        put(params, "integrator.observer.to_world", rgb.ScalarTransform4f().translate([0.1 * i, 0, -0.9]))
+        put(params, "integrator.falloff", rgb.Float(0.1 * i))
         seen(rgb, scene)
     assert len(reads) == 1
-    params["integrator.density.data"] = params["integrator.density.data"] * 0
-    params.update()
+    put(params, "integrator.density.data", params["integrator.density.data"] * 0)
     assert len(reads) == 2 and not np.array(scene.integrator().medium.occupancy.bits).any()
     assert (seen(rgb, scene) == 0).all()
 
@@ -62,8 +69,7 @@ def test01b_an_observer_who_moves_is_no_constant_of_the_kernel(rgb, of):
     scene = behind_a_wall(rgb)
     params = rgb.traverse(scene if of == "scene" else scene.integrator())
     name = "integrator.observer.to_world" if of == "scene" else "observer.to_world"
-    params[name] = rgb.Transform4f().translate([0.2, 0, -0.8])
-    params.update()
+    put(params, name, rgb.Transform4f().translate([0.2, 0, -0.8]))
     center = observer.center(scene.integrator().observer)
     assert np.allclose(np.ravel(np.array(center)), [0.2, 0, -0.8])
     assert scene.integrator().observer.world_transform().matrix[0, 3].state == dr.VarState.Evaluated
@@ -79,8 +85,7 @@ def test02_voxels_that_were_refused_are_read_again(rgb, reads):
         params["integrator.density.data"] = rgb.TensorXf(bad)
         with pytest.raises(Exception, match="not finite"):
             params.update()
-    params["integrator.density.data"] = rgb.TensorXf(good)
-    params.update()
+    put(params, "integrator.density.data", rgb.TensorXf(good))
     assert len(reads) == 4
 
 
@@ -104,15 +109,8 @@ def test03_a_map_follows_the_field(rgb, files, change):
         scene = behind_a_wall(rgb, visibility="map", map_height=64)
         key = "integrator.density.data"
     else:
-        integrator = with_field(
-            files,
-            aovs="observer_depth",
-            falloff=0.0,
-            visibility="map",
-            map_height=32,
-            observer=observer_at(rgb, -2, 0.3, -2),
-        )
-        scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb)})
+        how = {"falloff": 0.0, "visibility": "map", "map_height": 32, "observer": observer_at(rgb, -2, 0.3, -2)}
+        scene = scene_with(rgb, with_field(files, aovs="observer_depth", **how))
         key = "integrator.field.density_net.1"
     params = rgb.traverse(scene)
     before = seen(rgb, scene)
@@ -121,8 +119,7 @@ def test03_a_map_follows_the_field(rgb, files, change):
         value[:36] = 0  # the wall with the gap; what lies behind it stays
     else:
         value[0] = 0  # the logarithm of the density: the same everywhere, and thin
-    params[key] = rgb.TensorXf(value)
-    params.update()
+    put(params, key, rgb.TensorXf(value))
     after = seen(rgb, scene)
     assert np.abs(after - before).max() > 0.1
     # What a map that was made for it says.
@@ -135,12 +132,10 @@ def test04_a_map_outlasts_what_it_does_not_depend_on(rgb):
     seen(rgb, scene)
     kept = scene.integrator().cache.peek("map")[0]
     params = rgb.traverse(scene)
-    params["integrator.falloff"] = rgb.Float(0.7)
-    params.update()
+    put(params, "integrator.falloff", rgb.Float(0.7))
     softer = seen(rgb, scene)
     assert scene.integrator().cache.peek("map")[0] is kept and ((softer > 0.05) & (softer < 0.95)).any()
-    params["integrator.observer.to_world"] = rgb.ScalarTransform4f().translate([0.3, 0, -0.9])
-    params.update()
+    put(params, "integrator.observer.to_world", rgb.ScalarTransform4f().translate([0.3, 0, -0.9]))
     seen(rgb, scene)
     assert scene.integrator().cache.peek("map")[0] is not kept
 
@@ -165,29 +160,16 @@ def test05b_an_observer_is_told_of_its_pose_and_refuses_what_cameras_do(rgb):
 
 def test06_gaze_and_its_spread_fade_with_visibility(rgb, files, tmp_path):
     """By transmittance the point stays the same, so that hidden and open differ by that share alone, whatever it is."""
-    import drjit.llvm.ad as ns
-
-    from nerg_mi.fields.gaze_base import GazeEnsemble, RaySupport
-    from nerg_mi.formats.fields import load_gaze, save_gaze
-    from nerg_mi.rays.rays import Rays
-
-    from . import fields
-
     members = [fields.gaze(tmp_path / f"{k}.safetensors", seed=k) for k in (1, 2)]
     members[1].set_parameters({"emit_head.0": 20 * members[1].parameters()["emit_head.0"]})
     origins = np.random.default_rng(0).normal((-2, 0.3, -2), 0.3, (50, 3))
     save_gaze(GazeEnsemble(members, RaySupport.of(origins, 1.0)), tmp_path / "e.safetensors", {})
-    assert len(load_gaze(tmp_path / "e.safetensors", ns)[0].members) == 2
     d = np.random.default_rng(1).normal(size=(50, 3)) + (2, -0.3, 2)
-    Rays(np.arange(50), np.zeros(50), ("a",), origins, d / np.linalg.norm(d, axis=1, keepdims=True), np.ones(50)).save(
-        tmp_path / "rays.npz"
-    )
-    more = {
-        "gaze": {"type": "gazefield", "filename": str(tmp_path / "e.safetensors")},
-        "observer": observer_at(rgb, -2, 0.3, -2),
-        "kde": {"type": "gazekde", "filename": str(tmp_path / "rays.npz"), "kappa": 2.0},
-        "visibility": "transmittance",
-    }
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    Rays(np.arange(50), np.zeros(50), ("a",), origins, d, np.ones(50)).save(tmp_path / "rays.npz")
+    more = {"observer": observer_at(rgb, -2, 0.3, -2), "visibility": "transmittance"}
+    more["gaze"] = stored("gazefield", tmp_path / "e.safetensors")
+    more["kde"] = stored("gazekde", tmp_path / "rays.npz", kappa=2.0)
     aovs = "gaze,gaze_std,kde,support,visibility,opacity"
     hidden, open_ = (channels(rgb, with_field(files, aovs=aovs, occlusion=o, **more)) for o in (True, False))
     share = hidden["visibility.Y"]
@@ -199,3 +181,140 @@ def test06_gaze_and_its_spread_fade_with_visibility(rgb, files, tmp_path):
     # How much was recorded around the observer is no matter of what is hidden.
     np.testing.assert_array_equal(hidden["support.Y"], open_["support.Y"])
     assert hidden["support.Y"].max() > 1
+
+
+# ---- Functions frozen by ``dr.freeze``: recorded once, their replays equal what is traced whatever has changed ----
+
+
+def moved(mi, value, i):
+    return mi.Transform4f().translate([0.2 * i, 0, 0]) @ mi.Transform4f(value)
+
+
+def scaled(mi, value, i):
+    return value * (1 + 0.2 * i)
+
+
+def shifted(mi, value, i):
+    return value + 0.1 * i
+
+
+def sheet(mi, value, i):
+    """A sheet in an empty grid, elsewhere each time: what is known to be empty must not be what was recorded."""
+    data = np.zeros(value.shape, np.float32)
+    data[2 + i] = 20
+    return mi.TensorXf(data)
+
+
+def small(mi):
+    return still(camera(mi, size=6))
+
+
+def scene_of(mi, files, shapes=(), **more):
+    how = {"aovs": "depth,gaze,visibility", "falloff": 2.0, "observer": observer_at(mi, -2, 0.3, -2), **more}
+    return scene_with(mi, with_gaze(files, **how), small(mi), **dict(shapes))
+
+
+def splat_scene(mi):
+    place = plugin_class("splats").of(random_splats(40, degree=1, size=0.2))
+    return scene_with(mi, plugin("nerg", field=place, aovs="depth,opacity"), small(mi))
+
+
+def normalized_scene(mi, files):
+    fields.gaze(files / "normalized.safetensors", normalized=True)
+    return scene_of(mi, files, gaze=stored("gazefield", files / "normalized.safetensors"), aovs="gaze")
+
+
+def grid_scene(mi):
+    place = mi.ScalarTransform4f().translate(-1).scale(2)
+    grid = plugin("gridvolume", grid=mi.VolumeGrid(np.zeros((8, 8, 8), np.float32)), to_world=place)
+    return scene_with(mi, plugin("nerg", density=grid, aovs="depth,opacity"), small(mi))
+
+
+def cube_scene(mi, files):
+    cube = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, -1.3]).scale(0.2)}
+    return scene_of(mi, files, {"cube": cube})
+
+
+OBSERVER = "integrator.observer.to_world"
+FROZEN = {
+    "falloff": (scene_of, "integrator.falloff", scaled),
+    "observer": (scene_of, OBSERVER, moved),
+    "gaze weights": (scene_of, "integrator.gaze.grid.table", scaled),
+    "field weights": (scene_of, "integrator.field.density_net.1", scaled),
+    # What may be left out for one observer may not be for the next.
+    "from camera": (lambda mi, files: scene_of(mi, files, observer=observer_at(mi, 0.5, 0.4, -3)), OBSERVER, moved),
+    "camera": (lambda mi, files: scene_with(mi, with_gaze(files), camera(mi, size=6)), "sensor.to_world", moved),
+    "map": (lambda mi, files: scene_of(mi, files, visibility="map", map_height=32), OBSERVER, moved),
+    "transmittance": (lambda mi, files: scene_of(mi, files, visibility="transmittance"), OBSERVER, moved),
+    "normalized": (normalized_scene, OBSERVER, moved),
+    "grid": (lambda mi, files: grid_scene(mi), "integrator.density.data", sheet),
+    "mesh": (cube_scene, "cube.vertex_positions", shifted),
+    "splats": (lambda mi, files: splat_scene(mi), "integrator.field.centers", shifted),
+}
+
+
+@pytest.mark.parametrize("what", list(FROZEN))
+def test10_replays_are_what_is_traced(rgb, files, what):
+    make, key, change = FROZEN[what]
+    scene = make(rgb, files)
+    params = rgb.traverse(scene)
+    start = type(params[key])(params[key])
+    frozen, pictures = dr.freeze(lambda scene, seed: rgb.render(scene, spp=1, seed=seed)), []
+    for i in range(4):
+        put(params, key, change(rgb, start, i))
+        pictures.append(np.array(rgb.render(scene, spp=1, seed=i)))
+        assert np.allclose(np.array(frozen(scene, rgb.UInt32(i))), pictures[-1], atol=2e-6), i
+    # A parameter that was a number in the scene's description is recorded once more when it is an array.
+    assert frozen.n_recordings <= 3
+    assert not np.allclose(pictures[2], pictures[3], atol=1e-4)
+
+
+SPLATS = ["field." + name for name in ("centers", "scales", "rotations", "opacities", "harmonics")]
+
+
+@pytest.mark.parametrize("names", [["gaze.emit_head.0"], ["falloff"], SPLATS], ids=["gaze", "falloff", "splats"])
+def test11_a_frozen_training_goes_the_same_way(rgb, files, names):
+    """Derivatives of a frozen loss are those of the loss; and no kernel is compiled for where Gaussians have gone."""
+    make = lambda: splat_scene(rgb) if names is SPLATS else scene_of(rgb, files, aovs="gaze", radiance=False)
+    reference = rgb.render(make(), spp=1) * 1.3
+    keys, ways = [f"integrator.{name}" for name in names], []
+
+    def step(scene, params, reference, seed):
+        loss = dr.mean(dr.square(rgb.render(scene, params, spp=1, seed=seed) - reference), axis=None)
+        dr.backward(loss)
+        return loss
+
+    frozen = dr.freeze(step)
+    for descend in (step, frozen):
+        scene, way = make(), []
+        params = rgb.traverse(scene)
+        params.keep(keys)
+        opt = rgb.ad.Adam(lr=1e-2, params={key: params[key] for key in keys})
+        params.update(opt)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            for i in range(5):
+                if i == 3:
+                    dr.kernel_history_clear()
+                way.append(descend(scene, params, reference, rgb.UInt32(i)).numpy().item())
+                opt.step()
+                params.update(opt)
+            # Of all 36 pixels; others pack the Gaussians.
+            found = [k["cache_hit"] for k in dr.kernel_history() if k["size"] == 36 and "cache_hit" in k]
+        assert all(found) and (descend is frozen or found)
+        ways.append(way)
+    assert ways[0][1] != ways[0][0] and np.allclose(*ways, rtol=1e-4)
+    assert frozen.n_recordings <= 3
+
+
+def test12_gaussians_are_not_changed_inside(rgb):
+    scene = splat_scene(rgb)
+    params = rgb.traverse(scene)
+
+    @dr.freeze
+    def move(scene, params, by):
+        put(params, "integrator.field.centers", params["integrator.field.centers"] + by)
+        return rgb.render(scene, spp=1)
+
+    with pytest.raises(RuntimeError) as found:
+        move(scene, params, rgb.Float(0.1))
+    assert "call params.update() before the function" in str(found.value.__cause__)

@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.fields.splats import Splats, harmonics_of, joined
 from nerg_mi.formats.splats import write_ply_splats
+from nerg_mi.maths.color import decode_srgb, encode_srgb
 from nerg_mi.registration import plugin_class
 from tests.conftest import ROOT
 from tests.formats.splats.writers import random_splats
 
-from .scenes import camera, look_at
+from .scenes import camera, look_at, picture, stored
 from .scenes import render as draw
 
 
@@ -24,7 +25,7 @@ def render(rgb, tmp_path):
 
     def rendered(splats, sensor=None, others=(), field=(), **parameters):
         write_ply_splats(tmp_path / "a.ply", splats)
-        place = {"type": "splats", "filename": str(tmp_path / "a.ply"), **dict(field)}
+        place = stored("splats", tmp_path / "a.ply", **dict(field))
         integrator = {"type": "nerg", "field": place, **parameters}
         image = draw(rgb, integrator, sensor, **dict(others))
         names = rgb.load_dict(integrator).aov_names()
@@ -36,14 +37,6 @@ def render(rgb, tmp_path):
         return found | {"color": image[..., :3]}
 
     return rendered
-
-
-def linear(srgb):
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def srgb(linear):
-    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055)
 
 
 def wall(z=0.0, opacity=0.99, half=2.0, spacing=0.08, color=(0.2, 0.5, 0.8)):
@@ -59,7 +52,7 @@ def of_mitsuba(mi, path, sensor):
     """The sum of its colours, which it makes linear as it is."""
     scene = {"type": "scene", "i": {"type": "volprim_rf_basic"}, "s": sensor, "e": {"type": "ellipsoids"}}
     scene["e"]["filename"] = str(path)
-    return srgb(np.array(mi.render(mi.load_dict(scene), spp=1))[..., :3])
+    return encode_srgb(picture(mi, mi.load_dict(scene))[..., :3])
 
 
 def test_colors_are_those_of_mitsubas_own_renderer(rgb, tmp_path, render):
@@ -69,7 +62,7 @@ def test_colors_are_those_of_mitsubas_own_renderer(rgb, tmp_path, render):
     some = Splats(some.centers, scales, some.rotations, 0.4 * some.opacities, some.harmonics)
     ours = render(some, aovs="opacity", sensor=camera(rgb, size=32))
     opacity = ours["opacity"][..., None]
-    sums = opacity * srgb(ours["color"] / np.maximum(opacity, 1e-9))
+    sums = opacity * encode_srgb(ours["color"] / np.maximum(opacity, 1e-9))
     apart = np.abs(sums - of_mitsuba(rgb, tmp_path / "a.ply", camera(rgb, size=32))).max(-1)[opacity[..., 0] > 0]
     assert len(apart) > 300 and np.median(apart) < 1e-6 and (apart < 1e-4).mean() > 0.9
 
@@ -98,7 +91,7 @@ def test_a_wall_is_where_it_stands_for_camera_and_observer(rgb, render):
     # From the near plane on.
     assert np.allclose(found["depth"], np.linalg.norm(found["position"] - [0.5, 0.4, -3], axis=-1), atol=0.02)
     assert found["visibility"].min() == 1
-    assert np.allclose(linear(np.array([0.2, 0.5, 0.8])), found["color"].mean((0, 1)), atol=1e-3)
+    assert np.allclose(decode_srgb(np.array([0.2, 0.5, 0.8])), found["color"].mean((0, 1)), atol=1e-3)
 
 
 @pytest.mark.parametrize("visibility", ["depth", "transmittance", "map"])
@@ -155,7 +148,7 @@ def test_a_turned_place_shows_its_colors_turned(rgb, render):
 
 def test_a_picture_is_differentiated(rgb, tmp_path):
     write_ply_splats(tmp_path / "a.ply", random_splats(20, degree=0, size=0.2))
-    place = {"type": "splats", "filename": str(tmp_path / "a.ply")}
+    place = stored("splats", tmp_path / "a.ply")
     scene = rgb.load_dict({"type": "scene", "i": {"type": "nerg", "id": "i", "field": place}, "s": camera(rgb)})
     params = rgb.traverse(scene)
     key = next(k for k in params.keys() if k.endswith("field.opacities"))
@@ -212,7 +205,7 @@ def test_all_sizes_and_opacities_give_finite_pictures(rgb, tmp_path):
 
 def test_the_volume_says_what_it_is(rgb, tmp_path):
     write_ply_splats(tmp_path / "a.ply", wall())
-    volume = rgb.load_dict({"type": "splats", "filename": str(tmp_path / "a.ply"), "color_space": "linear"})
+    volume = rgb.load_dict(stored("splats", tmp_path / "a.ply", color_space="linear"))
     assert "count = 2601" in str(volume) and volume.medium().color_space == "linear"
     assert np.allclose(np.array(volume.bbox().max).ravel(), [2.24, 2.24, 0.003], atol=1e-3)
     params = rgb.traverse(volume)
@@ -228,4 +221,4 @@ def test_the_volume_says_what_it_is(rgb, tmp_path):
         kind.of(3)
     with pytest.raises(RuntimeError, match="lacks the column"):
         (tmp_path / "b.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
-        rgb.load_dict({"type": "splats", "filename": str(tmp_path / "b.ply")})
+        rgb.load_dict(stored("splats", tmp_path / "b.ply"))
