@@ -6,7 +6,7 @@ import pytest
 
 from nerg_mi.transport.geometry import pixel_directions, pixel_solid_angles
 
-from .scenes import picture, plugin, scene_with
+from .scenes import camera, picture, put, scene_with, still
 
 WIDTH, HEIGHT = 12, 7
 
@@ -15,35 +15,16 @@ def turned(mi):
     return mi.ScalarTransform4f().translate([1, -2, 3]).rotate([0.6, 0, 0.8], 70).rotate([0, 1, 0], 200)
 
 
-def panorama(mi, to_world=None, sampler=None, **film):
-    return {
-        "type": "panorama",
-        "to_world": to_world if to_world is not None else mi.ScalarTransform4f(),
-        # One sample in the middle of each pixel
-        "sampler": sampler or {"type": "stratified", "jitter": False, "sample_count": 1},
-        "film": plugin(
-            "hdrfilm",
-            width=WIDTH,
-            height=HEIGHT,
-            component_format="float32",
-            pixel_format="luminance" if "mono" in mi.variant() else "rgb",
-            rfilter={"type": "box"},
-            **film,
-        ),
-    }
+def panorama(mi, to_world=None, random=False, **film):
+    sensor = camera(mi, kind="panorama", film={"width": WIDTH, "height": HEIGHT} | film)
+    sensor["to_world"] = to_world if to_world is not None else mi.ScalarTransform4f()
+    return sensor if random else still(sensor)
 
 
 def scene(mi, image, sensor, to_world=None):
-    return scene_with(
-        mi,
-        {"type": "path"},
-        sensor,
-        sky=plugin(
-            "envmap",
-            bitmap=mi.Bitmap(image.astype(np.float32)),
-            to_world=to_world if to_world is not None else mi.ScalarTransform4f(),
-        ),
-    )
+    turn = to_world if to_world is not None else mi.ScalarTransform4f()
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(image.astype(np.float32)), "to_world": turn}
+    return scene_with(mi, {"type": "path"}, sensor, sky=sky)
 
 
 def noise(channels=3):
@@ -62,7 +43,7 @@ def test01_returns_the_pixels_of_an_envmap(rgb, moved):
 
 def test03_constant_sky_with_random_samples(rgb_and_mono):
     mi = rgb_and_mono
-    sensor = panorama(mi, turned(mi), sampler={"type": "independent"})
+    sensor = panorama(mi, turned(mi), random=True)
     got = np.array(mi.render(scene(mi, np.full((HEIGHT, WIDTH, 3), 0.7), sensor), spp=16))
     assert np.allclose(got, 0.7, atol=1e-6)
 
@@ -70,7 +51,7 @@ def test03_constant_sky_with_random_samples(rgb_and_mono):
 def test04_smooth_sky_with_random_samples(rgb):
     # A linear function of direction, on a map fine enough: pixels agree although samples are spread over them.
     v = pixel_directions(256, 129)
-    sensor = panorama(rgb, sampler={"type": "independent"}, width=32, height=17)
+    sensor = panorama(rgb, random=True, width=32, height=17)
     got = np.array(rgb.render(scene(rgb, 1 + v, sensor), spp=256))
     assert np.allclose(got, 1 + pixel_directions(32, 17), atol=0.05)
 
@@ -130,8 +111,7 @@ def test10_is_moved_through_traverse(rgb):
     image = noise()
     loaded = scene(rgb, image, panorama(rgb))
     params = rgb.traverse(loaded)
-    params["sensor.to_world"] = rgb.Transform4f().rotate([0, 1, 0], 180)
-    params.update()
+    put(params, "sensor.to_world", rgb.Transform4f().rotate([0, 1, 0], 180))
     got = picture(rgb, loaded)
     assert np.allclose(got[1:-1], np.roll(image, WIDTH // 2, axis=1)[1:-1], atol=1e-4)
     params["sensor.to_world"] = rgb.Transform4f().scale(2)
