@@ -207,6 +207,7 @@ WRONG = {
     "aovs": ["depth,colour", "depth,depth", 3, "gaze"],
     "step": [-1.0, float("inf")],
     "dt_gamma": [-1.0],
+    "quadrature": ["simpson"],
     "stop": [2.0, -1.0],
     "color_cutoff": [-1.0],
 }

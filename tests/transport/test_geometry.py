@@ -24,6 +24,7 @@ from nerg_mi.transport.geometry import (
 )
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.volume_medium import VolumeMedium
+from tests.plugins.scenes import plugin
 
 # ---- Where rays begin that start above a ceiling ----
 
@@ -191,11 +192,11 @@ SAMPLES = 1 << 14
 
 def scene_of(mi, *emitters, shapes=True):
     """A square in the plane z = 2 of albedo 0.25, 0.5, 0.75, whose half with x > 0 rays along +z meet."""
-    square = {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().translate([1, 0, 2]).rotate([1, 0, 0], 180),
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.25, 0.5, 0.75]}},
-    }
+    square = plugin(
+        "rectangle",
+        to_world=mi.ScalarTransform4f().translate([1, 0, 2]).rotate([1, 0, 0], 180),
+        bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.25, 0.5, 0.75]}},
+    )
     lights = {f"light{i}": emitter for i, emitter in enumerate(emitters)}
     return mi.load_dict({"type": "scene", **({"square": square} if shapes else {}), **lights})
 
@@ -354,13 +355,6 @@ def test_no_gradient_is_left_behind(slab):
     dr.enable_grad(o)
     depth, opacity = trace_depth(slab, o, ns.Array3f(D.T))
     assert not dr.grad_enabled(depth) and not dr.grad_enabled(opacity)
-
-
-def test_settings_are_used(slab):
-    coarse, _ = trace_depth(slab, O[:1], D[:1], MarchSettings(step=0.5), kind="expected")
-    fine, _ = trace_depth(slab, O[:1], D[:1], kind="expected")
-    # A constant density is integrated exactly whatever the step.
-    assert coarse[0] == pytest.approx(fine[0], abs=1e-4)
 
 
 def test_what_does_not_fit_is_named(slab):

@@ -23,6 +23,7 @@ from nerg_mi.transport.observer import ObserverCache, ObserverSettings
 from nerg_mi.transport.observer_gaze import FEWEST, FIRST, USUAL, PlacedGaze, integrate, nearest_depth
 from nerg_mi.transport.occlusion import trace_sight
 from tests.fields.gaze.test_log_density import BOX, SMALL
+from tests.plugins.scenes import plugin
 
 # ---- Gaze ----
 #
@@ -72,13 +73,10 @@ def test_is_the_sum_over_what_is_seen_all_around(rgb, variant):
     )
     field.set_parameters({"grid.table": ns.Float(3 * rng.normal(size=len(field.grid.table)).astype(np.float32))})
     room = rgb.load_dict(
-        {
-            "type": "scene",
-            "walls": {
-                "type": "cube",
-                "to_world": rgb.ScalarTransform4f().translate([0, 0, 1.5]).scale([1.9, 1.9, 1.4]),
-            },
-        }
+        plugin(
+            "scene",
+            walls=plugin("cube", to_world=rgb.ScalarTransform4f().translate([0, 0, 1.5]).scale([1.9, 1.9, 1.4])),
+        )
     )
     o = np.array([0.4, -0.7, 1.7])
     found = integral_at(rgb, PlacedGaze(field), Place(None, room), o, SETTINGS, 1 << 16)

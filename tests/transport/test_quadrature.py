@@ -1,10 +1,11 @@
-"""Tests of `nerg_mi.transport.quadrature`."""
+"""The quadrature rules: their shares against extended precision, what each is exact for, and another rule."""
 
 import math
 import subprocess
 import sys
 from dataclasses import dataclass
 from fractions import Fraction
+from types import SimpleNamespace
 
 import drjit as dr
 import drjit.llvm.ad as ns
@@ -12,13 +13,16 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.evaluation import study
 from nerg_mi.fields.occupancy import OccupancyGrid
+from nerg_mi.maths.arrays import quotient
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.medium import ColorPainter, LocalRay, VoxelCells
 from nerg_mi.transport.quadrature import (
     RULES,
     Registry,
+    Step,
     absorbed_share,
     boundaries,
     color_share,
@@ -27,7 +31,11 @@ from nerg_mi.transport.quadrature import (
     mean_depth_share,
 )
 from nerg_mi.transport.volume_medium import VolumeMedium
+from tests.plugins.scenes import camera, channels, constant, named, render
 from tests.reference import march_numpy as reference
+
+# ---- Tests of `nerg_mi.transport.quadrature` ----
+
 
 # ---- The step rule against integrals in extended precision, and its invariances ----
 
@@ -109,18 +117,6 @@ def test05_splitting_a_step_changes_nothing(share):
     moment = absorbed_share(a) * share * mean_depth_share(a) + behind * (share + (1 - share) * mean_depth_share(b))
     expected = (absorbed_share(whole) * mean_depth_share(whole)).numpy()
     assert np.allclose(moment.numpy(), expected, rtol=2e-6)
-
-
-def test06_permuting_steps_preserves_opacity():
-    tau = np.random.default_rng(0).exponential(0.1, 64).astype(np.float32)
-    opacities = []
-    for order in (np.arange(64), np.arange(64)[::-1], np.random.default_rng(1).permutation(64)):
-        light, total = 1.0, 0.0
-        for share in absorbed_share(ns.Float(tau[order])).numpy():
-            total += light * share
-            light *= 1 - share
-        opacities.append(total)
-    assert np.allclose(opacities, -np.expm1(-tau.astype(float).sum()), rtol=1e-6)
 
 
 # ------------------------------------------------------------------------
@@ -510,3 +506,102 @@ def test15_steps_that_are_not_taken_add_nothing(kind):
     taken = rule.step(medium, ray, t, delta, t + delta, rule.start(ns.Float), ns.Bool(True), False)
     left = rule.step(medium, ray, t + delta, delta, t + 2 * delta, taken.carry, ns.Bool(False), False)
     assert np.isclose(taken.dtau[0], 1.5) and (left.dtau[0], left.evals[0]) == (0, 0)
+
+
+# ---- Another quadrature rule is one object: registered, it marches, renders, is differentiated, and stand ----
+
+
+class Simpson:
+    """Three samples a step, which integrate cubic densities exactly."""
+
+    name = "simpson"
+    summary = "three samples a step"
+    in_cells = False
+
+    def start(self, Float):
+        return None
+
+    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> Step:
+        first, middle, last = (medium.density(ray.o + ray.d * (t + s * delta), active) for s in (0, 0.5, 1))
+        dtau = dr.select(active, (first + 4 * middle + last) * delta / 6, 0)
+        p = ray.o + ray.d * (t + 0.5 * delta)
+        return Step(
+            dtau,
+            linear_share(first * delta, last * delta),
+            lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),
+            lambda painter, lit: painter.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit),
+            None,
+            dr.select(active, 3.0, 0.0),
+        )
+
+
+@pytest.fixture
+def simpson():
+    rule = RULES.register(Simpson())
+    yield rule
+    RULES.unregister("simpson")
+
+
+class Cubic:
+    """Density 2 + z³ times ``gain``."""
+
+    occupancy = cells = step = hits = None
+
+    def __init__(self, gain=1.0):
+        self.gain = ns.Float(gain)
+
+    def parameters(self):
+        return [self.gain]
+
+    def density(self, p, active):
+        return dr.select(active, self.gain * (2 + p.z * p.z * p.z), 0)
+
+
+def marched(medium, rule, n):
+    z, t0, t1 = ns.Array3f(0, 0, 1), dr.opaque(ns.Float, 0), dr.opaque(ns.Float, 2)
+    settings = MarchSettings(2 / n, stop=0, quadrature=rule)
+    return march(medium, LocalRay(ns.Array3f(0), z, z, t0, t1), t0, t1, True, settings, count=True)
+
+
+def test01_it_marches(simpson):
+    found = marched(Cubic(), "simpson", 1)
+    # ∫ 2 + z³ over [0, 2]
+    assert np.isclose(found.tau[0], 8, rtol=1e-5) and found.density_evals[0] == 3
+    assert abs(marched(Cubic(), "constant", 1).tau[0] - 8) > 1
+
+
+def test02_it_is_differentiated(simpson):
+    medium = Cubic()
+    dr.enable_grad(medium.gain)
+    dr.backward(marched(medium, "simpson", 5).tau)
+    assert np.isclose(dr.grad(medium.gain)[0], 8, rtol=1e-5)
+
+
+def test03_it_renders(rgb, simpson):
+    sensor = camera(rgb, (0.5, 0.4, -3), (0.5, 0.5, 0.5))
+    tint = {"type": "constvolume", "value": 0.25}
+    pictures, counts = [], []
+    for rule in ("simpson", "constant"):
+        asked = constant(2.0, color=tint, quadrature=rule, step=0.05, aovs="opacity,depth,density_evals")
+        picture = render(rgb, asked, sensor)
+        pictures.append(picture[..., :-1])
+        counts.append(named(rgb, picture, asked)["density_evals.Y"])
+    assert counts[0].any() and np.array_equal(counts[0], 3 * counts[1])
+    # In homogeneous matter every rule is exact.
+    assert pictures[1][..., :3].max() > 0.1 and np.allclose(*pictures, rtol=1e-4, atol=1e-6)
+
+
+def test04_shapes_and_other_depths_go_with_it(rgb, simpson):
+    plate = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.7])}
+    for depth in ("median", "refined"):
+        found = [
+            channels(rgb, constant(5.0, quadrature=rule, depth=depth, step=0.03), plate=plate)["depth.T"]
+            for rule in ("simpson", "constant")
+        ]
+        assert found[1].any() and np.allclose(*found, rtol=1e-4)
+
+
+def test05_it_is_offered_wherever_rules_are(rgb, simpson):
+    subject = SimpleNamespace(marched=True, hits=False, extent=1.0, has_gaze=True, normalized=False, resampled=True)
+    assert {s.params.get("quadrature") for s in study.settings(subject)} >= {"constant", "linear", "simpson"}
+    assert RULES.manual().endswith("``simpson``: three samples a step.")

@@ -1,4 +1,6 @@
-"""Tests of `nerg_mi.transport.splat_medium`."""
+"""Gaussian splats as a medium: arrays, what a placed one meets, the next of all in their order, and the tree."""
+
+from __future__ import annotations
 
 import drjit as dr
 import drjit.llvm.ad as ns
@@ -6,13 +8,38 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from nerg_mi.fields.splats import Splats, harmonics_of
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import harmonics
 from nerg_mi.transport.medium import LastHit
-from nerg_mi.transport.splat_medium import AT_ONCE, SplatArrays, build_tree
+from nerg_mi.transport.splat_medium import AT_ONCE, SplatArrays, SplatMedium, build_tree
 from tests.formats.splats.writers import random_splats
 from tests.reference.splats import peaks
-from tests.transport.media.splats.scenes import medium_of, rays, stack
+
+# ---- Small places of Gaussian splats, and rays through them ----
+
+
+def medium_of(splats: Splats, to_world: Similarity | None = None) -> SplatMedium:
+    return SplatMedium(SplatArrays(splats, ns), to_world)
+
+
+def stack(depths, opacities, scale=0.1, colors=None) -> Splats:
+    """Balls on the z axis."""
+    n = len(depths)
+    centers = np.stack([np.zeros(n), np.zeros(n), np.asarray(depths, float)], axis=1)
+    colors = np.full((n, 3), 0.5) if colors is None else colors
+    return Splats(centers, np.full((n, 3), scale), [[1, 0, 0, 0]] * n, opacities, harmonics_of(colors))
+
+
+def rays(count: int, seed: int = 0, size: float = 1.2) -> tuple[np.ndarray, np.ndarray]:
+    """Origins in a cube and unit directions, float32."""
+    rng = np.random.default_rng(seed)
+    o, d = rng.uniform(-size, size, (count, 3)), rng.normal(size=(count, 3))
+    return o.astype(np.float32), (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
+
+
+# ---- Tests of `nerg_mi.transport.splat_medium` ----
+
 
 # ---- Arrays ----
 

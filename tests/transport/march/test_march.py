@@ -15,9 +15,10 @@ from nerg_mi.transport.march_primal import MarchSettings, march_primal
 from nerg_mi.transport.medium import ColorPainter, LocalRay
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.formats.splats.writers import random_splats
+from tests.plugins.scenes import plugin
 from tests.reference.splats import peaks, trace
 from tests.transport.march.test_march_primal import grid, slab
-from tests.transport.media.splats.scenes import medium_of, rays, stack
+from tests.transport.test_splat_medium import medium_of, rays, stack
 
 # ---- Adjoint ----
 #
@@ -29,35 +30,30 @@ def scene_of(mi, size, step, quadrature="constant"):
     """Voxels with a colour each: all rays of a camera cross them."""
     rng = np.random.default_rng(2)
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
-    volume = lambda data: {
-        "type": "gridvolume",
-        "grid": mi.VolumeGrid(data.astype(np.float32)),
-        "to_world": place,
-        "raw": True,
-    }
+    volume = lambda data: plugin("gridvolume", grid=mi.VolumeGrid(data.astype(np.float32)), to_world=place, raw=True)
     film = {"type": "hdrfilm", "width": size, "height": size, "component_format": "float32", "rfilter": {"type": "box"}}
     return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {
-                "type": "nerg",
-                "density": volume(0.1 + rng.exponential(1.2, (4, 5, 6))),
-                "color": volume(rng.uniform(0.1, 0.9, (4, 5, 6, 3))),
-                "step": step,
-                "stop": 0.0,
-                "color_cutoff": 0.0,
-                "quadrature": quadrature,
-                "depth": "expected",
-                "aovs": "depth,opacity",
-            },
-            "sensor": {
-                "type": "perspective",
-                "fov": 20,
-                "to_world": mi.ScalarTransform4f().look_at([0.3, 0.2, -3], [0, 0, 0], [0, 1, 0]),
-                "film": film,
-                "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
-            },
-        }
+        plugin(
+            "scene",
+            integrator=plugin(
+                "nerg",
+                density=volume(0.1 + rng.exponential(1.2, (4, 5, 6))),
+                color=volume(rng.uniform(0.1, 0.9, (4, 5, 6, 3))),
+                step=step,
+                stop=0.0,
+                color_cutoff=0.0,
+                quadrature=quadrature,
+                depth="expected",
+                aovs="depth,opacity",
+            ),
+            sensor=plugin(
+                "perspective",
+                fov=20,
+                to_world=mi.ScalarTransform4f().look_at([0.3, 0.2, -3], [0, 0, 0], [0, 1, 0]),
+                film=film,
+                sampler={"type": "stratified", "jitter": False, "sample_count": 1},
+            ),
+        )
     )
 
 

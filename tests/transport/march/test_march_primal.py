@@ -1,7 +1,7 @@
 """Tests of `nerg_mi.transport.march_primal`."""
 
 import math
-from dataclasses import FrozenInstanceError, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import drjit as dr
@@ -35,7 +35,7 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.formats.splats.writers import random_splats
 from tests.reference import march_numpy as reference
 from tests.reference.splats import trace
-from tests.transport.media.splats.scenes import medium_of, rays, stack
+from tests.transport.test_splat_medium import medium_of, rays, stack
 
 # ---- Hits ----
 #
@@ -252,13 +252,6 @@ def test01_slab(rgb, sigma, near):
         assert np.isclose(one(r.half), near + math.log(2) / sigma, rtol=1e-5)
     else:
         assert one(r.half) == (np.inf if sigma < 0.69 else pytest.approx(near + math.log(2) / sigma))
-
-
-@pytest.mark.parametrize("sigma", [10, 1e3, 1e6, 1e9])
-def test02_depth_remaining_before_a_dense_slab(rgb, sigma):
-    # With the face at the ray's origin the depth is 1/σ and nothing else.
-    r = run(rgb, slab(rgb, sigma), (0.5, 0.5, 0), (0, 0, 1))
-    assert np.isclose(one(r.expected_depth), reference.slab(sigma, 0, 1)[1], rtol=1e-5)
 
 
 @pytest.mark.parametrize("size", [1e-3, 1, 1e6])
@@ -515,11 +508,6 @@ def test18_colour_only_where_the_weight_counts(rgb):
     assert all(np.array_equal(r[0].tau.numpy(), r[c].tau.numpy()) for c in r)
 
 
-def test19_nothing_is_counted_unless_asked(rgb):
-    r = run(rgb, slab(rgb, 1, 1), (0.5, 0.5, 0), (0, 0, 1))
-    assert r.density_evals is None and r.color_evals is None and r.color is None
-
-
 @pytest.mark.parametrize("quadrature", ["constant", "linear"])
 def test20_no_goal_falls_between_two_sums(rgb, quadrature):
     sigma, n = 2.9, 1000
@@ -545,11 +533,6 @@ def test20_no_goal_falls_between_two_sums(rgb, quadrature):
 @pytest.mark.parametrize("stop, depth", [(0.0, math.inf), (1.0, 0.0), (1e-4, -math.log(1e-4))])
 def test01_the_optical_depth_that_ends_a_march(stop, depth):
     assert MarchSettings(0.1, stop=stop).opaque == depth
-
-
-def test02_settings_do_not_change():
-    with pytest.raises(FrozenInstanceError):
-        MarchSettings(0.1).step = 0.2
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,491 @@
+"""Media: what the protocol asks of each, fields, volumes, cells that are known to be empty, and features."""
+
+import inspect
+from dataclasses import replace
+from types import FunctionType
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.occupancy import OccupancyGrid, contracted_cascades
+from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
+from nerg_mi.maths.geometry import Box, ContractedBox, Similarity
+from nerg_mi.transport.field_medium import FeaturePainter, FieldMedium, color_painter, observed_features
+from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.march import march
+from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.medium import MAX_DENSITY, ColorPainter, LocalRay, Medium, bound, bounded
+from nerg_mi.transport.volume_medium import KnownEmpty, VolumeMedium
+from tests.maths.test_geometry import turn
+from tests.transport.test_splat_medium import medium_of, stack
+
+# ---- Tests of `nerg_mi.transport.medium` ----
+
+
+# ---- Cells ----
+#
+# The bound of a grid volume: nothing that its interpolant can return lies in a cell that counts as empty.
+
+
+@pytest.mark.parametrize("filter_type", ["nearest", "trilinear"])
+@pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
+@pytest.mark.parametrize("voxel", [(0, 3, 3), (7, 3, 3), (3, 0, 7), (4, 4, 4)])
+def test_no_matter_lies_in_an_empty_cell(rgb, wrap_mode, filter_type, voxel):
+    """Also not where a grid that repeats shows its first voxel at its far side."""
+    data = np.zeros((8, 8, 8), np.float32)
+    data[voxel] = 1
+    volume = rgb.load_dict(
+        {"type": "gridvolume", "grid": rgb.VolumeGrid(data), "wrap_mode": wrap_mode, "filter_type": filter_type}
+    )
+    cells = bound(data, ns)
+    it = dr.zeros(rgb.Interaction3f)
+    it.p = rgb.Point3f(np.random.default_rng(0).random((3, 100_000)).astype(np.float32))
+    matter, away = volume.eval_1(it).numpy() > 0, cells.empty_cells(it.p).numpy()
+    assert matter.any() and not away[matter].any()
+    # A bound that holds for all wrap modes, and yet leaves most of the box out.
+    assert (away > 0).mean() > 0.8
+
+
+@pytest.mark.parametrize("data", [np.ones((4, 4, 4)), np.pad([[[1.0]]], 1)])
+def test_there_is_no_bound_where_nothing_could_be_skipped(data):
+    assert bound(data, ns) is None
+
+
+# ---- What samples contribute to a sum: the medium's colour, in the array type that was asked for ----
+
+
+@pytest.mark.parametrize("kind", ["Color3f", "Spectrum", "Vector3f"])
+def test01_the_mediums_colour(rgb, kind):
+    array_type = getattr(rgb, kind)
+    data = np.broadcast_to(np.float32([0.2, 0.5, 0.8]), (2, 2, 2, 3)).copy()
+    color = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True})
+    medium, painter = (
+        VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0}), color),
+        ColorPainter(array_type),
+    )
+    p, w = rgb.Point3f(0.5, 0.5, 0.5), rgb.Vector3f(0, 0, 1)
+    found = painter.paint(medium, [], p, w, rgb.Bool(True))
+    assert type(found) is type(painter.zero()) is array_type
+    assert np.allclose(np.array(found).ravel(), [0.2, 0.5, 0.8], atol=1e-6)
+    assert not np.array(painter.zero()).any()
+    assert painter.color(medium, found, rgb.Float(0.5), medium.local(p, w), rgb.Bool(True)) is found
+
+
+# ---- Every medium answers all that the protocol asks, and densities are fit to be marched ----
+
+
+ASKED = {name: what for name, what in vars(Medium).items() if isinstance(what, (FunctionType, property))}
+
+
+ASKED = {name: what for name, what in ASKED.items() if not name.startswith("_")}
+
+
+def media(mi):
+    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(np.ones((2, 2, 2), np.float32))}
+    fog = {"type": "constvolume", "value": 2.0}
+    return [
+        FieldMedium(field()),
+        VolumeMedium(mi.load_dict(fog)),
+        VolumeMedium(mi.load_dict(grid), mi.load_dict(fog)),
+        medium_of(stack([0.2, 0.8], [0.5, 0.5], scale=0.25)),
+    ]
+
+
+def test01_every_medium_has_what_is_asked(rgb):
+    assert len(ASKED) > 15
+    for medium in media(rgb):
+        for name, what in ASKED.items():
+            found = getattr(medium, name)
+            if isinstance(what, property):
+                assert not callable(found), name
+            else:
+                wanted = list(inspect.signature(what).parameters)[1:]
+                assert list(inspect.signature(found).parameters) == wanted, (type(medium), name)
+
+
+def test02_and_answers_as_it_says(rgb):
+    for medium in media(rgb):
+        assert medium.color_space in ("srgb", "linear", "spectrum") and medium.length_scale > 0
+        assert medium.step is None or 0 < medium.step < medium.length_scale
+        lower, upper = medium.bounds()
+        assert lower.shape == upper.shape == (3,) and (upper > lower).all()
+        o, d = rgb.Point3f(0.4, 0.6, -1), rgb.Vector3f(0, 0, 1)
+        ray = medium.local(o, d)
+        assert isinstance(ray, LocalRay) and 0 < ray.t_near[0] < ray.t_far[0] < 10
+        assert medium.refresh() is None and medium.parameters()
+        if medium.hits is not None:
+            continue
+        p = medium.to_local(rgb.Point3f(0.4, 0.6, 0.5))
+        sigma, features = medium.density_features(p, True)
+        assert sigma[0] == medium.density(p, True)[0] > 0 and len(features) == medium.feature_count
+        if medium.has_color:
+            color = np.array(medium.color(features, p, ray.w, True)).ravel()
+            assert color.shape == (3,) and (color >= 0).all()
+
+
+@pytest.mark.parametrize("wrong, right", [(-1, 0), (np.nan, 0), (np.inf, MAX_DENSITY), (3e38, MAX_DENSITY), (2.5, 2.5)])
+def test03_densities_are_finite_and_not_negative(wrong, right):
+    assert bounded(ns.Float(wrong))[0] == np.float32(right)
+
+
+# ---- A radiance field in the scene: what scale and rotation do to it, and what it is asked for outside of ----
+
+
+GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
+BOX = Box((0, 0, 0), (1, 1, 2))
+
+
+def field(**kwargs):
+    f = RadianceField.random(
+        RadianceConfig(GRID, width=16, geometry=3, sh_degree=2), BOX, ns, march_step=0.05, **kwargs
+    )
+    f.set_parameters(
+        {"grid.table": ns.Float(np.random.default_rng(0).normal(size=len(f.grid.table)).astype(np.float32))}
+    )
+    return f
+
+
+def gather(mi, medium, o, d, scale):
+    ray = medium.local(mi.Point3f(o.tolist()), mi.Vector3f(d.tolist()))
+    t0 = dr.maximum(ray.t_near, 0)
+    result = march(medium, ray, t0, ray.t_far, True, MarchSettings(0.05 * scale), color=ColorPainter(mi.Color3f))
+    return result.opacity.numpy()[0], result.expected_depth.numpy()[0], np.array(result.color).ravel()
+
+
+def test01_scaling_place_and_camera_changes_no_opacity(rgb):
+    f = field()
+    o, d = np.array([0.4, 0.3, -1.0]), np.array([0.1, 0.05, 1.0])
+    d /= np.linalg.norm(d)
+    plain = gather(rgb, FieldMedium(f), o, d, 1)
+    assert 0.2 < plain[0] < 0.999
+    for scale in (1e-3, 1e3):
+        m = turn(scale)
+        moved = FieldMedium(f, Similarity(m))
+        got = gather(rgb, moved, (m @ [*o, 1])[:3], m[:3, :3] @ d / scale, scale)
+        assert np.isclose(got[0], plain[0], rtol=1e-4) and np.isclose(got[1], plain[1] * scale, rtol=1e-4)
+        # The direction that colour depends on turns with the field.
+        assert np.allclose(got[2], plain[2], rtol=1e-3)
+        assert np.isclose(moved.step, 0.05 * scale) and np.isclose(moved.length_scale, 6**0.5 * scale)
+
+
+def test02_its_box_in_the_scene(rgb):
+    m = turn(2.0)
+    medium = FieldMedium(field(), Similarity(m))
+    corners = np.array([m[:3] @ [x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 2)])
+    lower, upper = medium.bounds()
+    assert np.allclose(lower, corners.min(0)) and np.allclose(upper, corners.max(0))
+    # The unit cube of the occupancy grid holds the field's box: its longest edge spans it.
+    p = rgb.Point3f(*map(float, (m @ [0.25, 0.5, 2, 1])[:3]))
+    assert np.allclose(np.array(medium.to_unit(medium.to_local(p))).ravel(), [0.375, 0.5, 1], atol=1e-6)
+    v = medium.vector_to_unit(rgb.Vector3f(0, 0, 1))
+    assert np.allclose(np.array(v).ravel(), [0, 0, 0.5])
+
+
+@pytest.mark.parametrize("scale", [0.5, 4.0])
+def test03_density_is_that_of_a_scene_unit(rgb, scale):
+    f = field()
+    medium = FieldMedium(f, Similarity(np.diag([scale, scale, scale, 1])))
+    p = ns.Array3f([0.2, 0.7], [0.3, 0.1], [0.4, 1.9])
+    sigma, features = medium.density_features(p, True)
+    assert np.allclose(sigma.numpy(), f.density(p).numpy() / scale, rtol=1e-6)
+    assert np.array_equal(sigma.numpy(), medium.density(p, True).numpy())
+    assert len(features) == medium.feature_count == 3
+
+
+def test04_empty_cells_hold_nothing_also_where_no_march_has_looked(rgb):
+    bits = np.zeros((4, 4, 4), bool)
+    bits[0, 0, 0] = True
+    medium = FieldMedium(field(occupancy=OccupancyGrid(bits, ns, 0.01)))
+    # The longest edge of the box, two units, spans the four cells, and the others lie in the middle of them.
+    p = ns.Array3f([0.1, 0.1, 0.9], [0.1, 0.1, 0.9], [0.1, 1.9, 1.0])
+    found, inside = medium.occupied_density(p, True).numpy(), medium.density(p, True).numpy()
+    occupied = medium.occupancy.empty_cells(medium.to_unit(p)).numpy() == 0
+    assert (inside > 0).all() and np.array_equal(found, np.where(occupied, inside, 0))
+
+
+def test05_weights_are_read_whenever_it_is_asked(rgb):
+    f = field()
+    medium, p = FieldMedium(f), ns.Array3f(0.4, 0.3, 1.2)
+    before = medium.density(p, True).numpy()
+    f.set_parameters({"grid.table": dr.full(ns.Float, 0.5, len(f.grid.table))})
+    medium.refresh()
+    assert not np.allclose(medium.density(p, True).numpy(), before)
+
+
+# ---- A field without an end in the scene: rays through the contracted part against integrals in float64 ----
+
+
+GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
+ENDLESS = ContractedBox(Box((-1, -2, -2), (3, 2, 2)), 64)
+GROWTH = 1 / 128
+SCALE = 0.1
+
+
+def plain_field(**kwargs):
+    """One whose density net returns 0: σ = SCALE / m², m the largest coordinate in half edges (2 units) from (1, 0, 0),
+    at least 1."""
+    config = RadianceConfig(GRID, width=16, geometry=3, sh_degree=2, density_scale=SCALE)
+    field = RadianceField.random(config, ENDLESS, ns, march_step=0.02, march_growth=GROWTH, **kwargs)
+    field.set_parameters({k: dr.zeros(type(v), v.shape) for k, v in field.parameters().items() if "density" in k})
+    return field
+
+
+def by_sums(o, d, stop, count=100_000):
+    """Optical depth and mean distance of absorption up to the distance ``stop``, by sums in float64."""
+    edges = np.concatenate([[0], np.geomspace(1e-3, stop, count)])
+    t = 0.5 * (edges[1:] + edges[:-1])
+    m = np.maximum(np.abs((o + t[:, None] * d - ENDLESS.center) / 2).max(axis=1), 1)
+    tau = np.concatenate([[0], np.cumsum(SCALE / m**2 * np.diff(edges))])
+    weight = np.exp(-tau[:-1]) - np.exp(-tau[1:])
+    return tau[-1], float(weight @ t / weight.sum())
+
+
+def rays(count=24):
+    rng = np.random.default_rng(3)
+    d = rng.normal(size=(count, 3))
+    return ENDLESS.center + rng.uniform(-3, 3, (count, 3)), d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def absorbed(mi, medium, o, d, settings):
+    ray = medium.local(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
+    found = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, settings)
+    return ray.t_far.numpy(), found.tau.numpy(), found.expected_depth.numpy()
+
+
+# Steps of a share γ of their distance see the density of their middle: an error of the order of γ², and that of single
+# precision over hundreds of steps.
+@pytest.mark.parametrize("growth, tolerance", [(1 / 16, 2e-3), (1 / 128, 5e-5)])
+def test_rays_through_the_contracted_part(rgb, growth, tolerance):
+    medium, (o, d) = FieldMedium(plain_field()), rays()
+    far, tau, depth = absorbed(rgb, medium, o, d, MarchSettings(medium.step, dt_gamma=growth))
+    wanted = [by_sums(*ray, stop) for *ray, stop in zip(o, d, far)]
+    np.testing.assert_allclose(tau, [w[0] for w in wanted], rtol=tolerance)
+    np.testing.assert_allclose(depth, [w[1] for w in wanted], rtol=tolerance)
+    assert depth.max() > 2 * ENDLESS.side
+
+
+def test_depths_are_those_of_the_scene_wherever_it_is_placed(rgb):
+    (o, d), field = rays(20), plain_field()
+    _, tau, depth = absorbed(rgb, FieldMedium(field), o, d, MarchSettings(0.02, dt_gamma=GROWTH))
+    m = turn(10.0)
+    moved = FieldMedium(field, Similarity(m))
+    assert np.isclose(moved.step, 0.2) and moved.growth == GROWTH
+    at, along = o @ m[:3, :3].T + m[:3, 3], d @ m[:3, :3].T / 10
+    _, tau_m, depth_m = absorbed(rgb, moved, at, along, MarchSettings(0.2, dt_gamma=GROWTH))
+    np.testing.assert_allclose(tau_m, tau, rtol=1e-4)
+    np.testing.assert_allclose(depth_m, 10 * depth, rtol=1e-4)
+
+
+def test_empty_cells_are_passed_over_and_full_ones_are_not(rgb):
+    """One shell of cells far out, all else empty: what is absorbed lies there."""
+    r = 32
+    bits = np.zeros((r, r, r), bool)
+    bits[:, :, -3] = True
+    cascades = contracted_cascades(bits, 64, ns, 0.01)
+    near, far = (ENDLESS.from_unit(ns.Array3f((r - k) / r, 0.5, 0.5)).x.numpy()[0] for k in (3, 2))
+    o, d = np.array([[1.0, 0.1, 0.2]]), np.array([[1.0, 0.0, 0.0]])
+    settings = MarchSettings(0.02, dt_gamma=GROWTH)
+    _, tau, depth = absorbed(rgb, FieldMedium(plain_field(occupancy=cascades)), o, d, settings)
+    # Along x from the centre: the integral of SCALE / (x / 2)² over the shell, and over what its cells of the cascades
+    # are larger by.
+    shell = SCALE * 4 * (1 / (near - 1) - 1 / (far - 1))
+    assert shell * 0.95 < tau[0] < 1.6 * shell and near - 1 < depth[0] < 1.2 * far
+    behind = absorbed(rgb, FieldMedium(plain_field(occupancy=cascades)), o, -d, settings)
+    assert behind[1][0] == 0
+
+
+def test_the_medium_of_a_bounded_field_does_not_grow(rgb):
+    config = RadianceConfig(GRID, width=16, geometry=3, sh_degree=2)
+    assert FieldMedium(RadianceField.random(config, ENDLESS.core, ns, march_step=0.02)).growth == 0
+
+
+# ---- Mitsuba volumes as a medium: errors, what a march skips, and what a change of their data changes ----
+
+
+def test01_a_volume_without_extent_is_refused(rgb):
+    class Endless(rgb.Volume):
+        def __init__(self, lower, upper):
+            super().__init__(rgb.Properties())
+            self.box = rgb.ScalarBoundingBox3f(lower, upper)
+
+        def bbox(self):
+            return self.box
+
+    for lower, upper in (([-np.inf] * 3, [np.inf] * 3), ([0, 0, 0], [1, 1, 0])):
+        with pytest.raises(ValueError, match='"density".*to_world'):
+            VolumeMedium(Endless(lower, upper))
+
+
+def test02_volume_answers(rgb):
+    density = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.array([[[-3.0, 5.0]]], np.float32))})
+    medium = VolumeMedium(density)
+    p = rgb.Point3f([0.1, 0.9], 0.5, 0.5)
+    # Negative density would make light.
+    assert np.allclose(medium.density(p, True).numpy(), [0, 5]) and not medium.has_color and medium.occupancy is None
+    assert np.isclose(medium.length_scale, 3**0.5)
+    ray = medium.local(rgb.Point3f(0.5, 0.5, -2), rgb.Vector3f(0, 0, 1))
+    assert (ray.t_near.numpy()[0], ray.t_far.numpy()[0]) == (2, 3)
+
+
+def corner(n=8):
+    """Matter in one voxel only."""
+    data = np.zeros((n, n, n), np.float32)
+    data[0, 0, 0] = 2
+    return data
+
+
+def grid_of(mi, data):
+    return mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(data)})
+
+
+def test03_a_grid_is_skipped_and_its_steps_are_short_enough_for_its_voxels(rgb):
+    medium = VolumeMedium(grid_of(rgb, corner()))
+    assert medium.occupancy is not None and medium.occupancy.fraction < 0.1
+    assert medium.step == pytest.approx(min(3**0.5 / 1024, 0.5 / 8)) and medium.cells.edge == pytest.approx(1 / 8)
+    assert VolumeMedium(grid_of(rgb, np.ones((200, 2, 2), np.float32))).step == pytest.approx(3**0.5 / 1024)
+    fog = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0}))
+    assert fog.occupancy is None and fog.cells is None and fog.step is None
+
+
+def test04_nothing_is_skipped_while_derivatives_of_it_are_tracked(rgb):
+    volume = grid_of(rgb, corner())
+    medium, params = VolumeMedium(volume), rgb.traverse(volume)
+    dr.enable_grad(params["data"])
+    params.update()
+    medium.refresh()
+    assert medium.occupancy is None
+    params["data"] = dr.detach(params["data"])
+    params.update()
+    medium.refresh()
+    assert medium.occupancy is not None
+
+
+def test05_refreshing_reads_voxels_that_have_changed_and_no_others(rgb, monkeypatch):
+    from nerg_mi.transport import volume_medium as module
+
+    volume, read = grid_of(rgb, corner()), []
+    describe = module.describe
+    monkeypatch.setattr(module, "describe", lambda v: read.append(1) or describe(v))
+    medium, params = VolumeMedium(volume), rgb.traverse(volume)
+    first = medium.occupancy
+    medium.refresh()
+    assert len(read) == 1 and medium.occupancy is first
+    medium.refresh(anyway=True)
+    assert len(read) == 2
+    moved = np.ascontiguousarray(corner()[::-1, ::-1, ::-1])
+    params["data"] = rgb.TensorXf(moved[..., None])
+    params.update()
+    medium.refresh()
+    far = rgb.Point3f(0.97, 0.97, 0.97)
+    assert len(read) == 3
+    assert medium.density(far, True).numpy()[0] > 0 and medium.occupancy.empty_cells(far).numpy()[0] == 0
+
+
+def test06_voxels_that_are_not_finite_are_refused(rgb):
+    data = np.ones((3, 3, 3), np.float32)
+    data[2, 0, 1] = np.nan
+    with pytest.raises(NergError, match=r"1 values that are not finite.*\(2, 0, 1\)"):
+        VolumeMedium(grid_of(rgb, data))
+    with pytest.raises(NergError, match="2 channels"):
+        VolumeMedium(grid_of(rgb, np.ones((3, 2, 4, 2), np.float32)))
+
+
+def test07_its_coordinates_are_the_scenes(rgb):
+    to_world = rgb.ScalarTransform4f().translate([1, 2, 3]).scale([1, 2, 4])
+    medium = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0, "to_world": to_world}))
+    lower, upper = medium.bounds()
+    assert lower.tolist() == [1, 2, 3] and upper.tolist() == [2, 4, 7]
+    p = rgb.Point3f(1.5, 3, 4)
+    assert medium.to_local(p) is p
+    assert np.allclose(np.array(medium.to_unit(p)).ravel(), [0.5, 0.5, 0.25])
+    assert np.allclose(np.array(medium.vector_to_unit(rgb.Vector3f(1, 1, 1))).ravel(), [1, 0.5, 0.25])
+
+
+def test08_what_is_skipped_can_be_put_aside_and_back(rgb):
+    """As a recorded function does, which replaces what it finds by what it is called with."""
+    medium = VolumeMedium(grid_of(rgb, corner()))
+    known = KnownEmpty(medium)
+    kept, known.bound = known.bound, None
+    assert kept is not None and medium.occupancy is None
+    known.bound = kept
+    assert medium.occupancy is kept
+
+
+# ---- Features that a gaze field may ask for: of the point itself, or gathered on the way there ----
+
+
+O, D = np.array([0.1, -0.2, -3.0]), np.array([0.0, 0.1, 1.0]) / np.hypot(0.1, 1)
+
+
+@pytest.fixture
+def place(rgb):
+    """A field of the cube [-1, 1]³, at twice the size."""
+    config = RadianceConfig(HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=3, sh_degree=2)
+    field, rng = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0), np.random.default_rng(0)
+    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    return Place(FieldMedium(field, Similarity(np.diag([2.0, 2, 2, 1])))), field
+
+
+def asked(rgb, place, kind, p, active=True):
+    vector = lambda of, v: of(*map(float, v))
+    settings = MarchSettings(1 / 128, stop=0.0, color_cutoff=1e-2)
+    found = observed_features(
+        kind, place, vector(rgb.Point3f, p), vector(rgb.Point3f, O), vector(rgb.Vector3f, D), rgb.Bool(active), settings
+    )
+    return None if found is None else np.array([f[0] for f in found])
+
+
+def features(field, p):
+    """Density and features of points (N, 3) of the scene, whose unit is half of the field's."""
+    sigma, f = field.density_features(ns.Array3f(np.ascontiguousarray((p / 2).T, np.float32)))
+    return sigma.numpy() / 2, np.stack([x.numpy() for x in f], axis=1)
+
+
+def test_a_snapshot_is_of_the_point(rgb, place):
+    place, field = place
+    p = np.array([0.3, 0.5, 0.2])
+    assert np.allclose(asked(rgb, place, "snapshot", p), features(field, p[None])[1][0], atol=1e-5)
+    assert not asked(rgb, place, "snapshot", p, active=False).any() and asked(rgb, place, "", p) is None
+
+
+def test_accumulated_ones_are_weighted_by_what_reaches_the_eye(rgb, place):
+    place, field = place
+    t = np.linspace(0, 6, 6001)
+    p = O + D * (0.5 * (t[:-1] + t[1:]))[:, None]
+    sigma, f = features(field, p)
+    tau = sigma * np.diff(t) * (np.abs(p).max(axis=1) < 2)
+    weight = np.exp(-(np.cumsum(tau) - tau)) * -np.expm1(-tau)
+    found = asked(rgb, place, "accumulated", (0.3, 0.5, 0.2))
+    assert found.shape == (3,) and np.allclose(found, weight @ f, atol=5e-3 * np.abs(f).max())
+    assert not asked(rgb, place, "accumulated", (0.3, 0.5, 0.2), active=False).any()
+    assert np.abs(found - asked(rgb, place, "snapshot", (0.3, 0.5, 0.2))).max() > 0.01
+
+
+def test_colours_of_a_deferred_medium_come_of_what_is_accumulated(rgb, place):
+    """Beside features or alone; those of another medium from its samples."""
+    kinds = []
+    for deferred in (False, True):
+        field = place[1]
+        config = replace(field.config, deferred=deferred)
+        medium = FieldMedium(RadianceField(config, field.box, field.grid, field.density_net, field.color_net))
+        ray = medium.local(rgb.Point3f(0.1, -0.2, -3), rgb.Vector3f(*map(float, D)))
+        one, both = color_painter(medium, rgb.Color3f), color_painter(medium, rgb.Color3f, features=True)
+        kinds.append(type(one))
+        found = []
+        for painter in (one, both):
+            r = march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / 64, color_cutoff=0.0), color=painter)
+            found.append(np.array(painter.color(medium, r.color, r.opacity, ray, rgb.Bool(True))).ravel())
+            hidden = painter.color(medium, r.color, r.opacity, ray, rgb.Bool(False))
+            assert not deferred or not np.array(hidden).any()
+        sums = both.features(r.color)
+        assert len(sums) == 3 and np.allclose(found[0], found[1], atol=1e-6) and found[0].max() > 0.01
+        if deferred:
+            means = mean_features(sums, r.opacity)
+            want = np.array(r.opacity * medium.field.color(means, ray.w)).ravel()
+            assert np.allclose(found[0], want, atol=1e-6)
+    assert kinds == [ColorPainter, FeaturePainter]
+    assert FeaturePainter(medium).color(medium, r.color, r.opacity, ray, True) is None
