@@ -410,7 +410,7 @@ def describe(nerg) -> str:
     return "NergIntegrator[\n" + "".join(f"  {k} = {v},\n" for k, v in body.items()) + "]"
 
 
-class Pose(mi.TraversalCallback):
+class PoseFlags(mi.TraversalCallback):
     """Shows the pose of a sensor as what it is to us. Mitsuba calls it not differentiable, as silhouettes are not."""
 
     def __init__(self, cb, prefix):
@@ -539,7 +539,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     def traverse(self, cb):
         for name, child in self.children.items():
             if name == "observer":
-                child.traverse(Pose(cb, "observer."))
+                child.traverse(PoseFlags(cb, "observer."))
             else:
                 cb.put(name, child, mi.ParamFlags.Differentiable)
         cb.put("falloff", self.falloff, mi.ParamFlags.Differentiable)

@@ -235,7 +235,7 @@ class CameraView:
 
 
 @dataclass(frozen=True)
-class Attention:
+class SurfaceGaze:
     """What a gaze field says of a surface: ``gaze`` and its ``spread`` (None unless demanded) after occlusion, the
     factors ``emit`` and ``capture`` (None where a map knew the gaze), and the networks evaluated."""
 
@@ -326,7 +326,7 @@ class Pixel:
         return not self.context.gaze.field.config.features
 
     @cached_property
-    def attention(self) -> Attention:
+    def attention(self) -> SurfaceGaze:
         """The gaze of the observer on the surface that they see towards this one."""
         sight, gaze, p_o, r_o, surface = self.sight, self.gaze, self.observer.p_o, self.r_o, self.camera.surface
         networks = arrays.Float(gaze.field.networks)
@@ -342,10 +342,10 @@ class Pixel:
                 lambda _, density: density,
                 label="gaze",
             )
-            return Attention(shown(density), dr.select(unknown, networks, 0))
+            return SurfaceGaze(shown(density), dr.select(unknown, networks, 0))
         needed = surface if "factors" in self.context.demands else attended
         density, emit, capture, *spread = self._evaluated(needed)
-        return Attention(
+        return SurfaceGaze(
             shown(density),
             dr.select(needed, networks, 0),
             dr.select(surface, emit, 0),

@@ -164,7 +164,7 @@ class Walls:
 
 
 @dataclass(frozen=True, eq=False)
-class Walk:
+class PersonWalk:
     """Where a person was: ``places`` (N, 2) in the order of time, ``breaks`` (N,) bool where a new walk begins."""
 
     name: str
@@ -173,7 +173,7 @@ class Walk:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class SightLines:
     """``origins`` (N, 2), and unit ``directions`` (N, 2) or ``ends`` (N, 2) on the floor, of the people numbered
     ``person`` (N,)."""
 
@@ -186,9 +186,9 @@ def floor_figure(
     low: np.ndarray,
     high: np.ndarray,
     walls: Walls | None = None,
-    walks: list[Walk] | None = None,
-    rays: Sight | None = None,
-    fields: Sight | None = None,
+    walks: list[PersonWalk] | None = None,
+    rays: SightLines | None = None,
+    fields: SightLines | None = None,
     fov: float = 60.0,
     title: str = "Floor plan",
 ) -> Any:
@@ -239,7 +239,7 @@ def color_of(person: int) -> str:
     return PEOPLE[person % len(PEOPLE)]
 
 
-def _with_gaps(walk: Walk) -> np.ndarray:
+def _with_gaps(walk: PersonWalk) -> np.ndarray:
     """The places of a walk with a NaN before each at which a new one begins."""
     return np.insert(walk.places.astype(float), np.flatnonzero(walk.breaks), np.nan, axis=0)
 
@@ -252,7 +252,7 @@ def _plan(walls: Walls) -> np.ndarray:
     return np.repeat(np.where(walls.cut, _CUT, grey)[..., None], 3, axis=-1)
 
 
-def _draw_rays(axes: Any, rays: Sight) -> None:
+def _draw_rays(axes: Any, rays: SightLines) -> None:
     from matplotlib.collections import LineCollection
 
     lines = np.stack([rays.origins, rays.ends], axis=1)
@@ -261,7 +261,7 @@ def _draw_rays(axes: Any, rays: Sight) -> None:
     axes.scatter(*rays.ends.T, s=5, c=colors, linewidths=0, zorder=3.5)
 
 
-def _draw_fields(axes: Any, fields: Sight, fov: float) -> None:
+def _draw_fields(axes: Any, fields: SightLines, fov: float) -> None:
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Wedge
 
@@ -275,7 +275,7 @@ def _draw_fields(axes: Any, fields: Sight, fov: float) -> None:
 
 
 def _legend_entries(
-    walls: Walls | None, walks: list[Walk], rays: Sight | None, fields: Sight | None, fov: float
+    walls: Walls | None, walks: list[PersonWalk], rays: SightLines | None, fields: SightLines | None, fov: float
 ) -> list[tuple[str, dict[str, Any]]]:
     square = dict(linestyle="none", marker="s", markersize=6)
     found: list[tuple[str, dict[str, Any]]] = []

@@ -249,7 +249,7 @@ def gaze_figure(
 
 def visibility_figure(color, visibility, mask, title: str = "Visible to the observer"):
     """``visibility`` (h, w): 1 in the colours of the picture, 0 in a dark blue; hatched where ``mask`` is false."""
-    of = Layers(np.asarray(color), np.asarray(visibility), np.asarray(mask, bool))
+    of = OverlayLayers(np.asarray(color), np.asarray(visibility), np.asarray(mask, bool))
     return find_overlay("visibility").draw(of, None, Style(title=title))
 
 
@@ -343,7 +343,7 @@ Limits = tuple[float, float] | None
 
 
 @dataclass(frozen=True, eq=False)
-class Layers:
+class OverlayLayers:
     """A picture and what lies over it: linear ``color`` (h, w, 3), ``values`` (h, w), ``mask`` (h, w) bool where there
     is a surface; ``marker``: pixel (x, y) of the observer, or None; ``supported``: whether anything was recorded around
     the observer, so that their gaze is known; ``basis``: rays and people that it rests on, in words, "" where that is
@@ -413,7 +413,7 @@ class Overlay:
         """Whether its scale follows from the upper end alone."""
         return self.display.kind in ("heat", "diverging")
 
-    def limits(self, of: Layers) -> Limits:
+    def limits(self, of: OverlayLayers) -> Limits:
         """The ends of the scale of one picture; None where it shows nothing of the quantity, or needs no scale."""
         return self.limits_of(of.values, of.mask)
 
@@ -429,7 +429,7 @@ class Overlay:
             return -limit, limit
         return percentile_limits(values, mask)
 
-    def paint(self, of: Layers, limits: Limits, style: Style = USUAL, unknown=None) -> np.ndarray:
+    def paint(self, of: OverlayLayers, limits: Limits, style: Style = USUAL, unknown=None) -> np.ndarray:
         """Display values (h, w, 3) of ``of``, hatched where ``unknown`` (h, w) bool is true."""
         kind, colors = self.display.kind, style.colors or self.colors
         if kind == "heat":
@@ -440,7 +440,7 @@ class Overlay:
             shown = color_of(np.nan_to_num(of.values), self._ends(of.values, of.mask, limits), colors, self.color_kind)
         return shown if unknown is None else _hatched(shown, unknown)
 
-    def draw(self, of: Layers, limits: Limits, style: Style = USUAL) -> Any:
+    def draw(self, of: OverlayLayers, limits: Limits, style: Style = USUAL) -> Any:
         """A figure of ``of`` on a scale with these ``limits``."""
         needs_support, label = self.quantity.needs_support, self.quantity.scale_label
         title = style.title or self.quantity.heading
@@ -456,7 +456,7 @@ class Overlay:
         return sheet.page
 
     def add_scale(
-        self, sheet: Sheet, each: Sequence[Layers], limits: Limits, style: Style = USUAL, unknown: bool = False
+        self, sheet: Sheet, each: Sequence[OverlayLayers], limits: Limits, style: Style = USUAL, unknown: bool = False
     ) -> None:
         """The scale of the pictures ``each`` on a ``sheet``; ``unknown``: whether some are hatched."""
         label = self.quantity.scale_label
@@ -491,7 +491,7 @@ class Overlay:
         return limits or self.display.limits or percentile_limits(values, mask)
 
 
-def unknown_of(layers: Layers, of_gaze: bool) -> np.ndarray:
+def unknown_of(layers: OverlayLayers, of_gaze: bool) -> np.ndarray:
     """Where nothing is known (h, w), bool: where there is no surface, and everywhere for gaze without support."""
     void = ~np.asarray(layers.mask, bool)
     return void if layers.supported or not of_gaze else np.ones_like(void)

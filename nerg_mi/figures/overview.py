@@ -38,7 +38,7 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Frame:
+class PinholeFrame:
     """Pixels of a pinhole camera: ``fov``, degrees from left to right, ``aspect``: width by height, ``up`` (3,)."""
 
     fov: float
@@ -73,7 +73,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenSurfaces:
     """What somebody at ``eye`` (3,) meets: unit ``directions`` (P, 3), ``depth`` (P,), whether it is a surface,
     ``met`` (P,) bool, and ``attention`` (P,), density in 1/sr; ``weight`` (P,): solid angles."""
 
@@ -125,7 +125,14 @@ class Judge:
     median; they are the same on a surface and differ by half in fog, as there is in a field where no photo looked.
     """
 
-    def __init__(self, trace: Trace, frame: Frame, usual: float, seen: Seen | None = None, mean: Trace | None = None):
+    def __init__(
+        self,
+        trace: Trace,
+        frame: PinholeFrame,
+        usual: float,
+        seen: SeenSurfaces | None = None,
+        mean: Trace | None = None,
+    ):
         self.trace, self.frame, self.usual, self.seen, self.mean = trace, frame, usual, seen, mean
 
     def shots(self, origins: np.ndarray, targets: np.ndarray, size: tuple[int, int]) -> list[Shot]:
@@ -209,7 +216,7 @@ def _spread(depth: np.ndarray) -> float:
     return float(np.std(np.log(np.maximum(depth, 1e-9)))) if depth.size else 0.0
 
 
-def around_observer(trace: Trace, frame: Frame, seen: Seen, mean: Trace | None = None) -> Shot | None:
+def around_observer(trace: Trace, frame: PinholeFrame, seen: SeenSurfaces, mean: Trace | None = None) -> Shot | None:
     """The camera that shows best what the observer of ``seen`` looks at: in free sight of the observer, from above or
     beside. ``mean``: as `Judge` has it. None where nothing is met."""
     target = seen.looked_at()
@@ -246,7 +253,7 @@ def around_observer(trace: Trace, frame: Frame, seen: Seen, mean: Trace | None =
 
 def of_place(
     trace: Trace,
-    frame: Frame,
+    frame: PinholeFrame,
     lower: np.ndarray,
     upper: np.ndarray,
     outside: bool = True,

@@ -333,7 +333,7 @@ def _page_type() -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    class Page(Figure):
+    class FigurePage(Figure):
         def __init__(self, **how: Any):
             super().__init__(**how)
             FigureCanvasAgg(self)
@@ -341,7 +341,7 @@ def _page_type() -> Any:
         def _repr_png_(self) -> bytes:
             return encode(self, ".png")
 
-    return Page
+    return FigurePage
 
 
 class Sheet:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 # ---- Several pictures of the same rays, and the one that an integrator makes of them ----
 
 
-class Layers(Protocol):
+class LayerSource(Protocol):
     """What is rendered in place of a scene's integrator: several pictures of the same rays, each with AOVs of its
     own."""
 
@@ -65,7 +65,7 @@ STRIP_SECONDS = 0.5
 """A strip that took longer than this is followed by shorter ones, one that took less than half of it by longer ones."""
 
 
-class Pace:
+class SamplePace:
     """How many samples a strip has, from the time that those before it took; ``fixed``: always as many. It may serve
     several pictures in turn, in one variant."""
 
@@ -153,7 +153,7 @@ def _class(variant: str):
     # Mitsuba's classes belong to a variant.
     import mitsuba as mi
 
-    class Samples(mi.Sampler):
+    class StripSampler(mi.Sampler):
         def __init__(self, spp, generator):
             super().__init__(mi.Properties())
             self.set_sample_count(spp)
@@ -167,12 +167,12 @@ def _class(variant: str):
             return mi.Point2f(x, self.next_1d(active))
 
         def clone(self):
-            return Samples(self.sample_count(), type(self.generator)(self.generator))
+            return StripSampler(self.sample_count(), type(self.generator)(self.generator))
 
         def to_string(self):
             return f"Samples[{self.sample_count()} a pixel, {variant}]"
 
-    return Samples
+    return StripSampler
 
 
 # ---- Bands ----
@@ -263,8 +263,8 @@ def render_bands(
     rows: int = 0,
     strip: int = 0,
     on_strip: Callable[[int, int], None] | None = None,
-    layers: Layers | None = None,
-    pace: Pace | None = None,
+    layers: LayerSource | None = None,
+    pace: SamplePace | None = None,
 ) -> Iterator[Band]:
     """Render the picture of ``sensor`` band by band, from the top; in one piece where `why_whole` has a reason.
 
@@ -282,7 +282,7 @@ def render_bands(
     layers = OwnLayer(integrator) if layers is None else layers
     observing = lambda: integrator.seen_by(sensor, scene) if isinstance(integrator, Observing) else nullcontext()
     base = base_seed(sensor.sampler())
-    pace = pace or Pace(strip)
+    pace = pace or SamplePace(strip)
     pace.begin()
     done = 0
     for top in range(0, grid.height, grid.rows):
@@ -331,7 +331,7 @@ def _evaluate(block):
     dr.eval(block.tensor())
 
 
-def _trace(scene, sensor, layers: Layers, grid: _Grid, base, seed, top, first, count, start):
+def _trace(scene, sensor, layers: LayerSource, grid: _Grid, base, seed, top, first, count, start):
     """Trace samples ``first``, ..., of which those before ``start`` are of no account: where they lie in the block of
     the band at ``top``, who counts, and an iterator over their values in each layer. Follows
     ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by operation."""
@@ -413,7 +413,7 @@ class _Grid:
         return block
 
     @contextmanager
-    def as_whole(self, block, layers: Layers):
+    def as_whole(self, block, layers: LayerSource):
         """Add samples to ``block``, that of the first of ``layers``, and to the others, in the way in which Dr.Jit
         would add them to the whole picture, which is another for more than a million values
         (`dr.set_expand_threshold`) and rounds differently."""

@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import reading, size_of
 
 from .scene import check_scene_file
-from .scene_writer import Blank, Comment, Node, Place, Verbatim, document, element, relative_name, value_of
+from .scene_writer import Blank, Comment, Node, SceneContent, Verbatim, document, element, relative_name, value_of
 
 # ---- Somebody's scene file as the place of a scene with gaze ----
 #
@@ -28,7 +28,7 @@ SPP = 64
 """Samples a pixel: paths of light have more noise than fields."""
 
 
-def nested_place(path: Path, folder: Path) -> Place:
+def nested_place(path: Path, folder: Path) -> SceneContent:
     """The scene file ``path`` as the place of one that is written into ``folder``.
 
     Raises `NergError` for what is no scene file, and for one whose integrator is `nerg` already or one of several.
@@ -43,7 +43,7 @@ def nested_place(path: Path, folder: Path) -> Place:
     light: tuple[Node, ...] = ()
     if integrators:
         light = (Comment(f"What lights the shapes: the integrator of {path.name}."), *map(verbatim, integrators))
-    return Place(
+    return SceneContent(
         inside=light,
         beside=(Comment(f"What follows is {path.name}; its sensors are counted after ours."), *map(verbatim, others)),
         first=(*_paths(path, children, folder), *map(verbatim, defaults), Blank()),

@@ -213,7 +213,7 @@ class Lens:
 
 
 @dataclass(frozen=True)
-class Place:
+class SceneContent:
     """What a scene shows. ``inside``: children of the integrator (a field, volumes, an integrator that lights shapes);
     ``beside``: of the scene (shapes, lights); ``first``: before all else (paths and defaults of another file).
     ``files``: names of files by the `<default>` that holds them."""
@@ -230,7 +230,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Attention:
+class GazeFiles:
     """Whose attention it shows: files of a gaze field and of rays, or None; ``align`` (4, 4): from the rays to the
     scene, None where they are the same."""
 
@@ -250,8 +250,8 @@ class SceneText:
     diagonal of a box around the place and its cameras, in scene units; ``observer``: None where the camera is the
     observer."""
 
-    place: Place
-    attention: Attention
+    place: SceneContent
+    attention: GazeFiles
     camera: Eye
     observer: Eye | None
     up: np.ndarray
@@ -275,7 +275,7 @@ class SceneText:
         return document(_nodes(self), self.about, self.place.version)
 
 
-class _Names:
+class _SceneNames:
     """The `<default>`s and ids of a scene, under names that no other file has taken."""
 
     def __init__(self, taken: frozenset[str]):
@@ -292,7 +292,7 @@ class _Names:
 
 
 def _nodes(scene: SceneText) -> Sequence[Node]:
-    names, place = _Names(scene.place.taken), scene.place
+    names, place = _SceneNames(scene.place.taken), scene.place
     return [
         *place.first,
         *_defaults(scene, names),
@@ -306,7 +306,7 @@ def _nodes(scene: SceneText) -> Sequence[Node]:
     ]
 
 
-def _defaults(scene: SceneText, names: _Names) -> list[Node]:
+def _defaults(scene: SceneText, names: _SceneNames) -> list[Node]:
     height = max(1, round(scene.width / scene.lens.aspect))
     attention, sphere = scene.attention, 2 * round(0.4 * scene.width)
     files = {**scene.place.files, "gaze": attention.gaze, "rays": attention.rays}
@@ -349,7 +349,7 @@ def _defaults(scene: SceneText, names: _Names) -> list[Node]:
     ]
 
 
-def _integrator(scene: SceneText, names: _Names) -> Element:
+def _integrator(scene: SceneText, names: _SceneNames) -> Element:
     attention = scene.attention
     children: list[Node] = list(scene.place.inside)
     if attention.gaze is not None:
@@ -367,12 +367,12 @@ def _integrator(scene: SceneText, names: _Names) -> Element:
     return element("integrator", *children, type="nerg", id=names("integrator"))
 
 
-def _camera(scene: SceneText, names: _Names) -> Element:
+def _camera(scene: SceneText, names: _SceneNames) -> Element:
     pose = _look(names.use("camera"), names.use("target"), _up(scene.camera, names))
     return _perspective("camera", pose, scene, names, scene.lens.offset)
 
 
-def _own_sensors(scene: SceneText, names: _Names) -> list[Node]:
+def _own_sensors(scene: SceneText, names: _SceneNames) -> list[Node]:
     observer = scene.observer
     eye, ahead = ("camera", "target") if observer is None else ("eye", "ahead")
     pose = _look(names.use(eye), names.use(ahead), _up(observer or scene.camera, names))
@@ -403,7 +403,9 @@ def ahead_level(eye: Eye, up: np.ndarray) -> np.ndarray:
     raise ValueError(f"no direction is level under the up {up}")
 
 
-def _perspective(name: str, pose: Node, scene: SceneText, names: _Names, offset: Sequence[float] = (0, 0)) -> Element:
+def _perspective(
+    name: str, pose: Node, scene: SceneText, names: _SceneNames, offset: Sequence[float] = (0, 0)
+) -> Element:
     lens: list[Node] = [prop("float", "fov", names.use("fov")), prop("string", "fov_axis", "x")]
     lens += [prop("float", f"principal_point_offset_{a}", numbers([v])) for a, v in zip("xy", offset) if v]
     near, far = (numbers([distance]) for distance in clip_distances(scene.extent, scene.unit))
@@ -424,7 +426,7 @@ def _film(width: str, height: str) -> Element:
     )
 
 
-def _sampler(names: _Names) -> Element:
+def _sampler(names: _SceneNames) -> Element:
     return element("sampler", prop("integer", "sample_count", names.use("spp")), type="independent")
 
 
@@ -432,7 +434,7 @@ def _look(origin: str, target: str, up: str) -> Element:
     return transform(element("lookat", origin=origin, target=target, up=up))
 
 
-def _up(eye: Eye, names: _Names) -> str:
+def _up(eye: Eye, names: _SceneNames) -> str:
     return names.use("up") if eye.up is None else numbers(eye.up)
 
 

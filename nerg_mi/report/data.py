@@ -43,7 +43,7 @@ _INTEGRAL = 2048
 
 
 @dataclass(frozen=True, eq=False)
-class Eyes:
+class EyePositions:
     """Where people stood: ``positions`` (P, 3), and whose they are, ``person`` (P,)."""
 
     positions: np.ndarray
@@ -95,7 +95,7 @@ class Onlooker:
         return look_from(self._gaze, self._place, self._settings, eye)
 
 
-def eyes_of(rays: Rays, place: GazePlace, most: int) -> Eyes:
+def eyes_of(rays: Rays, place: GazePlace, most: int) -> EyePositions:
     """About ``most`` of the positions of ``rays``, in the place's coordinates, as many of each person: evenly chosen
     among theirs in the order of time, and begun at another part of it for each person, so that all together are spread
     over whole visits even where each person has only one. Of more people than that so many, evenly chosen."""
@@ -112,7 +112,7 @@ def eyes_of(rays: Rays, place: GazePlace, most: int) -> Eyes:
         # At the same share of as many equal stretches.
         chosen.append(own[((np.arange(count) + start) * len(own) / count).astype(int)])
     rows = np.concatenate(chosen)
-    return Eyes(place.points_from_rays(rays.origin[rows]), rays.person[rows])
+    return EyePositions(place.points_from_rays(rays.origin[rows]), rays.person[rows])
 
 
 def land_rays(
@@ -300,7 +300,7 @@ _FINE = 320
 
 
 @dataclass(frozen=True, eq=False)
-class Proxy:
+class ReportProxy:
     """``vertices`` (V, 3) float32; ``normals`` (V, 3) unit, towards where they were seen from; ``colors`` (V, 3) uint8
     sRGB; ``gaze`` (M, V) in 1/sr of M observers; ``spacing``: edge of the cube that a point stands for."""
 
@@ -320,7 +320,7 @@ def place_proxy(
     most: int = 80_000,
     size: tuple[int, int] = (320, 160),
     on_eye: Callable[[int, int], None] | None = None,
-) -> Proxy | None:
+) -> ReportProxy | None:
     """What panoramas of ``size`` from ``eyes`` (K, 3) show of ``scene`` (`mi.Scene`), as ``most`` points at most.
 
     The scene's integrator is ``nerg`` with the AOVs opacity and position. ``up`` (3,): up axis of the panoramas.
@@ -341,7 +341,7 @@ def place_proxy(
     colors, normals = values[:, :3], smooth_normals(points, values[:, 3:])
     baked = [gaze(np.asarray(observer, float), points, spacing) for observer in observers]
     heat = np.stack(baked).astype(np.float32) if baked else np.zeros((0, len(points)), np.float32)
-    return Proxy(points.astype(np.float32), normals.astype(np.float32), to_bytes(srgb(colors)), heat, spacing)
+    return ReportProxy(points.astype(np.float32), normals.astype(np.float32), to_bytes(srgb(colors)), heat, spacing)
 
 
 def thin(
@@ -449,7 +449,7 @@ def spread_out(points: np.ndarray, count: int, first: np.ndarray | None = None) 
 
 
 @dataclass(frozen=True)
-class Picture:
+class ReportPicture:
     """A PNG file, what it shows in words (``alt``) and what is said below it."""
 
     png: bytes
@@ -486,7 +486,7 @@ class Run:
     least: int = 1
     # For each looked-from place of people, how many people were within its radius.
     company: tuple[int, ...] = ()
-    pictures: Mapping[str, Picture] = field(default_factory=dict)
+    pictures: Mapping[str, ReportPicture] = field(default_factory=dict)
     stage: str | None = None
     # How many observers, paths and points the 3D scene has.
     stage_observers: int = 0
@@ -532,7 +532,7 @@ _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2,
 
 
 @dataclass(frozen=True)
-class Camera:
+class ReportCamera:
     """From where the pictures are taken: a camera at ``origin`` that looks at ``target`` (3,)."""
 
     origin: np.ndarray
@@ -544,12 +544,12 @@ class Stage:
     """What is drawn: the ``proxy`` of the place; ``observers`` (M, 3), of whom it has the gaze; people's ``paths``,
     (n, 3) each; ``boxes``; ``up`` (3,); the ``camera``."""
 
-    proxy: Proxy
+    proxy: ReportProxy
     observers: np.ndarray
     paths: Sequence[np.ndarray]
     boxes: Sequence[Region]
     up: np.ndarray
-    camera: Camera
+    camera: ReportCamera
 
 
 def pack(stage: Stage) -> str:

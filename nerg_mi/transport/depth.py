@@ -147,7 +147,7 @@ class Median:
         return dr.select(dr.isfinite(result.half), inside, distance)
 
 
-class Refined(Median):
+class RefinedMedian(Median):
     """The median, searched again with finer steps in the step that crosses, for densities that change within one."""
 
     name = "refined"
@@ -212,7 +212,7 @@ class _Half:
         self.depth = dr.select(rest, crossing, dr.select(opaque & active, result.half, 0))
 
 
-for _depth in (Expected(), Median(), Refined()):
+for _depth in (Expected(), Median(), RefinedMedian()):
     DEPTHS.register(_depth)
 
 

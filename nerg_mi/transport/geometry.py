@@ -140,7 +140,7 @@ class SceneRay:
 
 
 @dataclass
-class View:
+class RayView:
     """What one ray meets. Attached to whatever carries derivatives."""
 
     # The medium's part; None without a medium.
@@ -208,7 +208,7 @@ class Place:
         """Length of the diagonal of a box around what there is and ``points`` (3,), in scene units."""
         return float(np.linalg.norm(np.ptp([*(self.bounds() or ()), *(np.asarray(p, float) for p in points)], axis=0)))
 
-    def trace(self, ray: Ray3f | SceneRay, active: Bool, settings: MarchSettings, **options: Any) -> View:
+    def trace(self, ray: Ray3f | SceneRay, active: Bool, settings: MarchSettings, **options: Any) -> RayView:
         """What ``ray`` meets up to its ``maxt``; without shapes a ``SceneRay`` will do.
 
         ``settings``: of the march; ``options``: those of ``march.march``. Differentiable in the ray, in the medium's
@@ -224,7 +224,7 @@ class Place:
         if self.medium is None:
             opacity = dr.select(hit, Float(1), 0)
             at_shape = lambda kind, active: dr.select(active & hit, distance, 0)
-            return View(None, hit, distance, opacity, Float(0), preliminary, at_shape)
+            return RayView(None, hit, distance, opacity, Float(0), preliminary, at_shape)
 
         medium = self.medium
         local = medium.local(ray.o, ray.d)
@@ -233,7 +233,7 @@ class Place:
         front = result.opacity
         if self.scene is None:
             in_medium = lambda kind, active: surface_depth(kind, result, medium, local, t0, t1, active, settings)
-            return View(result, hit, distance, front, front, None, in_medium)
+            return RayView(result, hit, distance, front, front, None, in_medium)
 
         def in_both(kind, active):
             some = active & (front > 0)
@@ -241,7 +241,7 @@ class Place:
             through = DEPTHS.find(kind).with_shape(result, front, inside, hit, distance)
             return dr.select(active & hit, through, dr.select(some, inside, 0))
 
-        return View(result, hit, distance, dr.select(hit, 1, front), front, preliminary, in_both)
+        return RayView(result, hit, distance, dr.select(hit, 1, front), front, preliminary, in_both)
 
 
 def as_place(subject: Medium | Place) -> Place:
@@ -320,7 +320,7 @@ class Shading:
         sampler: mi.Sampler,
         ray: Ray3f,
         medium: mi.Medium | None,
-        view: View,
+        view: RayView,
         background: Color,
         hide_emitters: bool,
         active: Bool,

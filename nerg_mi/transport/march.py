@@ -15,8 +15,8 @@ from .march_primal import (
     MarchRequest,
     MarchResult,
     MarchSettings,
+    MarchSums,
     Occlusion,
-    Sums,
     advance,
     first_hit,
     limits,
@@ -67,7 +67,7 @@ def differentiable_march(
 
 
 @dataclass(kw_only=True)
-class _Replay(Sums):
+class _Replay(MarchSums):
     """Where a repeated march is: the primal's loop state as far as derivatives need it."""
 
     active: Bool

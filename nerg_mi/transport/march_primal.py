@@ -118,7 +118,7 @@ def add(total: Float, lost: Float, term: Float) -> tuple[Float, Float]:
 
 
 @dataclass(kw_only=True)
-class Sums:
+class MarchSums:
     """What matter along a ray adds up to, up to some point of it; rounding is carried along (`add`)."""
 
     # Optical depth.
@@ -148,12 +148,12 @@ class Sums:
 
 
 def nothing_absorbed(Float: type) -> dict[str, Any]:
-    """The fields of `Sums` where a march begins."""
+    """The fields of `MarchSums` where a march begins."""
     return {name: Float(0) for name in ("tau", "moment", "lost_tau", "lost_moment")}
 
 
 @dataclass(kw_only=True)
-class MarchResult(Sums):
+class MarchResult(MarchSums):
     """What a march gathered along each ray. Distances are in scene units, from the ray's start."""
 
     # Distance at which transmittance crosses 1/2, or optical depth the one asked for; infinite where it does not.
@@ -348,7 +348,7 @@ class MarchRequest:
 
 
 @dataclass
-class _Steps:
+class _StepState:
     """Where a march in steps is."""
 
     active: Bool
@@ -373,7 +373,7 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
     quadrature = RULES.find(settings.quadrature)
     cells = boundaries(quadrature, medium)
 
-    def body(state: _Steps) -> tuple[_Steps]:
+    def body(state: _StepState) -> tuple[_StepState]:
         share = Float(1) if state.share is None else state.share
         active, t, delta, t_next = advance(medium, ray, state.t, t1, share, settings, state.active, cells, fine_from)
         found, tau, pending = replace(state.found), state.found.tau, state.pending
@@ -400,9 +400,9 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
         if occlusion is not None:
             active = found.settle(occlusion.hidden(t_next, found.tau), active)
         active = active & (t_next < t1) & (found.tau < end)
-        return (_Steps(active, t_next, None if state.share is None else Float(1), step.carry, pending, found),)
+        return (_StepState(active, t_next, None if state.share is None else Float(1), step.carry, pending, found),)
 
-    start = _Steps(
+    start = _StepState(
         request.active,
         t0,
         # A state that never changes would have the loop recorded twice.

@@ -92,7 +92,7 @@ _ORDERED = 1 << 20
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class ObserverSurroundings:
     """Unit ``directions`` of equal area, the ``distance`` (scene units) to what is met along each, and whether no
     surface is met there (``escaped``). Evaluated, without derivatives. ``number`` (N,) of each direction along the
     spiral that all of them lie on; None where they are in its order."""
@@ -107,7 +107,7 @@ class AllAround:
     """The surroundings of one observer, in as many directions as they were asked for in."""
 
     def __init__(self) -> None:
-        self._traced: dict[int, Surroundings] = {}
+        self._traced: dict[int, ObserverSurroundings] = {}
         self.filling: Filling | None = None
         """What fills directions that escape, once that has been asked for."""
 
@@ -119,7 +119,7 @@ class AllAround:
         place: Place,
         center: Point3f,
         settings: ObserverSettings,
-    ) -> Surroundings:
+    ) -> ObserverSurroundings:
         """Those in ``count`` directions; the other arguments are those of ``trace_surroundings``, always the same."""
         if count not in self._traced:
             if field.config.fills_escaped and self.filling is None:
@@ -145,7 +145,7 @@ def trace_surroundings(
     settings: ObserverSettings,
     count: int | None = None,
     filling: Filling | None = None,
-) -> Surroundings:
+) -> ObserverSurroundings:
     """Those of the observer at ``center`` (one lane) in ``count`` directions (None: ``settings.directions``), for
     ``field`` in ``place``; ``filling``: see ``distance_along``."""
     count = count or settings.directions
@@ -155,7 +155,7 @@ def trace_surroundings(
         directions = fibonacci_vectors(count, None if number is None else variant_types().UInt32(number))
         distance, escaped = distance_along(field, to_world, place, center, directions, settings, filling)
         dr.eval(directions, distance, escaped)
-    return Surroundings(directions, distance, escaped, number)
+    return ObserverSurroundings(directions, distance, escaped, number)
 
 
 def distance_along(
@@ -167,7 +167,7 @@ def distance_along(
     settings: ObserverSettings,
     filling: Filling | None = None,
 ) -> tuple[Float, Bool]:
-    """``(distance, escaped)`` as of ``Surroundings`` along unit ``directions``: where ``field`` is to be
+    """``(distance, escaped)`` as of ``ObserverSurroundings`` along unit ``directions``: where ``field`` is to be
     evaluated, also where there is no surface. What escapes ends on the field's box, or at the depth of the nearest
     directions that do not, as the field wants it: of ``filling``, if it has been traced."""
     mi = variant_types()
@@ -359,11 +359,11 @@ class _SphereIntegral:
 
         return integrate(numbered, self.settings.directions, self.settings.integral_tolerance)
 
-    def _around(self, known: Known, count: int) -> Surroundings:
+    def _around(self, known: Known, count: int) -> ObserverSurroundings:
         placed = self.placed
         return known.value.of(count, placed.field, placed.to_world, self.place, known.center, self.settings)
 
-    def _integrand(self, known: Known, around: Surroundings) -> Float:
+    def _integrand(self, known: Known, around: ObserverSurroundings) -> Float:
         o = known.center + dr.zeros(type(known.center), dr.width(around.directions))
         emit, capture = self.placed.unnormalized(
             self.member, o + around.directions * around.distance, o, around.directions, True, around.escaped

@@ -9,7 +9,7 @@ import drjit as dr
 from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f, variant_types
 
 from .depth import DEPTHS
-from .geometry import Place, View
+from .geometry import Place, RayView
 from .march_primal import Occlusion
 from .observer import ObserverCache, ObserverSettings, distance_and_direction, fingerprint_of, visibility
 from .observer_gaze import ObservedGaze
@@ -208,7 +208,7 @@ def trace_sight(
     return Sight(dr.select(blocked, p_o + r_o * d_o, p_d), d_o, seen, evals, attended)
 
 
-def _met(view: View, settings: ObserverSettings, active: Bool) -> Float:
+def _met(view: RayView, settings: ObserverSettings, active: Bool) -> Float:
     """Depth of the surface on the observer's rays; infinite where there is none, or where it is known to lie behind the
     point."""
     march = view.march
@@ -245,5 +245,5 @@ def _map_of(
     return around, table
 
 
-def _evaluations(view: View) -> Float | None:
+def _evaluations(view: RayView) -> Float | None:
     return None if view.march is None else view.march.density_evals

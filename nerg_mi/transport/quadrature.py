@@ -233,7 +233,7 @@ _GAUSS = 0.5 / 3**0.5
 
 
 @dataclass
-class Step:
+class MarchStep:
     """One evaluated step, ``delta`` long in scene units. Attached to whatever carries derivatives."""
 
     # Its optical depth, 0 on lanes that are not active.
@@ -284,7 +284,7 @@ class Rule(Protocol):
         carry: Any,
         active: Bool,
         colored: bool,
-    ) -> Step:
+    ) -> MarchStep:
         """Evaluate the step from the distance ``t`` on, ``delta`` long.
 
         ``t_next``: where it ends, detached; equal to the next step's ``t`` unless something is leapt over in between.
@@ -331,7 +331,7 @@ def _step_along_line(
     last: Float,
     carry: tuple | None,
     evaluations: Float,
-) -> Step:
+) -> MarchStep:
     """The step from ``t`` on, ``delta`` long and of optical depth ``dtau``, whose density runs in a line from ``first``
     to ``last``."""
     share = linear_share(first * delta, last * delta)
@@ -340,7 +340,9 @@ def _step_along_line(
         p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
         return painter.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
 
-    return Step(dtau, share, lambda missing: linear_crossing(first, last, delta, missing), paint, carry, evaluations)
+    return MarchStep(
+        dtau, share, lambda missing: linear_crossing(first, last, delta, missing), paint, carry, evaluations
+    )
 
 
 class Constant:
@@ -353,7 +355,7 @@ class Constant:
     def start(self, Float):
         return None
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> Step:
+    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> MarchStep:
         p = ray.o + ray.d * (t + 0.5 * delta)
         sigma, features = medium.density_features(p, active) if colored else (medium.density(p, active), [])
         dtau = dr.select(active, sigma * delta, 0)
@@ -361,7 +363,7 @@ class Constant:
         def paint(painter, lit):
             return painter.paint(medium, features, p, ray.w, lit)
 
-        return Step(
+        return MarchStep(
             dtau,
             mean_depth_share(dtau),
             lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),
@@ -383,7 +385,7 @@ class Linear:
         # Density at the end of the step before, and where that was (distances are not negative).
         return Float(0), Float(-1)
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> Step:
+    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> MarchStep:
         fresh = active if carry is None else active & (carry[1] != t)
         if carry is None:
             first = medium.density(ray.o + ray.d * t, active)
@@ -419,7 +421,7 @@ class Cells:
     def start(self, Float):
         return None
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> Step:
+    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> MarchStep:
         a = medium.density(ray.o + ray.d * (t + (0.5 - _GAUSS) * delta), active)
         b = medium.density(ray.o + ray.d * (t + (0.5 + _GAUSS) * delta), active)
         mean = 0.5 * (a + b)

@@ -18,8 +18,8 @@ from nerg_mi.rendering.scene import files_of_scene
 
 from . import layers
 from .layers import Scale
-from .page import Page, Window
-from .points import View, heading_of
+from .page import BrowserWindow, Page
+from .points import PinholeView, heading_of
 from .scene import copied_view
 
 # ---- Controls ----
@@ -192,7 +192,7 @@ class Controls:
 
         @to_camera.on_click
         def _(event: Any) -> None:
-            view = View.of_page(event.client.camera)
+            view = PinholeView.of_page(event.client.camera)
             self.page.place_observer(view.origin, heading_of(view.ahead, session.place.up))
 
         @to_observer.on_click
@@ -253,7 +253,7 @@ class Controls:
                 self._sphere.show(colors)
 
         ahead, up = session.heading[:, 0], session.heading[:, 2]
-        view = View.of(session.observer, session.observer + ahead, up, np.radians(60), 1.5)
+        view = PinholeView.of(session.observer, session.observer + ahead, up, np.radians(60), 1.5)
         session.inset("own", view, own, INSET)
         session.sphere(sphere, INSET)
 
@@ -319,7 +319,7 @@ class Controls:
                 return
             event.client.send_file_download("view.xml", text.encode(), save_immediately=True)
 
-    def _window(self, event: Any) -> Window | None:
+    def _window(self, event: Any) -> BrowserWindow | None:
         return None if event.client is None else self.page.windows.get(event.client.client_id)
 
     def _heights(self) -> tuple[float, float]:
@@ -372,7 +372,7 @@ def rounded(at: np.ndarray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def about_picture(session: Any, window: Window) -> Provenance:
+def about_picture(session: Any, window: BrowserWindow) -> Provenance:
     """What the last picture of ``window`` was made of. Raises `NergError` for files of the scene that are gone."""
     assert window.last is not None and window.view is not None
     view, shade, scale = window.view, session.shade, session.scale()
@@ -414,7 +414,7 @@ _LEAST = 0.05
 _FEW = 8
 
 
-class Areas:
+class AreasPanel:
     """The part of a page's panel for areas, and their boxes."""
 
     def __init__(self, page: Page):
@@ -462,19 +462,19 @@ class Areas:
         def _(drawn: Any) -> None:
             scene.remove_rect_select_callback()
             proxy = self.session.proxy
-            view = View.of_page(client.camera)
+            view = PinholeView.of_page(client.camera)
             try:
                 if proxy is None:
                     raise NergError("there are no points to lay a box around yet; wait a moment")
                 lower, upper = box_around(proxy.points, proxy.size, view, drawn.screen_min, drawn.screen_max)
                 self.add(Region.of(name, lower, upper))
             except NergError as error:
-                tell(client, "Areas", sentence(error))
+                tell(client, "AreasPanel", sentence(error))
                 return
             self._name.value = f"area {len(self.session.regions) + 1}"
 
         # Messages arrive in order: whoever reads this can draw, and does not turn the camera instead.
-        tell(client, "Areas", "Draw a rectangle around a thing: a box is laid around what is in it.")
+        tell(client, "AreasPanel", "Draw a rectangle around a thing: a box is laid around what is in it.")
 
     def _remove(self, event: Any) -> None:
         self.session.regions = [r for r in self.session.regions if r.name != self._chosen.value]
@@ -560,7 +560,7 @@ def edges(region: Region) -> np.ndarray:
 
 
 def box_around(
-    points: np.ndarray, margin: float, view: View, low: tuple[float, float], high: tuple[float, float]
+    points: np.ndarray, margin: float, view: PinholeView, low: tuple[float, float], high: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Corners of a box around those of ``points`` (N, 3) that are seen within a rectangle of the picture (0..1 from its
     upper left corner), with a ``margin``: those that lie no deeper behind the foremost than the rectangle is wide

@@ -25,7 +25,7 @@ from . import layers
 from .controls import tell
 from .layers import Layer, Scale
 from .page import Page
-from .points import View
+from .points import PinholeView
 from .scene import CAMERA, TARGET, Shown, ceiling_of, check_copied, copied
 from .session import URGENCY
 
@@ -38,7 +38,7 @@ from .session import URGENCY
 _EVEN = 2
 
 
-def even(view: View, width: int) -> tuple[View, int]:
+def even(view: PinholeView, width: int) -> tuple[PinholeView, int]:
     """``view`` and ``width`` with as many pixels in each row and column as a video has: even numbers of them."""
     wide = max(width // _EVEN * _EVEN, 16)
     high = max(round(wide / view.aspect / _EVEN) * _EVEN, 16)
@@ -129,7 +129,7 @@ class Film:
         self._on_progress(0.0, text)
 
 
-def shown_of_flight(views: list[View], width: int, **others: Any) -> tuple[list[View], Shown]:
+def shown_of_flight(views: list[PinholeView], width: int, **others: Any) -> tuple[list[PinholeView], Shown]:
     """The ``views`` of a flight with even sides, and what their scene file is made of: the first of them, and what
     `Shown` has besides."""
     made = [even(view, width) for view in views]
@@ -146,7 +146,7 @@ MOST = 20_000
 """Frames of a flight at most."""
 
 
-def flight(views: Sequence[View], seconds: float, fps: float) -> list[View]:
+def flight(views: Sequence[PinholeView], seconds: float, fps: float) -> list[PinholeView]:
     """Views ``fps`` times a second on a smooth curve through ``views``, which it passes at equal intervals.
 
     A cubic spline with its ends at rest; two views are joined by a line. Raises `NergError` for less than two.
@@ -160,10 +160,10 @@ def flight(views: Sequence[View], seconds: float, fps: float) -> list[View]:
     known = np.array([np.concatenate([v.origin, v.origin + v.ahead, v.up]) for v in views])
     curve = CubicSpline(np.arange(len(views)), known, bc_type="clamped")(at)
     last = views[-1]
-    return [View.of(row[:3], row[3:6], row[6:], last.fov, last.aspect) for row in curve]
+    return [PinholeView.of(row[:3], row[3:6], row[6:], last.fov, last.aspect) for row in curve]
 
 
-def frames_csv(views: Sequence[View]) -> str:
+def frames_csv(views: Sequence[PinholeView]) -> str:
     """The text of a file of frames for a scene that `scene.copied` wrote."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
@@ -185,7 +185,7 @@ class Flying:
 
     def __init__(self, page: Page):
         self.page, self.session = page, page.session
-        self._kept: list[View] = []
+        self._kept: list[PinholeView] = []
         self._film: Film | None = None
         gui = page.server.gui
         with gui.add_folder(TITLE, expand_by_default=False):
@@ -209,7 +209,7 @@ class Flying:
                 self._film.cancel()
 
     def _keep(self, event: Any) -> None:
-        self._kept.append(View.of_page(event.client.camera))
+        self._kept.append(PinholeView.of_page(event.client.camera))
         count = len(self._kept)
         tell(event, TITLE, "One view is kept." if count == 1 else f"{count} views are kept.")
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import Layers, Overlay, Style, color_of, find_overlay, overlays_of, srgb, to_bytes
+from nerg_mi.figures.overlay import Overlay, OverlayLayers, Style, color_of, find_overlay, overlays_of, srgb, to_bytes
 from nerg_mi.figures.style import CATEGORICAL, DIVERGING, SEQUENTIAL, find_colors, hatch
 from nerg_mi.transport.aovs import AOVS
 
@@ -139,7 +139,7 @@ def colored(
     if layer.overlay is None or values is None:
         shown = srgb(color)
     else:
-        of = Layers(color, np.asarray(values).reshape(rows), mask)
+        of = OverlayLayers(color, np.asarray(values).reshape(rows), mask)
         shown = layer.overlay.paint(of, (scale.low, scale.high), Style(scale.colors))
     if hatched and len(shape) == 2 and layer.overlay is not None:
         shown = hatch(shown, ~mask)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError, expected, sentence
 
 from . import layers
-from .points import LEVELS, Picture, View
+from .points import LEVELS, PinholeView, StagePicture
 from .server import stop_server
 from .session import Session
 
@@ -35,7 +35,7 @@ _LONGEST_REST = 0.8
 
 
 @dataclass(eq=False)
-class Window:
+class BrowserWindow:
     """One browser: its ``client`` and the points in it; when it or what it shows ``moved`` last and whether that was
     ``noticed``, and when it ``looked`` elsewhere last; the ``version`` of its view, and whether it shows a ``picture``;
     ``stale``: why its points are greyed, "" where they are not; ``note``: what was done to its camera; ``free``: where
@@ -45,7 +45,7 @@ class Window:
     client: Any
     status: Any
     cloud: Any = None
-    view: View | None = None
+    view: PinholeView | None = None
     moved: float = 0.0
     looked: float = 0.0
     noticed: bool = False
@@ -54,7 +54,7 @@ class Window:
     stale: str = ""
     note: str = ""
     free: np.ndarray | None = None
-    last: tuple[Picture, np.ndarray] | None = None
+    last: tuple[StagePicture, np.ndarray] | None = None
     lines: list[str] = field(default_factory=list)
     level: int = LEVELS - 2
     frames: list[float] = field(default_factory=list)
@@ -104,7 +104,7 @@ class Page:
     def __init__(self, server: Any):
         self.server = server
         self.session: Session
-        self.windows: dict[int, Window] = {}
+        self.windows: dict[int, BrowserWindow] = {}
         self.problem = ""
         self._lock = threading.RLock()
         self._follow = self._count = False
@@ -232,7 +232,7 @@ class Page:
             for window in self.windows.values():
                 self._draw_points(window)
 
-    def _moving(self, window: Window, when: float) -> None:
+    def _moving(self, window: BrowserWindow, when: float) -> None:
         """The view of ``window``, or what it shows, is another one now: its points take the picture's place."""
         window.version += 1
         window.moved, window.noticed = when, False
@@ -247,12 +247,12 @@ class Page:
                     # There is nothing to take its place yet.
                     window.client.scene.set_background_image(layers.greyed(window.last[1]), format="jpeg")
 
-    def _refine(self, window: Window) -> None:
+    def _refine(self, window: BrowserWindow) -> None:
         version, began = window.version, time.monotonic()
         window.lines = []
         client = window.client
 
-        def deliver(picture: Picture, colors: np.ndarray) -> None:
+        def deliver(picture: StagePicture, colors: np.ndarray) -> None:
             with self._lock:
                 if window.version != version or client.client_id not in self.windows:
                     return
@@ -272,7 +272,7 @@ class Page:
         free = session.home.origin if window.free is None else window.free
         session.clear_way(client.client_id, at, free, lambda found: self._move_out(window, at, found))
 
-    def _move_out(self, window: Window, at: np.ndarray, found: np.ndarray) -> None:
+    def _move_out(self, window: BrowserWindow, at: np.ndarray, found: np.ndarray) -> None:
         """The camera of ``window``, which was moved to ``at`` (3,), stands at ``found`` (3,)."""
         with self._lock:
             if window.view is not None and window.view.origin is at:
@@ -281,7 +281,7 @@ class Page:
                     window.note = "The camera was inside of something; it stands before it now."
                     window.client.camera.position = tuple(found)
 
-    def _mark(self, window: Window) -> None:
+    def _mark(self, window: BrowserWindow) -> None:
         """Say what ``window`` shows, what of it is out of date, and what is computed; grey the points that are."""
         stale = self.session.stale_points
         if stale != window.stale:
@@ -311,7 +311,7 @@ class Page:
             return ""
         return f"Out of date: {why}."
 
-    def _draw_points(self, window: Window) -> None:
+    def _draw_points(self, window: BrowserWindow) -> None:
         shown = self.session.points(window.level)
         if shown is None:
             return
@@ -365,7 +365,7 @@ class Page:
 
     def _connected(self, client: Any) -> None:
         status = client.gui.add_markdown("points …", order=-10)
-        window = Window(client, status)
+        window = BrowserWindow(client, status)
         with self._lock:
             self.windows[client.client_id] = window
             self._look(window)
@@ -378,8 +378,8 @@ class Page:
         with self._lock:
             self._draw_points(window)
 
-    def _look(self, window: Window) -> None:
-        view, old = View.of_page(window.client.camera), window.view
+    def _look(self, window: BrowserWindow) -> None:
+        view, old = PinholeView.of_page(window.client.camera), window.view
         if not np.isfinite([*view.origin, *view.ahead, *view.up, view.fov, view.aspect]).all():
             self.on_error(NergError("the page sent a camera without a position; reload it"))
             return
@@ -398,7 +398,7 @@ class Page:
         window.view = view
         self._moving(window, now)
 
-    def _keep_pace(self, window: Window, at_rest: bool) -> None:
+    def _keep_pace(self, window: BrowserWindow, at_rest: bool) -> None:
         """Give the browser of ``window`` as many points as it draws quickly."""
         level = window.level_for_pace(at_rest)
         if level != window.level:

@@ -21,7 +21,7 @@ from nerg_mi.transport.geometry import Ceiling
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PinholeView:
     """A pinhole camera: ``origin`` (3,) in scene units, the unit vectors ``ahead`` and ``up`` (3,), perpendicular to
     each other, ``fov`` in radians between the lower and the upper border, and ``aspect``, width by height."""
 
@@ -32,7 +32,7 @@ class View:
     aspect: float
 
     @classmethod
-    def of(cls, origin: Any, target: Any, up: Any, fov: float, aspect: float) -> View:
+    def of(cls, origin: Any, target: Any, up: Any, fov: float, aspect: float) -> PinholeView:
         """One that looks at ``target``; ``up`` is made perpendicular, and chosen where it lies along the view."""
         origin = np.asarray(origin, float)
         ahead = _unit(np.asarray(target, float) - origin)
@@ -42,7 +42,7 @@ class View:
         return cls(origin, ahead, _unit(up - ahead * (ahead @ up)), float(fov), float(aspect))
 
     @classmethod
-    def of_page(cls, camera: Any) -> View:
+    def of_page(cls, camera: Any) -> PinholeView:
         """That of a `viser.CameraHandle`, whose frame has x to the right, y down and z ahead."""
         w, x, y, z = camera.wxyz
         ahead = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -51,7 +51,7 @@ class View:
         return cls.of(camera.position, np.asarray(camera.position) + ahead, -down, camera.fov, aspect)
 
     @classmethod
-    def of_sensor(cls, sensor: Any) -> View:
+    def of_sensor(cls, sensor: Any) -> PinholeView:
         """That of a perspective sensor of a Mitsuba scene; of others the place and the direction, and a usual lens."""
         import mitsuba as mi
 
@@ -140,7 +140,7 @@ SHARES = (4, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class StagePicture:
     """``values`` (height, width) or (height, width, channels) by quantity, means of ``samples`` a pixel; ``seconds``
     since it was begun; ``share``: one of `SHARES`; ``whole``: whether this is the last."""
 
@@ -151,7 +151,7 @@ class Picture:
     whole: bool
 
 
-class Pace:
+class BandPace:
     """How many rays a band has, one of `SIZES`, learnt from the time of those before."""
 
     def __init__(self) -> None:
@@ -175,16 +175,16 @@ class Pace:
 
 def refine(
     scene: Scene,
-    view: View,
+    view: PinholeView,
     observer: np.ndarray | None,
     quantities: Sequence[str],
     width: int,
     spp: int,
-    pace: Pace,
+    pace: BandPace,
     *,
     ceiling: Ceiling | None = None,
     seed: int = 0,
-) -> Iterator[Picture | None]:
+) -> Iterator[StagePicture | None]:
     """Pictures of ``quantities``, each better than the one before; None after each band of one.
 
     ``observer`` (3,): whose gaze it is; None: that of whoever stands at the camera. ``width`` in pixels and ``spp``
@@ -221,7 +221,7 @@ def refine(
             if number == samples or number & (number - 1) == 0:
                 means = {name: (v / number).astype(np.float32) for name, v in sums.items()}
                 whole = share == 1 and number == samples
-                yield Picture(means, number, time.perf_counter() - start, share, whole)
+                yield StagePicture(means, number, time.perf_counter() - start, share, whole)
 
 
 @contextmanager
@@ -310,7 +310,7 @@ class Points:
 
 
 @dataclass(frozen=True, eq=False)
-class Proxy:
+class PointProxy:
     """``points`` (N, 3) in scene units, their linear ``color`` (N, 3), and the ``size`` of the cells that they
     lie in. ``levels``: how many of the first points lie in cells of a size, ``(N, size)`` and fewer. ``near`` (N,): of
     the first `BATCH` points the one nearest to each. ``free`` (F, 3): places in free air."""
@@ -328,7 +328,7 @@ class Proxy:
         return np.percentile(self.points, 0.5, axis=0), np.percentile(self.points, 99.5, axis=0)
 
 
-def gather(scene: Scene, eyes: Sequence[np.ndarray], places: int = PLACES) -> Iterator[Proxy | None]:
+def gather(scene: Scene, eyes: Sequence[np.ndarray], places: int = PLACES) -> Iterator[PointProxy | None]:
     """Points seen from ``eyes`` (3,), and from places between them and what they see; None between steps, a first
     proxy of ``eyes`` alone, and in the end that of all."""
     directions = np.asarray(fibonacci_directions(RAYS), float)
@@ -367,7 +367,7 @@ def _some(free: Sequence[np.ndarray]) -> np.ndarray:
     return places[:: max(-(-len(places) // FREE), 1)]
 
 
-def way_out(scene: Scene, proxy: Proxy, at: np.ndarray, free: np.ndarray) -> np.ndarray | None:
+def way_out(scene: Scene, proxy: PointProxy, at: np.ndarray, free: np.ndarray) -> np.ndarray | None:
     """A position (3,) a little before the surface that hides ``at`` (3,) from the ``free`` one, where ``at`` lies
     within something: where none of the places in free air is seen from it, though it is not outside of the place.
     None where it does not."""
@@ -394,7 +394,7 @@ def _depth(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> np.ndarr
     return np.where(met, depth, np.inf)[: len(directions)]
 
 
-def thin(found: Sequence[tuple[np.ndarray, np.ndarray]], most: int = POINTS) -> Proxy:
+def thin(found: Sequence[tuple[np.ndarray, np.ndarray]], most: int = POINTS) -> PointProxy:
     """``found`` points (N, 3) with their colours (N, 3): one of those in each cell, ``most`` in all at most."""
     points, color = (np.concatenate([pair[k] for pair in found]) for k in (0, 1))
     if not len(points):
@@ -409,7 +409,7 @@ def thin(found: Sequence[tuple[np.ndarray, np.ndarray]], most: int = POINTS) -> 
     return ordered(points[first], color[first], size)
 
 
-def ordered(points: np.ndarray, color: np.ndarray, size: float) -> Proxy:
+def ordered(points: np.ndarray, color: np.ndarray, size: float) -> PointProxy:
     """The proxy of ``points`` (N, 3), of which there is one in each cell of ``size``, with their ``color`` (N, 3)."""
     from scipy.spatial import KDTree
 
@@ -424,7 +424,7 @@ def ordered(points: np.ndarray, color: np.ndarray, size: float) -> Proxy:
     points, color = points[order].astype(np.float32), color[order].astype(np.float32)
     counts = [int((rank >= k).sum()) for k in range(LEVELS)]
     near = np.asarray(KDTree(points[:BATCH]).query(points)[1] if len(points) else (), int)
-    return Proxy(points, color, size, tuple(zip(counts, [size, *widths])), near)
+    return PointProxy(points, color, size, tuple(zip(counts, [size, *widths])), near)
 
 
 def _one_in_each_cell(points: np.ndarray, size: float) -> np.ndarray:
@@ -433,7 +433,7 @@ def _one_in_each_cell(points: np.ndarray, size: float) -> np.ndarray:
     return np.sort(np.unique(cells, axis=0, return_index=True)[1])
 
 
-def bake(scene: Scene, proxy: Proxy, observer: np.ndarray) -> Iterator[dict[str, np.ndarray]]:
+def bake(scene: Scene, proxy: PointProxy, observer: np.ndarray) -> Iterator[dict[str, np.ndarray]]:
     """``gaze`` (1/sr) and ``visibility`` (N,) of the points of ``proxy`` for the ``observer`` (3,), after each step
     better: of points that are still to come that of the nearest one. Without a gaze field there is no gaze."""
     names = ["gaze", "visibility"] if scene.has_gaze else ["visibility"]

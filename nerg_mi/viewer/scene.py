@@ -20,7 +20,7 @@ from nerg_mi.rendering.scene_writer import Comment, document, element, numbers, 
 
 from . import layers
 from .page import Page
-from .points import View, heading_of
+from .points import PinholeView, heading_of
 from .session import ALL, RAYS, UNHURRIED, Tracks
 
 # ---- What a page shows as a scene file, which `nerg render` renders alike ----
@@ -41,7 +41,7 @@ class Shown:
     picture in pixels, samples ``spp`` a pixel, the integrator's ``falloff``, and the height and up (3,) of a
     ``ceiling`` that is cut off, or None."""
 
-    view: View
+    view: PinholeView
     observer: np.ndarray | None
     aovs: tuple[str, ...]
     width: int
@@ -122,7 +122,7 @@ def _sensor(shown: Shown):
     )
 
 
-def copied_view(session: Any, view: View) -> str:
+def copied_view(session: Any, view: PinholeView) -> str:
     """A scene file of ``view`` with the observer, the layer and the settings of ``session``."""
     check_copied(session)
     asked = tuple(name for name in layers.quantities(session.shade.layer) if name != "color")
@@ -151,7 +151,7 @@ _STEPS = 2000
 _NOTHING = 1.0  # length of a ray that meets no surface, in scene units
 
 
-class People:
+class PeoplePanel:
     """The part of a page's panel for rays, and their paths."""
 
     def __init__(self, page: Page, tracks: Tracks):
@@ -161,7 +161,7 @@ class People:
         self._recorded: dict[str, Any] = {}
         gui = page.server.gui
         first, last = tracks.times
-        with gui.add_folder("People"):
+        with gui.add_folder("PeoplePanel"):
             self._group = gui.add_dropdown("Who", tracks.groups, initial_value=ALL)
             self._drawn = gui.add_checkbox("Paths", False)
             self._rays = gui.add_checkbox("Rays", False)

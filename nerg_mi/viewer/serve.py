@@ -16,10 +16,10 @@ from pathlib import Path
 from nerg_mi.workflows.base import SILENT, Reporter, argument, command
 from nerg_mi.workflows.view import ViewOptions, place_to_view
 
-from .controls import Areas, Controls
+from .controls import AreasPanel, Controls
 from .flights import Flying
 from .page import Page
-from .scene import People
+from .scene import PeoplePanel
 from .server import Guard, is_loopback, new_token, require_viser, start_server
 from .session import Session
 
@@ -56,9 +56,9 @@ def viewer(
             Controls(page)
             Flying(page)
             if session.tracks is not None:
-                People(page, session.tracks)
+                PeoplePanel(page, session.tracks)
             if session.scene.has_gaze:
-                Areas(page)
+                AreasPanel(page)
             shown = "localhost" if options.host in ("0.0.0.0", "::") else options.host
             shown = f"[{shown}]" if ":" in shown else shown
             query = "" if token is None else f"?token={token}"

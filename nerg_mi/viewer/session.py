@@ -31,11 +31,11 @@ from . import layers
 from .layers import Layer, Scale, Shade
 from .points import (
     SIZES,
-    Pace,
-    Picture,
+    BandPace,
+    PinholeView,
+    PointProxy,
     Points,
-    Proxy,
-    View,
+    StagePicture,
     ahead_of,
     bake,
     filled,
@@ -127,7 +127,7 @@ ALL = "everybody"
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
+class PersonPose:
     """``person``, their eye ``at`` (3,) and ``ahead`` (3,), a unit vector, both in the place."""
 
     person: str
@@ -173,14 +173,14 @@ class Tracks:
         pairs = np.stack([self.at[rows[:-1]], self.at[rows[1:]]], axis=1)[joined]
         return pairs.astype(np.float32), person[:-1][joined]
 
-    def at_time(self, time: float, group: str = ALL) -> list[Pose]:
+    def at_time(self, time: float, group: str = ALL) -> list[PersonPose]:
         """Where those of a cohort are whose nearest ray is within `GAP` of ``time``."""
         near = np.flatnonzero(self._of(group) & (np.abs(self._rays.t - time) <= GAP))
         found = []
         for person in np.unique(self._rays.person[near]):
             own = near[self._rays.person[near] == person]
             k = own[np.argmin(np.abs(self._rays.t[own] - time))]
-            found.append(Pose(self._rays.persons[person], self.at[k], self.ahead[k]))
+            found.append(PersonPose(self._rays.persons[person], self.at[k], self.ahead[k]))
         return found
 
     def sample(self, group: str = ALL, most: int = RAYS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -347,7 +347,7 @@ class Session:
         self._place = place
         self.worker = Worker(listener.on_error)
         self.lock = threading.RLock()
-        self.proxy: Proxy | None = None
+        self.proxy: PointProxy | None = None
         self.baked: dict[str, np.ndarray] = {}
         self.baked_for: np.ndarray | None = None
         # Whose values `baked` and `shares` are: an observer's, with areas or without, of a `version`.
@@ -357,7 +357,7 @@ class Session:
         self.ceiling: float | None = None
         self.regions: list[Region] = []
         self.other_areas: list[dict[str, Any]] = []
-        self.pace = Pace()
+        self.pace = BandPace()
         self.checksums: dict[Path, str] = {}
         self._ranges: dict[str, tuple[float, float]] = {}
         self._busy: set[str] = set()
@@ -383,7 +383,7 @@ class Session:
         sensors = self.scene.mitsuba.sensors()
         if not sensors:
             raise NergError(f'"{self.place.scene}" has no sensor to begin with; give it one')
-        self.home = View.of_sensor(sensors[0])
+        self.home = PinholeView.of_sensor(sensors[0])
         self.spp = min(self.options.spp or int(sensors[0].sampler().sample_count()), _MOST_SPP)
         given = given_point(self.options.observer, "--observer")
         own = self.scene.observer
@@ -551,13 +551,20 @@ class Session:
             return fresh
 
     def picture(
-        self, name: Hashable, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int, spp: int
+        self,
+        name: Hashable,
+        view: PinholeView,
+        deliver: Callable[[StagePicture, np.ndarray], None],
+        width: int,
+        spp: int,
     ) -> None:
         """Refine the picture of ``view`` from now on, in place of one of the same ``name``; ``deliver`` is given each
         with its colours (height, width, 3) uint8."""
         self.worker.submit(("picture", name), URGENCY, self._refined(view, deliver, width, spp))
 
-    def inset(self, name: Hashable, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int) -> None:
+    def inset(
+        self, name: Hashable, view: PinholeView, deliver: Callable[[StagePicture, np.ndarray], None], width: int
+    ) -> None:
         """The same for a small picture that nobody waits for."""
         self.worker.submit(("inset", name), UNHURRIED, self._refined(view, deliver, width, 1, False))
 
@@ -662,7 +669,12 @@ class Session:
         yield None
 
     def _refined(
-        self, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int, spp: int, leads: bool = True
+        self,
+        view: PinholeView,
+        deliver: Callable[[StagePicture, np.ndarray], None],
+        width: int,
+        spp: int,
+        leads: bool = True,
     ) -> Iterator[None]:
         """``leads``: whether the automatic range is taken from it."""
         with self.lock:

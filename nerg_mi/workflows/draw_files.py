@@ -15,8 +15,8 @@ import numpy as np
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.figures.overlay import (
     Heat,
-    Layers,
     Overlay,
+    OverlayLayers,
     difference_figure,
     find_stored,
     gaze_figure,
@@ -56,7 +56,7 @@ def shared_note(names: Sequence[str], basis: Sequence[str]) -> str:
     return "; ".join(f"{name}: {words or 'not known'}" for name, words in zip(names, basis))
 
 
-def read_stored(path: Path, overlay: Overlay) -> Layers:
+def read_stored(path: Path, overlay: Overlay) -> OverlayLayers:
     """The EXR file ``path`` with the quantity of ``overlay``; without opacity there are surfaces everywhere, and
     nothing rests on rays where the file does not say so. Raises `NergError` for other files and for one that has no
     such channel."""
@@ -72,7 +72,7 @@ def read_stored(path: Path, overlay: Overlay) -> Layers:
     as_floats = lambda array: np.nan_to_num(np.asarray(array, np.float32))
     part = overlay.quantity.rests_on
     basis = read_exr_text(path, "picture").get(f"{part}.basis", "") if part else ""
-    return Layers(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask, basis=basis)
+    return OverlayLayers(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask, basis=basis)
 
 
 # ---- Difference ----
@@ -165,7 +165,7 @@ def _draw_sheet(files: Sequence[Path], options: SheetOptions, reporter: Reporter
         pictures.append(shrink(overlay.paint(stored, ends, style, unknown), options.width))
         # Of all values the outermost are enough for a scale.
         outermost = [stored.values[seen].min(), stored.values[seen].max()] if seen.any() else []
-        explained.append(Layers(stored.color, np.array(outermost), np.ones(len(outermost), bool)))
+        explained.append(OverlayLayers(stored.color, np.array(outermost), np.ones(len(outermost), bool)))
     scale = lambda sheet: overlay.add_scale(sheet, explained, ends, style, hatched)
     note = shared_note(names, notes)
     return Drawing(contact_sheet(pictures, names, options.columns, scale, note), list(files))

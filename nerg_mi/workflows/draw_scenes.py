@@ -14,8 +14,16 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.maps import Sight, Walk, Walls, floor_figure
-from nerg_mi.figures.overlay import Layers, Overlay, Style, find_overlay, occlusion_figure, shared_limits, unknown_of
+from nerg_mi.figures.maps import PersonWalk, SightLines, Walls, floor_figure
+from nerg_mi.figures.overlay import (
+    Overlay,
+    OverlayLayers,
+    Style,
+    find_overlay,
+    occlusion_figure,
+    shared_limits,
+    unknown_of,
+)
 from nerg_mi.figures.sphere import find_projection, sphere_figure
 from nerg_mi.figures.style import find_colors
 from nerg_mi.interruption import Interruption
@@ -192,7 +200,7 @@ def _corners(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     return low - edge, high + edge
 
 
-def _walks(rays: Rays, people: Mapping[int, int]) -> list[Walk]:
+def _walks(rays: Rays, people: Mapping[int, int]) -> list[PersonWalk]:
     """The path of each person: not finer than can be seen, and with breaks where they were not recorded."""
     sessions = find_sessions(rays)
     order = np.arange(len(rays)) if sessions.order is None else sessions.order
@@ -204,11 +212,11 @@ def _walks(rays: Rays, people: Mapping[int, int]) -> list[Walk]:
         step = np.linalg.norm(np.diff(places, axis=0), axis=1)
         breaks = np.r_[True, (np.abs(np.diff(t)) > _GAP) | (step > _JUMP) | (np.diff(recording) != 0)]
         kept = breaks | np.r_[True, np.diff(np.floor(np.cumsum(np.r_[0.0, step]) / _FINEST)) > 0]
-        found.append(Walk(rays.persons[person], places[kept], breaks[kept]))
+        found.append(PersonWalk(rays.persons[person], places[kept], breaks[kept]))
     return found
 
 
-def _sights(rays: Rays, number: dict[int, int], count: int) -> Sight | None:
+def _sights(rays: Rays, number: dict[int, int], count: int) -> SightLines | None:
     """``count`` rays, evenly taken."""
     if not count:
         return None
@@ -217,10 +225,10 @@ def _sights(rays: Rays, number: dict[int, int], count: int) -> Sight | None:
     if rays.hit is not None:
         hit = rays.hit[some, :2]
         ends = np.where(np.isfinite(hit), hit, ends)
-    return Sight(origins, ends, np.array([number[p] for p in rays.person[some]]))
+    return SightLines(origins, ends, np.array([number[p] for p in rays.person[some]]))
 
 
-def _fields(rays: Rays, number: dict[int, int], count: int) -> Sight | None:
+def _fields(rays: Rays, number: dict[int, int], count: int) -> SightLines | None:
     """Fields of view at ``count`` moments of each person, evenly spread over their rays."""
     if not count:
         return None
@@ -230,7 +238,7 @@ def _fields(rays: Rays, number: dict[int, int], count: int) -> Sight | None:
         mine = mine[np.argsort(rays.t[mine], kind="stable")]
         chosen.append(mine[np.unique(np.linspace(0, len(mine) - 1, count).astype(int))])
     some = np.concatenate(chosen)
-    return Sight(rays.origin[some, :2], _ahead(rays, some), np.array([number[p] for p in rays.person[some]]))
+    return SightLines(rays.origin[some, :2], _ahead(rays, some), np.array([number[p] for p in rays.person[some]]))
 
 
 def _ahead(rays: Rays, some: np.ndarray) -> np.ndarray:
@@ -271,7 +279,7 @@ class OpenScene:
             )
         return self.scene.sensors()[index]
 
-    def see(self, sensor: Any, overlay: Overlay) -> Layers:
+    def see(self, sensor: Any, overlay: Overlay) -> OverlayLayers:
         """What ``sensor`` sees with the ``overlay``'s quantity."""
         options, first = self._options, self._done
         on_strip = lambda part, total: self._tell((first + part / total) / self._parts)

@@ -16,14 +16,14 @@ import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.figures import style
-from nerg_mi.figures.overlay import Layers, Limits, Overlay, Style, find_overlay, shared_limits
+from nerg_mi.figures.overlay import Limits, Overlay, OverlayLayers, Style, find_overlay, shared_limits
 from nerg_mi.figures.style import Provenance, find_colors, provenance, rasterize, save
 from nerg_mi.files.atomic import check_writable, write_bytes
 from nerg_mi.files.video import check_video, video_frames
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering import bands
 from nerg_mi.rendering.aovs import is_nerg, prepare_for, render_asked
-from nerg_mi.rendering.bands import Pace
+from nerg_mi.rendering.bands import SamplePace
 from nerg_mi.rendering.files import FORMATS, DisplayRows, numbered, picture_rows, read_frames
 from nerg_mi.rendering.scene import activate, files_of_scene, load_scene
 from nerg_mi.rendering.scene_writer import pixel_of
@@ -105,7 +105,7 @@ def overlay_pictures(
     last = Picture((0, 0), 0)
     waits = shares_a_scale(overlay, len(frames), options)
 
-    def finish(layers: Layers, ends: Limits) -> None:
+    def finish(layers: OverlayLayers, ends: Limits) -> None:
         overlay.check_limits(ends)
         write(overlay.draw(layers, ends, style))
         stop.check()
@@ -146,15 +146,15 @@ def shares_a_scale(overlay: Overlay, count: int, options: PictureOptions) -> boo
     return count > 1 and overlay.scaled and (options.top is None or not overlay.is_scaled_by_top)
 
 
-def stacked(layers: Layers) -> np.ndarray:
+def stacked(layers: OverlayLayers) -> np.ndarray:
     """Colour, values and mask of ``layers`` as one array (h, w, 5) of float32."""
     array = np.concatenate([layers.color, layers.values[..., None], layers.mask[..., None]], axis=-1)
     return np.ascontiguousarray(array, np.float32)
 
 
-def unstacked(array: np.ndarray, marker: tuple[float, float] | None, supported: bool, basis: str) -> Layers:
+def unstacked(array: np.ndarray, marker: tuple[float, float] | None, supported: bool, basis: str) -> OverlayLayers:
     """What `stacked` was given, with its ``marker``, whether it is ``supported``, and its ``basis`` in words."""
-    return Layers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker, supported, basis)
+    return OverlayLayers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker, supported, basis)
 
 
 def check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
@@ -170,7 +170,7 @@ def check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
 
 def layers_of(
     path: Path, loaded: Any, camera: Any, overlay: Overlay, spp: int = 0, seed: int = 0, on_strip: OnStrip | None = None
-) -> Layers:
+) -> OverlayLayers:
     """What ``camera`` sees of the scene ``loaded`` from ``path`` with the quantity of ``overlay``, and who is there."""
     quantity = overlay.quantity
     asked = list(dict.fromkeys([quantity.name, "opacity", "depth"]))
@@ -181,7 +181,7 @@ def layers_of(
     marker = observer_pixel(loaded, camera, found.aovs["depth"])
     supported = not quantity.needs_support or is_supported(loaded, camera)
     basis = basis_words(loaded, quantity.rests_on)
-    return Layers(found.color, found.aovs[overlay.name], found.mask, marker, supported, basis)
+    return OverlayLayers(found.color, found.aovs[overlay.name], found.mask, marker, supported, basis)
 
 
 def basis_words(loaded: Any, part: str = "gaze") -> str:
@@ -313,7 +313,7 @@ def render_file(
     mode = activate(options.mode)
     if options.threads:
         set_thread_count(options.threads)
-    start, pace = time.perf_counter(), Pace()
+    start, pace = time.perf_counter(), SamplePace()
     done, top, picture = 0, None, Picture((0, 0), 0)
     with Interruption() as stop:
 
@@ -410,7 +410,13 @@ def _check_video(output: Path, options: PictureOptions) -> bool:
 
 
 def _picture(
-    write: Write, options: PictureOptions, stop: Interruption, pace: Pace, loaded: Any, camera: Any, on_strip: OnStrip
+    write: Write,
+    options: PictureOptions,
+    stop: Interruption,
+    pace: SamplePace,
+    loaded: Any,
+    camera: Any,
+    on_strip: OnStrip,
 ) -> Picture:
     """Render what ``camera`` sees, and ``write`` it."""
     width, height = map(int, camera.film().crop_size())

@@ -18,7 +18,7 @@ from nerg_mi.errors import MissingFile, NergError, mitsuba_says, plain
 from nerg_mi.evaluation.gaze_report import GazeResults, read_results
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures import maps, overlay
-from nerg_mi.figures.overlay import Heat, Layers, Style, find_overlay, srgb, to_bytes, top_of, unknown_of
+from nerg_mi.figures.overlay import Heat, OverlayLayers, Style, find_overlay, srgb, to_bytes, top_of, unknown_of
 from nerg_mi.figures.sphere import sphere_figure
 from nerg_mi.figures.style import Provenance, encode
 from nerg_mi.figures.style import versions as programs
@@ -39,12 +39,12 @@ from nerg_mi.rendering.scene import load_scene
 from nerg_mi.rendering.scene_writer import default_name, pixel_of
 from nerg_mi.report.data import (
     PATH_POINTS,
-    Camera,
-    Eyes,
+    EyePositions,
     Labels,
     ObjectAttention,
     Onlooker,
-    Picture,
+    ReportCamera,
+    ReportPicture,
     Run,
     Stage,
     attention_on,
@@ -216,10 +216,10 @@ class Views:
     supported: bool = True
     basis: str = ""
 
-    def layers(self, name: str, quantity: str = "gaze") -> Layers:
+    def layers(self, name: str, quantity: str = "gaze") -> OverlayLayers:
         """A ``quantity`` over the picture ``name``."""
         view, marker = self.seen[name], self.marker if name == "camera" else None
-        return Layers(view.color, view.aovs[quantity], view.mask, marker, self.supported, self.basis)
+        return OverlayLayers(view.color, view.aovs[quantity], view.mask, marker, self.supported, self.basis)
 
 
 def gaze_top(views: Mapping[str, Channels]) -> float | None:
@@ -229,13 +229,15 @@ def gaze_top(views: Mapping[str, Channels]) -> float | None:
     return max(tops) if tops else None
 
 
-def pictures_of_views(views: Views, top: float | None, place_known: bool, about: Provenance) -> dict[str, Picture]:
+def pictures_of_views(
+    views: Views, top: float | None, place_known: bool, about: Provenance
+) -> dict[str, ReportPicture]:
     """Colour and gaze from the camera, and the observer's own view and sphere, hatched where nothing is known;
     ``about``: what the header of each says."""
     out, text = {}, about.text()
     camera = views.seen["camera"]
     if place_known:
-        out["color"] = Picture(
+        out["color"] = ReportPicture(
             _png(srgb(camera.color), text), "The place in colour.", "The place, as the camera sees it."
         )
     if top is None:
@@ -250,7 +252,7 @@ def pictures_of_views(views: Views, top: float | None, place_known: bool, about:
         return encode(drawn, ".png", text)
 
     if place_known:
-        out["gaze"] = Picture(
+        out["gaze"] = ReportPicture(
             draw("camera", "Where the observer looks"),
             "Gaze of the observer over the colours of the place.",
             "The observer's gaze on the place. What the observer cannot see has none.",
@@ -258,13 +260,13 @@ def pictures_of_views(views: Views, top: float | None, place_known: bool, about:
         spread = camera.aovs.get("gaze_std")
         if spread is not None and np.any(spread[camera.mask] > 0):
             out["spread"] = _spread(views.layers("camera", "gaze_std"), text)
-    out["own"] = Picture(
+    out["own"] = ReportPicture(
         draw("own", "The observer's own view"), "Gaze in the observer's own view.", "What the observer sees ahead."
     )
     sphere = views.layers("sphere")
     arrays = sphere.color, sphere.values, sphere.mask
     drawn = sphere_figure(*arrays, heat, unknown=hatched(sphere), note=sphere.basis)
-    out["sphere"] = Picture(
+    out["sphere"] = ReportPicture(
         encode(drawn, ".png", text),
         "Gaze in all directions around the observer.",
         "All that the observer could turn to.",
@@ -272,17 +274,17 @@ def pictures_of_views(views: Views, top: float | None, place_known: bool, about:
     return out
 
 
-def _spread(of: Layers, text: Mapping[str, str]) -> Picture:
+def _spread(of: OverlayLayers, text: Mapping[str, str]) -> ReportPicture:
     spread = find_overlay("gaze_std")
     drawn = spread.draw(of, spread.limits(of), Style(colors="viridis", title="Where the fields disagree"))
-    return Picture(
+    return ReportPicture(
         encode(drawn, ".png", text),
         "Standard deviation of the gaze of the ensemble's members.",
         "How far the members of the ensemble are apart: where this is as large as the gaze itself, nothing is known.",
     )
 
 
-def pictures_of_rays(rays: Rays, test: Mapping[str, Any] | None, about: Provenance) -> dict[str, Picture]:
+def pictures_of_rays(rays: Rays, test: Mapping[str, Any] | None, about: Provenance) -> dict[str, ReportPicture]:
     """Plans of the floor. ``test``: what was held out of the training; ``about``: what the header of each says."""
     plan = encode(maps.floor_plan(rays), ".png", about.text())
     held_out = {}
@@ -292,8 +294,8 @@ def pictures_of_rays(rays: Rays, test: Mapping[str, Any] | None, about: Provenan
         words += " Circles: positions that were held out of the training."
     layout = encode(maps.layout_figure(rays, title="Rays", **held_out), ".png", about.text())
     return {
-        "plan": Picture(plan, "Plan of how densely the floor is walked.", "How densely the floor is walked."),
-        "layout": Picture(layout, "Plan of the places of all rays.", words),
+        "plan": ReportPicture(plan, "Plan of how densely the floor is walked.", "How densely the floor is walked."),
+        "layout": ReportPicture(layout, "Plan of the places of all rays.", words),
     }
 
 
@@ -584,7 +586,7 @@ class _Work:
         inputs = tuple((role, hide(name), digest) for role, name, digest in self._inputs())
         settings = setting_words(options)
         about = Provenance("nerg report", {n: d for _, n, d in inputs}, options.seed, settings, programs())
-        pictures: dict[str, Picture] = pictures_of_views(views, top, known, about)
+        pictures: dict[str, ReportPicture] = pictures_of_views(views, top, known, about)
         self._step(0.95, "writing")
         around: tuple[int, ...] = ()
         if rays is not None and self.rays is not None:
@@ -684,18 +686,18 @@ class _Work:
         loaded = self._load(scene, radiance="false", aovs="opacity")
         return GazePlace(Place(loaded.integrator().medium, loaded), self.field.box, kind, align=self.align)
 
-    def _eyes(self, place: GazePlace, scene: SceneResult) -> Eyes:
+    def _eyes(self, place: GazePlace, scene: SceneResult) -> EyePositions:
         """Where people stood, or where the observer is."""
         if self.rays is not None:
             return eyes_of(self.rays, place, self.options.eyes)
         return self._observer(scene)
 
-    def _observer(self, scene: SceneResult) -> Eyes:
+    def _observer(self, scene: SceneResult) -> EyePositions:
         at = scene.camera if scene.observer is None else scene.observer
-        return Eyes(np.asarray(at.origin, float)[None], np.zeros(1, int))
+        return EyePositions(np.asarray(at.origin, float)[None], np.zeros(1, int))
 
     def _objects(
-        self, areas: AreaSet, onlooker: Onlooker, place: GazePlace, eyes: Eyes, rays: Rays | None
+        self, areas: AreaSet, onlooker: Onlooker, place: GazePlace, eyes: EyePositions, rays: Rays | None
     ) -> tuple[ObjectAttention, ...]:
         if not areas.solids or self.given.scene.kind == "none":
             return ()
@@ -709,7 +711,7 @@ class _Work:
         return attention_on(list(areas.solids), shares, eyes.person, recorded)
 
     def _stage(
-        self, scene: SceneResult, onlooker: Onlooker, place: GazePlace, eyes: Eyes, boxes: Sequence[Region]
+        self, scene: SceneResult, onlooker: Onlooker, place: GazePlace, eyes: EyePositions, boxes: Sequence[Region]
     ) -> tuple[str | None, tuple[int, int, int, int]]:
         """The packed 3D scene, None where there are no surfaces, and how many observers, paths, points and boxes it
         has."""
@@ -731,7 +733,7 @@ class _Work:
         if proxy is None:
             return nothing
         paths = paths_of(self.rays, place) if self.rays is not None and o.paths else []
-        camera = Camera(np.asarray(scene.camera.origin, float), np.asarray(scene.camera.target, float))
+        camera = ReportCamera(np.asarray(scene.camera.origin, float), np.asarray(scene.camera.target, float))
         packed = pack(Stage(proxy, observers, paths, boxes, up, camera))
         return packed, (len(observers), len(paths), len(proxy.vertices), len(boxes))
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overview import Frame, Seen
+from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
@@ -25,8 +25,8 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import write_frames
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.rendering.scene_writer import (
-    Attention,
     Eye,
+    GazeFiles,
     Lens,
     SceneText,
     default_name,
@@ -318,11 +318,11 @@ class _Draft:
         """Scene units of a metre, where tracking tells; else 1."""
         return self.align.scale if self.tracked else 1.0
 
-    def attention(self, folder: Path) -> Attention:
+    def attention(self, folder: Path) -> GazeFiles:
         """What is shown of attention, by the names that files have in ``folder``."""
         name = lambda path: None if path is None else value_of(relative_name(path, folder))
         align = None if self.align.identity else self.align.matrix
-        return Attention(name(self.given.gaze), name(self.given.rays), align)
+        return GazeFiles(name(self.given.gaze), name(self.given.rays), align)
 
     def lamps(self, camera: float, eye: float) -> dict[str, float]:
         """Intensities of lamps by the `<default>` that says where they are."""
@@ -428,7 +428,7 @@ def _observer(
 
 
 def _camera(
-    scene: _Draft, probe: Probe, seen: Seen | None, options: SceneOptions, reporter: Reporter
+    scene: _Draft, probe: Probe, seen: SeenSurfaces | None, options: SceneOptions, reporter: Reporter
 ) -> tuple[Eye, Lens, str]:
     """The camera, its lens, and a sentence on how they were chosen."""
     lens = Lens() if options.fov is None else Lens(options.fov)
@@ -455,7 +455,7 @@ def _camera(
         if scene.observer is None:
             raise NergError("--own is the observer's view, and there is no observer; give --observer or --person")
         return scene.observer, lens, "The camera of sensor 0: the observer's own eye."
-    frame = Frame(lens.fov, lens.aspect, scene.up)
+    frame = PinholeFrame(lens.fov, lens.aspect, scene.up)
     box = scene.given.field_about.get("box") if scene.given.kind == "field" else None
     shot = best_camera(probe, seen, frame, box)
     if shot is None:

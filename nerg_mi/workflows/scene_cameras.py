@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says, plain
 from nerg_mi.fields.gaze_base import RaySupport
-from nerg_mi.figures.overview import Frame, Judge, Seen, Shot, around_observer, of_place
+from nerg_mi.figures.overview import Judge, PinholeFrame, SeenSurfaces, Shot, around_observer, of_place
 from nerg_mi.maths.geometry import Similarity, box_of
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
@@ -90,7 +90,7 @@ class Probe:
         """Length of the diagonal of a box around what there is and ``eyes``."""
         return self.place.extent(*(eye.origin for eye in eyes if eye is not None))
 
-    def around(self, eye: Eye) -> Seen:
+    def around(self, eye: Eye) -> SeenSurfaces:
         """What somebody at ``eye`` meets, as the sensor of the sphere shows it."""
         with mitsuba_says():
             found = render_channels(self.scene, self.scene.sensors()[SPHERE], spp=1)
@@ -100,7 +100,7 @@ class Probe:
         directions = pixel_directions(width, height).reshape(-1, 3) @ np.stack([np.cross(up, front), up, front])
         even = np.where(np.abs(directions @ up) < np.sin(np.radians(35)), _LEVEL, _STEEP)
         attention = even if self.quantity is None else found.aovs[self.quantity].reshape(-1).astype(float)
-        return Seen(
+        return SeenSurfaces(
             np.asarray(eye.origin, float),
             directions,
             found.aovs["depth"].reshape(-1).astype(float),
@@ -122,7 +122,7 @@ def shows_anything(scene: Any) -> bool:
         return bool(render_channels(scene, scene.sensors()[0], spp=1).aovs["opacity"].any())
 
 
-def turned_ahead(eye: Eye, seen: Seen) -> Eye:
+def turned_ahead(eye: Eye, seen: SeenSurfaces) -> Eye:
     """The observer at ``eye``, turned to where most of the attention goes."""
     towards = seen.main_direction
     at = int(np.argmax(seen.directions @ towards))
@@ -131,7 +131,7 @@ def turned_ahead(eye: Eye, seen: Seen) -> Eye:
     return replace(eye, target=eye.origin + away * towards, up=None)
 
 
-def best_camera(probe: Probe, seen: Seen | None, frame: Frame, field_box: dict | None) -> Shot | None:
+def best_camera(probe: Probe, seen: SeenSurfaces | None, frame: PinholeFrame, field_box: dict | None) -> Shot | None:
     """The best overview: of what the observer of ``seen`` looks at, or of the whole place. ``field_box``: the box of
     the radiance field, as its checkpoint has it, or None where the place is none."""
     mean = None if field_box is None else probe.mean
@@ -144,14 +144,14 @@ def best_camera(probe: Probe, seen: Seen | None, frame: Frame, field_box: dict |
     return of_place(probe.trace, frame, lower, upper, not box.contracted, mean)
 
 
-def best_photo(probe: Probe, seen: Seen | None, cameras: Sequence[PhotoCamera]) -> PhotoCamera:
+def best_photo(probe: Probe, seen: SeenSurfaces | None, cameras: Sequence[PhotoCamera]) -> PhotoCamera:
     """That of the ``cameras`` of photos which shows best what the observer of ``seen`` looks at, or the place. They are
     compared as if all had the lens of the first and were held level."""
     lens = cameras[0].lens
     origins, targets = (np.array([getattr(c.eye, name) for c in cameras]) for name in ("origin", "target"))
     ahead = targets - origins
     usual = seen.usual if seen is not None else float(np.median(probe.trace(origins, ahead)[0]))
-    judge = Judge(probe.trace, Frame(lens.fov, lens.aspect, probe.up), max(usual, 1e-6), seen, probe.mean)
+    judge = Judge(probe.trace, PinholeFrame(lens.fov, lens.aspect, probe.up), max(usual, 1e-6), seen, probe.mean)
     return cameras[judge.best_of(origins, targets)]
 
 

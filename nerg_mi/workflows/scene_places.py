@@ -23,7 +23,17 @@ from nerg_mi.rays.dataset import is_dataset
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rendering.files import check_vol, write_mesh
 from nerg_mi.rendering.nested_scene import nested_place
-from nerg_mi.rendering.scene_writer import Comment, Eye, Lens, Node, Place, element, prop, relative_name, value_of
+from nerg_mi.rendering.scene_writer import (
+    Comment,
+    Eye,
+    Lens,
+    Node,
+    SceneContent,
+    element,
+    prop,
+    relative_name,
+    value_of,
+)
 from nerg_mi.train.geometry import NOWHERE, shade_hits
 
 from .base import Reporter
@@ -259,7 +269,7 @@ class WrittenPlace:
     that intensity. ``words``: what it is, for a comment; ``contracted``: whether it has no end; ``files`` written;
     ``notes`` on its file: sentences on what is not used, and on what was guessed."""
 
-    make: Callable[[Path, dict[str, float]], Place]
+    make: Callable[[Path, dict[str, float]], SceneContent]
     words: str
     contracted: bool = False
     files: tuple[Path, ...] = ()
@@ -312,9 +322,9 @@ def _name(path: Path, folder: Path) -> str:
     return value_of(relative_name(path, folder))
 
 
-def _field(path: Path, folder: Path) -> Place:
+def _field(path: Path, folder: Path) -> SceneContent:
     volume = element("volume", prop("string", "filename", "$field"), name="field", type=plugin_of_field(path))
-    return Place(inside=(volume,), files={"field": _name(path, folder)})
+    return SceneContent(inside=(volume,), files={"field": _name(path, folder)})
 
 
 def mesh_of(output: Path) -> Path:
@@ -333,10 +343,10 @@ def _mesh(path: Path, output: Path, words: str) -> WrittenPlace:
     color = _mesh_color(mesh)
     light = element("integrator", prop("integer", "max_depth", 5), type="path")
 
-    def make(folder: Path, lamps: dict[str, float]) -> Place:
+    def make(folder: Path, lamps: dict[str, float]) -> SceneContent:
         bsdf = element("bsdf", element("bsdf", color, type="diffuse"), type="twosided")
         shape = element("shape", prop("string", "filename", "$place"), bsdf, type=kind, id="place")
-        return Place(
+        return SceneContent(
             inside=(Comment("What lights the shape."), light),
             beside=(
                 shape,
@@ -387,7 +397,7 @@ def _hits(path: Path, output: Path, words: str) -> WrittenPlace:
     color, end = shade_hits(density.reshape(shape[2], shape[1], shape[0]), lower, upper)
     write_volume(colors, color, lower, end)
 
-    def make(folder: Path, lamps: dict[str, float]) -> Place:
+    def make(folder: Path, lamps: dict[str, float]) -> SceneContent:
         # As `train.geometry.volume_dict` has it: interpolation would bring every surface nearer.
         nearest, box = prop("string", "filter_type", "nearest"), prop("boolean", "use_grid_bbox", "true")
         density = element(
@@ -396,12 +406,14 @@ def _hits(path: Path, output: Path, words: str) -> WrittenPlace:
         file = prop("string", "filename", "$color")
         raw = prop("boolean", "raw", "true")
         color = element("volume", file, box, raw, name="color", type="gridvolume")
-        return Place(inside=(density, color), files={"density": _name(path, folder), "color": _name(colors, folder)})
+        return SceneContent(
+            inside=(density, color), files={"density": _name(path, folder), "color": _name(colors, folder)}
+        )
 
     return WrittenPlace(make, words, files=(colors,))
 
 
-def _nowhere(lamps: dict[str, float]) -> Place:
+def _nowhere(lamps: dict[str, float]) -> SceneContent:
     cells = element(
         "texture",
         prop("rgb", "color0", 0.24),
@@ -419,4 +431,4 @@ def _nowhere(lamps: dict[str, float]) -> Place:
         type="sphere",
         id="nowhere",
     )
-    return Place(beside=(sphere,), spp=16)
+    return SceneContent(beside=(sphere,), spp=16)

@@ -9,7 +9,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures import overlay as figures
 from nerg_mi.figures.overlay import (
     Heat,
-    Layers,
+    OverlayLayers,
     find_overlay,
     overlay,
     overlays_of,
@@ -85,7 +85,7 @@ def test06_errors_are_sentences():
 X, Y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 16))
 
 
-LAYERS = Layers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))
+LAYERS = OverlayLayers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))
 
 
 @pytest.mark.parametrize("name", [of.name for aov in AOVS.values() for of in overlays_of(aov)])
@@ -105,9 +105,9 @@ def test_a_scale_for_all():
 
 
 def test_nothing_to_take_a_scale_from():
-    dark = Layers(LAYERS.color, 0 * Y, LAYERS.mask)
+    dark = OverlayLayers(LAYERS.color, 0 * Y, LAYERS.mask)
     assert find_overlay("gaze").limits(dark) is None
-    hidden = Layers(LAYERS.color, 2 * Y, X > 2)
+    hidden = OverlayLayers(LAYERS.color, 2 * Y, X > 2)
     assert find_overlay("gaze").limits(hidden) is None
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.figures.overview import Frame, Judge, Seen, around_observer, of_place
+from nerg_mi.figures.overview import Judge, PinholeFrame, SeenSurfaces, around_observer, of_place
 from nerg_mi.maths.geometry import box_interval
 from nerg_mi.maths.sphere import fibonacci_directions
 
 UP = np.array([0.0, 0, 1])
-FRAME = Frame(70, 1.5, UP)
+FRAME = PinholeFrame(70, 1.5, UP)
 
 
 def room(lower=(0, 0, 0), upper=(8, 6, 3), pillar=None):
@@ -35,7 +35,9 @@ def seen_from(eye, trace, attention):
     """What is met around ``eye``; ``attention`` of directions."""
     d = fibonacci_directions(4000)
     depth, opacity = trace(np.broadcast_to(eye, d.shape), d)
-    return Seen(np.asarray(eye, float), d, depth, opacity > 0.5, attention(d), np.full(len(d), 4 * np.pi / len(d)))
+    return SeenSurfaces(
+        np.asarray(eye, float), d, depth, opacity > 0.5, attention(d), np.full(len(d), 4 * np.pi / len(d))
+    )
 
 
 def test_directions_are_those_of_the_pixels():

@@ -65,11 +65,11 @@ def _read(folder: Path) -> object:
 
 def _nest(folder: Path) -> object:
     from nerg_mi.rendering.nested_scene import nested_place
-    from nerg_mi.rendering.scene_writer import Attention, Eye, SceneText
+    from nerg_mi.rendering.scene_writer import Eye, GazeFiles, SceneText
 
     place = nested_place(folder / "theirs.xml", folder / "ours")
     camera = Eye(np.zeros(3), np.ones(3))
-    return SceneText(place, Attention(), camera, None, np.array([0.0, 0, 1])).xml()
+    return SceneText(place, GazeFiles(), camera, None, np.array([0.0, 0, 1])).xml()
 
 
 def _make_nested(folder: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.rendering import bands
-from nerg_mi.rendering.bands import LEAST, PACKET, Channels, OwnLayer, Pace, render_bands, render_channels
+from nerg_mi.rendering.bands import LEAST, PACKET, Channels, OwnLayer, SamplePace, render_bands, render_channels
 from tests.plugins import fields
 from tests.plugins.scenes import camera, constant, observer_at
 
@@ -336,7 +336,7 @@ class Clock:
 @pytest.mark.parametrize(("fixed", "spp"), [(1 << 12, 1), (1 << 12, 3), (100, 1), (0, 4)])
 def test01_strips_follow_each_other_in_whole_packets_and_pixels(rgb, fixed, spp):
     start, stop = 1000 * spp, 1000 * spp + 50_000 * spp
-    strips = list(Pace(fixed).strips(start, stop, spp))
+    strips = list(SamplePace(fixed).strips(start, stop, spp))
     assert strips[0][0] == start - start % PACKET and sum(strips[-1]) == stop
     assert all(a + n == b for (a, n), (b, _) in zip(strips, strips[1:]))
     assert all((a + n) % PACKET == 0 == (a + n) % spp for a, n in strips[:-1])
@@ -347,7 +347,7 @@ def first_strip(it):
 
 
 def test02_short_ones_grow_and_long_ones_shrink_to_a_limit(rgb, monkeypatch):
-    clock, it = Clock(monkeypatch), Pace()
+    clock, it = Clock(monkeypatch), SamplePace()
     before = first_strip(it)
     # The first two are not asked: they were compiled, or wait for what was.
     clock.take(it, 0.01, 2)
@@ -363,13 +363,13 @@ def test02_short_ones_grow_and_long_ones_shrink_to_a_limit(rgb, monkeypatch):
 
 
 def test03_fixed_ones_stay(rgb, monkeypatch):
-    clock, it = Clock(monkeypatch), Pace(1 << 13)
+    clock, it = Clock(monkeypatch), SamplePace(1 << 13)
     clock.take(it, 0.01, 10)
     assert first_strip(it) == 1 << 13
 
 
 def test04_the_next_picture_goes_on_with_the_pace_of_the_last(rgb, monkeypatch):
-    clock, it = Clock(monkeypatch), Pace()
+    clock, it = Clock(monkeypatch), SamplePace()
     before = first_strip(it)
     clock.take(it, 0.01, 4)
     grown = first_strip(it)

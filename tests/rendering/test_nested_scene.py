@@ -10,7 +10,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.rendering.nested_scene import gaze_of_scene, nested_place, with_gaze
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.rendering.scene_writer import Attention, Eye, SceneText
+from nerg_mi.rendering.scene_writer import Eye, GazeFiles, SceneText
 from nerg_mi.workflows import demo
 
 # ---- Nested scene ----
@@ -53,7 +53,7 @@ def theirs(tmp_path):
 def shown(path, out):
     camera = Eye(np.array([0.3, 0, 4.0]), np.array([0, 0, 0.0]))
     place = nested_place(path, out.parent)
-    scene = SceneText(place, Attention(), camera, None, np.array([0.0, 1, 0]), width=12)
+    scene = SceneText(place, GazeFiles(), camera, None, np.array([0.0, 1, 0]), width=12)
     out.write_text(scene.xml())
     return load_scene(out)
 

@@ -11,12 +11,12 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.rendering.scene_writer import (
-    Attention,
     Blank,
     Comment,
     Eye,
+    GazeFiles,
     Lens,
-    Place,
+    SceneContent,
     SceneText,
     Verbatim,
     ahead_level,
@@ -69,7 +69,7 @@ def test_what_is_not_in_the_picture(rgb, camera):
 # ---- A written scene, loaded by Mitsuba: its sensors look where they should, and its defaults can be set ----
 
 
-CUBE = Place(beside=(element("shape", type="cube"),))
+CUBE = SceneContent(beside=(element("shape", type="cube"),))
 
 
 UP = np.array([0.0, 0, 1])
@@ -77,7 +77,7 @@ UP = np.array([0.0, 0, 1])
 
 def written(folder, **more):
     eye, camera = Eye(np.array([0, 0, 5.0]), np.array([0, 0, 0.0])), Eye(np.array([4, 1, 2.0]), np.array([0, 0, 0.5]))
-    given = {"place": CUBE, "attention": Attention(), "camera": camera, "observer": eye, "up": UP, "width": 24} | more
+    given = {"place": CUBE, "attention": GazeFiles(), "camera": camera, "observer": eye, "up": UP, "width": 24} | more
     scene = SceneText(**given)
     (folder / "scene.xml").write_text(scene.xml())
     return scene
@@ -119,7 +119,7 @@ def test_without_an_observer_the_camera_is_it(rgb, tmp_path):
 
 
 def test_names_that_others_have_taken(rgb, tmp_path):
-    place = Place(
+    place = SceneContent(
         first=(element("default", name="eye", value="9"),), beside=CUBE.beside, taken=frozenset({"eye", "camera"})
     )
     written(tmp_path, place=place, lens=Lens(50, 2.0))

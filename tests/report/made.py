@@ -9,7 +9,7 @@ import numpy as np
 from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.formats.areas import Region
 from nerg_mi.rays.quality import summarise
-from nerg_mi.report.data import Camera, ObjectAttention, Picture, Proxy, Run, Share, Stage, pack
+from nerg_mi.report.data import ObjectAttention, ReportCamera, ReportPicture, ReportProxy, Run, Share, Stage, pack
 from tests.evaluation.test_gaze import crowd
 from tests.evaluation.test_gaze_report import scored
 
@@ -22,7 +22,7 @@ PNG = bytes.fromhex(
 )
 
 
-def cube(side: int = 12) -> Proxy:
+def cube(side: int = 12) -> ReportProxy:
     """The six faces of a room of 4 m, seen from within, and two observers' gaze."""
     axis = np.linspace(0, 4, side)
     u, v = (m.ravel() for m in np.meshgrid(axis, axis))
@@ -35,7 +35,7 @@ def cube(side: int = 12) -> Proxy:
     p, n = np.concatenate(points), np.concatenate(normals)
     colors = (p / 4 * 255).astype(np.uint8)
     gaze = np.stack([np.exp(-np.linalg.norm(p - [4, 2, 2], axis=1)), np.exp(-np.linalg.norm(p - [2, 4, 2], axis=1))])
-    return Proxy(p.astype(np.float32), n.astype(np.float32), colors, gaze.astype(np.float32), 4 / side)
+    return ReportProxy(p.astype(np.float32), n.astype(np.float32), colors, gaze.astype(np.float32), 4 / side)
 
 
 SHELF = Region.of("shelf", np.zeros(3), np.ones(3))
@@ -43,7 +43,7 @@ SHELF = Region.of("shelf", np.zeros(3), np.ones(3))
 
 def stage(boxes=(SHELF,)) -> Stage:
     path = np.stack([np.linspace(1, 3, 9), np.full(9, 2.0), np.full(9, 1.6)], axis=1)
-    camera = Camera(np.array([7.0, 6, 5]), np.array([2.0, 2, 1]))
+    camera = ReportCamera(np.array([7.0, 6, 5]), np.array([2.0, 2, 1]))
     eyes = np.array([[1.0, 2, 1.6], [3, 2, 1.6]])
     return Stage(cube(), eyes, [path, path[:3]], boxes, np.array([0.0, 0, 1]), camera)
 
@@ -51,7 +51,7 @@ def stage(boxes=(SHELF,)) -> Stage:
 def whole(name: str = "shelf") -> Run:
     """Everything that can be shown; ``name``: what files, people and objects are called."""
     rays = crowd(400)
-    picture = lambda words: Picture(PNG, f"{words} {name}", f"{words} {name}.")
+    picture = lambda words: ReportPicture(PNG, f"{words} {name}", f"{words} {name}.")
     share = Share(0.25, 0.2, 0.3)
     person = {"method": "gaze field", "person": name, "rays": 12, "bits": 0.1, "CC": None, "KLD": 0.5}
     results = GazeResults(

@@ -26,8 +26,7 @@ from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.splat_medium import SplatArrays
 from tests.reference import splats as reference
 from tests.reference.splats import peaks
-from tests.surfaces.meshes import vmf
-from tests.surfaces.walls import TURN_X, wall
+from tests.surfaces.meshes import TURN_X, lookers_of_law, vmf, wall
 from tests.transport.test_splat_medium import medium_of, rays, stack
 
 # ---- Areas of Gaussians: closed forms, and what they add up to where many overlap ----

@@ -21,8 +21,8 @@ from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.medium import ColorPainter, LocalRay, VoxelCells
 from nerg_mi.transport.quadrature import (
     RULES,
+    MarchStep,
     Registry,
-    Step,
     absorbed_share,
     boundaries,
     color_share,
@@ -521,11 +521,11 @@ class Simpson:
     def start(self, Float):
         return None
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> Step:
+    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> MarchStep:
         first, middle, last = (medium.density(ray.o + ray.d * (t + s * delta), active) for s in (0, 0.5, 1))
         dtau = dr.select(active, (first + 4 * middle + last) * delta / 6, 0)
         p = ray.o + ray.d * (t + 0.5 * delta)
-        return Step(
+        return MarchStep(
             dtau,
             linear_share(first * delta, last * delta),
             lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),

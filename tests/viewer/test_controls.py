@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
 from nerg_mi.viewer.controls import Inset, box_around, edges, png_bytes, slider_end, table
 from nerg_mi.viewer.layers import STALE, Shade, layer_of
-from nerg_mi.viewer.points import View
+from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.scene import copied_view
 from nerg_mi.viewer.session import Worker
 
@@ -24,7 +24,7 @@ def test01_around_the_foremost():
     rng = np.random.default_rng(4)
     thing = np.array([2.0, 0, 1]) + 0.2 * (rng.random((500, 3)) - 0.5)
     wall = np.stack([np.full(500, 9.0), *(4 * rng.random((2, 500)) - 2)], axis=1)
-    view = View.of((0, 0, 1), (2, 0, 1), (0, 0, 1), 1.0, 1.5)
+    view = PinholeView.of((0, 0, 1), (2, 0, 1), (0, 0, 1), 1.0, 1.5)
     lower, upper = box_around(np.concatenate([thing, wall]), 0.01, view, (0.4, 0.35), (0.6, 0.65))
     assert np.allclose(lower, [1.9, -0.1, 0.9], atol=0.03) and np.allclose(upper, [2.1, 0.1, 1.1], atol=0.03)
     with pytest.raises(NergError, match="nothing within"):
@@ -32,7 +32,7 @@ def test01_around_the_foremost():
 
 
 def test02_a_rectangle_to_the_right_and_above():
-    view = View.of((0, 0, 0), (1, 0, 0), (0, 0, 1), 1.0, 1.0)
+    view = PinholeView.of((0, 0, 0), (1, 0, 0), (0, 0, 1), 1.0, 1.0)
     right, left = np.array([2, -0.5, 0.5]), np.array([2, 0.5, -0.5])
     points = np.concatenate([np.tile(p, (20, 1)) for p in (right, left)])
     lower, upper = box_around(points, 0.1, view, (0.55, 0.05), (0.95, 0.45))
@@ -88,7 +88,7 @@ def test01_a_slider_holds_its_value_in_any_unit(value, end):
 def test02_a_scene_of_what_is_shown(store, tmp_path):
     place = SimpleNamespace(made=False)
     options = SimpleNamespace(width=48)
-    view = View.of((7, 3, 2), (5, 4, 1), (0, 0, 1), 0.9, 1.5)
+    view = PinholeView.of((7, 3, 2), (5, 4, 1), (0, 0, 1), 0.9, 1.5)
     shown = SimpleNamespace(
         place=place,
         scene_file=store,

@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rendering.files import read_frames
 from nerg_mi.viewer.flights import Film, Flying, even, film_options, flight, frames_csv, shown_of_flight
 from nerg_mi.viewer.layers import Scale, layer_of
-from nerg_mi.viewer.points import View
+from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.scene import copied
 from nerg_mi.viewer.serve import viewer
 from nerg_mi.viewer.session import Worker
@@ -23,7 +23,7 @@ from tests.viewer.browser import require
 # ---- A flight as a video: in turns with other tasks, cancelled, and with what is shown ----
 
 
-HOME = View.of((-2, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
+HOME = PinholeView.of((-2, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def film_of(room, tmp_path):
     """A function that makes a film of a few frames of the room, and the list of what it told."""
 
     def make(seconds=0.5):
-        further = View.of((-1, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
+        further = PinholeView.of((-1, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
         kept = flight([HOME, further], seconds, 10)
         views, shown = shown_of_flight(kept, 49, observer=None, aovs=("depth",), spp=1, falloff=0.05)
         (tmp_path / "view.xml").write_text(copied(room, shown))
@@ -109,7 +109,7 @@ def test04_without_pyav_it_says_so(film_of, monkeypatch):
 
 @pytest.mark.parametrize("aspect, width", [(1.5, 720), (1.783, 481), (0.6, 33), (3.0, 2)])
 def test05_sides_are_even(aspect, width):
-    view, wide = even(View.of((0, 0, 0), (1, 0, 0), (0, 0, 1), 0.8, aspect), width)
+    view, wide = even(PinholeView.of((0, 0, 0), (1, 0, 0), (0, 0, 1), 0.8, aspect), width)
     assert wide % 2 == 0 and view.height(wide) % 2 == 0 and min(wide, view.height(wide)) >= 16
 
 
@@ -127,7 +127,7 @@ def test06_it_is_drawn_as_the_layer_is():
 
 
 def view(x, ahead=(0, 1, 0)):
-    return View.of((x, 0, 1), np.add((x, 0, 1), ahead), (0, 0, 1), 0.9, 1.5)
+    return PinholeView.of((x, 0, 1), np.add((x, 0, 1), ahead), (0, 0, 1), 0.9, 1.5)
 
 
 def test01_it_passes_the_views():
@@ -177,7 +177,7 @@ def test01_a_video_is_sent(room):
         part._begin(SimpleNamespace(client=client))
         assert "two views" in client.notes[-1] and part._film is None
         home = running.page.session.home
-        part._kept = [home, View.of(home.origin + 0.3, home.origin + home.ahead, home.up, home.fov, home.aspect)]
+        part._kept = [home, PinholeView.of(home.origin + 0.3, home.origin + home.ahead, home.up, home.fov, home.aspect)]
         part._seconds.value, part._fps.value = 0.2, 10
         part._begin(SimpleNamespace(client=client))
         assert running.page.session.worker.wait_idle(120)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.viewer.layers import layer_of
-from nerg_mi.viewer.points import View
+from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.serve import viewer
 from nerg_mi.workflows.view import ViewOptions
 from tests.viewer.browser import chromium, require
@@ -42,7 +42,7 @@ def pixels(driver):
     return np.array(mi.Bitmap(stream))[..., :3].astype(float)
 
 
-def on_screen(driver, view: View, point) -> tuple[int, int]:
+def on_screen(driver, view: PinholeView, point) -> tuple[int, int]:
     """Where ``point`` is in the window, in pixels."""
     away = np.asarray(point, float) - view.origin
     depth, rise = away @ view.ahead, np.tan(view.fov / 2)

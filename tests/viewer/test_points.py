@@ -19,8 +19,8 @@ from nerg_mi.viewer.points import (
     DIRECTIONS,
     LEVELS,
     SIZES,
-    Pace,
-    View,
+    BandPace,
+    PinholeView,
     bake,
     gather,
     heading_of,
@@ -150,8 +150,8 @@ QUANTITIES = ["color", "depth", "opacity", "visibility"]
 
 
 def test01_the_last_picture_is_that_of_the_integrator(room_scene):
-    view = View.of_sensor(room_scene.sensor(0))
-    steps = list(refine(room_scene, view, np.array([0, 0, 0.5]), QUANTITIES, 48, 64, Pace()))
+    view = PinholeView.of_sensor(room_scene.sensor(0))
+    steps = list(refine(room_scene, view, np.array([0, 0, 0.5]), QUANTITIES, 48, 64, BandPace()))
     pictures = [p for p in steps if p is not None]
     assert [p.share for p in pictures[:2]] == [4, 2] and [p.samples for p in pictures[2:]] == [1, 2, 4, 8, 16, 32, 64]
     assert pictures[0].values["depth"].shape == (8, 12) and pictures[-1].values["color"].shape == (32, 48, 3)
@@ -165,9 +165,9 @@ def test01_the_last_picture_is_that_of_the_integrator(room_scene):
 
 
 def test02_equal_seeds_give_equal_pictures_whatever_the_bands(room_scene):
-    view = View.of_sensor(room_scene.sensor(0))
+    view = PinholeView.of_sensor(room_scene.sensor(0))
     names = ["depth", "opacity"]
-    one, other = Pace(), Pace()
+    one, other = BandPace(), BandPace()
     other._at = 2
     first, second = (list(refine(room_scene, view, None, names, 150, 2, pace))[-1] for pace in (one, other))
     assert first is not None and second is not None
@@ -180,15 +180,15 @@ def test03_a_picture_that_is_left_off_is_not_gone_on_with(room_scene, monkeypatc
     traced = []
     original = module.trace
     monkeypatch.setattr(module, "trace", lambda *a, **k: traced.append(len(a[2])) or original(*a, **k))
-    view = View.of_sensor(room_scene.sensor(0))
-    steps = refine(room_scene, view, None, ["depth", "opacity"], 400, 4, Pace())
+    view = PinholeView.of_sensor(room_scene.sensor(0))
+    steps = refine(room_scene, view, None, ["depth", "opacity"], 400, 4, BandPace())
     next(steps)
     steps.close()
     assert traced == [SIZES[0]]
 
 
 def test04_the_pace_follows_the_time(monkeypatch):
-    pace = Pace()
+    pace = BandPace()
     for _ in range(10):
         pace.learn(0.01)
     assert pace.rays == SIZES[-1]
@@ -201,9 +201,9 @@ def test04_the_pace_follows_the_time(monkeypatch):
 
 def test05_from_above_the_ceiling_is_cut_off(room_scene):
     up = np.array([0.0, 0, 1])
-    view = View.of((1.5, 0, 5), (1.5, 0.01, 0), up, 0.3, 1.0)
-    whole = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, Pace()))[-1]
-    cut = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, Pace(), ceiling=Ceiling(0.5, up)))[-1]
+    view = PinholeView.of((1.5, 0, 5), (1.5, 0.01, 0), up, 0.3, 1.0)
+    whole = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, BandPace()))[-1]
+    cut = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, BandPace(), ceiling=Ceiling(0.5, up)))[-1]
     assert whole is not None and cut is not None
     # The top of the box lies at z = 1, 4 below the camera; below the cut is the floor.
     assert whole.values["depth"][16, 16] == pytest.approx(4, abs=0.02)
@@ -233,13 +233,13 @@ def test01_the_frame_of_a_page():
     camera = SimpleNamespace(
         wxyz=(w, x, y, z), position=(1.0, 2.0, 3.0), fov=0.8, image_width=600, image_height=400, aspect=1.5
     )
-    view = View.of_page(camera)
+    view = PinholeView.of_page(camera)
     assert np.allclose(view.ahead, [0, 1, 0]) and np.allclose(view.up, [0, 0, 1])
     assert view.aspect == 1.5 and view.fov == 0.8 and np.allclose(view.origin, [1, 2, 3])
 
 
 def test02_rays_are_those_of_the_same_mitsuba_sensor(rgb):
-    view = View.of((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
+    view = PinholeView.of((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
     sensor = rgb.load_dict(view.camera(30).to_dict())
     height = view.height(30)
     assert height == 20
@@ -251,8 +251,8 @@ def test02_rays_are_those_of_the_same_mitsuba_sensor(rgb):
 
 
 def test03_a_sensor_and_back(rgb):
-    view = View.of((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
-    found = View.of_sensor(rgb.load_dict(view.camera(300).to_dict()))
+    view = PinholeView.of((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
+    found = PinholeView.of_sensor(rgb.load_dict(view.camera(300).to_dict()))
     for name in ("origin", "ahead", "up", "fov", "aspect"):
         assert np.allclose(getattr(found, name), getattr(view, name), atol=1e-5), name
     assert math.isclose(view.across, math.degrees(2 * math.atan(math.tan(0.45) * 1.5)))
@@ -260,7 +260,7 @@ def test03_a_sensor_and_back(rgb):
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1)])
 def test04_straight_down_there_is_an_up_all_the_same(up):
-    view = View.of((0, 0, 5), (0, 0, 0), up, 0.9, 1.0)
+    view = PinholeView.of((0, 0, 5), (0, 0, 0), up, 0.9, 1.0)
     assert math.isclose(np.linalg.norm(view.up), 1) and abs(view.up @ view.ahead) < 1e-9
 
 

@@ -9,8 +9,8 @@ import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.viewer.page import Page
-from nerg_mi.viewer.points import Pace, View, refine
-from nerg_mi.viewer.scene import People, Shown, color_of, copied
+from nerg_mi.viewer.points import BandPace, PinholeView, refine
+from nerg_mi.viewer.scene import PeoplePanel, Shown, color_of, copied
 from nerg_mi.viewer.serve import viewer
 from nerg_mi.workflows.view import ViewOptions
 from tests.viewer.browser import require
@@ -18,7 +18,7 @@ from tests.viewer.browser import require
 # ---- A copied scene renders as what was viewed ----
 
 
-VIEW = View.of((6.9, 3.0, 2.0), (4.8, 4.2, 1.0), (0, 0, 1), 0.9, 1.5)
+VIEW = PinholeView.of((6.9, 3.0, 2.0), (4.8, 4.2, 1.0), (0, 0, 1), 0.9, 1.5)
 
 
 EYE = np.array([4.6, 3.1, 1.6])
@@ -34,14 +34,14 @@ def test01_pictures_are_alike(store, tmp_path):
     rendered = nerg.render(copy, quantities=["color", "gaze", "depth"])
     assert np.allclose(copy.observer, EYE) and rendered.color.shape == (1, 64, 96, 3)
     assert copy.integrator.aov_names()[-1].startswith("gaze")
-    steps = refine(nerg.Scene.load(store), VIEW, EYE, ["color", "gaze", "depth", "opacity"], 96, 16, Pace())
+    steps = refine(nerg.Scene.load(store), VIEW, EYE, ["color", "gaze", "depth", "opacity"], 96, 16, BandPace())
     viewed = [p for p in steps if p is not None][-1].values
     for name in ("color", "gaze", "depth"):
         off = np.abs(rendered[name][0] - viewed[name]).mean() / viewed[name].mean()
         assert off < 0.05, name
     # And not of any view: another one is off by far.
     other = nerg.render(
-        copy, quantities=["color"], camera=View.of((4, 3, 2), (2, 3, 1), (0, 0, 1), 0.9, 1.5).camera(96)
+        copy, quantities=["color"], camera=PinholeView.of((4, 3, 2), (2, 3, 1), (0, 0, 1), 0.9, 1.5).camera(96)
     )
     assert np.abs(other.color[0] - viewed["color"]).mean() / viewed["color"].mean() > 0.2
 
@@ -53,7 +53,7 @@ def test02_the_settings_are_those_that_were_viewed(store, tmp_path):
     assert float(np.ravel(np.array(scene.integrator.falloff))[0]) == pytest.approx(0.25)
     assert scene.sensor(0).sampler().sample_count() == 3 and len(scene.mitsuba.sensors()) == 4
     assert np.allclose(scene.observer, [2, 2, 1.7])
-    assert np.allclose(View.of_sensor(scene.sensor(0)).origin, [1, 2, 1.5])
+    assert np.allclose(PinholeView.of_sensor(scene.sensor(0)).origin, [1, 2, 1.5])
 
 
 def test03_shapes_and_no_observer(room, tmp_path):
@@ -65,11 +65,11 @@ def test03_shapes_and_no_observer(room, tmp_path):
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0.1, -0.2, 2)])
 def test04_what_is_cut_off_from_above(room, tmp_path, up):
-    view, up = View.of((1.5, 0, 5), (1.5, 0.01, 0), (0, 0, 1), 0.3, 1.0), np.array(up, float)
+    view, up = PinholeView.of((1.5, 0, 5), (1.5, 0.01, 0), (0, 0, 1), 0.3, 1.0), np.array(up, float)
     path = tmp_path / "view.xml"
     path.write_text(copied(room, Shown(view, None, ("depth",), 32, 1, 0.0, (0.5, up))))
     rendered = nerg.render(nerg.Scene.load(path), quantities=["depth"]).depth[0]
-    steps = refine(nerg.Scene.load(room), view, None, ["depth"], 32, 1, Pace(), ceiling=Ceiling(0.5, up))
+    steps = refine(nerg.Scene.load(room), view, None, ["depth"], 32, 1, BandPace(), ceiling=Ceiling(0.5, up))
     viewed = [p for p in steps if p is not None][-1].values["depth"]
     # The floor, 5 below the camera, in place of the top of a box that is cut through; rays vary within a
     # pixel, which tells at its edges.
@@ -110,7 +110,7 @@ def running(room, tmp_path):
 
 def test02_the_observer_follows_somebody(running):
     page: Page = running.page
-    people = People(page, page.session.tracks)
+    people = PeoplePanel(page, page.session.tracks)
     # Paths of all are drawn where they are wanted: many people's hide the place.
     assert len(people._shown) == 2 and people._paths is None
     people._drawn.value = True

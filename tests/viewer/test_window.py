@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from nerg_mi.viewer.page import Window
+from nerg_mi.viewer.page import BrowserWindow
 from nerg_mi.viewer.points import LEVELS
 
 
@@ -13,7 +13,7 @@ from nerg_mi.viewer.points import LEVELS
     [(0.2, False, 1), (0.2, True, 1), (0.03, True, 0), (0.017, True, -1), (0.017, False, 0)],
 )
 def test01_points_follow_the_pace(seconds, at_rest, change):
-    window = Window(None, None)
+    window = BrowserWindow(None, None)
     before = window.level
     for _ in range(20):
         window.learn_pace(seconds)
@@ -24,7 +24,7 @@ def test01_points_follow_the_pace(seconds, at_rest, change):
 
 
 def test02_a_few_frames_say_nothing_and_levels_have_an_end():
-    window = Window(None, None)
+    window = BrowserWindow(None, None)
     window.learn_pace(0.9)
     assert window.level_for_pace(True) == window.level
     for pace, end in ((0.5, LEVELS - 1), (0.01, 0)):
@@ -35,7 +35,7 @@ def test02_a_few_frames_say_nothing_and_levels_have_an_end():
 
 
 def test03_slow_frames_are_no_rest():
-    window = Window(None, None)
+    window = BrowserWindow(None, None)
     assert window.rest == pytest.approx(0.12)
     for _ in range(10):
         window.learn_pace(0.02)

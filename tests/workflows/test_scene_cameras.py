@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overview import Frame, Seen
+from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces
 from nerg_mi.maths.geometry import Similarity, box_interval
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.rendering.scene_writer import Attention, Eye, Lens, Place, SceneText, element
+from nerg_mi.rendering.scene_writer import Eye, GazeFiles, Lens, SceneContent, SceneText, element
 from nerg_mi.workflows.scene_cameras import (
     Probe,
     best_camera,
@@ -36,8 +36,8 @@ EYE = Eye(np.array([0.3, -0.2, 0.1]), np.array([1.0, 0.6, 0.4]))
 def probe(rgb, tmp_path):
     """A cube of ±1, whose up is +y."""
     up = np.array([0.0, 1, 0])
-    place = Place(beside=(element("shape", type="cube"),))
-    (tmp_path / "a.xml").write_text(SceneText(place, Attention(), EYE, EYE, up).xml())
+    place = SceneContent(beside=(element("shape", type="cube"),))
+    (tmp_path / "a.xml").write_text(SceneText(place, GazeFiles(), EYE, EYE, up).xml())
     return Probe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
 
 
@@ -60,7 +60,7 @@ def test_observers_within_matter_are_turned_ahead(depths, length):
     """They meet it at once; what they are turned to still lies before them, at a distance of what is met elsewhere."""
     directions = np.array([[0.6, 0.8, 0], *[[0, 0, 1.0]] * 3])
     depth = np.array([depths[0], *[depths[1]] * 3], float)
-    seen = Seen(EYE.origin, directions, depth, np.ones(4, bool), np.array([9.0, 0, 0, 0]), np.ones(4))
+    seen = SeenSurfaces(EYE.origin, directions, depth, np.ones(4, bool), np.array([9.0, 0, 0, 0]), np.ones(4))
     np.testing.assert_allclose(turned_ahead(EYE, seen).target, EYE.origin + length * directions[0])
 
 
@@ -89,9 +89,11 @@ def test_the_best_photo(probe):
 @pytest.mark.parametrize("room", [False, True], ids=["a thing", "a room"])
 def test_a_thing_is_seen_from_outside_and_a_room_from_within(rgb, tmp_path, room):
     """A cube whose faces look outwards is a thing, one whose faces look inwards a room."""
-    place = Place(beside=(element("shape", element("boolean", name="flip_normals", value=str(room)), type="cube"),))
+    place = SceneContent(
+        beside=(element("shape", element("boolean", name="flip_normals", value=str(room)), type="cube"),)
+    )
     up = np.array([0.0, 0, 1])
-    (tmp_path / "a.xml").write_text(SceneText(place, Attention(), EYE, EYE, up).xml())
+    (tmp_path / "a.xml").write_text(SceneText(place, GazeFiles(), EYE, EYE, up).xml())
     probe = Probe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
     assert probe.within(np.array([[0, 0, 0], [0.9, -0.5, 0.3], [3, 0, 0], [0, 0, -1.1]])).tolist() == [
         not room,
@@ -99,7 +101,7 @@ def test_a_thing_is_seen_from_outside_and_a_room_from_within(rgb, tmp_path, room
         False,
         False,
     ]
-    shot = best_camera(probe, None, Frame(70, 1.5, up), None)
+    shot = best_camera(probe, None, PinholeFrame(70, 1.5, up), None)
     assert (np.abs(shot.origin).max() < 1) == room and shot.opaque > 0.2
 
 
