@@ -1,9 +1,13 @@
-"""Tests of `nerg_mi.report.html`."""
+"""The report's HTML: what may stand in it, its sections, and the whole page."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import math
+import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -11,7 +15,8 @@ import pytest
 
 from nerg_mi.report import html
 from nerg_mi.report.html import Point, interval_chart, nice_ticks
-from tests.report.made import HOSTILE, PNG
+from nerg_mi.report.sections import SECTIONS, SETTINGS, page
+from tests.report.made import HOSTILE, PNG, bare, packed_scene, whole
 
 # ---- Charts: values where their scale says, and scales of round numbers ----
 
@@ -97,3 +102,133 @@ def test_pictures_are_within_the_page():
     ((_, attributes),) = Parsed(html.image(PNG, "a <picture>")).tags
     assert attributes["src"].startswith("data:image/png;base64,iVBOR") and attributes["alt"] == "a <picture>"
     assert Parsed(html.figure(html.image(PNG, ""), "<words>")).text == "<words>"
+
+
+# ---- The page: whole, bare, with hostile names, and loading nothing ----
+
+
+SIZE = 6_000_000
+
+
+def test_every_section_is_there():
+    for run in (whole(), bare()):
+        tags = Parsed(page(run)).tags
+        assert [a["id"] for t, a in tags if t == "section"] == [s.name for s in SECTIONS]
+        assert [a["href"] for t, a in tags if t == "a"] == [f"#{s.name}" for s in SECTIONS]
+
+
+def test_equal_runs_give_equal_bytes():
+    assert page(whole()) == page(whole()) and len(page(whole()).encode()) < SIZE
+
+
+def test_names_never_become_markup():
+    tame, hostile = (Parsed(page(whole(name))) for name in ("shelf", HOSTILE))
+    assert [t for t, _ in hostile.tags] == [t for t, _ in tame.tags]
+    keys = lambda found: [sorted(a) for _, a in found.tags]
+    assert keys(hostile) == keys(tame)
+    assert not any(key.startswith("on") for _, a in hostile.tags for key in a)
+    assert "alert(1)" in hostile.text and "\u202e" not in page(whole(HOSTILE))
+
+
+@pytest.mark.parametrize("run", [whole(), bare(), whole(HOSTILE)], ids=["whole", "bare", "hostile"])
+def test_nothing_is_loaded(run):
+    text = page(run)
+    for tag, attributes in Parsed(text).tags:
+        assert tag not in ("link", "iframe", "object", "embed", "form", "base", "video", "audio", "source"), tag
+        assert attributes.get("src", "data:image/png;base64,").startswith("data:image/png;base64,"), tag
+        assert attributes.get("href", "#").startswith("#") and "style" not in attributes, tag
+    style = re.search(r"<style>(.*?)</style>", text, re.S)[1]
+    assert "url(" not in style and "@import" not in style
+
+
+def test_the_policy_allows_what_is_in_the_page_and_no_more():
+    text = page(whole())
+    (policy,) = [a["content"] for t, a in Parsed(text).tags if a.get("http-equiv") == "Content-Security-Policy"]
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+    hashed = lambda kind: [
+        f"'sha256-{base64.b64encode(hashlib.sha256(part.encode()).digest()).decode()}'"
+        for part in re.findall(rf"<{kind}>(.*?)</{kind}>", text, re.S)
+    ]
+    assert rules["default-src"] == "'none'" and rules["img-src"] == "data:" and "connect-src" not in rules
+    assert rules["script-src"].split() == hashed("script") and rules["style-src"].split() == hashed("style")
+    assert len(hashed("script")) == 1
+    # Before anything that it governs.
+    assert text.index("Content-Security-Policy") < min(text.index("<style>"), text.index("<title>"))
+
+
+def test_a_report_without_a_scene_has_no_script():
+    text = page(bare())
+    assert "<script" not in text and "script-src 'none'" in text.replace("&#x27;", "'")
+
+
+def test_the_scene_is_data():
+    assert packed_scene(page(whole(HOSTILE)))["count"] == whole().stage_points
+
+
+# ---- Every section: shown from what there is, and told in one sentence where it is left out ----
+
+
+ABSENT = {"verdict", "data", "people", "gaze", "stage", "objects", "scores"}
+"""Sections that need more than a gaze field."""
+
+
+def text_of(section, run) -> str:
+    return Parsed(section.body(run)).text
+
+
+@pytest.mark.parametrize("section", SECTIONS, ids=lambda s: s.name)
+def test_shown_or_left_out_with_a_reason(section):
+    assert section.absent(whole()) is None and len(text_of(section, whole())) > 40
+    reason = section.absent(bare())
+    assert (reason is not None) == (section.name in ABSENT)
+    if reason is None:
+        assert section.body(bare())
+    else:
+        assert reason.endswith(".") and len(reason) > 40 and reason.count(".") <= 2
+
+
+def test_names_are_apart():
+    assert len({s.name for s in SECTIONS}) == len({s.title for s in SECTIONS}) == len(SECTIONS)
+
+
+def test_what_is_said():
+    said = {s.name: text_of(s, whole()) for s in SECTIONS}
+    assert said["verdict"].startswith("Better than nearest rays, the strongest baseline, for new people at new places.")
+    assert "4.00 × 4.00 × 4.00" in said["place"] and "9 that it was trained on" in said["place"]
+    assert "400 of 400 rows" in said["data"] and "median number of people within 0.25 m is 3" in said["people"]
+    assert "The observer stands somewhere. Densities are in 1/sr" in said["gaze"]
+    assert "the mean of all 2" in said["stage"] and "people's paths" in said["stage"]
+    assert "25.00 [20.00, 30.00]" in said["objects"] and "3 of 4" in said["objects"]
+    assert "lead in KLD, nats" in said["scores"] and "A field is" not in said["scores"]
+    assert "mean of 2 fields" in said["uncertainty"] and "CC 0.700, KLD 0.400" in said["uncertainty"]
+    assert "3 positions, 1 people, and every ray within 0.5 m" in said["settings"]
+    assert "A head is not a gaze" in said["limits"] and "Places are static" in said["limits"]
+    assert "ab" * 32 in said["provenance"]
+
+
+def test_who_was_held_out_is_counted_and_not_named():
+    assert "Ada" not in text_of(SETTINGS, replace(whole(), gaze={"provenance": {"test": {"people": ["Ada"]}}}))
+
+
+def test_shares_that_few_people_could_see_are_hidden():
+    objects = next(s for s in SECTIONS if s.name == "objects")
+    said = text_of(objects, replace(whole(), least=3))
+    assert "otherhidden" in said and "fewer than 3" in said and said.count("25.00") == 2
+    assert "hidden" not in text_of(objects, whole())
+
+
+def test_without_people_there_are_no_intervals_of_shares():
+    objects = next(s for s in SECTIONS if s.name == "objects")
+    (first, *_) = whole().objects
+    alone = replace(first, recorded=None, saw=None, looked=None, people=None)
+    said = text_of(objects, replace(whole(), objects=(alone,), eyes=1))
+    assert "at 1 place" in said and "rays recorded" not in said
+
+
+def test_one_split_each():
+    both = whole().results[0]
+    run = replace(whole(), results=(both, replace(both, split="pos", people=3)))
+    verdict, scores = (next(s for s in SECTIONS if s.name == n) for n in ("verdict", "scores"))
+    assert "No verdict for known people at new places: 3 people" in text_of(verdict, run)
+    assert "Known people at new places (3 people, 60 places)" in text_of(scores, run)
+    assert HOSTILE not in scores.body(replace(run, results=(replace(both, split=HOSTILE),)))

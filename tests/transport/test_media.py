@@ -23,9 +23,6 @@ from nerg_mi.transport.volume_medium import KnownEmpty, VolumeMedium
 from tests.maths.test_geometry import turn
 from tests.transport.test_splat_medium import medium_of, stack
 
-# ---- Tests of `nerg_mi.transport.medium` ----
-
-
 # ---- Cells ----
 #
 # The bound of a grid volume: nothing that its interpolant can return lies in a cell that counts as empty.

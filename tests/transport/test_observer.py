@@ -30,9 +30,6 @@ from nerg_mi.transport.observer import (
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.plugins.scenes import plugin
 
-# ---- Tests of `nerg_mi.transport.observer` ----
-
-
 # ---- What is kept of observers: for the same position, as long as what it was made of is the same ----
 
 
@@ -407,9 +404,6 @@ def test07_gradients_are_finite_on_the_very_edge():
     assert y.numpy().tolist() == [1, 1, 0]
     dr.backward(dr.sum(y), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
     assert not dr.grad(d).numpy().any()
-
-
-# ---- Tests of `nerg_mi.transport.jit` ----
 
 
 # ---- Arrays are told apart by identity, also where an object is assigned to and the old variable is gone ----

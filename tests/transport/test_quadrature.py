@@ -34,9 +34,6 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.plugins.scenes import camera, channels, constant, named, render
 from tests.reference import march_numpy as reference
 
-# ---- Tests of `nerg_mi.transport.quadrature` ----
-
-
 # ---- The step rule against integrals in extended precision, and its invariances ----
 
 

@@ -38,9 +38,6 @@ def rays(count: int, seed: int = 0, size: float = 1.2) -> tuple[np.ndarray, np.n
     return o.astype(np.float32), (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
 
 
-# ---- Tests of `nerg_mi.transport.splat_medium` ----
-
-
 # ---- Arrays ----
 
 

@@ -1,12 +1,69 @@
-"""The demo store, and a scene of a few shapes whose answers are known, for tests of the viewer."""
+"""The demo store, a room of a few shapes whose answers are known, and gaze fields in it."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 
 import nerg_mi as nerg
+from nerg_mi.fields.encoding import HashGridConfig
+from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.formats.fields import save_gaze
+from nerg_mi.maths.geometry import Box
 from nerg_mi.workflows import demo
-from tests.viewer.room import ROOM, write_gaze_fields
+
+# ---- A room of a few shapes whose answers are known, and gaze fields in it ----
+
+
+ROOM = """<scene version="3.0.0">
+    <integrator type="nerg" id="integrator">
+        <integrator type="direct"/>
+        <sensor name="observer" type="perspective">
+            <transform name="to_world"><lookat origin="0, 0, 0.5" target="1, 0, 0.5" up="0, 0, 1"/></transform>
+        </sensor>
+        <string name="aovs" value="depth"/>
+    </integrator>
+    <sensor type="perspective">
+        <float name="fov" value="60"/>
+        <transform name="to_world"><lookat origin="-2, 0, 1" target="2, 0, 0" up="0, 0, 1"/></transform>
+        <sampler type="independent"><integer name="sample_count" value="2"/></sampler>
+        <film type="hdrfilm">
+            <integer name="width" value="48"/><integer name="height" value="32"/><rfilter type="box"/>
+        </film>
+    </sensor>
+    <shape type="rectangle" id="floor">
+        <transform name="to_world"><scale value="3"/></transform>
+    </shape>
+    <shape type="cube" id="box">
+        <transform name="to_world"><scale value="0.5"/><translate x="1.5" z="0.5"/></transform>
+    </shape>
+    <emitter type="constant"/>
+</scene>
+"""
+
+
+def write_gaze_fields(folder: Path) -> list[Path]:
+    """Two untrained gaze fields in the room, of both factors and of emit alone: emit_capture.safetensors and
+    emit.safetensors in ``folder``."""
+    files, rng = [], np.random.default_rng(3)
+    grid = HashGridConfig(levels=2, log2_rows=10, base=2, finest=4)
+    for variant in ("emit_capture", "emit"):
+        config = LogGazeConfig(grid=grid, width=16, prior=8, variant=variant)
+        field = LogGazeField.random(
+            config, Box((-3, -3, -1), (3, 3, 2)), namespace("llvm"), 1, rng.normal(size=(8, 16))
+        )
+        # So that they differ beyond what one lacks.
+        table = field.grid.table
+        field.set_parameters({"grid.table": type(table)(rng.normal(size=len(table)).astype(np.float32))})
+        files.append(folder / f"{variant}.safetensors")
+        save_gaze(field, files[-1], {})
+    return files
+
+
+# ---- The demo store, and a scene of a few shapes whose answers are known, for tests of the viewer ----
 
 
 @pytest.fixture

@@ -1,15 +1,26 @@
-"""Tests of `nerg_mi.viewer.server`."""
+"""Who may talk to the viewer, what it serves and for how long, and how many points a browser is given."""
 
 from __future__ import annotations
 
 import http.client
 import socket
+import sys
+import time
+from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.viewer import serve
+from nerg_mi.viewer.page import BrowserWindow
+from nerg_mi.viewer.points import LEVELS
+from nerg_mi.viewer.serve import view_files, viewer
 from nerg_mi.viewer.server import CLIENTS, MESSAGE_BYTES, Guard, is_loopback, new_token, start_server
+from nerg_mi.workflows.view import ViewOptions
+from tests.viewer import browser
 from tests.viewer.browser import require
+from tests.workflows.recorder import Recorder
 
 # ---- Who is refused: other names, other sites, and whoever has no token ----
 
@@ -258,3 +269,127 @@ def test09_without_the_extra_a_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(NergError, match=r'pip install "nerg-mi\[viewer\]"'):
         start_server(Guard("127.0.0.1"), 0, "test")
+
+
+# ---- A viewer from files to an address ----
+
+
+@pytest.fixture
+def _viser():
+    require("viser")
+
+
+def answer_of(address: str) -> int:
+    parts = urlsplit(address)
+    connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=10)
+    connection.request("GET", f"/?{parts.query}")
+    return connection.getresponse().status
+
+
+@pytest.mark.usefixtures("_viser")
+def test01_an_address_that_answers_for_as_long_as_the_block(room):
+    with viewer([room], ViewOptions(port=0)) as running:
+        assert answer_of(running.address) == 200 and urlsplit(running.address).hostname == "127.0.0.1"
+        address = running.address
+    with pytest.raises(ConnectionError):
+        answer_of(address)
+
+
+@pytest.mark.usefixtures("_viser")
+def test02_elsewhere_there_is_a_token(room):
+    with viewer([room], ViewOptions(host="0.0.0.0", port=0)) as running:
+        assert answer_of(running.address) == 200
+        assert answer_of(running.address.partition("?")[0]) == 403
+
+
+@pytest.mark.usefixtures("_viser")
+def test03_a_moved_observer_is_seen_by_all(room):
+    with viewer([room], ViewOptions(port=0)) as running:
+        page, session = running.page, running.page.session
+        page.place_observer(np.array([3.0, 0, 0.5]), np.eye(3))
+        assert np.allclose(page._observer.position, [3, 0, 0.5]) and np.allclose(page._observer.wxyz, [1, 0, 0, 0])
+        end = time.monotonic() + 60
+        while session.baked_for is None or not np.array_equal(session.baked_for, session.observer):
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert page.problem == ""
+        page.on_error(KeyError("x"))
+        assert "mistake in the program" in page.problem
+
+
+@pytest.mark.usefixtures("_viser")
+def test04_until_ctrl_c(room, monkeypatch):
+    told = Recorder()
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(serve, "_wait", interrupted)
+    view_files([room], ViewOptions(port=0), told)
+    assert any(text.startswith("open http://127.0.0.1:") for text in told.messages)
+    assert told.messages[-1] == "the viewer has ended"
+
+
+@pytest.mark.usefixtures("_viser")
+def test05_files_that_are_not_there(tmp_path):
+    with pytest.raises(NergError, match="no file"):
+        with viewer([tmp_path / "a.xml"], ViewOptions(port=0)):
+            pass
+
+
+# ---- A browser is given as many points as it draws quickly ----
+
+
+@pytest.mark.parametrize(
+    ("seconds", "at_rest", "change"),
+    [(0.2, False, 1), (0.2, True, 1), (0.03, True, 0), (0.017, True, -1), (0.017, False, 0)],
+)
+def test01_points_follow_the_pace(seconds, at_rest, change):
+    window = BrowserWindow(None, None)
+    before = window.level
+    for _ in range(20):
+        window.learn_pace(seconds)
+    # The mouse rests now and then, and the page was left for a while.
+    for pause in (0.4, 0.9, 60.0):
+        window.learn_pace(pause)
+    assert window.level_for_pace(at_rest) == before + change
+
+
+def test02_a_few_frames_say_nothing_and_levels_have_an_end():
+    window = BrowserWindow(None, None)
+    window.learn_pace(0.9)
+    assert window.level_for_pace(True) == window.level
+    for pace, end in ((0.5, LEVELS - 1), (0.01, 0)):
+        window.frames[:] = [pace] * 20
+        for _ in range(2 * LEVELS):
+            window.level = window.level_for_pace(True)
+        assert window.level == end
+
+
+def test03_slow_frames_are_no_rest():
+    window = BrowserWindow(None, None)
+    assert window.rest == pytest.approx(0.12)
+    for _ in range(10):
+        window.learn_pace(0.02)
+    assert window.rest == pytest.approx(0.12)
+    window.learn_pace(0.9)
+    assert window.rest == pytest.approx(0.12)
+    for _ in range(8):
+        window.learn_pace(0.2)
+    assert window.rest == pytest.approx(0.6)
+    for _ in range(10):
+        window.learn_pace(0.9)
+    assert window.rest == pytest.approx(0.8)
+
+
+# ---- What is missing skips a test, or fails it where that was asked for ----
+
+
+def test01_what_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.setattr(browser, "REQUIRED", False)
+    with pytest.raises(pytest.skip.Exception, match=r"viser is not installed"):
+        browser.require("viser")
+    monkeypatch.setattr(browser, "REQUIRED", True)
+    with pytest.raises(pytest.fail.Exception, match="NERG_REQUIRE_BROWSER"):
+        browser.require("viser")
