@@ -33,7 +33,7 @@ from nerg_mi.maths.geometry import Similarity, box_interval
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import COORDINATES
 from nerg_mi.rays.readers.tables import iterate_table
-from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.statistics.shares import Look
 from nerg_mi.statistics.visits import Aoi, BoxAoi

@@ -27,7 +27,7 @@ from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.splats import plugin_of_field
 from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import plugin_class
-from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene_writer import clip_distances
 from nerg_mi.transport.geometry import check_shape
 
@@ -451,7 +451,7 @@ class Scene:
         results to the bit in less time, after some seconds of compilation (the page on performance, "Weights as
         constants"). ``constant`` false takes it back."""
         from nerg_mi.fields.mlp import set_constant_weights
-        from nerg_mi.rendering.aovs import fields_of
+        from nerg_mi.rendering.bands import fields_of
 
         for trained in fields_of(self.integrator):
             set_constant_weights(trained, constant)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.geometry import Place

@@ -97,19 +97,6 @@ def pixel_directions(width: int, height: int) -> np.ndarray:
     return np.stack([np.sin(φ) * np.sin(θ), np.cos(θ), -np.cos(φ) * np.sin(θ)], axis=-1)
 
 
-def direction_pixels(directions: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Where on the picture a direction lies, in pixels: shape (..., 2) as (x, y), the inverse of the mapping above.
-
-    `directions`: (..., 3), in the panorama's own frame, of any length but zero. x is in [0, width], y in
-    [1/2, height - 1/2].
-    """
-    _check(width, height)
-    v = np.asarray(directions, dtype=np.float64)
-    φ = np.arctan2(v[..., 0], -v[..., 2]) % (2 * np.pi)
-    θ = np.arctan2(np.hypot(v[..., 0], v[..., 2]), v[..., 1])  # precise at the poles, where acos is not
-    return np.stack([φ / (2 * np.pi) * width, θ / np.pi * (height - 1) + 0.5], axis=-1)
-
-
 def pixel_solid_angles(width: int, height: int) -> np.ndarray:
     """Solid angle in steradian that each pixel stands for: shape (height, width), float64; the sum is 4π.
 

@@ -29,7 +29,7 @@ from nerg_mi.ranges import VALUES
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.tables import iterate_table, table_columns
-from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.laplacian import SurfaceSums
 from nerg_mi.surfaces.mesh import (

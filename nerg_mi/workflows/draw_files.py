@@ -23,8 +23,7 @@ from nerg_mi.figures.overlay import (
     shared_limits,
     top_of,
 )
-from nerg_mi.figures.sheets import contact_sheet, shrink
-from nerg_mi.figures.style import find_colors
+from nerg_mi.figures.style import contact_sheet, find_colors, shrink
 from nerg_mi.files.images import read_exr, read_exr_text
 from nerg_mi.files.safe_read import reading
 from nerg_mi.formats.meshes import read_mesh_file

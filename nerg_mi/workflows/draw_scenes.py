@@ -31,7 +31,7 @@ from nerg_mi.ranges import COORDINATES, DECADES, SEEDS, SPP, VALUES, Checked, Ra
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.aovs import nerg_of
+from nerg_mi.rendering.bands import nerg_of
 from nerg_mi.rendering.scene import activate, load_scene
 from nerg_mi.rendering.scene_writer import pixel_of
 from nerg_mi.transport.geometry import Place, pixel_solid_angles, trace_depth
@@ -151,7 +151,7 @@ def _draw_floor(files: Sequence[Path], options: FloorOptions, reporter: Reporter
     low, high = _corners(rays)
     inputs, walls = [path], None
     if options.scene is not None:
-        from nerg_mi.rendering.aovs import nerg_of
+        from nerg_mi.rendering.bands import nerg_of
         from nerg_mi.rendering.scene import activate, load_scene
 
         activate(options.mode)

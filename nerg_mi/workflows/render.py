@@ -22,8 +22,7 @@ from nerg_mi.files.atomic import check_writable, write_bytes
 from nerg_mi.files.video import check_video, video_frames
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering import bands
-from nerg_mi.rendering.aovs import is_nerg, prepare_for, render_asked
-from nerg_mi.rendering.bands import SamplePace
+from nerg_mi.rendering.bands import SamplePace, is_nerg, prepare_for, render_asked
 from nerg_mi.rendering.files import FORMATS, DisplayRows, numbered, picture_rows, read_frames
 from nerg_mi.rendering.scene import activate, files_of_scene, load_scene
 from nerg_mi.rendering.scene_writer import pixel_of

@@ -19,7 +19,7 @@ from nerg_mi.ranges import COORDINATES, SPP, Checked, Range
 from nerg_mi.rays.dataset import is_dataset
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.aovs import is_nerg
+from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.nested_scene import gaze_of_scene, with_gaze
 from nerg_mi.rendering.scene import load_scene
 

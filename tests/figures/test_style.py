@@ -19,13 +19,13 @@ import pytest
 import nerg_mi
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat, add_scale, gaze_figure, overlay, scale_strip
-from nerg_mi.figures.sheets import contact_sheet, shrink
 from nerg_mi.figures.style import (
     DIVERGING,
     SEQUENTIAL,
     Provenance,
     Sheet,
     color_values,
+    contact_sheet,
     encode,
     even,
     files_among,
@@ -35,6 +35,7 @@ from nerg_mi.figures.style import (
     provenance,
     rasterize,
     save,
+    shrink,
     swatch,
     ticks_of,
     wrap,

@@ -7,8 +7,19 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rendering import bands
-from nerg_mi.rendering.aovs import SAMPLES, fields_of, prepare_for, render_asked
-from nerg_mi.rendering.bands import LEAST, PACKET, Channels, OwnLayer, SamplePace, render_bands, render_channels
+from nerg_mi.rendering.bands import (
+    LEAST,
+    PACKET,
+    SAMPLES,
+    Channels,
+    OwnLayer,
+    SamplePace,
+    fields_of,
+    prepare_for,
+    render_asked,
+    render_bands,
+    render_channels,
+)
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.workflows.demo import store_scene
 from tests.plugins import fields

@@ -12,8 +12,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import top_of
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.images import read_exr_text
-from nerg_mi.rendering import aovs
-from nerg_mi.rendering.aovs import prepare_for, render_asked
+from nerg_mi.rendering import bands
+from nerg_mi.rendering.bands import prepare_for, render_asked
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.workflows import render
 from nerg_mi.workflows.demo import store_scene
@@ -274,7 +274,7 @@ def test_long_renders_are_prepared_and_the_same_to_the_byte(tmp_path, monkeypatc
     options = PicturesPictureOptions(defaults={"width": "24", "height": "16"}, spp=2, mode="llvm_ad_rgb")
     render_file(store_scene(), tmp_path / "a.png", options)
     prepared = []
-    monkeypatch.setattr(aovs, "SAMPLES", 24 * 16 * 2)
+    monkeypatch.setattr(bands, "SAMPLES", 24 * 16 * 2)
     monkeypatch.setattr(
         render, "prepare_for", lambda samples, scene: prepared.append(prepare_for(samples, scene)) or prepared[-1]
     )

@@ -10,7 +10,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Style, find_overlay
 from nerg_mi.ranges import RANGE
-from nerg_mi.rendering.aovs import render_asked
+from nerg_mi.rendering.bands import render_asked
 from nerg_mi.transport.geometry import pixel_directions
 from nerg_mi.workflows import draw_scenes as scenes
 from nerg_mi.workflows.draw import draw
