@@ -469,12 +469,12 @@ class AreasPanel:
                 lower, upper = box_around(proxy.points, proxy.size, view, drawn.screen_min, drawn.screen_max)
                 self.add(Region.of(name, lower, upper))
             except NergError as error:
-                tell(client, "AreasPanel", sentence(error))
+                tell(client, "Areas", sentence(error))
                 return
             self._name.value = f"area {len(self.session.regions) + 1}"
 
         # Messages arrive in order: whoever reads this can draw, and does not turn the camera instead.
-        tell(client, "AreasPanel", "Draw a rectangle around a thing: a box is laid around what is in it.")
+        tell(client, "Areas", "Draw a rectangle around a thing: a box is laid around what is in it.")
 
     def _remove(self, event: Any) -> None:
         self.session.regions = [r for r in self.session.regions if r.name != self._chosen.value]

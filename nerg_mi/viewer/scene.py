@@ -161,7 +161,7 @@ class PeoplePanel:
         self._recorded: dict[str, Any] = {}
         gui = page.server.gui
         first, last = tracks.times
-        with gui.add_folder("PeoplePanel"):
+        with gui.add_folder("People"):
             self._group = gui.add_dropdown("Who", tracks.groups, initial_value=ALL)
             self._drawn = gui.add_checkbox("Paths", False)
             self._rays = gui.add_checkbox("Rays", False)
