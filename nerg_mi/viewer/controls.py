@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from html import escape
 from typing import Any
 
@@ -40,6 +42,15 @@ def tell(event_or_client: Any, title: str, text: str) -> None:
     client = getattr(event_or_client, "client", event_or_client)
     if client is not None:
         client.add_notification(title=title, body=text, with_close_button=True, auto_close_seconds=12.0)
+
+
+@contextmanager
+def telling(event_or_client: Any, title: str) -> Iterator[None]:
+    """Tell one page of what is refused within the block, which ends there."""
+    try:
+        yield
+    except NergError as error:
+        tell(event_or_client, title, sentence(error))
 
 
 class Inset:
@@ -111,7 +122,6 @@ class Controls:
             if event.client is None:
                 # Written by the program, which has set all else.
                 return
-            fixed = None
             chosen = next(la for la in session.layers if la.title == layer.value)
             if tuple(colors.options) != _maps_of(chosen):
                 colors.options = _maps_of(chosen)
@@ -119,22 +129,15 @@ class Controls:
                 # A range in 1/sr says nothing of metres.
                 automatic.value = True
             ends.disabled = automatic.value
-            if automatic.value:
-                scale = session.scale()
-            elif event.target is automatic:
+            if event.target is automatic and not automatic.value:
                 scale = session.scale()
                 ends.value = (float(f"{scale.low:.3g}"), float(f"{scale.high:.3g}"))
-                fixed = ends.value
-            else:
-                fixed = ends.value
-            if fixed is not None:
-                try:
-                    Scale(fixed[0], fixed[1])
-                except NergError as error:
-                    tell(event, "Range", sentence(error))
-                    return
-            session.set_shade(layer=chosen, colors=None if colors.value == _USUAL else colors.value, fixed=fixed)
-            self._shown_anew()
+            fixed = None if automatic.value else ends.value
+            with telling(event, "Range"):
+                if fixed is not None:
+                    Scale(*fixed)
+                session.set_shade(layer=chosen, colors=None if colors.value == _USUAL else colors.value, fixed=fixed)
+                self._shown_anew()
 
         for handle in (layer, colors, automatic, ends):
             handle.on_update(change)
@@ -159,13 +162,10 @@ class Controls:
 
         @falloff.on_update
         def _(event: Any) -> None:
-            try:
+            with telling(event, "Fall-off"):
                 session.set_falloff(falloff.value)
-            except NergError as error:
-                tell(event, "Fall-off", sentence(error))
-                return
-            self.page.follow()
-            self._shown_anew()
+                self.page.follow()
+                self._shown_anew()
 
     def _shown_anew(self) -> None:
         self.page.recolor()
@@ -299,25 +299,18 @@ class Controls:
             if window is None or window.last is None:
                 tell(event, "Picture", "There is no picture yet: wait until the view rests.")
                 return
-            try:
-                about = about_picture(session, window)
-            except NergError as error:
-                tell(event, "Picture", sentence(error))
-                return
-            data = png_bytes(session, window.last[1], about.text())
-            event.client.send_file_download("view.png", data, save_immediately=True)
+            with telling(event, "Picture"):
+                data = png_bytes(session, window.last[1], about_picture(session, window).text())
+                event.client.send_file_download("view.png", data, save_immediately=True)
 
         @copy.on_click
         def _(event: Any) -> None:
             window = self._window(event)
             if window is None or window.view is None:
                 return
-            try:
+            with telling(event, "Scene"):
                 text = copied_view(session, window.view)
-            except NergError as error:
-                tell(event, "Scene", sentence(error))
-                return
-            event.client.send_file_download("view.xml", text.encode(), save_immediately=True)
+                event.client.send_file_download("view.xml", text.encode(), save_immediately=True)
 
     def _window(self, event: Any) -> BrowserWindow | None:
         return None if event.client is None else self.page.windows.get(event.client.client_id)
@@ -461,17 +454,13 @@ class AreasPanel:
         @scene.on_rect_select()
         def _(drawn: Any) -> None:
             scene.remove_rect_select_callback()
-            proxy = self.session.proxy
-            view = PinholeView.of_page(client.camera)
-            try:
+            proxy, view = self.session.proxy, PinholeView.of_page(client.camera)
+            with telling(client, "Areas"):
                 if proxy is None:
                     raise NergError("there are no points to lay a box around yet; wait a moment")
                 lower, upper = box_around(proxy.points, proxy.size, view, drawn.screen_min, drawn.screen_max)
                 self.add(Region.of(name, lower, upper))
-            except NergError as error:
-                tell(client, "Areas", sentence(error))
-                return
-            self._name.value = f"area {len(self.session.regions) + 1}"
+                self._name.value = f"area {len(self.session.regions) + 1}"
 
         # Messages arrive in order: whoever reads this can draw, and does not turn the camera instead.
         tell(client, "Areas", "Draw a rectangle around a thing: a box is laid around what is in it.")

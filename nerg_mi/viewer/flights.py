@@ -22,7 +22,7 @@ from nerg_mi.workflows.options import PictureOptions
 from nerg_mi.workflows.render import render_file
 
 from . import layers
-from .controls import tell
+from .controls import tell, telling
 from .layers import Layer, Scale
 from .page import Page
 from .points import PinholeView
@@ -49,16 +49,11 @@ def film_options(layer: Layer, scale: Scale, frames: Path, fps: float, mode: str
     """How `render_file` draws the frames of the file ``frames`` as ``layer`` shows them, with the ends and colours of
     ``scale``."""
     overlay = layer.overlay
+    options = PictureOptions(frames=frames, fps=fps, mode=mode)
     if overlay is None:
-        return PictureOptions(frames=frames, fps=fps, mode=mode)
-    return PictureOptions(
-        frames=frames,
-        fps=fps,
-        mode=mode,
-        overlay=overlay.name,
-        top=scale.high if overlay.scaled else None,
-        cmap=None if layer.kind == "shade" else scale.colors,
-    )
+        return options
+    top, cmap = scale.high if overlay.scaled else None, None if layer.kind == "shade" else scale.colors
+    return replace(options, overlay=overlay.name, top=top, cmap=cmap)
 
 
 class Film:
@@ -214,13 +209,10 @@ class Flying:
         tell(event, TITLE, "One view is kept." if count == 1 else f"{count} views are kept.")
 
     def _save_frames(self, event: Any) -> None:
-        try:
+        with telling(event, TITLE):
             text = frames_csv(flight(self._kept, self._seconds.value, self._fps.value))
-        except NergError as error:
-            tell(event, TITLE, sentence(error))
-            return
-        event.client.send_file_download("view.frames.csv", text.encode(), save_immediately=True)
-        tell(event, TITLE, "nerg render view.xml -o flight.mp4 --frames view.frames.csv renders it.")
+            event.client.send_file_download("view.frames.csv", text.encode(), save_immediately=True)
+            tell(event, TITLE, "nerg render view.xml -o flight.mp4 --frames view.frames.csv renders it.")
 
     def _begin(self, event: Any) -> None:
         """Make a video, and send it to the page that asked."""

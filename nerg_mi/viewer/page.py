@@ -200,8 +200,8 @@ class Page:
 
     def _show_gizmo(self) -> None:
         """The gizmo, but not to somebody alone who looks out of the observer's eye: it would fill the view."""
-        near = [w for w in self.windows.values() if w.view is not None]
-        away = [float(np.linalg.norm(w.view.origin - self.session.observer)) for w in near if w.view is not None]
+        views = [w.view for w in self.windows.values() if w.view is not None]
+        away = [float(np.linalg.norm(view.origin - self.session.observer)) for view in views]
         visible = len(away) != 1 or away[0] > _NEAR
         if self._observer.visible != visible:
             self._observer.visible = visible

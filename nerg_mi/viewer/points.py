@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -207,7 +207,7 @@ def refine(
                 part, size = directions[done : done + pace.rays], pace.rays
                 turn = seed + 7919 * sample + done
                 # The last and largest picture is that of the scene's own settings.
-                with rough_integrals(scene, share > 1), cut(scene, ceiling):
+                with rough_integrals(scene, share > 1), changed(scene, "ceiling", ceiling):
                     found = _traced(scene, view.origin, filled(part, size), quantities, observer, turn)
                 parts.append({name: v[: len(part)] for name, v in found.items()})
                 pace.learn(time.perf_counter() - began)
@@ -225,28 +225,21 @@ def refine(
 
 
 @contextmanager
-def rough_integrals(scene: Scene, rough: bool = True) -> Iterator[None]:
+def changed(scene: Scene, name: str, value: Any) -> Iterator[None]:
+    """Let the scene's integrator have this attribute within the block."""
+    before = getattr(scene.integrator, name)
+    setattr(scene.integrator, name, value)
+    try:
+        yield
+    finally:
+        setattr(scene.integrator, name, before)
+
+
+def rough_integrals(scene: Scene, rough: bool = True) -> AbstractContextManager[None]:
     """Let gaze fields be integrated over `DIRECTIONS` alone within the block, where ``rough``."""
-    integrator = scene.integrator
-    own = integrator.observer_settings
-    if rough and own.directions > DIRECTIONS:
-        integrator.observer_settings = replace(own, directions=DIRECTIONS)
-    try:
-        yield
-    finally:
-        integrator.observer_settings = own
-
-
-@contextmanager
-def cut(scene: Scene, ceiling: Ceiling | None) -> Iterator[None]:
-    """Leave out what is above the ``ceiling`` within the block."""
-    integrator = scene.integrator
-    own = integrator.ceiling
-    integrator.ceiling = ceiling
-    try:
-        yield
-    finally:
-        integrator.ceiling = own
+    settings = scene.integrator.observer_settings
+    fewer = replace(settings, directions=min(settings.directions, DIRECTIONS)) if rough else settings
+    return changed(scene, "observer_settings", fewer)
 
 
 def filled(directions: np.ndarray, size: int) -> np.ndarray:
