@@ -207,15 +207,9 @@ def test_layout_says_how_far_the_rays_reach(rays):
 
 
 def row(thing, source, share):
-    return {
-        "thing": thing,
-        "source": source,
-        "share": share,
-        "share_low": share / 2,
-        "share_high": 2 * share,
-        "reach": None,
-        "dwell": 1.0,
-    }
+    return dict(
+        thing=thing, source=source, share=share, share_low=share / 2, share_high=2 * share, reach=None, dwell=1.0
+    )
 
 
 def test01_bars_are_as_long_as_shares_and_sorted():

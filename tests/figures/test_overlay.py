@@ -157,12 +157,12 @@ def test01_pixel_for_pixel(rgb, tmp_path):
 
 @pytest.mark.parametrize("name", ["depth", "gaze", "visibility", "occlusion"])
 def test02_equal_input_equal_file(tmp_path, name):
-    draw = {
-        "depth": lambda: figures.depth_figure(3 + GAZE, MASK),
-        "gaze": lambda: figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT),
-        "visibility": lambda: figures.visibility_figure(PLOTS_COLOR, GAZE, MASK),
-        "occlusion": lambda: figures.occlusion_figure(*[(PLOTS_COLOR, GAZE, MASK)] * 3, HEAT, (3, 4)),
-    }[name]
+    draw = dict(
+        depth=lambda: figures.depth_figure(3 + GAZE, MASK),
+        gaze=lambda: figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT),
+        visibility=lambda: figures.visibility_figure(PLOTS_COLOR, GAZE, MASK),
+        occlusion=lambda: figures.occlusion_figure(*[(PLOTS_COLOR, GAZE, MASK)] * 3, HEAT, (3, 4)),
+    )[name]
     for k in "ab":
         save(draw(), tmp_path / f"{k}.png", {"Comment": "seed 1"})
     a, b = ((tmp_path / f"{k}.png").read_bytes() for k in "ab")

@@ -125,11 +125,7 @@ def test_everything_is_said(tmp_path):
     found = json.loads(about.text()["Comment"])
     assert found["inputs"] == {"scene.xml": hashlib.sha256(b"<scene/>").hexdigest()}
     assert (found["what"], found["seed"], found["settings"]) == ("nerg render", 7, {"spp": 4})
-    assert found["versions"] == {
-        "nerg_mi": nerg_mi.__version__,
-        "mitsuba": mitsuba.__version__,
-        "drjit": drjit.__version__,
-    }
+    assert found["versions"] == dict(nerg_mi=nerg_mi.__version__, mitsuba=mitsuba.__version__, drjit=drjit.__version__)
     assert about.text()["Software"] == ", ".join(f"{k} {found['versions'][k]}" for k in ("nerg_mi", "mitsuba", "drjit"))
 
 

@@ -23,7 +23,7 @@ from nerg_mi.rendering.bands import (
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.workflows.demo import store_scene
 from tests.plugins import fields
-from tests.plugins.scenes import camera, constant, observer_at, with_gaze
+from tests.plugins.scenes import camera, constant, observer_at, plugin, with_gaze
 
 # ---- A picture is the same however it is divided, and its memory is that of a band ----
 
@@ -31,40 +31,40 @@ from tests.plugins.scenes import camera, constant, observer_at, with_gaze
 def neural(mi, folder, sensor, **kwargs):
     fields.radiance(folder / "field.safetensors", density_scale=2.0)
     fields.gaze(folder / "gaze.safetensors")
-    integrator = {
-        "type": "nerg",
-        "field": {"type": "nerf", "filename": str(folder / "field.safetensors")},
-        "gaze": {"type": "gazefield", "filename": str(folder / "gaze.safetensors")},
-        "aovs": "depth,gaze,visibility,position",
-        "jitter": True,
+    integrator = plugin(
+        "nerg",
+        field={"type": "nerf", "filename": str(folder / "field.safetensors")},
+        gaze={"type": "gazefield", "filename": str(folder / "gaze.safetensors")},
+        aovs="depth,gaze,visibility,position",
+        jitter=True,
         **kwargs,
-    }
+    )
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
 
 
 def panorama(mi):
-    return {
-        "type": "panorama",
-        "to_world": mi.ScalarTransform4f().translate([0.3, 0, -2]),
-        "film": camera(mi)["film"] | {"width": 24, "height": 13},
-    }
+    return plugin(
+        "panorama",
+        to_world=mi.ScalarTransform4f().translate([0.3, 0, -2]),
+        film=camera(mi)["film"] | {"width": 24, "height": 13},
+    )
 
 
 def lit(mi, film, sensor="perspective", sampler="independent"):
     """A textured ball under `path`, which draws random numbers in a loop of its own."""
     return mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "aov", "aovs": "dd:depth", "in": {"type": "path", "max_depth": 3}},
-            "ball": {"type": "sphere", "b": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}},
-            "sky": {"type": "constant"},
-            "sensor": {
-                "type": sensor,
-                "to_world": mi.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", **film},
-                "sampler": {"type": sampler, "seed": 11},
-            },
-        }
+        plugin(
+            "scene",
+            integrator={"type": "aov", "aovs": "dd:depth", "in": {"type": "path", "max_depth": 3}},
+            ball={"type": "sphere", "b": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}},
+            sky={"type": "constant"},
+            sensor=plugin(
+                sensor,
+                to_world=mi.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0]),
+                film={"type": "hdrfilm", **film},
+                sampler={"type": sampler, "seed": 11},
+            ),
+        )
     )
 
 
@@ -93,24 +93,19 @@ def test_shapes_are_the_same_to_the_bit(rgb, spp):
 def test_a_camera_in_fog_is_the_same_to_the_bit(rgb):
     fog = {"type": "homogeneous", "albedo": 0.9, "sigma_t": 0.8}
     scene = rgb.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "volpath", "max_depth": 4},
-            "sky": {"type": "constant"},
-            "room": {
-                "type": "cube",
-                "to_world": rgb.ScalarTransform4f().scale(3),
-                "bsdf": {"type": "null"},
-                "interior": fog,
-            },
-            "ball": {"type": "sphere", "radius": 0.5},
-            "sensor": {
-                "type": "perspective",
-                "to_world": rgb.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0]),
-                "medium": fog,
-                "film": {"type": "hdrfilm", **BOX},
-            },
-        }
+        plugin(
+            "scene",
+            integrator={"type": "volpath", "max_depth": 4},
+            sky={"type": "constant"},
+            room=plugin("cube", to_world=rgb.ScalarTransform4f().scale(3), bsdf={"type": "null"}, interior=fog),
+            ball={"type": "sphere", "radius": 0.5},
+            sensor=plugin(
+                "perspective",
+                to_world=rgb.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0]),
+                medium=fog,
+                film={"type": "hdrfilm", **BOX},
+            ),
+        )
     )
     assert bands.why_whole(scene, scene.sensors()[0]) is None
     assert np.array_equal(divided(scene, 4, rows=4), whole(rgb, scene, 4))
@@ -238,19 +233,15 @@ def test_progress_and_stopping(rgb):
 @pytest.fixture
 def scene_channels(rgb):
     return rgb.load_dict(
-        {
-            "type": "scene",
-            "integrator": {
-                "type": "nerg",
-                "density": {"type": "constvolume", "value": 3.0},
-                "aovs": "depth,opacity,position",
-            },
-            "sensor": {
-                "type": "perspective",
-                "to_world": rgb.ScalarTransform4f().look_at([0.5, 0.5, -2], [0.5, 0.5, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", "width": 9, "height": 6, "rfilter": {"type": "box"}},
-            },
-        }
+        plugin(
+            "scene",
+            integrator=plugin("nerg", density={"type": "constvolume", "value": 3.0}, aovs="depth,opacity,position"),
+            sensor=plugin(
+                "perspective",
+                to_world=rgb.ScalarTransform4f().look_at([0.5, 0.5, -2], [0.5, 0.5, 0], [0, 1, 0]),
+                film={"type": "hdrfilm", "width": 9, "height": 6, "rfilter": {"type": "box"}},
+            ),
+        )
     )
 
 
@@ -266,12 +257,12 @@ def test_each_channel_by_its_name(rgb, scene_channels):
 
 def test_one_channel_of_colour_becomes_three(mono):
     scene = mono.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "direct"},
-            "light": {"type": "constant"},
-            "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 3}},
-        }
+        plugin(
+            "scene",
+            integrator={"type": "direct"},
+            light={"type": "constant"},
+            sensor={"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 3}},
+        )
     )
     assert render_channels(scene, scene.sensors()[0], spp=1).color.shape == (3, 4, 3)
 
@@ -279,14 +270,6 @@ def test_one_channel_of_colour_becomes_three(mono):
 def test_a_surface_is_where_half_is_absorbed():
     seen = Channels(np.zeros((1, 3, 3)), {"opacity": np.array([[0.49, 0.5, 1.0]])}, None)
     assert seen.mask.tolist() == [[False, True, True]]
-
-
-def test_whoever_is_told_may_end_it(scene_channels):
-    def end(done, total):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        render_channels(scene_channels, scene_channels.sensors()[0], spp=1, on_strip=end)
 
 
 # ---- Several pictures of the same rays: each is the one that an integrator makes alone ----

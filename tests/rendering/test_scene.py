@@ -156,23 +156,27 @@ DEADLY = {
 }
 
 
-@pytest.mark.parametrize("name", DEADLY)
-def test_what_would_end_the_process_is_a_sentence(tmp_path, name):
+def written(folder, name):
+    """The scene file of what is deadly, and what is said of it."""
     text, files, said = DEADLY[name]
-    (tmp_path / "s.xml").write_text(text)
+    (folder / "s.xml").write_text(text)
     for file, data in files.items():
-        (tmp_path / file).write_bytes(data)
-    run = [
-        sys.executable,
-        "-c",
-        "from nerg_mi.cli import main; main()",
-        "render",
-        "s.xml",
-        "-o",
-        "a.exr",
-        "-m",
-        "llvm_ad_rgb",
-    ]
+        (folder / file).write_bytes(data)
+    return folder / "s.xml", said
+
+
+@pytest.mark.parametrize("name", [name for name in DEADLY if "film" not in name])
+def test_what_would_end_the_process_is_refused_before_it_is_loaded(tmp_path, name):
+    path, said = written(tmp_path, name)
+    with pytest.raises(NergError, match=said):
+        check_scene_file(path)
+
+
+@pytest.mark.parametrize("name", ["corner", "film", "long film"])
+def test_a_command_says_it_in_a_line(tmp_path, name):
+    path, said = written(tmp_path, name)
+    main = [sys.executable, "-c", "from nerg_mi.cli import main; main()"]
+    run = [*main, "render", path.name, "-o", "a.exr", "-m", "llvm_ad_rgb"]
     done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, timeout=180)
     assert done.returncode == 1, done.stderr[-500:]
     assert len(done.stderr.strip().splitlines()) == 1 and said in done.stderr

@@ -31,6 +31,7 @@ from nerg_mi.rendering.scene_writer import (
     transform,
     value_of,
 )
+from tests.plugins.scenes import plugin
 
 # ---- Where points lie in a picture, against a pinhole written down by hand ----
 
@@ -38,13 +39,13 @@ from nerg_mi.rendering.scene_writer import (
 @pytest.fixture
 def camera(rgb):
     return rgb.load_dict(
-        {
-            "type": "perspective",
-            "fov": 60,
-            "fov_axis": "x",
-            "to_world": rgb.ScalarTransform4f().look_at([1, -4, 2], [0, 0, 1], [0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": 30, "height": 20},
-        }
+        plugin(
+            "perspective",
+            fov=60,
+            fov_axis="x",
+            to_world=rgb.ScalarTransform4f().look_at([1, -4, 2], [0, 0, 1], [0, 0, 1]),
+            film={"type": "hdrfilm", "width": 30, "height": 20},
+        )
     )
 
 

@@ -57,16 +57,16 @@ def whole(name: str = "shelf") -> Run:
     results = GazeResults(
         f"{name}.safetensors", "", "both", 60, 30, 20.0, tuple(scored((0.9, 0.85, 0.3), reach=0.02)), (person,)
     )
-    provenance = {
-        "recipe": name,
-        "steps": 160,
-        "rays": 400,
-        "settings": {"loss": name, "deep": {"rate": 0.01}},
-        "probes": {"radius": 0.25},
-        "test": {"centres": [[0, 0, 1]] * 3, "people": [name], "purged_within": 0.5},
-        "validation": {"cc": 0.7, "kld": 0.4, "zones": 3, "probes": 60},
-        "rays_file": {"file": name},
-    }
+    provenance = dict(
+        recipe=name,
+        steps=160,
+        rays=400,
+        settings={"loss": name, "deep": {"rate": 0.01}},
+        probes={"radius": 0.25},
+        test={"centres": [[0, 0, 1]] * 3, "people": [name], "purged_within": 0.5},
+        validation={"cc": 0.7, "kld": 0.4, "zones": 3, "probes": 60},
+        rays_file={"file": name},
+    )
     # Areas have no such names as turn text round.
     packed = stage((Region.of(name.replace("\u202e", "")[:80], np.zeros(3), np.ones(3)),))
     return Run(

@@ -171,14 +171,14 @@ NAMES = ("Grace", "Ada", "Ada Lovelace", "X")
 
 def named():
     rays = crowd(500)
-    about = {
-        "frame": rays.metadata["frame"],
-        "rows_read": 600,
-        "sources": [{"file": "Ada.csv", "sha256": "0"}],
-        "dropped": [{"reason": "blink", "file": "Ada.csv", "count": 2, "rows": [[1, 2]]}],
-        "steps": [{"step": "filter", "kept": 9, "of": 10, "persons": ["Ada"]}],
-        "remark": "Ada was tired",
-    }
+    about = dict(
+        frame=rays.metadata["frame"],
+        rows_read=600,
+        sources=[{"file": "Ada.csv", "sha256": "0"}],
+        dropped=[{"reason": "blink", "file": "Ada.csv", "count": 2, "rows": [[1, 2]]}],
+        steps=[{"step": "filter", "kept": 9, "of": 10, "persons": ["Ada"]}],
+        remark="Ada was tired",
+    )
     return replace(rays, persons=NAMES, metadata=about)
 
 

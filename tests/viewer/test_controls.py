@@ -147,11 +147,7 @@ def test01_a_factor_that_a_variant_lacks_is_no_layer(room, gaze_fields, tmp_path
 
 
 def test01_a_channel_is_a_layer():
-    found = {
-        "position": np.arange(12.0).reshape(2, 2, 3),
-        "depth": np.ones((2, 2)),
-        "features": np.ones((2, 5)) * range(5),
-    }
+    found = dict(position=np.arange(12.0).reshape(2, 2, 3), depth=np.ones((2, 2)), features=np.ones((2, 5)) * range(5))
     for name, expected in (("position.Y", [[1, 4], [7, 10]]), ("depth", np.ones((2, 2))), ("features.3", [3, 3])):
         assert np.array_equal(layer_of(name).values(found), expected), name
     assert layer_of("gaze").values(found) is None and layer_of("color").values(found) is None

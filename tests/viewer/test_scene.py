@@ -10,7 +10,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.viewer.page import Page
 from nerg_mi.viewer.points import BandPace, PinholeView, refine
-from nerg_mi.viewer.scene import PeoplePanel, Shown, color_of, copied
+from nerg_mi.viewer.scene import PeoplePanel, Shown, copied
 from nerg_mi.viewer.serve import viewer
 from nerg_mi.workflows.view import ViewOptions
 from tests.viewer.browser import require
@@ -88,13 +88,6 @@ def test05_without_an_integrator_there_is_nothing_to_copy(tmp_path, rgb):
 
 
 # ---- People in a page: their paths, a moment, and whose eye the observer follows ----
-
-
-def test01_a_colour_for_each_person():
-    colors = color_of(np.array([0, 1, 0, 11]))
-    assert colors.shape == (4, 3) and colors.dtype == np.uint8
-    assert np.array_equal(colors[0], colors[2]) and np.array_equal(colors[1], colors[3])
-    assert not np.array_equal(colors[0], colors[1])
 
 
 @pytest.fixture

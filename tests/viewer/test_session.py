@@ -15,8 +15,7 @@ from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.nested_scene import with_gaze
-from nerg_mi.viewer import session as session_
-from nerg_mi.viewer import session as session_module
+from nerg_mi.viewer import session as module
 from nerg_mi.viewer.layers import layer_of
 from nerg_mi.viewer.page import Page
 from nerg_mi.viewer.session import ALL, GAP, Listener, Session, Tracks, Worker
@@ -40,8 +39,9 @@ class Heard:
     """A listener that counts."""
 
     def __init__(self):
-        self.proxies = self.baked = self.shares = self.ranges = 0
+        self.proxies = self.baked = self.shares = 0
         self.errors = []
+        self.on_error, self.on_range = self.errors.append, lambda: None
 
     def on_proxy(self):
         self.proxies += 1
@@ -51,12 +51,6 @@ class Heard:
 
     def on_shares(self):
         self.shares += 1
-
-    def on_range(self):
-        self.ranges += 1
-
-    def on_error(self, error):
-        self.errors.append(error)
 
 
 @pytest.fixture
@@ -275,7 +269,7 @@ def test08_what_cannot_be_counted_is_told_once(session_of, room, gaze_fields, mo
         raise NergError("no")
         yield
 
-    monkeypatch.setattr(session_module, "shares_in_steps", refuse)
+    monkeypatch.setattr(module, "shares_in_steps", refuse)
     session = session_of(room, gaze_fields[0])
     assert session.worker.wait_idle(120)
     while not session.follow_shares():
@@ -302,16 +296,16 @@ def test01_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
     faces = {"floor": 2, "box": 12}
     regions = [Region.of("left", (0, 0.5, -0.1), (2, 2, 0.4)), Region.of("right", (0, -2, -0.1), (2, -0.5, 0.4))]
     shapes = [name for name in faces if name in {s.id() for s in scene.mitsuba.shapes() if s.is_mesh()}]
-    steps = list(session_.shares_in_steps(scene, AT, regions, shapes))
+    steps = list(module.shares_in_steps(scene, AT, regions, shapes))
     assert [sorted(step) for step in steps] == [["left", "right"], sorted(shapes)]
     one = nerg.attention(scene, regions[0].corners, observers=AT[None]).share[0]
     assert steps[0]["left"] == pytest.approx(float(one), rel=0.03) and steps[0]["left"] > 0
-    monkeypatch.setattr(session_, "FACES", 1)
-    assert list(session_.shape_groups(scene, shapes)) == [[name] for name in shapes]
+    monkeypatch.setattr(module, "FACES", 1)
+    assert list(module.shape_groups(scene, shapes)) == [[name] for name in shapes]
 
 
 def test02_without_areas_and_shapes_there_is_nothing(scene):
-    assert list(session_.shares_in_steps(scene, AT, [], [])) == []
+    assert list(module.shares_in_steps(scene, AT, [], [])) == []
 
 
 # ---- Paths of people, and where they are at a moment ----
@@ -395,60 +389,51 @@ def test01_all_steps_are_made_on_one_thread(worker):
     assert len({entry[2] for entry in log}) == 1 and log[0][2] != threading.get_ident()
 
 
-def test02_the_urgent_comes_between_the_steps_of_another(worker):
-    log, gate = [], threading.Event()
-    started = threading.Event()
+@pytest.fixture
+def held(worker):
+    """Begins a task of a name and an urgency that waits in its first step: the log of all steps, and what lets it go
+    on."""
 
-    def slow():
-        for k in range(4):
-            started.set()
-            assert gate.wait(10)
-            log.append(("slow", k))
-            yield
+    def begin(name, urgency, count):
+        log, gate, started = [], threading.Event(), threading.Event()
 
-    worker.submit("slow", 5, slow())
-    assert started.wait(10)
+        def task():
+            for k in range(count):
+                started.set()
+                assert gate.wait(10)
+                log.append((name, k))
+                yield
+
+        worker.submit(name, urgency, task())
+        assert started.wait(10)
+        return log, gate.set
+
+    return begin
+
+
+def test02_the_urgent_comes_between_the_steps_of_another(worker, held):
+    log, go_on = held("slow", 5, 4)
     worker.submit("urgent", 0, (log.append(("urgent", k)) for k in range(2)))
-    gate.set()
+    go_on()
     assert worker.wait_idle(10)
     assert log == [("slow", 0), ("urgent", 0), ("urgent", 1), ("slow", 1), ("slow", 2), ("slow", 3)]
 
 
-def test03_a_new_task_of_a_name_replaces_the_old_one(worker):
-    log, gate, started = [], threading.Event(), threading.Event()
-
-    def old():
-        for k in range(100):
-            started.set()
-            assert gate.wait(10)
-            log.append(("old", k))
-            yield
-
-    worker.submit("picture", 3, old())
-    assert started.wait(10)
+def test03_a_new_task_of_a_name_replaces_the_old_one(worker, held):
+    log, go_on = held("picture", 3, 100)
     worker.submit("picture", 3, (log.append(("new", k)) for k in range(3)))
-    gate.set()
+    go_on()
     assert worker.wait_idle(10)
-    assert log == [("old", 0), ("new", 0), ("new", 1), ("new", 2)]
+    assert log == [("picture", 0), ("new", 0), ("new", 1), ("new", 2)]
 
 
-def test04_cancelled_tasks_end(worker):
-    log, gate, started = [], threading.Event(), threading.Event()
-
-    def task():
-        for k in range(100):
-            started.set()
-            assert gate.wait(10)
-            log.append(k)
-            yield
-
-    worker.submit("picture", 3, task())
-    assert started.wait(10)
+def test04_cancelled_tasks_end(worker, held):
+    log, go_on = held("picture", 3, 100)
     worker.cancel("picture")
-    gate.set()
+    go_on()
     assert worker.wait_idle(10) and worker.idle
     assert worker.call(lambda: 7).result(10) == 7
-    assert log == [0]
+    assert log == [("picture", 0)]
 
 
 def test05_tasks_of_one_urgency_take_turns(worker):
