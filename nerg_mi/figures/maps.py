@@ -16,7 +16,6 @@ from .style import INK, PAPER, SMALL, TITLE, new_page, wrap
 #
 # How tracking lies in a place, before and after it is aligned: from above and from the side.
 
-
 _PLACE, _HITS, _HEADS, _WANTED = "#b9b4aa", "#d9730d", "#2b6cb0", "#1c7c3c"
 _MOST = 20_000  # points drawn of a kind; more of them only hide each other
 _SIDE = 420
@@ -82,7 +81,6 @@ def _frame(axes, parts: Sequence[np.ndarray], at: tuple[int, int]) -> None:
 #
 # Where pictures were taken: cameras and points of a place, from above and from the side.
 
-
 _CAMERA, _PATH = "#c0392b", "#e2a49c"
 _MOST_POINTS = 40_000  # drawn; more of them only hide each other
 _CAMERA_FIGURES_SIDE = 520  # pixels of each of the two plans
@@ -137,7 +135,6 @@ def _bounds(centers: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
 # The floor plan of a place: what stands there, where people walked, what they looked at and what they could see.
 #
 # Axes are in metres, x to the right and y up, z the height; +z is up.
-
 
 PEOPLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#332288")
 """Colours of people, which can be told apart with any kind of colour blindness (Okabe and Ito; Tol), and in grey by
@@ -304,7 +301,6 @@ def _legend_entries(
 #
 # Both return a matplotlib ``Figure`` with axes in metres, x to the right and y up; ``figures.save`` writes it. pyplot
 # stays out of it.
-
 
 _POINTS, _SURFACES = "#2b6cb0", "#b9b4aa"
 _RAY_FIGURES_MOST_POINTS = 60_000  # drawn; more of them only hide each other

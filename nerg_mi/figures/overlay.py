@@ -21,7 +21,6 @@ from .style import SMALL, Sheet, color_values, find_colors, hatch
 # The sRGB transfer function of IEC 61966-2-1; nothing is scaled or compressed, so that equal radiance has equal bytes
 # in every picture. What is brighter than white is clipped.
 
-
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Weights of linear sRGB for the luminance (Rec. 709)."""
 
@@ -51,7 +50,6 @@ def write_png(path, display, text: dict[str, str] | None = None) -> None:
 # Values are densities in 1/sr. Colours come from one of matplotlib's perceptually uniform maps; the heat grows more
 # opaque with the value, over a picture that is dimmed and greyed, so that goods stay recognisable and their colours are
 # not mistaken for heat. Where there is no surface nothing is coloured, and what is not known can be hatched.
-
 
 MOST_DECADES = float(DECADES.high)
 
@@ -153,12 +151,10 @@ def scale_strip(heat: Heat, steps: int = 256) -> np.ndarray:
 # Each function takes arrays as the integrator gives them (rows from the top) and returns a matplotlib ``Figure``, see
 # `sheet`; `style.save` writes it.
 
-
 HIDDEN = np.array([0.16, 0.20, 0.42])
 """Tint (display sRGB) of what the observer cannot see."""
 
 GAZE = AOVS["gaze"].scale_label
-
 _STEPS = 256
 
 
@@ -337,7 +333,6 @@ def _hatched(shown, unknown) -> np.ndarray:
 #
 # What can be laid over a picture: the AOVs of the integrator `nerg`, drawn as their table says
 # (`nerg_mi.transport.aovs`), and which scale several pictures share. Values are (h, w) each.
-
 
 Limits = tuple[float, float] | None
 

@@ -11,7 +11,6 @@ import numpy as np
 from nerg_mi.maths.sphere import fibonacci_directions
 
 Trace = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-
 SURFACE = 0.5
 """Opacity from which on a ray meets a surface."""
 

@@ -20,7 +20,6 @@ from .style import INK, SMALL, Sheet, hatch
 # Longitude λ in (-π, π] is positive to the right of the front, latitude φ in [-π/2, π/2] positive upwards. Places (x,
 # y) lie in [-1, 1] x [-1, 1], on paper twice as wide as it is high. One more map is one more entry of `PROJECTIONS`.
 
-
 _STEPS = 60
 _POLE = 1e-12
 

@@ -16,7 +16,6 @@ MOST = 40
 
 _COLORS = {"tracked": "#2b6cb0", "field": "#d9730d"}
 _GRID = "#dddddd"
-
 Row = dict[str, Any]
 
 

@@ -29,7 +29,6 @@ from nerg_mi.files.atomic import check_writable, file_sha256, write_bytes
 # equal, also to people who do not tell red from green, and on grey paper. Rainbows (``jet``) are left out: they show
 # edges where the values have none.
 
-
 SEQUENTIAL = ("inferno", "magma", "plasma", "viridis", "cividis")
 """For values from a least to a greatest one."""
 
@@ -65,7 +64,6 @@ def color_values(name: str, shares: Any, kind: str = "sequential") -> np.ndarray
 # ---- Hatching ----
 #
 # Where a picture knows nothing: diagonal lines over paled colours, which no value of any scale looks like.
-
 
 PERIOD, WIDTH = 8, 2
 """Pixels from line to line along a row, and of a line."""
@@ -104,9 +102,7 @@ def swatch(height: int, width: int, unit: int = 1) -> np.ndarray:
 # Nothing of the machine is in it: of files their names and the SHA-256 of their bytes, no folders, no users, no times,
 # so that equal inputs give equal files.
 
-
 _PROGRAMS = ("mitsuba", "drjit")
-
 _OF_THE_RUN = ("seed", "store", "scheduler")
 """Options that are said elsewhere, or on which nothing that is made depends."""
 
@@ -211,7 +207,6 @@ def _plain(value: Any) -> Any:
 #
 # Figures as files: PNG and SVG, byte for byte the same for the same input, and as pixels for a video.
 
-
 FORMATS = (".png", ".svg")
 """Suffixes of figures that are written."""
 
@@ -258,7 +253,6 @@ def rasterize(figure: Any) -> np.ndarray:
 #
 # Ticks of a scale: round values, written so that they are short however small or large they are.
 
-
 _SUPER = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -304,7 +298,6 @@ def _power(p: int) -> str:
 # A pixel of a picture is a pixel of the page; one that is too small to carry a title is shown with each pixel as a
 # square of several. Text, bars and gaps grow with the pictures, so that they can be read when a large one is shown
 # small.
-
 
 DPI = 100
 INK, PAPER = "#1c1c1c", "#ffffff"

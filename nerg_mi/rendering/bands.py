@@ -60,7 +60,6 @@ class OwnLayer:
 #
 # How a picture is divided into strips of samples, which an interruption and a report of progress can fall between.
 
-
 PACKET = 64
 """Samples that Dr.Jit may add up as one (16 on a CPU, 32 on a GPU): a strip begins at a multiple of this many."""
 
@@ -191,7 +190,6 @@ def _class(variant: str):
 # box filter the pixels are those of ``mi.render``, bit by bit, also where a pixel's samples fall into two strips. With
 # a wider filter the samples of the rows around a band are rendered again for it; what is added up is the same, in
 # another order, and pixels differ by the rounding of single precision.
-
 
 BYTES_PER_VALUE = 22
 """Memory that a band needs for each value (channel of a pixel), in bytes: 4 in the block that samples are added to, the
@@ -466,7 +464,6 @@ def _crop(film, size, offset) -> None:
 #
 # A picture taken apart: its colour and its AOVs as arrays.
 
-
 SURFACE = 0.5
 """Opacity from which on a pixel shows a surface, as the integrator has it by default."""
 
@@ -575,7 +572,6 @@ def render_asked(
 # ---- Long renders ----
 #
 # What pays only where many samples are rendered of one scene: kernels that know the weights of its fields.
-
 
 SAMPLES = 1 << 27
 """From so many on a render is long: 146 pictures of 1280 x 720 pay for some seconds of compilation many times."""

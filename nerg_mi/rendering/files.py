@@ -27,7 +27,6 @@ from nerg_mi.formats.ply import PLY_MAGIC, parse_ply, write_columns
 # Sequences of pictures: a CSV file whose header names `<default>`s of a scene and whose rows are their values in each
 # picture.
 
-
 FRAMES_BYTES = 64 << 20
 """A file of frames may have so many bytes."""
 
@@ -150,9 +149,7 @@ def check_vol(path: str | os.PathLike) -> None:
 #
 # Picture files that are written from the top in pieces: .exr with all channels of a film, .png with its colour.
 
-
 FORMATS = (".exr", ".png")
-
 _DITHER = 256
 """Rows after which the pattern repeats that Mitsuba adds where it rounds to 8 bits."""
 

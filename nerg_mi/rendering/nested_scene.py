@@ -20,7 +20,6 @@ from .scene_writer import Blank, Comment, Node, SceneContent, Verbatim, document
 # (docs/shapes-and-fields.md). An `<include>` cannot do that, so that the file is copied: what it includes becomes a
 # part of the copy, its sensors come after ours, and a `<path>` leads to the files that it names.
 
-
 BYTES = 16 << 20
 """A scene file that is copied may have so many bytes, with each that it includes."""
 

@@ -31,7 +31,6 @@ from .files import check_mesh, check_points, check_vol
 # The XML is read as a stream of tags, without recursion and without entities; the files that it includes are followed,
 # and the meshes, volumes and pictures that it names are looked at by their headers.
 
-
 DEPTH = 256
 """Elements may be nested so deep; Mitsuba's parser ends the process at some thousands."""
 
@@ -211,7 +210,6 @@ class _Scene:
 # ---- Pictures ----
 #
 # What comes before a picture: the Mitsuba variant that renders it, and its scene.
-
 
 _PREFERRED = ("cuda_ad_rgb", "llvm_ad_rgb")
 # What mi.load_file takes besides the values of a scene.

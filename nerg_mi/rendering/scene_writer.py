@@ -51,7 +51,6 @@ def pixel_of(camera: Any, point: Point3f) -> tuple[float, float] | None:
 #
 # Nothing here knows what a scene is for: `scene_parts` says what belongs into one.
 
-
 _INDENT = "    "
 _WIDTH = 120
 # What XML 1.0 holds besides tabs and line ends; halves of pairs come from file names that are no text.

@@ -36,7 +36,6 @@ from nerg_mi.transport.observer_gaze import PlacedGaze, look_from
 # What people could look at, and how much gaze a field says they give it: from places where they stood, in all
 # directions. Everything is in the coordinates of the place.
 
-
 _GOLDEN = (math.sqrt(5) - 1) / 2
 # Directions of the integral of a normalised field: shares are divided by their own sum.
 _INTEGRAL = 2048
@@ -213,7 +212,6 @@ def results_without_names(found: GazeResults, labels: Labels) -> GazeResults:
 # Intervals are of 95 %, of the mean over people: Student's t with n - 1 degrees of freedom, which for means is what the
 # bootstrap over people comes to with many resamples, widened for few (`nerg_mi.evaluation.gaze_report.widening`).
 
-
 LEAST_PEOPLE = 3
 """Fewer people than these give no interval."""
 
@@ -288,7 +286,6 @@ def _each(values: np.ndarray, person: np.ndarray) -> np.ndarray:
 # A place as some ten thousand points that a browser draws by itself, with the gaze of observers baked into them.
 #
 # Points are what panoramas from several eyes show, one a small cube. All lengths are scene units.
-
 
 GazeAt = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 """``(observer (3,), points (V, 3), spacing) -> (V,)``: gaze in 1/sr after occlusion, of points known to ``spacing``."""
@@ -521,7 +518,6 @@ class Run:
 #
 # Positions are 16 bits an axis of the points' box, normals and colours 8 bits a component, gaze the square root of its
 # share of the observer's own scale in 8 bits.
-
 
 PATH_POINTS = 16_000
 """Positions of all people's paths together, at most."""

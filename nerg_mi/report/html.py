@@ -12,7 +12,6 @@ from dataclasses import dataclass
 #
 # HTML by hand: text is escaped unless it is HTML already, so that no name of a file or a person becomes markup.
 
-
 VOID = ("img", "br", "hr", "meta", "input")
 """Elements that hold nothing."""
 
@@ -85,7 +84,6 @@ def figure(content: Html, caption: Content) -> Html:
 # ---- Charts ----
 #
 # Small charts as SVG within the page: values with their intervals, side by side.
-
 
 ROW, TOP, FOOT = 22, 26, 30
 _LABELS, _WIDTH = 190, 250

@@ -571,7 +571,6 @@ VERDICT = Section("verdict", "Verdict", _show_verdict, _explain_absent_verdict)
 #
 # Another one is defined beside these and named here.
 
-
 SECTIONS: tuple[Section, ...] = (
     VERDICT,
     PLACE,

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 #
 # A roof that is left out of views from above: where rays begin that start over it.
 
-
 _LEAST_FALL = 1e-9
 """Cosine to straight down below which a ray runs along the plane, and is traced as it is."""
 
@@ -359,7 +358,6 @@ def _beyond(ray: Ray3f) -> Any:
 # ---- Trace ----
 #
 # Depths along many rays at once, outside of any render: where the surfaces are that people look at.
-
 
 BATCH = 1 << 19
 """Rays that are marched in one launch."""

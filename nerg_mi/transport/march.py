@@ -44,7 +44,6 @@ from .quadrature import RULES, absorbed_share, boundaries
 #
 # Steps keep their lengths and move with the ray's entry t0; the last one ends at t1.
 
-
 _INPUTS = ("o", "d", "w", "t0", "t1")
 
 

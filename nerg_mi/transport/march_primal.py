@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 # as much as makes a surface well before it. What follows, the surface itself in most cases, cannot change the answer:
 # it is not evaluated.
 
-
 _HALF = math.log(2)
 
 
@@ -312,7 +311,6 @@ def leap(
 # accumulates in log space, so that opacity is -expm1(-τ) to full precision however thin the medium. Steps whose
 # midpoint lies in an empty cell of the medium's occupancy grid are leapt over without an evaluation; marching ends
 # behind opaque surfaces.
-
 
 LOG2 = 0.6931471805599453
 

@@ -205,7 +205,6 @@ class Hits(Protocol):
 # tools and neural fields run through one code path. Rays are handed over once (``local``), then every sample is
 # ``o + t d`` in the medium's own coordinates while ``t`` stays the distance in the scene.
 
-
 MAX_DENSITY = 1e30
 """Infinite densities count as this one, which is opaque over any length."""
 

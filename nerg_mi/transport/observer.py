@@ -132,7 +132,6 @@ def _detached(p_o: Point3f) -> Point3f:
 # ---- How an observer's rays are traced, and what they decide ----
 
 VISIBILITIES = ("depth", "transmittance", "map")
-
 DIRECTIONS = 1 << 17
 """Of an integral over an observer's sphere at most: enough for a thousandth at depths that jump from surface to
 surface."""
@@ -168,7 +167,6 @@ class ObserverSettings:
 # ---- Where a camera's, or an observer's, eye is, and where a point lies from there ----
 #
 # The eye is the centre of the sensor, not the origin of its rays: Mitsuba starts those at the near plane.
-
 
 _CENTERED = {"PerspectiveCamera", "ThinLensCamera", "Panorama", "RadianceMeter"}
 

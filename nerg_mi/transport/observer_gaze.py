@@ -28,13 +28,11 @@ from .observer import Known, ObserverCache, ObserverSettings, fingerprint_of, se
 # sphere; Aistleitner, Brauchart & Dick 2012 for these points), which tells the error of a sum from the scatter of sums
 # over parts of its points.
 
-
 FIRST = 1 << 13
 """Directions that are tried first for a tolerance of `USUAL`, which they mostly keep; fewer for a wider one, `FEWEST`
 at least."""
 
 USUAL, FEWEST = 5e-3, 1 << 11
-
 PARTS = 8
 """Parts of a sum whose scatter tells its error. Every eighth point of a golden spiral lies on one too, of eight times
 the angle, and no rounder; parts err in opposite ways more often than not, so that the error is told too large, by two
@@ -80,7 +78,6 @@ def _sum(values: np.ndarray) -> Integral:
 # ---- Surroundings ----
 #
 # What an observer meets in every direction: over which a gaze field is integrated.
-
 
 _FILL = 1 << 14
 """Directions whose depths fill those that escape. Always the same: filled from its own directions, an integral of more
@@ -235,7 +232,6 @@ def _beyond(field: AnyGazeField, to_world: Similarity, center: Point3f, directio
 # A field alone cannot be evaluated for an observer: a normalised one must be divided by its integral over the
 # observer's sphere, which depends on where they stand, and one with semantic features needs those of the place. So a
 # ``PlacedGaze`` has no densities; ``at`` gives an ``ObservedGaze``, which has.
-
 
 STEP = 1 / 256
 """How far an observer is moved for the derivatives of an integral, of the side of the field's box: edges that pass

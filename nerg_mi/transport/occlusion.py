@@ -121,7 +121,6 @@ _PAST = 4
 # Ray casts agree on a shape to this share of the scene's diagonal, or of twice the coordinates there: what is far
 # away takes no part in how exactly a near one is met, but for the size of its triangles.
 EXACT, _FAR = 1e-4, 3e-7
-
 LARGEST = 1e18
 """Tolerance at most, in scene units: the square of a distance so long is still finite in single precision."""
 

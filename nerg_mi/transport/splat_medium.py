@@ -24,7 +24,6 @@ from .medium import LastHit, LocalRay, NextHits
 # is a number of bits (cf. Hapala et al. 2011, "Efficient Stack-less BVH Traversal for Ray Tracing"). Every node is
 # split at the median of its longest side, into halves that are one apart at most. Plain NumPy.
 
-
 COLUMNS = 8
 """Numbers a node: the lower and the upper corner of its box, the axis that it is split along, and one unused."""
 
@@ -93,7 +92,6 @@ def build_tree(lower: np.ndarray, upper: np.ndarray) -> Tree:
 # ---- Arrays ----
 #
 # Gaussian splats as arrays of Dr.Jit: what can be trained, and what kernels read.
-
 
 SHAPE = 16
 """Numbers a Gaussian in ``shapes``: the matrix (row by row) that leads to its own axes and standard deviations, its
@@ -213,7 +211,6 @@ def _dot(a: list[Float], b: list[Float]) -> Float:
 # how far its centre is. The tree is walked nearer child first; a box is left out where it begins behind the last of the
 # Gaussians that are wanted, or behind where those already found leave no light. A ray may start inside of Gaussians:
 # what counts is that their peak lies before it.
-
 
 AT_ONCE = 12
 """So many are found in one walk through the tree."""

@@ -28,7 +28,6 @@ from .scene import copied_view
 #
 # The panel: what is shown and how, the observer's own view, the numbers, and the camera.
 
-
 INSET = 240
 """Width of the observer's own view, in pixels."""
 
@@ -398,7 +397,6 @@ def png_bytes(session: Any, colors: np.ndarray, text: dict[str, str] | None = No
 # ---- Areas ----
 #
 # Areas of interest in the page: boxes that are drawn, moved, named, and saved as JSON.
-
 
 COLOR = (90, 200, 255)
 _CHOSEN = (255, 210, 60)

@@ -34,7 +34,6 @@ from .session import URGENCY
 # The job behind ``nerg render --frames`` does it, which knows nothing of turns: it runs in a thread of its own, which
 # goes on only while the render thread waits for it, so that Dr.Jit is used by one of them at a time.
 
-
 _EVEN = 2
 
 
@@ -136,7 +135,6 @@ def shown_of_flight(views: list[PinholeView], width: int, **others: Any) -> tupl
 #
 # A camera's flight through views that were kept, as the frames of a sequence that `nerg render --frames` renders.
 
-
 MOST = 20_000
 """Frames of a flight at most."""
 
@@ -170,7 +168,6 @@ def frames_csv(views: Sequence[PinholeView]) -> str:
 # ---- Flying ----
 #
 # The part of the panel for a camera's flight: views that are kept, and their frames or their video.
-
 
 TITLE = "Flight"
 

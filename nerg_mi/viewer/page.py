@@ -21,7 +21,6 @@ from .session import Session
 #
 # One browser that looks: its view, what it is shown, and how quickly it draws.
 
-
 SLOW, QUICK = 1 / 20, 1 / 40
 """Seconds a frame above which a browser is given fewer points, and below which more."""
 
@@ -88,12 +87,10 @@ class BrowserWindow:
 # While a camera moves its browser draws points by itself; when it rests a picture of the integrator stands in their
 # place, first small, then fine. Nothing here waits for rendering: a clock looks what is to be done.
 
-
 TICK = 0.04
 """Seconds between two looks of the clock."""
 
 _NEAR = 0.4
-
 _POINT = 1.15
 """Width of a drawn point, in cells of the grid that points lie in."""
 

@@ -124,7 +124,6 @@ def ahead_of(scene: Scene) -> np.ndarray:
 # It is a generator, so that whoever drives it can stop between two bands of rays. Its values are those of the
 # integrator `nerg` (`nerg_mi.api.query.trace`).
 
-
 BAND_SECONDS = 0.35
 """A band of rays should take so long at most: what is more urgent waits for its end."""
 
@@ -269,7 +268,6 @@ def _traced(
 # Rays in all directions, from places that see different parts of it, end on surfaces; of points that lie in one cell of
 # a grid one is kept. They are in such an order that the first of them are spread over the place as evenly as all: a
 # browser that draws slowly is given fewer, and a step of their gaze says roughly that of all.
-
 
 RAYS = 1 << 14
 """Rays from each place."""

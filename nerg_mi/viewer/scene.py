@@ -145,7 +145,6 @@ def check_copied(session: Any) -> None:
 #
 # People in the page: their paths, rays and probes, where they are at a moment, and whose eye the observer is.
 
-
 NOBODY = "(nobody)"
 _STEPS = 2000
 _NOTHING = 1.0  # length of a ray that meets no surface, in scene units

@@ -28,7 +28,6 @@ from nerg_mi.errors import NergError, sentence
 # `Host` and `Origin`: the former must be a name of this server, the latter, where there is one, this very server.
 # Whoever can reach an address other than the loopback's needs a token as well.
 
-
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 """Names by which a browser on this machine reaches it."""
 
@@ -166,7 +165,6 @@ def _is_address(name: str) -> bool:
 #
 # viser takes no checks of its own, so that the websockets' `serve` that it calls is wrapped while it starts; where that
 # call is not made as expected, nothing is served at all.
-
 
 _STARTING = threading.Lock()
 

@@ -110,7 +110,6 @@ def shape_groups(scene: Scene, shapes: Sequence[str]) -> Iterator[list[str]]:
 #
 # People of the rays: their paths, and where they are at a moment.
 
-
 VERTICES = 20_000
 """Points of all paths together, at most: what a browser draws without effort."""
 
@@ -209,7 +208,6 @@ class Tracks:
 # Dr.Jit is used from one thread at a time. A task is a generator: each of its steps is short, between two of them
 # another task may be more urgent, and whoever submits one under a name that is taken replaces the other, whose further
 # steps are then never made. That is how a picture is cancelled when the view moves.
-
 
 Result = TypeVar("Result")
 Task = Generator[Any, None, None] | Iterator[Any]
@@ -316,7 +314,6 @@ class Worker:
 #
 # All of Mitsuba and Dr.Jit is used on the thread of the `Worker`. What is found is told to a `Listener`, on that
 # thread.
-
 
 URGENCY = 1
 """Of tasks that take turns: the first picture is coarse, and nobody waits long for numbers."""

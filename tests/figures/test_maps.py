@@ -78,7 +78,6 @@ def test_wedges_open_to_where_cameras_look():
 
 # ---- The floor plan: places in metres, walls where they are, and a legend of what is drawn ----
 
-
 LOW, HIGH = np.array([0.0, 0.0]), np.array([4.0, 3.0])
 
 

@@ -26,7 +26,6 @@ from nerg_mi.transport.aovs import AOVS
 
 # ---- Heat over a picture ----
 
-
 COLOR = np.random.default_rng(0).random((6, 8, 3))
 
 
@@ -81,10 +80,7 @@ def test06_errors_are_sentences():
 
 # ---- The table of overlays: scales that are shared, and figures of each ----
 
-
 X, Y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 16))
-
-
 LAYERS = OverlayLayers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))
 
 
@@ -122,19 +118,10 @@ def test_one_that_is_not_there():
 
 # ---- Figures show each pixel once, and are the same file for the same input ----
 
-
 RNG = np.random.default_rng(0)
-
-
 PLOTS_COLOR, GAZE = RNG.random((24, 36, 3)), RNG.random((24, 36))
-
-
 MASK = np.ones((24, 36), bool)
-
-
 MASK[:4] = False
-
-
 HEAT = Heat(top=0.8)
 
 

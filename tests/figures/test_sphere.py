@@ -14,10 +14,7 @@ from nerg_mi.transport.geometry import pixel_directions
 
 # ---- Maps of the sphere against their closed forms, and their areas ----
 
-
 RNG = np.random.default_rng(0)
-
-
 LONGITUDE, LATITUDE = RNG.uniform(-np.pi, np.pi, 200), np.arcsin(RNG.uniform(-1, 1, 200))
 
 
@@ -71,16 +68,9 @@ def test_one_that_is_not_there():
 
 # ---- The observer's sphere as a map: where its parts lie, and that each map shows what the panorama has ----
 
-
 HEIGHT, WIDTH = 90, 180
-
-
 BLACK, NOBODY = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
-
-
 ALL = np.ones((HEIGHT, WIDTH), bool)
-
-
 HEAT = Heat(top=1.0, ramp=1e-6, opacity=1.0)
 
 

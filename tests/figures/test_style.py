@@ -78,13 +78,8 @@ def test_others_are_refused():
 
 # ---- Hatching: exactly where nothing is known, and plainly not a value ----
 
-
 SHOWN = np.random.default_rng(0).random((40, 60, 3))
-
-
 UNKNOWN = np.zeros((40, 60), bool)
-
-
 UNKNOWN[5:30, 10:50] = True
 
 
@@ -175,22 +170,11 @@ def test_files_among_other_things(tmp_path):
 
 # ---- Figures as files: read back by other libraries, whole in themselves, and equal for equal input ----
 
-
 RNG = np.random.default_rng(3)
-
-
 COLOR, GAZE = RNG.random((160, 200, 3)), RNG.random((160, 200))
-
-
 MASK = np.ones((160, 200), bool)
-
-
 ABOUT = Provenance("nerg render", {"scène.xml": "ab" * 32}, 5, {"spp": 2}, {"nerg_mi": "1"})
-
-
 SVG = "{http://www.w3.org/2000/svg}"
-
-
 LINK = "{http://www.w3.org/1999/xlink}href"
 
 
@@ -248,7 +232,6 @@ def test_notebooks_show_a_figure_by_itself():
 
 # ---- Ticks say the values of the places at which they stand ----
 
-
 SUPER = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹−", "-0123456789-")
 
 
@@ -298,7 +281,6 @@ def test_less_than_a_decade():
 
 
 # ---- The page: nothing lies upon anything else, whatever the pictures' sizes, and bars say what is shown ----
-
 
 SIZES = [(320, 480), (60, 1200), (500, 60), (16, 24), (1, 1), (900, 1600), (3, 400)]
 
@@ -379,7 +361,6 @@ def test_helpers():
 
 
 # ---- Several pictures on one page: each whole, in its place, on one scale ----
-
 
 RANDOM = np.random.default_rng(0)
 

@@ -30,7 +30,6 @@ from .scenes import (
 
 # ---- Densities and sizes ----
 
-
 SLAB = [1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9]
 
 

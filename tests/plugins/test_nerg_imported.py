@@ -15,7 +15,6 @@ from tests.reference import torch_ngp_numpy as reference
 from .scenes import camera, center_rays, named, plugin, render, still, stored
 
 pytestmark = pytest.mark.usefixtures("torch")
-
 SIZE, STEP = 6, 0.02
 
 

@@ -117,7 +117,6 @@ def test07_another_observer_is_another_object(rgb, files):
 
 # ---- The integrator's context for other AOVs, along any rays, and for several observers of the same rays ----
 
-
 EYES = [(0.3, -3, 0.4), (2.5, -1, 0.5), (-1.5, -2.0, 1.0)]
 
 

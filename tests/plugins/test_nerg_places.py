@@ -25,8 +25,6 @@ from .scenes import (
 
 EYE = (-2, 0.3, -2)
 COLOR = (0.9, 0.4, 0.1)
-
-
 AOVS = ["depth.T", "opacity.Y", "position.X", "position.Y", "position.Z", "visibility.Y"]
 TOLERANCE = 1e-3
 

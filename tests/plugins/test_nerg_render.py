@@ -203,7 +203,6 @@ def test08_quadratures_converge_to_one_picture(rgb, quadrature):
 
 # ---- A roof that cameras above it look through ----
 
-
 SIGMA, HEIGHT = 3.0, 0.6
 
 

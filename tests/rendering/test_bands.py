@@ -457,7 +457,6 @@ def test_what_cannot_be_asked(rgb, files):
 
 # ---- Renders of many samples: which are prepared, and that nothing else changes ----
 
-
 SMALL = {"width": "24", "height": "16", "spp": "1"}
 
 

@@ -73,7 +73,6 @@ def test_numbers_in_names():
 #
 # Meshes and volumes are refused where their counts or corners are wrong, before Mitsuba believes them.
 
-
 CORNERS = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
 
 
@@ -89,8 +88,6 @@ def face(*corners: int) -> bytes:
 
 
 TEXT = b"0 0 0\n1 0 0\n0 1 0\n"
-
-
 BIG = struct.pack(">9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + b"\x03" + struct.pack(">3i", 0, 1, 2)
 
 

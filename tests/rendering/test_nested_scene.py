@@ -17,7 +17,6 @@ from nerg_mi.workflows import demo
 #
 # Somebody's scene as a place: its light goes into ours, its sensors come after ours, its files are found.
 
-
 THEIRS = """<scene version="3.0.0">
     <!-- theirs -->
     <default name="eye" value="0.5"/>
@@ -96,10 +95,7 @@ def test_what_cannot_be_nested(theirs, tmp_path, text, said):
 
 # ---- A scene with another gaze field: the same but for it, wherever the copy lies ----
 
-
 PLAIN = """<scene version="3.0.0"><default name="n" value="a"/>{}<shape type="sphere"/></scene>"""
-
-
 NERG = """<integrator type="nerg"><volume name="gaze" type="gazefield"><string name="filename" value="$n.bin"/></volume>
 </integrator>"""
 

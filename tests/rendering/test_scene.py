@@ -71,8 +71,6 @@ def test_a_scene_that_is_not_there(tmp_path):
 
 
 SCENE = '<scene version="3.0.0">{}</scene>'
-
-
 SCALED = '<shape type="{}"><transform name="to_world"><scale value="{}"/></transform></shape>'
 
 
@@ -110,7 +108,6 @@ def test_a_picture_needs_an_integrator(rgb, tmp_path):
 #
 # A scene that would end the process or fill the memory is one sentence, by whichever command it comes in.
 
-
 SENSOR = """<sensor type="perspective"><sampler type="{sampler}"><integer name="sample_count" value="{spp}"/></sampler>
 <film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{height}"/></film></sensor>"""
 
@@ -135,12 +132,8 @@ def mesh(corner: int) -> bytes:
 
 
 EMPTY_VOLUME = b"VOL\x03" + struct.pack("<5i6f", 1, 0, 0, 0, 1, 0, 0, 0, 1, 1, 1)
-
-
 GRID = """<shape type="cube"><medium name="interior" type="heterogeneous"><volume name="sigma_t" type="gridvolume">
 <string name="filename" value="a.vol"/></volume></medium></shape>"""
-
-
 DEEP = '<shape type="cube">' * 20000 + "</shape>" * 20000
 
 
@@ -288,11 +281,7 @@ def test_the_other_ways_in_are_guarded(standins, tmp_path):
 
 
 ROW = "0 0 0 {0}\n1 0 0 {0}\n0 1 0 {0}\n3 0 1 2\n"
-
-
 PROPERTIES = "".join(f"property float {name}\n" for name in "xyz")
-
-
 TINT = """<shape type="ply"><string name="filename" value="a.ply"/><bsdf type="diffuse"><texture name="reflectance"
 type="mesh_attribute"><string name="name" value="vertex_color"/></texture></bsdf></shape>"""
 

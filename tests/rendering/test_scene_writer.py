@@ -69,10 +69,7 @@ def test_what_is_not_in_the_picture(rgb, camera):
 
 # ---- A written scene, loaded by Mitsuba: its sensors look where they should, and its defaults can be set ----
 
-
 CUBE = SceneContent(beside=(element("shape", type="cube"),))
-
-
 UP = np.array([0.0, 0, 1])
 
 
@@ -145,7 +142,6 @@ def test_names_are_relative_below_a_common_folder(tmp_path):
 
 
 # ---- Text of scene files: what is escaped, what is refused, and how it is laid out ----
-
 
 NASTY = "a<b>&\"c\"'d' \n\té"
 

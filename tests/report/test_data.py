@@ -45,7 +45,6 @@ from tests.report.made import bare, stage, whole
 
 # ---- What people could look at, in a hall of four walls where depths are known in closed form ----
 
-
 LOW, HIGH = np.array([-2.0, -6.0, 0.0]), np.array([2.0, 6.0, 3.0])
 
 
@@ -165,7 +164,6 @@ def test_where_no_place_is_known_nothing_is_met(rgb):
 
 # ---- People without their names ----
 
-
 NAMES = ("Grace", "Ada", "Ada Lovelace", "X")
 
 
@@ -276,7 +274,6 @@ def test_shares_stay_shares_and_few_people_have_no_interval():
 
 
 # ---- A place as points: on its surfaces, with normals that face who saw them ----
-
 
 PROXY_LOW, PROXY_HIGH = np.array([-2.0, -3.0, 0.0]), np.array([2.0, 3.0, 3.0])
 

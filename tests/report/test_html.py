@@ -20,7 +20,6 @@ from tests.report.made import HOSTILE, PNG, bare, packed_scene, whole
 
 # ---- Charts: values where their scale says, and scales of round numbers ----
 
-
 SVG = "{http://www.w3.org/2000/svg}"
 
 
@@ -106,7 +105,6 @@ def test_pictures_are_within_the_page():
 
 # ---- The page: whole, bare, with hostile names, and loading nothing ----
 
-
 SIZE = 6_000_000
 
 
@@ -166,7 +164,6 @@ def test_the_scene_is_data():
 
 
 # ---- Every section: shown from what there is, and told in one sentence where it is left out ----
-
 
 ABSENT = {"verdict", "data", "people", "gaze", "stage", "objects", "scores"}
 """Sections that need more than a gaze field."""

@@ -82,7 +82,6 @@ def test04_up_is_a_direction(rgb, up):
 
 # ---- The mapping of a full-sphere picture: closed forms and round trips ----
 
-
 SIZES = [(1, 2), (2, 3), (16, 8), (33, 17), (256, 128)]
 
 
@@ -115,7 +114,6 @@ def test05_too_small():
 
 
 # ---- What one ray meets: shapes behind a medium, and derivatives of the distances to them ----
-
 
 SETTINGS = MarchSettings(0.01)
 
@@ -173,10 +171,7 @@ def test_distances_follow_a_shape_where_no_ray_moves(rgb):
 # What light comes from behind a field: from shapes, lit or in their plain albedo, from an environment, or from the
 # background.
 
-
 BACKGROUND = 0.125
-
-
 SAMPLES = 1 << 14
 
 
@@ -282,8 +277,6 @@ def wall(rgb):
 
 
 O = np.array([[-1.0, 0.3, 0.4], [-1.0, 0.3, 0.4], [0.25, 0.5, 0.5]], np.float32)
-
-
 D = np.array([[1.0, 0, 0], [-1.0, 0, 0], [1.0, 0, 0]], np.float32)
 
 

@@ -74,10 +74,7 @@ def test01_the_mediums_colour(rgb, kind):
 
 # ---- Every medium answers all that the protocol asks, and densities are fit to be marched ----
 
-
 ASKED = {name: what for name, what in vars(Medium).items() if isinstance(what, (FunctionType, property))}
-
-
 ASKED = {name: what for name, what in ASKED.items() if not name.startswith("_")}
 
 
@@ -130,7 +127,6 @@ def test03_densities_are_finite_and_not_negative(wrong, right):
 
 
 # ---- A radiance field in the scene: what scale and rotation do to it, and what it is asked for outside of ----
-
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((0, 0, 0), (1, 1, 2))
@@ -214,7 +210,6 @@ def test05_weights_are_read_whenever_it_is_asked(rgb):
 
 
 # ---- A field without an end in the scene: rays through the contracted part against integrals in float64 ----
-
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 ENDLESS = ContractedBox(Box((-1, -2, -2), (3, 2, 2)), 64)
@@ -413,7 +408,6 @@ def test08_what_is_skipped_can_be_put_aside_and_back(rgb):
 
 
 # ---- Features that a gaze field may ask for: of the point itself, or gathered on the way there ----
-
 
 O, D = np.array([0.1, -0.2, -3.0]), np.array([0.0, 0.1, 1.0]) / np.hypot(0.1, 1)
 

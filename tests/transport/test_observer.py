@@ -155,7 +155,6 @@ def test_a_place_is_told_by_its_shapes_and_its_medium(rgb):
 
 # ---- Settings of what is traced from an observer: which of them decide where a ray meets its surface ----
 
-
 SETTINGS = ObserverSettings(march=MarchSettings(0.1))
 
 

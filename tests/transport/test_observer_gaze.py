@@ -30,7 +30,6 @@ from tests.plugins.scenes import plugin
 # A placed gaze field, which only what it says of observers can be evaluated of; its integral over an observer's
 # sphere.
 
-
 SETTINGS = ObserverSettings(march=MarchSettings(0.1))
 
 
@@ -242,7 +241,6 @@ def test_a_cache_tells_tolerances_of_the_integral_apart(rgb):
 # ---- Integral ----
 #
 # Integrals over the sphere against closed forms: in as few directions as do, and never worse than is said.
-
 
 MOST = 1 << 17
 

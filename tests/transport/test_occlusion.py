@@ -16,10 +16,7 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 #
 # The map around an observer: depths and gaze between its entries, across the seam of azimuth 0 and at the poles.
 
-
 HEIGHT = 32
-
-
 SETTINGS = ObserverSettings(march=MarchSettings(0.1), depth="expected", map_height=HEIGHT)
 
 
@@ -128,7 +125,6 @@ def test_the_gaze_of_a_map_is_that_of_its_directions(rgb):
 
 
 # ---- What an observer meets on the way to a point: where the point is looked for, and what it costs ----
-
 
 STEP = 0.01
 

@@ -36,7 +36,6 @@ from tests.reference import march_numpy as reference
 
 # ---- The step rule against integrals in extended precision, and its invariances ----
 
-
 TAU = np.logspace(-8, 8, 1601).astype(np.float32)
 
 

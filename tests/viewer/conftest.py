@@ -17,7 +17,6 @@ from nerg_mi.workflows import demo
 
 # ---- A room of a few shapes whose answers are known, and gaze fields in it ----
 
-
 ROOM = """<scene version="3.0.0">
     <integrator type="nerg" id="integrator">
         <integrator type="direct"/>

@@ -126,7 +126,6 @@ def test03_a_png(rgb):
 
 # ---- Layers: what a scene has, their ranges and colours ----
 
-
 OF_ALL = "visible to the observer", "observer depth", "evaluations of density", "evaluations of colour"
 
 

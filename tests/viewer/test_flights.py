@@ -22,7 +22,6 @@ from tests.viewer.browser import require
 
 # ---- A flight as a video: in turns with other tasks, cancelled, and with what is shown ----
 
-
 HOME = PinholeView.of((-2, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
 
 

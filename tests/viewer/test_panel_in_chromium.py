@@ -137,7 +137,6 @@ class Panel:
 
 # ---- The panel in a real browser: what is clicked happens, and what is saved is what is shown ----
 
-
 pytestmark = pytest.mark.slow
 
 

@@ -145,7 +145,6 @@ def test07_who_is_put_into_something_is_put_out_before_it(room_scene):
 
 # ---- Pictures in steps: those of `nerg.render`, in bands that can be left off ----
 
-
 QUANTITIES = ["color", "depth", "opacity", "visibility"]
 
 

@@ -17,10 +17,7 @@ from tests.viewer.browser import require
 
 # ---- A copied scene renders as what was viewed ----
 
-
 VIEW = PinholeView.of((6.9, 3.0, 2.0), (4.8, 4.2, 1.0), (0, 0, 1), 0.9, 1.5)
-
-
 EYE = np.array([4.6, 3.1, 1.6])
 
 

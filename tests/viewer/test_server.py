@@ -24,7 +24,6 @@ from tests.workflows.recorder import Recorder
 
 # ---- Who is refused: other names, other sites, and whoever has no token ----
 
-
 LOCAL = Guard("127.0.0.1")
 
 
@@ -126,7 +125,6 @@ def test09_loopback():
 
 
 # ---- A running server refuses what its guard refuses, over HTTP and before a websocket opens ----
-
 
 OPEN = {
     "Connection": "Upgrade",

@@ -23,7 +23,6 @@ from nerg_mi.workflows.view import ViewOptions, place_to_view
 
 # ---- The page is told all that a session tells ----
 
-
 TOLD = [name for name in vars(Listener) if name.startswith("on_")]
 
 
@@ -281,7 +280,6 @@ def test08_what_cannot_be_counted_is_told_once(session_of, room, gaze_fields, mo
 
 # ---- Shares of attention in steps: those of the library, whichever are counted together ----
 
-
 AT = np.array([0.2, 0.1, 0.6])
 
 
@@ -309,7 +307,6 @@ def test02_without_areas_and_shapes_there_is_nothing(scene):
 
 
 # ---- Paths of people, and where they are at a moment ----
-
 
 SAME = Similarity(np.eye(4))
 

@@ -195,11 +195,7 @@ def test04_density_at_the_ends_is_what_moving_them_takes_in(mode):
 
 # Ends nowhere, so that the sums are smooth but for the rims of Gaussians.
 SETTINGS = MarchSettings(0.01, stop=0.0)
-
-
 NAMES = ("centers", "scales", "rotations", "opacities", "harmonics")
-
-
 STEP = 1e-5
 
 

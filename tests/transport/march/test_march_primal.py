@@ -41,7 +41,6 @@ from tests.transport.test_splat_medium import medium_of, rays, stack
 #
 # Depth, opacity and colour of Gaussian splats against closed forms and against a look at all of them in float64.
 
-
 SETTINGS = MarchSettings(0.01, stop=HITS_STOP)
 
 
@@ -113,7 +112,6 @@ def test_light_goes_on_as_far_as_splats_are_trained(rgb):
 # ---- Occlusion ----
 #
 # Rays that end as soon as it is known whether a point is hidden: the same answers, with fewer evaluations.
-
 
 COUNT = 2000
 
@@ -208,10 +206,7 @@ def test_limits_of_what_is_known(rgb):
 #
 # The march against closed forms and a float64 march: slabs of every density, grids, leaping, jitter, stopping.
 
-
 DIAGONAL = 3**0.5
-
-
 DEFAULT = MarchSettings(DIAGONAL / 1024)
 
 
