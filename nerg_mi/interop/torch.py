@@ -146,7 +146,7 @@ class GazeModule(_FieldModule):
 
     A normalised field's integral is found once an observer, over directions of equal area::
 
-        around = trace_surroundings(field, Similarity(), place, eye, settings)  # directions, their depths, what escapes
+        around = Outlook(field, Similarity(), place, eye, settings).trace()  # directions, their depths, what escapes
 
         Z = module.integral(p_od, p_o, r_o, escaped)  # everywhere around the observer
         gaze = module(p_od, p_o, r_o, Z)  # anywhere

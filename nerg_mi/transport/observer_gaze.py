@@ -108,20 +108,12 @@ class AllAround:
         self.filling: Filling | None = None
         """What fills directions that escape, once that has been asked for."""
 
-    def of(
-        self,
-        count: int,
-        field: AnyGazeField,
-        to_world: Similarity,
-        place: Place,
-        center: Point3f,
-        settings: ObserverSettings,
-    ) -> ObserverSurroundings:
-        """Those in ``count`` directions; the other arguments are those of ``trace_surroundings``, always the same."""
+    def of(self, count: int, outlook: Outlook) -> ObserverSurroundings:
+        """Those in ``count`` directions; ``outlook``: always the observer's."""
         if count not in self._traced:
-            if field.config.fills_escaped and self.filling is None:
-                self.filling = trace_filling(field, to_world, place, center, settings)
-            self._traced[count] = trace_surroundings(field, to_world, place, center, settings, count, self.filling)
+            if outlook.field.config.fills_escaped and self.filling is None:
+                self.filling = outlook.trace_filling()
+            self._traced[count] = outlook.trace(count, self.filling)
         return self._traced[count]
 
 
@@ -134,64 +126,71 @@ class Filling:
     distance: np.ndarray
 
 
-def trace_surroundings(
-    field: AnyGazeField,
-    to_world: Similarity,
-    place: Place,
-    center: Point3f,
-    settings: ObserverSettings,
-    count: int | None = None,
-    filling: Filling | None = None,
-) -> ObserverSurroundings:
-    """Those of the observer at ``center`` (one lane) in ``count`` directions (None: ``settings.directions``), for
-    ``field`` in ``place``; ``filling``: see ``distance_along``."""
-    count = count or settings.directions
-    # A recording takes no arrays from NumPy.
-    number = None if recording() or count > _ORDERED else neighbourly_order(count)
-    with dr.suspend_grad():
-        directions = fibonacci_vectors(count, None if number is None else variant_types().UInt32(number))
-        distance, escaped = distance_along(field, to_world, place, center, directions, settings, filling)
-        dr.eval(directions, distance, escaped)
-    return ObserverSurroundings(directions, distance, escaped, number)
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """What the observer at ``center`` (one lane) meets in ``place``, traced with ``settings``, where ``field``, which
+    ``to_world`` places in the scene, is to be evaluated."""
 
+    field: AnyGazeField
+    to_world: Similarity
+    place: Place
+    center: Point3f
+    settings: ObserverSettings
 
-def distance_along(
-    field: AnyGazeField,
-    to_world: Similarity,
-    place: Place,
-    center: Point3f,
-    directions: Vector3f,
-    settings: ObserverSettings,
-    filling: Filling | None = None,
-) -> tuple[Float, Bool]:
-    """``(distance, escaped)`` as of ``ObserverSurroundings`` along unit ``directions``: where ``field`` is to be
-    evaluated, also where there is no surface. What escapes ends on the field's box, or at the depth of the nearest
-    directions that do not, as the field wants it: of ``filling``, if it has been traced."""
-    mi = variant_types()
-    width = dr.width(directions)
-    if not field.config.needs_surfaces:
-        return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
-    met, depth = met_along(place, center, directions, settings, _beyond(field, to_world, center, directions))
-    if field.config.fills_escaped:
-        escaped = ~np.array(met)
-        if escaped.any():
-            known = filling or trace_filling(field, to_world, place, center, settings)
-            if len(known.distance):
-                depth = np.array(depth)
-                depth[escaped] = nearest_depth(known.directions, known.distance, np.array(directions).T[escaped])
-                depth = mi.Float(depth)
-    return depth, ~met
+    def trace(self, count: int | None = None, filling: Filling | None = None) -> ObserverSurroundings:
+        """The surroundings in ``count`` directions (None: ``settings.directions``); ``filling``: see
+        ``distance_along``."""
+        count = count or self.settings.directions
+        # A recording takes no arrays from NumPy.
+        number = None if recording() or count > _ORDERED else neighbourly_order(count)
+        with dr.suspend_grad():
+            directions = fibonacci_vectors(count, None if number is None else variant_types().UInt32(number))
+            distance, escaped = self.distance_along(directions, filling)
+            dr.eval(directions, distance, escaped)
+        return ObserverSurroundings(directions, distance, escaped, number)
 
+    def distance_along(self, directions: Vector3f, filling: Filling | None = None) -> tuple[Float, Bool]:
+        """``(distance, escaped)`` as of ``ObserverSurroundings`` along unit ``directions``: where the field is to be
+        evaluated, also where there is no surface. What escapes ends on the field's box, or at the depth of the nearest
+        directions that do not, as the field wants it: of ``filling``, if it has been traced."""
+        mi = variant_types()
+        width = dr.width(directions)
+        if not self.field.config.needs_surfaces:
+            return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
+        met, depth = self.met_along(directions, self._beyond(directions))
+        if self.field.config.fills_escaped:
+            escaped = ~np.array(met)
+            if escaped.any():
+                known = filling or self.trace_filling()
+                if len(known.distance):
+                    depth = np.array(depth)
+                    depth[escaped] = nearest_depth(known.directions, known.distance, np.array(directions).T[escaped])
+                    depth = mi.Float(depth)
+        return depth, ~met
 
-def trace_filling(
-    field: AnyGazeField, to_world: Similarity, place: Place, center: Point3f, settings: ObserverSettings
-) -> Filling:
-    """Of the observer at ``center``; see ``distance_along``."""
-    few = fibonacci_vectors(_FILL)
-    with dr.suspend_grad():
-        traced = met_along(place, center, few, settings, _beyond(field, to_world, center, few))
-    known, distance = (np.array(v) for v in traced)
-    return Filling(np.array(few).T[known], distance[known])
+    def trace_filling(self) -> Filling:
+        """What fills directions that escape."""
+        few = fibonacci_vectors(_FILL)
+        with dr.suspend_grad():
+            traced = self.met_along(few, self._beyond(few))
+        known, distance = (np.array(v) for v in traced)
+        return Filling(np.array(few).T[known], distance[known])
+
+    def met_along(self, directions: Vector3f, beyond: Float | float = 0.0) -> tuple[Bool, Float]:
+        """Whether a surface is met along unit ``directions`` (lanes), and its distance in scene units; ``beyond`` where
+        none is."""
+        mi, settings = variant_types(), self.settings
+        everywhere = dr.full(mi.Bool, True, dr.width(directions))
+        view = self.place.trace(mi.Ray3f(self.center, directions), everywhere, settings.march)
+        met = everywhere & view.meets(settings.surface_opacity)
+        return met, cast("Float", dr.select(met, view.depth(settings.depth, met), beyond))
+
+    def _beyond(self, directions: Vector3f) -> Float:
+        """Where a ray that meets nothing ends: on the gaze field's box, or its diagonal away."""
+        box, local = self.field.box, self.to_world
+        o, d = local.point_to_local(self.center), local.vector_to_local(directions)
+        near, far = intersect_box(o, d, box.lower, box.upper)
+        return dr.select((near < far) & (far > 0) & dr.isfinite(far), far, box.diagonal * local.scale)
 
 
 def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -204,27 +203,6 @@ def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> n
     weight = 1 / (apart**2 + 1e-3)
     log = np.log(np.maximum(depth, 1e-6))[which]
     return np.exp((weight * log).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)
-
-
-def met_along(
-    place: Place, center: Point3f, directions: Vector3f, settings: ObserverSettings, beyond: Float | float = 0.0
-) -> tuple[Bool, Float]:
-    """Whether a surface is met along unit ``directions`` (lanes) from ``center``, and its distance in scene units;
-    ``beyond`` where none is."""
-    mi = variant_types()
-    everywhere = dr.full(mi.Bool, True, dr.width(directions))
-    view = place.trace(mi.Ray3f(center, directions), everywhere, settings.march)
-    met = everywhere & view.meets(settings.surface_opacity)
-    return met, cast("Float", dr.select(met, view.depth(settings.depth, met), beyond))
-
-
-def _beyond(field: AnyGazeField, to_world: Similarity, center: Point3f, directions: Vector3f) -> Float:
-    """Where a ray that meets nothing ends: on the gaze field's box, or its diagonal away."""
-    box = field.box
-    near, far = intersect_box(
-        to_world.point_to_local(center), to_world.vector_to_local(directions), box.lower, box.upper
-    )
-    return dr.select((near < far) & (far > 0) & dr.isfinite(far), far, box.diagonal * to_world.scale)
 
 
 # ---- A gaze field in the scene, and what it says of observers ----
@@ -250,6 +228,10 @@ class PlacedGaze:
     def parameters(self) -> list:
         """Arrays that gaze depends on, for derivatives."""
         return list(self.field.parameters().values())
+
+    def outlook(self, place: Place, center: Point3f, settings: ObserverSettings) -> Outlook:
+        """What the observer at ``center`` (one lane) meets where the field is to be evaluated for them."""
+        return Outlook(self.field, self.to_world, place, center, settings)
 
     def at(
         self, observers: list[Point3f], place: Place, settings: ObserverSettings, cache: ObserverCache | None = None
@@ -356,8 +338,7 @@ class _SphereIntegral:
         return integrate(numbered, self.settings.directions, self.settings.integral_tolerance)
 
     def _around(self, known: Known, count: int) -> ObserverSurroundings:
-        placed = self.placed
-        return known.value.of(count, placed.field, placed.to_world, self.place, known.center, self.settings)
+        return known.value.of(count, self.placed.outlook(self.place, known.center, self.settings))
 
     def _integrand(self, known: Known, around: ObserverSurroundings) -> Float:
         o = known.center + dr.zeros(type(known.center), dr.width(around.directions))
@@ -408,17 +389,9 @@ class ObservedGaze:
         """
         return mean(self._each(p_od, p_o, r_o, active, semantic, escaped))
 
-    def spread(
-        self,
-        p_od: Point3f,
-        p_o: Point3f,
-        r_o: Vector3f,
-        active: Bool,
-        semantic: list[Float] | None = None,
-        escaped: Bool | bool = False,
-    ) -> tuple[Float, Float, Float, Float]:
+    def spread(self, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool) -> tuple[Float, Float, Float, Float]:
         """``evaluate`` of an ensemble, and the standard deviation of its members' gaze (1/sr)."""
-        found = self._each(p_od, p_o, r_o, active, semantic, escaped)
+        found = self._each(p_od, p_o, r_o, active)
         gaze, emit, capture = mean(found)
         return gaze, emit, capture, spread(found)
 
@@ -438,20 +411,19 @@ class ObservedGaze:
         found, distance, escaped = self._look(p_o, r_o, filling)
         if not self._placed.field.config.needs_surfaces:
             with dr.suspend_grad():
-                met, distance = met_along(self._place, variant_types().Point3f(dr.detach(p_o)), r_o, self._settings)
+                center = variant_types().Point3f(dr.detach(p_o))
+                met, distance = self._placed.outlook(self._place, center, self._settings).met_along(r_o)
                 escaped = ~met
         return found, dr.select(escaped, dr.inf, distance)
 
     def _look(self, p_o: Point3f, r_o: Vector3f, filling: Filling | None = None) -> tuple[list[Float], Float, Bool]:
-        """``(gaze of each member, distance, escaped)``, the last two as of ``observer_gaze.distance_along``."""
+        """``(gaze of each member, distance, escaped)``, the last two as of ``Outlook.distance_along``."""
         mi = variant_types()
         with dr.suspend_grad():
             center = mi.Point3f(dr.detach(p_o))
             dr.make_opaque(center)
-            placed, width = self._placed, dr.width(r_o)
-            distance, escaped = distance_along(
-                placed.field, placed.to_world, self._place, center, r_o, self._settings, filling
-            )
+            width = dr.width(r_o)
+            distance, escaped = self._placed.outlook(self._place, center, self._settings).distance_along(r_o, filling)
             o = center + dr.zeros(mi.Point3f, width)
             everywhere = dr.full(mi.Bool, True, width)
             found = self._each(o + r_o * distance, o, r_o, everywhere, None, escaped)
@@ -464,8 +436,8 @@ class ObservedGaze:
         p_o: Point3f,
         r_o: Vector3f,
         active: Bool,
-        semantic: list[Float] | None,
-        escaped: Bool | bool,
+        semantic: list[Float] | None = None,
+        escaped: Bool | bool = False,
     ) -> list[tuple]:
         """``(gaze, emit, capture)`` of each member."""
         field, local = self._placed.field, self._placed.to_world

@@ -16,7 +16,7 @@ from nerg_mi.formats.fields import save_gaze
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverSettings
-from nerg_mi.transport.observer_gaze import PlacedGaze, trace_surroundings
+from nerg_mi.transport.observer_gaze import PlacedGaze
 
 from .fields import BOX, GRID, RNG, radiance, rays, varied
 
@@ -216,7 +216,7 @@ def test04b_a_normalised_FieldDensity(torch, interop, rgb, kind, tmp_path):
     shape = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.6]).scale(5)}
     place, eye = Place(None, rgb.load_dict({"type": "scene", "s": shape})), rgb.Point3f(0.1, -0.2, 0.3)
     placed, settings = PlacedGaze(field), ObserverSettings(march=MarchSettings(step=1), directions=1 << 12)
-    around = trace_surroundings(field, placed.to_world, place, eye, settings)
+    around = placed.outlook(place, eye, settings).trace()
     observed = placed.at([eye], place, settings)
     tensor = lambda v: torch.tensor(np.ascontiguousarray(np.array(v).T, np.float32))
     r_o, escaped = tensor(around.directions), torch.tensor(np.array(around.escaped))
