@@ -134,7 +134,7 @@ class Controls:
             fixed = None if automatic.value else ends.value
             with telling(event, "Range"):
                 if fixed is not None:
-                    Scale(*fixed)
+                    Scale(fixed[0], fixed[1])
                 session.set_shade(layer=chosen, colors=None if colors.value == _USUAL else colors.value, fixed=fixed)
                 self._shown_anew()
 

@@ -126,7 +126,7 @@ def test03_densities_are_finite_and_not_negative(wrong, right):
     assert bounded(ns.Float(wrong))[0] == np.float32(right)
 
 
-# ---- A radiance field in the scene: what scale and rotation do to it, and what it is asked for outside of ----
+# ---- A radiance field in the scene: scale and rotation, and nothing is asked for outside of its bounds ----
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((0, 0, 0), (1, 1, 2))

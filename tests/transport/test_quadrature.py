@@ -504,7 +504,7 @@ def test15_steps_that_are_not_taken_add_nothing(kind):
     assert np.isclose(taken.dtau[0], 1.5) and (left.dtau[0], left.evals[0]) == (0, 0)
 
 
-# ---- Another quadrature rule is one object: registered, it marches, renders, is differentiated, and stand ----
+# ---- Another rule is one object: registered, it marches, renders and is differentiated, and stands in the manual ----
 
 
 class Simpson:
