@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
-from .style import INK, PAPER, SMALL, TITLE, new_page, wrap
+from .style import INK, PAPER, SMALL, TITLE, label_axes, label_bar, new_page, wrap
 
 # ---- Alignment figures ----
 #
@@ -49,9 +49,7 @@ def alignment_figure(
             _dots(axes, h, (a, b), _HEADS, 2, "heads")
             _frame(axes, [v for v in (shown, targets, p, h) if v is not None and len(v)], (a, b))
             axes.set_title(f"{when}, {view}", fontsize=9, color=INK, loc="left")
-            axes.set_xlabel("xyz"[a], fontsize=7, color=INK, labelpad=1)
-            axes.set_ylabel("xyz"[b], fontsize=7, color=INK, labelpad=1)
-            axes.tick_params(labelsize=7, colors=INK, length=2)
+            label_axes(axes, "xyz"[a], "xyz"[b], 7, labelpad=1)
     figure.axes[0].legend(fontsize=7, frameon=False, markerscale=5, loc="upper right")
     figure.suptitle(title, fontsize=10, color=INK)
     figure.tight_layout()
@@ -111,11 +109,9 @@ def camera_figure(to_world: np.ndarray, points: np.ndarray, colors: np.ndarray, 
             axes.plot(wedge[:, a], wedge[:, b], color=_CAMERA, linewidth=0.8)
         axes.set_aspect("equal")
         axes.set_title(name, fontsize=9, color=INK)
-        axes.set_xlabel("xyz"[a], fontsize=8, color=INK)
-        axes.set_ylabel("xyz"[b], fontsize=8, color=INK)
+        label_axes(axes, "xyz"[a], "xyz"[b])
         axes.set_xlim(low[a] - size, high[a] + size)
         axes.set_ylim(low[b] - size, high[b] + size)
-        axes.tick_params(labelsize=7, colors=INK, length=2)
     figure.suptitle(title, fontsize=10, color=INK)
     figure.tight_layout()
     return figure
@@ -218,9 +214,7 @@ def floor_figure(
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("x [m]", fontsize=SMALL, color=INK)
-    axes.set_ylabel("y [m]", fontsize=SMALL, color=INK)
-    axes.tick_params(labelsize=SMALL, colors=INK, length=2)
+    label_axes(axes, "x [m]", "y [m]", ticks=SMALL)
     for spine in axes.spines.values():
         spine.set_linewidth(0.5)
     page.text(_LEFT / width, 1 - 8 / height, wrap(title, pixels[0], TITLE), fontsize=TITLE, color=INK, va="top")
@@ -339,9 +333,7 @@ def floor_plan(rays, cell: float | None = None, title: str = "Where people stood
         *edges, density, cmap="viridis", norm=LogNorm(bottom, max(top, bottom * 1.01)), rasterized=True
     )
     _arrows(axes, rays, low, high)
-    bar = figure.colorbar(image, cax=figure.axes[1])
-    bar.set_label(f"rays/m² in cells of {cell:g} m; white: no ray", fontsize=7, color=INK)
-    bar.ax.tick_params(labelsize=7, colors=INK, length=2)
+    label_bar(figure.colorbar(image, cax=figure.axes[1]), f"rays/m² in cells of {cell:g} m; white: no ray", 7)
     return figure
 
 
@@ -479,9 +471,7 @@ def _sheet(low, high, title: str, bar: bool = False, pad: float = 0.0):
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("x [m]", fontsize=7, color=INK)
-    axes.set_ylabel("y [m]", fontsize=7, color=INK)
-    axes.tick_params(labelsize=7, colors=INK, length=2)
+    label_axes(axes, "x [m]", "y [m]", 7)
     for spine in axes.spines.values():
         spine.set_linewidth(0.5)
     axes.set_title(title, fontsize=9, color=INK, loc="left", pad=19 if not bar else 6)

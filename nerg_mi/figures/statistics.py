@@ -9,7 +9,7 @@ import numpy as np
 
 from nerg_mi.statistics.tables import is_too_low
 
-from .style import INK, new_page
+from .style import INK, label_axes, label_bar, new_page
 
 MOST = 40
 """So many things are drawn, those of the greatest share."""
@@ -86,8 +86,7 @@ def moves_figure(names: Sequence[str], moves: np.ndarray, title: str = "From thi
     bar = page.colorbar(
         image, cax=page.add_axes(((room + side + 10) / width, room / height, 12 / width, side / height))
     )
-    bar.set_label("% of the moves from there", fontsize=7, color=INK)
-    bar.ax.tick_params(labelsize=7, colors=INK, length=2)
+    label_bar(bar, "% of the moves from there", 7)
     return page
 
 
@@ -109,11 +108,8 @@ def map_figure(points: np.ndarray, values: np.ndarray, step: float, label: str, 
     axis.set_xlim(low[0], high[0])
     axis.set_ylim(low[1], high[1])
     axis.set_aspect("equal")
-    axis.set_xlabel("x [m]", fontsize=8, color=INK)
-    axis.set_ylabel("y [m]", fontsize=8, color=INK)
-    axis.tick_params(labelsize=7, colors=INK, length=2)
+    label_axes(axis, "x [m]", "y [m]")
     axis.set_title(title, fontsize=10, color=INK, loc="left")
     bar = page.colorbar(cells, cax=page.add_axes((1 - 95 / width, 50 / height, 14 / width, size[1] / height)))
-    bar.set_label(label, fontsize=8, color=INK)
-    bar.ax.tick_params(labelsize=7, colors=INK, length=2)
+    label_bar(bar, label)
     return page

@@ -320,6 +320,18 @@ def new_page(width: float, height: float) -> Any:
     return _page_type()(figsize=size, dpi=DPI, facecolor=PAPER)
 
 
+def label_axes(axes: Any, x: str, y: str, size: float = SMALL, ticks: float = 7, **how: Any) -> None:
+    """Say along ``axes`` what they are of, in letters of a ``size``, beside ``ticks`` of another."""
+    axes.set_xlabel(x, fontsize=size, color=INK, **how)
+    axes.set_ylabel(y, fontsize=size, color=INK, **how)
+    axes.tick_params(labelsize=ticks, colors=INK, length=2)
+
+
+def label_bar(bar: Any, text: str, size: float = SMALL) -> None:
+    bar.set_label(text, fontsize=size, color=INK)
+    bar.ax.tick_params(labelsize=7, colors=INK, length=2)
+
+
 @functools.cache
 def _page_type() -> Any:
     # Matplotlib is loaded when something is drawn, and not with every command.
