@@ -452,7 +452,7 @@ def read_nerg(
         raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
     state = StateDict(Path(path), model)
     with building(path):
-        gaze = FieldDensity(state, _variant(state, whole.get("variant")), ns)
+        gaze = gaze_field(state, _variant(state, whole.get("variant")), ns)
         nerf = state.below("model_nerf.")
         field = radiance_field(nerf, ns, given) if nerf.names() else None
     return field, gaze, origin(path, whole, "NeRG", averaged)
@@ -481,7 +481,7 @@ def _variant(state: StateDict, stored) -> str:
     return _VARIANTS[name]
 
 
-def FieldDensity(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
+def gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
     """The gaze field that the authors' state dictionary describes."""
     bound = float(np.abs(decimals(state["aabb_train"])).max())
     normalized = "net1.lin0.weight" in state

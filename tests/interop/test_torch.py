@@ -139,7 +139,7 @@ def test03_gradients_equal_central_differences(torch, interop):
 
 
 @pytest.mark.parametrize("trunk", ["relu", "layernorm", "linear"])
-def test04_a_FieldDensity(torch, interop, trunk):
+def test04_a_gaze_field(torch, interop, trunk):
     field = varied(GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2, trunk=trunk), BOX, ns))
     module = interop.GazeModule(field)
     (p_od, r_o), (p_o, _) = rays(torch, 60), rays(torch, 60)
@@ -210,7 +210,7 @@ def normalised(kind):
 
 
 @pytest.mark.parametrize("kind", ["product", "log", "mixed", "capture"])
-def test04b_a_normalised_FieldDensity(torch, interop, rgb, kind, tmp_path):
+def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
     """The default recipe's fields: integral and density of Dr.Jit's own marching, in a place of which half is open."""
     field = normalised(kind)
     shape = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.6]).scale(5)}
