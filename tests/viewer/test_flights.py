@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -92,14 +92,7 @@ def test03_dropped_steps_end_it_too(film_of):
 
 
 def test04_without_pyav_it_says_so(film_of, monkeypatch):
-    usual = builtins.__import__
-
-    def without(name, *args, **more):
-        if name == "av":
-            raise ImportError(name)
-        return usual(name, *args, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "av", None)
     film, _, ended = film_of()
     for _ in film.steps():
         pass
