@@ -32,7 +32,8 @@ def measure(name: str, make: Make, args: argparse.Namespace) -> list[dict]:
     """A row a population and error of one place, which is printed."""
     from nerg_mi.cli.progress import TerminalReporter
     from nerg_mi.workflows.base import select_backend
-    from nerg_mi.workflows.evaluate import FoldOptions, evaluate_folds
+    from nerg_mi.workflows.evaluate import evaluate_folds
+    from nerg_mi.workflows.gaze_commands import FoldOptions
 
     select_backend("llvm_ad_rgb", args.threads)
     folder, rays, where = write_place(name, make, args)

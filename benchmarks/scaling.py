@@ -56,7 +56,7 @@ def bake(folder: Path, name: str, detail: float, **more) -> tuple[int, bytes]:
     """Observers and the bytes of what is made of them."""
     from nerg_mi.scenes import store
     from nerg_mi.workflows.bake import bake
-    from nerg_mi.workflows.bake_options import BakeOptions
+    from nerg_mi.workflows.scene_commands import BakeOptions
 
     out = folder / f"{name}.ply"
     gaze = files(store) / "shoppers.safetensors"

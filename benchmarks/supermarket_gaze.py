@@ -27,8 +27,10 @@ OURS, BAR = "gaze field", "4,096 nearest rays"
 
 def main(argv=None) -> None:
     from nerg_mi.cli.progress import TerminalReporter
-    from nerg_mi.workflows.evaluate import FoldOptions, evaluate_folds
-    from nerg_mi.workflows.rays import ImportOptions, import_rays
+    from nerg_mi.workflows.evaluate import evaluate_folds
+    from nerg_mi.workflows.gaze_commands import FoldOptions
+    from nerg_mi.workflows.rays import import_rays
+    from nerg_mi.workflows.rays_commands import RaysImportOptions
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "vr_supermarket"
@@ -49,7 +51,7 @@ def main(argv=None) -> None:
     if not files:
         raise SystemExit(f'no recordings in "{args.data}"; set NERG_DATA to the folder that holds vr_supermarket')
     rays = args.out / "rays.npz"
-    import_rays(files, ImportOptions(reader="vr_supermarket", output=rays))
+    import_rays(files, RaysImportOptions(reader="vr_supermarket", output=rays))
     options = FoldOptions(
         geometry="hits",
         recipe=args.recipe,

@@ -84,7 +84,8 @@ def main(argv=None) -> None:
     from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.scenes.tabletop.photos import DEPTH_FILE
     from nerg_mi.scenes.tabletop.table import CENTRE
-    from nerg_mi.workflows.train_radiance import RadianceOptions, train_radiance
+    from nerg_mi.workflows.radiance_commands import RadianceOptions
+    from nerg_mi.workflows.train_radiance import train_radiance
 
     if not (args.views / DEPTH_FILE).is_file():
         raise SystemExit(f"{args.views} holds no photos; make them with: python -m nerg_mi.scenes.tabletop.make")

@@ -185,7 +185,8 @@ def trained(tmp_path_factory):
 
     import mitsuba as mi
 
-    from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
+    from nerg_mi.workflows.gaze_commands import GazeOptions
+    from nerg_mi.workflows.train_gaze import train_gaze
     from tests.evaluation.test_gaze import crowd
 
     mi.set_variant("llvm_ad_rgb")

@@ -24,7 +24,7 @@ from nerg_mi.rays.readers.registry import shared_options
 from nerg_mi.train import gaze_settings, radiance_settings
 from nerg_mi.workflows import rays
 from nerg_mi.workflows.base import Command
-from nerg_mi.workflows.draw import KINDS as FIGURES
+from nerg_mi.workflows.scene_commands import KINDS as FIGURES
 from tools.command_pages import commands
 
 
@@ -81,7 +81,7 @@ def _fault(kind, field, value) -> str | None:
 
 def test_all_kinds_of_options_are_found():
     names = {kind.__name__ for kind in KINDS}
-    assert {"BakeOptions", "GazeOptions", "SurfaceOptions", "TableOptions", "TickOption", "ProbeSettings"} <= names
+    assert {"BakeOptions", "GazeOptions", "FoldOptions", "TableOptions", "TickOption", "ProbeSettings"} <= names
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: f"{k.__module__}.{k.__name__}")

@@ -1,7 +1,4 @@
-"""``nerg bake``: Put gaze on surfaces: how much of it each square metre receives, as colours and tables.
-
-Attention on surfaces: from meshes, scenes or fields to files with attention, and the files themselves.
-"""
+"""Attention on surfaces: from meshes, scenes or fields to files with attention, and the files themselves."""
 
 from __future__ import annotations
 
@@ -32,22 +29,25 @@ from nerg_mi.surfaces.mesh import Mesh, Refined, texture_rows, unroll, unroller
 from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays, ray_seconds
 
 from .bake_chunks import (
+    UNITS,
     BakeScene,
     Receivers,
     alignment_of,
     check_values,
+    cone_of,
     cut,
     find_crowd,
     halves_of,
     rays_of,
     read_receivers,
+    source_of,
     sums_in_one_go,
     sums_in_parts,
     tracked_rays,
 )
-from .bake_options import UNITS, BakeOptions, cone_of, source_of
-from .base import SILENT, Reporter, argument, command, out, select_backend
+from .base import SILENT, Reporter, select_backend
 from .parts import Parts
+from .scene_commands import BakeOptions
 
 # ---- Outputs ----
 #
@@ -292,17 +292,6 @@ def bake(
     return Bake(mesh, density, share, on, elsewhere, escaped, total, summary, tuple(paths))
 
 
-@command(
-    "bake",
-    "Put gaze on surfaces: how much of it each square metre receives, from a gaze field or from tracked rays.",
-    options=BakeOptions,
-    surface=argument("Mesh (.ply, .obj, .glb), scene (.xml), radiance field (.safetensors), or Gaussian splats."),
-    output=out(
-        "Files to write, repeatable: .ply, .glb (with colours), .csv (of faces), .json (summary); of Gaussian splats "
-        ".ply and .json.",
-        list[Path],
-    ),
-)
 def bake_any(surface: Path, output: list[Path], options: BakeOptions, reporter: Reporter) -> None:
     """`bake` on a mesh, and `bake_splats.bake_splats` on Gaussian splats."""
     from .bake_splats import bake_splats
@@ -311,7 +300,7 @@ def bake_any(surface: Path, output: list[Path], options: BakeOptions, reporter: 
 
 
 def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
-    """Whose gaze it is, of `bake_options.SOURCES`. Raises `NergError` for options that contradict each other."""
+    """Whose gaze it is, of `bake_chunks.SOURCES`. Raises `NergError` for options that contradict each other."""
     for path in paths:
         check_writable(path, *SUFFIXES)
     check_texture(paths, options.texture)

@@ -26,21 +26,24 @@ from nerg_mi.surfaces.sources import Crowd, RaySettings, TrackedRays, ray_second
 from nerg_mi.surfaces.splats import HIDDEN, SplatSmoother, splat_areas, whole_areas
 
 from .bake_chunks import (
+    UNITS,
     SplatPlace,
     SplatScene,
     alignment_of,
     check_values,
+    cone_of,
     find_crowd,
     halves_of,
     rays_of,
+    source_of,
     splat_place,
     sums_in_one_go,
     sums_in_parts,
     tracked_rays,
 )
-from .bake_options import UNITS, BakeOptions, cone_of, source_of
 from .base import SILENT, Reporter, select_backend
 from .parts import Parts
+from .scene_commands import BakeOptions
 
 COLUMN = "attention"
 """The column of a file that holds what each Gaussian receives."""

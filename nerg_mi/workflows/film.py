@@ -1,7 +1,4 @@
-"""``nerg render``: Render a scene file to a picture or a video.
-
-Rendering sequences of pictures, as frames or a video, whole or in parts.
-"""
+"""Rendering sequences of pictures, as frames or a video, whole or in parts."""
 
 from __future__ import annotations
 
@@ -24,8 +21,8 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.scene import activate, load_scene
 from nerg_mi.threads import set_thread_count
 
-from .base import SILENT, Reporter, argument, command, out
-from .options import FilmOptions, PictureOptions, as_base
+from .base import SILENT, Reporter
+from .options import as_base
 from .render import (
     AskedPictures,
     PictureResult,
@@ -41,6 +38,7 @@ from .render import (
     style_of,
     unstacked,
 )
+from .scene_commands import FilmOptions, PictureOptions
 
 if TYPE_CHECKING:
     from .parts import Parts, PlannedScene
@@ -50,18 +48,6 @@ _LAYERS_SHARE = 0.8
 """How much of a film with a common scale is rendering; the rest is drawing."""
 
 
-@command(
-    "render",
-    "Render a scene file to a picture or a video, with the integrator that the scene names.",
-    more="""An EXR file holds all channels in float32, those of the AOVs among them; a PNG file holds the colour,
-tonemapped to sRGB, or an overlay with its scale, which an SVG file can hold, too. Pictures of a sequence have a number
-added to their names, or are the frames of an MP4 file.
-
-With --store or --scheduler each picture is kept when it is done, and the same command goes on where it ended.""",
-    options=FilmOptions,
-    scene=argument("Mitsuba scene file (.xml)."),
-    output=out("Picture to write: .exr (all channels), .png; .svg, .mp4."),
-)
 def render_film(
     scene: str | Path, output: str | Path, options: FilmOptions | None = None, reporter: Reporter = SILENT
 ) -> PictureResult:

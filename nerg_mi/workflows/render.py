@@ -32,7 +32,7 @@ from nerg_mi.transport.aovs import AOVS
 from nerg_mi.transport.observer import center
 
 from .base import SILENT, Reporter
-from .options import PictureOptions
+from .scene_commands import PictureOptions
 
 # ---- Pictures with a quantity laid over their colour, alone or as a sequence with one scale ----
 

@@ -1,7 +1,4 @@
-"""``nerg stats``: Count attention on things, in rays and by a gaze field: numbers with intervals, and what if.
-
-Attention on things as numbers: counted in rays, foretold by a field, by cohort, time and zone; and what if.
-"""
+"""Attention on things as numbers: counted in rays, foretold by a field, by cohort, time and zone; and what if."""
 
 from __future__ import annotations
 
@@ -53,7 +50,7 @@ from nerg_mi.statistics.tables import (
 from nerg_mi.statistics.visibility import Isovists, Targets
 from nerg_mi.statistics.visits import ALL, Cell, Sums, Total
 
-from .base import SILENT, Reporter, argument, command, out, select_backend
+from .base import SILENT, Reporter, select_backend
 from .options import parse_point
 from .parts import Parts
 from .scene_places import kind_of_file
@@ -87,16 +84,6 @@ class _Given:
     rays: Path | Rays | None = None
 
 
-@command(
-    "stats",
-    "Count attention on things: in rays, and as a gaze field predicts it, with intervals over people.",
-    more="""Share, dwell, reach, first looks, returns, distance, what could be seen; by cohort, time and zone;
-differences, moves from thing to thing, what if something stood elsewhere. --visibility tells what can be seen from
-where.""",
-    options=StatisticsOptions,
-    files=argument("Rays or a dataset, a scene, a gaze field, a place; in any order.", list[Path]),
-    output=out("Folder for tables and pictures."),
-)
 def statistics(
     files: Sequence[str | Path | Rays],
     output: str | Path | None = None,

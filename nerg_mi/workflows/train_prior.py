@@ -1,7 +1,4 @@
-"""``nerg train prior``: Make a gaze field for a place where nobody was tracked: how high people looked in other places.
-
-A gaze field for a place where nobody was tracked: what people in other places say of it.
-"""
+"""A gaze field for a place where nobody was tracked: what people in other places say of it."""
 
 from __future__ import annotations
 
@@ -14,24 +11,14 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.ranges import RAYS, SEEDS, Checked
 from nerg_mi.rays.dataset_open import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_log_density import KAPPA, prior_field
 
-from .base import SILENT, Reporter, argument, command, out, select_backend
-from .options import option
+from .base import SILENT, Reporter, select_backend
+from .gaze_commands import PriorOptions
 
 # ---- Options of the gaze field for a place where nobody was tracked ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class PriorOptions(Checked):
-    """Which rays are read, and where the field is made."""
-
-    most: int = option(10_000_000, "Rays of a dataset at most; of more, a sample by --seed.", within=RAYS)
-    seed: int = option(0, "Seed of that sample.", "-s", "--seed", within=SEEDS)
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
 
 
 # ---- Gaze prior ----
@@ -55,13 +42,6 @@ class PriorResult:
     output: Path | None
 
 
-@command(
-    "train prior",
-    more="It stands in any place whose z axis points up. What it is worth: docs/gaze-evaluation.md.",
-    options=PriorOptions,
-    rays=argument("Rays files (.npz or .parquet) or datasets, one a place.", list[Path]),
-    output=out("Checkpoint to write (.safetensors)."),
-)
 def learn_prior(
     rays: Rays | str | Path | Sequence[Rays | str | Path],
     output: str | Path | None = None,

@@ -19,10 +19,9 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows import ablation, evaluate, study, train_radiance
 from nerg_mi.workflows import train_gaze as gaze_job
 from nerg_mi.workflows import train_radiance as radiance_job
-from nerg_mi.workflows.ablation import AblationOptions
-from nerg_mi.workflows.geometry import GazeEvaluationOptions
-from nerg_mi.workflows.train_gaze import GazeOptions
-from nerg_mi.workflows.train_radiance import RadianceOptions
+from nerg_mi.workflows.gaze_commands import AblationOptions, GazeEvaluationOptions, GazeOptions
+from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOptions
+from nerg_mi.workflows.scene_commands import StudyOptions
 from tests.surfaces.meshes import box
 
 
@@ -90,7 +89,7 @@ def raise_it(*arguments):
             (
                 Path("f.safetensors"),
                 Path("photos"),
-                train_radiance.RadianceScoreOptions(spp=3, pictures=Path("out"), mode="llvm_ad_rgb"),
+                RadianceScoreOptions(spp=3, pictures=Path("out"), mode="llvm_ad_rgb"),
             ),
         ),
         (
@@ -109,7 +108,7 @@ def raise_it(*arguments):
             study,
             "run_study",
             lambda: nerg.study("slab", "out", quick=True),
-            ("slab", "out", study.StudyOptions(quick=True, mode="llvm_ad_rgb")),
+            ("slab", "out", StudyOptions(quick=True, mode="llvm_ad_rgb")),
         ),
     ],
 )

@@ -7,7 +7,7 @@ import pytest
 
 import nerg_mi.cli
 from nerg_mi.files.images import write_exr
-from nerg_mi.workflows.draw import KINDS
+from nerg_mi.workflows.scene_commands import KINDS
 from tests.workflows.drawing.test_draw_scenes import WALLS_SCENE as SCENE
 
 

@@ -12,7 +12,7 @@ import pytest
 from nerg_mi.cli import main
 from nerg_mi.formats.fields import load_gaze, load_radiance
 from nerg_mi.workflows import train_gaze  # noqa: F401 (declares the command)
-from nerg_mi.workflows.train_gaze import GazeOptions
+from nerg_mi.workflows.gaze_commands import GazeOptions
 from tests.plugins import fields as radiance_fields
 from tests.train.gaze.looks import looking_at
 

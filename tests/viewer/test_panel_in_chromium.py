@@ -12,7 +12,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.viewer.serve import viewer
-from nerg_mi.workflows.view import ViewOptions
+from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import chromium, require
 from tests.viewer.panel import Panel
 from tests.viewer.room import ROOM, write_gaze_fields

@@ -12,7 +12,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.viewer import serve
 from nerg_mi.viewer.serve import view_files, viewer
-from nerg_mi.workflows.view import ViewOptions
+from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import require
 from tests.workflows.recorder import Recorder
 

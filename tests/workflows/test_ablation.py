@@ -11,7 +11,8 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
 from nerg_mi.workflows import ablation as ablation_bench
-from nerg_mi.workflows.ablation import AblationOptions, Bench, ablate, law_of, plan_of
+from nerg_mi.workflows.ablation import Bench, ablate, law_of, plan_of
+from nerg_mi.workflows.gaze_commands import AblationOptions
 from tests.evaluation.test_gaze import crowd
 from tests.formats.splats.writers import random_splats, write_inria
 

@@ -12,8 +12,9 @@ from nerg_mi.maths.geometry import Box
 from nerg_mi.train.geometry import GazePlace
 from nerg_mi.workflows import align as alignment
 from nerg_mi.workflows import geometry
-from nerg_mi.workflows.align import AlignOptions, align
+from nerg_mi.workflows.align import align
 from nerg_mi.workflows.geometry import check_place
+from nerg_mi.workflows.rays_commands import AlignOptions
 from tests.alignment import rooms
 
 from .recorder import Recorder

@@ -9,7 +9,8 @@ from nerg_mi.scenes import store
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows.bake import BakeOptions, bake
+from nerg_mi.workflows.bake import bake
+from nerg_mi.workflows.scene_commands import BakeOptions
 from tests.surfaces.meshes import box
 from tests.workflows.recorder import Recorder
 

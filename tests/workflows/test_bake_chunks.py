@@ -29,7 +29,7 @@ from nerg_mi.workflows.bake_chunks import (
     splat_place,
     tracked_rays,
 )
-from nerg_mi.workflows.bake_options import BakeOptions
+from nerg_mi.workflows.scene_commands import BakeOptions
 from tests.plugins import fields
 from tests.surfaces.meshes import box, joined
 from tests.surfaces.test_splats import falling

@@ -13,8 +13,8 @@ from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.maths.sphere import C0
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows import bake_chunks
-from nerg_mi.workflows.bake_options import BakeOptions
 from nerg_mi.workflows.bake_splats import COLUMN, bake_splats
+from nerg_mi.workflows.scene_commands import BakeOptions
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.plugins import fields
 from tests.surfaces.walls import wall

@@ -2,7 +2,8 @@
 
 import pytest
 
-from nerg_mi.workflows.export import ImportOptions, import_checkpoint
+from nerg_mi.workflows.export import import_checkpoint
+from nerg_mi.workflows.radiance_commands import CheckpointImportOptions
 from tests.formats.torch_ngp.test_fields import small_state
 from tests.formats.torch_ngp.test_nerg import save, small_gaze
 from tests.workflows.recorder import Recorder
@@ -21,5 +22,5 @@ def test_fields_without_any_file(tmp_path):
 def test_files_in_their_order(tmp_path):
     path = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state())
     outputs = tmp_path / "f.safetensors", tmp_path / "g.safetensors"
-    found = import_checkpoint(path, *outputs, ImportOptions(half=True))
+    found = import_checkpoint(path, *outputs, CheckpointImportOptions(half=True))
     assert tuple(found.files) == outputs and all(p.is_file() for p in outputs)

@@ -14,7 +14,8 @@ from nerg_mi.rays.dataset_write import SourceWriter
 from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.workflows import rays
 from nerg_mi.workflows.evaluate import evaluate_gaze
-from nerg_mi.workflows.rays import FilterOptions, ImportOptions, card_of, filter_rays, import_rays
+from nerg_mi.workflows.rays import card_of, filter_rays, import_rays
+from nerg_mi.workflows.rays_commands import FilterOptions, RaysImportOptions
 from nerg_mi.workflows.train_gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
 from tests.rays.dataset.making import DAY, assert_same, settings, write_dataset, write_source
@@ -25,8 +26,8 @@ from .recorder import Recorder
 pytest.importorskip("pyarrow")
 
 
-def options(**given) -> ImportOptions:
-    return ImportOptions(**{"settings": settings(), "workers": 1, **given})
+def options(**given) -> RaysImportOptions:
+    return RaysImportOptions(**{"settings": settings(), "workers": 1, **given})
 
 
 @pytest.fixture
@@ -64,7 +65,7 @@ def test_pseudonyms(files, tmp_path):
     (tmp_path / "salt").write_bytes(bytes(range(32)))
     salted = {"pseudonyms": True, "salt": tmp_path / "salt"}
     found = import_rays(files, options(output=tmp_path / "a.rays", **salted))
-    assert found.rays.persons == import_rays(files, ImportOptions(settings=settings(), **salted)).rays.persons
+    assert found.rays.persons == import_rays(files, RaysImportOptions(settings=settings(), **salted)).rays.persons
     random = import_rays(files, options(output=tmp_path / "b.rays", pseudonyms=True))
     assert len(random.rays.persons) == 9 and not set(random.rays.persons) & set(found.rays.persons)
     with pytest.raises(NergError, match="random salt"):
@@ -82,7 +83,7 @@ def test_pseudonyms(files, tmp_path):
 )
 def test_options_of_datasets(given, why):
     with pytest.raises(NergError, match=why):
-        ImportOptions(**given)
+        RaysImportOptions(**given)
 
 
 @pytest.mark.parametrize(

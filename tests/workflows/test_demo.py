@@ -7,7 +7,8 @@ import pytest
 
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows import demo
-from nerg_mi.workflows.demo import STAGES, DemoOptions, make_demo
+from nerg_mi.workflows.demo import STAGES, make_demo
+from nerg_mi.workflows.scene_commands import DemoOptions
 from tests.figures.standins import write_standins
 from tests.workflows.recorder import Recorder
 

@@ -11,8 +11,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze import SCORES
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.evaluate import evaluate_gaze
-from nerg_mi.workflows.geometry import GazeEvaluationOptions
-from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
+from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions, GazeOptions
+from nerg_mi.workflows.train_gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
 
 OPTIONS = GazeEvaluationOptions(min_rays=8, directions=128, resamples=2, pictures=1)

@@ -11,7 +11,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.workflows import film
 from nerg_mi.workflows.film import render_film
-from nerg_mi.workflows.options import FilmOptions
+from nerg_mi.workflows.scene_commands import FilmOptions
 from tests.cli.test_render import SCENE
 from tests.conftest import ROOT
 from tests.workflows.recorder import Recorder

@@ -7,7 +7,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.tables import write_json
 from nerg_mi.threads import set_thread_count
 from nerg_mi.workflows import evaluate
-from nerg_mi.workflows.evaluate import SCORED, FoldOptions, evaluate_folds
+from nerg_mi.workflows.evaluate import SCORED, evaluate_folds
+from nerg_mi.workflows.gaze_commands import FoldOptions
 from nerg_mi.workflows.parts import account_for_store
 from tests.evaluation.test_gaze import crowd
 from tests.tasks.clusters import ClusterOfProcesses, wait_until

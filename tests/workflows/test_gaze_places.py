@@ -11,7 +11,8 @@ import pytest
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
-from nerg_mi.workflows.geometry import GazeEvaluationOptions, make_place, place_of_training
+from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions
+from nerg_mi.workflows.geometry import make_place, place_of_training
 from nerg_mi.workflows.options import PlaceOptions
 from tests.plugins import fields
 from tests.train.gaze.looks import BOX, around, looking_at

@@ -8,8 +8,9 @@ from nerg_mi.errors import NergError
 from nerg_mi.tasks.engines import Local, Processes, run_plan
 from nerg_mi.tasks.store import Store
 from nerg_mi.workflows.film import make_picture
-from nerg_mi.workflows.options import PartOptions, PictureOptions
+from nerg_mi.workflows.options import PartOptions
 from nerg_mi.workflows.parts import Parts, PlannedScene, account_for_store, size
+from nerg_mi.workflows.scene_commands import PictureOptions
 from tests.tasks import works
 from tests.workflows.recorder import Recorder
 

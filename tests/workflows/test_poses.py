@@ -17,7 +17,8 @@ from nerg_mi.photos.colmap import Up
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.structure import Reconstruction
 from nerg_mi.workflows import poses as job
-from nerg_mi.workflows.poses import STAGES, PoseOptions, find_poses
+from nerg_mi.workflows.poses import STAGES, find_poses
+from nerg_mi.workflows.radiance_commands import PoseOptions
 from tests.photos.structure import rendered
 
 from .recorder import Recorder

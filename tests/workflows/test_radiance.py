@@ -10,7 +10,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.train.radiance_settings import RadianceSettings
 from nerg_mi.workflows import train_radiance as radiance
-from nerg_mi.workflows.train_radiance import RadianceOptions, RadianceScoreOptions, evaluate_radiance, train_radiance
+from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOptions
+from nerg_mi.workflows.train_radiance import evaluate_radiance, train_radiance
 from tests.cli.test_eval import place  # noqa: F401  (fixture)
 from tests.workflows.recorder import Recorder
 

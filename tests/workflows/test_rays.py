@@ -9,18 +9,8 @@ from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.registry import make_options
-from nerg_mi.workflows.rays import (
-    FilterOptions,
-    FilterSteps,
-    ImportOptions,
-    PlotOptions,
-    SplitOptions,
-    filter_rays,
-    import_rays,
-    least_mask,
-    plot_rays,
-    split_rays,
-)
+from nerg_mi.workflows.rays import FilterSteps, filter_rays, import_rays, least_mask, plot_rays, split_rays
+from nerg_mi.workflows.rays_commands import FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 from tests.cli.rays.running import write_walk
 from tests.rays.dataset.making import crowd
 from tests.rays.readers.examples import EXAMPLES
@@ -90,13 +80,13 @@ def test_import(tmp_path):
     given, heard = EXAMPLES["table"].make(tmp_path), Heard()
     (tmp_path / "more.csv").write_text(given.read_text())
     settings = make_options("table", EXAMPLES["table"].options)
-    options = ImportOptions(settings=settings, output=tmp_path / "rays.npz")
+    options = RaysImportOptions(settings=settings, output=tmp_path / "rays.npz")
     result = import_rays([given, tmp_path / "more.csv"], options, heard)
     assert len(result.rays) == 40 == result.summary.rays and result.rays.persons == ("ann", "bo")
     assert heard.shares == [(0.0, "reading gaze.csv"), (0.5, "reading more.csv")] and heard.messages == []
     kept = Rays.load(tmp_path / "rays.npz")
     assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(columns(kept), columns(result.rays)))
-    assert len(import_rays(given, ImportOptions(settings=settings)).rays) == 20
+    assert len(import_rays(given, RaysImportOptions(settings=settings)).rays) == 20
 
 
 def test_the_way_back_to_the_files(tmp_path):
@@ -104,14 +94,14 @@ def test_the_way_back_to_the_files(tmp_path):
     given, align = EXAMPLES["table"].make(tmp_path), tmp_path / "align.json"
     table = EXAMPLES["table"].options
     settings = make_options("table", {**table, "up": "-y", "units": "mm"})
-    rays = import_rays(given, ImportOptions(settings=settings, align_output=align)).rays
+    rays = import_rays(given, RaysImportOptions(settings=settings, align_output=align)).rays
     back = read_similarity(align, "--align", "rays to field")
-    plain = import_rays(given, ImportOptions(settings=make_options("table", table))).rays
+    plain = import_rays(given, RaysImportOptions(settings=make_options("table", table))).rays
     assert np.isclose(back.scale, 1000.0)
     assert np.allclose(rays.origin @ back.matrix[:3, :3].T + back.matrix[:3, 3], plain.origin)
     with pytest.raises(NergError, match="left-handed"):
         left = make_options("table", {**table, "up": "y", "handedness": "left"})
-        import_rays(given, ImportOptions(settings=left, align_output=align, output=tmp_path / "none.npz"))
+        import_rays(given, RaysImportOptions(settings=left, align_output=align, output=tmp_path / "none.npz"))
     assert not (tmp_path / "none.npz").exists()
 
 
@@ -120,18 +110,19 @@ def test_import_under_pseudonyms(tmp_path):
     settings = make_options("table", EXAMPLES["table"].options)
     (tmp_path / "salt").write_bytes(bytes(range(32)))
     one, two = (
-        import_rays(given, ImportOptions(settings=settings, pseudonyms=True, salt=tmp_path / "salt")) for _ in range(2)
+        import_rays(given, RaysImportOptions(settings=settings, pseudonyms=True, salt=tmp_path / "salt"))
+        for _ in range(2)
     )
     assert one.rays.persons == two.rays.persons and not set(one.rays.persons) & {"ann", "bo"}
     with pytest.raises(NergError, match="belongs to --pseudonyms"):
-        ImportOptions(settings=settings, salt=tmp_path / "salt")
+        RaysImportOptions(settings=settings, salt=tmp_path / "salt")
 
 
 def test_an_output_that_cannot_be_written_is_found_first(tmp_path, walk):
     (tmp_path / "folder.npz").mkdir()
     for output in (tmp_path / "rays.txt", tmp_path / "folder.npz"):
         for job in (
-            lambda output=output: import_rays("absent.csv", ImportOptions(reader="varjo", output=output)),
+            lambda output=output: import_rays("absent.csv", RaysImportOptions(reader="varjo", output=output)),
             lambda output=output: filter_rays("absent.npz", FilterOptions(start=0, output=output)),
             lambda output=output: split_rays("absent.npz", SplitOptions(people=0.5, test_output=output)),
         ):

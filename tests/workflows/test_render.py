@@ -17,9 +17,9 @@ from nerg_mi.rendering.aovs import prepare_for, render_asked
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.workflows import render
 from nerg_mi.workflows.demo import store_scene
-from nerg_mi.workflows.options import PictureOptions
-from nerg_mi.workflows.render import PictureOptions as PicturesPictureOptions
 from nerg_mi.workflows.render import render_file
+from nerg_mi.workflows.scene_commands import PictureOptions
+from nerg_mi.workflows.scene_commands import PictureOptions as PicturesPictureOptions
 from tests.cli.test_render import SCENE
 from tests.pictures import mitsuba_bitmap
 from tests.plugins import fields

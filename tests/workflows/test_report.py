@@ -12,8 +12,10 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze_report import write_report
 from nerg_mi.workflows import report
-from nerg_mi.workflows.report import ReportOptions, make_report
-from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
+from nerg_mi.workflows.gaze_commands import GazeOptions
+from nerg_mi.workflows.report import make_report
+from nerg_mi.workflows.scene_commands import ReportOptions
+from nerg_mi.workflows.train_gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
 from tests.evaluation.test_gaze_report import scored
 from tests.report.made import packed_scene

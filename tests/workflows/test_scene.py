@@ -21,9 +21,10 @@ from nerg_mi.rendering.bands import render_channels
 from nerg_mi.rendering.files import read_frames
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.workflows.geometry import make_place
-from nerg_mi.workflows.options import PictureOptions, PlaceOptions
+from nerg_mi.workflows.options import PlaceOptions
 from nerg_mi.workflows.render import render_file
-from nerg_mi.workflows.scene import SceneOptions, write_scene
+from nerg_mi.workflows.scene import write_scene
+from nerg_mi.workflows.scene_commands import PictureOptions, SceneOptions
 from tests.formats.splats.writers import write_inria
 from tests.pictures import mitsuba_bitmap
 from tests.plugins import fields

@@ -2,7 +2,8 @@
 
 import pytest
 
-from nerg_mi.workflows.study import StudyOptions, run_study
+from nerg_mi.workflows.scene_commands import StudyOptions
+from nerg_mi.workflows.study import run_study
 from tests.workflows.recorder import Recorder
 
 

@@ -7,7 +7,8 @@ import pytest
 from nerg_mi.evaluation.study import measure, settings
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.workflows import study
-from nerg_mi.workflows.study import StudyOptions, measure_part, planned_study, run_study, twin_beside
+from nerg_mi.workflows.scene_commands import StudyOptions
+from nerg_mi.workflows.study import measure_part, planned_study, run_study, twin_beside
 from tests.evaluation.test_study_subject import SCENE, TWIN
 from tests.tasks.clusters import ClusterOfProcesses, wait_until
 from tests.tasks.works import laid_out

@@ -13,11 +13,13 @@ import pytest
 from nerg_mi.aoi.options import CountOptions, PredictionOptions, StatisticsOptions
 from nerg_mi.surfaces.sources import GazeSettings, RaySettings
 from nerg_mi.tasks.task import Part, Plan, rebuilt
-from nerg_mi.workflows.ablation import AblationOptions, training_options
-from nerg_mi.workflows.evaluate import FoldOptions, fold_options
+from nerg_mi.workflows.ablation import training_options
+from nerg_mi.workflows.evaluate import fold_options
 from nerg_mi.workflows.film import picture_options
-from nerg_mi.workflows.options import FilmOptions, PartOptions, as_base, option
-from nerg_mi.workflows.study import StudyOptions, planned_study
+from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions
+from nerg_mi.workflows.options import PartOptions, as_base, option
+from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions
+from nerg_mi.workflows.study import planned_study
 from tests.tasks import works
 
 STORE = {"store", "scheduler", "threads"}

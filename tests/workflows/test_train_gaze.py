@@ -20,7 +20,8 @@ from nerg_mi.train.gaze_data import surface_distances
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer, surroundings
 from nerg_mi.train.gaze_recipes import Recipe, register
 from nerg_mi.train.geometry import GazePlace, place_of_scene
-from nerg_mi.workflows.train_gaze import GazeOptions, check_plan, plan_gaze, train_gaze
+from nerg_mi.workflows.gaze_commands import GazeOptions
+from nerg_mi.workflows.train_gaze import check_plan, plan_gaze, train_gaze
 from nerg_mi.workflows.train_radiance import train_radiance
 from tests.train.gaze.looks import BOX, RAYS, looking_at
 
@@ -151,7 +152,8 @@ def test_recipes_in_a_scene_of_shapes(rays, tmp_path, recipe):
 
 def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, monkeypatch, capsys):
     """A second log density, which is one entry: hold-out, ensembles and ablation know it by that."""
-    from nerg_mi.workflows.ablation import AblationOptions, ablate
+    from nerg_mi.workflows.ablation import ablate
+    from nerg_mi.workflows.gaze_commands import AblationOptions
 
     monkeypatch.setattr(gaze_recipes, "RECIPES", dict(gaze_recipes.RECIPES))
     grid = HashGridConfig(levels=2, log2_rows=8, base=2, finest=4)

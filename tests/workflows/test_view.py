@@ -13,7 +13,8 @@ from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.formats.gltf import shown_unlit
 from nerg_mi.rendering.nested_scene import gaze_of_scene
 from nerg_mi.workflows import demo
-from nerg_mi.workflows.view import ViewOptions, place_to_view, write_variants
+from nerg_mi.workflows.scene_commands import ViewOptions
+from nerg_mi.workflows.view import place_to_view, write_variants
 from tests.formats.splats.writers import random_splats, write_spz
 from tests.workflows.recorder import Recorder
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.workflows.bake_options import CONE, BakeOptions, cone_of, source_of
+from nerg_mi.workflows.bake_chunks import CONE, cone_of, source_of
+from nerg_mi.workflows.scene_commands import BakeOptions
 
 GAZE, RAYS = Path("gaze.safetensors"), Path("rays.npz")
 

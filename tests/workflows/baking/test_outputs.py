@@ -11,7 +11,8 @@ import trimesh
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows.bake import BakeOptions, bake, check_texture, vertex_normals
+from nerg_mi.workflows.bake import bake, check_texture, vertex_normals
+from nerg_mi.workflows.scene_commands import BakeOptions
 from tests.surfaces.meshes import box, joined
 
 

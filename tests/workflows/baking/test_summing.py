@@ -25,9 +25,9 @@ from nerg_mi.workflows.bake_chunks import (
     sums_in_one_go,
     sums_in_parts,
 )
-from nerg_mi.workflows.bake_options import BakeOptions
 from nerg_mi.workflows.options import PartOptions
 from nerg_mi.workflows.parts import Parts
+from nerg_mi.workflows.scene_commands import BakeOptions
 from tests.conftest import ROOT
 from tests.plugins import fields
 from tests.surfaces.meshes import box, joined

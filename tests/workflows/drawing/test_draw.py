@@ -9,7 +9,8 @@ import json
 import pytest
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.workflows.draw import KINDS, draw, find_kind
+from nerg_mi.workflows.draw import draw, find_kind
+from nerg_mi.workflows.scene_commands import KINDS
 from tests.workflows.drawing.test_draw_files import write
 from tests.workflows.recorder import Recorder
 

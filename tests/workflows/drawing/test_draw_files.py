@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.workflows.draw_files`."""
+"""Tests of `nerg_mi.workflows.draw`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from nerg_mi.figures.style import color_values
 from nerg_mi.files.images import write_exr
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import write_ply_splats
-from nerg_mi.workflows.draw import draw
-from nerg_mi.workflows.draw_files import read_baked, read_stored, shared_note
+from nerg_mi.workflows.draw import draw, read_baked, read_stored, shared_note
 from tests.surfaces.walls import wall
 
 # ---- Quantities in EXR files ----

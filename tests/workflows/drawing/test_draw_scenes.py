@@ -14,15 +14,8 @@ from nerg_mi.rendering.aovs import render_asked
 from nerg_mi.transport.geometry import pixel_directions
 from nerg_mi.workflows import draw_scenes as scenes
 from nerg_mi.workflows.draw import draw
-from nerg_mi.workflows.draw_scenes import (
-    ScaleOptions,
-    SceneOptions,
-    SphereOptions,
-    cut_place,
-    film,
-    open_scene,
-    upright_pose,
-)
+from nerg_mi.workflows.draw_scenes import cut_place, film, open_scene, upright_pose
+from nerg_mi.workflows.scene_commands import ScaleOptions, SceneFigureOptions, SphereOptions
 from tests.cli.test_render import SCENE
 from tests.workflows.recorder import Recorder
 
@@ -83,7 +76,7 @@ def test_a_film_that_is_too_large():
 
 def test_another_integrator_is_refused(tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE)
-    options = SceneOptions(mode="llvm_ad_rgb")
+    options = SceneFigureOptions(mode="llvm_ad_rgb")
     with (
         pytest.raises(NergError, match='needs the integrator "nerg"'),
         open_scene(tmp_path / "scene.xml", options, Recorder()),
@@ -159,7 +152,7 @@ def test_three_pictures_with_one_scale(rgb, scene_triptych, monkeypatch):
     assert (without.values >= with_.values - 1e-6).all() and (without.values > with_.values + 1e-3).any()
     assert (without.color == with_.color).all() and own.values.shape == with_.values.shape
     # The first is what a camera at the observer's place sees, with its own gaze.
-    with scenes.open_scene(scene_triptych, SceneOptions(mode=MODE, spp=2, defaults=behind), told) as opened:
+    with scenes.open_scene(scene_triptych, SceneFigureOptions(mode=MODE, spp=2, defaults=behind), told) as opened:
         plain = opened.see(opened.camera(0), find_overlay("gaze"))
         again = render_asked(scene_triptych, opened.scene, opened.camera(0), ["gaze", "opacity"], spp=2)
     assert (plain.values == with_.values).all() and (again.aovs["gaze"] == with_.values).all()

@@ -10,8 +10,8 @@ import pytest
 from nerg_mi.evaluation.ablation import Variant
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.workflows import ablation, evaluate
+from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeOptions
 from nerg_mi.workflows.options import exposed_options
-from nerg_mi.workflows.train_gaze import GazeOptions
 
 FIELDS = [f for kind in (ProbeSettings, GazeSettings) for f in fields(kind) if "help" in f.metadata]
 SETTINGS = {f.metadata["option"] or f.name for f in FIELDS}
@@ -37,7 +37,7 @@ def training(monkeypatch):
 
 
 def test_folds_have_them(training, tmp_path):
-    options = evaluate.FoldOptions(geometry="hits", **CHOSEN)
+    options = FoldOptions(geometry="hits", **CHOSEN)
     with pytest.raises(Stop):
         evaluate.train_and_score(evaluate.Folds(options, ("both",), None, None), 3, tmp_path)
     assert {name: getattr(training[0], name) for name in CHOSEN} == CHOSEN and training[0].seed == 3
@@ -46,14 +46,14 @@ def test_folds_have_them(training, tmp_path):
 
 
 def test_ablations_have_them(training):
-    bench = SimpleNamespace(options=ablation.AblationOptions(**CHOSEN, default_steps=3), place=None)
+    bench = SimpleNamespace(options=AblationOptions(**CHOSEN, default_steps=3), place=None)
     with pytest.raises(Stop):
         ablation.plan_of(Variant(name="emit", recipe="default", gaze="emit"), 3, bench)
     assert {name: getattr(training[0], name) for name in CHOSEN} == CHOSEN
     assert training[0].kappa is training[0].radius is None and training[0].steps == 3
 
 
-@pytest.mark.parametrize("kind", [evaluate.FoldOptions, ablation.AblationOptions])
+@pytest.mark.parametrize("kind", [FoldOptions, AblationOptions])
 def test_none_is_forgotten(kind):
     assert {f.name for f in fields(kind)} | {"seed", "freeze", "loss", "mix_folds"} >= SETTINGS
     assert exposed_options(kind()) == {} and set(exposed_options(kind(**CHOSEN))) == set(CHOSEN)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from nerg_mi.workflows.evaluate import FoldOptions
+from nerg_mi.workflows.gaze_commands import FoldOptions
 
 
 def test_they_say_a_place_and_who_makes_parts():

@@ -1,6 +1,6 @@
 """Options of the field for a place where nobody was tracked."""
 
-from nerg_mi.workflows.train_prior import PriorOptions
+from nerg_mi.workflows.gaze_commands import PriorOptions
 
 
 def test_a_sample_is_drawn_of_datasets_alone():

@@ -3,7 +3,7 @@
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.workflows.rays import FilterOptions, SplitOptions
+from nerg_mi.workflows.rays_commands import FilterOptions, SplitOptions
 
 
 def test_options_that_ask_for_nothing_say_what_can_be_asked():

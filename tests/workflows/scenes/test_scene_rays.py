@@ -7,7 +7,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.workflows import scene
-from nerg_mi.workflows.scene import SceneOptions, write_scene
+from nerg_mi.workflows.scene import write_scene
+from nerg_mi.workflows.scene_commands import SceneOptions
 from tests.workflows.recorder import Recorder
 
 pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
