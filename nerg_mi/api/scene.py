@@ -125,9 +125,7 @@ def _of_scene(scene, name: str) -> dict[str, Any]:
     return found | {f"{name}_light_{i}": light for i, light in enumerate(lights)}
 
 
-# ---- Variant ----
-#
-# The Mitsuba variant that the library works in: the one that is set, or the best where none is.
+# ---- The Mitsuba variant that the library works in: the one that is set, or the best where none is ----
 
 
 def active_mitsuba() -> ModuleType:
@@ -158,9 +156,7 @@ def array_module() -> ModuleType:
     return namespace(active_mitsuba().variant())
 
 
-# ---- Fields ----
-#
-# Fields and rays in memory: read from files, handed to scenes, and saved again.
+# ---- Fields and rays in memory: read from files, handed to scenes, and saved again ----
 
 
 FilePath: TypeAlias = str | Path
@@ -278,9 +274,7 @@ def _existing(path: FilePath) -> Path:
         raise NergError(f"a file is named by a string or a path, got {type(path).__name__}") from error
 
 
-# ---- Options ----
-#
-# What a call of the library is given, looked at before any work: names of options first, then files.
+# ---- What a call of the library is given, looked at before any work: names of options first, then files ----
 
 
 Options = TypeVar("Options", bound="DataclassInstance")
@@ -354,9 +348,7 @@ def checkpoint_of(value: object, name: str) -> Iterator[Path]:
     yield file_of(value, name)
 
 
-# ---- Scene ----
-#
-# Scenes: a place, whose gaze it is, and from where it is seen.
+# ---- Scenes: a place, whose gaze it is, and from where it is seen ----
 
 
 COLOR = "color"

@@ -308,9 +308,7 @@ def import_rays(
     return rays.import_rays(paths, job, reporter).rays
 
 
-# ---- Training ----
-#
-# Trainings: from recordings to fields in memory.
+# ---- Trainings: from recordings to fields in memory ----
 
 
 def train_radiance(

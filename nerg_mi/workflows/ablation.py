@@ -42,9 +42,6 @@ from .options import exposed_options
 from .parts import Parts, PlannedScene
 from .train_gaze import plan_gaze, train_planned
 
-# ---- Options of the ablation of gaze fields ----
-
-
 # ---- What the variants of an ablation have in common, and the training of one of them ----
 
 
@@ -136,8 +133,6 @@ def law_of(name: str) -> Baseline:
 
 
 # ---- Ablation ----
-#
-# ``nerg ablate``: Train every variant of a gaze field alike, and compare them.
 #
 # The paper's ablation: every variant of a gaze field, trained alike, scored on what it saw and on what it did not.
 

@@ -29,14 +29,7 @@ from .base import SILENT, Reporter, select_backend
 from .options import parse_point
 from .rays_commands import AlignOptions
 
-# ---- Options of finding how tracking lies in a place ----
-
-
-# ---- Alignment ----
-#
-# ``nerg align``: Find how tracking lies in a place: from points, a twin, cameras, or the tracking alone.
-#
-# How tracking lies in a place: found from what there is as evidence, judged, and written for ``--align``.
+# ---- How tracking lies in a place: found from what there is as evidence, judged, and written for ``--align`` ----
 
 
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}

@@ -49,9 +49,7 @@ from .base import SILENT, Reporter, select_backend
 from .parts import Parts
 from .scene_commands import BakeOptions
 
-# ---- Outputs ----
-#
-# Files of a bake: meshes with colours (.ply, .glb), a table of faces (.csv), and a summary (.json).
+# ---- Files of a bake: meshes with colours (.ply, .glb), a table of faces (.csv), and a summary (.json) ----
 
 
 SUFFIXES = (".ply", ".glb", ".csv", ".json")
@@ -178,8 +176,6 @@ def check_texture(paths: list[Path], pixels: int | None) -> None:
 
 
 # ---- Bake ----
-#
-# ``nerg bake``: Put gaze on surfaces: how much of it each square metre receives, as colours and tables.
 #
 # Gaze on surfaces: how much of it each square metre of a mesh receives, from a gaze field or from tracked rays.
 

@@ -161,9 +161,7 @@ def parts_of(who: Crowd | TrackedRays) -> Iterator[Crowd | TrackedRays]:
         yield Crowd(who.positions[a : a + OBSERVERS], who.weights[a : a + OBSERVERS])
 
 
-# ---- Lookers ----
-#
-# Who looks: one observer, a path of them, or the people of tracked rays.
+# ---- Who looks: one observer, a path of them, or the people of tracked rays ----
 
 
 POSITIONS = 1_000_000
@@ -251,9 +249,7 @@ def alignment_of(options: BakeOptions) -> Similarity:
     )
 
 
-# ---- Receivers ----
-#
-# What receives gaze: a mesh file, shapes of a scene file, or the surface of a radiance field.
+# ---- What receives gaze: a mesh file, shapes of a scene file, or the surface of a radiance field ----
 
 
 FACES = 100_000
@@ -351,9 +347,7 @@ def _joined(path: Path, found: dict[str, Triangles], others: tuple[Triangles, ..
     return Receivers(mesh, tuple(found), shape[index], number[index], others)
 
 
-# ---- Splat chunks ----
-#
-# The work of a bake of Gaussian splats in parts: as `chunks`, of files alone.
+# ---- The work of a bake of Gaussian splats in parts: as `chunks`, of files alone ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -431,9 +425,7 @@ def splat_place(splats: Splats) -> SplatPlace:
     return SplatPlace(splats, arrays, place, settings, shortest_axes(splats))
 
 
-# ---- Summing ----
-#
-# All parts of a bake and their sums, in this process or wherever parts are run: the same to the bit.
+# ---- All parts of a bake and their sums, in this process or wherever parts are run: the same to the bit ----
 
 
 _BEGIN, _END = 0.05, 0.9  # of a bake is this

@@ -14,9 +14,7 @@ from typing import Any, Protocol, TypeVar
 from nerg_mi import __version__, llvm
 from nerg_mi.threads import set_thread_count
 
-# ---- Backend ----
-#
-# Where a job computes: the Mitsuba variant and the number of threads.
+# ---- Where a job computes: the Mitsuba variant and the number of threads ----
 
 
 def select_backend(mode: str | None, threads: int | None = None) -> ModuleType:
@@ -39,9 +37,9 @@ def select_backend(mode: str | None, threads: int | None = None) -> ModuleType:
 # What the command line runs: functions of workflows, each declared as a command where it is defined, or by its name
 # in a module that loads quickly, since help and completion import that module alone.
 #
-# A module with commands begins with their names and their lines in the list of commands, as in
-# "``nerg train gaze``: Train a gaze field on rays of attention." The command line finds it by these lines, without
-# importing it, so that a further command is a further module and nothing else.
+# A module with commands begins with their names and their lines in the list of commands, as in "``nerg train gaze``:
+# Train a gaze field on rays of attention." The command line finds it by these lines, without importing it, so that a
+# further command is a further module and nothing else.
 
 
 @dataclass(frozen=True)
@@ -149,9 +147,7 @@ def imported(function: str) -> Callable[..., Any]:
     return getattr(importlib.import_module(module), name)
 
 
-# ---- Reporter ----
-#
-# Whom a job tells how it goes: a command's terminal, a notebook, or nobody.
+# ---- Whom a job tells how it goes: a command's terminal, a notebook, or nobody ----
 
 
 class Reporter(Protocol):

@@ -41,9 +41,7 @@ from .draw_scenes import Drawing
 from .scene_cameras import given_point
 from .scene_commands import KINDS, BakedFigureOptions, DifferenceOptions, Kind, SheetOptions
 
-# ---- Files ----
-#
-# Pictures in files: colour, and quantities that were rendered with it.
+# ---- Pictures in files: colour, and quantities that were rendered with it ----
 
 
 EXR = ".exr"
@@ -75,9 +73,7 @@ def read_stored(path: Path, overlay: Overlay) -> Layers:
     return Layers(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask, basis=basis)
 
 
-# ---- Difference ----
-#
-# How two pictures differ in a quantity: the first less the second.
+# ---- How two pictures differ in a quantity: the first less the second ----
 
 
 def difference(files: Sequence[Path], options: DifferenceOptions, reporter: Reporter) -> Drawing:
@@ -102,9 +98,7 @@ def difference(files: Sequence[Path], options: DifferenceOptions, reporter: Repo
     return Drawing(figure, list(files))
 
 
-# ---- Sheet ----
-#
-# A contact sheet: several pictures on one page, with one scale where a quantity lies over them.
+# ---- A contact sheet: several pictures on one page, with one scale where a quantity lies over them ----
 
 
 def sheet(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> Drawing:
@@ -161,9 +155,7 @@ def _display(path: Path) -> np.ndarray:
     return shown[..., :3]
 
 
-# ---- Surface ----
-#
-# A baked surface: gaze on a mesh, with its scale.
+# ---- A baked surface: gaze on a mesh, with its scale ----
 
 
 _HEADER = 1 << 16

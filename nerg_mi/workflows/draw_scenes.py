@@ -30,9 +30,7 @@ from .base import Reporter
 from .render import layers_of
 from .scene_commands import FloorOptions, SceneFigureOptions, SphereOptions, TriptychOptions
 
-# ---- Kind ----
-#
-# A kind of figure: what it is called, which files and options it takes, and how it is drawn.
+# ---- A kind of figure: what it is called, which files and options it takes, and how it is drawn ----
 
 
 @dataclass(frozen=True)
@@ -45,9 +43,7 @@ class Drawing:
     seed: int | None = None
 
 
-# ---- Floor ----
-#
-# The floor plan of rays in their place: paths, where people looked, and fields of view.
+# ---- The floor plan of rays in their place: paths, where people looked, and fields of view ----
 
 
 _GAP = 1.0  # seconds without a ray after which a path begins anew
@@ -344,9 +340,7 @@ def _own_camera(observer: Any, camera: Any) -> Any:
     return mi.load_dict(own)
 
 
-# ---- Walls ----
-#
-# A place cut at a height, seen from above: what a floor plan of it shows.
+# ---- A place cut at a height, seen from above: what a floor plan of it shows ----
 
 
 CELLS = 360

@@ -48,9 +48,6 @@ from .train_prior import RECIPE as PRIOR
 
 # ---- Evaluation ----
 #
-# ``nerg eval gaze``: Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the
-# people.
-#
 # The evaluation of a gaze field, at positions and of people that it was not trained on, beside what needs no field.
 
 
@@ -247,15 +244,7 @@ def _notes(
     )
 
 
-# ---- Options of the evaluation of gaze fields over folds ----
-
-
-# ---- Folds ----
-#
-# ``nerg eval folds``: Train and score a gaze field again and again, each time without other people and zones, and
-# tell the means.
-#
-# Gaze fields over folds: trained and scored again and again, each time without other people and other zones.
+# ---- Gaze fields over folds: trained and scored again and again, each time without other people and other zones ----
 
 
 FIELD, SCORED = "gaze.safetensors", "scores.json"

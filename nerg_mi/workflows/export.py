@@ -29,14 +29,7 @@ from .radiance_commands import (
     VolumeOptions,
 )
 
-# ---- Options of the import of checkpoints of other programs, and of their refinement ----
-
-
-# ---- Checkpoints ----
-#
-# ``nerg import``: Convert checkpoints of torch-ngp and of the NeRG paper's authors.
-#
-# Fields that other programs have trained, as fields of our own.
+# ---- Fields that other programs have trained, as fields of our own ----
 
 
 @dataclass(frozen=True)
@@ -115,20 +108,10 @@ def _tell(path: Path, reporter: Reporter) -> None:
     reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
 
-# ---- Options of the exports of a radiance field ----
-
-
 # ---- Export ----
 #
-# ``nerg export mesh``: A mesh by marching cubes, with vertex colours: .ply or .glb.
-# ``nerg export points``: A cloud of surface points with normals and colours: .ply or .glb.
-# ``nerg export splats``: Gaussian splats on the surface, with its colours: .ply, for viewers of splats and the volume
-# "splats".
-# ``nerg export volume``: Density, and colour, as Mitsuba grid volumes (.vol).
-# ``nerg export torch-ngp``: A torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes.
-#
-# Radiance fields for other tools, in the field's own units: meshes, points, Gaussian splats, grid volumes,
-# torch-ngp checkpoints.
+# Radiance fields for other tools, in the field's own units: meshes, points, Gaussian splats, grid volumes, torch-ngp
+# checkpoints.
 
 
 _FIELD, _FILE = argument("Radiance field (.safetensors)."), out("File to write.")
@@ -288,11 +271,7 @@ def _corner(values) -> str:
     return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
 
 
-# ---- Refinement ----
-#
-# ``nerg refine``: Find more closely where a radiance field holds matter, so that it renders faster.
-#
-# A finer bound on where a trained field holds matter, for checkpoints that were written without one.
+# ---- A finer bound on where a trained field holds matter, for checkpoints that were written without one ----
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,6 @@ from .base import SILENT, Reporter
 from .gaze_commands import GazeEvaluationOptions
 from .options import PlaceOptions
 
-# ---- Options of the evaluation of a gaze field ----
-
-
 # ---- Gaze places ----
 #
 # The places of jobs on gaze: made of a field, a scene, hit points or nothing, and found again for an evaluation.

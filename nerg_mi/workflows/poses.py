@@ -30,14 +30,7 @@ from nerg_mi.photos.video_frames import copy_frames
 from .base import SILENT, Reporter
 from .radiance_commands import PoseOptions
 
-# ---- Options of finding the poses of photos ----
-
-
-# ---- Poses ----
-#
-# ``nerg poses``: Find out from where photos, or frames of a video, were taken.
-#
-# Photos without poses, or a video, made a capture that can be trained on.
+# ---- Photos without poses, or a video, made a capture that can be trained on ----
 
 
 STAGES = {"pictures": 0.0, "features": 0.08, "matching": 0.25, "mapping": 0.65, "writing": 0.98}

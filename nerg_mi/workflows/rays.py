@@ -33,14 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# ---- Rays ----
-#
-# Options of what is done to rays of attention: importing, filtering and splitting.
-
-
-# ---- Filtering ----
-#
-# What a filter does to rays, step by step: conditions, fixations, thinning, a sample.
+# ---- What a filter does to rays, step by step: conditions, fixations, thinning, a sample ----
 
 
 @dataclass(frozen=True)
@@ -130,9 +123,7 @@ def least_mask(lot: np.ndarray, n: int) -> np.ndarray:
     return mask
 
 
-# ---- Datasets ----
-#
-# Datasets of rays: tracking files imported into one, its sanity cards, and some of its rays.
+# ---- Datasets of rays: tracking files imported into one, its sanity cards, and some of its rays ----
 
 
 FileName = str | os.PathLike
@@ -318,16 +309,7 @@ def _write_filtered(dataset: RayDataset, options: FilterOptions, steps: _Totals,
         writers[source.id].finish(metadata, **kept)
 
 
-# ---- Tracking ----
-#
-# ``nerg rays import``: Convert tracking files to rays: right-handed, z up, metres, seconds. ``nerg rays guess``:
-# Propose the preset or the column map of unknown files: what is sure, what is a guess, what no file says. ``nerg rays
-# show``: The sanity card: rays, persons, duration, rate, what was dropped, extent, eye height. ``nerg rays filter``:
-# Keep some rays: conditions first, then fixations, then thinning of those who stand still. ``nerg rays split``: Split
-# into training and test rays that share none: by position, person, time, or several of them at once. ``nerg rays
-# plot``: The floor plan: where people stood and how densely, or the layout.
-#
-# Rays of attention from tracking files, and what is done to them: imported, summed up, filtered, split, drawn.
+# ---- Rays of attention from tracking files, and what is done to them: imported, summed up, filtered, split, drawn ----
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,9 +68,6 @@ from .scene_cameras import support_of_rays, to_place
 from .scene_commands import ReportOptions, SceneOptions
 from .scene_places import KINDS, PLACES, GivenFiles, kind_of_file, recognise
 
-# ---- Options of the report on a gaze field ----
-
-
 # ---- What the files are that a report is made of, found from the files themselves ----
 
 RESULTS = "gaze.json"
@@ -257,9 +254,7 @@ def _png(display: np.ndarray, text: Mapping[str, str]) -> bytes:
     return encode_png(mi.Bitmap(to_bytes(display)), text)
 
 
-# ---- Results ----
-#
-# The evaluations that a report shows: those that were given, and those that are made for it.
+# ---- The evaluations that a report shows: those that were given, and those that are made for it ----
 
 
 def given_results(given: ReportFiles) -> tuple[list[GazeResults], list[str]]:
@@ -423,11 +418,7 @@ def setting_words(options: ReportOptions) -> dict[str, str]:
     }
 
 
-# ---- Report ----
-#
-# ``nerg report``: Write a report on a gaze field: one HTML file with a verdict, pictures, scores and the place in 3D.
-#
-# A report on a gaze field: one HTML file of its place, people, gaze, objects, scores, limits and provenance.
+# ---- A report on a gaze field: one HTML file of its place, people, gaze, objects, scores, limits and provenance ----
 
 
 VIEWS = ("camera", "own", "sphere")

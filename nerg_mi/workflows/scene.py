@@ -60,12 +60,7 @@ from .scene_places import (
     recognise,
 )
 
-# ---- Options of scene files that are written for checkpoints ----
-
-
-# ---- Scene rays ----
-#
-# Rays that a scene shows: those of a file, or some of a dataset, which are kept in a file beside the scene.
+# ---- Rays that a scene shows: those of a file, or some of a dataset, which are kept in a file beside the scene ----
 
 
 MOST = 1_000_000
@@ -110,11 +105,7 @@ def _file_beside(scene: Path) -> Path:
     return scene.with_suffix(".rays.npz")
 
 
-# ---- Scene ----
-#
-# ``nerg scene``: Write a scene file for a field, a mesh, a gaze field or rays, with a camera and an observer.
-#
-# From checkpoints, meshes and rays to a scene file that `nerg render` renders.
+# ---- From checkpoints, meshes and rays to a scene file that `nerg render` renders ----
 
 
 SMALLEST = 0.05

@@ -20,9 +20,7 @@ from nerg_mi.transport.geometry import Place, pixel_directions, pixel_solid_angl
 
 from .scene_places import PhotoCamera
 
-# ---- Cameras ----
-#
-# From where a scene is shown: what an observer meets around, and the best camera for it.
+# ---- From where a scene is shown: what an observer meets around, and the best camera for it ----
 
 
 GLANCE = (48, 32)
@@ -182,9 +180,7 @@ def upright(eye: Eye, up: np.ndarray) -> Eye:
     return eye
 
 
-# ---- Observers ----
-#
-# Who looks, and where: people of the rays, or the place where most of them were.
+# ---- Who looks, and where: people of the rays, or the place where most of them were ----
 
 
 RADIUS = 0.5

@@ -217,9 +217,7 @@ With --store or --scheduler each picture is kept when it is done, and the same c
 )
 
 
-# ---- Figures ----
-#
-# One more is a `Kind` in the table, and the function that draws it.
+# ---- One more is a `Kind` in the table, and the function that draws it ----
 
 
 @dataclass(frozen=True)

@@ -27,14 +27,7 @@ from .base import SILENT, Reporter, select_backend, versions
 from .parts import Parts, PlannedScene
 from .scene_commands import StudyOptions
 
-# ---- Options of the study of error against run time ----
-
-
-# ---- Study ----
-#
-# ``nerg study``: Measure error against run time: a scene at many settings, compared with what is true.
-#
-# The study of error against run time: a scene at many settings, each compared with what is true.
+# ---- The study of error against run time: a scene at many settings, each compared with what is true ----
 
 
 ROWS = 4
@@ -174,8 +167,8 @@ def twin_beside(scene: Path) -> ExactSurfaces | None:
 # ---- Parts ----
 #
 # Settings, a few each, with the default beside them, measured wherever that is. Errors and evaluations are the same
-# wherever they are found. Times are those of the process that measured the row; its own times of the default, taken in
-# the same rounds, are in the row as well, so that rows of different machines compare.
+# wherever they are found. Times are those of the process that measured the row; its own times of the default, taken
+# in the same rounds, are in the row as well, so that rows of different machines compare.
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,6 @@ from .gaze_commands import GazeOptions
 from .geometry import check_place, make_place, place_kind
 from .options import chosen_settings
 
-# ---- Options of the training of a gaze field ----
-
-
 # ---- Gaze plan ----
 #
 # What the options of a gaze training come to: whether they go together, and the plan that they make of a recipe.
@@ -137,12 +134,7 @@ def _choices(options: GazeOptions, kind: str, views_alone: bool) -> FieldChoices
     )
 
 
-# ---- Gaze ----
-#
-# ``nerg train gaze``: Train a gaze field on rays of attention, and report its scores at positions that were held
-# out.
-#
-# The training of a gaze field: from rays of attention, salience images or both to a checkpoint.
+# ---- The training of a gaze field: from rays of attention, salience images or both to a checkpoint ----
 
 
 # From this share of the blind density on, that is most of what a field says.

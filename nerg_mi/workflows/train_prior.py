@@ -18,15 +18,7 @@ from nerg_mi.train.gaze_log_density import KAPPA, prior_field
 from .base import SILENT, Reporter, select_backend
 from .gaze_commands import PriorOptions
 
-# ---- Options of the gaze field for a place where nobody was tracked ----
-
-
-# ---- Gaze prior ----
-#
-# ``nerg train prior``: Make a gaze field for a place where nobody was tracked: how high people looked in other
-# places.
-#
-# A gaze field for a place where nobody was tracked: what people in other places say of it.
+# ---- A gaze field for a place where nobody was tracked: what people in other places say of it ----
 
 
 RECIPE = "prior"

@@ -22,16 +22,7 @@ from .base import SILENT, Reporter, select_backend
 from .options import chosen_settings
 from .radiance_commands import RadianceOptions, RadianceScoreOptions
 
-# ---- Options of the training and of the evaluation of a radiance field ----
-
-
-# ---- Radiance ----
-#
-# ``nerg train radiance``: Train a radiance field on posed pictures, and report the error on those held out.
-# ``nerg eval radiance``: PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the
-# integrator.
-#
-# Radiance fields from posed photos: training, and scores on the photos that were held out.
+# ---- Radiance fields from posed photos: training, and scores on the photos that were held out ----
 
 
 # Photos whose exposures differ by less than this, which nobody sees, are not told of.

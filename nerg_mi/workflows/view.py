@@ -29,9 +29,6 @@ from .scene_cameras import given_point
 from .scene_commands import SceneOptions, ViewOptions
 from .scene_places import KINDS, kind_of_file, training_place
 
-# ---- Options of the viewer ----
-
-
 # ---- From files and folders to the scene that a viewer shows ----
 
 RAYS = 2_000_000
