@@ -20,11 +20,10 @@ from tests.figures.standins import write_standins
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.formats.torch_ngp.test_fields import small_state
 from tests.formats.torch_ngp.test_nerg import save, small_gaze
+from tests.pictures import SCENE
 from tests.plugins import fields
 from tests.surfaces.meshes import box
-from tests.workflows.drawing.scenes import write_scene
-
-from .test_render import SCENE
+from tests.workflows.watched import write_scene
 
 DEMO = "occlusion.png gaze.png gaze_sphere.png depth.png visibility.png color.png scene.exr report.html run.json"
 DEMO += " heatmap.glb aoi.csv"
@@ -209,8 +208,8 @@ CASES = (
     ),
 )
 
-MAKES_A_FOLDER = {"poses": "tests/cli/test_poses.py"}
-"""Commands that make a folder as a whole, which must not be there before -> where their output is tried."""
+MAKES_A_FOLDER = {"poses"}
+"""Commands that make a folder as a whole, which must not be there before: `test_scenes` tries them."""
 
 INPUTS = {
     "scene": {"photos", "align"},
