@@ -113,7 +113,7 @@ def bake_splats(
         found = sums_in_one_go(scene, groups, reporter)
     sums = merge(found)
     reporter.progress(0.9, "areas of Gaussians")
-    spread = _Spread(splat_place(given), source, options.smooth * align.scale)
+    spread = _SplatSpread(splat_place(given), source, options.smooth * align.scale)
     density = spread.density(sums)
     if not (density > 0).any():
         raise NergError(
@@ -152,7 +152,7 @@ def recolored(splats: Splats, values: np.ndarray, heat: Heat) -> Splats:
     return replace(splats, harmonics=harmonics_of(shown), extra=extra, color_space="srgb")
 
 
-class _Spread:
+class _SplatSpread:
     """From sums of a ``source`` to densities of the Gaussians of ``there``, smoothed by ``length`` scene units, or not
     if that is 0. ``area`` (N,): of both sides of each."""
 

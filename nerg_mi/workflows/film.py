@@ -111,7 +111,7 @@ def _rendered(
         if not asked.video:
             header = next(provenances(scene, [frame], options, str(options.mode), False)).text()
         notes = {name: made.notes[name] for name in ("marker", "supported", "basis")}
-        drawings.append(Part(Drawing(made.path, ends, **notes, header=header), f"drawing {k + 1}"))
+        drawings.append(Part(LayersToDraw(made.path, ends, **notes, header=header), f"drawing {k + 1}"))
     _write(scene, asked, options, parts, Plan(what, draw_layers, of_each, drawings, suffix), _LAYERS_SHARE)
     return layers[-1].notes, None if ends is None else ends[1]
 
@@ -176,7 +176,7 @@ def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> d
 
 
 @dataclass(frozen=True)
-class Drawing:
+class LayersToDraw:
     """``layers`` (.npy) that `make_layers` made, with its notes; ``ends`` of the scale; ``header`` of the file."""
 
     layers: Path
@@ -187,7 +187,7 @@ class Drawing:
     header: Mapping[str, str]
 
 
-def draw_layers(options: PictureOptions, drawing: Drawing, output: Path) -> None:
+def draw_layers(options: PictureOptions, drawing: LayersToDraw, output: Path) -> None:
     """The figure of a picture's layers."""
     marker = None if drawing.marker is None else (drawing.marker[0], drawing.marker[1])
     layers = unstacked(read_npy(drawing.layers, "layers"), marker, drawing.supported, drawing.basis)

@@ -9,7 +9,7 @@ from pathlib import Path
 from nerg_mi.errors import NergError
 from nerg_mi.files.tables import markdown_table
 from nerg_mi.rendering.scene import files_of_scene
-from nerg_mi.tasks.engines import Output, Progress, open_engine, run_plan
+from nerg_mi.tasks.engines import Output, PlanProgress, open_engine, run_plan
 from nerg_mi.tasks.store import Account, JobAccount, Store, read_account, remove_stale
 from nerg_mi.tasks.task import Files, Plan
 
@@ -35,7 +35,7 @@ class Parts:
         """The outputs of ``plan`` in its order; see `run_plan`. Of the whole job this is from the share ``since`` to
         the share ``until``. Ctrl-C says where it goes on from."""
 
-        def show(progress: Progress) -> None:
+        def show(progress: PlanProgress) -> None:
             self._reporter.progress(since + (until - since) * progress.share, progress.line(until == 1.0))
 
         try:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Step:
+class FilterStep:
     """A step that was taken: what the metadata of rays keep of it."""
 
     name: str
@@ -54,7 +54,7 @@ class FilterSteps:
     """
 
     def __init__(self, rays: Rays, *, own: bool, reporter: Reporter = SILENT, strict: bool = True) -> None:
-        self.rays, self.taken = rays, list[Step]()
+        self.rays, self.taken = rays, list[FilterStep]()
         self._own, self._reporter, self._strict = own, reporter, strict
 
     def select(self, conditions: dict[str, Any]) -> None:
@@ -98,7 +98,7 @@ class FilterSteps:
         before = len(self.rays)
         rays = filters.fixation_rays(self.rays, label)[0] if before else self.rays
         self._reporter.message(f"fixations: one ray each, {len(rays):,} of {before:,} rays")
-        self._take(rays, Step("fixations", len(rays), before, about))
+        self._take(rays, FilterStep("fixations", len(rays), before, about))
 
     def _keep(self, mask: np.ndarray, name: str, about: dict[str, Any]) -> None:
         """Keep the rays of a mask (N,); in their own memory, if nobody else holds them."""
@@ -107,9 +107,9 @@ class FilterSteps:
             raise NergError(f"{name} leaves none of {len(rays):,} rays; widen its conditions")
         self._reporter.message(f"{name}: {count:,} of {len(rays):,} rays")
         kept = rays.keep_in_place(mask) if self._own else rays.select(mask)
-        self._take(kept, Step(name, count, len(rays), about))
+        self._take(kept, FilterStep(name, count, len(rays), about))
 
-    def _take(self, rays: Rays, step: Step) -> None:
+    def _take(self, rays: Rays, step: FilterStep) -> None:
         self.rays = rays.with_step(step=step.name, kept=step.kept, of=step.of, **step.about)
         self._own = True
         self.taken.append(step)
@@ -217,12 +217,12 @@ class _Totals:
     """The steps of all blocks together."""
 
     def __init__(self, count: int) -> None:
-        self._count, self._steps, self.fixations = count, list[Step](), None
+        self._count, self._steps, self.fixations = count, list[FilterStep](), None
 
     def filtered(self, dataset: RayDataset, options: FilterOptions) -> Iterator[Rays]:
         """What is left of each part of ``dataset``."""
         conditions = Conditions(**options.conditions)
-        selected = Step("filter", 0, self._count, options.conditions)
+        selected = FilterStep("filter", 0, self._count, options.conditions)
         for block in dataset.scan(conditions, whole=options.follows):
             steps = FilterSteps(block, own=True, strict=False)
             count = steps.follow(options)
@@ -233,17 +233,17 @@ class _Totals:
             if len(steps.rays):
                 yield steps.rays
 
-    def add(self, taken: list[Step]) -> None:
+    def add(self, taken: list[FilterStep]) -> None:
         """Add the steps of one block."""
         before = self._steps or [replace(step, kept=0, of=0) for step in taken]
         self._steps = [replace(a, kept=a.kept + b.kept, of=a.of + b.of) for a, b in zip(before, taken)]
 
-    def add_last(self, step: Step) -> None:
+    def add_last(self, step: FilterStep) -> None:
         """Add a step that was taken by all blocks together."""
         self._steps.append(step)
 
     @property
-    def steps(self) -> list[Step]:
+    def steps(self) -> list[FilterStep]:
         """Those of all blocks; what met conditions is of all rays, of which many were not read."""
         return [replace(step, of=self._count) if step.name == "filter" else step for step in self._steps]
 
@@ -284,7 +284,7 @@ def _sampled(dataset: RayDataset, options: FilterOptions, steps: _Totals) -> lis
             held, lots = _least(held, lots, n)
             limit = max(float(lot.max()) for lot in lots if len(lot))
     held, _ = _least(held, lots, n)
-    steps.add_last(Step("sample", min(n, count), count, {"seed": options.seed}))
+    steps.add_last(FilterStep("sample", min(n, count), count, {"seed": options.seed}))
     return held
 
 

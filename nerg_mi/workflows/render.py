@@ -41,7 +41,7 @@ BYTES_PER_PIXEL = 400
 
 
 @dataclass(frozen=True)
-class Picture:
+class RenderedPicture:
     """``size`` (width, height) in pixels, number of ``channels``, and why it was not divided, as `PictureResult` has
     them."""
 
@@ -55,7 +55,7 @@ OVERLAY_FORMATS = (*style.FORMATS, ".mp4")
 OnStrip = Callable[[int, int], None]
 """Is told how many samples are done, and of how many."""
 
-Make = Callable[[Any, Any, OnStrip], Picture]
+Make = Callable[[Any, Any, OnStrip], RenderedPicture]
 """Makes a picture of a scene, a sensor, and a function that is told of each strip."""
 
 
@@ -89,9 +89,9 @@ def overlay_pictures(
     frames: Sequence[Mapping[str, str]],
     write: Callable[[Any], None],
     options: PictureOptions,
-    render: Callable[[Mapping[str, str], Make], Picture],
+    render: Callable[[Mapping[str, str], Make], RenderedPicture],
     stop: Interruption,
-) -> tuple[Picture, float | None]:
+) -> tuple[RenderedPicture, float | None]:
     """Give ``write`` a figure with the overlay of ``options`` for each of ``frames``, values of `<default>`s of the
     scene file ``path``, one after the other. Gives the last one, and the upper end of the scale of all, None where
     there is none.
@@ -102,7 +102,7 @@ def overlay_pictures(
     overlay = find_overlay(options.overlay or "")
     style = style_of(options)
     limits: list[Limits] = []
-    last = Picture((0, 0), 0)
+    last = RenderedPicture((0, 0), 0)
     waits = shares_a_scale(overlay, len(frames), options)
 
     def finish(layers: Layers, ends: Limits) -> None:
@@ -113,7 +113,7 @@ def overlay_pictures(
     with tempfile.TemporaryDirectory() as folder:
         kept: list[tuple[Path, tuple[int, ...], Any, bool, str]] = []
 
-        def make(loaded: Any, camera: Any, on_strip: OnStrip) -> Picture:
+        def make(loaded: Any, camera: Any, on_strip: OnStrip) -> RenderedPicture:
             check_memory(path, camera, options)
             layers = layers_of(path, loaded, camera, overlay, options.spp, options.seed, on_strip)
             limits.append(overlay.limits(layers))
@@ -125,7 +125,7 @@ def overlay_pictures(
                 kept.append((file, array.shape, layers.marker, layers.supported, layers.basis))
             else:
                 finish(layers, shared_limits(limits[-1:], options.top))
-            return Picture((width, height), 3)
+            return RenderedPicture((width, height), 3)
 
         for frame in frames:
             last = render(frame, make)
@@ -314,7 +314,7 @@ def render_file(
     if options.threads:
         set_thread_count(options.threads)
     start, pace = time.perf_counter(), Pace()
-    done, top, picture = 0, None, Picture((0, 0), 0)
+    done, top, picture = 0, None, RenderedPicture((0, 0), 0)
     with Interruption() as stop:
 
         def on_strip(part: int, total: int) -> None:
@@ -324,7 +324,7 @@ def render_file(
             speed = f"{part / seconds:,.0f} samples/s" if len(frames) == 1 else f"{done} of {len(frames)} pictures"
             reporter.progress(share, f"{speed}, {seconds * (1 - share) / share:.0f} s left")
 
-        def render(frame: Mapping[str, str], make: Make) -> Picture:
+        def render(frame: Mapping[str, str], make: Make) -> RenderedPicture:
             nonlocal done
             loaded = load_scene(scene, {**(options.defaults or {}), **frame})
             stop.check()
@@ -411,7 +411,7 @@ def _check_video(output: Path, options: PictureOptions) -> bool:
 
 def _picture(
     write: Write, options: PictureOptions, stop: Interruption, pace: Pace, loaded: Any, camera: Any, on_strip: OnStrip
-) -> Picture:
+) -> RenderedPicture:
     """Render what ``camera`` sees, and ``write`` it."""
     width, height = map(int, camera.film().crop_size())
     rows = bands.rows_for(loaded, camera, 1e9 * options.memory - resident_bytes() - RESERVE)
@@ -440,7 +440,7 @@ def _picture(
 
     with mitsuba_says():
         write(to_file, pixels)
-    return Picture((width, height), channels, whole)
+    return RenderedPicture((width, height), channels, whole)
 
 
 def sensor_of(path: Path, scene, index: int):

@@ -462,7 +462,7 @@ def make_report(
     if options.evaluate:
         results += made_results(given, options, results, reporter)
     with Interruption() as stop:
-        work = _Work(given, ns, options, reporter, stop)
+        work = _ReportWork(given, ns, options, reporter, stop)
         run = work.run(areas, results, doubts, rendered)
     write_text(output, page(run))
     size = output.stat().st_size / 1e6
@@ -474,7 +474,7 @@ def make_report(
     return ReportResult(output, run)
 
 
-class _Work:
+class _ReportWork:
     """What is computed for a report, with what its parts have in common: the scene, the field, its place, the rays."""
 
     def __init__(

@@ -102,7 +102,7 @@ def statistics(
     reporter.progress(0.0, "reading")
     areas = _areas(options)
     ns = select_backend(options.mode, options.threads)
-    result = _Work(given, areas, options, ns, reporter, output).run()
+    result = _StatisticsWork(given, areas, options, ns, reporter, output).run()
     if output is not None:
         inputs = [p for p in (given.scene, given.field, given.gaze, given.rays) if isinstance(p, Path)]
         inputs += [p for p in (options.areas, options.what_if) if p is not None and p.is_file()]
@@ -135,7 +135,7 @@ def _areas(options: StatisticsOptions) -> Areas:
     return read_areas(options.areas)
 
 
-class _Work:
+class _StatisticsWork:
     """What is computed, with what its parts have in common."""
 
     def __init__(

@@ -78,7 +78,7 @@ CASES = (
         "-o {o}/demo --width 24 --spp 1 -m llvm_ad_rgb",
         _below("demo", DEMO),
         ("demo",),
-        ("workflows.report._Work.run", "workflows.bake.sums_in_one_go"),
+        ("workflows.report._ReportWork.run", "workflows.bake.sums_in_one_go"),
     ),
     Case("render", "{i}/scene.xml -o {o}/a.exr -m llvm_ad_rgb", ("a.exr",)),
     Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb", ("a.png",)),
@@ -113,7 +113,7 @@ CASES = (
         "report",
         "{i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 --points 200 -m llvm_ad_rgb",
         ("a.html",),
-        once=("workflows.report._Work.run",),
+        once=("workflows.report._ReportWork.run",),
     ),
     Case("rays import", "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'", ("a.npz",)),
     Case(

@@ -67,7 +67,7 @@ def run(trained, tmp_path_factory):
 @pytest.fixture
 def without_3d(monkeypatch):
     """No 3D scene is made, where it is not the matter."""
-    monkeypatch.setattr(report._Work, "_stage", lambda *_: (None, (0, 0, 0, 0)))
+    monkeypatch.setattr(report._ReportWork, "_stage", lambda *_: (None, (0, 0, 0, 0)))
 
 
 def test_everything_of_a_folder(run, tmp_path):
