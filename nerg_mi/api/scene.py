@@ -66,18 +66,6 @@ def mesh_child(path: str | os.PathLike[str]) -> Any:
     return shown
 
 
-def box_dict(lower: np.ndarray, upper: np.ndarray, turn: np.ndarray | None = None) -> dict:
-    """The box between two corners as a mesh that Mitsuba takes, turned about its middle by the rotation ``turn`` (3, 3)
-    if there is one; a variant must be set."""
-    import mitsuba as mi
-
-    center, half = (lower + upper) / 2, (upper - lower) / 2
-    frame = np.eye(4)
-    frame[:3, :3] = (np.eye(3) if turn is None else turn) * half
-    frame[:3, 3] = center
-    return {"type": "cube", "to_world": mi.ScalarTransform4d(frame.tolist())}
-
-
 def scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
     """``shapes`` by their names, as a scene's dict takes them; the variant must be active.
 

@@ -15,7 +15,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.metrics import cc
 from nerg_mi.figures.overlay import Heat, overlay
-from nerg_mi.figures.style import Provenance, provenance
+from nerg_mi.figures.style import Provenance
 from nerg_mi.files.atomic import check_writable, write_bytes
 from nerg_mi.files.images import encode_png
 from nerg_mi.files.tables import write_csv, write_json
@@ -26,7 +26,7 @@ from nerg_mi.maths.color import decode_srgb
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import Smoother, Sums, merge
 from nerg_mi.surfaces.mesh import Mesh, Refined, texture_rows, unroll, unroller
-from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays, ray_seconds
+from nerg_mi.surfaces.sources import GazeSettings, RaySettings
 
 from .bake_chunks import (
     UNITS,
@@ -36,17 +36,13 @@ from .bake_chunks import (
     check_values,
     cone_of,
     cut,
-    find_crowd,
-    halves_of,
-    rays_of,
+    origin_of,
     read_receivers,
     source_of,
-    sums_in_one_go,
-    sums_in_parts,
-    tracked_rays,
+    sums_of,
+    who_looks,
 )
 from .base import SILENT, Reporter, select_backend
-from .parts import Parts
 from .scene_commands import BakeOptions
 
 # ---- Files of a bake: meshes with colours (.ply, .glb), a table of faces (.csv), and a summary (.json) ----
@@ -226,7 +222,6 @@ def bake(
     source = _check(surface, paths, options, rays)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.0, "reading")
-    tracked = rays_of(options, rays)
     align = alignment_of(options)
     receivers = read_receivers(surface, options.shapes, options.resolution, ns, reporter)
     across = receivers.mesh.diagonal / align.scale
@@ -247,22 +242,8 @@ def bake(
         GazeSettings(angle=math.radians(options.angle), cone=cone),
         RaySettings(cone=cone, bundle=options.bundle, seed=options.seed),
     )
-    factor = 1.0
-    if source == "rays":
-        assert tracked is not None
-        who: Crowd | TrackedRays = tracked_rays(tracked, align, options.weights)
-        factor = float(ray_seconds(tracked).sum()) if options.unit == "seconds" else 1.0
-    else:
-        who = find_crowd(options, tracked, align, reporter)
-    groups = [who]
-    if options.halves and tracked is not None and isinstance(who, TrackedRays):
-        groups = halves_of(who, tracked, options.seed)
-    name = paths[0] if paths else surface
-    found = (
-        sums_in_parts(scene, groups, Parts(options, name, reporter, options.threads), f"nerg bake {name.absolute()}")
-        if options.in_parts
-        else sums_in_one_go(scene, groups, reporter)
-    )
+    groups, factor = who_looks(options, source, rays, align, reporter)
+    found = sums_of(scene, groups, options, paths[0] if paths else surface, reporter)
     sums = merge(found)
     reporter.progress(0.9, "smoothing")
     smoother = Smoother(mesh, options.smooth * align.scale) if options.smooth > 0 else None
@@ -274,10 +255,7 @@ def bake(
     if len(found) == 2:
         summary["halves_cc"] = _agreement(mesh, found, smoother)
     heat = Heat(options.top or _top(mesh, density), options.cmap, decades=options.decades)
-    given = (surface, options.gaze, options.rays, options.path, options.align)
-    about = provenance("nerg bake", [p for p in given if p is not None], options.seed, options)
-    summary["provenance"] = {"what": about.what, "inputs": dict(about.inputs), "seed": about.seed}
-    summary["provenance"] |= {"settings": dict(about.settings), "versions": dict(about.versions)}
+    about, summary["provenance"] = origin_of(surface, options)
     baked = Baked(receivers, refined, density, share, UNITS[options.unit], align.scale, heat, about, summary)
     _tell(summary, reporter)
     for path in paths:

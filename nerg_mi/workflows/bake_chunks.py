@@ -14,7 +14,7 @@ from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats
-from nerg_mi.figures.style import find_colors
+from nerg_mi.figures.style import Provenance, find_colors, provenance
 from nerg_mi.files.atomic import replacing
 from nerg_mi.files.safe_read import read_npy
 from nerg_mi.formats.checkpoint import read_metadata
@@ -42,6 +42,7 @@ from nerg_mi.surfaces.sources import (
     TrackedRays,
     gaze_sums,
     lookers_of_field,
+    ray_seconds,
     ray_sums,
     ray_weights,
     thin,
@@ -219,6 +220,20 @@ def find_crowd(options: BakeOptions, rays: Rays | None, align: Similarity, repor
         f"{crowd.farthest / align.scale:.2f} m)"
     )
     return crowd
+
+
+def who_looks(
+    options: BakeOptions, source: str, rays: Rays | None, align: Similarity, reporter: Reporter
+) -> tuple[list[Crowd | TrackedRays], float]:
+    """Whose gaze of the ``source`` is put on a surface, of rays two halves of the people where that is asked for; and
+    the factor from shares of it to the unit. ``rays``: those in memory."""
+    tracked = rays_of(options, rays)
+    if source == "field":
+        return [find_crowd(options, tracked, align, reporter)], 1.0
+    assert tracked is not None
+    who = tracked_rays(tracked, align, options.weights)
+    factor = float(ray_seconds(tracked).sum()) if options.unit == "seconds" else 1.0
+    return [*halves_of(who, tracked, options.seed)] if options.halves else [who], factor
 
 
 def tracked_rays(rays: Rays, align: Similarity, by: str) -> TrackedRays:
@@ -517,3 +532,25 @@ def halves_of(who: TrackedRays, rays: Rays, seed: int) -> list[Crowd | TrackedRa
         TrackedRays(who.origins[rows], who.directions[rows], who.weights[rows], start)
         for rows, start in zip(order, [0, len(order[0])])
     ]
+
+
+def sums_of(
+    scene: BakeScene | SplatScene,
+    groups: Sequence[Crowd | TrackedRays],
+    options: BakeOptions,
+    name: Path,
+    reporter: Reporter,
+) -> list[Sums]:
+    """The sums of each of ``groups``, in one go or in parts as ``options`` say; ``name``: a file of the bake."""
+    if not options.in_parts:
+        return sums_in_one_go(scene, groups, reporter)
+    parts = Parts(options, name, reporter, options.threads)
+    return sums_in_parts(scene, groups, parts, f"nerg bake {name.absolute()}")
+
+
+def origin_of(surface: Path, options: BakeOptions) -> tuple[Provenance, dict[str, Any]]:
+    """What a bake of ``surface`` was made of, and the same as its summary has it (JSON)."""
+    given = (surface, options.gaze, options.rays, options.path, options.align)
+    about = provenance("nerg bake", [p for p in given if p is not None], options.seed, options)
+    told = {"what": about.what, "inputs": dict(about.inputs), "seed": about.seed}
+    return about, {**told, "settings": dict(about.settings), "versions": dict(about.versions)}

@@ -59,7 +59,7 @@ from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import center
 
-from .base import SILENT, Reporter, select_backend, versions
+from .base import SILENT, Reporter, Silent, select_backend, versions
 from .evaluate import evaluate_gaze
 from .gaze_commands import GazeEvaluationOptions
 from .render import basis_words, is_supported
@@ -495,6 +495,8 @@ class _ReportWork:
         rendered: Mapping[str, Channels] | None,
     ) -> Run:
         """All that is shown."""
+        import mitsuba as mi
+
         given, options = self.given, self.options
         labels = Labels(self.rays, results)
         rays = self.rays if self.rays is None or options.names else rays_without_names(self.rays, labels)
@@ -542,7 +544,7 @@ class _ReportWork:
             stage,
             *sizes,
             inputs,
-            versions(_variant()),
+            versions(mi.variant()),
             settings,
             views.basis,
             about.json(),
@@ -670,20 +672,14 @@ class _ReportWork:
         return self.align.matrix[:3, 2] / self.align.scale
 
 
-class _Quiet:
+class _Quiet(Silent):
     """Passes on only what may be wrong: the lines of a job within this one name files that nobody keeps."""
 
     def __init__(self, reporter: Reporter):
         self._reporter = reporter
 
-    def message(self, text: str) -> None:
-        pass
-
     def warn(self, text: str) -> None:
         self._reporter.warn(text)
-
-    def progress(self, share: float, text: str = "") -> None:
-        pass
 
 
 def _objects(path: Path, reporter: Reporter) -> Areas:
@@ -704,9 +700,3 @@ def _load(given: ReportFiles, path: Path) -> Rays:
 
 def _corners(box: AnyBox) -> tuple[np.ndarray, np.ndarray]:
     return np.array(box.core.lower, float), np.array(box.core.upper, float)
-
-
-def _variant() -> str:
-    import mitsuba as mi
-
-    return str(mi.variant())

@@ -7,7 +7,6 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.api.query import ObserverOf, box_shares
-from nerg_mi.api.scene import box_dict
 from nerg_mi.formats.areas import Region
 from nerg_mi.report.data import Onlooker
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
@@ -41,6 +40,14 @@ def hits_box(o, d, low, high) -> np.ndarray:
     with np.errstate(divide="ignore"):
         a, b = (np.array(low) - o) / d, (np.array(high) - o) / d
     return np.minimum(a, b).max(axis=1) < np.maximum(a, b).min(axis=1)
+
+
+def box_dict(lower, upper) -> dict:
+    """The box between two corners, as Mitsuba takes it."""
+    import mitsuba as mi
+
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    return {"type": "cube", "to_world": mi.ScalarTransform4d().translate(middle.tolist()).scale(half.tolist())}
 
 
 @pytest.fixture

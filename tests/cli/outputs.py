@@ -78,7 +78,7 @@ CASES = (
         "-o {o}/demo --width 24 --spp 1 -m llvm_ad_rgb",
         _below("demo", DEMO),
         ("demo",),
-        ("workflows.report._ReportWork.run", "workflows.bake.sums_in_one_go"),
+        ("workflows.report._ReportWork.run", "workflows.bake.sums_of"),
     ),
     Case("render", "{i}/scene.xml -o {o}/a.exr -m llvm_ad_rgb", ("a.exr",)),
     Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb", ("a.png",)),
