@@ -43,8 +43,7 @@ from .gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions
 from .geometry import check_place, place_kind, place_of_training
 from .options import exposed_options, shared_options
 from .parts import Parts, PlannedScene
-from .train_gaze import train_gaze
-from .train_prior import RECIPE as PRIOR
+from .train_gaze import PRIOR, train_gaze
 
 # ---- Evaluation ----
 #

@@ -6,7 +6,7 @@ people.
 the means.
 ``nerg ablate``: Train every variant of a gaze field alike, and compare them.
 
-What these commands take; their workflows run in `.train_gaze`, `.train_prior`, `.evaluate` and `.ablation`.
+What these commands take; their workflows run in `.train_gaze`, `.evaluate` and `.ablation`.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class PriorOptions(Checked):
 
 declare(
     "train prior",
-    "nerg_mi.workflows.train_prior:learn_prior",
+    "nerg_mi.workflows.train_gaze:learn_prior",
     more="It stands in any place whose z axis points up. What it is worth: docs/gaze-evaluation.md.",
     options=PriorOptions,
     rays=argument("Rays files (.npz or .parquet) or datasets, one a place.", list[Path]),

@@ -204,7 +204,7 @@ declare(
 
 declare(
     "render",
-    "nerg_mi.workflows.film:render_film",
+    "nerg_mi.workflows.render:render_film",
     "Render a scene file to a picture or a video, with the integrator that the scene names.",
     more="""An EXR file holds all channels in float32, those of the AOVs among them; a PNG file holds the colour,
 tonemapped to sRGB, or an overlay with its scale, which an SVG file can hold, too. Pictures of a sequence have a number

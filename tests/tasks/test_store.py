@@ -205,7 +205,7 @@ def test_keys_name_code_and_programs():
 
 
 def test_the_digest_follows_the_sources_that_compute(tmp_path):
-    sources = ("maths/vmf.py", "workflows/film.py", "cli/render.py", "tasks/store.py", "notes.txt")
+    sources = ("maths/vmf.py", "workflows/render.py", "cli/render.py", "tasks/store.py", "notes.txt")
     for name in sources:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("x = 1\n")

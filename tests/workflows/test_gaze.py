@@ -27,8 +27,7 @@ from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeEv
 from nerg_mi.workflows.geometry import make_place, place_of_training
 from nerg_mi.workflows.options import PlaceOptions
 from nerg_mi.workflows.parts import account_for_store
-from nerg_mi.workflows.train_gaze import train_gaze
-from nerg_mi.workflows.train_prior import learn_prior
+from nerg_mi.workflows.train_gaze import learn_prior, train_gaze
 from tests.conftest import ROOT
 from tests.evaluation.test_gaze import crowd
 from tests.formats.splats.writers import random_splats, write_inria

@@ -23,10 +23,10 @@ from nerg_mi.workflows import options
 from nerg_mi.workflows.ablation import training_options
 from nerg_mi.workflows.base import SILENT, select_backend, versions
 from nerg_mi.workflows.evaluate import fold_options
-from nerg_mi.workflows.film import picture_options
 from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, PriorOptions
 from nerg_mi.workflows.options import PartOptions, as_base, option
 from nerg_mi.workflows.rays_commands import FilterOptions, SplitOptions
+from nerg_mi.workflows.render import picture_options
 from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions
 from nerg_mi.workflows.study import planned_study
 from tests.tasks import works

@@ -21,12 +21,11 @@ from nerg_mi.rendering.aovs import prepare_for, render_asked
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.tasks.engines import Local, Processes, run_plan
 from nerg_mi.tasks.store import Store
-from nerg_mi.workflows import film, render
+from nerg_mi.workflows import render
 from nerg_mi.workflows.demo import store_scene
-from nerg_mi.workflows.film import make_picture, render_film
 from nerg_mi.workflows.options import PartOptions
 from nerg_mi.workflows.parts import Parts, PlannedScene, account_for_store, size
-from nerg_mi.workflows.render import render_file
+from nerg_mi.workflows.render import make_picture, render_file, render_film
 from nerg_mi.workflows.scene_commands import FilmOptions, PictureOptions
 from nerg_mi.workflows.scene_commands import PictureOptions as PicturesPictureOptions
 from tests.conftest import ROOT
@@ -342,8 +341,8 @@ def test_parts_give_the_bytes_of_one_go(scene, name, overlay):
 
 def test_pictures_that_are_kept_are_not_rendered_again(scene, monkeypatch):
     store, rendered = scene.parent / "store", []
-    original = film.render_file
-    monkeypatch.setattr(film, "render_file", lambda *given: rendered.append(given) or original(*given))
+    original = render.render_file
+    monkeypatch.setattr(render, "render_file", lambda *given: rendered.append(given) or original(*given))
     film_of(scene, "one", "a.png", store=store)
     told = Recorder()
     film_of(scene, "two", "a.png", told, store=store)
@@ -390,7 +389,7 @@ def test_files_of_the_scene_are_the_same_wherever_it_lies(scene, tmp_path):
 def test_one_picture_needs_nothing_of_it(scene, tmp_path):
     """Neither the engine nor dask is loaded where no parts are asked for."""
     code = (
-        "import sys\nfrom nerg_mi.workflows.film import render_film\n"
+        "import sys\nfrom nerg_mi.workflows.render import render_film\n"
         "from nerg_mi.workflows.options import FilmOptions\n"
         f"render_film({str(scene)!r}, {str(tmp_path / 'a.png')!r}, FilmOptions(mode='llvm_ad_rgb'))\n"
         "print([m for m in sys.modules if m.startswith(('nerg_mi.tasks', 'distributed', 'dask'))])"
