@@ -207,7 +207,9 @@ def test_options_that_contradict_each_other(make, message):
 # ---- Jobs on datasets: imported, summed up and filtered as files are, and trained and scored on ----
 
 
-pytest.importorskip("pyarrow")
+@pytest.fixture
+def parquet():
+    pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
 
 
 def options(**given) -> RaysImportOptions:
@@ -219,7 +221,7 @@ def files(tmp_path):
     return [write_source(tmp_path / "files" / f"{k}.csv", k, 200, start=DAY) for k in range(3)]
 
 
-def test_import_into_a_dataset(files, tmp_path):
+def test_import_into_a_dataset(parquet, files, tmp_path):
     heard, output = Recorder(), tmp_path / "shop.rays"
     found = import_rays(files, options(output=output, place_name="shop"), heard)
     at_once = import_rays(files, options(workers=None))
@@ -238,14 +240,14 @@ def test_import_into_a_dataset(files, tmp_path):
     assert [title for title, _ in card_of(output / "place=north")] == [str(output / "place=north")]
 
 
-def test_what_could_not_be_imported_is_told_in_the_end(files, tmp_path):
+def test_what_could_not_be_imported_is_told_in_the_end(parquet, files, tmp_path):
     files[1].write_text("t\n")
     with pytest.raises(NergError, match=r"1\.csv.*1.*3"):
         import_rays(files, options(output=tmp_path / "shop.rays"))
     assert len(RayDataset.open(tmp_path / "shop.rays")) == 398
 
 
-def test_pseudonyms(files, tmp_path):
+def test_pseudonyms(parquet, files, tmp_path):
     (tmp_path / "salt").write_bytes(bytes(range(32)))
     salted = {"pseudonyms": True, "salt": tmp_path / "salt"}
     found = import_rays(files, options(output=tmp_path / "a.rays", **salted))
@@ -265,7 +267,7 @@ def test_pseudonyms(files, tmp_path):
         ({"align_output": "a.json", "output": "a.rays"}, "--write-align belongs to files"),
     ],
 )
-def test_options_of_datasets(given, why):
+def test_options_of_datasets(parquet, given, why):
     with pytest.raises(NergError, match=why):
         RaysImportOptions(**given)
 
@@ -280,7 +282,7 @@ def test_options_of_datasets(given, why):
         {"thin": 0.5, "thin_distance": 9.0, "box": (0, 4, 0, 4, 0, 3)},
     ],
 )
-def test_filters_are_those_of_a_file(tmp_path, given):
+def test_filters_are_those_of_a_file(parquet, tmp_path, given):
     dataset, rays = write_dataset(tmp_path)
     heard, expected = Recorder(), Recorder()
     found = filter_rays(dataset.folder, FilterOptions(**given, output=tmp_path / "a.parquet"), heard)
@@ -304,7 +306,7 @@ def test_filters_are_those_of_a_file(tmp_path, given):
         import_rays([tmp_path / "files" / "0.csv"], options(output=tmp_path / "b.rays"))
 
 
-def test_samples(tmp_path):
+def test_samples(parquet, tmp_path):
     dataset, rays = write_dataset(tmp_path)
     plain = filter_rays(dataset.folder, FilterOptions(sample=50, seed=2)).rays
     assert np.array_equal(plain.t, dataset.sample(50, 2).t)
@@ -324,7 +326,7 @@ def test_samples(tmp_path):
         filter_rays(dataset.folder, FilterOptions(sample=4, output=tmp_path / "c.rays"))
 
 
-def test_filters_that_cannot_be(tmp_path, monkeypatch):
+def test_filters_that_cannot_be(parquet, tmp_path, monkeypatch):
     dataset, _ = write_dataset(tmp_path)
     with pytest.raises(NergError, match="nothing is left of 1,197 rays"):
         filter_rays(dataset.folder, FilterOptions(start=0, end=1, output=tmp_path / "a.rays"))
@@ -348,7 +350,7 @@ def crowded(tmp_path_factory):
 
 
 @pytest.mark.parametrize("most", [10_000, 2500])
-def test_training_and_scores_are_of_the_same_rays(crowded, tmp_path, most):
+def test_training_and_scores_are_of_the_same_rays(parquet, crowded, tmp_path, most):
     heard, gaze = Recorder(), tmp_path / "gaze.safetensors"
     trained = train_gaze(crowded, gaze, replace(TRAINING, most=most, seed=3), heard)
     about = trained.provenance["rays_file"]
@@ -365,7 +367,7 @@ def test_training_and_scores_are_of_the_same_rays(crowded, tmp_path, most):
     assert [row["KLD"] for row in scored.rows] == pytest.approx([row["KLD"] for row in found.rows], rel=1e-6)
 
 
-def test_another_dataset_is_not_scored(crowded, tmp_path):
+def test_another_dataset_is_not_scored(parquet, crowded, tmp_path):
     train_gaze(crowded, tmp_path / "gaze.safetensors", TRAINING)
     dataset, _ = write_dataset(tmp_path, 1)
     with pytest.raises(NergError, match=r"corridor\.rays"):

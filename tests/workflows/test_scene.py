@@ -337,7 +337,9 @@ def test_a_gaze_field_without_anything_needs_an_observer(rgb, folder, tmp_path):
 # ---- Rays of a file and of a dataset, as a scene shows them ----
 
 
-pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
+@pytest.fixture
+def parquet():
+    pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
 
 
 def test_a_file_is_shown_as_it_is(tmp_path):
@@ -349,7 +351,7 @@ def test_a_file_is_shown_as_it_is(tmp_path):
     assert none.rays is None and none.file is None and none.of_person("Ada") is None
 
 
-def test_a_sample_of_a_dataset_is_kept_beside_the_scene(tmp_path, monkeypatch):
+def test_a_sample_of_a_dataset_is_kept_beside_the_scene(parquet, tmp_path, monkeypatch):
     """A sample misses most moments of a person, all of whose rays are read for an eye."""
     _, rays = write_dataset(tmp_path)
     recorder = Recorder()
@@ -365,7 +367,7 @@ def test_a_sample_of_a_dataset_is_kept_beside_the_scene(tmp_path, monkeypatch):
     assert len(own) == int((rays.person == rays.persons.index("p1_0")).sum())
 
 
-def test_a_scene_of_a_dataset(rgb, tmp_path):
+def test_a_scene_of_a_dataset(parquet, rgb, tmp_path):
     """Named by its place as well; the scene renders, and a person is found in it."""
     write_dataset(tmp_path)
     options = SceneOptions(person="p2_1", time=DAY + 2 * 43_200 + 3.0, geometry="none")
@@ -376,7 +378,7 @@ def test_a_scene_of_a_dataset(rgb, tmp_path):
         write_scene([tmp_path / "shop.rays"], tmp_path / "b.xml", SceneOptions(person="Eve", time=1.0))
 
 
-def test_a_name_that_is_taken_by_a_folder(tmp_path):
+def test_a_name_that_is_taken_by_a_folder(parquet, tmp_path):
     write_dataset(tmp_path, files=1)
     (tmp_path / "a.rays.npz").mkdir()
     with pytest.raises(NergError, match=r"a\.rays\.npz"):
@@ -448,16 +450,13 @@ def test04_two_of_a_kind_are_told(rgb, tmp_path, rays_file):
         place_to_view([demo.store_scene()], tmp_path, ViewOptions(up=(0, 0, 0)))
 
 
-def test05_a_place_of_a_dataset(rgb, tmp_path):
+def test05_a_place_of_a_dataset(parquet, rgb, tmp_path):
     """As everywhere, a dataset is named by its folder, or by that of a place in it."""
-    pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
-    from tests.rays.dataset.making import write_dataset
-
-    _, rays_file = write_dataset(tmp_path)
+    _, rays = write_dataset(tmp_path)
     (tmp_path / "a.obj").write_text(MESH)
     for name in ("shop.rays", "shop.rays/place=shop"):
         place = place_to_view([tmp_path / "a.obj", tmp_path / name], tmp_path, ViewOptions(up=(0, 0, 1)))
-        assert place.rays is not None and len(place.rays) == len(rays_file) and place.made
+        assert place.rays is not None and len(place.rays) == len(rays) and place.made
 
 
 @pytest.mark.nightly
