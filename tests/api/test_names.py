@@ -144,9 +144,6 @@ def test03_scalar_variants_are_refused(rgb):
         active_mitsuba()
 
 
-# ---- nerg_mi.api.arrays ----
-
-
 # ---- What comes in from NumPy and what goes out to it ----
 
 

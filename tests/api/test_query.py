@@ -21,11 +21,7 @@ from tests.workflows.recorder import Recorder
 
 
 BOX = [(-0.2, 1.8, -0.1), (0.2, 2.2, 0.1)]
-
-
 EYE = (1.2, 2.2, 1.5)
-
-
 FAR = {"type": "sphere", "radius": 0.01, "center": [0, 0, -50]}
 
 

@@ -47,8 +47,6 @@ ROOT = Path(__file__).resolve().parents[2]
 BREACHES = ("other exception", "crash", "hang", "executed", "left a file", "memory", "slow", "no sentence")
 # A case has 5 s of the processor's time; the machine may be busy, and a hang is a hang.
 _PATIENCE = 60.0
-
-
 SPECIAL = ("fifo", "/dev/zero", "/dev/null", "folder", "missing", "loop", "sparse")
 """What may stand at a path in place of a regular file: itself, or a link to it."""
 

@@ -29,18 +29,11 @@ from tests.surfaces.walls import wall
 from tests.workflows.recorder import Recorder
 from tests.workflows.watched import MODE, write_scene
 
-# ---- nerg_mi.workflows.draw ----
-
-
 # ---- Quantities in EXR files ----
 
 
 RNG = np.random.default_rng(0)
-
-
 COLOR, GAZE = RNG.random((6, 8, 3)).astype(np.float32), RNG.random((6, 8)).astype(np.float32)
-
-
 OPACITY = np.where(np.arange(8) < 3, 0.2, 0.9).astype(np.float32) * np.ones((6, 1), np.float32)
 
 
@@ -152,8 +145,6 @@ def test_what_the_pictures_rest_on_is_said_below(tmp_path):
 
 
 SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-
-
 ABOVE = {"camera": (0.0, 0.0, 2.0), "target": (0.0, 0.0, 0.0), "up": (0.0, 1.0, 0.0), "fov": 90.0}
 
 
@@ -241,9 +232,6 @@ def test_splats_show_their_gaze_themselves(tmp_path):
     write_ply_splats(tmp_path / "splats.ply", wall(0.0, 0.4, 0.05))
     with pytest.raises(NergError, match="holds Gaussian splats"):
         read_baked(tmp_path / "splats.ply")
-
-
-# ---- nerg_mi.workflows.draw_scenes ----
 
 
 # ---- Options that kinds of figures share ----
@@ -397,8 +385,6 @@ def test_a_scene_whose_camera_is_the_observer(rgb, scene_triptych, tmp_path):
 
 
 LOW, HIGH = np.array([-2.0, -1.0]), np.array([2.0, 1.0])
-
-
 WALLS_SCENE = """<scene version="3.0.0"><integrator type="nerg"/>
 <shape type="rectangle"><transform name="to_world"><scale value="5"/></transform></shape>
 <shape type="cube"><transform name="to_world"><scale x="0.3" y="0.4" z="0.25"/>
@@ -485,9 +471,6 @@ def test_over_a_place(rgb, rays, tmp_path):
 def test_what_a_floor_plan_refuses(rays, given, said):
     with pytest.raises(NergError, match=said):
         draw("floor", rays, **given)
-
-
-# ---- nerg_mi.workflows.draw ----
 
 
 # ---- Figures drawn and written, with where they come from ----

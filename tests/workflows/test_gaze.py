@@ -181,9 +181,6 @@ def test_the_spread_of_an_ensemble_is_judged_as_support_is(tmp_path):
     assert "spread" in (tmp_path / "out" / "folds.md").read_text()
 
 
-# ---- nerg_mi.workflows.ablation ----
-
-
 # ---- The ablation as a job: rows that are kept and found again, frames, laws, what is refused ----
 
 

@@ -238,9 +238,6 @@ def test_what_runs_has_what_cannot_change_a_result_at_its_default():
     assert task.value == PartOptions() and not task.files
 
 
-# ---- nerg_mi.workflows.base ----
-
-
 # ---- The reporter of jobs that were given none ----
 
 

@@ -159,9 +159,6 @@ def test_files_in_their_order(torch, tmp_path):
     assert tuple(found.files) == outputs and all(p.is_file() for p in outputs)
 
 
-# ---- nerg_mi.workflows.export ----
-
-
 # ---- Exports by jobs: from a file and from a field that is loaded ----
 
 

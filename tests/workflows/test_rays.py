@@ -27,9 +27,6 @@ from tests.workflows.test_gaze import OPTIONS, TRAINING
 
 from .recorder import Recorder
 
-# ---- nerg_mi.workflows.rays ----
-
-
 # ---- The steps of a filter, of rays that nobody else holds and of those that somebody does ----
 
 
@@ -341,6 +338,7 @@ def test_filters_that_cannot_be(parquet, tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def crowded(tmp_path_factory):
     """A dataset of 3,000 rays of four people in a corridor."""
+    pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
     folder = tmp_path_factory.mktemp("crowded") / "corridor.rays"
     write_head(folder, Head(2))
     writer = SourceWriter(folder, "0" * 32, 2)

@@ -34,15 +34,10 @@ from tests.plugins import fields
 from tests.tasks import works
 from tests.workflows.recorder import Recorder
 
-# ---- nerg_mi.workflows.render ----
-
-
 # ---- Pictures with a quantity over them: what is asked for, their scale, sequences, and what is refused ----
 
 
 MODE = "llvm_ad_rgb"
-
-
 OVERLAYS_SCENE = """<scene version="3.0.0">
     <default name="eye" value="0.2, 0.1, -2.5"/>
     <default name="size" value="12"/>

@@ -213,9 +213,6 @@ def test_damaged_rays_are_a_sentence(run, tmp_path):
     assert not (tmp_path / "a.html").exists()
 
 
-# ---- nerg_mi.workflows.report ----
-
-
 # ---- What files are, found from the files: in any order, in folders, and what makes no report ----
 
 
@@ -371,8 +368,6 @@ def test_plans():
 
 
 BOX = Box((0.0, 0.0, 0.0), (8.0, 6.0, 3.0))
-
-
 PLACE = GazePlace(None, BOX, "none")
 
 

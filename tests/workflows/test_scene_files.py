@@ -44,9 +44,6 @@ from nerg_mi.workflows.scene_places import (
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.workflows.recorder import Recorder
 
-# ---- nerg_mi.workflows.scene_cameras ----
-
-
 # ---- What is looked around with before a camera is chosen: directions, depths and bounds of a known room ----
 
 
@@ -188,9 +185,6 @@ def test_where_most_rays_are():
     assert np.linalg.norm(support_of_rays(rays).densest() - (5, 5, 1.6)) < 0.15
 
 
-# ---- nerg_mi.workflows.scene_places ----
-
-
 # ---- What files are, by what is in them, and what goes together ----
 
 
@@ -280,9 +274,7 @@ def test_provenance_is_not_believed(folder):
             recognise([folder / "b.safetensors"], None, Recorder())
 
 
-# ---- Photos ----
-#
-# The camera of a photo, against the pose in its file, in the coordinates in which a field was trained.
+# ---- The camera of a photo, against the pose in its file, in the coordinates in which a field was trained ----
 
 
 POSE = np.array([[1, 0, 0, 0.5], [0, 0, -1, -3], [0, 1, 0, 1.2], [0, 0, 0, 1]], float)  # looks along +y, up is +z

@@ -29,8 +29,6 @@ from tests.train.gaze.looks import BOX, RAYS, looking_at
 
 
 QUICK = GazeOptions(geometry="none", radius=0.5, probes=6, min_rays=8, steps=3, directions=64, zones=0)
-
-
 WALL = """<scene version="3.0.0"><shape type="rectangle"><transform name="to_world">
     <scale value="2"/><lookat origin="1.5, 0, 1.5" target="0, 0, 1.5" up="0, 0, 1"/></transform></shape></scene>"""
 
@@ -271,14 +269,8 @@ def test_an_output_is_trained_once_at_a_time(tmp_path, train):
 
 
 HITS = GazeOptions(geometry="hits")
-
-
 FIELD = GazeOptions(field=Path("field.safetensors"), recipe="small")
-
-
 VIEWS = GazeOptions(geometry="none", views=Path("photos"), salience="maps")
-
-
 SCENE = GazePlace(None, BOX, "scene")
 
 
