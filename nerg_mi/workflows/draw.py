@@ -328,6 +328,12 @@ def draw(
     )
 
 
+def draw_files(files: Path | list[Path], output: Path, options: Any, reporter: Reporter) -> None:
+    """The figure of the kind whose ``options`` these are, written to ``output``."""
+    kind = next(kind for kind in KINDS.values() if kind.options is type(options))
+    draw_kind(kind, files if isinstance(files, list) else [files], output, options, reporter)
+
+
 def draw_kind(kind: Kind, files: Sequence[Path], output: Path | None, options: Any, reporter: Reporter = SILENT) -> Any:
     """The figure of ``kind`` of ``files``, with an object of its ``options``; written to ``output``, with its
     provenance, where that is given."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.ranges import (
@@ -36,7 +36,7 @@ from nerg_mi.ranges import (
     Range,
 )
 
-from .base import Reporter, argument, command, declare, extra, out
+from .base import argument, declare, extra, out
 from .options import PartOptions, best_variant, coordinates, cpu_threads, definitions, option, parse_numbers
 
 if TYPE_CHECKING:
@@ -393,24 +393,15 @@ KINDS = {kind.name: kind for kind in _TABLE}
 """The kinds of figures, in the order in which they are listed."""
 
 
-def _declare(kind: Kind) -> None:
-    """Make ``kind`` a command."""
-
-    @command(
-        f"draw {kind.name}",
-        kind.summary,
-        options=kind.options,
-        files=argument(f"{kind.takes[:1].upper()}{kind.takes[1:]}.", list[Path] if kind.most > 1 else Path),
+for _kind in KINDS.values():
+    declare(
+        f"draw {_kind.name}",
+        "nerg_mi.workflows.draw:draw_files",
+        _kind.summary,
+        options=_kind.options,
+        files=argument(f"{_kind.takes[:1].upper()}{_kind.takes[1:]}.", list[Path] if _kind.most > 1 else Path),
         output=out("Picture to write: .png or .svg."),
     )
-    def draw_files(files: Path | list[Path], output: Path, options: Any, reporter: Reporter) -> None:
-        from .draw import draw_kind
-
-        draw_kind(kind, files if isinstance(files, list) else [files], output, options, reporter)
-
-
-for _kind in KINDS.values():
-    _declare(_kind)
 
 
 # ---- Gaze on surfaces ----
