@@ -23,8 +23,14 @@ from nerg_mi.workflows import options
 from nerg_mi.workflows.ablation import training_options
 from nerg_mi.workflows.base import SILENT, select_backend, versions
 from nerg_mi.workflows.evaluate import fold_options
-from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, PriorOptions
-from nerg_mi.workflows.options import PartOptions, as_base, option
+from nerg_mi.workflows.gaze_commands import (
+    AblationOptions,
+    FoldOptions,
+    GazeEvaluationOptions,
+    GazeOptions,
+    PriorOptions,
+)
+from nerg_mi.workflows.options import PartOptions, as_base, option, shared_options
 from nerg_mi.workflows.rays_commands import FilterOptions, SplitOptions
 from nerg_mi.workflows.render import picture_options
 from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions
@@ -108,6 +114,16 @@ def test_they_say_a_place_and_who_makes_parts():
     options = FoldOptions(geometry="hits", store=Path("kept"))
     assert options.in_parts and (options.folds, options.first, options.people) == (5, 0, 0.5)
     assert set(options.splits.split(",")) == {"both", "pos", "people"}
+
+
+def test_options_that_are_repeated_are_read_again_and_those_of_one_name_are_not():
+    folds = FoldOptions(geometry="none", steps=3, kappa=9.0)
+    shared = shared_options(folds, GazeOptions)
+    assert shared["steps"] == 3 and shared["geometry"] == "none" and not {"kappa", "min_rays", "threads"} & set(shared)
+    assert GazeOptions(**shared).steps == 3
+    scoring = {"kappa": 9.0, "directions": 2048, "min_rays": 64}
+    assert shared_options(folds, GazeEvaluationOptions) == scoring
+    assert FoldOptions(ensemble=1000).ensemble == 1000, "with the range that it has in a training"
 
 
 # ---- Options of filtering and splitting; what they do to rays is tried in tests/workflows/test_rays.py ----
