@@ -8,6 +8,7 @@ import types
 import typing
 from dataclasses import FrozenInstanceError, dataclass, fields, is_dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_type_hints
 
 import drjit as dr
@@ -16,10 +17,13 @@ import pytest
 import nerg_mi.workflows
 from nerg_mi.aoi.options import CountOptions, PredictionOptions, StatisticsOptions
 from nerg_mi.errors import NergError
+from nerg_mi.evaluation.ablation import Variant
 from nerg_mi.ranges import Checked
 from nerg_mi.surfaces.sources import GazeSettings, RaySettings
 from nerg_mi.tasks.task import Part, Plan, rebuilt
-from nerg_mi.workflows import options
+from nerg_mi.train.gaze_settings import GazeSettings as TrainingSettings
+from nerg_mi.train.gaze_settings import ProbeSettings
+from nerg_mi.workflows import ablation, evaluate, options
 from nerg_mi.workflows.ablation import training_options
 from nerg_mi.workflows.base import SILENT, select_backend, versions
 from nerg_mi.workflows.evaluate import fold_options
@@ -30,7 +34,7 @@ from nerg_mi.workflows.gaze_commands import (
     GazeOptions,
     PriorOptions,
 )
-from nerg_mi.workflows.options import PartOptions, as_base, option, shared_options
+from nerg_mi.workflows.options import PartOptions, as_base, exposed_options, option, shared_options
 from nerg_mi.workflows.rays_commands import FilterOptions, SplitOptions
 from nerg_mi.workflows.render import picture_options
 from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions
@@ -117,13 +121,61 @@ def test_they_say_a_place_and_who_makes_parts():
 
 
 def test_options_that_are_repeated_are_read_again_and_those_of_one_name_are_not():
-    folds = FoldOptions(geometry="none", steps=3, kappa=9.0)
+    folds = FoldOptions(geometry="none", recipe="small", kappa=9.0)
     shared = shared_options(folds, GazeOptions)
-    assert shared["steps"] == 3 and shared["geometry"] == "none" and not {"kappa", "min_rays", "threads"} & set(shared)
-    assert GazeOptions(**shared).steps == 3
+    assert shared["recipe"] == "small" and shared["geometry"] == "none"
+    assert not {"kappa", "min_rays", "threads"} & set(shared)
     scoring = {"kappa": 9.0, "directions": 2048, "min_rays": 64}
     assert shared_options(folds, GazeEvaluationOptions) == scoring
     assert FoldOptions(ensemble=1000).ensemble == 1000, "with the range that it has in a training"
+
+
+# ---- A setting of gaze trainings is an option of all that trains: of folds and of ablations, too ----
+
+FIELDS = [f for kind in (ProbeSettings, TrainingSettings) for f in fields(kind) if "help" in f.metadata]
+SETTINGS = {f.metadata["option"] or f.name for f in FIELDS}
+CHOSEN = {"learning_rate": 0.5, "cap": 7, "placement": "grid", "fresh": True}
+
+
+class Stop(Exception):
+    pass
+
+
+@pytest.fixture
+def training(monkeypatch):
+    """The options that a training is begun with, which is then ended."""
+    seen = []
+
+    def begin(*arguments):
+        seen.extend(a for a in arguments if isinstance(a, GazeOptions))
+        raise Stop
+
+    monkeypatch.setattr(evaluate, "train_gaze", begin)
+    monkeypatch.setattr(ablation, "plan_gaze", begin)
+    return seen
+
+
+def test_folds_have_them(training, tmp_path):
+    options = FoldOptions(geometry="hits", **CHOSEN)
+    with pytest.raises(Stop):
+        evaluate.train_and_score(evaluate.Folds(options, ("both",), None, None), 3, tmp_path)
+    assert {name: getattr(training[0], name) for name in CHOSEN} == CHOSEN and training[0].seed == 3
+    # What tests are made by has the same words, and is left out.
+    assert training[0].kappa is training[0].radius is None
+
+
+def test_ablations_have_them(training):
+    bench = SimpleNamespace(options=AblationOptions(**CHOSEN, default_steps=3), place=None)
+    with pytest.raises(Stop):
+        ablation.plan_of(Variant(name="emit", recipe="default", gaze="emit"), 3, bench)
+    assert {name: getattr(training[0], name) for name in CHOSEN} == CHOSEN
+    assert training[0].kappa is training[0].radius is None and training[0].steps == 3
+
+
+@pytest.mark.parametrize("kind", [FoldOptions, AblationOptions])
+def test_none_is_forgotten(kind):
+    assert {f.name for f in fields(kind)} | {"seed", "freeze", "loss", "mix_folds"} >= SETTINGS
+    assert exposed_options(kind()) == {} and set(exposed_options(kind(**CHOSEN))) == set(CHOSEN)
 
 
 # ---- Options of filtering and splitting; what they do to rays is tried in tests/workflows/test_rays.py ----
