@@ -131,7 +131,7 @@ def _group(
     return app
 
 
-def _about_group(name: str, entries: Mapping[str, Entry]) -> str:
+def _about_group(name: str, entries: Mapping[str, ListedCommand]) -> str:
     """The line about the commands that begin with ``name``: of a group that `GROUPS` has not, what they are called."""
     below = [other.removeprefix(f"{name} ") for other in entries if other.startswith(f"{name} ")]
     return GROUPS.get(name) or f"Commands: {', '.join(below)}."
