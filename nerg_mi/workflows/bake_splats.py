@@ -88,9 +88,11 @@ def bake_splats(
         reporter.message(f"of {path}: {note}")
     align, cone = alignment_of(options), cone_of(options, source)
     of_rays = RaySettings(cone=cone, bundle=options.bundle, seed=options.seed)
-    of_field = () if source == "rays" else (options.gaze, cone)
     groups, factor = who_looks(options, source, rays, align, reporter)
-    scene = SplatScene(path, len(given), *of_field, of_rays=of_rays)
+    if source == "rays":
+        scene = SplatScene(path, len(given), of_rays=of_rays)
+    else:
+        scene = SplatScene(path, len(given), options.gaze, cone, of_rays)
     found = sums_of(scene, groups, options, paths[0] if paths else path, reporter)
     sums = merge(found)
     reporter.progress(0.9, "areas of Gaussians")

@@ -544,7 +544,7 @@ class _ReportWork:
             stage,
             *sizes,
             inputs,
-            versions(mi.variant()),
+            versions(str(mi.variant())),
             settings,
             views.basis,
             about.json(),

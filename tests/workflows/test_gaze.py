@@ -133,7 +133,7 @@ def threads():
 
 
 @pytest.fixture
-def trained(monkeypatch):
+def folds_trained(monkeypatch):
     """The seeds of the folds that were trained and scored with one thread, which cost nothing here."""
     seeds = []
 
@@ -151,13 +151,13 @@ def trained(monkeypatch):
     return seeds
 
 
-def test_folds_that_are_kept_are_not_trained_again(tmp_path, trained):
+def test_folds_that_are_kept_are_not_trained_again(tmp_path, folds_trained):
     def go(rays=None, **more):
-        trained.clear()
+        folds_trained.clear()
         told = Recorder()
         rays = crowd(300) if rays is None else rays
         evaluate_folds(rays, tmp_path / "out", FoldOptions(**SMALL | more, store=tmp_path / "store"), told)
-        return list(trained)
+        return list(folds_trained)
 
     assert go() == [0, 1] and go() == [] and go(folds=4) == [2, 3] and go(first=2, folds=3) == [4]
     # Other rays, and another recipe, are another evaluation; a change of how it is computed is none.

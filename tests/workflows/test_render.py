@@ -385,7 +385,7 @@ def test_one_picture_needs_nothing_of_it(scene, tmp_path):
     """Neither the engine nor dask is loaded where no parts are asked for."""
     code = (
         "import sys\nfrom nerg_mi.workflows.render import render_film\n"
-        "from nerg_mi.workflows.options import FilmOptions\n"
+        "from nerg_mi.workflows.scene_commands import FilmOptions\n"
         f"render_film({str(scene)!r}, {str(tmp_path / 'a.png')!r}, FilmOptions(mode='llvm_ad_rgb'))\n"
         "print([m for m in sys.modules if m.startswith(('nerg_mi.tasks', 'distributed', 'dask'))])"
     )
