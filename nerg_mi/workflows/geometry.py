@@ -1,4 +1,4 @@
-"""The place that gaze is tied to: of a training, and of a field that is evaluated, with the options of the latter."""
+"""The place that gaze is tied to: of a training, and of a field that is evaluated."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Options of workflows: how one is declared, which are settings, too, and those that several workflows share.
 
-An option is a field that `option` makes of a dataclass, which stands beside its workflow: a notebook reads it there,
-and the command line makes its option of it.
+An option is a field that `option` makes of a dataclass, which stands where its command is declared: a notebook reads it
+there, and the command line makes its option of it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Options of the viewer. From files and folders to the scene that a viewer shows."""
+"""From files and folders to the scene that a viewer shows."""
 
 from __future__ import annotations
 
@@ -28,8 +28,6 @@ from .scene import write_scene
 from .scene_cameras import given_point
 from .scene_commands import SceneOptions, ViewOptions
 from .scene_places import KINDS, kind_of_file, training_place
-
-# ---- From files and folders to the scene that a viewer shows ----
 
 RAYS = 2_000_000
 """Of larger datasets so many rays are shown, drawn at random."""
