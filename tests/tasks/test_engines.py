@@ -20,8 +20,8 @@ from nerg_mi.tasks.engines import (
     Done,
     FilesElsewhere,
     Local,
+    PlanProgress,
     Processes,
-    Progress,
     import_distributed,
     open_engine,
     own_host,
@@ -158,12 +158,12 @@ def test_parts_that_another_version_planned_are_refused(store, monkeypatch):
 
 
 def test_progress_has_rate_and_time_left():
-    progress = Progress(10, reused=2, done=2)
+    progress = PlanProgress(10, reused=2, done=2)
     assert progress.line() == "2 of 10 parts" and progress.left is None and progress.share == 0.2
     progress.done, progress.seconds = 6, 8.0
     assert progress.left == pytest.approx(8.0) and progress.line() == "6 of 10 parts, 30 a minute, 8 s left"
     progress.seconds = 2.0
-    assert progress.line(False) == "6 of 10 parts, 2 a second" and Progress(0).share == 1.0
+    assert progress.line(False) == "6 of 10 parts, 2 a second" and PlanProgress(0).share == 1.0
 
 
 def test_other_processors_are_told_of_once(store):
