@@ -1,4 +1,4 @@
-"""A scene of stock plugins, and pictures as Mitsuba reads them, also on one core."""
+"""A scene of stock plugins, a box as Mitsuba takes it, and pictures as Mitsuba reads them, also on one core."""
 
 from __future__ import annotations
 
@@ -32,3 +32,11 @@ def mitsuba_bitmap(path):
 
     with threads_for_mitsuba():
         return mi.Bitmap(str(path))
+
+
+def box_dict(lower, upper) -> dict:
+    """The box between two corners, as Mitsuba takes it."""
+    import mitsuba as mi
+
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    return {"type": "cube", "to_world": mi.ScalarTransform4d().translate(middle.tolist()).scale(half.tolist())}

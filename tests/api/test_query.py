@@ -14,6 +14,7 @@ from nerg_mi.statistics.visits import MARGIN, Box
 from nerg_mi.train.geometry import GazePlace
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import SIGN, STAND, write_place
+from tests.pictures import box_dict
 from tests.plugins import fields
 from tests.workflows.recorder import Recorder
 
@@ -36,14 +37,6 @@ def hits_box(o, d, low, high) -> np.ndarray:
     with np.errstate(divide="ignore"):
         a, b = (np.array(low) - o) / d, (np.array(high) - o) / d
     return np.minimum(a, b).max(axis=1) < np.maximum(a, b).min(axis=1)
-
-
-def box_dict(lower, upper) -> dict:
-    """The box between two corners, as Mitsuba takes it."""
-    import mitsuba as mi
-
-    middle, half = (lower + upper) / 2, (upper - lower) / 2
-    return {"type": "cube", "to_world": mi.ScalarTransform4d().translate(middle.tolist()).scale(half.tolist())}
 
 
 @pytest.fixture
