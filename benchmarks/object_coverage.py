@@ -58,8 +58,8 @@ class Population:
 def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     from nerg_mi.aoi.measured import count_block
     from nerg_mi.aoi.scene import things_of
-    from nerg_mi.formats.areas import Areas, Region
-    from nerg_mi.statistics.tables import People
+    from nerg_mi.formats.areas import AreaSet, Region
+    from nerg_mi.statistics.tables import Participants
     from nerg_mi.statistics.visits import ALL
 
     around, goods, _ = made_store()
@@ -68,12 +68,12 @@ def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
         middle, size = box.middle, np.subtract(box.upper, box.lower)
         half = np.where(size == size.min(), size / 2, np.minimum(size / 2, 0.06))
         labels.append(Region.of(f"label of {box.name}", middle - half, middle + half))
-    areas = Areas((*goods.areas, *labels))
+    areas = AreaSet((*goods.areas, *labels))
     counting = counting_of(around, areas, things_of(areas.things, {}))
     walks, rng = Walks(WALKS), np.random.default_rng(3)
     found: dict[str, list] = defaultdict(list)
     for _ in range(VISITS):
-        people = People.of(count_block(walks.rays(np.arange(WALKS), rng), counting), ALL, True)
+        people = Participants.of(count_block(walks.rays(np.arange(WALKS), rng), counting), ALL, True)
         for m in MEASURES:
             found[m.name].append(m.pair(people))
     made = {k: [np.concatenate(w).astype(float) for w in zip(*v)] for k, v in found.items()}

@@ -34,14 +34,14 @@ def made_store():
 
 
 def counting_of(around, areas, things, seen: bool = True):
-    from nerg_mi.aoi.measured import Counting
-    from nerg_mi.statistics.visibility import CellsInView, Targets
-    from nerg_mi.statistics.visits import LookRules
+    from nerg_mi.aoi.measured import AoiContext
+    from nerg_mi.statistics.shares import CellsInView, SamplePoints
+    from nerg_mi.statistics.visits import VisitRules
 
-    in_view = CellsInView(Targets.of(things, 48), around.depth, 0.1, 0.03) if seen else None
+    in_view = CellsInView(SamplePoints.of(things, 48), around.depth, 0.1, 0.03) if seen else None
     members = list(areas.members().values())
-    rules = LookRules(gap=2.0, pause=60.0, merge=0.15, least=0.1)
-    return Counting(
+    rules = VisitRules(gap=2.0, pause=60.0, merge=0.15, least=0.1)
+    return AoiContext(
         around, things, areas.names, members, range(len(members)), rules, 0.03, view=120.0, cells_in_view=in_view
     )
 
@@ -92,12 +92,12 @@ class Walks:
 
 
 def errors() -> None:
-    from nerg_mi.aoi.measured import Eyes, count_block
+    from nerg_mi.aoi.measured import Viewpoints, count_block
     from nerg_mi.aoi.predicted import foretell
     from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.scenes.store import twin
-    from nerg_mi.statistics.tables import People
-    from nerg_mi.statistics.visibility import Targets
+    from nerg_mi.statistics.shares import SamplePoints
+    from nerg_mi.statistics.tables import Participants
     from nerg_mi.statistics.visits import ALL, land
     from nerg_mi.workflows.base import SILENT
 
@@ -106,7 +106,7 @@ def errors() -> None:
     counting = counting_of(around, areas, things)
     rng = np.random.default_rng(1)
     rays = walks.rays(np.arange(12), rng)
-    people = People.of(count_block(rays, counting), ALL, True)
+    people = Participants.of(count_block(rays, counting), ALL, True)
     # Brute force: a ray at a time to the twin, every box by its six planes, sums by plain loops.
     depth = twin.cast(rays.origin, rays.direction)
     dwell = np.zeros((12, len(areas.names)))
@@ -169,7 +169,7 @@ def errors() -> None:
     near = np.array([v.mean() for v in landed.distance])
     off = np.abs(near - mean)
     print(f"| mean distance [m] of these | the same | {off.max():.2g} (median {np.median(off):.2g}) |")
-    at = Eyes(
+    at = Viewpoints(
         eyes, np.tile([1.0, 0, 0], (len(eyes), 1)), tuple(map(str, range(len(eyes)))), (frozenset([ALL]),) * len(eyes)
     )
     told = foretell(around, at, things, counting.members, 0.03, 360.0, 48, 8192, SILENT)
@@ -185,7 +185,7 @@ def errors() -> None:
     some = np.linspace(0, len(rays) - 1, 1500).round().astype(int)
     chosen = rays.select(some)
     seen = counting.visible(chosen)
-    targets = Targets.of(things, 48)
+    targets = SamplePoints.of(things, 48)
     exact = np.zeros_like(seen)
     for n in range(len(chosen)):
         away = targets.points - chosen.origin[n]

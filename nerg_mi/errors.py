@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 
 class NergError(ValueError):
@@ -45,6 +47,15 @@ def chosen(options: str) -> Iterator[None]:
         raise
     except ValueError as error:
         raise NergError(f"{str(error).rstrip('.')}; give other values by {options}") from error
+
+
+def import_extra(name: str, need: str, extra: str) -> Any:
+    """The module ``name`` of a library that an ``extra`` installs. Raises `ImportError`, which begins with the ``need``
+    ("a mesh needs scikit-image"), where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ImportError(f'{need}, which is not installed: pip install "nerg-mi[{extra}]"') from None
 
 
 def expected(error: BaseException) -> bool:

@@ -13,14 +13,14 @@ from nerg_mi.formats.areas import Region
 from nerg_mi.rays.dataset import RayDataset, is_dataset, merge_rays
 from nerg_mi.rays.filters import time_order
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.visibility import CellsInView
+from nerg_mi.statistics.shares import CellsInView
 from nerg_mi.statistics.visits import (
     ALL,
+    Aoi,
     Cell,
-    Landed,
-    LookRules,
-    Sums,
-    Thing,
+    HitAssignment,
+    VisitRules,
+    VisitSums,
     concatenate,
     cone,
     land,
@@ -29,16 +29,16 @@ from nerg_mi.statistics.visits import (
     unite,
 )
 
-from .scene import Surroundings
+from .scene import GazeScene
 
-BLOCK = 1 << 17
-"""About so many rays are looked at at once."""
+# ---- Rays as sums ----
 
+BLOCK = 1 << 17  # about so many rays are looked at at once
 _LAND = 1 << 15
 
 
 @dataclass(frozen=True)
-class Window:
+class TimeWindow:
     """A time from ``start`` (inclusive) to ``end``, on the rays' clock, in seconds."""
 
     name: str
@@ -47,23 +47,23 @@ class Window:
 
 
 @dataclass(frozen=True, eq=False)
-class Counting:
+class AoiContext:
     """How rays are counted. ``names`` of the areas, and of which ``things`` each consists, ``members``; ``movable``:
     areas between which looks move; ``margin`` in units of the place; ``hits``: whether rays end at their hit points;
     ``view`` in degrees; ``cells_in_view``: None where it is not asked what could be seen."""
 
-    around: Surroundings
-    things: Sequence[Thing]
+    around: GazeScene
+    things: Sequence[Aoi]
     names: tuple[str, ...]
     members: Sequence[tuple[int, ...]]
     movable: Sequence[int]
-    rules: LookRules
+    rules: VisitRules
     margin: float
     tolerance: float = 0.0
     hits: bool = False
     view: float = 360.0
     cells_in_view: CellsInView | None = None
-    windows: Sequence[Window] = ()
+    windows: Sequence[TimeWindow] = ()
     zones: Sequence[Region] = ()
     cohorts: dict[str, str] = field(default_factory=dict)
     cohort_names: tuple[str, ...] = ()
@@ -88,13 +88,13 @@ class Counting:
             return np.zeros(len(rays), bool)
         return rays.cohort == rays.cohorts.index(name)
 
-    def land(self, rays: Rays) -> Landed:
+    def land(self, rays: Rays) -> HitAssignment:
         """What the rays are on, area by area; distances in metres."""
         parts = [self._land(rays, slice(a, a + _LAND)) for a in range(0, max(len(rays), 1), _LAND)]
         found = regroup(concatenate(parts), self.members)
-        return Landed(found.count, found.rows, tuple(d / self.around.scale for d in found.distance))
+        return HitAssignment(found.count, found.rows, tuple(d / self.around.scale for d in found.distance))
 
-    def _land(self, rays: Rays, part: slice) -> Landed:
+    def _land(self, rays: Rays, part: slice) -> HitAssignment:
         around = self.around
         o, d = around.points(rays.origin[part]), around.directions(rays.direction[part])
         known: np.ndarray | None = None
@@ -130,7 +130,7 @@ def ahead(rays: Rays) -> np.ndarray:
     return np.where(known, rays.head, rays.direction)
 
 
-def count_block(rays: Rays, counting: Counting) -> Sums:
+def count_block(rays: Rays, counting: AoiContext) -> VisitSums:
     """The partial sums of a block of rays that holds sittings as a whole: a pure function of its arguments, whose
     results `nerg_mi.statistics.visits.merge` adds up in the order of the blocks."""
     landed = counting.land(rays)
@@ -138,7 +138,7 @@ def count_block(rays: Rays, counting: Counting) -> Sums:
     return partial_sums(rays, landed, counting.names, cells, counting.rules, counting.visible(rays), counting.movable)
 
 
-def blocks_of(source: Rays | RayDataset | str | Path, rules: LookRules, most: int = BLOCK) -> Iterator[Rays]:
+def blocks_of(source: Rays | RayDataset | str | Path, rules: VisitRules, most: int = BLOCK) -> Iterator[Rays]:
     """The rays of a file, or of a dataset, in blocks of about ``most`` that hold sittings as a whole; persons sorted by
     name, and each one's rays by time. The same blocks every time. Raises `NergError` for rays that cannot be read."""
     if isinstance(source, (str, Path)) and is_dataset(source):
@@ -172,7 +172,7 @@ def ray_count(source: Rays | str | Path) -> int:
     return len(RayDataset.open(source)) if is_dataset(source) else len(Rays.load(source))
 
 
-def _whole(parts: Iterator[tuple[tuple, Rays]], rules: LookRules, most: int) -> Iterator[Rays]:
+def _whole(parts: Iterator[tuple[tuple, Rays]], rules: VisitRules, most: int) -> Iterator[Rays]:
     """Parts, each with a key that those have in common which may go on with each other, cut where sittings end; what a
     part ends with is kept until it is known that the next does not go on with it."""
     held: Rays | None = None
@@ -205,7 +205,7 @@ def _sorted(rays: Rays) -> Rays:
     return rays if order is None else rays.select(order)
 
 
-def _ends(rays: Rays, rules: LookRules) -> np.ndarray:
+def _ends(rays: Rays, rules: VisitRules) -> np.ndarray:
     """Where sittings begin, with 0 first and the number of rays last."""
     step = np.diff(rays.t)
     new = (np.diff(rays.person) != 0) | (step > rules.pause * (1 + 1e-9))
@@ -213,7 +213,7 @@ def _ends(rays: Rays, rules: LookRules) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Eyes:
+class Viewpoints:
     """Where people stood, in the place: ``positions``, ``ahead`` (E, 3), whose they are, ``person`` (E,) names, and of
     which ``cells`` each is."""
 
@@ -223,7 +223,7 @@ class Eyes:
     cells: tuple[frozenset[Cell], ...]
 
 
-class EyePicker:
+class ViewpointSampler:
     """Takes every so manieth ray of a stream, and one of each block whose people would have none: of each a position, a
     direction, and whose and of which cells it is, which is less than what is counted of its person."""
 
@@ -234,7 +234,7 @@ class EyePicker:
         self._cells: list[frozenset[Cell]] = []
         self._same: dict[frozenset[Cell], frozenset[Cell]] = {}
 
-    def take(self, rays: Rays, counting: Counting) -> None:
+    def take(self, rays: Rays, counting: AoiContext) -> None:
         """The chosen of a block."""
         number = self._passed + np.arange(len(rays))
         chosen = number % self._every == self._every // 2
@@ -253,7 +253,7 @@ class EyePicker:
             mine = frozenset(cell for cell, mask in cells if mask is None or mask[k])
             self._cells.append(self._same.setdefault(mine, mine))
 
-    def eyes(self) -> Eyes:
+    def eyes(self) -> Viewpoints:
         """All that were taken."""
         found = np.concatenate(self._points)
-        return Eyes(found[:, :3], found[:, 3:], tuple(self._person), tuple(self._cells))
+        return Viewpoints(found[:, :3], found[:, 3:], tuple(self._person), tuple(self._cells))

@@ -1,12 +1,17 @@
-"""Options of statistics of attention."""
+"""Options of statistics of attention, apart from what follows them: the command line lists them at once."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from nerg_mi.errors import NergError, plain
 from nerg_mi.ranges import COORDINATES, SECONDS, SEEDS, THREADS, TIMES, Checked, Range
 from nerg_mi.workflows.options import PartOptions, option, parse_numbers, parse_point
+
+if TYPE_CHECKING:
+    from nerg_mi.statistics.visits import VisitRules
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +64,12 @@ class CountOptions(SettingOptions):
         for text in self.windows:
             parse_window(text)
 
+    def visit_rules(self) -> VisitRules:
+        """What a look is. Raises `NergError` for times that contradict each other."""
+        from nerg_mi.statistics.visits import VisitRules
+
+        return VisitRules(self.gap, self.pause, self.merge, self.least)
+
 
 @dataclass(frozen=True, kw_only=True)
 class PredictionOptions(SettingOptions):
@@ -100,8 +111,6 @@ class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
 
 def parse_window(text: str) -> tuple[str, float, float]:
     """Name, start and end of NAME=FROM,TO. Raises `NergError` for other texts."""
-    from nerg_mi.errors import NergError, plain
-
     name, sign, rest = text.partition("=")
     ends = parse_numbers(rest, "--window") if sign else ()
     if not name.strip() or len(ends) != 2 or not TIMES.low <= ends[0] < ends[1] <= TIMES.high:

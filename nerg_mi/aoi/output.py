@@ -4,9 +4,10 @@ made."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from nerg_mi.files.atomic import replacing, write_text
 from nerg_mi.files.tables import markdown_table, write_csv
 from nerg_mi.rays.rays import pyarrow_modules
 from nerg_mi.statistics.tables import BY_NAME, FIELD, MEASURES, PersonRows, Row, shown
-from nerg_mi.statistics.visits import Sums
+from nerg_mi.statistics.visits import VisitSums
 from nerg_mi.workflows.base import Reporter
 
 from .options import StatisticsOptions
@@ -25,16 +26,11 @@ from .options import StatisticsOptions
 #
 # Tables of statistics as files: CSV, Markdown and, with pyarrow, Parquet.
 
-
-MOST_LINES = 10_000
-"""Rows of a table in Markdown: more are nobody's to read."""
-
+MOST_LINES = 10_000  # rows of a table in Markdown: more are nobody's to read
 _PART = 1 << 16
-
 SUPPORT = "support [rays]"
 _MEASURES = {"share": "share of gaze", "visible": "visible share"}
 _WORDS = {"cell", "value", "first", "second", "thing", "source", "person", "from", "to", "measure", "found"}
-
 Cells = Callable[[Row], Sequence[Any]]
 
 
@@ -167,46 +163,30 @@ def plain_columns(rows: Sequence[Row], names: Sequence[str] = ()) -> tuple[list[
 #
 # Results of statistics as files: a table each, pictures, and the account of how they were made.
 
-
-LARGEST_MATRIX = 60
-"""Things of which moves are drawn at most."""
-
+LARGEST_MATRIX = 60  # things of which moves are drawn at most
 _COLUMNS = {"things": thing_columns, "differences": difference_columns, "what_if": what_if_columns}
 
 
-class Results(Protocol):
-    """The tables of `nerg_mi.workflows.statistics.StatisticsResult`."""
+@dataclass(frozen=True, eq=False)
+class StatisticsResult:
+    """Rows of tables, each a dict: ``things`` (by cell, thing and source), ``differences``, ``moves``, ``durations``,
+    ``people``, ``what_if``, ``isovists``; ``sums``: what they were made of; ``blanked``: numbers on too few people;
+    ``files`` that were written."""
 
-    @property
-    def things(self) -> list[Row]: ...
-
-    @property
-    def differences(self) -> list[Row]: ...
-
-    @property
-    def moves(self) -> list[Row]: ...
-
-    @property
-    def durations(self) -> list[Row]: ...
-
-    @property
-    def people(self) -> Sequence[Row]: ...
-
-    @property
-    def what_if(self) -> list[Row]: ...
-
-    @property
-    def isovists(self) -> list[Row]: ...
-
-    @property
-    def blanked(self) -> int: ...
-
-    @property
-    def sums(self) -> Sums | None: ...
+    things: list[Row] = field(default_factory=list)
+    differences: list[Row] = field(default_factory=list)
+    moves: list[Row] = field(default_factory=list)
+    durations: list[Row] = field(default_factory=list)
+    people: Sequence[Row] = ()
+    what_if: list[Row] = field(default_factory=list)
+    isovists: list[Row] = field(default_factory=list)
+    sums: VisitSums | None = None
+    blanked: int = 0
+    files: list[Path] = field(default_factory=list)
 
 
 def write_results(
-    folder: Path, result: Results, inputs: Sequence[Path], options: StatisticsOptions, reporter: Reporter
+    folder: Path, result: StatisticsResult, inputs: Sequence[Path], options: StatisticsOptions, reporter: Reporter
 ) -> list[Path]:
     """Write what there is into the ``folder``: each table as CSV, Markdown and Parquet, and its picture."""
     about = provenance("nerg stats", inputs, options.seed, options)

@@ -13,12 +13,12 @@ import numpy as np
 
 from nerg_mi.files.atomic import replacing
 from nerg_mi.files.safe_read import read_npz
-from nerg_mi.formats.areas import Areas, files_of_areas, read_areas
+from nerg_mi.formats.areas import AreaSet, files_of_areas, read_areas
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.rays.dataset import HEAD, RayDataset, is_dataset, read_head, read_source, source_path
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import files_of_scene
-from nerg_mi.statistics.visits import Cell, Sums
+from nerg_mi.statistics.visits import Cell, VisitSums
 from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.tasks.task import RENDERS, Files, Part, Plan
 from nerg_mi.workflows.base import select_backend
@@ -26,9 +26,9 @@ from nerg_mi.workflows.geometry import file_of_training, place_key
 from nerg_mi.workflows.options import as_base
 from nerg_mi.workflows.parts import Parts, PlannedScene
 
-from .measured import Counting, Eyes, blocks_of, count_block
+from .measured import AoiContext, Viewpoints, blocks_of, count_block
 from .options import CountOptions, PredictionOptions, SettingOptions, StatisticsOptions
-from .predicted import Foretold, Setting, setting_of
+from .predicted import AoiScene, PredictedAttention, setting_of
 from .scene import files_of_changes, read_changes
 
 # ---- What is run for a part ----
@@ -46,7 +46,7 @@ class PlannedSetting:
     areas: Files
     changes: Files | None = None
 
-    def opened(self) -> Setting:
+    def opened(self) -> AoiScene:
         """The setting, in its Mitsuba variant, after its changes."""
         ns = select_backend(self.options.mode)
         scene = None if self.scene is None else self.scene.checked()
@@ -64,7 +64,7 @@ class PlannedCount:
     hits: bool
     cohorts: tuple[str, ...]
 
-    def opened(self) -> Counting:
+    def opened(self) -> AoiContext:
         """How rays are counted."""
         return self.setting.opened().counting(self.hits, self.cohorts)
 
@@ -119,15 +119,15 @@ OF_EYES = ("share", "distance", "visible", "support")
 
 def foretell_part(common: PlannedPrediction, places: Places, output: Path) -> None:
     """What a field foretells (.npz) of people at some places."""
-    setting: Setting = prepare_once(common, common.setting.opened)
+    setting: AoiScene = prepare_once(common, common.setting.opened)
     count = len(places.positions)
-    eyes = Eyes(places.positions, places.ahead, ("",) * count, (frozenset(),) * count)
+    eyes = Viewpoints(places.positions, places.ahead, ("",) * count, (frozenset(),) * count)
     seen = setting.foretold(eyes, common.view)
     with replacing(output) as temporary, temporary.open("wb") as out:
         np.savez(out, **{name: getattr(seen, name) for name in (*OF_EYES, "members")})
 
 
-def write_sums(path: Path, found: list[Sums]) -> None:
+def write_sums(path: Path, found: list[VisitSums]) -> None:
     """Write sums one by one (.npz), so that whoever adds them does so in the order in which they were made."""
     arrays: dict[str, np.ndarray] = {}
     for k, sums in enumerate(found):
@@ -140,7 +140,7 @@ def write_sums(path: Path, found: list[Sums]) -> None:
         np.savez(out, allow_pickle=False, **arrays)
 
 
-def read_sums(path: Path) -> list[Sums]:
+def read_sums(path: Path) -> list[VisitSums]:
     """What `write_sums` has written."""
     arrays = read_npz(path, "part of a count")
     found = []
@@ -148,24 +148,21 @@ def read_sums(path: Path) -> list[Sums]:
         names = json.loads(str(arrays[f"{k}.names"]))
         cells = tuple(Cell(**cell) for cell in names["cells"])
         rows = tuple((cells[c], person) for c, person in names["rows"])
-        found.append(Sums(tuple(names["areas"]), cells, rows, **{name: arrays[f"{k}.{name}"] for name in _ARRAYS}))
+        found.append(VisitSums(tuple(names["areas"]), cells, rows, **{name: arrays[f"{k}.{name}"] for name in _ARRAYS}))
     return found
 
 
-def read_foretold(path: Path) -> Foretold:
+def read_foretold(path: Path) -> PredictedAttention:
     """What `foretell_part` has written."""
-    return Foretold(**read_npz(path, "part of what a field foretells"))
+    return PredictedAttention(**read_npz(path, "part of what a field foretells"))
 
 
-_ARRAYS = tuple(f.name for f in fields(Sums) if f.name not in ("areas", "cells", "rows"))
+_ARRAYS = tuple(f.name for f in fields(VisitSums) if f.name not in ("areas", "cells", "rows"))
 
 
 # ---- Parts ----
 
-
-EYES = 32
-"""Places of a part from which a field is asked."""
-
+EYES = 32  # places of a part from which a field is asked
 _COUNTED = 0.6  # of all, where a field is asked too
 _DONE = 0.8
 _TOLD, _CHANGED = 0.9, 0.99  # when intervals are known, and after changes
@@ -181,11 +178,13 @@ class CountingParts:
     scene: Path | None
     field: Path | None
     gaze: Path | None
-    areas: Areas
+    areas: AreaSet
     options: StatisticsOptions
     mode: str
 
-    def count(self, rays: Rays | Path, counting: Counting, seen: Callable[[Rays], None] | None) -> Iterator[Sums]:
+    def count(
+        self, rays: Rays | Path, counting: AoiContext, seen: Callable[[Rays], None] | None
+    ) -> Iterator[VisitSums]:
         """The sums of each block of ``rays``, in the order of `blocks_of`. ``seen`` is shown each block before that, in
         the same order, where it is not None."""
         common = PlannedCount(self._setting(CountOptions), counting.hits, counting.cohort_names)
@@ -215,7 +214,7 @@ class CountingParts:
             for made in self.parts.run(self._plan(self.what, count_part, common, parts), 0.0, until):
                 yield from read_sums(made.path)
 
-    def foretell(self, eyes: Eyes, view: float, changes: Path | None = None) -> Foretold:
+    def foretell(self, eyes: Viewpoints, view: float, changes: Path | None = None) -> PredictedAttention:
         """What the field says of ``eyes`` that see ``view`` degrees, after the ``changes`` of a file, if there are
         any."""
         setting, what, since, until = self._setting(PredictionOptions), f"{self.what} (the field)", _COUNTED, _DONE
@@ -230,7 +229,7 @@ class CountingParts:
         plan = self._plan(what, foretell_part, PlannedPrediction(setting, view), places)
         found = [read_foretold(made.path) for made in self.parts.run(plan, since, until)]
         each = {name: np.concatenate([getattr(f, name) for f in found]) for name in OF_EYES}
-        return Foretold(**each, members=np.concatenate([f.members for f in found], axis=1))
+        return PredictedAttention(**each, members=np.concatenate([f.members for f in found], axis=1))
 
     def _plan(self, what: str, work: Callable, common: Any, parts: list[Part]) -> Plan:
         return Plan(what, work, common, parts, ".npz", (*RENDERS, "scipy"))

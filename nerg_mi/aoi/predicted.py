@@ -14,23 +14,33 @@ import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
-from nerg_mi.formats.areas import Areas, Group, read_regions
+from nerg_mi.formats.areas import AreaGroup, AreaSet, read_regions
+from nerg_mi.formats.meshes import MeshFile
 from nerg_mi.statistics.estimates import adjusted, ratio_differences
-from nerg_mi.statistics.shares import ROUGH, gaze_shares
-from nerg_mi.statistics.tables import BY_NAME, FIELD, PLACES, Floor, People, Row
-from nerg_mi.statistics.visibility import CellsInView, Isovists, Targets, in_view, standing, unhidden
-from nerg_mi.statistics.visits import ALL, Cell, LookRules, Thing
+from nerg_mi.statistics.shares import (
+    ROUGH,
+    CellsInView,
+    Isovists,
+    SamplePoints,
+    gaze_shares,
+    in_view,
+    standing,
+    unhidden,
+)
+from nerg_mi.statistics.tables import BY_NAME, FIELD, PLACES, MinParticipantsFilter, Participants, Row
+from nerg_mi.statistics.visits import ALL, Aoi, Cell
 from nerg_mi.workflows.base import SILENT, Reporter
 
-from .measured import Counting, Eyes, Window
+from .measured import AoiContext, TimeWindow, Viewpoints
 from .options import CountOptions, PredictionOptions, SettingOptions, parse_window
 from .scene import (
     Changes,
-    Surroundings,
+    GazeScene,
     changed_areas,
     changed_scene,
     read_changes,
     read_cohorts,
+    read_meshes,
     shapes_of,
     surroundings_of_files,
     things_of,
@@ -47,7 +57,7 @@ from .scene import (
 
 
 @dataclass(frozen=True, eq=False)
-class Foretold:
+class PredictedAttention:
     """Of E eyes and A areas: ``share`` (E, A) of the gaze, ``distance`` (E, A) its mean in metres, times the share,
     ``visible`` (E, A) bool, ``support`` (E,) rays that the field learnt from there, NaN where it does not say;
     ``members`` (M, E, A): the share by each member of an ensemble, by one field the same share again."""
@@ -59,7 +69,7 @@ class Foretold:
     members: np.ndarray
 
 
-def eyes_of_some(eyes: Eyes, most: int, reporter: Reporter) -> Eyes:
+def eyes_of_some(eyes: Viewpoints, most: int, reporter: Reporter) -> Viewpoints:
     """Those of at most ``most`` people, who are the same whatever the order in which they came: those whose names have
     the least checksums."""
     people = sorted(set(eyes.person), key=lambda name: (crc32(name.encode("utf-8", "surrogatepass")), name))
@@ -69,20 +79,20 @@ def eyes_of_some(eyes: Eyes, most: int, reporter: Reporter) -> Eyes:
     chosen = set(people[:most])
     rows = [k for k, person in enumerate(eyes.person) if person in chosen]
     person, cells = tuple(eyes.person[k] for k in rows), tuple(eyes.cells[k] for k in rows)
-    return Eyes(eyes.positions[rows], eyes.ahead[rows], person, cells)
+    return Viewpoints(eyes.positions[rows], eyes.ahead[rows], person, cells)
 
 
 def foretell(
-    around: Surroundings,
-    eyes: Eyes,
-    things: Sequence[Thing],
+    around: GazeScene,
+    eyes: Viewpoints,
+    things: Sequence[Aoi],
     members: Sequence[tuple[int, ...]],
     margin: float,
     view: float,
     samples: int,
     directions: int,
     reporter: Reporter,
-) -> Foretold:
+) -> PredictedAttention:
     """What the gaze field of ``around`` says of each of the ``eyes``, whose shares over the sphere add up to one, in
     so many ``directions`` around each or, where a thing is small, more."""
     E = len(eyes.positions)
@@ -90,16 +100,16 @@ def foretell(
     found = gaze_shares(
         around.look_from, eyes.positions, things, members, margin, replace(ROUGH, first=directions), told
     )
-    targets = Targets.of(things, samples)
+    targets = SamplePoints.of(things, samples)
     seen = in_view(targets, eyes.positions, eyes.ahead, unhidden(targets, eyes.positions, around.depth, margin), view)
     visible = np.stack([seen[:, list(of)].any(axis=1) for of in members], axis=1)
     support = np.array([around.support(p) for p in eyes.positions])
-    return Foretold(found.share, found.distance / around.scale, visible, support, found.members)
+    return PredictedAttention(found.share, found.distance / around.scale, visible, support, found.members)
 
 
 def foretold_people(
-    foretold: Foretold, eyes: Eyes, cell: Cell, times: dict[str, float], glance: float
-) -> People | None:
+    foretold: PredictedAttention, eyes: Viewpoints, cell: Cell, times: dict[str, float], glance: float
+) -> Participants | None:
     """The people of a cell by the field; ``times``: for how long each was there, in seconds; ``glance``: seconds that
     one takes. None where no eye is of the cell."""
     rows = [k for k, cells in enumerate(eyes.cells) if cell in cells and eyes.person[k] in times]
@@ -121,7 +131,7 @@ def foretold_people(
     reached = -np.expm1(-missed * (time / glance)[:, None])
     seconds = time[:, None]
     distance, visible = mean(foretold.distance) * seconds, mean(foretold.visible) * seconds
-    return People(tuple(names), time, share * seconds, distance, visible, reached)
+    return Participants(tuple(names), time, share * seconds, distance, visible, reached)
 
 
 # ---- Places ----
@@ -129,7 +139,7 @@ def foretold_people(
 # Places on the floor where nobody was tracked: where one can stand, and what is seen from there.
 
 
-def look_around(around: Surroundings, height: float, step: float, floor: float) -> np.ndarray:
+def look_around(around: GazeScene, height: float, step: float, floor: float) -> np.ndarray:
     """Places (G, 3) at eye height where one can stand. Raises `NergError` where there are none."""
     lower, upper = around.bounds()
     found = standing(lower, upper, step * around.scale, height * around.scale, around.depth, floor)
@@ -140,10 +150,10 @@ def look_around(around: Surroundings, height: float, step: float, floor: float) 
     return found
 
 
-def places_of(positions: np.ndarray) -> Eyes:
+def places_of(positions: np.ndarray) -> Viewpoints:
     """Somebody at each of ``positions`` (M, 3), who may turn round."""
     names = tuple(f"observer {k + 1:0{len(str(len(positions)))}d}" for k in range(len(positions)))
-    return Eyes(positions, np.tile([1.0, 0, 0], (len(positions), 1)), names, (frozenset([ALL]),) * len(positions))
+    return Viewpoints(positions, np.tile([1.0, 0, 0], (len(positions), 1)), names, (frozenset([ALL]),) * len(positions))
 
 
 def isovist_rows(found: Isovists, names: Sequence[str], members: Sequence[tuple[int, ...]]) -> list[Row]:
@@ -162,14 +172,20 @@ def isovist_rows(found: Isovists, names: Sequence[str], members: Sequence[tuple[
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
+class AoiScene:
     """``areas`` in what is ``around`` people, and the ``things`` that they consist of; ``options`` of how it is
-    counted (`CountOptions`), asked of a field (`PredictionOptions`), or both."""
+    counted (`CountOptions`), asked of a field (`PredictionOptions`), or both; ``meshes`` that were read, by file."""
 
-    around: Surroundings
-    areas: Areas
-    things: Sequence[Thing]
+    around: GazeScene
+    areas: AreaSet
+    things: Sequence[Aoi]
     options: SettingOptions
+    meshes: Mapping[Path, MeshFile]
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences on what of the meshes is not used."""
+        return [f"of {file}: {note}" for file, mesh in self.meshes.items() for note in mesh.notes]
 
     @cached_property
     def members(self) -> list[tuple[int, ...]]:
@@ -181,49 +197,45 @@ class Setting:
         """In units of the place."""
         return self.options.margin * self.around.scale
 
-    @property
-    def rules(self) -> LookRules:
-        """What a look is."""
-        assert isinstance(self.options, CountOptions)
-        return rules_of(self.options)
-
-    def counting(self, hits: bool, cohorts: tuple[str, ...]) -> Counting:
+    def counting(self, hits: bool, cohorts: tuple[str, ...]) -> AoiContext:
         """How rays are counted which end at their ``hits``, or not, and have these ``cohorts`` where no table does."""
         o = self.options
         assert isinstance(o, CountOptions)
         in_view = None
         if o.seen:
-            targets = Targets.of(self.things, o.samples)
+            targets = SamplePoints.of(self.things, o.samples)
             in_view = CellsInView(targets, self._depth_or_things, o.cell * self.around.scale, self.margin)
-        leaves = [k for k, area in enumerate(self.areas.areas) if not isinstance(area, Group)]
+        leaves = [k for k, area in enumerate(self.areas.areas) if not isinstance(area, AreaGroup)]
         table = {} if o.cohorts is None else read_cohorts(o.cohorts)
-        return Counting(
+        return AoiContext(
             self.around,
             self.things,
             self.areas.names,
             self.members,
             leaves,
-            self.rules,
+            o.visit_rules(),
             self.margin,
             o.tolerance,
             hits,
             o.view,
             in_view,
-            [Window(*parse_window(text)) for text in o.windows],
+            [TimeWindow(*parse_window(text)) for text in o.windows],
             [] if o.zones is None else read_regions(o.zones),
             table,
             tuple(sorted(set(table.values()))) if table else cohorts,
         )
 
-    def changed(self, changes: Changes) -> Setting:
+    def changed(self, changes: Changes) -> AoiScene:
         """The same after ``changes`` of shapes and areas. Raises `NergError` for those that cannot be made."""
         areas, around, shapes = changed_areas(self.areas, changes), self.around, shapes_of(self.around.scene)
+        meshes = {**self.meshes, **read_meshes(file for file in changes.meshes if file not in self.meshes)}
         if changes.of_shapes:
-            scene, shapes = changed_scene(around.scene, changes)
+            scene, shapes = changed_scene(around.scene, changes, meshes)
             around = around.within(scene)
-        return replace(self, around=around, areas=areas, things=things_of(areas.things, shapes))
+        things = things_of(areas.things, shapes, meshes)
+        return replace(self, around=around, areas=areas, things=things, meshes=meshes)
 
-    def foretold(self, eyes: Eyes, view: float, reporter: Reporter = SILENT) -> Foretold:
+    def foretold(self, eyes: Viewpoints, view: float, reporter: Reporter = SILENT) -> PredictedAttention:
         """What the field says of the gaze of ``eyes`` that see so many degrees (``view``)."""
         o = self.options
         assert isinstance(o, PredictionOptions)
@@ -243,21 +255,17 @@ class Setting:
         return reach
 
 
-def rules_of(options: CountOptions) -> LookRules:
-    """What a look is. Raises `NergError` for options that contradict each other."""
-    return LookRules(options.gap, options.pause, options.merge, options.least)
-
-
 def setting_of(
-    scene: Path | None, field: Path | None, gaze: Path | None, areas: Areas, options: SettingOptions, ns: ModuleType
-) -> Setting:
+    scene: Path | None, field: Path | None, gaze: Path | None, areas: AreaSet, options: SettingOptions, ns: ModuleType
+) -> AoiScene:
     """The setting of these files. Raises `NergError`; what is plainly wrong is told before anything is loaded."""
     if isinstance(options, CountOptions):
         # Before anything is read.
-        rules_of(options)
+        options.visit_rules()
     align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
     around = surroundings_of_files(scene, field, gaze, align, ns)
-    return Setting(around, areas, things_of(areas.things, shapes_of(around.scene)), options)
+    meshes = read_meshes(areas.meshes)
+    return AoiScene(around, areas, things_of(areas.things, shapes_of(around.scene), meshes), options, meshes)
 
 
 # ---- Trust ----
@@ -265,13 +273,15 @@ def setting_of(
 # How far what a field foretells is to be trusted: the spread of an ensemble's members, and how many rays it learnt
 # from around the eyes.
 
-
-SPREAD = ("share", "dwell", "reach")
-"""Numbers whose spread over members is told."""
+SPREAD = ("share", "dwell", "reach")  # numbers whose spread over members is told
 
 
 def add_trust(
-    rows: Sequence[Row], foretold: Foretold, eyes: Eyes, times: Mapping[Cell, dict[str, float]], glance: float
+    rows: Sequence[Row],
+    foretold: PredictedAttention,
+    eyes: Viewpoints,
+    times: Mapping[Cell, dict[str, float]],
+    glance: float,
 ) -> None:
     """Give ``rows`` of the table of things ``support``, the median over the eyes of their cell, ``places``, the eyes of
     the cell for each of its people, and ``share_spread``, ``dwell_spread`` and ``reach_spread``, the standard
@@ -295,7 +305,7 @@ def add_trust(
         row["places"] = places if told and row["people"] is not None else None
 
 
-def support_of(foretold: Foretold, mine: np.ndarray | None = None) -> float | None:
+def support_of(foretold: PredictedAttention, mine: np.ndarray | None = None) -> float | None:
     """Rays that the field learnt from around an eye, at the median of all, or of ``mine`` (E,); None where the
     checkpoint keeps none."""
     some = foretold.support if mine is None else foretold.support[mine]
@@ -303,7 +313,7 @@ def support_of(foretold: Foretold, mine: np.ndarray | None = None) -> float | No
     return float(np.median(some)) if len(some) else None
 
 
-def tell_support(foretold: Foretold, reporter: Reporter) -> None:
+def tell_support(foretold: PredictedAttention, reporter: Reporter) -> None:
     """Say what is missing where nobody can tell how much data the numbers of a field rest on."""
     if support_of(foretold) is None:
         reporter.message(
@@ -312,7 +322,7 @@ def tell_support(foretold: Foretold, reporter: Reporter) -> None:
         )
 
 
-def tell_places(eyes: Eyes, reporter: Reporter) -> None:
+def tell_places(eyes: Viewpoints, reporter: Reporter) -> None:
     """Say so where a field is asked from too few places a person for their reach: who looks at a thing only where it is
     near is taken for somebody who does not, unless one of their places is there."""
     people = len(set(eyes.person))
@@ -324,7 +334,7 @@ def tell_places(eyes: Eyes, reporter: Reporter) -> None:
 
 
 def _spreads(
-    foretold: Foretold, eyes: Eyes, cell: Cell, times: Mapping[Cell, dict[str, float]], glance: float
+    foretold: PredictedAttention, eyes: Viewpoints, cell: Cell, times: Mapping[Cell, dict[str, float]], glance: float
 ) -> dict[str, np.ndarray]:
     if len(foretold.members) < 2:
         return {}
@@ -342,16 +352,16 @@ def _spreads(
 
 # ---- The table of what a change would do, by the field ----
 
-Foretell = Callable[[Setting, Eyes], Foretold]
+Foretell = Callable[[AoiScene, Viewpoints], PredictedAttention]
 
 
 def what_if_rows(
     path: Path,
-    setting: Setting,
-    eyes: Eyes,
-    before: Foretold,
+    setting: AoiScene,
+    eyes: Viewpoints,
+    before: PredictedAttention,
     foretell: Foretell,
-    floor: Floor,
+    floor: MinParticipantsFilter,
     resamples: int,
     seed: int,
 ) -> list[Row]:
@@ -392,7 +402,9 @@ def what_if_rows(
     return rows
 
 
-def _of(eyes: Eyes, names: list[str], values: np.ndarray, areas: Areas, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _of(
+    eyes: Viewpoints, names: list[str], values: np.ndarray, areas: AreaSet, name: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean of an area's ``values`` (E, A) over the eyes of each person, and who has any, (P, 1) each."""
     total, count = np.zeros((len(names), 1)), np.zeros((len(names), 1))
     if name in areas.names:
@@ -407,7 +419,7 @@ def _mean(pair: tuple[np.ndarray, np.ndarray]) -> float:
     return float(pair[0].sum() / pair[1].sum())
 
 
-def _row(name: str, measure: str, old, new, floor: Floor, resamples: int, seed: int) -> Row:
+def _row(name: str, measure: str, old, new, floor: MinParticipantsFilter, resamples: int, seed: int) -> Row:
     mean = lambda pair: _mean(pair) if pair[1].sum() else None
     people = int(min(old[1].sum() or new[1].sum(), new[1].sum() or old[1].sum()))
     told = floor.passes(people)

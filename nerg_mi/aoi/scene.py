@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,18 +16,19 @@ from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import with_formula
 from nerg_mi.formats.areas import (
     Area,
-    Areas,
-    Entry,
-    Group,
+    AreaEntry,
+    AreaGroup,
+    AreaSet,
     MeshPart,
     Region,
     SceneShape,
     check_name,
     is_number,
+    mesh_beside,
     parse_box,
 )
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.formats.meshes import read_mesh_file
+from nerg_mi.formats.meshes import MeshFile, read_mesh_file
 from nerg_mi.maths.geometry import Similarity, box_interval
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import COORDINATES
@@ -36,7 +36,7 @@ from nerg_mi.rays.readers.tables import iterate_table
 from nerg_mi.rendering.aovs import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.statistics.shares import Look
-from nerg_mi.statistics.visits import Box, Thing
+from nerg_mi.statistics.visits import Aoi, BoxAoi
 from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.train import geometry
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
@@ -53,8 +53,7 @@ if TYPE_CHECKING:
 
 # ---- Which cohort people are of, from a table ----
 
-MOST_PEOPLE = 10_000_000
-"""So many people may have a cohort."""
+MOST_PEOPLE = 10_000_000  # so many people may have a cohort
 
 
 def read_cohorts(path: Path) -> dict[str, str]:
@@ -78,7 +77,7 @@ def read_cohorts(path: Path) -> dict[str, str]:
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
+class GazeScene:
     """``place``: what rays meet, None where nothing is known; ``gaze`` of a field, or None; ``align``: from the rays'
     frame; ``scene``: whose shapes they are, or None; ``observer`` (3,): the scene's own; ``kind`` of depth."""
 
@@ -138,13 +137,13 @@ class Surroundings:
             raise NergError("there is no place whose bounds are known; give a scene or a radiance field")
         return np.array(bounds, float)
 
-    def within(self, scene: mi.Scene) -> Surroundings:
+    def within(self, scene: mi.Scene) -> GazeScene:
         """The same with the shapes of another ``scene``."""
         assert self.place is not None
         return replace(self, place=Place(self.place.medium, scene), scene=scene)
 
 
-def surroundings_of_scene(path: Path, gaze: Path | None, align: Similarity | None, ns: ModuleType) -> Surroundings:
+def surroundings_of_scene(path: Path, gaze: Path | None, align: Similarity | None, ns: ModuleType) -> GazeScene:
     """A scene's shapes, and the field and gaze of its integrator where that is a ``nerg``; ``gaze``: another gaze field
     in their stead. Raises `NergError` for a scene with neither shapes nor a field."""
     from nerg_mi.transport.observer import center
@@ -161,15 +160,15 @@ def surroundings_of_scene(path: Path, gaze: Path | None, align: Similarity | Non
     if gaze is not None:
         field, about = load_gaze(gaze, ns)
         provenance = about.get("provenance", about)
-        return Surroundings(place, PlacedGaze(field), align or align_of_training(provenance), scene, observer=observer)
+        return GazeScene(place, PlacedGaze(field), align or align_of_training(provenance), scene, observer=observer)
     settings = integrator.observer_settings if own and integrator.gaze is not None else None
     found = integrator.gaze if own else None
-    return Surroundings(place, found, align or Similarity(), scene, settings, observer)
+    return GazeScene(place, found, align or Similarity(), scene, settings, observer)
 
 
 def surroundings_of_files(
     scene: Path | None, field: Path | None, gaze: Path | None, align: Similarity | None, ns: ModuleType
-) -> Surroundings:
+) -> GazeScene:
     """What the files that are given say. Raises `NergError` for those that cannot be used together."""
     if scene is not None:
         if field is not None:
@@ -182,25 +181,24 @@ def surroundings_of_files(
         return _of_place(made, PlacedGaze(network), align or made.align)
     if field is not None:
         return _of_place(geometry.place_of_field(field, ns), None, align or Similarity())
-    return Surroundings(None, None, align or Similarity())
+    return GazeScene(None, None, align or Similarity())
 
 
-def _of_place(place: GazePlace, gaze: PlacedGaze | None, align: Similarity) -> Surroundings:
+def _of_place(place: GazePlace, gaze: PlacedGaze | None, align: Similarity) -> GazeScene:
     medium = place.medium
     inside = medium if isinstance(medium, Place) or medium is None else Place(medium)
-    return Surroundings(inside, gaze, align, None if inside is None else inside.scene)
+    return GazeScene(inside, gaze, align, None if inside is None else inside.scene)
 
 
 # ---- Things ----
 #
 # Areas of interest as things that rays meet: boxes in closed form, meshes and shapes by ray casts of Mitsuba.
 
-
 _RAYS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
-class ShapeThing:
+class ShapeAoi:
     """A Mitsuba shape, of the scene or by itself."""
 
     name: str
@@ -246,23 +244,30 @@ class ShapeThing:
         return points, np.zeros_like(points)
 
 
-def things_of(areas: Sequence[Region | MeshPart | SceneShape], shapes: Mapping[str, Any]) -> list[Thing]:
-    """``areas`` as things, in their order; ``shapes`` of the scene by name; the variant must be active. Raises
-    `NergError` for shapes that there are not, and for meshes that cannot be read."""
-    found: list[Thing] = []
+def read_meshes(files: Iterable[Path]) -> dict[Path, MeshFile]:
+    """The meshes in ``files``, each read once. Raises `NergError` for a file that is missing or damaged."""
+    return {file: read_mesh_file(file) for file in dict.fromkeys(files)}
+
+
+def things_of(
+    areas: Sequence[Region | MeshPart | SceneShape], shapes: Mapping[str, Any], meshes: Mapping[Path, MeshFile]
+) -> list[Aoi]:
+    """``areas`` as things, in their order; ``shapes`` of the scene by name, ``meshes`` of parts by file; the variant
+    must be active. Raises `NergError` for shapes and faces that there are not."""
+    found: list[Aoi] = []
     for area in areas:
         if isinstance(area, Region):
-            found.append(Box(area))
+            found.append(BoxAoi(area))
         elif isinstance(area, MeshPart):
-            found.append(thing_of_shape(area.name, load_mesh(area)))
+            found.append(thing_of_shape(area.name, _mesh_of_part(area, meshes[area.file])))
         else:
             found.append(thing_of_shape(area.name, shape_named(shapes, area.shape)))
     return found
 
 
-def thing_of_shape(name: str, shape: Any) -> ShapeThing:
+def thing_of_shape(name: str, shape: Any) -> ShapeAoi:
     """A Mitsuba shape as a thing."""
-    return ShapeThing(name, shape, scene_of({name: shape}))
+    return ShapeAoi(name, shape, scene_of({name: shape}))
 
 
 def scene_of(shapes: Mapping[str, Any]) -> mi.Scene:
@@ -291,10 +296,8 @@ def shape_named(shapes: Mapping[str, Any], name: str) -> Any:
     return shapes[name]
 
 
-def load_mesh(part: MeshPart) -> Any:
-    """The mesh of a part, with its faces alone, which are those of the file. Raises `NergError` for a file that is
-    missing or damaged."""
-    mesh = read_mesh_file(part.file)
+def _mesh_of_part(part: MeshPart, mesh: MeshFile) -> Any:
+    """The faces of a part alone, which are numbered as in the file of its ``mesh``."""
     chosen = mesh.faces[part.chosen(int(mesh.polygons.max()) + 1)[mesh.polygons]]
     used, index = np.unique(chosen, return_inverse=True)
     return mitsuba_mesh(mesh.vertices[used], index.reshape(-1, 3), part.name)
@@ -315,13 +318,8 @@ def load_mesh(part: MeshPart) -> Any:
 # shapes keep the areas that name them; boxes, which name no shape, are moved as areas. The gaze field stays as it was
 # trained: it knows places and what stood there, and says of a thing at its new place what it learnt of surfaces there.
 
-
-BYTES = 1 << 20
-"""A file of changes may have so many bytes."""
-
-MOST_CHANGES = 1000
-"""And so many changes, or observers, of a kind."""
-
+BYTES = 1 << 20  # a file of changes may have so many bytes
+MOST_CHANGES = 1000  # and so many changes, or observers, of a kind
 _KEYS = ("move", "remove", "add", "swap", "observers", "shift")
 _EXAMPLE = '{"move": [{"shape": "sign", "by": [0.5, 0, 0]}], "remove": ["stand"]}'
 
@@ -356,6 +354,11 @@ class Changes:
     shift: np.ndarray | None = None
 
     @property
+    def meshes(self) -> list[Path]:
+        """Files of what is added or swapped."""
+        return [put.what for put in (*self.add, *self.swap) if isinstance(put.what, Path)]
+
+    @property
     def of_shapes(self) -> bool:
         """Whether the scene is another one."""
         return bool(self.remove or self.add or self.swap or any(m.is_shape for m in self.move))
@@ -386,8 +389,7 @@ def read_changes(path: str | Path) -> Changes:
 
 def files_of_changes(path: str | Path, changes: Changes) -> list[Path]:
     """The files that ``changes`` were read from: the ``path`` and its meshes."""
-    meshes = [put.what for put in (*changes.add, *changes.swap) if isinstance(put.what, Path)]
-    return list(dict.fromkeys([Path(path), *meshes]))
+    return list(dict.fromkeys([Path(path), *changes.meshes]))
 
 
 def _listed(found: dict[str, Any], key: str) -> list[Any]:
@@ -414,14 +416,8 @@ def _put(given: Any, key: str, path: Path) -> Put:
     name = _word(given[key], key)
     check_name(name)
     if "mesh" not in given:
-        return Put(name, parse_box(Entry(name, given, f'"{plain(name, 40)}"')))
-    mesh = _word(given["mesh"], "mesh")
-    folder = os.path.realpath(path.parent)
-    if os.path.isabs(mesh) or os.path.commonpath([folder, os.path.realpath(os.path.join(folder, mesh))]) != folder:
-        raise NergError(f'"{plain(mesh, 80)}" lies outside of the folder of the changes; put it, or a copy, there')
-    if Path(mesh).suffix.lower() not in (".ply", ".obj"):
-        raise NergError(f'the mesh "{plain(mesh, 80)}" is no .ply or .obj; convert it')
-    return Put(name, path.parent / mesh)
+        return Put(name, parse_box(AreaEntry(name, given, f'"{plain(name, 40)}"')))
+    return Put(name, mesh_beside(given["mesh"], path, "changes"))
 
 
 def _word(given: Any, what: str) -> str:
@@ -437,7 +433,7 @@ def _three(given: Any, what: str) -> tuple[float, float, float]:
     return float(given[0]), float(given[1]), float(given[2])
 
 
-def changed_areas(areas: Areas, changes: Changes) -> Areas:
+def changed_areas(areas: AreaSet, changes: Changes) -> AreaSet:
     """The areas after the changes: without those of shapes that are gone, boxes moved, and one for each shape that was
     added and has none. Raises `NergError` for an area to be moved that there is not, or is no box."""
     found: dict[str, Area] = {area.name: area for area in areas.areas}
@@ -455,13 +451,13 @@ def changed_areas(areas: Areas, changes: Changes) -> Areas:
     lost = {a.name for a in found.values() if isinstance(a, SceneShape) and a.shape in changes.remove}
     rest: list[Area] = []
     for area in found.values():
-        if isinstance(area, Group):
+        if isinstance(area, AreaGroup):
             parts = tuple(p for p in area.parts if p not in lost)
             lost |= set() if parts else {area.name}
-            area = Group(area.name, parts)
+            area = AreaGroup(area.name, parts)
         if area.name not in lost:
             rest.append(area)
-    return Areas(tuple(rest))
+    return AreaSet(tuple(rest))
 
 
 def _moved(box: Region, move: Move) -> Region:
@@ -473,9 +469,12 @@ def _moved(box: Region, move: Move) -> Region:
     return Region.of(box.name, np.array(box.lower) + by, np.array(box.upper) + by, turn)
 
 
-def changed_scene(scene: mi.Scene | None, changes: Changes) -> tuple[mi.Scene, dict[str, Any]]:
+def changed_scene(
+    scene: mi.Scene | None, changes: Changes, meshes: Mapping[Path, MeshFile]
+) -> tuple[mi.Scene, dict[str, Any]]:
     """Another scene with the changed shapes, which has those that stay in common with ``scene``, and all of its shapes
-    by name. Raises `NergError` for shapes that there are not, or cannot be moved."""
+    by name; ``meshes`` of what is added, by file. Raises `NergError` for shapes that there are not, or cannot be
+    moved."""
     if scene is None:
         raise NergError("shapes are changed in a scene; give one (.xml), since a trained field cannot be taken apart")
     kept = shapes_of(scene)
@@ -492,7 +491,7 @@ def changed_scene(scene: mi.Scene | None, changes: Changes) -> tuple[mi.Scene, d
     for put in (*changes.add, *changes.swap):
         if put.name in kept:
             raise NergError(f'there is a shape "{plain(put.name, 40)}" already; "swap" it, or choose another name')
-        kept[put.name] = _made(put)
+        kept[put.name] = _made(put, meshes)
     if not kept:
         raise NergError("no shape is left; leave one at least")
     return scene_of(kept), kept
@@ -511,9 +510,9 @@ def _moved_shape(shape: Any, move: Move) -> Any:
     return mitsuba_mesh(turned, np.array(params["faces"]).reshape(-1, 3), move.name)
 
 
-def _made(put: Put) -> Any:
+def _made(put: Put, meshes: Mapping[Path, MeshFile]) -> Any:
     if isinstance(put.what, Path):
-        mesh = read_mesh_file(put.what)
+        mesh = meshes[put.what]
         return mitsuba_mesh(mesh.vertices, mesh.faces, put.name)
     corner = lambda *bits: sum(b << k for k, b in enumerate(bits))
     faces = []

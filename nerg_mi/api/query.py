@@ -18,7 +18,7 @@ from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import FARTHEST, Range, check_number
 from nerg_mi.statistics.shares import Shares, SumRule, gaze_shares
-from nerg_mi.statistics.visits import MARGIN, Box
+from nerg_mi.statistics.visits import MARGIN, BoxAoi
 from nerg_mi.workflows.base import SILENT, Reporter
 
 from . import arrays
@@ -451,7 +451,7 @@ def box_shares(
         return gaze_shares(
             lambda eye: look_from(i.gaze, place, i.observer_settings, eye),
             observers,
-            [Box(region) for region in regions],
+            [BoxAoi(region) for region in regions],
             [(k,) for k in range(len(regions))],
             margin,
             rule,

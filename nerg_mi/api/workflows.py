@@ -21,13 +21,13 @@ from .scene import FilePath, TrainedField, check_names, checkpoint_of, file_of, 
 
 if TYPE_CHECKING:
     from nerg_mi.alignment.check import Alignment
+    from nerg_mi.aoi.output import StatisticsResult
     from nerg_mi.evaluation.metrics import ViewScores
     from nerg_mi.fields.gaze_base import AnyGazeField
     from nerg_mi.fields.radiance import RadianceField
     from nerg_mi.workflows.ablation import AblationResult
     from nerg_mi.workflows.bake import Bake
     from nerg_mi.workflows.evaluate import GazeEvaluation
-    from nerg_mi.workflows.statistics import StatisticsResult
     from nerg_mi.workflows.study import StudyResult
 
 
@@ -234,7 +234,7 @@ def stats(
     ``files``: rays (in memory, or their file, or a dataset), a scene, a gaze field, a radiance field, in any order.
     ``areas``: a JSON file of boxes, meshes, shapes and groups (docs/statistics.md). ``output``: folder for the tables.
     ``options``: those of `nerg stats` (`nerg_mi.aoi.options.StatisticsOptions`). Gives a
-    `nerg_mi.workflows.statistics.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
+    `nerg_mi.aoi.output.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
 
     >>> import json, nerg_mi as nerg
     >>> from nerg_mi.api.workflows import stats

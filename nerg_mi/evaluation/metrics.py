@@ -15,7 +15,7 @@ from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.maths.color import mean_score, psnr, psnr_of_fitted_half
 from nerg_mi.photos.cameras import Camera, pixel_directions, sensor_dict
-from nerg_mi.photos.images import View, pinhole, through_lens
+from nerg_mi.photos.images import PhotoView, pinhole, through_lens
 
 # ---- Images ----
 #
@@ -188,7 +188,7 @@ class ViewScores:
 
 def score_views(
     field: str | Path,
-    views: list[View],
+    views: list[PhotoView],
     spp: int = 16,
     pictures: Path | None = None,
     on_view: Callable[[str, float, float], None] = lambda name, psnr, ssim: None,

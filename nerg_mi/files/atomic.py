@@ -25,7 +25,6 @@ from .safe_read import open_file
 # one step (POSIX rename), so that a reader, a killed process, a full disk or a power cut meets the old file or the new
 # one.
 
-
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder",
     errno.EDQUOT: "your quota is used up; free some space or choose another folder",

@@ -23,25 +23,19 @@ from .safe_read import open_file, reading
 
 # ---- What a picture's header says of its size, so that no decoder makes room for more than is read here ----
 
-PIXELS = 1 << 27
-"""A picture may have so many pixels: 16,384 x 8,192."""
-
-DECODED_BYTES = 3 << 27
-"""Its values may take so many bytes: three 8-bit channels of as many pixels."""
+PIXELS = 1 << 27  # a picture may have so many pixels: 16,384 x 8,192
+DECODED_BYTES = 3 << 27  # its values may take so many bytes: three 8-bit channels of as many pixels
 
 WARRANTED = 16
 """So many times its file's bytes a picture may take in any case, in pixels as in bytes: photos of 200 million pixels
 and large environment maps are no attack, where a small file that claims as much is one."""
 
-BYTES = 4 << 30
-"""A file may have so many bytes."""
+BYTES = 4 << 30  # maximum bytes of a file
 
 JPEG_BYTES = 1 << 29
 """And so many as JPEG, which is read whole: a photo of 200 million pixels has a fifth of them."""
 
-SCANS = 100
-"""A progressive JPEG may run over its pixels so many times; encoders make ten."""
-
+SCANS = 100  # a progressive JPEG may run over its pixels so many times; encoders make ten
 _EXR_HEADER_BYTES = 1 << 20
 _EXR_KINDS = {0: 4, 1: 2, 2: 4}
 
@@ -225,6 +219,10 @@ def _exr_pixel_bytes(channels: bytes) -> int:
 # Mitsuba's own reader brings an older copy of that library, in which overflows are known; its own writer shares
 # Dr.Jit's thread pool and waits for ever where that has one thread.
 
+_OF_THE_FORMAT = set(
+    "compression type channels dataWindow displayWindow lineOrder screenWindowCenter screenWindowWidth".split()
+)
+
 
 def write_exr(
     path: str | os.PathLike, channels: Mapping[str, np.ndarray], attributes: Mapping[str, str] | None = None
@@ -237,40 +235,36 @@ def write_exr(
     """
     import OpenEXR
 
-    names = {
-        "compression",
-        "type",
-        "channels",
-        "dataWindow",
-        "displayWindow",
-        "lineOrder",
-        "screenWindowCenter",
-        "screenWindowWidth",
-    }
-    taken = names & set(attributes or {})
+    taken = _OF_THE_FORMAT & set(attributes or {})
     if taken:
         raise ValueError(f"the attributes {', '.join(sorted(taken))} belong to the format; give them other names")
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        **{k: str(v) for k, v in (attributes or {}).items()},
-    }
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
     data = {name: np.ascontiguousarray(value) for name, value in channels.items()}
     rows = len(next(iter(data.values())))
     with replacing(path) as temporary:
-        try:
-            with OpenEXR.File(header, data) as file:
-                file.write(str(temporary))
-        except RuntimeError as error:
-            _raise_if_full(temporary)
-            raise NergError(
-                f'"{path}" could not be written ({str(error).strip()}); choose another name or folder'
-            ) from error
-        if not _whole(temporary, rows):
-            # The library does not look at what becomes of the last kilobytes, which leave its buffer as the file is
-            # closed.
-            _raise_if_full(temporary)
-            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        with _writing(path, temporary), OpenEXR.File(header, data) as file:
+            file.write(str(temporary))
+        _check_whole(path, temporary, rows)
+
+
+@contextmanager
+def _writing(path: str | os.PathLike, temporary: Path) -> Iterator[None]:
+    """What the library says of the file ``temporary``, which is to become ``path``, as one sentence."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        _raise_if_full(temporary)
+        raise NergError(
+            f'"{path}" could not be written ({str(error).strip()}); choose another name or folder'
+        ) from error
+
+
+def _check_whole(path: str | os.PathLike, temporary: Path, rows: int) -> None:
+    """Raise `OSError` for a file that is cut off: the library does not look at what becomes of the last kilobytes,
+    which leave its buffer as the file is closed."""
+    if not _whole(temporary, rows):
+        _raise_if_full(temporary)
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
 
 
 def _whole(path: Path, rows: int) -> bool:
@@ -278,20 +272,15 @@ def _whole(path: Path, rows: int) -> bool:
     try:
         with path.open("rb") as file:
             file.seek(8)  # magic number and version
-            while _name(file):
-                _name(file)  # the type of the attribute
+            while _exr_name(file):
+                _exr_name(file)  # the type of the attribute
                 file.seek(struct.unpack("<i", file.read(4))[0], os.SEEK_CUR)
             blocks = -(-rows // 16)
             last = max(struct.unpack(f"<{blocks}Q", file.read(8 * blocks)))
             file.seek(last + 4)  # the block's first row
             return last > 0 and last + 8 + struct.unpack("<i", file.read(4))[0] == path.stat().st_size
-    except struct.error:
+    except (struct.error, EOFError):
         return False
-
-
-def _name(file) -> bytes:
-    """The bytes before the next zero."""
-    return b"".join(iter(lambda: file.read(1) or b"\0", b"\0"))
 
 
 def _raise_if_full(path: Path) -> None:
@@ -368,13 +357,8 @@ def exr_rows(
                 file = OpenEXR.OutputFile(str(temporary), header)
             count = len(next(iter(channels.values())))
             data = {name: np.ascontiguousarray(value, np.float32).tobytes() for name, value in channels.items()}
-            try:
+            with _writing(path, temporary):
                 file.writePixels(data, count)
-            except (OSError, RuntimeError) as error:
-                _raise_if_full(temporary)
-                raise NergError(
-                    f'"{path}" could not be written ({str(error).strip()}); choose another name or folder'
-                ) from error
             rows += count
 
         try:
@@ -384,9 +368,7 @@ def exr_rows(
                 file.close()
         if rows != height:
             raise ValueError(f"{rows} of {height} rows were written")
-        if not _whole(temporary, rows):
-            _raise_if_full(temporary)
-            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+        _check_whole(path, temporary, rows)
 
 
 @contextmanager
@@ -419,8 +401,8 @@ def bitmap_channels(bitmap) -> dict[str, np.ndarray]:
 
 def write_bitmap_exr(path: str | Path, bitmap) -> None:
     """Write a Mitsuba bitmap with all of its channels, as float32, and the text of its metadata."""
-    attributes = {key: value for key, value in bitmap.metadata().items() if isinstance(value, (str, int, float))}
-    write_exr(path, bitmap_channels(bitmap), {k: str(v) for k, v in attributes.items()})
+    attributes = {k: str(v) for k, v in bitmap.metadata().items() if isinstance(v, (str, int, float))}
+    write_exr(path, bitmap_channels(bitmap), attributes)
 
 
 # ---- PNG files, whole or absent, with text in their headers ----

@@ -19,6 +19,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 import numpy as np
@@ -32,14 +33,9 @@ from nerg_mi.errors import MissingFile, NergError, plain, sentence
 # A reader asks first how large things are, by the bytes that are there and by the limits stated here, and only then
 # makes room for them. Compressed files and NumPy's follow below; headers of pictures: `nerg_mi.files.images`.
 
-JSON_BYTES = 64 << 20
-"""A JSON file may have so many bytes: the poses of some 80,000 frames."""
-
-JSON_VALUES = 8_000_000
-"""So many values may stand in it: each takes up to 100 bytes of memory."""
-
-JSON_DEPTH = 64
-"""So deep may arrays and objects be nested; what this package reads is six deep at most."""
+JSON_BYTES = 64 << 20  # a JSON file may have so many bytes: the poses of some 80,000 frames
+JSON_VALUES = 8_000_000  # so many values may stand in it: each takes up to 100 bytes of memory
+JSON_DEPTH = 64  # so deep may arrays and objects be nested; what this package reads is six deep at most
 
 _DAMAGED = (
     OSError,
@@ -61,7 +57,6 @@ _DAMAGED = (
     SyntaxError,
     pickle.UnpicklingError,
 )
-
 
 _REMEDY = "copy it again, or make it anew"
 
@@ -144,6 +139,16 @@ def size_of(path: str | os.PathLike, what: str = "file", most: int | None = None
             f'the {what} "{path}" has {found.st_size:,} bytes, more than the {most:,} that are read; give a smaller one'
         )
     return found.st_size
+
+
+def is_ordinary(path: Path, what: str = "file") -> bool:
+    """Whether there is an ordinary file ``path``; a folder is none. `NergError` for a device, a pipe or a socket, which
+    is no missing file."""
+    if path.is_file():
+        return True
+    if path.exists() and not path.is_dir():
+        size_of(path, what)
+    return False
 
 
 @contextmanager
@@ -234,16 +239,9 @@ def _check_json(text: str, path, what: str) -> None:
 # Deflate makes up to 1,032 bytes of one. What is inflated may be 100 times the compressed file, and `FREE` bytes in any
 # case, for an array of zeros is no attack.
 
-
-RATIO = 100
-"""So many times its own size may a compressed file inflate to."""
-
-FREE = 256 << 20
-"""So many bytes it may inflate to whatever its size."""
-
-DIRECTORY_BYTES = 8 << 20
-"""A zip archive's list of members may have so many bytes: some 100,000 members."""
-
+RATIO = 100  # so many times its own size may a compressed file inflate to
+FREE = 256 << 20  # so many bytes it may inflate to whatever its size
+DIRECTORY_BYTES = 8 << 20  # a zip archive's list of members may have so many bytes: some 100,000 members
 _CHUNK = 1 << 20
 _GZIP = 16 + zlib.MAX_WBITS
 # Bytes of a gzip file without any that come out: its header with names, and zeros that fill up a tape's block.
@@ -434,10 +432,7 @@ def _directory_bytes(path, size: int) -> int:
 #
 # Lines of large text files, plain or gzip, in blocks: memory stays bounded whatever the file holds.
 
-
-LINE_CHARACTERS = 1 << 20
-"""A line of a tracking file may be so long: HoloLens 2 writes 17,000 characters."""
-
+LINE_CHARACTERS = 1 << 20  # a line of a tracking file may be so long: HoloLens 2 writes 17,000 characters
 _BLOCK_CHARACTERS = 1 << 24
 _LINE_BLOCKS_CHUNK = 1 << 22
 
@@ -500,9 +495,7 @@ def _opened(path: str | os.PathLike, what: str) -> Iterator[IO[bytes]]:
 # NumPy's files, .npy and .npz: what a header claims is compared with the bytes that are there before an array is
 # made.
 
-
-HEADER_BYTES = 10_000
-"""The header of an array may have so many bytes."""
+HEADER_BYTES = 10_000  # the header of an array may have so many bytes
 
 
 class Npz:

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, import_extra, plain
 
 from .atomic import replacing
 from .safe_read import reading, size_of
@@ -24,7 +24,6 @@ from .safe_read import reading, size_of
 #
 # FFmpeg writes a line of its index for each sample that a table tells of, and again for each edit: a few bytes of a
 # table can tell of billions.
-
 
 _CONTAINERS = frozenset(
     b"moov trak mdia minf stbl edts moof traf mvex udta wave tref dinf ilst gmhd".split()  # whose boxes FFmpeg reads
@@ -209,9 +208,7 @@ def _look(file: BinaryIO, kind: bytes, start: int, end: int, claims: _Claims) ->
 #
 # Videos that play everywhere, written frame by frame: H.264 in MP4, whole or absent.
 
-
 CODEC = "libx264"
-
 _QUALITY = "17"  # x264's constant rate factor: no difference is seen from about 18 down
 _MOST_FPS = 1000.0
 _LEAST, _MOST = 16, 8192
@@ -311,8 +308,4 @@ def _encoding(path: str | os.PathLike, av: Any) -> Iterator[None]:
 
 
 def _pyav() -> Any:
-    try:
-        import av
-    except ImportError:
-        raise ImportError('a video needs PyAV, which is not installed: pip install "nerg-mi[video]"') from None
-    return av
+    return import_extra("av", "a video needs PyAV", "video")

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import is_count, read_bytes, read_json, reading
+from nerg_mi.fields.splats import matrices_of
+from nerg_mi.files.safe_read import is_count, is_ordinary, read_bytes, read_json, reading
 from nerg_mi.ranges import FARTHEST
 
 # ---- Regions ----
@@ -26,19 +27,10 @@ from nerg_mi.ranges import FARTHEST
 # What else may stand in such a file (parts of meshes, shapes of a scene, groups, the objects of a recording) is read by
 # `nerg_mi.formats.areas`.
 
-
-BYTES = 4 << 20
-"""A file of areas may have so many bytes."""
-
-MOST = 1000
-"""And so many areas."""
-
-Quaternion = tuple[float, float, float, float]
-"""x, y, z, w."""
-
-BEYOND_BOXES = ("mesh", "shape", "parts", "adt")
-"""Keys of which an area has one that is no box."""
-
+BYTES = 4 << 20  # a file of areas may have so many bytes
+MOST = 1000  # and so many areas
+Quaternion = tuple[float, float, float, float]  # x, y, z, w
+BEYOND_BOXES = ("mesh", "shape", "parts", "adt")  # keys of which an area has one that is no box
 _LETTERS = 80
 _EXAMPLE = '{"shelf": [[0, 0, 0], [1, 2, 3]]}'
 
@@ -97,13 +89,7 @@ class Region:
         if self.turn is None:
             return np.eye(3)
         x, y, z, w = np.array(self.turn, float) / math.hypot(*self.turn)
-        return np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        return matrices_of(np.array([[w, x, y, z]]))[0]
 
     def to_own(self, points: np.ndarray) -> np.ndarray:
         """``points`` (..., 3) turned back about the middle, where this is the box between `corners`."""
@@ -143,15 +129,13 @@ def _turn(turn: Iterable[float] | float | None, name: str) -> Quaternion | None:
         return None
     if isinstance(turn, (int, float)):
         half = math.radians(float(turn)) / 2 if math.isfinite(turn) else math.nan
-        x, y, z, w = 0.0, 0.0, math.sin(half), math.cos(half)
+        numbers = [0.0, 0.0, math.sin(half), math.cos(half)]
     else:
-        given = [float(v) for v in turn]
-        size = math.hypot(*given)
-        if len(given) != 4 or not 1e-6 < size < 1e6:
-            raise NergError(f'the turn of the area "{plain(name, 40)}" is degrees about z, or four numbers x, y, z, w')
-        x, y, z, w = (v / size for v in given)
-    if not math.isfinite(x + y + z + w):
+        numbers = [float(v) for v in turn]
+    size = math.hypot(*numbers)
+    if len(numbers) != 4 or not 1e-6 < size < 1e6:
         raise NergError(f'the turn of the area "{plain(name, 40)}" is degrees about z, or four numbers x, y, z, w')
+    x, y, z, w = numbers if isinstance(turn, (int, float)) else (v / size for v in numbers)
     return (x, y, z, w)
 
 
@@ -171,7 +155,7 @@ def read_regions(path: str | Path) -> list[Region]:
 
 
 @dataclass(frozen=True)
-class Entry:
+class AreaEntry:
     """What a file says of an area: its ``name`` and what it is ``given`` as; ``where``: for errors."""
 
     name: object
@@ -184,7 +168,7 @@ class Entry:
         return not (isinstance(self.given, dict) and any(key in self.given for key in BEYOND_BOXES))
 
 
-def read_entries(path: str | Path) -> list[Entry]:
+def read_entries(path: str | Path) -> list[AreaEntry]:
     """What a file of areas has, not looked at yet. Raises `NergError` for what is no such file, and for names that come
     twice."""
     found = read_json(path, "file of areas", BYTES)
@@ -199,10 +183,10 @@ def read_entries(path: str | Path) -> list[Entry]:
     names = [name for name, _ in listed if isinstance(name, str)]
     if len(set(names)) < len(names):
         raise NergError(f'"{path}" has two areas of one name; rename one of them')
-    return [Entry(name, given, f'"{path}", area {k + 1}') for k, (name, given) in enumerate(listed)]
+    return [AreaEntry(name, given, f'"{path}", area {k + 1}') for k, (name, given) in enumerate(listed)]
 
 
-def parse_box(entry: Entry) -> Region:
+def parse_box(entry: AreaEntry) -> Region:
     """The box of an entry. Raises `NergError` for what is none."""
     name, given, where = entry.name, entry.given, entry.where
     corners: Any = (given.get("min"), given.get("max")) if isinstance(given, dict) else given
@@ -238,8 +222,7 @@ def box_json(region: Region) -> dict[str, Any]:
 
 # ---- What an area of interest can be, besides a box (`nerg_mi.formats.areas.Region`) ----
 
-DEEPEST = 100
-"""So deep may groups be nested that stand before their parts."""
+DEEPEST = 100  # so deep may groups be nested that stand before their parts
 
 
 @dataclass(frozen=True)
@@ -273,18 +256,18 @@ class SceneShape:
 
 
 @dataclass(frozen=True)
-class Group:
+class AreaGroup:
     """Several others, by their names: whoever looks at one of its ``parts`` looks at it."""
 
     name: str
     parts: tuple[str, ...]
 
 
-Area = Region | MeshPart | SceneShape | Group
+Area = Region | MeshPart | SceneShape | AreaGroup
 
 
 @dataclass(frozen=True)
-class Areas:
+class AreaSet:
     """The areas of a file, in its order, whose names are different.
 
     ``others``: those that are no boxes, as they stand in the file. Raises `NergError` for groups of what there is not,
@@ -300,7 +283,7 @@ class Areas:
         if twice is not None:
             raise NergError(f'two areas are called "{twice}"; rename one of them')
         for area in self.areas:
-            if not isinstance(area, Group):
+            if not isinstance(area, AreaGroup):
                 continue
             unknown = next((p for p in area.parts if p not in names), None)
             if unknown is not None:
@@ -320,7 +303,12 @@ class Areas:
     @property
     def things(self) -> tuple[Region | MeshPart | SceneShape, ...]:
         """Those that are no groups."""
-        return tuple(a for a in self.areas if not isinstance(a, Group))
+        return tuple(a for a in self.areas if not isinstance(a, AreaGroup))
+
+    @property
+    def meshes(self) -> list[Path]:
+        """Files of those that are parts of meshes."""
+        return [a.file for a in self.areas if isinstance(a, MeshPart)]
 
     @property
     def solids(self) -> dict[str, tuple[int, ...]]:
@@ -343,7 +331,7 @@ def _resolve(area: Area, by_name: dict[str, Area], known: dict[str, frozenset[in
     Raises `NergError` for a group that holds itself."""
     if area.name in above or len(above) > DEEPEST:
         raise NergError(f'the group "{area.name}" holds itself, or groups are nested deeper than {DEEPEST}')
-    if area.name in known or not isinstance(area, Group):
+    if area.name in known or not isinstance(area, AreaGroup):
         return
     for part in area.parts:
         _resolve(by_name[part], by_name, known, (*above, area.name))
@@ -359,14 +347,9 @@ def _resolve(area: Area, by_name: dict[str, Area], known: dict[str, frozenset[in
 # twin's world has y up; that of rays z: (x, y, z) becomes (x, -z, y), as `nerg rays import --preset aria` does for its
 # recordings. Poses with a time are those of objects that were carried about: these have no one place, and are left out.
 
-
 BOXES, POSES, NAMES = "3d_bounding_box.csv", "scene_objects.csv", "instances.json"
-
-TABLE_BYTES = 256 << 20
-"""A table may have so many bytes."""
-
+TABLE_BYTES = 256 << 20  # a table may have so many bytes
 _THIN = 1e-3  # metres: a box that is thinner is made so thick
-
 _UID, _TIME = "object_uid", "timestamp[ns]"
 _SIDES = [f"p_local_obj_{axis}{end}[m]" for end in ("min", "max") for axis in "xyz"]
 _PLACE = [f"t_wo_{axis}[m]" for axis in "xyz"]
@@ -458,7 +441,7 @@ def _rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
 
 def _names(path: Path) -> dict[str, tuple[str, str]]:
     """Name and category of objects; none where there is no such file."""
-    if not path.is_file():
+    if not is_ordinary(path, "file of instances"):
         return {}
     found = read_json(path, "file of instances")
     if not isinstance(found, dict):
@@ -476,11 +459,8 @@ def _names(path: Path) -> dict[str, tuple[str, str]]:
 
 # ---- Reading areas of interest from a JSON file, or from the folder of a recording of Aria Digital Twin ----
 
-MESHES = (".ply", ".obj")
-"""Suffixes of meshes that an area can be a part of."""
-
-PARTS = 1000
-"""So many ranges of faces, parts of a group, or categories may an area name."""
+MESHES = (".ply", ".obj")  # suffixes of meshes that an area can be a part of
+PARTS = 1000  # so many ranges of faces, parts of a group, or categories may an area name
 
 _READING_EXAMPLE = (
     '{"name": "a", "min": [0, 0, 0], "max": [1, 2, 3]}, {"name": "b", "mesh": "sign.ply", "faces": [0, [4, 9]]}, '
@@ -488,7 +468,7 @@ _READING_EXAMPLE = (
 )
 
 
-def read_areas(path: str | Path) -> Areas:
+def read_areas(path: str | Path) -> AreaSet:
     """The areas of a JSON file, or the objects in the folder of a recording of Aria Digital Twin.
 
     Beside boxes (`nerg_mi.formats.areas.read_regions`) an area is a mesh or some of its faces (``mesh``: a .ply or
@@ -498,7 +478,7 @@ def read_areas(path: str | Path) -> Areas:
     """
     path = Path(path)
     if path.is_dir():
-        return Areas(tuple(read_twin_objects(path)))
+        return AreaSet(tuple(read_twin_objects(path)))
     found: list[Area] = []
     others: list[dict[str, Any]] = []
     for entry in read_entries(path):
@@ -514,22 +494,21 @@ def read_areas(path: str | Path) -> Areas:
         if len(found) > MOST:
             raise NergError(f'"{path}" has more than {MOST} areas; choose some of the objects by "categories"')
     try:
-        return Areas(tuple(found), tuple(others))
+        return AreaSet(tuple(found), tuple(others))
     except NergError as error:
         raise NergError(f'"{path}": {error}') from error
 
 
-def files_of_areas(path: str | Path, areas: Areas) -> list[Path]:
+def files_of_areas(path: str | Path, areas: AreaSet) -> list[Path]:
     """The files that `read_areas` and whoever loads the meshes of its ``areas`` read of ``path``."""
     path = Path(path)
     if path.is_dir():
         return files_of_twin(path)
-    meshes = [area.file for area in areas.areas if isinstance(area, MeshPart)]
     twins = [file for given in areas.others if "adt" in given for file in files_of_twin(path.parent / given["adt"])]
-    return list(dict.fromkeys([path, *meshes, *twins]))
+    return list(dict.fromkeys([path, *areas.meshes, *twins]))
 
 
-def _other(entry: Entry, path: Path) -> list[Area]:
+def _other(entry: AreaEntry, path: Path) -> list[Area]:
     """The areas of an entry that is no box."""
     given = entry.given
     if "adt" in given:
@@ -539,20 +518,16 @@ def _other(entry: Entry, path: Path) -> list[Area]:
         raise NergError(f"an area needs a name, as in {_READING_EXAMPLE}")
     check_name(name)
     if "mesh" in given:
-        file = _inside(given["mesh"], path)
-        if file.suffix.lower() not in MESHES:
-            raise NergError(
-                f'the mesh "{plain(file.name, 60)}" is no .ply or .obj; convert it to one of {", ".join(MESHES)}'
-            )
+        file = mesh_beside(given["mesh"], path)
         return [MeshPart(name, file, None if given.get("faces") is None else _ranges(given["faces"]))]
     if "shape" in given:
         if not isinstance(given["shape"], str) or not given["shape"]:
             raise NergError('"shape" must be the id of a shape of the scene')
         return [SceneShape(name, given["shape"])]
-    return [Group(name, _words(given["parts"], "parts"))]
+    return [AreaGroup(name, _words(given["parts"], "parts"))]
 
 
-def _objects(entry: Entry, path: Path) -> list[Area]:
+def _objects(entry: AreaEntry, path: Path) -> list[Area]:
     categories = entry.given.get("categories")
     chosen = None if categories is None else _words(categories, "categories")
     objects: list[Area] = list(read_twin_objects(_inside(entry.given["adt"], path), chosen))
@@ -561,17 +536,28 @@ def _objects(entry: Entry, path: Path) -> list[Area]:
     if not isinstance(entry.name, str):
         raise NergError("a name must be a text")
     check_name(entry.name)
-    return [*objects, Group(entry.name, tuple(a.name for a in objects))]
+    return [*objects, AreaGroup(entry.name, tuple(a.name for a in objects))]
 
 
-def _inside(name: object, path: Path) -> Path:
-    """The file or folder ``name`` beside the file of areas ``path``, or below."""
-    if not isinstance(name, str) or not name or "\0" in name or len(name) > 1000:
-        raise NergError(f"a file is named by a text, as in {_READING_EXAMPLE}")
+def mesh_beside(name: object, path: Path, what: str = "areas") -> Path:
+    """The mesh ``name`` (.ply, .obj) beside the file ``path`` of ``what``, or below. Raises `NergError` for other
+    names."""
+    file = _inside(name, path, what)
+    if file.suffix.lower() not in MESHES:
+        raise NergError(
+            f'the mesh "{plain(file.name, 60)}" is no .ply or .obj; convert it to one of {", ".join(MESHES)}'
+        )
+    return file
+
+
+def _inside(name: object, path: Path, what: str = "areas") -> Path:
+    """The file or folder ``name`` beside the file ``path`` of ``what``, or below."""
+    if not isinstance(name, str) or not 0 < len(name) <= 1000 or "\0" in name:
+        raise NergError('a file is named by a text, as in {"name": "a", "mesh": "sign.ply"}')
     folder = os.path.realpath(path.parent)
     found = os.path.realpath(os.path.join(folder, name))
     if os.path.isabs(name) or os.path.commonpath([folder, found]) != folder:
-        raise NergError(f'"{plain(name, 80)}" lies outside of the folder of the areas; put it, or a copy, there')
+        raise NergError(f'"{plain(name, 80)}" lies outside of the folder of the {what}; put it, or a copy, there')
     return path.parent / name
 
 

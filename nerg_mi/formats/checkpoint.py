@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -18,17 +19,9 @@ from nerg_mi.errors import MissingFile, NergError, plain
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.safe_read import open_file, parse_json, reading
 
-FORMAT = 1
-"""The version of the files, raised when an earlier version of this package could misread them."""
-
-CHECKPOINT_BYTES = 16 << 30
-"""A checkpoint may have so many bytes."""
-
-HEADER_BYTES = 16 << 20
-"""The header, which names every array and holds the metadata, may have so many bytes."""
-
-
-_Contents = TypeVar("_Contents")
+FORMAT = 1  # the version of the files, raised when an earlier version of this package could misread them
+CHECKPOINT_BYTES = 16 << 30  # a checkpoint may have so many bytes
+HEADER_BYTES = 16 << 20  # the header, which names every array and holds the metadata, may have so many bytes
 
 
 def write_checkpoint(path: str | Path, kind: str, tensors: dict[str, np.ndarray], metadata: dict) -> None:
@@ -48,30 +41,33 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, np.ndarray],
 
     Raises `MissingFile` when there is no such file and `NergError` when it is not such a checkpoint.
     """
-    return _read(path, lambda f: _contents(f, Path(path), kind))
+    with _opened(Path(path)) as file:
+        metadata = _metadata(file, Path(path), kind)
+        return {name: file.get_tensor(name) for name in file.keys()}, metadata
 
 
 def read_metadata(path: str | Path) -> dict:
     """The metadata of a checkpoint of any kind, which they name as ``kind``; raises as `read_checkpoint`."""
-    return _read(path, lambda f: _metadata(f, Path(path)))
+    with _opened(Path(path)) as file:
+        return _metadata(file, Path(path))
 
 
-def _read(path: str | Path, contents: Callable[[Any], _Contents]) -> _Contents:
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     from safetensors import SafetensorError, safe_open
 
-    path = Path(path)
     if not path.exists():
         raise MissingFile(f'the checkpoint "{path}" does not exist: correct its name, or make one with "nerg train"')
     _check_header(path)
     # The library asks NumPy for types that it has not (bfloat16), which is the file's doing.
     with reading(path, "checkpoint", also=(TypeError, AttributeError)):
         try:
-            with safe_open(path, framework="numpy") as f:
-                return contents(f)
-        except SafetensorError as e:
+            with safe_open(path, framework="numpy") as file:
+                yield file
+        except SafetensorError as error:
             raise NergError(
-                f'"{path}" is not a readable safetensors file: {plain(e)}; copy it again, or make it anew'
-            ) from e
+                f'"{path}" is not a readable safetensors file: {plain(error)}; copy it again, or make it anew'
+            ) from error
 
 
 def _check_header(path: Path) -> None:
@@ -91,14 +87,9 @@ def _check_header(path: Path) -> None:
         raise NergError(f'"{path}" is not a readable safetensors file: its header is no JSON object; copy it again')
 
 
-def _contents(f, path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:
-    metadata = _metadata(f, path, kind)
-    return {k: f.get_tensor(k) for k in f.keys()}, metadata
-
-
-def _metadata(f, path: Path, kind: str | None = None) -> dict:
+def _metadata(file: Any, path: Path, kind: str | None = None) -> dict:
     """What the header says, of a checkpoint of ``kind``; None: of any."""
-    raw = (f.metadata() or {}).get("nerg")
+    raw = (file.metadata() or {}).get("nerg")
     if raw is None:
         raise NergError(
             f'"{path}" is a safetensors file but not a nerg_mi checkpoint (no "nerg" metadata); name one that is'

@@ -29,18 +29,12 @@ from .checkpoint import read_checkpoint, read_metadata, write_checkpoint
 #
 # The file's arrays bound most sizes, but lists of layers and levels are made from the numbers alone.
 
-
 _MOST = {"width": 4096, "geometry": 4096, "density_hidden": 64, "color_hidden": 64, "hidden": 64, "sh_degree": 10}
 """The largest whole numbers of an architecture, by name; beyond them no field is trained and no kernel compiles."""
 
-FINEST = 1 << 24
-"""The finest resolution of a grid: float32 tells no more cells apart."""
-
-MEMBERS = 64
-"""Members of an ensemble."""
-
-OCCUPANCY_CELLS = 1 << 26
-"""Cells of an occupancy grid, over all of its levels: 400 along each edge."""
+FINEST = 1 << 24  # the finest resolution of a grid: float32 tells no more cells apart
+MEMBERS = 64  # members of an ensemble
+OCCUPANCY_CELLS = 1 << 26  # cells of an occupancy grid, over all of its levels: 400 along each edge
 
 
 @contextmanager
@@ -69,10 +63,10 @@ def check_sizes(about: object, what: str = "architecture", most: Mapping[str, in
     for name, value in about.items():
         if name in most and not (isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most[name]):
             raise ValueError(
-                f'"{name}" of its {what} must be a whole number from 1 to {most[name]}, not {_short(value)}'
+                f'"{name}" of its {what} must be a whole number from 1 to {most[name]}, not {plain(repr(value), 40)}'
             )
     if "finest" in about and not 1 <= number(about, "finest", what) <= FINEST:
-        raise ValueError(f'"finest" of its {what} must lie in 1..{FINEST}, not {_short(about["finest"])}')
+        raise ValueError(f'"finest" of its {what} must lie in 1..{FINEST}, not {plain(repr(about["finest"]), 40)}')
     if "grid" in about:
         grid = about["grid"]
         check_sizes(grid, "grid", config_type(grid).limits if isinstance(grid, dict) else {})
@@ -84,7 +78,7 @@ def number(about: object, name: str, what: str) -> float:
     cannot hold it."""
     value = about[name] if isinstance(about, dict) else None
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= VALUES.high:
-        raise ValueError(f'"{name}" of its {what} must be a finite number, not {_short(value)}')
+        raise ValueError(f'"{name}" of its {what} must be a finite number, not {plain(repr(value), 40)}')
     return value
 
 
@@ -97,14 +91,9 @@ def check_occupancy(about: dict) -> dict:
     if not (isinstance(resolution, int) and resolution >= 1 and levels * resolution**3 <= OCCUPANCY_CELLS):
         raise ValueError(
             f'"resolution" of its occupancy must be a whole number of cells along an edge, {OCCUPANCY_CELLS:,} '
-            f"cells at most, not {_short(resolution)}"
+            f"cells at most, not {plain(repr(resolution), 40)}"
         )
     return about
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else text[:40] + "..."
 
 
 # ---- Arrays ----

@@ -17,23 +17,14 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import plain
+from nerg_mi.fields.splats import matrices_of
 from nerg_mi.files.safe_read import is_count, parse_json, reading
 
-GLTF_MAGIC = b"glTF"
-"""A file begins with these bytes."""
-
-GLTF_BYTES = 1 << 30
-"""A file may have so many bytes."""
-
-DEPTH = 64
-"""Nodes may be nested so deep."""
-
-INSTANCES = 100_000
-"""So many meshes may stand in a scene."""
-
-TRIANGLES = 20_000_000
-"""So many triangles may be in all of them."""
-
+GLTF_MAGIC = b"glTF"  # beginning of a file
+GLTF_BYTES = 1 << 30  # maximum bytes of a file
+DEPTH = 64  # nodes may be nested so deep
+INSTANCES = 100_000  # so many meshes may stand in a scene
+TRIANGLES = 20_000_000  # so many triangles may be in all of them
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _INDICES = {5121: "u1", 5123: "<u2", 5125: "<u4"}
 _FLOATS = {5126: "<f4"}
@@ -43,7 +34,6 @@ _QUANTIZATION, _INSTANCING = "KHR_mesh_quantization", "EXT_mesh_gpu_instancing"
 # Beginnings of extensions that change how triangles look, and not where they are.
 _LOOKS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
 _TRIANGLES = 4
-
 
 Attribute = tuple[str, np.ndarray, bool]
 """Name of a vertex attribute, its values (V,) or (V, components), and whether integers stand for 0 to 1."""
@@ -253,13 +243,9 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
         out = np.array(node["matrix"], np.float64).reshape(4, 4).T
     else:
         x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
-        rotation = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
         out = np.eye(4)
-        out[:3, :3] = np.array(rotation) * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
+        rotation = matrices_of(np.array([[w, x, y, z]]))[0]
+        out[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
         out[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
     if not np.isfinite(out).all():
         raise ValueError("one of its nodes stands nowhere")

@@ -22,15 +22,9 @@ from nerg_mi.maths.coordinates import check_near_origin
 from .gltf import GLTF_BYTES, GLTF_MAGIC, parse_glb
 from .ply import PLY_MAGIC, PlyTable, parse_numbers, parse_ply
 
-BYTES = 64 << 30
-"""A file may have so many bytes."""
-
-TEXT_BYTES = 1 << 30
-"""And so many where it is text."""
-
-GREY = 0.5
-"""What has no colour."""
-
+BYTES = 64 << 30  # maximum bytes of a file
+TEXT_BYTES = 1 << 30  # and so many where it is text
+GREY = 0.5  # what has no colour
 _BLOCK = 1 << 24  # bytes of text that are read at once, and of its longest line
 _FLAT = 1e-6  # of a polygon's area: a triangle of its fan that is turned over by more makes it concave
 _CORNERS_TRIED, _AT_ONCE = 64, 1 << 20
@@ -399,5 +393,4 @@ def _read_glb(path: str | os.PathLike) -> MeshFile:
     )
 
 
-READERS = {".ply": _read_ply, ".obj": _read_obj, ".glb": _read_glb}
-"""Readers by the ending of a file's name."""
+READERS = {".ply": _read_ply, ".obj": _read_obj, ".glb": _read_glb}  # readers by the ending of a file's name

@@ -20,15 +20,9 @@ import numpy as np
 
 from nerg_mi.files.atomic import write_bytes
 
-PLY_MAGIC = b"ply"
-"""A file begins with these bytes."""
-
-HEADER_BYTES = 1 << 20
-"""The header of a file may be so long."""
-
-TEXT_BYTES = 256 << 20
-"""And the rows, where their numbers are text."""
-
+PLY_MAGIC = b"ply"  # beginning of a file
+HEADER_BYTES = 1 << 20  # the header of a file may be so long
+TEXT_BYTES = 256 << 20  # and the rows, where their numbers are text
 _TYPES = {"<f4": "float", "|u1": "uchar"}
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -129,7 +123,7 @@ def _elements(head: str) -> tuple[str, list[tuple[str, int, list[_Property]]], t
     return order, elements, tuple(c for c in comments if c)
 
 
-class _Rows:
+class _RowSource:
     """Where values are in a file: in bytes, or in words."""
 
     length: int
@@ -212,7 +206,7 @@ class _Rows:
         return PlyTable(count, columns, lists, kinds), at
 
 
-class _Bytes(_Rows):
+class _Bytes(_RowSource):
     def __init__(self, raw: np.ndarray, order: str):
         self._raw, self._order, self.length = raw, order, len(raw)
 
@@ -240,7 +234,7 @@ class _Bytes(_Rows):
         return lambda k: rows[f"{k}"].reshape(count, -1).squeeze(1 if widths[k][1] == 1 else ()).astype(widths[k][0])
 
 
-class _Words(_Rows):
+class _Words(_RowSource):
     def __init__(self, raw: np.ndarray):
         if len(raw) > TEXT_BYTES:
             raise ValueError(f"it is text of more than {TEXT_BYTES:,} bytes, and larger files are read as binary")

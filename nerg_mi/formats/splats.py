@@ -38,10 +38,7 @@ from .surfaces import points
 #
 # Gaussian splats as ``.splat`` (antimatter15): 32 bytes each, colours that are the same from everywhere.
 
-
-SPLAT_BYTES = 4 << 30
-"""A file may have so many bytes."""
-
+SPLAT_BYTES = 4 << 30  # maximum bytes of a file
 _ROW = np.dtype([("center", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 _SPLAT_BLOCK = 1 << 14  # Gaussians that are converted at once
 
@@ -70,9 +67,7 @@ def read_splat(path: str | os.PathLike) -> Splats:
 #
 # Gaussian splats as binary glTF with the extension KHR_gaussian_splatting, in glTF's frame: y up.
 
-
 EXTENSION = "KHR_gaussian_splatting"
-
 _POINTS = 0
 _COLOR_SPACES = {"srgb_rec709_display": "srgb", "lin_rec709_display": "linear"}
 _SLACK = 1e-4
@@ -157,13 +152,8 @@ def _check_range(name: str, values: np.ndarray, low: float, high: float, otherwi
 # their Gaussians become a thousandth as thick as they are wide. Of Mip-Splatting (Yu et al. 2024) the 3D filter is
 # applied. Opacities and lengths where logits and logarithms belong are recognised by values that these cannot have.
 
-
-PLY_BYTES = 8 << 30
-"""A file may have so many bytes."""
-
-HEADER_BYTES = 64 << 10
-"""So many of them tell splats from meshes."""
-
+PLY_BYTES = 8 << 30  # maximum bytes of a file
+HEADER_BYTES = 64 << 10  # so many of them tell splats from meshes
 _CENTER, _SCALE, _ROTATION = ("x", "y", "z"), ("scale_0", "scale_1", "scale_2"), tuple(f"rot_{i}" for i in range(4))
 _BASE, _NORMAL = tuple(f"f_dc_{i}" for i in range(3)), ("nx", "ny", "nz")
 _FILTER = "filter_3D"
@@ -284,10 +274,7 @@ def write_ply_splats(path: str | os.PathLike, splats: Splats, comments: tuple[st
 #
 # Axes are the file's: x right, y up, z back, unless its writer was told otherwise.
 
-
-COUNT = 50_000_000
-"""A file may hold so many Gaussians."""
-
+COUNT = 50_000_000  # a file may hold so many Gaussians
 _MAGIC = 0x5053474E
 _COLOR_SCALE = 0.15
 
@@ -411,7 +398,6 @@ def read_splats(path: str | os.PathLike) -> Splats:
 #
 # No training: where a lattice crosses the field's surface a Gaussian is laid along it, as wide as its neighbours are
 # far, in the colour that the field has there from in front. Depths are then those of the field to a fraction of a cell.
-
 
 WIDTH = 0.7
 """Standard deviation along the surface, in distances to the nearest neighbours: one more widely smears colours, one

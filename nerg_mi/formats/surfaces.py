@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, import_extra
 from nerg_mi.fields.extraction import Lattice, Sampler, crossings, opacity, surface_density
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import write_bytes
@@ -56,10 +56,7 @@ def mesh(
     than this share of the area of the largest are dropped; ``unseen``: keep faces where the occupancy grid ends and the
     density does not (backs of walls, insides of things: nothing that a picture shows). Needs scikit-image.
     """
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError:
-        raise ImportError('a mesh needs scikit-image, which is not installed: pip install "nerg-mi[mesh]"') from None
+    measure = import_extra("skimage.measure", "a mesh needs scikit-image", "mesh")
     import trimesh
 
     sampler, lattice = Sampler(field), Lattice.over(field, resolution)
@@ -72,7 +69,7 @@ def mesh(
             f"density crosses {threshold:g} per unit nowhere (it lies in {density.min():g} .. {density.max():g} on "
             f"{lattice.shape} points): choose another --density"
         )
-    index, faces, _, _ = marching_cubes(volume.transpose(2, 1, 0), level, allow_degenerate=False)
+    index, faces, _, _ = measure.marching_cubes(volume.transpose(2, 1, 0), level, allow_degenerate=False)
     index, hidden = crossings(sampler, lattice, index.astype(np.float64), threshold)
     vertices, total = lattice.points(index), len(faces)
     if not unseen:
@@ -197,9 +194,7 @@ def _srgb(field: RadianceField, sampler: Sampler, p, normals) -> np.ndarray:
     return encode_srgb(c) if field.color_space == "linear" else c
 
 
-# ----------------------------------------------------------------------------
-# Files
-# ----------------------------------------------------------------------------
+# ---- Files ----
 
 
 def write_ply(surface: Surface, path: str | Path) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, plain
+from nerg_mi.errors import MissingFile, NergError, import_extra, plain
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.safe_read import open_zip, read_member, reading, size_of
 
@@ -23,15 +23,12 @@ if TYPE_CHECKING:
 PICKLE_BYTES = 8 << 20
 """The pickle may have so many bytes: it holds names and shapes, the numbers are in records of their own."""
 
-OPERATIONS = 1_000_000
-"""So many operations may it have."""
+OPERATIONS = 1_000_000  # so many operations may it have
 
 WORK = 8 * PICKLE_BYTES
 """So many values and characters may its operations take in all, what is repeated counted each time."""
 
-EXPANDED = 1 << 20
-"""So many numbers may a tensor have that repeats those of its storage."""
-
+EXPANDED = 1 << 20  # so many numbers may a tensor have that repeats those of its storage
 _TEXT = 64
 # What torch.load would also make of a file, and no checkpoint of weights has: sparse and quantised tensors, devices,
 # sets, byte arrays of any size, ...
@@ -86,12 +83,7 @@ _STANDINS = [
 
 
 def _import_torch() -> Any:
-    try:
-        import torch
-    except ImportError:
-        raise ImportError(
-            'checkpoints of torch need torch, which is not installed: pip install "nerg-mi[torch]"'
-        ) from None
+    torch = import_extra("torch", "checkpoints of torch need torch", "torch")
     # Before, weights_only could be led to run code (CVE-2025-32434).
     if tuple(int(n) for n in re.findall(r"\d+", torch.__version__)[:2]) < (2, 6):
         raise ImportError(

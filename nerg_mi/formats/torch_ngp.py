@@ -174,7 +174,6 @@ def layers(state: StateDict, name: str, ns: ModuleType) -> MLP:
 #
 # Occupancy as torch-ngp keeps it: bits of 128^3 cells in Morton order, a cube a cascade.
 
-
 _CELLS = 128
 
 
@@ -249,9 +248,7 @@ def _overlapped(bits: np.ndarray, share: float) -> np.ndarray:
 # They hold a state dictionary and no sizes: those are read off the shapes, and the hash grid's resolutions
 # follow from ``aabb_train``. What is not in the file is an argument here.
 
-
-MARCH_STEP = 2 * math.sqrt(3) / 1024
-"""torch-ngp's shortest step, at its default of 1,024 steps."""
+MARCH_STEP = 2 * math.sqrt(3) / 1024  # torch-ngp's shortest step, at its default of 1,024 steps
 
 
 @dataclass(frozen=True)
@@ -266,8 +263,7 @@ class Given:
     background_radius: float | None = None
 
 
-AS_TRAINED_BY_DEFAULT = Given()
-"""What holds for a checkpoint that torch-ngp's own defaults have trained."""
+AS_TRAINED_BY_DEFAULT = Given()  # what holds for a checkpoint that torch-ngp's own defaults have trained
 
 
 def read_torch_ngp(
@@ -425,7 +421,6 @@ def write_torch_ngp(field: RadianceField, path: str | Path) -> None:
 #
 # Checkpoints of the paper's authors (github.com/ch-andrei/nerg-neural-gaze): a gaze field, and the NeRF it looks
 # at.
-
 
 _VARIANTS = {"Emit": "emit", "Capture": "capture", "EmitCapture": "emit_capture"}
 _HEADS = {

@@ -67,7 +67,6 @@ class Intrinsics:
 # (radial over radial, tangential); fisheye: ``cv::fisheye``, image radius θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)
 # at the angle θ from the axis.
 
-
 _NEWTON = 20
 # Samples of the angle that decide how far a fisheye's polynomial rises.
 _ANGLES = np.linspace(0, np.pi, 4097)

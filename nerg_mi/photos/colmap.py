@@ -17,9 +17,9 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, plain, sentence
 from nerg_mi.files.atomic import file_sha256
-from nerg_mi.files.safe_read import open_file, size_of
+from nerg_mi.files.safe_read import is_ordinary, open_file, size_of
 
-from .posed import FARTHEST, FileFinder, Frame, MaskFile, PosedImages, Unused, name_some, settled
+from .posed import FARTHEST, FileFinder, MaskFile, PosedFrame, PosedImages, Unused, name_some, settled
 from .transforms import read_frame_poses
 
 # ---- Colmap ----
@@ -29,15 +29,11 @@ from .transforms import read_frame_poses
 # The layout of both is COLMAP's (src/colmap/scene/reconstruction_io): little-endian; world-to-camera poses as a
 # quaternion (w, x, y, z) and a translation; cameras look along +z with y down; the first pixel's centre is (0.5, 0.5).
 
-
 BYTES = 8 << 30
 """A file of a model may have so many bytes: ``images.bin`` of some 30,000 photos, most of it observations."""
 
-IMAGES = 1 << 18
-"""A model may have so many images, and as many cameras."""
-
-POINTS = 12_000_000
-"""And so many points."""
+IMAGES = 1 << 18  # a model may have so many images, and as many cameras
+POINTS = 12_000_000  # and so many points
 
 # COLMAP's numbers of its camera models, and how many parameters each has.
 _MODELS = {
@@ -115,10 +111,10 @@ def model_files(folder: str | Path) -> dict[str, Path] | None:
     none."""
     folder = Path(folder)
     for suffix in (".bin", ".txt"):
-        if all((folder / (n + suffix)).is_file() for n in ("cameras", "images")):
-            return {
-                n: folder / (n + suffix) for n in ("cameras", "images", "points3D") if (folder / (n + suffix)).is_file()
-            }
+        files = {name: folder / (name + suffix) for name in ("cameras", "images", "points3D")}
+        files = {name: path for name, path in files.items() if is_ordinary(path, "COLMAP file")}
+        if {"cameras", "images"} <= files.keys():
+            return files
     return None
 
 
@@ -208,7 +204,7 @@ def _digest(files: dict[str, Path]) -> str:
     return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
-def _frame(name: str, camera: _Camera | None, number: int, q, t, image: Path, masks: FileFinder | None) -> Frame:
+def _frame(name: str, camera: _Camera | None, number: int, q, t, image: Path, masks: FileFinder | None) -> PosedFrame:
     if camera is None:
         raise NergError(f"the model has no camera {number}")
     if not image.is_file():
@@ -221,7 +217,7 @@ def _frame(name: str, camera: _Camera | None, number: int, q, t, image: Path, ma
         if not existing:
             raise NergError(f'its mask "{plain(paths[0])}" does not exist')
         mask = MaskFile(existing[0])
-    return Frame(name, image, _to_world(q, t), lens, mask=mask, ignores_exif=True)
+    return PosedFrame(name, image, _to_world(q, t), lens, mask=mask, ignores_exif=True)
 
 
 def _to_world(q, t) -> np.ndarray:
@@ -433,7 +429,6 @@ def _trusted(points: Iterator[_Point]) -> tuple[int, np.ndarray]:
 #
 # Which file describes a posed image set, and its poses by the names of its images, whether or not they are there.
 
-
 _MODEL_FOLDERS = ("", "sparse", "colmap/sparse")
 
 
@@ -457,7 +452,7 @@ def find_source(dataset: str | Path) -> Path:
         # A file of a COLMAP model stands for the model.
         return dataset.parent if dataset.suffix in (".bin", ".txt") else dataset
     for name in ("transforms.json", "transforms_train.json"):
-        if (dataset / name).is_file():
+        if is_ordinary(dataset / name, "transforms file"):
             return dataset / name
     for name in _MODEL_FOLDERS:
         models = _list_models(dataset / name)

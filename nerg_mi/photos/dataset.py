@@ -13,7 +13,7 @@ from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, box_interval
 from . import cameras
 from .cameras import Camera, pixel_directions, project
 from .colmap import Up
-from .images import View, load_usable, read_split, up_of
+from .images import PhotoView, load_usable, read_split, up_of
 from .posed import PosedImages, Unused
 
 # ---- Bounds ----
@@ -282,9 +282,9 @@ class Dataset:
     """Views in the coordinates asked for, and what is known of the place that they show."""
 
     # To train on.
-    train: list[View]
+    train: list[PhotoView]
     # To score on, never to learn from.
-    held_out: list[View]
+    held_out: list[PhotoView]
     # Where density may be, contracted where the place does not end at the box that was found.
     box: AnyBox
     # How the box was found, the end of a sentence.
@@ -370,7 +370,7 @@ def open_dataset(
     )
 
 
-def _check_depth(posed: PosedImages, views: list[View]) -> None:
+def _check_depth(posed: PosedImages, views: list[PhotoView]) -> None:
     """Raise `NergError` for depth in other units than the cameras'."""
     seen = [(v.camera, v.depth) for v in views if v.depth is not None]
     reason = explain_wrong_depth(seen) if seen else None
@@ -381,7 +381,7 @@ def _check_depth(posed: PosedImages, views: list[View]) -> None:
         )
 
 
-def _describe_masks(views: list[View]) -> list[str]:
+def _describe_masks(views: list[PhotoView]) -> list[str]:
     """A sentence on what the masks of ``views`` leave out, where there are any."""
     fractions = [v.left_out for v in views if v.left_out is not None]
     if not fractions:
@@ -391,7 +391,7 @@ def _describe_masks(views: list[View]) -> list[str]:
     return [f"masks leave out {np.mean(fractions):.1%} of the pixels of {len(fractions)} frames"]
 
 
-def _extent(posed: PosedImages, views: list[View], aabb, unbounded: bool | None) -> Extent:
+def _extent(posed: PosedImages, views: list[PhotoView], aabb, unbounded: bool | None) -> Extent:
     """Where density may be: the box that is given, or the one that is found; contracted as asked for, or as found."""
     extent = _found(posed, views, aabb)
     if unbounded is None or unbounded == extent.box.contracted:
@@ -402,7 +402,7 @@ def _extent(posed: PosedImages, views: list[View], aabb, unbounded: bool | None)
     return Extent(core, extent.how, "room", "it is to end at its box, as asked for")
 
 
-def _found(posed: PosedImages, views: list[View], aabb) -> Extent:
+def _found(posed: PosedImages, views: list[PhotoView], aabb) -> Extent:
     if aabb is not None:
         if len(aabb) != 6:
             raise NergError(f"aabb needs the six numbers x0,y0,z0,x1,y1,z1, got {len(aabb)}")
@@ -419,7 +419,7 @@ def _found(posed: PosedImages, views: list[View], aabb) -> Extent:
     return Extent(box, how, "room", "it ends at its box")
 
 
-def _depth_points(views: list[View]) -> np.ndarray | None:
+def _depth_points(views: list[PhotoView]) -> np.ndarray | None:
     """World points that views with depth see, evenly over their pixels; None where a view has no depth."""
     depths = [v.depth for v in views if v.depth is not None]
     if len(depths) < len(views):
@@ -445,7 +445,7 @@ def _up(up: Up) -> str:
     )
 
 
-def _unit(posed: PosedImages, views: list[View], box: AnyBox, scale: float) -> str:
+def _unit(posed: PosedImages, views: list[PhotoView], box: AnyBox, scale: float) -> str:
     """What is known of the length of a unit."""
     centers = np.array([v.camera.center for v in views])
     size = " x ".join(f"{u - l:.3g}" for l, u in zip(box.lower, box.upper))

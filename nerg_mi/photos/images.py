@@ -13,7 +13,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, plain
 from nerg_mi.files.images import check_image, read_exr
-from nerg_mi.files.safe_read import read_npy, reading
+from nerg_mi.files.safe_read import is_ordinary, read_npy, reading
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import LENGTHS, check_number
 
@@ -30,7 +30,7 @@ from .cameras import (
     view_tangents,
 )
 from .colmap import Up, describe_other_models, find_source, find_up, read_colmap, turn_to_z
-from .posed import DepthFile, Frame, MaskFile, PosedImages, Unused, name_some
+from .posed import DepthFile, MaskFile, PosedFrame, PosedImages, Unused, name_some
 from .transforms import read_dataparser, read_transforms
 
 # ---- Pictures, depth and masks from files, and photos as their cameras describe them ----
@@ -88,7 +88,7 @@ def read_image(path: str | Path) -> np.ndarray:
     return np.clip(out, 0, 1)
 
 
-def read_photo(frame: Frame) -> np.ndarray:
+def read_photo(frame: PosedFrame) -> np.ndarray:
     """The pixels of `read_image` as the camera of ``frame`` describes them.
 
     A photo whose EXIF orientation says that it is to be turned is turned where the camera's width and height are those
@@ -243,7 +243,7 @@ def _depth_channel(channels: dict[str, np.ndarray], path: Path) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class View:
+class PhotoView:
     """One picture with its camera.
 
     ``pixels``: (h, w, 3) or (h, w, 4), sRGB as stored, alpha straight (not premultiplied): uint8, uint16 or floats in
@@ -282,7 +282,7 @@ class View:
         return color[..., :3] * alpha + (1 - alpha) * background
 
 
-def split_holdout(frames: list[Frame], every: int) -> tuple[list[Frame], list[Frame]]:
+def split_holdout(frames: list[PosedFrame], every: int) -> tuple[list[PosedFrame], list[PosedFrame]]:
     """Training and held-out frames: every ``every``-th of ``frames`` (sorted by file name), the first
     included, is held out; 0 holds none out."""
     if every < 0 or every == 1:
@@ -297,8 +297,8 @@ def split_holdout(frames: list[Frame], every: int) -> tuple[list[Frame], list[Fr
 
 
 def load_usable(
-    frames: list[Frame], width: int | None = None, downscale: float | None = None, depth: bool = False
-) -> tuple[list[View], list[Unused]]:
+    frames: list[PosedFrame], width: int | None = None, downscale: float | None = None, depth: bool = False
+) -> tuple[list[PhotoView], list[Unused]]:
     """`load_view` of all ``frames``, and those for which it failed."""
     check_size(width, downscale)
     views, unused = [], []
@@ -320,7 +320,9 @@ def check_size(width: int | None, downscale: float | None) -> None:
         raise NergError(f"downscale must be at least 1, got {downscale}")
 
 
-def load_view(frame: Frame, width: int | None = None, downscale: float | None = None, depth: bool = False) -> View:
+def load_view(
+    frame: PosedFrame, width: int | None = None, downscale: float | None = None, depth: bool = False
+) -> PhotoView:
     """Load ``frame`` at its own size, at ``width`` pixels, or divided by ``downscale``.
 
     Pictures are averaged over the area of the new pixels, on their stored (sRGB) values, as other
@@ -351,11 +353,11 @@ def load_view(frame: Frame, width: int | None = None, downscale: float | None = 
     if pixels.dtype == np.float32:
         # 16 bits tell more than the photo and take half the room.
         pixels = np.round(pixels * 65535).astype(np.uint16)
-    return View(frame.name, Camera(intrinsics, frame.to_world), pixels, distance, mask, left_out)
+    return PhotoView(frame.name, Camera(intrinsics, frame.to_world), pixels, distance, mask, left_out)
 
 
 def _as_floats(pixels: np.ndarray) -> np.ndarray:
-    """``pixels`` of any of the types of `View.pixels` as float32 in 0..1."""
+    """``pixels`` of any of the types of `PhotoView.pixels` as float32 in 0..1."""
     if pixels.dtype in (np.uint8, np.uint16):
         return pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
     return pixels.astype(np.float32, copy=False)
@@ -391,7 +393,7 @@ class Split:
     words for provenance."""
 
     posed: PosedImages
-    held_out: list[Frame]
+    held_out: list[PosedFrame]
     rule: str
 
 
@@ -507,7 +509,7 @@ def _test_file(source: Path) -> Path | None:
         return None
     for name in ("transforms_test.json", "transforms_val.json"):
         path = source.with_name(name)
-        if path.is_file() and path != source:
+        if path != source and is_ordinary(path, "transforms file"):
             return path
     return None
 
@@ -562,7 +564,7 @@ class Undistorted(NamedTuple):
     sensor: dict
 
 
-def undistorted(view: View) -> Undistorted:
+def undistorted(view: PhotoView) -> Undistorted:
     """``view`` as a pinhole camera of the same place, size and principal point would have taken it.
 
     The focal length stays (the mean of the two where pixels are not square), so that details keep their size at
@@ -631,7 +633,7 @@ def _forward(intrinsics: Intrinsics) -> np.ndarray:
     return cameras.rays(pixel_grid(intrinsics), intrinsics)
 
 
-def _own_mask(view: View) -> np.ndarray:
+def _own_mask(view: PhotoView) -> np.ndarray:
     return np.ones(view.shape, bool) if view.mask is None else view.mask
 
 

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import line_blocks
+from nerg_mi.files.safe_read import is_ordinary, line_blocks
 from nerg_mi.maths.coordinates import check_near_origin
 
 from .cameras import Intrinsics
@@ -24,27 +24,8 @@ from .cameras import Intrinsics
 # Poses are OpenGL camera-to-world matrices (x right, y up, z back) in the data set's own
 # coordinates and units; readers do not re-centre, scale or turn them.
 
-
-LENS_KEYS = (
-    "w",
-    "h",
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "k1",
-    "k2",
-    "p1",
-    "p2",
-    "k3",
-    "k4",
-    "k5",
-    "k6",
-    "camera_angle_x",
-    "camera_angle_y",
-    "fisheye",
-)
-"""Keys of `Frame.lens`, all floats: pixels, radians, and coefficients as `Intrinsics` has them; "fisheye" is 1 for
+LENS_KEYS = tuple("w h fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6 camera_angle_x camera_angle_y fisheye".split())
+"""Keys of `PosedFrame.lens`, all floats: pixels, radians, and coefficients as `Intrinsics` has them; "fisheye" is 1 for
 fisheye lenses."""
 
 FARTHEST = 1e12
@@ -84,10 +65,11 @@ class FileFinder:
     def find(self, name: str, what: str) -> Path:
         """The file ``name``; as it is spelled, where there is none.
 
-        Raises `NergError` for one outside of the root, and where several files differ from ``name`` by case alone.
+        Raises `NergError` for one outside of the root, for a device or a pipe, and where several files differ from
+        ``name`` by case alone.
         """
         path = inside(self.root, self.folder / name, what)
-        if path.is_file():
+        if is_ordinary(path, what):
             return path
         slashes = name.replace("\\", "/")
         inside(self.root, self.folder / slashes, what)
@@ -107,7 +89,7 @@ class FileFinder:
                     return None
                 part = names[0]
             path = path / part
-        return path if path.is_file() else None
+        return path if is_ordinary(path, what) else None
 
     def _names(self, folder: Path) -> dict[str, list[str]]:
         if folder not in self._listed:
@@ -143,7 +125,7 @@ class MaskFile:
 
 
 @dataclass(frozen=True)
-class Frame:
+class PosedFrame:
     """One posed image. ``name``: its path as the file spells it; ``to_world``: (4, 4) OpenGL camera-to-world;
     ``lens``: its camera keys, see `LENS_KEYS`; ``ignores_exif``: both are of the pixels as they are stored, whatever
     the EXIF orientation."""
@@ -221,7 +203,7 @@ class PosedImages:
 
     # The file.
     path: Path
-    frames: list[Frame]
+    frames: list[PosedFrame]
     # Frames that cannot be used.
     unused: list[Unused]
     # (2, 3) corners of the scene box, from the file, or None.
@@ -312,7 +294,7 @@ def rigid_pose(matrix: object) -> np.ndarray:
     return pose
 
 
-def settled(path: Path, frames: list[Frame], unused: list[Unused]) -> tuple[list[Frame], list[Unused]]:
+def settled(path: Path, frames: list[PosedFrame], unused: list[Unused]) -> tuple[list[PosedFrame], list[Unused]]:
     """Both in order of their names, each image file counting once. Raises `NergError` where no frame is left, and for
     cameras too far from the origin for single precision."""
     frames, repeated = drop_repeated(sorted(frames, key=lambda f: f.name))
@@ -323,9 +305,9 @@ def settled(path: Path, frames: list[Frame], unused: list[Unused]) -> tuple[list
     return frames, unused
 
 
-def drop_repeated(frames: list[Frame]) -> tuple[list[Frame], list[Unused]]:
+def drop_repeated(frames: list[PosedFrame]) -> tuple[list[PosedFrame], list[Unused]]:
     """``frames`` with each image file once, and what was said about it again."""
-    first: dict[Path, Frame] = {}
+    first: dict[Path, PosedFrame] = {}
     kept, unused = [], []
     for frame in frames:
         key = frame.image.resolve()
@@ -352,7 +334,6 @@ def _none_usable(path: Path, unused: list[Unused]) -> NergError:
 # ---- Semidense ----
 #
 # Semi-dense points of Project Aria: what the glasses saw of a place, in the world of the recording's trajectory.
-
 
 INV_DIST_STD, DIST_STD = 0.005, 0.01
 """Points whose inverse distance (1/m) and distance (m) are known less well are left out, as in Aria's own tools."""

@@ -16,7 +16,7 @@ from . import cameras
 from .cameras import Camera, Intrinsics, all_used, area_average, nearest, overlap
 from .colmap import find_source
 from .images import open_bitmap, read_mask, read_photo, read_posed
-from .posed import Frame, MaskFile, inside
+from .posed import MaskFile, PosedFrame, inside
 
 # ---- Solid angles of a picture's pixels, whatever the lens ----
 #
@@ -105,7 +105,6 @@ def spectral_residual(photo: np.ndarray, width: int = WIDTH) -> np.ndarray:
 # A salience image says how the gaze of somebody at the camera's centre is shared among the pixels, and nothing about
 # what lies outside the picture: with the share s_i of pixel i and its solid angle dω_i, the density there is s_i / dω_i
 # / Σ s, in 1/sr, given that the picture is looked at.
-
 
 SUFFIXES = (".png", ".exr", ".npy")
 PER = ("pixel", "steradian")
@@ -286,7 +285,7 @@ def _stored(path: Path) -> np.ndarray:
     return np.array(bitmap)
 
 
-def _files(folder: Path, frames: list[Frame], allow_outside: bool) -> tuple[dict[str, Path], list[str]]:
+def _files(folder: Path, frames: list[PosedFrame], allow_outside: bool) -> tuple[dict[str, Path], list[str]]:
     """The file of each frame that has one, and names of the others."""
     if not folder.is_dir():
         raise MissingFile(
@@ -314,7 +313,7 @@ def _files(folder: Path, frames: list[Frame], allow_outside: bool) -> tuple[dict
     return out, [p.name for stem, p in found.items() if stem not in owner]
 
 
-def _view(frame: Frame, path: Path | None, model, per: str) -> SalienceView:
+def _view(frame: PosedFrame, path: Path | None, model, per: str) -> SalienceView:
     if path is None:
         photo = read_photo(frame)
         size = photo.shape[1::-1]
@@ -352,14 +351,14 @@ def _opaque(photo: np.ndarray) -> np.ndarray:
     return photo if photo.shape[2] == 3 else photo[..., :3] * photo[..., 3:]
 
 
-def _photo_size(frame: Frame) -> tuple[int, int]:
+def _photo_size(frame: PosedFrame) -> tuple[int, int]:
     """Width and height: what the camera says, or else the file."""
     if "w" in frame.lens and "h" in frame.lens:
         return round(frame.lens["w"]), round(frame.lens["h"])
     return read_photo(frame).shape[1::-1]
 
 
-def _unmasked(frame: Frame, file: MaskFile, intrinsics: Intrinsics) -> np.ndarray:
+def _unmasked(frame: PosedFrame, file: MaskFile, intrinsics: Intrinsics) -> np.ndarray:
     """Which pixels of a map are known altogether, by the mask ``file`` of its ``frame``."""
     mask = read_mask(file, read_photo(frame).shape[:2])
     width, height = min(intrinsics.width, mask.shape[1]), min(intrinsics.height, mask.shape[0])

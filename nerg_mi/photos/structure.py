@@ -1,5 +1,5 @@
-"""Structure from motion, as seen from outside: which photos can be used, which are compared, the process that
-reconstructs, and how far its poses are from others."""
+"""Structure from motion, as seen from outside: which photos can be used, which are compared, and the process that
+reconstructs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -29,65 +29,6 @@ from nerg_mi.files.safe_read import read_bytes, reading
 
 from .colmap import Up
 from .posed import Unused, inside
-
-# ---- How far poses are from others of the same pictures, whatever coordinates both are in ----
-
-
-@dataclass(frozen=True)
-class PoseErrors:
-    """``rotation``: (N,) degrees; ``scatter``: (N,) degrees that are left without the turn that all cameras have in
-    common, in their own frames, as where one lens has another principal point; ``position``: (N,), as shares of the
-    extent of the reference's cameras, which is their largest distance from their mean; ``similarity``: (4, 4), from
-    the poses' coordinates to the reference's."""
-
-    rotation: np.ndarray
-    scatter: np.ndarray
-    position: np.ndarray
-    similarity: np.ndarray
-
-
-def fit_similarity(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """The similarity (4, 4) that takes ``points`` (N, 3) closest to ``targets`` (N, 3), by least squares.
-
-    S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991. Raises
-    ``ValueError`` for less than three points, or points on a line, which leave it open.
-    """
-    if len(points) < 3 or points.shape != targets.shape:
-        raise ValueError(f"a similarity needs 3 pairs of points or more, got {len(points)} and {len(targets)}")
-    a, b = points - points.mean(axis=0), targets - targets.mean(axis=0)
-    u, s, vt = np.linalg.svd(b.T @ a)
-    if s[1] <= 1e-9 * s[0]:
-        raise ValueError("the points lie on a line, around which anything can be turned")
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * sign) @ vt
-    scale = float(s @ sign / np.sum(a * a))
-    out = np.eye(4)
-    out[:3, :3] = scale * rotation
-    out[:3, 3] = targets.mean(axis=0) - scale * rotation @ points.mean(axis=0)
-    return out
-
-
-def pose_errors(found: np.ndarray, reference: np.ndarray) -> PoseErrors:
-    """Errors of the camera-to-world poses ``found`` (N, 4, 4) against ``reference`` (N, 4, 4), after the similarity
-    that fits their positions best."""
-    similarity = fit_similarity(found[:, :3, 3], reference[:, :3, 3])
-    scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
-    apart = np.swapaxes(reference[:, :3, :3], 1, 2) @ (similarity[:3, :3] / scale) @ found[:, :3, :3]
-    # The rotation nearest to their mean.
-    u, _, vt = np.linalg.svd(apart.mean(axis=0))
-    common = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    moved = found[:, :3, 3] @ similarity[:3, :3].T + similarity[:3, 3]
-    centers = reference[:, :3, 3]
-    extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    position = np.linalg.norm(moved - centers, axis=1) / extent
-    return PoseErrors(_degrees(apart), _degrees(apart @ common.T), position, similarity)
-
-
-def _degrees(rotations: np.ndarray) -> np.ndarray:
-    """Angles (N,) of ``rotations`` (N, 3, 3): by the sine of the half, which is exact where they are small."""
-    half = np.linalg.norm(rotations - np.eye(3), axis=(1, 2)) / np.sqrt(8)
-    return np.degrees(2 * np.arcsin(np.clip(half, 0, 1)))
-
 
 # ---- Which pictures are compared with which ----
 
@@ -117,16 +58,14 @@ def chosen_pairs(count: int, matching: str = "auto") -> list[tuple[int, int]]:
 #
 # Pictures as structure from motion takes them: upright copies for the capture, small ones to find features in.
 
-
-SIDE = 65_500
-"""Longest side of a picture in pixels: that of a JPEG file."""
+SIDE = 65_500  # longest side of a picture in pixels: that of a JPEG file
 
 # As good as telephones write them; colours are not stored more coarsely than brightness.
 _JPEG = dict(format="JPEG", quality=95, subsampling=0)
 
 
 @dataclass(frozen=True)
-class Picture:
+class PhotoCopy:
     """A picture of the capture. ``name``: its file in ``images/``; ``size``, ``small``: width and height of it and of
     the copy that features are found in, in pixels; ``made_by``: what else pictures of one camera have in common (its
     maker, model and focal length, as far as it is told); ``focal``: focal length in pixels of ``size``, None where it
@@ -183,7 +122,7 @@ def shrunk(image: Any, size: tuple[int, int]) -> bytes:
     return out.getvalue()
 
 
-def cameras_of(pictures: Iterable[Picture], share: bool = True) -> list[int]:
+def cameras_of(pictures: Iterable[PhotoCopy], share: bool = True) -> list[int]:
     """Number, from 0, of the camera of each picture: those of equal size, maker, model and focal length ``share`` one.
 
     A telephone held upright and held across has two: each with its principal point at the centre of its pictures.
@@ -199,9 +138,7 @@ def cameras_of(pictures: Iterable[Picture], share: bool = True) -> list[int]:
 #
 # A folder of photos: which can be used, copied as they are to be looked at.
 
-
-SUFFIXES = (".jpg", ".jpeg", ".png")
-"""Of the files that are taken for photos, in small letters."""
+SUFFIXES = (".jpg", ".jpeg", ".png")  # of the files that are taken for photos, in small letters
 
 # Pictures that a camera writes and that are not read here: to be named, not passed over.
 _OTHERS = (".heic", ".heif", ".tif", ".tiff", ".webp", ".dng", ".raw", ".cr2", ".nef", ".arw", ".avif", ".exr", ".bmp")
@@ -211,10 +148,8 @@ _FOCAL, _FOCAL_AS_35 = 0x920A, 0xA405
 _DIAGONAL_35 = 43.267
 # So many pixels a photo may have that its bytes do not warrant, and so many bytes: those of large panoramas.
 _PIXELS, _BYTES = 1 << 26, 1 << 28
-# EXIF orientation -> what makes it upright, as Pillow calls it.
-_TURNS = dict(
-    zip(range(2, 9), "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90".split())
-)
+# What makes pictures of the EXIF orientations 2 to 8 upright, as Pillow calls it.
+_TURNS = "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSVERSE ROTATE_90".split()
 # Modes of Pillow whose files other programs read as they are.
 _KEPT = ("L", "RGB", "RGBA", "I;16")
 
@@ -223,7 +158,7 @@ def list_photos(folder: str | Path) -> tuple[list[Path], list[Unused]]:
     """Photos directly in ``folder``, by name, and pictures of other kinds. `NergError` where there is no photo."""
     folder = Path(folder)
     with reading(folder, "folder of photos"):
-        files = sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+        files = sorted(p for p in folder.iterdir() if not (p.is_dir() or p.name.startswith(".")))
     photos = [p for p in files if p.suffix.lower() in SUFFIXES]
     others = [
         Unused(p.name, "only JPEG and PNG photos are read; convert it") for p in files if p.suffix.lower() in _OTHERS
@@ -246,14 +181,14 @@ def copy_photos(
     longest: int,
     progress: Callable[[int, int], None],
     allow_outside: bool = False,
-) -> tuple[list[Picture], list[Unused]]:
+) -> tuple[list[PhotoCopy], list[Unused]]:
     """Copy each of the ``photos`` to ``folders``, turned as its EXIF orientation says, and those that cannot be used.
 
     A photo that stands upright as it is stored is copied byte for byte; another is stored anew, a JPEG at quality 95, a
     PNG in 8 bits. ``longest``: side of the small copies in pixels. ``progress(done, of)`` is told after each.
     ``allow_outside``: follow links that lead out of the photos' folder.
     """
-    pictures: list[Picture] = []
+    pictures: list[PhotoCopy] = []
     unused: list[Unused] = []
     seen: dict[str, str] = {}
     for k, path in enumerate(photos):
@@ -269,7 +204,7 @@ def copy_photos(
 
 def _copied(
     path: Path, folders: Folders, index: int, longest: int, seen: dict[str, str], allow_outside: bool
-) -> Picture:
+) -> PhotoCopy:
     """``seen``: names of the photos before by their content, to which this one is added."""
     photo = read_photo(path if allow_outside else inside(path.parent, path, "photo"))
     image, name = photo.image, path.name
@@ -281,7 +216,7 @@ def _copied(
     small = small_size(size, longest)
     write_bytes(folders.small / small_name(index), shrunk(image, small))
     focal = photo.as_35 / _DIAGONAL_35 * float((size[0] ** 2 + size[1] ** 2) ** 0.5) if photo.as_35 else None
-    return Picture(name, size, small, photo.made_by, focal)
+    return PhotoCopy(name, size, small, photo.made_by, focal)
 
 
 @dataclass(frozen=True)
@@ -299,6 +234,7 @@ class Photo:
 
 def read_photo(path: Path) -> Photo:
     """The photo ``path``; `NergError` for what is none, is damaged, or claims more pixels than its bytes warrant."""
+    from PIL.Image import Transpose
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.PngImagePlugin import PngImageFile
 
@@ -317,9 +253,9 @@ def read_photo(path: Path) -> Photo:
         image = (JpegImageFile if kind == "jpeg" else PngImageFile)(io.BytesIO(raw))
         image.load()
         orientation, made_by, as_35 = _notes(image)
-        turn = _TURNS.get(orientation)
-        upright = image if turn is None else image.transpose(_transpose(turn))
-    return Photo(raw, upright, turn is None and image.mode in _KEPT, made_by, as_35)
+        is_turned = 2 <= orientation <= 8
+        upright = image.transpose(Transpose[_TURNS[orientation - 2]]) if is_turned else image
+    return Photo(raw, upright, not is_turned and image.mode in _KEPT, made_by, as_35)
 
 
 def _notes(image: Any) -> tuple[int, tuple, float | None]:
@@ -335,16 +271,9 @@ def _notes(image: Any) -> tuple[int, tuple, float | None]:
     return orientation, made_by, as_35 if 5 <= as_35 <= 2000 else None
 
 
-def _transpose(name: str) -> Any:
-    from PIL import Image
-
-    return Image.Transpose[name]
-
-
 # ---- Reconstruction ----
 #
 # Structure from motion, as seen from outside: starts the process of `worker`, listens, and reads what it found.
-
 
 LENSES = {"auto": None, "radial": "SIMPLE_RADIAL", "opencv": "OPENCV"}
 """Names of lenses -> COLMAP's model that is refined; auto: by how many pictures a camera has."""
@@ -388,7 +317,7 @@ def check_installed() -> None:
 
 
 def reconstruct(
-    pictures: list[Picture], work: Path, settings: Settings, progress: Callable[[str, int, int], None]
+    pictures: list[PhotoCopy], work: Path, settings: Settings, progress: Callable[[str, int, int], None]
 ) -> Reconstruction | None:
     """Find the poses of ``pictures``, whose small copies lie in ``work``/small; None where no three fit together.
 
@@ -418,7 +347,7 @@ def reconstruct(
     )
 
 
-def _job(pictures: list[Picture], settings: Settings) -> dict[str, Any]:
+def _job(pictures: list[PhotoCopy], settings: Settings) -> dict[str, Any]:
     numbers = cameras_of(pictures, settings.share)
     cameras = []
     for number in range(max(numbers) + 1):
@@ -433,12 +362,10 @@ def _job(pictures: list[Picture], settings: Settings) -> dict[str, Any]:
             }
         )
     return {
+        **asdict(settings),
         "pictures": [{"name": p.name, "camera": n} for p, n in zip(pictures, numbers)],
         "cameras": cameras,
         "lens": LENSES[settings.lens],
-        "matching": settings.matching,
-        "orient": settings.orient,
-        "seed": settings.seed,
         "threads": settings.threads or -1,
     }
 

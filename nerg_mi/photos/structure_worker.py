@@ -23,8 +23,7 @@ import numpy as np
 from .colmap import find_up, turn_to_z
 from .structure import chosen_pairs, small_name
 
-SMALLEST = 3
-"""So many pictures a model needs: two of them tell a place from one that is bent."""
+SMALLEST = 3  # so many pictures a model needs: two of them tell a place from one that is bent
 
 # Cameras with so many pictures have all parameters of OpenCV's lens refined, others a focal length and one radial term.
 _MANY = 10

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError, plain, sentence
-from nerg_mi.files.safe_read import JSON_BYTES, parse_json, read_bytes
+from nerg_mi.files.safe_read import JSON_BYTES, is_ordinary, parse_json, read_bytes
 
 from .cameras import OPENGL_FROM_MITSUBA
 from .posed import (
@@ -29,8 +29,8 @@ from .posed import (
     LENS_KEYS,
     DepthFile,
     FileFinder,
-    Frame,
     MaskFile,
+    PosedFrame,
     PosedImages,
     Unused,
     fold_name,
@@ -233,7 +233,7 @@ def _pose(data: dict) -> np.ndarray:
 
 def _frame(
     data: dict, entry: dict, finder: FileFinder, name: str, image: Path, metre: float, notes: list[str]
-) -> Frame:
+) -> PosedFrame:
     """One frame; ``data``: its keys over those of the file."""
     if not image.is_file():
         raise NergError("its image does not exist")
@@ -244,7 +244,7 @@ def _frame(
     if depth is not None and not depth.path.is_file():
         notes.append(f'"{plain(name)}" is used without depth: its depth file "{plain(depth.path)}" does not exist')
         depth = None
-    return Frame(name, image, pose, lens, depth, mask)
+    return PosedFrame(name, image, pose, lens, depth, mask)
 
 
 def _image_file(finder: FileFinder, name: str) -> Path:
@@ -262,7 +262,7 @@ def _mask(entry: dict, finder: FileFinder, image: Path) -> MaskFile | None:
             )
         return MaskFile(mask)
     dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")
-    return MaskFile(inside(finder.root, dynamic, "mask"), hides=True) if dynamic.is_file() else None
+    return MaskFile(inside(finder.root, dynamic, "mask"), hides=True) if is_ordinary(dynamic, "mask") else None
 
 
 def _depth(data: dict, entry: dict, finder: FileFinder, metre: float) -> DepthFile | None:
@@ -367,7 +367,7 @@ def _rigid(m: np.ndarray) -> bool:
     return bool(np.abs(m[:3, :3] @ m[:3, :3].T - np.eye(3)).max() < 1e-3 and np.linalg.det(m[:3, :3]) > 0)
 
 
-def _splits(data: dict, frames: list[Frame]) -> tuple[list[str] | None, list[str]]:
+def _splits(data: dict, frames: list[PosedFrame]) -> tuple[list[str] | None, list[str]]:
     """Held-out and spare frames by nerfstudio's lists of file names."""
     listed = {
         k: {fold_name(x) for x in data[f"{k}_filenames"] if isinstance(x, str)}

@@ -11,12 +11,12 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, import_extra
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.safe_read import reading, size_of
 from nerg_mi.files.video import check_movie
 
-from .structure import SIDE, SUFFIXES, Folders, Picture, encoded, shrunk, small_name, small_size
+from .structure import SIDE, SUFFIXES, Folders, PhotoCopy, encoded, shrunk, small_name, small_size
 
 FORMATS = ("mov", "matroska", "avi", "mpegts", "mpeg", "asf")
 """Kinds of files, as FFmpeg calls them, that are taken for videos: of .mp4 and .mov; .mkv and .webm; .avi; .mts; .mpg;
@@ -64,7 +64,7 @@ def copy_frames(
     longest: int,
     threads: int | None,
     progress: Callable[[int, int], None],
-) -> list[Picture]:
+) -> list[PhotoCopy]:
     """Copy ``count`` frames of a video, at most, to ``folders``: as JPEG at quality 95, turned as it is to be shown.
 
     Each is named by its number among all frames of the video, as ``nerg rays import --frames "frame_{frame1}"`` counts.
@@ -73,14 +73,14 @@ def copy_frames(
     """
     from PIL import Image
 
-    pictures: list[Picture] = []
+    pictures: list[PhotoCopy] = []
     for frame in sharpest_frames(video, count, threads):
         image = Image.fromarray(frame.pixels)
         name = f"frame_{frame.number:06d}.jpg"
         write_bytes(folders.images / name, encoded(image, ".jpg"))
         small = small_size(image.size, longest)
         write_bytes(folders.small / small_name(len(pictures)), shrunk(image, small))
-        pictures.append(Picture(name, image.size, small, seconds=frame.seconds))
+        pictures.append(PhotoCopy(name, image.size, small, seconds=frame.seconds))
         progress(len(pictures), count)
     return pictures
 
@@ -119,11 +119,7 @@ def sharpest_frames(video: str | Path, count: int, threads: int | None = None) -
 
 
 def _pyav() -> Any:
-    try:
-        import av
-    except ImportError:
-        raise ImportError('frames of a video need PyAV, which is not installed: pip install "nerg-mi[poses]"') from None
-    return av
+    return import_extra("av", "frames of a video need PyAV", "poses")
 
 
 @contextmanager

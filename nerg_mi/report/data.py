@@ -24,7 +24,7 @@ from nerg_mi.rays.quality import RaysSummary
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.statistics.shares import Look, Shares
-from nerg_mi.statistics.visits import Landed, Thing, land, regroup
+from nerg_mi.statistics.visits import Aoi, HitAssignment, land, regroup
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place, default_settings, trace_depth
@@ -120,10 +120,10 @@ def land_rays(
     place: GazePlace,
     onlooker: Onlooker,
     most: int,
-    things: Sequence[Thing],
+    things: Sequence[Aoi],
     members: Sequence[tuple[int, ...]],
     margin: float,
-) -> tuple[Landed, np.ndarray]:
+) -> tuple[HitAssignment, np.ndarray]:
     """What up to ``most`` of the ``rays``, evenly chosen, are on of objects that consist of ``things`` by their
     numbers, ``members``, and whose each is (N,). Rays end at their own hit points, or else at what they meet in the
     place. ``margin``: as of `visits.land`."""
@@ -243,7 +243,7 @@ class ObjectAttention:
 
 
 def attention_on(
-    names: Sequence[str], shares: Shares, who: np.ndarray, recorded: tuple[Landed, np.ndarray] | None = None
+    names: Sequence[str], shares: Shares, who: np.ndarray, recorded: tuple[HitAssignment, np.ndarray] | None = None
 ) -> tuple[ObjectAttention, ...]:
     """Attention on each of the objects called ``names``, by the ``shares`` of eyes, which are those of ``who`` (P,).
 

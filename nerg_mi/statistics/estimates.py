@@ -9,8 +9,7 @@ import numpy as np
 
 # ---- Numbers with their 95 % intervals, their differences, and which of many differences are found ----
 
-LEAST_PEOPLE = 3
-"""Fewer people than these, or than these who add anything to a number, give no interval."""
+LEAST_PEOPLE = 3  # fewer people than these, or than these who add anything to a number, give no interval
 
 
 @dataclass(frozen=True)
@@ -64,16 +63,10 @@ def adjusted(p: np.ndarray) -> np.ndarray:
 # that of Student's t of n - 1 degrees of freedom, n = (Σ j²)² / Σ j⁴ the effective number of people (Kish 1965, section
 # 8.2) of what each one adds to the jackknife's error, j_p.
 
-
-RESAMPLES = 1999
-"""Draws of people."""
-
-TOWARDS = 0.01
-"""λ."""
-
+RESAMPLES = 1999  # draws of participants
+TOWARDS = 0.01  # λ
 _HELD = 0.95
 _BLOCK = 1 << 22
-
 Pair = tuple[np.ndarray, np.ndarray]
 
 
@@ -217,7 +210,6 @@ def _quantile(t: np.ndarray, error: np.ndarray) -> np.ndarray:
 # others (Agresti and Caffo 2000), and of the same ones, where the two that are added are of opposite outcomes (Bonett
 # and Price 2012). Of people some of whom are of both, these two are their covariance's ends. Interval and p-value are
 # of one statistic: p < 0.05 where 0 is outside.
-
 
 _ALPHA = 0.05
 _Z = 1.959963984540054

@@ -10,16 +10,16 @@ from typing import Any, overload
 import numpy as np
 
 from .estimates import Estimates, adjusted, proportion_differences, proportions, ratio_differences, ratios
-from .visits import ALL, BINS, Cell, Sums
+from .visits import ALL, BINS, Cell, VisitSums
 
 # ---- The numbers that are told of things, each a ratio of sums over people (`intervals`) ----
 
 
 @dataclass(frozen=True, eq=False)
-class People:
+class Participants:
     """The sums of P people in one cell.
 
-    ``names``, sorted; ``time`` (P,) seconds; the others (P, A), as `Sums` has them. ``looks``, ``first_sum`` and
+    ``names``, sorted; ``time`` (P,) seconds; the others (P, A), as `VisitSums` has them. ``looks``, ``first_sum`` and
     ``first_count`` are None where nobody was tracked, as a field does not tell them; ``reached``: how probable it is
     that each looked at all, 0 or 1 where they were tracked; ``present`` (P,): who is of the cell, None for all.
     """
@@ -36,7 +36,7 @@ class People:
     present: np.ndarray | None = None
 
     @classmethod
-    def of(cls, sums: Sums, cell: Cell, seen: bool) -> People:
+    def of(cls, sums: VisitSums, cell: Cell, seen: bool) -> Participants:
         """Those of a cell; ``seen``: whether it is known what they could see."""
         rows, names = sums.persons_of(cell)
         return cls(
@@ -51,7 +51,7 @@ class People:
             sums.first_count[rows],
         )
 
-    def aligned(self, names: Sequence[str]) -> People:
+    def aligned(self, names: Sequence[str]) -> Participants:
         """The same with a row for each of ``names``, of whom those who are not there have nothing."""
         place = {name: k for k, name in enumerate(names)}
         to = np.array([place[name] for name in self.names], np.int64)
@@ -95,12 +95,12 @@ class Measure:
     title: str
     definition: str
     over: str
-    pair: Callable[[People], Pair | None]
+    pair: Callable[[Participants], Pair | None]
     most: float = np.inf
     counts: bool = False
     compared: bool = False
 
-    def estimate(self, people: People, resamples: int, seed: int) -> Estimates | None:
+    def estimate(self, people: Participants, resamples: int, seed: int) -> Estimates | None:
         """The number of each area, with its interval."""
         pair = self.pair(people)
         if pair is None:
@@ -110,32 +110,28 @@ class Measure:
         return proportions(x, y) if binary else ratios(x, y, resamples=resamples, seed=seed, most=self.most)
 
 
-def _share(p: People) -> Pair:
-    time = np.where(p.time > 0, p.time, 1)[:, None]
-    return np.where(p.timed, p.on_time / time, 0), np.repeat(p.timed, p.on_time.shape[1], axis=1).astype(float)
-
-
-def _visible_share(p: People) -> Pair | None:
-    if p.visible is None:
+def _share(p: Participants, seconds: np.ndarray | None) -> Pair | None:
+    """The share that ``seconds`` (P, A) are of each participant's time."""
+    if seconds is None:
         return None
     time = np.where(p.time > 0, p.time, 1)[:, None]
-    return np.where(p.timed, p.visible / time, 0), np.repeat(p.timed, p.on_time.shape[1], axis=1).astype(float)
+    return np.where(p.timed, seconds / time, 0), np.repeat(p.timed, seconds.shape[1], axis=1).astype(float)
 
 
-def _first(p: People) -> Pair | None:
+def _first(p: Participants) -> Pair | None:
     if p.first_sum is None or p.first_count is None:
         return None
     some = p.first_count > 0
     return np.where(some, p.first_sum / np.where(some, p.first_count, 1), 0), some.astype(float)
 
 
-def _returns(p: People) -> Pair | None:
+def _returns(p: Participants) -> Pair | None:
     if p.looks is None:
         return None
     return np.maximum(p.looks - 1, 0), (p.looks > 0).astype(float)
 
 
-def _unseen(p: People) -> Pair | None:
+def _unseen(p: Participants) -> Pair | None:
     if p.visible is None:
         return None
     could = (p.visible > 0).astype(float)
@@ -148,7 +144,7 @@ MEASURES = (
         title="share of time",
         definition="mean of D_pk / T_p",
         over="people with time",
-        pair=_share,
+        pair=lambda p: _share(p, p.on_time),
         most=1.0,
         compared=True,
     ),
@@ -199,7 +195,7 @@ MEASURES = (
         title="visible share",
         definition="mean of V_pk / T_p",
         over="people with time",
-        pair=_visible_share,
+        pair=lambda p: _share(p, p.visible),
         most=1.0,
     ),
     Measure(
@@ -224,7 +220,6 @@ MEASURES = (
 """All, in the order of tables."""
 
 BY_NAME = {measure.name: measure for measure in MEASURES}
-
 COMPARED = tuple(measure.name for measure in MEASURES if measure.compared)
 
 
@@ -232,21 +227,18 @@ COMPARED = tuple(measure.name for measure in MEASURES if measure.compared)
 #
 # Tables of numbers: things by cell and source, differences, moves, durations; with a floor on people.
 
-
 TRACKED, FIELD = "tracked", "field"
 """Sources of numbers: rays that were recorded, and what the gaze field foretells."""
 
 PLACES = 16
 """From so many places a person a field should be asked for their reach: from fewer it comes out too low."""
 
-MOST_VALUES = 12
-"""So many values of a dimension are compared with each other."""
-
+MOST_VALUES = 12  # so many values of a dimension are compared with each other
 Row = dict[str, Any]
 
 
 @dataclass
-class Floor:
+class MinParticipantsFilter:
     """Blanks numbers that rest on fewer than ``least`` people, and counts those that were."""
 
     least: int = 1
@@ -261,7 +253,12 @@ class Floor:
 
 
 def thing_rows(
-    areas: Sequence[str], cells: Mapping[Cell, Mapping[str, People]], floor: Floor, *, resamples: int, seed: int
+    areas: Sequence[str],
+    cells: Mapping[Cell, Mapping[str, Participants]],
+    floor: MinParticipantsFilter,
+    *,
+    resamples: int,
+    seed: int,
 ) -> list[Row]:
     """A row for each cell, area and source: ``people`` in the cell, and of each measure its value, ``_low``, ``_high``
     and ``_people``, None where it is not known or blanked."""
@@ -291,8 +288,8 @@ def _number(value: float) -> float | None:
 
 def difference_rows(
     areas: Sequence[str],
-    cells: Mapping[Cell, Mapping[str, People]],
-    floor: Floor,
+    cells: Mapping[Cell, Mapping[str, Participants]],
+    floor: MinParticipantsFilter,
     *,
     source: str = TRACKED,
     resamples: int,
@@ -327,8 +324,8 @@ def _differences(
     dimension: str,
     values: tuple[str, str],
     measure: Measure,
-    people: tuple[People, People],
-    floor: Floor,
+    people: tuple[Participants, Participants],
+    floor: MinParticipantsFilter,
     resamples: int,
     seed: int,
 ) -> list[Row]:
@@ -350,7 +347,7 @@ def _differences(
     return rows
 
 
-def move_rows(sums: Sums, floor: Floor) -> list[Row]:
+def move_rows(sums: VisitSums, floor: MinParticipantsFilter) -> list[Row]:
     """Moves between things of each cell: ``from``, ``to``, how many ``moves``, and their ``share`` of those from
     there."""
     rows = []
@@ -365,7 +362,7 @@ def move_rows(sums: Sums, floor: Floor) -> list[Row]:
     return rows
 
 
-def duration_rows(sums: Sums, floor: Floor) -> list[Row]:
+def duration_rows(sums: VisitSums, floor: MinParticipantsFilter) -> list[Row]:
     """How many looks at each area last how long, of each cell; `BINS` in seconds."""
     rows = []
     names = [f"{a:g} to {b:g} s" if np.isfinite(b) else f"{a:g} s or more" for a, b in zip(BINS[:-1], BINS[1:])]
@@ -416,7 +413,7 @@ class PersonRows(Sequence[Row]):
 
     columns = ("person", "thing", "time", "rays", "dwell", "looks", "first_look", "visible")
 
-    def __init__(self, sums: Sums, names: Mapping[str, str], seen: bool):
+    def __init__(self, sums: VisitSums, names: Mapping[str, str], seen: bool):
         rows, persons = sums.persons_of(ALL)
         self._of = sorted((names[person], r) for person, r in zip(persons, rows.tolist()))
         self._sums, self._seen = sums, seen

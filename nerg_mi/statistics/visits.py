@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import box_interval
+from nerg_mi.maths.vmf import tangents
 from nerg_mi.ranges import SECONDS, check_number
 from nerg_mi.rays.filters import person_order
 from nerg_mi.rays.rays import Rays
@@ -26,12 +27,10 @@ from nerg_mi.rays.rays import Rays
 # depth + margin. Where no surfaces are known, things are solid: one hides another that the ray enters after it has left
 # the first; things that overlap along the ray both have the look.
 
-
-MARGIN = 0.03
-"""In metres: of surfaces that are known as exactly as a radiance field has them."""
+MARGIN = 0.03  # in metres: of surfaces that are known as exactly as a radiance field has them
 
 
-class Thing(Protocol):
+class Aoi(Protocol):
     """What can be looked at, in the coordinates of the place."""
 
     @property
@@ -65,7 +64,7 @@ class Thing(Protocol):
 
 
 @dataclass(frozen=True)
-class Box:
+class BoxAoi:
     """A box, upright or turned."""
 
     region: Region
@@ -113,7 +112,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Landed:
+class HitAssignment:
     """What N rays land on, thing by thing: the ``rows`` of those that are on it, and at which ``distance`` each enters
     it, or from within meets the surface there."""
 
@@ -130,13 +129,13 @@ class Landed:
 
 
 def land(
-    things: Sequence[Thing],
+    things: Sequence[Aoi],
     o: np.ndarray,
     d: np.ndarray,
     depth: np.ndarray | None,
     margin: float = 0.0,
     among: Sequence[np.ndarray] | None = None,
-) -> Landed:
+) -> HitAssignment:
     """What rays (N, 3) with unit directions land on.
 
     ``depth`` (N,): of the surface that each meets, infinite where it meets none; None: no surfaces are known.
@@ -158,10 +157,10 @@ def land(
         found = np.flatnonzero(on)
         rows.append(found if among is None else among[k][found])
         distance.append(at[found].astype(np.float64))
-    return Landed(len(o), tuple(rows), tuple(distance))
+    return HitAssignment(len(o), tuple(rows), tuple(distance))
 
 
-def _land_on_solids(things: Sequence[Thing], o: np.ndarray, d: np.ndarray, margin: float) -> Landed:
+def _land_on_solids(things: Sequence[Aoi], o: np.ndarray, d: np.ndarray, margin: float) -> HitAssignment:
     """What rays land on where nothing is known but the things."""
     spans = [thing.interval(o, d) for thing in things]
     entered = [
@@ -171,10 +170,10 @@ def _land_on_solids(things: Sequence[Thing], o: np.ndarray, d: np.ndarray, margi
     for (_, far), met in zip(spans, entered):
         reach = np.where(met, np.minimum(reach, far), reach)
     rows = [np.flatnonzero(met & (near <= reach + margin)) for (near, _), met in zip(spans, entered)]
-    return Landed(len(o), tuple(rows), tuple(near[r].astype(np.float64) for (near, _), r in zip(spans, rows)))
+    return HitAssignment(len(o), tuple(rows), tuple(near[r].astype(np.float64) for (near, _), r in zip(spans, rows)))
 
 
-def regroup(landed: Landed, members: Sequence[tuple[int, ...]]) -> Landed:
+def regroup(landed: HitAssignment, members: Sequence[tuple[int, ...]]) -> HitAssignment:
     """The same for areas that consist of some of the things each, ``members``: a ray is on an area if it is on any of
     them, at the least of their distances."""
     rows, distance = [], []
@@ -189,10 +188,10 @@ def regroup(landed: Landed, members: Sequence[tuple[int, ...]]) -> Landed:
         found, first = np.unique(every[order], return_index=True)
         rows.append(found)
         distance.append(far[order][first])
-    return Landed(landed.count, tuple(rows), tuple(distance))
+    return HitAssignment(landed.count, tuple(rows), tuple(distance))
 
 
-def unite(parts: Sequence[Landed]) -> Landed:
+def unite(parts: Sequence[HitAssignment]) -> HitAssignment:
     """What the same rays land on in any of several ways, such as the directions of a cone: of each thing the union of
     the rays, with the distance of the first way that has it."""
     count, things = parts[0].count, len(parts[0].rows)
@@ -203,28 +202,23 @@ def unite(parts: Sequence[Landed]) -> Landed:
         found, first = np.unique(every, return_index=True)
         rows.append(found)
         distance.append(far[first])
-    return Landed(count, tuple(rows), tuple(distance))
+    return HitAssignment(count, tuple(rows), tuple(distance))
 
 
-def concatenate(parts: Sequence[Landed]) -> Landed:
+def concatenate(parts: Sequence[HitAssignment]) -> HitAssignment:
     """What rays land on that follow each other."""
     starts = np.cumsum([0, *(part.count for part in parts)])
     things = len(parts[0].rows)
     rows = [np.concatenate([part.rows[k] + a for part, a in zip(parts, starts)]) for k in range(things)]
     distance = [np.concatenate([part.distance[k] for part in parts]) for k in range(things)]
-    return Landed(int(starts[-1]), tuple(rows), tuple(distance))
+    return HitAssignment(int(starts[-1]), tuple(rows), tuple(distance))
 
 
 def cone(d: np.ndarray, degrees: float, rings: Sequence[tuple[float, int]] = ((0.5, 6), (1.0, 12))) -> list[np.ndarray]:
     """Unit directions (N, 3) about each of ``d`` (N, 3), itself first, then so many evenly on each of the ``rings``
     (share of the angle ``degrees``, number): 19 directions that leave no hole wider than half of the angle."""
     d = np.asarray(d, float)
-    sign = np.where(d[:, 2] >= 0, 1.0, -1.0)
-    a = -1.0 / (sign + d[:, 2])
-    b = d[:, 0] * d[:, 1] * a
-    # Two unit vectors beside each direction (Duff et al. 2017).
-    u = np.stack([1 + sign * d[:, 0] ** 2 * a, sign * b, -sign * d[:, 0]], axis=1)
-    v = np.stack([b, sign + d[:, 1] ** 2 * a, -d[:, 1]], axis=1)
+    u, v = tangents(d)
     found = [d]
     for share, number in rings:
         angle = np.radians(degrees * share)
@@ -237,15 +231,15 @@ def cone(d: np.ndarray, degrees: float, rings: Sequence[tuple[float, int]] = ((0
 #
 # Looks: how long each ray stands for, and which rays on a thing are one look at it.
 #
-# A *sitting* is a run of a person's rays without a pause of more than `LookRules.pause`. A ray stands for the time to
-# the next of its sitting, unless that is more than `LookRules.gap` away: then, and at the end of a sitting, for the
+# A *sitting* is a run of a person's rays without a pause of more than `VisitRules.pause`. A ray stands for the time to
+# the next of its sitting, unless that is more than `VisitRules.gap` away: then, and at the end of a sitting, for the
 # sitting's usual step (the median of those that are no longer than the gap), or for none where there is no such step. A
-# *look* at a thing is a run of rays on it, in which nothing else lasts longer than `LookRules.merge`; one that lasts
-# less than `LookRules.least` from its first ray's start to its last one's end is none.
+# *look* at a thing is a run of rays on it, in which nothing else lasts longer than `VisitRules.merge`; one that lasts
+# less than `VisitRules.least` from its first ray's start to its last one's end is none.
 
 
 @dataclass(frozen=True)
-class LookRules:
+class VisitRules:
     """Times in seconds. Raises `NergError` for those that are no numbers, or negative."""
 
     gap: float = 1.0
@@ -272,7 +266,7 @@ class Timeline:
     sitting: np.ndarray
 
 
-def timeline(person: np.ndarray, t: np.ndarray, rules: LookRules) -> Timeline:
+def timeline(person: np.ndarray, t: np.ndarray, rules: VisitRules) -> Timeline:
     """That of rays in this order already. Raises ``ValueError`` where they are not, or a time is not finite."""
     if not np.isfinite(t).all():
         raise ValueError("times must be finite")
@@ -303,7 +297,7 @@ def _medians(of: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Looks:
+class Visits:
     """L looks at one thing in the order of persons and times: the row of the ``first`` ray of each, when it ``start``s
     and ``end``s."""
 
@@ -319,10 +313,10 @@ class Looks:
         return self.end - self.start
 
 
-def looks_at(rows: np.ndarray, line: Timeline, rules: LookRules) -> Looks:
+def looks_at(rows: np.ndarray, line: Timeline, rules: VisitRules) -> Visits:
     """The looks whose rays are ``rows`` of a ``line``, sorted."""
     if not len(rows):
-        return Looks(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+        return Visits(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
     start, end = line.t[rows], line.t[rows] + line.weight[rows]
     # The latest end so far: a ray that stands for long may outlast the next.
     apart = start[1:] - end[:-1] > rules.merge + 1e-9
@@ -331,7 +325,7 @@ def looks_at(rows: np.ndarray, line: Timeline, rules: LookRules) -> Looks:
     last = np.r_[first[1:], len(rows)] - 1
     lasted = end[last] - start[first]
     kept = lasted >= rules.least - 1e-9
-    return Looks(rows[first][kept], start[first][kept], end[last][kept])
+    return Visits(rows[first][kept], start[first][kept], end[last][kept])
 
 
 # ---- Sums ----
@@ -342,7 +336,6 @@ def looks_at(rows: np.ndarray, line: Timeline, rules: LookRules) -> Looks:
 # floor. A ray may be of several. `partial_sums` takes any block of rays, in any order, that holds sittings as a whole;
 # `merge` adds such sums. Added up in the same order they are the same to the bit, however the blocks were shared out;
 # memory is that of people x cells x areas, and not of rays.
-
 
 BINS = np.array([0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0, np.inf])
 """Edges of the histogram of how long looks last, in seconds."""
@@ -360,7 +353,7 @@ ALL = Cell("all", "")
 
 
 @dataclass
-class Sums:
+class VisitSums:
     """R rows, each of one person in one cell, and A areas; times in seconds, distances in metres.
 
     ``time``, ``time2`` (R,): sums of the times that rays stand for, and of their squares; ``rays``, ``sittings``.
@@ -391,7 +384,7 @@ class Sums:
     moves: np.ndarray
 
     @classmethod
-    def empty(cls, areas: Sequence[str], cells: Sequence[Cell], rows: Sequence[tuple[Cell, str]] = ()) -> Sums:
+    def empty(cls, areas: Sequence[str], cells: Sequence[Cell], rows: Sequence[tuple[Cell, str]] = ()) -> VisitSums:
         """Sums of nothing, with room for ``rows``."""
         R, A, C = len(rows), len(areas), len(cells)
         found = {name: np.zeros(R) for name in _OF_ROWS} | {name: np.zeros((R, A)) for name in _OF_AREAS}
@@ -399,11 +392,6 @@ class Sums:
         found["last"] -= np.inf
         lasted, moves = np.zeros((C, A, len(BINS) - 1)), np.zeros((C, A, A))
         return cls(tuple(areas), tuple(cells), tuple(rows), **found, lasted=lasted, moves=moves)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays."""
-        return sum(v.nbytes for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray))
 
     def persons_of(self, cell: Cell) -> tuple[np.ndarray, list[str]]:
         """The rows of a cell, and whose they are, sorted by name."""
@@ -423,10 +411,10 @@ class Total:
         self._areas, self._cells = tuple(areas), tuple(cells)
         self._place: dict[tuple[Cell, str], int] = {}
         # With room for rows that come, so that adding takes as long as what is added.
-        self._room = Sums.empty(areas, cells)
+        self._room = VisitSums.empty(areas, cells)
         self._held = 0
 
-    def add(self, part: Sums) -> None:
+    def add(self, part: VisitSums) -> None:
         """Add ``part``. Raises ``ValueError`` where its areas or cells are others."""
         if (part.areas, part.cells) != (self._areas, self._cells):
             raise ValueError("sums of other areas or cells cannot be added")
@@ -443,21 +431,21 @@ class Total:
         self._room.moves += part.moves
 
     def _grow(self, held: int) -> None:
-        room, known = Sums.empty(self._areas, self._cells, [(ALL, "")] * held), self._room
+        room, known = VisitSums.empty(self._areas, self._cells, [(ALL, "")] * held), self._room
         for name in (*_OF_ROWS, *_OF_AREAS):
             getattr(room, name)[: self._held] = getattr(known, name)
         room.lasted, room.moves = known.lasted, known.moves
         self._room, self._held = room, held
 
-    def sums(self) -> Sums:
+    def sums(self) -> VisitSums:
         """What has been added so far; not a copy."""
         n = len(self._place)
         arrays = {name: getattr(self._room, name)[:n] for name in (*_OF_ROWS, *_OF_AREAS)}
         made = dict(lasted=self._room.lasted, moves=self._room.moves)
-        return Sums(self._areas, self._cells, tuple(self._place), **arrays, **made)
+        return VisitSums(self._areas, self._cells, tuple(self._place), **arrays, **made)
 
 
-def merge(sums: Iterable[Sums]) -> Sums:
+def merge(sums: Iterable[VisitSums]) -> VisitSums:
     """The sum of one or more, in the order in which they are given. Raises ``ValueError`` where areas or cells
     differ."""
     total: Total | None = None
@@ -471,13 +459,13 @@ def merge(sums: Iterable[Sums]) -> Sums:
 
 def partial_sums(
     rays: Rays,
-    landed: Landed,
+    landed: HitAssignment,
     areas: Sequence[str],
     cells: Sequence[tuple[Cell, np.ndarray | None]],
-    rules: LookRules,
+    rules: VisitRules,
     visible: np.ndarray | None = None,
     movable: Sequence[int] | None = None,
-) -> Sums:
+) -> VisitSums:
     """The sums of a block of N ``rays`` that holds sittings as a whole.
 
     ``landed``: which of the ``areas`` they are on, row by row of ``rays``; ``cells``: with a mask (N,) of the rays that
@@ -496,7 +484,7 @@ def partial_sums(
         starts.append(len(keys))
         present.append(codes)
         keys += [(cell, rays.persons[code]) for code in codes]
-    out = Sums.empty(areas, [cell for cell, _ in cells], keys)
+    out = VisitSums.empty(areas, [cell for cell, _ in cells], keys)
     # Of each cell the row of each person in it.
     tables = []
     for codes, start in zip(present, starts):
@@ -531,7 +519,7 @@ def _sum_into(out: np.ndarray, rows: np.ndarray, values: np.ndarray | float = 1.
         out += np.bincount(rows, weights=weights, minlength=len(out))
 
 
-def _add_rows(out: Sums, line: Timeline, mask: np.ndarray | None, table: np.ndarray) -> np.ndarray:
+def _add_rows(out: VisitSums, line: Timeline, mask: np.ndarray | None, table: np.ndarray) -> np.ndarray:
     """What does not depend on areas; when each sitting begins in the cell, infinite where it does not come there."""
     row = table[line.person] if mask is None else table[line.person[mask]]
     weight, t, sitting = (v if mask is None else v[mask] for v in (line.weight, line.t, line.sitting))
@@ -546,7 +534,7 @@ def _add_rows(out: Sums, line: Timeline, mask: np.ndarray | None, table: np.ndar
 
 
 def _add_area(
-    out: Sums,
+    out: VisitSums,
     a: int,
     line: Timeline,
     mask: np.ndarray | None,
@@ -567,7 +555,7 @@ def _add_area(
 
 
 def _add_looks(
-    out: Sums,
+    out: VisitSums,
     a: int,
     line: Timeline,
     table: np.ndarray,
@@ -585,7 +573,7 @@ def _add_looks(
     _sum_into(out.first_count[:, a], row[which])
 
 
-def _add_moves(out: Sums, line: Timeline, masks: list, found: list, movable: Sequence[int]) -> None:
+def _add_moves(out: VisitSums, line: Timeline, masks: list, found: list, movable: Sequence[int]) -> None:
     if not len(movable):
         return
     first = np.concatenate([found[a].first for a in movable])

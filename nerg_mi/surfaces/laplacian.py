@@ -21,10 +21,7 @@ from .mesh import Mesh
 # degrees together, so that no weight of the cotangent Laplacian is negative, however long and thin triangles were.
 # Edges of one triangle, or of more than two, stay.
 
-
-ROUNDS = 2000
-"""Flips that do not touch each other are made in one round; more rounds than these are not made."""
-
+ROUNDS = 2000  # flips that do not touch each other are made in one round; more rounds than these are not made
 _WORTH = -1e-9
 
 
@@ -138,9 +135,7 @@ def _is_triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 # negative then all the same, across edges of more or fewer than two triangles, counts as 0: heat never becomes
 # negative, and nothing of it is lost, since L stays symmetric with rows that add up to 0.
 
-
-MOLLIFY = 1e-5
-"""Share of the mean length of edges by which two edges of a triangle exceed the third at least."""
+MOLLIFY = 1e-5  # share of the mean length of edges by which two edges of a triangle exceed the third at least
 
 
 def laplacian(mesh: Mesh) -> sparse.csr_array:
@@ -184,9 +179,7 @@ def _cotangents(lengths: np.ndarray) -> np.ndarray:
 # where no edge leads nothing arrives, exactly. Backwards in time a Gaussian comes out with the right variance and, to
 # the order 1/n, with longer tails.
 
-
-STEPS = 8
-"""Steps in time."""
+STEPS = 8  # steps in time
 
 
 class Smoother:
@@ -221,7 +214,7 @@ class Smoother:
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
+class SurfaceSums:
     """Attention, weighted by whom it is of, all in float64.
 
     ``face`` (F,): the integral over each face; ``vertex`` (V,): that of the attention times the hat function of each
@@ -238,13 +231,13 @@ class Sums:
     count: int = 0
 
     @classmethod
-    def none(cls, faces: int, vertices: int) -> Sums:
+    def none(cls, faces: int, vertices: int) -> SurfaceSums:
         """Nothing yet."""
         return cls(np.zeros(faces), np.zeros(vertices))
 
-    def plus(self, other: Sums) -> Sums:
+    def plus(self, other: SurfaceSums) -> SurfaceSums:
         """Both; the order in which sums are added decides their last digits."""
-        return Sums(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+        return SurfaceSums(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
     @property
     def on_surface(self) -> float:
@@ -257,7 +250,7 @@ class Sums:
         return self.total - self.on_surface - self.elsewhere - self.escaped
 
 
-def merge(parts: Iterable[Sums]) -> Sums:
+def merge(parts: Iterable[SurfaceSums]) -> SurfaceSums:
     """The sum of ``parts``, of which there is one at least, in their order."""
     parts = iter(parts)
     found = next(parts)

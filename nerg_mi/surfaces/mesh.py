@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, import_extra
 from nerg_mi.maths.arrays import aligned, vector_of
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.types import variant_types
@@ -52,11 +52,6 @@ class Mesh:
     def vertex_area(self) -> np.ndarray:
         """A third of the area of the triangles around each vertex, (V,): the integral of its hat function."""
         return np.bincount(self.faces.ravel(), np.repeat(self.area / 3, 3), len(self.vertices))
-
-    @property
-    def longest(self) -> np.ndarray:
-        """Longest edge (F,) of each triangle."""
-        return np.linalg.norm(self.corners - np.roll(self.corners, 1, axis=1), axis=2).max(axis=1)
 
     @property
     def diagonal(self) -> float:
@@ -143,8 +138,7 @@ def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 # ---- Shapes of Mitsuba scenes as triangles ----
 
-Triangles = tuple[np.ndarray, np.ndarray]
-"""Vertices (V, 3) float64 and faces (F, 3) int64."""
+Triangles = tuple[np.ndarray, np.ndarray]  # vertices (V, 3) float64 and faces (F, 3) int64
 
 
 def shape_triangles(shape: Any) -> Triangles | None:
@@ -161,13 +155,11 @@ def shape_triangles(shape: Any) -> Triangles | None:
 # edge of a neighbour: a surface stays as connected as it was. Triangles of one, two or three such edges become two,
 # three or four (Bank, Sherman, Weiser 1983, "red" and "green").
 
-
-MOST_REFINED_FACES = 8_000_000
-"""A refined mesh has so many faces at most."""
+MOST_REFINED_FACES = 8_000_000  # a refined mesh has so many faces at most
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class RefinedMesh:
     """``mesh`` cut of another: ``parent`` (F,) the face of that which each face lies in, and ``place`` (F, 3, 3), of
     each of its corners the barycentric coordinates there."""
 
@@ -176,7 +168,7 @@ class Refined:
     place: np.ndarray
 
 
-def refine(mesh: Mesh, longest: float) -> Refined:
+def refine(mesh: Mesh, longest: float) -> RefinedMesh:
     """``mesh`` with edges of at most ``longest`` scene units. Raises `NergError` for more than `MOST_REFINED_FACES`
     faces."""
     vertices, faces = mesh.vertices, mesh.faces
@@ -186,7 +178,7 @@ def refine(mesh: Mesh, longest: float) -> Refined:
         ends = vertices[edges]
         long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > longest
         if not long.any():
-            return Refined(Mesh(vertices, faces), parent, place)
+            return RefinedMesh(Mesh(vertices, faces), parent, place)
         middle = np.full(len(edges), -1)
         middle[long] = len(vertices) + np.arange(np.count_nonzero(long))
         cut = middle[of_face]
@@ -246,8 +238,7 @@ def _taken(rows: np.ndarray, triangles) -> tuple[np.ndarray, np.ndarray]:
 
 # ---- A surface among all that may hide it, as rays are cast at it ----
 
-SURFACE_OPACITY = 0.5
-"""Opacity of a medium from which on a ray ends in it."""
+SURFACE_OPACITY = 0.5  # opacity of a medium from which on a ray ends in it
 
 NEAR = 1e-5
 """What a ray meets so near before a point, as a share of the distance, does not hide it: its own face, a neighbour."""
@@ -263,7 +254,7 @@ class Ends:
     elsewhere: np.ndarray
 
 
-class Target:
+class SurfaceTarget:
     """``mesh``, which receives attention, ``others``, meshes that hide it, and a ``medium`` that both stand in, with
     ``place``, in which all of it is traced.
 
@@ -357,15 +348,9 @@ def mitsuba_mesh(vertices: np.ndarray, faces: np.ndarray, name: str, bsdf: Mappi
 #
 # A surface unrolled into a square, and values on it as a texture: charts by xatlas, an optional extra.
 
-
-GUTTER = 4
-"""Pixels by which colours go on beyond the border of a chart, for filters that look there."""
-
-TEXTURE_ROWS = 256
-"""Rows of a texture that are computed at once."""
-
-MOST_CHART_FACES = 400_000
-"""A mesh of more triangles is not unrolled."""
+GUTTER = 4  # pixels by which colours go on beyond the border of a chart, for filters that look there
+TEXTURE_ROWS = 256  # rows of a texture that are computed at once
+MOST_CHART_FACES = 400_000  # a mesh of more triangles is not unrolled
 
 
 @dataclass(frozen=True, eq=False)
@@ -380,11 +365,7 @@ class Charts:
 
 def unroller() -> Any:
     """The package xatlas; `ImportError` with the remedy where it is not installed."""
-    try:
-        import xatlas
-    except ImportError:
-        raise ImportError('a texture needs xatlas, which is not installed: pip install "nerg-mi[bake]"') from None
-    return xatlas
+    return import_extra("xatlas", "a texture needs xatlas", "bake")
 
 
 def unroll(mesh: Mesh, pixels: int) -> Charts:
@@ -419,7 +400,7 @@ def unroll(mesh: Mesh, pixels: int) -> Charts:
 
 
 def texture_rows(
-    charts: Charts, refined: Refined, values: np.ndarray, pixels: int
+    charts: Charts, refined: RefinedMesh, values: np.ndarray, pixels: int
 ) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
     """``values`` (V,) on the vertices of ``refined``, of whose whole mesh ``charts`` are, as a square texture.
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.arrays import vector_of
-from nerg_mi.maths.types import Point3f, Vector3f, variant_types
+from nerg_mi.maths.types import Float, Point3f, Vector3f, variant_types
+from nerg_mi.maths.vmf import tangents
 from nerg_mi.probes.surface_attention import Density, attended
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
@@ -22,8 +23,8 @@ from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings
 from nerg_mi.transport.observer_gaze import PlacedGaze
 
-from .laplacian import Sums, deposit, merge
-from .mesh import Mesh, Target
+from .laplacian import SurfaceSums, deposit, merge
+from .mesh import Mesh, SurfaceTarget
 
 # ---- Cones ----
 #
@@ -36,13 +37,7 @@ from .mesh import Mesh, Target
 # degree l into itself times (1 + P_l(cos 2σ)) / 2, and so keeps the integral over the sphere. Of a ray, which is a
 # point among directions, it is a bundle of rays, each of which ends at what it meets itself.
 
-
-RING = 6
-"""Directions around the middle one."""
-
-WIDEST = 30.0
-"""Degrees that a cone may measure: the tangent plane is no picture of the sphere beyond."""
-
+RING = 6  # directions around the middle one
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 
 
@@ -74,19 +69,10 @@ def bundle(directions: np.ndarray, sigma: float, count: int, rng: np.random.Gene
     # The angle of a Gaussian of two dimensions is Rayleigh's.
     angle = np.minimum(sigma * np.sqrt(-2 * np.log1p(-shell)), np.pi)
     turn = 2 * np.pi * rng.random((n, 1)) + _GOLDEN * np.arange(count)
-    side, up = _beside(directions)
+    side, up = tangents(directions)
     around = np.cos(turn)[..., None] * side[:, None] + np.sin(turn)[..., None] * up[:, None]
     out = np.cos(angle)[..., None] * directions[:, None] + np.sin(angle)[..., None] * around
     return out / np.linalg.norm(out, axis=-1, keepdims=True)
-
-
-def _beside(d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors at right angles to each of ``d`` (N, 3) and to each other (Duff et al. 2017)."""
-    sign = np.where(d[:, 2] >= 0, 1.0, -1.0)
-    a = -1.0 / (sign + d[:, 2])
-    b = d[:, 0] * d[:, 1] * a
-    first = np.stack([1 + sign * d[:, 0] ** 2 * a, sign * b, -sign * d[:, 0]], axis=1)
-    return first, np.stack([b, sign + d[:, 1] ** 2 * a, -d[:, 1]], axis=1)
 
 
 # ---- Pieces of faces that are small as an observer sees them, with their exact solid angles ----
@@ -96,12 +82,8 @@ def _beside(d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # has room for so many of them only. The solid angle of a triangle is that of A. van Oosterom and J. Strackee, "The
 # Solid Angle of a Plane Triangle" (1983); no Jacobian has to be evaluated where it is steep.
 
-
-LEVELS = 40
-"""A face is cut in four so many times at most: to 10^-12 of its size."""
-
-MOST_PIECES = 1 << 25
-"""Pieces of a mesh at most, as one observer sees it: five gigabytes."""
+LEVELS = 40  # a face is cut in four so many times at most: to 10^-12 of its size
+MOST_PIECES = 1 << 25  # pieces of a mesh at most, as one observer sees it: five gigabytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,15 +199,12 @@ def solid_angles(corners: np.ndarray) -> np.ndarray:
 # of a face, as those of shelves on walls do, falls between the same two rows of pieces everywhere, and loses up to a
 # third of a piece along all its length; halving the pieces keeps the cuts parallel to it, and the loss often as large.
 
-
-MIXED = 1e-6
-"""Of all gaze, what a piece may have at most that is seen in part."""
+MIXED = 1e-6  # of all gaze, what a piece may have at most that is seen in part
 
 WHOLE = 2e-5
 """Of all gaze, what a piece may have at most: densities narrower than a piece is are integrated too."""
 
-CUTS = 12
-"""A piece is cut so many times at most."""
+CUTS = 12  # a piece is cut so many times at most
 
 # Four points spread over a piece tell which share of it is seen. Its corners tell whether an outline passes, and
 # nothing else: those of a hidden side reach into sight wherever it meets an edge that is seen. They are looked at a
@@ -236,7 +215,7 @@ _LOOKED_AT = np.vstack([_SPREAD, _WITHIN + (1 - 3 * _WITHIN) * np.eye(3)])
 
 
 def visible_pieces(
-    target: Target, pieces: Pieces, density: Callable[[Pieces], np.ndarray], total: float, batch: int
+    target: SurfaceTarget, pieces: Pieces, density: Callable[[Pieces], np.ndarray], total: float, batch: int
 ) -> Iterator[tuple[Pieces, np.ndarray]]:
     """``pieces`` that are seen, cut where outlines pass, with the gaze (P,) that each receives.
 
@@ -260,7 +239,7 @@ def visible_pieces(
             left = left.part(cut).quartered()
 
 
-def _seen(target: Target, pieces: Pieces) -> np.ndarray:
+def _seen(target: SurfaceTarget, pieces: Pieces) -> np.ndarray:
     """Whether each of the points (P, 7) is seen at which pieces are looked at."""
     points = np.matmul(_LOOKED_AT, pieces.relative) + pieces.eye
     count = len(_LOOKED_AT)
@@ -271,9 +250,7 @@ def _seen(target: Target, pieces: Pieces) -> np.ndarray:
 #
 # Where people were, by how long: the time of each tracked ray, and a few observers that stand for all of them.
 
-
-GAP = 0.5
-"""Seconds that a ray stands for at most: nobody knows where people were while they were not tracked."""
+GAP = 0.5  # seconds that a ray stands for at most: nobody knows where people were while they were not tracked
 
 WEIGHTS = ("time", "person", "equal")
 """Whom rays count by: each by its time; so that all people count alike; each alike."""
@@ -283,7 +260,7 @@ _ROUNDS = 50
 
 
 @dataclass(frozen=True, eq=False)
-class Crowd:
+class WeightedObservers:
     """Observers at ``positions`` (M, 3), places where somebody was, with ``weights`` (M,) that add up to one. ``mean``
     and ``farthest``: distance from there of where people were, the root of its mean square and 95 % of it."""
 
@@ -316,7 +293,7 @@ def ray_weights(rays: Rays, by: str, gap: float = GAP) -> np.ndarray:
     return seconds / seconds.sum()
 
 
-def thin(positions: np.ndarray, weights: np.ndarray, count: int, seed: int = 0) -> Crowd:
+def cluster_observers(positions: np.ndarray, weights: np.ndarray, count: int, seed: int = 0) -> WeightedObservers:
     """At most ``count`` observers that stand for people who were at ``positions`` (N, 3) by ``weights`` (N,).
 
     Weighted k-means (S. Lloyd 1982) from starts that are drawn far apart (k-means++, D. Arthur, S. Vassilvitskii 2007),
@@ -347,7 +324,9 @@ def thin(positions: np.ndarray, weights: np.ndarray, count: int, seed: int = 0) 
     order = np.argsort(apart, kind="stable")
     far = apart[order][np.searchsorted(np.cumsum(weights[order]), 0.95 * weights.sum()).clip(max=len(apart) - 1)]
     kept = total > 0
-    return Crowd(standing[kept], total[kept] / total.sum(), float(np.sqrt((weights * apart**2).sum())), float(far))
+    return WeightedObservers(
+        standing[kept], total[kept] / total.sum(), float(np.sqrt((weights * apart**2).sum())), float(far)
+    )
 
 
 def _cells(positions: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -384,9 +363,7 @@ def _spread(place: np.ndarray, mass: np.ndarray, count: int, rng: np.random.Gene
 # A line ends at one point of a mesh: a thin edge loses it, and a gap lets all of it through. A cone as wide as the
 # tracker errs and the fovea sees is divided among what it meets (Martin et al., view-cone sampling, arXiv 2601.02721).
 
-
-CASTS = 1 << 20
-"""Rays that are cast in one launch."""
+CASTS = 1 << 20  # rays that are cast in one launch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -422,7 +399,7 @@ class TrackedRays:
         return TrackedRays(self.origins[rows], self.directions[rows], self.weights[rows], self.first + start)
 
 
-def ray_sums(target: Target, rays: TrackedRays, settings: RaySettings) -> Sums:
+def ray_sums(target: SurfaceTarget, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
     """What ``rays`` leave on ``target``: partial sums, which `visits.merge` adds up to those of more rays.
 
     The draws depend on the seed and on ``rays.first`` alone, so that parts that are cut alike give the same everywhere.
@@ -443,7 +420,7 @@ def ray_sums(target: Target, rays: TrackedRays, settings: RaySettings) -> Sums:
         elsewhere += float(weights[ends.elsewhere].sum())
         escaped += float(weights[~on & ~ends.elsewhere].sum())
     weight = float(rays.weights.sum())
-    return Sums(on_faces, on_vertices, elsewhere, escaped, weight, weight, len(rays))
+    return SurfaceSums(on_faces, on_vertices, elsewhere, escaped, weight, weight, len(rays))
 
 
 # ---- Sphere rule ----
@@ -456,10 +433,7 @@ def ray_sums(target: Target, rays: TrackedRays, settings: RaySettings) -> Sums:
 # axes they would be parallel to the outlines of upright things, which would fall between the same two directions
 # everywhere.
 
-
-CELLS = 1 << 14
-"""Cells of the first cut, 1.6 degrees wide: narrower densities may be missed."""
-
+CELLS = 1 << 14  # cells of the first cut, 1.6 degrees wide: narrower densities may be missed
 _FINEST = 64
 # Any turn that makes no axis of the scene lie along a ring.
 _ASKEW = np.linalg.qr(np.array([[0.61, -0.37, 0.42], [0.29, 0.83, -0.31], [-0.53, 0.17, 0.71]]))[0]
@@ -519,16 +493,12 @@ def _directions(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
 # (`sphere_rule`) tell what g adds up to and how much of it meets something else, or nothing. Both sums use other
 # points, and what they lack of each other is the error that is told.
 
-
-BATCH = 1 << 18
-"""Pieces in one launch."""
-
-FACES = 1 << 16
-"""Faces that are cut into pieces together."""
+BATCH = 1 << 18  # pieces in one launch
+FACES = 1 << 16  # faces that are cut into pieces together
 
 
 @dataclass(frozen=True, kw_only=True)
-class GazeSettings:
+class GazeSumSettings:
     """``angle``: radian under which an observer sees a piece at most; ``cone``: standard deviation in radian of the
     cone that gaze is seen through, 0 for none; ``directions`` over the sphere, about."""
 
@@ -538,7 +508,7 @@ class GazeSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Looker:
+class SurfaceObserver:
     """An observer at ``center`` (one lane): their ``density`` where they see a surface, as
     `nerg_mi.probes.surface_attention` wants it, and ``along`` directions, whatever is met there."""
 
@@ -547,27 +517,17 @@ class Looker:
     along: Callable[[Vector3f], Any]
 
 
-MakeLooker = Callable[[np.ndarray], Looker]
-"""Of an observer's position (3,)."""
+MakeObserver = Callable[[np.ndarray], SurfaceObserver]  # of an observer's position (3,)
 
 
-def lookers_of_law(law: Callable[[Vector3f], Any]) -> MakeLooker:
-    """Observers whose density depends on the direction alone: ``law`` of unit directions, in 1/sr."""
-
-    def make(eye: np.ndarray) -> Looker:
-        return Looker(_center(eye), lambda p_od, p_o, r_o, active: law(r_o), law)
-
-    return make
-
-
-def lookers_of_field(gaze: PlacedGaze, place: Place, settings: ObserverSettings) -> MakeLooker:
+def observers_from_field(gaze: PlacedGaze, place: Place, settings: ObserverSettings) -> MakeObserver:
     """Observers whose gaze is the field ``gaze`` in ``place``, traced with ``settings``."""
 
-    def make(eye: np.ndarray) -> Looker:
+    def make(eye: np.ndarray) -> SurfaceObserver:
         center = _center(eye)
         # Nobody is asked for twice, and what is known of all of them would fill the memory.
         observed = gaze.at([center], place, settings, ObserverCache())
-        return Looker(
+        return SurfaceObserver(
             center,
             lambda p_od, p_o, r_o, active: observed.evaluate(p_od, p_o, r_o, active)[0],
             lambda directions: observed.along(center, directions),
@@ -577,21 +537,24 @@ def lookers_of_field(gaze: PlacedGaze, place: Place, settings: ObserverSettings)
 
 
 def gaze_sums(
-    target: Target, make: MakeLooker, eyes: np.ndarray, weights: Sequence[float] | np.ndarray, settings: GazeSettings
-) -> Sums:
+    target: SurfaceTarget,
+    make: MakeObserver,
+    eyes: np.ndarray,
+    weights: Sequence[float] | np.ndarray,
+    settings: GazeSumSettings,
+) -> SurfaceSums:
     """What observers at ``eyes`` (M, 3), who count by ``weights`` (M,), leave on ``target``: partial sums, which
     `merge` adds up to those of more observers."""
-    none = Sums.none(len(target.mesh.faces), len(target.mesh.vertices))
+    none = SurfaceSums.none(len(target.mesh.faces), len(target.mesh.vertices))
     with dr.suspend_grad():
         return merge([none, *(_of_one(target, make(eye), float(w), eye, settings) for eye, w in zip(eyes, weights))])
 
 
-def _of_one(target: Target, looker: Looker, weight: float, eye: np.ndarray, settings: GazeSettings) -> Sums:
-    import mitsuba as mi
-
+def _of_one(
+    target: SurfaceTarget, looker: SurfaceObserver, weight: float, eye: np.ndarray, settings: GazeSumSettings
+) -> SurfaceSums:
     mesh, eye = target.mesh, np.asarray(eye, np.float64)
-    along = along_through(looker, settings.cone)
-    everywhere = lambda d: np.broadcast_to(np.array(along(vector_of(mi.Vector3f, d)), np.float64), (len(d),))
+    everywhere = along_through(looker, settings.cone)
     directions, angles = sphere_rule(everywhere, settings.directions)
     share = weight * angles * everywhere(directions)
     ends = target.ends(np.broadcast_to(eye, directions.shape), directions)
@@ -602,11 +565,11 @@ def _of_one(target: Target, looker: Looker, weight: float, eye: np.ndarray, sett
         for some, received in _received(target, looker, pieces, total / weight if weight else 0.0, settings.cone):
             found = deposit(mesh.faces, len(mesh.vertices), some.face, some.place, weight * received)
             on_faces, on_vertices = on_faces + found[0], on_vertices + found[1]
-    return Sums(on_faces, on_vertices, float(share[ends.elsewhere].sum()), escaped, total, weight, 1)
+    return SurfaceSums(on_faces, on_vertices, float(share[ends.elsewhere].sum()), escaped, total, weight, 1)
 
 
 def _received(
-    target: Target, looker: Looker, pieces: Pieces, total: float, cone: float
+    target: SurfaceTarget, looker: SurfaceObserver, pieces: Pieces, total: float, cone: float
 ) -> Iterator[tuple[Pieces, np.ndarray]]:
     """Pieces, some of which may be cut again, and the gaze (P,) that each receives."""
     density = density_through(looker, cone)
@@ -616,49 +579,70 @@ def _received(
     for a in range(0, len(pieces), BATCH):
         # Most of a place is hidden from wherever one stands, and gaze costs more than rays.
         some = pieces.part(slice(a, a + BATCH))
-        some = some.part(_launch(target, looker.center, _uniform, some) > 0)
+        some = some.part(_of_seen(target, looker, uniform, some) > 0)
         if len(some):
-            yield some, some.solid_angle * _launch(target, looker.center, density, some)
+            yield some, some.solid_angle * _of_seen(target, looker, density, some)
 
 
-def unhidden(looker: Looker, density: Density, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def _of_seen(target: SurfaceTarget, looker: SurfaceObserver, density: Density, pieces: Pieces) -> np.ndarray:
+    normals = target.mesh.normals[pieces.face]
+    return after_occlusion(target.place, looker, density, pieces.center, normals, target.falloff, target.settings)
+
+
+def unhidden(looker: SurfaceObserver, density: Density, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """``density`` (N,) of ``looker`` at ``points`` (N, 3), along unit ``directions`` (N, 3), in 1/sr, whatever may
     stand between."""
     mi = variant_types()
     r_o, p_od = vector_of(mi.Vector3f, directions), vector_of(mi.Point3f, points)
     p_o = looker.center + dr.zeros(mi.Point3f, len(points))
-    found = density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(points)))
-    return np.broadcast_to(np.array(found, np.float64), (len(points),))
+    return _rows(density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(points))), len(points))
 
 
-def density_through(looker: Looker, cone: float) -> Density:
+def density_through(looker: SurfaceObserver, cone: float) -> Density:
     """The density of ``looker`` seen through a cone of standard deviation ``cone`` in radian; 0: itself."""
     if cone == 0:
         return looker.density
     return lambda p_od, p_o, r_o, active: blurred(looker.along, r_o, cone)
 
 
-def _of_pieces(looker: Looker, density: Density, pieces: Pieces) -> np.ndarray:
+def _of_pieces(looker: SurfaceObserver, density: Density, pieces: Pieces) -> np.ndarray:
     middle = pieces.relative.mean(axis=1)
     return unhidden(looker, density, pieces.center, middle / np.linalg.norm(middle, axis=1, keepdims=True))
 
 
-def _launch(target: Target, center: Point3f, density: Density, pieces: Pieces) -> np.ndarray:
-    """``density`` (P,) after occlusion by what may be a medium, at the centroids of ``pieces``, in 1/sr."""
+def after_occlusion(
+    place: Place,
+    looker: SurfaceObserver,
+    density: Density,
+    points: np.ndarray,
+    normals: np.ndarray,
+    falloff: float,
+    settings: ObserverSettings,
+    penetration: Float | float = 0.0,
+) -> np.ndarray:
+    """``density`` (N,) of ``looker`` after occlusion by what may be a medium, at ``points`` on surfaces with
+    ``normals`` (N, 3), in 1/sr; ``penetration`` as of `nerg_mi.probes.surface_attention.attended`."""
     mi = variant_types()
-    p_o, p = center + dr.zeros(mi.Point3f, len(pieces)), vector_of(mi.Point3f, pieces.center)
-    normals = vector_of(mi.Vector3f, target.mesh.normals[pieces.face])
-    found = attended(target.place, density, p_o, p, normals, target.falloff, target.settings, True)
-    return np.broadcast_to(np.array(found, np.float64), (len(pieces),))
+    p_o, p = looker.center + dr.zeros(mi.Point3f, len(points)), vector_of(mi.Point3f, points)
+    n = vector_of(mi.Vector3f, normals)
+    return _rows(attended(place, density, p_o, p, n, falloff, settings, True, penetration=penetration), len(points))
 
 
-def _uniform(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
+def uniform(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
+    """A density of 1, of which occlusion leaves the visibility."""
     return type(r_o.x)(1)
 
 
-def along_through(looker: Looker, cone: float) -> Callable[[Vector3f], Any]:
-    """The density of ``looker`` in unit directions, seen through a cone as `density_through` has it."""
-    return looker.along if cone == 0 else lambda directions: blurred(looker.along, directions, cone)
+def _rows(values: Any, count: int) -> np.ndarray:
+    """What a kernel gives, (count,) float64, also where it is one constant."""
+    return np.broadcast_to(np.array(values, np.float64), (count,))
+
+
+def along_through(looker: SurfaceObserver, cone: float) -> Callable[[np.ndarray], np.ndarray]:
+    """The density (N,) of ``looker`` in unit directions (N, 3), seen through a cone as `density_through` has it."""
+    mi = variant_types()
+    along = looker.along if cone == 0 else lambda directions: blurred(looker.along, directions, cone)
+    return lambda d: _rows(along(vector_of(mi.Vector3f, d)), len(d))
 
 
 def _center(eye: np.ndarray) -> Point3f:

@@ -12,24 +12,25 @@ from scipy import sparse
 from nerg_mi.fields.splats import Splats, matrices_of
 from nerg_mi.maths.arrays import aligned, vector_of
 from nerg_mi.maths.types import variant_types
-from nerg_mi.probes.surface_attention import attended
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.march_primal import HITS_STOP
 from nerg_mi.transport.medium import LastHit, LocalRay
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.splat_medium import MOST_ABSORBED, SplatArrays, SplatHits
 
-from .laplacian import Sums
+from .laplacian import SurfaceSums
 from .sources import (
-    Looker,
-    MakeLooker,
+    MakeObserver,
     RaySettings,
+    SurfaceObserver,
     TrackedRays,
+    after_occlusion,
     along_through,
     bundle,
     density_through,
     sphere_rule,
     unhidden,
+    uniform,
 )
 
 # ---- Splat hits ----
@@ -42,7 +43,7 @@ from .sources import (
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class HitGroup:
     """The next hits of the rays numbered ``rows`` (M,), nearest first, K at most: ``index`` (M, K) of the Gaussians in
     the order of the file, ``arriving`` and ``absorbed`` (M, K), the light that reaches each and the share of it that it
     takes, which is 0 where there is no hit. ``left`` (M,): light behind the last; ``through`` (M,): nothing is met of
@@ -62,7 +63,7 @@ def groups_of_hits(
     directions: np.ndarray,
     before: np.ndarray | None = None,
     stop: float = HITS_STOP,
-) -> Generator[Group, np.ndarray | None, None]:
+) -> Generator[HitGroup, np.ndarray | None, None]:
     """What rays with ``origins`` (N, 3) and unit ``directions`` (N, 3), in the frame of ``arrays``, meet of them.
 
     Up to the distances ``before`` (N,), everywhere without them, and until no more than ``stop`` of the light is left.
@@ -82,7 +83,7 @@ def groups_of_hits(
         # A group is cut short where no light is left, too.
         through = ~more & (left > stop)
         index = np.where(met, order[np.where(met, place, 0)], -1)
-        wanted = yield Group(rows, index, arriving, absorbed, left, through)
+        wanted = yield HitGroup(rows, index, arriving, absorbed, left, through)
         if wanted is not None:
             more &= np.isin(rows, wanted)
         rows, light, last, thing = rows[more], left[more], t[more, -1], place[more, -1]
@@ -117,16 +118,9 @@ def _next(hits, origins, directions, after, before, light, stop) -> tuple[np.nda
 # plane would then be that of their numbers. They start as far before it as a point may lie
 # behind a surface and still be seen: a place that stands before it hides it, and takes nothing of its area.
 
-
-RAYS = 8
-"""To a side of a Gaussian."""
-
-HIDDEN = 0.05
-"""Of its whole area: a side of which less is seen counts as hidden."""
-
-TILT = np.radians(25)
-"""Of the rays."""
-
+RAYS = 8  # to a side of a Gaussian
+HIDDEN = 0.05  # of its whole area: a side of which less is seen counts as hidden
+TILT = np.radians(25)  # of the rays
 _BATCH = 1 << 17
 # Multiples of both together fill a square evenly (the plastic number).
 _SPREAD = 0.7548776662466927, 0.5698402909980532
@@ -211,15 +205,11 @@ def _light(arrays: SplatArrays, o: np.ndarray, d: np.ndarray, distance: np.ndarr
 # Gaze per area is that share by the area that a Gaussian takes of what is seen (`splat_areas`): of rays that fall on a
 # surface with the density D, a Gaussian receives D ∫ T_i α_i dA, whatever else is around.
 
-
-DIRECTIONS = 1 << 14
-"""In which an observer's gaze is looked at, about."""
-
-CASTS = 1 << 17
-"""Rays that are cast in one launch: each brings a dozen hits."""
+DIRECTIONS = 1 << 14  # in which an observer's gaze is looked at, about
+CASTS = 1 << 17  # rays that are cast in one launch: each brings a dozen hits
 
 
-def splat_ray_sums(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, settings: RaySettings) -> Sums:
+def splat_ray_sums(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
     """What ``rays``, in the frame of ``arrays``, leave on the Gaussians: partial sums, whose ``face`` (2 N,) are the
     shares on their sides 0, then on their sides 1, and whose ``vertex`` is empty.
 
@@ -242,17 +232,16 @@ def splat_ray_sums(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, set
             shares += np.bincount(side * count + thing, share, 2 * count)
             escaped += float((weights[group.rows] * group.left)[group.through].sum())
     weight = float(rays.weights.sum())
-    return Sums(shares, np.zeros(0), 0.0, escaped, weight, weight, len(rays))
+    return SurfaceSums(shares, np.zeros(0), 0.0, escaped, weight, weight, len(rays))
 
 
-def gaze_and_escaped(arrays: SplatArrays, looker: Looker, eye: np.ndarray, cone: float = 0.0) -> tuple[float, float]:
+def gaze_and_escaped(
+    arrays: SplatArrays, looker: SurfaceObserver, eye: np.ndarray, cone: float = 0.0
+) -> tuple[float, float]:
     """What the gaze of ``looker``, an observer at ``eye`` (3,) in the frame of ``arrays``, adds up to over the sphere,
-    and how much of it meets no Gaussian: what comes through, as of rays. ``cone``: as of `sources.GazeSettings`.
+    and how much of it meets no Gaussian: what comes through, as of rays. ``cone``: as of `sources.GazeSumSettings`.
     """
-    import mitsuba as mi
-
-    along = along_through(looker, cone)
-    density = lambda d: np.broadcast_to(np.array(along(vector_of(mi.Vector3f, d)), np.float64), (len(d),))
+    density = along_through(looker, cone)
     with dr.suspend_grad():
         directions, angles = sphere_rule(density, DIRECTIONS)
         share, escaped = angles * density(directions), 0.0
@@ -282,24 +271,12 @@ def gaze_and_escaped(arrays: SplatArrays, looker: Looker, eye: np.ndarray, cone:
 #
 # Gaussians closer than half a step, which face the same way, are one cell, whose density all of them have.
 
-
-FACING = np.cos(np.radians(30))
-"""Cosine between the normals of neighbours at least."""
-
-RISE = np.sin(np.radians(15))
-"""Sine of the angle at which a neighbour may lie out of the plane."""
-
-STEPS = 100
-"""Steps at most, where all of a kernel's reach is covered."""
-
-MOST = 400
-"""Steps at most, where many Gaussians lie at borders."""
-
-CLOSE = 0.7
-"""Standard deviation of a step at least, as a share of the edge of a square of a Gaussian's area."""
-
-REACH = 3.0
-"""Standard deviations of a step after which it is cut off."""
+FACING = np.cos(np.radians(30))  # cosine between the normals of neighbours at least
+RISE = np.sin(np.radians(15))  # sine of the angle at which a neighbour may lie out of the plane
+STEPS = 100  # steps at most, where all of a kernel's reach is covered
+MOST = 400  # steps at most, where many Gaussians lie at borders
+CLOSE = 0.7  # standard deviation of a step at least, as a share of the edge of a square of a Gaussian's area
+REACH = 3.0  # standard deviations of a step after which it is cut off
 
 
 class SplatSmoother:
@@ -414,15 +391,13 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 # `nerg_mi.probes.surface_attention.attended`, of a point that lies before the centre by the thickness of the Gaussian
 # too. Such densities are colours: rendered in place of them, they mix by the light that reaches the eye.
 
-
-BATCH = 1 << 18
-"""Gaussians in one launch."""
+BATCH = 1 << 18  # Gaussians in one launch
 
 
 def splat_densities(
     splats: Splats,
     place: Place,
-    make: MakeLooker,
+    make: MakeObserver,
     eyes: np.ndarray,
     weights: np.ndarray,
     settings: ObserverSettings,
@@ -447,7 +422,7 @@ def splat_densities(
 def _of_one(
     splats: Splats,
     place: Place,
-    looker: Looker,
+    looker: SurfaceObserver,
     eye: np.ndarray,
     settings: ObserverSettings,
     cone: float,
@@ -458,7 +433,8 @@ def _of_one(
         part = slice(a, a + BATCH)
         centers, scales = splats.centers[part].astype(np.float64), splats.scales[part].astype(np.float64)
         facing, normals, depth = _facing(centers - eye, matrices_of(splats.rotations[part]), scales)
-        seen = _seen(place, looker, centers, normals, depth, settings, falloff)
+        before = variant_types().Float(aligned(depth))
+        seen = after_occlusion(place, looker, uniform, centers, normals, falloff, settings, before)
         rows = np.flatnonzero(seen > 0)
         # Most of a place is hidden from wherever one stands, and gaze costs more than rays.
         if len(rows):
@@ -486,22 +462,3 @@ def _facing(to: np.ndarray, axes: np.ndarray, scales: np.ndarray) -> tuple[np.nd
     normals = -np.einsum("nij,nj->ni", axes, across)
     near = np.maximum(distance, widest)
     return np.where(length > 0, area / near**2, 0.0), normals, depth
-
-
-def _seen(
-    place: Place,
-    looker: Looker,
-    centers: np.ndarray,
-    normals: np.ndarray,
-    depth: np.ndarray,
-    settings: ObserverSettings,
-    falloff: float,
-) -> np.ndarray:
-    """Visibility (N,) of ``centers`` on surfaces with ``normals``, which begin before them by ``depth``."""
-    mi = variant_types()
-    p, n = vector_of(mi.Point3f, centers), vector_of(mi.Vector3f, normals)
-    p_o = looker.center + dr.zeros(mi.Point3f, len(centers))
-    uniform = lambda p_od, p_o, r_o, active: type(r_o.x)(1)
-    before = mi.Float(aligned(depth).ravel())
-    found = attended(place, uniform, p_o, p, n, falloff, settings, True, penetration=before)
-    return np.broadcast_to(np.array(found, np.float64), (len(centers),))

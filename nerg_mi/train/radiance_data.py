@@ -11,7 +11,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.photos.cameras import Intrinsics, fisheye_limit
-from nerg_mi.photos.images import View
+from nerg_mi.photos.images import PhotoView
 
 # ---- Directions that lenses show, on the device: the float32 counterpart of `photos.cameras.rays` ----
 
@@ -130,7 +130,7 @@ class PixelBank:
     ray is computed from its camera when it is drawn. Depth keeps 1/65535 of its picture's largest.
     """
 
-    def __init__(self, ns, views: list[View]):
+    def __init__(self, ns, views: list[PhotoView]):
         self.ns = ns
         counts = [v.pixels.shape[0] * v.pixels.shape[1] for v in views]
         used = [n if v.mask is None else int(np.count_nonzero(v.mask)) for n, v in zip(counts, views)]
@@ -155,7 +155,7 @@ class PixelBank:
         self._store_colors(views, used)
         self._store_depth(views, used)
 
-    def _store_colors(self, views: list[View], used: list[int]) -> None:
+    def _store_colors(self, views: list[PhotoView], used: list[int]) -> None:
         self._channels = 4 if any(v.has_alpha for v in views) else 3
         bytes_ = all(v.pixels.dtype == np.uint8 for v in views)
         table = np.empty((self.size, self._channels), np.uint8 if bytes_ else np.float16)
@@ -172,7 +172,7 @@ class PixelBank:
         self._color_unit = 1 / 255 if bytes_ else 1.0
         self._colors = self._color_type(table.ravel())
 
-    def _store_depth(self, views: list[View], used: list[int]) -> None:
+    def _store_depth(self, views: list[PhotoView], used: list[int]) -> None:
         self._depth, self.depth_everywhere = None, False
         self.has_depth = any(v.depth is not None for v in views)
         if not self.has_depth:
@@ -231,5 +231,5 @@ class PixelBank:
                 yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, known)
 
 
-def _mask(view: View) -> np.ndarray:
+def _mask(view: PhotoView) -> np.ndarray:
     return np.ones(view.shape, bool) if view.mask is None else view.mask

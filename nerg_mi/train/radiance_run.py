@@ -24,7 +24,7 @@ from nerg_mi.maths.color import mean_score, psnr, psnr_of_fitted_half
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.dataset import Dataset
-from nerg_mi.photos.images import View
+from nerg_mi.photos.images import PhotoView
 
 from .radiance_losses import PHOTOS
 from .radiance_settings import RadianceSettings
@@ -34,7 +34,7 @@ from .trainer import StepClock, kept_unless, require_same, restoring
 # ---- How much of what photos show lies beyond the part of a place that its field resolves best ----
 
 
-def share_beyond(views: list[View], render: Callable[[View], Preview], core: Box, every: int = 1) -> float:
+def share_beyond(views: list[PhotoView], render: Callable[[PhotoView], Preview], core: Box, every: int = 1) -> float:
     """Share of the pixels of ``views`` (every ``every``-th, from ``every // 2`` on) that show what lies outside of
     ``core``, or nothing, by the depths that ``render`` finds for them."""
     outside = []
@@ -68,7 +68,7 @@ class HeldOutError:
 
 
 def measure(
-    trainer: RadianceTrainer, views: list[View], every: int = 1, field: RadianceField | None = None
+    trainer: RadianceTrainer, views: list[PhotoView], every: int = 1, field: RadianceField | None = None
 ) -> HeldOutError:
     """The error on ``views``, on every ``every``-th pixel of those that their masks leave in.
 
@@ -306,7 +306,12 @@ def load_run(trainer: RadianceTrainer, path: Path | None, about: dict) -> list:
 
 
 def _result(
-    trainer: RadianceTrainer, dataset: Dataset, watched: list[View], history: list, seconds: float, interrupted: bool
+    trainer: RadianceTrainer,
+    dataset: Dataset,
+    watched: list[PhotoView],
+    history: list,
+    seconds: float,
+    interrupted: bool,
 ) -> tuple[RadianceField, dict]:
     """The field that the run has come to, and its provenance with the error on all held-out views."""
     field = trainer.field()
@@ -347,7 +352,9 @@ def _rounded(decibels: float) -> float | None:
     return None if math.isnan(decibels) else round(decibels, 3)
 
 
-def _look(trainer: RadianceTrainer, watched: list[View], history: list, field: RadianceField | None = None) -> None:
+def _look(
+    trainer: RadianceTrainer, watched: list[PhotoView], history: list, field: RadianceField | None = None
+) -> None:
     """Add the error on the ``watched`` views, if any of their pixels counts, to ``history``: every so many pixels, as
     many as take little time."""
     every, seconds = trainer.pixels_within(watched, _LOOK_SAMPLES), trainer.seconds
@@ -357,7 +364,7 @@ def _look(trainer: RadianceTrainer, watched: list[View], history: list, field: R
         history.append(row)
 
 
-def write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:
+def write_preview(trainer: RadianceTrainer, view: PhotoView, path: Path) -> None:
     """PNG of ``view`` as the field shows it now, beside what is true, on as many pixels as take little time."""
     import mitsuba as mi
 

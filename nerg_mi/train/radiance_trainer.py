@@ -18,7 +18,7 @@ from nerg_mi.maths.arrays import aligned
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Float
 from nerg_mi.photos.cameras import pixel_directions
-from nerg_mi.photos.images import View
+from nerg_mi.photos.images import PhotoView
 from nerg_mi.transport.quadrature import mean_depth_share
 
 from .radiance_data import PixelBank
@@ -56,7 +56,7 @@ class Preview:
 
 
 def render_view(
-    field: RadianceField, occupied, table: StepTable, view: View, near: float, every: int = 1, stop: float = 1e-3
+    field: RadianceField, occupied, table: StepTable, view: PhotoView, near: float, every: int = 1, stop: float = 1e-3
 ) -> Preview:
     """March every ``every``-th pixel of ``view`` through ``field``.
 
@@ -121,7 +121,13 @@ class RadianceTrainer(Trainer):
     AVERAGE_EVERY = 4
 
     def __init__(
-        self, views: list[View], box: AnyBox, config: RadianceConfig, settings: RadianceSettings, ns, depth: bool = True
+        self,
+        views: list[PhotoView],
+        box: AnyBox,
+        config: RadianceConfig,
+        settings: RadianceSettings,
+        ns,
+        depth: bool = True,
     ):
         if not views:
             raise NergError("there are no pictures to train on")
@@ -377,12 +383,12 @@ class RadianceTrainer(Trainer):
         seen: Any = dr.compress(weight > 1e-3)
         return samples, dr.gather(ns.Array3f, samples.p, seen)
 
-    def pixels_within(self, views: list[View], samples: int) -> int:
+    def pixels_within(self, views: list[PhotoView], samples: int) -> int:
         """The ``every`` of `render` with which ``views`` take about so many ``samples``, by those of the last step."""
         rays = sum(v.pixels.shape[0] * v.pixels.shape[1] for v in views)
         return max(1, int(np.ceil((rays * max(self.looked * self.stride, 1) / samples) ** 0.5)))
 
-    def render(self, view: View, every: int = 1, field: RadianceField | None = None) -> Preview:
+    def render(self, view: PhotoView, every: int = 1, field: RadianceField | None = None) -> Preview:
         """Every ``every``-th pixel of ``view`` by the trainer's own marcher.
 
         Of ``field``, by its own occupancy; without one, of the averaged weights so far.

@@ -15,7 +15,7 @@ import numpy as np
 from nerg_mi.api.query import box_shares, mesh_shares, trace
 from nerg_mi.api.scene import COLOR, Scene, active_mitsuba
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.formats.areas import Areas, Region, read_areas
+from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.ranges import FARTHEST
@@ -396,7 +396,7 @@ class Session:
         cut = self.scene.integrator.ceiling
         self.cut_up, self.ceiling = (self.place.up, None) if cut is None else (cut.up, cut.height)
         self.tracks = None if self.place.rays is None else Tracks(self.place.rays, self.place.align)
-        areas = read_areas(self.options.regions) if self.options.regions is not None else Areas(())
+        areas = read_areas(self.options.regions) if self.options.regions is not None else AreaSet(())
         # What is no box is not shown, and is saved again with what is.
         self.regions, self.other_areas = areas.boxes, list(areas.others)
         shapes = [shape.id() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()]

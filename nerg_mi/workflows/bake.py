@@ -24,9 +24,9 @@ from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import is_splats
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.laplacian import Smoother, Sums, merge
-from nerg_mi.surfaces.mesh import Mesh, Refined, texture_rows, unroll, unroller
-from nerg_mi.surfaces.sources import GazeSettings, RaySettings
+from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, merge
+from nerg_mi.surfaces.mesh import Mesh, RefinedMesh, texture_rows, unroll, unroller
+from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
 
 from .bake_chunks import (
     UNITS,
@@ -60,7 +60,7 @@ class Baked:
     faces; ``receivers`` as they were given; ``scale``: scene units a metre."""
 
     receivers: Receivers
-    refined: Refined
+    refined: RefinedMesh
     density: np.ndarray
     share: np.ndarray
     unit: str
@@ -239,7 +239,7 @@ def bake(
         receivers.others,
         options.gaze if source == "field" else None,
         surface.absolute() if surface.suffix.lower() == ".xml" else None,
-        GazeSettings(angle=math.radians(options.angle), cone=cone),
+        GazeSumSettings(angle=math.radians(options.angle), cone=cone),
         RaySettings(cone=cone, bundle=options.bundle, seed=options.seed),
     )
     groups, factor = who_looks(options, source, rays, align, reporter)
@@ -282,7 +282,7 @@ def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | 
     return source_of(options, rays, surface.suffix.lower() == ".xml")
 
 
-def _smoothed(mesh: Mesh, sums: Sums, smoother: Smoother | None) -> tuple[np.ndarray, np.ndarray]:
+def _smoothed(mesh: Mesh, sums: SurfaceSums, smoother: Smoother | None) -> tuple[np.ndarray, np.ndarray]:
     """Integrals over faces (F,) and over hat functions (V,), after smoothing."""
     if smoother is None:
         return sums.face, sums.vertex
@@ -290,7 +290,7 @@ def _smoothed(mesh: Mesh, sums: Sums, smoother: Smoother | None) -> tuple[np.nda
     return (amount / mesh.vertex_area)[mesh.faces].mean(axis=1) * mesh.area, amount
 
 
-def _agreement(mesh: Mesh, halves: list[Sums], smoother: Smoother | None) -> float:
+def _agreement(mesh: Mesh, halves: list[SurfaceSums], smoother: Smoother | None) -> float:
     """Correlation of two halves' densities over the surface."""
     first, second = (_smoothed(mesh, half, smoother)[0] / mesh.area for half in halves)
     return float(cc(first, second, mesh.area))
@@ -309,7 +309,7 @@ def _top(mesh: Mesh, density: np.ndarray) -> float:
 def _summary(
     receivers: Receivers,
     parent: np.ndarray,
-    sums: Sums,
+    sums: SurfaceSums,
     share: np.ndarray,
     factor: float,
     options: BakeOptions,

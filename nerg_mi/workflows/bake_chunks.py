@@ -31,21 +31,30 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.tables import iterate_table, table_columns
 from nerg_mi.rendering.aovs import is_nerg
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.surfaces.laplacian import Sums
-from nerg_mi.surfaces.mesh import SURFACE_OPACITY, Mesh, Refined, Target, Triangles, refine, shape_triangles, weld
+from nerg_mi.surfaces.laplacian import SurfaceSums
+from nerg_mi.surfaces.mesh import (
+    SURFACE_OPACITY,
+    Mesh,
+    RefinedMesh,
+    SurfaceTarget,
+    Triangles,
+    refine,
+    shape_triangles,
+    weld,
+)
 from nerg_mi.surfaces.sources import (
     WEIGHTS,
-    Crowd,
-    GazeSettings,
-    MakeLooker,
+    GazeSumSettings,
+    MakeObserver,
     RaySettings,
     TrackedRays,
+    WeightedObservers,
+    cluster_observers,
     gaze_sums,
-    lookers_of_field,
+    observers_from_field,
     ray_seconds,
     ray_sums,
     ray_weights,
-    thin,
 )
 from nerg_mi.surfaces.splats import gaze_and_escaped, shortest_axes, splat_densities, splat_ray_sums
 from nerg_mi.tasks.engines import Output, prepare_once
@@ -119,15 +128,15 @@ class BakeScene:
     others: tuple[Triangles, ...] = ()
     gaze: Path | None = None
     scene: Path | None = None
-    of_gaze: GazeSettings = field(default_factory=GazeSettings)
+    of_gaze: GazeSumSettings = field(default_factory=GazeSumSettings)
     of_rays: RaySettings = field(default_factory=RaySettings)
 
     @property
-    def nothing(self) -> Sums:
+    def nothing(self) -> SurfaceSums:
         """Of nobody."""
-        return Sums.none(len(self.mesh.faces), len(self.mesh.vertices))
+        return SurfaceSums.none(len(self.mesh.faces), len(self.mesh.vertices))
 
-    def sums(self, part: Crowd | TrackedRays) -> Sums:
+    def sums(self, part: WeightedObservers | TrackedRays) -> SurfaceSums:
         """Partial sums of the observers, or of the rays, of ``part``. A variant must be active; what is loaded is kept
         for the next part. Raises `NergError`."""
         target, make = prepare_once(self, self._loaded)
@@ -137,7 +146,7 @@ class BakeScene:
             raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --from rays")
         return gaze_sums(target, make, part.positions, part.weights, self.of_gaze)
 
-    def _loaded(self) -> tuple[Target, MakeLooker | None]:
+    def _loaded(self) -> tuple[SurfaceTarget, MakeObserver | None]:
         import mitsuba as mi
 
         medium, settings, falloff, gaze = None, None, 0.0, None
@@ -146,20 +155,20 @@ class BakeScene:
             if is_nerg(integrator):
                 medium, gaze = integrator.medium, integrator.gaze
                 settings, falloff = integrator.observer_settings, float(np.ravel(np.array(integrator.falloff))[0])
-        target = Target(self.mesh, list(self.others), medium, settings if medium is not None else None, falloff)
+        target = SurfaceTarget(self.mesh, list(self.others), medium, settings if medium is not None else None, falloff)
         if self.gaze is not None:
             gaze = PlacedGaze(load_gaze(self.gaze, namespace(mi.Float))[0])
-        return target, None if gaze is None else lookers_of_field(gaze, target.place, target.settings)
+        return target, None if gaze is None else observers_from_field(gaze, target.place, target.settings)
 
 
-def parts_of(who: Crowd | TrackedRays) -> Iterator[Crowd | TrackedRays]:
+def parts_of(who: WeightedObservers | TrackedRays) -> Iterator[WeightedObservers | TrackedRays]:
     """``who`` in parts, always the same."""
     if isinstance(who, TrackedRays):
         for a in range(0, len(who), RAYS):
             yield who.part(a, a + RAYS)
         return
     for a in range(0, len(who.weights), OBSERVERS):
-        yield Crowd(who.positions[a : a + OBSERVERS], who.weights[a : a + OBSERVERS])
+        yield WeightedObservers(who.positions[a : a + OBSERVERS], who.weights[a : a + OBSERVERS])
 
 
 # ---- Who looks: one observer, a path of them, or the people of tracked rays ----
@@ -169,7 +178,7 @@ POSITIONS = 1_000_000
 """A path has so many positions at most."""
 
 
-def read_path(path: Path) -> Crowd:
+def read_path(path: Path) -> WeightedObservers:
     """Observers of a CSV file with columns x, y, z, and weight where they do not all count alike. Raises
     `NergError`."""
     names = ("x", "y", "z")
@@ -186,7 +195,7 @@ def read_path(path: Path) -> Crowd:
     weights = rows[:, 3] if weighted else np.ones(len(rows))
     if not ((weights >= 0) & (weights <= VALUES.high)).all() or not weights.sum() > 0:
         raise NergError(f'the path "{path}" has weights that are no numbers, negative, or all 0; correct them')
-    return Crowd(rows[:, :3], weights / weights.sum())
+    return WeightedObservers(rows[:, :3], weights / weights.sum())
 
 
 def rays_of(options: BakeOptions, given: Rays | None) -> Rays | None:
@@ -200,7 +209,7 @@ def rays_of(options: BakeOptions, given: Rays | None) -> Rays | None:
     return found
 
 
-def find_crowd(options: BakeOptions, rays: Rays | None, align: Similarity, reporter: Reporter) -> Crowd:
+def find_crowd(options: BakeOptions, rays: Rays | None, align: Similarity, reporter: Reporter) -> WeightedObservers:
     """The observers of a gaze field, in the place. Raises `NergError` where none, or several kinds, are given."""
     given = [name for name, value in (("--observer", options.observer), ("--path", options.path)) if value is not None]
     if len(given) > 1:
@@ -208,12 +217,14 @@ def find_crowd(options: BakeOptions, rays: Rays | None, align: Similarity, repor
     if options.observer is not None:
         if len(options.observer) != 3:
             raise NergError(f"--observer is three numbers x,y,z, got {options.observer}")
-        return Crowd(np.array([options.observer], np.float64), np.ones(1))
+        return WeightedObservers(np.array([options.observer], np.float64), np.ones(1))
     if options.path is not None:
         return read_path(options.path)
     if rays is None:
         raise NergError("nobody looks: give --observer x,y,z, a --path, or the --rays of people who were there")
-    crowd = thin(placed(rays.origin, align), ray_weights(rays, options.weights), options.observers, options.seed)
+    crowd = cluster_observers(
+        placed(rays.origin, align), ray_weights(rays, options.weights), options.observers, options.seed
+    )
     reporter.message(
         f"{len(crowd.weights)} observers stand for {len(np.unique(rays.person))} people at {len(rays):,} moments, who "
         f"were {crowd.mean / align.scale:.2f} m away from them (root mean square; 95 % within "
@@ -224,7 +235,7 @@ def find_crowd(options: BakeOptions, rays: Rays | None, align: Similarity, repor
 
 def who_looks(
     options: BakeOptions, source: str, rays: Rays | None, align: Similarity, reporter: Reporter
-) -> tuple[list[Crowd | TrackedRays], float]:
+) -> tuple[list[WeightedObservers | TrackedRays], float]:
     """Whose gaze of the ``source`` is put on a surface, of rays two halves of the people where that is asked for; and
     the factor from shares of it to the unit. ``rays``: those in memory."""
     tracked = rays_of(options, rays)
@@ -314,7 +325,7 @@ def read_receivers(
     return _joined(path, found, others, reporter)
 
 
-def cut(receivers: Receivers, longest: float | None, scale: float) -> Refined:
+def cut(receivers: Receivers, longest: float | None, scale: float) -> RefinedMesh:
     """Their mesh with edges of at most ``longest`` metres, or of a length that gives about `FACES` triangles;
     ``scale``: scene units a metre."""
     mesh = receivers.mesh
@@ -378,11 +389,11 @@ class SplatScene:
     of_rays: RaySettings = field(default_factory=RaySettings)
 
     @property
-    def nothing(self) -> Sums:
+    def nothing(self) -> SurfaceSums:
         """Of nobody."""
-        return Sums.none(2 * self.count, 0)
+        return SurfaceSums.none(2 * self.count, 0)
 
-    def sums(self, part: Crowd | TrackedRays) -> Sums:
+    def sums(self, part: WeightedObservers | TrackedRays) -> SurfaceSums:
         """Partial sums of the observers, or of the rays, of ``part``: ``face`` is, of rays, shares of gaze on the sides
         of the Gaussians, and of observers densities of theirs, which are no part of ``total``. A variant must be
         active; what is loaded is kept for the next part. Raises `NergError`."""
@@ -400,17 +411,19 @@ class SplatScene:
                 there.splats, there.place, lambda _, own=looker: own, eye, np.array([weight]), there.settings, self.cone
             )
             total, escaped = gaze_and_escaped(there.arrays, looker, eye[0], self.cone)
-            sums = sums.plus(Sums(densities.ravel(), np.zeros(0), 0.0, weight * escaped, weight * total, weight, 1))
+            sums = sums.plus(
+                SurfaceSums(densities.ravel(), np.zeros(0), 0.0, weight * escaped, weight * total, weight, 1)
+            )
         return sums
 
-    def _loaded(self) -> tuple[SplatPlace, MakeLooker | None]:
+    def _loaded(self) -> tuple[SplatPlace, MakeObserver | None]:
         import mitsuba as mi
 
         there = splat_place(read_splats(self.splats))
         if self.gaze is None:
             return there, None
         gaze = PlacedGaze(load_gaze(self.gaze, namespace(mi.Float))[0])
-        return there, lookers_of_field(gaze, there.place, there.settings)
+        return there, observers_from_field(gaze, there.place, there.settings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -448,8 +461,8 @@ _NUMBERS = ("elsewhere", "escaped", "total", "weight", "count")
 
 
 def sums_in_one_go(
-    scene: BakeScene | SplatScene, groups: Sequence[Crowd | TrackedRays], reporter: Reporter
-) -> list[Sums]:
+    scene: BakeScene | SplatScene, groups: Sequence[WeightedObservers | TrackedRays], reporter: Reporter
+) -> list[SurfaceSums]:
     """The sums of each of ``groups``, of which nothing is kept."""
     parts = [list(parts_of(group)) for group in groups]
     count, done, totals = sum(map(len, parts)), 0, []
@@ -484,8 +497,8 @@ class PlannedBake:
 
 
 def sums_in_parts(
-    scene: BakeScene | SplatScene, groups: Sequence[Crowd | TrackedRays], parts: Parts, what: str
-) -> list[Sums]:
+    scene: BakeScene | SplatScene, groups: Sequence[WeightedObservers | TrackedRays], parts: Parts, what: str
+) -> list[SurfaceSums]:
     """The sums of each of ``groups``, whose parts are kept; ``what``: the job, as its user calls it."""
     whole: list[Part] = []
     for group in groups:
@@ -504,7 +517,7 @@ def sums_in_parts(
     return totals
 
 
-def bake_part(common: PlannedBake, part: Crowd | TrackedRays, output: Path) -> dict[str, float]:
+def bake_part(common: PlannedBake, part: WeightedObservers | TrackedRays, output: Path) -> dict[str, float]:
     """Sums over faces and vertices (.npy) of some observers, or rays, with the others as notes."""
     select_backend(common.mode)
     if common.files is not None:
@@ -515,13 +528,13 @@ def bake_part(common: PlannedBake, part: Crowd | TrackedRays, output: Path) -> d
     return {name: getattr(sums, name) for name in _NUMBERS}
 
 
-def read_sums(made: Output, faces: int) -> Sums:
+def read_sums(made: Output, faces: int) -> SurfaceSums:
     """What `bake_part` has written, of so many ``faces``."""
     values = read_npy(made.path, "part of a bake")
-    return Sums(values[:faces], values[faces:], **{name: made.notes[name] for name in _NUMBERS})
+    return SurfaceSums(values[:faces], values[faces:], **{name: made.notes[name] for name in _NUMBERS})
 
 
-def halves_of(who: TrackedRays, rays: Rays, seed: int) -> list[Crowd | TrackedRays]:
+def halves_of(who: TrackedRays, rays: Rays, seed: int) -> list[WeightedObservers | TrackedRays]:
     """``who``, which are the ``rays``, as those of two halves of the people, drawn by ``seed``."""
     people = np.unique(rays.person)
     if len(people) < 2:
@@ -536,11 +549,11 @@ def halves_of(who: TrackedRays, rays: Rays, seed: int) -> list[Crowd | TrackedRa
 
 def sums_of(
     scene: BakeScene | SplatScene,
-    groups: Sequence[Crowd | TrackedRays],
+    groups: Sequence[WeightedObservers | TrackedRays],
     options: BakeOptions,
     name: Path,
     reporter: Reporter,
-) -> list[Sums]:
+) -> list[SurfaceSums]:
     """The sums of each of ``groups``, in one go or in parts as ``options`` say; ``name``: a file of the bake."""
     if not options.in_parts:
         return sums_in_one_go(scene, groups, reporter)

@@ -20,7 +20,7 @@ from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.sphere import C0
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.laplacian import Sums, merge
+from nerg_mi.surfaces.laplacian import SurfaceSums, merge
 from nerg_mi.surfaces.sources import RaySettings
 from nerg_mi.surfaces.splats import HIDDEN, SplatSmoother, splat_areas, whole_areas
 
@@ -149,7 +149,7 @@ class _SplatSpread:
                 there.splats.centers, there.axes, self._areas, least, length, there.tolerance
             )
 
-    def density(self, sums: Sums) -> np.ndarray:
+    def density(self, sums: SurfaceSums) -> np.ndarray:
         """Gaze (N,) per square scene unit, as a share of all."""
         found = sums.face.reshape(2, -1) / sums.weight
         if self._source == "field":
@@ -162,7 +162,7 @@ class _SplatSpread:
         return (found / np.where(self._divisor > 0, self._divisor, 1)).sum(axis=0)
 
 
-def _summary(sums: Sums, source: str, unit: str, factor: float, attention: np.ndarray) -> dict[str, Any]:
+def _summary(sums: SurfaceSums, source: str, unit: str, factor: float, attention: np.ndarray) -> dict[str, Any]:
     found = {"source": source, "unit": unit, "factor": factor, "lookers": sums.count, "gaussians": len(attention)}
     found["looked_at"] = int((attention > 0).sum())
     w = sums.weight

@@ -17,7 +17,7 @@ from nerg_mi.photos.colmap import read_colmap
 from nerg_mi.photos.posed import Unused, name_some
 from nerg_mi.photos.structure import (
     Folders,
-    Picture,
+    PhotoCopy,
     Reconstruction,
     Settings,
     check_installed,
@@ -104,7 +104,7 @@ def find_poses(
 
 def _copy(
     pictures: Path, folders: Folders, options: PoseOptions, reporter: Reporter
-) -> tuple[list[Picture], list[Unused]]:
+) -> tuple[list[PhotoCopy], list[Unused]]:
     progress = lambda done, of: _progress(reporter, "pictures", done, of)
     skipped: list[Unused] = []
     if pictures.is_dir():
@@ -136,7 +136,7 @@ def _progress(reporter: Reporter, stage: str, done: int, of: int) -> None:
     reporter.progress(min(share, 1.0), text[stage])
 
 
-def _tell_pictures(copies: list[Picture], skipped: list[Unused], reporter: Reporter) -> None:
+def _tell_pictures(copies: list[PhotoCopy], skipped: list[Unused], reporter: Reporter) -> None:
     for line in skipped:
         reporter.message(str(line))
     sizes = sorted({p.size for p in copies})
@@ -145,7 +145,7 @@ def _tell_pictures(copies: list[Picture], skipped: list[Unused], reporter: Repor
 
 
 def _report(
-    copies: list[Picture], unregistered: list[str], skipped: list[Unused], found: Reconstruction, options: PoseOptions
+    copies: list[PhotoCopy], unregistered: list[str], skipped: list[Unused], found: Reconstruction, options: PoseOptions
 ) -> dict:
     up = found.up
     return {

@@ -21,7 +21,7 @@ from nerg_mi.figures.style import Provenance, encode
 from nerg_mi.figures.style import versions as programs
 from nerg_mi.files.atomic import check_writable, file_sha256, write_text
 from nerg_mi.files.images import encode_png
-from nerg_mi.formats.areas import Areas, Region, read_areas
+from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
@@ -54,7 +54,7 @@ from nerg_mi.report.data import (
 )
 from nerg_mi.report.sections import page
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
-from nerg_mi.statistics.visits import MARGIN, Box
+from nerg_mi.statistics.visits import MARGIN, BoxAoi
 from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import center
@@ -456,7 +456,7 @@ def make_report(
     options, output = options or ReportOptions(), Path(output)
     check_writable(output, ".html", ".htm")
     given = sort_files([Path(file) for file in files])
-    areas = Areas(()) if options.objects is None else _objects(options.objects, reporter)
+    areas = AreaSet(()) if options.objects is None else _objects(options.objects, reporter)
     results, doubts = given_results(given)
     ns = select_backend(options.mode, options.threads)
     if options.evaluate:
@@ -489,7 +489,7 @@ class _ReportWork:
 
     def run(
         self,
-        areas: Areas,
+        areas: AreaSet,
         results: Sequence[GazeResults],
         doubts: Sequence[str],
         rendered: Mapping[str, Channels] | None,
@@ -627,11 +627,11 @@ class _ReportWork:
         return Eyes(np.asarray(at.origin, float)[None], np.zeros(1, int))
 
     def _objects(
-        self, areas: Areas, onlooker: Onlooker, place: GazePlace, eyes: Eyes, rays: Rays | None
+        self, areas: AreaSet, onlooker: Onlooker, place: GazePlace, eyes: Eyes, rays: Rays | None
     ) -> tuple[ObjectAttention, ...]:
         if not areas.solids or self.given.scene.kind == "none":
             return ()
-        things, members = [Box(box) for box in areas.boxes], list(areas.solids.values())
+        things, members = [BoxAoi(box) for box in areas.boxes], list(areas.solids.values())
         count, margin = len(eyes.positions), MARGIN * self.align.scale
         told = lambda done: self._step(0.55 + 0.2 * done / count, f"objects: place {done} of {count}")
         shares = gaze_shares(onlooker.look_from, eyes.positions, things, members, margin, ROUGH, told)
@@ -682,7 +682,7 @@ class _Quiet(Silent):
         self._reporter.warn(text)
 
 
-def _objects(path: Path, reporter: Reporter) -> Areas:
+def _objects(path: Path, reporter: Reporter) -> AreaSet:
     areas = read_areas(path)
     if len(areas.solids) < len(areas.areas):
         reporter.warn(

@@ -18,7 +18,7 @@ from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.photos.colmap import find_source
 from nerg_mi.photos.images import read_photo, read_posed
-from nerg_mi.photos.posed import Frame, PosedImages
+from nerg_mi.photos.posed import PosedFrame, PosedImages
 from nerg_mi.rays.dataset import is_dataset
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rendering.files import check_vol, write_mesh
@@ -216,7 +216,7 @@ def _posed(photos: Path, provenance: dict, allow_outside: bool) -> PosedImages:
     return posed
 
 
-def _camera(frame: Frame) -> PhotoCamera:
+def _camera(frame: PosedFrame) -> PhotoCamera:
     lens = frame.lens
     size = (round(lens["w"]), round(lens["h"])) if "w" in lens and "h" in lens else _size(frame)
     i = frame.intrinsics(*size)
@@ -228,12 +228,12 @@ def _camera(frame: Frame) -> PhotoCamera:
     return PhotoCamera(frame.name, Eye(origin, origin + ahead, up), taken, i.is_distorted)
 
 
-def _size(frame: Frame) -> tuple[int, int]:
+def _size(frame: PosedFrame) -> tuple[int, int]:
     height, width = read_photo(frame).shape[:2]
     return width, height
 
 
-def _frame(posed: PosedImages, photo: str) -> Frame:
+def _frame(posed: PosedImages, photo: str) -> PosedFrame:
     frames = posed.frames
     for f in frames:
         if photo in (f.name, f.image.name, f.image.stem):

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.aoi.measured import Counting, EyePicker, Eyes, blocks_of, cohort_names, count_block, ray_count
+from nerg_mi.aoi.measured import (
+    AoiContext,
+    Viewpoints,
+    ViewpointSampler,
+    blocks_of,
+    cohort_names,
+    count_block,
+    ray_count,
+)
 from nerg_mi.aoi.options import StatisticsOptions
-from nerg_mi.aoi.output import write_results
+from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.aoi.parts import CountingParts
 from nerg_mi.aoi.predicted import (
-    Foretold,
-    Setting,
+    AoiScene,
+    PredictedAttention,
     add_trust,
     eyes_of_some,
     foretold_people,
@@ -30,16 +38,17 @@ from nerg_mi.aoi.predicted import (
 from nerg_mi.aoi.scene import read_changes
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder, make_folder
-from nerg_mi.formats.areas import Areas, read_areas
+from nerg_mi.formats.areas import AreaSet, read_areas
 from nerg_mi.interruption import Interruption
 from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.estimates import LEAST_PEOPLE
+from nerg_mi.statistics.shares import Isovists, SamplePoints
 from nerg_mi.statistics.tables import (
     FIELD,
     TRACKED,
-    Floor,
-    People,
+    MinParticipantsFilter,
+    Participants,
     PersonRows,
     Row,
     difference_rows,
@@ -47,31 +56,12 @@ from nerg_mi.statistics.tables import (
     move_rows,
     thing_rows,
 )
-from nerg_mi.statistics.visibility import Isovists, Targets
-from nerg_mi.statistics.visits import ALL, Cell, Sums, Total
+from nerg_mi.statistics.visits import ALL, Cell, Total, VisitSums
 
 from .base import SILENT, Reporter, select_backend
 from .options import parse_point
 from .parts import Parts
 from .scene_places import kind_of_file
-
-
-@dataclass(frozen=True, eq=False)
-class StatisticsResult:
-    """Rows of tables, each a dict: ``things`` (by cell, thing and source), ``differences``, ``moves``, ``durations``,
-    ``people``, ``what_if``, ``isovists``; ``sums``: what they were made of; ``blanked``: numbers on too few people;
-    ``files`` that were written."""
-
-    things: list[Row] = field(default_factory=list)
-    differences: list[Row] = field(default_factory=list)
-    moves: list[Row] = field(default_factory=list)
-    durations: list[Row] = field(default_factory=list)
-    people: Sequence[Row] = ()
-    what_if: list[Row] = field(default_factory=list)
-    isovists: list[Row] = field(default_factory=list)
-    sums: Sums | None = None
-    blanked: int = 0
-    files: list[Path] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -127,10 +117,10 @@ def _sort(files: Sequence[str | Path | Rays]) -> _Given:
     return _Given(**found)  # pyright: ignore[reportArgumentType]
 
 
-def _areas(options: StatisticsOptions) -> Areas:
+def _areas(options: StatisticsOptions) -> AreaSet:
     if options.areas is None:
         if options.visibility:
-            return Areas(())
+            return AreaSet(())
         raise NergError("say which things are asked about: --areas FILE")
     return read_areas(options.areas)
 
@@ -141,7 +131,7 @@ class _StatisticsWork:
     def __init__(
         self,
         given: _Given,
-        areas: Areas,
+        areas: AreaSet,
         options: StatisticsOptions,
         ns: ModuleType,
         reporter: Reporter,
@@ -150,6 +140,8 @@ class _StatisticsWork:
         self.given, self.areas, self.options, self.reporter = given, areas, options, reporter
         self.setting = setting_of(given.scene, given.field, given.gaze, areas, options, ns)
         self.around, self.things, self.members = self.setting.around, self.setting.things, self.setting.members
+        for note in self.setting.notes:
+            reporter.message(note)
         if options.what_if is not None and self.around.gaze is None:
             raise NergError("--what-if is what a gaze field foretells: give one, or a scene that has one")
         if options.what_if is not None:
@@ -159,7 +151,7 @@ class _StatisticsWork:
 
     def run(self) -> StatisticsResult:
         """All that is asked for."""
-        o, floor = self.options, Floor(self.options.min_people)
+        o, floor = self.options, MinParticipantsFilter(self.options.min_people)
         if o.visibility:
             return StatisticsResult(isovists=isovist_rows(self._isovists(), self.areas.names, self.members))
         counting = None if self.given.rays is None else self._counting(self.given.rays)
@@ -168,11 +160,11 @@ class _StatisticsWork:
             raise NergError("there is nobody to tell of: give rays, or a gaze field (or --visibility for isovists)")
         cells = [ALL] if counting is None else list(sums.cells) if sums is not None else []
         seen = counting is not None and counting.cells_in_view is not None
-        people: dict[Cell, dict[str, People]] = {cell: {} for cell in cells}
+        people: dict[Cell, dict[str, Participants]] = {cell: {} for cell in cells}
         times: dict[Cell, dict[str, float]] = {cell: {} for cell in cells}
         for cell in cells:
             if sums is not None:
-                people[cell][TRACKED] = tracked = People.of(sums, cell, seen)
+                people[cell][TRACKED] = tracked = Participants.of(sums, cell, seen)
                 times[cell] = dict(zip(tracked.names, tracked.time.tolist()))
             else:
                 times[cell] = dict.fromkeys(eyes.person, 1.0)
@@ -207,8 +199,8 @@ class _StatisticsWork:
             self.reporter.message(f"{floor.blanked:,} numbers rest on fewer than {floor.least} people and are blank")
         return result
 
-    def _counting(self, rays: Path | Rays) -> Counting:
-        first = next(blocks_of(rays, self.setting.rules))
+    def _counting(self, rays: Path | Rays) -> AoiContext:
+        first = next(blocks_of(rays, self.options.visit_rules()))
         hits = self.around.place is None and first.hit is not None and bool(np.isfinite(first.hit).any())
         if self.around.place is None:
             self.reporter.message(
@@ -218,10 +210,10 @@ class _StatisticsWork:
             )
         return self.setting.counting(hits, cohort_names(rays, first))
 
-    def _count(self, counting: Counting) -> tuple[Sums, Eyes]:
+    def _count(self, counting: AoiContext) -> tuple[VisitSums, Viewpoints]:
         assert self.given.rays is not None
         count = ray_count(self.given.rays)
-        picker = EyePicker(max(1, count // self.options.eyes))
+        picker = ViewpointSampler(max(1, count // self.options.eyes))
         total: Total | None = None
 
         def pick(block: Rays) -> None:
@@ -240,18 +232,18 @@ class _StatisticsWork:
         sums = total.sums()
         self.reporter.message(f"{count:,} rays of {len(sums.persons_of(ALL)[0]):,} people")
         if self.around.gaze is None:
-            return sums, Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ())
+            return sums, Viewpoints(np.zeros((0, 3)), np.zeros((0, 3)), (), ())
         eyes = eyes_of_some(picker.eyes(), self.options.eyes, self.reporter)
         tell_places(eyes, self.reporter)
         return sums, eyes
 
     def _counted(
-        self, rays: Rays | Path, counting: Counting, seen: Callable[[Rays], None] | None, count: int
-    ) -> Iterator[Sums]:
+        self, rays: Rays | Path, counting: AoiContext, seen: Callable[[Rays], None] | None, count: int
+    ) -> Iterator[VisitSums]:
         """The sums of each block, in this process."""
         done = 0
         with Interruption() as stop:
-            for block in blocks_of(rays, self.setting.rules):
+            for block in blocks_of(rays, self.options.visit_rules()):
                 stop.check()
                 yield count_block(block, counting)
                 if seen is not None:
@@ -270,7 +262,7 @@ class _StatisticsWork:
         what = f"nerg stats {name.absolute()}"
         return CountingParts(parts, what, g.scene, g.field, g.gaze, self.areas, o, str(mi.variant()))
 
-    def _standing(self) -> Eyes:
+    def _standing(self) -> Viewpoints:
         """Observers who were not tracked."""
         o = self.options
         if o.observers:
@@ -287,34 +279,36 @@ class _StatisticsWork:
         """Degrees that people see. Without rays nobody knows where somebody is turned."""
         return self.options.view if self.given.rays is not None else 360.0
 
-    def _foretold(self, eyes: Eyes) -> Foretold:
+    def _foretold(self, eyes: Viewpoints) -> PredictedAttention:
         """What the field says where people stood."""
         if self.parts is None:
             return self.setting.foretold(eyes, self._view, self.reporter)
         return self.parts.foretell(eyes, self._view)
 
     def _isovists(self) -> Isovists:
-        from nerg_mi.statistics.visibility import isovists
+        from nerg_mi.statistics.shares import isovists
 
         o = self.options
         points = look_around(self.around, o.height, o.step, o.floor)
         box = self.around.bounds()
         self.reporter.message(f"{len(points):,} places on the floor")
         reach = float(np.linalg.norm(box[1] - box[0]))
-        return isovists(points, self.around.depth, Targets.of(self.things, o.samples), self.setting.margin, reach)
+        return isovists(points, self.around.depth, SamplePoints.of(self.things, o.samples), self.setting.margin, reach)
 
-    def _what_if(self, eyes: Eyes, before: Foretold | None, floor: Floor) -> list[Row]:
+    def _what_if(self, eyes: Viewpoints, before: PredictedAttention | None, floor: MinParticipantsFilter) -> list[Row]:
         o, parts = self.options, self.parts
         assert o.what_if is not None and before is not None
 
-        def foretell(there: Setting, others: Eyes) -> Foretold:
+        def foretell(there: AoiScene, others: Viewpoints) -> PredictedAttention:
+            for note in there.notes[len(self.setting.notes) :]:
+                self.reporter.message(note)
             if parts is None:
                 return there.foretold(others, self._view, self.reporter)
             return parts.foretell(others, self._view, o.what_if)
 
         return what_if_rows(o.what_if, self.setting, eyes, before, foretell, floor, o.resamples, o.seed)
 
-    def _people(self, sums: Sums | None, seen: bool) -> Sequence[Row]:
+    def _people(self, sums: VisitSums | None, seen: bool) -> Sequence[Row]:
         o = self.options
         if sums is None:
             return ()
@@ -327,7 +321,7 @@ class _StatisticsWork:
             named = pseudonyms(persons, None if o.salt is None else read_salt(o.salt))
         return PersonRows(sums, named, seen)
 
-    def _tell(self, people: Mapping[Cell, Mapping[str, People]]) -> None:
+    def _tell(self, people: Mapping[Cell, Mapping[str, Participants]]) -> None:
         for cell in (c for c, found in people.items() if TRACKED in found and not found[TRACKED].names):
             self.reporter.message(f"nobody is in the {cell.dimension} {cell.value}; windows are on the rays' own clock")
         few = [cell for cell, found in people.items() for p in found.values() if 0 < p.there.sum() < LEAST_PEOPLE]

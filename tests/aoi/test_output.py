@@ -8,15 +8,13 @@ import pytest
 
 from nerg_mi.aoi import output
 from nerg_mi.aoi.options import StatisticsOptions
-from nerg_mi.aoi.output import write_results
+from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.figures.statistics import things_figure
 from nerg_mi.statistics.tables import PLACES, PersonRows
-from nerg_mi.statistics.visits import ALL, Sums
-from nerg_mi.workflows.statistics import StatisticsResult
+from nerg_mi.statistics.visits import ALL, VisitSums
 from tests.workflows.recorder import Recorder
 
 # ---- Results as a folder of files ----
-
 
 THING = {
     "cell": "all",
@@ -52,7 +50,6 @@ def test02_equal_results_are_equal_files(tmp_path):
 
 
 # ---- Tables as CSV, Markdown and Parquet ----
-
 
 ROWS = [
     {"cell": "all", "value": "", "thing": "a|b", "n": 3, "x": 0.125},
@@ -134,7 +131,7 @@ def test06_differences_in_their_units():
 
 
 def test07_many_people_are_written_in_parts(tmp_path, monkeypatch):
-    sums = Sums.empty(("x", "y"), (ALL,), [(ALL, f"p{k}") for k in range(5)])
+    sums = VisitSums.empty(("x", "y"), (ALL,), [(ALL, f"p{k}") for k in range(5)])
     # The first part of the file knows no first look.
     sums.looks[3:], sums.first_sum[3:], sums.first_count[3:] = 1, 2.5, 1
     rows = PersonRows(sums, {f"p{k}": f"p{k}" for k in range(5)}, False)

@@ -9,11 +9,11 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.aoi.measured import Eyes
+from nerg_mi.aoi.measured import Viewpoints
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.predicted import (
-    Foretold,
-    Setting,
+    AoiScene,
+    PredictedAttention,
     add_trust,
     eyes_of_some,
     foretell,
@@ -27,14 +27,15 @@ from nerg_mi.aoi.predicted import (
     tell_support,
     what_if_rows,
 )
-from nerg_mi.aoi.scene import Surroundings, surroundings_of_files, things_of
+from nerg_mi.aoi.scene import Changes, GazeScene, Put, surroundings_of_files, things_of
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.formats.areas import Areas, Region, read_areas
+from nerg_mi.formats.areas import AreaSet, MeshPart, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.statistics.tables import PLACES, Floor
-from nerg_mi.statistics.visibility import Targets, isovists
-from nerg_mi.statistics.visits import ALL, Box, Cell
+from nerg_mi.statistics.shares import SamplePoints, isovists
+from nerg_mi.statistics.tables import PLACES, MinParticipantsFilter
+from nerg_mi.statistics.visits import ALL, BoxAoi, Cell
+from nerg_mi.transport.geometry import Place
 from nerg_mi.workflows.base import SILENT
 from tests.workflows.recorder import Recorder
 
@@ -43,7 +44,7 @@ from .place import SIGN, write_place
 # ---- What a field foretells, against sums over directions that are written out ----
 
 
-class Law(Surroundings):
+class Law(GazeScene):
     """A gaze that is known: twice as dense ahead (x > 0) as behind, and seven units of support."""
 
     def look_from(self, eye):
@@ -55,8 +56,7 @@ class Law(Surroundings):
 
 AROUND = Law(None, None, Similarity())
 
-
-EYES = Eyes(
+EYES = Viewpoints(
     np.array([[0.0, 0, 0], [0, 0, 0.2], [0, 0, 0]]),
     np.tile([1.0, 0, 0], (3, 1)),
     ("Ada", "Ada", "Bo"),
@@ -66,7 +66,7 @@ EYES = Eyes(
 
 def test01_shares_are_integrals():
     # A cube of which the eye sees a face of 2 x 2 at x = 1: a sixth of the sphere; of the hemisphere's gaze 2/3.
-    things = [Box(Region.of("ahead", [1, -1, -1], [2, 1, 1])), Box(Region.of("behind", [-2, -1, -1], [-1, 1, 1]))]
+    things = [BoxAoi(Region.of("ahead", [1, -1, -1], [2, 1, 1])), BoxAoi(Region.of("behind", [-2, -1, -1], [-1, 1, 1]))]
     found = foretell(AROUND, EYES, things, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
     assert np.allclose(found.share[0], [2 / 9, 1 / 9, 3 / 9], rtol=2e-3)
     # The mean distance to a square face, over its solid angle, by quadrature in its plane.
@@ -79,7 +79,7 @@ def test01_shares_are_integrals():
 
 
 def test02_people():
-    things = [Box(Region.of("ahead", [1, -1, -1], [2, 1, 1]))]
+    things = [BoxAoi(Region.of("ahead", [1, -1, -1], [2, 1, 1]))]
     found = foretell(AROUND, EYES, things, [(0,)], 0.0, 120.0, 24, 4096, SILENT)
     people = foretold_people(found, EYES, ALL, {"Ada": 3.0, "Bo": 6.0}, 0.3)
     assert people.names == ("Ada", "Bo")
@@ -100,7 +100,7 @@ class Two(Law):
 
 
 def test03_members_of_an_ensemble():
-    things = [Box(Region.of("ahead", [1, -1, -1], [2, 1, 1])), Box(Region.of("behind", [-2, -1, -1], [-1, 1, 1]))]
+    things = [BoxAoi(Region.of("ahead", [1, -1, -1], [2, 1, 1])), BoxAoi(Region.of("behind", [-2, -1, -1], [-1, 1, 1]))]
     found = foretell(Two(None, None, Similarity()), EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT)
     # A sixth of the sphere each: evenly of both, and 10/11 or 1/11 of a hemisphere's third by one.
     assert found.members.shape == (2, 3, 2) and np.allclose(found.share[0], 1 / 6, rtol=3e-3)
@@ -110,13 +110,13 @@ def test03_members_of_an_ensemble():
 
 def test04_of_very_many_people_some_are_asked():
     names = tuple(f"{k // 2:04d}" for k in range(400))
-    many = Eyes(np.arange(1200.0).reshape(400, 3), np.ones((400, 3)), names, (frozenset([ALL]),) * 400)
+    many = Viewpoints(np.arange(1200.0).reshape(400, 3), np.ones((400, 3)), names, (frozenset([ALL]),) * 400)
     told = Recorder()
     some = eyes_of_some(many, 50, told)
     assert len(set(some.person)) == 50 and len(some.person) == 100 and len(some.positions) == len(some.cells) == 100
     assert all((some.positions[k] == many.positions[names.index(n) + k % 2]).all() for k, n in enumerate(some.person))
     back = np.arange(400)[::-1]
-    turned = eyes_of_some(Eyes(many.positions[back], many.ahead, names[::-1], many.cells), 50, SILENT)
+    turned = eyes_of_some(Viewpoints(many.positions[back], many.ahead, names[::-1], many.cells), 50, SILENT)
     assert set(turned.person) == set(some.person) and eyes_of_some(many, 200, SILENT) is many
     assert "50 of 200 people" in told.messages[0]
 
@@ -132,7 +132,7 @@ def test01_on_the_floor_of_a_room(tmp_path):
     with pytest.raises(NergError, match="--floor"):
         look_around(around, 1.6, 0.25, -2.0)
     rows = isovist_rows(
-        isovists(found[:4], around.depth, Targets.of([Box(Region.of("s", *SIGN))], 24), 0.01, 9.0),
+        isovists(found[:4], around.depth, SamplePoints.of([BoxAoi(Region.of("s", *SIGN))], 24), 0.01, 9.0),
         ("s", "g"),
         [(0,), (0,)],
     )
@@ -182,24 +182,21 @@ def test_what_is_plainly_wrong_is_told_before_anything_is_loaded(tmp_path, rgb):
 
 # ---- Support and the spread of an ensemble, from foretold numbers that are known ----
 
-
 ZONE = Cell("zone", "z")
 
-
-TRUST_EYES = Eyes(
+TRUST_EYES = Viewpoints(
     np.zeros((3, 3)),
     np.ones((3, 3)),
     ("Ada", "Ada", "Bo"),
     (frozenset([ALL]), frozenset([ALL, ZONE]), frozenset([ALL])),
 )
 
-
 TIMES = {ALL: {"Ada": 2.0, "Bo": 6.0}, ZONE: {"Ada": 1.0}}
 
 
 def foretold(*members, support=(1.0, 8.0, 3.0)):
     each = np.array(members, float)[:, :, None]
-    return Foretold(each.mean(axis=0), each.mean(axis=0), each.mean(axis=0) > 0, np.array(support), each)
+    return PredictedAttention(each.mean(axis=0), each.mean(axis=0), each.mean(axis=0) > 0, np.array(support), each)
 
 
 def rows():
@@ -246,18 +243,15 @@ def test_few_places_a_person_are_told():
     tell_places(TRUST_EYES, told)
     assert len(told.messages) == 1 and "1.5 places a person" in told.messages[0] and "--eyes 32 " in told.messages[0]
     count = 2 * PLACES
-    many = Eyes(np.zeros((count, 3)), np.ones((count, 3)), ("Ada", "Bo") * PLACES, (frozenset([ALL]),) * count)
+    many = Viewpoints(np.zeros((count, 3)), np.ones((count, 3)), ("Ada", "Bo") * PLACES, (frozenset([ALL]),) * count)
     tell_places(many, told)
-    tell_places(Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ()), told)
+    tell_places(Viewpoints(np.zeros((0, 3)), np.zeros((0, 3)), (), ()), told)
     assert len(told.messages) == 1
 
 
 # ---- The table of a change, from foretold numbers that are known ----
 
-
-AREAS = Areas((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])))
-
-
+AREAS = AreaSet((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])))
 WHAT_IF_EYES = places_of(np.arange(15.0).reshape(5, 3))
 
 
@@ -265,7 +259,7 @@ def told(share, support=5.0, members=1):
     """Of an ensemble the members differ by 0.1 times their number from the first, at the first eye."""
     share = np.asarray(share, float)
     each = np.stack([share + 0.1 * k * (np.arange(len(share)) == 0)[:, None] for k in range(members)])
-    return Foretold(share, share, share > 0, np.full(len(share), support), each)
+    return PredictedAttention(share, share, share > 0, np.full(len(share), support), each)
 
 
 def rows_what_if(tmp_path, changes, after, floor=None, members=1):
@@ -277,9 +271,11 @@ def rows_what_if(tmp_path, changes, after, floor=None, members=1):
         return after
 
     before = told([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]], members=members)
-    around, things = Surroundings(None, None, Similarity()), things_of(AREAS.things, {})
-    setting = Setting(around, AREAS, things, StatisticsOptions())
-    found = what_if_rows(tmp_path / "c.json", setting, WHAT_IF_EYES, before, foretell, floor or Floor(), 199, 0)
+    around, things = GazeScene(None, None, Similarity()), things_of(AREAS.things, {}, {})
+    setting = AoiScene(around, AREAS, things, StatisticsOptions(), {})
+    found = what_if_rows(
+        tmp_path / "c.json", setting, WHAT_IF_EYES, before, foretell, floor or MinParticipantsFilter(), 199, 0
+    )
     return {(r["thing"], r["measure"]): r for r in found}, asked[0]
 
 
@@ -302,7 +298,7 @@ def test02_other_observers_are_other_people(tmp_path):
 
 
 def test03_a_floor_on_people(tmp_path):
-    floor = Floor(9)
+    floor = MinParticipantsFilter(9)
     found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5), floor)
     assert all(r["before"] is None and r["difference"] is None for r in found.values()) and floor.blanked == 4
 
@@ -319,6 +315,23 @@ def test04_members_of_an_ensemble(tmp_path):
         rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5))[0]["a", "share"]["difference_spread"]
         is None
     )
+
+
+def test_what_of_meshes_is_not_used_is_named_once(tmp_path):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    for name, extra in (("one", "usemtl red\n"), ("two", "vp 1 2\n")):
+        (tmp_path / f"{name}.obj").write_text(extra + triangle)
+    one, two = tmp_path / "one.obj", tmp_path / "two.obj"
+    areas = AreaSet((MeshPart("a", one), MeshPart("b", one, ((0, 0),))))
+    setting = setting_of(None, None, None, areas, StatisticsOptions(), ns)
+    assert setting.notes == [f"of {one}: statements that are not used: usemtl"]
+    scene = mi.load_dict({"type": "scene", "s": {"type": "sphere"}})
+    setting = replace(setting, around=GazeScene(Place(None, scene), None, Similarity(), scene))
+    changes = Changes(add=(Put("c", one), Put("d", two)))
+    assert setting.changed(changes).notes == [*setting.notes, f"of {two}: statements that are not used: vp"]
 
 
 def test05_no_support(tmp_path):

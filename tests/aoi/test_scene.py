@@ -13,6 +13,7 @@ from nerg_mi.aoi.scene import (
     changed_scene,
     read_changes,
     read_cohorts,
+    read_meshes,
     scene_of,
     shape_named,
     shapes_of,
@@ -22,7 +23,7 @@ from nerg_mi.aoi.scene import (
 )
 from nerg_mi.errors import NergError
 from nerg_mi.files.tables import write_csv
-from nerg_mi.formats.areas import Areas, Group, MeshPart, Region, SceneShape
+from nerg_mi.formats.areas import AreaGroup, AreaSet, MeshPart, Region, SceneShape
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.mesh import mitsuba_mesh
@@ -42,6 +43,16 @@ def written(tmp_path, **changes):
     return read_changes(tmp_path / "c.json")
 
 
+def change(scene, tmp_path, **changes):
+    """The changed scene, and its shapes."""
+    made = written(tmp_path, **changes)
+    return changed_scene(scene, made, read_meshes(made.meshes))
+
+
+def things(areas, shapes):
+    return things_of(areas, shapes, read_meshes(AreaSet(tuple(areas)).meshes))
+
+
 def cast(scene, o, d):
     import mitsuba as mi
 
@@ -54,10 +65,10 @@ EYE, EAST = (1.0, 1.6, 1.6), (1.0, 0, 0)
 
 def test01_moved_and_turned(scene_changes, tmp_path):
     assert cast(scene_changes, EYE, EAST) == pytest.approx(1.5)
-    moved, shapes = changed_scene(scene_changes, written(tmp_path, move=[{"shape": "stand", "by": [0.3, 0, 0]}]))
+    moved, shapes = change(scene_changes, tmp_path, move=[{"shape": "stand", "by": [0.3, 0, 0]}])
     assert cast(moved, EYE, EAST) == pytest.approx(1.8, abs=1e-5) and set(shapes) == {"room", "sign", "stand"}
     # A quarter turn about its own middle: 0.4 x 1 m become 1 x 0.4 m.
-    turned, _ = changed_scene(scene_changes, written(tmp_path, move=[{"shape": "stand", "turn": 90}]))
+    turned, _ = change(scene_changes, tmp_path, move=[{"shape": "stand", "turn": 90}])
     assert cast(turned, EYE, EAST) == pytest.approx(2.7 - 0.5 - 1.0, abs=1e-5)
     assert cast(turned, (1.0, 1.9, 1.6), EAST) == pytest.approx(3.0, abs=1e-5)
     # The scene that there was is as it was, and so are the names of its shapes.
@@ -66,23 +77,25 @@ def test01_moved_and_turned(scene_changes, tmp_path):
 
 
 def test02_removed_added_and_swapped(scene_changes, tmp_path):
-    removed, shapes = changed_scene(scene_changes, written(tmp_path, remove=["stand"]))
+    removed, shapes = change(scene_changes, tmp_path, remove=["stand"])
     assert cast(removed, EYE, EAST) == pytest.approx(3.0) and "stand" not in shapes
     wall = {"name": "wall", "min": [2, 0, 0], "max": [2.1, 4, 3]}
-    added, shapes = changed_scene(scene_changes, written(tmp_path, add=[wall]))
+    added, shapes = change(scene_changes, tmp_path, add=[wall])
     assert cast(added, EYE, EAST) == pytest.approx(1.0) and cast(added, (2.05, 1, 1), EAST) == pytest.approx(
         0.05, abs=1e-5
     )
-    swapped, _ = changed_scene(scene_changes, written(tmp_path, swap=[wall | {"shape": "stand"}]))
+    swapped, _ = change(scene_changes, tmp_path, swap=[wall | {"shape": "stand"}])
     assert cast(swapped, EYE, EAST) == pytest.approx(1.0)
     (tmp_path / "tri.obj").write_text("v 2.2 0 0\nv 2.2 4 0\nv 2.2 2 9\nf 1 2 3\n")
-    mesh, _ = changed_scene(scene_changes, written(tmp_path, swap=[{"shape": "stand", "mesh": "tri.obj"}]))
+    mesh, _ = change(scene_changes, tmp_path, swap=[{"shape": "stand", "mesh": "tri.obj"}])
     assert cast(mesh, EYE, EAST) == pytest.approx(1.2)
 
 
 def test03_areas_follow(tmp_path):
     box = Region.of("shelf", *SIGN)
-    areas = Areas((box, SceneShape("stand", "stand"), Group("all", ("shelf", "stand")), Group("g", ("stand",))))
+    areas = AreaSet(
+        (box, SceneShape("stand", "stand"), AreaGroup("all", ("shelf", "stand")), AreaGroup("g", ("stand",)))
+    )
     found = changed_areas(
         areas, written(tmp_path, move=[{"area": "shelf", "by": [1, 0, 0], "turn": 90}], remove=["stand"])
     )
@@ -112,12 +125,12 @@ def test04_observers(tmp_path):
 )
 def test05_what_cannot_be_done(scene_changes, tmp_path, changes, said):
     with pytest.raises(NergError, match=said):
-        changed_scene(scene_changes, written(tmp_path, **changes))
+        change(scene_changes, tmp_path, **changes)
 
 
 def test06_a_field_cannot_be_taken_apart(tmp_path):
     with pytest.raises(NergError, match="give one"):
-        changed_scene(None, written(tmp_path, remove=["sign"]))
+        change(None, tmp_path, remove=["sign"])
 
 
 @pytest.mark.parametrize(
@@ -231,7 +244,6 @@ def test05_two_places(folder):
 
 # ---- Areas as things: meshes, some of their faces, shapes of a scene ----
 
-
 TWO = "v 1 0 0\nv 1 1 0\nv 1 0 1\nv 3 0 0\nv 3 1 0\nv 3 0 1\nf 1 2 3\nf 4 5 6\n"
 
 
@@ -248,15 +260,15 @@ def test01_one_of_each(scene_things, tmp_path):
         MeshPart("far", tmp_path / "two.obj", ((1, 1),)),
         SceneShape("stand", "stand"),
     ]
-    things = things_of(areas, shapes_of(scene_things))
-    assert [t.name for t in things] == ["box", "both", "far", "stand"] and [t.open for t in things] == [
+    made = things(areas, shapes_of(scene_things))
+    assert [t.name for t in made] == ["box", "both", "far", "stand"] and [t.open for t in made] == [
         False,
         True,
         True,
         True,
     ]
     o, d = np.array([[0.0, 0.2, 0.2], [0, 1.5, 1.5]]), np.tile([1.0, 0, 0], (2, 1))
-    near = np.array([t.interval(o, d)[0] for t in things])
+    near = np.array([t.interval(o, d)[0] for t in made])
     assert np.allclose(near[1:], [[1.0, np.inf], [3.0, np.inf], [np.inf, 2.5]])
     # The scene's shapes have their names still.
     assert set(shapes_of(scene_things)) == {"room", "sign", "stand"}
@@ -264,9 +276,7 @@ def test01_one_of_each(scene_things, tmp_path):
 
 def test02_samples_lie_on_the_surface(scene_things, tmp_path):
     (tmp_path / "two.obj").write_text(TWO)
-    both, stand = things_of(
-        [MeshPart("m", tmp_path / "two.obj"), SceneShape("stand", "stand")], shapes_of(scene_things)
-    )
+    both, stand = things([MeshPart("m", tmp_path / "two.obj"), SceneShape("stand", "stand")], shapes_of(scene_things))
     points, normals = both.samples(64)
     assert points.shape == (64, 3) and not normals.any()
     assert (np.isclose(points[:, 0], 1) | np.isclose(points[:, 0], 3)).all() and 20 < np.isclose(
@@ -294,10 +304,10 @@ def test04_what_there_is_not(scene_things, tmp_path):
     with pytest.raises(NergError, match="give a scene"):
         shape_named(shapes_of(None), "x")
     with pytest.raises(NergError, match="there is no mesh"):
-        things_of([MeshPart("m", tmp_path / "none.ply")], {})
+        things([MeshPart("m", tmp_path / "none.ply")], {})
     (tmp_path / "two.obj").write_text(TWO)
     with pytest.raises(NergError, match="face 2"):
-        things_of([MeshPart("m", tmp_path / "two.obj", ((0, 2),))], {})
+        things([MeshPart("m", tmp_path / "two.obj", ((0, 2),))], {})
 
 
 def test05_meshes_keep_their_names_in_a_scene():

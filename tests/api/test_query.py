@@ -10,7 +10,7 @@ from nerg_mi.api.query import ObserverOf, box_shares
 from nerg_mi.formats.areas import Region
 from nerg_mi.report.data import Onlooker
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
-from nerg_mi.statistics.visits import MARGIN, Box
+from nerg_mi.statistics.visits import MARGIN, BoxAoi
 from nerg_mi.train.geometry import GazePlace
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import SIGN, STAND, write_place
@@ -262,7 +262,7 @@ def test14_statistics_viewer_and_report_say_the_same(room):
     assert viewer["the sign"] == pytest.approx(here.share[0], rel=0.03)
     field = scene.integrator.gaze.field
     onlooker = Onlooker(field, GazePlace(scene.place, field.box, "scene"))
-    things = [Box(region) for region in regions]
+    things = [BoxAoi(region) for region in regions]
     report = gaze_shares(onlooker.look_from, eye[None], things, [(0,), (1,)], MARGIN, ROUGH)
     assert report.share[0, 0] == pytest.approx(here.share[0], rel=0.03)
     assert report.share[0, 1] == pytest.approx(viewer["corner"], rel=0.03) and viewer["corner"] > 1e-3

@@ -18,8 +18,8 @@ from nerg_mi.rays.rays import Rays
 from tests.evaluation.test_gaze import crowd
 from tests.figures.standins import write_standins
 from tests.formats.splats.writers import random_splats, write_inria
-from tests.formats.torch_ngp.test_fields import small_state
-from tests.formats.torch_ngp.test_nerg import save, small_gaze
+from tests.formats.test_torch_ngp import save_nerg as save
+from tests.formats.test_torch_ngp import small_gaze, small_state
 from tests.pictures import SCENE
 from tests.plugins import fields
 from tests.surfaces.meshes import box

@@ -18,8 +18,8 @@ from nerg_mi.formats.fields import load_gaze, load_radiance
 from nerg_mi.formats.torch_files import write_torch
 from nerg_mi.workflows.gaze_commands import GazeOptions
 from tests.evaluation.test_gaze import crowd
-from tests.formats.torch_ngp.test_fields import small_state
-from tests.formats.torch_ngp.test_nerg import save, small_gaze
+from tests.formats.test_torch_ngp import save_nerg as save
+from tests.formats.test_torch_ngp import small_gaze, small_state
 from tests.plugins.fields import radiance
 from tests.train.gaze.looks import looking_at
 

@@ -21,8 +21,8 @@ from nerg_mi.photos import structure
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import check_scene_file
 from nerg_mi.workflows import poses
-from tests.formats.torch_ngp.test_fields import small_state
-from tests.formats.torch_ngp.test_nerg import save, small_gaze
+from tests.formats.test_torch_ngp import save_nerg as save
+from tests.formats.test_torch_ngp import small_gaze, small_state
 from tests.pictures import SCENE
 from tests.plugins import fields
 from tests.surfaces.meshes import box as box_of

@@ -31,7 +31,7 @@ from nerg_mi.workflows import demo
 from nerg_mi.workflows import poses as posing
 from nerg_mi.workflows.scene_commands import KINDS, DemoOptions
 from tests.aoi.place import people, write_place
-from tests.photos.structure import rendered
+from tests.photos import rendered
 from tests.pictures import SCENE, mitsuba_bitmap
 from tests.surfaces.meshes import box
 from tests.tasks import works

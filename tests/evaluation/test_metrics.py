@@ -15,7 +15,7 @@ from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import latlong_grid
 from nerg_mi.photos.cameras import Camera, Intrinsics
-from nerg_mi.photos.images import View
+from nerg_mi.photos.images import PhotoView
 
 # ---- Images ----
 #
@@ -141,7 +141,7 @@ def test_scores_of_views_and_what_is_written(fog, tmp_path):
 
     mi.set_variant("llvm_ad_rgb")
     seen = Renderer(fog)(camera())
-    view = View("frame.png", camera(), (seen.color + 0.1).astype(np.float32), seen.depth.astype(np.float32))
+    view = PhotoView("frame.png", camera(), (seen.color + 0.1).astype(np.float32), seen.depth.astype(np.float32))
     scores = score_views(fog, [view, view], pictures=tmp_path / "out")
     assert scores.psnr_mean == pytest.approx(20, abs=0.2) and len(scores.psnr) == 2
     assert (scores.width, scores.height, scores.views) == (16, 12, ["frame.png", "frame.png"])
@@ -149,7 +149,7 @@ def test_scores_of_views_and_what_is_written(fog, tmp_path):
     assert (tmp_path / "out" / "frame.png").is_file()
     written = json.loads(json.dumps(scores.to_dict()))
     assert written["psnr_mean"] == scores.psnr_mean and written["depth"]["median"] == scores.depth.median
-    assert "depth" not in score_views(fog, [View("frame.png", view.camera, view.color)]).to_dict()
+    assert "depth" not in score_views(fog, [PhotoView("frame.png", view.camera, view.color)]).to_dict()
     with pytest.raises(ValueError, match="--holdout"):
         score_views(fog, [])
 

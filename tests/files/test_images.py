@@ -82,7 +82,6 @@ from nerg_mi.files.images import write_bitmap_exr
 write_bitmap_exr(sys.argv[1], mi.Bitmap(np.ones((64, 64, 3), np.float32)))
 """
 
-
 _READ = """
 import sys
 import nerg_mi, mitsuba as mi, drjit as dr

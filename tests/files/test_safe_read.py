@@ -393,14 +393,6 @@ def test_what_is_no_text(tmp_path, monkeypatch):
         lines(tmp_path)
 
 
-@pytest.mark.parametrize("cut", [5, 40, -9, -1])
-def test_a_gzip_file_that_is_cut_off(tmp_path, cut):
-    path = tmp_path / "t.csv.gz"
-    path.write_bytes(gzip.compress("".join(f"{i},{i * 7}\n" for i in range(3000)).encode())[:cut])
-    with pytest.raises(NergError, match="t.csv.gz"):
-        lines(path)
-
-
 def test_line_blocks_limits_themselves_are_within(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "LINE_CHARACTERS", 4)
     path = tmp_path / "t.csv"
@@ -412,7 +404,6 @@ def test_line_blocks_limits_themselves_are_within(tmp_path, monkeypatch):
 
 
 # ---- Arrays are made only of bytes that are there ----
-
 
 _ARRAYS = [
     np.arange(12.0).reshape(3, 4),

@@ -23,8 +23,6 @@ def checked(path: Path, *boxes: bytes) -> None:
 
 
 DATA = box(b"mdat", bytes(1000))
-
-
 FILE = "film.mp4"
 
 
@@ -108,8 +106,6 @@ def edits(*entries: tuple[int, int, int], long: bool = False) -> bytes:
 
 
 STEADY = runs(b"stts", (6, 1000))
-
-
 ONCE = 1 << 16  # the speed of an edit
 
 
@@ -183,7 +179,6 @@ def test_times_are_those_that_ffmpeg_shows(tmp_path):
 
 
 # ---- Videos read back by FFmpeg: every frame, its colours, the rate and what the header says ----
-
 
 HEIGHT, WIDTH = 48, 80
 

@@ -10,8 +10,9 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import (
-    Areas,
-    Group,
+    MOST,
+    AreaGroup,
+    AreaSet,
     MeshPart,
     Region,
     SceneShape,
@@ -22,32 +23,31 @@ from nerg_mi.formats.areas import (
     to_json,
 )
 from nerg_mi.rays.readers.base import Frame
+from nerg_mi.workflows import demo
 
 # ---- What an area can be, and how groups resolve ----
-
 
 A, B = Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])
 
 
 def test01_members_count_once():
-    areas = Areas((Group("all", ("pair", "a")), A, B, Group("pair", ("a", "b"))))
+    areas = AreaSet((AreaGroup("all", ("pair", "a")), A, B, AreaGroup("pair", ("a", "b"))))
     assert areas.members() == {"all": (0, 1), "a": (0,), "b": (1,), "pair": (0, 1)}
     assert areas.things == (A, B) and areas.names == ("all", "a", "b", "pair")
 
 
 def test02_two_of_one_name():
     with pytest.raises(NergError, match='two areas are called "a"'):
-        Areas((A, A))
+        AreaSet((A, A))
 
 
 def test03_many_groups_of_groups_are_resolved_at_once():
     # Each of the two holds all that came before: without care, two to the power of their number of ways.
-    groups = [Group("g0", ("a", "b"))] + [Group(f"g{k}", (f"g{k - 1}", "a")) for k in range(1, 7)]
-    assert Areas((A, B, *groups)).members()["g6"] == (0, 1)
+    groups = [AreaGroup("g0", ("a", "b"))] + [AreaGroup(f"g{k}", (f"g{k - 1}", "a")) for k in range(1, 7)]
+    assert AreaSet((A, B, *groups)).members()["g6"] == (0, 1)
 
 
 # ---- Areas of interest of every kind as files ----
-
 
 BOX = {"name": "shelf", "min": [0, 0, 0], "max": [1, 2, 3]}
 
@@ -72,8 +72,8 @@ def test01_one_of_every_kind(tmp_path):
         Region.of("shelf", [0, 0, 0], [1, 2, 3]),
         MeshPart("sign", tmp_path / "sign.ply", ((0, 0), (4, 9))),
         SceneShape("till", "till_0"),
-        Group("all", ("shelf", "both")),
-        Group("both", ("till", "shelf")),
+        AreaGroup("all", ("shelf", "both")),
+        AreaGroup("both", ("till", "shelf")),
     )
     assert areas.members() == {"shelf": (0,), "sign": (1,), "till": (2,), "all": (0, 2), "both": (0, 2)}
     assert areas.areas[1].chosen(12).nonzero()[0].tolist() == [0, 4, 5, 6, 7, 8, 9]
@@ -86,11 +86,12 @@ def test01_one_of_every_kind(tmp_path):
     assert read_areas(tmp_path / "b.json") == areas
 
 
-def test02_old_files_read_alike(tmp_path):
-    for k, value in enumerate(({"a": [[0, 0, 0], [1, 2, 3]]}, {"mesh": {"min": [0, 0, 0], "max": [1, 2, 3]}})):
-        path = tmp_path / f"{k}.json"
-        path.write_text(json.dumps(value))
-        assert list(read_areas(path).areas) == read_regions(path)
+@pytest.mark.parametrize("value", [[[0, 0, 0], [1, 2, 3]], {"min": [0, 0, 0], "max": [1, 2, 3]}])
+@pytest.mark.parametrize("name", ["Käse & Co", "mesh"])
+def test02_old_files_read_alike(tmp_path, name, value):
+    (tmp_path / "a.json").write_text(json.dumps({name: value}))
+    assert list(read_areas(tmp_path / "a.json").areas) == read_regions(tmp_path / "a.json")
+    assert read_regions(tmp_path / "a.json") == [Region.of(name, [0, 0, 0], [1, 2, 3])]
 
 
 def test03_a_turned_box(tmp_path):
@@ -110,6 +111,19 @@ def test03_a_turned_box(tmp_path):
     assert read_regions(tmp_path / "b.json") == [box]
 
 
+def test03b_what_lies_in_a_box():
+    box = Region.of("b", [0, 0, 0], [1, 1, 1])
+    points = np.array([[0.5, 0.5, 0.5], [1.0, 0.0, 1.0], [1.01, 0.5, 0.5], [np.inf, 0, 0], [0.5, 0.5, -0.2]])
+    assert box.holds(points).tolist() == [True, True, False, False, False]
+    assert box.holds(points, 0.02).tolist() == [True, True, True, False, False]
+    assert box.holds(points.reshape(1, 5, 3)).shape == (1, 5)
+
+
+def test03c_those_of_the_store():
+    regions = read_regions(demo.store_scene().parent / "regions.json")
+    assert len(regions) > 20 and all((r.corners[0] < r.corners[1]).all() for r in regions)
+
+
 def test04_groups_of_boxes_are_solids(tmp_path):
     other = {"name": "b", "min": [5, 0, 0], "max": [6, 1, 1]}
     mesh = {"name": "m", "mesh": "m.ply"}
@@ -118,44 +132,76 @@ def test04_groups_of_boxes_are_solids(tmp_path):
     assert areas.solids == {"shelf": (0,), "b": (1,), "g": (0, 1)} and [b.name for b in areas.boxes] == ["shelf", "b"]
 
 
+NO_REGIONS = [
+    [],
+    {},
+    {"regions": 3},
+    {"a": [[0, 0, 0], [1, 1, float("nan")]]},
+    {"a": [0, 1]},
+    {"a": [0, 0, 0, 1, 1, 1]},
+    {"a": None},
+    {"": [[0, 0, 0], [1, 1, 1]]},
+    {"regions": [3]},
+    {"regions": [{"name": "a"}]},
+    {"regions": [BOX | {"min": [0, 0]}]},
+    {"regions": [BOX | {"min": "000"}]},
+    {"regions": [BOX | {"min": [0, 0, "x"]}]},
+    {"regions": [BOX | {"min": [0, 0, True]}]},
+    {"regions": [BOX | {"min": [1, 0, 0]}]},
+    {"regions": [BOX | {"max": [1, 1, 1.1e7]}]},
+    {"regions": [BOX | {"max": [1, 1, 10**400]}]},
+    {"regions": [BOX | {"name": 7}]},
+    {"regions": [BOX | {"name": ""}]},
+    {"regions": [BOX | {"name": "a\n"}]},
+    {"regions": [BOX | {"name": "a" * 81}]},
+    {"regions": [BOX, BOX]},
+    {"regions": [BOX] * (MOST + 1)},
+]
+NO_AREAS = [
+    [{"name": "g", "parts": ["g"]}],
+    [{"name": "g", "parts": ["h"]}, {"name": "h", "parts": ["g"]}],
+    [{"name": "g", "parts": ["nobody"]}],
+    [{"name": "g", "parts": []}],
+    [{"name": "g", "parts": "abc"}],
+    [{"name": "g", "parts": [3]}],
+    [{"parts": ["a"]}],
+    [BOX, {"name": "shelf", "shape": "x"}],
+    [{"name": "s", "shape": 3}],
+    [{"name": "s", "shape": ""}],
+    [{"name": "a\n", "shape": "x"}],
+    [{"name": "m", "mesh": 3}],
+    [{"name": "m", "mesh": "m.stl"}],
+    [{"name": "m", "mesh": "../m.ply"}],
+    [{"name": "m", "mesh": "/m.ply"}],
+    [{"name": "m", "mesh": "m\0.ply"}],
+    [{"name": "m", "mesh": "m.ply", "faces": []}],
+    [{"name": "m", "mesh": "m.ply", "faces": [-1]}],
+    [{"name": "m", "mesh": "m.ply", "faces": [[3, 2]]}],
+    [{"name": "m", "mesh": "m.ply", "faces": [[1, 2, 3]]}],
+    [{"name": "m", "mesh": "m.ply", "faces": [True]}],
+    [{"name": "m", "mesh": "m.ply", "faces": 7}],
+    [{"adt": "nowhere"}],
+    [{"adt": "..", "name": "x"}],
+    [BOX | {"turn": [0, 0, 0, 0]}],
+    [BOX | {"turn": [0, 0, 1]}],
+    [BOX | {"turn": "x"}],
+    [BOX | {"turn": 1e400}],
+]
+
+
 @pytest.mark.parametrize(
-    "entries",
+    "read, value",
     [
-        [{"name": "g", "parts": ["g"]}],
-        [{"name": "g", "parts": ["h"]}, {"name": "h", "parts": ["g"]}],
-        [{"name": "g", "parts": ["nobody"]}],
-        [{"name": "g", "parts": []}],
-        [{"name": "g", "parts": "abc"}],
-        [{"name": "g", "parts": [3]}],
-        [{"parts": ["a"]}],
-        [BOX, {"name": "shelf", "shape": "x"}],
-        [{"name": "s", "shape": 3}],
-        [{"name": "s", "shape": ""}],
-        [{"name": "a\n", "shape": "x"}],
-        [{"name": "m", "mesh": 3}],
-        [{"name": "m", "mesh": "m.stl"}],
-        [{"name": "m", "mesh": "../m.ply"}],
-        [{"name": "m", "mesh": "/m.ply"}],
-        [{"name": "m", "mesh": "m\0.ply"}],
-        [{"name": "m", "mesh": "m.ply", "faces": []}],
-        [{"name": "m", "mesh": "m.ply", "faces": [-1]}],
-        [{"name": "m", "mesh": "m.ply", "faces": [[3, 2]]}],
-        [{"name": "m", "mesh": "m.ply", "faces": [[1, 2, 3]]}],
-        [{"name": "m", "mesh": "m.ply", "faces": [True]}],
-        [{"name": "m", "mesh": "m.ply", "faces": 7}],
-        [{"adt": "nowhere"}],
-        [{"adt": "..", "name": "x"}],
-        [BOX | {"turn": [0, 0, 0, 0]}],
-        [BOX | {"turn": [0, 0, 1]}],
-        [BOX | {"turn": "x"}],
-        [BOX | {"turn": 1e400}],
+        *((read, value) for value in NO_REGIONS for read in (read_regions, read_areas)),
+        *((read_areas, {"regions": entries}) for entries in NO_AREAS),
     ],
 )
-def test05_others_are_told_in_a_sentence(tmp_path, entries):
-    path = written(tmp_path, *entries)
+def test05_others_are_told_in_a_sentence(tmp_path, read, value):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(value))
     with pytest.raises(NergError) as told:
-        read_areas(path)
-    assert str(tmp_path) in str(told.value) and "\n" not in str(told.value)
+        read(path)
+    assert str(path) in str(told.value) and "\n" not in str(told.value)
 
 
 def test06_groups_may_be_nested_so_deep(tmp_path):
@@ -169,16 +215,12 @@ def test06_groups_may_be_nested_so_deep(tmp_path):
 
 # ---- The objects of Aria Digital Twin as boxes in the frame of rays ----
 
-
 BOX_HEAD = (
     "object_uid,timestamp[ns],p_local_obj_xmin[m],p_local_obj_xmax[m],p_local_obj_ymin[m],p_local_obj_ymax[m],"
     "p_local_obj_zmin[m],p_local_obj_zmax[m]"
 )
 
-
 POSE_HEAD = "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m],q_wo_w,q_wo_x,q_wo_y,q_wo_z"
-
-
 HALF = np.sqrt(0.5)
 
 

@@ -215,9 +215,9 @@ def _make_changes(folder: Path) -> None:
 
 def _read_changes(folder: Path) -> object:
     from nerg_mi.aoi.scene import changed_areas, read_changes
-    from nerg_mi.formats.areas import Areas, Region
+    from nerg_mi.formats.areas import AreaSet, Region
 
-    return changed_areas(Areas((Region.of("shelf", [0, 0, 0], [1, 1, 1]),)), read_changes(folder / "changes.json"))
+    return changed_areas(AreaSet((Region.of("shelf", [0, 0, 0], [1, 1, 1]),)), read_changes(folder / "changes.json"))
 
 
 def _make_cohorts(folder: Path) -> None:

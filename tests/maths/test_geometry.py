@@ -13,7 +13,7 @@ from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import read_splats
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.maths.geometry import Box, ContractedBox, Similarity, box_interval, box_of, intersect_box
-from nerg_mi.photos.posed import Frame, settled
+from nerg_mi.photos.posed import PosedFrame, settled
 from nerg_mi.rays.readers.base import UNITY, RaysBuilder
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos
 from tests.reference import march_numpy as reference
@@ -301,7 +301,7 @@ def read_rays(path: Path, points: np.ndarray) -> None:
 def read_cameras(path: Path, points: np.ndarray) -> None:
     poses = np.tile(np.eye(4), (len(points), 1, 1))
     poses[:, :3, 3] = points
-    settled(path / "a.json", [Frame(f"{k}", path / f"{k}", pose, {}) for k, pose in enumerate(poses)], [])
+    settled(path / "a.json", [PosedFrame(f"{k}", path / f"{k}", pose, {}) for k, pose in enumerate(poses)], [])
 
 
 def splats_by(name, write):

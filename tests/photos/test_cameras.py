@@ -23,7 +23,6 @@ from tests.reference import opencv
 
 # ---- Rays of cameras: distortion, projection, and agreement with Mitsuba's own camera ----
 
-
 FOX = Intrinsics(135, 240, 171.94, 171.81, 69.3, 120.7, 0.0578421, -0.0805099, -0.000980296, 0.00015575)
 
 
@@ -112,7 +111,6 @@ def test_what_bends_the_picture():
 
 
 # ---- Lens models against OpenCV's, restated; and their inverses ----
-
 
 LENSES = {
     "fox": FOX,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import struct
 import tracemalloc
 
@@ -71,11 +72,7 @@ def quaternion(matrix):
 
 
 POINTS = np.random.default_rng(2).normal(size=(6, 3))
-
-
 TRACKS, ERRORS = [4, 3, 2, 5, 3, 7], [0.5, 1.0, 0.5, 9.0, 2.0, 0.1]
-
-
 TRUSTED = [0, 1, 4, 5]
 
 
@@ -171,28 +168,37 @@ def test_missing_images_and_masks_are_listed(model):
     assert "does not exist" in reasons[NAMES[0]] and "mask" in reasons[NAMES[3]]
 
 
+@pytest.mark.parametrize("name", ["images/a.png", "masks/a.png.png", "0/images.bin", "0/points3D.bin"])
+def test_a_pipe_is_no_missing_file(tmp_path, name):
+    for folder in ("0", "images", "masks"):
+        (tmp_path / folder).mkdir()
+    write_bin(tmp_path / "0", ["a.png", "b.png"])
+    for folder in ("images", "masks"):
+        for photo in ("a.png", "b.png"):
+            (tmp_path / folder / (photo if folder == "images" else f"{photo}.png")).touch()
+    (tmp_path / name).unlink()
+    os.mkfifo(tmp_path / name)
+    read = lambda: read_colmap(tmp_path / "0", tmp_path / "images", tmp_path / "masks")
+    if name.startswith("0/"):
+        with pytest.raises(NergError, match=f'{name}" is a pipe'):
+            read()
+    else:
+        found = read()
+        assert [f.name for f in found.frames] == ["b.png"] and f'{name}" is a pipe' in found.unused[0].reason
+
+
 def test_a_zero_quaternion_is_listed(tmp_path):
-    write_txt(tmp_path, ["a.png", "b.png"])
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(b"")
+    write_txt(tmp_path, ["a.png", "b.png"])
     text = (tmp_path / "images.txt").read_text().splitlines()
     words = text[1].split()
     text[1] = " ".join([words[0], "0", "0", "0", "0", *words[5:]])
     (tmp_path / "images.txt").write_text("\n".join(text))
     posed = read_colmap(tmp_path, tmp_path)
     assert [f.name for f in posed.frames] == ["b.png"] and "quaternion" in posed.unused[0].reason
-
-
-@pytest.mark.parametrize(
-    "name, record", [("cameras", "camera record"), ("images", "image record"), ("points3D", "point record")]
-)
-def test_a_binary_file_cut_short_is_told_with_its_place(tmp_path, name, record):
-    (tmp_path / "a.png").write_bytes(b"")
-    write_bin(tmp_path, ["a.png"])
-    path = tmp_path / f"{name}.bin"
-    path.write_bytes(path.read_bytes()[:-4])
-    with pytest.raises(ValueError, match=f"{name}.bin.*ends in the middle of {record}"):
-        read_colmap(tmp_path, tmp_path)
+    with pytest.raises(NergError, match='image "a.png" of .*its quaternion is zero'):
+        read_named_poses(tmp_path)
 
 
 def test_an_unknown_model_number_ends_a_binary_file(tmp_path):
@@ -248,16 +254,27 @@ def test_masks_outside_of_the_capture_are_used_only_if_allowed(tmp_path):
     assert read_colmap(*where, allow_outside=True).frames[0].mask is not None
 
 
-@pytest.mark.parametrize("count", [2**63, 2**64 - 1, 10**9])
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_counts_beyond_the_file_are_told_with_its_name(tmp_path, name, count):
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "a.png").write_bytes(b"")
-    write_bin(tmp_path, ["a.png"])
-    raw = (tmp_path / name).read_bytes()
-    (tmp_path / name).write_bytes(struct.pack("<Q", count) + raw[8:])
-    with pytest.raises(NergError, match=name):
-        read_colmap(tmp_path, tmp_path / "images")
+def claiming(count):
+    return lambda raw: struct.pack("<Q", count) + raw[8:]
+
+
+@pytest.mark.parametrize("name, record", [("cameras", "camera"), ("images", "image"), ("points3D", "point")])
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda raw: raw[:-4], "ends in the middle of {record} record"),
+        *((claiming(count), "") for count in (2**63, 2**64 - 1, 10**9)),
+        (lambda raw: claiming(struct.unpack("<Q", raw[:8])[0] - 1)(raw), "more bytes than the"),
+    ],
+)
+def test_binary_files_that_their_headers_do_not_fit_are_refused(tmp_path, name, record, change, said):
+    for photo in ("a.png", "b.png"):
+        (tmp_path / photo).write_bytes(b"")
+    write_bin(tmp_path, ["a.png", "b.png"])
+    path = tmp_path / f"{name}.bin"
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(NergError, match=f"{name}.bin.*{said.format(record=record)}"):
+        read_colmap(tmp_path, tmp_path)
 
 
 def test_observations_may_stand_on_a_long_line_and_nothing_else(tmp_path):
@@ -336,17 +353,6 @@ def test_a_text_file_with_another_count_than_its_header_is_noted(tmp_path, name,
     path.write_text(f"# Number of {what}: 24, mean observations: 2\n{text}")
     (note,) = read_colmap(tmp_path, tmp_path).notes
     assert f"{name}.txt" in note and f"has {counts[name]} records" in note and "states 24" in note
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_a_binary_file_with_more_than_its_header_states_is_refused(tmp_path, name):
-    (tmp_path / "a.png").write_bytes(b"")
-    write_bin(tmp_path, ["a.png", "b.png"])
-    path = tmp_path / f"{name}.bin"
-    raw = path.read_bytes()
-    path.write_bytes(struct.pack("<Q", struct.unpack("<Q", raw[:8])[0] - 1) + raw[8:])
-    with pytest.raises(NergError, match=f"{name}.bin.* more bytes than the"):
-        read_colmap(tmp_path, tmp_path)
 
 
 def test_gigabytes_of_observations_are_skipped(tmp_path, monkeypatch):
@@ -444,17 +450,9 @@ def test_the_checksum_is_that_of_a_training(tmp_path):
     ],
 )
 def test_what_is_no_pose(tmp_path, frames, message):
-    path = tmp_path / "transforms.json"
-    path.write_text(json.dumps({"frames": frames}))
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     with pytest.raises(NergError, match=message):
-        read_named_poses(path)
-
-
-def test_a_model_whose_quaternion_is_zero(tmp_path):
-    folder = write_colmap(tmp_path / "sparse", some_poses(1))
-    (folder / "images.txt").write_text("1 0 0 0 0 0 0 0 1 a.jpg\n\n")
-    with pytest.raises(NergError, match='image "a.jpg" of .*its quaternion is zero'):
-        read_named_poses(folder)
+        read_named_poses(tmp_path / "transforms.json")
 
 
 @pytest.mark.parametrize("base", ["sparse", "colmap/sparse", "."])
@@ -469,16 +467,13 @@ def test_of_several_models_the_largest_is_taken(tmp_path, base, counts):
 
 
 def test_binary_models_are_counted_by_their_header(tmp_path):
+    assert describe_other_models(write_colmap(tmp_path / "other/sparse/0", some_poses(2))) == []
     for name, count in (("0", 2), ("1", 24)):
         (tmp_path / "sparse" / name).mkdir(parents=True)
         for file in ("cameras.bin", "images.bin"):
             (tmp_path / "sparse" / name / file).write_bytes(count.to_bytes(8, "little"))
     assert find_source(tmp_path).name == "1"
     assert describe_other_models(tmp_path / "sparse/0")[0].endswith('"0" (2 images) is used, and not "1" (24 images)')
-
-
-def test_a_single_model_needs_no_note(tmp_path):
-    assert describe_other_models(write_colmap(tmp_path / "sparse/0", some_poses(2))) == []
 
 
 def test_notes_on_a_model_come_with_its_poses(tmp_path):
@@ -491,7 +486,6 @@ def test_notes_on_a_model_come_with_its_poses(tmp_path):
 
 
 # ---- Up, of cameras and points whose up is known ----
-
 
 SOME = Rotation.from_euler("xyz", [40, -70, 110], degrees=True).as_matrix()
 

@@ -34,7 +34,6 @@ from tests.reference import opencv
 #
 # The scene box around an object, in a room and around points; and cameras that see what no other does.
 
-
 LENS = Intrinsics(10, 10, 10.0, 10.0, 5.0, 5.0)
 
 
@@ -53,8 +52,6 @@ def directions(count, seed=4):
 
 
 AROUND = [looking(np.array([1, 2, 3]) + 4 * d, [1, 2, 3]) for d in directions(20)]
-
-
 INSIDE = [looking(c, c + d) for c, d in zip(np.random.default_rng(4).uniform(0, 4, (20, 3)), directions(20))]
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.photos import posed
-from nerg_mi.photos.posed import Frame, drop_repeated, read_semidense, rigid_pose
+from nerg_mi.photos.posed import PosedFrame, drop_repeated, read_semidense, rigid_pose
 from nerg_mi.photos.transforms import read_transforms
 from tests.photos.written_sets import frame
 
@@ -58,18 +58,6 @@ def test_a_mirroring_change_of_coordinates_is_refused(write):
         t.moved(np.diag([1.0, 1, -1, 1]))
 
 
-@pytest.mark.parametrize("keys", [{"fl_x": 1e-300}, {"fl_x": 1e300}, {"cx": 1e300}, {"cy": -1e9}, {"k2": 1e200}])
-def test_lenses_that_no_camera_has_are_refused(write, keys):
-    t = read_transforms(write({"fl_x": 30.0, **keys, "frames": [frame("a.png")]}))
-    with pytest.raises(NergError, match="a.png"):
-        t.frames[0].intrinsics(8, 8)
-
-
-def test_a_distortion_of_nothing_is_none(write):
-    t = read_transforms(write({"fl_x": 30.0, "k1": 1e-320, "k3": -1e-300, "frames": [frame("a.png")]}))
-    assert not t.frames[0].intrinsics(8, 8).is_distorted
-
-
 def test_the_nearest_rotation_is_what_a_rounded_pose_means():
     turned = np.array([[0.0, -1.001, 0.0, 1], [1.0, 0.0, 0.0, 2], [0.0, 0.0, 1.0, 3]])
     pose = rigid_pose(turned.tolist())
@@ -95,14 +83,13 @@ def test_what_is_no_pose(matrix, reason):
 def test_an_image_that_is_listed_again_counts_once(tmp_path):
     (tmp_path / "a.png").touch()
     (tmp_path / "b.png").symlink_to(tmp_path / "a.png")
-    first = Frame("a.png", tmp_path / "a.png", np.eye(4), {})
-    again = Frame("b.png", tmp_path / "b.png", np.diag([1.0, -1, -1, 1]), {})
+    first = PosedFrame("a.png", tmp_path / "a.png", np.eye(4), {})
+    again = PosedFrame("b.png", tmp_path / "b.png", np.diag([1.0, -1, -1, 1]), {})
     kept, unused = drop_repeated([first, again])
     assert kept == [first] and "another pose" in unused[0].reason
 
 
 # ---- Semi-dense points of Aria's glasses ----
-
 
 HEAD = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std"
 

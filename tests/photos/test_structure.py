@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import struct
+import subprocess
 import sys
 import zlib
 from pathlib import Path
@@ -17,91 +18,28 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from nerg_mi.alignment.similarity import fit_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.photos import structure
+from nerg_mi.photos.colmap import read_colmap
 from nerg_mi.photos.images import read_image
 from nerg_mi.photos.structure import (
     EXHAUSTIVE,
     Folders,
-    Picture,
+    PhotoCopy,
     Settings,
     cameras_of,
     check_installed,
     chosen_pairs,
     copy_photos,
     encoded,
-    fit_similarity,
     list_photos,
-    pose_errors,
     reconstruct,
     shrunk,
     small_name,
     small_size,
 )
-
-# ---- Poses against others: similarities and errors that are known ----
-
-
-def similarity(scale: float, seed: int = 0) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, :3] = scale * Rotation.random(random_state=seed).as_matrix()
-    out[:3, 3] = 1, -2, 3
-    return out
-
-
-def poses(count: int = 12) -> np.ndarray:
-    out = np.tile(np.eye(4), (count, 1, 1))
-    out[:, :3, :3] = Rotation.random(count, random_state=1).as_matrix()
-    out[:, :3, 3] = np.random.default_rng(2).normal(size=(count, 3))
-    return out
-
-
-def moved(all_poses: np.ndarray, by: np.ndarray) -> np.ndarray:
-    out = all_poses.copy()
-    scale = np.cbrt(np.linalg.det(by[:3, :3]))
-    out[:, :3, :3] = by[:3, :3] / scale @ all_poses[:, :3, :3]
-    out[:, :3, 3] = all_poses[:, :3, 3] @ by[:3, :3].T + by[:3, 3]
-    return out
-
-
-@pytest.mark.parametrize("flat", [False, True])
-def test_a_similarity_is_found_again(flat):
-    points = np.random.default_rng(0).normal(size=(9, 3)) * [1, 1, 0 if flat else 1]
-    by = similarity(2.5)
-    assert np.allclose(fit_similarity(points, points @ by[:3, :3].T + by[:3, 3]), by)
-
-
-def test_a_mirror_is_none():
-    points = np.random.default_rng(0).normal(size=(9, 3))
-    assert np.linalg.det(fit_similarity(points, points * [1, 1, -1])[:3, :3]) > 0
-
-
-@pytest.mark.parametrize(
-    "points, said", [(np.eye(3)[:2], "3 pairs"), (np.outer(np.arange(5.0), [1, 2, 3]), "on a line")]
-)
-def test_what_leaves_it_open_is_refused(points, said):
-    with pytest.raises(ValueError, match=said):
-        fit_similarity(points, points)
-
-
-def test_errors_do_not_depend_on_coordinates():
-    errors = pose_errors(poses(), moved(poses(), similarity(0.3)))
-    assert errors.rotation.max() < 1e-6 and errors.position.max() < 1e-12
-
-
-def test_errors_are_those_that_were_made():
-    reference, wrong = poses(), poses()
-    wrong[4, :3, :3] = wrong[4, :3, :3] @ Rotation.from_rotvec([0, np.radians(7), 0]).as_matrix()
-    errors = pose_errors(wrong, reference)
-    assert errors.rotation[4] == pytest.approx(7) and np.delete(errors.rotation, 4).max() < 1e-6
-    wrong = poses()
-    wrong[:, :3, :3] = wrong[:, :3, :3] @ Rotation.from_rotvec([0.02, -0.01, 0]).as_matrix()
-    errors = pose_errors(wrong, reference)
-    assert errors.rotation == pytest.approx(np.degrees(np.hypot(0.02, 0.01))) and errors.scatter.max() < 1e-6
-    wrong = moved(poses(), similarity(5))
-    wrong[0, :3, 3] += 0.01
-    assert 0 < pose_errors(wrong, reference).position.argmax() + 1 == 1
-
+from tests.photos import rendered
 
 # ---- Which pictures are compared ----
 
@@ -205,18 +143,6 @@ def test_notes_tell_focal_length_and_camera(folder, folders):
     assert float(picture.made_by[2]) == 4.25
 
 
-def test_damaged_notes_do_not_matter(folder, folders):
-    ramp().save(folder / "a.jpg", exif=b"Exif\x00\x00MM\x00*\xff\xff\xff\xff" + bytes(range(256)))
-    (picture,), unused = copied(folder, folders)
-    assert picture.made_by in ((), ("", "", "")) and not unused
-
-
-def test_palettes_are_stored_anew(folder, folders):
-    ramp().quantize(16).save(folder / "a.png")
-    (picture,), _ = copied(folder, folders)
-    assert Image.open(folders.images / picture.name).mode == "RGB"
-
-
 def test_what_cannot_be_used_is_named(folder, folders):
     ramp().save(folder / "a.jpg", quality=95)
     ramp().save(folder / "b.jpg", quality=95)
@@ -225,22 +151,18 @@ def test_what_cannot_be_used_is_named(folder, folders):
     (folder / "cut.jpg").write_bytes(raw[: len(raw) // 2])
     (folder / "empty.png").write_bytes(b"")
     (folder / "text.jpg").write_text("no picture")
-    ramp().save(folder / "a gif.jpg", "gif")
+    ramp().save(folder / "gif.jpg", "gif")
+    ramp().save(folder / "bmp.jpg", "bmp")
+    ramp(seed=1).save(folder / "png.jpg", "png")
+    (folder / "heic.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    ramp().quantize(16).save(folder / "palette.png")
     pictures, unused = copied(folder, folders)
-    assert [p.name for p in pictures] == ["a.jpg", "good.jpg"]
-    assert unused["b.jpg"] == 'it is the same file as "a.jpg"'
-    assert set(unused) == {"b.jpg", "cut.jpg", "empty.png", "text.jpg", "a gif.jpg"}
-    assert all("cannot be read" in unused[n] and n in unused[n] for n in set(unused) - {"b.jpg"})
-    assert {p.name for p in folders.images.iterdir()} == {"a.jpg", "good.jpg"}
-
-
-def test_pictures_of_other_kinds_are_named_whatever_they_are_called(folder, folders):
-    ramp().save(folder / "a.jpg", "bmp")
-    ramp(seed=1).save(folder / "b.jpg", "png")
-    (folder / "c.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
-    pictures, unused = copied(folder, folders)
-    assert [p.name for p in pictures] == ["b.jpg"] and 'of the kind "bmp"' in unused["a.jpg"]
-    assert "no picture of a kind that is read" in unused["c.jpg"]
+    used = ["a.jpg", "good.jpg", "palette.png", "png.jpg"]
+    assert [p.name for p in pictures] == used and {p.name for p in folders.images.iterdir()} == set(used)
+    assert Image.open(folders.images / "palette.png").mode == "RGB"
+    assert unused.pop("b.jpg") == 'it is the same file as "a.jpg"' and 'of the kind "bmp"' in unused.pop("bmp.jpg")
+    assert set(unused) == {"cut.jpg", "empty.png", "text.jpg", "gif.jpg", "heic.jpg"}
+    assert all("cannot be read" in reason and name in reason for name, reason in unused.items())
 
 
 def test_links_out_of_the_folder_are_followed_only_if_allowed(folder, folders, tmp_path):
@@ -297,8 +219,11 @@ def test_odd_notes_leave_a_photo_as_it_is(folder, folders):
         head = b"Exif\0\0MM\0*\0\0\0\x08" + struct.pack(">H", len(found) // 12)
         # What follows are the same notes again.
         ramp(seed=k).save(folder / f"{k}.jpg", exif=head + found + struct.pack(">I", 8))
+    damaged = b"Exif\0\0MM\0*\xff\xff\xff\xff" + bytes(range(256))
+    ramp(seed=4).save(folder / "4.jpg", exif=damaged)
     pictures, unused = copied(folder, folders)
-    assert [p.size for p in pictures] == [(48, 32)] * 4 and not unused
+    assert [p.size for p in pictures] == [(48, 32)] * 5 and not unused
+    assert pictures[4].made_by in ((), ("", "", ""))
 
 
 def test_others_are_named_and_hidden_ones_are_not(folder):
@@ -308,6 +233,13 @@ def test_others_are_named_and_hidden_ones_are_not(folder):
     photos, others = list_photos(folder)
     assert [p.name for p in photos] == ["a.jpg"] and [o.name for o in others] == ["b.HEIC"]
     assert "JPEG and PNG" in others[0].reason
+
+
+def test_a_pipe_is_no_photo(folder, folders):
+    ramp().save(folder / "a.jpg")
+    os.mkfifo(folder / "b.jpg")
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["a.jpg"] and 'b.jpg" is a pipe' in unused["b.jpg"]
 
 
 def test_a_folder_without_photos_is_told(folder, tmp_path):
@@ -350,16 +282,15 @@ def test_files_are_of_their_names_kind(suffix, kind):
 def test_pictures_of_one_size_share_a_camera():
     upright, across = ((3, 4), (3, 4)), ((4, 3), (4, 3))
     sizes = [upright, across, upright, upright]
-    pictures = [Picture(str(k), *size) for k, size in enumerate(sizes)]
+    pictures = [PhotoCopy(str(k), *size) for k, size in enumerate(sizes)]
     assert cameras_of(pictures) == [0, 1, 0, 0] and cameras_of(pictures, share=False) == [0, 1, 2, 3]
-    made = [Picture(str(k), *upright, made_by=("maker", focal)) for k, focal in enumerate(["4.2", "4.2", "9"])]
+    made = [PhotoCopy(str(k), *upright, made_by=("maker", focal)) for k, focal in enumerate(["4.2", "4.2", "9"])]
     assert cameras_of(made) == [0, 0, 1]
 
 
 # ---- The process that finds poses, from outside: what it is given, and how its end is told ----
 
-
-PICTURES = [Picture(f"{k}.jpg", (400, 300), (200, 150), focal=380.0 if k else None) for k in range(4)]
+PICTURES = [PhotoCopy(f"{k}.jpg", (400, 300), (200, 150), focal=380.0 if k else None) for k in range(4)]
 
 
 @pytest.fixture
@@ -436,3 +367,99 @@ def test_it_ends_with_whoever_started_it(installed, monkeypatch, tmp_path):
         reconstruct(PICTURES, tmp_path, Settings(), progress)
     with pytest.raises(ProcessLookupError):
         os.kill(found[0], 0)
+
+
+# ---- Reconstruction of photos whose poses are known, in the process in which it runs ----
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    pytest.importorskip("pycolmap")
+    return rendered.write_photos(tmp_path_factory.mktemp("photos"))
+
+
+def found(photos, work):
+    """A reconstruction, its model as it is read, and what was told on the way."""
+    folders, steps = Folders(work / "images", work / "small"), []
+    folders.images.mkdir()
+    folders.small.mkdir()
+    pictures, _ = copy_photos(list_photos(photos)[0], folders, 320, lambda *now: None)
+    made = reconstruct(pictures, work, Settings(threads=1), lambda *now: steps.append(now))
+    return made, made and read_colmap(work / "sparse" / "0", folders.images), steps
+
+
+def pose_errors(poses, reference):
+    """Degrees between rotations, distances of centres in units of the extent of those of the reference, and the
+    similarity that was taken out of both."""
+    similarity = fit_similarity(poses[:, :3, 3], reference[:, :3, 3])
+    turn = similarity[:3, :3] / np.cbrt(np.linalg.det(similarity[:3, :3]))
+    apart = np.swapaxes(reference[:, :3, :3], 1, 2) @ turn @ poses[:, :3, :3]
+    centers = reference[:, :3, 3]
+    away = poses[:, :3, 3] @ similarity[:3, :3].T + similarity[:3, 3] - centers
+    extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
+    angles = np.degrees(Rotation.from_matrix(apart).magnitude())
+    return angles, np.linalg.norm(away, axis=1) / extent, similarity
+
+
+@pytest.fixture(scope="module")
+def first(photos, tmp_path_factory):
+    """A folder, and what was found of the photos in it."""
+    work = tmp_path_factory.mktemp("first")
+    return work, found(photos, work)
+
+
+def test_poses_and_lens_are_found(first):
+    made, model, steps = first[1]
+    assert made.parts == [[f"{k}.png" for k in range(8)]] and 0 < made.error < 0.5 and made.points > 300
+    assert list(dict.fromkeys(stage for stage, _, _ in steps)) == ["features", "matching", "mapping"]
+    assert steps[-1] == ("mapping", 8, 8)
+    poses = np.array([f.to_world for f in model.frames])
+    assert np.allclose(poses, made.to_world)
+    angles, apart, similarity = pose_errors(poses, rendered.poses())
+    assert angles.max() < 1 and apart.max() < 0.01
+    # The model stands upright, and its points are those of a floor and a box on it.
+    truth = similarity[:3, :3] / np.cbrt(np.linalg.det(similarity[:3, :3]))
+    assert np.degrees(np.arccos(truth[2, 2])) < 1 and made.up.sure and made.up.plane > 0.3
+    points = model.points @ similarity[:3, :3].T + similarity[:3, 3]
+    low, high = np.quantile(points[:, 2], [0.02, 0.98])
+    assert low == pytest.approx(0, abs=0.03) and high == pytest.approx(0.7, abs=0.05)
+    lens = model.frames[0].intrinsics(320, 240)
+    assert lens.fx == lens.fy == pytest.approx(rendered.FOCAL, rel=0.02) and abs(lens.k1) < 0.05
+    assert len(made.surface) == len(made.colors) and made.colors.dtype == np.uint8
+
+
+@pytest.mark.nightly
+def test_equal_photos_give_equal_poses_whatever_their_size(photos, first, tmp_path):
+    """The second time with small copies of the same pixels, of photos that are larger: of the same place."""
+    from PIL import Image
+
+    (tmp_path / "large").mkdir()
+    for path in photos.iterdir():
+        Image.open(path).resize((960, 720), Image.Resampling.NEAREST).save(tmp_path / "large" / path.name)
+    work, models = [first[0], tmp_path / "b", tmp_path / "c"], [first[1][1]]
+    for at, folder in zip(work[1:], (photos, tmp_path / "large")):
+        at.mkdir()
+        models.append(found(folder, at)[1])
+    files = [[(at / "sparse" / "0" / f"{k}.bin").read_bytes() for k in ("images", "points3D")] for at in work[:2]]
+    assert files[0] == files[1]
+    large, small = models[2].frames[0].intrinsics(960, 720), models[0].frames[0].intrinsics(320, 240)
+    assert large.fx == pytest.approx(3 * small.fx, rel=0.02) and large.cx == 480
+    angles, apart, _ = pose_errors(*(np.array([f.to_world for f in m.frames]) for m in (models[2], models[0])))
+    assert angles.max() < 0.5 and apart.max() < 0.01
+
+
+def test_nothing_that_fits_together(tmp_path):
+    pytest.importorskip("pycolmap")
+    from PIL import Image
+
+    (tmp_path / "photos").mkdir()
+    for k in range(3):
+        Image.fromarray(np.full((60, 80, 3), 80 * k, np.uint8)).save(tmp_path / "photos" / f"{k}.png")
+    assert found(tmp_path / "photos", tmp_path)[0] is None
+
+
+def test_it_speaks_lines_of_json_alone(photos, tmp_path):
+    """What libraries print, and why it ends, goes to the standard error."""
+    command = [sys.executable, "-m", "nerg_mi.photos.structure_worker", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1 and done.stdout == "" and "job.json" in done.stderr

@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.formats.torch_ngp import read_nerg
-from tests.formats.torch_ngp.test_nerg import save
+from tests.formats.test_torch_ngp import save_nerg as save
 from tests.reference import march_numpy
 from tests.reference import torch_ngp_numpy as reference
 

@@ -36,8 +36,8 @@ from nerg_mi.report.data import (
     thin,
 )
 from nerg_mi.statistics.shares import Shares
-from nerg_mi.statistics.visits import Box as Solid
-from nerg_mi.statistics.visits import Landed
+from nerg_mi.statistics.visits import BoxAoi as Solid
+from nerg_mi.statistics.visits import HitAssignment
 from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place
 from tests.evaluation.test_gaze import crowd
@@ -226,7 +226,7 @@ def of_field(share, seen=None):
 
 
 def on_rows(rows, count):
-    return Landed(count, (np.array(rows, int),), (np.ones(len(rows)),))
+    return HitAssignment(count, (np.array(rows, int),), (np.ones(len(rows)),))
 
 
 def test_shares_of_people_count_alike():

@@ -28,7 +28,6 @@ def test_hypotheses_without_a_p_value_do_not_count(p, expected):
 
 # ---- Intervals of ratios of sums over people, and of their differences ----
 
-
 ONES = np.ones
 
 
@@ -263,7 +262,6 @@ def test17_people_of_both_are_drawn_together():
 
 
 # ---- Shares of people: intervals and differences that hold for few ----
-
 
 P = np.linspace(0.001, 0.999, 999)
 

@@ -9,8 +9,8 @@ from nerg_mi.statistics.tables import (
     BY_NAME,
     MEASURES,
     TRACKED,
-    Floor,
-    People,
+    MinParticipantsFilter,
+    Participants,
     PersonRows,
     difference_rows,
     duration_rows,
@@ -18,13 +18,13 @@ from nerg_mi.statistics.tables import (
     shown,
     thing_rows,
 )
-from nerg_mi.statistics.visits import ALL, BINS, Cell, Sums
+from nerg_mi.statistics.visits import ALL, BINS, Cell, VisitSums
 
 # ---- The numbers that are told, from sums that are written out ----
 
 
 # Three people, two things: Ada looks at the first alone, Bo at both, Cy at none and has no time.
-PEOPLE = People(
+PEOPLE = Participants(
     ("Ada", "Bo", "Cy"),
     np.array([10.0, 20.0, 0.0]),
     on_time=np.array([[2.0, 0], [4, 1], [0, 0]]),
@@ -35,7 +35,6 @@ PEOPLE = People(
     first_sum=np.array([[4.0, 0], [6, 8], [0, 0]]),
     first_count=np.array([[2.0, 0], [1, 1], [0, 0]]),
 )
-
 
 EXPECTED = {
     "share": ([(0.2 + 0.2) / 2, (0 + 0.05) / 2], [2, 2]),
@@ -62,7 +61,7 @@ def test02_values_and_people(name):
 
 
 def test03_a_field_tells_less():
-    told = People(PEOPLE.names, PEOPLE.time, PEOPLE.on_time, PEOPLE.distance, None, np.full((3, 2), 0.5))
+    told = Participants(PEOPLE.names, PEOPLE.time, PEOPLE.on_time, PEOPLE.distance, None, np.full((3, 2), 0.5))
     known = {m.name for m in MEASURES if m.estimate(told, 199, 0) is not None}
     assert known == {"share", "dwell", "reach", "distance"}
     assert BY_NAME["reach"].estimate(told, 199, 0).value == pytest.approx([0.5, 0.5])
@@ -77,7 +76,7 @@ def test04_those_who_are_not_there_count_for_nothing():
 
 
 def test05_nobody():
-    none = People((), np.zeros(0), *(np.zeros((0, 2)) for _ in range(7)))
+    none = Participants((), np.zeros(0), *(np.zeros((0, 2)) for _ in range(7)))
     for measure in MEASURES:
         found = measure.estimate(none, 199, 0)
         assert np.isnan(found.value).all() and found.people.tolist() == [0, 0]
@@ -87,7 +86,9 @@ def test05_nobody():
 
 
 def sums():
-    found = Sums.empty(("x", "y"), (ALL, Cell("zone", "z")), [(ALL, "Bo"), (Cell("zone", "z"), "Bo"), (ALL, "Ada")])
+    found = VisitSums.empty(
+        ("x", "y"), (ALL, Cell("zone", "z")), [(ALL, "Bo"), (Cell("zone", "z"), "Bo"), (ALL, "Ada")]
+    )
     found.time[:] = 10, 5, 20
     found.rays[:] = 50, 25, 100
     found.on_time[:] = [[1, 2], [9, 9], [3, 0]]
@@ -114,10 +115,7 @@ def test02_nobody_knows_what_was_visible():
 
 # ---- Tables of numbers, and the floor on people ----
 
-
 A, B = Cell("cohort", "a"), Cell("cohort", "b")
-
-
 HOW = {"resamples": 299, "seed": 0}
 
 
@@ -127,12 +125,12 @@ def people(n, share, seed, prefix="p"):
     on = 100 * np.clip(rng.normal(share, 0.03, (n, 2)), 0, 1)
     looks = np.round(on / 2)
     names = tuple(f"{prefix}{k:02d}" for k in range(n))
-    return People(names, time, on, on * 2, None, (looks > 0) * 1.0, looks, on, looks)
+    return Participants(names, time, on, on * 2, None, (looks > 0) * 1.0, looks, on, looks)
 
 
 def test01_a_row_for_each_cell_thing_and_source():
     cells = {ALL: {TRACKED: people(12, 0.2, 0)}, A: {TRACKED: people(2, 0.2, 1)}}
-    rows = thing_rows(("x", "y"), cells, Floor(), **HOW)
+    rows = thing_rows(("x", "y"), cells, MinParticipantsFilter(), **HOW)
     assert [(r["cell"], r["value"], r["thing"]) for r in rows] == [
         ("all", "", "x"),
         ("all", "", "y"),
@@ -147,7 +145,7 @@ def test01_a_row_for_each_cell_thing_and_source():
 
 
 def test02_cells_of_few_people_are_blank_and_counted():
-    floor = Floor(5)
+    floor = MinParticipantsFilter(5)
     cells = {ALL: {TRACKED: people(12, 0.2, 0)}, A: {TRACKED: people(4, 0.2, 1)}}
     rows = thing_rows(("x", "y"), cells, floor, **HOW)
     assert rows[0]["share"] is not None
@@ -156,28 +154,28 @@ def test02_cells_of_few_people_are_blank_and_counted():
     # Of both things: the number of people, and the measures that rays tell.
     told = sum(measure.pair(cells[A][TRACKED]) is not None for measure in MEASURES)
     assert floor.blanked == 2 * (1 + told) and told >= 7
-    nobody = Floor(5)
+    nobody = MinParticipantsFilter(5)
     assert nobody.passes(0) and nobody.passes(5) and not nobody.passes(4) and nobody.blanked == 1
 
 
 def test03_differences_are_found_where_they_are():
     cells = {A: {TRACKED: people(15, 0.2, 0, "a")}, B: {TRACKED: people(15, 0.4, 1, "b")}}
-    rows = difference_rows(("x", "y"), cells, Floor(), compared=("share", "reach"), **HOW)
+    rows = difference_rows(("x", "y"), cells, MinParticipantsFilter(), compared=("share", "reach"), **HOW)
     shares = [r for r in rows if r["measure"] == "share"]
     assert len(rows) == 4 and all(r["found"] and 0.1 < r["low"] < r["difference"] < r["high"] < 0.3 for r in shares)
     assert not any(r["found"] for r in rows if r["measure"] == "reach")
     assert all(r["p_adjusted"] >= r["p"] for r in rows)
     assert (rows[0]["first"], rows[0]["second"]) == ("a", "b")
-    blank = difference_rows(("x", "y"), cells, Floor(16), compared=("share",), **HOW)
+    blank = difference_rows(("x", "y"), cells, MinParticipantsFilter(16), compared=("share",), **HOW)
     assert all(r["difference"] is None and r["p"] is None and not r["found"] for r in blank)
 
 
 def test04_one_value_has_nothing_to_be_compared_with():
-    assert difference_rows(("x", "y"), {ALL: {TRACKED: people(5, 0.2, 0)}}, Floor(), **HOW) == []
+    assert difference_rows(("x", "y"), {ALL: {TRACKED: people(5, 0.2, 0)}}, MinParticipantsFilter(), **HOW) == []
 
 
 def sums_tables():
-    found = Sums.empty(("x", "y"), (ALL,), [(ALL, "Bo"), (ALL, "Ada")])
+    found = VisitSums.empty(("x", "y"), (ALL,), [(ALL, "Bo"), (ALL, "Ada")])
     found.time[:] = 10, 20
     found.rays[:] = 50, 100
     found.on_time[:] = [[1, 2], [3, 0]]
@@ -189,10 +187,10 @@ def sums_tables():
 
 
 def test05_moves_and_durations():
-    rows = move_rows(sums_tables(), Floor())
+    rows = move_rows(sums_tables(), MinParticipantsFilter())
     assert [(r["from"], r["to"], r["moves"], r["share"]) for r in rows] == [("x", "y", 3, 1.0), ("y", "x", 1, 1.0)]
-    assert all(r["moves"] is None for r in move_rows(sums_tables(), Floor(3)))
-    lasted = duration_rows(sums_tables(), Floor())
+    assert all(r["moves"] is None for r in move_rows(sums_tables(), MinParticipantsFilter(3)))
+    lasted = duration_rows(sums_tables(), MinParticipantsFilter())
     assert len(lasted) == 2 and lasted[0]["0.2 to 0.5 s"] == 3 and len(lasted[0]) == 3 + len(BINS) - 1
 
 
@@ -204,4 +202,4 @@ def test06_as_markdown_has_it():
 
 def test09_nobody_is_compared_with_nobody():
     cells = {A: {TRACKED: people(15, 0.2, 0, "a")}, B: {TRACKED: people(0, 0.4, 1, "b")}}
-    assert difference_rows(("x", "y"), cells, Floor(), **HOW) == []
+    assert difference_rows(("x", "y"), cells, MinParticipantsFilter(), **HOW) == []

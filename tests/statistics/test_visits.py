@@ -14,11 +14,11 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.visits import (
     ALL,
     BINS,
-    Box,
+    BoxAoi,
     Cell,
-    Landed,
-    LookRules,
-    Sums,
+    HitAssignment,
+    VisitRules,
+    VisitSums,
     concatenate,
     cone,
     land,
@@ -34,7 +34,7 @@ from nerg_mi.statistics.visits import (
 
 
 def box(name, lower, upper, turn=None):
-    return Box(Region.of(name, lower, upper, turn))
+    return BoxAoi(Region.of(name, lower, upper, turn))
 
 
 def brute(region, o, d):
@@ -198,7 +198,7 @@ def slow_looks(rows, t, weight, sitting, rules):
 @pytest.mark.parametrize("seed", range(4))
 def test01_against_loops(seed):
     rng = np.random.default_rng(seed)
-    rules = LookRules(gap=0.5, pause=5.0, merge=0.25, least=0.15)
+    rules = VisitRules(gap=0.5, pause=5.0, merge=0.25, least=0.15)
     person = np.sort(rng.integers(0, 4, 120))
     step = rng.choice([0.0, 0.1, 0.2, 0.2, 0.3, 0.7, 6.0], 120)
     t = np.concatenate([np.cumsum(step[person == p]) for p in range(4)])
@@ -213,37 +213,37 @@ def test01_against_loops(seed):
 
 
 def test02_one_ray_stands_for_no_time():
-    line = timeline(np.array([0, 1, 1]), np.array([5.0, 1.0, 1.2]), LookRules())
+    line = timeline(np.array([0, 1, 1]), np.array([5.0, 1.0, 1.2]), VisitRules())
     assert np.allclose(line.weight, [0, 0.2, 0.2])
-    assert len(looks_at(np.array([0]), line, LookRules())) == 0
-    assert len(looks_at(np.array([0]), line, LookRules(least=0.0))) == 1
-    assert len(looks_at(np.zeros(0, int), line, LookRules())) == 0
+    assert len(looks_at(np.array([0]), line, VisitRules())) == 0
+    assert len(looks_at(np.array([0]), line, VisitRules(least=0.0))) == 1
+    assert len(looks_at(np.zeros(0, int), line, VisitRules())) == 0
 
 
 def test03_equal_times_count_once():
-    line = timeline(np.zeros(4, int), np.array([0.0, 0.0, 0.2, 0.2]), LookRules())
+    line = timeline(np.zeros(4, int), np.array([0.0, 0.0, 0.2, 0.2]), VisitRules())
     assert np.allclose(line.weight, [0, 0.2, 0, 0.2])
 
 
 def test04_no_rays():
-    assert len(timeline(np.zeros(0, int), np.zeros(0), LookRules()).t) == 0
+    assert len(timeline(np.zeros(0, int), np.zeros(0), VisitRules()).t) == 0
 
 
 @pytest.mark.parametrize("t", [[0.0, np.nan], [1.0, 0.0], [0.0, np.inf]])
 def test05_times_that_are_none_or_unsorted(t):
     with pytest.raises(ValueError):
-        timeline(np.zeros(2, int), np.array(t), LookRules())
+        timeline(np.zeros(2, int), np.array(t), VisitRules())
 
 
 @pytest.mark.parametrize("bad", [{"gap": 0}, {"gap": -1}, {"pause": 0.5}, {"merge": np.nan}, {"least": np.inf}])
 def test06_rules_that_are_none(bad):
     with pytest.raises(NergError, match="--"):
-        LookRules(**bad)
+        VisitRules(**bad)
 
 
 def test07_times_on_the_bounds():
     """A pause as long as it may be joins sittings, an interruption as long as it may be looks."""
-    rules = LookRules(gap=0.5, pause=4.0, merge=0.25, least=0.25)
+    rules = VisitRules(gap=0.5, pause=4.0, merge=0.25, least=0.25)
     line = timeline(np.zeros(4, int), np.array([0.0, 4.0, 8.0, 12.5]), rules)
     assert line.sitting.tolist() == [0, 0, 0, 1]
     line = timeline(np.zeros(6, int), np.arange(6) * 0.25, rules)
@@ -254,10 +254,7 @@ def test07_times_on_the_bounds():
 
 # ---- Sums of blocks, against dictionaries filled ray by ray, and in any number of parts ----
 
-
-RULES = LookRules(gap=0.5, pause=5.0, merge=0.25, least=0.15)
-
-
+RULES = VisitRules(gap=0.5, pause=5.0, merge=0.25, least=0.15)
 AREAS = ("a", "b", "c")
 
 
@@ -276,7 +273,7 @@ def made(seed=0, n=150, people=3):
     on = rng.random((n, 3)) < (0.5, 0.2, 0.0)
     far = rng.random((n, 3)) + 1
     rows = tuple(np.flatnonzero(on[:, k]) for k in range(3))
-    landed = Landed(n, rows, tuple(far[r, k] for k, r in enumerate(rows)))
+    landed = HitAssignment(n, rows, tuple(far[r, k] for k, r in enumerate(rows)))
     return rays, landed, on, far, rng.random((n, 3)) < 0.4
 
 
@@ -360,7 +357,7 @@ def pick(landed, rows):
     place = {int(r): k for k, r in enumerate(rows)}
     keep = [[place[int(r)] for r in of if int(r) in place] for of in landed.rows]
     far = [np.array([d for r, d in zip(of, ds) if int(r) in place]) for of, ds in zip(landed.rows, landed.distance)]
-    return Landed(len(rows), tuple(np.array(k, int) for k in keep), tuple(far))
+    return HitAssignment(len(rows), tuple(np.array(k, int) for k in keep), tuple(far))
 
 
 def test02_in_parts_it_is_the_same():
@@ -372,7 +369,7 @@ def test02_in_parts_it_is_the_same():
         parts.append(partial_sums(rays.select(rows), pick(landed, rows), AREAS, [(ALL, None)], RULES, visible[rows]))
     merged = merge(parts)
     assert merged.rows == whole.rows
-    for f in fields(Sums):
+    for f in fields(VisitSums):
         value = getattr(whole, f.name)
         if isinstance(value, np.ndarray):
             assert np.array_equal(getattr(merged, f.name), value), f.name
@@ -404,10 +401,10 @@ def test03b_the_last_visit_ends_when_its_last_ray_does():
     d = np.tile([1.0, 0, 0], (8, 1))
     rays = Rays(t, np.zeros(8, int), ("ann",), d, d, np.ones(8))
     on = np.array([1, 2, 5, 6])
-    landed = Landed(8, (on,), (np.ones(4),))
-    early = partial_sums(rays, landed, ("a",), [(ALL, None)], LookRules())
+    landed = HitAssignment(8, (on,), (np.ones(4),))
+    early = partial_sums(rays, landed, ("a",), [(ALL, None)], VisitRules())
     assert early.looks[0, 0] == 2 and early.first[0, 0] == 0.25 and early.last[0, 0] == 1.75
-    late = partial_sums(replace(rays, t=t + 100), landed, ("a",), [(ALL, None)], LookRules())
+    late = partial_sums(replace(rays, t=t + 100), landed, ("a",), [(ALL, None)], VisitRules())
     for parts in ([early, late], [late, early]):
         assert merge(parts).first[0, 0] == 0.25 and merge(parts).last[0, 0] == 101.75
 

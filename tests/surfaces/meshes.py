@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from nerg_mi.fields.splats import Splats
 from nerg_mi.surfaces.mesh import Mesh, weld
+from nerg_mi.surfaces.sources import SurfaceObserver
 
 _QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 
@@ -22,6 +24,10 @@ def joined(*parts) -> Mesh:
     start = np.cumsum([0, *(len(v) for v, _ in parts)])
     faces = np.concatenate([f + s for (_, f), s in zip(parts, start)])
     return weld(np.concatenate([v for v, _ in parts]), faces)[0]
+
+
+def longest_edge(mesh: Mesh) -> float:
+    return float(np.linalg.norm(mesh.corners - np.roll(mesh.corners, 1, axis=1), axis=2).max())
 
 
 def plate(n: int, jitter: float = 0.0, side: float = 1.0, z: float = 0.0, seed: int = 0) -> tuple:
@@ -42,3 +48,31 @@ def vmf(mi, mu, kappa: float):
     mean = mi.Vector3f(*(np.asarray(mu, float) / np.linalg.norm(mu)).tolist())
     scale = kappa / (2 * np.pi * -np.expm1(-2 * kappa))
     return lambda d: scale * dr.exp(kappa * (dr.dot(mean, d) - 1))
+
+
+def lookers_of_law(law):
+    """Observers whose density depends on the direction alone: ``law`` of unit directions, in 1/sr."""
+    import mitsuba as mi
+
+    def make(eye):
+        center = mi.Point3f(np.asarray(eye, float).tolist())
+        return SurfaceObserver(center, lambda p_od, p_o, r_o, active: law(r_o), law)
+
+    return make
+
+
+# ---- Walls of flat Gaussians that overlap ----
+
+TURN_X = (0.0, 1.0, 0.0, 0.0)
+"""By half a turn around x: what points along z points against it."""
+
+
+def wall(z=0.0, side=1.0, apart=0.02, jitter=0.0, opacity=0.9, turned=(1.0, 0.0, 0.0, 0.0), seed=0) -> Splats:
+    """A square wall in the plane ``z`` around the axis, of disks that are ``apart`` and 0.7 of that wide."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(-side / 2 + apart / 2, side / 2, apart)
+    p = np.stack([*np.meshgrid(x, x, indexing="ij"), np.full((len(x), len(x)), z)], axis=-1).reshape(-1, 3)
+    p[:, 2] += jitter * rng.normal(size=len(p))
+    n = len(p)
+    scales = np.tile([0.7 * apart, 0.7 * apart, 1e-3], (n, 1))
+    return Splats(p, scales, np.tile(turned, (n, 1)), np.full(n, opacity), np.zeros((n, 1, 3)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.surfaces.laplacian import Smoother, Sums, delaunay, deposit, heron, laplacian, merge, twins
+from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, delaunay, deposit, heron, laplacian, merge, twins
 from nerg_mi.surfaces.mesh import Mesh, weld
 from tests.surfaces.meshes import box, joined, plate
 
@@ -172,11 +172,11 @@ def test01_a_deposit_is_divided_among_corners_and_keeps_its_sum():
 
 def test02_sums_add_up_in_their_order():
     rng = np.random.default_rng(0)
-    parts = [Sums(rng.random(3), rng.random(4), *rng.random(4), 1) for _ in range(5)]
+    parts = [SurfaceSums(rng.random(3), rng.random(4), *rng.random(4), 1) for _ in range(5)]
     whole = merge(parts)
     assert np.array_equal(
         whole.face, ((((parts[0].face + parts[1].face) + parts[2].face) + parts[3].face) + parts[4].face)
     )
     assert whole.count == 5 and np.isclose(whole.weight, sum(p.weight for p in parts))
     assert np.isclose(whole.unaccounted, whole.total - whole.face.sum() - whole.elsewhere - whole.escaped)
-    assert Sums.none(2, 3).on_surface == 0
+    assert SurfaceSums.none(2, 3).on_surface == 0

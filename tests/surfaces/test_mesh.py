@@ -1,14 +1,16 @@
 """Tests of `nerg_mi.surfaces.mesh`."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces import mesh
-from nerg_mi.surfaces.mesh import Target, refine, shape_triangles, weld
+from nerg_mi.surfaces.mesh import SurfaceTarget, refine, shape_triangles, texture_rows, unroll, weld
 from nerg_mi.transport.volume_medium import VolumeMedium
-from tests.surfaces.meshes import box, joined, plate
+from tests.surfaces.meshes import box, joined, longest_edge, plate
 
 # ---- Meshes made whole: vertices of one place are one, and faces that are none are left out ----
 
@@ -19,7 +21,7 @@ def test01_a_box_whose_sides_repeat_its_corners_is_one_surface():
     assert (len(mesh.vertices), len(mesh.faces), repairs.merged) == (8, 12, 28)
     assert np.array_equal(index, np.arange(12)) and np.isclose(mesh.area.sum(), 22)
     assert np.allclose(mesh.corners, v[f]) and np.isclose(mesh.vertex_area.sum(), 22)
-    assert np.isclose(mesh.diagonal, np.sqrt(14)) and np.isclose(mesh.longest.max(), np.sqrt(13))
+    assert np.isclose(mesh.diagonal, np.sqrt(14))
     assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1)
 
 
@@ -76,7 +78,7 @@ def test01_a_closed_box_stays_closed_and_its_area_what_it_is(longest):
     whole = joined(box((0, 0, 0), (1, 2, 3)))
     found = refine(whole, longest)
     assert set(edge_counts(found.mesh.faces)) == {2}
-    assert found.mesh.longest.max() <= longest
+    assert longest_edge(found.mesh) <= longest
     assert np.allclose(np.bincount(found.parent, found.mesh.area), whole.area, rtol=1e-12)
     # Outwards still: the flux of x is three times the volume, with the sign of the whole's.
     flux = lambda m: np.einsum("fi,fi->", m.corners.mean(1), m.normals * m.area[:, None])
@@ -103,7 +105,7 @@ def test03_too_many(monkeypatch):
 
 def test01_each_ray_ends_where_it_should(rgb):
     room, inner = joined(box((0, 0, 0), (4, 3, 2), without=1)), box((2, 1, 0.5), (3, 2, 1.5))
-    target = Target(room, [inner])
+    target = SurfaceTarget(room, [inner])
     d = fibonacci_directions(4000)[1:]
     eye = np.array([1.0, 1.5, 1.0])
     found = target.ends(np.broadcast_to(eye, d.shape), d)
@@ -124,7 +126,48 @@ def test01_each_ray_ends_where_it_should(rgb):
 def test02_a_ray_may_end_in_a_medium_before(rgb):
     fog = rgb.load_dict({"type": "constvolume", "value": 100.0, "to_world": rgb.ScalarTransform4f().scale(0.5)})
     sheet = (np.array([(-2.0, -2, 2), (2, -2, 2), (2, 2, 2), (-2, 2, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
-    target = Target(joined(sheet), medium=VolumeMedium(fog))
+    target = SurfaceTarget(joined(sheet), medium=VolumeMedium(fog))
     origins = np.array([(0.25, 0.25, -1), (1.0, 1.0, -1)])
     found = target.ends(origins, np.broadcast_to([0.0, 0, 1], (2, 3)))
     assert found.elsewhere.tolist() == [True, False] and (found.face >= 0).tolist() == [False, True]
+
+
+# ---- Charts ----
+
+
+@pytest.mark.parametrize("scale", [1e-5, 1e5])
+@pytest.mark.parametrize("rows", [3, 100, 256])
+def test01_a_texture_has_at_each_point_what_the_surface_has(rgb, scale, rows, monkeypatch):
+    pytest.importorskip("xatlas", reason="xatlas is not installed")
+    monkeypatch.setattr("nerg_mi.surfaces.mesh.TEXTURE_ROWS", rows)
+    mesh, pixels = joined(box((0, 0, 0), (scale, 2 * scale, 0.5 * scale))), 256
+    refined = refine(mesh, 0.2 * scale)
+    charts = unroll(mesh, pixels)
+    assert charts.uv.min() >= 0 and charts.uv.max() <= 1
+    assert np.array_equal(charts.vertex[charts.faces], mesh.faces)
+    values = refined.mesh.vertices @ [1.0, 2, 3] / scale
+    blocks = list(texture_rows(charts, refined, values, pixels))
+    found, known = (np.concatenate([block[k] for block in blocks]) for k in (1, 2))
+    assert [block[0].start for block in blocks] == list(range(0, pixels, rows))
+    assert found.shape == known.shape == (256, 256) and 0.3 < known.mean() < 1
+    # At points drawn on the surface, by the nearest pixel.
+    rng = np.random.default_rng(0)
+    face, b = rng.integers(0, len(mesh.faces), 500), rng.dirichlet((2, 2, 2), 500)
+    uv = np.einsum("ni,nik->nk", b, charts.uv[charts.faces[face]])
+    there = np.einsum("ni,nik->nk", b, mesh.corners[face]) @ [1.0, 2, 3] / scale
+    column, row = np.floor(uv * pixels).astype(int).T
+    assert known[row, column].all() and np.abs(found[row, column] - there).max() < 0.06
+
+
+def test02_what_does_not_fit(rgb, monkeypatch):
+    pytest.importorskip("xatlas", reason="xatlas is not installed")
+    cube = joined(box((0, 0, 0), (1, 1, 1)))
+    monkeypatch.setattr(mesh, "MOST_CHART_FACES", 4)
+    with pytest.raises(NergError, match="leave out --texture"):
+        unroll(cube, 64)
+
+
+def test03_without_xatlas_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    with pytest.raises(ImportError, match=r'pip install "nerg-mi\[bake\]"'):
+        unroll(joined(box((0, 0, 0), (1, 1, 1))), 64)

@@ -12,25 +12,24 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import merge
-from nerg_mi.surfaces.mesh import Target, refine
+from nerg_mi.surfaces.mesh import SurfaceTarget, refine
 from nerg_mi.surfaces.sources import (
-    GazeSettings,
+    GazeSumSettings,
     RaySettings,
     TrackedRays,
     blurred,
     bundle,
+    cluster_observers,
     gaze_sums,
-    lookers_of_law,
     pieces_of,
     ray_seconds,
     ray_sums,
     ray_weights,
     solid_angles,
     sphere_rule,
-    thin,
     visible_pieces,
 )
-from tests.surfaces.meshes import box, joined, plate, vmf
+from tests.surfaces.meshes import box, joined, lookers_of_law, plate, vmf
 
 # ---- Cones: the rule on the sphere against Legendre polynomials, and bundles against Rayleigh's law ----
 
@@ -80,23 +79,16 @@ def test03_bundles_are_gaussian_unit_and_the_same_for_a_seed():
 
 # ---- Gaze on surfaces: conserved, and what `nerg.attention` says of the same ----
 
-
 ROOM = box((0, 0, 0), (4, 3, 2.5))
-
-
 SHELF = box((1.5, 2, 0), (3, 2.4, 1.8))
-
-
-SETTINGS = GazeSettings()
-
-
+SETTINGS = GazeSumSettings()
 MEAN = np.array([0.84, 0.5, -0.2]) / np.linalg.norm([0.84, 0.5, -0.2])
 
 
 @pytest.mark.parametrize(("kappa", "eye"), [(1.0, (1.0, 0.7, 1.5)), (500.0, (0.001, 1.3, 1.2))])
 def test01_a_closed_room_receives_all(rgb, kappa, eye):
     """Also an observer a millimetre from a wall."""
-    target = Target(refine(joined(ROOM, SHELF), 0.4).mesh)
+    target = SurfaceTarget(refine(joined(ROOM, SHELF), 0.4).mesh)
     sums = gaze_sums(target, lookers_of_law(vmf(rgb, MEAN, kappa)), np.array([eye]), [1.0], SETTINGS)
     assert abs(sums.total - 1) < 3e-4 and sums.escaped == 0 and sums.elsewhere == 0
     assert abs(sums.unaccounted) < 1e-3
@@ -110,7 +102,11 @@ def test02_surfaces_what_hides_them_and_what_escapes_are_what_they_are(rgb, y, k
     for without in (None, 1):
         room = joined(box((0, 0, 0), (4, 3, 2.5), without))
         sums = gaze_sums(
-            Target(room, [SHELF]), lookers_of_law(vmf(rgb, MEAN, kappa)), np.array([(1.0, y, 1.5)]), [2.0], SETTINGS
+            SurfaceTarget(room, [SHELF]),
+            lookers_of_law(vmf(rgb, MEAN, kappa)),
+            np.array([(1.0, y, 1.5)]),
+            [2.0],
+            SETTINGS,
         )
         exact = _shares(kappa, np.array([1.0, y, 1.5]), without is not None)
         found = np.array([sums.on_surface, sums.elsewhere, sums.escaped]) / 2
@@ -136,9 +132,9 @@ def _shares(kappa: float, eye: np.ndarray, window: bool, count: int = 1 << 17) -
 
 def test03_a_uniform_law_gives_solid_angles_and_a_cone_changes_nothing_of_it(rgb):
     uniform = lambda d: dr.full(rgb.Float, 1 / (4 * np.pi), dr.width(d))
-    target, eye = Target(joined(ROOM)), np.array([(1.0, 0.7, 1.5)])
+    target, eye = SurfaceTarget(joined(ROOM)), np.array([(1.0, 0.7, 1.5)])
     for cone in (0.0, 0.03):
-        sums = gaze_sums(target, lookers_of_law(uniform), eye, [1.0], GazeSettings(angle=0.1, cone=cone))
+        sums = gaze_sums(target, lookers_of_law(uniform), eye, [1.0], GazeSumSettings(angle=0.1, cone=cone))
         floor = sums.face[(target.mesh.corners[:, :, 2] == 0).all(axis=1)].sum()
         # Of a rectangle, by the four rectangles between the foot point and its corners.
         x, y, h = np.array([1.0, 3.0]), np.array([0.7, 2.3]), 1.5
@@ -147,7 +143,7 @@ def test03_a_uniform_law_gives_solid_angles_and_a_cone_changes_nothing_of_it(rgb
 
 
 def test04_a_cone_widens_a_law_and_keeps_its_total(rgb):
-    target, eye = Target(refine(joined(ROOM), 0.2).mesh), np.array([(2.0, 1.5, 1.2)])
+    target, eye = SurfaceTarget(refine(joined(ROOM), 0.2).mesh), np.array([(2.0, 1.5, 1.2)])
     law, cone = lookers_of_law(vmf(rgb, (1, 0.1, 0), 400.0)), 0.026
     plain = gaze_sums(target, law, eye, [1.0], SETTINGS)
     wide = gaze_sums(target, law, eye, [1.0], dataclasses.replace(SETTINGS, cone=cone))
@@ -171,27 +167,31 @@ def test05_it_is_what_attention_says(rgb, tmp_path):
     thing = box((4.4, 4.65, 0.0), (4.9, 5.0, 1.45))
     expected = nerg.attention(scene, box_dict(*np.array([(4.4, 4.65, 0.0), (4.9, 5.0, 1.45)])), [eye], divisions=24)
     from nerg_mi.formats.meshes import read_mesh_file
-    from nerg_mi.surfaces.sources import lookers_of_field
+    from nerg_mi.surfaces.sources import observers_from_field
 
     read = read_mesh_file(here / "twin.ply")
     twin = read.vertices, read.faces
-    target = Target(joined(thing), [twin])
+    target = SurfaceTarget(joined(thing), [twin])
     # Looked at as if it stood there: the goods in the box hide it, as they hide the box of `attention`.
-    make = lookers_of_field(scene.integrator.gaze, target.place, target.settings)
+    make = observers_from_field(scene.integrator.gaze, target.place, target.settings)
     sums = gaze_sums(target, make, np.array([eye]), [1.0], SETTINGS)
     assert expected.share[0] > 0.001
     # The field is normalised over what is seen: with the box there, and without it.
     gaze, at = scene.integrator.gaze, rgb.Point3f(eye)
     there, without = (
         float(gaze.at([at], place, target.settings).integrals(at)[0][0])
-        for place in (target.place, Target(joined(twin)).place)
+        for place in (target.place, SurfaceTarget(joined(twin)).place)
     )
     assert abs(there / without - 1) > 0.03
     assert np.isclose(sums.face.sum() * there / without, expected.share[0], rtol=0.01)
 
 
 def test06_parts_add_up_to_the_whole_bit_by_bit(rgb):
-    target, law, coarse = Target(joined(ROOM)), lookers_of_law(vmf(rgb, (0, 1, 0), 5.0)), GazeSettings(angle=0.2)
+    target, law, coarse = (
+        SurfaceTarget(joined(ROOM)),
+        lookers_of_law(vmf(rgb, (0, 1, 0), 5.0)),
+        GazeSumSettings(angle=0.2),
+    )
     eyes, weights = np.random.default_rng(0).uniform(0.5, 2, (3, 3)), np.array([0.2, 0.3, 0.5])
     each = [gaze_sums(target, law, eyes[k : k + 1], weights[k : k + 1], coarse) for k in range(3)]
     whole = gaze_sums(target, law, eyes, weights, coarse)
@@ -199,7 +199,6 @@ def test06_parts_add_up_to_the_whole_bit_by_bit(rgb):
 
 
 # ---- Pieces that an outline crosses are cut until what is left out is little ----
-
 
 FLOOR = (np.array([(-1.0, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]), np.array([(0, 1, 2), (0, 2, 3)]))
 
@@ -209,7 +208,7 @@ def test01_the_edge_of_a_shadow_along_the_cuts_of_a_face(rgb):
     eye = np.array([0.0, 0.0, 2.0])
     for x in (0.07, 0.13, 0.51):
         plate = FLOOR[0] * [0.5, 1, 1] + [0.5 + x / 2, 0, 1]
-        target = Target(joined(FLOOR), [(plate, FLOOR[1])])
+        target = SurfaceTarget(joined(FLOOR), [(plate, FLOOR[1])])
         pieces = pieces_of(target.mesh, eye, 0.3)
         parts = list(visible_pieces(target, pieces, lambda some: np.ones(len(some)), 2 * np.pi, 1 << 12))
         found = sum(received.sum() for _, received in parts)
@@ -222,7 +221,7 @@ def test01_the_edge_of_a_shadow_along_the_cuts_of_a_face(rgb):
 
 def test02_a_narrow_density_is_integrated(rgb):
     """Of a density that is narrower than a piece the pieces are cut, too."""
-    target, eye = Target(joined(FLOOR)), np.array([0.13, 0.06, 0.5])
+    target, eye = SurfaceTarget(joined(FLOOR)), np.array([0.13, 0.06, 0.5])
     pieces = pieces_of(target.mesh, eye, 0.4)
 
     def law(some):
@@ -235,7 +234,6 @@ def test02_a_narrow_density_is_integrated(rgb):
 
 
 # ---- Solid angles of pieces, however near the observer stands ----
-
 
 PIECES_ROOM = joined(box((0, 0, 0), (1.0, 1.0, 1.0)))
 
@@ -309,7 +307,7 @@ def test03_observers_stand_where_somebody_was_with_the_time_of_all_near():
     which = rng.choice(3, 3000, p=(0.5, 0.3, 0.2))
     positions = places[which] + rng.normal(0, 0.05, (3000, 3))
     weights = rng.random(3000)
-    found = thin(positions, weights, 3, seed=1)
+    found = cluster_observers(positions, weights, 3, seed=1)
     expected = np.bincount(which, weights) / weights.sum()
     order = np.argsort(-found.weights)
     assert np.allclose(found.weights[order], expected[np.argsort(-expected)])
@@ -318,20 +316,19 @@ def test03_observers_stand_where_somebody_was_with_the_time_of_all_near():
     near = np.linalg.norm(positions[:, None] - found.positions, axis=2).min(axis=1)
     assert np.isclose(found.mean, np.sqrt((weights * near**2).sum() / weights.sum()))
     assert abs(np.mean(near <= found.farthest) - 0.95) < 0.02
-    again = thin(positions, weights, 3, seed=1)
+    again = cluster_observers(positions, weights, 3, seed=1)
     assert np.array_equal(again.positions, found.positions)
 
 
 def test04_more_observers_are_nearer_and_fewer_places_than_observers_are_all_taken():
     positions = np.random.default_rng(2).uniform(0, 5, (2000, 3))
-    errors = [thin(positions, np.ones(2000), n).mean for n in (4, 32, 256)]
+    errors = [cluster_observers(positions, np.ones(2000), n).mean for n in (4, 32, 256)]
     assert errors[0] > 1.5 * errors[1] > 2 * errors[2]
-    few = thin(np.tile([[1.0, 2, 3], [4, 5, 6]], (50, 1)), np.ones(100), 10)
+    few = cluster_observers(np.tile([[1.0, 2, 3], [4, 5, 6]], (50, 1)), np.ones(100), 10)
     assert len(few.weights) == 2 and few.mean == few.farthest == 0 and np.allclose(few.weights, 0.5)
 
 
 # ---- Tracked rays as cones: what passes a gap, and what parts of them add up to ----
-
 
 SIGMA = np.radians(1.5)
 
@@ -349,7 +346,7 @@ def test01_a_line_goes_through_a_gap_whole_and_a_cone_by_what_passes(rgb):
     right = (-left[0] * [1, 1, -1], left[1])
     wall = box((-5, -5, 4), (5, 5, 4.1))
     mesh = joined(left, right, wall)
-    target, behind = Target(mesh), mesh.corners[:, :, 2].min(axis=1) > 3
+    target, behind = SurfaceTarget(mesh), mesh.corners[:, :, 2].min(axis=1) > 3
     line = ray_sums(target, rays_ray_source(1000), RaySettings())
     assert line.face[behind].sum() == np.float64(1000) * (1 / 1000) or np.isclose(line.face[behind].sum(), 1)
     cone = ray_sums(target, rays_ray_source(4000), RaySettings(cone=SIGMA, bundle=16))
@@ -364,14 +361,14 @@ def test01_a_line_goes_through_a_gap_whole_and_a_cone_by_what_passes(rgb):
 def test02_a_thin_edge_gets_its_part(rgb):
     """A rod of 1 cm, which hardly any line meets that is aimed at it with an error of a degree."""
     rod = joined(box((-0.005, -3, 2), (0.005, 3, 2.01)))
-    sums = ray_sums(Target(rod), rays_ray_source(20_000), RaySettings(cone=SIGMA))
+    sums = ray_sums(SurfaceTarget(rod), rays_ray_source(20_000), RaySettings(cone=SIGMA))
     expected = 2 * norm.cdf(np.arctan(0.005 / 2) / SIGMA) - 1
     assert np.isclose(sums.face.sum(), expected, rtol=0.05)
     assert np.isclose(sums.escaped, 1 - sums.face.sum())
 
 
 def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
-    target, settings = Target(joined(plate(9, side=4.0, z=2.0))), RaySettings(cone=SIGMA, bundle=8, seed=5)
+    target, settings = SurfaceTarget(joined(plate(9, side=4.0, z=2.0))), RaySettings(cone=SIGMA, bundle=8, seed=5)
     every = rays_ray_source(1000, spread=0.2, seed=1)
     parts = [every.part(a, a + 300) for a in range(0, 1000, 300)]
     assert [p.first for p in parts] == [0, 300, 600, 900] and len(parts[-1]) == 100
@@ -389,7 +386,7 @@ def test04_on_elsewhere_and_escaped_add_up_where_something_hides_the_surface(rgb
     hiding = (np.array([(-9.0, -9, 1), (9, -9, 1), (9, 0, 1), (-9, 0, 1)]), np.array([(0, 1, 2), (0, 2, 3)]))
     some = rays_ray_source(4000, spread=0.3, seed=2)
     some = TrackedRays(some.origins, some.directions, np.linspace(0.5, 1.5, 4000))
-    sums = ray_sums(Target(joined(plate_left), [hiding]), some, RaySettings(cone=cone, bundle=8))
+    sums = ray_sums(SurfaceTarget(joined(plate_left), [hiding]), some, RaySettings(cone=cone, bundle=8))
     hidden, left = some.directions[:, 1] < 0, some.directions[:, 0] < 0
     expected = [some.weights[rows].sum() for rows in (~hidden & left, hidden, ~hidden & ~left)]
     found = [sums.on_surface, sums.elsewhere, sums.escaped]
@@ -398,7 +395,6 @@ def test04_on_elsewhere_and_escaped_add_up_where_something_hides_the_surface(rgb
 
 
 # ---- Directions over the sphere: all of it, and as exact for narrow densities as for wide ones ----
-
 
 SPHERE_RULE_MEAN = np.array([0.3, -0.5, 0.81]) / np.linalg.norm([0.3, -0.5, 0.81])
 

@@ -8,7 +8,7 @@ import pytest
 from nerg_mi.fields.splats import Splats, joined, matrices_of
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces.laplacian import merge
-from nerg_mi.surfaces.sources import RaySettings, TrackedRays, lookers_of_law
+from nerg_mi.surfaces.sources import RaySettings, TrackedRays
 from nerg_mi.surfaces.splats import (
     HIDDEN,
     SplatSmoother,
@@ -26,8 +26,7 @@ from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.splat_medium import SplatArrays
 from tests.reference import splats as reference
 from tests.reference.splats import peaks
-from tests.surfaces.meshes import vmf
-from tests.surfaces.walls import TURN_X, wall
+from tests.surfaces.meshes import TURN_X, lookers_of_law, vmf, wall
 from tests.transport.media.splats.scenes import medium_of, rays, stack
 
 # ---- Areas of Gaussians: closed forms, and what they add up to where many overlap ----
@@ -116,10 +115,7 @@ def test02_up_to_a_distance_and_no_farther_than_is_asked_for(rgb):
 
 # ---- Tracked rays on Gaussians: what is left where, to whom it adds up, and per area ----
 
-
 LINE = RaySettings()
-
-
 CONE = RaySettings(cone=np.radians(1.5), bundle=8, seed=5)
 
 
@@ -186,7 +182,6 @@ def test04_of_gaze_meets_none_what_comes_through(rgb, cone):
 # ---- Splat smoothing ----
 #
 # Smoothing over Gaussians: as wide as is said, nothing lost, nothing through the air, around an edge or a board.
-
 
 TOLERANCE = 0.002
 
@@ -275,10 +270,7 @@ def test04_many_in_one_cell_have_one_density_and_a_length_has_to_be_positive():
 
 # ---- Gaze on Gaussian splats: closed forms, and the sum that looks at all Gaussians in double precision ----
 
-
 EYE = np.array([[0.0, 0, -2]])
-
-
 ALONG = np.array([0.0, 0, 1])
 
 

@@ -26,7 +26,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import C0
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import merge
-from nerg_mi.surfaces.sources import Crowd, GazeSettings, RaySettings, TrackedRays
+from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings, TrackedRays, WeightedObservers
 from nerg_mi.tasks.engines import Output
 from nerg_mi.workflows import bake_chunks
 from nerg_mi.workflows.bake import bake, check_texture, vertex_normals
@@ -58,9 +58,8 @@ from nerg_mi.workflows.scene_commands import BakeOptions
 from tests.conftest import ROOT
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.plugins import fields
-from tests.surfaces.meshes import box, joined
+from tests.surfaces.meshes import box, joined, longest_edge, wall
 from tests.surfaces.test_splats import falling
-from tests.surfaces.walls import wall
 from tests.tasks.works import laid_out
 from tests.workflows.recorder import Recorder
 
@@ -288,7 +287,7 @@ def engine(rgb, monkeypatch):
 
 def crowd(n):
     at = np.random.default_rng(1).uniform((3, 2, 1.4), (5, 4, 1.8), (n, 3))
-    return Crowd(at, np.full(n, 1 / n))
+    return WeightedObservers(at, np.full(n, 1 / n))
 
 
 def directed(n, seed=0):
@@ -317,13 +316,13 @@ def equal(one, other):
 @pytest.mark.usefixtures("engine")
 @pytest.mark.nightly
 def test_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again(tmp_path):
-    scene = BakeScene(ROOM, gaze=GAZE, of_gaze=GazeSettings(angle=0.5, directions=1024), of_rays=OF_RAYS)
+    scene = BakeScene(ROOM, gaze=GAZE, of_gaze=GazeSumSettings(angle=0.5, directions=1024), of_rays=OF_RAYS)
     groups = [crowd(3), directed(500)]
     whole = sums_in_one_go(scene, groups, Recorder())
     assert equal(sums_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake"), whole)
     # Started again with two observers more: one part is another one, and one is new.
     told = Recorder()
-    more = [Crowd(np.r_[groups[0].positions, groups[0].positions[:2]], np.full(5, 1 / 3)), groups[1]]
+    more = [WeightedObservers(np.r_[groups[0].positions, groups[0].positions[:2]], np.full(5, 1 / 3)), groups[1]]
     sums_in_parts(scene, more, parts(tmp_path, told), "a bake")
     assert told.steps[-1][1].startswith("5 of 5 parts") and made(told) == 2
 
@@ -354,7 +353,7 @@ def test_files_that_were_sent_serve_as_those_that_lie_there(tmp_path):
     write_ply_splats(tmp_path / "wall.ply", plain)
     for scene, who in (
         (
-            BakeScene(ROOM, (box((1, 1, 0), (2, 2, 1)),), GAZE, of_gaze=GazeSettings(angle=0.5, directions=1024)),
+            BakeScene(ROOM, (box((1, 1, 0), (2, 2, 1)),), GAZE, of_gaze=GazeSumSettings(angle=0.5, directions=1024)),
             crowd(1),
         ),
         (SplatScene(tmp_path / "wall.ply", len(plain), of_rays=OF_RAYS), falling(100)),
@@ -423,8 +422,8 @@ def test01_parts_are_cut_alike_and_a_pickled_scene_gives_the_same(rgb, monkeypat
 
 
 def test02_observers_of_a_field(rgb):
-    scene = BakeScene(ROOM, gaze=files(store) / "shoppers.safetensors", of_gaze=GazeSettings(angle=0.2))
-    crowd = Crowd(np.array([(4.4, 2.8, 1.6)] * 5), np.full(5, 0.2))
+    scene = BakeScene(ROOM, gaze=files(store) / "shoppers.safetensors", of_gaze=GazeSumSettings(angle=0.2))
+    crowd = WeightedObservers(np.array([(4.4, 2.8, 1.6)] * 5), np.full(5, 0.2))
     parts = list(parts_of(crowd))
     assert [len(p.weights) for p in parts] == [4, 1]
     found = scene.sums(parts[1])
@@ -433,7 +432,7 @@ def test02_observers_of_a_field(rgb):
 
 def test03_without_a_field_nobody_looks(rgb):
     with pytest.raises(NergError, match="there is no gaze field"):
-        BakeScene(ROOM).sums(Crowd(np.ones((1, 3)), np.ones(1)))
+        BakeScene(ROOM).sums(WeightedObservers(np.ones((1, 3)), np.ones(1)))
 
 
 # ---- Who looks ----
@@ -519,7 +518,7 @@ def test01_a_mesh_is_cut_as_finely_as_asked_in_metres(rgb, tmp_path):
     assert found.names == ("a",) and found.index.tolist() == list(range(12)) and not found.others
     assert told.messages == ["a.ply: 2 faces that repeat others left out"]
     # Two scene units a metre.
-    assert cut(found, 0.25, 2.0).mesh.longest.max() <= 0.5
+    assert longest_edge(cut(found, 0.25, 2.0).mesh) <= 0.5
     assert 50_000 < len(cut(found, None, 1.0).mesh.faces) < 250_000
 
 
@@ -571,7 +570,7 @@ def test01_a_pickled_scene_gives_the_same_and_another_file_is_another_scene(scen
 
 def test02_without_a_field_nobody_looks(scene):
     with pytest.raises(NergError, match="there is no gaze field"):
-        scene.sums(Crowd(np.ones((1, 3)), np.ones(1)))
+        scene.sums(WeightedObservers(np.ones((1, 3)), np.ones(1)))
 
 
 def test03_how_far_apart_two_ideas_of_a_surface_may_be(rgb):

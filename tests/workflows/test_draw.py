@@ -25,7 +25,7 @@ from nerg_mi.workflows.draw import draw, find_kind, read_baked, read_stored, sha
 from nerg_mi.workflows.draw_scenes import cut_place, film, open_scene, upright_pose
 from nerg_mi.workflows.scene_commands import KINDS, ScaleOptions, SceneFigureOptions, SphereOptions
 from tests.pictures import SCENE
-from tests.surfaces.walls import wall
+from tests.surfaces.meshes import wall
 from tests.workflows.recorder import Recorder
 from tests.workflows.watched import MODE, write_scene
 

@@ -19,7 +19,7 @@ from nerg_mi.aoi.options import CountOptions, PredictionOptions, StatisticsOptio
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.ablation import Variant
 from nerg_mi.ranges import Checked
-from nerg_mi.surfaces.sources import GazeSettings, RaySettings
+from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
 from nerg_mi.tasks.task import Part, Plan, rebuilt
 from nerg_mi.train.gaze_settings import GazeSettings as TrainingSettings
 from nerg_mi.train.gaze_settings import ProbeSettings
@@ -223,7 +223,7 @@ AFTER_COUNTS |= {"names", "salt", "resamples", "seed"} | STORE
 OF_COUNTS = {f.name for f in fields(CountOptions)} - {f.name for f in fields(PredictionOptions)}
 COMMANDS["stats, counts"] = (StatisticsOptions, lambda o: as_base(o, CountOptions), AFTER_COUNTS | {"directions"})
 COMMANDS["stats, a field"] = (StatisticsOptions, lambda o: as_base(o, PredictionOptions), AFTER_COUNTS | OF_COUNTS)
-COMMANDS["bake, a field"] = (GazeSettings, lambda o: o, set())
+COMMANDS["bake, a field"] = (GazeSumSettings, lambda o: o, set())
 COMMANDS["bake, rays"] = (RaySettings, lambda o: o, set())
 
 

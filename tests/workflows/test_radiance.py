@@ -43,9 +43,9 @@ from nerg_mi.workflows.radiance_commands import (
     RadianceScoreOptions,
 )
 from nerg_mi.workflows.train_radiance import evaluate_radiance, train_radiance
-from tests.formats.torch_ngp.test_fields import small_state
-from tests.formats.torch_ngp.test_nerg import save, small_gaze
-from tests.photos.structure import rendered
+from tests.formats.test_torch_ngp import save_nerg as save
+from tests.formats.test_torch_ngp import small_gaze, small_state
+from tests.photos import rendered
 from tests.plugins import fields
 from tests.plugins.fields import radiance
 from tests.workflows.recorder import Recorder

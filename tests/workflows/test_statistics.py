@@ -112,8 +112,9 @@ def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
 def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     changes = {
         "move": [{"shape": "stand", "by": [0, 1.9, 0]}],
-        "add": [{"name": "new", "min": [1, 3.5, 1], "max": [2, 3.8, 2]}],
+        "add": [{"name": "new", "min": [1, 3.5, 1], "max": [2, 3.8, 2]}, {"name": "tile", "mesh": "tile.obj"}],
     }
+    (folder / "tile.obj").write_text("usemtl red\nv 5.9 0 0\nv 5.9 1 0\nv 5.9 0 1\nf 1 2 3\n")
     (folder / "changes.json").write_text(json.dumps(changes))
     options = StatisticsOptions(areas=folder / "areas.json", what_if=folder / "changes.json", **FAST)
     recorder = Recorder()
@@ -129,6 +130,7 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     assert sign["source"] == "field" and sign["after"] > sign["before"] and sign["people"] == 6
     assert rows["new", "share"]["before"] is None and rows["new", "share"]["after"] > 0
     assert rows["the sign", "share"]["after"] != rows["the sign", "share"]["before"]
+    assert recorder.messages.count(f"of {folder / 'tile.obj'}: statements that are not used: usemtl") == 1
     # Its checkpoint says nothing of what it learnt from.
     assert any("keeps no support" in text for text in recorder.messages) and field[0]["support"] is None
     assert "not in the checkpoint" in (tmp_path / "out" / "what_if.md").read_text()
@@ -171,11 +173,13 @@ def test07_without_a_place(folder):
     recorder = Recorder()
     options = StatisticsOptions(areas=folder / "boxes.json", **FAST)
     (folder / "boxes.json").write_text(
-        json.dumps({"sign": [[4, 1.5, 1], [4.2, 2.5, 2]], "far": [[5, 0, 0], [6, 4, 3]]})
+        json.dumps({"sign": [[4, 1.5, 1], [4.2, 2.5, 2]], "far": [[5, 0, 0], [6, 4, 3]], "tile": {"mesh": "tile.obj"}})
     )
+    (folder / "tile.obj").write_text("usemtl red\nv 5.9 0 0\nv 5.9 1 0\nv 5.9 0 1\nf 1 2 3\n")
     rays = people()
     statistics([rays], None, options, recorder)
     assert any("things hide each other" in text for text in recorder.messages)
+    assert recorder.messages.count(f"of {folder / 'tile.obj'}: statements that are not used: usemtl") == 1
     hit = np.array([o + first_box(o, d)[1] * d for o, d in zip(rays.origin, rays.direction)])
     recorder = Recorder()
     known = Rays(rays.t, rays.person, rays.persons, rays.origin, rays.direction, rays.confidence, hit)

@@ -9,7 +9,6 @@ import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
-from nerg_mi.workflows.gaze_commands import AblationOptions, GazeOptions
 
 import nerg_mi.fields
 import nerg_mi.train
@@ -18,6 +17,7 @@ from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.train import gaze_recipes
 from nerg_mi.workflows.ablation import ablate
+from nerg_mi.workflows.gaze_commands import AblationOptions, GazeOptions
 from nerg_mi.workflows.train_gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
 from tests.plugins.scenes import camera, look_at, render

@@ -10,7 +10,7 @@ from nerg_mi.fields.radiance import RadianceConfig
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
 from nerg_mi.photos.dataset import Dataset
-from nerg_mi.photos.images import View
+from nerg_mi.photos.images import PhotoView
 from nerg_mi.train.radiance_settings import RadianceSettings
 from nerg_mi.train.radiance_trainer import RadianceTrainer
 from tests.tiny import ball_pose
@@ -32,7 +32,7 @@ def ball(pose, depth=True):
     t = np.where(hit, -b - np.sqrt(np.where(hit, b * b - c, 0)), 0)
     rgb = 0.5 + 0.4 * (o + d * t[:, None]) / RADIUS
     color = np.concatenate([np.where(hit[:, None], rgb, 0), hit[:, None]], axis=1)
-    return View(
+    return PhotoView(
         "ball",
         Camera(LENS, pose),
         color.reshape(24, 24, 4).astype(np.float32),

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import builtins
 import socket
+import sys
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -43,6 +43,17 @@ def film(av, tmp_path) -> Path:
             out.mux(stream.encode(frame))
         out.mux(stream.encode())
     return path
+
+
+def remux(av, film, path, **metadata):
+    """The pictures of ``film`` in another container, as they are coded."""
+    with av.open(str(film)) as given, av.open(str(path), "w") as out:
+        out.metadata.update(metadata)
+        stream = out.add_stream_from_template(given.streams.video[0])
+        for packet in given.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                out.mux(packet)
 
 
 def test_blur_takes_sharpness():
@@ -147,12 +158,7 @@ LISTS = {
 @pytest.mark.parametrize("name", LISTS)
 def test_nothing_but_the_file_is_opened(name, av, film, tmp_path):
     """FFmpeg would follow lists to other files and addresses."""
-    with av.open(str(film)) as given, av.open(str(tmp_path / "film.ts"), "w") as out:
-        stream = out.add_stream_from_template(given.streams.video[0])
-        for packet in given.demux(video=0):
-            if packet.dts is not None:
-                packet.stream = stream
-                out.mux(packet)
+    remux(av, film, tmp_path / "film.ts")
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(0)
         (tmp_path / name).write_text(LISTS[name].format(port=server.getsockname()[1]))
@@ -178,13 +184,7 @@ def test_a_name_is_no_address(name, film, tmp_path, monkeypatch):
 
 
 def test_titles_need_not_be_utf8(av, film, tmp_path):
-    with av.open(str(film)) as given, av.open(str(tmp_path / "a.avi"), "w") as out:
-        out.metadata["title"] = "XXXXXXXX"
-        stream = out.add_stream_from_template(given.streams.video[0])
-        for packet in given.demux(video=0):
-            if packet.dts is not None:
-                packet.stream = stream
-                out.mux(packet)
+    remux(av, film, tmp_path / "a.avi", title="XXXXXXXX")
     raw = (tmp_path / "a.avi").read_bytes()
     assert b"XXXXXXXX" in raw
     (tmp_path / "a.avi").write_bytes(raw.replace(b"XXXXXXXX", b"caf\xe9\xff\xfe\x80 "))
@@ -227,13 +227,6 @@ def test_a_video_that_is_mostly_destroyed_is_told(film, monkeypatch):
         list(sharpest_frames(film, 3))
 
 
-def test_frames_that_are_hardly_wide_are_compared():
-    frame = lambda w, h: SimpleNamespace(width=w, height=h, to_ndarray=lambda **given: given)
-    for size, found in (((1, 9), (3, 27)), ((2, 2), (3, 3)), ((3840, 2160), (480, 270)), ((64, 90_000), (64, 1920))):
-        given = module._gray(frame(*size))
-        assert (given["width"], given["height"]) == found
-
-
 def test_a_damaged_stretch_is_passed_over(film, tmp_path):
     raw = bytearray(film.read_bytes())
     at = raw.index(b"mdat") + 4
@@ -243,15 +236,15 @@ def test_a_damaged_stretch_is_passed_over(film, tmp_path):
     assert len(list(sharpest_frames(tmp_path / "b.mp4", 3))) == 3
 
 
+def test_frames_that_are_hardly_wide_are_compared():
+    frame = lambda w, h: SimpleNamespace(width=w, height=h, to_ndarray=lambda **given: given)
+    for size, found in (((1, 9), (3, 27)), ((2, 2), (3, 3)), ((3840, 2160), (480, 270)), ((64, 90_000), (64, 1920))):
+        given = module._gray(frame(*size))
+        assert (given["width"], given["height"]) == found
+
+
 def test_without_pyav(tmp_path, monkeypatch):
-    original = builtins.__import__
-
-    def no_av(name, *given, **more):
-        if name == "av":
-            raise ImportError(name="av")
-        return original(name, *given, **more)
-
-    monkeypatch.setattr(builtins, "__import__", no_av)
+    monkeypatch.setitem(sys.modules, "av", None)
     (tmp_path / "a.mp4").write_bytes(b"film")
     with pytest.raises(ImportError, match=r'"nerg-mi\[poses\]\"'):
         list(sharpest_frames(tmp_path / "a.mp4", 3))
