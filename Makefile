@@ -17,7 +17,7 @@
 #   make fuzz      damage what every reader reads, 20,000 times, and count what comes of it (some ten minutes)
 #   make faults    kill commands at moments spread over their run: nothing may be lost
 #   make soak      thousands of frames and steps: memory may not grow
-#   make bench     frames, stages, growth and memory beside peers (under ten minutes); ARGS=--long for more
+#   make bench     frames, stages, growth, memory and start beside peers (under ten minutes); ARGS=--long for more
 #   make bench-gpu the same on a CUDA device, where there is one
 #   make packages  build the packages, install and try them with every Python that is here (nox)
 #

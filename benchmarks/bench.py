@@ -1,10 +1,10 @@
 """All that is said of speed, in one run: frames and their stages beside PyTorch, densities beside SciPy, volumes beside
 `volpath`, and how each cost grows.
 
-    python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb] [--page docs/performance.md]
+    python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb] [--update docs/performance.md]
     [--out out/benchmarks/bench]
 
-Parts: ``frames``, ``stages``, ``kde``, ``volume``, ``growth``, ``memory``; else all.
+Parts: ``frames``, ``stages``, ``kde``, ``volume``, ``growth``, ``memory``, ``start``; else all.
 Works that are compared do the same, which is checked first, and take turns; figures are medians with their quartiles.
 Prints tables, writes them as CSV and a figure, and puts them into the page that is named. ``--long``: more runs,
 larger sizes, and PyTorch at 1280 x 720. With a CUDA variant the parts without a peer are measured in wall-clock
@@ -25,8 +25,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from collections.abc import Callable
 
-import cold_kernels  # noqa: F401
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+import processes
 import torch_frames
 from nerg_mi.figures.style import save
 from nerg_mi.llvm import has_cuda
@@ -145,7 +145,7 @@ class Run:
 
         import mitsuba as mi
 
-        self.long, self.out, self.page, self.threads = args.long, args.out, args.page, args.threads
+        self.long, self.out, self.page, self.threads = args.long, args.out, args.update, args.threads
         self.runs = args.runs or (9 if args.long else 5)
         self.cuda = mi.variant().startswith("cuda")
         folder, ns = store_scene().parent, namespace(mi.variant())
@@ -352,13 +352,14 @@ def growth(run: Run) -> None:
 
 
 def memory(run: Run) -> None:
-    import frame_memory
-
-    rows = [frame_memory.measured(*size) for size in frame_memory.SIZES]
-    run.table("Memory", frame_memory.HEAD, rows, "memory")
+    run.table("Memory", processes.HEADS["memory"], processes.memory(), "memory")
 
 
-PARTS = {part.__name__: part for part in (frames, stages, kde, volume, growth, memory)}
+def start(run: Run) -> None:
+    run.table("Start", processes.HEADS["start"], processes.start(run.runs), "start")
+
+
+PARTS = {part.__name__: part for part in (frames, stages, kde, volume, growth, memory, start)}
 
 
 def main(argv=None) -> None:
@@ -368,7 +369,7 @@ def main(argv=None) -> None:
     parser.add_argument("--runs", type=int, default=0)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant")
-    parser.add_argument("--page", type=Path)
+    parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/bench"))
     args = parser.parse_args(argv)
     asked = args.only.split(",")

@@ -2,6 +2,7 @@
 
     python benchmarks/places.py [--only room,office] [--folds 4] [--first 0] [--mix-folds N] [--mix-kappa K]
         [--recipe default] [--variant VARIANT] [--no-surfaces] [--against FOLDS.csv] [--out out/benchmarks/places]
+    python benchmarks/places.py --uncertainty --folds 3 --zones 6 [--ensemble 5] [--out out/benchmarks/uncertainty]
 
 Real people in a supermarket (surfaces from their hit points) and in three scenes of EyeNavGS (no geometry), the demo
 store's shoppers among its field, and four generated places with laws of their own (`generated_places.py`), among their
@@ -12,6 +13,13 @@ field less the best of the others, fold by fold, with 95 % of Student's t; `way`
 blind density to the split half in CC, where that is better than blind. `--mix-folds 0` is a field without a chosen
 share of the blind density, `--no-surfaces` one that is told of no surfaces, where they are known, too. `--against`
 prints the field less that of another run, fold by fold, from its folds.csv.
+
+`--uncertainty` asks in the same folds whether a field knows what it does not know; more zones are better then, since
+positions of a zone are neighbours. A row a place: Spearman's rho of little support with the error, at new positions and
+at any where held-out people stood, with 95 % of resamples of zones; the mean error of all and of the surest half; and
+the share of held-out rays in the smallest regions that are said to hold 80 % of the gaze, and in those that should hold
+it by what the training held out. With `--ensemble` fields are means of so many, and the spread of these, which the AOV
+`gaze_std` shows, is ranked beside support.
 """
 
 from __future__ import annotations
@@ -19,9 +27,10 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable
+from math import isnan, nan
 from pathlib import Path
 
-from timing import write_rows
+from timing import print_table, write_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -29,14 +38,12 @@ Make = Callable[[Path], tuple[Path, dict]]
 """Writes the rays of a place into a folder; gives their file and where the place is: options of a fold."""
 
 
-def place_parser(what: str, out: str, folds: int, choose: bool = True) -> argparse.ArgumentParser:
-    """Options of a benchmark of places: which, if they may be chosen, in how many ``folds``, and where to (below
-    out/benchmarks)."""
+def place_parser(what: str, out: str, folds: int) -> argparse.ArgumentParser:
+    """Options of a benchmark of places: which, in how many ``folds``, and where to (below out/benchmarks)."""
     parser = argparse.ArgumentParser(description=what.splitlines()[0])
     data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
     parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
-    if choose:
-        parser.add_argument("--only", help="names of places, with commas between. Default: all that there are.")
+    parser.add_argument("--only", help="names of places, with commas between. Default: all that there are.")
     parser.add_argument("--folds", type=int, default=folds)
     parser.add_argument("--threads", type=int)
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks") / out)
@@ -127,26 +134,38 @@ def main(argv=None) -> None:
     parser.add_argument("--recipe", default="default")
     parser.add_argument("--variant", help="emit, capture or emit_capture. Default: the recipe's.")
     parser.add_argument("--first", type=int, default=0, help="seed of the first fold")
+    parser.add_argument("--zones", type=int, default=3, help="zones of test positions of a fold")
     parser.add_argument("--mix-folds", type=int, help="Default: the recipe's.")
     parser.add_argument("--mix-kappa", type=float, help="Default: the recipe's.")
     parser.add_argument("--no-surfaces", action="store_true", help="as if no place had known surfaces")
     parser.add_argument("--against", type=Path, help="folds.csv of a run whose field this one is compared with")
+    parser.add_argument("--uncertainty", action="store_true", help="whether fields know what they do not know")
+    parser.add_argument("--ensemble", type=int, default=0, help="members of each fold's field")
     args = parse(parser, argv)
     if args.against is not None and not args.against.is_file():
         parser.error(f'"{args.against}" is not there; it is written by a run whose --out is its folder')
     each: list[dict] = []
+    unsure: list[dict] = []
     for name, make in asked_places(args).items():
-        each += score(name, make, args)
+        result = evaluate(name, make, args)
+        each += [
+            {"place": name, **{key: row[key] for key in ("fold", "split", "method", *SCORES)}} for row in result.each
+        ]
+        unsure += uncertainty(name, result)
+    write_rows(args.out / "folds.csv", each)
+    if args.uncertainty:
+        write_rows(args.out / "uncertainty.csv", unsure)
+        show_uncertainty(unsure)
+        return
     rows = summarise(each)
     write_rows(args.out / "places.csv", rows)
-    write_rows(args.out / "folds.csv", each)
     show(rows)
     if args.against is not None:
         show_change(each, args.against)
 
 
-def score(name: str, make: Make, args: argparse.Namespace) -> list[dict]:
-    """A row a fold and method."""
+def evaluate(name: str, make: Make, args: argparse.Namespace):
+    """What `nerg eval folds` finds in a place."""
     from nerg_mi.cli.progress import TerminalReporter
     from nerg_mi.workflows.base import select_backend
     from nerg_mi.workflows.evaluate import evaluate_folds
@@ -160,14 +179,15 @@ def score(name: str, make: Make, args: argparse.Namespace) -> list[dict]:
         variant=args.variant,
         folds=args.folds,
         first=args.first,
-        splits="both",
+        zones=args.zones,
+        splits="both,people" if args.uncertainty else "both",
+        ensemble=args.ensemble,
         mix_folds=args.mix_folds,
         mix_kappa=args.mix_kappa,
         threads=args.threads,
     )
     with TerminalReporter() as reporter:
-        found = evaluate_folds(rays, folder / "eval", options, reporter)
-    return [{"place": name, **{k: row[k] for k in ("fold", "method", *SCORES)}} for row in found.each]
+        return evaluate_folds(rays, folder / "eval", options, reporter)
 
 
 def summarise(each: list[dict]) -> list[dict]:
@@ -225,18 +245,60 @@ def show_change(each: list[dict], before: Path) -> None:
 
 def show(rows: list[dict]) -> None:
     for s in SCORES:
-        print(f"\n{s:12s} field  blind   best  half  rank  field less best")
-        for r in rows:
-            print(
-                f"{r['place']:12s}{r[s]:6.3f}{r[f'{s} blind']:7.3f}{r[f'{s} best']:7.3f}{r[f'{s} half']:6.2f}"
-                f"{r[f'{s} rank']:6d}  {r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}  {r[f'{s} best is']}"
-            )
-    print("\nmeans over places: " + ", ".join(f"{s} {sum(r[s] for r in rows) / len(rows):.3f}" for s in SCORES))
+        table = [
+            [
+                r["place"],
+                f"{r[f'{s} blind']:.3f}",
+                f"{r[s]:.3f}",
+                f"{r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}",
+                "" if isnan(r[f"{s} half"]) else f"{r[f'{s} half']:.2f}",
+            ]
+            for r in rows
+        ]
+        print_table(f"{s} in all places", (s, "blind", "field", "less best", "split half"), table)
+    print("means over places: " + ", ".join(f"{s} {sum(r[s] for r in rows) / len(rows):.3f}" for s in SCORES))
     ranks = [r[f"{s} rank"] for r in rows for s in SCORES]
     worst = max(rows, key=lambda r: r["KLD less"])
     print(f"mean rank {sum(ranks) / len(ranks):.2f}; worst place in KLD: {worst['place']}, {worst['KLD less']:+.3f}")
-    far = [r for r in rows if r["way"] == r["way"]]
+    far = [r for r in rows if not isnan(r["way"])]
     print("way from blind to split half in CC: " + ", ".join(f"{r['place']} {r['way']:.0%}" for r in far))
+
+
+def uncertainty(name: str, result) -> list[dict]:
+    """A row a signal, population ("both": new positions) and error of one place."""
+    held = {(r["split"], r["method"]): r["80%"] for r in result.calibration}
+    regions = {"of 80%": held["both", OURS], "of 80%, calibrated": held.get(("both", f"{OURS}, calibrated"), nan)}
+    keys = ("signal", "split", "error", "positions", "rho", "100%", "50%")
+    ranks = [r for r in result.uncertainty if r["split"] != "people"]
+    ends = lambda r: {key: r.get(key, nan) for key in ("rho.low", "rho.high")}
+    return [{"place": name, **{key: r[key] for key in keys}, **ends(r), **regions} for r in ranks]
+
+
+def show_uncertainty(rows: list[dict]) -> None:
+    by = {(r["place"], r["signal"], r["split"], r["error"]): r for r in rows}
+    places = list(dict.fromkeys(r["place"] for r in rows))
+    populations = {"new": "both", "any": "anywhere"}
+
+    def rho(place: str, split: str, error: str) -> str:
+        r = by.get((place, "support", split, error))
+        if r is None or isnan(r["rho"]):
+            return "too few"
+        return f"{r['rho']:+.2f} [{r['rho.low']:+.2f}, {r['rho.high']:+.2f}]"
+
+    table = []
+    for place in places:
+        r = by[place, "support", "anywhere", "KLD"]
+        ranks = [rho(place, split, error) for split in populations.values() for error in ("KLD", "excess")]
+        regions = [f"{r[key]:.0%}" for key in ("of 80%", "of 80%, calibrated")]
+        table.append([place, *ranks, f"{r['100%']:.2f}, {r['50%']:.2f}", *regions])
+    head = ["place", *(f"{name}, {error}" for name in populations for error in ("KLD", "excess"))]
+    head += ["KLD at any: all, surest half", "regions of 80 % hold", "calibrated"]
+    print_table("Little support and errors", head, table)
+    if any(r["signal"] == "spread" for r in rows):
+        pairs = [(name, signal) for name in populations for signal in ("support", "spread")]
+        rhos = [[f"{by[p, signal, populations[name], 'KLD']['rho']:+.2f}" for name, signal in pairs] for p in places]
+        head = ["place", *(f"{name}: {signal}" for name, signal in pairs)]
+        print_table("Support and spread", head, [[p, *row] for p, row in zip(places, rhos)])
 
 
 if __name__ == "__main__":

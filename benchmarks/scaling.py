@@ -11,16 +11,17 @@ of the time that was waited.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
-from timing import write_rows
+from timing import print_table, write_rows
 
 import numpy as np
 
@@ -52,7 +53,7 @@ def room(folder: Path, observers: int, count: int) -> None:
     Rays(t, person, names, origin, d, np.ones(len(person))).save(folder / "rays.npz")
 
 
-def bake(folder: Path, name: str, detail: float, **more) -> tuple[int, bytes]:
+def bake(folder: Path, detail: float, name: str, **more) -> tuple[int, bytes]:
     """Observers and the bytes of what is made of them."""
     from nerg_mi.scenes import store
     from nerg_mi.workflows.bake import bake
@@ -90,15 +91,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         room(folder, args.observers, args.rays)
-        works = {
-            f"bake, detail {d:g}": (args.observers, lambda name, d=d, **m: bake(folder, name, d, **m)) for d in DETAILS
+        works: dict[str, tuple[int, str, Callable]] = {
+            f"bake of {args.observers} observers, detail {d:g}": (args.observers, "observers", partial(bake, folder, d))
+            for d in DETAILS
         }
-        works["stats"] = (args.rays, lambda name, **more: count(folder, name, **more))
-        whole = {what: work(f"whole {what}", threads=1) for what, (_, work) in works.items()}
+        works[f"counts of {args.rays:,} rays"] = (args.rays, "rays", partial(count, folder))
+        whole = {what: work(f"whole {what}", threads=1) for what, (_, _, work) in works.items()}
         with ClusterOfProcesses(folder) as cluster:
             for workers in (1, 2):
                 cluster.start_worker()
-                for what, (units, work) in works.items():
+                for what, (units, unit, work) in works.items():
                     given = {"scheduler": cluster.address, "threads": 1}
                     work(f"warm {what}", **given, store=folder / f"warm {what} {workers}")
                     store = folder / f"{what} {workers}"
@@ -108,22 +110,21 @@ def main() -> None:
                     receipts = list(Store(store).receipts())
                     each = [r.seconds for r in receipts]
                     size = sum(r.size for r in receipts) / len(receipts)
+                    if made != whole[what][1]:
+                        raise SystemExit(f"{what}: {workers} workers make something else than one process")
                     row = {
-                        "what": what,
+                        "work": f"{what}, {faces:,} triangles" if faces else what,
                         "workers": workers,
-                        "units": units,
-                        "faces": faces,
                         "parts": len(each),
-                        "seconds": round(seconds, 2),
-                        "units_a_second": round(units / seconds, 2),
-                        "computed_a_part": round(statistics.median(each), 3),
-                        "besides_a_part": round((workers * seconds - sum(each)) / len(each), 3),
-                        "bytes_a_part": round(size),
-                        "equal": made == whole[what][1],
+                        "waited": f"{seconds:.1f} s",
+                        "computed a part": f"{statistics.median(each):.2f} s",
+                        "besides a part": f"{(workers * seconds - sum(each)) / len(each):.2f} s",
+                        "output of a part": f"{size / 1000:,.0f} kB",
+                        "throughput": f"{units / seconds:,.{2 if units / seconds < 1000 else 0}f} {unit} a second",
                     }
                     rows.append(row)
-                    print(json.dumps(row), flush=True)
-    args.out.mkdir(parents=True, exist_ok=True)
+                    print(row, flush=True)
+    print_table("Measured", list(rows[0]), [list(row.values()) for row in rows])
     write_rows(args.out / "scaling.csv", rows)
 
 

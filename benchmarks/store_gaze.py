@@ -38,20 +38,12 @@ def fresh_draws(law, count: int, kappa: float):
 
 
 def main(argv=None) -> None:
-    from timing import write_rows
+    from timing import print_table, write_rows
 
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.evaluation.gaze import (
-        EPS,
-        FieldDensity,
-        map_scores,
-        nearest_probes,
-        nearest_rays,
-        position_blind,
-        score_table,
-    )
+    from nerg_mi.evaluation.gaze import EPS, FieldDensity, map_scores, nearest_probes, nearest_rays, position_blind
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze, load_radiance
     from nerg_mi.maths.sphere import fibonacci_directions
@@ -110,7 +102,8 @@ def main(argv=None) -> None:
         maps = method(positions, directions)
         rows.append({"method": name, **map_scores(truth, maps), "integral": float(4 * np.pi * np.mean(maps))})
     title = f"{len(positions)} held-out positions against the law ({len(train):,} of {len(rays):,} rays trained on)"
-    print(score_table(rows, title))
+    table = [[r["method"], *(f"{r[k]:.3f}" for k in ("KLD", "CC", "SIM")), f"{r['MAE']:.4f}"] for r in rows]
+    print_table(title, ("", "KLD", "CC", "SIM", "MAE, 1/sr"), table)
     integral = 4 * np.pi * methods["gaze field"](positions, directions).mean(axis=1)
     print(
         f"integral of the gaze field over the sphere: mean {integral.mean():.3f}, "

@@ -9,10 +9,11 @@ observer see the surface that this pixel's ray meets in the twin, and 0 where it
 Away from silhouettes: pixels within `--margin` pixels of a discontinuity of the exact depth or of the exact visibility
 are left out; there a centimetre decides, and a field has no edges finer than its grid. How many that are is a column.
 
-Columns: `agree` away from silhouettes, of it the share `wrongly seen` and `wrongly hidden`; `agree all` with
-silhouettes; `agree own`: the exact test is made at the field's own surface point instead of the twin's (5 cm before it
-are not tested); `kept` share of pixels away from silhouettes; `visible` share of pixels that are exactly visible;
-errors of depth in cm over all pixels with a surface, `p90 cm away` over those away from silhouettes.
+Printed are means over the pairs: how many pixels do not agree, away from silhouettes and all; how many are `kept` as
+away from them; errors of depth in cm over all pixels with a surface, `p90 cm away` over those away from silhouettes.
+The CSV has a row a pair: `agree` away from silhouettes, of it the share `wrongly seen` and `wrongly hidden`; `agree
+all` with silhouettes; `agree own`: the exact test is made at the field's own surface point instead of the twin's (5 cm
+before it are not tested); `visible` share of pixels that are exactly visible.
 """
 
 from __future__ import annotations
@@ -119,38 +120,19 @@ def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, wid
     }
 
 
-def table(rows: list[dict]) -> None:
-    """Print ``rows``, and their means for each kind of depth and visibility."""
-    from rich.console import Console
-    from rich.table import Table
-
-    out = Table(title="Visibility and depth against exact ray casts")
-    names = [k for k in rows[0] if k != "seconds"]
-    for k in names:
-        out.add_column(k, justify="left" if isinstance(rows[0][k], str) else "right", no_wrap=k == "pair")
-
-    def cells(row):
-        return [
-            v if isinstance(v, str) else f"{v:.2f}" if k in CENTIMETRES else f"{100 * v:.2f}"
-            for k, v in ((k, row[k]) for k in names)
-        ]
-
-    for row in rows:
-        out.add_row(*cells(row))
-    out.add_section()
+def table(rows: list[dict]) -> list[list[str]]:
+    """Cells of the means over pairs, a row a kind of depth and visibility."""
+    out = []
     for key in dict.fromkeys((r["depth"], r["visibility"]) for r in rows):
         mine = [r for r in rows if (r["depth"], r["visibility"]) == key]
-        mean = {
-            k: "mean" if k == "pair" else v if isinstance(v, str) else float(np.mean([r[k] for r in mine]))
-            for k, v in mine[0].items()
-        }
-        out.add_row(*cells(mean), style="bold")
-    Console(width=max(180, Console().width)).print(out)
-    print("Shares in percent, depth errors in cm.")
+        mean = {k: float(np.mean([r[k] for r in mine])) for k, v in mine[0].items() if not isinstance(v, str)}
+        wrong = [f"{100 * (1 - mean[k]):.2f}" for k in ("agree", "agree all")]
+        out.append([*key, *wrong, f"{mean['kept']:.0%}", *(f"{mean[k]:.2f}" for k in CENTIMETRES)])
+    return out
 
 
 def main(argv=None) -> None:
-    from timing import write_rows
+    from timing import print_table, write_rows
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--field", type=Path, help="checkpoint (default: that of the store)")
@@ -181,7 +163,8 @@ def main(argv=None) -> None:
         for kind in args.kinds.split(",")
         for pair in args.pair or PAIRS
     ]
-    table(rows)
+    head = ("depth", "visibility", "wrong %, away", "wrong %, all", "kept", *CENTIMETRES)
+    print_table("Visibility and depth against exact ray casts", head, table(rows))
     write_rows(args.out, rows)
 
 

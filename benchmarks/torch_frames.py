@@ -1,38 +1,34 @@
-"""A frame of the demo store beside a plain PyTorch renderer of the same checkpoints, steps and camera.
-
-    python benchmarks/torch_frames.py [--sizes 320x180,1280x720] [--runs 3] [--compile] [--csv FILE]
+"""A frame of the demo store beside a plain PyTorch renderer of the same checkpoints, steps and camera, for `bench.py`.
 
 Colour, depth and gaze of an observer who is not the camera, after occlusion. The peer is eager PyTorch as radiance
 fields are commonly rendered with it: steps of the field's own length in slabs, cells that its occupancy grid says are
 empty left out, samples and rays compacted, the density net first and the colour net where the weight exceeds 1e-3, rays
 ended at T < 1e-4; then the observer's rays to the surfaces, which end where they are opaque or have arrived; then the
 gaze; the integral over the observer's sphere is kept between frames, as ours is. Its grid is evaluated as torch-ngp's
-fallback does, eight gathers a level, and in a second row with less traffic in memory; `--compile` adds one with the
-encoding and the networks through torch.compile. Before anything is timed they render the same rays, and the program
-stops where colours are less alike than 35 dB or the means of gaze differ by more than 2 %. Runs are taken in turns; the
-figures are medians of wall-clock seconds, with their quartiles, and processor seconds. Our first frame is timed with no
-kernel compiled before.
+fallback does, eight gathers a level, in a second row with less traffic in memory, and in a third with the encoding and
+the networks through torch.compile. Our first frame is timed with no kernel compiled before.
 """
 
 from __future__ import annotations
 
-import argparse
+import atexit
 import itertools
 import os
+import shutil
 import sys
+import tempfile
 import time
 from functools import partial
-from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-import cold_kernels  # noqa: F401
+# First frames are first frames: no kernel is compiled before. Once Dr.Jit is loaded it would be too late.
+if "drjit" not in sys.modules:
+    os.environ["DRJIT_CACHE_DIR"] = tempfile.mkdtemp(prefix="kernels-")
+    atexit.register(shutil.rmtree, os.environ["DRJIT_CACHE_DIR"], ignore_errors=True)
 import nerg_mi as nerg
 from nerg_mi.figures.overlay import srgb
-from nerg_mi.formats.fields import load_gaze, load_radiance
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.workflows.demo import store_scene
-from timing import in_turns, median, print_table, spread, write_rows
+from timing import in_turns, median, spread
 from torch_radiance import _PRIMES, TorchModel, harmonics
 
 import numpy as np
@@ -272,52 +268,6 @@ def agreement(scene, peer: TorchRenderer, width: int = 160, height: int = 90) ->
     }
 
 
-def main(argv=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", default="320x180,1280x720")
-    parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--compile", action="store_true")
-    parser.add_argument("--csv", type=Path, default=Path("out/benchmarks/torch_frames.csv"))
-    args = parser.parse_args(argv)
-
-    import drjit as dr
-    import mitsuba as mi
-    import torch
-
-    mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.fields.mlp import namespace
-
-    dr.set_thread_count(args.threads)
-    torch.set_num_threads(args.threads)
-    folder, ns = store_scene().parent, namespace("llvm_ad_rgb")
-    field, gaze = load_radiance(folder / "store.safetensors", ns)[0], load_gaze(folder / "shoppers.safetensors", ns)[0]
-    scene = nerg.Scene.load(store_scene())
-    falloff = float(np.ravel(np.array(scene.integrator.falloff))[0])
-    peers = {
-        "PyTorch, eager": TorchRenderer(field, gaze, falloff, TorchModel),
-        "PyTorch, eager, corner by corner": TorchRenderer(field, gaze, falloff),
-    }
-    if args.compile:
-        peers["PyTorch, compiled"] = TorchRenderer(field, gaze, falloff, TorchModel, compiled=True)
-    for name, peer in peers.items():
-        found = agreement(scene, peer)
-        print(name, ", ".join(f"{k} {v:.4g}" for k, v in found.items()), flush=True)
-        if found["color_db"] < 35 or abs(found["gaze_mean"]) > 0.02:
-            raise SystemExit("the two do not render the same picture")
-    rows = []
-    for size in args.sizes.split(","):
-        width, height = map(int, size.split("x"))
-        o, d = camera_rays(width, height)
-        still = {"width": width, "height": height, "spp": 1, "aovs": "depth,gaze"}
-        frames: dict = {**our_frames(still)}
-        frames |= {name: partial(peer.frame, o, d, scene.observer) for name, peer in peers.items()}
-        rows += measure(frames, size, args.runs)
-    write_rows(args.csv, rows)
-    head = list(rows[0])
-    print_table("A frame beside PyTorch", head, [[r[k] for k in head] for r in rows])
-
-
 class Ours:
     """Frames of the demo store with these ``values`` of its scene, when called; ``constant``: with the weights of its
     networks as constants of the kernels. ``first``: seconds that the first frame took, compilation included."""
@@ -370,7 +320,3 @@ def measure(frames: dict, size: str, runs: int) -> list[dict]:
         }
         for name, taken in seconds.items()
     ]
-
-
-if __name__ == "__main__":
-    main()

@@ -5,10 +5,10 @@
 Same grid, networks, initial weights, rays, step table, occupancy grid, density pass, losses, optimiser and schedule, on
 the same machine in the same run, one after the other; the peer is eager PyTorch, gathers and sums, autograd. Before
 they start, both evaluate the same random points, and the program stops if they differ. Without our trainer's extras:
-thinned samples, damped derivatives near cameras, cleared cells, and the settling of the grid, which are switched off in
-both. Both fields are scored by the integrator, under the occupancy found in the same way. ``--turns``: instead, both
-take 8 steps in turns, so often, after 100 that clear the first fog, marching finely from the start, and what a step
-takes is printed.
+thinned samples, damped derivatives near cameras, cleared cells, colours of each photo, and the settling of the grid,
+which are switched off in both. Both fields are scored by the integrator, under the occupancy found in the same way.
+``--turns``: instead, both take 8 steps in turns, so often, after 100 that clear the first fog, marching finely from the
+start, and what a step takes is printed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from fox_radiance import default_data, validation
+from radiance import FOX, open_views
 from timing import in_turns, median, spread
 
 import numpy as np
@@ -49,6 +49,9 @@ def take_turns(ours, peer, turns: int, steps: int = 8, before: int = 100) -> Non
 
 
 _PRIMES = (1, 2654435761, 805459861)
+
+OFF = {"settle": 2.0, "empty_weight": 0.0, "grid_decay": 0.0, "thin_least": 1.0, "reach": 0.0, "photo_colors": False}
+"""Settings without what the peer does not have."""
 
 
 class TorchModel:
@@ -285,7 +288,7 @@ def main(argv=None) -> None:
     from timing import write_rows
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=default_data())
+    parser.add_argument("--data", type=Path, default=FOX)
     parser.add_argument("--minutes", type=float, default=2.0)
     parser.add_argument("--width", type=int, default=135)
     parser.add_argument("--size", default="small")
@@ -295,29 +298,21 @@ def main(argv=None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/torch_radiance"))
     args = parser.parse_args(argv)
 
-    import drjit as dr
-    import mitsuba as mi
-    import torch
-
-    mi.set_variant("llvm_ad_rgb")
-    dr.set_thread_count(args.threads)
-    torch.set_num_threads(args.threads)
     from nerg_mi.evaluation.metrics import score_views
-    from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import save_radiance
-    from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
     from nerg_mi.train.radiance_trainer import RadianceTrainer
+    from nerg_mi.workflows.base import select_backend
 
-    ns = namespace("llvm_ad_rgb")
-    data = open_dataset(args.data, None, args.width)
-    data = validation(data) if args.validate else data
+    import torch
+
+    ns = select_backend("llvm_ad_rgb", args.threads)
+    torch.set_num_threads(args.threads)
+    data = open_views(args.data, args, args.width)
     if any(v.has_alpha or v.mask is not None for v in data.train):
         raise SystemExit("the peer knows neither alpha nor masks; give a set of plain photos")
     fine = {"strides": ()} if args.turns else {}
-    settings = RadianceSettings(
-        minutes=args.minutes, settle=2.0, empty_weight=0.0, grid_decay=0.0, thin_least=1.0, reach=0.0, **fine
-    )
+    settings = RadianceSettings(minutes=args.minutes, **OFF, **fine)
     make = lambda: RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
     args.out.mkdir(parents=True, exist_ok=True)
     ours, judge = make(), make()

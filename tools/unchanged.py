@@ -1,8 +1,10 @@
 """What the commands make, compared bit for bit with what they made before: for changes that are to change nothing.
 
-    python tools/unchanged.py record FOLDER [--only NAME ...]   run every command below, keep what it writes and digests
+    python tools/unchanged.py record FOLDER [--only NAME ...]   run every command below and keep what it writes
     python tools/unchanged.py compare FOLDER [--only NAME ...]  run them again, and name what differs; exit code 1 where
                                                                 anything does
+
+Compared are channels and pixels, arrays, tables and the errors of a study, not headers, times or names of files.
 
 Pictures of the demo store with every kind of depth, visibility, quadrature, gaze field and AOV, of shapes and through a
 panorama; trainings of radiance and gaze at one thread; a study's errors; tables and exports. Everything is made of the
@@ -24,6 +26,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 STORE = ROOT / "scenes" / "store"
@@ -185,15 +189,28 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     )
 
 
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    """What a rays file or a picture holds by its names: headers, which name files and times, are left out."""
+    if path.suffix == ".exr":
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            return {name: channel.pixels for name, channel in file.channels().items()}
+    if path.suffix == ".png":
+        with Image.open(path) as image:
+            return {image.mode: np.asarray(image)}
+    with np.load(path) as file:
+        stored = {name: file[name] for name in file.files}
+    return {name: array for name, array in stored.items() if array.dtype.kind in "fiub" and array.ndim}
+
+
 def digest(path: Path) -> str:
-    """Of what a file holds: of a checkpoint or a rays file its arrays, since their documents tell times and names of
-    files; of others their bytes."""
-    if path.suffix == ".npz":
-        with np.load(path) as file:
-            arrays = {name: file[name] for name in file.files}
-        kept = [(name, a.tobytes()) for name, a in arrays.items() if a.dtype.kind in "fiub" and a.ndim]
-        return hashlib.sha256(b"".join(name.encode() + bytes_ for name, bytes_ in kept)).hexdigest()
-    data = path.read_bytes()
+    """Digest of the arrays of a picture, a rays file or a checkpoint, of the rows of a study, or of a file's bytes."""
+    if path.name == "study":
+        data = errors_of_study(path)
+    elif path.suffix in (".exr", ".png", ".npz"):
+        parts = [f"{name} {a.dtype} {a.shape}".encode() + a.tobytes() for name, a in sorted(arrays(path).items())]
+        data = b"".join(parts)
+    else:
+        data = path.read_bytes()
     if path.suffix == ".safetensors":
         (size,) = struct.unpack("<Q", data[:8])
         header = json.loads(data[8 : 8 + size])
@@ -202,18 +219,12 @@ def digest(path: Path) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def errors_of_study(folder: Path) -> str:
-    """Digest of a study's rows without their times and memory, and without the fronts that follow from times."""
+def errors_of_study(folder: Path) -> bytes:
+    """A study's rows without their times and memory, and without the fronts that follow from times."""
     rows = list(csv.DictReader((folder / "study.csv").open()))
-    kept = [
-        {
-            k: v
-            for k, v in row.items()
-            if not any(w in k for w in ("ms", "second", "time", "memory", "bytes", "peak", "pareto"))
-        }
-        for row in rows
-    ]
-    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+    measured = ("ms", "second", "time", "memory", "bytes", "peak", "pareto")
+    errors = [{k: v for k, v in row.items() if not any(w in k for w in measured)} for row in rows]
+    return json.dumps(errors, sort_keys=True).encode()
 
 
 def wanted(folder: Path, only: list[str]) -> list[tuple[str, list[str]]]:
@@ -229,43 +240,35 @@ def wanted(folder: Path, only: list[str]) -> list[tuple[str, list[str]]]:
 
 
 def run(folder: Path, only: list[str]) -> dict[str, str]:
-    """Run every command that is ``wanted``; file -> digest, or what went wrong."""
-    found = {}
+    """Run every command that is ``wanted``; output -> digest, or the error."""
+    results = {}
     for name, line in wanted(folder, only):
         out = folder / name
-        answer = subprocess.run([*NERG, *line, "-o", str(out)], capture_output=True, text=True)
-        if answer.returncode != 0:
-            found[name] = f"exit code {answer.returncode}: {answer.stderr.strip()[-400:]}"
-        elif name == "study":
-            found[name] = errors_of_study(out)
-        elif out.is_dir():
-            for table in sorted(out.glob("*.csv")):
-                found[f"{name}/{table.name}"] = digest(table)
-        else:
-            found[name] = digest(out)
-        print(f"{name:28} {found.get(name, '')[:70]}", flush=True)
-    return found
+        process = subprocess.run([*NERG, *line, "-o", str(out)], capture_output=True, text=True)
+        tables = sorted(out.glob("*.csv")) if out.is_dir() and name != "study" else []
+        for path in tables or [out]:
+            output = path.relative_to(folder).as_posix()
+            failed = f"exit code {process.returncode}: {process.stderr.strip()[-400:]}" if process.returncode else ""
+            results[output] = failed or digest(path)
+            print(f"{output:28} {results[output][:70]}", flush=True)
+    return results
 
 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["record", "compare"])
-    parser.add_argument("folder", type=Path, help="of the recorded digests and of what the commands made")
+    parser.add_argument("folder", type=Path, help="of what the commands made")
     more = "only outputs whose names contain this, and what they are made of; may be given several times"
     parser.add_argument("--only", action="append", default=[], help=more)
     args = parser.parse_args(argv)
-    record = args.folder / "digests.json"
     if args.what == "record":
         args.folder.mkdir(parents=True, exist_ok=True)
-        found = run(args.folder.resolve(), args.only)
-        before = json.loads(record.read_text()) if record.exists() and args.only else {}
-        record.write_text(json.dumps({**before, **found}, indent=1))
-        return int(any(v.startswith("exit code") for v in found.values()))
-    known = json.loads(record.read_text())
+        return int(any(v.startswith("exit code") for v in run(args.folder.resolve(), args.only).values()))
     with tempfile.TemporaryDirectory(prefix="nerg-unchanged-") as temporary:
-        found = run(Path(temporary), args.only)
-    differ = [name for name, value in found.items() if known.get(name) != value]
-    print(f"{len(found)} outputs, {len(differ)} of them differ" + "".join(f"\n  {n}" for n in differ))
+        results = run(Path(temporary), args.only)
+    before = {name: digest(args.folder / name) for name in results if (args.folder / name).exists()}
+    differ = [name for name, value in results.items() if before.get(name) != value]
+    print(f"{len(results)} outputs, {len(differ)} of them differ" + "".join(f"\n  {n}" for n in differ))
     return int(bool(differ))
 
 

@@ -59,7 +59,7 @@ def test05_a_missing_device_is_one_sentence(benchmark, monkeypatch, capsys):
 
 
 def test06_memory_of_this_process(benchmark):
-    memory = benchmark("frame_memory")
+    memory = benchmark("processes")
     # The kernel counts pages in batches, so that the two may be a few apart.
     assert memory.status("VmHWM") > 0.9 * memory.status("VmRSS") > 9
     with pytest.raises(RuntimeError, match="VmNothing"):

@@ -23,7 +23,20 @@ from tests.reference import march_numpy
 
 # ---- Measure ----
 #
-# What a study measures and says meanwhile: one sample unless told, rounds over all rows, and the axes of the cost.
+# What a study measures, and what it says meanwhile.
+
+
+def test_what_the_second_frame_of_an_observer_compiles_is_in_no_time(monkeypatch):
+    subject, calls = open_subject("slab", "auto", 6, 4), []
+    render = subject.render
+    monkeypatch.setattr(study_paper, "timed", lambda *args: calls.append("timed") or (1.0, 1.0))
+    monkeypatch.setattr(subject, "render", lambda *args: calls.append("render") or render(*args))
+    rows = [study_paper.StudyRow("depth only", "leave out", {"aovs": "depth,opacity", "radiance": False})]
+    said = []
+    study_paper.measure(subject, rows, 2, on_step=said.append)
+    assert said == ["depth only", "time of depth only"]
+    # For the rays of the truth, the errors, the counts, and what is compiled then.
+    assert calls == ["render"] * 4 + ["timed"] * 2
 
 
 # ---- What is counted: operations that are traced, whatever the machine ----

@@ -1,0 +1,153 @@
+"""What is measured in processes of their own, for `bench.py`: the memory of a frame, and how long it takes to start.
+
+    python benchmarks/processes.py memory [--sizes 640x360,1280x720,1920x1080] [--update docs/performance.md]
+    python benchmarks/processes.py start [--runs 5] [--update docs/performance.md]
+
+Memory: the demo store, colour, depth and gaze of an observer who is not the camera, one sample a pixel. Resident: the
+most memory of the process (high-water mark of its resident set) beyond what it held with the package imported and the
+variant chosen; the field, the compiled kernels and the picture are in it. Arrays: the most that Dr.Jit held in arrays.
+In one piece by ``mi.render``, and by `nerg render`, which renders in strips. Kernels come from the cache: a first
+process, which is not counted, compiles them.
+
+Start: until something is there, imports, the command's help, the first picture, the demo, in turns; medians of
+wall-clock seconds with their quartiles, and seconds of the processor. Files are in the system's memory after the first
+turn, which does not count. "Cold" has no kernels compiled, "warm" those of the runs before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+from nerg_mi.workflows.demo import store_scene
+from timing import median, print_table, spread
+
+SIZES = ((320, 180), (1280, 720), (1920, 1080))
+WAYS = ("mi.render", "nerg render")
+HEADS = {
+    "memory": ("frame", *(f"`{way}`, MB resident (MB of arrays)" for way in WAYS)),
+    "start": ("what", "s", "quartiles", "CPU s"),
+}
+COMMAND = [str(Path(sys.executable).with_name("nerg"))]
+VARIANT = 'import nerg_mi, mitsuba; mitsuba.set_variant("llvm_ad_rgb")'
+
+
+def status(name: str) -> float:
+    """An entry of this process's memory, in MB: ``VmRSS`` or ``VmHWM``."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(name + ":"):
+            return int(line.split()[1]) * 1024 / 1e6
+    raise RuntimeError(f'this system does not say "{name}" of a process; measure on Linux')
+
+
+def peak(way: str, width: int, height: int) -> dict[str, float]:
+    """Of one frame in this process."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.rendering.scene import load_scene
+    from nerg_mi.workflows.render import render_file
+    from nerg_mi.workflows.scene_commands import PictureOptions
+
+    dr.eval(mi.Float([0.0, 1.0]) + 1)
+    dr.sync_thread()
+    # What was held for a moment before counts no more.
+    Path("/proc/self/clear_refs").write_text("5")
+    before = status("VmRSS")
+    values = {"width": str(width), "height": str(height), "spp": "1", "aovs": "depth,gaze"}
+    if way == "mi.render":
+        np.array(mi.render(load_scene(store_scene(), values), spp=1))
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            options = PictureOptions(spp=1, defaults=values, mode="llvm_ad_rgb")
+            render_file(store_scene(), Path(folder) / "a.exr", options)
+    arrays = dr.detail.malloc_watermark(dr.JitBackend.LLVM) / 1e6
+    return {"resident": status("VmHWM") - before, "arrays": arrays}
+
+
+def memory(sizes=SIZES) -> list[list[str]]:
+    """A row for each of ``sizes``."""
+    rows = []
+    for width, height in sizes:
+        row = [f"{width} x {height}"]
+        for way in WAYS:
+            command = [sys.executable, __file__, "memory", "--one", way, "--sizes", f"{width}x{height}"]
+            for _ in range(2):
+                peaks = json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
+            row.append(f"{peaks['resident']:.0f} ({peaks['arrays']:.0f})")
+        rows.append(row)
+    return rows
+
+
+def works(folder: Path) -> dict[str, tuple[list[str], bool]]:
+    """What is run, and whether it begins with no kernels compiled, by name; files are written into ``folder``."""
+    picture = [*COMMAND, "render", str(store_scene()), "-o", str(folder / "a.png"), "-m", "llvm_ad_rgb"]
+    demo = [*COMMAND, "demo", "-o", str(folder / "demo"), "-m", "llvm_ad_rgb"]
+    return {
+        "`import nerg_mi`": ([sys.executable, "-c", "import nerg_mi"], False),
+        "... and choose a variant": ([sys.executable, "-c", VARIANT], False),
+        "`nerg --help`": ([*COMMAND, "--help"], False),
+        "`nerg render`, 480 x 320, 4 samples a pixel, warm": (picture, False),
+        "... cold": (picture, True),
+        "`nerg demo`, warm": (demo, False),
+    }
+
+
+def seconds_of(command: list[str], kernels: Path) -> tuple[float, float]:
+    """Wall-clock and processor seconds of ``command``, which keeps compiled ``kernels``. Raises
+    ``CalledProcessError`` where it fails."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    environment = {**os.environ, "DRJIT_CACHE_DIR": str(kernels)}
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def start(runs: int) -> list[list[str]]:
+    """A row for each of `works`."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "warm").mkdir()
+        commands = works(folder)
+        times: dict[str, list[tuple[float, float]]] = {name: [] for name in commands}
+        for turn in range(runs + 1):
+            for what, (command, cold) in commands.items():
+                with tempfile.TemporaryDirectory(dir=folder) as empty:
+                    seconds = seconds_of(command, Path(empty) if cold else folder / "warm")
+                if turn:
+                    times[what].append(seconds)
+    rows = []
+    for what, seconds in times.items():
+        wall, cpu = zip(*seconds)
+        rows.append([what, f"{median(wall):.3g}", spread(wall), f"{median(cpu):.3g}"])
+    return rows
+
+
+def main(argv=None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=HEADS)
+    parser.add_argument("--sizes", default=",".join(f"{w}x{h}" for w, h in SIZES), help="of the frames")
+    parser.add_argument("--runs", type=int, default=5, help="of each start")
+    parser.add_argument("--one", choices=WAYS, help="print the memory of one frame, measured in this process")
+    parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
+    args = parser.parse_args(argv)
+    sizes = [tuple(map(int, size.split("x"))) for size in args.sizes.split(",")]
+    if args.one:
+        print(json.dumps(peak(args.one, *sizes[0])))
+        return
+    rows = memory(sizes) if args.what == "memory" else start(args.runs)
+    print_table(args.what.capitalize(), HEADS[args.what], rows, args.update)
+
+
+if __name__ == "__main__":
+    main()

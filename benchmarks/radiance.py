@@ -1,0 +1,246 @@
+"""Radiance fields trained on photos: PSNR, SSIM and depth of views that were held out, rendered by the integrator.
+
+    python benchmarks/radiance.py fox [--minutes 1,2,4,7,10] [--width 135] [--deferred] [--validate] [--set hold=0.5]
+    python -m nerg_mi.scenes.store.make --stage views          # once: pictures of the store, rendered from the twin
+    python benchmarks/radiance.py store [--minutes 10] [--size medium] [--only images|depth]
+    python -m nerg_mi.scenes.tabletop.make                     # once: photos, rendered from a place made of a seed
+    python benchmarks/radiance.py tabletop [--minutes 4] [--bounded]
+
+fox: real photos, every 8th held out. One training of the last of the ``--minutes``, with the learning rate's schedule
+over all of it; at each of them the weights so far are written, the clock stopping, and scored as `nerg eval radiance`
+does, after training. A row for a shorter time is thus what a longer run has come to, not what a run of that length ends
+with. "fitted" is the PSNR of right halves, their colours fitted on left ones, since nobody knows the exposure of a
+photo that was held out. ``--data`` takes another posed image set.
+
+store: a room seen from inside, from its pictures alone and with their depth; depth and the opacity of the walls are
+compared with exact ray casts to the twin.
+
+tabletop: an unbounded capture, photos around a table in a room with a view, at the defaults of `nerg train radiance`.
+The photos are read as a user's are: COLMAP's model, every 8th held out, the box found by its points. Depth is compared
+with exact ray casts. "near": what lies within 1.5 m of the object; "far": what is farther than 4 m from the camera,
+without the sky; "beyond": what lies outside of the field's box, or of the core of one whose surroundings are
+contracted, the sky too. ``--bounded``: as if nothing were to be seen beyond that box.
+
+``--validate`` never opens the held-out views: every 8th of the *training* views takes their place; choices are made
+with it. Each writes a CSV beside the printed table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
+import numpy as np
+
+# BLAS threads wait in a busy loop, in the way of the others.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+ROOT = Path(__file__).resolve().parents[1]
+FOX = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "fox"
+NEAR, FAR = 1.5, 4.0
+"""Metres: from the object's middle at most, and from the camera at least."""
+OFF = 0.1
+"""Depth that errs by a larger share is off."""
+SCORES = ("minutes", "steps", "ms a step", "PSNR, dB", "fitted, dB", "SSIM")
+
+
+def open_views(folder: Path, args: argparse.Namespace, width: int | None = None):
+    """The data set of ``folder``; with ``--validate`` every 8th training view replaces those that are held out."""
+    from nerg_mi.photos.dataset import open_dataset
+
+    if not folder.exists():
+        raise SystemExit(f"{folder} does not exist; give a posed image set with --data, or make it (--help)")
+    data = open_dataset(folder, None, width)
+    if args.validate:
+        data = replace(data, held_out=data.train[::8], train=[v for k, v in enumerate(data.train) if k % 8])
+    print(f"{len(data.train)} views to train on, {len(data.held_out)} to score; load {os.getloadavg()[0]:.1f}")
+    return data
+
+
+def fields(data, stops: list[float], args: argparse.Namespace, name: str, depth: bool, deferred=False) -> Iterator:
+    """Trains once; ``(trainer, path, row)`` after each of the minutes ``stops``, with the field so far in a file that
+    begins with ``name``."""
+    from nerg_mi.formats.fields import save_radiance
+    from nerg_mi.train.radiance_run import warm_up
+    from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
+    from nerg_mi.train.radiance_trainer import RadianceTrainer
+    from nerg_mi.workflows.base import select_backend
+
+    ns = select_backend("llvm_ad_rgb", args.threads)
+    pairs = (pair.split("=", 1) for pair in args.set)
+    settings = RadianceSettings(
+        minutes=stops[-1], seed=args.seed, **{key: ast.literal_eval(value) for key, value in pairs}
+    )
+    config = replace(sized_config(args.size, data.box), deferred=deferred)
+    trainer = RadianceTrainer(data.train, data.box, config, settings, ns, depth=depth)
+    warm_up(trainer)
+    for stop in stops:
+        while trainer.seconds < 60 * stop and trainer.progress < 1:
+            trainer.step()
+        seconds = trainer.seconds
+        path = args.out / f"{name}_{stop:g}.safetensors"
+        save_radiance(trainer.field(), path, {"minutes": stop, "settings": settings.to_dict()})
+        row = {"minutes": stop, "steps": trainer.steps, "ms a step": 1e3 * seconds / trainer.steps}
+        yield trainer, path, row | {"load": os.getloadavg()[0]}
+        # What was spent on looking is no training.
+        trainer.restore(seconds, trainer.hard)
+    speed = trainer.clock.summary()
+    print(f"{speed['evaluations_a_second']:.3g} field evaluations a second; step in ms: {speed['step_ms']}")
+
+
+def scored(path: Path, held_out: list, spp: int):
+    """Scores of a field, and the columns of `SCORES` that come from them."""
+    from nerg_mi.evaluation.metrics import score_views
+
+    scores = score_views(path, held_out, spp, path.with_suffix(""))
+    row = {"PSNR, dB": scores.psnr_mean, "fitted, dB": scores.psnr_fitted_mean, "SSIM": scores.ssim_mean}
+    return scores, row
+
+
+def cells(row: dict) -> list[str]:
+    """Of the columns of `SCORES`."""
+    formats = ("g", ",", ".1f", ".2f", ".2f", ".3f")
+    return [f"{row[key]:{format_}}" for key, format_ in zip(SCORES, formats)]
+
+
+def fox(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
+    """Title, head and cells of the table, and the rows of the CSV."""
+    from nerg_mi.train.radiance_run import measure
+
+    data = open_views(args.data, args, args.width)
+    stops = sorted(float(m) for m in args.minutes.split(","))
+    rows = []
+    for trainer, path, row in fields(data, stops, args, f"fox_{args.width}", False, args.deferred):
+        rows.append(row | {"training views, dB": measure(trainer, data.train[::8], 2).mean, "file": path})
+    for row in rows:
+        row |= scored(row["file"], data.held_out, args.spp)[1]
+    table = [[*cells(row), f"{row['training views, dB']:.1f}"] for row in rows]
+    return "The fox", [*SCORES, "training views, dB"], table, rows
+
+
+def store(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
+    data, table, rows = open_views(args.data, args), [], []
+    for source in ("images", "depth") if args.only is None else (args.only,):
+        for _, path, row in fields(data, [float(args.minutes)], args, source, source == "depth"):
+            scores, columns = scored(path, data.held_out, args.spp)
+            depth = scores.depth
+            row |= {"from": source, **columns, "depth_median": depth.median, "depth_mean": depth.mean}
+            row |= {"depth_off": depth.off, "opacity": depth.opacity, "translucent": depth.translucent}
+            rows.append(row)
+            name = "images alone" if source == "images" else "images and depth"
+            more = [f"{100 * depth.median:.2f} cm", f"{depth.off:.1%}", f"{depth.opacity:.4f}"]
+            table.append([name, *cells(row), *more])
+    return "The store", ["from", *SCORES, "depth off, median", "by more than a tenth", "opacity"], table, rows
+
+
+def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
+    from nerg_mi.photos.dataset import open_dataset
+    from nerg_mi.scenes.tabletop.photos import DEPTH_FILE
+    from nerg_mi.scenes.tabletop.table import CENTRE
+    from nerg_mi.workflows.radiance_commands import RadianceOptions
+    from nerg_mi.workflows.train_radiance import train_radiance
+
+    if not (args.data / DEPTH_FILE).is_file():
+        raise SystemExit(f"{args.data} holds no photos; make them with: python -m nerg_mi.scenes.tabletop.make")
+    path, minutes = args.out / "tabletop.safetensors", float(args.minutes)
+    unbounded = False if args.bounded else None
+    options = RadianceOptions(minutes=minutes, unbounded=unbounded, threads=args.threads, seed=args.seed)
+    result = train_radiance(args.data, path, options)
+    about, box = result.provenance, result.field.box.core
+    held_out = open_dataset(args.data / DEPTH_FILE).held_out
+    if [v.name.rpartition("/")[2] for v in held_out] != about["held_out"]["frames"]:
+        raise SystemExit(f"{args.data / DEPTH_FILE} holds out other photos than the capture beside it")
+    for line in about["complaints"]:
+        print(line)
+    s = score_depths(path, held_out, box, CENTRE, args.spp, args.out / "pictures")
+    size = " x ".join(f"{u - l:.1f}" for l, u in zip(box.lower, box.upper)) + " m"
+    size += ", contracted" if result.field.box.contracted else ""
+    table = [f"{minutes:g}", f"{about['seconds']:.0f}", f"{about['steps']:,}", f"{s['psnr']:.2f}", f"{s['ssim']:.3f}"]
+    table += [f"{s['psnr_within']:.2f}, {s['psnr_beyond']:.2f}", f"{s['beyond']:.1%}"]
+    table += [f"{100 * s['near_median']:.2f} cm, {s['near_off']:.1%}", f"{s['far_median']:.1%}, {s['far_off']:.1%}"]
+    head = ["minutes", "seconds", "steps", "PSNR, dB", "SSIM", "within, beyond", "pixels beyond"]
+    head += ["near: median, off", "far: median, off", "box"]
+    row = {"minutes": minutes, "seconds": about["seconds"], "steps": about["steps"], **s, "box": size}
+    return "An unbounded capture", head, [[*table, size]], [row]
+
+
+def score_depths(field: Path, views: list, box, center, spp: int, pictures: Path) -> dict[str, float]:
+    """Means over ``views`` of PSNR in dB and SSIM, and over all of their pixels: PSNR within and ``beyond`` the
+    ``box``, and errors of depth near ``center`` and far."""
+    from nerg_mi.evaluation.metrics import Renderer, ssim
+    from nerg_mi.figures.overlay import write_png
+    from nerg_mi.files.atomic import make_folder
+    from nerg_mi.maths.color import decibels, psnr
+    from nerg_mi.photos.cameras import pixel_directions
+
+    make_folder(pictures)
+    render, rows, parts = Renderer(field, spp), [], []
+    for k, view in enumerate(views):
+        seen, truth = render(view.camera, k), view.over(0)
+        rows.append((psnr(seen.color, truth), ssim(seen.color, truth)))
+        write_png(pictures / f"{Path(view.name).stem}.png", np.concatenate([seen.color, truth], axis=1))
+        directions = pixel_directions(view.camera.intrinsics) @ view.camera.to_world[:3, :3].T
+        place = view.camera.center + view.depth[..., None] * directions
+        inside = np.all((place >= box.lower) & (place <= box.upper), axis=-1) & (view.depth > 0)
+        near = (np.linalg.norm(place - center, axis=-1) < NEAR) & (view.depth > 0)
+        squares = np.mean((np.clip(seen.color, 0, 1) - truth) ** 2, axis=-1)
+        parts.append([v.ravel() for v in (view.depth, seen.depth, squares, ~inside, near)])
+    depth, rendered, squares, beyond, near = (np.concatenate(v) for v in zip(*parts))
+    beyond, near, far = beyond.astype(bool), near.astype(bool), depth > FAR
+    error = np.abs(rendered - depth)
+    share = error / np.maximum(depth, 1e-9)
+    out = {"psnr": float(np.mean([p for p, _ in rows])), "ssim": float(np.mean([s for _, s in rows]))}
+    for name, which in (("within", ~beyond), ("beyond", beyond)):
+        out[f"psnr_{name}"] = decibels(float(squares[which].mean())) if which.any() else float("nan")
+    return out | {
+        "beyond": float(beyond.mean()),
+        "near_median": float(np.median(error[near])),
+        "near_off": float(np.mean(share[near] > OFF)),
+        "far_median": float(np.median(share[far])),
+        "far_off": float(np.mean(share[far] > OFF)),
+    }
+
+
+SETS = {
+    "fox": (fox, FOX, "1,2,4,7,10"),
+    "store": (store, ROOT / "scenes" / "store" / "build", "10"),
+    "tabletop": (tabletop, ROOT / "scenes" / "tabletop" / "build", "4"),
+}
+"""What trains and scores, the folder of the views, and the minutes, by name."""
+
+
+def main(argv=None) -> None:
+    from timing import print_table, write_rows
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=SETS)
+    parser.add_argument("--data", type=Path, help="folder of the views")
+    parser.add_argument("--minutes", help="of the training; of the fox several, at which it is looked at")
+    parser.add_argument("--width", type=int, default=135, help="of the fox's photos in pixels")
+    parser.add_argument("--size", default="small", help="of the fields of the fox and of the store")
+    parser.add_argument("--deferred", action="store_true", help="fox: ask the colour network once a ray")
+    parser.add_argument("--only", choices=("images", "depth"), help="what the store's field is trained on")
+    parser.add_argument("--bounded", action="store_true", help="tabletop: as of nerg train radiance")
+    parser.add_argument("--validate", action="store_true", help="fox, store: leave the held-out views alone")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="fox, store: a setting")
+    parser.add_argument("--spp", type=int, default=16, help="rays a pixel; the default is that of nerg eval radiance")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/radiance"))
+    args = parser.parse_args(argv)
+    work, folder, minutes = SETS[args.what]
+    args.data, args.minutes = args.data or folder, args.minutes or minutes
+    args.out.mkdir(parents=True, exist_ok=True)
+    title, head, table, rows = work(args)
+    print_table(title, head, table)
+    write_rows(args.out / f"{args.what}.csv", rows)
+
+
+if __name__ == "__main__":
+    main()
