@@ -33,7 +33,7 @@ RUN = .venv/bin/python
 # order of tests/conftest.py.
 JOBS ?= auto
 PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
-ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_images.py tests/files/test_images.py \
+ONE_CORE = tests/cli/test_scenes.py tests/cli/test_ending.py tests/files/test_images.py tests/files/test_images.py \
 	tests/test_runtime.py tests/renders
 
 .PHONY: demo test test-all check lint types format docs manual onecore coverage fuzz faults soak packages bench bench-gpu setup

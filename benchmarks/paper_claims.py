@@ -27,8 +27,9 @@ ORDER = ("emit", "capture", "loss code")
 
 def main(argv=None) -> None:
     from nerg_mi.cli.progress import TerminalReporter
-    from nerg_mi.workflows.ablation import AblationOptions, ablate
+    from nerg_mi.workflows.ablation import ablate
     from nerg_mi.workflows.base import select_backend
+    from nerg_mi.workflows.gaze_commands import AblationOptions
 
     parser = place_parser(__doc__, "paper_claims", folds=4)
     parser.set_defaults(only="supermarket,store")

@@ -94,10 +94,11 @@ def makers(data: Path) -> dict[str, Make]:
 
 def recorded(files: list[Path], reader: str, folder: Path) -> Path:
     """Rays of recordings; a reader leaves out those whose gaze is frozen, and says so."""
-    from nerg_mi.workflows.rays import ImportOptions, import_rays
+    from nerg_mi.workflows.rays import import_rays
+    from nerg_mi.workflows.rays_commands import RaysImportOptions
 
     path = folder / "rays.npz"
-    import_rays(files, ImportOptions(reader=reader, output=path))
+    import_rays(files, RaysImportOptions(reader=reader, output=path))
     return path
 
 
@@ -106,13 +107,14 @@ def store(folder: Path) -> tuple[Path, dict]:
     from nerg_mi.rays.readers.skeleton import SkeletonOptions
     from nerg_mi.scenes.store import make
     from nerg_mi.workflows import demo
-    from nerg_mi.workflows.rays import ImportOptions, import_rays
+    from nerg_mi.workflows.rays import import_rays
+    from nerg_mi.workflows.rays_commands import RaysImportOptions
 
     csv = Path(make.__file__).parent / "build" / "shoppers.csv"
     if not csv.is_file():
         make.main(["--stage", "shoppers"])
     path = folder / "rays.npz"
-    import_rays([csv], ImportOptions(reader="skeleton", settings=SkeletonOptions(tick=0.001), output=path))
+    import_rays([csv], RaysImportOptions(reader="skeleton", settings=SkeletonOptions(tick=0.001), output=path))
     return path, {"field": demo.store_scene().parent / "store.safetensors"}
 
 
@@ -166,7 +168,8 @@ def evaluate(name: str, make: Make, args: argparse.Namespace):
     """What `nerg eval folds` finds in a place."""
     from nerg_mi.cli.progress import TerminalReporter
     from nerg_mi.workflows.base import select_backend
-    from nerg_mi.workflows.evaluate import FoldOptions, evaluate_folds
+    from nerg_mi.workflows.evaluate import evaluate_folds
+    from nerg_mi.workflows.gaze_commands import FoldOptions
 
     select_backend("llvm_ad_rgb", args.threads)
     folder, rays, where = write_place(name, make, args)

@@ -56,8 +56,8 @@ def peak(way: str, width: int, height: int) -> dict[str, float]:
 
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.rendering.scene import load_scene
-    from nerg_mi.workflows.options import PictureOptions
     from nerg_mi.workflows.render import render_file
+    from nerg_mi.workflows.scene_commands import PictureOptions
 
     dr.eval(mi.Float([0.0, 1.0]) + 1)
     dr.sync_thread()

@@ -143,7 +143,8 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
     from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.scenes.tabletop.photos import DEPTH_FILE
     from nerg_mi.scenes.tabletop.table import CENTRE
-    from nerg_mi.workflows.train_radiance import RadianceOptions, train_radiance
+    from nerg_mi.workflows.radiance_commands import RadianceOptions
+    from nerg_mi.workflows.train_radiance import train_radiance
 
     if not (args.data / DEPTH_FILE).is_file():
         raise SystemExit(f"{args.data} holds no photos; make them with: python -m nerg_mi.scenes.tabletop.make")

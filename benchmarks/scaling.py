@@ -57,7 +57,7 @@ def bake(folder: Path, detail: float, name: str, **more) -> tuple[int, bytes]:
     """Observers and the bytes of what is made of them."""
     from nerg_mi.scenes import store
     from nerg_mi.workflows.bake import bake
-    from nerg_mi.workflows.bake_options import BakeOptions
+    from nerg_mi.workflows.scene_commands import BakeOptions
 
     out = folder / f"{name}.ply"
     gaze = files(store) / "shoppers.safetensors"
@@ -68,7 +68,7 @@ def bake(folder: Path, detail: float, name: str, **more) -> tuple[int, bytes]:
 
 def count(folder: Path, name: str, **more) -> tuple[int, bytes]:
     """Rays and the bytes of the table."""
-    from nerg_mi.aoi.measured import StatisticsOptions
+    from nerg_mi.aoi.options import StatisticsOptions
     from nerg_mi.workflows.statistics import statistics as stats
 
     options = StatisticsOptions(areas=folder / "areas.json", resamples=199, names=True, mode="llvm_ad_rgb", **more)

@@ -42,7 +42,8 @@ COLUMNS = {
 def make(path: Path, resolution: int) -> None:
     """Splats of the store's field."""
     from nerg_mi.workflows.demo import store_scene
-    from nerg_mi.workflows.export import SplatOptions, export_splats
+    from nerg_mi.workflows.export import export_splats
+    from nerg_mi.workflows.radiance_commands import SplatOptions
 
     path.parent.mkdir(parents=True, exist_ok=True)
     export_splats(store_scene().parent / "store.safetensors", path, SplatOptions(resolution=resolution))

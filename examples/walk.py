@@ -17,8 +17,8 @@ from pathlib import Path
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.tables import write_csv
-from nerg_mi.workflows.options import PictureOptions
 from nerg_mi.workflows.render import render_file
+from nerg_mi.workflows.scene_commands import PictureOptions
 
 import numpy as np
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import gc
 import importlib.util
+import json
 import os
 import signal
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -185,7 +187,8 @@ def trained(tmp_path_factory):
 
     import mitsuba as mi
 
-    from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
+    from nerg_mi.workflows.gaze_commands import GazeOptions
+    from nerg_mi.workflows.train_gaze import train_gaze
     from tests.evaluation.test_gaze import crowd
 
     mi.set_variant("llvm_ad_rgb")
@@ -195,6 +198,35 @@ def trained(tmp_path_factory):
     options = GazeOptions(geometry="hits", test_zones=1, test_positions=3, **small)
     train_gaze(folder / "rays.npz", folder / "gaze.safetensors", options)
     return folder
+
+
+@pytest.fixture
+def cube(tmp_path):
+    """An opaque grey cube of density 50 seen by 3 cameras, whose photos are grey of 0.5; and the field that it is."""
+    import drjit.llvm.ad as ns
+    import mitsuba as mi
+
+    from nerg_mi.fields.encoding import HashGridConfig
+    from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+    from nerg_mi.formats.fields import save_radiance
+    from nerg_mi.maths.geometry import Box
+
+    mi.set_variant("llvm_ad_rgb")
+    grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8)
+    config = RadianceConfig(grid=grid, width=16, color_hidden=1, density_scale=50.0)
+    field = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0, march_step=0.05)
+    field.set_parameters({k: type(v)(np.zeros(v.shape, np.float32)) for k, v in field.parameters().items()})
+    frames = []
+    for k in range(3):
+        mi.Bitmap(np.full((14, 16, 3), 128, np.uint8)).write(str(tmp_path / f"{k}.png"))
+        pose = np.eye(4)
+        pose[:3, 3] = 0.05 * k, 0, 3
+        frames.append({"file_path": f"{k}.png", "transform_matrix": pose.tolist()})
+    lens = {"w": 16, "h": 14, "fl_x": 60.0, "fl_y": 60.0, "cx": 8.0, "cy": 7.0}
+    about = {**lens, "frames": frames, "aabb": [[-1, -1, -1], [1, 1, 1]]}
+    (tmp_path / "transforms.json").write_text(json.dumps(about))
+    save_radiance(field, tmp_path / "cube.safetensors", {})
+    return tmp_path
 
 
 # ------------------------------------------------------------------------

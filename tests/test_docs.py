@@ -1,21 +1,27 @@
-"""What the pages say of options and defaults is what the code has."""
+"""What the pages say of options, defaults, names and versions is what the code has."""
 
 from __future__ import annotations
 
 import functools
+import inspect
 import re
 import shlex
+import subprocess
+import sys
 from dataclasses import fields
+from importlib import import_module
 from types import SimpleNamespace
 
 import pytest
 import typer
 
+import nerg_mi as nerg
 import nerg_mi.cli
+from nerg_mi.cli.building import find_commands
 from nerg_mi.evaluation import study as study_settings
 from nerg_mi.transport.march_primal import MarchSettings
 from tests.conftest import ROOT
-from tools import command_pages
+from tools import command_pages, generated
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 OF_DASK = {"--dashboard-address", "--no-dashboard", "--protocol", "--tls-ca-file", "--tls-cert", "--tls-key"}
@@ -131,3 +137,108 @@ def test10_settings_of_the_study_are_the_studys():
     ):
         told |= {line.split("|")[1].strip() for line in table.splitlines()}
     assert len(told) > 50 and told <= names
+
+
+# ---- The README and the pages at the root ----
+
+
+def test11_commands_of_the_readme_exist():
+    said = set(re.findall(r"^\| `nerg (\w+)", (ROOT / "README.md").read_text("utf-8"), re.M))
+    assert said and said <= {name.split()[0] for name in find_commands()}
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])
+def test12_links_lead_somewhere(page):
+    for target in re.findall(r"\]\((?!http)([^)#]+)", (ROOT / page).read_text("utf-8")):
+        assert (ROOT / target).exists(), target
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/rays.md", "docs/trust.md"])
+def test13_every_way_to_another_machine_is_named(page):
+    """A page that says what leaves the machine names the commands that connect (`tests/cli/test_outputs.py` has the
+    others open none)."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert "Nothing leaves the machine unless" in text
+    for name in ("--scheduler tcp://", "nerg worker", "nerg view"):
+        assert name in text, name
+
+
+def said(file: str, pattern: str) -> str:
+    """What the first line of ``file`` that matches ``pattern`` says."""
+    match = re.search(pattern, (ROOT / file).read_text(encoding="utf-8"), re.M)
+    assert match, f"{file} has no line {pattern}"
+    return match[1]
+
+
+def test_one_version():
+    assert said("pyproject.toml", r'^version = "(.+)"$') == nerg.__version__
+    assert said("CITATION.cff", r"^version: (\S+)$") == nerg.__version__
+    assert said("CHANGELOG.md", r"^## (\d\S*)") == nerg.__version__
+
+
+def test_types_come_with_the_package():
+    assert (ROOT / "nerg_mi" / "py.typed").is_file()
+    assert '"nerg_mi" = ["py.typed"]' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+# ---- Public names ----
+
+
+def test20_names_of_the_page_on_python_are_those_of_the_package():
+    text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    table = text.partition("## All names")[2]
+    assert set(re.findall(r"`(\w+)`", table)) - {"save"} == set(nerg.__all__)
+    assert set(re.findall(r"\bnerg\.(?!py\b)(\w+)", text)) <= set(nerg.__all__)
+
+
+REFERENCE = (ROOT / "docs" / "python-reference.md").read_text(encoding="utf-8")
+LISTED = re.findall(r"^\.\. auto(?:function|class|exception):: (\S+)", REFERENCE, re.M)
+
+
+def named(path: str) -> object:
+    module, _, name = path.rpartition(".")
+    return getattr(import_module(module), name) if module else getattr(nerg, path)
+
+
+def test21_every_public_name_is_listed_once():
+    assert sorted(path.rpartition(".")[2] for path in LISTED if named(path) in PUBLIC) == sorted(nerg.__all__)
+    assert len(set(LISTED)) == len(LISTED)
+
+
+PUBLIC = [getattr(nerg, name) for name in nerg.__all__]
+
+
+@pytest.mark.parametrize("path", LISTED)
+def test22_what_is_public_is_documented(path):
+    value = named(path)
+    assert inspect.getdoc(value), path
+    if inspect.isclass(value):
+        for name, member in vars(value).items():
+            if not name.startswith("_") and (inspect.isroutine(member) or isinstance(member, (property, classmethod))):
+                assert inspect.getdoc(member), f"{path}.{name} has no docstring"
+
+
+def test23_what_functions_give_is_listed():
+    """The classes of results, by the annotations of what returns them."""
+    given = set()
+    for function in filter(inspect.isfunction, PUBLIC):
+        given |= set(re.findall(r"\b[A-Z]\w+", str(inspect.signature(function).return_annotation)))
+    names = {path.rpartition(".")[2] for path in LISTED}
+    assert given - names <= {"RadianceField", "AnyGazeField"}  # the networks themselves, within a TrainedField
+
+
+# ---- Parts of pages that are made of the code ----
+
+
+def test_every_page_is_up_to_date():
+    # In a process of its own: other tests register what is made up.
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.generated", "--check"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr[-2000:]
+
+
+def test_every_part_stands_on_a_page():
+    text = "".join(page.read_text(encoding="utf-8") for page in generated.pages())
+    for name in generated.PARTS:
+        assert text.count(f"<!-- made by make docs: {name} -->") == 1, name

@@ -1,4 +1,4 @@
-"""Every number that a user gives has a range, declared with it, and is tried at the range's ends and beyond them."""
+"""Every number that a user gives has a range, declared with it; properties of plugins; and what errors say."""
 
 from __future__ import annotations
 
@@ -14,17 +14,24 @@ import pytest
 import typer
 from typer.core import TyperOption
 
+import nerg_mi as nerg
 import nerg_mi.aoi
 import nerg_mi.rays.readers
 import nerg_mi.workflows
+from nerg_mi import errors, properties
 from nerg_mi.cli.building import build_command
 from nerg_mi.errors import NergError
+from nerg_mi.evaluation.ablation import frame_timer
+from nerg_mi.evaluation.metrics import Renderer
+from nerg_mi.formats.surfaces import write_volume
+from nerg_mi.photos.cameras import Camera, Intrinsics
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, Checked, Range, check_number, ranged
 from nerg_mi.rays.readers.registry import shared_options
 from nerg_mi.train import gaze_settings, radiance_settings
+from nerg_mi.train.geometry import place_of_scene, place_of_volume
 from nerg_mi.workflows import rays
 from nerg_mi.workflows.base import Command
-from nerg_mi.workflows.draw import KINDS as FIGURES
+from nerg_mi.workflows.scene_commands import KINDS as FIGURES
 from tools.command_pages import commands
 
 
@@ -81,7 +88,7 @@ def _fault(kind, field, value) -> str | None:
 
 def test_all_kinds_of_options_are_found():
     names = {kind.__name__ for kind in KINDS}
-    assert {"BakeOptions", "GazeOptions", "SurfaceOptions", "TableOptions", "TickOption", "ProbeSettings"} <= names
+    assert {"BakeOptions", "GazeOptions", "FoldOptions", "TableOptions", "TickOption", "ProbeSettings"} <= names
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: f"{k.__module__}.{k.__name__}")
@@ -146,3 +153,246 @@ def test_several_numbers_are_checked_one_by_one():
 def test_numbers_of_numpy_are_numbers():
     check_number(np.float32(2), Range(0, FARTHEST), "x")
     check_number(np.int64(2), Range(0, FARTHEST), "x", whole=True)
+
+
+# ---- Properties of plugins: what is taken, and that a wrong one is named with what it may be ----
+
+
+ANY = Range(-1e9, 1e9)
+
+
+@pytest.mark.parametrize(
+    "read, given, found",
+    [
+        (lambda p: properties.number(p, "x", 1.5, ANY), {}, 1.5),
+        (lambda p: properties.number(p, "x", 1.5, Range(0, 9)), {"x": 2}, 2.0),
+        (lambda p: properties.integer(p, "x", 4, Range(1, 9)), {"x": 9.0}, 9),
+        (lambda p: properties.boolean(p, "x", True), {"x": False}, False),
+        (lambda p: properties.choice(p, "x", "a", ("a", "b")), {"x": "b"}, "b"),
+        (lambda p: properties.text(p, "x"), {"x": "name"}, "name"),
+        (lambda p: properties.text(p, "x", "other"), {}, "other"),
+        (lambda p: properties.color(p, "x", 0.25), {}, [0.25, 0.25, 0.25]),
+        (lambda p: properties.color(p, "x", 0.0), {"x": [0.1, 2.0, 0.0]}, [0.1, 2.0, 0.0]),
+    ],
+)
+def test_values(read, given, found):
+    assert read(given) == found and type(read(given)) is type(found)
+
+
+def test_a_colour_of_a_texture(rgb):
+    texture = rgb.load_dict({"type": "rgb", "value": [0.1, 0.2, 0.4]})
+    assert properties.color({"x": texture}, "x", 0.0) == pytest.approx([0.1, 0.2, 0.4])
+
+
+@pytest.mark.parametrize(
+    "read, value, words",
+    [
+        (lambda p: properties.number(p, "x", 1, Range(0, 2)), 3, "0 .. 2, got 3"),
+        (lambda p: properties.number(p, "x", 1, ANY), math.nan, "nan"),
+        (lambda p: properties.number(p, "x", 1, ANY), True, "must be a number"),
+        (lambda p: properties.number(p, "x", 1, ANY), "1", "must be a number, got '1'"),
+        (lambda p: properties.integer(p, "x", 1, Range(0, 9)), 2.5, "whole number"),
+        (lambda p: properties.boolean(p, "x", True), 1, "true or false"),
+        (lambda p: properties.choice(p, "x", "a", ("a", "b")), "c", "one of a, b, got 'c'"),
+        (lambda p: properties.text(p, "x"), None, "a string, got nothing"),
+        (lambda p: properties.color(p, "x", 0), [1, 2], "one number or three"),
+        (lambda p: properties.color(p, "x", 0), [1, -2, 0], "not negative"),
+        (lambda p: properties.color(p, "x", 0), "red", "an rgb colour, got 'red'"),
+    ],
+)
+def test_a_wrong_value_is_named(read, value, words):
+    with pytest.raises(NergError) as said:
+        read({"x": value})
+    assert '"x"' in str(said.value) and words in str(said.value)
+
+
+def test_a_field_of_a_file_or_in_memory(rgb):
+    import drjit.llvm.ad as ns
+
+    class Field:
+        def __init__(self, array):
+            self.array = array
+
+        def parameters(self):
+            return {"table": self.array}
+
+    load = lambda path, ns: (path, {"about": ns})
+    field, metadata, filename = properties.trained({"filename": "here.safetensors"}, None, load, ns)
+    assert field == filename and filename.endswith("here.safetensors") and metadata == {"about": ns}
+    mine = Field(ns.TensorXf([1.0]))
+    assert properties.trained({}, mine, load, ns) == (mine, {}, "")
+    with pytest.raises(NergError, match='"filename"'):
+        properties.trained({}, None, load, ns)
+    # Arrays that are not of the backend in use.
+    with pytest.raises(NergError, match='"llvm_ad_rgb"'):
+        properties.trained({}, Field([1.0]), load, ns)
+
+
+def test_a_file_is_looked_for_in_the_folders_of_a_scene(rgb, tmp_path):
+    (tmp_path / "here.ply").touch()
+    known = rgb.file_resolver()
+    rgb.set_file_resolver(type(known)(known))
+    try:
+        rgb.file_resolver().append(rgb.filesystem.path(str(tmp_path)))
+        assert properties.resolved("here.ply") == str(tmp_path / "here.ply")
+        assert properties.resolved("there.ply") == "there.ply"
+    finally:
+        rgb.set_file_resolver(known)
+
+
+def test_a_transform_is_a_matrix_or_the_identity(rgb):
+    place = rgb.ScalarTransform4f().translate([1, 2, 3]).scale(2)
+    assert np.allclose(properties.transform({"to_world": place}, "to_world"), np.array(place.matrix))
+    assert np.array_equal(properties.transform({}, "to_world"), np.eye(4))
+    with pytest.raises(NergError, match='"to_world".*3'):
+        properties.transform({"to_world": 3}, "to_world")
+
+
+# ---- Errors in one sentence, and which of them a user can mend ----
+
+
+TRACE = """While loading "a.xml" (line 3): could not instantiate plugin of type "nerg":
+Traceback (most recent call last):
+  File "nerg.py", line 7, in __init__
+    raise {error}
+{error}: "step" must lie in 0 .. 1, got 2
+"""
+
+
+def caught(code) -> BaseException:
+    try:
+        code()
+    except BaseException as error:
+        return error
+    raise AssertionError("nothing was raised")
+
+
+@pytest.mark.parametrize(
+    "error, mendable",
+    [
+        (NergError("a"), True),
+        (errors.MissingFile("a"), True),
+        (caught(lambda: open("/nowhere/at/all")), True),
+        (caught(lambda: __import__("a_module_that_is_not_there")), True),
+        (caught(lambda: __import__("nerg_mi.not_there")), False),
+        (MemoryError(), True),
+        (OSError("a function's own"), False),
+        (ValueError("wrong"), False),
+        (TypeError("wrong"), False),
+        (KeyboardInterrupt(), False),
+    ],
+)
+def test_what_can_be_mended(error, mendable):
+    assert errors.expected(error) is mendable
+
+
+def test_values_that_were_chosen_are_the_users_to_mend():
+    with pytest.raises(NergError, match=r"^a box needs a size; give other values by --aabb$"):
+        with errors.chosen("--aabb"):
+            raise ValueError("a box needs a size.")
+    with pytest.raises(NergError, match="^as it is$"):
+        with errors.chosen("--aabb"):
+            raise NergError("as it is")
+    with pytest.raises(TypeError):
+        with errors.chosen("--aabb"):
+            raise TypeError
+
+
+def test_what_mitsuba_wraps_is_said_with_its_place():
+    with pytest.raises(NergError) as said:
+        with errors.mitsuba_says():
+            raise RuntimeError(TRACE.format(error="nerg_mi.errors.NergError"))
+    words = str(said.value)
+    assert words.startswith('While loading "a.xml" (line 3)') and words.endswith('"step" must lie in 0 .. 1, got 2')
+    assert "Traceback" not in words and "\n" not in words and "NergError" not in words
+
+
+def test_what_mitsuba_quotes_may_be_no_text():
+    with pytest.raises(NergError, match="is damaged"), errors.mitsuba_says():
+        b"\xfe".decode()
+
+
+def test_a_mistake_in_a_plugin_is_none_of_the_scene():
+    with pytest.raises(RuntimeError) as said:
+        with errors.mitsuba_says():
+            raise RuntimeError(TRACE.format(error="TypeError"))
+    assert not isinstance(said.value, NergError)
+
+
+def _mesh(folder):
+    (folder / "file.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    return lambda: place_of_scene(folder / "file.obj")
+
+
+def _volume(folder):
+    write_volume(folder / "file.vol", np.ones((2, 2, 2), np.float32), (0, 0, 0), (1, 1, 1))
+    return lambda: place_of_volume(folder / "file.vol")
+
+
+def _timer(folder):
+    render = frame_timer(_volume(folder)(), np.zeros((1, 3)), folder)
+    return lambda: render(folder / "file.safetensors")
+
+
+def _camera_of_photo(folder):
+    renderer = Renderer.__new__(Renderer)
+    renderer.spp = 1
+    return lambda: renderer(Camera(Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.5), np.eye(4)))
+
+
+def _camera_of_scene(folder):
+    scene = nerg.make_scene(shapes={"type": "cube"})
+    return lambda: scene.sensor(nerg.Camera((0, -3, 0), (0, 0, 0)))
+
+
+@pytest.mark.parametrize(
+    "prepare, names_file",
+    [
+        (_mesh, True),
+        (_volume, True),
+        (_timer, True),
+        (lambda folder: lambda: Renderer(folder / "file.safetensors"), True),
+        (_camera_of_photo, False),
+        (_camera_of_scene, False),
+        (lambda folder: lambda: nerg.make_scene(shapes={"type": "cube"}), False),
+        (lambda folder: lambda: nerg.make_scene(shapes={"type": "scene", "box": {"type": "cube"}}), False),
+    ],
+)
+def test_what_mitsuba_refuses_of_a_file_or_camera_is_the_users(rgb, tmp_path, monkeypatch, prepare, names_file):
+    def refuse(*_, **__):
+        raise RuntimeError("[plugin.cpp:7] it has no sides")
+
+    load = prepare(tmp_path)
+    monkeypatch.setattr(rgb, "load_dict", refuse)
+    with pytest.raises(NergError, match="it has no sides$") as said:
+        load()
+    assert (str(tmp_path / "file.") in str(said.value)) is names_file
+
+
+@pytest.mark.parametrize("load", [_timer, lambda folder: lambda: Renderer(folder / "file.safetensors")])
+@pytest.mark.parametrize("content", [None, b"", b"\x08\0\0\0\0\0\0\0{}      "], ids=["missing", "empty", "other"])
+def test_checkpoints_that_cannot_be_rendered_are_named(rgb, tmp_path, load, content):
+    if content is not None:
+        (tmp_path / "file.safetensors").write_bytes(content)
+    with pytest.raises(NergError, match=r"file\.safetensors"):
+        load(tmp_path)()
+
+
+@pytest.mark.parametrize(
+    "error, words",
+    [
+        (caught(lambda: open("/nowhere/a.txt")), 'there is no file "/nowhere/a.txt"'),
+        (PermissionError(13, "Permission denied", "a.txt"), '"a.txt": permission denied'),
+        (OSError(28, "No space left on device"), "no space left on device"),
+        (MemoryError(), "there is not enough memory; ask for less, or close other programs"),
+        (RuntimeError("[film.cpp:12] two\nlines"), "two lines"),
+        (KeyError(), "KeyError"),
+    ],
+)
+def test_one_line(error, words):
+    assert errors.sentence(error) == words
+
+
+def test_text_of_a_file_is_cut_and_made_printable():
+    assert errors.plain("a\x1b[2Jb\n") == "a?[2Jb?"
+    assert errors.plain("x" * 400, 10) == "x" * 10 + "..." and errors.plain("x" * 10, 10) == "x" * 10

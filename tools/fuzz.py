@@ -21,8 +21,7 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
 from tests.fuzz import cases, commands, readers, semantic
-from tests.fuzz.keeping import CORPUS, kept
-from tests.fuzz.watch import BREACHES, run_cases
+from tests.fuzz.watch import BREACHES, CORPUS, kept, run_cases
 from tools.page import table, update
 
 HEAD = (

@@ -20,7 +20,7 @@ from nerg_mi.statistics.tables import BY_NAME, FIELD, MEASURES, PersonRows, Row,
 from nerg_mi.statistics.visits import VisitSums
 from nerg_mi.workflows.base import Reporter
 
-from .measured import StatisticsOptions
+from .options import StatisticsOptions
 
 # ---- Writing ----
 #

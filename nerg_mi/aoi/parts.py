@@ -26,16 +26,8 @@ from nerg_mi.workflows.geometry import file_of_training, place_key
 from nerg_mi.workflows.options import as_base
 from nerg_mi.workflows.parts import Parts, PlannedScene
 
-from .measured import (
-    AoiContext,
-    CountOptions,
-    PredictionOptions,
-    SettingOptions,
-    StatisticsOptions,
-    Viewpoints,
-    blocks_of,
-    count_block,
-)
+from .measured import AoiContext, Viewpoints, blocks_of, count_block
+from .options import CountOptions, PredictionOptions, SettingOptions, StatisticsOptions
 from .predicted import AoiScene, PredictedAttention, setting_of
 from .scene import files_of_changes, read_changes
 

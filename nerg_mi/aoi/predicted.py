@@ -31,7 +31,8 @@ from nerg_mi.statistics.tables import BY_NAME, FIELD, PLACES, MinParticipantsFil
 from nerg_mi.statistics.visits import ALL, Aoi, Cell
 from nerg_mi.workflows.base import SILENT, Reporter
 
-from .measured import AoiContext, CountOptions, PredictionOptions, SettingOptions, TimeWindow, Viewpoints, parse_window
+from .measured import AoiContext, TimeWindow, Viewpoints
+from .options import CountOptions, PredictionOptions, SettingOptions, parse_window
 from .scene import (
     Changes,
     GazeScene,

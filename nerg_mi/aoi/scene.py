@@ -44,7 +44,8 @@ from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place, corners_of, default_settings, trace_depth
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import PlacedGaze, look_from
-from nerg_mi.workflows.geometry import GazeEvaluationOptions, align_of_training, place_of_training
+from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions
+from nerg_mi.workflows.geometry import align_of_training, place_of_training
 
 if TYPE_CHECKING:
     import mitsuba as mi

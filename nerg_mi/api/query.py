@@ -25,9 +25,7 @@ from . import arrays
 from .arrays import Floats, Labelled, same_for_all
 from .scene import COLOR, FilePath, Scene, active_mitsuba, asked_quantities, context_for, mesh_child
 
-# ---- Observed ----
-#
-# One observer of a scene: what they see of points, and the density of their gaze.
+# ---- One observer of a scene: what they see of points, and the density of their gaze ----
 
 
 class ObserverOf:
@@ -79,9 +77,7 @@ class ObserverOf:
         return values
 
 
-# ---- Queries ----
-#
-# Questions to a scene that are no pictures: what rays meet, and what observers see of points.
+# ---- Questions to a scene that are no pictures: what rays meet, and what observers see of points ----
 
 
 BATCH = 1 << 18

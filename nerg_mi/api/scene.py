@@ -66,18 +66,6 @@ def mesh_child(path: str | os.PathLike[str]) -> Any:
     return shown
 
 
-def box_dict(lower: np.ndarray, upper: np.ndarray, turn: np.ndarray | None = None) -> dict:
-    """The box between two corners as a mesh that Mitsuba takes, turned about its middle by the rotation ``turn`` (3, 3)
-    if there is one; a variant must be set."""
-    import mitsuba as mi
-
-    center, half = (lower + upper) / 2, (upper - lower) / 2
-    frame = np.eye(4)
-    frame[:3, :3] = (np.eye(3) if turn is None else turn) * half
-    frame[:3, 3] = center
-    return {"type": "cube", "to_world": mi.ScalarTransform4d(frame.tolist())}
-
-
 def scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
     """``shapes`` by their names, as a scene's dict takes them; the variant must be active.
 
@@ -125,9 +113,7 @@ def _of_scene(scene, name: str) -> dict[str, Any]:
     return found | {f"{name}_light_{i}": light for i, light in enumerate(lights)}
 
 
-# ---- Variant ----
-#
-# The Mitsuba variant that the library works in: the one that is set, or the best where none is.
+# ---- The Mitsuba variant that the library works in: the one that is set, or the best where none is ----
 
 
 def active_mitsuba() -> ModuleType:
@@ -158,9 +144,7 @@ def array_module() -> ModuleType:
     return namespace(active_mitsuba().variant())
 
 
-# ---- Fields ----
-#
-# Fields and rays in memory: read from files, handed to scenes, and saved again.
+# ---- Fields and rays in memory: read from files, handed to scenes, and saved again ----
 
 
 FilePath: TypeAlias = str | Path
@@ -278,9 +262,7 @@ def _existing(path: FilePath) -> Path:
         raise NergError(f"a file is named by a string or a path, got {type(path).__name__}") from error
 
 
-# ---- Options ----
-#
-# What a call of the library is given, looked at before any work: names of options first, then files.
+# ---- What a call of the library is given, looked at before any work: names of options first, then files ----
 
 
 Options = TypeVar("Options", bound="DataclassInstance")
@@ -354,9 +336,7 @@ def checkpoint_of(value: object, name: str) -> Iterator[Path]:
     yield file_of(value, name)
 
 
-# ---- Scene ----
-#
-# Scenes: a place, whose gaze it is, and from where it is seen.
+# ---- Scenes: a place, whose gaze it is, and from where it is seen ----
 
 
 COLOR = "color"

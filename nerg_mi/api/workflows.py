@@ -8,9 +8,14 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.base import SILENT, Reporter
+from nerg_mi.workflows.gaze_commands import AblationOptions, GazeEvaluationOptions, GazeOptions
+from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOptions
+from nerg_mi.workflows.rays_commands import AlignOptions, RaysImportOptions
+from nerg_mi.workflows.scene_commands import BakeOptions, StudyOptions
 
 from .scene import FilePath, TrainedField, check_names, checkpoint_of, file_of, options_of, rays_of
 
@@ -20,15 +25,10 @@ if TYPE_CHECKING:
     from nerg_mi.evaluation.metrics import ViewScores
     from nerg_mi.fields.gaze_base import AnyGazeField
     from nerg_mi.fields.radiance import RadianceField
-    from nerg_mi.workflows.ablation import AblationOptions, AblationResult
-    from nerg_mi.workflows.align import AlignOptions
+    from nerg_mi.workflows.ablation import AblationResult
     from nerg_mi.workflows.bake import Bake
-    from nerg_mi.workflows.bake_options import BakeOptions
     from nerg_mi.workflows.evaluate import GazeEvaluation
-    from nerg_mi.workflows.geometry import GazeEvaluationOptions
-    from nerg_mi.workflows.study import StudyOptions, StudyResult
-    from nerg_mi.workflows.train_gaze import GazeOptions
-    from nerg_mi.workflows.train_radiance import RadianceOptions, RadianceScoreOptions
+    from nerg_mi.workflows.study import StudyResult
 
 
 # ---- How tracking lies in a place ----
@@ -48,8 +48,8 @@ def align(
     ``output``: alignment to write besides (.json), which ``align=`` of `train_gaze` takes, with a picture beside it.
     ``changes``: options one by one on top of ``options``: the place (``field=``, ``scene=``, ``surface=``), evidence
     (``pairs=``, ``twin=``, ``cameras=`` with ``place_cameras=``; none of them: the tracking alone), and what is known
-    (``up=``, ``scale=``, ...); `nerg_mi.workflows.align.AlignOptions` says what there is. Raises `NergError` for
-    evidence that leaves it open, for a mirrored frame and for a bad fit.
+    (``up=``, ``scale=``, ...); `nerg_mi.workflows.rays_commands.AlignOptions` says what there is. Raises `NergError`
+    for evidence that leaves it open, for a mirrored frame and for a bad fit.
 
     >>> import nerg_mi as nerg
     >>> rows = "0,0,0,1,0,0\\n2,0,0,5,0,0\\n0,1,0,1,2,0\\n0,0,1,1,0,2\\n"
@@ -59,7 +59,6 @@ def align(
     [2.0, 0.0, 0.0, 1.0]
     """
     from nerg_mi.workflows import align as alignment
-    from nerg_mi.workflows.align import AlignOptions
 
     job = options_of(AlignOptions, "align", options, changes)
     return alignment.align(None if rays is None else rays_of(rays), output, job, reporter).alignment
@@ -82,7 +81,7 @@ def bake(
     ``rays``: what `load_rays` gave, or a file of them; the people whose places a gaze field is asked for, or whose gaze
     it is. ``outputs``: files to write (.ply, .glb, .csv, .json). ``changes``: options one by one
     (``gaze="gaze.safetensors"``, ``observer=(4.4, 2.8, 1.6)``, ``smooth=0.05``, ...) on top of ``options``;
-    `nerg_mi.workflows.bake_options.BakeOptions` says what there is. Raises `NergError`.
+    `nerg_mi.workflows.scene_commands.BakeOptions` says what there is. Raises `NergError`.
 
     >>> from importlib.resources import files
     >>> from nerg_mi.api.workflows import bake
@@ -93,7 +92,6 @@ def bake(
     """
     from nerg_mi.rays.rays import Rays
     from nerg_mi.workflows import bake as baking
-    from nerg_mi.workflows.bake_options import BakeOptions
 
     in_memory = rays if isinstance(rays, Rays) else None
     if rays is not None and in_memory is None:
@@ -118,7 +116,7 @@ def evaluate_radiance(
 
     ``field``: a checkpoint, or a field in memory. ``photos``: as for `train_radiance`; those that were held out are
     scored. ``changes``: options one by one (``spp=16``, ``pictures="folder"``, ...) on top of ``options``;
-    `nerg_mi.workflows.train_radiance.RadianceScoreOptions` says what there is. Raises `NergError`.
+    `nerg_mi.workflows.radiance_commands.RadianceScoreOptions` says what there is. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
@@ -129,7 +127,7 @@ def evaluate_radiance(
     """
     from nerg_mi.workflows import train_radiance
 
-    job = options_of(train_radiance.RadianceScoreOptions, "evaluate_radiance", options, changes)
+    job = options_of(RadianceScoreOptions, "evaluate_radiance", options, changes)
     with checkpoint_of(field, "field") as path:
         return train_radiance.evaluate_radiance(path, file_of(photos, "photos"), job, reporter)
 
@@ -148,7 +146,7 @@ def evaluate_gaze(
     ``gaze``: a checkpoint that was trained with ``test_zones``, or what that training gave. ``rays``: those that it
     was trained on, or their file. ``output``: folder for tables and pictures, which is made. ``changes``: options
     one by one (``split="pos"``, ``resamples=200``, ...) on top of ``options``;
-    `nerg_mi.workflows.geometry.GazeEvaluationOptions` says what there is. Raises `NergError`.
+    `nerg_mi.workflows.gaze_commands.GazeEvaluationOptions` says what there is. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> held_out = {"test_zones": 1, "test_positions": 4, "geometry": "none", "zones": 0}
@@ -159,7 +157,6 @@ def evaluate_gaze(
     ('gaze field', 'pos')
     """
     from nerg_mi.workflows import evaluate
-    from nerg_mi.workflows.geometry import GazeEvaluationOptions
 
     job = options_of(GazeEvaluationOptions, "evaluate_gaze", options, changes)
     data = rays_of(rays)
@@ -180,7 +177,7 @@ def ablate(
     ``rays``: what `load_rays` or `import_rays` gave, or a file of them. ``output``: folder for checkpoints, table and
     plot, which is made; what an earlier run has left there is not trained again. Where people looked around is said as
     for `train_gaze`. ``changes``: options one by one (``recipes="small"``, ``seeds=1``, ...) on top of ``options``;
-    `nerg_mi.workflows.ablation.AblationOptions` says what there is. Raises `NergError`.
+    `nerg_mi.workflows.gaze_commands.AblationOptions` says what there is. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> small = {"recipes": "default", "variant": ("emit",), "seeds": 1, "default_steps": 2, "probes": 8, "cameras": 0}
@@ -190,7 +187,6 @@ def ablate(
     ['emit']
     """
     from nerg_mi.workflows import ablation
-    from nerg_mi.workflows.ablation import AblationOptions
 
     job = options_of(AblationOptions, "ablate", options, changes)
     return ablation.ablate(rays_of(rays), output, job, reporter)
@@ -208,8 +204,8 @@ def study(
 
     ``scene``: a scene file, or one with a known truth: ``slab``, ``sphere``, ``sheets``, ``fog`` or ``ramp``.
     ``output``: folder for tables and plots, which is made. ``changes``: options one by one (``quick=True``,
-    ``only="depth"``, ...) on top of ``options``; `nerg_mi.workflows.study.StudyOptions` says what there is. A full
-    study takes up to half an hour. Raises `NergError`.
+    ``only="depth"``, ...) on top of ``options``; `nerg_mi.workflows.scene_commands.StudyOptions` says what there is. A
+    full study takes up to half an hour. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> result = nerg.study("slab", folder / "study", quick=True, width=8, height=8)
@@ -218,7 +214,7 @@ def study(
     """
     from nerg_mi.workflows import study as studies
 
-    job = options_of(studies.StudyOptions, "study", options, changes)
+    job = options_of(StudyOptions, "study", options, changes)
     return studies.run_study(str(scene if isinstance(scene, str) else file_of(scene, "scene")), output, job, reporter)
 
 
@@ -237,7 +233,7 @@ def stats(
 
     ``files``: rays (in memory, or their file, or a dataset), a scene, a gaze field, a radiance field, in any order.
     ``areas``: a JSON file of boxes, meshes, shapes and groups (docs/statistics.md). ``output``: folder for the tables.
-    ``options``: those of `nerg stats` (`nerg_mi.aoi.measured.StatisticsOptions`). Gives a
+    ``options``: those of `nerg stats` (`nerg_mi.aoi.options.StatisticsOptions`). Gives a
     `nerg_mi.aoi.output.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
 
     >>> import json, nerg_mi as nerg
@@ -249,7 +245,6 @@ def stats(
     >>> row["thing"], round(row["share"], 3), row["reach"], row["distance"]
     ('shelf', 0.667, 1.0, 2.0)
     """
-    from nerg_mi.aoi.measured import StatisticsOptions
     from nerg_mi.workflows.statistics import statistics
 
     given = [files] if isinstance(files, (str, os.PathLike, Rays)) else list(files)
@@ -277,8 +272,8 @@ def import_rays(
     CSV or Parquet table through the option ``columns``. ``output``: rays file to write besides (.npz or .parquet), or a
     dataset (.rays), of which large ones are given as a sample (`nerg_mi.workflows.rays.ImportResult`).
     ``options``: those of the reader, and ``skip_bad_lines``, ``pseudonyms`` and ``salt``, of a dataset ``place_name``,
-    ``day`` and ``workers`` (`nerg_mi.workflows.rays.ImportOptions`). What was dropped, and why, is in the rays'
-    ``metadata``. Raises `NergError`.
+    ``day`` and ``workers`` (`nerg_mi.workflows.rays_commands.RaysImportOptions`). What was dropped, and why, is in the
+    rays' ``metadata``. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> _ = (folder / "day.csv").write_text("t,who,x,y,z,dx,dy,dz\\n0.0,Ada,1,1,1.6,1,0,0\\n0.1,Ada,1,1,1.6,0,1,0\\n")
@@ -298,7 +293,7 @@ def import_rays(
             'write a table to a file (df.to_csv("day.csv")), and name its columns (columns="origin=x,y,z ...")'
         )
     of_readers = options_of(reader_named(reader).Options)
-    ours = {f.name for f in fields(rays.ImportOptions)} - {"reader", "settings", "output"}
+    ours = {f.name for f in fields(RaysImportOptions)} - {"reader", "settings", "output"}
     every = {option.name for name in reader_names() for option in options_of(reader_named(name).Options)}
     check_names("import_rays", options, sorted(every | ours))
     paths = [file_of(file, "files") for file in several]
@@ -309,13 +304,11 @@ def import_rays(
         # Values may be written as for the command.
         if isinstance(value, str) and (read := parse.get(name)) is not None:
             of_reader[name] = read(value)
-    job = rays.ImportOptions(reader=reader, settings=make_options(reader, of_reader), output=output, **of_job)
+    job = RaysImportOptions(reader=reader, settings=make_options(reader, of_reader), output=output, **of_job)
     return rays.import_rays(paths, job, reporter).rays
 
 
-# ---- Training ----
-#
-# Trainings: from recordings to fields in memory.
+# ---- Trainings: from recordings to fields in memory ----
 
 
 def train_radiance(
@@ -331,7 +324,7 @@ def train_radiance(
     ``photos``: a folder, its transforms.json, or a COLMAP model. ``output``: checkpoint to write besides
     (.safetensors), with a preview and, while the training is not done, a state to resume from. ``changes``: options one
     by one (``minutes=5``, ``size="medium"``, ...) on top of ``options``;
-    `nerg_mi.workflows.train_radiance.RadianceOptions` says what there is. ``reporter`` is told how it goes
+    `nerg_mi.workflows.radiance_commands.RadianceOptions` says what there is. ``reporter`` is told how it goes
     (`nerg_mi.workflows.base`). What comes back has the error on held-out photos in its ``provenance``. After Ctrl-C it
     is the result so far, or ``KeyboardInterrupt`` where there is an ``output``, which is written. Raises `NergError`.
 
@@ -342,7 +335,7 @@ def train_radiance(
     """
     from nerg_mi.workflows import train_radiance as radiance
 
-    job = options_of(radiance.RadianceOptions, "train_radiance", options, changes)
+    job = options_of(RadianceOptions, "train_radiance", options, changes)
     result = radiance.train_radiance(file_of(photos, "photos"), output, job, reporter)
     return _trained(result.field, result.provenance, output)
 
@@ -361,8 +354,8 @@ def train_gaze(
     ``salience=``). Where people looked around is said by one of the options ``field="field.safetensors"``,
     ``scene="scene.xml"`` (or a mesh) and ``geometry="hits"`` or ``"none"``. ``changes``: these and other options one by
     one (``minutes=5``, ``recipe="small"``, ``test_zones=3``, ...) on top of ``options``;
-    `nerg_mi.workflows.train_gaze.GazeOptions` says what there is. ``output`` and ``reporter``: as for `train_radiance`.
-    What comes back has its scores on held-out positions in its ``provenance``. Raises `NergError`.
+    `nerg_mi.workflows.gaze_commands.GazeOptions` says what there is. ``output`` and ``reporter``: as for
+    `train_radiance`. What comes back has its scores on held-out positions in its ``provenance``. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> gaze = nerg.train_gaze(rays, geometry="none", steps=2, zones=0, probes=8, directions=64)
@@ -370,7 +363,6 @@ def train_gaze(
     ('gaze', 2)
     """
     from nerg_mi.workflows import train_gaze as gaze
-    from nerg_mi.workflows.train_gaze import GazeOptions
 
     job = options_of(GazeOptions, "train_gaze", options, changes)
     result = gaze.train_gaze(None if rays is None else rays_of(rays), output, job, reporter)

@@ -44,16 +44,16 @@ _LINES = re.compile(r"``nerg ([a-z -]+)``: (.*?)(?=\n``nerg |\Z)", re.S)
 
 
 @dataclass(frozen=True)
-class Entry:
+class ListedCommand:
     """A command in the list: what is said about it, and the module that declares it."""
 
     line: str
     module: str
 
 
-def find_commands() -> dict[str, Entry]:
+def find_commands() -> dict[str, ListedCommand]:
     """All commands by name, those that are listed first at the beginning. No module is imported."""
-    commands: dict[str, Entry] = {}
+    commands: dict[str, ListedCommand] = {}
     for package in PACKAGES:
         for folder in map(Path, importlib.import_module(package).__path__):
             for path in sorted(folder.rglob("*.py")):
@@ -63,7 +63,7 @@ def find_commands() -> dict[str, Entry]:
                     continue
                 module = ".".join((package, *path.relative_to(folder).with_suffix("").parts))
                 for name, line in _LINES.findall(re.split(r"\n\s*\n|\"\"\"", head[3:])[0]):
-                    commands[name] = Entry(" ".join(line.split()), module)
+                    commands[name] = ListedCommand(" ".join(line.split()), module)
     place = {name: k for k, name in enumerate(_ORDER)}
     return dict(sorted(commands.items(), key=lambda item: place.get(item[0].split()[0], len(place))))
 
@@ -100,7 +100,7 @@ def _global_options(
 
 def _group(
     prefix: str,
-    entries: Mapping[str, Entry],
+    entries: Mapping[str, ListedCommand],
     callback: Callable[..., None] = lambda: None,
     arguments: Sequence[str] = (),
     **settings: Any,
@@ -131,7 +131,7 @@ def _group(
     return app
 
 
-def _about_group(name: str, entries: Mapping[str, Entry]) -> str:
+def _about_group(name: str, entries: Mapping[str, ListedCommand]) -> str:
     """The line about the commands that begin with ``name``: of a group that `GROUPS` has not, what they are called."""
     below = [other.removeprefix(f"{name} ") for other in entries if other.startswith(f"{name} ")]
     return GROUPS.get(name) or f"Commands: {', '.join(below)}."
@@ -141,7 +141,7 @@ def _listed() -> None:
     """Stands for a command in the list of commands; one that is called is built."""
 
 
-def _build(name: str, entries: Mapping[str, Entry]) -> Any:
+def _build(name: str, entries: Mapping[str, ListedCommand]) -> Any:
     """The parser of the command ``name``, or of the group of those that begin with it."""
     below = {other: entry for other, entry in entries.items() if other.startswith(f"{name} ")}
     if name in entries:
@@ -152,7 +152,7 @@ def _build(name: str, entries: Mapping[str, Entry]) -> Any:
             return build_command(COMMANDS[name], entry.line)
         # Commands that have no lines of their own, as figures.
         below = {
-            c.name: Entry(c.help, entry.module) for c in COMMANDS.values() if c.name.startswith(f"{name} ")
+            c.name: ListedCommand(c.help, entry.module) for c in COMMANDS.values() if c.name.startswith(f"{name} ")
         } | below
         if not below:
             raise LookupError(f'{entry.module} names a command "{name}" and declares none')

@@ -245,7 +245,7 @@ def _make(task: Task) -> tuple[Receipt, str]:
 
 
 @dataclass
-class Progress:
+class PlanProgress:
     """How far a plan is: ``done`` of ``total`` tasks, ``reused`` of them from earlier runs; ``seconds`` since the first
     that was missing was begun, and the kinds of ``processors``."""
 
@@ -288,7 +288,7 @@ def run_plan(
     plan: Plan,
     store: Store,
     engine: Engine,
-    on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_progress: Callable[[PlanProgress], None] = lambda progress: None,
     warn: Warn = lambda text: None,
 ) -> Iterator[Output]:
     """Gives the output of each part of ``plan``, in its order, as soon as it and all before it are there.
@@ -301,7 +301,7 @@ def run_plan(
     missing: dict[str, Task] = {}
     whole: set[str] = set()
     counts = Counter(task.key for task in plan.tasks)
-    progress = Progress(len(plan.tasks))
+    progress = PlanProgress(len(plan.tasks))
     for task in plan.tasks:
         if task.key in whole or task.key in missing:
             continue

@@ -217,14 +217,14 @@ class Store:
         write_text(path, json.dumps(content) + "\n")
         return path
 
-    def plans(self) -> list[Remembered]:
+    def plans(self) -> list[StoredPlan]:
         """All plans, by their names. Raises `NergError` for one that is damaged."""
         plans = [read_plan(path) for path in sorted(self.folder.glob("plans/*.json"))]
         return sorted(plans, key=lambda plan: plan.what)
 
 
 @dataclass(frozen=True)
-class Remembered:
+class StoredPlan:
     """A plan as a store has it: the ``keys`` of its tasks with their suffixes, the SHA-256 of the ``inputs`` by path,
     where they were, and those of them that all tasks read, ``common``."""
 
@@ -234,7 +234,7 @@ class Remembered:
     common: frozenset[str]
 
 
-def read_plan(path: str | os.PathLike) -> Remembered:
+def read_plan(path: str | os.PathLike) -> StoredPlan:
     """The plan in the file ``path``. Raises `NergError` for one that is damaged or of another version."""
     content = read_json(path, "plan")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -249,7 +249,7 @@ def read_plan(path: str | os.PathLike) -> Remembered:
     good = good and all(_KEY.fullmatch(k) and _SUFFIX.fullmatch(v) for k, v in content["keys"].items())
     if not good:
         raise NergError(f'the plan "{path}" is damaged; remove it, and start its job again')
-    return Remembered(content["what"], content["keys"], content["inputs"], frozenset(content["common"]))
+    return StoredPlan(content["what"], content["keys"], content["inputs"], frozenset(content["common"]))
 
 
 # ---- What is done, left and stale ----
@@ -314,7 +314,7 @@ def read_account(store: Store, age: float = AGE) -> Account:
     return Account(tuple(jobs), stale, leftovers, size, sum(map(_size, leftovers)))
 
 
-def _job(plan: Remembered, receipts: dict[str, Receipt], checksums: Checksums) -> tuple[JobAccount, set[str]]:
+def _job(plan: StoredPlan, receipts: dict[str, Receipt], checksums: Checksums) -> tuple[JobAccount, set[str]]:
     """How far a plan is, and the keys of what it asks for that is not out of date."""
     gone, changed, digests, others = [], [], set[str](), set[str]()
     for path, digest in plan.inputs.items():

@@ -21,8 +21,8 @@ from nerg_mi.maths.geometry import AnyBox
 
 from .gaze_data import Batch
 from .gaze_recipes import DEFAULT, FieldChoices, Recipe, register
-from .gaze_settings import LOSSES, gaze_loss
-from .gaze_trainer import GazeTrainer
+from .gaze_settings import LOSSES
+from .gaze_trainer import GazeTrainer, gaze_loss
 from .radiance_losses import stack, unstack
 
 # ---- Product model ----

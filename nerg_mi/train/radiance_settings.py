@@ -2,15 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.radiance import RadianceConfig
-from nerg_mi.maths.geometry import AnyBox
-from nerg_mi.ranges import LEARNING_RATES, LOSS_WEIGHTS, MINUTES, SEEDS, STEPS, Range, ranged, setting
+from nerg_mi.ranges import LEARNING_RATES, LOSS_WEIGHTS, MINUTES, SEEDS, STEPS, Checked, Range, ranged, setting
 
-from .trainer import RunSettings
+if TYPE_CHECKING:
+    from nerg_mi.fields.radiance import RadianceConfig
+    from nerg_mi.maths.geometry import AnyBox
+
+# ---- What settings of all trainings have ----
+
+
+class RunSettings(Checked):
+    """Base of the settings of a training, a dataclass with these fields."""
+
+    steps: int | None  # Of both one is set
+    minutes: float | None
+    # Held for the share ``hold`` of the run; then it decays exponentially to ``final_rate`` times itself.
+    learning_rate: float
+    final_rate: float
+    hold: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.steps is None) == (self.minutes is None):
+            raise NergError("give the length of the training either in steps or in minutes")
+
+    def rate(self, progress: float) -> float:
+        """Learning rate at ``progress`` in 0..1 of the run."""
+        late = max(0.0, progress - self.hold) / (1 - self.hold)
+        return self.learning_rate * self.final_rate ** min(late, 1.0)
+
+    def to_dict(self) -> dict:
+        """As JSON, for the provenance."""
+        return asdict(self)  # pyright: ignore[reportArgumentType] it is a dataclass
+
 
 # ---- How much one step of a radiance training takes on, from what the last one found ----
 #
@@ -69,6 +97,10 @@ def sized_config(size: str, box: AnyBox, deferred: bool = False) -> RadianceConf
     """Architecture of a ``size`` for a scene box: an untrained field absorbs about 1 - 1/e across it. Of a contracted
     one, whose inner cube takes half of each edge of the grid, it resolves that as it would a box. ``deferred``: whether
     the colour network is asked once a ray."""
+    # The options of a training are read without them, which load Dr.Jit.
+    from nerg_mi.fields.encoding import HashGridConfig
+    from nerg_mi.fields.radiance import RadianceConfig
+
     if size not in _SIZES:
         raise NergError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
     levels, rows, base, finest, width, color_hidden = _SIZES[size]

@@ -7,7 +7,6 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
@@ -18,34 +17,8 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import reading
 from nerg_mi.formats.fields import number
-from nerg_mi.ranges import Checked
 
-# ---- Settings and trainer ----
-
-
-class RunSettings(Checked):
-    """Base of the settings of a training, a dataclass with these fields."""
-
-    steps: int | None  # Of both one is set
-    minutes: float | None
-    # Held for the share ``hold`` of the run; then it decays exponentially to ``final_rate`` times itself.
-    learning_rate: float
-    final_rate: float
-    hold: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if (self.steps is None) == (self.minutes is None):
-            raise NergError("give the length of the training either in steps or in minutes")
-
-    def rate(self, progress: float) -> float:
-        """Learning rate at ``progress`` in 0..1 of the run."""
-        late = max(0.0, progress - self.hold) / (1 - self.hold)
-        return self.learning_rate * self.final_rate ** min(late, 1.0)
-
-    def to_dict(self) -> dict:
-        """As JSON, for the provenance."""
-        return asdict(self)  # pyright: ignore[reportArgumentType] it is a dataclass
+# ---- Trainer ----
 
 
 class Trainer:

@@ -18,8 +18,8 @@ from nerg_mi.errors import NergError, expected, sentence
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.video import check_video
 from nerg_mi.rendering.scene_writer import numbers
-from nerg_mi.workflows.options import PictureOptions
 from nerg_mi.workflows.render import render_file
+from nerg_mi.workflows.scene_commands import PictureOptions
 
 from . import layers
 from .controls import tell, telling

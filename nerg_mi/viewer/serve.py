@@ -1,7 +1,4 @@
-"""``nerg view``: Show a place with its gaze in the browser, where the observer is dragged.
-
-What the viewer serves, and for how long.
-"""
+"""What the viewer serves, and for how long."""
 
 from __future__ import annotations
 
@@ -13,8 +10,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.workflows.base import SILENT, Reporter, argument, command
-from nerg_mi.workflows.view import ViewOptions, place_to_view
+from nerg_mi.workflows.base import SILENT, Reporter
+from nerg_mi.workflows.scene_commands import ViewOptions
+from nerg_mi.workflows.view import place_to_view
 
 from .controls import AreasPanel, Controls
 from .flights import Flying
@@ -67,17 +65,6 @@ def viewer(
             page.close()
 
 
-@command(
-    "view",
-    more="The page is served to this machine alone, until Ctrl-C; nothing is fetched from anywhere else. At another "
-    "--host its address has a token.",
-    options=ViewOptions,
-    files=argument(
-        "A scene, or a place (radiance field, splats, mesh, .vol), a gaze field, rays; a folder.",
-        list[Path],
-        metavar="FILES",
-    ),
-)
 def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT) -> None:
     """Serve ``files`` until Ctrl-C, which is the way to end it. Raises as `viewer`."""
     options = options or ViewOptions()

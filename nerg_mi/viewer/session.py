@@ -25,7 +25,8 @@ from nerg_mi.statistics.shares import ROUGH
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.workflows.render import basis_words
 from nerg_mi.workflows.scene_cameras import given_point
-from nerg_mi.workflows.view import PlaceToView, ViewOptions
+from nerg_mi.workflows.scene_commands import ViewOptions
+from nerg_mi.workflows.view import PlaceToView
 
 from . import layers
 from .layers import Layer, Scale, Shade

@@ -1,7 +1,4 @@
-"""``nerg ablate``: Train every variant of a gaze field alike, and compare them.
-
-Training every variant of a gaze field alike, in parts, and comparing them.
-"""
+"""Training every variant of a gaze field alike, in parts, and comparing them."""
 
 from __future__ import annotations
 
@@ -16,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,64 +26,21 @@ from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.formats.splats import is_splats
-from nerg_mi.ranges import FIRST_SEEDS, KAPPAS, LENGTHS, STEPS, TEST_SHARES, THREADS, Range
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan
 from nerg_mi.train.gaze_data import Supervision, digest_rays, hold_out
 from nerg_mi.train.gaze_recipes import gaze_recipe
-from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan
 from nerg_mi.train.geometry import GazePlace
 
-from .base import SILENT, Reporter, argument, command, out, select_backend
+from .base import SILENT, Reporter, select_backend
+from .gaze_commands import AblationOptions, GazeOptions
 from .geometry import check_place, make_place, place_kind
-from .options import PartOptions, PlaceOptions, exposed_options, exposes, option
+from .options import exposed_options
 from .parts import Parts, PlannedScene
-from .train_gaze import GazeOptions, plan_gaze, train_planned
-
-# ---- Options of the ablation of gaze fields ----
-
-
-@dataclass(frozen=True, kw_only=True)
-@exposes(ProbeSettings, GazeSettings, default="Default: the recipe's.", without=("seed", "freeze", "loss", "mix_folds"))
-class AblationOptions(PlaceOptions, PartOptions):
-    """Which variants are trained, on what they are scored, and how a frame is timed. Lengths are metres."""
-
-    if TYPE_CHECKING:
-        # Options that are settings, too.
-        def __init__(self, **options: Any) -> None: ...
-
-    recipes: str = option("default,paper", "Recipes to ablate, separated by commas.")
-    variant: tuple[str, ...] = option(
-        (), 'Only this one, such as emit_capture or "semantic snapshot"; may be given several times.'
-    )
-    seeds: int = option(3, "Seeds of the default recipe; the others have one.", within=Range(1, 1000))
-    first: int = option(0, "Seed of what is held out, and of the first training.", within=FIRST_SEEDS)
-    steps: int | None = option(None, "Steps of every recipe but the default one. Default: the recipe's.", within=STEPS)
-    default_steps: int | None = option(None, "Steps of the default recipe. Default: its own.", within=STEPS)
-    zones: int = option(3, "Zones of test positions.", within=Range(1, 1000))
-    positions: int = option(60, "Test positions.", within=Range(1, 10**5))
-    people: float = option(0.0, "Share of the people who are held out besides.", within=TEST_SHARES)
-    radius: float = option(0.25, "Radius of the test's probes in metres.", within=LENGTHS)
-    kappa: float = option(20.0, "Concentration of the truth's kernel.", within=KAPPAS)
-    min_rays: int = option(64, "Rays at a test position at least.", within=Range(1, 10**6))
-    law: str | None = option(
-        None,
-        'Truth in closed form, where it is known: "MODULE:CLASS", whose instances have density(positions, directions) '
-        "in 1/sr.",
-    )
-    refit: bool = option(
-        True,
-        "Train every recipe but the default one, which always does, again on all rays for as many steps as were best "
-        "on some.",
-    )
-    cameras: int = option(4, "Cameras that a frame is timed over (the paper: 32); 0: none.", within=Range(0, 10000))
-    size: str = option("320x180", "Of a frame (the paper: 1280x720).")
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS, changes_result=False)
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
-
+from .train_gaze import plan_gaze, train_planned
 
 # ---- What the variants of an ablation have in common, and the training of one of them ----
 
@@ -133,6 +86,7 @@ def plan_of(variant: Variant, seed: int, bench: Bench) -> GazePlan:
     options, quick = bench.options, gaze_recipe(variant.recipe).quick
     plan = plan_gaze(
         GazeOptions(
+            **exposed_options(options),
             recipe=variant.recipe,
             variant=variant.gaze,
             semantic=variant.semantic,
@@ -141,7 +95,6 @@ def plan_of(variant: Variant, seed: int, bench: Bench) -> GazePlan:
             freeze=variant.frozen,
             loss=variant.loss or None,
             steps=(options.default_steps if quick else options.steps) or None,
-            **exposed_options(options),
             refit=options.refit or quick,
             # Heads are compared: what is mixed in besides would make them alike.
             mix_folds=0,
@@ -181,8 +134,6 @@ def law_of(name: str) -> Baseline:
 
 # ---- Ablation ----
 #
-# ``nerg ablate``: Train every variant of a gaze field alike, and compare them.
-#
 # The paper's ablation: every variant of a gaze field, trained alike, scored on what it saw and on what it did not.
 
 
@@ -199,13 +150,6 @@ class AblationResult:
     files: list[Path]
 
 
-@command(
-    "ablate",
-    "Train every variant of a gaze field alike; losses on training and held-out positions, and the time of a frame.",
-    options=AblationOptions,
-    rays=argument("Rays file (.npz or .parquet), as nerg rays import writes it."),
-    output=out("Folder for checkpoints, table and plot."),
-)
 def ablate(
     rays: Rays | str | Path, output: str | Path, options: AblationOptions | None = None, reporter: Reporter = SILENT
 ) -> AblationResult:

@@ -1,7 +1,4 @@
-"""``nerg align``: Find how tracking lies in a place: from points, a twin, cameras, or the tracking alone.
-
-How tracking lies in a place: found from what there is as evidence, judged, and written for ``--align``.
-"""
+"""How tracking lies in a place: found from what there is as evidence, judged, and written for ``--align``."""
 
 from __future__ import annotations
 
@@ -23,59 +20,16 @@ from nerg_mi.figures.style import provenance, save
 from nerg_mi.files.atomic import check_writable, file_sha256
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.photos.colmap import turn_to_z
-from nerg_mi.ranges import COORDINATES, LENGTHS, SEEDS, THREADS, Checked, Range
 from nerg_mi.rays.direction_checks import DECLARED
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train import geometry
 from nerg_mi.train.geometry import GazePlace
 
-from .base import SILENT, Reporter, argument, command, out, select_backend
-from .options import option, parse_point
+from .base import SILENT, Reporter, select_backend
+from .options import parse_point
+from .rays_commands import AlignOptions
 
-# ---- Options of finding how tracking lies in a place ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class AlignOptions(Checked):
-    """What an alignment is found from, and what is known beforehand. Lengths of the tracking are metres."""
-
-    field: Path | None = option(None, "The place: a radiance field, or Gaussian splats.")
-    scene: Path | None = option(None, "Or: a Mitsuba scene.")
-    surface: Path | None = option(
-        None, "Or: a mesh or points on surfaces (.ply, .obj, .glb, .npy, .csv of x,y,z or of Aria)."
-    )
-    pairs: Path | None = option(
-        None, "Evidence: picked points, CSV of x,y,z,place_x,place_y,place_z (three or more), or JSON."
-    )
-    twin: Path | None = option(None, "Or: a mesh or points (as --surface) in the tracking's frame.")
-    cameras: Path | None = option(None, "Or: posed photos in the tracking's frame (transforms.json, COLMAP), with ...")
-    place_cameras: Path | None = option(None, "... the same photos' poses in the place's frame.")
-    start: Path | None = option(None, "Or: an alignment that is near, which the tracking refines.")
-    refine: bool = option(False, "Refine what the evidence gave by the tracking.")
-    up: str | None = option(
-        None, "Axis of the place that is up (z, -y, ... or x,y,z): only turns about it are left. The tracking's is z."
-    )
-    floor: float = option(0.0, "Height of the floor in the tracking.", within=COORDINATES)
-    place_floor: float | None = option(
-        None, "Height of the floor in the place, along --up. Default: found.", within=COORDINATES
-    )
-    scale: float | None = option(
-        None, "Units of the place a metre of the tracking, where that is known.", within=LENGTHS
-    )
-    max_residual: float = option(
-        10.0, "Centimetres of the median residual beyond which a fit is refused.", within=Range(0, 10**9)
-    )
-    force: bool = option(False, "Write a fit that is refused, too.")
-    seed: int = option(0, "Seed of the rays by which the place is traced.", within=SEEDS)
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
-
-
-# ---- Alignment ----
-#
-# ``nerg align``: Find how tracking lies in a place: from points, a twin, cameras, or the tracking alone.
-#
-# How tracking lies in a place: found from what there is as evidence, judged, and written for ``--align``.
+# ---- How tracking lies in a place: found from what there is as evidence, judged, and written for ``--align`` ----
 
 
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
@@ -89,15 +43,6 @@ class AlignResult:
     files: list[Path]
 
 
-@command(
-    "align",
-    "Find how tracking lies in a place: the similarity from the rays' frame to the place's.",
-    more="""From picked points, a twin, cameras known in both frames, or from the tracking alone: heads in free space,
-gaze that ends on surfaces. A mirrored frame is found and named.""",
-    options=AlignOptions,
-    rays=argument("Rays file (.npz or .parquet). Not needed with --pairs, --twin or --cameras.", required=False),
-    output=out("Alignment to write (.json), which --align takes; beside it a picture."),
-)
 def align(
     rays: Rays | str | Path | None,
     output: str | Path | None = None,

@@ -1,7 +1,4 @@
-"""``nerg bake``: Put gaze on surfaces: how much of it each square metre receives, as colours and tables.
-
-Attention on surfaces: from meshes, scenes or fields to files with attention, and the files themselves.
-"""
+"""Attention on surfaces: from meshes, scenes or fields to files with attention, and the files themselves."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.metrics import cc
 from nerg_mi.figures.overlay import Heat, overlay
-from nerg_mi.figures.style import Provenance, provenance
+from nerg_mi.figures.style import Provenance
 from nerg_mi.files.atomic import check_writable, write_bytes
 from nerg_mi.files.images import encode_png
 from nerg_mi.files.tables import write_csv, write_json
@@ -29,29 +26,26 @@ from nerg_mi.maths.color import decode_srgb
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, merge
 from nerg_mi.surfaces.mesh import Mesh, RefinedMesh, texture_rows, unroll, unroller
-from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings, TrackedRays, WeightedObservers, ray_seconds
+from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
 
 from .bake_chunks import (
+    UNITS,
     BakeScene,
     Receivers,
     alignment_of,
     check_values,
+    cone_of,
     cut,
-    find_crowd,
-    halves_of,
-    rays_of,
+    origin_of,
     read_receivers,
-    sums_in_one_go,
-    sums_in_parts,
-    tracked_rays,
+    source_of,
+    sums_of,
+    who_looks,
 )
-from .bake_options import UNITS, BakeOptions, cone_of, source_of
-from .base import SILENT, Reporter, argument, command, out, select_backend
-from .parts import Parts
+from .base import SILENT, Reporter, select_backend
+from .scene_commands import BakeOptions
 
-# ---- Outputs ----
-#
-# Files of a bake: meshes with colours (.ply, .glb), a table of faces (.csv), and a summary (.json).
+# ---- Files of a bake: meshes with colours (.ply, .glb), a table of faces (.csv), and a summary (.json) ----
 
 
 SUFFIXES = (".ply", ".glb", ".csv", ".json")
@@ -179,8 +173,6 @@ def check_texture(paths: list[Path], pixels: int | None) -> None:
 
 # ---- Bake ----
 #
-# ``nerg bake``: Put gaze on surfaces: how much of it each square metre receives, as colours and tables.
-#
 # Gaze on surfaces: how much of it each square metre of a mesh receives, from a gaze field or from tracked rays.
 
 
@@ -230,7 +222,6 @@ def bake(
     source = _check(surface, paths, options, rays)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.0, "reading")
-    tracked = rays_of(options, rays)
     align = alignment_of(options)
     receivers = read_receivers(surface, options.shapes, options.resolution, ns, reporter)
     across = receivers.mesh.diagonal / align.scale
@@ -251,22 +242,8 @@ def bake(
         GazeSumSettings(angle=math.radians(options.angle), cone=cone),
         RaySettings(cone=cone, bundle=options.bundle, seed=options.seed),
     )
-    factor = 1.0
-    if source == "rays":
-        assert tracked is not None
-        who: WeightedObservers | TrackedRays = tracked_rays(tracked, align, options.weights)
-        factor = float(ray_seconds(tracked).sum()) if options.unit == "seconds" else 1.0
-    else:
-        who = find_crowd(options, tracked, align, reporter)
-    groups = [who]
-    if options.halves and tracked is not None and isinstance(who, TrackedRays):
-        groups = halves_of(who, tracked, options.seed)
-    name = paths[0] if paths else surface
-    found = (
-        sums_in_parts(scene, groups, Parts(options, name, reporter, options.threads), f"nerg bake {name.absolute()}")
-        if options.in_parts
-        else sums_in_one_go(scene, groups, reporter)
-    )
+    groups, factor = who_looks(options, source, rays, align, reporter)
+    found = sums_of(scene, groups, options, paths[0] if paths else surface, reporter)
     sums = merge(found)
     reporter.progress(0.9, "smoothing")
     smoother = Smoother(mesh, options.smooth * align.scale) if options.smooth > 0 else None
@@ -278,10 +255,7 @@ def bake(
     if len(found) == 2:
         summary["halves_cc"] = _agreement(mesh, found, smoother)
     heat = Heat(options.top or _top(mesh, density), options.cmap, decades=options.decades)
-    given = (surface, options.gaze, options.rays, options.path, options.align)
-    about = provenance("nerg bake", [p for p in given if p is not None], options.seed, options)
-    summary["provenance"] = {"what": about.what, "inputs": dict(about.inputs), "seed": about.seed}
-    summary["provenance"] |= {"settings": dict(about.settings), "versions": dict(about.versions)}
+    about, summary["provenance"] = origin_of(surface, options)
     baked = Baked(receivers, refined, density, share, UNITS[options.unit], align.scale, heat, about, summary)
     _tell(summary, reporter)
     for path in paths:
@@ -292,17 +266,6 @@ def bake(
     return Bake(mesh, density, share, on, elsewhere, escaped, total, summary, tuple(paths))
 
 
-@command(
-    "bake",
-    "Put gaze on surfaces: how much of it each square metre receives, from a gaze field or from tracked rays.",
-    options=BakeOptions,
-    surface=argument("Mesh (.ply, .obj, .glb), scene (.xml), radiance field (.safetensors), or Gaussian splats."),
-    output=out(
-        "Files to write, repeatable: .ply, .glb (with colours), .csv (of faces), .json (summary); of Gaussian splats "
-        ".ply and .json.",
-        list[Path],
-    ),
-)
 def bake_any(surface: Path, output: list[Path], options: BakeOptions, reporter: Reporter) -> None:
     """`bake` on a mesh, and `bake_splats.bake_splats` on Gaussian splats."""
     from .bake_splats import bake_splats
@@ -311,7 +274,7 @@ def bake_any(surface: Path, output: list[Path], options: BakeOptions, reporter: 
 
 
 def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
-    """Whose gaze it is, of `bake_options.SOURCES`. Raises `NergError` for options that contradict each other."""
+    """Whose gaze it is, of `bake_chunks.SOURCES`. Raises `NergError` for options that contradict each other."""
     for path in paths:
         check_writable(path, *SUFFIXES)
     check_texture(paths, options.texture)

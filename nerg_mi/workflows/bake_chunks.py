@@ -14,7 +14,7 @@ from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats
-from nerg_mi.figures.style import find_colors
+from nerg_mi.figures.style import Provenance, find_colors, provenance
 from nerg_mi.files.atomic import replacing
 from nerg_mi.files.safe_read import read_npy
 from nerg_mi.formats.checkpoint import read_metadata
@@ -52,6 +52,7 @@ from nerg_mi.surfaces.sources import (
     cluster_observers,
     gaze_sums,
     observers_from_field,
+    ray_seconds,
     ray_sums,
     ray_weights,
 )
@@ -63,10 +64,41 @@ from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import PlacedGaze
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 
-from .bake_options import BakeOptions
 from .base import Reporter, select_backend
 from .geometry import align_of_training
 from .parts import Parts, PlannedScene
+from .scene_commands import BakeOptions
+
+# ---- Whose gaze a bake is asked for, and in which unit ----
+
+UNITS = {"share": "share of gaze per square metre [1/m²]", "seconds": "gaze per square metre [s/m²]"}
+SOURCES = ("field", "rays")
+CONE = 1.5
+"""Degrees of a tracked ray's: the error of good trackers, and the radius of the fovea."""
+
+
+def source_of(options: BakeOptions, rays: Rays | None, with_gaze: bool = False) -> str:
+    """Whose gaze it is, of `SOURCES`; ``rays`` are those in memory, and ``with_gaze`` says whether the surface may have
+    a gaze field of its own. Raises `NergError` for options that contradict each other."""
+    people = rays is not None or options.rays is not None
+    source = options.source or ("field" if options.gaze is not None or (with_gaze and not people) else "rays")
+    if source not in SOURCES:
+        raise NergError(f'--from is {" or ".join(SOURCES)}, got "{source}"')
+    if options.unit not in UNITS:
+        raise NergError(f'--unit is {" or ".join(UNITS)}, got "{options.unit}"')
+    if source == "rays" and not people:
+        raise NergError("whose gaze is it? give a gaze field by --gaze, or rays by --rays")
+    if source == "rays" and (options.observer is not None or options.path is not None):
+        raise NergError("--observer and --path look with a gaze field; give --gaze, or leave them out")
+    if source == "field" and (options.unit == "seconds" or options.halves):
+        raise NergError("--unit seconds and --halves are of rays, whose time is known; add --from rays")
+    return source
+
+
+def cone_of(options: BakeOptions, source: str) -> float:
+    """Standard deviation in radian of the cone of a look."""
+    return float(np.radians(CONE if options.cone is None and source == "rays" else options.cone or 0.0))
+
 
 # ---- Chunks ----
 #
@@ -139,9 +171,7 @@ def parts_of(who: WeightedObservers | TrackedRays) -> Iterator[WeightedObservers
         yield WeightedObservers(who.positions[a : a + OBSERVERS], who.weights[a : a + OBSERVERS])
 
 
-# ---- Lookers ----
-#
-# Who looks: one observer, a path of them, or the people of tracked rays.
+# ---- Who looks: one observer, a path of them, or the people of tracked rays ----
 
 
 POSITIONS = 1_000_000
@@ -203,6 +233,20 @@ def find_crowd(options: BakeOptions, rays: Rays | None, align: Similarity, repor
     return crowd
 
 
+def who_looks(
+    options: BakeOptions, source: str, rays: Rays | None, align: Similarity, reporter: Reporter
+) -> tuple[list[WeightedObservers | TrackedRays], float]:
+    """Whose gaze of the ``source`` is put on a surface, of rays two halves of the people where that is asked for; and
+    the factor from shares of it to the unit. ``rays``: those in memory."""
+    tracked = rays_of(options, rays)
+    if source == "field":
+        return [find_crowd(options, tracked, align, reporter)], 1.0
+    assert tracked is not None
+    who = tracked_rays(tracked, align, options.weights)
+    factor = float(ray_seconds(tracked).sum()) if options.unit == "seconds" else 1.0
+    return [*halves_of(who, tracked, options.seed)] if options.halves else [who], factor
+
+
 def tracked_rays(rays: Rays, align: Similarity, by: str) -> TrackedRays:
     """The rays themselves in the place, with weights ``by`` one of `WEIGHTS` that add up to one."""
     directions = rays.direction @ (align.matrix[:3, :3] / align.scale).T
@@ -231,9 +275,7 @@ def alignment_of(options: BakeOptions) -> Similarity:
     )
 
 
-# ---- Receivers ----
-#
-# What receives gaze: a mesh file, shapes of a scene file, or the surface of a radiance field.
+# ---- What receives gaze: a mesh file, shapes of a scene file, or the surface of a radiance field ----
 
 
 FACES = 100_000
@@ -331,9 +373,7 @@ def _joined(path: Path, found: dict[str, Triangles], others: tuple[Triangles, ..
     return Receivers(mesh, tuple(found), shape[index], number[index], others)
 
 
-# ---- Splat chunks ----
-#
-# The work of a bake of Gaussian splats in parts: as `chunks`, of files alone.
+# ---- The work of a bake of Gaussian splats in parts: as `chunks`, of files alone ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,9 +453,7 @@ def splat_place(splats: Splats) -> SplatPlace:
     return SplatPlace(splats, arrays, place, settings, shortest_axes(splats))
 
 
-# ---- Summing ----
-#
-# All parts of a bake and their sums, in this process or wherever parts are run: the same to the bit.
+# ---- All parts of a bake and their sums, in this process or wherever parts are run: the same to the bit ----
 
 
 _BEGIN, _END = 0.05, 0.9  # of a bake is this
@@ -507,3 +545,25 @@ def halves_of(who: TrackedRays, rays: Rays, seed: int) -> list[WeightedObservers
         TrackedRays(who.origins[rows], who.directions[rows], who.weights[rows], start)
         for rows, start in zip(order, [0, len(order[0])])
     ]
+
+
+def sums_of(
+    scene: BakeScene | SplatScene,
+    groups: Sequence[WeightedObservers | TrackedRays],
+    options: BakeOptions,
+    name: Path,
+    reporter: Reporter,
+) -> list[SurfaceSums]:
+    """The sums of each of ``groups``, in one go or in parts as ``options`` say; ``name``: a file of the bake."""
+    if not options.in_parts:
+        return sums_in_one_go(scene, groups, reporter)
+    parts = Parts(options, name, reporter, options.threads)
+    return sums_in_parts(scene, groups, parts, f"nerg bake {name.absolute()}")
+
+
+def origin_of(surface: Path, options: BakeOptions) -> tuple[Provenance, dict[str, Any]]:
+    """What a bake of ``surface`` was made of, and the same as its summary has it (JSON)."""
+    given = (surface, options.gaze, options.rays, options.path, options.align)
+    about = provenance("nerg bake", [p for p in given if p is not None], options.seed, options)
+    told = {"what": about.what, "inputs": dict(about.inputs), "seed": about.seed}
+    return about, {**told, "settings": dict(about.settings), "versions": dict(about.versions)}

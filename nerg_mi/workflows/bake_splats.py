@@ -14,7 +14,6 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation.metrics import cc
 from nerg_mi.fields.splats import Splats, harmonics_of
 from nerg_mi.figures.overlay import Heat, overlay, top_of
-from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.splats import read_splats, write_ply_splats
@@ -22,25 +21,24 @@ from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.sphere import C0
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import SurfaceSums, merge
-from nerg_mi.surfaces.sources import RaySettings, TrackedRays, WeightedObservers, ray_seconds
+from nerg_mi.surfaces.sources import RaySettings
 from nerg_mi.surfaces.splats import HIDDEN, SplatSmoother, splat_areas, whole_areas
 
 from .bake_chunks import (
+    UNITS,
     SplatPlace,
     SplatScene,
     alignment_of,
     check_values,
-    find_crowd,
-    halves_of,
-    rays_of,
+    cone_of,
+    origin_of,
+    source_of,
     splat_place,
-    sums_in_one_go,
-    sums_in_parts,
-    tracked_rays,
+    sums_of,
+    who_looks,
 )
-from .bake_options import UNITS, BakeOptions, cone_of, source_of
 from .base import SILENT, Reporter, select_backend
-from .parts import Parts
+from .scene_commands import BakeOptions
 
 COLUMN = "attention"
 """The column of a file that holds what each Gaussian receives."""
@@ -88,29 +86,17 @@ def bake_splats(
     given = read_splats(path)
     for note in (*given.guesses, *given.notes):
         reporter.message(f"of {path}: {note}")
-    align, tracked, cone = alignment_of(options), rays_of(options, rays), cone_of(options, source)
+    align, cone = alignment_of(options), cone_of(options, source)
     of_rays = RaySettings(cone=cone, bundle=options.bundle, seed=options.seed)
-    factor = 1.0
+    groups, factor = who_looks(options, source, rays, align, reporter)
     if source == "rays":
-        assert tracked is not None
-        who: WeightedObservers | TrackedRays = tracked_rays(tracked, align, options.weights)
-        factor = float(ray_seconds(tracked).sum()) if options.unit == "seconds" else 1.0
         scene = SplatScene(path, len(given), of_rays=of_rays)
     else:
-        who = find_crowd(options, tracked, align, reporter)
         scene = SplatScene(path, len(given), options.gaze, cone, of_rays)
-    groups = [who]
-    if options.halves and tracked is not None and isinstance(who, TrackedRays):
-        groups = halves_of(who, tracked, options.seed)
-    name = paths[0] if paths else path
-    if options.in_parts:
-        parts = Parts(options, name, reporter, options.threads)
-        found = sums_in_parts(scene, groups, parts, f"nerg bake {name.absolute()}")
-    else:
-        found = sums_in_one_go(scene, groups, reporter)
+    found = sums_of(scene, groups, options, paths[0] if paths else path, reporter)
     sums = merge(found)
     reporter.progress(0.9, "areas of Gaussians")
-    spread = _Spread(splat_place(given), source, options.smooth * align.scale)
+    spread = _SplatSpread(splat_place(given), source, options.smooth * align.scale)
     density = spread.density(sums)
     if not (density > 0).any():
         raise NergError(
@@ -122,10 +108,7 @@ def bake_splats(
     if len(found) == 2:
         summary["halves_cc"] = float(cc(spread.density(found[0]), spread.density(found[1]), spread.area))
     heat = Heat(options.top or top_of(attention, attention > 0), options.cmap, decades=options.decades)
-    inputs = [p for p in (path, options.gaze, options.rays, options.path, options.align) if p is not None]
-    about = provenance("nerg bake", inputs, options.seed, options)
-    summary["provenance"] = {"what": about.what, "inputs": dict(about.inputs), "seed": about.seed}
-    summary["provenance"] |= {"settings": dict(about.settings), "versions": dict(about.versions)}
+    about, summary["provenance"] = origin_of(path, options)
     baked = recolored(given, attention, heat)
     _tell(summary, heat.top, reporter)
     comments = (f"{COLUMN}: {unit}", f"colours end at {heat.top:.6g}", f"nerg_mi {about.json()}")
@@ -149,7 +132,7 @@ def recolored(splats: Splats, values: np.ndarray, heat: Heat) -> Splats:
     return replace(splats, harmonics=harmonics_of(shown), extra=extra, color_space="srgb")
 
 
-class _Spread:
+class _SplatSpread:
     """From sums of a ``source`` to densities of the Gaussians of ``there``, smoothed by ``length`` scene units, or not
     if that is 0. ``area`` (N,): of both sides of each."""
 

@@ -3,6 +3,7 @@ versions of libraries."""
 
 from __future__ import annotations
 
+import importlib
 import platform
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,9 +14,7 @@ from typing import Any, Protocol, TypeVar
 from nerg_mi import __version__, llvm
 from nerg_mi.threads import set_thread_count
 
-# ---- Backend ----
-#
-# Where a job computes: the Mitsuba variant and the number of threads.
+# ---- Where a job computes: the Mitsuba variant and the number of threads ----
 
 
 def select_backend(mode: str | None, threads: int | None = None) -> ModuleType:
@@ -35,11 +34,12 @@ def select_backend(mode: str | None, threads: int | None = None) -> ModuleType:
 
 # ---- Commands ----
 #
-# What the command line runs: functions of workflows, each declared as a command where it is defined.
+# What the command line runs: functions of workflows, each declared as a command where it is defined, or by its name
+# in a module that loads quickly, since help and completion import that module alone.
 #
-# A module with commands begins with their names and their lines in the list of commands, as in
-# "``nerg train gaze``: Train a gaze field on rays of attention." The command line finds it by these lines, without
-# importing it, so that a further command is a further module and nothing else.
+# A module with commands begins with their names and their lines in the list of commands, as in "``nerg train gaze``:
+# Train a gaze field on rays of attention." The command line finds it by these lines, without importing it, so that a
+# further command is a further module and nothing else.
 
 
 @dataclass(frozen=True)
@@ -125,16 +125,29 @@ def command(
         Arguments and options by the names of what they set: a field of ``options``, or a parameter of the function.
     """
 
-    def declare(run: Run) -> Run:
+    def decorate(run: Run) -> Run:
         COMMANDS[name] = Command(name, run, help, more, options, without, further, parameters)
         return run
 
-    return declare
+    return decorate
 
 
-# ---- Reporter ----
-#
-# Whom a job tells how it goes: a command's terminal, a notebook, or nobody.
+def declare(name: str, function: str, help: str = "", /, **settings: Any) -> None:
+    """Declare the command ``name`` as `command` does; ``function``: what it runs, as "MODULE:NAME", imported then."""
+
+    def run(**values: Any) -> Any:
+        return imported(function)(**values)
+
+    command(name, help, **settings)(run)
+
+
+def imported(function: str) -> Callable[..., Any]:
+    """The function "MODULE:NAME"."""
+    module, _, name = function.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+# ---- Whom a job tells how it goes: a command's terminal, a notebook, or nobody ----
 
 
 class Reporter(Protocol):

@@ -1,6 +1,4 @@
-"""``nerg demo``: Render the demo store: pictures of what a gaze field is.
-
-The demo: every picture that shows what a gaze field is, rendered from a scene with an observer.
+"""The demo: every picture that shows what a gaze field is, rendered from a scene with an observer.
 
 The scene has three sensors: 0 a camera that sees behind what hides it from the observer, 1 the observer's own view, 2
 the observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field, and it has the `<default>`s of
@@ -36,11 +34,10 @@ from nerg_mi.transport.geometry import pixel_solid_angles
 from nerg_mi.transport.observer import center
 
 from .bake import bake
-from .bake_options import BakeOptions
-from .base import SILENT, Reporter, command, extra, versions
-from .options import DemoOptions
+from .base import SILENT, Reporter, versions
 from .render import basis_texts, basis_words
-from .report import RESULTS, ReportOptions, make_report
+from .report import RESULTS, make_report
+from .scene_commands import BakeOptions, DemoOptions, ReportOptions
 
 CAMERA, OWN, SPHERE = range(3)
 """Index of each sensor."""
@@ -188,13 +185,6 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     return DemoResult(files, clock.seconds, report)
 
 
-@command(
-    "demo",
-    "Render the demo store: colour, depth, gaze, visibility, the observer's gaze sphere, occlusion, EXR, a report.",
-    options=DemoOptions,
-    without=("scene",),
-    out=extra(Path("out/demo"), "Folder to write into; it is made.", Path, "-o", "--out"),
-)
 def make_demo_to_look_at(out: Path, options: DemoOptions, reporter: Reporter) -> None:
     """`make_demo`, and how its pictures are looked at."""
     make_demo(out, options, reporter)

@@ -1,13 +1,13 @@
-"""What a kind of figure is, and the figures of scenes: gaze spheres, occlusion, and floor plans.
+"""Figures of scenes: gaze spheres, occlusion, and floor plans.
 
-To add a kind, define a `Kind` here and add it to ``SCENE_KINDS``.
+One more is a `Kind` in the table of `.scene_commands`, and the function that draws it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +15,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.figures.maps import PersonWalk, SightLines, Walls, floor_figure
-from nerg_mi.figures.overlay import (
-    Overlay,
-    OverlayLayers,
-    Style,
-    find_overlay,
-    occlusion_figure,
-    shared_limits,
-    unknown_of,
-)
+from nerg_mi.figures.overlay import Overlay, OverlayLayers, find_overlay, occlusion_figure, shared_limits, unknown_of
 from nerg_mi.figures.sphere import find_projection, sphere_figure
-from nerg_mi.figures.style import find_colors
 from nerg_mi.interruption import Interruption
-from nerg_mi.ranges import COORDINATES, DECADES, SEEDS, SPP, VALUES, Checked, Range
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
@@ -37,12 +27,10 @@ from nerg_mi.rendering.scene_writer import pixel_of
 from nerg_mi.transport.geometry import Place, pixel_solid_angles, trace_depth
 
 from .base import Reporter
-from .options import definitions, option
 from .render import layers_of
+from .scene_commands import FloorOptions, SceneFigureOptions, SphereOptions, TriptychOptions
 
-# ---- Kind ----
-#
-# A kind of figure: what it is called, which files and options it takes, and how it is drawn.
+# ---- A kind of figure: what it is called, which files and options it takes, and how it is drawn ----
 
 
 @dataclass(frozen=True)
@@ -55,65 +43,7 @@ class Drawing:
     seed: int | None = None
 
 
-@dataclass(frozen=True)
-class Kind:
-    """``name`` and ``summary`` for people; ``takes``: what its files are; ``most``: how many of them at most;
-    ``options``: a dataclass, frozen and of keywords alone, whose fields ``option`` makes (`nerg_mi.workflows.options`);
-    ``draw(files, options, reporter)``. Raises `NergError` for what the user can mend."""
-
-    name: str
-    summary: str
-    takes: str
-    most: int
-    options: type
-    draw: Callable[[Sequence[Path], Any, Reporter], Drawing]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ColorOptions(Checked):
-    """The colours of a figure's values."""
-
-    top: float | None = option(
-        None, "Upper end of the scale, in its unit.  [default: the 99.5th percentile]", within=VALUES
-    )
-    cmap: str | None = option(None, "Colour map: inferno, magma, plasma, viridis, cividis.  [default: inferno]")
-    decades: float = option(0.0, "Powers of ten that the scale spans; 0: a linear scale.", within=DECADES)
-
-    def style(self, title: str | None = None, kind: str = "sequential") -> Style:
-        """How overlays are drawn by these options, with colour maps of that ``kind`` (`find_colors`). Raises
-        `NergError` for what cannot be drawn."""
-        if self.cmap is not None:
-            find_colors(self.cmap, kind)
-        return Style(self.cmap, self.decades, False, title)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScaleOptions(ColorOptions):
-    """The same of a figure that can be hatched."""
-
-    hatching: bool = option(True, "Hatch where nothing is known.")
-
-    def style(self, title: str | None = None, kind: str = "sequential") -> Style:
-        """How overlays are drawn by these options, with colour maps of that ``kind`` (`find_colors`). Raises
-        `NergError` for what cannot be drawn."""
-        return replace(super().style(title, kind), hatched=self.hatching)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneOptions(ScaleOptions):
-    """How a scene file is rendered for a figure."""
-
-    defaults: Mapping[str, str] | None = definitions()
-    spp: int = option(0, "Samples a pixel; 0: as the scene says.", within=Range(0, SPP.high))
-    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
-    mode: str | None = option(
-        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
-    )
-
-
-# ---- Floor ----
-#
-# The floor plan of rays in their place: paths, where people looked, and fields of view.
+# ---- The floor plan of rays in their place: paths, where people looked, and fields of view ----
 
 
 _GAP = 1.0  # seconds without a ray after which a path begins anew
@@ -122,25 +52,7 @@ _FINEST = 0.02  # metres between points of a path
 _REACH = 1.2  # metres that a field of view, or a ray whose hit is not known, is drawn long
 
 
-@dataclass(frozen=True, kw_only=True)
-class FloorOptions(Checked):
-    """What a floor plan shows."""
-
-    scene: Path | None = option(None, "Scene file of the place, whose walls and furniture are drawn.")
-    defaults: Mapping[str, str] | None = definitions()
-    cut: float = option(1.2, "Height at which the place is cut, metres above its floor.", within=COORDINATES)
-    floor: float = option(0.0, "Height of the floor (z).", within=COORDINATES)
-    paths: bool = option(True, "Draw where people walked.")
-    rays: int = option(0, "Draw so many rays, from the eye to what was looked at.", within=Range(0, 20000))
-    views: int = option(0, "Draw so many fields of view of each person.", within=Range(0, 1000))
-    fov: float = option(60.0, "Degrees that a field of view is wide.", within=Range(1, 180))
-    people: str | None = option(None, "Draw these people alone: names with commas between them.")
-    mode: str | None = option(
-        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
-    )
-
-
-def _draw_floor(files: Sequence[Path], options: FloorOptions, reporter: Reporter) -> Drawing:
+def floor(files: Sequence[Path], options: FloorOptions, reporter: Reporter) -> Drawing:
     """The plan of the rays of a file, over the place of ``options.scene`` where there is one."""
     (path,) = files
     rays = _of_people(load_rays(path), options.people)
@@ -246,11 +158,6 @@ def _ahead(rays: Rays, some: np.ndarray) -> np.ndarray:
     return rays.origin[some, :2] + _REACH * rays.direction[some, :2]
 
 
-FLOOR_KIND = Kind(
-    "floor", "The floor plan of rays in their place.", "file of rays (.npz)", 1, FloorOptions, _draw_floor
-)
-
-
 # ---- A scene file opened for a figure, and what its cameras see ----
 
 MOST_PIXELS = 1 << 23
@@ -263,7 +170,7 @@ class OpenScene:
     ``see`` renders, and tells of it as the next of ``parts`` pictures. Made by `open_scene`.
     """
 
-    def __init__(self, path: Path, scene: Any, options: SceneOptions, tell: Callable[[float], None], parts: int):
+    def __init__(self, path: Path, scene: Any, options: SceneFigureOptions, tell: Callable[[float], None], parts: int):
         self.path, self.scene, self._options = path, scene, options
         self.nerg = nerg_of(path, scene)
         if not scene.sensors():
@@ -289,7 +196,7 @@ class OpenScene:
 
 
 @contextmanager
-def open_scene(path: Path, options: SceneOptions, reporter: Reporter, parts: int = 1) -> Iterator[OpenScene]:
+def open_scene(path: Path, options: SceneFigureOptions, reporter: Reporter, parts: int = 1) -> Iterator[OpenScene]:
     """The scene file ``path``, of which ``parts`` pictures will be rendered within the block, which Ctrl-C ends. Raises
     `NergError` for what is none, or has another integrator than `nerg`."""
     activate(options.mode)
@@ -347,18 +254,7 @@ def sampler_like(sensor: Any) -> dict[str, Any]:
 # ---- The gaze of a scene's observer over all directions, as a map of the sphere ----
 
 
-@dataclass(frozen=True, kw_only=True)
-class SphereOptions(SceneOptions):
-    """How an observer's sphere is drawn."""
-
-    sensor: int = option(
-        0, "Where no observer is: whose place it is, counted from 0.", "-s", "--sensor", within=Range(0, 65535)
-    )
-    projection: str = option("mollweide", "Projection: mollweide (equal areas) or equirectangular.")
-    width: int = option(800, "Width of the map in pixels; it is half as high.", within=Range(64, 2896))
-
-
-def _draw_sphere(files: Sequence[Path], options: SphereOptions, reporter: Reporter) -> Drawing:
+def sphere(files: Sequence[Path], options: SphereOptions, reporter: Reporter) -> Drawing:
     """The sphere of the observer of the scene file, or of its camera where it has none, turned to where they look."""
     import mitsuba as mi
 
@@ -388,24 +284,12 @@ def _draw_sphere(files: Sequence[Path], options: SphereOptions, reporter: Report
     return Drawing(figure, [path], options.seed)
 
 
-SPHERE_KIND = Kind(
-    "sphere", "The gaze of an observer over all directions.", "scene file (.xml)", 1, SphereOptions, _draw_sphere
-)
-
-
 # ---- Triptych ----
 #
 # The paper's occlusion figure of any scene: the observer's view, and another camera without and with occlusion.
 
 
-@dataclass(frozen=True, kw_only=True)
-class TriptychOptions(SceneOptions):
-    """How occlusion is shown."""
-
-    sensor: int = option(0, "The other camera, counted from 0.", "-s", "--sensor", within=Range(0, 65535))
-
-
-def _draw_triptych(files: Sequence[Path], options: TriptychOptions, reporter: Reporter) -> Drawing:
+def triptych(files: Sequence[Path], options: TriptychOptions, reporter: Reporter) -> Drawing:
     """Three pictures with one scale; the scene file needs an observer who is not the camera."""
     from nerg_mi.transport.observer import center
 
@@ -456,19 +340,7 @@ def _own_camera(observer: Any, camera: Any) -> Any:
     return mi.load_dict(own)
 
 
-TRIPTYCH_KIND = Kind(
-    "triptych", "Occlusion: three views of a gaze.", "scene file (.xml)", 1, TriptychOptions, _draw_triptych
-)
-
-
-# ---- The kinds of figures of scenes, in the order in which they are listed ----
-
-SCENE_KINDS: tuple[Kind, ...] = (SPHERE_KIND, TRIPTYCH_KIND, FLOOR_KIND)
-
-
-# ---- Walls ----
-#
-# A place cut at a height, seen from above: what a floor plan of it shows.
+# ---- A place cut at a height, seen from above: what a floor plan of it shows ----
 
 
 CELLS = 360

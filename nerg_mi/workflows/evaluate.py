@@ -1,10 +1,4 @@
-"""``nerg eval gaze``: Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the
-people.
-``nerg eval folds``: Train and score a gaze field again and again, each time without other people and zones, and tell
-the means.
-
-Scoring a gaze field on held-out rays, and trainings and scores over folds.
-"""
+"""Scoring a gaze field on held-out rays, and trainings and scores over folds."""
 
 from __future__ import annotations
 
@@ -12,7 +6,7 @@ import math
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -37,26 +31,21 @@ from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.probes.probes import LEVELS, level_name
-from nerg_mi.ranges import DIRECTIONS, FIRST_SEEDS, KAPPAS, RAYS, THREADS, Range
 from nerg_mi.rays.dataset import is_dataset
 from nerg_mi.rays.dataset_open import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan
 from nerg_mi.threads import set_thread_count
-from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.geometry import GazePlace
 
-from .base import SILENT, Reporter, argument, command, out, select_backend
-from .geometry import GazeEvaluationOptions, check_place, place_kind, place_of_training
-from .options import PartOptions, PlaceOptions, exposed_options, exposes, option
+from .base import SILENT, Reporter, select_backend
+from .gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions
+from .geometry import check_place, place_kind, place_of_training
+from .options import exposed_options, shared_options
 from .parts import Parts, PlannedScene
-from .train_gaze import GazeOptions, train_gaze
-from .train_prior import RECIPE as PRIOR
+from .train_gaze import PRIOR, train_gaze
 
 # ---- Evaluation ----
-#
-# ``nerg eval gaze``: Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the
-# people.
 #
 # The evaluation of a gaze field, at positions and of people that it was not trained on, beside what needs no field.
 
@@ -170,13 +159,6 @@ def evaluate_gaze(
     return GazeEvaluation(rows, persons, split, len(test.centres), len(test.persons), files, places, ranks, regions)
 
 
-@command(
-    "eval gaze",
-    options=GazeEvaluationOptions,
-    gaze=argument("Checkpoint of a gaze field that was trained with --test-zones (.safetensors)."),
-    rays=argument("The rays file or dataset that it was trained on."),
-    output=out("Folder for tables and pictures. Default: GAZE.eval.", default=None),
-)
 def print_evaluation(
     gaze: Path, rays: Path, output: Path | None, options: GazeEvaluationOptions, reporter: Reporter
 ) -> None:
@@ -261,53 +243,7 @@ def _notes(
     )
 
 
-# ---- Options of the evaluation of gaze fields over folds ----
-
-
-@dataclass(frozen=True, kw_only=True)
-@exposes(ProbeSettings, GazeSettings, default="Default: the recipe's.", without=("seed", "freeze"))
-class FoldOptions(PlaceOptions, PartOptions):
-    """How many folds there are, what each holds out, and how its field is trained and scored. Lengths are metres."""
-
-    if TYPE_CHECKING:
-        # Options that are settings, too.
-        def __init__(self, **options: Any) -> None: ...
-
-    folds: int = option(5, "Folds: each holds out other people and other zones.", within=Range(2, 10_000))
-    first: int = option(0, "Seed of the first fold; the others have those that follow.", within=FIRST_SEEDS)
-    splits: str = option(
-        "both,pos,people", "What is new, with commas between: both (people and positions), pos, people."
-    )
-    zones: int = option(3, "Zones of test positions of a fold.", within=Range(1, 1000))
-    positions: int = option(60, "Test positions in them.", within=Range(1, 10**5))
-    people: float = option(0.5, "Share of the people who are held out of a fold's training.", within=Range(0.01, 0.99))
-    recipe: str = option("default", "Recipe of the trainings; see docs/gaze-training.md.")
-    variant: str | None = option(
-        None, "emit, capture or emit_capture. Default: emit_capture, and capture without any geometry."
-    )
-    ensemble: int = option(
-        0, "Members of each fold's field, whose spread is judged as support is. 0: one field.", within=Range(0, 100)
-    )
-    align: Path | None = option(None, "JSON file with the 4x4 similarity from the rays' frame to the place's.")
-    most: int = option(10_000_000, "Rays of a dataset at most; of more, a sample by --first.", within=RAYS)
-    kappa: float = option(20.0, "Concentration of the kernel of truth and baselines.", within=KAPPAS)
-    directions: int = option(2048, "Directions that maps are compared in.", within=DIRECTIONS)
-    min_rays: int = option(64, "Rays at a test position at least.", within=Range(1, 10**6))
-    threads: int | None = option(
-        None,
-        "CPU threads. Default: all; 1 makes a training repeat itself to the bit.",
-        within=THREADS,
-        changes_result=False,
-    )
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
-
-
-# ---- Folds ----
-#
-# ``nerg eval folds``: Train and score a gaze field again and again, each time without other people and zones, and
-# tell the means.
-#
-# Gaze fields over folds: trained and scored again and again, each time without other people and other zones.
+# ---- Gaze fields over folds: trained and scored again and again, each time without other people and other zones ----
 
 
 FIELD, SCORED = "gaze.safetensors", "scores.json"
@@ -383,13 +319,6 @@ def evaluate_folds(
     return FoldResult(rows, each, fields, written, positions, ranks, held)
 
 
-@command(
-    "eval folds",
-    more="Each fold is kept when it is done, and the same command goes on where it ended.",
-    options=FoldOptions,
-    rays=argument("Rays file (.npz or .parquet) or dataset."),
-    output=out("Folder for the table."),
-)
 def print_folds(rays: Path, output: Path, options: FoldOptions, reporter: Reporter) -> None:
     """`evaluate_folds`, with the means as a table for each split."""
     result = evaluate_folds(rays, output, options, reporter)
@@ -421,19 +350,12 @@ def train_and_score(common: Folds, seed: int, output: Path) -> None:
     if common.scene is not None:
         common.scene.checked()
     training = GazeOptions(
-        field=o.field,
-        scene=o.scene,
-        geometry=o.geometry,
-        align=o.align,
-        recipe=o.recipe,
-        variant=o.variant,
+        **shared_options(o, GazeOptions),
         **exposed_options(o),
-        ensemble=o.ensemble,
         test_zones=o.zones,
         test_positions=o.positions,
         test_people=o.people,
         seed=seed,
-        mode=o.mode,
     )
     train_gaze(common.rays, gaze, training)
     tables = {}
@@ -442,9 +364,7 @@ def train_and_score(common: Folds, seed: int, output: Path) -> None:
             field=o.field,
             scene=o.scene,
             split=split,
-            kappa=o.kappa,
-            directions=o.directions,
-            min_rays=o.min_rays,
+            **shared_options(o, GazeEvaluationOptions),
             resamples=0,
             seed=seed,
             mode=o.mode,

@@ -1,14 +1,4 @@
-"""``nerg import``: Convert checkpoints of torch-ngp and of the NeRG paper's authors.
-``nerg export mesh``: A mesh by marching cubes, with vertex colours: .ply or .glb.
-``nerg export points``: A cloud of surface points with normals and colours: .ply or .glb.
-``nerg export splats``: Gaussian splats on the surface, with its colours: .ply, for viewers of splats and the volume
-"splats".
-``nerg export volume``: Density, and colour, as Mitsuba grid volumes (.vol).
-``nerg export torch-ngp``: A torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes.
-``nerg refine``: Find more closely where a radiance field holds matter, so that it renders faster.
-
-Fields as other files: meshes, points, splats, volumes and checkpoints of other programs; and fields from these.
-"""
+"""Fields as other files: meshes, points, splats, volumes and checkpoints of other programs; and fields from these."""
 
 from __future__ import annotations
 
@@ -27,46 +17,19 @@ from nerg_mi.formats.fields import load_radiance, occupancy_arrays, save_gaze, s
 from nerg_mi.formats.splats import splats_of_field, write_ply_splats
 from nerg_mi.formats.surfaces import Surface, density_and_color, mesh, points, write_glb, write_ply, write_volume
 from nerg_mi.formats.torch_ngp import Given, is_nerg, open_checkpoint, read_nerg, read_torch_ngp, write_torch_ngp
-from nerg_mi.ranges import VALUES, Checked, Range
 
-from .base import SILENT, Reporter, argument, command, extra, out, select_backend
-from .options import option
+from .base import SILENT, Reporter, argument, out, select_backend
+from .radiance_commands import (
+    CheckpointImportOptions,
+    MeshOptions,
+    PointOptions,
+    RefineOptions,
+    SplatOptions,
+    TorchNgpOptions,
+    VolumeOptions,
+)
 
-# ---- Options of the import of checkpoints of other programs, and of their refinement ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportOptions(Checked):
-    """What a checkpoint does not say of itself, and how its fields are stored."""
-
-    ema: bool | None = option(
-        None, "Moving averages of the weights, or the weights.  [default: averages, if there are any]", "--ema/--no-ema"
-    )
-    color_space: str = option("srgb", "What --color_space was in training: srgb or linear.")
-    bg_radius: float | None = option(
-        None,
-        "What --bg_radius was in training, where there is a background network; 0: leave it out.",
-        within=Range(0, 10**6),
-    )
-    finest: int | None = option(
-        None, "Finest resolution of the hash grid.  [default: 2048 x bound]", within=Range(2, 1 << 24)
-    )
-    half: bool = option(False, "Store the weights in fp16.")
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RefineOptions(Checked):
-    """On what a bound is refined."""
-
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
-
-
-# ---- Checkpoints ----
-#
-# ``nerg import``: Convert checkpoints of torch-ngp and of the NeRG paper's authors.
-#
-# Fields that other programs have trained, as fields of our own.
+# ---- Fields that other programs have trained, as fields of our own ----
 
 
 @dataclass(frozen=True)
@@ -84,7 +47,7 @@ def import_checkpoint(
     file: str | Path,
     output: str | Path | None = None,
     gaze: str | Path | None = None,
-    options: ImportOptions | None = None,
+    options: CheckpointImportOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> ImportedFields:
     """Read a checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors; nothing in the file is run.
@@ -92,7 +55,7 @@ def import_checkpoint(
     ``output``, ``gaze``: files for the radiance and the gaze field (.safetensors), None: not written. Raises
     `NergError` where the file does not hold what is to be written, and for what the user can mend.
     """
-    options = options or ImportOptions()
+    options = options or CheckpointImportOptions()
     output, gaze = (None if path is None else Path(path) for path in (output, gaze))
     for path in (output, gaze):
         if path is not None:
@@ -124,16 +87,8 @@ def import_checkpoint(
     return ImportedFields(field, attention, origin, [path for path in (output, gaze) if path is not None])
 
 
-@command(
-    "import",
-    "Convert a checkpoint to the fields of the volumes `nerf` and `gazefield`. Nothing in the file is run.",
-    options=ImportOptions,
-    file=argument("Checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors."),
-    output=out("Radiance field to write (.safetensors).", default=None),
-    gaze=extra(None, "Gaze field to write (.safetensors).", Path, "-g", "--gaze"),
-)
 def import_to_files(
-    file: Path, output: Path | None, gaze: Path | None, options: ImportOptions, reporter: Reporter
+    file: Path, output: Path | None, gaze: Path | None, options: CheckpointImportOptions, reporter: Reporter
 ) -> None:
     """`import_checkpoint` to one file at least."""
     if output is None and gaze is None:
@@ -153,81 +108,10 @@ def _tell(path: Path, reporter: Reporter) -> None:
     reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
 
-# ---- Options of the exports of a radiance field ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class LatticeOptions(Checked):
-    """Where a radiance field is evaluated."""
-
-    resolution: int = option(256, "Lattice cells along the longest edge of the field's box.", within=Range(2, 2048))
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SurfaceOptions(LatticeOptions):
-    """Where the surface of a field lies."""
-
-    density: float | None = option(
-        None,
-        "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]",
-        within=VALUES,
-    )
-    up: str = option("z", "Up axis of the field, for .glb: z or y.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeshOptions(SurfaceOptions):
-    """What is left out of a mesh, and what is added to it."""
-
-    fill: int = option(1, "Close holes of up to twice so many cells; 0: none.", within=Range(0, 2048))
-    keep: float = option(0.001, "Drop pieces with less than this share of the largest one's area.", within=Range(0, 1))
-    unseen: bool = option(False, "Keep the backs and insides that training never looked at.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class PointOptions(SurfaceOptions):
-    """Which points of a surface are written."""
-
-    count: int | None = option(None, "Points at most.  [default: all]", within=Range(1, 10**9))
-
-
-@dataclass(frozen=True, kw_only=True)
-class SplatOptions(LatticeOptions):
-    """How many Gaussians a surface becomes, and where it lies."""
-
-    density: float | None = option(
-        None,
-        "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]",
-        within=VALUES,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class VolumeOptions(LatticeOptions):
-    """What a grid volume holds."""
-
-    color: Path | None = option(None, "Also write the colour, to this .vol file.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class TorchNgpOptions(Checked):
-    """How a field is read that becomes a torch-ngp checkpoint."""
-
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
-
-
 # ---- Export ----
 #
-# ``nerg export mesh``: A mesh by marching cubes, with vertex colours: .ply or .glb.
-# ``nerg export points``: A cloud of surface points with normals and colours: .ply or .glb.
-# ``nerg export splats``: Gaussian splats on the surface, with its colours: .ply, for viewers of splats and the volume
-# "splats".
-# ``nerg export volume``: Density, and colour, as Mitsuba grid volumes (.vol).
-# ``nerg export torch-ngp``: A torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes.
-#
-# Radiance fields for other tools, in the field's own units: meshes, points, Gaussian splats, grid volumes,
-# torch-ngp checkpoints.
+# Radiance fields for other tools, in the field's own units: meshes, points, Gaussian splats, grid volumes, torch-ngp
+# checkpoints.
 
 
 _FIELD, _FILE = argument("Radiance field (.safetensors)."), out("File to write.")
@@ -241,7 +125,6 @@ class Export:
     surface: Surface | None = None
 
 
-@command("export mesh", options=MeshOptions, field=_FIELD, output=_FILE)
 def export_mesh(
     field: str | Path | RadianceField,
     output: str | Path,
@@ -278,7 +161,6 @@ def export_mesh(
     return _written([output], start, reporter, found)
 
 
-@command("export points", options=PointOptions, field=_FIELD, output=_FILE)
 def export_points(
     field: str | Path | RadianceField,
     output: str | Path,
@@ -295,7 +177,6 @@ def export_points(
     return _written([output], start, reporter, found)
 
 
-@command("export splats", options=SplatOptions, field=_FIELD, output=_FILE)
 def export_splats(
     field: str | Path | RadianceField,
     output: str | Path,
@@ -314,7 +195,6 @@ def export_splats(
     return _written([output], start, reporter)
 
 
-@command("export volume", options=VolumeOptions, field=_FIELD, output=_FILE)
 def export_volume(
     field: str | Path | RadianceField,
     output: str | Path,
@@ -343,7 +223,6 @@ def export_volume(
     return done
 
 
-@command("export torch-ngp", options=TorchNgpOptions, field=_FIELD, output=_FILE)
 def export_torch_ngp(
     field: str | Path | RadianceField,
     output: str | Path,
@@ -392,11 +271,7 @@ def _corner(values) -> str:
     return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
 
 
-# ---- Refinement ----
-#
-# ``nerg refine``: Find more closely where a radiance field holds matter, so that it renders faster.
-#
-# A finer bound on where a trained field holds matter, for checkpoints that were written without one.
+# ---- A finer bound on where a trained field holds matter, for checkpoints that were written without one ----
 
 
 @dataclass(frozen=True)
@@ -409,15 +284,6 @@ class Refinement:
     output: Path
 
 
-@command(
-    "refine",
-    "Find more closely where a trained field holds matter, so that it renders with fewer evaluations.",
-    more="Fields that are trained or imported now have it. Weights stay as they are, and gaze fields know the new "
-    "file.",
-    options=RefineOptions,
-    field=argument("Radiance field (.safetensors)."),
-    output=out("Radiance field to write (.safetensors)."),
-)
 def refine_checkpoint(
     field: str | Path, output: str | Path, options: RefineOptions | None = None, reporter: Reporter = SILENT
 ) -> Refinement:

@@ -1,9 +1,9 @@
-"""The place that gaze is tied to: of a training, and of a field that is evaluated, with the options of the latter."""
+"""The place that gaze is tied to: of a training, and of a field that is evaluated."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -14,37 +14,13 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import is_field
 from nerg_mi.maths.geometry import AnyBox, Similarity
 from nerg_mi.photos.salience import SalienceView
-from nerg_mi.ranges import DIRECTIONS, KAPPAS, SEEDS, THREADS, Checked, Range
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train import geometry
 from nerg_mi.train.geometry import GazePlace
 
 from .base import SILENT, Reporter
-from .options import PlaceOptions, option
-
-# ---- Options of the evaluation of a gaze field ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class GazeEvaluationOptions(Checked):
-    """What a gaze field is scored on. The place is the one that it was trained in."""
-
-    field: Path | None = option(None, "Radiance field, or splats, it was trained in. Default: its name, beside it.")
-    scene: Path | None = option(None, "Or: the Mitsuba scene.")
-    geometry: Path | None = option(None, "Or: the place of hit points (.vol).")
-    split: str | None = option(
-        None, "both: new positions and people; pos: new positions; people: new people. Default: both, or pos."
-    )
-    kappa: float = option(20.0, "Concentration of the kernel of truth and baselines.", within=KAPPAS)
-    blind_kappa: float = option(50.0, "That of the blind density which bits are counted from.", within=KAPPAS)
-    directions: int = option(2048, "Directions that maps are compared in.", within=DIRECTIONS)
-    min_rays: int = option(64, "Rays at a test position at least.", within=Range(1, 10**6))
-    resamples: int = option(200, "Of the people, for the intervals.", within=Range(0, 10**5))
-    pictures: int = option(4, "Test positions to draw.", within=Range(0, 10000))
-    seed: int = option(0, "Seed of rays, resamples and halves.", within=SEEDS)
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS, changes_result=False)
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
-
+from .gaze_commands import GazeEvaluationOptions
+from .options import PlaceOptions
 
 # ---- Gaze places ----
 #

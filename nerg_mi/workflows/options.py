@@ -1,45 +1,32 @@
 """Options of workflows: how one is declared, which are settings, too, and those that several workflows share.
 
-An option is a field that `option` makes of a dataclass, which stands beside its workflow: a notebook reads it there,
-and the command line makes its option of it.
+An option is a field that `option` makes of a dataclass, which stands where its command is declared: a notebook reads it
+there, and the command line makes its option of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.ranges import (
-    CHANGES_RESULT,
-    COORDINATES,
-    DECADES,
-    FLAG,
-    RANGE,
-    RATES,
-    SEEDS,
-    SPP,
-    VALUES,
-    Checked,
-    Range,
-    check_number,
-)
-
-# ---- Options ----
-#
-# Typed options of jobs: for each job a dataclass, frozen and of keywords alone.
-#
-# A field tells its meaning once, by ``option``: a notebook reads it here, and the command makes its option of it
-# (``nerg_mi.cli.building``).
-
+from nerg_mi.ranges import CHANGES_RESULT, COORDINATES, FLAG, RANGE, THREADS, Checked, Range, check_number
 
 # Key in the metadata of a field that `exposes` made.
 _EXPOSED = "nerg_mi.exposed"
 
 Base = TypeVar("Base")
 Class = TypeVar("Class", bound=type)
+
+
+class Derived(Checked):
+    """Base of options of which some are declared elsewhere, by `exposes` or `repeats`."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
 
 
 def option(
@@ -113,6 +100,26 @@ def exposed_options(options: Any) -> dict[str, Any]:
     return {name: value for name in names if (value := getattr(options, name)) is not None}
 
 
+def repeats(kind: type, *names: str) -> Callable[[Class], Class]:
+    """Decorator of a class, under ``dataclass``: gives it the options ``names`` of ``kind``, as they are there, which
+    `shared_options` reads again."""
+
+    def decorate(derived: Class) -> Class:
+        for name in names:
+            declared = kind.__dataclass_fields__[name]
+            derived.__annotations__[name] = declared.type
+            setattr(derived, name, declared)
+        return derived
+
+    return decorate
+
+
+def shared_options(options: Any, kind: type) -> dict[str, Any]:
+    """Keywords of the options ``kind``, for those that ``options`` repeat or have from the same base."""
+    declared = type(options).__dataclass_fields__
+    return {f.name: getattr(options, f.name) for f in fields(kind) if declared.get(f.name) is f}
+
+
 def as_base(options: Any, kind: type[Base]) -> Base:
     """The fields of ``options`` that the dataclass ``kind`` has, of which theirs is derived: who is given it cannot
     depend on the others."""
@@ -151,61 +158,33 @@ def parse_definitions(pairs: Iterable[str], flag: str) -> dict[str, str]:
     return values
 
 
+# ---- Options that many workflows have ----
+
+
 def definitions() -> Any:
     """The field ``defaults`` of options of what renders a scene: a mapping of texts, or None."""
     help = "Value for $KEY or a <default> of the scene; repeatable."
     return option(None, help, "-D", "--define", parse=parse_definitions, metavar="KEY=VALUE")
 
 
-# ---- Options of the rendering of a scene file, and of the demo's pictures ----
+def coordinates(help: str, *names: str) -> Any:
+    """A field of several coordinates, or None."""
+    return option(None, help, *names, parse=parse_numbers, within=COORDINATES)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PictureOptions(Checked):
-    """How a scene file is rendered."""
-
-    defaults: Mapping[str, str] | None = definitions()
-    sensor: int = option(0, "Index of the sensor, counted from 0.", "-s", "--sensor", within=Range(0, 65535))
-    mode: str | None = option(
-        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
-    )
-    spp: int = option(0, "Samples a pixel; 0: as the scene says.", within=Range(0, SPP.high))
-    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
-    threads: int = option(
-        0, "Worker threads; 0: one a core.", "-t", "--threads", within=Range(0, 1024), changes_result=False
-    )
-    memory: float = option(
-        1.0, "GB that rendering may take; larger pictures are made in bands.", within=Range(1e-6, 10**6)
-    )
-    overlay: str | None = option(
-        None, "AOV to lay over the colour, with its scale (.png, .svg, .mp4): gaze, kde, depth or any other."
-    )
-    top: float | None = option(
-        None, "Upper end of the overlay's scale, for gaze in 1/sr.  [default: the 99.5th percentile]", within=VALUES
-    )
-    cmap: str | None = option(
-        None, "Colour map of the overlay: inferno, magma, plasma, viridis, cividis.  [default: the overlay's own]"
-    )
-    decades: float = option(0.0, "Powers of ten that the overlay's scale spans; 0: a linear scale.", within=DECADES)
-    hatching: bool = option(True, "Hatch the overlay where nothing is known.")
-    frames: Path | None = option(
-        None, "Render a sequence: CSV file whose header names <default>s, a line of values for each picture."
-    )
-    fps: float = option(25.0, "Pictures a second of an .mp4.", within=RATES)
+def best_variant() -> Any:
+    """The field ``mode`` of options: a Mitsuba variant, or None for the best that works."""
+    return option(None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode")
 
 
-@dataclass(frozen=True, kw_only=True)
-class DemoOptions(Checked):
-    """Which pictures the demo makes."""
+def llvm_variant() -> Any:
+    """The field ``mode`` of options of what runs on the processor by default."""
+    return option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
 
-    scene: Path | None = option(None, "Scene file.  [default: the demo store's]")
-    defaults: Mapping[str, str] | None = definitions()
-    width: int = option(600, "Width of a picture in pixels; pictures are 3:2.", within=Range(3, 16384))
-    spp: int = option(8, "Samples a pixel.", within=Range(0, SPP.high))
-    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
-    mode: str | None = option(
-        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
-    )
+
+def cpu_threads(more: str = "") -> Any:
+    """The field ``threads`` of options."""
+    return option(None, f"CPU threads. Default: all{more}.", within=THREADS, changes_result=False)
 
 
 # ---- Options of jobs that are done in parts, each of which is kept ----
@@ -231,11 +210,6 @@ class PartOptions(Checked):
     def in_parts(self) -> bool:
         """Whether the job is to be done in parts at all."""
         return self.store is not None or self.scheduler is not None
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilmOptions(PictureOptions, PartOptions):
-    """How a scene file is rendered, in one go or in parts."""
 
 
 # ---- Options that say where people looked around ----

@@ -1,7 +1,4 @@
-"""``nerg jobs``: Say what is done of a long job, what is left and what is stale.
-
-Long workflows in parts: where parts run, and what is done, missing and stale in their store.
-"""
+"""Long workflows in parts: where parts run, and what is done, missing and stale in their store."""
 
 from __future__ import annotations
 
@@ -12,11 +9,11 @@ from pathlib import Path
 from nerg_mi.errors import NergError
 from nerg_mi.files.tables import markdown_table
 from nerg_mi.rendering.scene import files_of_scene
-from nerg_mi.tasks.engines import Output, Progress, open_engine, run_plan
+from nerg_mi.tasks.engines import Output, PlanProgress, open_engine, run_plan
 from nerg_mi.tasks.store import Account, JobAccount, Store, read_account, remove_stale
 from nerg_mi.tasks.task import Files, Plan
 
-from .base import SILENT, Reporter, argument, command, extra
+from .base import SILENT, Reporter
 from .options import PartOptions
 
 SUFFIX = ".tasks"
@@ -38,7 +35,7 @@ class Parts:
         """The outputs of ``plan`` in its order; see `run_plan`. Of the whole job this is from the share ``since`` to
         the share ``until``. Ctrl-C says where it goes on from."""
 
-        def show(progress: Progress) -> None:
+        def show(progress: PlanProgress) -> None:
             self._reporter.progress(since + (until - since) * progress.share, progress.line(until == 1.0))
 
         try:
@@ -75,14 +72,6 @@ class PlannedScene:
         return self.files.path
 
 
-@command(
-    "jobs",
-    "Say what is done of the jobs in a store, what is left, what it takes in bytes, and what is stale.",
-    more="Stale is what no job asks for any more as it was started last, and what was made of files that have changed "
-    "since.",
-    folder=argument("Store of a job: what was given as --store, or OUTPUT.tasks."),
-    remove=extra(False, "Take out what no job asks for any more, and what is left over.", bool, "--remove-stale"),
-)
 def account_for_store(folder: str | Path, remove: bool = False, reporter: Reporter = SILENT) -> Account:
     """Report the jobs in the store ``folder``: how far each is, what it takes, and which inputs have changed.
 

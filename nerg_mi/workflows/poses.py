@@ -1,7 +1,4 @@
-"""``nerg poses``: Find out from where photos, or frames of a video, were taken.
-
-Photos without poses, or a video, made a capture that can be trained on.
-"""
+"""Photos without poses, or a video, made a capture that can be trained on."""
 
 from __future__ import annotations
 
@@ -29,45 +26,11 @@ from nerg_mi.photos.structure import (
     reconstruct,
 )
 from nerg_mi.photos.video_frames import copy_frames
-from nerg_mi.ranges import SEEDS, THREADS, Checked, Range
 
-from .base import SILENT, Reporter, argument, command, out
-from .options import option
+from .base import SILENT, Reporter
+from .radiance_commands import PoseOptions
 
-# ---- Options of finding the poses of photos ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class PoseOptions(Checked):
-    """How the poses of photos are found."""
-
-    frames: int = option(
-        80, "Of a video: frames to take, each the sharpest of an equally long stretch.", within=Range(3, 10**6)
-    )
-    size: int = option(
-        960, "Longer side, in pixels, of the copies that features are found in.", within=Range(64, 65536)
-    )
-    matching: str = option(
-        "auto", "Pictures to compare: exhaustive (all), sequential (in order), auto (all up to 100, else in order)."
-    )
-    lens: str = option(
-        "auto",
-        "What is found of a lens: radial (f, k1), opencv (fx, fy, k1, k2, p1, p2), auto (opencv from 10 photos on).",
-    )
-    single_camera: bool = option(
-        True, "Photos of equal size (and maker, model, focal length, where told) share a camera; else each has its own."
-    )
-    allow_outside: bool = option(False, "Follow links that lead out of the folder of photos.")
-    orient: bool = option(True, "Turn the place so that up is +z, as far as cameras and a floor tell.")
-    seed: int = option(0, "Seed of what is drawn at random.", within=SEEDS)
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
-
-
-# ---- Poses ----
-#
-# ``nerg poses``: Find out from where photos, or frames of a video, were taken.
-#
-# Photos without poses, or a video, made a capture that can be trained on.
+# ---- Photos without poses, or a video, made a capture that can be trained on ----
 
 
 STAGES = {"pictures": 0.0, "features": 0.08, "matching": 0.25, "mapping": 0.65, "writing": 0.98}
@@ -98,14 +61,6 @@ class PosesResult:
     report: dict
 
 
-@command(
-    "poses",
-    "Find out from where photos were taken, or frames of a video, and write them as a capture for nerg train radiance.",
-    more='Needs pycolmap, and PyAV for videos: pip install "nerg-mi[poses]".',
-    options=PoseOptions,
-    pictures=argument("Folder of photos (JPEG, PNG), or a video.", metavar="PHOTOS|VIDEO"),
-    output=out("Folder to make: a capture with poses."),
-)
 def find_poses(
     pictures: str | Path, output: str | Path, options: PoseOptions | None = None, reporter: Reporter = SILENT
 ) -> PosesResult:

@@ -1,14 +1,4 @@
-"""``nerg rays import``: Convert tracking files to rays: right-handed, z up, metres, seconds.
-``nerg rays guess``: Propose the preset or the column map of unknown files: what is sure, what is a guess, what no file
-says.
-``nerg rays show``: The sanity card: rays, persons, duration, rate, what was dropped, extent, eye height.
-``nerg rays filter``: Keep some rays: conditions first, then fixations, then thinning of those who stand still.
-``nerg rays split``: Split into training and test rays that share none: by position, person, time, or several of them at
-once.
-``nerg rays plot``: The floor plan: where people stood and how densely, or the layout.
-
-Tracking files to rays: importing, filtering, splitting and plotting sets and datasets of them.
-"""
+"""Tracking files to rays: importing, filtering, splitting and plotting sets and datasets of them."""
 
 from __future__ import annotations
 
@@ -26,7 +16,6 @@ from nerg_mi.figures import maps, style
 from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_new_folder, check_writable, replacing_folder
 from nerg_mi.files.tables import write_json
-from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, Checked, Range
 from nerg_mi.rays import filters
 from nerg_mi.rays.dataset import MOST, RAY_BYTES, UNKNOWN, Conditions, RayDataset, is_dataset, merge_rays, write_head
 from nerg_mi.rays.dataset_open import load_rays, summarise_dataset
@@ -35,173 +24,20 @@ from nerg_mi.rays.guess import Proposal, propose_imports
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.quality import RaysSummary, card_table, summarise
 from nerg_mi.rays.rays import SUFFIXES, Rays
-from nerg_mi.rays.readers.registry import TABLE, parse_options, preset_names, read_rays, reader_named, shared_options
+from nerg_mi.rays.readers.registry import TABLE, parse_options, read_rays, reader_named
 
-from .base import SILENT, Parameter, Reporter, argument, command, extra, out
-from .options import option, parse_numbers
+from .base import SILENT, Reporter
+from .rays_commands import DATASET, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# ---- Rays ----
-#
-# Options of what is done to rays of attention: importing, filtering and splitting.
-
-
-DETECTORS = ("ivt", "idt")
-DATASET = ".rays"
-"""How the name of a dataset ends where one is written; any other name is that of a file."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportOptions(Checked):
-    """How tracking files become rays. Raises `NergError` for a salt without pseudonyms, and for what only a dataset
-    has."""
-
-    reader: str = option("table", "Name of a registered reader (nerg_mi.rays.readers.registry).")
-    settings: Any = option(None, "An object of the reader's Options. Default: as they are by default.")
-    place_name: str | None = option(None, "Of a dataset: the place of all files.  [default: unknown]")
-    day: str | None = option(
-        None, "Of a dataset: the day of all rays, as 2026-11-22.  [default: by their times, in UTC, else unknown]"
-    )
-    workers: int | None = option(
-        None, "Of a dataset: processes that import files beside each other.  [default: a core each]", within=THREADS
-    )
-    skip_bad_lines: bool = option(
-        False, "Leave out lines that cannot be read, with an account of them: at most 1 % of a file's."
-    )
-    pseudonyms: bool = option(False, "Replace the names of persons, also in the names of files, by salted hashes.")
-    salt: Path | str | None = option(
-        None,
-        "--pseudonyms: file of 16 random bytes or more, so that several imports agree.  [default: random, not kept]",
-    )
-    output: Path | str | None = option(None, "Rays file (.npz or .parquet) or dataset (.rays) to write.")
-    align_output: Path | str | None = option(
-        None,
-        "JSON file to write: the similarity from the rays to the files' own frame, for --align where a place is in "
-        "that frame.",
-        "--write-align",
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.salt is not None and not self.pseudonyms:
-            raise NergError("--salt belongs to --pseudonyms; add it, or leave out --salt")
-        given = [n for n in ("place_name", "day", "workers") if getattr(self, n) is not None]
-        if given and not self.into_dataset:
-            raise NergError(
-                f"--{given[0].replace('_', '-')} belongs to datasets; let the name of the output end in {DATASET}"
-            )
-        if self.align_output is not None and self.into_dataset:
-            raise NergError(
-                "--write-align belongs to files of rays; the sources of a dataset may differ in their frames"
-            )
-
-    @property
-    def into_dataset(self) -> bool:
-        """Whether a dataset is to be written."""
-        return self.output is not None and Path(self.output).suffix.lower() == DATASET
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilterOptions(Checked):
-    """Which rays to keep: conditions first, then fixations, then fewer of those who stand still.
-
-    Raises `NergError` for an unknown word, or where nothing is said.
-    """
-
-    start: float | None = option(None, "Rays from this time on, seconds.", "--from", within=TIMES)
-    end: float | None = option(None, "Rays before this time, seconds.", "--to", within=TIMES)
-    persons: tuple[str, ...] = option((), "Only this person; repeatable.", "--person")
-    without_persons: tuple[str, ...] = option((), "Not this person; repeatable.", "--without-person")
-    cohorts: tuple[str, ...] = option((), "Only this cohort; repeatable.", "--cohort")
-    box: tuple[float, ...] | None = option(
-        None, "Origins in this box: x0,x1,y0,y1,z0,z1, metres.", parse=parse_numbers, within=COORDINATES
-    )
-    min_confidence: float | None = option(None, "Only rays of at least this confidence.", within=Range(0, 1))
-    with_hit: bool = option(False, "Only rays whose hit point is known.")
-    fixations: str | None = option(None, "Only rays of fixations: ivt (by velocity) or idt (by dispersion).")
-    velocity: float = option(100.0, "ivt: degrees a second that end a fixation.", within=Range(0, 10**6))
-    dispersion: float = option(3.0, "idt: degrees within which a fixation stays.", within=Range(0, 180))
-    least: float | None = option(None, "Shortest fixation, seconds.  [default: ivt 0.06, idt 0.1]", within=SECONDS)
-    one_ray: bool = option(False, "One ray a fixation, its mean.")
-    thin: float | None = option(None, "A stop counts as at most this many seconds of rays.", within=SECONDS)
-    thin_distance: float = option(0.1, "With --thin, a stop is a stay within this many metres.", within=Range(0, 10**6))
-    sample: int | None = option(None, "So many of the rays that are left, each as likely as any other.", within=RAYS)
-    seed: int = option(0, "Seed of --sample.", within=SEEDS)
-    output: Path | str | None = option(
-        None, "Rays file to write (.npz or .parquet), or of a dataset another (.rays).", "-o", "--output"
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.fixations not in (None, *DETECTORS):
-            raise NergError(f'--fixations is "{self.fixations}"; it is ivt or idt')
-        if self.one_ray and self.fixations is None:
-            raise NergError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
-        if not self.conditions and not self.follows and self.sample is None:
-            raise NergError(
-                "say which rays to keep, for instance with --from, --person, --box, --fixations, --thin or --sample "
-                "(--help lists all)"
-            )
-
-    @property
-    def follows(self) -> bool:
-        """Whether it is asked for what must see the rays of a person one after the other."""
-        return self.fixations is not None or self.thin is not None
-
-    @property
-    def conditions(self) -> dict[str, Any]:
-        """What was asked for, as `nerg_mi.rays.filters.select_mask` takes it."""
-        what = {
-            "time": None if self.start is None and self.end is None else (self.start, self.end),
-            "persons": list(self.persons) or None,
-            "without_persons": list(self.without_persons) or None,
-            "cohorts": list(self.cohorts) or None,
-            "box": None if self.box is None else list(self.box),
-            "min_confidence": self.min_confidence,
-            "with_hit": self.with_hit or None,
-        }
-        return {name: value for name, value in what.items() if value is not None}
-
-
-@dataclass(frozen=True, kw_only=True)
-class SplitOptions(Checked):
-    """How training and test rays are parted: by position, person or time, or several of them at once.
-
-    Raises `NergError` where nothing is said.
-    """
-
-    zones: int = option(0, "By position: zones held out; 0: not by position.", within=Range(0, 1000))
-    radius: float = option(
-        0.25, "By position: R of probes, metres; rays within 2R of a test position are purged.", within=LENGTHS
-    )
-    zone_radius: float = option(0.2, "By position: radius of a zone, metres.", within=Range(0, 10**6))
-    positions: int = option(150, "By position: test positions in the zones.", within=Range(1, 10**5))
-    min_rays: int = option(64, "By position: rays that a test position has within R.", within=Range(1, 10**6))
-    people: float = option(0.0, "By person: share held out, at random; 0: not by person.", within=Range(0, 1))
-    persons: tuple[str, ...] = option((), "By person: this one is held out; repeatable.", "--person")
-    time: float = option(0.0, "By time: share at the end that is held out; 0: not by time.", within=Range(0, 1))
-    gap: float = option(5.0, "By time: seconds purged before the end part.", within=SECONDS)
-    clock: str = option("all", "By time: all (one clock), or person (each their own).")
-    seed: int = option(0, "Seed of zones, positions and people.", within=SEEDS)
-    train_output: Path | str | None = option(None, "Rays file to write of the training rays (.npz or .parquet).")
-    test_output: Path | str | None = option(None, "The same of the test rays.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not (self.zones or self.people or self.persons or self.time):
-            raise NergError("say how to split: --zones 3, --people 0.5, --person NAME, --time 0.2, or several of them")
-
-
-# ---- Filtering ----
-#
-# What a filter does to rays, step by step: conditions, fixations, thinning, a sample.
+# ---- What a filter does to rays, step by step: conditions, fixations, thinning, a sample ----
 
 
 @dataclass(frozen=True)
-class Step:
+class FilterStep:
     """A step that was taken: what the metadata of rays keep of it."""
 
     name: str
@@ -218,7 +54,7 @@ class FilterSteps:
     """
 
     def __init__(self, rays: Rays, *, own: bool, reporter: Reporter = SILENT, strict: bool = True) -> None:
-        self.rays, self.taken = rays, list[Step]()
+        self.rays, self.taken = rays, list[FilterStep]()
         self._own, self._reporter, self._strict = own, reporter, strict
 
     def select(self, conditions: dict[str, Any]) -> None:
@@ -262,7 +98,7 @@ class FilterSteps:
         before = len(self.rays)
         rays = filters.fixation_rays(self.rays, label)[0] if before else self.rays
         self._reporter.message(f"fixations: one ray each, {len(rays):,} of {before:,} rays")
-        self._take(rays, Step("fixations", len(rays), before, about))
+        self._take(rays, FilterStep("fixations", len(rays), before, about))
 
     def _keep(self, mask: np.ndarray, name: str, about: dict[str, Any]) -> None:
         """Keep the rays of a mask (N,); in their own memory, if nobody else holds them."""
@@ -271,9 +107,9 @@ class FilterSteps:
             raise NergError(f"{name} leaves none of {len(rays):,} rays; widen its conditions")
         self._reporter.message(f"{name}: {count:,} of {len(rays):,} rays")
         kept = rays.keep_in_place(mask) if self._own else rays.select(mask)
-        self._take(kept, Step(name, count, len(rays), about))
+        self._take(kept, FilterStep(name, count, len(rays), about))
 
-    def _take(self, rays: Rays, step: Step) -> None:
+    def _take(self, rays: Rays, step: FilterStep) -> None:
         self.rays = rays.with_step(step=step.name, kept=step.kept, of=step.of, **step.about)
         self._own = True
         self.taken.append(step)
@@ -287,16 +123,14 @@ def least_mask(lot: np.ndarray, n: int) -> np.ndarray:
     return mask
 
 
-# ---- Datasets ----
-#
-# Datasets of rays: tracking files imported into one, its sanity cards, and some of its rays.
+# ---- Datasets of rays: tracking files imported into one, its sanity cards, and some of its rays ----
 
 
 FileName = str | os.PathLike
 Card = tuple[Rays, RaysSummary, tuple[tuple[str, str], ...]]
 
 
-def import_dataset(files: Sequence[FileName], options: ImportOptions, reporter: Reporter) -> Card:
+def import_dataset(files: Sequence[FileName], options: RaysImportOptions, reporter: Reporter) -> Card:
     """Import ``files`` into the dataset ``options.output``, each unless it is there unchanged; the card of their place.
 
     Raises `NergError` where some could not be imported, after the others were.
@@ -383,12 +217,12 @@ class _Totals:
     """The steps of all blocks together."""
 
     def __init__(self, count: int) -> None:
-        self._count, self._steps, self.fixations = count, list[Step](), None
+        self._count, self._steps, self.fixations = count, list[FilterStep](), None
 
     def filtered(self, dataset: RayDataset, options: FilterOptions) -> Iterator[Rays]:
         """What is left of each part of ``dataset``."""
         conditions = Conditions(**options.conditions)
-        selected = Step("filter", 0, self._count, options.conditions)
+        selected = FilterStep("filter", 0, self._count, options.conditions)
         for block in dataset.scan(conditions, whole=options.follows):
             steps = FilterSteps(block, own=True, strict=False)
             count = steps.follow(options)
@@ -399,17 +233,17 @@ class _Totals:
             if len(steps.rays):
                 yield steps.rays
 
-    def add(self, taken: list[Step]) -> None:
+    def add(self, taken: list[FilterStep]) -> None:
         """Add the steps of one block."""
         before = self._steps or [replace(step, kept=0, of=0) for step in taken]
         self._steps = [replace(a, kept=a.kept + b.kept, of=a.of + b.of) for a, b in zip(before, taken)]
 
-    def add_last(self, step: Step) -> None:
+    def add_last(self, step: FilterStep) -> None:
         """Add a step that was taken by all blocks together."""
         self._steps.append(step)
 
     @property
-    def steps(self) -> list[Step]:
+    def steps(self) -> list[FilterStep]:
         """Those of all blocks; what met conditions is of all rays, of which many were not read."""
         return [replace(step, of=self._count) if step.name == "filter" else step for step in self._steps]
 
@@ -450,7 +284,7 @@ def _sampled(dataset: RayDataset, options: FilterOptions, steps: _Totals) -> lis
             held, lots = _least(held, lots, n)
             limit = max(float(lot.max()) for lot in lots if len(lot))
     held, _ = _least(held, lots, n)
-    steps.add_last(Step("sample", min(n, count), count, {"seed": options.seed}))
+    steps.add_last(FilterStep("sample", min(n, count), count, {"seed": options.seed}))
     return held
 
 
@@ -475,22 +309,7 @@ def _write_filtered(dataset: RayDataset, options: FilterOptions, steps: _Totals,
         writers[source.id].finish(metadata, **kept)
 
 
-# ---- Tracking ----
-#
-# ``nerg rays import``: Convert tracking files to rays: right-handed, z up, metres, seconds. ``nerg rays guess``:
-# Propose the preset or the column map of unknown files: what is sure, what is a guess, what no file says. ``nerg rays
-# show``: The sanity card: rays, persons, duration, rate, what was dropped, extent, eye height. ``nerg rays filter``:
-# Keep some rays: conditions first, then fixations, then thinning of those who stand still. ``nerg rays split``: Split
-# into training and test rays that share none: by position, person, time, or several of them at once. ``nerg rays
-# plot``: The floor plan: where people stood and how densely, or the layout.
-#
-# Rays of attention from tracking files, and what is done to them: imported, summed up, filtered, split, drawn.
-
-
-KINDS = ("density", "layout")
-
-_RAYS_FILE = argument("Rays file (.npz or .parquet), or dataset (a folder).")
-_OUTPUT = out("Rays file (.npz or .parquet) or dataset (.rays) to write.")
+# ---- Rays of attention from tracking files, and what is done to them: imported, summed up, filtered, split, drawn ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -507,14 +326,14 @@ class ImportResult:
 
 
 def import_rays(
-    files: FileName | Sequence[FileName], options: ImportOptions | None = None, reporter: Reporter = SILENT
+    files: FileName | Sequence[FileName], options: RaysImportOptions | None = None, reporter: Reporter = SILENT
 ) -> ImportResult:
     """Tracking files (or folders, by the reader) as rays: right-handed, z up, metres, seconds.
 
     Raises `NergError` for what the reader refuses, or an output that cannot be written, before anything is read; for an
     alignment with files whose frame is the other hand's.
     """
-    options = options or ImportOptions()
+    options = options or RaysImportOptions()
     files = [files] if isinstance(files, (str, os.PathLike)) else list(files)
     if options.into_dataset:
         return ImportResult(*import_dataset(files, options, reporter))
@@ -549,24 +368,8 @@ def _to_files(rays: Rays) -> list[list[float]]:
     return (back + 0.0).tolist()
 
 
-def _reader_parameters() -> dict[str, Parameter]:
-    """The options of all readers that are registered now."""
-    parameters = {"preset": extra(None, f"Known recording: {', '.join(preset_names())}.", str, "--preset")}
-    for o in shared_options():
-        parameters[o.name] = extra(False if o.kind is bool else None, o.help, o.kind, o.flag)
-    return parameters
-
-
-@command(
-    "rays import",
-    options=ImportOptions,
-    without=("reader", "settings"),
-    further=_reader_parameters,
-    files=argument("Tracking files (CSV, CSV.gz, Parquet or skeleton files; for pupil, folders).", list[Path]),
-    output=_OUTPUT,
-)
 def import_files(
-    files: list[Path], preset: str | None, options: ImportOptions, reporter: Reporter, **settings: Any
+    files: list[Path], preset: str | None, options: RaysImportOptions, reporter: Reporter, **settings: Any
 ) -> None:
     """`import_rays` by a preset, or by a column map, with the sanity card."""
     settings = {name: value for name, value in settings.items() if value is not None and value is not False}
@@ -590,12 +393,6 @@ def guess_imports(files: Sequence[FileName], reporter: Reporter = SILENT) -> lis
     return propose_imports([Path(file) for file in files])
 
 
-@command(
-    "rays guess",
-    more="Nothing is imported: the whole command is printed, one for all files that are alike, for you to check and to "
-    "run.",
-    files=argument("Unknown tracking files, folders of them, or folders of recordings.", list[Path]),
-)
 def print_guesses(files: list[Path], reporter: Reporter) -> None:
     """`guess_imports` in words. Names of columns are printed without control characters of a terminal."""
     proposals = guess_imports(files, reporter)
@@ -619,11 +416,6 @@ def card_of(path: FileName, reporter: Reporter = SILENT) -> list[tuple[str, Impo
     return [(title, ImportResult(*card)) for title, card in dataset_cards(path)]
 
 
-@command(
-    "rays show",
-    more="Of a dataset one for each place; of very many rays some figures are of a sample, as it says.",
-    rays=_RAYS_FILE,
-)
 def print_cards(rays: Path, reporter: Reporter) -> None:
     """`card_of` as tables."""
     for title, card in card_of(rays, reporter):
@@ -639,7 +431,6 @@ class FilterResult:
     fixations: int | None
 
 
-@command("rays filter", options=FilterOptions, rays=_RAYS_FILE, output=_OUTPUT)
 def filter_rays(rays: Rays | FileName, options: FilterOptions, reporter: Reporter = SILENT) -> FilterResult:
     """Some of the rays; each step is noted in their metadata. ``rays``: those, or a file of them.
 
@@ -713,15 +504,6 @@ def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter 
     return result
 
 
-@command(
-    "rays split",
-    more="Of several, training rays are on the training side of each and test rays on the test side of each; the rest "
-    "is purged.",
-    options=SplitOptions,
-    without=("train_output", "test_output"),
-    rays=_RAYS_FILE,
-    output=out("Rays file; -train and -test are put before its ending."),
-)
 def split_file(rays: Path, output: Path, options: SplitOptions, reporter: Reporter) -> None:
     """`split_rays` of a file, to two files beside each other."""
     train, test = (output.with_name(f"{output.stem}-{side}{output.suffix}") for side in ("train", "test"))
@@ -730,28 +512,9 @@ def split_file(rays: Path, output: Path, options: SplitOptions, reporter: Report
     _tell_tracking(test, reporter)
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlotOptions(Checked):
-    """What a floor plan shows. Raises `NergError` for an unknown word, or test rays beside densities."""
-
-    kind: str = option("density", "density: rays/m² with mean directions; layout: each ray's place, with dimensions.")
-    cell: float | None = option(
-        None, "density: edge of a cell, metres.  [default: a fiftieth of the plan]", within=LENGTHS
-    )
-    test: Rays | Path | str | None = option(None, "layout: the test rays of a split, drawn beside.")
-    output: Path | str | None = option(None, "Picture to write (.png or .svg).", "-o", "--output")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.kind not in KINDS:
-            raise NergError(f'--kind is "{self.kind}"; it is density or layout')
-        if self.kind == "density" and self.test is not None:
-            raise NergError("--test is drawn in the layout; add --kind layout")
-
-
-@command("rays plot", options=PlotOptions, rays=_RAYS_FILE, output=out("Picture to write (.png or .svg)."))
-def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions(), reporter: Reporter = SILENT) -> Figure:
+def plot_rays(rays: Rays | FileName, options: PlotOptions | None = None, reporter: Reporter = SILENT) -> Figure:
     """The floor plan of rays, or of a file of them, as a figure of matplotlib."""
+    options = options or PlotOptions()
     reporter.progress(0.0, "drawing rays")
     if options.output is not None:
         check_writable(options.output, *style.FORMATS)

@@ -1,16 +1,17 @@
-"""Rendering a scene file to a picture, with overlays of its AOVs."""
+"""Rendering a scene file to one picture or a sequence, as frames or a video, with overlays, in one go or in parts."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.figures import style
 from nerg_mi.figures.overlay import Limits, Overlay, OverlayLayers, Style, find_overlay, shared_limits
 from nerg_mi.figures.style import Provenance, find_colors, provenance, rasterize, save
-from nerg_mi.files.atomic import check_writable, write_bytes
+from nerg_mi.files.atomic import check_writable, replacing, write_bytes
+from nerg_mi.files.safe_read import read_npy
 from nerg_mi.files.video import check_video, video_frames
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering import bands
@@ -31,7 +33,12 @@ from nerg_mi.transport.aovs import AOVS
 from nerg_mi.transport.observer import center
 
 from .base import SILENT, Reporter
-from .options import PictureOptions
+from .options import as_base
+from .scene_commands import FilmOptions, PictureOptions
+
+if TYPE_CHECKING:
+    from .parts import Parts, PlannedScene
+
 
 # ---- Pictures with a quantity laid over their colour, alone or as a sequence with one scale ----
 
@@ -40,7 +47,7 @@ BYTES_PER_PIXEL = 400
 
 
 @dataclass(frozen=True)
-class Picture:
+class RenderedPicture:
     """``size`` (width, height) in pixels, number of ``channels``, and why it was not divided, as `PictureResult` has
     them."""
 
@@ -54,7 +61,7 @@ OVERLAY_FORMATS = (*style.FORMATS, ".mp4")
 OnStrip = Callable[[int, int], None]
 """Is told how many samples are done, and of how many."""
 
-Make = Callable[[Any, Any, OnStrip], Picture]
+Make = Callable[[Any, Any, OnStrip], RenderedPicture]
 """Makes a picture of a scene, a sensor, and a function that is told of each strip."""
 
 
@@ -88,9 +95,9 @@ def overlay_pictures(
     frames: Sequence[Mapping[str, str]],
     write: Callable[[Any], None],
     options: PictureOptions,
-    render: Callable[[Mapping[str, str], Make], Picture],
+    render: Callable[[Mapping[str, str], Make], RenderedPicture],
     stop: Interruption,
-) -> tuple[Picture, float | None]:
+) -> tuple[RenderedPicture, float | None]:
     """Give ``write`` a figure with the overlay of ``options`` for each of ``frames``, values of `<default>`s of the
     scene file ``path``, one after the other. Gives the last one, and the upper end of the scale of all, None where
     there is none.
@@ -101,7 +108,7 @@ def overlay_pictures(
     overlay = find_overlay(options.overlay or "")
     style = style_of(options)
     limits: list[Limits] = []
-    last = Picture((0, 0), 0)
+    last = RenderedPicture((0, 0), 0)
     waits = shares_a_scale(overlay, len(frames), options)
 
     def finish(layers: OverlayLayers, ends: Limits) -> None:
@@ -112,7 +119,7 @@ def overlay_pictures(
     with tempfile.TemporaryDirectory() as folder:
         kept: list[tuple[Path, tuple[int, ...], Any, bool, str]] = []
 
-        def make(loaded: Any, camera: Any, on_strip: OnStrip) -> Picture:
+        def make(loaded: Any, camera: Any, on_strip: OnStrip) -> RenderedPicture:
             check_memory(path, camera, options)
             layers = layers_of(path, loaded, camera, overlay, options.spp, options.seed, on_strip)
             limits.append(overlay.limits(layers))
@@ -124,7 +131,7 @@ def overlay_pictures(
                 kept.append((file, array.shape, layers.marker, layers.supported, layers.basis))
             else:
                 finish(layers, shared_limits(limits[-1:], options.top))
-            return Picture((width, height), 3)
+            return RenderedPicture((width, height), 3)
 
         for frame in frames:
             last = render(frame, make)
@@ -313,7 +320,7 @@ def render_file(
     if options.threads:
         set_thread_count(options.threads)
     start, pace = time.perf_counter(), SamplePace()
-    done, top, picture = 0, None, Picture((0, 0), 0)
+    done, top, picture = 0, None, RenderedPicture((0, 0), 0)
     with Interruption() as stop:
 
         def on_strip(part: int, total: int) -> None:
@@ -323,7 +330,7 @@ def render_file(
             speed = f"{part / seconds:,.0f} samples/s" if len(frames) == 1 else f"{done} of {len(frames)} pictures"
             reporter.progress(share, f"{speed}, {seconds * (1 - share) / share:.0f} s left")
 
-        def render(frame: Mapping[str, str], make: Make) -> Picture:
+        def render(frame: Mapping[str, str], make: Make) -> RenderedPicture:
             nonlocal done
             loaded = load_scene(scene, {**(options.defaults or {}), **frame})
             stop.check()
@@ -416,7 +423,7 @@ def _picture(
     loaded: Any,
     camera: Any,
     on_strip: OnStrip,
-) -> Picture:
+) -> RenderedPicture:
     """Render what ``camera`` sees, and ``write`` it."""
     width, height = map(int, camera.film().crop_size())
     rows = bands.rows_for(loaded, camera, 1e9 * options.memory - resident_bytes() - RESERVE)
@@ -445,7 +452,7 @@ def _picture(
 
     with mitsuba_says():
         write(to_file, pixels)
-    return Picture((width, height), channels, whole)
+    return RenderedPicture((width, height), channels, whole)
 
 
 def sensor_of(path: Path, scene, index: int):
@@ -473,3 +480,157 @@ def resident_bytes() -> int:
         import sys
 
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+# ---- Rendering sequences of pictures, as frames or a video, whole or in parts ----
+
+
+_LAYERS_SHARE = 0.8
+"""How much of a film with a common scale is rendering; the rest is drawing."""
+
+
+def render_film(
+    scene: str | Path, output: str | Path, options: FilmOptions | None = None, reporter: Reporter = SILENT
+) -> PictureResult:
+    """Render the scene file ``scene`` to ``output``, as `render_file` does, and to the same bytes.
+
+    With ``options.store`` or ``options.scheduler`` each picture of a sequence is a part, which is kept and not rendered
+    again: whatever ended the job, the same call goes on. A picture depends on the scene, on the files that it names, on
+    its own values and on the options, and on nothing else: those whose inputs have changed are rendered again. The
+    reporter hears the progress of either.
+    """
+    options = options or FilmOptions()
+    if not options.in_parts:
+        return render_file(scene, output, options, reporter)
+    # A single picture needs neither time nor memory for it.
+    from .parts import Parts
+
+    scene, output = Path(scene), Path(output)
+    asked = asked_pictures(scene, output, options)
+    parts = Parts(options, output, reporter, options.threads)
+    reporter.progress(0.0, "reading the scene")
+    mode = activate(options.mode)
+    if options.threads:
+        set_thread_count(options.threads)
+    start = time.perf_counter()
+    first, top = _rendered(scene, asked, replace(options, mode=mode), parts)
+    size, channels = (int(first["size"][0]), int(first["size"][1])), int(first.get("channels", 3))
+    seconds = time.perf_counter() - start
+    result = PictureResult(asked.files[0], size, channels, mode, seconds, first.get("whole"), tuple(asked.files), top)
+    reporter.message(account(result, asked, options))
+    reporter.message(f"The parts are kept in {parts.store.folder}; nerg jobs says what they take.")
+    return result
+
+
+def _rendered(
+    scene: Path, asked: AskedPictures, options: FilmOptions, parts: Parts
+) -> tuple[Mapping[str, Any], float | None]:
+    """Make all pictures. Gives the notes of the last, and the upper end of the overlays' scale."""
+    from nerg_mi.tasks.task import Part, Plan
+
+    from .parts import PlannedScene
+
+    suffix = ".png" if asked.video else asked.files[0].suffix.lower()
+    what = f"nerg render {os.path.abspath(asked.files[0])}"
+    of_each = picture_options(options)
+    frames = [
+        Part(PlannedScene.of(scene, {**(options.defaults or {}), **frame}), f"picture {k + 1}")
+        for k, frame in enumerate(asked.frames)
+    ]
+    overlay = None if options.overlay is None else find_overlay(options.overlay)
+    if overlay is None or not shares_a_scale(overlay, len(frames), options):
+        last = _write(scene, asked, options, parts, Plan(what, make_picture, of_each, frames, suffix), 0.0)
+        return last, last.get("top")
+    # All are rendered, then the scale of all is known, and each is drawn by it.
+    layers = list(parts.run(Plan(f"{what} (values)", make_layers, of_each, frames, ".npy"), 0.0, _LAYERS_SHARE))
+    limits = [None if made.notes["limits"] is None else tuple(made.notes["limits"]) for made in layers]
+    ends = shared_limits(limits, options.top)
+    overlay.check_limits(ends)
+    drawings = []
+    for k, (frame, made) in enumerate(zip(asked.frames, layers)):
+        header = {}
+        if not asked.video:
+            header = next(provenances(scene, [frame], options, str(options.mode), False)).text()
+        notes = {name: made.notes[name] for name in ("marker", "supported", "basis")}
+        drawings.append(Part(LayersToDraw(made.path, ends, **notes, header=header), f"drawing {k + 1}"))
+    _write(scene, asked, options, parts, Plan(what, draw_layers, of_each, drawings, suffix), _LAYERS_SHARE)
+    return layers[-1].notes, None if ends is None else ends[1]
+
+
+def _write(
+    scene: Path, asked: AskedPictures, options: FilmOptions, parts: Parts, plan: Any, since: float
+) -> Mapping[str, Any]:
+    """Bring the outputs of ``plan`` to where they belong, one after the other. Gives the notes of the last."""
+    last: Mapping[str, Any] = {}
+    arriving = parts.run(plan, since)
+    if not asked.video:
+        for file, made in zip(asked.files, arriving):
+            last = made.notes
+            with replacing(file) as temporary:
+                shutil.copyfile(made.path, temporary)
+        return last
+    import mitsuba as mi
+
+    headers = provenances(scene, asked.frames, options, str(options.mode), True)
+    with video_frames(asked.files[0], options.fps, next(headers).text()) as add:
+        for made in arriving:
+            last = made.notes
+            add(np.array(mi.Bitmap(str(made.path)))[..., :3])
+    return last
+
+
+# ---- Parts ----
+
+
+def picture_options(options: PictureOptions) -> PictureOptions:
+    """The ``options`` of a single picture: a part has the values of its frame itself, and belongs to any video."""
+    return replace(as_base(options, PictureOptions), defaults=None, frames=None, fps=PictureOptions().fps)
+
+
+def make_picture(options: PictureOptions, scene: PlannedScene, output: Path) -> dict[str, Any]:
+    """A picture file, as `render_file` writes it."""
+    made = render_file(scene.checked(), output, replace(options, defaults=scene.defaults))
+    return {"size": made.size, "channels": made.channels, "whole": made.whole, "top": made.top}
+
+
+def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> dict[str, Any]:
+    """A picture's colour and overlay as they are before they are drawn (.npy), with what a scale is made of."""
+    path = scene.checked()
+    activate(options.mode)
+    overlay = find_overlay(options.overlay or "")
+    with Interruption() as stop:
+        loaded = load_scene(path, scene.defaults)
+        camera = sensor_of(path, loaded, options.sensor)
+        check_memory(path, camera, options)
+        layers = layers_of(path, loaded, camera, overlay, options.spp, options.seed, lambda *_: stop.check())
+        stop.check()
+    with replacing(output) as temporary, temporary.open("wb") as out:
+        np.save(out, stacked(layers))
+    height, width = layers.mask.shape
+    return {
+        "size": (width, height),
+        "limits": overlay.limits(layers),
+        "marker": layers.marker,
+        "supported": bool(layers.supported),
+        "basis": layers.basis,
+    }
+
+
+@dataclass(frozen=True)
+class LayersToDraw:
+    """``layers`` (.npy) that `make_layers` made, with its notes; ``ends`` of the scale; ``header`` of the file."""
+
+    layers: Path
+    ends: Limits
+    marker: Sequence[float] | None
+    supported: bool
+    basis: str
+    header: Mapping[str, str]
+
+
+def draw_layers(options: PictureOptions, drawing: LayersToDraw, output: Path) -> None:
+    """The figure of a picture's layers."""
+    marker = None if drawing.marker is None else (drawing.marker[0], drawing.marker[1])
+    layers = unstacked(read_npy(drawing.layers, "layers"), marker, drawing.supported, drawing.basis)
+    figure = find_overlay(options.overlay or "").draw(layers, drawing.ends, style_of(options))
+    save(figure, output, drawing.header)

@@ -1,7 +1,4 @@
-"""``nerg report``: Write a report on a gaze field: one HTML file with a verdict, pictures, scores and the place in 3D.
-
-The report on a gaze field: its inputs, scores, pictures and surroundings, computed and written as HTML.
-"""
+"""The report on a gaze field: its inputs, scores, pictures and surroundings, computed and written as HTML."""
 
 from __future__ import annotations
 
@@ -29,7 +26,6 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.ranges import COORDINATES, FIELDS_OF_VIEW, SEEDS, SPP, THREADS, Checked, Range
 from nerg_mi.rays.dataset import is_dataset
 from nerg_mi.rays.dataset_open import load_rays, rays_digest
 from nerg_mi.rays.quality import summarise
@@ -63,59 +59,14 @@ from nerg_mi.train.geometry import GazePlace
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.observer import center
 
-from .base import SILENT, Reporter, argument, command, out, select_backend, versions
+from .base import SILENT, Reporter, Silent, select_backend, versions
 from .evaluate import evaluate_gaze
-from .geometry import GazeEvaluationOptions
-from .options import option, parse_numbers
+from .gaze_commands import GazeEvaluationOptions
 from .render import basis_words, is_supported
-from .scene import SceneOptions, SceneResult, write_scene
+from .scene import SceneResult, write_scene
 from .scene_cameras import support_of_rays, to_place
+from .scene_commands import ReportOptions, SceneOptions
 from .scene_places import KINDS, PLACES, GivenFiles, kind_of_file, recognise
-
-# ---- Options of the report on a gaze field ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReportOptions(Checked):
-    """What a report shows. Positions are in the coordinates of the place."""
-
-    objects: Path | None = option(None, 'JSON file of named objects: {"shelf": [[x0, y0, z0], [x1, y1, z1]], ...}.')
-    evaluate: bool = option(
-        False, "Score the field on the rays that were held out of its training (about a minute a split)."
-    )
-    names: bool = option(False, "Show the names of people. Without it they are numbered.")
-    min_persons: int = option(1, "Hide shares of objects that fewer people could see.", within=Range(1, 10**6))
-    paths: bool = option(True, "Draw people's paths in 3D. How somebody walks can tell who it is.")
-    title: str | None = option(None, "Title.  [default: the gaze field's name]")
-    observer: tuple[float, ...] | None = option(
-        None,
-        "Position of the observer in the pictures, x,y,z.  [default: where most rays are]",
-        parse=parse_numbers,
-        within=COORDINATES,
-    )
-    camera_from: tuple[float, ...] | None = option(
-        None,
-        "Position of the camera, x,y,z.  [default: the best overview]",
-        "--from",
-        parse=parse_numbers,
-        within=COORDINATES,
-    )
-    camera_to: tuple[float, ...] | None = option(
-        None, "Point that it looks at, x,y,z.", "--to", parse=parse_numbers, within=COORDINATES
-    )
-    fov: float | None = option(
-        None, "Degrees between the left and right border of its picture.  [default: 70]", within=FIELDS_OF_VIEW
-    )
-    eyes: int = option(200, "Places of people from which objects are looked for.", within=Range(1, 10_000))
-    points: int = option(80_000, "Points of the 3D scene at most.", within=Range(100, 100_000))
-    width: int = option(480, "Width of the pictures in pixels.", within=Range(24, 1200))
-    spp: int = option(2, "Samples a pixel.", within=SPP)
-    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
-    mode: str | None = option(
-        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
-    )
-
 
 # ---- What the files are that a report is made of, found from the files themselves ----
 
@@ -305,9 +256,7 @@ def _png(display: np.ndarray, text: Mapping[str, str]) -> bytes:
     return encode_png(mi.Bitmap(to_bytes(display)), text)
 
 
-# ---- Results ----
-#
-# The evaluations that a report shows: those that were given, and those that are made for it.
+# ---- The evaluations that a report shows: those that were given, and those that are made for it ----
 
 
 def given_results(given: ReportFiles) -> tuple[list[GazeResults], list[str]]:
@@ -471,11 +420,7 @@ def setting_words(options: ReportOptions) -> dict[str, str]:
     }
 
 
-# ---- Report ----
-#
-# ``nerg report``: Write a report on a gaze field: one HTML file with a verdict, pictures, scores and the place in 3D.
-#
-# A report on a gaze field: one HTML file of its place, people, gaze, objects, scores, limits and provenance.
+# ---- A report on a gaze field: one HTML file of its place, people, gaze, objects, scores, limits and provenance ----
 
 
 VIEWS = ("camera", "own", "sphere")
@@ -496,21 +441,6 @@ class ReportResult:
     run: Run
 
 
-@command(
-    "report",
-    "Write a report on a gaze field: one HTML file that opens from disk and needs no network.",
-    more="""It shows the place, the data, where people were, the gaze, named objects, the scores beside their baselines
-with a verdict in a sentence, uncertainty, settings, limits, provenance and the place in 3D. What is missing is left
-out, and said so.""",
-    options=ReportOptions,
-    files=argument(
-        "In any order: a gaze field, and what there is of its place, rays, evaluations (gaze.json, or the folder of "
-        "nerg eval gaze); a folder stands for what lies in it.",
-        list[Path],
-        metavar="RUN",
-    ),
-    output=out("File to write (.html).", default=Path("report.html")),
-)
 def make_report(
     files: Sequence[str | Path],
     output: str | Path,
@@ -534,7 +464,7 @@ def make_report(
     if options.evaluate:
         results += made_results(given, options, results, reporter)
     with Interruption() as stop:
-        work = _Work(given, ns, options, reporter, stop)
+        work = _ReportWork(given, ns, options, reporter, stop)
         run = work.run(areas, results, doubts, rendered)
     write_text(output, page(run))
     size = output.stat().st_size / 1e6
@@ -546,7 +476,7 @@ def make_report(
     return ReportResult(output, run)
 
 
-class _Work:
+class _ReportWork:
     """What is computed for a report, with what its parts have in common: the scene, the field, its place, the rays."""
 
     def __init__(
@@ -567,6 +497,8 @@ class _Work:
         rendered: Mapping[str, Channels] | None,
     ) -> Run:
         """All that is shown."""
+        import mitsuba as mi
+
         given, options = self.given, self.options
         labels = Labels(self.rays, results)
         rays = self.rays if self.rays is None or options.names else rays_without_names(self.rays, labels)
@@ -614,7 +546,7 @@ class _Work:
             stage,
             *sizes,
             inputs,
-            versions(_variant()),
+            versions(str(mi.variant())),
             settings,
             views.basis,
             about.json(),
@@ -742,20 +674,14 @@ class _Work:
         return self.align.matrix[:3, 2] / self.align.scale
 
 
-class _Quiet:
+class _Quiet(Silent):
     """Passes on only what may be wrong: the lines of a job within this one name files that nobody keeps."""
 
     def __init__(self, reporter: Reporter):
         self._reporter = reporter
 
-    def message(self, text: str) -> None:
-        pass
-
     def warn(self, text: str) -> None:
         self._reporter.warn(text)
-
-    def progress(self, share: float, text: str = "") -> None:
-        pass
 
 
 def _objects(path: Path, reporter: Reporter) -> AreaSet:
@@ -776,9 +702,3 @@ def _load(given: ReportFiles, path: Path) -> Rays:
 
 def _corners(box: AnyBox) -> tuple[np.ndarray, np.ndarray]:
     return np.array(box.core.lower, float), np.array(box.core.upper, float)
-
-
-def _variant() -> str:
-    import mitsuba as mi
-
-    return str(mi.variant())

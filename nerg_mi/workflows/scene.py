@@ -1,7 +1,4 @@
-"""``nerg scene``: Write a scene file for a field, a mesh, a gaze field or rays, with a camera and an observer.
-
-Writing a scene file for fields, meshes, splats or rays, with a camera and an observer.
-"""
+"""Writing a scene file for fields, meshes, splats or rays, with a camera and an observer."""
 
 from __future__ import annotations
 
@@ -18,7 +15,6 @@ from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.ranges import COORDINATES, FIELDS_OF_VIEW, RATES, SECONDS, TIMES, Checked, Range
 from nerg_mi.rays.dataset import Conditions, RayDataset, is_dataset
 from nerg_mi.rays.dataset_open import load_rays
 from nerg_mi.rays.rays import Rays
@@ -36,11 +32,10 @@ from nerg_mi.rendering.scene_writer import (
 )
 from nerg_mi.train.geometry import place_of_hits
 
-from .base import SILENT, Reporter, argument, command, out, select_backend
-from .options import option, parse_numbers
+from .base import SILENT, Reporter, select_backend
 from .scene_cameras import (
+    PersonWalk,
     Probe,
-    Walk,
     best_camera,
     best_photo,
     eye_of_person,
@@ -53,6 +48,7 @@ from .scene_cameras import (
     upright,
     walk_of_person,
 )
+from .scene_commands import SceneOptions
 from .scene_places import (
     LAMP,
     GivenFiles,
@@ -64,67 +60,7 @@ from .scene_places import (
     recognise,
 )
 
-# ---- Options of scene files that are written for checkpoints ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class SceneOptions(Checked):
-    """Who looks, and from where it is shown. Positions are in the coordinates of the place."""
-
-    observer: tuple[float, ...] | None = option(
-        None,
-        "Position of the observer's eye, x,y,z.  [default: where most rays are]",
-        parse=parse_numbers,
-        within=COORDINATES,
-    )
-    person: str | None = option(None, "Person of the rays whose eye the observer's is, at --time or --times.")
-    time: float | None = option(None, "When, in seconds of the rays' clock.", within=TIMES)
-    times: tuple[float, ...] | None = option(
-        None,
-        "From when to when, A,B: also writes the frames of a walk, for nerg render --frames.",
-        parse=parse_numbers,
-        within=TIMES,
-    )
-    fps: float = option(10.0, "Frames a second of --times.", within=RATES)
-    gap: float = option(0.5, "Seconds without a ray of that person that are bridged.", within=SECONDS)
-    camera_from: tuple[float, ...] | None = option(
-        None,
-        "Position of the camera, x,y,z.  [default: the best overview]",
-        "--from",
-        parse=parse_numbers,
-        within=COORDINATES,
-    )
-    camera_to: tuple[float, ...] | None = option(
-        None, "Point that it looks at, x,y,z.", "--to", parse=parse_numbers, within=COORDINATES
-    )
-    own: bool = option(False, "The camera is the observer's own eye.")
-    photos: Path | None = option(None, "Photos that the radiance field was trained on: the camera is one of theirs.")
-    photo: str | None = option(None, "Which of them: its name, or its number from 0 on.  [default: the best]")
-    allow_outside: bool = option(False, "Read files outside of --photos' folder too, where it names them.")
-    fov: float | None = option(
-        None, "Degrees between the left and right border of the picture.  [default: 70]", within=FIELDS_OF_VIEW
-    )
-    width: int = option(480, "Width of the picture in pixels.", within=Range(1, 16384))
-    up: tuple[float, ...] | None = option(
-        None,
-        "Which way is up in the place, x,y,z.  [default: as its files say]",
-        parse=parse_numbers,
-        within=COORDINATES,
-    )
-    align: Path | None = option(
-        None, "JSON file with the 4x4 similarity from the rays' frame to the place's.  [default: the gaze field's]"
-    )
-    geometry: str | None = option(
-        None, 'What rays alone are shown in: "hits", their hit points, or "none".  [default: hits if there are any]'
-    )
-    mode: str | None = option(
-        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
-    )
-
-
-# ---- Scene rays ----
-#
-# Rays that a scene shows: those of a file, or some of a dataset, which are kept in a file beside the scene.
+# ---- Rays that a scene shows: those of a file, or some of a dataset, which are kept in a file beside the scene ----
 
 
 MOST = 1_000_000
@@ -169,11 +105,7 @@ def _file_beside(scene: Path) -> Path:
     return scene.with_suffix(".rays.npz")
 
 
-# ---- Scene ----
-#
-# ``nerg scene``: Write a scene file for a field, a mesh, a gaze field or rays, with a camera and an observer.
-#
-# From checkpoints, meshes and rays to a scene file that `nerg render` renders.
+# ---- From checkpoints, meshes and rays to a scene file that `nerg render` renders ----
 
 
 SMALLEST = 0.05
@@ -195,19 +127,6 @@ class SceneResult:
     taken: frozenset[str] = frozenset()
 
 
-@command(
-    "scene",
-    "Write a scene file for a place, a gaze field or rays, with a camera and an observer.",
-    more="""A gaze field alone is shown in the place that it was trained in, which is found beside it. The scene is
-commented; each of its defaults can be set when it is rendered (nerg render -D).""",
-    options=SceneOptions,
-    files=argument(
-        "In any order: a place (radiance field, splats, mesh, .xml scene, .vol), a gaze field, rays.",
-        list[Path],
-        metavar="FILES",
-    ),
-    output=out("Scene file to write (.xml)."),
-)
 def write_scene(
     files: Sequence[str | Path], output: str | Path, options: SceneOptions | None = None, reporter: Reporter = SILENT
 ) -> SceneResult:
@@ -385,7 +304,7 @@ def _up(given: GivenFiles, align: Similarity, options: SceneOptions) -> np.ndarr
 
 def _observer(
     given: GivenFiles, rays: Rays | None, align: Similarity, ns, options: SceneOptions, reporter: Reporter
-) -> tuple[Eye | None, Walk | None, str]:
+) -> tuple[Eye | None, PersonWalk | None, str]:
     """The observer, the walk of one, and a sentence on them."""
     point = given_point(options.observer, "--observer")
     if point is not None:
@@ -486,7 +405,7 @@ def _about(output: Path, text: SceneText, place: WrittenPlace, scene: _Draft) ->
     )
 
 
-def _frames(walk: Walk, own: bool, taken: frozenset[str]) -> list[dict[str, str]]:
+def _frames(walk: PersonWalk, own: bool, taken: frozenset[str]) -> list[dict[str, str]]:
     names = ["eye", "ahead", *(["camera", "target"] if own else [])]
     rows = []
     for eye in walk.eyes:

@@ -20,9 +20,7 @@ from nerg_mi.transport.geometry import Place, pixel_directions, pixel_solid_angl
 
 from .scene_places import PhotoCamera
 
-# ---- Cameras ----
-#
-# From where a scene is shown: what an observer meets around, and the best camera for it.
+# ---- From where a scene is shown: what an observer meets around, and the best camera for it ----
 
 
 GLANCE = (48, 32)
@@ -182,9 +180,7 @@ def upright(eye: Eye, up: np.ndarray) -> Eye:
     return eye
 
 
-# ---- Observers ----
-#
-# Who looks, and where: people of the rays, or the place where most of them were.
+# ---- Who looks, and where: people of the rays, or the place where most of them were ----
 
 
 RADIUS = 0.5
@@ -197,7 +193,7 @@ _NAMED = 8
 
 
 @dataclass(frozen=True)
-class Walk:
+class PersonWalk:
     """Where somebody was, and looked, at moments of equal distance: ``eyes`` of each frame, at ``times`` (F,) in
     seconds; ``missing``: how many more frames there would be where nothing is known of them."""
 
@@ -222,7 +218,7 @@ def eye_of_person(rays: Rays, person: str, time: float, gap: float, align: Simil
 
 def walk_of_person(
     rays: Rays, person: str, first: float, last: float, fps: float, gap: float, align: Similarity
-) -> Walk:
+) -> PersonWalk:
     """Where ``person`` was from ``first`` to ``last`` (seconds), ``fps`` times a second.
 
     Positions are linear between two rays, directions the mean of theirs, weighted alike. A moment between two rays
@@ -255,7 +251,7 @@ def walk_of_person(
     # Two opposite directions have no mean: that of the nearer ray.
     nearer = np.where(share < 0.5, rays.direction[own[before]], rays.direction[own[after]])[known]
     direction = np.where(length > 1e-3, direction / np.maximum(length, 1e-3), nearer)
-    return Walk(times[known], _eyes(origin, direction, align), int(np.sum(~known)))
+    return PersonWalk(times[known], _eyes(origin, direction, align), int(np.sum(~known)))
 
 
 def support_of_rays(rays: Rays) -> RaySupport:

@@ -1,7 +1,4 @@
-"""``nerg stats``: Count attention on things, in rays and by a gaze field: numbers with intervals, and what if.
-
-Attention on things as numbers: counted in rays, foretold by a field, by cohort, time and zone; and what if.
-"""
+"""Attention on things as numbers: counted in rays, foretold by a field, by cohort, time and zone; and what if."""
 
 from __future__ import annotations
 
@@ -14,7 +11,6 @@ import numpy as np
 
 from nerg_mi.aoi.measured import (
     AoiContext,
-    StatisticsOptions,
     Viewpoints,
     ViewpointSampler,
     blocks_of,
@@ -22,6 +18,7 @@ from nerg_mi.aoi.measured import (
     count_block,
     ray_count,
 )
+from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.aoi.parts import CountingParts
 from nerg_mi.aoi.predicted import (
@@ -61,7 +58,7 @@ from nerg_mi.statistics.tables import (
 )
 from nerg_mi.statistics.visits import ALL, Cell, Total, VisitSums
 
-from .base import SILENT, Reporter, argument, command, out, select_backend
+from .base import SILENT, Reporter, select_backend
 from .options import parse_point
 from .parts import Parts
 from .scene_places import kind_of_file
@@ -77,16 +74,6 @@ class _Given:
     rays: Path | Rays | None = None
 
 
-@command(
-    "stats",
-    "Count attention on things: in rays, and as a gaze field predicts it, with intervals over people.",
-    more="""Share, dwell, reach, first looks, returns, distance, what could be seen; by cohort, time and zone;
-differences, moves from thing to thing, what if something stood elsewhere. --visibility tells what can be seen from
-where.""",
-    options=StatisticsOptions,
-    files=argument("Rays or a dataset, a scene, a gaze field, a place; in any order.", list[Path]),
-    output=out("Folder for tables and pictures."),
-)
 def statistics(
     files: Sequence[str | Path | Rays],
     output: str | Path | None = None,
@@ -105,7 +92,7 @@ def statistics(
     reporter.progress(0.0, "reading")
     areas = _areas(options)
     ns = select_backend(options.mode, options.threads)
-    result = _Work(given, areas, options, ns, reporter, output).run()
+    result = _StatisticsWork(given, areas, options, ns, reporter, output).run()
     if output is not None:
         inputs = [p for p in (given.scene, given.field, given.gaze, given.rays) if isinstance(p, Path)]
         inputs += [p for p in (options.areas, options.what_if) if p is not None and p.is_file()]
@@ -138,7 +125,7 @@ def _areas(options: StatisticsOptions) -> AreaSet:
     return read_areas(options.areas)
 
 
-class _Work:
+class _StatisticsWork:
     """What is computed, with what its parts have in common."""
 
     def __init__(

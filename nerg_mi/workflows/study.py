@@ -1,14 +1,11 @@
-"""``nerg study``: Measure error against run time: a scene at many settings, compared with what is true.
-
-A study of the settings of a scene, in one go or in parts.
-"""
+"""A study of the settings of a scene, in one go or in parts."""
 
 from __future__ import annotations
 
 import re
 import time
 import uuid
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,39 +19,15 @@ from nerg_mi.figures.style import Provenance, files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
-from nerg_mi.ranges import Range
 from nerg_mi.rendering.scene import activate, files_of_scene
 from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.tasks.task import Part, Plan, processor
 
-from .base import SILENT, Reporter, argument, command, extra, select_backend, versions
-from .options import PartOptions, definitions, option
+from .base import SILENT, Reporter, select_backend, versions
 from .parts import Parts, PlannedScene
+from .scene_commands import StudyOptions
 
-# ---- Options of the study of error against run time ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class StudyOptions(PartOptions):
-    """What a study renders, and how often."""
-
-    scene_kind: str = option("auto", "What SCENE is: auto, analytic or file.")
-    width: int = option(192, "Width of a picture in pixels.", within=Range(1, 16384))
-    height: int = option(128, "Height of a picture in pixels.", within=Range(1, 16384))
-    repeats: int = option(5, "Timed renders of each setting; their median counts.", within=Range(1, 10000))
-    quick: bool = option(False, "A few settings only, each timed once.")
-    only: str = option("", "Only the default, and settings whose name matches.", metavar="REGEX")
-    defaults: Mapping[str, str] | None = definitions()
-    mode: str | None = option(
-        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
-    )
-
-
-# ---- Study ----
-#
-# ``nerg study``: Measure error against run time: a scene at many settings, compared with what is true.
-#
-# The study of error against run time: a scene at many settings, each compared with what is true.
+# ---- The study of error against run time: a scene at many settings, each compared with what is true ----
 
 
 ROWS = 4
@@ -72,15 +45,6 @@ class StudyResult:
     report: dict
 
 
-@command(
-    "study",
-    "Measure error against run time: render a scene at many settings, compare each with what is true, and plot it.",
-    more="""Writes study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. A
-full study takes up to half an hour.""",
-    options=StudyOptions,
-    scene=argument("Scene file (.xml), or slab, sphere, sheets, fog or ramp.", str),
-    out=extra(..., "Folder to write into; it is made.", Path, "-o", "--out"),
-)
 def run_study(
     scene: str | Path, out: str | Path, options: StudyOptions | None = None, reporter: Reporter = SILENT
 ) -> StudyResult:
@@ -203,8 +167,8 @@ def twin_beside(scene: Path) -> ExactSurfaces | None:
 # ---- Parts ----
 #
 # Settings, a few each, with the default beside them, measured wherever that is. Errors and evaluations are the same
-# wherever they are found. Times are those of the process that measured the row; its own times of the default, taken in
-# the same rounds, are in the row as well, so that rows of different machines compare.
+# wherever they are found. Times are those of the process that measured the row; its own times of the default, taken
+# in the same rounds, are in the row as well, so that rows of different machines compare.
 
 
 @dataclass(frozen=True)

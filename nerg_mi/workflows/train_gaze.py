@@ -1,15 +1,13 @@
-"""``nerg train gaze``: Train a gaze field on rays of attention, and report its scores at positions that were held out.
-
-Training a gaze field on rays: what is trained on which rays, and the run.
-"""
+"""Training a gaze field on rays: what is trained on which rays, and the run; and a field for untracked places."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,90 +19,25 @@ from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.photos.salience import SalienceSet, open_salience
-from nerg_mi.ranges import LENGTHS, RAYS, SECONDS, SEEDS, TEST_SHARES, THREADS, Range
 from nerg_mi.rays.dataset import is_dataset
 from nerg_mi.rays.dataset_open import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train import gaze_run
 from nerg_mi.train.gaze_data import Supervision, TargetNeeds, check_kernels, far_views, hold_out
 from nerg_mi.train.gaze_ensemble import train_ensemble
+from nerg_mi.train.gaze_log_density import KAPPA, prior_field
 from nerg_mi.train.gaze_recipes import FieldChoices, Recipe, gaze_recipe
 from nerg_mi.train.gaze_run import mixes
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan, GazeProgress, StateSettings
 from nerg_mi.train.geometry import GazePlace
 
-from .base import SILENT, Reporter, argument, command, out, select_backend
+from .base import SILENT, Reporter, select_backend
+from .gaze_commands import GazeOptions, PriorOptions
 from .geometry import check_place, make_place, place_kind
-from .options import PlaceOptions, chosen_settings, exposes, option
+from .options import chosen_settings
 
-# ---- Options of the training of a gaze field ----
-
-
-@dataclass(frozen=True, kw_only=True)
-@exposes(ProbeSettings, GazeSettings, default="Default: the recipe's.")
-class GazeOptions(PlaceOptions):
-    """How a gaze field is trained; what is None is the recipe's. Lengths are metres, in the rays' frame."""
-
-    if TYPE_CHECKING:
-        # Options that are settings, too.
-        def __init__(self, **options: Any) -> None: ...
-        def __getattr__(self, name: str) -> Any: ...
-
-    views: Path | None = option(None, "Posed photos (folder or transforms file) with salience.")
-    salience: str | None = option(
-        None, "Folder of them, called as the photos are (.png, .exr, .npy), or spectral-residual."
-    )
-    salience_per: str = option("pixel", "What they count gaze per: pixel or steradian.")
-    align_views: Path | None = option(None, "JSON file with the 4x4 similarity from the photos' frame to the place's.")
-    allow_outside: bool = option(
-        False, "Read files outside of --views' folder and that of --salience too, where they name them."
-    )
-    recipe: str = option(
-        "default", "Word of docs/gaze-training.md; default generalises best. Sets what is not set below."
-    )
-    voxel: float | None = option(
-        None,
-        "Edge of the voxels of --geometry hits in metres.  [default: 0.08, more in very large places]",
-        within=LENGTHS,
-    )
-    align: Path | None = option(
-        None, "How the rays lie in the place: what nerg align writes, or JSON with the 4x4 similarity. Default: alike."
-    )
-    force: bool = option(False, "Train even where no gaze meets a surface of the place.")
-    most: int = option(
-        10_000_000, "Rays of a dataset at most; of more, a sample by --seed in which each is as likely.", within=RAYS
-    )
-    variant: str | None = option(
-        None, "emit, capture or emit_capture. Default: emit_capture; without any geometry folds choose it or capture."
-    )
-    activation: str | None = option(None, "Of the emit head of small and paper: softplus, exp or linear.")
-    size: str | None = option(None, "Of the field of small and paper: small or paper.")
-    normalized: bool = option(False, "Divide the field of small and paper by its integral over the sphere.")
-    semantic: str = option(
-        "", "Give emit the features of --field: accumulated along the ray, or snapshot at the surface."
-    )
-    semantic_own: bool = option(False, "Besides the gaze field's own, not in their place.")
-    begin: str = option("random", "Weights of the trunk to begin with: random, or those of the radiance field (field).")
-    test_zones: int = option(
-        0, "Zones of test positions that are left out of everything; 0: none.", within=Range(0, 1000)
-    )
-    test_positions: int = option(64, "Test positions in them.", within=Range(1, 10**5))
-    test_people: float = option(0.0, "Share of the people who are left out of everything besides.", within=TEST_SHARES)
-    ensemble: int = option(
-        0,
-        "Train so many fields on resamples of the people and the images; the mean is the gaze, their spread its "
-        "uncertainty. 0: one field.",
-        within=Range(0, 1000),
-    )
-    resume: bool = option(False, "Go on with the interrupted run of this output.")
-    save_every: float = option(
-        60.0, "Seconds between two states for --resume; 0: only one, when it ends early.", within=SECONDS
-    )
-    seed: int = option(0, "Seed of probes, directions, weights, batches and splits.", within=SEEDS)
-    half: bool = option(False, "Store the weights in fp16.")
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS, changes_result=False)
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+# ---- Training a gaze field on rays: what is trained on which rays, and the run ----
 
 
 # ---- Gaze plan ----
@@ -207,12 +140,7 @@ def _choices(options: GazeOptions, kind: str, views_alone: bool) -> FieldChoices
     )
 
 
-# ---- Gaze ----
-#
-# ``nerg train gaze``: Train a gaze field on rays of attention, and report its scores at positions that were held
-# out.
-#
-# The training of a gaze field: from rays of attention, salience images or both to a checkpoint.
+# ---- The training of a gaze field: from rays of attention, salience images or both to a checkpoint ----
 
 
 # From this share of the blind density on, that is most of what a field says.
@@ -233,14 +161,6 @@ class GazeResult:
     interrupted: bool
 
 
-@command(
-    "train gaze",
-    options=GazeOptions,
-    rays=argument(
-        "Rays file (.npz or .parquet) or dataset, as nerg rays import writes it. None: --views alone.", required=False
-    ),
-    output=out("Checkpoint to write (.safetensors)."),
-)
 def train_gaze(
     rays: Rays | str | Path | None,
     output: str | Path | None = None,
@@ -449,3 +369,66 @@ def _tell(result: GazeResult, reporter: Reporter) -> None:
             )
     if result.output is not None:
         reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")
+
+
+# ---- A gaze field for a place where nobody was tracked: what people in other places say of it ----
+
+
+# ---- A gaze field for a place where nobody was tracked: what people in other places say of it ----
+
+
+PRIOR = "prior"
+"""What the provenance of such a field names as its recipe."""
+
+
+@dataclass(frozen=True)
+class PriorResult:
+    """``field``; its ``provenance`` (JSON), as its checkpoint ``output`` holds it, where one was asked for."""
+
+    field: AnyGazeField
+    provenance: dict
+    output: Path | None
+
+
+def learn_prior(
+    rays: Rays | str | Path | Sequence[Rays | str | Path],
+    output: str | Path | None = None,
+    options: PriorOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> PriorResult:
+    """A gaze field for any place whose z axis points up, of how high people looked: ``rays``, or their files
+    (.npz or .parquet) or datasets, one a place, or those of one place alone. Places count alike, and people within a
+    place. It does not depend on where an observer stands, and is written to ``output`` (.safetensors) where that is
+    given.
+
+    Raises `NergError` for what the user can mend.
+    """
+    options, output = options or PriorOptions(), None if output is None else Path(output)
+    rays = [rays] if isinstance(rays, (Rays, str, Path)) else rays
+    if not rays:
+        raise NergError("a prior is learnt from the rays of other places: give at least one file of them")
+    if output is not None:
+        check_writable(output, ".safetensors")
+    ns = select_backend(options.mode)
+    learnt, files = [], []
+    for k, place in enumerate(rays):
+        reporter.progress(k / len(rays), "reading rays")
+        data = place if isinstance(place, Rays) else load_rays(place, options.most, options.seed)
+        of_file = {} if isinstance(place, Rays) else {"file": Path(place).name, "sha256": rays_digest(place)}
+        learnt.append(data)
+        files.append({**of_file, "rays": len(data), "persons": len(data.persons)})
+    if empty := [str(k + 1) for k, data in enumerate(learnt) if not len(data)]:
+        raise NergError(f"no ray is in place {', '.join(empty)} of those that a prior is learnt from; leave it out")
+    field = prior_field(learnt, ns)
+    provenance = {
+        "recipe": PRIOR,
+        "kappa": KAPPA,
+        "places": files,
+        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    }
+    if output is not None:
+        save_gaze(field, output, provenance)
+        people = sum(of["persons"] for of in files)
+        many = f"{len(files)} place{'' if len(files) == 1 else 's'}"
+        reporter.message(f"wrote {output}: how high {people} people looked in {many}, wherever an observer stands")
+    return PriorResult(field, provenance, output)

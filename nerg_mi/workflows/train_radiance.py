@@ -1,9 +1,4 @@
-"""``nerg train radiance``: Train a radiance field on posed pictures, and report the error on those held out.
-``nerg eval radiance``: PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the
-integrator.
-
-Radiance fields from posed photos: training, and scores on the photos that were held out.
-"""
+"""Radiance fields from posed photos: training, and scores on the photos that were held out."""
 
 from __future__ import annotations
 
@@ -11,7 +6,6 @@ import math
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from nerg_mi.errors import NergError, chosen
 from nerg_mi.evaluation.metrics import ViewScores, score_views
@@ -21,91 +15,14 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.photos.dataset import Dataset, open_dataset
-from nerg_mi.ranges import COORDINATES, LENGTHS, SECONDS, SPP, THREADS, Checked, Range
 from nerg_mi.train import radiance_run
 from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
 
-from .base import SILENT, Reporter, argument, command, out, select_backend
-from .options import chosen_settings, exposes, option, parse_numbers
+from .base import SILENT, Reporter, select_backend
+from .options import chosen_settings
+from .radiance_commands import RadianceOptions, RadianceScoreOptions
 
-# ---- Options of the training and of the evaluation of a radiance field ----
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhotoOptions(Checked):
-    """How a posed image set is read."""
-
-    holdout: int | None = option(
-        None, "Hold out every so many frames, 0 none. Default: transforms_test.json, else 8.", within=Range(0, 10**6)
-    )
-    width: int | None = option(
-        None, "Width of the pictures in pixels. Default: as they are, or as it was trained.", within=Range(1, 65536)
-    )
-    scale: float = option(
-        1.0, "Multiply all lengths by this: what a unit of the data set measures, in metres.", within=LENGTHS
-    )
-    coordinates: str = option(
-        "file",
-        "Of the field: file, upright (+z up), original (applied_transform undone), a dataparser_transforms.json.",
-    )
-    depth: bool = option(True, "Use the data set's depth, where it has any.")
-    allow_outside: bool = option(False, "Read files outside of the data set's folder too, where it names them.")
-
-
-@dataclass(frozen=True, kw_only=True)
-@exposes(RadianceSettings)
-class RadianceOptions(PhotoOptions):
-    """How a radiance field is trained."""
-
-    if TYPE_CHECKING:
-        # Options that are settings, too.
-        def __init__(self, **options: Any) -> None: ...
-        def __getattr__(self, name: str) -> Any: ...
-
-    size: str = option("small", "Size of the field: small, medium or paper.")
-    deferred: bool = option(False, "Ask the colour network once a ray, not at every sample: faster frames.")
-    downscale: float | None = option(
-        None, "In place of a width: divide the pictures' size by this.", within=Range(1, 1000)
-    )
-    aabb: tuple[float, ...] | None = option(
-        None,
-        "Bounds of what is seen: x0,y0,z0,x1,y1,z1, in the coordinates of the field.",
-        parse=parse_numbers,
-        within=COORDINATES,
-    )
-    unbounded: bool | None = option(
-        None,
-        "Whether anything is to be seen beyond those bounds. Default: as the points tell, and no without any.",
-        "--unbounded/--bounded",
-    )
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
-    half: bool = option(False, "Store the weights in fp16.")
-    resume: bool = option(False, "Go on with the interrupted run of this output.")
-    save_every: float = option(
-        60.0, "Seconds between two states for --resume; 0: only one, when it ends early.", within=SECONDS
-    )
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RadianceScoreOptions(PhotoOptions):
-    """On which views a radiance field is scored, and how they are rendered. The photos are read as in its training."""
-
-    train: bool = option(False, "Score the training views instead.")
-    spp: int = option(16, "Rays a pixel. The scatter of few is part of the score.", within=SPP)
-    pictures: Path | None = option(None, "Folder for the pictures, each beside its photo.", "-o", "--output")
-    json_file: Path | None = option(None, "Write the scores to this file.", "--json")
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
-    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
-
-
-# ---- Radiance ----
-#
-# ``nerg train radiance``: Train a radiance field on posed pictures, and report the error on those held out.
-# ``nerg eval radiance``: PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the
-# integrator.
-#
-# Radiance fields from posed photos: training, and scores on the photos that were held out.
+# ---- Radiance fields from posed photos: training, and scores on the photos that were held out ----
 
 
 # Photos whose exposures differ by less than this, which nobody sees, are not told of.
@@ -129,12 +46,6 @@ class RadianceResult:
         return None if held_out is None else held_out["mean"]
 
 
-@command(
-    "train radiance",
-    options=RadianceOptions,
-    dataset=argument("Folder of posed photos, its transforms.json, or a COLMAP model."),
-    output=out("Checkpoint to write (.safetensors)."),
-)
 def train_radiance(
     dataset: str | Path,
     output: str | Path | None = None,
@@ -319,13 +230,6 @@ def evaluate_radiance(
     return scores
 
 
-@command(
-    "eval radiance",
-    more="The pictures are written into FIELD.eval where no other folder is given.",
-    options=RadianceScoreOptions,
-    field=argument("Checkpoint of a radiance field (.safetensors)."),
-    dataset=argument("Posed image set with the views to compare with."),
-)
 def evaluate_beside(field: Path, dataset: Path, options: RadianceScoreOptions, reporter: Reporter) -> None:
     """`evaluate_radiance`, with pictures beside the ``field`` where no other folder is chosen."""
     options = replace(options, pictures=options.pictures or field.with_suffix(".eval"))

@@ -54,7 +54,8 @@ def make_field(job: Job) -> list[Path]:
     """The radiance field, trained on the pictures and their exact depth; the test views are held out."""
     import mitsuba as mi
 
-    from nerg_mi.workflows.train_radiance import RadianceOptions, train_radiance
+    from nerg_mi.workflows.radiance_commands import RadianceOptions
+    from nerg_mi.workflows.train_radiance import train_radiance
 
     _require(job.build / "transforms.json", "views")
     path = job.build / "store.safetensors"
@@ -89,7 +90,8 @@ def make_gaze(job: Job) -> list[Path]:
     it."""
     import mitsuba as mi
 
-    from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
+    from nerg_mi.workflows.gaze_commands import GazeOptions
+    from nerg_mi.workflows.train_gaze import train_gaze
 
     source, place = job.build / "rays.npz", job.store / "store.safetensors"
     _require(source, "rays")
@@ -116,7 +118,7 @@ def make_evaluation(job: Job) -> list[Path]:
     import mitsuba as mi
 
     from nerg_mi.workflows.evaluate import evaluate_gaze
-    from nerg_mi.workflows.geometry import GazeEvaluationOptions
+    from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions
     from nerg_mi.workflows.report import RESULTS
 
     source, gaze = job.build / "rays.npz", job.store / "shoppers.safetensors"

@@ -7,7 +7,7 @@ import csv
 import pytest
 
 from nerg_mi.aoi import output
-from nerg_mi.aoi.measured import StatisticsOptions
+from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.figures.statistics import things_figure
 from nerg_mi.statistics.tables import PLACES, PersonRows

@@ -10,16 +10,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.aoi import measured
-from nerg_mi.aoi.measured import (
-    AoiContext,
-    PredictionOptions,
-    StatisticsOptions,
-    TimeWindow,
-    ViewpointSampler,
-    ahead,
-    blocks_of,
-    count_block,
-)
+from nerg_mi.aoi.measured import AoiContext, TimeWindow, ViewpointSampler, ahead, blocks_of, count_block
+from nerg_mi.aoi.options import PredictionOptions, StatisticsOptions
 from nerg_mi.aoi.parts import (
     Places,
     PlannedPrediction,

@@ -9,7 +9,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.aoi.measured import StatisticsOptions, Viewpoints
+from nerg_mi.aoi.measured import Viewpoints
+from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.predicted import (
     AoiScene,
     PredictedAttention,

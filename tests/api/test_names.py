@@ -1,14 +1,25 @@
-"""The names at the top of the package: few, typed, imported when they are used, each with an example that runs."""
+"""The names at the top of the package, the variant that they take, and their arrays and cameras."""
 
+from __future__ import annotations
+
+import copy
 import doctest
 import inspect
+import pickle
 import subprocess
 import sys
 from importlib.resources import files
 
+import numpy as np
 import pytest
 
 import nerg_mi as nerg
+from nerg_mi.api.arrays import Labelled, points, same_for_all, unit
+from nerg_mi.api.scene import active_mitsuba, array_module
+from nerg_mi.errors import NergError
+
+# ---- The names at the top of the package ----
+
 
 HEAVY = {"numpy", "mitsuba", "drjit", "scipy", "matplotlib", "safetensors", "torch", "trimesh", "rich", "typer"}
 
@@ -109,3 +120,138 @@ def test07_examples_run(name, tmp_path, request):
     said = []
     results = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(test, out=said.append)
     assert results.failed == 0, "".join(said)
+
+
+# ---- The API takes the variant that is set, and sets one only where there is none ----
+
+
+def test01_one_is_set_where_there_is_none():
+    code = "import nerg_mi as nerg, mitsuba as mi; nerg.Scene; print(mi.variant()); "
+    code += "from nerg_mi.api.scene import active_mitsuba; print(active_mitsuba().variant())"
+    before, after = run(code).split()
+    assert before == "None" and after in ("cuda_ad_rgb", "llvm_ad_rgb")
+
+
+def test02_one_that_is_set_stays(mono):
+    assert active_mitsuba() is mono and mono.variant() == "llvm_ad_mono"
+    assert array_module().__name__ == "drjit.llvm.ad"
+    assert mono.variant() == "llvm_ad_mono"
+
+
+def test03_scalar_variants_are_refused(rgb):
+    rgb.set_variant("scalar_rgb")
+    with pytest.raises(NergError, match='"scalar_rgb".*mi.set_variant'):
+        active_mitsuba()
+
+
+# ---- What comes in from NumPy and what goes out to it ----
+
+
+def test01_points_of_every_shape():
+    assert points((1, 2, 3), "x").shape == (1, 3)
+    assert points([[1, 2, 3], [4, 5, 6]], "x").dtype == np.float32
+    assert points(np.ones((5, 3), int)[::2], "x").flags.c_contiguous
+
+
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        ((1, 2), r"eyes must have the shape \(3,\) or \(N, 3\), got \(2,\)"),
+        (np.zeros((0, 3)), r"shape .* got \(0, 3\)"),
+        ("here", "eyes must be numbers"),
+        ([(0, 0, 0), (0, np.nan, 0)], r"row 1 is \[0.0, nan, 0.0\]"),
+        ([(0, 0, 0), (0, 0, 1.1e7)], "coordinates from -1e.07 to 1e.07, and row 1"),
+        ((1e308, 0, 0), "row 0 is"),
+        ((10**400, 0, 0), "eyes must have coordinates from"),
+        ([(0, 0), (0, 0, 1)], "eyes must be numbers"),
+    ],
+)
+def test02_wrong_points_are_told_by_name(wrong, said):
+    with pytest.raises(NergError, match=said):
+        points(wrong, "eyes")
+
+
+def test03_directions_are_made_unit_and_one_serves_all():
+    d = unit((0, 3, 4), 5, "d")
+    assert d.shape == (5, 3) and np.allclose(d, (0, 0.6, 0.8))
+    with pytest.raises(NergError, match="d must not be zero, and row 1 is"):
+        unit([(1, 0, 0), (0, 0, 0)], 2, "d")
+    with pytest.raises(NergError, match="as many as the origins, 3, got 2"):
+        unit([(1, 0, 0), (0, 1, 0)], 3, "d")
+
+
+def make():
+    depth = same_for_all(np.arange(6, dtype=np.float32).reshape(2, 3), 4)
+    color = np.zeros((4, 2, 3, 3), np.float32)
+    return Labelled({"depth": depth, "color": color}, ("observer", "row", "column"), np.zeros((4, 3), np.float32))
+
+
+def test04_arrays_have_names():
+    result = make()
+    assert result.names == ("depth", "color") and list(result) == ["depth", "color"] and len(result) == 2
+    assert result.depth is result["depth"] and "color" in result and "gaze" not in result
+    assert "depth" in dir(result)
+    assert repr(result).splitlines() == [
+        "Labelled(observer 4, row 2, column 3)",
+        "  depth  (4, 2, 3), float32",
+        "  color  (4, 2, 3, 3), float32",
+    ]
+
+
+def test05_what_is_not_there_is_said():
+    with pytest.raises(KeyError, match='"gaze"'):
+        make()["gaze"]
+    with pytest.raises(AttributeError, match='there is no "gaze"'):
+        make().gaze  # noqa: B018
+
+
+def test06_what_is_the_same_for_all_cannot_be_written_to():
+    with pytest.raises(ValueError):
+        make().depth[0, 0, 0] = 1
+
+
+def test07_copies():
+    result = make()
+    assert np.array_equal(copy.copy(result).depth, result.depth)
+    assert np.array_equal(pickle.loads(pickle.dumps(result)).color, result.color)
+
+
+# ---- A camera in a few numbers, and what is refused ----
+
+
+def test01_the_middle_of_the_picture_is_the_target(rgb):
+    camera = nerg.Camera(origin=(1, 2, 3), target=(4, 6, 3), up=(0, 0, 1), fov=40, width=64, height=32)
+    sensor = rgb.load_dict(camera.to_dict(4))
+    ray, _ = sensor.sample_ray(0, 0, (0.5, 0.5), (0.5, 0.5))
+    assert np.allclose(np.ravel(ray.d), (0.6, 0.8, 0), atol=1e-6)
+    assert np.allclose(np.ravel(sensor.world_transform() @ rgb.Point3f(0)), (1, 2, 3))
+    assert tuple(sensor.film().size()) == (64, 32) and sensor.sampler().sample_count() == 4
+    assert sensor.film().rfilter().is_box_filter()
+
+
+def test02_fov_is_that_of_the_width_and_up_is_up(rgb):
+    sensor = rgb.load_dict(nerg.Camera((0, 0, 0), (0, 1, 0), fov=90, width=20, height=10).to_dict())
+    left, right, top = (np.ravel(sensor.sample_ray(0, 0, at, (0.5, 0.5))[0].d) for at in ((0, 0.5), (1, 0.5), (0.5, 0)))
+    assert np.isclose(np.dot(left, right), 0, atol=1e-6)
+    assert right[0] > 0 > left[0] and top[2] > 0
+
+
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        ({"target": (1, 2, 3)}, "cannot look at the same point"),
+        ({"target": (1, 2, 8)}, "cannot look along its own up"),
+        ({"up": (0, 0, 0)}, "own up"),
+        ({"fov": 180}, "must lie in 0.0001 .. 179.9, got 180"),
+        ({"fov": float("nan")}, "got nan"),
+        ({"width": 0}, "the width of a picture must lie in 1 .. "),
+        ({"height": 2.5}, "must be a whole number, got 2.5"),
+        ({"width": 1 << 20, "height": 1 << 20}, "at most 268,435,456 pixels"),
+        ({"origin": (0, float("inf"), 0)}, "origin of a camera"),
+        ({"origin": (0, 1)}, "origin of a camera must"),
+        ({"origin": [(0, 1, 2)]}, "origin of a camera"),
+    ],
+)
+def test03_what_is_no_camera(wrong, said):
+    with pytest.raises(nerg.NergError, match=said):
+        nerg.Camera(**{"origin": (1, 2, 3), "target": (4, 5, 6), **wrong})

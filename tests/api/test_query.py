@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.aoi.measured import StatisticsOptions
+from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.api.query import ObserverOf, box_shares
-from nerg_mi.api.scene import box_dict
 from nerg_mi.formats.areas import Region
 from nerg_mi.report.data import Onlooker
 from nerg_mi.statistics.shares import ROUGH, gaze_shares
@@ -15,6 +14,7 @@ from nerg_mi.statistics.visits import MARGIN, BoxAoi
 from nerg_mi.train.geometry import GazePlace
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import SIGN, STAND, write_place
+from tests.pictures import box_dict
 from tests.plugins import fields
 from tests.workflows.recorder import Recorder
 
@@ -22,11 +22,7 @@ from tests.workflows.recorder import Recorder
 
 
 BOX = [(-0.2, 1.8, -0.1), (0.2, 2.2, 0.1)]
-
-
 EYE = (1.2, 2.2, 1.5)
-
-
 FAR = {"type": "sphere", "radius": 0.01, "center": [0, 0, -50]}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.scene import TrainedField, asked_quantities, box_dict, mesh_child, options_of, scene_children
+from nerg_mi.api.scene import TrainedField, asked_quantities, mesh_child, options_of, scene_children
 from nerg_mi.api.workflows import bake, stats
 from nerg_mi.errors import NergError
 from tests.formats.splats.writers import random_splats, write_inria
@@ -411,11 +411,6 @@ end_header
 0 1 0 {1}
 3 0 1 2
 """
-
-
-def test03_a_box_reaches_from_corner_to_corner(rgb):
-    box = rgb.load_dict(box_dict(np.array((1.0, 2, 3)), np.array((2.0, 5, 4)))).bbox()
-    assert np.allclose(np.ravel(box.min), (1, 2, 3)) and np.allclose(np.ravel(box.max), (2, 5, 4))
 
 
 def test04_files_are_looked_at_first(rgb, tmp_path):

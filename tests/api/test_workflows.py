@@ -10,19 +10,15 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-import nerg_mi.api.workflows as module
 from nerg_mi.api import workflows
 from nerg_mi.api.workflows import bake
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows import ablation, evaluate, study, train_radiance
-from nerg_mi.workflows import train_gaze as gaze_job
-from nerg_mi.workflows import train_radiance as radiance_job
-from nerg_mi.workflows.ablation import AblationOptions
-from nerg_mi.workflows.geometry import GazeEvaluationOptions
-from nerg_mi.workflows.train_gaze import GazeOptions
-from nerg_mi.workflows.train_radiance import RadianceOptions
+from nerg_mi.workflows import ablation, evaluate, study, train_gaze, train_radiance
+from nerg_mi.workflows.gaze_commands import AblationOptions, GazeEvaluationOptions, GazeOptions
+from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOptions
+from nerg_mi.workflows.scene_commands import StudyOptions
 from tests.surfaces.meshes import box
 
 
@@ -52,7 +48,7 @@ def test_files_may_be_named_by_strings_and_options_are_checked(tmp_path):
 
 @pytest.mark.nightly
 def test01_the_example_runs(rgb):
-    assert run_example(module.bake, {}) == 0
+    assert run_example(workflows.bake, {}) == 0
 
 
 def test02_rays_in_memory_and_in_a_file_are_one(rgb, tmp_path):
@@ -67,66 +63,84 @@ def test02_rays_in_memory_and_in_a_file_are_one(rgb, tmp_path):
         bake(tmp_path / "room.ply", rays=rays, smoth=0.1)
 
 
-# ---- Evaluation ----
-#
-# Scores from a call: options are passed on to the jobs. That these work is shown by the examples (test_names).
+# ---- Options are passed on to the jobs; that these work is shown by the examples (test_names) ----
 
 
 class Asked(Exception):
     """Ends a job before it begins, with what it was asked."""
 
 
-def raise_it(*arguments):
-    raise Asked(*arguments)
+LLVM = {"mode": "llvm_ad_rgb"}
+JOBS = {
+    "evaluate_radiance": (
+        train_radiance,
+        lambda: nerg.evaluate_radiance("f.safetensors", "photos", spp=3, pictures="out"),
+        (Path("f.safetensors"), Path("photos"), RadianceScoreOptions(spp=3, pictures=Path("out"), **LLVM)),
+    ),
+    "evaluate_gaze": (
+        evaluate,
+        lambda: nerg.evaluate_gaze("g.safetensors", "r.npz", "out", split="pos"),
+        (Path("g.safetensors"), Path("r.npz"), "out", GazeEvaluationOptions(split="pos", **LLVM)),
+    ),
+    "ablate": (
+        ablation,
+        lambda: nerg.ablate("r.npz", "out", options=AblationOptions(seeds=2), recipes="small"),
+        (Path("r.npz"), "out", AblationOptions(seeds=2, recipes="small", **LLVM)),
+    ),
+    "run_study": (
+        study,
+        lambda: nerg.study("slab", "out", quick=True),
+        ("slab", "out", StudyOptions(quick=True, **LLVM)),
+    ),
+    "train_radiance": (
+        train_radiance,
+        lambda: nerg.train_radiance("photos", "out.safetensors", options=RadianceOptions(seed=3), steps=7),
+        (Path("photos"), "out.safetensors", RadianceOptions(seed=3, steps=7, **LLVM)),
+    ),
+    "train_gaze": (
+        train_gaze,
+        lambda: nerg.train_gaze(None, geometry="none", kappa=9.0),
+        (None, None, GazeOptions(geometry="none", kappa=9.0, **LLVM)),
+    ),
+}
 
 
-@pytest.mark.parametrize(
-    "module, job, call, expected",
-    [
-        (
-            train_radiance,
-            "evaluate_radiance",
-            lambda: nerg.evaluate_radiance("f.safetensors", "photos", spp=3, pictures="out"),
-            (
-                Path("f.safetensors"),
-                Path("photos"),
-                train_radiance.RadianceScoreOptions(spp=3, pictures=Path("out"), mode="llvm_ad_rgb"),
-            ),
-        ),
-        (
-            evaluate,
-            "evaluate_gaze",
-            lambda: nerg.evaluate_gaze("g.safetensors", "r.npz", "out", split="pos"),
-            (Path("g.safetensors"), Path("r.npz"), "out", GazeEvaluationOptions(split="pos", mode="llvm_ad_rgb")),
-        ),
-        (
-            ablation,
-            "ablate",
-            lambda: nerg.ablate("r.npz", "out", options=AblationOptions(seeds=2), recipes="small"),
-            (Path("r.npz"), "out", AblationOptions(seeds=2, recipes="small", mode="llvm_ad_rgb")),
-        ),
-        (
-            study,
-            "run_study",
-            lambda: nerg.study("slab", "out", quick=True),
-            ("slab", "out", study.StudyOptions(quick=True, mode="llvm_ad_rgb")),
-        ),
-    ],
-)
-def test01_options_reach_the_jobs(monkeypatch, tmp_path, module, job, call, expected):
+@pytest.fixture
+def asked(monkeypatch, tmp_path):
+    """Jobs that raise what they are asked, and the files that they are asked for."""
     monkeypatch.chdir(tmp_path)
     for name in ("f.safetensors", "g.safetensors", "r.npz", "photos"):
         Path(name).touch()
-    monkeypatch.setattr(module, job, raise_it)
+
+    def raise_it(*arguments):
+        raise Asked(*arguments)
+
+    for job, (module, *_) in JOBS.items():
+        monkeypatch.setattr(module, job, raise_it)
+
+
+@pytest.mark.parametrize("job", JOBS)
+def test01_options_reach_the_jobs(asked, job):
+    _, call, expected = JOBS[job]
     with pytest.raises(Asked) as found:
         call()
     assert found.value.args[:-1] == expected
 
 
-@pytest.mark.parametrize("name", ["evaluate_radiance", "evaluate_gaze", "ablate", "study"])
+@pytest.mark.parametrize(
+    "name", ["evaluate_radiance", "evaluate_gaze", "ablate", "study", "train_gaze", "train_radiance"]
+)
 def test02_wrong_options_are_told(name):
     with pytest.raises(nerg.NergError, match=f'{name} has no option "nothing"'):
         getattr(nerg, name)("a", "b", nothing=3)
+    with pytest.raises(nerg.NergError, match=f"{name} works in the variant that is set"):
+        getattr(nerg, name)("a", "b", mode="scalar_rgb")
+
+
+def test03_the_variant_in_use_stays(mono, asked):
+    with pytest.raises(Asked) as found:
+        nerg.train_radiance("photos")
+    assert found.value.args[2].mode == "llvm_ad_mono" and mono.variant() == "llvm_ad_mono"
 
 
 # ---- Statistics from a notebook: the example of its docstring, and its options ----
@@ -189,44 +203,7 @@ def test04_progress_is_told(table):
     assert any("day.csv" in text for text in told)
 
 
-# ---- Training ----
-#
-# Trainings from a call: options are passed on, and what comes back is a field in memory with its provenance.
-
-
-@pytest.fixture
-def asked(monkeypatch):
-    """What the jobs were asked last."""
-
-    def raise_it(*arguments):
-        raise Asked(*arguments)
-
-    monkeypatch.setattr(gaze_job, "train_gaze", raise_it)
-    monkeypatch.setattr(radiance_job, "train_radiance", raise_it)
-
-
-def test01_training_options_reach_the_jobs(asked, tmp_path):
-    with pytest.raises(Asked) as found:
-        nerg.train_radiance(str(tmp_path), "out.safetensors", options=RadianceOptions(seed=3), steps=7)
-    photos, output, options, _ = found.value.args
-    assert (photos, output) == (tmp_path, "out.safetensors")
-    assert options == RadianceOptions(seed=3, steps=7, mode="llvm_ad_rgb")
-    with pytest.raises(Asked) as found:
-        nerg.train_gaze(None, geometry="none", kappa=9.0)
-    assert found.value.args[2] == GazeOptions(geometry="none", kappa=9.0, mode="llvm_ad_rgb")
-
-
-def test02_training_wrong_options_are_told(asked):
-    with pytest.raises(nerg.NergError, match='train_gaze.*"kapa".*"kappa"'):
-        nerg.train_gaze(None, kapa=9.0)
-    with pytest.raises(nerg.NergError, match="train_radiance"):
-        nerg.train_radiance("photos", mode="scalar_rgb")
-
-
-def test03_the_variant_in_use_stays(mono, asked, tmp_path):
-    with pytest.raises(Asked) as found:
-        nerg.train_radiance(tmp_path)
-    assert found.value.args[2].mode == "llvm_ad_mono" and mono.variant() == "llvm_ad_mono"
+# ---- What comes back of a training is a field in memory with its provenance ----
 
 
 @pytest.mark.nightly

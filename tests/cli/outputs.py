@@ -20,11 +20,10 @@ from tests.figures.standins import write_standins
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.formats.test_torch_ngp import save_nerg as save
 from tests.formats.test_torch_ngp import small_gaze, small_state
+from tests.pictures import SCENE
 from tests.plugins import fields
 from tests.surfaces.meshes import box
-from tests.workflows.drawing.scenes import write_scene
-
-from .test_render import SCENE
+from tests.workflows.watched import write_scene
 
 DEMO = "occlusion.png gaze.png gaze_sphere.png depth.png visibility.png color.png scene.exr report.html run.json"
 DEMO += " heatmap.glb aoi.csv"
@@ -79,7 +78,7 @@ CASES = (
         "-o {o}/demo --width 24 --spp 1 -m llvm_ad_rgb",
         _below("demo", DEMO),
         ("demo",),
-        ("workflows.report._Work.run", "workflows.bake.sums_in_one_go"),
+        ("workflows.report._ReportWork.run", "workflows.bake.sums_of"),
     ),
     Case("render", "{i}/scene.xml -o {o}/a.exr -m llvm_ad_rgb", ("a.exr",)),
     Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb", ("a.png",)),
@@ -114,7 +113,7 @@ CASES = (
         "report",
         "{i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 --points 200 -m llvm_ad_rgb",
         ("a.html",),
-        once=("workflows.report._Work.run",),
+        once=("workflows.report._ReportWork.run",),
     ),
     Case("rays import", "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'", ("a.npz",)),
     Case(
@@ -209,8 +208,8 @@ CASES = (
     ),
 )
 
-MAKES_A_FOLDER = {"poses": "tests/cli/test_poses.py"}
-"""Commands that make a folder as a whole, which must not be there before -> where their output is tried."""
+MAKES_A_FOLDER = {"poses"}
+"""Commands that make a folder as a whole, which must not be there before: `test_scenes` tries them."""
 
 INPUTS = {
     "scene": {"photos", "align"},

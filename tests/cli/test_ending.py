@@ -1,7 +1,8 @@
-"""How a command ends: its exit code, and what is said. `test_main` tries the same through the command."""
+"""How a command ends, on Ctrl-C too, and what it tells until then."""
 
 import io
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -9,9 +10,11 @@ import time
 
 import pytest
 
-from nerg_mi.cli import main
+from nerg_mi.cli import main, progress
 from nerg_mi.cli.ending import FAULT, INTERRUPTED, USER_ERROR, CtrlC, end_of, open_streams, shorten_values
+from nerg_mi.cli.progress import TerminalReporter
 from nerg_mi.errors import NergError
+from nerg_mi.formats.checkpoint import read_checkpoint
 
 
 def test_what_the_user_can_mend_and_what_not():
@@ -110,3 +113,228 @@ def test_messages_repeat_the_ends_of_long_values(capsys, long):
     assert said.count("...") >= 3 and max(map(len, said.splitlines())) < 800
     assert shorten_values(f"got {long!r}; correct it", ["--up", long]).endswith("; correct it")
     assert shorten_values("got red", ["--up=red"]) == "got red"
+
+
+# ---- What a job tells, on a terminal and elsewhere ----
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def replace_streams(monkeypatch):
+    """Another standard output and error, of which only the latter is a terminal."""
+    out, err = io.StringIO(), Terminal()
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", err)
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    return out, err
+
+
+def test_the_bar_is_on_the_terminal_and_messages_are_where_they_are_piped(monkeypatch):
+    out, err = replace_streams(monkeypatch)
+    with TerminalReporter() as reporter:
+        reporter.message("[before]")
+        assert err.getvalue() == ""
+        reporter.progress(0.25, "3 s left")
+        reporter.message("a line with [brackets] of " + 40 * "words ")
+        reporter.warn("thin")
+        reporter.progress(0.5, "2 s left [x]")
+    shown = err.getvalue()
+    assert out.getvalue() == "[before]\na line with [brackets] of " + 40 * "words " + "\n"
+    assert "50%" in shown and "2 s left [x]" in shown and "warning: thin" in shown
+    # The bar is taken away again: its line is erased.
+    assert "\x1b[2K" in shown
+
+
+def test_nothing_but_messages_where_there_is_no_terminal(capsys):
+    with TerminalReporter() as reporter:
+        reporter.progress(0.5, "half")
+        reporter.message("done")
+        reporter.warn("thin")
+    assert capsys.readouterr() == ("done\n", "warning: thin\n")
+
+
+class Clock:
+    """A clock that moves when it is told to."""
+
+    def __init__(self, monkeypatch):
+        self.now = 1000.0
+        monkeypatch.setattr(progress.time, "monotonic", lambda: self.now)
+        # The beat of a real second would read this clock at any moment; the tests beat themselves.
+        monkeypatch.setattr(TerminalReporter, "_beat", lambda self: None)
+
+
+def test_a_log_gets_a_line_every_ten_seconds(capsys, monkeypatch):
+    clock = Clock(monkeypatch)
+    with TerminalReporter() as reporter:
+        for second in range(35):
+            clock.now = 1000.0 + second
+            reporter.progress(second / 100, f"{100 - second} s left, held out 21.30 dB")
+    lines = [f"{k:4.0%} {100 - int(100 * k)} s left, held out 21.30 dB" for k in (0.1, 0.2, 0.3)]
+    assert capsys.readouterr() == ("", "\n".join(lines) + "\n")
+
+
+def test_what_a_job_does_not_say_is_added(capsys, monkeypatch):
+    clock = Clock(monkeypatch)
+    with TerminalReporter() as reporter:
+        reporter.progress(0.0, "reading")
+        clock.now += 20
+        reporter.tell_when_due()
+        clock.now += 20
+        reporter.progress(0.25, "scores")
+        clock.now += 200
+        reporter.progress(0.25, "scores")
+    # A quarter took 40 s, so that the rest takes 120; then 240 s, so that it takes twelve minutes.
+    said = ["  0% reading, 20 s so far", " 25% scores, 2 min left", " 25% scores, 12 min left"]
+    assert capsys.readouterr().err.splitlines() == said
+
+
+def test_what_is_prepared_is_no_measure_of_the_rest(capsys, monkeypatch):
+    clock = Clock(monkeypatch)
+    with TerminalReporter() as reporter:
+        reporter.progress(0.0, "reading")
+        clock.now += 9
+        reporter.progress(0.0, "preparing")
+        clock.now += 9
+        reporter.progress(0.1, "steps")
+    assert capsys.readouterr().err.splitlines() == [" 10% steps, 81 s left"]
+
+
+def test_a_long_step_that_tells_nothing_is_spoken_for(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "EVERY", 0.2)
+    with TerminalReporter() as reporter:
+        reporter.progress(0.5, "integrating")
+        assert reporter._pulse is not None
+        reporter._ended.wait(2.5)
+    said = capsys.readouterr().err
+    assert " 50% integrating" in said
+    assert not reporter._pulse.is_alive()
+
+
+def test_the_bar_says_how_long_the_rest_takes(monkeypatch):
+    clock = Clock(monkeypatch)
+    _, err = replace_streams(monkeypatch)
+    with TerminalReporter() as reporter:
+        reporter.progress(0.1, "views")
+        clock.now += 10
+        reporter.progress(0.5, "views")
+        assert reporter.line() == "views, 10 s left" and reporter._pulse is None
+    assert "views, 10 s left" in err.getvalue()
+
+
+@pytest.mark.parametrize(
+    "seconds, said", [(0.4, "0 s"), (119, "119 s"), (120, "2 min"), (7199, "120 min"), (9000, "2.5 h")]
+)
+def test_durations(seconds, said):
+    assert progress.duration(seconds) == said
+
+
+# ---- Ctrl-C in a process of its own: exit code 130, outputs whole or absent, trainings to be gone on with ----
+
+_CHILD = """
+import os, pkgutil, signal, sys
+import nerg_mi.cli
+name, calls, *arguments = sys.argv[1:]
+owner, _, function = name.rpartition(".")
+owner = pkgutil.resolve_name(owner)
+original, left = getattr(owner, function), int(calls)
+
+def interrupted(*given, **more):
+    global left
+    left -= 1
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGINT)
+    return original(*given, **more)
+
+setattr(owner, function, interrupted)
+nerg_mi.cli.main(arguments)
+"""
+
+
+def interrupted(name: str, calls: int, *arguments) -> subprocess.CompletedProcess:
+    """`nerg` in a process that gets SIGINT as a function is called for the so-many-th time."""
+    command = [sys.executable, "-c", _CHILD, f"nerg_mi.{name}", str(calls), *map(str, arguments)]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=300, env={**os.environ, "PYTHONPATH": os.getcwd()}
+    )
+
+
+ENDLESS = "--steps 1000000 --save-every 0"
+GAZE = "--geometry none --radius 0.6 --probes 8 --directions 64 --zones 0 --min-rays 8"
+
+
+# Steps that a radiance training takes, and forgets, before its first.
+WARM_UP = 5
+
+
+def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
+    line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} --variant capture {ENDLESS}"
+    done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 4, *line.split())
+    assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
+    assert sorted(os.listdir(tmp_path)) == ["a.run", "a.safetensors"]
+    # The step during which it came is finished.
+    assert read_checkpoint(tmp_path / "a.run", "gaze run")[1]["steps"] == 4
+    assert read_checkpoint(tmp_path / "a.safetensors", "gaze")[1]["provenance"]["interrupted"]
+
+
+def test_a_gaze_training_whose_variant_is_not_chosen_yet_says_that_nothing_was_kept(inputs, tmp_path):
+    line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {ENDLESS}"
+    done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 4, *line.split())
+    assert done.returncode == 130 and "nothing was kept" in done.stderr and "--resume" not in done.stderr, done.stderr
+    assert not os.listdir(tmp_path)
+
+
+def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
+    line = f"train radiance {inputs}/photos -o {tmp_path}/a.safetensors {ENDLESS}"
+    done = interrupted("train.radiance_trainer.RadianceTrainer.step", WARM_UP + 4, *line.split())
+    assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
+    assert sorted(os.listdir(tmp_path)) == ["a.preview.png", "a.run", "a.safetensors"]
+    assert read_checkpoint(tmp_path / "a.run", "radiance run")[1]["steps"] == 4
+    assert read_checkpoint(tmp_path / "a.safetensors", "radiance")[1]["provenance"]["interrupted"]
+
+
+def test_an_ensemble_keeps_its_members_and_its_state(inputs, tmp_path):
+    some = "--variant capture --steps 3 --ensemble 2 --save-every 0"
+    line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {some}"
+    done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 5, *line.split())
+    assert done.returncode == 130 and "member 2 of 2; go on with --resume" in done.stderr, done.stderr
+    assert sorted(os.listdir(tmp_path)) == ["a.member0.safetensors", "a.run"]
+
+
+ENDS = {
+    "eval": (
+        "evaluation.metrics.Renderer.__call__",
+        2,
+        "eval radiance {i}/field.safetensors {i}/photos --holdout 2 -o {o}",
+    ),
+    "study": (
+        "evaluation.study.measure",
+        1,
+        "study slab -o {o} --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
+    ),
+    "ablate": (
+        "train.gaze_log_density.LikelihoodTrainer.step",
+        3,
+        "ablate {i}/rays.npz -o {o} --geometry none --recipes default --variant emit --zones 1 --positions 4 "
+        "--min-rays 8 --radius 0.5 --cameras 0 --probes 8",
+    ),
+    "rays import": (
+        "rays.readers.table.add_tables",
+        1,
+        "rays import {i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'",
+    ),
+    "export": ("fields.extraction.Sampler.on", 1, "export points {i}/field.safetensors -o {o}/a.ply --resolution 16"),
+}
+"""Function during whose so-many-th call Ctrl-C comes, and the command line with its folders of inputs and outputs."""
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_a_command_ends_at_once(name, inputs, tmp_path):
+    function, calls, line = ENDS[name]
+    done = interrupted(function, calls, *shlex.split(line.format(i=inputs, o=tmp_path / "out")))
+    assert done.returncode == 130 and "Interrupted." in done.stderr and "Traceback" not in done.stderr, done.stderr
+    found = sorted(p.name for p in tmp_path.rglob("*") if p.is_file())
+    assert found == (["0.png"] if name == "eval" else [])

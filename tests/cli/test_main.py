@@ -1,32 +1,36 @@
-"""The frame of the command: what it lists, what it imports, and how it fails."""
+"""The frame of the command: what it lists, what it imports, what shells complete, how it fails, and `nerg doctor`."""
 
+import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-import nerg_mi.cli
-import nerg_mi.cli.machine
+from nerg_mi import diagnosis, llvm
 from nerg_mi.cli.building import GROUPS, find_commands
 from nerg_mi.errors import MissingFile, NergError, UnusableLLVM, chosen, mitsuba_says, sentence
 from nerg_mi.workflows.base import COMMANDS
 from tests.conftest import ROOT
+from tools.command_pages import commands
 
 HEAVY = {"mitsuba", "drjit", "numpy", "scipy", "matplotlib", "torch", "trimesh", "OpenEXR"}
 
 
-def nerg(*arguments, after=""):
+def in_a_process(*arguments, after="", **environment):
     code = (
         f"import sys; sys.argv[1:] = {list(arguments)!r}\n"
         f"from nerg_mi.cli import main\ntry: main()\nfinally:\n    {after or 'pass'}"
     )
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    environment = {**os.environ, **environment}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
 
 
 def test01_help_lists_every_command():
-    done = nerg("--help")
+    done = in_a_process("--help")
     assert done.returncode == 0
     for name, entry in find_commands().items():
         name, _, below = name.partition(" ")
@@ -35,25 +39,46 @@ def test01_help_lists_every_command():
 
 
 def test02_help_imports_nothing_heavy():
-    done = nerg("--help", after="print('loaded:', *sys.modules)")
+    done = in_a_process("--help", after="print('loaded:', *sys.modules)")
     loaded = set(done.stdout.partition("loaded:")[2].split())
     assert "nerg_mi.cli" in loaded and not HEAVY & loaded
     assert not {entry.module for entry in find_commands().values()} & loaded
 
 
-def test03_no_help_loads_mitsuba():
+def test03_no_help_of_a_command_imports_anything_heavy():
+    """But for that of imports, whose options are those of the readers of tables."""
     code = (
-        "import sys\nfrom tools.command_pages import commands\n"
-        "for path, command, _ in commands(): assert command.help, path\n"
-        "print(*{'mitsuba', 'torch'} & set(sys.modules))"
+        "import importlib, sys\nfrom nerg_mi.cli import building\n"
+        "for entry in building.find_commands().values(): importlib.import_module(entry.module)\n"
+        "for name, command in building.COMMANDS.items():\n"
+        "    if name not in ('rays import', 'view'): building.build_command(command)\n"
+        f"print(*{HEAVY} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0 and not done.stdout.strip(), done.stderr
+    assert done.returncode == 0 and not done.stdout.strip(), (done.stdout, done.stderr)
 
 
-def test04_wrong_command_line():
-    assert nerg("no-such-command").returncode == 2
-    assert nerg("render", "scene.xml").returncode == 2  # -o is missing
+def test04_wrong_command_line(nerg):
+    assert nerg("no-such-command").code == 2
+    assert nerg("render", "scene.xml").code == 2  # -o is missing
+
+
+def test05_mode_is_the_variant_of_commands_that_compute():
+    having = set()
+    for path, command, _ in commands():
+        name = path.removeprefix("nerg ")
+        options = {option: p for p in command.params for option in p.opts}
+        having |= {name} if "--mode" in options else set()
+        assert ("-m" in options) == ("--mode" in options)
+        # The former name, or the factors of a gaze field.
+        assert ("--variant" in options) == ("--mode" in options), name
+        factors = name in ("train gaze", "eval folds", "ablate")
+        assert "--variant" not in options or options["--variant"].hidden != factors, name
+    assert having >= {"align", "bake", "demo", "refine", "render", "report", "scene", "stats", "study", "view"}
+    assert all(any(name.startswith(f"{group} ") for name in having) for group in ("train", "eval", "export", "draw"))
+
+
+# ---- How a command fails ----
 
 
 def failing(monkeypatch, error):
@@ -79,24 +104,21 @@ def failing(monkeypatch, error):
         ),
     ],
 )
-def test05_expected_error_is_one_sentence(monkeypatch, capsys, error, said):
+def test05_expected_error_is_one_sentence(monkeypatch, nerg, error, said):
     failing(monkeypatch, error)
-    with pytest.raises(SystemExit) as end:
-        nerg_mi.cli.main(["doctor"])
-    assert end.value.code == 1
-    assert capsys.readouterr().err.strip() == said
+    ended = nerg("doctor")
+    assert ended.code == 1 and ended.err.strip() == said
 
 
 @pytest.mark.parametrize("error, code", [(NergError("no."), 1), (TypeError("a bug"), 70)])
 @pytest.mark.parametrize("ask", ["--debug", "--traceback", "NERG_TRACEBACK"])
-def test06_traceback_on_request(monkeypatch, capsys, error, code, ask):
+def test06_traceback_on_request(monkeypatch, nerg, error, code, ask):
     failing(monkeypatch, error)
     if ask.isupper():
         monkeypatch.setenv(ask, "1")
-    with pytest.raises(SystemExit) as end:
-        nerg_mi.cli.main(["doctor"] + [ask] * ask.startswith("--"))
-    said = capsys.readouterr().err
-    assert end.value.code == code and "Traceback (most recent call last)" in said and "in command" in said
+    ended = nerg("doctor", *([ask] if ask.startswith("--") else []))
+    said = ended.err
+    assert ended.code == code and "Traceback (most recent call last)" in said and "in command" in said
     assert said.strip().splitlines()[-1].startswith("nerg: ")
 
 
@@ -115,13 +137,11 @@ def test06_traceback_on_request(monkeypatch, capsys, error, code, ask):
         ),
     ],
 )
-def test07_a_mistake_in_the_program_is_shown_as_one(monkeypatch, capsys, error, said):
+def test07_a_mistake_in_the_program_is_shown_as_one(monkeypatch, nerg, error, said):
     failing(monkeypatch, error)
-    with pytest.raises(SystemExit) as end:
-        nerg_mi.cli.main(["doctor"])
-    out = capsys.readouterr()
-    assert end.value.code == 70 and not out.out
-    assert out.err == (
+    ended = nerg("doctor")
+    assert ended.code == 70 and not ended.out
+    assert ended.err == (
         f"nerg: internal error ({said}): this is a fault of nerg_mi and not of your input; run again with --debug and "
         "report the traceback\n"
     )
@@ -193,16 +213,14 @@ def test07e_a_mistake_in_a_plugin_is_not(said):
     assert not isinstance(raised.value, NergError)
 
 
-def test07f_a_plugin_with_a_mistake(rgb, tmp_path, capsys, monkeypatch):
+def test07f_a_plugin_with_a_mistake(rgb, tmp_path, nerg, monkeypatch):
     """From its constructor through Mitsuba to the command line."""
     scene = tmp_path / "a.xml"
     scene.write_text('<scene version="3.0.0"><integrator type="nerg"/><sensor type="perspective"/></scene>')
     rgb.set_variant("llvm_ad_rgb")
     monkeypatch.setattr("nerg_mi.plugins.nerg.choice", lambda *a: 1 / 0)
-    with pytest.raises(SystemExit) as end:
-        nerg_mi.cli.main(["render", str(scene), "-o", str(tmp_path / "a.exr"), "-m", "llvm_ad_rgb"])
-    said = capsys.readouterr().err
-    assert end.value.code == 70 and "internal error" in said and "ZeroDivisionError: division by zero" in said
+    ended = nerg("render", scene, "-o", tmp_path / "a.exr", "-m", "llvm_ad_rgb")
+    assert ended.code == 70 and "internal error" in ended.err and "ZeroDivisionError: division by zero" in ended.err
 
 
 def test08_sentence_of_a_mitsuba_error():
@@ -214,3 +232,89 @@ def test08_sentence_of_a_mitsuba_error():
     assert sentence(error) == (
         'At string (line 1, col 49): failed to instantiate volume plugin of type "nerf": "filename" must be given.'
     )
+
+
+# ---- nerg doctor, on this machine and on one whose libLLVM is unusable ----
+
+
+def test09_this_machine():
+    done = in_a_process("doctor")
+    assert done.returncode == 0, done.stdout + done.stderr
+    for word in ("libLLVM", "CUDA", "llvm_ad_rgb", "threads", *diagnosis.EXTRAS, "ready to render"):
+        assert word in done.stdout
+
+
+def test10_unusable_llvm(tmp_path):
+    bad = tmp_path / "libLLVM-15.so.1"
+    bad.touch()
+    done = in_a_process("doctor", **{llvm.VARIABLE: str(bad)})
+    assert "Traceback" not in done.stderr
+    assert f"LLVM 15 ({bad}) cannot run the kernels of Dr.Jit" in done.stdout
+    assert "llvm_ad_rgb" not in done.stdout
+    if not llvm.has_cuda():
+        assert done.returncode == 1 and "nothing can be rendered" in done.stdout
+
+
+# ---- Shells complete sub-commands and options of the installed command ----
+
+NERG = Path(sys.executable).with_name("nerg")
+needs_command = pytest.mark.skipif(not NERG.exists(), reason="the command nerg is not installed beside this Python")
+
+
+def ask(shell: str, line: str) -> subprocess.CompletedProcess[str]:
+    """What the installed command answers a shell in which `line` was typed up to Tab."""
+    words = line.split(" ")
+    how = {"COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)} if shell == "bash" else {"_TYPER_COMPLETE_ARGS": line}
+    how |= {"_NERG_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    return subprocess.run([NERG], env={**os.environ, **how}, capture_output=True, text=True, timeout=60)
+
+
+@needs_command
+def test_bash_is_given_commands_and_those_below():
+    assert set(ask("bash", "nerg ").stdout.split()) == {name.split()[0] for name in find_commands()}
+    assert ask("bash", "nerg tr").stdout.split() == ["train"]
+    assert set(ask("bash", "nerg train ").stdout.split()) == {"radiance", "gaze", "prior"}
+    assert {"import", "guess", "show", "filter"} <= set(ask("bash", "nerg rays ").stdout.split())
+
+
+@needs_command
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_options_are_those_of_the_command(shell):
+    done = ask(shell, "nerg train gaze --fr")
+    assert done.returncode == 0 and done.stderr == ""
+    assert "--fresh-directions" in done.stdout and "--seed" not in done.stdout
+    assert "--overlay" in ask(shell, "nerg render --ov").stdout
+
+
+@needs_command
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_script_that_a_shell_reads_is_printed(shell):
+    environment = {**os.environ, "_NERG_COMPLETE": f"source_{shell}"}
+    done = subprocess.run([NERG], env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and "_NERG_COMPLETE=complete_" in done.stdout and "nerg" in done.stdout
+
+
+@needs_command
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+def test_bash_completes_by_that_script(tmp_path):
+    """As a shell does it: the script is read, its function called, what it leaves in COMPREPLY looked at."""
+    script = "\n".join(
+        [
+            'eval "$(_NERG_COMPLETE=source_bash nerg)"',
+            "COMP_WORDS=(nerg render --over) COMP_CWORD=2",
+            '_nerg_completion nerg; printf "%s\\n" "${COMPREPLY[@]}"',
+        ]
+    )
+    environment = {**os.environ, "PATH": f"{NERG.parent}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(["bash", "--norc", "-c", script], env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == ["--overlay"], done.stderr
+
+
+@needs_command
+def test_it_is_installed_into_the_home_it_is_given(tmp_path):
+    environment = {**os.environ, "HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    command = [NERG, "--install-completion", "bash"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "_nerg_completion" in (tmp_path / ".bash_completions" / "nerg.sh").read_text()
+    assert "nerg.sh" in (tmp_path / ".bashrc").read_text()

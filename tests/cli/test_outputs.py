@@ -19,7 +19,7 @@ import nerg_mi.cli
 from nerg_mi.cli.building import callback_of, find_commands
 from nerg_mi.workflows.base import COMMANDS
 
-from .outputs import CASES, INPUTS, MAKES_A_FOLDER, OF_TORCH, make_inputs
+from .outputs import CASES, INPUTS, MAKES_A_FOLDER, OF_TORCH
 
 
 def nerg(capsys, *arguments) -> tuple[int, str]:
@@ -27,20 +27,6 @@ def nerg(capsys, *arguments) -> tuple[int, str]:
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(list(map(str, arguments)))
     return end.value.code or 0, capsys.readouterr().err
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    folder = make_inputs(tmp_path_factory.mktemp("inputs"))
-    place = "--geometry hits --radius 0.5 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8"
-    line = f"train gaze {folder}/rays.npz -o {folder}/gaze.safetensors {place} --test-zones 1 --test-positions 3"
-    with pytest.raises(SystemExit) as end:
-        nerg_mi.cli.main(line.split())
-    assert not end.value.code
-    return folder
 
 
 def files(folder: Path) -> dict[str, bytes]:

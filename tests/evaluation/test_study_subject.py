@@ -13,7 +13,8 @@ from nerg_mi.evaluation.study_subject import open_subject, parameters
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.train.gaze_data import box_exit
-from nerg_mi.workflows.study import StudyOptions, run_study, twin_beside
+from nerg_mi.workflows.scene_commands import StudyOptions
+from nerg_mi.workflows.study import run_study, twin_beside
 from tests.evaluation.gaze_fields import KINDS, saved
 from tests.reference import march_numpy
 

@@ -40,8 +40,7 @@ from nerg_mi.figures.style import (
     ticks_of,
     wrap,
 )
-from nerg_mi.workflows.bake_options import BakeOptions
-from nerg_mi.workflows.options import PictureOptions
+from nerg_mi.workflows.scene_commands import BakeOptions, PictureOptions
 
 # ---- Colour maps by name: what is let in, and that what is let in is even ----
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.fuzz.describe import Reader
+from tests.fuzz.watch import Reader
 
 _SIZE = 8, 6
 _NAMES = "a.png", "b.png", "c.png"

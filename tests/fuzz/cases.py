@@ -8,9 +8,8 @@ from pathlib import Path
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
-from tests.fuzz.describe import Reader
 from tests.fuzz.mutations import mutated
-from tests.fuzz.watch import Case
+from tests.fuzz.watch import Case, Reader
 
 
 def make_inputs(readers: list[Reader], folder: Path) -> Path:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from tests.fuzz.describe import Reader
+from tests.fuzz.watch import Reader
 
 _ABOUT = {"sha": 1, "width": 24}
 

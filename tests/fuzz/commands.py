@@ -26,8 +26,7 @@ from typer.core import TyperOption
 from nerg_mi.ranges import COORDINATES, TIMES
 from nerg_mi.train.gaze_recipes import recipes
 from tests.cli import outputs
-from tests.fuzz.describe import Reader
-from tests.fuzz.watch import Case
+from tests.fuzz.watch import Case, Reader
 
 SKIPPED = {"demo", "study", "ablate", "eval folds", "export torch-ngp", "refine"}
 SKIPPED |= set() if outputs.HAS_TORCH else set(outputs.OF_TORCH)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from tests.fuzz.describe import Reader
+from tests.fuzz.watch import Reader
 
 
 def _make(folder: Path) -> None:

@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.fuzz.describe import Reader
-from tests.fuzz.watch import SPECIAL, Case
+from tests.fuzz.watch import SPECIAL, Case, Reader
 
 SPECIAL_FRACTION = 0.06
 _FACTORS = (0, -1, 1e-30, 1e-3, 0.01, 100, 1000, 1e6, 1e30, 1e38, 1e300)

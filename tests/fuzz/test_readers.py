@@ -12,9 +12,8 @@ import pytest
 
 from tests.fuzz import commands, semantic
 from tests.fuzz.cases import draw_cases, make_inputs
-from tests.fuzz.keeping import corpus, kept
 from tests.fuzz.readers import ALL, READERS
-from tests.fuzz.watch import BREACHES, Case, run_cases
+from tests.fuzz.watch import BREACHES, Case, corpus, kept, run_cases
 
 CASES = 750
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.rays.readers.registry import reader_names
-from tests.fuzz.describe import Reader
+from tests.fuzz.watch import Reader
 from tests.rays.readers.examples import EXAMPLES, TABLE, VARIANTS, Example, write_walk
 
 

@@ -1,24 +1,52 @@
-"""Runs cases in a warm child process, and sees it crash or hang."""
+"""Readers as the fuzzer sees them, cases in a warm child process that may crash or hang, and the corpus."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
+import importlib.util
 import json
 import os
 import select
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+# ---- What a reader is to the fuzzer ----
+
+
+@dataclass(frozen=True)
+class Reader:
+    """``make`` writes a small valid input into an empty folder; ``read`` reads that folder and uses what it gets.
+
+    ``targets``: the files in it that are damaged, by name, each with the kinds of structure that damage may keep, of
+    "json", "text", "zip", "gzip", "npy", "safetensors", "png", "boxes" (of MP4); bytes are damaged in any case. Both
+    functions import what they need themselves. ``needs``: a package that may be missing, without which there is no
+    such reader. ``is_command``: it runs a command, which may write files and load what it needs.
+    """
+
+    name: str
+    make: Callable[[Path], None]
+    targets: dict[str, tuple[str, ...]]
+    read: Callable[[Path], object]
+    needs: str | None = None
+    is_command: bool = False
+
+    @property
+    def installed(self) -> bool:
+        return self.needs is None or importlib.util.find_spec(self.needs) is not None
+
+
+# ---- Runs cases in a warm child process, and sees it crash or hang ----
+
 
 ROOT = Path(__file__).resolve().parents[2]
 BREACHES = ("other exception", "crash", "hang", "executed", "left a file", "memory", "slow", "no sentence")
 # A case has 5 s of the processor's time; the machine may be busy, and a hang is a hang.
 _PATIENCE = 60.0
-
-
 SPECIAL = ("fifo", "/dev/zero", "/dev/null", "folder", "missing", "loop", "sparse")
 """What may stand at a path in place of a regular file: itself, or a link to it."""
 
@@ -118,3 +146,24 @@ def run_cases(
     finally:
         if child is not None:
             child.close()
+
+
+# ---- The corpus: cases that once broke the contract, and some made by hand, which the tests replay ----
+
+
+CORPUS = Path(__file__).with_name("corpus")
+
+
+def kept(case: Case) -> str:
+    """Name of the file in the corpus that holds ``case``; of one without data, what stands in its place."""
+    return f"{_prefix(case.reader, case.target)}-{case.special or hashlib.sha256(case.data).hexdigest()[:12]}"
+
+
+def _prefix(reader: str, target: str) -> str:
+    return f"{reader}-{target}".replace("/", "_").replace(" ", "_")
+
+
+def corpus(readers: list[Reader]) -> list[Case]:
+    """All cases that are kept. Raises `KeyError` for a file of a reader that there is not."""
+    known = {_prefix(r.name, t): (r.name, t) for r in readers for t in r.targets}
+    return [Case(*known[p.name.rsplit("-", 1)[0]], p.read_bytes()) for p in sorted(CORPUS.iterdir())]

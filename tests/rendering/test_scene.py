@@ -257,7 +257,8 @@ def test_pictures_of_a_scene_are_looked_at(tmp_path, name):
 
 
 def test_samples_of_the_option_are_bounded(tmp_path):
-    from nerg_mi.workflows.render import PictureOptions, render_file
+    from nerg_mi.workflows.render import render_file
+    from nerg_mi.workflows.scene_commands import PictureOptions
 
     with pytest.raises(NergError, match="--spp.*0.*16777216"):
         render_file(tmp_path / "s.xml", tmp_path / "a.exr", PictureOptions(spp=1 << 31))
@@ -266,7 +267,8 @@ def test_samples_of_the_option_are_bounded(tmp_path):
 def test_the_other_ways_in_are_guarded(standins, tmp_path):
     from nerg_mi.evaluation import study_subject
     from nerg_mi.train.geometry import place_of_scene
-    from nerg_mi.workflows.demo import DemoOptions, make_demo
+    from nerg_mi.workflows.demo import make_demo
+    from nerg_mi.workflows.scene_commands import DemoOptions
 
     (tmp_path / "s.xml").write_text(scene(DEEP))
     with pytest.raises(NergError, match="deep"):

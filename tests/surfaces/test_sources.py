@@ -159,7 +159,7 @@ def test05_it_is_what_attention_says(rgb, tmp_path):
     from nerg_mi.scenes import store
 
     import nerg_mi as nerg
-    from nerg_mi.api.scene import box_dict
+    from tests.pictures import box_dict
 
     here = files(store)
     eye = (4.4, 2.8, 1.6)

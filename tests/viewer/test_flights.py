@@ -17,7 +17,7 @@ from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.scene import copied
 from nerg_mi.viewer.serve import viewer
 from nerg_mi.viewer.session import Worker
-from nerg_mi.workflows.view import ViewOptions
+from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import require
 
 # ---- A flight as a video: in turns with other tasks, cancelled, and with what is shown ----

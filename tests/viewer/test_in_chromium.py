@@ -14,7 +14,7 @@ import pytest
 from nerg_mi.viewer.layers import layer_of
 from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.serve import viewer
-from nerg_mi.workflows.view import ViewOptions
+from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import chromium, require
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.viewer.serve import viewer
-from nerg_mi.workflows.view import ViewOptions
+from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import chromium, require
 from tests.viewer.conftest import ROOM, write_gaze_fields
 from tests.viewer.test_in_chromium import drag, until

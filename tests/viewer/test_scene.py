@@ -12,7 +12,7 @@ from nerg_mi.viewer.page import Page
 from nerg_mi.viewer.points import BandPace, PinholeView, refine
 from nerg_mi.viewer.scene import PeoplePanel, Shown, copied
 from nerg_mi.viewer.serve import viewer
-from nerg_mi.workflows.view import ViewOptions
+from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import require
 
 # ---- A copied scene renders as what was viewed ----

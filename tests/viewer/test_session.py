@@ -19,7 +19,8 @@ from nerg_mi.viewer import session as module
 from nerg_mi.viewer.layers import layer_of
 from nerg_mi.viewer.page import Page
 from nerg_mi.viewer.session import ALL, GAP, Listener, Session, Tracks, Worker
-from nerg_mi.workflows.view import ViewOptions, place_to_view
+from nerg_mi.workflows.scene_commands import ViewOptions
+from nerg_mi.workflows.view import place_to_view
 
 # ---- The page is told all that a session tells ----
 

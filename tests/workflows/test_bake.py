@@ -1,17 +1,70 @@
-"""Bakes from files to sums: a field's people, rays, units, and options that contradict each other."""
+"""Gaze on surfaces: what a bake is asked for, its chunks and sums, on meshes and splats, and its files."""
 
+from __future__ import annotations
+
+import csv
+import io
+import json
+import pickle
+import struct
+from dataclasses import replace
 from importlib.resources import files
+from pathlib import Path
 
+import drjit.llvm.ad as ns
 import numpy as np
 import pytest
+import trimesh
 from nerg_mi.scenes import store
 
 from nerg_mi.errors import NergError
+from nerg_mi.figures.style import color_values
+from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.ply import write_columns
+from nerg_mi.formats.splats import read_splats, write_ply_splats
+from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.sphere import C0
 from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows.bake import BakeOptions, bake
-from tests.surfaces.meshes import box
+from nerg_mi.surfaces.laplacian import merge
+from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings, TrackedRays, WeightedObservers
+from nerg_mi.tasks.engines import Output
+from nerg_mi.workflows import bake_chunks
+from nerg_mi.workflows.bake import bake, check_texture, vertex_normals
+from nerg_mi.workflows.bake_chunks import (
+    CONE,
+    BakeScene,
+    PlannedBake,
+    SplatScene,
+    bake_part,
+    check_values,
+    cone_of,
+    cut,
+    find_crowd,
+    halves_of,
+    parts_of,
+    read_path,
+    read_receivers,
+    read_sums,
+    source_of,
+    splat_place,
+    sums_in_one_go,
+    sums_in_parts,
+    tracked_rays,
+)
+from nerg_mi.workflows.bake_splats import COLUMN, bake_splats
+from nerg_mi.workflows.options import PartOptions
+from nerg_mi.workflows.parts import Parts
+from nerg_mi.workflows.scene_commands import BakeOptions
+from tests.conftest import ROOT
+from tests.formats.splats.writers import random_splats, write_inria
+from tests.plugins import fields
+from tests.surfaces.meshes import box, joined, longest_edge, wall
+from tests.surfaces.test_splats import falling
+from tests.tasks.works import laid_out
 from tests.workflows.recorder import Recorder
+
+# ---- Bakes from files to sums: a field's people, rays, units, and options that contradict each other ----
+
 
 GAZE = files(store) / "shoppers.safetensors"
 
@@ -61,32 +114,6 @@ def test03_units_of_the_place_are_not_metres(rgb, tmp_path):
     assert np.allclose(first.density, second.density, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "options, said",
-    [
-        ({}, "whose gaze is it"),
-        ({"source": "eyes"}, "--from"),
-        ({"gaze": GAZE}, "nobody looks"),
-        ({"gaze": GAZE, "observer": (1, 2, 3), "unit": "seconds"}, "add --from rays"),
-        ({"unit": "hours"}, "--unit"),
-        ({"gaze": GAZE, "observer": (1, 2, 3), "smooth": -1.0}, "--smooth must lie in"),
-        ({"gaze": GAZE, "observer": (1, 2, 3), "cone": 99.0}, "--cone must lie in"),
-        ({"gaze": GAZE, "observer": (1, 2, 3), "top": 0.0}, "--top must lie in"),
-        ({"gaze": GAZE, "observer": (1, 2, 3), "cmap": "jet"}, "no perceptually uniform"),
-    ],
-)
-def test04_options_that_contradict_each_other(rgb, room, options, said):
-    with pytest.raises(NergError, match=said):
-        bake(room, (), BakeOptions(**options, mode="llvm_ad_rgb"))
-
-
-def test05_rays_do_not_look_from_elsewhere_and_one_person_has_no_halves(rgb, room):
-    with pytest.raises(NergError, match="look with a gaze field"):
-        bake(room, (), BakeOptions(observer=(1, 2, 3), mode="llvm_ad_rgb"), rays=rays())
-    with pytest.raises(NergError, match="two people at least"):
-        bake(room, (), BakeOptions(halves=True, detail=3.0, mode="llvm_ad_rgb"), rays=rays(people=1))
-
-
 def test06_what_is_not_asked_for_is_not_made(rgb, room, monkeypatch):
     """No smoothing, no Laplacian; no texture, no xatlas."""
     from nerg_mi.surfaces import laplacian
@@ -113,3 +140,552 @@ def test07_a_mesh_in_millimetres_is_told(rgb, tmp_path):
     options["detail"] = 5.0
     bake(tmp_path / "mm.ply", (), BakeOptions(**options, align=tmp_path / "align.json"), mended, rays=rays(4))
     assert not mended.warnings
+
+
+# ---- What is asked for, and what contradicts it ----
+
+
+GAZE_FILE, RAYS_FILE = Path("gaze.safetensors"), Path("rays.npz")
+
+
+@pytest.mark.parametrize(
+    "options, with_gaze, source",
+    [
+        ({"gaze": GAZE_FILE, "rays": RAYS_FILE}, False, "field"),
+        ({"gaze": GAZE_FILE, "rays": RAYS_FILE, "source": "rays"}, False, "rays"),
+        ({"rays": RAYS_FILE}, True, "rays"),
+        ({}, True, "field"),
+    ],
+)
+def test01_whose_gaze(options, with_gaze, source):
+    assert source_of(BakeOptions(**options), None, with_gaze) == source
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({}, "whose gaze is it"),
+        ({"source": "eyes"}, "--from"),
+        ({"rays": RAYS_FILE, "unit": "hours"}, "--unit"),
+        ({"gaze": GAZE_FILE, "halves": True}, "add --from rays"),
+        ({"rays": RAYS_FILE, "observer": (0.0, 0.0, 0.0)}, "--observer and --path"),
+    ],
+)
+def test02_what_contradicts_itself(options, said):
+    with pytest.raises(NergError, match=said):
+        source_of(BakeOptions(**options), None)
+
+
+def test03_cones():
+    assert cone_of(BakeOptions(), "rays") == np.radians(CONE) and cone_of(BakeOptions(), "field") == 0
+    assert cone_of(BakeOptions(cone=3.0), "field") == np.radians(3.0)
+
+
+# ---- Files of a bake open elsewhere, with the same mesh, colours and values ----
+
+
+@pytest.fixture(scope="module")
+def baked(tmp_path_factory):
+    import mitsuba as mi
+
+    from nerg_mi.formats.ply import write_columns
+
+    mi.set_variant("llvm_ad_rgb")
+    folder, (v, f) = tmp_path_factory.mktemp("baked"), box((0, 0, 0), (4, 3, 2.5))
+    write_columns(folder / "room.ply", dict(zip("xyz", v.T)), f)
+    n, rng = 300, np.random.default_rng(0)
+    d = rng.normal((1.0, 0.4, -0.1), 0.2, (n, 3))
+    rays = Rays(
+        np.arange(n) / 10,
+        np.arange(n) // 75,
+        tuple("abcd"),
+        np.tile([1.0, 1, 1.5], (n, 1)),
+        d / np.linalg.norm(d, axis=1, keepdims=True),
+        np.ones(n),
+    )
+    names = [folder / f"a{suffix}" for suffix in (".ply", ".glb", ".csv", ".json")]
+    options = BakeOptions(detail=0.5, smooth=0.1, halves=True, mode="llvm_ad_rgb")
+    return folder, bake(folder / "room.ply", names, options, rays=rays)
+
+
+def test01_ply_and_glb_are_the_same_to_trimesh(baked):
+    folder, result = baked
+    ply = trimesh.load(folder / "a.ply", process=False)
+    glb = trimesh.load(folder / "a.glb", process=False, force="mesh")
+    assert np.array_equal(ply.faces, result.mesh.faces) and np.array_equal(glb.faces, result.mesh.faces)
+    assert np.allclose(ply.vertices, result.mesh.vertices, atol=1e-6)
+    # The node turns z up into glTF's y.
+    assert np.allclose(
+        glb.vertices, np.stack([ply.vertices[:, 0], ply.vertices[:, 2], -ply.vertices[:, 1]], 1), atol=1e-5
+    )
+    values = ply.metadata["_ply_raw"]["vertex"]["data"]["value"]
+    assert np.allclose(np.ravel(values), result.density, rtol=1e-6)
+    # Of a mesh with a material trimesh keeps the colours beside it; they are linear, those of a PLY are as shown.
+    (inner,) = trimesh.load(folder / "a.glb", process=False).geometry.values()
+    linear = np.array(inner.visual.vertex_attributes["color"], float)[:, :3] / 65535
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    assert np.abs(shown - np.array(ply.visual.vertex_colors)[:, :3] / 255).max() < 0.6 / 255
+    assert np.allclose(np.ravel(inner.vertex_attributes["_VALUE"]), result.density, rtol=1e-6)
+    assert len(np.unique(ply.visual.vertex_colors, axis=0)) > 20
+
+
+def test02_the_table_adds_up_and_the_summary_says_what_was_done(baked):
+    folder, result = baked
+    rows = list(csv.DictReader(io.StringIO((folder / "a.csv").read_text())))
+    assert (
+        len(rows) == 12 and [int(r["face"]) for r in rows] == list(range(12)) and {r["shape"] for r in rows} == {"room"}
+    )
+    share = np.array([float(r["share"]) for r in rows])
+    assert np.isclose(share.sum(), result.on_surface) and np.isclose(result.on_surface, 1, atol=1e-6)
+    assert np.allclose([float(r["value"]) * float(r["area_m2"]) for r in rows], share, rtol=1e-6)
+    assert np.isclose(sum(float(r["area_m2"]) for r in rows), 2 * (12 + 10 + 7.5))
+    told = json.loads((folder / "a.json").read_text())
+    assert told["lookers"] == 300 and 0.3 < told["halves_cc"] <= 1 and told["shapes"] == {"room": pytest.approx(1)}
+    assert list(told["provenance"]["inputs"]) == ["room.ply"] and told["provenance"]["settings"]["smooth"] == 0.1
+    raw = (folder / "a.glb").read_bytes()
+    document = json.loads(raw[20 : 20 + struct.unpack_from("<I", raw, 12)[0]])
+    assert document["asset"]["extras"]["provenance"]["what"] == "nerg bake"
+    assert b"comment nerg_mi" in (folder / "a.ply").read_bytes()[:4000]
+
+
+def test03_a_texture(baked, tmp_path):
+    pytest.importorskip("xatlas", reason="xatlas is not installed")
+    folder, _ = baked
+    rays = Rays([0.0, 0.1], [0, 0], ("a",), np.ones((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]]), np.ones(2))
+    options = BakeOptions(detail=0.4, texture=128, mode="llvm_ad_rgb")
+    bake(folder / "room.ply", [tmp_path / "t.glb"], options, rays=rays)
+    found = trimesh.load(tmp_path / "t.glb", process=False, force="mesh")
+    picture = np.asarray(found.visual.material.baseColorTexture)
+    assert picture.shape[:2] == (128, 128) and len(found.faces) == 12
+    # Where somebody looks it is brighter than where nobody does.
+    assert picture[..., 0].max() > picture[..., 0][picture[..., 0] > 0].min() + 50
+
+
+def test04_normals_and_textures_that_go_nowhere(tmp_path):
+    mesh = joined(box((0, 0, 0), (1, 1, 1)))
+    normals = vertex_normals(mesh)
+    # Of a cube's corners they point along the diagonals.
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1)
+    assert np.all(np.abs(np.abs((normals * np.sign(mesh.vertices - 0.5)).sum(axis=1))) > 1.6)
+    with pytest.raises(NergError, match=r"\.glb"):
+        check_texture([tmp_path / "a.ply"], 64)
+
+
+# ---- Bakes in parts: the sums of one go to the bit, whoever makes the parts, and only what has to be made ----
+
+
+ROOM = joined(box((0, 0, 0), (8, 6, 3)))
+OF_RAYS = RaySettings(cone=0.03, bundle=4)
+
+
+@pytest.fixture
+def engine(rgb, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setattr(bake_chunks, "RAYS", 300)
+    monkeypatch.setattr(bake_chunks, "OBSERVERS", 2)
+
+
+def crowd(n):
+    at = np.random.default_rng(1).uniform((3, 2, 1.4), (5, 4, 1.8), (n, 3))
+    return WeightedObservers(at, np.full(n, 1 / n))
+
+
+def directed(n, seed=0):
+    d = np.random.default_rng(seed).normal(size=(n, 3))
+    return TrackedRays(np.full((n, 3), 1.5), d / np.linalg.norm(d, axis=1, keepdims=True), np.full(n, 1 / n))
+
+
+def parts(folder, told=None, **options):
+    return Parts(PartOptions(store=folder, **options), folder / "a.ply", told or Recorder(), 1)
+
+
+def made(told):
+    """How many parts were not kept from before."""
+    return int(told.steps[-1][1].split()[0]) - int(told.steps[0][1].split()[0])
+
+
+def equal(one, other):
+    return all(
+        np.array_equal(a.face, b.face)
+        and np.array_equal(a.vertex, b.vertex)
+        and (a.elsewhere, a.escaped, a.total, a.weight, a.count) == (b.elsewhere, b.escaped, b.total, b.weight, b.count)
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+@pytest.mark.usefixtures("engine")
+@pytest.mark.nightly
+def test_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again(tmp_path):
+    scene = BakeScene(ROOM, gaze=GAZE, of_gaze=GazeSumSettings(angle=0.5, directions=1024), of_rays=OF_RAYS)
+    groups = [crowd(3), directed(500)]
+    whole = sums_in_one_go(scene, groups, Recorder())
+    assert equal(sums_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake"), whole)
+    # Started again with two observers more: one part is another one, and one is new.
+    told = Recorder()
+    more = [WeightedObservers(np.r_[groups[0].positions, groups[0].positions[:2]], np.full(5, 1 / 3)), groups[1]]
+    sums_in_parts(scene, more, parts(tmp_path, told), "a bake")
+    assert told.steps[-1][1].startswith("5 of 5 parts") and made(told) == 2
+
+
+@pytest.mark.usefixtures("engine")
+def test_a_part_depends_on_what_it_reads_and_on_nothing_else(tmp_path):
+    def bake_rays(scene, who):
+        told = Recorder()
+        sums_in_parts(scene, [who], parts(tmp_path, told), "a bake")
+        return made(told)
+
+    scene = BakeScene(ROOM, of_rays=OF_RAYS)
+    who = directed(900)
+    assert bake_rays(scene, who) == 3 and bake_rays(scene, who) == 0
+    # Some rays of the second part are others.
+    who.directions[400:500] *= -1
+    assert bake_rays(scene, who) == 1
+    # The mesh is another one.
+    higher = replace(ROOM, vertices=ROOM.vertices * (1, 1, 1.5))
+    assert bake_rays(replace(scene, mesh=higher), who) == 3
+    assert bake_rays(replace(scene, of_rays=RaySettings(cone=0.02, bundle=4)), who) == 3
+
+
+@pytest.mark.usefixtures("engine")
+def test_files_that_were_sent_serve_as_those_that_lie_there(tmp_path):
+    """A worker of another machine has what it was sent in a folder of its own."""
+    plain = wall(0.0, 0.4, 0.05)
+    write_ply_splats(tmp_path / "wall.ply", plain)
+    for scene, who in (
+        (
+            BakeScene(ROOM, (box((1, 1, 0), (2, 2, 1)),), GAZE, of_gaze=GazeSumSettings(angle=0.5, directions=1024)),
+            crowd(1),
+        ),
+        (SplatScene(tmp_path / "wall.ply", len(plain), of_rays=OF_RAYS), falling(100)),
+    ):
+        there = laid_out(PlannedBake.of(scene), tmp_path / "there")
+        notes = bake_part(there, who, tmp_path / "a.npy")
+        found = read_sums(Output(tmp_path / "a.npy", notes), len(scene.nothing.face))
+        assert there != PlannedBake.of(scene) and equal([found], sums_in_one_go(scene, [who], Recorder()))
+
+
+@pytest.mark.usefixtures("engine")
+@pytest.mark.nightly
+def test_two_processes_give_the_sums_of_splats(tmp_path):
+    plain = wall(0.0, 0.4, 0.05)
+    write_ply_splats(tmp_path / "wall.ply", plain)
+    fields.gaze(tmp_path / "gaze.safetensors")
+    scene = SplatScene(tmp_path / "wall.ply", len(plain), tmp_path / "gaze.safetensors", of_rays=OF_RAYS)
+    groups = [falling(500, 0.5), crowd(2)]
+    there = sums_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake")
+    assert equal(there, sums_in_one_go(scene, groups, Recorder()))
+
+
+@pytest.mark.usefixtures("engine")
+def test_halves_are_of_people():
+    n = 40
+    given = Rays(
+        np.arange(n) / 10, np.arange(n) % 4, tuple("abcd"), np.ones((n, 3)), np.eye(3)[np.arange(n) % 3], np.ones(n)
+    )
+    first, second = halves_of(directed(n), given, 0)
+    assert len(first) == len(second) == 20 and (first.first, second.first) == (0, 20)
+    with pytest.raises(NergError, match="two people at least"):
+        halves_of(directed(n), replace(given, person=np.zeros(n, int)), 0)
+
+
+@pytest.mark.usefixtures("engine")
+def test_the_files_of_a_bake_have_the_same_bytes(tmp_path):
+    v, f = box((0, 0, 0), (8, 6, 3))
+    write_columns(tmp_path / "room.ply", dict(zip("xyz", v.T)), f)
+    n = 1000
+    d = directed(n).directions
+    given = Rays(np.arange(n) / 10, np.arange(n) % 2, ("a", "b"), np.full((n, 3), 1.5), d, np.ones(n))
+    given.save(tmp_path / "rays.npz")
+    common = {"rays": tmp_path / "rays.npz", "detail": 2.0, "halves": True, "mode": "llvm_ad_rgb"}
+    for folder, more in (("one", {}), ("parts", {"store": tmp_path / "store"})):
+        outputs = [tmp_path / folder / f"a{suffix}" for suffix in (".ply", ".glb", ".csv", ".json")]
+        bake(tmp_path / "room.ply", outputs, BakeOptions(**common, **more))
+    names = sorted(p.name for p in (tmp_path / "one").iterdir())
+    assert len(names) == 4 and names == sorted(p.name for p in (tmp_path / "parts").iterdir())
+    for name in names:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
+
+
+# ---- Parts of a bake: the same wherever and however often they are computed ----
+
+
+def test01_parts_are_cut_alike_and_a_pickled_scene_gives_the_same(rgb, monkeypatch):
+    monkeypatch.setattr(bake_chunks, "RAYS", 300)
+    scene = BakeScene(ROOM, of_rays=RaySettings(cone=0.03, bundle=4))
+    parts = list(parts_of(directed(1000)))
+    assert [len(p) for p in parts] == [300, 300, 300, 100] and [p.first for p in parts] == [0, 300, 600, 900]
+    first = [scene.sums(part) for part in parts]
+    again = pickle.loads(pickle.dumps(scene))
+    late = [again.sums(part) for part in reversed(parts)][::-1]
+    assert np.array_equal(merge(first).vertex, merge(late).vertex)
+    assert np.isclose(merge(first).face.sum(), 1)
+
+
+def test02_observers_of_a_field(rgb):
+    scene = BakeScene(ROOM, gaze=files(store) / "shoppers.safetensors", of_gaze=GazeSumSettings(angle=0.2))
+    crowd = WeightedObservers(np.array([(4.4, 2.8, 1.6)] * 5), np.full(5, 0.2))
+    parts = list(parts_of(crowd))
+    assert [len(p.weights) for p in parts] == [4, 1]
+    found = scene.sums(parts[1])
+    assert 0.5 < found.on_surface / found.weight < 1.5 and found.count == 1 and abs(found.escaped) < 1e-6
+
+
+def test03_without_a_field_nobody_looks(rgb):
+    with pytest.raises(NergError, match="there is no gaze field"):
+        BakeScene(ROOM).sums(WeightedObservers(np.ones((1, 3)), np.ones(1)))
+
+
+# ---- Who looks ----
+
+
+TURNED = Similarity(np.array([[0, -2, 0, 1], [2, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1.0]]))
+
+
+def rays_lookers():
+    n = 20
+    t = np.arange(n) / 10
+    return Rays(t, np.zeros(n), ("a",), np.stack([t, 0 * t, 0 * t + 1.6], 1), np.tile([1.0, 0, 0], (n, 1)), np.ones(n))
+
+
+def test01_a_path(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n4,5,6\n")
+    found = read_path(tmp_path / "a.csv")
+    assert found.positions.tolist() == [[1, 2, 3], [4, 5, 6]] and found.weights.tolist() == [0.5, 0.5]
+    (tmp_path / "b.csv").write_text("weight;x;y;z\n3;1;2;3\n1;4;5;6\n")
+    assert read_path(tmp_path / "b.csv").weights.tolist() == [0.75, 0.25]
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("x,y\n1,2\n", 'no column "z"'),
+        ("x,y,z\n", "0 positions"),
+        ("x,y,z\n1,2,nan\n", "positions of the path .* row 0 is"),
+        ("x,y,z\n1,2,3\n1,2,1e200\n", r"coordinates from -1e\+07 to 1e\+07, and row 1 is \[1.0, 2.0, 1e\+200\]"),
+        ("x,y,z\n-1.1e7,2,3\n", "row 0 is"),
+        ("x,y,z,weight\n1,2,3,inf\n", "no numbers"),
+        ("x,y,z,weight\n1,2,3,nan\n", "no numbers"),
+        ("x,y,z,weight\n1,2,3,-1\n", "negative"),
+    ],
+)
+def test02_paths_that_are_none(tmp_path, text, said):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(NergError, match=said):
+        read_path(tmp_path / "a.csv")
+
+
+def test03_people_stand_in_the_place():
+    told = Recorder()
+    found = find_crowd(BakeOptions(observers=4), rays_lookers(), TURNED, told)
+    assert len(found.weights) == 4 and np.allclose(found.positions[:, 0], 1) and np.allclose(found.positions[:, 2], 3.2)
+    # Metres are told, of which the place has two units each.
+    assert f"{found.mean / 2:.2f} m away" in told.messages[0] and "1 people at 20 moments" in told.messages[0]
+    who = tracked_rays(rays_lookers(), TURNED, "time")
+    assert np.allclose(who.directions, [0, 1, 0]) and np.allclose(who.origins[:, 1], 2 * rays_lookers().origin[:, 0])
+    assert np.isclose(who.weights.sum(), 1)
+
+
+def test04_one_observer_or_nobody():
+    assert find_crowd(BakeOptions(observer=(1, 2, 3)), None, TURNED, Recorder()).positions.tolist() == [[1, 2, 3]]
+    for options, said in (
+        (BakeOptions(), "nobody looks"),
+        (BakeOptions(observer=(1, 2)), "three numbers"),
+        (BakeOptions(observer=(1, 2, 3), path="a.csv"), "give one of them"),
+    ):
+        with pytest.raises(NergError, match=said):
+            find_crowd(options, None, TURNED, Recorder())
+    for options, said in ((BakeOptions(weights="money"), "--weights"), (BakeOptions(cmap="jet"), "no perceptually")):
+        with pytest.raises(NergError, match=said):
+            check_values(options)
+
+
+# ---- What receives gaze ----
+
+
+SCENE = """<scene version="3.0.0">
+    <shape type="cube" id="sign"/>
+    <shape type="rectangle" id="wall"><transform name="to_world"><translate z="5"/></transform></shape>
+    {more}
+</scene>
+"""
+
+
+def test01_a_mesh_is_cut_as_finely_as_asked_in_metres(rgb, tmp_path):
+    v, f = box((0, 0, 0), (2, 2, 2))
+    write_columns(tmp_path / "a.ply", dict(zip("xyz", v.T)), np.concatenate([f, f[:2, ::-1]]))
+    told = Recorder()
+    found = read_receivers(tmp_path / "a.ply", (), 16, ns, told)
+    assert found.names == ("a",) and found.index.tolist() == list(range(12)) and not found.others
+    assert told.messages == ["a.ply: 2 faces that repeat others left out"]
+    # Two scene units a metre.
+    assert longest_edge(cut(found, 0.25, 2.0).mesh) <= 0.5
+    assert 50_000 < len(cut(found, None, 1.0).mesh.faces) < 250_000
+
+
+def test02_shapes_of_a_scene_receive_or_hide(rgb, tmp_path):
+    (tmp_path / "a.xml").write_text(SCENE.format(more=""))
+    both = read_receivers(tmp_path / "a.xml", (), 16, ns, Recorder())
+    assert both.names == ("sign", "wall") and np.bincount(both.shape).tolist() == [12, 2]
+    sign = read_receivers(tmp_path / "a.xml", ("sign",), 16, ns, Recorder())
+    assert sign.names == ("sign",) and len(sign.mesh.faces) == 12 and len(sign.others) == 1
+    with pytest.raises(NergError, match='"door"'):
+        read_receivers(tmp_path / "a.xml", ("door",), 16, ns, Recorder())
+    (tmp_path / "b.xml").write_text(SCENE.format(more='<shape type="sphere" id="ball"/>'))
+    with pytest.raises(NergError, match='"ball" .* is a Sphere'):
+        read_receivers(tmp_path / "b.xml", (), 16, ns, Recorder())
+    (tmp_path / "c.xml").write_text('<scene version="3.0.0"/>')
+    with pytest.raises(NergError, match="has no shapes"):
+        read_receivers(tmp_path / "c.xml", (), 16, ns, Recorder())
+
+
+def test03_a_field_gives_its_surface(rgb, tmp_path):
+    pytest.importorskip("skimage", reason="scikit-image is not installed")
+    fields.radiance(tmp_path / "f.safetensors")
+    found = read_receivers(tmp_path / "f.safetensors", (), 8, ns, Recorder())
+    assert found.names == ("f",) and len(found.mesh.faces) > 10
+    with pytest.raises(NergError, match="--shape"):
+        read_receivers(tmp_path / "f.safetensors", ("a",), 8, ns, Recorder())
+
+
+# ---- Parts of a bake of splats: the same wherever and however often they are computed ----
+
+
+@pytest.fixture
+def scene(tmp_path, rgb):
+    plain = wall(0.0, 0.4, 0.05)
+    write_ply_splats(tmp_path / "wall.ply", plain)
+    return SplatScene(tmp_path / "wall.ply", len(plain), of_rays=OF_RAYS)
+
+
+def test01_a_pickled_scene_gives_the_same_and_another_file_is_another_scene(scene):
+    rays = falling(100, 0.5)
+    first = scene.sums(rays)
+    again = pickle.loads(pickle.dumps(scene))
+    assert np.array_equal(again.sums(rays).face, first.face)
+    assert len(first.face) == len(scene.nothing.face) == 2 * 64 and not len(first.vertex)
+    write_ply_splats(scene.splats, wall(0.1, 0.4, 0.05))
+    moved = replace(scene)
+    assert not np.array_equal(moved.sums(rays).face, first.face)
+
+
+def test02_without_a_field_nobody_looks(scene):
+    with pytest.raises(NergError, match="there is no gaze field"):
+        scene.sums(WeightedObservers(np.ones((1, 3)), np.ones(1)))
+
+
+def test03_how_far_apart_two_ideas_of_a_surface_may_be(rgb):
+    assert np.isclose(splat_place(wall(0.0, 0.2)).tolerance, 2 * 1e-3)
+
+
+# ---- Gaze that is written back to Gaussian splats: from files to a file ----
+
+
+OPTIONS = {"mode": "llvm_ad_rgb", "observer": (0.0, 0.0, -3.0)}
+
+
+@pytest.fixture
+def place(tmp_path):
+    """A few balls that do not hide each other, and a gaze field."""
+    splats = random_splats(30, size=0.02)
+    write_inria(tmp_path / "place.ply", splats, shuffled=True)
+    fields.gaze(tmp_path / "gaze.safetensors")
+    return tmp_path
+
+
+def bake_place(place, output="out.ply", reporter=None, **more):
+    options = BakeOptions(gaze=place / "gaze.safetensors", **(OPTIONS | more))
+    return bake_splats(place / "place.ply", [place / output], options, reporter or Recorder())
+
+
+def test01_each_gaussian_has_what_the_field_says_and_all_else_is_kept(rgb, place):
+    told = Recorder()
+    found = bake_place(place, reporter=told)
+    given, back = read_splats(place / "place.ply"), read_splats(place / "out.ply")
+    assert found.files == (place / "out.ply",) and "30 are looked at by 1 observer;" in told.messages[1]
+    assert told.messages[0].endswith("place.ply: columns that are not used: label")
+    to = given.centers - np.array(OPTIONS["observer"])
+    distance = np.linalg.norm(to, axis=1)
+    w = to / distance[:, None]
+    own = np.einsum("nji,nj->ni", given.axes(), w) / given.scales
+    area = np.linalg.norm(own, axis=1) * given.scales.min(axis=1)
+    field = load_gaze(place / "gaze.safetensors", ns)[0]
+    array = lambda rows: ns.Array3f(np.ascontiguousarray(np.asarray(rows, np.float32).T))
+    origins = array(np.tile(OPTIONS["observer"], (30, 1)))
+    gaze = np.array(field.evaluate(array(given.centers), origins, array(w), ns.Bool(True))[0])
+    assert np.allclose(found.attention, gaze * area / distance**2, rtol=1e-3)
+    assert np.allclose(back.extra[COLUMN], found.attention, rtol=1e-6)
+    assert np.array_equal(back.extra["label"], given.extra["label"]) and back.degree == 0
+    for name in ("centers", "scales", "rotations", "opacities"):
+        assert np.allclose(getattr(back, name), getattr(given, name), rtol=1e-5, atol=1e-6)
+    # The hottest is nine tenths of the map's last colour.
+    hot = 0.5 + C0 * back.harmonics[found.attention.argmax(), 0]
+    assert np.abs(hot - color_values("inferno", np.ones(1))[0]).max() < 0.1
+
+
+def test02_people_on_a_path_and_places_in_other_units(rgb, place):
+    (place / "walk.csv").write_text("x,y,z,weight\n0,0,-3,1\n0,0,-3,3\n0,3,0,0\n")
+    (place / "align.json").write_text("[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]")
+    one = bake_place(place)
+    many = bake_place(place, observer=None, path=place / "walk.csv", align=place / "align.json", top=0.5, decades=2.0)
+    assert many.observers == 3 and np.allclose(many.attention, 4 * one.attention, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({"texture": 512}, "--texture"),
+        ({"shapes": ("a",)}, "--shape is of surfaces"),
+        ({"source": "field", "gaze": None}, "--field SPLATS"),
+    ],
+)
+def test03_what_splats_have_not(rgb, place, options, said):
+    given = BakeOptions(**({"gaze": place / "gaze.safetensors"} | OPTIONS | options))
+    with pytest.raises(NergError, match=said):
+        bake_splats(place / "place.ply", [place / "out.ply"], given)
+    with pytest.raises(NergError, match=".ply"):
+        bake_place(place, "out.glb")
+    assert not (place / "out.ply").exists()
+
+
+def looks(n=600):
+    """Rays of two people from before a wall of a square metre, at it."""
+    rng = np.random.default_rng(0)
+    d = np.concatenate([rng.normal(0, 0.12, (n, 2)), np.ones((n, 1))], axis=1)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    return Rays(np.arange(n) / 10, np.arange(n) % 2, ("a", "b"), np.tile([0.0, 0, -1], (n, 1)), d, np.ones(n))
+
+
+def test04_rays_themselves_in_parts_and_in_one_go(rgb, tmp_path, monkeypatch):
+    """Shares, seconds, halves, smoothed; the files are the same to the byte."""
+    monkeypatch.setattr(bake_chunks, "RAYS", 200)
+    write_ply_splats(tmp_path / "wall.ply", wall(0.0, 1.0, 0.03, 0.0005))
+    looks().save(tmp_path / "rays.npz")
+    common = {"rays": tmp_path / "rays.npz", "mode": "llvm_ad_rgb", "bundle": 4, "halves": True, "smooth": 0.05}
+    for folder, more in (("one", {}), ("parts", {"store": tmp_path / "store"})):
+        told = Recorder()
+        outputs = [tmp_path / folder / f"a{suffix}" for suffix in (".ply", ".json")]
+        found = bake_splats(tmp_path / "wall.ply", outputs, BakeOptions(**common, **more), told)
+    for name in ("a.ply", "a.json"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
+    summary = json.loads((tmp_path / "one" / "a.json").read_text())
+    assert abs(summary["on_splats"] + summary["escaped"] - 1) < 1e-3 and summary["on_splats"] > 0.9
+    assert 0.7 < summary["halves_cc"] <= 1 and summary["lookers"] == 600
+    assert any("lies on Gaussians" in line for line in told.messages)
+    # Where they look most: a Gaussian of the law, the cone and the smoothing.
+    most = 1 / (2 * np.pi * (0.12**2 + np.radians(1.5) ** 2 + 0.05**2))
+    middle = np.linalg.norm(found.splats.centers[:, :2], axis=1) < 0.06
+    assert np.isclose(np.median(found.attention[middle]), most, rtol=0.15)
+    seconds = bake_splats(tmp_path / "wall.ply", (), BakeOptions(**common, unit="seconds", store=tmp_path / "store"))
+    assert np.allclose(seconds.attention, 120 * found.attention, rtol=0.01) and seconds.summary["unit"].endswith(
+        "[s/m^2]"
+    )
+
+
+def test05_a_field_smoothed_and_in_parts(rgb, place):
+    (place / "walk.csv").write_text("x,y,z\n0,0,-3\n0,1,-3\n1,0,-3\n")
+    common = {"observer": None, "path": place / "walk.csv"}
+    one, parts = (bake_place(place, "one.ply", **common), bake_place(place, "two.ply", store=place / "store", **common))
+    assert np.array_equal(one.attention, parts.attention)
+    # Balls that are apart and turned anyhow have nobody to share with.
+    smoothed = bake_place(place, "three.ply", smooth=0.01, **common)
+    assert np.median(np.abs(smoothed.attention / one.attention - 1)) < 0.01

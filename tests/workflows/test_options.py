@@ -1,19 +1,48 @@
-"""Typed options of every workflow: frozen, of keywords alone, each with its help."""
+"""Typed options of every workflow, what parts of a job are kept by, and where a workflow computes."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
-from dataclasses import FrozenInstanceError, fields, is_dataclass
+import types
+import typing
+from dataclasses import FrozenInstanceError, dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import get_type_hints
 
+import drjit as dr
 import pytest
 
 import nerg_mi.workflows
-from nerg_mi.aoi.measured import StatisticsOptions
+from nerg_mi.aoi.options import CountOptions, PredictionOptions, StatisticsOptions
 from nerg_mi.errors import NergError
+from nerg_mi.evaluation.ablation import Variant
 from nerg_mi.ranges import Checked
-from nerg_mi.workflows import options
+from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
+from nerg_mi.tasks.task import Part, Plan, rebuilt
+from nerg_mi.train.gaze_settings import GazeSettings as TrainingSettings
+from nerg_mi.train.gaze_settings import ProbeSettings
+from nerg_mi.workflows import ablation, evaluate, options
+from nerg_mi.workflows.ablation import training_options
+from nerg_mi.workflows.base import SILENT, select_backend, versions
+from nerg_mi.workflows.evaluate import fold_options
+from nerg_mi.workflows.gaze_commands import (
+    AblationOptions,
+    FoldOptions,
+    GazeEvaluationOptions,
+    GazeOptions,
+    PriorOptions,
+)
+from nerg_mi.workflows.options import PartOptions, as_base, exposed_options, option, shared_options
+from nerg_mi.workflows.rays_commands import FilterOptions, SplitOptions
+from nerg_mi.workflows.render import picture_options
+from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions
+from nerg_mi.workflows.study import planned_study
+from tests.tasks import works
+
+# ---- Typed options of every workflow: frozen, of keywords alone, each with its help ----
+
 
 MODULES = [
     importlib.import_module(f"nerg_mi.workflows.{m.name}") for m in pkgutil.iter_modules(nerg_mi.workflows.__path__)
@@ -72,3 +101,246 @@ def test_definitions():
     for pair in ("level", "=3", ""):
         with pytest.raises(NergError, match="write -D key=value"):
             options.parse_definitions([pair], "--define")
+
+
+# ---- Options of the field for a place where nobody was tracked ----
+
+
+def test_a_sample_is_drawn_of_datasets_alone():
+    options = PriorOptions()
+    assert (options.most, options.seed, options.mode) == (10_000_000, 0, "llvm_ad_rgb")
+
+
+# ---- Options of folds: those of places and of parts among them ----
+
+
+def test_they_say_a_place_and_who_makes_parts():
+    options = FoldOptions(geometry="hits", store=Path("kept"))
+    assert options.in_parts and (options.folds, options.first, options.people) == (5, 0, 0.5)
+    assert set(options.splits.split(",")) == {"both", "pos", "people"}
+
+
+def test_options_that_are_repeated_are_read_again_and_those_of_one_name_are_not():
+    folds = FoldOptions(geometry="none", recipe="small", kappa=9.0)
+    shared = shared_options(folds, GazeOptions)
+    assert shared["recipe"] == "small" and shared["geometry"] == "none"
+    assert not {"kappa", "min_rays", "threads"} & set(shared)
+    scoring = {"kappa": 9.0, "directions": 2048, "min_rays": 64}
+    assert shared_options(folds, GazeEvaluationOptions) == scoring
+    assert FoldOptions(ensemble=1000).ensemble == 1000, "with the range that it has in a training"
+
+
+# ---- A setting of gaze trainings is an option of all that trains: of folds and of ablations, too ----
+
+FIELDS = [f for kind in (ProbeSettings, TrainingSettings) for f in fields(kind) if "help" in f.metadata]
+SETTINGS = {f.metadata["option"] or f.name for f in FIELDS}
+CHOSEN = {"learning_rate": 0.5, "cap": 7, "placement": "grid", "fresh": True}
+
+
+class Stop(Exception):
+    pass
+
+
+@pytest.fixture
+def training(monkeypatch):
+    """The options that a training is begun with, which is then ended."""
+    seen = []
+
+    def begin(*arguments):
+        seen.extend(a for a in arguments if isinstance(a, GazeOptions))
+        raise Stop
+
+    monkeypatch.setattr(evaluate, "train_gaze", begin)
+    monkeypatch.setattr(ablation, "plan_gaze", begin)
+    return seen
+
+
+def test_folds_have_them(training, tmp_path):
+    options = FoldOptions(geometry="hits", **CHOSEN)
+    with pytest.raises(Stop):
+        evaluate.train_and_score(evaluate.Folds(options, ("both",), None, None), 3, tmp_path)
+    assert {name: getattr(training[0], name) for name in CHOSEN} == CHOSEN and training[0].seed == 3
+    # What tests are made by has the same words, and is left out.
+    assert training[0].kappa is training[0].radius is None
+
+
+def test_ablations_have_them(training):
+    bench = SimpleNamespace(options=AblationOptions(**CHOSEN, default_steps=3), place=None)
+    with pytest.raises(Stop):
+        ablation.plan_of(Variant(name="emit", recipe="default", gaze="emit"), 3, bench)
+    assert {name: getattr(training[0], name) for name in CHOSEN} == CHOSEN
+    assert training[0].kappa is training[0].radius is None and training[0].steps == 3
+
+
+@pytest.mark.parametrize("kind", [FoldOptions, AblationOptions])
+def test_none_is_forgotten(kind):
+    assert {f.name for f in fields(kind)} | {"seed", "freeze", "loss", "mix_folds"} >= SETTINGS
+    assert exposed_options(kind()) == {} and set(exposed_options(kind(**CHOSEN))) == set(CHOSEN)
+
+
+# ---- Options of filtering and splitting; what they do to rays is tried in tests/workflows/test_rays.py ----
+
+
+def test_options_that_ask_for_nothing_say_what_can_be_asked():
+    with pytest.raises(NergError, match="say which rays to keep"):
+        FilterOptions()
+    with pytest.raises(NergError, match="say how to split"):
+        SplitOptions()
+
+
+def test_a_detector_is_a_known_one():
+    with pytest.raises(NergError, match='"dbscan"'):
+        FilterOptions(fixations="dbscan")
+    with pytest.raises(NergError, match="add --fixations"):
+        FilterOptions(one_ray=True, thin=1.0)
+
+
+def test_conditions_are_what_was_asked_for():
+    assert FilterOptions(end=2.0, persons=("Ada",), thin=1.0).conditions == {"time": (None, 2.0), "persons": ["Ada"]}
+    assert FilterOptions(thin=1.0).conditions == {}
+    assert FilterOptions(box=(0, 1, 0, 1, 0, 1)).conditions == {"box": [0, 1, 0, 1, 0, 1]}
+
+
+# ---- What parts of a job are kept by ----
+
+
+STORE = {"store", "scheduler", "threads"}
+
+# Of each command, what its parts are given of its options, and which options that leaves out: those of the schedule,
+# and those by which the command chooses parts or makes something of their outputs, none of which a part sees.
+COMMANDS = {
+    "render": (FilmOptions, picture_options, STORE | {"defaults", "frames", "fps"}),
+    "ablate": (AblationOptions, training_options, STORE | {"recipes", "variant", "seeds", "cameras", "size"}),
+    "study": (
+        StudyOptions,
+        lambda o: planned_study(None, "sphere", o).options,
+        STORE - {"threads"} | {"only", "defaults", "scene_kind"},
+    ),
+    "folds": (FoldOptions, fold_options, STORE | {"folds", "first", "splits", "most"}),
+}
+AFTER_COUNTS = {"eyes", "glance", "what_if", "visibility", "observers", "height", "floor", "step", "min_people"}
+AFTER_COUNTS |= {"names", "salt", "resamples", "seed"} | STORE
+OF_COUNTS = {f.name for f in fields(CountOptions)} - {f.name for f in fields(PredictionOptions)}
+COMMANDS["stats, counts"] = (StatisticsOptions, lambda o: as_base(o, CountOptions), AFTER_COUNTS | {"directions"})
+COMMANDS["stats, a field"] = (StatisticsOptions, lambda o: as_base(o, PredictionOptions), AFTER_COUNTS | OF_COUNTS)
+COMMANDS["bake, a field"] = (GazeSumSettings, lambda o: o, set())
+COMMANDS["bake, rays"] = (RaySettings, lambda o: o, set())
+
+
+def other_value(kind, f, options, folder):
+    """A valid value of the field ``f`` of options, other than that of ``options``."""
+    hint, old = typing.get_type_hints(kind)[f.name], getattr(options, f.name)
+    kinds = [k for k in typing.get_args(hint) if k is not type(None)] if is_union(hint) else [hint]
+    for k in kinds:
+        if k is bool:
+            return not old
+        if k in (int, float):
+            low, high = (w.low, w.high) if (w := f.metadata.get("nerg_mi.range")) else (0, 100)
+            near = [k(v) for v in (low, low + 1, (low + high) / 2, high, 1, 2)]
+            return next(v for v in near if v != old and low <= v <= high)
+        if k is Path:
+            (folder / f.name).write_text(f.name)
+            return folder / f.name
+        if typing.get_origin(k) is tuple:
+            return ("a=0,1",) if f.name == "windows" else ("1,2,3",)
+        if typing.get_origin(k) is not None:
+            return {"level": "0.5"}
+        if k is str:
+            return "auto" if f.name == "mode" and old != "auto" else f"{old or ''}x"
+    raise AssertionError(f"what is another {f.name}?")
+
+
+def is_union(hint):
+    return typing.get_origin(hint) in (typing.Union, types.UnionType)
+
+
+def key(value):
+    (task,) = Plan("p", works.mixed, value, [Part("a")], ".txt").tasks
+    return task.key
+
+
+@pytest.mark.parametrize("command", list(COMMANDS))
+def test_each_option_changes_the_key_of_a_part_exactly_when_it_changes_its_work(command, tmp_path):
+    kind, of_parts, others = COMMANDS[command]
+    options = kind()
+    before, left_out = key(of_parts(options)), set()
+    for f in fields(kind):
+        changed = of_parts(replace(options, **{f.name: other_value(kind, f, options, tmp_path)}))
+        same_work = rebuilt(changed) == rebuilt(of_parts(options))
+        assert (key(changed) == before) == same_work, f.name
+        if same_work:
+            left_out.add(f.name)
+    assert left_out == others
+
+
+@dataclass(frozen=True, kw_only=True)
+class Later(CountOptions):
+    """Options to which some were added."""
+
+    weight: float = option(1.0, "A new option.")
+    processes: int = option(1, "One that changes no result.", changes_result=False)
+
+
+def test_a_new_option_is_in_the_key_and_one_of_the_schedule_is_not():
+    assert key(Later(weight=2.0)) != key(Later()) and key(Later(processes=2)) == key(Later())
+    assert rebuilt(Later(processes=2)).processes == 1
+
+
+def test_a_file_is_its_bytes_wherever_it_lies(tmp_path):
+    def options(folder, text):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "zones.json").write_text(text)
+        return CountOptions(zones=tmp_path / folder / "zones.json")
+
+    before = key(options("a", "one"))
+    assert key(options("b", "one")) == before != key(options("a", "two"))
+
+
+def test_parts_are_asked_for_by_either_option():
+    assert not PartOptions().in_parts
+    assert PartOptions(store=Path("s")).in_parts and PartOptions(scheduler="local").in_parts
+
+
+def test_what_runs_has_what_cannot_change_a_result_at_its_default():
+    (task,) = Plan("p", works.mixed, None, [Part(PartOptions(store=Path("s"), scheduler="tcp://a:1"))], ".txt").tasks
+    assert task.value == PartOptions() and not task.files
+
+
+# ---- The reporter of jobs that were given none ----
+
+
+def test_it_says_nothing(capsys):
+    SILENT.message("a")
+    SILENT.warn("b")
+    SILENT.progress(0.5, "c")
+    assert capsys.readouterr() == ("", "")
+
+
+# ---- What a report says about the programs that made it ----
+
+
+def test_versions_of_what_has_a_part():
+    found = versions("llvm_ad_rgb")
+    assert set(found) == {"nerg_mi", "mitsuba", "drjit", "numpy", "python", "libLLVM"} and all(found.values())
+    assert "libLLVM" not in versions("scalar_rgb")
+
+
+# ---- Where a job computes ----
+
+
+def test_variant_and_threads(rgb):
+    before = dr.thread_count()
+    rgb.set_variant("llvm_ad_mono")
+    try:
+        assert select_backend("llvm_ad_rgb", 1).__name__ == "drjit.llvm.ad"
+        assert rgb.variant() == "llvm_ad_rgb" and dr.thread_count() == 1
+    finally:
+        dr.set_thread_count(before)
+    select_backend("llvm_ad_rgb")
+    assert dr.thread_count() == before
+
+
+@pytest.mark.parametrize("mode, said", [("llvm_rgb", "there is no variant"), ("scalar_rgb", "need a JIT variant")])
+def test_what_no_field_can_be_computed_on(mode, said):
+    with pytest.raises(NergError, match=said):
+        select_backend(mode)

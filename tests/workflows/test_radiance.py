@@ -1,18 +1,56 @@
-"""Radiance fields by jobs: what a notebook gets, and what it is told."""
+"""Radiance fields: poses of photos, trainings and scores, and fields of and for other programs."""
+
+from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
+import drjit.llvm.ad as ns
 import numpy as np
 import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint
+from nerg_mi.formats.fields import is_field, load_radiance
+from nerg_mi.formats.splats import read_splats
+from nerg_mi.photos.colmap import Up
+from nerg_mi.photos.dataset import open_dataset
+from nerg_mi.photos.structure import Reconstruction
 from nerg_mi.train.radiance_settings import RadianceSettings
-from nerg_mi.workflows import train_radiance as radiance
-from nerg_mi.workflows.train_radiance import RadianceOptions, RadianceScoreOptions, evaluate_radiance, train_radiance
-from tests.cli.test_eval import place  # noqa: F401  (fixture)
+from nerg_mi.workflows import poses as job
+from nerg_mi.workflows import train_radiance as training
+from nerg_mi.workflows.export import (
+    PointOptions,
+    SplatOptions,
+    VolumeOptions,
+    export_points,
+    export_splats,
+    export_volume,
+    import_checkpoint,
+    refine_checkpoint,
+)
+from nerg_mi.workflows.poses import STAGES, find_poses
+from nerg_mi.workflows.radiance_commands import (
+    CheckpointImportOptions,
+    PoseOptions,
+    RadianceOptions,
+    RadianceScoreOptions,
+)
+from nerg_mi.workflows.train_radiance import evaluate_radiance, train_radiance
+from tests.formats.test_torch_ngp import save_nerg as save
+from tests.formats.test_torch_ngp import small_gaze, small_state
+from tests.photos import rendered
+from tests.plugins import fields
+from tests.plugins.fields import radiance
 from tests.workflows.recorder import Recorder
+
+# ---- Radiance fields by jobs: what a notebook gets, and what it is told ----
 
 
 @pytest.fixture(autouse=True)
@@ -23,7 +61,7 @@ def coarse(monkeypatch):
     class Coarse(RadianceSettings):
         resolution: int = 32
 
-    monkeypatch.setattr(radiance, "RadianceSettings", Coarse)
+    monkeypatch.setattr(training, "RadianceSettings", Coarse)
 
 
 class Impatient(Recorder):
@@ -34,10 +72,10 @@ class Impatient(Recorder):
             raise KeyboardInterrupt
 
 
-def test_a_result_without_any_file(place):  # noqa: F811
-    before, told = set(place.iterdir()), Recorder()
-    result = train_radiance(place, options=RadianceOptions(steps=3, holdout=3), reporter=told)
-    assert set(place.iterdir()) == before and result.output is None and not result.interrupted
+def test_a_result_without_any_file(cube):
+    before, told = set(cube.iterdir()), Recorder()
+    result = train_radiance(cube, options=RadianceOptions(steps=3, holdout=3), reporter=told)
+    assert set(cube.iterdir()) == before and result.output is None and not result.interrupted
     assert result.provenance["steps"] == 3 and result.psnr == result.provenance["psnr_held_out"]["mean"]
     assert result.field.box.lower == pytest.approx((-1.025,) * 3) and result.field.occupancy is not None
     assert "2 views to train on, 1 held out, 16 x 14 pixels" in told.messages
@@ -46,58 +84,359 @@ def test_a_result_without_any_file(place):  # noqa: F811
     assert shares == sorted(shares) and shares[-1] == 1 and told.steps[1][1].endswith("step 1")
 
 
-def test_a_deferred_field(place, tmp_path):  # noqa: F811
+def test_a_deferred_field(cube, tmp_path):
     """As trained, as written, and as evaluated by the integrator."""
     out, options = tmp_path / "f.safetensors", RadianceOptions(steps=3, holdout=3, deferred=True)
-    result = train_radiance(place, out, options)
+    result = train_radiance(cube, out, options)
     assert result.field.config.deferred
-    scores = evaluate_radiance(out, place, RadianceScoreOptions(holdout=3, spp=4))
+    scores = evaluate_radiance(out, cube, RadianceScoreOptions(holdout=3, spp=4))
     assert np.isfinite(scores.psnr_mean)
 
 
-def test_an_interrupted_run_without_any_file_is_a_result(place):  # noqa: F811
-    result = train_radiance(place, options=RadianceOptions(steps=10**6, holdout=0), reporter=Impatient())
+def test_an_interrupted_run_without_any_file_is_a_result(cube):
+    result = train_radiance(cube, options=RadianceOptions(steps=10**6, holdout=0), reporter=Impatient())
     assert result.interrupted and result.provenance["steps"] == 1 and result.psnr is None
 
 
-def test_an_interrupted_run_with_an_output_can_be_resumed(place):  # noqa: F811
-    out = place / "a.safetensors"
+def test_an_interrupted_run_with_an_output_can_be_resumed(cube):
+    out = cube / "a.safetensors"
     with pytest.raises(KeyboardInterrupt, match="go on with --resume"):
-        train_radiance(place, out, RadianceOptions(steps=2, holdout=3), Impatient())
+        train_radiance(cube, out, RadianceOptions(steps=2, holdout=3), Impatient())
     assert out.is_file() and out.with_suffix(".run").is_file()
-    result = train_radiance(place, out, RadianceOptions(steps=2, holdout=3, resume=True))
+    result = train_radiance(cube, out, RadianceOptions(steps=2, holdout=3, resume=True))
     assert result.provenance["steps"] == 2 and not out.with_suffix(".run").exists()
     assert read_checkpoint(out, "radiance")[1]["provenance"]["steps"] == 2
 
 
-def test_nothing_to_resume_without_an_output(place):  # noqa: F811
+def test_nothing_to_resume_without_an_output(cube):
     with pytest.raises(NergError, match="nothing to resume"):
-        train_radiance(place, options=RadianceOptions(steps=2, resume=True))
+        train_radiance(cube, options=RadianceOptions(steps=2, resume=True))
 
 
-def test_scores_without_any_file(place):  # noqa: F811
-    before, told = set(place.iterdir()), Recorder()
-    scores = evaluate_radiance(place / "cube.safetensors", place, RadianceScoreOptions(holdout=2, spp=4), told)
-    assert set(place.iterdir()) == before
+def test_scores_without_any_file(cube):
+    before, told = set(cube.iterdir()), Recorder()
+    scores = evaluate_radiance(cube / "cube.safetensors", cube, RadianceScoreOptions(holdout=2, spp=4), told)
+    assert set(cube.iterdir()) == before
     assert scores.psnr_mean == pytest.approx(np.mean(scores.psnr)) and scores.depth is None and scores.spp == 4
     assert len(told.messages) == len(scores.views) + 3 and told.messages[-2].startswith("mean")
     assert told.messages[-1].endswith(f"{np.mean(scores.psnr_fitted):.2f} dB")
 
 
-def test_views_too_small_for_a_score_have_none(place, tmp_path):  # noqa: F811
+def test_views_too_small_for_a_score_have_none(cube, tmp_path):
     """One pixel has no right half to fit colours for, and no window of structural similarity."""
     told, out, table = Recorder(), tmp_path / "f.safetensors", tmp_path / "s.json"
-    result = train_radiance(place, out, RadianceOptions(steps=2, holdout=3, width=1), told)
+    result = train_radiance(cube, out, RadianceOptions(steps=2, holdout=3, width=1), told)
     assert result.provenance["psnr_held_out"]["mean_fitted"] is None and np.isfinite(result.psnr)
-    evaluate_radiance(out, place, RadianceScoreOptions(holdout=3, width=1, spp=1, json_file=table), told)
+    evaluate_radiance(out, cube, RadianceScoreOptions(holdout=3, width=1, spp=1, json_file=table), told)
     scores = json.loads(table.read_text())
     assert scores["ssim"] == scores["psnr_fitted"] == [None] and scores["psnr_mean"] > 0
     assert not any("nan" in text for text in told.messages) and "11 x 11" in told.warnings[-1]
 
 
-def test_views_that_were_trained_on_are_no_held_out_views(place):  # noqa: F811
-    out = place / "a.safetensors"
-    train_radiance(place, out, RadianceOptions(steps=2, holdout=3))
+def test_views_that_were_trained_on_are_no_held_out_views(cube):
+    out = cube / "a.safetensors"
+    train_radiance(cube, out, RadianceOptions(steps=2, holdout=3))
     with pytest.raises(NergError, match="was trained on"):
-        evaluate_radiance(out, place, RadianceScoreOptions(holdout=2))
-    assert evaluate_radiance(out, place, RadianceScoreOptions(holdout=2, train=True, spp=1)).views
+        evaluate_radiance(out, cube, RadianceScoreOptions(holdout=2))
+    assert evaluate_radiance(out, cube, RadianceScoreOptions(holdout=2, train=True, spp=1)).views
+
+
+# ---- Checkpoints of other programs by jobs: the fields themselves, with and without files ----
+
+
+def test_fields_without_any_file(torch, tmp_path):
+    path, told = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state()), Recorder()
+    found = import_checkpoint(path, reporter=told)
+    assert found.field is not None and found.gaze.config.variant == "emit_capture" and found.files == []
+    assert [p.name for p in tmp_path.iterdir()] == ["nerg.pth"]
+    assert told.messages == [f'"{path}" also holds a gaze field: --gaze NAME.safetensors writes it']
+
+
+def test_files_in_their_order(torch, tmp_path):
+    path = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state())
+    outputs = tmp_path / "f.safetensors", tmp_path / "g.safetensors"
+    found = import_checkpoint(path, *outputs, CheckpointImportOptions(half=True))
+    assert tuple(found.files) == outputs and all(p.is_file() for p in outputs)
+
+
+# ---- Exports by jobs: from a file and from a field that is loaded ----
+
+
+@pytest.fixture
+def field(tmp_path):
+    fields.radiance(tmp_path / "f.safetensors")
+    return tmp_path / "f.safetensors"
+
+
+def test_a_field_and_its_file_are_exported_alike(field, tmp_path):
+    options, told = PointOptions(resolution=16, density=3.0, count=50), Recorder()
+    first = export_points(field, tmp_path / "a.ply", options, told)
+    second = export_points(load_radiance(field, ns)[0], tmp_path / "b.ply", options)
+    assert first.files == [tmp_path / "a.ply"] and len(first.surface.vertices) == 50
+    assert np.array_equal(first.surface.vertices, second.surface.vertices)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert told.messages[0].startswith("50 points") and told.messages[1].startswith(f"wrote {tmp_path / 'a.ply'}")
+
+
+def test_splats_lie_on_the_surface(field, tmp_path):
+    told = Recorder()
+    done = export_splats(field, tmp_path / "a.ply", SplatOptions(resolution=16, density=3.0), told)
+    splats = read_splats(tmp_path / "a.ply")
+    assert done.files == [tmp_path / "a.ply"] and told.messages[0].startswith(f"{len(splats):,} Gaussians")
+    assert (np.abs(splats.centers) < 1.3).all()
+
+
+def test_a_volume_with_its_colour(field, tmp_path):
+    done = export_volume(field, tmp_path / "d.vol", VolumeOptions(resolution=8, color=tmp_path / "c.vol"))
+    assert done.files == [tmp_path / "c.vol", tmp_path / "d.vol"] and done.surface is None
+    assert all(path.is_file() for path in done.files)
+
+
+def test_an_axis_that_is_none(field, tmp_path):
+    with pytest.raises(NergError, match="must be z or y"):
+        export_points(field, tmp_path / "a.glb", PointOptions(up="x"))
+
+
+# ---- Checkpoints with a finer bound: the same field, known to those who name the old file ----
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("refined")
+    bits = np.random.default_rng(0).random((6, 6, 6)) < 0.4
+    radiance(folder / "old.safetensors", density_scale=8e-3, occupancy=OccupancyGrid(bits, ns, 0.05))
+    found = refine_checkpoint(folder / "old.safetensors", folder / "new.safetensors")
+    return folder / "old.safetensors", folder / "new.safetensors", found
+
+
+def test_only_the_bound_is_another(files):
+    old, new, found = files
+    (tensors, meta), (again, about) = (read_checkpoint(p, "radiance") for p in (old, new))
+    assert set(again) - set(tensors) == {"occupancy.parts"}
+    assert all(
+        np.array_equal(again[name], tensors[name]) and again[name].dtype == tensors[name].dtype for name in tensors
+    )
+    assert {k: v for k, v in about.items() if k not in ("occupancy", "refined_from")} == {
+        k: v for k, v in meta.items() if k != "occupancy"
+    }
+    # Of readers that know no parts the cells are what they were.
+    assert {k: v for k, v in about["occupancy"].items() if k != "refined"} == meta["occupancy"]
+    loaded = load_radiance(new, ns)[0].occupancy
+    assert np.array_equal(loaded.masks, found.occupancy.masks) and loaded.missed == found.occupancy.missed
+    assert 0 < loaded.fraction < found.before == loaded.coarse.fraction
+
+
+def test_a_gaze_field_knows_it(files, tmp_path):
+    old, new, _ = files
+    known = file_sha256(old)
+    assert is_field(old, known) and is_field(new, known)
+    assert not is_field(new, "0" * 64) and not is_field(new, None)
+    refine_checkpoint(new, tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == new.read_bytes()
+
+
+def test_new_weights_drop_it(files):
+    field, _ = load_radiance(files[1], ns)
+    refined = field.occupancy
+    field.set_parameters({"density_net.0": field.parameters()["density_net.0"]})
+    assert isinstance(field.occupancy, OccupancyGrid) and np.array_equal(field.occupancy.bits, refined.coarse_bits)
+
+
+@pytest.mark.parametrize(
+    "occupancy, what",
+    [(None, "no occupancy grid to refine"), (CascadeGrid(np.ones((2, 4, 4, 4), bool), 2.0, ns, 0.1), "nested cubes")],
+)
+def test_fields_without_such_a_grid(tmp_path, occupancy, what):
+    radiance(tmp_path / "f.safetensors", occupancy=occupancy)
+    with pytest.raises(NergError, match=what):
+        refine_checkpoint(tmp_path / "f.safetensors", tmp_path / "g.safetensors")
+    assert not (tmp_path / "g.safetensors").exists()
+
+
+# ---- Photos made a capture ----
+
+
+COUNT = 9
+
+
+@pytest.fixture
+def photos(tmp_path) -> Path:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for k in range(COUNT):
+        pixels = np.random.default_rng(k).integers(0, 255, (24, 32, 3)).astype(np.uint8)
+        Image.fromarray(pixels).save(folder / f"{k}.png")
+    return folder
+
+
+def written(pictures, work: Path, keep: int) -> Reconstruction:
+    """A model of the first ``keep`` pictures, as text."""
+    model = work / "sparse" / "0"
+    model.mkdir(parents=True)
+    to_world = rendered.poses(len(pictures))[:keep]
+    (model / "cameras.txt").write_text("1 OPENCV 32 24 30 30 16 12 0.01 0 0 0\n")
+    lines = []
+    for k, (picture, pose) in enumerate(zip(pictures, to_world), 1):
+        rotation = (pose[:3, :3] @ np.diag([1, -1, -1])).T
+        x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+        t = -rotation @ pose[:3, 3]
+        lines += [f"{k} {w} {x} {y} {z} {t[0]} {t[1]} {t[2]} 1 {picture.name}\n", "\n"]
+    (model / "images.txt").write_text("".join(lines))
+    points = np.random.default_rng(0).uniform(-1, 1, (400, 3)) * [1, 1, 0.2]
+    rows = [f"{k} {p[0]} {p[1]} {p[2]} 9 9 9 0.3 1 0 2 0 3 0\n" for k, p in enumerate(points)]
+    (model / "points3D.txt").write_text("".join(rows))
+    names = [p.name for p in pictures]
+    up = Up(np.array([0, 0, 1.0]), 0.5, 0.4, 0.7)
+    parts = [names[:keep]] + ([names[keep:]] if len(names) - keep >= 3 else [])
+    colors = np.full((400, 3), 99, np.uint8)
+    return Reconstruction(parts, 0.4, 400, up, [{"model": "OPENCV"}], to_world, points, colors)
+
+
+@pytest.fixture
+def finds(monkeypatch):
+    """`finds(keep)` lets so many pictures have a pose; gives a list of the settings that were asked for."""
+
+    def choose(keep: int, change=lambda made: made) -> list:
+        asked = []
+
+        def stand_in(pictures, work, settings, progress):
+            asked.append(settings)
+            for stage in ("features", "matching", "mapping"):
+                progress(stage, 1, 2)
+            return change(written(pictures, Path(work), keep)) if keep else None
+
+        monkeypatch.setattr(job, "reconstruct", stand_in)
+        return asked
+
+    monkeypatch.setattr(job, "check_installed", lambda: None)
+    return choose
+
+
+def test_the_capture_is_read_as_it_was_found(photos, finds, tmp_path):
+    asked = finds(COUNT)
+    told = Recorder()
+    options = PoseOptions(lens="radial", threads=1, seed=3, single_camera=False)
+    result = find_poses(photos, tmp_path / "new" / "capture", options, told)
+    (settings,) = asked
+    assert (settings.lens, settings.threads, settings.seed, settings.share) == ("radial", 1, 3, False)
+    assert sorted(os.listdir(result.output)) == ["images", "poses.json", "poses.png", "sparse"]
+    assert os.listdir(tmp_path / "new") == ["capture"]
+    data = open_dataset(result.output)
+    assert [v.name for v in data.held_out] == ["0.png", "8.png"] and len(data.train) == 7
+    poses = {v.name: v.camera.to_world for v in (*data.train, *data.held_out)}
+    assert np.allclose([poses[f"{k}.png"] for k in range(COUNT)], rendered.poses(COUNT), atol=1e-9)
+    assert "points on surfaces" in data.box_from and not data.unused
+    for k in range(COUNT):
+        assert (result.output / "images" / f"{k}.png").read_bytes() == (photos / f"{k}.png").read_bytes()
+    assert result.unregistered == [] and result.points == 400 and not told.warnings
+    text = "\n".join(told.messages)
+    assert "9 of 9 pictures have a pose, 400 points; mean reprojection error 0.40 pixels" in text
+    assert "up is +z: the cameras are held level to 0.5 degrees" in text and "nerg train radiance" in text
+
+
+def test_progress_grows_through_all_stages(photos, finds, tmp_path):
+    finds(COUNT)
+    told = Recorder()
+    find_poses(photos, tmp_path / "capture", None, told)
+    shares = [share for share, _ in told.steps]
+    assert shares == sorted(shares) and 0 < shares[0] < STAGES["features"] and shares[-1] == STAGES["writing"]
+    words = " ".join(text for _, text in told.steps)
+    for said in ("copying pictures, 9 of 9", "finding features", "comparing pictures", "placing pictures, 1 of 2"):
+        assert said in words
+
+
+def test_pictures_without_a_pose_are_named_and_left_out(photos, finds, tmp_path):
+    finds(7)
+    told = Recorder()
+    (photos / "bad.jpg").write_bytes(b"\xff\xd8 no photo")
+    result = find_poses(photos, tmp_path / "capture", None, told)
+    assert result.unregistered == ["7.png", "8.png"] and [u.name for u in result.skipped] == ["bad.jpg"]
+    assert sorted(os.listdir(result.output / "images")) == [f"{k}.png" for k in range(7)]
+    text = "\n".join(told.messages)
+    assert "without a pose: 7.png, 8.png" in text and 'left out "bad.jpg"' in text and not told.warnings
+    report = json.loads((result.output / "poses.json").read_text())
+    assert report == result.report and report["unregistered"] == ["7.png", "8.png"] and "bad.jpg" in report["skipped"]
+
+
+def test_too_few_and_parts_are_warned_of(photos, finds, tmp_path):
+    finds(4)
+    told = Recorder()
+    find_poses(photos, tmp_path / "capture", None, told)
+    parts, few = told.warnings
+    assert "parts that nothing connects" in parts and "another has 5 (4.png, 5.png" in parts
+    assert "less than half" in few and "take more of them" in few
+
+
+def test_an_up_that_is_unsure_or_not_asked_for_is_told(photos, finds, tmp_path):
+    from dataclasses import replace
+
+    told = Recorder()
+    finds(COUNT, lambda made: replace(made, up=Up(np.array([0, 0, 1.0]), 40.0)))
+    find_poses(photos, tmp_path / "a", None, told)
+    assert "do not agree on what is up" in told.warnings[0] and "--no-orient" in told.warnings[0]
+    finds(COUNT, lambda made: replace(made, up=None))
+    result = find_poses(photos, tmp_path / "b", PoseOptions(orient=False), told)
+    assert "up was not looked for" in told.messages and result.report["up"] is None
+
+
+def test_nothing_found_is_an_error_and_leaves_nothing(photos, finds, tmp_path):
+    finds(0)
+    with pytest.raises(NergError, match="no 3 of the 9 pictures .* show the same place; take more"):
+        find_poses(photos, tmp_path / "capture")
+    assert os.listdir(tmp_path) == ["photos"]
+
+
+def test_a_model_that_was_cut_short_is_not_taken(photos, finds, tmp_path):
+    """A disk that fills is not told of by COLMAP."""
+
+    def cut(made):
+        (work,) = (tmp_path).glob(".capture*.part/.work-*")
+        (work / "sparse" / "0" / "images.txt").write_text("1 0.5 0.5\n")
+        return made
+
+    finds(COUNT, cut)
+    with pytest.raises(NergError, match=r"images.txt"):
+        find_poses(photos, tmp_path / "capture")
+    assert os.listdir(tmp_path) == ["photos"]
+
+
+@pytest.mark.parametrize("stage", ["copying", "finding", "comparing", "placing", "writing"])
+def test_ctrl_c_leaves_nothing(stage, photos, finds, tmp_path):
+    class Interrupts(Recorder):
+        def progress(self, share, text=""):
+            if text.startswith(stage):
+                raise KeyboardInterrupt
+
+    finds(COUNT)
+    with pytest.raises(KeyboardInterrupt):
+        find_poses(photos, tmp_path / "capture", None, Interrupts())
+    assert os.listdir(tmp_path) == ["photos"]
+
+
+def test_photos_that_are_too_few(photos, finds, tmp_path):
+    finds(COUNT)
+    for k in range(2, COUNT):
+        (photos / f"{k}.png").unlink()
+    with pytest.raises(NergError, match="has 2 pictures that can be used, and poses need 3 or more of the same place$"):
+        find_poses(photos, tmp_path / "capture")
+    for k in range(2, 6):
+        (photos / f"{k}.png").write_bytes((photos / "0.png").read_bytes())
+    with pytest.raises(NergError, match='"2.png".*"0.png"'):
+        find_poses(photos, tmp_path / "capture")
+    assert os.listdir(tmp_path) == ["photos"]
+
+
+def test_frames_of_a_video(finds, tmp_path):
+    av = pytest.importorskip("av", reason='PyAV is not installed (pip install "nerg-mi[poses]")')
+    with av.open(str(tmp_path / "film.mp4"), "w") as out:
+        stream = out.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 32, 24, "yuv420p"
+        for k in range(12):
+            pixels = np.random.default_rng(k).integers(0, 255, (24, 32, 3)).astype(np.uint8)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        out.mux(stream.encode())
+    finds(4)
+    result = find_poses(tmp_path / "film.mp4", tmp_path / "capture", PoseOptions(frames=4))
+    seconds = list(result.report["seconds"].values())
+    assert result.registered == [f"frame_{round(10 * s) + 1:06d}.jpg" for s in seconds]
+    assert len(seconds) == 4 and seconds == sorted(seconds) and seconds[-1] >= 0.8

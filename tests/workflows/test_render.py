@@ -1,8 +1,12 @@
-"""Tests of `nerg_mi.workflows.render`."""
+"""Pictures and films of a scene, in one go and in parts."""
 
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -15,22 +19,25 @@ from nerg_mi.files.images import read_exr_text
 from nerg_mi.rendering import bands
 from nerg_mi.rendering.bands import prepare_for, render_asked
 from nerg_mi.rendering.scene import load_scene
+from nerg_mi.tasks.engines import Local, Processes, run_plan
+from nerg_mi.tasks.store import Store
 from nerg_mi.workflows import render
 from nerg_mi.workflows.demo import store_scene
-from nerg_mi.workflows.options import PictureOptions
-from nerg_mi.workflows.render import PictureOptions as PicturesPictureOptions
-from nerg_mi.workflows.render import render_file
-from tests.cli.test_render import SCENE
-from tests.pictures import mitsuba_bitmap
+from nerg_mi.workflows.options import PartOptions
+from nerg_mi.workflows.parts import Parts, PlannedScene, account_for_store, size
+from nerg_mi.workflows.render import make_picture, render_file, render_film
+from nerg_mi.workflows.scene_commands import FilmOptions, PictureOptions
+from nerg_mi.workflows.scene_commands import PictureOptions as PicturesPictureOptions
+from tests.conftest import ROOT
+from tests.pictures import SCENE, mitsuba_bitmap
 from tests.plugins import fields
+from tests.tasks import works
 from tests.workflows.recorder import Recorder
 
 # ---- Pictures with a quantity over them: what is asked for, their scale, sequences, and what is refused ----
 
 
 MODE = "llvm_ad_rgb"
-
-
 OVERLAYS_SCENE = """<scene version="3.0.0">
     <default name="eye" value="0.2, 0.1, -2.5"/>
     <default name="size" value="12"/>
@@ -281,3 +288,195 @@ def test_long_renders_are_prepared_and_the_same_to_the_byte(tmp_path, monkeypatc
     render_file(store_scene(), tmp_path / "b.png", options)
     assert prepared == [True]
     assert mitsuba_bitmap(tmp_path / "a.png") == mitsuba_bitmap(tmp_path / "b.png")
+
+
+# ---- Films in parts: the bytes of one go, whoever makes the parts, and only what has to be made ----
+
+
+AOV = 'type="aov"><string name="aovs" value="dd:depth"/>'
+BALL = SCENE.replace(AOV, 'type="nerg">').replace('value="8"', 'value="16"')
+
+
+@pytest.fixture
+def scene(tmp_path, rgb):
+    (tmp_path / "scene.xml").write_text(BALL)
+    (tmp_path / "frames.csv").write_text("level\n0.25\n0.5\n0.75\n")
+    return tmp_path / "scene.xml"
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def film_of(scene, folder, name, told=None, **options):
+    given = {"frames": scene.parent / "frames.csv", "mode": "llvm_ad_rgb", "seed": 3} | options
+    return render_film(scene, scene.parent / folder / name, FilmOptions(**given), told or Recorder())
+
+
+@pytest.mark.parametrize(
+    "name, overlay",
+    [
+        ("a.png", {}),
+        ("a.exr", {}),
+        ("a.png", {"overlay": "depth"}),
+        ("a.svg", {"overlay": "depth", "top": 4.0}),
+        ("a.mp4", {}),
+        ("a.mp4", {"overlay": "depth"}),
+    ],
+)
+def test_parts_give_the_bytes_of_one_go(scene, name, overlay):
+    if name.endswith("mp4"):
+        pytest.importorskip("av")
+    whole = film_of(scene, "whole", name, **overlay)
+    parts = film_of(scene, "parts", name, store=scene.parent / "store", **overlay)
+    found = files(scene.parent / "parts")
+    assert found == files(scene.parent / "whole") and found
+    assert (parts.size, parts.top, len(parts.files)) == (whole.size, whole.top, len(whole.files))
+
+
+def test_pictures_that_are_kept_are_not_rendered_again(scene, monkeypatch):
+    store, rendered = scene.parent / "store", []
+    original = render.render_file
+    monkeypatch.setattr(render, "render_file", lambda *given: rendered.append(given) or original(*given))
+    film_of(scene, "one", "a.png", store=store)
+    told = Recorder()
+    film_of(scene, "two", "a.png", told, store=store)
+    assert len(rendered) == 3 and files(scene.parent / "one") == files(scene.parent / "two")
+    assert told.steps[-1] == (1.0, "3 of 3 parts") and "parts are kept in" in told.messages[-1]
+    # One picture's values change: that one is rendered, and the video of the pictures takes all from the store.
+    (scene.parent / "frames.csv").write_text("level\n0.25\n0.6\n0.75\n")
+    film_of(scene, "three", "a.png", store=store)
+    assert len(rendered) == 4
+    # The scene changes: all are.
+    scene.write_text(BALL.replace("0.3", "0.31"))
+    film_of(scene, "four", "a.png", store=store)
+    assert len(rendered) == 7 and files(scene.parent / "four") != files(scene.parent / "three")
+
+
+def test_ctrl_c_says_where_it_goes_on_from(scene):
+    class Impatient(Recorder):
+        def progress(self, share, text=""):
+            super().progress(share, text)
+            if text.startswith("1 of 3 parts"):
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match=r"are kept in .*/a.tasks: the same command goes on"):
+        film_of(scene, "out", "a.png", Impatient(), scheduler="local")
+    told = Recorder()
+    film_of(scene, "out", "a.png", told, scheduler="local")
+    assert ("1 of 3 parts" in text for _, text in told.steps) and told.steps[1][1] == "1 of 3 parts"
+
+
+def test_files_of_the_scene_are_the_same_wherever_it_lies(scene, tmp_path):
+    """A picture's name does not depend on folders: a moved project finds its parts."""
+    (tmp_path / "moved").mkdir()
+    os.rename(scene, tmp_path / "moved" / "scene.xml")
+    os.rename(tmp_path / "frames.csv", tmp_path / "moved" / "frames.csv")
+    moved, store = tmp_path / "moved" / "scene.xml", tmp_path / "store"
+    first = film_of(moved, "out", "a.png", store=store)
+    os.rename(tmp_path / "moved", tmp_path / "again")
+    told = Recorder()
+    second = film_of(tmp_path / "again" / "scene.xml", "out", "a.png", told, store=store)
+    assert (0.0, "3 of 3 parts") in told.steps or (1.0, "3 of 3 parts") in told.steps
+    assert first.files[0].name == second.files[0].name
+
+
+def test_one_picture_needs_nothing_of_it(scene, tmp_path):
+    """Neither the engine nor dask is loaded where no parts are asked for."""
+    code = (
+        "import sys\nfrom nerg_mi.workflows.render import render_film\n"
+        "from nerg_mi.workflows.scene_commands import FilmOptions\n"
+        f"render_film({str(scene)!r}, {str(tmp_path / 'a.png')!r}, FilmOptions(mode='llvm_ad_rgb'))\n"
+        "print([m for m in sys.modules if m.startswith(('nerg_mi.tasks', 'distributed', 'dask'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_options_that_contradict_are_told_before_any_work(scene, tmp_path):
+    with pytest.raises(NergError, match="there is no scheduler"):
+        film_of(scene, "out", "a.png", scheduler="nowhere")
+    with pytest.raises(NergError, match=r"let its name end in"):
+        film_of(scene, "out", "a.jpg", store=tmp_path / "store")
+    assert not (tmp_path / "store").exists() and not (tmp_path / "out").exists()
+
+
+# ---- From options to a store and an engine, and what is said of a store ----
+
+
+def test_the_store_is_beside_the_output_unless_it_is_named(tmp_path):
+    beside = Parts(PartOptions(scheduler="local:2"), tmp_path / "walk.mp4", Recorder())
+    assert beside.store.folder == tmp_path / "walk.tasks" and isinstance(beside.engine, Processes)
+    named = Parts(PartOptions(store=tmp_path / "s"), tmp_path / "walk.mp4", Recorder())
+    assert named.store.folder == tmp_path / "s"
+
+
+def test_progress_of_a_share_of_the_job(tmp_path):
+    told = Recorder()
+    parts = Parts(PartOptions(store=tmp_path / "s"), tmp_path / "a", told)
+    assert len(list(parts.run(works.plan(2), 0.0, 0.8))) == 2
+    assert len(list(parts.run(works.some(*"abcd"), 0.8))) == 4
+    assert [round(share, 2) for share, _ in told.steps] == [0.0, 0.4, 0.8, 0.8, 0.85, 0.9, 0.95, 1.0]
+    texts = [text for _, text in told.steps]
+    assert all(" left" not in text for text in texts[:3]) and texts[0] == "0 of 2 parts"
+    assert texts[-1].startswith("4 of 4 parts") and texts[-1].endswith("0 s left")
+
+
+def test_ctrl_c_says_where_the_parts_are(tmp_path):
+    class Impatient(Recorder):
+        def progress(self, share, text=""):
+            raise KeyboardInterrupt
+
+    parts = Parts(PartOptions(store=tmp_path / "s"), tmp_path / "a", Impatient())
+    with pytest.raises(KeyboardInterrupt, match=r"kept in .*/s: the same command goes on"):
+        list(parts.run(works.plan(2)))
+
+
+def test_a_scene_that_reads_another_file_than_was_planned_is_refused(tmp_path):
+    """As on a worker where a whole path leads to somebody else's file."""
+    (tmp_path / "more.xml").write_text('<scene version="3.0.0"/>')
+    scene = tmp_path / "scene.xml"
+    scene.write_text(f'<scene version="3.0.0"><include filename="{tmp_path / "more.xml"}"/></scene>')
+    planned = PlannedScene.of(scene)
+    assert planned.checked() == scene and len(planned.files.all) == 2
+    there = works.laid_out(planned, tmp_path / "worker")
+    with pytest.raises(NergError, match="is not the file that the job was planned with"):
+        make_picture(PictureOptions(), there, tmp_path / "a.png")
+    scene.write_text('<scene version="3.0.0"><include filename="more.xml"/></scene>')
+    there = works.laid_out(PlannedScene.of(scene), tmp_path / "relative")
+    shutil.move(tmp_path / "more.xml", tmp_path / "gone.xml")
+    assert there.checked().read_text() == scene.read_text() and there.checked() != scene
+
+
+# ---- What is said of a store ----
+
+
+def test_lines_and_removal(tmp_path):
+    (tmp_path / "a").write_text("before")
+    store = Store(tmp_path / "store")
+    arriving = run_plan(works.plan(5, what="nerg render walk.mp4"), store, Local())
+    next(arriving), next(arriving)
+    arriving.close()
+    list(run_plan(works.plan(2, (tmp_path / "a",), what="another"), store, Local()))
+    (tmp_path / "a").write_text("after")
+    told = Recorder()
+    account = account_for_store(store.folder, reporter=told)
+    lines = told.messages[0].splitlines()
+    assert lines[2].startswith("| another | 2 | 2 | 0 | 130 bytes | 0 s | 2 |")
+    assert lines[3].startswith("| nerg render walk.mp4 | 5 | 2 | 3 | 130 bytes |")
+    assert told.messages[1] == f"changed since another: {tmp_path / 'a'}"
+    assert told.messages[2].startswith("260 bytes in all; stale: 2 outputs, 130 bytes;")
+    assert "--remove-stale" in told.messages[3] and len(account.stale) == 2
+    told = Recorder()
+    account_for_store(store.folder, True, told)
+    assert told.messages[-1] == "Removed 130 bytes." and len(list(store.receipts())) == 2
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(NergError, match="there is no folder"):
+        account_for_store(tmp_path / "none")
+
+
+def test_sizes():
+    counts = (0, 999, 1200, 34_000, 5_600_000, 7.8e9, 2e12)
+    assert [size(n) for n in counts] == ["0 bytes", "999 bytes", "1.2 kB", "34 kB", "5.6 MB", "7.8 GB", "2.0 TB"]

@@ -1,4 +1,4 @@
-"""The report as a job: from files to a page, with what is missing left out."""
+"""Reports on gaze fields."""
 
 from __future__ import annotations
 
@@ -6,18 +6,44 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze_report import write_report
+from nerg_mi.figures.style import provenance
+from nerg_mi.files.atomic import file_sha256
+from nerg_mi.maths.geometry import Box, Similarity
+from nerg_mi.rays.rays import Rays
+from nerg_mi.report.data import PATH_POINTS
+from nerg_mi.train.geometry import GazePlace
 from nerg_mi.workflows import report
-from nerg_mi.workflows.report import ReportOptions, make_report
-from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
+from nerg_mi.workflows.gaze_commands import GazeOptions
+from nerg_mi.workflows.report import (
+    Views,
+    company,
+    free_places,
+    gaze_top,
+    make_report,
+    panorama_eyes,
+    paths_of,
+    pictures_of_rays,
+    pictures_of_views,
+    place_words,
+    sort_files,
+)
+from nerg_mi.workflows.scene_commands import ReportOptions
+from nerg_mi.workflows.train_gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
 from tests.evaluation.test_gaze_report import scored
+from tests.formats.splats.writers import random_splats, write_inria
 from tests.report.made import packed_scene
 from tests.workflows.recorder import Recorder
+
+# ---- The report as a job: from files to a page, with what is missing left out ----
+
 
 SMALL = ReportOptions(width=24, spp=1, points=600, eyes=4, mode="llvm_ad_rgb")
 NAMES = ("Ada", "Grace", "Mary", "Edsger")
@@ -41,7 +67,7 @@ def run(trained, tmp_path_factory):
 @pytest.fixture
 def without_3d(monkeypatch):
     """No 3D scene is made, where it is not the matter."""
-    monkeypatch.setattr(report._Work, "_stage", lambda *_: (None, (0, 0, 0, 0)))
+    monkeypatch.setattr(report._ReportWork, "_stage", lambda *_: (None, (0, 0, 0, 0)))
 
 
 def test_everything_of_a_folder(run, tmp_path):
@@ -185,3 +211,232 @@ def test_damaged_rays_are_a_sentence(run, tmp_path):
     with pytest.raises(NergError, match=r"rays\.npz"):
         make_report([run / "gaze.safetensors", tmp_path / "rays.npz"], tmp_path / "a.html", SMALL)
     assert not (tmp_path / "a.html").exists()
+
+
+# ---- What files are, found from the files: in any order, in folders, and what makes no report ----
+
+
+@pytest.fixture(scope="module")
+def folder(standins, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    for file in standins.values():
+        shutil.copy(file, folder)
+    crowd(100).save(folder / "rays.npz")
+    (folder / "gaze.eval").mkdir()
+    (folder / "gaze.eval" / "gaze.json").write_text("{}")
+    (folder / "notes.txt").write_text("nothing of ours")
+    return folder
+
+
+def test_in_any_order_and_in_folders(folder):
+    files = [folder / n for n in ("shoppers.safetensors", "store.safetensors", "rays.npz", "gaze.eval")]
+    for given in (files, files[::-1], [folder], [*files[:2], files[2], files[3] / "gaze.json"]):
+        found = sort_files(given)
+        assert found.gaze == files[0] and found.scene.place == files[1] and found.rays == files[2]
+        assert found.results == (files[3] / "gaze.json",) and found.scene.kind == "field"
+        assert found.shown == [files[1], files[0]]
+
+
+def test_inputs_have_their_checksums(folder):
+    roles = {role: digest for role, _, digest in sort_files([folder]).inputs()}
+    assert roles["rays"] == file_sha256(folder / "rays.npz") and roles["radiance field"] != roles["gaze field"]
+    assert set(roles) == {"gaze field", "radiance field", "rays", "evaluation"}
+
+
+def test_splats_are_called_so(folder, tmp_path):
+    write_inria(tmp_path / "place.ply", random_splats(5))
+    found = sort_files([folder / "shoppers.safetensors", tmp_path / "place.ply"])
+    assert found.inputs()[1][0] == "splats" and place_words(found) == "Gaussian splats, place.ply."
+    assert place_words(sort_files([folder])).startswith("A radiance field")
+
+
+def test_what_makes_no_report(folder, tmp_path):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    shutil.copy(folder / "shoppers.safetensors", tmp_path / "again.safetensors")
+    cases = [
+        ([folder / "rays.npz"], "there is none among these files; name its checkpoint"),
+        ([folder / "nowhere"], "there is no file or folder"),
+        ([empty], "holds no checkpoint, rays or evaluation"),
+        ([folder, tmp_path / "again.safetensors"], "are both a gaze; a report is of one of them"),
+        ([folder, folder / "notes.txt"], "is none of these"),
+    ]
+    for given, why in cases:
+        with pytest.raises(NergError, match=why):
+            sort_files(given)
+
+
+def test_what_is_named_twice_is_one(folder):
+    assert sort_files([folder, folder / "shoppers.safetensors"]).gaze == folder / "shoppers.safetensors"
+    assert json.loads((folder / "gaze.eval" / "gaze.json").read_text()) == {}
+
+
+# ---- Pictures of a report: one scale, and none where there is nothing to show ----
+
+
+def view(gaze, **aovs):
+    gaze = np.broadcast_to(np.asarray(gaze, float), (32, 48))
+    mask = np.ones((32, 48), bool)
+    mask[:4] = False
+    return SimpleNamespace(color=np.full((32, 48, 3), 0.3), aovs={"gaze": gaze, **aovs}, mask=mask)
+
+
+def three(own=0.5):
+    return {"camera": view(0.2), "own": view(own), "sphere": view(0.1)}
+
+
+def drawn(seen, top=0.5, known=True, **about):
+    return pictures_of_views(Views(seen, **about), top, known, ABOUT)
+
+
+ABOUT = provenance("nerg report", seed=7, settings={"width": 48})
+
+
+def test_one_scale_for_all():
+    assert gaze_top(three()) == pytest.approx(0.5)
+    assert gaze_top({"camera": view(0.0)}) is None
+    # Where there is no surface gaze does not count.
+    assert gaze_top({"camera": view(np.where(np.arange(32)[:, None] < 4, 9.0, 0.0))}) is None
+
+
+def test_which_pictures_there_are():
+    assert set(drawn(three())) == {"color", "gaze", "own", "sphere"}
+    assert set(drawn(three(), known=False)) == {"own", "sphere"}
+    assert set(drawn(three(), None)) == {"color"}
+    spread = {**three(), "camera": view(0.2, gaze_std=np.full((32, 48), 0.05))}
+    assert "spread" in drawn(spread, marker=(3.0, 4.0))
+
+
+def test_they_are_png_files_with_words_and_the_same_again():
+    one, two = (drawn(three(), marker=(3.0, 4.0)) for _ in range(2))
+    for name, picture in one.items():
+        assert picture.png.startswith(b"\x89PNG") and picture.png == two[name].png
+        assert picture.alt.endswith(".") and picture.caption.endswith(".")
+
+
+def test_each_says_in_its_header_what_it_was_made_of():
+    every = drawn(three()) | pictures_of_rays(crowd(300), None, ABOUT)
+    assert set(every) == {"color", "gaze", "own", "sphere", "plan", "layout"}
+    for name, picture in every.items():
+        assert ABOUT.json().encode("latin-1") in picture.png, name
+
+
+def hatched(pictures, name):
+    """How many of the picture's pixels are grey: the colours of its place are not, nor those of gaze."""
+    return sum(1 for row in pixels(pictures[name].png) for p in row if p.max() - p.min() < 3 and 60 < p.max() < 240)
+
+
+def pixels(png):
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant("llvm_ad_rgb")
+    stream = mi.MemoryStream()
+    stream.write(png)
+    stream.seek(0)
+    return np.array(mi.Bitmap(stream).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)).astype(
+        int
+    )
+
+
+@pytest.mark.parametrize("name", ["gaze", "own", "sphere"])
+def test_what_is_not_known_is_hatched(name):
+    """More of it where nobody was recorded around the observer: then nothing of the gaze is known."""
+    every = {k: view(0.3) for k in ("camera", "own", "sphere")}
+    for seen in every.values():
+        seen.color[...] = (0.6, 0.1, 0.1)
+    known, alone = (hatched(drawn(every, supported=s), name) for s in (True, False))
+    assert alone > 1.5 * known > 0
+
+
+def test_the_rays_that_it_rests_on_are_named():
+    plain, told = (drawn(three(), basis=b) for b in ("", "made of 300 rays of 3 people"))
+    for name in ("gaze", "own", "sphere"):
+        a, b = (pixels(p[name].png) for p in (plain, told))
+        # A line more, below the picture.
+        assert b.shape[0] > a.shape[0] and b.shape[1] == a.shape[1]
+        assert (b[-16:] < 128).any() and b[-16:].shape == (16, *b.shape[1:])
+
+
+def test_plans():
+    found = pictures_of_rays(crowd(300), {"centres": [[-0.5, 0, 1.6]], "radius": 0.5}, ABOUT)
+    assert set(found) == {"plan", "layout"} and "held out" in found["layout"].caption
+    assert "held out" not in pictures_of_rays(crowd(300), None, ABOUT)["layout"].caption
+
+
+# ---- Where a report looks from, and the paths that it draws ----
+
+
+BOX = Box((0.0, 0.0, 0.0), (8.0, 6.0, 3.0))
+PLACE = GazePlace(None, BOX, "none")
+
+
+class Walls:
+    """Meets the walls of the box, and a block in its middle, as an onlooker does."""
+
+    BLOCK = np.array([[3.0, 2.0, 0.0], [5.0, 4.0, 3.0]])
+
+    def meet(self, o, d):
+        low, high = np.array(BOX.lower), np.array(BOX.upper)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out = np.where(d == 0, np.inf, np.where(d > 0, (high - o) / d, (low - o) / d)).min(axis=1)
+            a, b = ((c - o) / d for c in self.BLOCK)
+            near, far = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+        within = (near < far) & (far > 0)
+        return np.where(within, np.maximum(near, 0), out), np.ones(len(o), bool)
+
+
+def walkers(count=4, n=400):
+    """People who walk along x for n steps of 2 cm, ten a second."""
+    t = np.tile(np.arange(n) * 0.1, count)
+    person = np.repeat(np.arange(count), n)
+    origin = np.stack([np.tile(np.arange(n) * 0.02, count), 1.0 + person, np.full(n * count, 1.6)], axis=1)
+    ahead = np.tile([1.0, 0, 0], (n * count, 1))
+    return Rays(t, person, tuple("abcdefgh"[:count]), origin, ahead, np.ones(n * count))
+
+
+def test_free_places_are_in_the_room_and_not_in_the_block():
+    found = free_places(Walls(), (np.zeros(3), np.array([8.0, 6, 3])), np.array([0.0, 0, 1]), np.array([1.0, 1, 1.6]))
+    assert len(found) > 30 and (found[:, 2] == 1.6).all()
+    inside = ((found[:, :2] > [2.9, 1.9]) & (found[:, :2] < [5.1, 4.1])).all(axis=1)
+    assert not inside.any() and (found > 0.1).all() and (found[:, 0] < 7.9).all()
+
+
+def test_panoramas_begin_with_the_observer():
+    standing = np.stack([np.linspace(0, 8, 50), np.zeros(50), np.full(50, 1.6)], axis=1)
+    eyes = panorama_eyes(standing, np.array([4.0, 0, 1.6]), 3)
+    assert np.allclose(eyes, [[4, 0, 1.6], [0, 0, 1.6], [8, 0, 1.6]]) or np.allclose(
+        eyes, [[4, 0, 1.6], [8, 0, 1.6], [0, 0, 1.6]]
+    )
+    assert len(panorama_eyes(standing[:0], np.zeros(3))) == 1
+
+
+def test_company_counts_people_and_not_rays():
+    rays = walkers()
+    eyes = np.array([[2.0, 1.0, 1.6], [2.0, 1.5, 1.6], [2.0, 9.0, 1.6]])
+    assert company(rays, eyes, PLACE, 0.55) == (1, 2, 0)
+    # In a place of other units the radius is still in metres.
+    scaled = replace(PLACE, align=Similarity(np.diag([0.1, 0.1, 0.1, 1.0])))
+    assert company(rays, 0.1 * eyes, scaled, 0.55) == (1, 2, 0)
+
+
+def test_paths_follow_people_with_gaps():
+    rays = walkers(2)
+    gap = rays.select(~((rays.person == 0) & (rays.t > 10) & (rays.t < 14)))
+    paths = paths_of(gap, PLACE)
+    assert len(paths) == 3
+    for path in paths:
+        steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+        assert (steps < 0.2).all() and (steps[1:] > 0.1).all() and np.ptp(path[:, 1]) == 0
+    assert max(path[:, 0].max() for path in paths) == pytest.approx(7.98, abs=0.16)
+
+
+def test_somebody_who_stands_is_no_path():
+    rays = walkers(1)
+    assert paths_of(replace(rays, origin=np.tile([1.0, 1, 1.6], (len(rays), 1))), PLACE) == []
+
+
+def test_no_more_of_paths_than_fits():
+    rays = walkers(8, 40_000)
+    paths = paths_of(rays, PLACE)
+    assert 0 < sum(map(len, paths)) <= PATH_POINTS and all(len(p) > 1 for p in paths)

@@ -1,33 +1,45 @@
-"""Scenes written for every kind of place, each rendered as it stands: what is in the picture, and who looks."""
+"""Scene files for fields, meshes and rays, and scenes for the viewer."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import trimesh
 
+import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.fields.splats import Splats
+from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
+from nerg_mi.formats.gltf import shown_unlit
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.rendering.files import read_frames
+from nerg_mi.rendering.nested_scene import gaze_of_scene
 from nerg_mi.rendering.scene import load_scene
+from nerg_mi.workflows import demo, scene
 from nerg_mi.workflows.geometry import make_place
-from nerg_mi.workflows.options import PictureOptions, PlaceOptions
+from nerg_mi.workflows.options import PlaceOptions
 from nerg_mi.workflows.render import render_file
-from nerg_mi.workflows.scene import SceneOptions, write_scene
-from tests.formats.splats.writers import write_inria
+from nerg_mi.workflows.scene import write_scene
+from nerg_mi.workflows.scene_commands import PictureOptions, SceneOptions, ViewOptions
+from nerg_mi.workflows.view import place_to_view, write_variants
+from tests.formats.splats.writers import random_splats, write_inria, write_spz
 from tests.pictures import mitsuba_bitmap
 from tests.plugins import fields
+from tests.rays.dataset.making import DAY, assert_same, write_dataset
 from tests.workflows.recorder import Recorder
+
+# ---- Scenes written for every kind of place, each rendered as it stands ----
+
 
 MODE = "llvm_ad_rgb"
 SMALL = {"width": "18", "height": "12", "sphere_width": "16", "sphere_height": "8", "spp": "2"}
@@ -320,3 +332,152 @@ def test_a_gaze_field_without_anything_needs_an_observer(rgb, folder, tmp_path):
     result = write_scene([gaze], tmp_path / "a.xml", SceneOptions(observer=(0.1, 0, 0), mode=MODE))
     _, found = shown(result.path)
     assert found.mask.all() and found.aovs["gaze"].max() > 0 and len(np.unique(found.color.round(3))) > 1
+
+
+# ---- Rays of a file and of a dataset, as a scene shows them ----
+
+
+@pytest.fixture
+def parquet():
+    pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
+
+
+def test_a_file_is_shown_as_it_is(tmp_path):
+    rays = Rays(np.zeros(1), np.zeros(1, int), ("Ada",), np.zeros((1, 3)), np.eye(3)[:1], np.ones(1))
+    rays.save(tmp_path / "rays.npz")
+    found = scene.load_scene_rays(tmp_path / "rays.npz", tmp_path / "a.xml", Recorder())
+    assert found.file == tmp_path / "rays.npz" and found.made == () and found.of_person("Ada") is found.rays
+    none = scene.load_scene_rays(None, tmp_path / "a.xml", Recorder())
+    assert none.rays is None and none.file is None and none.of_person("Ada") is None
+
+
+def test_a_sample_of_a_dataset_is_kept_beside_the_scene(parquet, tmp_path, monkeypatch):
+    """A sample misses most moments of a person, all of whose rays are read for an eye."""
+    _, rays = write_dataset(tmp_path)
+    recorder = Recorder()
+    whole = scene.load_scene_rays(tmp_path / "shop.rays", tmp_path / "a.xml", recorder)
+    assert whole.file == tmp_path / "a.rays.npz" and whole.made == (whole.file,)
+    assert_same(Rays.load(whole.file), rays)
+    assert any(f"{len(rays):,} rays" in line for line in recorder.messages)
+    monkeypatch.setattr(scene, "MOST", 100)
+    some = scene.load_scene_rays(tmp_path / "shop.rays", tmp_path / "a.xml", recorder)
+    assert some.rays is not None and len(some.rays) == 100 == len(Rays.load(whole.file))
+    own = some.of_person("p1_0")
+    assert own is not None and own.persons == ("p1_0",)
+    assert len(own) == int((rays.person == rays.persons.index("p1_0")).sum())
+
+
+def test_a_scene_of_a_dataset(parquet, rgb, tmp_path):
+    """Named by its place as well; the scene renders, and a person is found in it."""
+    write_dataset(tmp_path)
+    options = SceneOptions(person="p2_1", time=DAY + 2 * 43_200 + 3.0, geometry="none")
+    made = write_scene([tmp_path / "shop.rays" / "place=shop"], tmp_path / "a.xml", options)
+    assert made.quantity == "kde" and tmp_path / "a.rays.npz" in made.files
+    assert made.observer is not None and load_scene(made.path, {"spp": "1"}).sensors()
+    with pytest.raises(NergError, match="Eve"):
+        write_scene([tmp_path / "shop.rays"], tmp_path / "b.xml", SceneOptions(person="Eve", time=1.0))
+
+
+def test_a_name_that_is_taken_by_a_folder(parquet, tmp_path):
+    write_dataset(tmp_path, files=1)
+    (tmp_path / "a.rays.npz").mkdir()
+    with pytest.raises(NergError, match=r"a\.rays\.npz"):
+        scene.check_rays(tmp_path / "shop.rays", tmp_path / "a.xml")
+
+
+# ---- From files and folders to the scene that a viewer shows ----
+
+
+MESH = "v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n"
+
+
+@pytest.fixture
+def rays_file(tmp_path):
+    path = tmp_path / "rays.npz"
+    ahead = [[1.0, 0, 0]] * 3
+    nerg.Rays([0, 1, 2], [0, 0, 0], ("Ada",), [[0, 0, 1.6]] * 3, ahead, np.ones(3)).save(path)
+    return path
+
+
+def test01_a_scene_with_nerg_is_taken_as_it_is(rgb, tmp_path, rays_file):
+    store = demo.store_scene()
+    place = place_to_view([store, rays_file], tmp_path / "new", ViewOptions(up=(0, 0, 2)))
+    assert place.scene == store and not place.made and len(place.rays) == 3
+    assert np.array_equal(place.up, [0, 0, 1]) and place.name == f"{store.name} + rays.npz"
+
+
+def test02_of_others_a_scene_is_made(rgb, tmp_path):
+    (tmp_path / "a.obj").write_text(MESH)
+    told = Recorder()
+    place = place_to_view([tmp_path / "a.obj"], tmp_path, ViewOptions(up=(0, 1, 0)), told)
+    assert place.made and place.rays is None and np.allclose(place.up, [0, 1, 0])
+    assert type(nerg.Scene.load(place.scene)).__name__ == "Scene"
+
+
+def test03_a_folder_stands_for_what_is_in_it(rgb, tmp_path, rays_file):
+    run = tmp_path / "run"
+    run.mkdir()
+    with pytest.raises(NergError, match="holds nothing"):
+        place_to_view([run], tmp_path)
+    (run / "a.obj").write_text(MESH)
+    (run / "notes.txt").write_text("x")
+    (run / "mesh.glb").write_bytes(b"".join(shown_unlit([("POSITION", np.eye(3, dtype="<f4"), False)], None)))
+    assert place_to_view([run], tmp_path).name == "a.obj"
+    for name in ("scene.xml", "other.xml"):
+        shutil.copy(demo.store_scene().parent / "shapes.xml", run / name)
+    for name in ("twin.ply", "twin_lights.ply", "display.xml"):
+        shutil.copy(demo.store_scene().parent / name, run / name)
+    (run / "scene.xml").unlink()
+    with pytest.raises(NergError, match="name the one to view"):
+        place_to_view([run], tmp_path)
+
+
+def test03_splats_in_a_folder(rgb, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    write_spz(run / "a.spz", random_splats(9))
+    place = place_to_view([run], tmp_path, ViewOptions(observer=(0.0, 0.0, -3.0)))
+    assert place.made and place.name == "a.spz" and 'type="splats"' in place.scene.read_text()
+
+
+def test04_two_of_a_kind_are_told(rgb, tmp_path, rays_file):
+    shutil.copy(rays_file, tmp_path / "more.npz")
+    with pytest.raises(NergError, match="both rays"):
+        place_to_view([rays_file, tmp_path / "more.npz"], tmp_path)
+    with pytest.raises(NergError, match="nothing to view"):
+        place_to_view([], tmp_path)
+    with pytest.raises(NergError, match="up must be a direction"):
+        place_to_view([demo.store_scene()], tmp_path, ViewOptions(up=(0, 0, 0)))
+
+
+def test05_a_place_of_a_dataset(parquet, rgb, tmp_path):
+    """As everywhere, a dataset is named by its folder, or by that of a place in it."""
+    _, rays = write_dataset(tmp_path)
+    (tmp_path / "a.obj").write_text(MESH)
+    for name in ("shop.rays", "shop.rays/place=shop"):
+        place = place_to_view([tmp_path / "a.obj", tmp_path / name], tmp_path, ViewOptions(up=(0, 0, 1)))
+        assert place.rays is not None and len(place.rays) == len(rays) and place.made
+
+
+@pytest.mark.nightly
+def test06_several_gaze_fields_are_variants(rgb, tmp_path):
+    store = demo.store_scene()
+    run, told = tmp_path / "run", Recorder()
+    run.mkdir()
+    for name in ("a", "b"):
+        shutil.copy(store.parent / "shoppers.safetensors", run / f"{name}.safetensors")
+    place = place_to_view([store, run], tmp_path, reporter=told)
+    assert list(place.variants) == ["shoppers", "a", "b"] and place.scene == place.variants["shoppers"]
+    assert gaze_of_scene(place.variants["b"]) == (run / "b.safetensors").resolve() and place.made and not told.warnings
+    # Where a name is taken, the folder's is put before it; a field of another place is told.
+    shutil.copy(run / "a.safetensors", tmp_path / "a.safetensors")
+    metadata = {"provenance": {"field_file": {"file": "x", "sha256": "y"}}}
+    write_checkpoint(tmp_path / "c.safetensors", "gaze", {"a": np.zeros(1, np.float32)}, metadata)
+    files = [run / "a.safetensors", tmp_path / "a.safetensors", tmp_path / "c.safetensors"]
+    found = write_variants(store, files, tmp_path, told)
+    assert list(found) == ["a", f"{tmp_path.name}/a", "c"]
+    assert len(told.warnings) == 1 and "another place" in told.warnings[0]
+    # Of fields alone a scene is made, in the place of their training.
+    shutil.copy(store.parent / "store.safetensors", run / "store.safetensors")
+    place = place_to_view([run], tmp_path)
+    assert place.made and list(place.variants) == ["a", "b"]

@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from nerg_mi.aoi.measured import StatisticsOptions
+from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.statistics import statistics

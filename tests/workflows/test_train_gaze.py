@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import drjit.llvm.ad as ns
@@ -20,18 +20,15 @@ from nerg_mi.train.gaze_data import surface_distances
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer, surroundings
 from nerg_mi.train.gaze_recipes import Recipe, register
 from nerg_mi.train.geometry import GazePlace, place_of_scene
-from nerg_mi.workflows.train_gaze import GazeOptions, check_plan, plan_gaze, train_gaze
+from nerg_mi.workflows.gaze_commands import GazeOptions
+from nerg_mi.workflows.train_gaze import check_plan, plan_gaze, train_gaze
 from nerg_mi.workflows.train_radiance import train_radiance
 from tests.train.gaze.looks import BOX, RAYS, looking_at
 
-# ---- Gaze ----
-#
-# The training of a gaze field as a job, and by its command: places, recipes, hold-out, resumption, what is told.
+# ---- The training of a gaze field, and by its command: places, recipes, hold-out, resumption, what is told ----
 
 
 QUICK = GazeOptions(geometry="none", radius=0.5, probes=6, min_rays=8, steps=3, directions=64, zones=0)
-
-
 WALL = """<scene version="3.0.0"><shape type="rectangle"><transform name="to_world">
     <scale value="2"/><lookat origin="1.5, 0, 1.5" target="0, 0, 1.5" up="0, 0, 1"/></transform></shape></scene>"""
 
@@ -151,7 +148,8 @@ def test_recipes_in_a_scene_of_shapes(rays, tmp_path, recipe):
 
 def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, monkeypatch, capsys):
     """A second log density, which is one entry: hold-out, ensembles and ablation know it by that."""
-    from nerg_mi.workflows.ablation import AblationOptions, ablate
+    from nerg_mi.workflows.ablation import ablate
+    from nerg_mi.workflows.gaze_commands import AblationOptions
 
     monkeypatch.setattr(gaze_recipes, "RECIPES", dict(gaze_recipes.RECIPES))
     grid = HashGridConfig(levels=2, log2_rows=8, base=2, finest=4)
@@ -172,47 +170,18 @@ def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, mo
     assert result.provenance["recipe"] == "coarse" and result.provenance["steps"] == 3
     RAYS.save(tmp_path / "rays.npz")
     out = tmp_path / "gaze.safetensors"
-    code, _, said = nerg(
-        capsys,
-        tmp_path / "rays.npz",
-        "-o",
-        out,
-        "--geometry",
-        "hits",
-        "--voxel",
-        0.3,
-        "--recipe",
-        "coarse",
-        "--test-zones",
-        1,
-        "--test-positions",
-        4,
-        "--min-rays",
-        8,
-    )
+    line = "--geometry hits --voxel 0.3 --recipe coarse --test-zones 1 --test-positions 4 --min-rays 8"
+    code, _, said = nerg(capsys, tmp_path / "rays.npz", "-o", out, *line.split())
     assert code == 0, said
     field, meta = load_gaze(out, ns)
     assert field.config.escaped == "nearest" and len(meta["provenance"]["test"]["centres"]) == 4
-    code, _, said = nerg(
-        capsys, tmp_path / "rays.npz", "-o", out, "--geometry", "none", "--recipe", "coarse", "--loss", "paper"
-    )
-    assert code == 1 and "the recipe coarse has no choice of --loss" in said and "add --recipe small" in said
-    options = AblationOptions(
-        geometry="none",
-        recipes="coarse",
-        variant=("emit",),
-        seeds=2,
-        zones=1,
-        positions=4,
-        min_rays=8,
-        radius=0.5,
-        cameras=0,
-    )
+    with pytest.raises(NergError, match="coarse has no choice of --loss.*add --recipe small"):
+        check_plan(GazeOptions(geometry="none", recipe="coarse", loss="paper"))
+    test = {"zones": 1, "positions": 4, "min_rays": 8, "radius": 0.5, "cameras": 0}
+    options = AblationOptions(geometry="none", recipes="coarse", variant=("emit",), seeds=2, **test)
     rows = ablate(RAYS, tmp_path / "rows", options).rows
-    assert [(r["recipe"], r["variant"], r["seed"], r["steps"]) for r in rows] == [
-        ("coarse", "emit", 0, 3),
-        ("coarse", "emit", 1, 3),
-    ]
+    found = [(r["recipe"], r["variant"], r["seed"], r["steps"]) for r in rows]
+    assert found == [("coarse", "emit", 0, 3), ("coarse", "emit", 1, 3)]
 
 
 def test_positions_and_people_are_held_out_and_told(tmp_path):
@@ -300,14 +269,8 @@ def test_an_output_is_trained_once_at_a_time(tmp_path, train):
 
 
 HITS = GazeOptions(geometry="hits")
-
-
 FIELD = GazeOptions(field=Path("field.safetensors"), recipe="small")
-
-
 VIEWS = GazeOptions(geometry="none", views=Path("photos"), salience="maps")
-
-
 SCENE = GazePlace(None, BOX, "scene")
 
 
@@ -354,38 +317,17 @@ def test_what_goes_together_is_not_refused(options, alone):
 
 
 def test_every_option_of_settings_and_probes_arrives():
-    options = GazeOptions(
-        scene=Path("a.xml"),
-        recipe="small",
-        steps=7,
-        seed=3,
-        loss="code",
-        zones=1,
-        refit=False,
-        learning_rate=0.5,
-        weight_decay=0.25,
-        integral=2.0,
-        radius=0.4,
-        probes=9,
-        placement="grid",
-        cap=32,
-        min_rays=4,
-        kappa_rule="silverman",
-        kappa=11.0,
-        weights="person",
-        directions=33,
-        fresh=True,
-        variant="emit",
-        activation="exp",
-        size="paper",
-        normalized=True,
-    )
-    plan = plan_gaze(options, SCENE)
-    s, p, c = plan.settings, plan.probes, plan.config
-    assert (s.steps, s.seed, s.loss, s.zones, s.refit, s.learning_rate) == (7, 3, "code", 1, False, 0.5)
-    assert (s.weight_decay, s.integral, s.frozen) == (0.25, 2.0, False)
-    assert (p.radius, p.count, p.placement, p.cap, p.min_rays) == (0.4, 9, "grid", 32, 4)
-    assert (p.kappa_rule, p.kappa, p.weights, p.directions, p.fresh) == ("silverman", 11.0, "person", 33, True)
+    given = {"steps": 7, "seed": 3, "loss": "code", "zones": 1, "refit": False, "learning_rate": 0.5, "integral": 2.0}
+    given |= {"weight_decay": 0.25, "radius": 0.4, "probes": 9, "placement": "grid", "cap": 32, "min_rays": 4}
+    given |= {"kappa_rule": "silverman", "kappa": 11.0, "weights": "person", "directions": 33, "fresh": True}
+    of_field = {"variant": "emit", "activation": "exp", "size": "paper", "normalized": True}
+    plan = plan_gaze(GazeOptions(scene=Path("a.xml"), recipe="small", **given, **of_field), SCENE)
+    names = {}
+    for settings in (plan.settings, plan.probes):
+        names |= {f.metadata.get("option") or f.name: getattr(settings, f.name) for f in fields(settings)}
+    # Directions of a batch are another setting than those of a probe.
+    assert {name: names[name] for name in given} == given and plan.probes.directions == 33
+    c = plan.config
     assert (c.variant, c.activation, c.grid.levels, c.normalized) == ("emit", "exp", 16, True)
 
 

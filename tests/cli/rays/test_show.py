@@ -1,7 +1,8 @@
 """``nerg rays show``."""
 
 from nerg_mi.errors import NergError
-from nerg_mi.workflows.rays import SplitOptions, split_rays
+from nerg_mi.workflows.rays import split_rays
+from nerg_mi.workflows.rays_commands import SplitOptions
 from tests.cli.rays.running import run, write_walk
 
 

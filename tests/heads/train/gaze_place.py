@@ -5,8 +5,7 @@ import numpy as np
 from nerg_mi.fields.gaze_place import PlaceConfig, PlaceField
 
 from .gaze_recipes import Recipe, register
-from .gaze_settings import gaze_loss
-from .gaze_trainer import GazeTrainer
+from .gaze_trainer import GazeTrainer, gaze_loss
 
 
 class PlaceTrainer(GazeTrainer):

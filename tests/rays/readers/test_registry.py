@@ -14,7 +14,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers import registry
 from nerg_mi.rays.readers.base import option
-from nerg_mi.workflows.rays import ImportOptions, import_rays
+from nerg_mi.workflows.rays import import_rays
+from nerg_mi.workflows.rays_commands import RaysImportOptions
 from tests.rays.readers.made_up import MadeUp, MadeUpOptions, write_recording
 
 
@@ -28,7 +29,7 @@ def made_up():
 def test_a_format_is_added_by_one_object(tmp_path, made_up):
     eyes, heads = write_recording(tmp_path)
     settings = MadeUpOptions(heads=heads, scale=0.01, tick=1e-3)
-    result = import_rays(eyes, ImportOptions(reader="made_up", settings=settings))
+    result = import_rays(eyes, RaysImportOptions(reader="made_up", settings=settings))
     rays = result.rays
     assert np.allclose(rays.origin, [[1, 3, 1.6]]) and np.allclose(rays.direction, [[0, 1, 0]])
     assert rays.persons == ("ann",) and result.summary.dropped == {"a blink": 1}

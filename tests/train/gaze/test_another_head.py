@@ -16,8 +16,9 @@ from nerg_mi.fields import gaze_base
 from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.train import gaze_recipes
-from nerg_mi.workflows.ablation import AblationOptions, ablate
-from nerg_mi.workflows.train_gaze import GazeOptions, train_gaze
+from nerg_mi.workflows.ablation import ablate
+from nerg_mi.workflows.gaze_commands import AblationOptions, GazeOptions
+from nerg_mi.workflows.train_gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
 from tests.plugins.scenes import camera, look_at, render
 

@@ -19,7 +19,8 @@ from nerg_mi.train import gaze_log_density, gaze_product
 from nerg_mi.train.gaze_data import GazeTargets, targets_of_probes
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer, log_gaze, log_mean_exp
 from nerg_mi.train.gaze_product import ProductTrainer, gaze_density
-from nerg_mi.train.gaze_settings import KLD_EPS, GazeSettings
+from nerg_mi.train.gaze_settings import GazeSettings
+from nerg_mi.train.gaze_trainer import KLD_EPS
 from tests.fields.gaze.test_log_density import BOX, SMALL, jit, made, vectors
 
 from .looks import SMALL as PRODUCT

@@ -16,7 +16,8 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import latlong_grid
 from nerg_mi.train.gaze_product import sized_gaze_config
 from nerg_mi.train.gaze_recipes import DEFAULT, FieldChoices, gaze_recipe, recipes, register
-from nerg_mi.train.gaze_settings import CODE, KLD_EPS, LOSSES, PAPER, GazeSettings, gaze_loss
+from nerg_mi.train.gaze_settings import CODE, LOSSES, PAPER, GazeSettings
+from nerg_mi.train.gaze_trainer import KLD_EPS, gaze_loss
 from nerg_mi.train.geometry import GazePlace
 
 from .looks import BOX, NOWHERE

@@ -1,0 +1,64 @@
+"""Running `nerg` in this process, and what several files of tests run it on."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from typing import NamedTuple
+
+import pytest
+
+from nerg_mi.cli import main
+from nerg_mi.cli.building import find_commands
+from nerg_mi.workflows.base import COMMANDS
+from tests.cli.outputs import make_inputs
+
+
+class Ended(NamedTuple):
+    """How a command ended: its exit code, and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def nerg(capsys):
+    """Runs a command."""
+
+    def run(*arguments) -> Ended:
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main([str(a) for a in arguments])
+        return Ended(end.value.code or 0, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def handed(monkeypatch):
+    """``handed(name)``: the keywords of each call of a command's workflow, which does not run, but for the reporter."""
+
+    def keep(name: str) -> list[dict]:
+        importlib.import_module(find_commands()[name].module)
+        calls: list[dict] = []
+        run = lambda *, reporter, **values: calls.append(values)
+        monkeypatch.setitem(COMMANDS, name, replace(COMMANDS[name], run=run))
+        return calls
+
+    return keep
+
+
+@pytest.fixture(scope="session")
+def inputs(tmp_path_factory):
+    """What the commands of `outputs.CASES` read."""
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    folder = make_inputs(tmp_path_factory.mktemp("inputs"))
+    place = "--geometry hits --radius 0.5 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8"
+    line = f"train gaze {folder}/rays.npz -o {folder}/gaze.safetensors {place} --test-zones 1 --test-positions 3"
+    with pytest.raises(SystemExit) as end:
+        main(line.split())
+    assert not end.value.code
+    return folder

@@ -1,0 +1,224 @@
+"""Commands that train, score and convert fields: what reaches their workflows, and what they write and say."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+import trimesh
+
+from nerg_mi.fields.occupancy import OccupancyGrid
+from nerg_mi.formats.checkpoint import read_checkpoint, read_metadata
+from nerg_mi.formats.fields import load_gaze, load_radiance
+from nerg_mi.formats.torch_files import write_torch
+from nerg_mi.workflows.gaze_commands import GazeOptions
+from tests.evaluation.test_gaze import crowd
+from tests.formats.test_torch_ngp import save_nerg as save
+from tests.formats.test_torch_ngp import small_gaze, small_state
+from tests.plugins.fields import radiance
+from tests.train.gaze.looks import looking_at
+
+# ---- Radiance fields ----
+
+
+def test_scores_and_files(cube, nerg):
+    ended = nerg("eval", "radiance", cube / "cube.safetensors", cube, "--holdout", 2, "--json", cube / "s.json")
+    assert not ended.code
+    scores = json.loads((cube / "s.json").read_text())
+    assert scores["width"] == 16 and scores["height"] == 14 and scores["views"]
+    assert scores["psnr_mean"] == pytest.approx(-20 * np.log10(128 / 255 - 0.5), abs=1.5)
+    assert len(scores["psnr"]) == len(scores["views"]) == len(list((cube / "cube.eval").iterdir()))
+
+
+@pytest.mark.nightly
+def test_the_machine_s_speed_and_what_is_wrong_are_told(cube, nerg):
+    ended = nerg("train", "radiance", cube, "-o", cube / "a.safetensors", "--steps", 3, "--holdout", 3)
+    assert not ended.code and "warning: only 3 steps" in ended.err
+    assert float(re.search(r"3 steps in \d+ s; (\S+) field evaluations a second", ended.out)[1]) > 0
+    about = read_checkpoint(cube / "a.safetensors", "radiance")[1]["provenance"]
+    assert about["evaluations_a_second"] > 0 and about["step_ms"]["max"] >= about["step_ms"]["median"]
+    assert [x for x in about["complaints"] if x.startswith("only 3 steps")]
+
+
+# The command, and what it says once the photos may be read: of the gaze, that photos of one grey have no salience.
+OUTSIDE = {
+    "train radiance": ("train radiance {c}/set -o {c}/out.safetensors --steps 2 --holdout 3", r"2 steps in"),
+    "eval radiance": ("eval radiance {c}/cube.safetensors {c}/set --holdout 2 -o {c}/out.safetensors", r"PSNR"),
+    "train gaze": (
+        "train gaze -o {c}/out.safetensors --views {c}/set --salience spectral-residual --field {c}/cube.safetensors",
+        "no salience",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_photos_beyond_the_folder_are_read_only_if_allowed(name, cube, nerg):
+    (cube / "set").mkdir()
+    text = (cube / "transforms.json").read_text()
+    (cube / "set" / "transforms.json").write_text(re.sub(r'"(\d.png)"', r'"../\1"', text))
+    line, said = OUTSIDE[name]
+    line = line.format(c=cube).split()
+    ended = nerg(*line)
+    assert ended.code == 1 and "--allow-outside" in ended.err and not re.search(said, ended.out + ended.err)
+    ended = nerg(*line, "--allow-outside")
+    assert re.search(said, ended.out + ended.err) and "outside of" not in ended.out + ended.err
+
+
+# ---- Gaze fields ----
+
+PATHS = {"field": "place.safetensors", "scene": "room.xml", "views": "photos", "align_views": "a.json"} | {
+    "align": "b.json"
+}
+
+
+def other_value(f):
+    """A value of the option ``f``, other than its default."""
+    if f.name in PATHS:
+        return Path(PATHS[f.name])
+    if f.name == "mode":
+        return "llvm_ad_mono"
+    hint = str(f.type)
+    if "bool" in hint:
+        return not f.default if isinstance(f.default, bool) else False
+    if "str" in hint:
+        return "hits" if f.name == "geometry" else "word"
+    within = f.metadata["nerg_mi.range"]
+    value = within.low + (0.25 if "float" in hint else 1)
+    return value if value != f.default else value + 1
+
+
+def test_the_workflow_is_given_what_is_said(handed, nerg):
+    """Every option there is, and none of them."""
+    given = handed("train gaze")
+    options = GazeOptions(**{f.name: other_value(f) for f in fields(GazeOptions)})
+    line = []
+    for f in fields(GazeOptions):
+        flag = (f.metadata["names"] or ("--" + f.name.replace("_", "-"),))[-1]
+        value = getattr(options, f.name)
+        if isinstance(value, bool):
+            line.append(flag.split("/")[0 if value else -1])
+        else:
+            line += [flag, value]
+    assert nerg("train", "gaze", "rays.npz", "-o", "out.safetensors", *line).code == 0
+    assert nerg("train", "gaze", "-o", "out.safetensors").code == 0
+    output = Path("out.safetensors")
+    assert given == [
+        {"rays": Path("rays.npz"), "output": output, "options": options},
+        {"rays": None, "output": output, "options": GazeOptions()},
+    ]
+
+
+def test_a_field_takes_over_features_and_weights(tmp_path, nerg):
+    radiance(tmp_path / "field.safetensors", density_scale=30.0)
+    taken = load_radiance(tmp_path / "field.safetensors", ns)[0]
+    looking_at((0.5, 0.1, 0.2), 300).save(tmp_path / "rays.npz")
+    line = "train gaze {o}/rays.npz -o {o}/gaze.safetensors --field {o}/field.safetensors --recipe small --steps 4 "
+    line += "--semantic snapshot --probes 6 --radius 0.5 --min-rays 8 --directions 32 --zones 0 --begin field --freeze"
+    ended = nerg(*line.format(o=tmp_path).split())
+    assert ended.code == 0, ended.err
+    trained, about = load_gaze(tmp_path / "gaze.safetensors", ns)
+    assert trained.config.semantic == "snapshot" and about["provenance"]["begins_as"] == "field.safetensors"
+    np.testing.assert_array_equal(np.array(trained.grid.table), np.array(taken.grid.table))
+
+
+@pytest.mark.parametrize("recipe", ["default", "small"])
+def test_a_field_from_salience_images(recipe, tmp_path, nerg, rgb):
+    """Six photos from places a metre apart, of which five have salience images."""
+    frames, rng = [], np.random.default_rng(0)
+    (tmp_path / "maps").mkdir()
+    for k in range(6):
+        pose = np.eye(4)
+        pose[:3, 3] = k, 0, 1.6
+        rgb.Bitmap(rng.integers(0, 255, (12, 16, 3)).astype(np.uint8)).write(str(tmp_path / f"p{k}.png"))
+        if k:
+            np.save(tmp_path / "maps" / f"p{k}.npy", rng.uniform(size=(12, 16)))
+        frames.append({"file_path": f"p{k}.png", "transform_matrix": pose.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
+    # A place, which small needs, is a scene of one wall.
+    scene, out = tmp_path / "wall.xml", tmp_path / "out.safetensors"
+    scene.write_text('<scene version="3.0.0"><shape type="cube"/></scene>')
+    place = ["--geometry", "none"] if recipe == "default" else ["--scene", scene]
+    quick = "--steps 2 --directions 64 --zones 0".split()
+    images = ["--views", tmp_path, "--salience", tmp_path / "maps"]
+    ended = nerg("train", "gaze", *images, "--recipe", recipe, *place, *quick, "-o", out)
+    assert ended.code == 0, ended.err
+    assert "5 views with salience; without: p0.png" in ended.out and "0 probes and 5 views" in ended.out
+    field, meta = load_gaze(out, ns)
+    assert field.config.normalized and meta["provenance"]["salience"]["used"] == 5
+    assert "rays_file" not in meta["provenance"]
+
+
+@pytest.mark.nightly
+def test_a_field_is_scored_as_it_was_trained(tmp_path, nerg):
+    crowd().save(tmp_path / "rays.npz")
+    gaze = tmp_path / "gaze.safetensors"
+    line = "--geometry hits --voxel 0.2 --radius 0.6 --steps 5 --directions 64 --probes 20 --zones 0"
+    train = ["train", "gaze", tmp_path / "rays.npz", "-o", gaze, *line.split()]
+    assert nerg(*train).code == 0
+    ended = nerg("eval", "gaze", gaze, tmp_path / "rays.npz")
+    assert ended.code == 1 and "--test-zones 3" in ended.err
+    assert nerg(*train, "--test-zones", "2", "--test-positions", "6", "--test-people", "0.5").code == 0
+    line = "--min-rays 16 --resamples 4 --directions 256 --pictures 1"
+    assert nerg("eval", "gaze", gaze, tmp_path / "rays.npz", *line.split()).code == 0
+    found = json.loads((tmp_path / "gaze.eval" / "gaze.json").read_text())
+    names = [r["method"] for r in found["methods"]]
+    assert names[:2] == ["gaze field", "uniform"] and "4,096 nearest rays" in names and found["split"] == "both"
+    assert found["methods"][0]["integral"] == pytest.approx(1, abs=0.02)
+    for name in ("gaze.md", "gaze.csv", "persons.csv", "positions.png"):
+        assert (tmp_path / "gaze.eval" / name).stat().st_size > 100
+    crowd(seed=1).save(tmp_path / "others.npz")
+    ended = nerg("eval", "gaze", gaze, tmp_path / "others.npz")
+    assert ended.code == 1 and "trained on other rays" in " ".join(ended.err.split())
+
+
+# ---- To and from other programs ----
+
+
+def test_a_nerf_is_imported(tmp_path, nerg, torch):
+    write_torch(tmp_path / "ngp.pth", {"model": small_state()})
+    ended = nerg("import", tmp_path / "ngp.pth", "-o", tmp_path / "field.safetensors", "--color-space", "linear")
+    assert ended.code == 0 and "raw weights, no occupancy grid" in ended.out and "wrote" in ended.out
+    field, meta = load_radiance(tmp_path / "field.safetensors", ns)
+    assert field.color_space == "linear" and meta["provenance"]["format"] == "torch-ngp"
+    assert np.array_equal(field.color_net.weights[2].numpy(), small_state()["color_net.2.weight"])
+
+
+def test_a_nerf_and_its_gaze_are_imported(tmp_path, nerg, torch):
+    path = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state())
+    ended = nerg("import", path, "-o", tmp_path / "field.safetensors")
+    assert ended.code == 0 and "also holds a gaze field" in ended.out
+    ended = nerg("import", path, "-o", tmp_path / "f.safetensors", "-g", tmp_path / "g.safetensors", "--half")
+    assert ended.code == 0 and "gaze: emit_capture, trunk layernorm, bound 1" in ended.out
+    assert (tmp_path / "g.safetensors").stat().st_size < 0.6 * small_gaze()["encoder.embeddings"].nbytes + 1e5
+
+
+def test_forms_of_an_exported_field(tmp_path, nerg):
+    radiance(tmp_path / "f.safetensors")
+
+    def export(kind, name, *more):
+        ended = nerg("export", kind, tmp_path / "f.safetensors", "-o", tmp_path / name, *more)
+        assert ended.code == 0, ended.err
+        return ended.out
+
+    assert "50 points" in export("points", "p.ply", "--resolution", 16, "--density", 3, "--count", 50)
+    assert len(trimesh.load(tmp_path / "p.ply").vertices) == 50
+    said = export("volume", "d.vol", "--color", tmp_path / "c.vol", "--resolution", 8)
+    assert "8 x 8 x 8 voxels from (-1, -1, -1) to (1, 1, 1)" in said
+    assert (tmp_path / "c.vol").stat().st_size == 48 + 8**3 * 3 * 4 == 3 * (tmp_path / "d.vol").stat().st_size - 2 * 48
+    pytest.importorskip("skimage")
+    assert "around holes" in export("mesh", "m.glb", "--resolution", 16, "--density", 3)
+    assert len(trimesh.load(tmp_path / "m.glb", force="mesh").faces) > 100
+
+
+def test_a_refined_field_says_so(tmp_path, nerg):
+    occupancy = OccupancyGrid(np.ones((4, 4, 4), bool), ns, 0.1)
+    radiance(tmp_path / "f.safetensors", density_scale=1e-2, occupancy=occupancy)
+    ended = nerg("refine", tmp_path / "f.safetensors", "-o", tmp_path / "g.safetensors")
+    assert ended.code == 0 and "where it was 100.00 %" in ended.out
+    refined = read_metadata(tmp_path / "g.safetensors")["occupancy"]["refined"]
+    assert refined["threshold"] == pytest.approx(0.01) and refined["missed"] >= 0

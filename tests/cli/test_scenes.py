@@ -1,0 +1,454 @@
+"""Commands that render, draw and measure: what reaches their workflows, and what they write and say."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nerg_mi.evaluation.gaze_report import judge, read_results
+from nerg_mi.evaluation.study import COLUMNS
+from nerg_mi.files import atomic
+from nerg_mi.files.images import write_exr
+from nerg_mi.formats.ply import write_columns
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.bands import render_channels
+from nerg_mi.tasks import engines
+from nerg_mi.tasks.engines import Local, run_plan
+from nerg_mi.tasks.store import Store
+from nerg_mi.threads import VARIABLE
+from nerg_mi.workflows import demo
+from nerg_mi.workflows import poses as posing
+from nerg_mi.workflows.scene_commands import KINDS, DemoOptions
+from tests.aoi.place import people, write_place
+from tests.photos import rendered
+from tests.pictures import SCENE, mitsuba_bitmap
+from tests.surfaces.meshes import box
+from tests.tasks import works
+from tests.workflows.test_draw import WALLS_SCENE, walk
+
+NERG = [sys.executable, "-c", "from nerg_mi.cli import main; main()"]
+"""The command in a process of its own."""
+LLVM = ("-m", "llvm_ad_rgb")
+
+
+def interrupt(arguments, sign: bytes) -> tuple[bytes, int]:
+    """Run a command on a terminal, press Ctrl-C when it shows `sign`, and give what it showed and its exit code."""
+    ours, theirs = os.openpty()
+    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "120"}
+    command = [*NERG, *map(str, arguments)]
+    child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=theirs, stderr=theirs, env=environment)
+    os.close(theirs)
+    said = b""
+    try:
+        while True:
+            try:
+                part = os.read(ours, 4096)
+            except OSError:  # the terminal is closed
+                break
+            said += part
+            if part and sign in said and sign not in said[: -len(part)]:
+                child.send_signal(signal.SIGINT)
+        return said, child.wait(timeout=120)
+    finally:
+        child.kill()
+        os.close(ours)
+
+
+# ---- nerg render ----
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE)
+    return path
+
+
+@pytest.fixture
+def render(scene, tmp_path, nerg):
+    """Renders the scene to a file of a name, and gives what is in it."""
+
+    def picture(name, *options, mode="llvm_ad_rgb", path=scene):
+        ended = nerg("render", path, "-o", tmp_path / name, "-m", mode, *options)
+        assert ended.code == 0 and str(tmp_path / name) in ended.out, ended.err
+        return mitsuba_bitmap(tmp_path / name)
+
+    return picture
+
+
+def test_exr_has_all_channels_in_float32(rgb, render):
+    bitmap = render("new/out.exr")
+    assert tuple(bitmap.size()) == (16, 8)
+    fields = [field.name for field in bitmap.struct_()]
+    assert set("RGB") <= set(fields) and "dd.T" in fields
+    assert bitmap.component_format() == rgb.Struct.Type.Float32
+    assert np.allclose(np.array(bitmap)[0, 0, :3], 0.25)
+    assert {"Y", "dd.T"} <= {field.name for field in render("mono.exr", mode="llvm_ad_mono").struct_()}
+
+
+def test_png_is_tonemapped_colour(render):
+    picture = np.array(render("out.png", "-D", "level=0.5"))
+    assert picture.shape == (8, 16, 3) and picture.dtype == np.uint8
+    assert abs(int(picture[0, 0, 0]) - 188) <= 1  # 0.5 in sRGB
+
+
+def test_define_sensor_spp_and_seed(render):
+    assert np.array(render("panorama.exr", "-s", 1)).shape[:2] == (6, 12)
+    assert np.allclose(np.array(render("level.exr", "-D", "level=0.75", "-D", "integrator=direct"))[0, 0, :3], 0.75)
+    a, b, c = (np.array(render(f"{i}.exr", "--spp", 1, "--seed", seed)) for i, seed in enumerate((3, 3, 4)))
+    assert np.array_equal(a, b) and not np.array_equal(a, c)
+
+
+def test_a_mistake_of_the_program_while_it_renders_is_told_as_one(scene, tmp_path, monkeypatch, nerg):
+    def broken(*args, **options):
+        raise RuntimeError(
+            'in a plugin:\nTraceback (most recent call last):\n  File "x.py", line 1, in f\nTypeError: no len()'
+        )
+
+    monkeypatch.setattr("nerg_mi.rendering.bands.render_bands", broken)
+    ended = nerg("render", scene, "-o", tmp_path / "out.exr")
+    assert ended.code == 70 and "internal error" in ended.err and not (tmp_path / "out.exr").exists()
+
+
+@pytest.mark.parametrize("name", ["out.exr", "out.png"])
+def test_one_thread_is_enough(scene, tmp_path, name):
+    # Mitsuba's EXR writer never returns where Dr.Jit has one thread.
+    out = tmp_path / name
+    subprocess.run([*NERG, "render", scene, "-o", out, *LLVM, "-t", "1"], check=True, timeout=180)
+    assert tuple(mitsuba_bitmap(out).size()) == (16, 8)
+
+
+@pytest.mark.parametrize("name", ["out.exr", "out.png"])
+def test_a_picture_takes_the_place_of_another_whole(scene, tmp_path, monkeypatch, nerg, render, name):
+    out = tmp_path / name
+    out.write_bytes(b"what was there")
+    before = set(tmp_path.iterdir())
+
+    def full(path):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic, "_flush", full)
+        assert nerg("render", scene, "-o", out, *LLVM).code == 1
+    assert out.read_bytes() == b"what was there" and set(tmp_path.iterdir()) == before
+    assert tuple(render(name).size()) == (16, 8)
+
+
+@pytest.mark.parametrize("name", ["out.exr", "out.png"])
+def test_ctrl_c_ends_it_and_leaves_nothing(tmp_path, name):
+    folder = tmp_path / "pictures"
+    large = tmp_path / "large.xml"
+    large.write_text(SCENE.replace('value="16"', 'value="3000"').replace('value="8"', 'value="3000"'))
+    said, code = interrupt(["render", large, "-o", folder / name, *LLVM, "--spp", 256, "--memory", 0.3], b"samples/s")
+    assert code == 130 and b"Interrupted." in said
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("memory", [1.0, 1e-3])
+def test_memory_changes_no_pixel(rgb, scene, render, memory):
+    loaded = rgb.load_file(str(scene))
+    rgb.render(loaded, spp=3)
+    options = ("--spp", 3, "--memory", memory)
+    assert np.array_equal(np.array(render("a.exr", *options)), np.array(loaded.sensors()[0].film().bitmap()))
+    assert np.array_equal(np.array(render("a.png", *options)), np.array(render("b.png", "--spp", 3)))
+
+
+def test_one_piece_beyond_the_memory_is_said(tmp_path, nerg):
+    other = tmp_path / "other.xml"
+    other.write_text(SCENE.replace('type="independent"', 'type="multijitter"'))
+    ended = nerg("render", other, "-o", tmp_path / "a.exr", *LLVM, "--memory", 1e-3)
+    words = "in one piece, beyond 0.001 GB, because of the sampler MultijitterSampler"
+    assert ended.code == 0 and words in ended.out.replace("\n", " ")
+    ended = nerg("render", other, "-o", tmp_path / "b.exr", "--memory", 0)
+    assert ended.code == 2 and "--memory" in ended.err
+
+
+# ---- nerg demo, the whole way: on random fields always, on the store's own where they are present ----
+
+PICTURES = {"occlusion.png", "gaze.png", "gaze_sphere.png", "depth.png", "visibility.png", "color.png", "scene.exr"}
+NAMES = PICTURES | {"heatmap.glb", "report.html", "aoi.csv", "run.json"}
+TINY = ("--width", 48, "--spp", 1, *LLVM)
+
+
+def defines(files):
+    return [a for k, v in files.items() for a in ("-D", f"{k}={v}")]
+
+
+def test_the_demo_writes_and_names_everything(rgb, standins, tmp_path, nerg):
+    out = tmp_path / "new" / "demo"
+    ended = nerg("demo", "--out", out, *TINY, *defines(standins))
+    assert ended.code == 0 and {p.name for p in out.iterdir()} == NAMES
+    assert all(str(out / n) in ended.out for n in NAMES) and "Look at them with: " in ended.out
+
+    bitmap = mitsuba_bitmap(out / "scene.exr")
+    fields = [f.name for f in bitmap.struct_()]
+    assert set(fields) == {"R", "G", "B", "depth.T", "opacity.Y", "gaze.Y", "visibility.Y"}
+    assert bitmap.component_format() == rgb.Struct.Type.Float32 and tuple(bitmap.size()) == (48, 32)
+
+    report = json.loads((out / "run.json").read_text())
+    assert report["seed"] == 0 and report["spp"] == 1 and report["variant"] == "llvm_ad_rgb"
+    assert {"nerg_mi", "mitsuba", "drjit", "numpy", "libLLVM"} <= set(report["versions"])
+    assert set(report["seconds"]) == set(demo.STAGES)
+    assert set(report["inputs"]) == {"scene.xml", "store.safetensors", "shoppers.safetensors"}
+    # Every object of the store, with its share of what this observer looks at.
+    shares = {row["object"]: float(row["observer_share"]) for row in csv.DictReader((out / "aoi.csv").open())}
+    assert len(shares) == 30 and all(share >= 0 for share in shares.values()) and 0 < sum(shares.values()) < 1.01
+    # Inputs and the seed stand in every picture, and rays and people in the page.
+    header = (out / "heatmap.glb").read_bytes()
+    assert header[:4] == b"glTF" and report["inputs"]["shoppers.safetensors"].encode() in header
+    for name in PICTURES:
+        header = (out / name).read_bytes()
+        assert all(digest.encode() in header for digest in report["inputs"].values()) and b'"seed": 0' in header, name
+    assert "made of 4,321 rays of 12 people" in (out / "report.html").read_text("utf-8")
+    for name, digest in report["outputs"].items():
+        assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
+
+
+@pytest.mark.nightly
+def test_equal_seeds_equal_files_of_the_demo(rgb, standins, tmp_path):
+    def outputs(name, seed):
+        options = DemoOptions(defaults=standins, seed=seed, mode="llvm_ad_rgb", width=36, spp=1)
+        return demo.make_demo(tmp_path / name, options).report["outputs"]
+
+    first, second, other = outputs("a", 3), outputs("b", 3), outputs("c", 4)
+    assert first == second
+    assert first["scene.exr"] != other["scene.exr"]
+
+
+@pytest.mark.parametrize("name", ["field", "gaze"])
+def test_a_missing_checkpoint_names_the_command(standins, tmp_path, nerg, name):
+    files = {**standins, name: str(tmp_path / "nowhere.safetensors")}
+    ended = nerg("demo", "--out", tmp_path / "out", *TINY, *defines(files))
+    assert ended.code == 1 and f"the {name} checkpoint" in ended.err and "python -m nerg_mi.scenes.store" in ended.err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.nightly
+def test_the_store_itself(rgb):
+    """Committed checkpoints: the shelf hides what lies behind it, and gaze is what occlusion leaves of it."""
+    missing = [f for f in demo.CHECKPOINTS.values() if not (demo.store_scene().parent / f).is_file()]
+    if missing:
+        pytest.skip(f"{', '.join(missing)} of the store are not made yet: {demo.MAKE}")
+    scene = rgb.load_file(str(demo.store_scene()), width="60", height="40")
+    without = rgb.load_file(str(demo.store_scene()), width="60", height="40", occlusion="false", radiance="false")
+    hidden, plain = (render_channels(s, s.sensors()[demo.CAMERA], 1) for s in (scene, without))
+    assert hidden.mask.mean() > 0.99
+    seen = hidden.aovs["visibility"]
+    assert 0.15 < seen.mean() < 0.6
+    # The observer's point and the camera's agree where it is seen; elsewhere gaze is gone.
+    assert np.all(hidden.aovs["gaze"][seen == 0] == 0) and plain.aovs["gaze"][seen == 0].max() > 0
+    x, y = demo.observer_pixel(scene)
+    assert 0 < x < 60 and 0 < y < 40
+    small = rgb.load_file(str(demo.store_scene()), sphere_width="64", sphere_height="32")
+    sphere = render_channels(small, small.sensors()[demo.SPHERE], 1)
+    assert 0.7 < demo.sphere_integral(sphere) < 1.3  # a density over the sphere
+
+
+def test_the_demo_s_evaluation_is_of_the_field_that_it_carries(standins):
+    store = demo.store_scene()
+    gaze = store.parent / demo.CHECKPOINTS["gaze"]
+    assert demo.evaluation_beside(store, gaze) == [store.parent / "gaze.json"], "run make --stage evaluation"
+    # And of no other one.
+    assert demo.evaluation_beside(store, Path(standins["gaze"])) == []
+    results = read_results(store.parent / "gaze.json")
+    verdict = judge(results.rows, results.split, results.people, results.positions)
+    assert results.people == 100 and results.positions == 64
+    assert verdict.sentence.startswith("Better than position-blind, the strongest baseline, and than nearest rays")
+
+
+def test_ctrl_c_ends_the_demo_and_leaves_nothing(standins, tmp_path):
+    large = ["demo", "--out", tmp_path / "out", "--width", 2000, "--spp", 1000, *LLVM, *defines(standins)]
+    said, code = interrupt(large, b"camera")
+    assert code == 130 and b"Interrupted." in said
+    assert not (tmp_path / "out").exists()
+
+
+# ---- nerg draw, nerg scene, nerg view, nerg report ----
+
+
+def test_help_names_every_kind_of_figure_and_its_options(nerg):
+    said = nerg("draw", "--help").out
+    assert all(name in said and kind.summary in said for name, kind in KINDS.items())
+    said = nerg("draw", "sphere", "--help").out
+    assert all(flag in said for flag in ("--projection", "--top", "--cmap", "-D", "--output", "--width"))
+    assert "-D" not in nerg("draw", "sheet", "--help").out
+
+
+def test_a_difference(nerg, tmp_path):
+    for k in (1.0, 2.0):
+        write_exr(tmp_path / f"{k:.0f}.exr", {"gaze.Y": np.full((20, 30), k, np.float32)})
+    out = tmp_path / "new" / "a.svg"
+    ended = nerg("draw", "difference", tmp_path / "1.exr", tmp_path / "2.exr", "-o", out, "--top", 3)
+    assert ended.code == 0 and f"Wrote {out}" in ended.out and b"<svg" in out.read_bytes()
+
+
+def test_values_for_the_scene_of_a_figure(nerg, tmp_path):
+    walk().save(tmp_path / "rays.npz")
+    text = WALLS_SCENE.replace('<scene version="3.0.0">', '<scene version="3.0.0"><default name="tall" value="1"/>')
+    (tmp_path / "scene.xml").write_text(text.replace('y="0.2" z="1"', 'y="0.2" z="$tall"'))
+    line = ("draw", "floor", tmp_path / "rays.npz", "--scene", tmp_path / "scene.xml", *LLVM, "-o")
+    for k, more in enumerate(((), ("-D", "tall=0.1"))):
+        assert nerg(*line, tmp_path / f"{k}.png", *more).code == 0
+    assert (tmp_path / "0.png").read_bytes() != (tmp_path / "1.png").read_bytes()
+    ended = nerg(*line, tmp_path / "a.png", "-D", "tal=0.1")
+    assert ended.code == 1 and 'asks for no "$tal"' in ended.err
+
+
+def test_a_mesh_becomes_a_picture(nerg, tmp_path):
+    (tmp_path / "a.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
+    path = tmp_path / "new" / "scene.xml"
+    ended = nerg("scene", tmp_path / "a.obj", "-o", path, "--from=0,-3,2", "--to=0,0,0", "--width", 24, *LLVM)
+    assert ended.code == 0 and f"wrote {path}" in " ".join(ended.out.split())
+    assert nerg("render", path, "-o", tmp_path / "a.png", *LLVM, "--spp", 4).code == 0
+    picture = np.array(mitsuba_bitmap(tmp_path / "a.png"))
+    assert picture.shape == (16, 24, 3) and picture[8, 12].min() > 60 and picture[0, 0].max() == 0
+
+
+def test_options_reach_the_viewer_and_the_report(handed, nerg):
+    given = handed("view")
+    line = "view a.xml b.npz --port 0 --observer=1,2,3 --host ::1 --name lab --width 320"
+    assert nerg(*line.split()).code == 0
+    ((files, options),) = ((call["files"], call["options"]) for call in given)
+    assert [f.name for f in files] == ["a.xml", "b.npz"] and options.observer == (1, 2, 3)
+    assert (options.host, options.port, options.names, options.width) == ("::1", 0, ("lab",), 320)
+
+    given = handed("report")
+    line = "report gaze.safetensors day.npz -o a.html --objects o.json --names --min-persons 3 --no-paths --from 1,2,3"
+    assert nerg(*line.split(), "--to", "0,0,1", "--evaluate", "--title", "Mine").code == 0
+    ((files, output, options),) = ((call["files"], call["output"], call["options"]) for call in given)
+    assert files == [Path("gaze.safetensors"), Path("day.npz")] and output == Path("a.html")
+    assert options.objects == Path("o.json") and options.names and options.min_persons == 3 and not options.paths
+    assert options.camera_from == (1, 2, 3) and options.camera_to == (0, 0, 1)
+    assert options.evaluate and options.title == "Mine"
+
+
+# ---- nerg align, nerg bake, nerg stats, nerg study ----
+
+
+def test_a_file_of_pairs_becomes_an_alignment_and_a_picture(nerg, tmp_path):
+    rows = "0,0,0,1,0,0\n2,0,0,5,0,0\n0,1,0,1,2,0\n0,0,1,1,0,2\n"
+    (tmp_path / "p.csv").write_text("x,y,z,place_x,place_y,place_z\n" + rows)
+    ended = nerg("align", "--pairs", tmp_path / "p.csv", "-o", tmp_path / "a.json")
+    assert not ended.code and "4 pairs" in ended.out and "residuals:" in ended.out
+    assert json.loads((tmp_path / "a.json").read_text())["evidence"]["kind"] == "pairs"
+    assert (tmp_path / "a.png").is_file()
+
+
+def test_rays_on_a_room_without_a_wall(nerg, tmp_path):
+    v, f = box((0, 0, 0), (4, 3, 2.5), without=1)
+    write_columns(tmp_path / "room.ply", dict(zip("xyz", v.T)), f)
+    d = np.array([(1.0, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
+    Rays(np.arange(4) / 10, np.zeros(4), ("a",), np.ones((4, 3)), d, np.ones(4)).save(tmp_path / "a.npz")
+    line = f"bake {tmp_path}/room.ply --rays {tmp_path}/a.npz --cone 0 --detail 1 -o {tmp_path}/a.json -m llvm_ad_rgb"
+    ended = nerg(*line.split(), "--weights", "equal")
+    assert not ended.code and "of the gaze of 4 rays 75.00% lies on the surface" in ended.out
+    assert "25.00% meets no surface" in ended.out and json.loads((tmp_path / "a.json").read_text())["escaped"] == 0.25
+
+
+def test_attention_is_counted(nerg, tmp_path):
+    write_place(tmp_path, gaze=False)
+    people().save(tmp_path / "rays.npz")
+    line = "stats {o}/rays.npz {o}/scene.xml --areas {o}/areas.json -o {o}/out --window early=0,8 --resamples 199"
+    ended = nerg(*line.format(o=tmp_path).split(), *LLVM)
+    assert ended.code == 0 and "480 rays of 6 people" in ended.out + ended.err
+    assert "| window early | the sign | tracked | 6 |" in (tmp_path / "out" / "things.md").read_text()
+
+
+@pytest.mark.nightly
+def test_a_quick_study(tmp_path, nerg):
+    out = tmp_path / "new"
+    ended = nerg(*"study slab --quick --width 24 --height 16 -m llvm_ad_rgb --out".split(), out)
+    assert not ended.code
+    for name in ("study.csv", "study.md", "scaling.csv", "study.json", "errors.png", "scaling.png"):
+        assert (out / name).is_file() and str(out / name) in ended.out.replace("\n", "")
+    with (out / "study.csv").open() as f:
+        rows = list(csv.DictReader(f))
+    assert tuple(rows[0]) == COLUMNS
+    by_name = {r["setting"]: r for r in rows}
+    default = by_name["default"]
+    assert float(default["seconds"]) > 0 and float(default["density_evals"]) > 100 and float(default["peak_mb"]) > 0
+    assert float(default["depth_mae"]) < 1e-5
+    # Evaluations that are not needed are not made.
+    assert float(by_name["no colour"]["color_evals"]) == 0 and by_name["no colour"]["color_rmse"] == ""
+    assert float(by_name["no observer"]["density_evals"]) < 0.8 * float(default["density_evals"])
+    assert any("depth" in r["pareto"] for r in rows)
+    report = json.loads((out / "study.json").read_text())
+    assert report["scene"] == "slab" and len(report["rows"]) == len(rows) and report["against_paper"]
+    assert {r["axis"] for r in report["scaling"]} == {"pixels", "samples", "extent"}
+    paper = next(p for p in report["against_paper"] if p["paper"]["setting"] == "paper, 1024 steps")
+    assert paper["paper"]["depth_mae"] > 1000 * paper["default"]["depth_mae"]
+
+
+# ---- nerg jobs, nerg worker ----
+
+
+def test_a_store_is_told_of_and_swept(tmp_path, nerg):
+    store = Store(tmp_path / "store")
+    for count in (3, 1):
+        list(run_plan(works.plan(count, what="a film"), store, Local()))
+    ended = nerg("jobs", store.folder)
+    assert ended.code == 0 and "| a film | 1 | 1 | 0 |" in ended.out and "stale: 2 outputs" in ended.out
+    assert len(list(store.receipts())) == 3
+    assert "Removed 130 bytes." in nerg("jobs", store.folder, "--remove-stale").out
+    assert len(list(store.receipts())) == 1
+
+
+def test_a_worker_serves_an_address_and_warns_of_an_open_one(monkeypatch, nerg):
+    served = []
+    monkeypatch.setattr(engines, "serve_cluster", lambda *a: served.append((*a[:2], a[3], os.environ.get(VARIABLE))))
+    # What the command sets is taken back after the test.
+    monkeypatch.setenv(VARIABLE, "")
+    ended = nerg(*"worker tcp://127.0.0.1:8786 --threads 3 --wait 5 --name a".split())
+    assert ended.code == 0 and ended.err == ""
+    assert served == [("tcp://127.0.0.1:8786", 5.0, "a", "3")]
+    assert "warning: nothing protects tcp://192.0.2.1:8786" in nerg("worker", "tcp://192.0.2.1:8786").err
+
+
+# ---- nerg poses ----
+
+
+@pytest.fixture
+def photos(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setattr(posing, "check_installed", lambda: None)
+    (tmp_path / "photos").mkdir()
+    for k in range(3):
+        Image.fromarray(np.full((8, 9, 3), 50 * k, np.uint8)).save(tmp_path / "photos" / f"{k}.png")
+    return tmp_path / "photos"
+
+
+def test_links_are_followed_only_if_allowed(photos, nerg, monkeypatch, tmp_path):
+    monkeypatch.setattr(posing, "reconstruct", lambda *given: None)
+    (photos / "2.png").rename(tmp_path / "2.png")
+    (photos / "2.png").symlink_to(tmp_path / "2.png")
+    ended = nerg("poses", photos, "-o", tmp_path / "capture")
+    assert ended.code == 1 and "has 2 pictures" in ended.err and "--allow-outside" in ended.err
+    ended = nerg("poses", photos, "-o", tmp_path / "capture", "--allow-outside")
+    assert ended.code == 1 and "no 3 of the 3 pictures" in ended.err
+
+
+def test_ctrl_c_ends_poses_and_leaves_nothing(photos, nerg, monkeypatch, tmp_path):
+    monkeypatch.setattr(posing, "reconstruct", lambda *given: signal.raise_signal(signal.SIGINT))
+    ended = nerg("poses", photos, "-o", tmp_path / "capture")
+    assert ended.code == 130 and "Interrupted" in ended.err and os.listdir(tmp_path) == ["photos"]
+
+
+def test_photos_become_a_capture_that_can_be_trained_on(nerg, tmp_path):
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip('pycolmap is not installed (pip install "nerg-mi[poses]")')
+    photos = rendered.write_photos(tmp_path / "photos", 6)
+    ended = nerg("poses", photos, "-o", tmp_path / "capture", "--threads", "1")
+    assert ended.code == 0 and "6 of 6 pictures have a pose" in ended.out and "warning" not in ended.err
+    assert sorted(os.listdir(tmp_path / "capture")) == ["images", "poses.json", "poses.png", "sparse"]
+    ended = nerg("train", "radiance", tmp_path / "capture", "-o", tmp_path / "a.safetensors", "--steps", "2")
+    assert not ended.code and "points on surfaces" in ended.out

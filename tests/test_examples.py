@@ -1,0 +1,133 @@
+"""Examples, at sizes that take seconds: what is found, not what is printed; and notebooks from top to bottom."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from examples import place_product
+from examples import recover_observer as example
+from tests.conftest import ROOT
+
+# ---- Placing a product, at a size that takes seconds: what is found, not what is printed ----
+
+
+@pytest.fixture(scope="module")
+def shelf_run(tmp_path_factory):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    out = tmp_path_factory.mktemp("applications") / "shelf.png"
+    return place_product.main(["--quick", "--out", str(out)]), out
+
+
+@pytest.mark.nightly
+def test01_the_box_climbs_to_where_the_sweep_says(shelf_run):
+    found, out = shelf_run
+    at, values = found["sweep"]
+    assert out.stat().st_size > 10_000 and values.min() > 0 and values.max() > 2 * values.min()
+    for start, end, before, after, optimum, share in found["rows"]:
+        assert after > before and abs(end - optimum) < 0.1 and share > 0.97, (start, end, optimum, share)
+
+
+@pytest.mark.nightly
+def test02_derivatives_without_edges_are_those_of_the_sweep(shelf_run):
+    checks = shelf_run[0]["checks"]
+    automatic, central = checks[:, 3], checks[:, 4]
+    assert np.allclose(automatic, central, rtol=0.05, atol=0.05 * np.abs(central).max())
+    assert np.all((checks[:, 5] >= 0) & (checks[:, 5] < 0.05))
+
+
+def test03_uphill():
+    values = np.array([0, 1, 3, 2, 2.5, 4, 1, 0.0])
+    assert place_product.uphill(values, 0, 1) == 2 and place_product.uphill(values, 0, 3) == 5
+    assert place_product.uphill(values, 7, 2) == 5 and place_product.uphill(values, 5, 1) == 5
+
+
+def test04_an_unknown_shelf_is_named(rgb):
+    with pytest.raises(SystemExit, match='no shelf "attic".*wall_cosmetics'):
+        place_product.Shelf("attic")
+
+
+# ---- Recovering an observer, at sizes that take seconds: what is found, not what is printed ----
+
+
+def test01_distances_of_pictures():
+    a = np.random.default_rng(0).exponential(1, (2, 16, 24))
+    b, c = (np.roll(a, k, axis=2) for k in (1, 8))
+    assert example.distance(a, a) == 0 and example.loss(a, a) == 0
+    # A block of 8 averages what moved by one pixel; not so what moved by eight.
+    assert 0 < example.distance(a, b) < example.distance(a, c) and example.loss(a, b) > 0
+    assert np.allclose(example.pooled(a, 8), a.reshape(2, 2, 8, 3, 8).mean((2, 4)))
+    assert example.distance(np.stack([a, b]), a).shape == (2,)
+
+
+def test02_a_step_solves_a_linear_problem_and_leaves_edges_out():
+    """Logarithms linear in the position: one step, but for its damping; pixels dark in either picture have no say."""
+    rng = np.random.default_rng(1)
+    J, truth = rng.normal(0, 0.1, (2, 6, 8, 3)), np.array([0.1, -0.05, 0.02])
+    now = rng.uniform(1, 2, (2, 6, 8))
+    given = (now + example.FLOOR) * np.exp(J @ truth) - example.FLOOR
+    slope = (now + example.FLOOR)[..., None] * J
+    assert np.allclose(example.gauss_newton_step(now, slope, given, 1e3), truth, rtol=0.02, atol=1e-3)
+    given[:, ::2] = 0
+    now[:, :, ::3] = 0
+    assert np.allclose(example.gauss_newton_step(now, slope, given, 1e3), truth, rtol=0.03, atol=2e-3)
+    far = example.gauss_newton_step(now, slope * 0.01, given, 1e3)
+    assert np.linalg.norm(far) <= example.LONGEST * 1.0001
+
+
+@pytest.mark.nightly
+def test03_an_observer_is_found_again(rgb):
+    pictures, truth = example.Pictures((24, 16), cameras=example.CAMERAS[2:3]), np.array([4.4, 2.8, 1.6])
+    start = truth + (0.1, 0.2, 0.05)
+    derivatives = pictures.derivatives(truth)
+    # Where all pictures around are bright no edge passes: there the derivatives are those of the pictures.
+    # Far enough for what directions add to the integral over the sphere where edges pass them.
+    h = 1e-2
+    ends = [[pictures.at(truth + s * h * e) for s in (1, -1)] for e in np.eye(3)]
+    differences = np.stack([(a - b) / (2 * h) for a, b in ends], -1)
+    bend = np.max([np.abs(a + b - 2 * pictures.at(truth)) for a, b in ends], axis=0) / h
+    smooth = bend < 0.02
+    assert np.abs(differences[smooth]).max() > 0.1 and smooth.mean() > 0.5
+    assert np.linalg.norm((derivatives - differences)[smooth]) < 0.1 * np.linalg.norm(differences[smooth])
+
+    found = example.descend(pictures, pictures.given(truth, seed=1), start, 5)
+    end, least = found.answer()
+    assert np.linalg.norm(end - truth) < 0.06 and least < found.losses[0]
+
+
+def test04_guesses_and_observers_stand_where_one_can_stand():
+    for points, clearance in ((example.first_guesses(0.8), 0.15), (example.true_observers(5, 0), 0.22)):
+        assert len(points) >= 5 and points.shape[1] == 3 and example.standing(points[:, :2], clearance).all()
+    assert not np.array_equal(example.true_observers(5, 0), example.true_observers(5, 1))
+
+
+# ---- Notebooks run from top to bottom, and their cells give the kinds of output that are stored ----
+
+
+def outputs(book) -> list[list[str]]:
+    """The kinds of output of each cell."""
+    return [
+        ["+".join(sorted(o["data"])) if "data" in o else o.get("name", o.output_type) for o in cell.get("outputs", ())]
+        for cell in book.cells
+    ]
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.ipynb")), ids=lambda p: p.stem)
+def test_it_runs_and_gives_what_is_stored(path, tmp_path):
+    nbformat = pytest.importorskip("nbformat", reason="nbclient, of the extra test, is not installed")
+    pytest.importorskip("ipykernel", reason="ipykernel, of the extra test, is not installed")
+    from jupyter_client.manager import KernelManager
+    from nbclient import NotebookClient
+
+    book = nbformat.read(path, as_version=4)
+    stored = outputs(book)
+    # Over a socket of the file system and no port; of this Python, whatever kernels are installed by that name.
+    kernel = KernelManager(transport="ipc", ip=str(tmp_path / "kernel"))
+    kernel.kernel_spec.argv = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+    NotebookClient(book, km=kernel, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    assert outputs(book) == stored and any("image/png" in kind for cell in stored for kind in cell)

@@ -1,0 +1,375 @@
+"""A checkout that nobody has installed, plugins in every order of imports, libLLVM, and what is found of a machine."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy
+import pytest
+
+from nerg_mi import diagnosis, llvm
+from nerg_mi.errors import UnusableLLVM
+from nerg_mi.registration import PLUGINS
+from tests.conftest import ROOT
+
+# ---- A checkout that nobody has installed ----
+
+
+# Where the dependencies are: without the site module nothing of that folder's .pth files, and so no editable
+# installation, counts.
+SITE = Path(numpy.__file__).parents[1]
+
+
+@pytest.fixture
+def clone(tmp_path):
+    """The checkout as it is cloned."""
+    for name in ("nerg_mi", "plugins", "scenes"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "build"))
+    return tmp_path
+
+
+def uninstalled(code: str, folder: Path, **environment):
+    """Run ``code`` in ``folder`` by a Python that knows the dependencies, and no installation of the package."""
+    begin = f"import sys\nsys.path.append({str(SITE)!r})\n"
+    begin += "assert not any('editable' in repr(f).lower() for f in sys.meta_path)\n"
+    kept = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    return subprocess.run(
+        [sys.executable, "-S", "-c", begin + textwrap.dedent(code)],
+        cwd=folder,
+        env=kept | environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+USE = """
+    import nerg_mi, mitsuba as mi
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant("llvm_ad_mono")
+    mi.set_variant("llvm_ad_rgb")
+    print(type(mi.load_dict({"type": "nerg", "density": {"type": "constvolume"}})).__name__)
+    from nerg_mi.scenes.store import layout
+    from nerg_mi.plugins import nerg
+    print(nerg.__file__, layout.__file__)
+"""
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test01_plugins_and_scenes_are_found(clone, elsewhere):
+    done = uninstalled(USE, Path("/"), PYTHONPATH=str(clone)) if elsewhere else uninstalled(USE, clone)
+    assert done.returncode == 0, done.stderr
+    kind, files = done.stdout.strip().splitlines()[-2:]
+    assert kind == "NergIntegrator"
+    assert files.split() == [str(clone / "plugins" / "nerg.py"), str(clone / "scenes" / "store" / "layout.py")]
+
+
+# ---- Plugins are there in every order of imports and after every change of variant. Each order needs a pr ----
+
+
+CHECK = """
+def check():
+    import mitsuba as mi
+    sensor = mi.load_dict({"type": "panorama", "film": {"type": "hdrfilm", "width": 8, "height": 4}})
+    assert sensor.variant_name() == mi.variant(), (sensor.variant_name(), mi.variant())
+"""
+
+
+def run(code):
+    done = subprocess.run([sys.executable, "-c", CHECK + textwrap.dedent(code)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import nerg_mi; import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); check()",
+        "import mitsuba as mi; import nerg_mi; mi.set_variant('llvm_ad_rgb'); check()",
+        "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import nerg_mi; check()",
+        "import drjit; import nerg_mi; import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); check()",
+        "import nerg_mi; from mitsuba import set_variant; set_variant('llvm_ad_mono'); check()",
+        "import nerg_mi, importlib; importlib.reload(nerg_mi); import mitsuba as mi; "
+        "mi.set_variant('llvm_ad_rgb'); check()",
+    ],
+)
+def test01_every_order(code):
+    run(code)
+
+
+def test02_back_and_forth():
+    run(
+        """
+        import nerg_mi, mitsuba as mi
+        for variant in ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_rgb", "llvm_ad_mono"):
+            mi.set_variant(variant)
+            if variant != "scalar_rgb":
+                check()
+        """
+    )
+
+
+def test03_import_loads_nothing():
+    loaded = run("import nerg_mi, sys; print(*sys.modules)").split()
+    assert not {"mitsuba", "drjit", "numpy", "torch"} & set(loaded)
+
+
+def test04_mitsuba_without_torch():
+    assert (
+        "torch"
+        not in run(
+            "import nerg_mi, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import sys; print(*sys.modules)"
+        ).split()
+    )
+
+
+@pytest.mark.parametrize("name, kind", [p for p in PLUGINS if p[1] != "volume"])
+def test05_scalar_sentence(rgb, name, kind):
+    rgb.set_variant("scalar_rgb")
+    said = f'"{name}" needs a variant that compiles its kernels, and "scalar_rgb" is active: call mi.set_variant'
+    with pytest.raises(RuntimeError, match=said):
+        rgb.load_dict({"type": name})
+    with pytest.raises(RuntimeError, match=said):
+        rgb.load_string(f'<scene version="3.0.0"><{kind} type="{name}"/></scene>')
+
+
+def test05b_scalar_variants_are_warned_of_and_forgotten():
+    # A volume that scalar_rgb knew, as a texture, could not be loaded from a dict in any later variant.
+    code = (
+        "import nerg_mi, mitsuba as mi\n"
+        "mi.set_variant('scalar_rgb'); mi.set_variant('llvm_ad_rgb')\n"
+        "try: mi.load_dict({'type': 'nerg', 'field': {'type': 'nerf', 'filename': 'nowhere'}})\n"
+        "except RuntimeError as e: print(e)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (
+        '"nerf", "gazefield", "gazekde", "splats", "nerg") needs a variant that compiles its kernels'
+        in done.stdout + done.stderr
+    )
+    assert '"nowhere" does not exist' in done.stdout.replace(str(Path.cwd()) + "/", "")
+
+
+def test06_entry_points():
+    entries = {e.name: e for e in importlib.metadata.entry_points(group="mitsuba") if e.name.startswith("nerg_")}
+    assert set(entries) == {f"nerg_{name}" for name, _ in PLUGINS}
+    for name, entry in entries.items():
+        module = entry.load()
+        assert module.__name__ == "nerg_mi.plugins." + name.removeprefix("nerg_")
+        importlib.reload(module)  # what Mitsuba after 3.9 does when the variant changes
+
+
+def test07_broken_plugin_is_not_hidden():
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "import nerg_mi.registration as r; r.PLUGINS += (('missing', 'sensor'),)\n"
+            "import mitsuba as mi; mi.set_variant('llvm_ad_rgb')",
+        ],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1 and "nerg_mi.plugins.missing" in done.stderr
+
+
+# ---- The choice of libLLVM ----
+
+
+def fake(folder, *names):
+    for name in names:
+        (folder / name).touch()
+    return folder
+
+
+@pytest.fixture
+def machine(tmp_path, monkeypatch):
+    """A machine whose only libraries are those put into a folder, with no NVIDIA driver and Dr.Jit not loaded."""
+    monkeypatch.setattr(llvm, "_FOLDERS", {sys.platform: (str(tmp_path),)})
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "nothing"))
+    monkeypatch.setattr(llvm, "_loaded", lambda: None)
+    monkeypatch.setattr(llvm, "has_cuda", lambda: False)
+    # Set first, so that what a test makes of it is undone also where it was not set.
+    monkeypatch.setenv(llvm.VARIABLE, "")
+    monkeypatch.delenv(llvm.VARIABLE)
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "name, version",
+    [
+        ("libLLVM-14.so.1", (14,)),
+        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
+        ("libLLVM.so.19.1", (19, 1)),
+        ("libLLVM-22.so", (22,)),
+        ("libLLVM.so.20.1-rust-1.86", (20, 1)),
+    ],
+)
+def test01_version_from_name(tmp_path, name, version):
+    fake(tmp_path, name)
+    assert llvm.version_of(str(tmp_path / name)) == version
+
+
+def test02_version_of_link_is_that_of_its_target(tmp_path):
+    fake(tmp_path, "libLLVM-15.so.1")
+    (tmp_path / "libLLVM.so").symlink_to("libLLVM-15.so.1")
+    assert llvm.version_of(str(tmp_path / "libLLVM.so")) == (15,)
+
+
+def test03_nameless_library_is_asked(tmp_path):
+    good = next((library for library in llvm.installed() if library.usable), None)
+    if good is None:
+        pytest.skip("no usable libLLVM in the usual places of this machine")
+    # A hard copy would be 100 MB; a file name without a number that is no link will do where hard links are possible.
+    nameless = tmp_path / "libLLVM.so"
+    try:
+        os.link(os.path.realpath(good.path), nameless)
+    except OSError:
+        pytest.skip("the temporary folder is on another file system than libLLVM")
+    assert llvm.version_of(str(nameless))[0] == good.version[0]
+
+
+def test04_no_library_has_no_version(tmp_path):
+    (tmp_path / "libLLVM.so").write_text("not a library")
+    assert llvm.version_of(str(tmp_path / "libLLVM.so")) is None
+    assert llvm.version_of(str(tmp_path / "missing.so")) is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the names of the files are those of Linux")
+def test05_newest_usable_is_taken(machine):
+    fake(machine, "libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1")
+    llvm.prepare()
+    assert os.environ[llvm.VARIABLE] == str(machine / "libLLVM.so.19.1")
+    assert llvm.problem() is None
+    llvm.require()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the names of the files are those of Linux")
+def test06_only_bad_ones(machine, monkeypatch):
+    fake(machine, "libLLVM-15.so.1", "libLLVM-16.so.1")
+    llvm.prepare()
+    assert llvm.VARIABLE not in os.environ
+    with pytest.raises(UnusableLLVM, match="16.*17.*libllvm19"):
+        llvm.require()
+    # With an NVIDIA driver the package is of use, and only an llvm variant is refused.
+    monkeypatch.setattr(llvm, "has_cuda", lambda: True)
+    llvm.require()
+    llvm.require("cuda_ad_rgb")
+    with pytest.raises(UnusableLLVM, match="LLVM 16"):
+        llvm.require("llvm_ad_rgb")
+
+
+def test07_none_at_all_is_refused_only_by_an_llvm_variant(machine):
+    llvm.prepare()
+    llvm.require()
+    llvm.require("scalar_rgb")
+    with pytest.raises(UnusableLLVM, match="No libLLVM was found"):
+        llvm.require("llvm_ad_rgb")
+
+
+def test08_named_by_the_user_is_never_replaced(machine, monkeypatch):
+    fake(machine, "libLLVM.so.19.1", "libLLVM-15.so.1")
+    for bad, said in (("libLLVM-15.so.1", "LLVM 15"), ("missing.so", "is no file")):
+        monkeypatch.setenv(llvm.VARIABLE, str(machine / bad))
+        monkeypatch.setattr(llvm, "has_cuda", lambda: True)
+        llvm.prepare()
+        assert os.environ[llvm.VARIABLE] == str(machine / bad)
+        with pytest.raises(UnusableLLVM, match=said):
+            llvm.require()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the names of the files are those of Linux")
+def test09_remedy_names_the_good_one_that_is_there(machine, monkeypatch):
+    fake(machine, "libLLVM.so.19.1", "libLLVM-15.so.1")
+    monkeypatch.setenv(llvm.VARIABLE, str(machine / "libLLVM-15.so.1"))
+    assert f"unset {llvm.VARIABLE}, since LLVM 19.1" in llvm.problem()
+
+
+def test10_real_old_library_is_refused_and_never_aborts():
+    old = next((library for library in llvm.installed() if library.version[0] in (15, 16)), None)
+    if old is None:
+        pytest.skip("no libLLVM 15 or 16 on this machine")
+    orders = "import nerg_mi, drjit", "import nerg_mi, mitsuba", "import drjit, nerg_mi", "import mitsuba, nerg_mi"
+    for code in orders:
+        run = subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, llvm.VARIABLE: old.path}, capture_output=True, text=True
+        )
+        assert run.returncode == 1, code
+        last = run.stderr.strip().splitlines()[-1]
+        assert last.startswith(f"nerg_mi.errors.UnusableLLVM: LLVM {old.version[0]}"), last
+
+
+def test11_loaded_version_counts(monkeypatch):
+    import drjit as dr
+
+    assert llvm.current().version == tuple(dr.detail.llvm_version())
+    # What is set after Dr.Jit was loaded has no effect on it.
+    monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM-15.so.1")
+    assert llvm.problem() is None
+
+
+@pytest.mark.parametrize("late", ["drjit", "mitsuba"])
+def test12_refused_when_drjit_is_imported_and_not_before(late, tmp_path):
+    """What needs no kernel works without them, `nerg doctor` for one; a second import is refused like the first."""
+    fake(tmp_path, "libLLVM-15.so.1")
+    code = (
+        "import nerg_mi.diagnosis\nprint('imported')\n"
+        f"try: import {late}\nexcept ImportError as error: print(type(error).__name__)\nimport {late}"
+    )
+    bad = {**os.environ, llvm.VARIABLE: str(tmp_path / "libLLVM-15.so.1")}
+    run = subprocess.run([sys.executable, "-c", code], env=bad, capture_output=True, text=True)
+    assert run.returncode == 1 and run.stdout.split() == ["imported", "UnusableLLVM"]
+    assert run.stderr.strip().splitlines()[-1].startswith("nerg_mi.errors.UnusableLLVM: LLVM 15")
+
+
+# ---- What is found out about a machine, and how it is told ----
+
+
+def test_a_dying_backend_is_reported(monkeypatch):
+    monkeypatch.setattr(
+        diagnosis, "_TRIAL", "import os, sys; print('LLVM ERROR: no', file=sys.stderr, flush=True); os.abort()"
+    )
+    assert diagnosis.try_backend("llvm") == {"variants": [], "failed": {"llvm": "LLVM ERROR: no"}}
+
+
+def test_extras_by_their_names(monkeypatch):
+    """The names are those of distributions, as pyproject.toml has them: that of scikit-image is not that of its
+    module."""
+    project = (ROOT / "pyproject.toml").read_text()
+    assert all(f'["{name}>=' in project for name in diagnosis.EXTRAS)
+
+
+def test_a_trouble_stands_below_its_topic():
+    found = diagnosis.Diagnosis(
+        [diagnosis.Finding("LLVM", "none", "install it"), diagnosis.Finding("threads", "2")], usable=False
+    )
+    assert str(found) == "LLVM     none\n         -> install it\nthreads  2"
+
+
+WORKS = {"variants": ["llvm_ad_rgb"], "failed": {}, "threads": 2, "version": [19, 1, 7]}
+NOTHING = {"variants": [], "failed": {"llvm": "it died"}}
+
+
+@pytest.mark.parametrize("found, verdict", [(WORKS, "ready to render"), (NOTHING, "nothing can be rendered")])
+def test_the_verdict(monkeypatch, found, verdict):
+    scalar = {"variants": ["scalar_rgb"], "failed": {}}
+    monkeypatch.setattr(diagnosis, "try_backend", lambda backend: scalar if backend == "scalar" else found)
+    monkeypatch.setattr(llvm, "has_cuda", lambda: False)
+    monkeypatch.setattr(llvm, "problem", lambda: None)
+    told = diagnosis.examine()
+    assert told.usable is (found is WORKS) and verdict in str(told)
+    assert ("it died" in str(told)) is (found is NOTHING)
+
+
+@pytest.mark.parametrize("version, old", [([12, 4], True), ([12, 8], False), ([13, 0], False)])
+def test_an_old_driver_is_named(monkeypatch, version, old):
+    monkeypatch.setattr(diagnosis, "try_backend", lambda backend: {**WORKS, "version": version})
+    monkeypatch.setattr(llvm, "has_cuda", lambda: True)
+    assert ("R570" in str(diagnosis.examine())) is old

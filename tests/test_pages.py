@@ -1,0 +1,462 @@
+"""Every block of code of the pages: what Python and XML say is run, commands are parsed as they stand, and those of the
+quick start are run on a small recording. A block that is neither has a reason, in one table."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nerg_mi.cli
+from nerg_mi.aoi.scene import read_changes
+from nerg_mi.formats.areas import read_areas
+from nerg_mi.rays.rays import Rays
+from nerg_mi.workflows import demo
+from tests.conftest import ROOT
+from tests.figures.standins import write_standins
+from tests.workflows.test_draw import walk
+from tests.workflows.watched import write_scene
+
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+RUN_ELSEWHERE = {
+    ("splats.md", "python"): "tests/plugins/test_splats.py",
+    ("rays.md", "python"): "tests/rays/test_manual.py",
+}
+"""All blocks of a language on a page -> the tests elsewhere that run them."""
+
+NOT_RUN = {
+    ("applications.md", "text"): "a formula",
+    ("bake.md", "text"): "formulas, and what a command prints",
+    ("plugins.md", "math"): "a formula",
+    ("python-reference.md", "{eval-rst}"): "what Sphinx is told; `make manual` builds the page",
+    ("quickstart.md", "text"): "what commands print",
+    ("tracking.md", ""): "what commands print, and a list of files",
+    ("posed-images.md", "text"): "installs a package, which needs the network",
+}
+"""All blocks of a language on a page -> why nothing is there to be run."""
+
+SHELL = {
+    "make": "its target is looked up in the Makefile",
+    "python": "its script and options are looked up by tests/test_docs.py",
+    "nerg": "it is parsed, and run where it is quick",
+    "export": "a setting of the reader's shell",
+    "_NERG_COMPLETE=source_bash": "tests/cli/test_main.py asks for it",
+    "_NERG_COMPLETE=source_zsh": "tests/cli/test_main.py asks for it",
+    "_NERG_COMPLETE=source_fish": "tests/cli/test_main.py asks for it",
+    "pip": "installs packages, which needs the network; its extras are looked up in pyproject.toml",
+    "ffmpeg": "a program of others",
+    "dask": "a program of others",
+    "openssl": "a program of others",
+}
+"""First words of the lines of shell blocks -> what becomes of them."""
+
+
+@dataclass(frozen=True)
+class Block:
+    page: str
+    language: str
+    text: str
+
+    @property
+    def lines(self) -> list[str]:
+        """The lines of a shell, those that go on joined, a loop as what it repeats."""
+        joined = re.sub(r"\\\n\s*", " ", self.text).splitlines()
+        return [re.sub(r"^for \w+ in .*?; do (.*); done$", r"\1", line.strip()) for line in joined if line.strip()]
+
+
+def run(text: str, page: str, names: dict | None = None) -> dict:
+    """The names that a block of Python defines, on top of ``names``."""
+    names = {} if names is None else names
+    exec(compile(text, page, "exec"), names)
+    return names
+
+
+def blocks(*languages: str, page: str = "") -> list[Block]:
+    """The blocks of the pages, of these languages or all, of this page or all."""
+    found = []
+    for path in PAGES:
+        for _, language, text in re.findall(r"^( *)```([^\n`]*)\n(.*?)^ *```", path.read_text("utf-8"), re.M | re.S):
+            if (not languages or language in languages) and page in ("", path.name):
+                found.append(Block(path.name, language, text))
+    return found
+
+
+def test01_no_block_is_left_out():
+    here = {"sh", ("README.md", "python"), ("README.md", "xml"), ("pictures.md", "py"), ("python.md", "py")}
+    here |= {(f"{page}.md", "json") for page in ("report", "shop", "statistics")}
+    here |= {(f"{page}.md", "python") for page in "clusters gradients interchange python shop sign tracking".split()}
+    here |= {(b.page, b.language) for b in blocks("xml", "python") if b.page in ("plugins.md", *XML_PAGES)}
+    for block in blocks():
+        key = (block.page, block.language)
+        assert block.language in here or key in here or key in RUN_ELSEWHERE or key in NOT_RUN, key
+    for table in (RUN_ELSEWHERE, NOT_RUN):
+        assert set(table) <= {(b.page, b.language) for b in blocks()}, "the table names blocks that are gone"
+    assert not [file for file in RUN_ELSEWHERE.values() if not (ROOT / file).is_file()]
+
+
+def test03_every_line_of_a_shell_is_known():
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.M)) | {"check", "test"}
+    extras = set(re.findall(r"^(\w+) = \[", (ROOT / "pyproject.toml").read_text(), re.M))
+    for block in blocks("sh"):
+        for line in block.lines:
+            if line.startswith("#"):
+                continue
+            words = shlex.split(re.sub(r"[\[\]|]", " ", line) if line.startswith("python ") else line, comments=True)
+            first = words[0].removeprefix(".venv/bin/")
+            assert first in SHELL, (block.page, line)
+            if first == "make":
+                assert words[1] in targets, line
+            if first == "pip":
+                assert {e for found in re.findall(r"\[([\w,]+)\]", line) for e in found.split(",")} <= extras, line
+
+
+def test04_areas_are_read(tmp_path):
+    from nerg_mi.formats.areas import read_regions
+
+    for block in blocks("json", page="report.md"):
+        (tmp_path / "a.json").write_text(block.text)
+        assert all(region.holds(region.corners).all() for region in read_regions(tmp_path / "a.json"))
+
+
+XML_PAGES = ("gaze-training.md", "performance.md", "plugins.md", "shapes-and-fields.md", "splats.md")
+
+
+@pytest.fixture
+def place(rgb, standins, tmp_path, monkeypatch):
+    """A folder with what snippets name: stand-ins of the store's fields, a scene of them, rays."""
+    from tests.evaluation.test_gaze import crowd
+    from tests.formats.splats.writers import random_splats, write_inria
+
+    for file in standins.values():
+        shutil.copy(file, tmp_path)
+    shutil.copy(demo.store_scene(), tmp_path)
+    shutil.copy(tmp_path / "store.safetensors", tmp_path / "field.safetensors")
+    crowd().save(tmp_path / "day.npz")
+    write_inria(tmp_path / "store.ply", random_splats())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def as_scene(text: str) -> str:
+    """A snippet within what it stands in."""
+    if text.lstrip().startswith("<scene"):
+        return text
+    if text.lstrip().startswith("<volume"):
+        aovs = '<string name="aovs" value="kde"/>' if "gazekde" in text else ""
+        field = (
+            ""
+            if 'name="field"' in text
+            else '<volume name="field" type="nerf"><string name="filename" value="store.safetensors"/></volume>'
+        )
+        text = f'<integrator type="nerg">{field}{text}{aovs}</integrator>'
+    return f'<scene version="3.0.0">{text}</scene>'
+
+
+@pytest.mark.parametrize("block", [b for b in blocks("xml") if b.page in XML_PAGES], ids=lambda b: b.page)
+def test05_xml_is_a_scene(rgb, place, block):
+    (place / "a.xml").write_text(as_scene(block.text))
+    scene = rgb.load_file(str(place / "a.xml"))
+    if "integrator" in as_scene(block.text) or "include" in block.text:
+        assert type(scene.integrator()).__name__ == "NergIntegrator"
+    else:
+        assert len(scene.sensors()) == 1
+
+
+@pytest.mark.parametrize("block", blocks("python", page="plugins.md"), ids=lambda b: b.text.split("\n")[0])
+def test06_dicts_of_plugins_are_loaded(rgb, place, block):
+    made = eval("{" + block.text + "}", {"mi": rgb})
+    if "type" in made:
+        assert rgb.load_dict(made) is not None
+        return
+    integrator = {"type": "nerg", "field": {"type": "nerf", "filename": "store.safetensors"}, **made}
+    if "kde" in made:
+        integrator["aovs"] = "kde"
+    assert type(rgb.load_dict({"type": "scene", "integrator": integrator}).integrator()).__name__ == "NergIntegrator"
+
+
+def test07_torch(rgb, place):
+    pytest.importorskip("torch", reason="torch is not installed")
+    (block,) = blocks("python", page="interchange.md")
+    names = run(block.text, block.page)
+    assert names["sigma"].shape == (100,) and names["color"].shape == (100, 3)
+
+
+def test08_datasets(tmp_path, monkeypatch):
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    from tests.rays.dataset.making import write_dataset
+
+    monkeypatch.chdir(tmp_path)
+    _, rays = write_dataset(tmp_path, place="north")
+    names: dict = {}
+    for block in blocks("python", page="tracking.md"):
+        text = block.text.replace('["ann"]', '["p0_1"]')
+        run(text, block.page, names)
+    assert len(names["some"]) == len(rays) == names["seen"].count_rows()
+    assert len(names["rays"]) > 0 and set(np.array(names["rays"].persons)[names["rays"].person]) == {"p0_1"}
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test09_from_recordings(rgb, place, monkeypatch):
+    """The block of trainings, whose inputs are a table of four people and photos of the store, with fewer steps."""
+    import nerg_mi as nerg
+
+    rays = nerg.load_rays("day.npz")
+    names = [rays.persons[k] for k in rays.person]
+    table = np.column_stack([rays.t, rays.origin, rays.direction])
+    lines = [",".join(map(str, row)) + f",{who}" for row, who in zip(table, names)]
+    Path("day.csv").write_text("t,x,y,z,dx,dy,dz,who\n" + "\n".join(lines) + "\n")
+    (text,) = [block.text for block in blocks("py", page="python.md")]
+    fewer = {"minutes=5": "steps=2, holdout=0", "test_zones=3": FEW}
+    for long, short in fewer.items():
+        assert text.count(long) == 1
+        text = text.replace(long, short)
+    write_photos(place / "photos", nerg)
+    names = run(text, "docs/python.md", {"nerg": nerg})
+    assert names["field"].kind == "radiance" and names["gaze"].kind == "gaze" and names["scores"].rows
+
+
+FEW = "test_zones=1, test_positions=4, radius=0.6, probes=8, steps=2, directions=64, min_rays=8, seed=1, force=True"
+
+
+def write_photos(folder: Path, nerg) -> None:
+    """Four posed photos of the stand-in store."""
+    import mitsuba as mi
+
+    folder.mkdir()
+    scene, frames = nerg.make_scene("store.safetensors"), []
+    for i, eye in enumerate([(4.4, 2.8, 1.6), (4.4, 3.4, 1.6), (4.5, 2.2, 1.5), (4.5, 4.0, 1.5)]):
+        camera = nerg.Camera(eye, (4.8, 4.9, 1.2), fov=70, width=24, height=16)
+        color = nerg.render(scene, quantities="color", camera=camera, spp=4).color[0]
+        mi.util.write_bitmap(str(folder / f"{i}.png"), mi.TensorXf(np.ascontiguousarray(color)), write_async=False)
+        pose = np.array(mi.ScalarTransform4f().look_at(list(eye), [4.8, 4.9, 1.2], [0, 0, 1]).matrix)
+        frames.append({"file_path": f"{i}.png", "transform_matrix": (pose @ np.diag([-1, 1, -1, 1])).tolist()})
+    about = {"camera_angle_x": float(np.radians(70)), "w": 24, "h": 16, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(about))
+
+
+# ---- Pages whose blocks lead from one to the next, on the store's own files or on stand-ins of its fields ----
+
+
+@pytest.fixture
+def clone(rgb, tmp_path, monkeypatch):
+    """``clone(name, ...)``: a folder with these files of the demo store, as a clone has them, where code runs."""
+
+    def make(*names: str) -> Path:
+        store = tmp_path / "scenes" / "store"
+        store.mkdir(parents=True)
+        for name in names:
+            shutil.copy(demo.store_scene().with_name(name), store)
+        monkeypatch.chdir(tmp_path)
+        return store
+
+    return make
+
+
+def of_readme(text: str) -> str:
+    """An example of the README with a smaller picture."""
+    size = r'(width=|height=|name="(?:width|height)" value=")(480|320)'
+    small, count = re.subn(size, lambda m: f"{m[1]}{int(m[2]) // 20 + 12}", text)
+    assert count, "the example has no resolution to make smaller"
+    return small
+
+
+@pytest.fixture
+def readme(clone):
+    """The scene and the checkpoints; random ones where the store has none."""
+    own = list(demo.CHECKPOINTS.values())
+    has_own = all(demo.store_scene().with_name(name).is_file() for name in own)
+    store = clone("scene.xml", *(own if has_own else ()))
+    if not has_own:
+        write_standins(store)
+    return store
+
+
+def test10_the_scene_of_the_readme(rgb, readme):
+    (block,) = blocks("xml", page="README.md")
+    (readme / "example.xml").write_text(of_readme(block.text))
+    picture = np.array(rgb.render(rgb.load_file(str(readme / "example.xml"))))
+    assert picture.shape == (28, 36, 7) and np.isfinite(picture).all()
+    assert picture[..., 3].max() > 0 and picture[..., 5].max() > 0
+
+
+def test11_the_python_of_the_readme(readme):
+    (block,) = blocks("python", page="README.md")
+    names = run(of_readme(block.text), "README.md")
+    one, other = names["gaze"]
+    assert one.shape == (28, 36) and one.max() > 0 and not np.array_equal(one, other)
+    assert names["share"].shape == (2,) and (names["share"] >= 0).all()
+
+
+def test12_a_sign(clone, capsys):
+    """For fewer visitors."""
+    clone("twin.ply", "shoppers.safetensors")
+    names: dict = {}
+    for block in blocks("python", page="sign.md"):
+        run(block.text.replace("4.8, 9)", "4.8, 3)"), block.page, names)
+    said = capsys.readouterr().out.splitlines()
+    assert len(said) == 6 and said[0].endswith("see more than half of it")
+    seen, share = names["seen"], names["share"]
+    assert len(share) == 12 and np.all((share >= 0) & (share < 0.2)) and share.max() > 1e-4
+    # The third aisle sees it best, and what nobody can see attracts nobody.
+    assert seen.reshape(4, 3).mean(axis=1).argmax() == 2
+    assert np.all(share[seen == 0] < 0.3 * share.max())
+
+
+@pytest.mark.nightly
+def test13_gradients(clone):
+    """On untrained fields, and smaller."""
+    write_standins(clone("scene.xml"))
+    names: dict = {}
+    for block in blocks("python", page="gradients.md"):
+        small = block.text.replace("width=480, height=320", "width=12, height=8").replace("batch=4096", "batch=64")
+        run(small, block.page, names)
+    assert np.isfinite(np.array(names["change"])).all() and np.any(np.array(names["change"]) != 0)
+    losses, errors = ([x.numpy().item() for x in names[name]] for name in ("losses", "errors"))
+    # From whole views, then frozen; and of a camera that nothing was trained on, before and after, then with batches of
+    # rays.
+    assert len(losses) == 14 and max(losses[9:]) < losses[0] and losses[-1] < losses[9]
+    assert len(errors) == 4 and errors[1] < errors[0] and errors[3] < errors[2], errors
+
+
+def shoppers(people: int = 5, each: int = 60) -> Rays:
+    """People in the aisles who look about."""
+    rng = np.random.default_rng(0)
+    n = people * each
+    origin = np.column_stack([rng.choice([2.75, 4.55, 6.3], n), rng.uniform(0.8, 4.8, n), np.full(n, 1.6)])
+    d = rng.normal(size=(n, 3)) * (1, 1, 0.3)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    times, who = np.tile(0.2 * np.arange(each), people), np.repeat(np.arange(people), each)
+    return Rays(times, who, tuple("abcde"[:people]), origin, d, np.ones(n))
+
+
+def test14_a_shop(rgb, tmp_path, monkeypatch):
+    """The page's own settings, on fewer people, places and directions."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("shapes.xml", "twin.ply", "twin_lights.ply", "shoppers.safetensors"):
+        shutil.copy(demo.store_scene().with_name(name), tmp_path)
+    for name, block in zip(("areas", "zones", "changes"), blocks("json", page="shop.md")):
+        (tmp_path / f"{name}.json").write_text(block.text)
+    shoppers().save(tmp_path / "shop.npz")
+    (block,) = blocks("python", page="shop.md")
+    fewer = 'output="numbers", eyes=5, directions=512, resamples=199, samples=8'
+    names = run(block.text.replace('output="numbers"', fewer), block.page)
+    assert set(names["counted"]) == set(read_areas(tmp_path / "areas.json").names)
+    assert names["weakest"] in names["counted"] and "display" in {r["thing"] for r in names["found"].what_if}
+    assert (tmp_path / "numbers" / "things.png").is_file()
+
+
+def test15_files_of_statistics(tmp_path):
+    areas, changes = (block.text for block in blocks("json", page="statistics.md"))
+    (tmp_path / "a.json").write_text(areas)
+    (tmp_path / "c.json").write_text(changes)
+    assert len(read_areas(tmp_path / "a.json").areas) == len(json.loads(areas)["regions"])
+    found = read_changes(tmp_path / "c.json")
+    assert found.move and found.remove and found.add and found.swap and found.observers is not None
+
+
+def test16_pictures(tmp_path, rgb, monkeypatch):
+    import nerg_mi as nerg
+
+    path = write_scene(tmp_path)
+    walk().save(tmp_path / "rays.npz")
+    shutil.copy(tmp_path / "gaze.safetensors", tmp_path / "shoppers.safetensors")
+    monkeypatch.chdir(tmp_path)
+    names = {"nerg": nerg, "scene": nerg.Scene.load(str(path))}
+    for block in blocks("py", page="pictures.md"):
+        if "from PIL" in block.text:
+            names["draw"]("floor", "rays.npz", "gaze.png")
+        smaller = block.text.replace("scenes/store/scene.xml", "scene.xml").replace("width=480", "width=64, spp=1")
+        run(smaller, block.page, names)
+    assert {"floor.svg", "gaze.svg"} <= set(os.listdir("."))
+    assert b"my notebook" in Path("gaze.svg").read_bytes()
+
+
+def test17_clusters(capsys):
+    (block,) = blocks("python", page="clusters.md")
+    run(block.text, block.page, {"__name__": "page"})
+    assert capsys.readouterr().out == ".txt 2.0\n"
+
+
+def test18_python(rgb, tmp_path, monkeypatch):
+    """Thirty lines lead from loading to a plotted share of attention; then fields are saved, and asked."""
+    import matplotlib
+
+    import nerg_mi as nerg
+
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    texts, names = [block.text for block in blocks("python", page="python.md")], {}
+    assert len([line for line in texts[0].splitlines() if line.strip()]) <= 30
+    for text in texts[:4]:
+        small = text.replace("width=480, height=320", "width=24, height=16").replace("4.6, 10)", "4.6, 8)")
+        assert small.count("width=24") == text.count("width=480")
+        run(small.replace("spp=4", "spp=1"), "docs/python.md", names)
+        if text is texts[0]:
+            share = np.array(list(names["share"].values()))
+            assert share.shape == (4, 8) and (share >= 0).all() and (share.sum(axis=0) < 1.1).all()
+            # Those who come nearer to the coolers look at them more.
+            assert share.max() > 0.01 and share[3, -1] > share[3, 0]
+            assert names["view"].gaze.shape == (2, 16, 24)
+    assert (tmp_path / "attention.png").stat().st_size > 10_000
+    assert nerg.load_field(tmp_path / "copy.safetensors").kind == "radiance"
+    assert names["on_display"].share.shape == (1,) and names["on_display"].share[0] > 0
+    assert names["seen"].gaze.shape == (1, 2) and names["down"].color.shape == (2, 3)
+    assert 1.5 < names["down"].depth[0] < 1.7
+
+
+# ---- The quick start ----
+
+SMALLER = {
+    "nerg render": "--spp 1 -D width=24 -D height=16",
+    "nerg train": "--radius 0.6 --probes 8 --steps 2 --directions 64 --min-rays 8 --seed 1 --test-positions 4 --force",
+    "nerg eval": "--min-rays 4",
+    "nerg scene": "--width 36",
+    "nerg report": "--width 36 --spp 1 --points 500",
+    "nerg stats": "--eyes 8 --directions 256 --resamples 199",
+}
+"""What is added to a command, so that it takes a second."""
+
+
+def quick_start() -> list[str]:
+    """The commands of the page; the viewer serves until somebody ends it: tests/viewer tries it."""
+    lines = [line for block in blocks("sh", page="quickstart.md") for line in block.text.splitlines()]
+    return [line for line in lines if line.startswith("nerg ") and not line.startswith("nerg view")]
+
+
+def test20_the_quick_start_leads_from_a_recording_to_a_picture():
+    done = [" ".join(line.split()[:2]) for line in quick_start()]
+    order = ["nerg rays", "nerg train", "nerg eval", "nerg scene", "nerg render", "nerg report", "nerg stats"]
+    assert [command for command in done[2:] if command in order][-len(order) :] == order
+    assert set(SMALLER) <= set(done)
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test21_commands_of_the_quick_start(rgb, clone, tmp_path, capsys):
+    from nerg_mi.scenes.store import layout, shoppers, twin
+
+    store = clone("scene.xml", "regions.json")
+    (store / "build").mkdir()
+    (tmp_path / "out").mkdir()
+    write_standins(store)
+    recording = store / "build" / "shoppers.csv"
+    shoppers.write_shoppers(layout.build(0), recording, say=str, shoppers=6, stops=(4, 5), scene=twin.load_twin())
+    for line in quick_start():
+        words = shlex.split(line, comments=True)[1:]
+        words += shlex.split(SMALLER.get(" ".join(line.split()[:2]), ""))
+        with pytest.raises(SystemExit) as end:
+            nerg_mi.cli.main(words)
+        assert not end.value.code, (line, capsys.readouterr().err)
+        for name in re.findall(r"-o (\S+)", line):
+            assert (tmp_path / name).stat().st_size > 0, line
+    # What the guess prints stands on the page.
+    assert "preset skeleton" in (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")

@@ -1,0 +1,518 @@
+"""Figures: of files, of scenes, and floor plans; any kind of them, drawn and written."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.figures.overlay import Heat, Style, find_overlay, find_stored, overlay, srgb, top_of, write_png
+from nerg_mi.figures.style import color_values
+from nerg_mi.files.images import write_exr
+from nerg_mi.formats.ply import write_columns
+from nerg_mi.formats.splats import write_ply_splats
+from nerg_mi.ranges import RANGE
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.bands import render_asked
+from nerg_mi.transport.geometry import pixel_directions
+from nerg_mi.workflows import draw_scenes as scenes
+from nerg_mi.workflows.draw import draw, find_kind, read_baked, read_stored, shared_note
+from nerg_mi.workflows.draw_scenes import cut_place, film, open_scene, upright_pose
+from nerg_mi.workflows.scene_commands import KINDS, ScaleOptions, SceneFigureOptions, SphereOptions
+from tests.pictures import SCENE
+from tests.surfaces.meshes import wall
+from tests.workflows.recorder import Recorder
+from tests.workflows.watched import MODE, write_scene
+
+# ---- Quantities in EXR files ----
+
+
+RNG = np.random.default_rng(0)
+COLOR, GAZE = RNG.random((6, 8, 3)).astype(np.float32), RNG.random((6, 8)).astype(np.float32)
+OPACITY = np.where(np.arange(8) < 3, 0.2, 0.9).astype(np.float32) * np.ones((6, 1), np.float32)
+
+
+def write(path, text=None, **more):
+    write_exr(path, {name: COLOR[..., k] for k, name in enumerate("RGB")} | {"gaze.Y": GAZE} | more, text)
+    return path
+
+
+def test_colour_values_and_mask(tmp_path):
+    found = read_stored(write(tmp_path / "a.exr", **{"opacity.Y": OPACITY}), find_stored("gaze"))
+    np.testing.assert_array_equal(found.color, COLOR)
+    np.testing.assert_array_equal(found.values, GAZE)
+    np.testing.assert_array_equal(found.mask, np.tile(np.arange(8) >= 3, (6, 1)))
+    assert read_stored(write(tmp_path / "b.exr"), find_stored("gaze.Y")).mask.all()
+
+
+def test_what_gaze_rests_on(tmp_path):
+    text = {"gaze.basis": "made of 5 rays of 2 people", "kde.basis": "made of 3 rays of 1 person"}
+    path = write(tmp_path / "a.exr", text, **{"kde.Y": GAZE, "depth.T": GAZE})
+    bases = [read_stored(path, find_stored(channel)).basis for channel in ("gaze", "kde.Y", "depth")]
+    assert bases == [*text.values(), ""] and read_stored(write(tmp_path / "b.exr"), find_stored("gaze")).basis == ""
+    assert shared_note("ab", bases[:1] * 2) == bases[0]
+    assert shared_note("ab", ["x", ""]) == "a: x; b: not known"
+
+
+def test_what_is_refused(tmp_path):
+    with pytest.raises(NergError, match='has no "depth"; it has R, G, B, gaze.Y'):
+        read_stored(write(tmp_path / "a.exr"), find_stored("depth"))
+    with pytest.raises(NergError, match="holds no quantities"):
+        read_stored(tmp_path / "a.png", find_stored("gaze"))
+
+
+# ---- Differences of two files ----
+
+
+def test_the_first_less_the_second(tmp_path):
+    other = GAZE[::-1].copy()
+    a = write(tmp_path / "a.exr", **{"opacity.Y": OPACITY})
+    b = write(tmp_path / "b.exr", **{"opacity.Y": OPACITY, "gaze.Y": other})
+    figure = draw("difference", [a, b], top=0.5)
+    shown = figure.axes[0].images[0].get_array()
+    mask = OPACITY > 0.5
+    wanted = color_values("RdBu_r", np.clip(0.5 + (GAZE - other), 0, 1), kind="diverging")
+    np.testing.assert_allclose(shown[mask], wanted[mask], atol=1e-6)
+    assert np.ptp(shown[~mask], axis=-1).max() < 1e-9 and figure.axes[0].get_title() == "a less b"
+
+
+def test_difference_what_is_refused(tmp_path):
+    a = write(tmp_path / "a.exr")
+    write_exr(tmp_path / "b.exr", {"gaze.Y": np.ones((3, 4), np.float32)})
+    for files, given, said in (
+        ([a], {}, "two pictures, and 1 were given"),
+        ([a, tmp_path / "b.exr"], {}, "8 x 6 and 4 x 3 pixels cannot be compared"),
+        ([a, a], {"cmap": "viridis"}, "no diverging colour map"),
+        ([a, a], {"top": -1.0}, "--top must lie in"),
+        ([a, a, a], {}, "1 to 2 files, and 3 were given"),
+    ):
+        with pytest.raises(NergError, match=said):
+            draw("difference", files, **given)
+
+
+# ---- Contact sheets of files ----
+
+
+def test_one_scale_for_all(tmp_path):
+    bright = np.where(OPACITY > 0.5, 3 * GAZE, 100)
+    files = [
+        write(tmp_path / "first.exr", **{"opacity.Y": OPACITY}),
+        write(tmp_path / "second.exr", **{"opacity.Y": OPACITY, "gaze.Y": bright.astype(np.float32)}),
+    ]
+    figure = draw("sheet", files, overlay="gaze")
+    assert [a.get_title() for a in figure.axes[:2]] == ["first", "second"]
+    bar = figure.axes[-1 if figure.axes[-1].get_ylabel() else -2]
+    bar = next(a for a in figure.axes if a.get_ylabel())
+    top = top_of(bright, OPACITY > 0.5)
+    said = [float(t.get_text()) for t in bar.get_yticklabels()]
+    np.testing.assert_allclose(bar.get_yticks(), np.array(said) / top, atol=1e-6)
+    assert "no data" in [t.get_text() for a in figure.axes for t in a.texts]
+
+
+def test_pictures_as_they_are(rgb, tmp_path):
+    write_png(tmp_path / "a.png", COLOR)
+    write(tmp_path / "b.exr")
+    figure = draw("sheet", [tmp_path / "a.png", tmp_path / "b.exr"], tmp_path / "out.png", columns=2)
+    a, b = (axes.images[0].get_array() for axes in figure.axes)
+    np.testing.assert_allclose(a, COLOR, atol=0.51 / 255)
+    np.testing.assert_allclose(b, srgb(COLOR))
+    assert (tmp_path / "out.png").is_file()
+
+
+def test_nothing_to_take_a_scale_from(tmp_path):
+    dark = write(tmp_path / "a.exr", **{"gaze.Y": 0 * GAZE})
+    with pytest.raises(NergError, match='"gaze" is 0'):
+        draw("sheet", dark, overlay="gaze")
+    assert draw("sheet", dark, overlay="gaze", top=1.0).axes
+
+
+def test_what_the_pictures_rest_on_is_said_below(tmp_path):
+    texts = [{"gaze.basis": f"made of {n} rays of 2 people"} for n in (5, 6)]
+    a, b = (write(tmp_path / f"{name}.exr", text) for name, text in zip("ab", texts))
+    said = lambda *files: {t.get_text().replace("\n", " ") for t in draw("sheet", list(files), overlay="gaze").texts}
+    assert said(a, a) == {texts[0]["gaze.basis"]}
+    assert said(a, b) == {f"a: {texts[0]['gaze.basis']}; b: {texts[1]['gaze.basis']}"}
+    figure = draw("difference", [a, a])
+    assert figure.texts[0].get_text().replace("\n", " ") == texts[0]["gaze.basis"]
+
+
+# ---- Baked surfaces: what is seen of them where, in the colours of their values ----
+
+
+SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+ABOVE = {"camera": (0.0, 0.0, 2.0), "target": (0.0, 0.0, 0.0), "up": (0.0, 1.0, 0.0), "fov": 90.0}
+
+
+def write_surface(path, values, vertices=SQUARE, comments=("value: share of gaze per square metre [1/m²]",), **columns):
+    faces = np.concatenate([4 * k + np.array([[0, 1, 2], [0, 2, 3]]) for k in range(len(vertices) // 4)])
+    columns = dict(zip("xyz", np.asarray(vertices, np.float32).T)) | columns
+    write_columns(path, columns | {"value": np.asarray(values, np.float32)}, faces, comments=comments)
+    return path
+
+
+def picture(figure):
+    return np.asarray(figure.axes[0].images[0].get_array())
+
+
+def bar(figure):
+    return next(axes for axes in figure.axes if axes.get_ylabel())
+
+
+def test_values_lie_where_they_are(tmp_path):
+    """From 2 above, a view of 90 degrees is 4 wide: the square fills the middle half, brighter to the right."""
+    path = write_surface(tmp_path / "a.ply", [0, 4, 4, 0])
+    figure = draw("surface", path, mode="llvm_ad_rgb", width=80, height=80, top=4.0, **ABOVE)
+    shown = picture(figure)
+    paper = shown[2, 2]
+    assert np.allclose(shown[:19], paper) and np.allclose(shown[:, :19], paper) and np.allclose(shown[61:], paper)
+    # From 0 at the left to 4 at the right, over grey that is lit from the camera and from above.
+    x = (np.arange(20, 60) + 0.5) / 20 - 2
+    grey = 0.18 + 0.3 * (0.6 * 2 / np.sqrt(4 + x**2 + 0.025**2) + 0.4 * 0)
+    wanted = overlay(np.repeat(grey[None, :, None], 3, axis=2), 2 * (x + 1)[None], Heat(4.0))
+    # To a step of the colour map, between whose colours single precision may decide otherwise.
+    np.testing.assert_allclose(shown[40, 20:60], wanted[0], atol=0.02)
+    assert bar(figure).get_ylabel().replace("\n", " ") == "share of gaze per square metre [1/m²]"
+
+
+def test_what_is_above_is_left_out_and_all_is_seen_at_first(tmp_path):
+    lid = SQUARE + [0, 0, 1]
+    path = write_surface(tmp_path / "a.ply", [1] * 4 + [9] * 4, np.concatenate([SQUARE, lid]))
+    size = {"width": 60, "height": 60, "top": 9.0, "mode": "llvm_ad_rgb"}
+    level = {"up": (0.0, 0.0, 1.0)}
+    closed, opened = (
+        picture(draw("surface", path, **size, **(ABOVE | more))) for more in (level, level | {"below": 0.5})
+    )
+    assert closed[30, 30].sum() > opened[30, 30].sum() + 0.3
+    seen = picture(draw("surface", path, **size))
+    filled = np.abs(seen - seen[0, 0]).sum(axis=2) > 0.02
+    rows, columns = np.flatnonzero(filled.any(axis=1)), np.flatnonzero(filled.any(axis=0))
+    assert 0 < rows[0] and rows[-1] < 59 and 0 < columns[0] and columns[-1] < 59
+    assert max(np.ptp(rows), np.ptp(columns)) > 50, "it fills the picture"
+
+
+def test_the_header_says_what_it_is_made_of(tmp_path):
+    comments = ("value: seconds per square metre [s/m²]", 'nerg_mi {"inputs": {"day.npz": "ab", "shop.ply": "cd"}}')
+    path = write_surface(tmp_path / "a.ply", [1, 2, 3, 4], comments=comments)
+    baked = read_baked(path)
+    assert baked.label == "seconds per square metre [s/m²]" and baked.made_of == ("day.npz", "shop.ply")
+    np.testing.assert_array_equal(baked.values, [1, 2, 3, 4])
+    figure = draw("surface", path, width=32, height=32, mode="llvm_ad_rgb")
+    assert figure.axes[0].get_title().replace("\n", " ") == "Seconds per square metre"
+    assert figure.texts[0].get_text().replace("\n", " ") == "made of day.npz, shop.ply"
+
+
+def test_surface_what_is_refused(tmp_path):
+    good = write_surface(tmp_path / "a.ply", [1, 2, 3, 4])
+    columns = dict(zip("xyz", SQUARE.astype(np.float32).T))
+    write_columns(tmp_path / "bare.ply", columns, np.array([[0, 1, 2]]))
+    (tmp_path / "a.glb").write_bytes(b"x")
+    (tmp_path / "odd.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
+    damaged = write_surface(tmp_path / "damaged.ply", [1, 2, 3, 4], comments=("nerg_mi {",))
+    for path, given, said in (
+        (tmp_path / "a.glb", {}, "give the .ply"),
+        (tmp_path / "none.ply", {}, "there is no file"),
+        (tmp_path / "bare.ply", {}, "no property value"),
+        (tmp_path / "odd.ply", {}, "odd.ply"),
+        (damaged, {}, "is damaged"),
+        (good, {"below": -1.0}, "larger --below"),
+        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 5)}, "in the picture"),
+        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "elsewhere than --camera"),
+        (good, {"up": (0.0, 0, 0)}, "--up must not be of length 0"),
+    ):
+        with pytest.raises(NergError, match=said):
+            draw("surface", path, mode="llvm_ad_rgb", width=32, height=32, **given)
+
+
+def test_splats_show_their_gaze_themselves(tmp_path):
+    write_ply_splats(tmp_path / "splats.ply", wall(0.0, 0.4, 0.05))
+    with pytest.raises(NergError, match="holds Gaussian splats"):
+        read_baked(tmp_path / "splats.ply")
+
+
+# ---- Options that kinds of figures share ----
+
+
+def test_a_style_of_options():
+    assert ScaleOptions(cmap="viridis", decades=3, hatching=False).style("a") == Style("viridis", 3, False, "a")
+    for given, said in (({"top": 0.0}, "--top"), ({"decades": -1}, "--decades"), ({"cmap": "jet"}, '"jet" is no')):
+        with pytest.raises(NergError, match=said):
+            ScaleOptions(**given).style()
+
+
+def test_a_scale_is_needed():
+    find_overlay("visibility").check_limits(None)
+    find_overlay("gaze").check_limits((0, 1))
+    with pytest.raises(NergError, match='"gaze" is 0 wherever'):
+        find_overlay("gaze").check_limits(None)
+
+
+# ---- Scenes opened for figures: level poses, films, and what is refused ----
+
+
+def camera(mi, origin, target, up):
+    return mi.load_dict({"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(origin, target, up)})
+
+
+@pytest.mark.parametrize(
+    "target, up, level, heading",
+    [
+        ((4, 6, 0.5), (0, 0, 1), (0, 0, 1), (0.6, 0.8, 0)),  # looks down a little, z up
+        ((1, 2.5, -9), (0, 1, 0), (0, 1, 0), (0, 0, -1)),  # y up
+        ((1, 9, 3), (0, 0, -1), (0, 0, -1), (0, 1, 0)),  # upside down
+    ],
+)
+def test_a_level_pose(rgb, target, up, level, heading):
+    matrix = np.array(upright_pose(camera(rgb, (1, 2, 3), target, up)).matrix, float)
+    np.testing.assert_allclose(matrix[:3, 3], (1, 2, 3), atol=1e-6)
+    np.testing.assert_allclose(matrix[:3, 1], level, atol=1e-6)
+    np.testing.assert_allclose(matrix[:3, 2], heading, atol=1e-6)
+
+
+def test_straight_down_there_is_some_heading(rgb):
+    matrix = np.array(upright_pose(camera(rgb, (0, 0, 3), (0, 0, 0), (0, 1, 0))).matrix, float)
+    assert np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6)
+
+
+def test_a_film_that_is_too_large():
+    assert film(30, 20)["rfilter"] == {"type": "box"}
+    with pytest.raises(NergError, match="4,096.*4,096"):
+        film(4096, 4096)
+    # What the widest sphere needs, a gigabyte to draw, is allowed.
+    (width,) = (f.metadata[RANGE].high for f in fields(SphereOptions) if f.name == "width")
+    assert film(width, width // 2)["width"] == width
+
+
+def test_another_integrator_is_refused(tmp_path):
+    (tmp_path / "scene.xml").write_text(SCENE)
+    options = SceneFigureOptions(mode="llvm_ad_rgb")
+    with (
+        pytest.raises(NergError, match='needs the integrator "nerg"'),
+        open_scene(tmp_path / "scene.xml", options, Recorder()),
+    ):
+        pass
+
+
+# ---- The observer's sphere of a scene file ----
+
+
+@pytest.fixture(scope="module")
+def scene_sphere(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+def test_it_shows_the_observers_gaze(rgb, scene_sphere):
+    """Against the API's rays from the observer's eye, in directions of the panorama that it has turned itself."""
+    import nerg_mi as nerg
+
+    figure = draw("sphere", scene_sphere, width=64, spp=1, mode=MODE, projection="equirectangular", top=0.5)
+    assert "integral" in figure.axes[0].get_title().replace("\n", " ")
+    assert figure.axes[-1].get_ylabel().replace("\n", " ") == "gaze density [1/sr]"
+    shown = figure.axes[0].images[0].get_array()
+    assert shown.shape == (32, 64, 3)
+    eye = np.array([0.2, 0.1, -2.5])
+    # Level, towards the middle of the place: up is y. Right of a camera of Mitsuba's is -x of its own.
+    ahead = -eye * (1, 0, 1)
+    ahead /= np.linalg.norm(ahead)
+    up = np.array([0.0, 1.0, 0.0])
+    own = pixel_directions(64, 32)
+    world = own[..., :1] * np.cross(up, ahead) + own[..., 1:2] * up + own[..., 2:] * ahead
+    seen = nerg.trace(nerg.Scene.load(str(scene_sphere)), eye, world.reshape(-1, 3), ["depth", "opacity", "gaze"])
+    met = (seen.opacity.reshape(32, 64) > 0.9) & (seen.gaze.reshape(32, 64) > 0.3)
+    void = seen.opacity.reshape(32, 64) < 0.1
+    assert met.sum() > 20 and void.sum() > 500
+    # The paper's pale hatching where nothing is met, dark or hot colours where something is.
+    grey = np.ptp(shown, axis=-1) < 0.01
+    rows = np.rint((np.arange(32) + 0.5) / 32 * 31).astype(int)
+    inner = lambda m: m & np.roll(m, 1, 0) & np.roll(m, -1, 0) & np.roll(m, 1, 1) & np.roll(m, -1, 1)
+    assert grey[inner(void)[rows]].mean() > 0.95 and grey[inner(met)[rows]].mean() < 0.2
+
+
+def test_what_a_scene_figure_refuses(scene_sphere):
+    for given, said in (
+        ({"projection": "globe"}, 'no projection "globe"'),
+        ({"sensor": 7}, "has 1 sensor"),
+        ({"cmap": "jet"}, '"jet" is no'),
+        ({"color": 1}, 'has no option "color"'),
+    ):
+        with pytest.raises(NergError, match=said):
+            draw("sphere", scene_sphere, mode=MODE, width=64, **given)
+
+
+# ---- Occlusion of any scene with an observer ----
+
+
+@pytest.fixture(scope="module")
+def scene_triptych(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+def test_three_pictures_with_one_scale(rgb, scene_triptych, monkeypatch):
+    seen = []
+    see = scenes.OpenScene.see
+    monkeypatch.setattr(scenes.OpenScene, "see", lambda self, *of: seen.append(see(self, *of)) or seen[-1])
+    told = Recorder()
+    behind = {"eye": "0.2, 0.1, 2.5"}
+    figure = draw("triptych", scene_triptych, reporter=told, mode=MODE, spp=2, defaults=behind)
+    # Three pictures, the scale, and the swatch for what is not known.
+    assert len(figure.axes) == 5 and [s for s, _ in told.steps] == sorted(s for s, _ in told.steps)
+    own, without, with_ = seen
+    # Occlusion takes away, and only that; what is seen itself stays.
+    assert (without.values >= with_.values - 1e-6).all() and (without.values > with_.values + 1e-3).any()
+    assert (without.color == with_.color).all() and own.values.shape == with_.values.shape
+    # The first is what a camera at the observer's place sees, with its own gaze.
+    with scenes.open_scene(scene_triptych, SceneFigureOptions(mode=MODE, spp=2, defaults=behind), told) as opened:
+        plain = opened.see(opened.camera(0), find_overlay("gaze"))
+        again = render_asked(scene_triptych, opened.scene, opened.camera(0), ["gaze", "opacity"], spp=2)
+    assert (plain.values == with_.values).all() and (again.aovs["gaze"] == with_.values).all()
+    assert own.values.max() > 0
+
+
+def test_a_scene_whose_camera_is_the_observer(rgb, scene_triptych, tmp_path):
+    text = scene_triptych.read_text()
+    a, b = text.index("        <sensor name"), text.index('        <string name="aovs"')
+    alone = scene_triptych.with_name("alone.xml")
+    alone.write_text(text[:a] + text[b:])
+    with pytest.raises(NergError, match="has no observer beside its camera"):
+        draw("triptych", alone, mode=MODE, defaults={})
+
+
+# ---- A place cut at a height: boxes whose walls and heights are known ----
+
+
+LOW, HIGH = np.array([-2.0, -1.0]), np.array([2.0, 1.0])
+WALLS_SCENE = """<scene version="3.0.0"><integrator type="nerg"/>
+<shape type="rectangle"><transform name="to_world"><scale value="5"/></transform></shape>
+<shape type="cube"><transform name="to_world"><scale x="0.3" y="0.4" z="0.25"/>
+  <translate x="-1" y="0" z="0.25"/></transform></shape>
+<shape type="cube"><transform name="to_world"><scale x="0.5" y="0.2" z="1"/>
+  <translate x="1" y="0.3" z="1"/></transform></shape></scene>"""
+
+
+def test_boxes(rgb, tmp_path):
+    (tmp_path / "scene.xml").write_text(WALLS_SCENE)
+    scene = rgb.load_file(str(tmp_path / "scene.xml"))
+    plan = cut_place(scene.integrator(), scene, LOW, HIGH, 1.2, 0.0)
+    ny, nx = plan.height.shape
+    side = (plan.high - plan.low) / (nx, ny)
+    assert plan.level == 1.2 and np.allclose(side, side[0])
+    x, y = plan.low[0] + (np.arange(nx) + 0.5) * side[0], plan.low[1] + (np.arange(ny) + 0.5) * side[0]
+    x, y = np.meshgrid(x, y)
+    low_box = (np.abs(x + 1) < 0.3) & (np.abs(y) < 0.4)
+    tall_box = (np.abs(x - 1) < 0.5) & (np.abs(y - 0.3) < 0.2)
+    np.testing.assert_allclose(plan.height[low_box], 0.5, atol=1e-4)
+    np.testing.assert_allclose(plan.height[~low_box & ~tall_box], 0.0, atol=1e-4)
+    # The cut goes along the walls of the tall box, a cell wide to each side, and nowhere else.
+    edge = np.maximum(np.abs(x - 1) - 0.5, np.abs(y - 0.3) - 0.2)
+    assert plan.cut[np.abs(edge) < 0.4 * side[0]].all() and not plan.cut[np.abs(edge) > 1.01 * side[0]].any()
+
+
+# ---- Floor plans of rays: paths by person and recording, sights, fields of view ----
+
+
+def walk(hits=True):
+    """Ada walks along x, stops being recorded, and comes back; Bob stands."""
+    t = np.r_[np.arange(20) * 0.1, 30 + np.arange(20) * 0.1, np.arange(5) * 0.1]
+    x = np.r_[np.arange(20) * 0.05, 1 - np.arange(20) * 0.05, np.full(5, -0.5)]
+    y = np.r_[np.zeros(20), np.full(20, 0.4), np.full(5, -0.5)]
+    person = np.r_[np.zeros(40, np.int32), np.ones(5, np.int32)]
+    direction = np.tile([0.0, 1.0, 0.0], (45, 1))
+    origin = np.stack([x, y, np.full(45, 1.6)], axis=1)
+    return Rays(t, person, ("Ada", "Bob"), origin, direction, np.ones(45), origin + direction * 0.7 if hits else None)
+
+
+@pytest.fixture
+def rays(tmp_path):
+    walk().save(tmp_path / "rays.npz")
+    return tmp_path / "rays.npz"
+
+
+def paths(figure):
+    return [line for line in figure.axes[0].lines if line.get_linestyle() == "-" and len(line.get_xdata()) > 1]
+
+
+def test_paths_break_where_nobody_was_recorded(rays):
+    figure = draw("floor", rays)
+    assert figure.texts[0].get_text() == "45 rays of 2 people"
+    assert [t.get_text() for t in figure.axes[0].get_legend().get_texts()] == ["Ada", "Bob"]
+    ada = paths(figure)[0]
+    xy = np.stack([ada.get_xdata(), ada.get_ydata()], axis=1)
+    gaps = np.flatnonzero(np.isnan(xy[:, 0]))
+    assert len(gaps) == 2 and gaps[0] == 0
+    first, second = xy[1 : gaps[1]], xy[gaps[1] + 1 :]
+    assert np.all(first[:, 1] == 0) and np.all(second[:, 1] == 0.4) and len(first) == len(second) == 20
+
+
+def test_one_person_and_what_they_looked_at(rays):
+    figure = draw("floor", rays, people="Bob", rays=3, views=2)
+    lines, wedges = (c for c in figure.axes[0].collections if type(c).__name__ in ("LineCollection", "PatchCollection"))
+    if type(lines).__name__ == "PatchCollection":
+        lines, wedges = wedges, lines
+    segments = np.stack(lines.get_segments())
+    np.testing.assert_allclose(segments, np.tile([[-0.5, -0.5], [-0.5, 0.2]], (len(segments), 1, 1)))
+    assert len(wedges.get_paths()) == 2
+
+
+def test_over_a_place(rgb, rays, tmp_path):
+    (tmp_path / "scene.xml").write_text(WALLS_SCENE)
+    figure = draw("floor", rays, tmp_path / "a.svg", scene=str(tmp_path / "scene.xml"), mode="llvm_ad_rgb")
+    assert len(figure.axes[0].images) == 1
+    text = (tmp_path / "a.svg").read_text()
+    assert "scene.xml" in text and "rays.npz" in text and str(tmp_path) not in text
+
+
+@pytest.mark.parametrize(
+    "given, said", [({"people": "Eve"}, 'no person "Eve"; they have Ada, Bob'), ({"cut": 0.0}, "--cut is a height")]
+)
+def test_what_a_floor_plan_refuses(rays, given, said):
+    with pytest.raises(NergError, match=said):
+        draw("floor", rays, **given)
+
+
+# ---- Figures drawn and written, with where they come from ----
+
+
+def test_a_file_says_where_it_comes_from(tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+    told = Recorder()
+    a = write(tmp_path / "a.exr")
+    figure = draw("sheet", str(a), str(tmp_path / "new" / "b.png"), told, overlay="gaze", decades=2.0)
+    width, height = (round(v) for v in figure.bbox.size)
+    assert told.messages == [f"Wrote {tmp_path / 'new' / 'b.png'} ({width} x {height})."]
+    with image.open(tmp_path / "new" / "b.png") as found:
+        assert found.size == (width, height)
+        about = json.loads(found.text["Comment"])
+    assert about["what"] == "nerg draw sheet" and about["settings"] == {"overlay": "gaze", "decades": 2.0}
+    assert about["inputs"] == {"a.exr": hashlib.sha256(a.read_bytes()).hexdigest()} and about["seed"] is None
+
+
+def test_what_any_figure_refuses(tmp_path):
+    a = write(tmp_path / "a.exr")
+    with pytest.raises(NergError, match="end in .png or .svg"):
+        draw("sheet", a, tmp_path / "b.pdf")
+    with pytest.raises(MissingFile, match="gone.exr"):
+        draw("sheet", tmp_path / "gone.exr")
+    with pytest.raises(NergError, match="1.*400.*0"):
+        draw("sheet", [])
+    with pytest.raises(NergError, match='no figure "pie"'):
+        draw("pie", a)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+# ---- The table of kinds ----
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_each_tells_what_it_is(name):
+    kind = find_kind(name)
+    assert kind.name == name and kind.summary.endswith(".") and kind.most >= 1
+    assert kind.options() is not None and all(f.metadata["help"] for f in dataclasses.fields(kind.options))
+
+
+def test_one_that_is_not_there():
+    with pytest.raises(NergError, match='no figure "pie"; there are sphere, triptych'):
+        find_kind("pie")

@@ -1,0 +1,473 @@
+"""Evaluations of gaze fields, folds, ablations, priors, and the places of all of these."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.alignment.check import read_similarity
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation import ablation as scoring
+from nerg_mi.evaluation.gaze import SCORES
+from nerg_mi.files.tables import write_json
+from nerg_mi.formats.fields import load_gaze
+from nerg_mi.rays.rays import Rays
+from nerg_mi.threads import set_thread_count
+from nerg_mi.train.gaze_log_density import elevation_density
+from nerg_mi.workflows import ablation, evaluate
+from nerg_mi.workflows.ablation import Bench, ablate, law_of, plan_of
+from nerg_mi.workflows.evaluate import SCORED, evaluate_folds, evaluate_gaze
+from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeEvaluationOptions, GazeOptions
+from nerg_mi.workflows.geometry import make_place, place_of_training
+from nerg_mi.workflows.options import PlaceOptions
+from nerg_mi.workflows.parts import account_for_store
+from nerg_mi.workflows.train_gaze import learn_prior, train_gaze
+from tests.conftest import ROOT
+from tests.evaluation.test_gaze import crowd
+from tests.formats.splats.writers import random_splats, write_inria
+from tests.plugins import fields
+from tests.tasks.clusters import ClusterOfProcesses, wait_until
+from tests.train.gaze.looks import BOX, around, looking_at
+from tests.workflows.recorder import Recorder
+
+# ---- The evaluation of a gaze field as a job: its rows, files, and what it refuses ----
+
+
+OPTIONS = GazeEvaluationOptions(min_rays=8, directions=128, resamples=2, pictures=1)
+TRAINING = GazeOptions(
+    geometry="none", radius=0.5, probes=8, steps=2, directions=64, zones=0, min_rays=8, test_zones=1, test_positions=3
+)
+
+
+def test_scores_stand_beside_the_baselines(trained, tmp_path):
+    found = evaluate_gaze(trained / "gaze.safetensors", trained / "rays.npz", tmp_path / "eval", OPTIONS)
+    names = [row["method"] for row in found.rows]
+    assert names[0] == "gaze field" and "uniform" in names and "4,096 nearest rays" in names and found.split == "pos"
+    assert all(set(SCORES) <= set(row) for row in found.rows) and 1 <= found.positions <= 3 and found.people >= 2
+    assert {row["method"] for row in found.persons} == {"gaze field", "4,096 nearest rays"}
+    files = {"gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.png", "positions.csv"}
+    assert {p.name for p in found.files} == files
+    # All stand in one zone; a field of no support would say so at each.
+    assert len(found.by_position) == found.positions and {row["group"] for row in found.by_position} == {"0"}
+    assert all(row["support"] >= 0 and row["KLD"] > 0 for row in found.by_position)
+    assert {row["method"] for row in found.calibration} >= {"gaze field", "4,096 nearest rays"}
+    # By what the folds of the training held out.
+    assert found.calibration[1]["method"] == "gaze field, calibrated"
+    assert json.loads((tmp_path / "eval" / "gaze.json").read_text())["methods"][0]["KLD"] == found.rows[0]["KLD"]
+    assert "directions of equal area" in (tmp_path / "eval" / "gaze.md").read_text()
+
+
+def test_without_a_folder_nothing_is_written(trained):
+    before = set(trained.iterdir())
+    found = evaluate_gaze(trained / "gaze.safetensors", Rays.load(trained / "rays.npz"), options=OPTIONS)
+    assert found.files == [] and set(trained.iterdir()) == before and found.rows[0]["method"] == "gaze field"
+
+
+def test_what_cannot_be_scored_is_refused(trained, tmp_path):
+    gaze = trained / "gaze.safetensors"
+    crowd(2000).save(tmp_path / "rays.npz")
+    with pytest.raises(NergError, match=r"other rays than .*; give the file rays\.npz"):
+        evaluate_gaze(gaze, tmp_path / "rays.npz", options=OPTIONS)
+    with pytest.raises(NergError, match="no people were held out"):
+        evaluate_gaze(gaze, trained / "rays.npz", options=replace(OPTIONS, split="both"))
+    train_gaze(crowd(1000), tmp_path / "gaze.safetensors", replace(TRAINING, test_zones=0))
+    with pytest.raises(NergError, match="trained on all positions"):
+        evaluate_gaze(tmp_path / "gaze.safetensors", crowd(1000), options=OPTIONS)
+
+
+# ---- Folds: trained and scored by workers of which one is killed, kept, and the same in this process ----
+
+
+SMALL = {"geometry": "none", "folds": 2, "zones": 1, "positions": 3, "radius": 0.6, "probes": 8, "steps": 2}
+SMALL |= {"directions": 128, "min_rays": 8, "splits": "both,pos", "threads": 1}
+
+
+class Killer(Recorder):
+    """Ends the first worker when the first fold is told of: it has another one in hand then."""
+
+    def __init__(self, cluster):
+        super().__init__()
+        self.cluster = cluster
+
+    def message(self, text):
+        super().message(text)
+        if text.startswith("fold 0"):
+            self.cluster.workers[0].kill()
+
+
+def test_two_workers_of_which_one_is_killed_score_as_this_process_does(tmp_path, rgb):
+    pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
+    crowd(3000).save(tmp_path / "rays.npz")
+    with ClusterOfProcesses(tmp_path) as cluster:
+        told = Killer(cluster)
+        cluster.start_worker(), cluster.start_worker()
+        wait_until(lambda: all("works for" in cluster.log(f"worker{k}") for k in (0, 1)), "both workers are there")
+        options = FoldOptions(**SMALL | {"folds": 3}, scheduler=cluster.address)
+        found = evaluate_folds(tmp_path / "rays.npz", tmp_path / "out", options, told)
+        assert cluster.workers[0].poll() is not None and cluster.workers[1].poll() is None
+    assert {p.name for p in found.files} == {"folds.md", "folds.csv", "positions.csv", "folds.json"}
+    assert {row["fold"] for row in found.each} == {0, 1, 2} and {row["split"] for row in found.rows} == {"both", "pos"}
+    # Each fold's zone is a group of its own, and all positions together are asked too.
+    assert {row["group"].split()[0] for row in found.by_position} == {"0", "1", "2"}
+    assert {row["split"] for row in found.uncertainty} == {"both", "pos", "anywhere"}
+    assert found.calibration[0]["folds"] == 3 and 0 <= found.calibration[0]["80%"] <= 1
+    ours = [row["KLD"] for row in found.each if row["split"] == "both" and row["method"] == "gaze field"]
+    assert found.rows[0]["KLD"] == pytest.approx(sum(ours) / 3) and ours[0] != ours[1]
+    assert found.rows[0]["KLD.low"] < found.rows[0]["KLD"] and all(field.is_file() for field in found.fields)
+    here = evaluate_folds(tmp_path / "rays.npz", tmp_path / "here", FoldOptions(**SMALL | {"folds": 3}))
+    assert [f.read_bytes() for f in here.files] == [f.read_bytes() for f in found.files]
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    """What a job sets is the process's: it is set back."""
+    before = dr.thread_count()
+    yield
+    set_thread_count(before)
+
+
+@pytest.fixture
+def folds_trained(monkeypatch):
+    """The seeds of the folds that were trained and scored with one thread, which cost nothing here."""
+    seeds = []
+
+    def score(common, seed, output):
+        assert dr.thread_count() == 1
+        seeds.append(seed)
+        rows = [{"method": "gaze field", "KLD": 1.0 / (1 + seed), "CC": 0.5}]
+        write_json(
+            output / SCORED, {split: {"rows": rows, "by_position": [], "calibration": []} for split in common.splits}
+        )
+
+    score.__qualname__ = "train_and_score"
+
+    monkeypatch.setattr(evaluate, "train_and_score", score)
+    return seeds
+
+
+def test_folds_that_are_kept_are_not_trained_again(tmp_path, folds_trained):
+    def go(rays=None, **more):
+        folds_trained.clear()
+        told = Recorder()
+        rays = crowd(300) if rays is None else rays
+        evaluate_folds(rays, tmp_path / "out", FoldOptions(**SMALL | more, store=tmp_path / "store"), told)
+        return list(folds_trained)
+
+    assert go() == [0, 1] and go() == [] and go(folds=4) == [2, 3] and go(first=2, folds=3) == [4]
+    # Other rays, and another recipe, are another evaluation; a change of how it is computed is none.
+    assert go(crowd(301)) == [0, 1] and go(steps=3) == [0, 1] and go(threads=2) == []
+    (job,) = account_for_store(tmp_path / "store").jobs
+    assert (job.what, job.total, job.left) == (f"nerg eval folds {tmp_path / 'out'}", 2, 0)
+
+
+def test_what_is_plainly_wrong(tmp_path):
+    with pytest.raises(NergError, match="--splits"):
+        evaluate_folds(crowd(300), tmp_path / "out", FoldOptions(**SMALL | {"splits": "both,time"}))
+    with pytest.raises(NergError, match="say where people looked around"):
+        evaluate_folds(crowd(300), tmp_path / "out", FoldOptions(**SMALL | {"geometry": None}))
+
+
+@pytest.mark.nightly
+def test_the_spread_of_an_ensemble_is_judged_as_support_is(tmp_path):
+    found = evaluate_folds(crowd(3000), tmp_path / "out", FoldOptions(**SMALL | {"ensemble": 2, "splits": "both"}))
+    assert {(row["signal"], row["error"]) for row in found.uncertainty} >= {("support", "KLD"), ("spread", "KLD")}
+    assert all(row["spread"] > 0 for row in found.by_position)
+    assert "spread" in (tmp_path / "out" / "folds.md").read_text()
+
+
+# ---- The ablation as a job: rows that are kept and found again, frames, laws, what is refused ----
+
+
+ABLATION_OPTIONS = AblationOptions(
+    geometry="hits",
+    recipes="default",
+    variant=("capture", "emit_capture"),
+    seeds=2,
+    default_steps=2,
+    zones=2,
+    positions=6,
+    min_rays=8,
+    radius=0.5,
+    cameras=1,
+    size="16x8",
+    probes=12,
+)
+
+
+class Uniform:
+    """A law under which people look anywhere."""
+
+    def density(self, positions, directions):
+        return np.full((len(positions), len(directions)), 1 / (4 * np.pi))
+
+
+@pytest.mark.nightly
+def test_rows_are_made_once(tmp_path, monkeypatch):
+    """With two variants, for the time that compiling takes; the trainers know all of them."""
+    found = ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
+    assert len(found.rows) == 4 and {r["seed"] for r in found.rows} == {0, 1}
+    whole = [r["test_relative"] for r in found.rows if r["variant"] == "emit_capture"]
+    assert np.mean(whole) == pytest.approx(1)
+    assert all(r["frame_seconds"] > 0 and np.isfinite(r["test_loss"]) for r in found.rows)
+    assert (tmp_path / "default_capture_0.safetensors").exists() and all(p.is_file() for p in found.files)
+    assert json.loads((tmp_path / "ablation.json").read_text())["rows"] == found.rows
+    # What is there already is not trained again; what would be another training is.
+    trained = []
+    monkeypatch.setattr(ablation, "_train", lambda made, plan, path, bench: trained.append(path.stem) or found.rows[0])
+    ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
+    assert trained == []
+    other = replace(ABLATION_OPTIONS, law="tests.workflows.test_gaze:Uniform", seeds=1, variant=("capture",))
+    ablate(crowd(3000), tmp_path, other)
+    assert trained == ["default_capture_0"]
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"law": "nowhere"}, "MODULE:CLASS"),
+        ({"law": "tests.workflows.test_gaze:Nobody"}, "MODULE:CLASS"),
+        ({"variant": ("emitt",)}, 'emit_capture here, got "emitt"'),
+        ({"size": "320"}, "WIDTHxHEIGHT"),
+        ({"recipes": "default,best"}, '"best"'),
+        ({"geometry": None}, "one of --field FILE"),
+    ],
+)
+def test_what_is_wrong_is_told_before_any_work(tmp_path, change, said):
+    with pytest.raises(NergError, match=said):
+        ablate(crowd(100), tmp_path / "new", replace(ABLATION_OPTIONS, **change))
+    assert not (tmp_path / "new").exists()
+
+
+def test_splats_have_no_features_of_a_radiance_field(tmp_path):
+    write_inria(tmp_path / "place.ply", random_splats(5))
+    given = replace(
+        ABLATION_OPTIONS, geometry=None, field=tmp_path / "place.ply", recipes="small", variant=("semantic snapshot",)
+    )
+    with pytest.raises(NergError, match="loss code here, got"):
+        ablate(crowd(100), tmp_path / "new", given)
+
+
+@pytest.mark.parametrize("recipe, seeds, steps, refit", [("default", [0, 1], 2, True), ("small", [0], 5, False)])
+def test_only_quick_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, steps, refit):
+    """And have steps of their own."""
+    plans = {}
+    row = {"test_KLD": 1.0, "test_CC": 0.5, "train_seconds": 1.0, "test_loss": 1.0, "train_loss": 1.0, "steps": 1}
+
+    def kept(made, plan, path, bench):
+        plans[made["seed"]] = plan
+        path.write_bytes(b"")
+        return {**made, **row}
+
+    monkeypatch.setattr(ablation, "_train", kept)
+    options = replace(ABLATION_OPTIONS, recipes=recipe, variant=("emit",), steps=5, refit=False, cameras=0)
+    ablate(crowd(1000), tmp_path, options)
+    assert sorted(plans) == seeds
+    for seed, plan in plans.items():
+        s = plan.settings
+        assert (s.seed, s.steps, s.refit, plan.config.variant, plan.probes.count) == (seed, steps, refit, "emit", 12)
+        assert s.watched_rays == 8
+
+
+def test_another_first_seed_holds_others_out(tmp_path, monkeypatch):
+    made = []
+
+    def kept(row, plan, path, bench):
+        made.append((row["seed"], plan.settings.seed, bench.centres.tobytes()))
+        path.write_bytes(b"")
+        return {**row, "test_KLD": 1.0, "test_CC": 0.5, "train_seconds": 1.0, "test_loss": 1.0, "train_loss": 1.0}
+
+    monkeypatch.setattr(ablation, "_train", kept)
+    monkeypatch.setattr(scoring, "write_ablation", lambda *args: [])
+    for first in (0, 5):
+        ablate(crowd(1000), tmp_path / str(first), replace(ABLATION_OPTIONS, first=first, variant=("emit",), cameras=0))
+    assert [m[:2] for m in made] == [(0, 0), (1, 1), (5, 5), (6, 6)]
+    assert made[0][2] == made[1][2] != made[2][2] == made[3][2]
+
+
+# ---- How variants are planned, and the laws that are named ----
+
+
+def test_a_semantic_variant_is_planned_with_the_features_of_the_place(tmp_path):
+    import drjit.llvm.ad as ns
+
+    from nerg_mi.train.geometry import place_of_field
+    from tests.plugins import fields
+
+    fields.radiance(tmp_path / "field.safetensors")
+    place = place_of_field(tmp_path / "field.safetensors", ns)
+    bench = Bench(None, {}, None, 0, place, tmp_path, ns, replace(ABLATION_OPTIONS, geometry=None))
+    for variant in scoring.all_variants(True, ["small"]):
+        plan = plan_of(variant, 0, bench)
+        c = plan.config
+        assert (c.variant, c.semantic, c.semantic_own) == (variant.gaze, variant.semantic, variant.semantic_own)
+        assert (plan.initial is not None, plan.settings.frozen) == (variant.begin, variant.frozen)
+        assert plan.settings.loss == (variant.loss or "paper")
+        if variant.semantic or variant.begin:
+            assert c.geometry == place.radiance.config.geometry
+
+
+def test_a_law_is_that_of_the_class_that_is_named():
+    assert law_of("tests.workflows.test_gaze:Uniform")([[0, 0, 0]], [[1, 0, 0]] * 3).shape == (1, 3)
+    for name in ("nowhere:Law", "tests.workflows.test_gaze:Nobody", "tests.workflows.test_gaze"):
+        with pytest.raises(NergError, match="MODULE:CLASS"):
+            law_of(name)
+
+
+# ---- Trainings of an ablation in parts: kept, and run by a process of its own as by this one ----
+
+
+TIMES = ("train_seconds", "frame_seconds")
+ONE = replace(ABLATION_OPTIONS, variant=("emit_capture",), seeds=1, cameras=0, threads=1)
+
+
+def scores(found):
+    return [{k: v for k, v in row.items() if k not in TIMES} for row in found.rows]
+
+
+@pytest.fixture
+def trainings(monkeypatch):
+    """What was trained in this process."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    found, original = [], ablation.train_variant
+    monkeypatch.setattr(ablation, "train_variant", lambda *given: found.append(given[:2]) or original(*given))
+    return found
+
+
+@pytest.mark.nightly
+def test_a_training_elsewhere_scores_as_one_here_and_is_kept(tmp_path, rgb, trainings):
+    rays = crowd(3000)
+    elsewhere = ablate(rays, tmp_path / "a", replace(ONE, scheduler="local:1"))
+    assert trainings == []
+    here = ablate(rays, tmp_path / "b", ONE)
+    assert scores(elsewhere) == scores(here)
+    trainings.clear()
+    assert (tmp_path / "a" / "default_emit_capture_0.safetensors").is_file()
+    # One seed more: that one is trained, whoever does it.
+    ablate(rays, tmp_path / "a", replace(ONE, seeds=2, store=tmp_path / "a.tasks"))
+    assert [seed for _, seed in trainings] == [1]
+    told = Recorder()
+    (job,) = account_for_store(tmp_path / "a.tasks", reporter=told).jobs
+    assert (job.what, job.total, job.left) == (f"nerg ablate {tmp_path / 'a'}", 2, 0)
+
+
+# ---- A gaze field of other places: what it says, what its checkpoint holds, and what is refused ----
+
+
+def looking(elevation: float, count: int = 200, seed: int = 0) -> Rays:
+    """Two people who look at about one ``elevation`` (radians), to all sides."""
+    rng = np.random.default_rng(seed)
+    up, around = elevation + 0.1 * rng.normal(size=count), rng.uniform(0, 2 * np.pi, count)
+    d = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=1)
+    return Rays(np.arange(count), np.arange(count) % 2, ("a", "b"), rng.normal(size=(count, 3)), d, np.ones(count))
+
+
+def test_its_checkpoint_is_the_density_of_other_places_anywhere(tmp_path, rgb):
+    places = [looking(-0.6), looking(0.2, seed=1)]
+    for k, rays in enumerate(places):
+        rays.save(tmp_path / f"{k}.npz")
+    path = tmp_path / "prior.safetensors"
+    found = learn_prior([tmp_path / "0.npz", tmp_path / "1.npz"], path)
+    assert [(p["file"], p["rays"], p["persons"]) for p in found.provenance["places"]] == [
+        ("0.npz", 200, 2),
+        ("1.npz", 200, 2),
+    ]
+    field, metadata = load_gaze(path, found.field.ns)
+    assert metadata["provenance"] == found.provenance
+    ns, sine = field.ns, np.array([-0.9, -0.56, 0.0, 0.2, 0.8])
+    r = ns.Array3f(np.stack([np.sqrt(1 - sine**2), 0 * sine, sine]).astype(np.float32))
+    gaze = np.array(field.evaluate(r, ns.Array3f(30.0, 4.0, 1.6), r, integral=ns.Float(1.0))[0])
+    # Rows of the table are 2.8 degrees, and a thousandth is uniform.
+    np.testing.assert_allclose(gaze, elevation_density(places, sine), atol=0.006)
+    with pytest.raises(NergError, match="learnt in other places"):
+        evaluate_gaze(path, places[0])
+    assert learn_prior(tmp_path / "1.npz").provenance["places"] == found.provenance["places"][1:]
+    # A notebook has the rays at hand.
+    same = learn_prior(places)
+    assert same.output is None and "file" not in same.provenance["places"][0]
+    np.testing.assert_array_equal(np.array(same.field.prior.array), np.array(field.prior.array))
+
+
+def test_what_is_refused(tmp_path):
+    with pytest.raises(NergError, match="at least one file"):
+        learn_prior([])
+    with pytest.raises(NergError, match="safetensors"):
+        learn_prior([looking(0.0)], tmp_path / "prior.npz")
+    none = looking(0.0).select(np.zeros(200, bool))
+    with pytest.raises(NergError, match="no ray is in place 2"):
+        learn_prior([looking(0.0), none])
+
+
+# ---- Places of jobs: one of each kind, found again for an evaluation, and alignments read from files ----
+
+
+WALL = '<scene version="3.0.0"><shape type="cube"/></scene>'
+
+
+@pytest.fixture
+def rays():
+    return looking_at((1.5, 0.4, 1.2))
+
+
+def made(folder, kind, rays):
+    """A place of a ``kind``, whose files are in ``folder``."""
+    if kind == "field":
+        fields.radiance(folder / "place.safetensors")
+    (folder / "place.xml").write_text(WALL)
+    options = {
+        "field": PlaceOptions(field=folder / "place.safetensors"),
+        "scene": PlaceOptions(scene=folder / "place.xml"),
+        "hits": PlaceOptions(geometry="hits"),
+        "none": PlaceOptions(geometry="none"),
+    }[kind]
+    return make_place(options, rays, (), folder / "place.vol", ns, voxel=0.2)
+
+
+@pytest.mark.parametrize("kind", ["field", "scene", "hits", "none"])
+def test_a_place_is_found_again_where_its_checkpoint_is(rays, tmp_path, kind):
+    place = made(tmp_path, kind, rays)
+    assert place.kind == kind and (place.radiance is not None) == (kind == "field")
+    matrix = np.diag([2.0, 2, 2, 1])
+    provenance = json.loads(json.dumps(place.about)) | {"align": matrix.tolist()}
+    again = place_of_training(tmp_path / "gaze.safetensors", provenance, BOX, GazeEvaluationOptions(), ns)
+    assert again.kind == kind and again.align.scale == pytest.approx(2)
+    assert again.box == (BOX if kind == "none" else place.box)
+    if kind == "none":
+        return
+    option = {"field": "field", "scene": "scene", "hits": "geometry"}[kind]
+    elsewhere = GazeEvaluationOptions(**{option: tmp_path / "other"})
+    with pytest.raises(NergError, match=f"does not exist; say where it is with --{option}"):
+        place_of_training(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
+    (tmp_path / "other").write_bytes(b"something else")
+    with pytest.raises(NergError, match=f"is not the file .* give that one with --{option}"):
+        place_of_training(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
+
+
+def test_a_checkpoint_that_does_not_say_where_it_was_trained():
+    with pytest.raises(NergError, match="does not say"):
+        place_of_training(Path("gaze.safetensors"), {}, BOX, GazeEvaluationOptions(), ns)
+
+
+def test_without_geometry_the_box_holds_whoever_looked(rays):
+    views = around(5)
+    for given, seen in ((rays, ()), (None, views), (rays, views)):
+        place = make_place(PlaceOptions(geometry="none"), given, seen, None, ns)
+        eyes = np.concatenate(([given.origin] if given else []) + [v.camera.center[None] for v in seen])
+        np.testing.assert_allclose(place.box.lower, eyes.min(axis=0) - 2)
+    with pytest.raises(NergError, match="made of rays and written"):
+        make_place(PlaceOptions(geometry="hits"), None, views, None, ns)
+
+
+def test_a_similarity_is_four_rows_of_a_file(tmp_path):
+    path = tmp_path / "align.json"
+    path.write_text(json.dumps(np.diag([3.0, 3, 3, 1]).tolist()))
+    assert read_similarity(path, "--align", "rays to field").scale == pytest.approx(3)
+    for wrong in ("[1, 2]", '{"a": 1}', json.dumps(np.diag([3.0, 2, 3, 1]).tolist())):
+        path.write_text(wrong)
+        with pytest.raises(NergError, match=r"--align-views.*align\.json"):
+            read_similarity(path, "--align-views", "photos to field")

@@ -1,0 +1,457 @@
+"""Cameras, observers and places of scene files that are written."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces
+from nerg_mi.files.atomic import file_sha256
+from nerg_mi.formats.checkpoint import write_checkpoint
+from nerg_mi.formats.surfaces import write_volume
+from nerg_mi.maths.color import encode_srgb
+from nerg_mi.maths.geometry import Similarity, box_interval
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.scene import load_scene
+from nerg_mi.rendering.scene_writer import Eye, GazeFiles, Lens, SceneContent, SceneText, document, element
+from nerg_mi.train.geometry import file_identity
+from nerg_mi.workflows.scene_cameras import (
+    Probe,
+    best_camera,
+    best_photo,
+    eye_of_person,
+    given_point,
+    probe_values,
+    support_of_rays,
+    to_place,
+    turned_ahead,
+    upright,
+    walk_of_person,
+)
+from nerg_mi.workflows.scene_places import (
+    GivenFiles,
+    PhotoCamera,
+    camera_of_photo,
+    cameras_of_photos,
+    colors_of,
+    kind_of_file,
+    place_of_files,
+    recognise,
+)
+from tests.formats.splats.writers import random_splats, write_inria
+from tests.workflows.recorder import Recorder
+
+# ---- What is looked around with before a camera is chosen: directions, depths and bounds of a known room ----
+
+
+EYE = Eye(np.array([0.3, -0.2, 0.1]), np.array([1.0, 0.6, 0.4]))
+
+
+@pytest.fixture
+def probe(rgb, tmp_path):
+    """A cube of ±1, whose up is +y."""
+    up = np.array([0.0, 1, 0])
+    place = SceneContent(beside=(element("shape", type="cube"),))
+    (tmp_path / "a.xml").write_text(SceneText(place, GazeFiles(), EYE, EYE, up).xml())
+    return Probe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
+
+
+def test_what_is_met_around(probe):
+    seen = probe.around(EYE)
+    _, far = box_interval(np.broadcast_to(EYE.origin, seen.directions.shape), seen.directions, -np.ones(3), np.ones(3))
+    assert seen.met.all() and np.sum(seen.weight) == pytest.approx(4 * np.pi)
+    # Pixels are sampled anywhere in them: a few degrees.
+    assert np.quantile(np.abs(seen.depth - far) / far, 0.95) < 0.08
+    depth, opacity = probe.trace(EYE.origin[None], np.array([[1.0, 0, 0]]))
+    assert depth[0] == pytest.approx(0.7) and opacity[0] == 1
+    np.testing.assert_allclose(np.array(probe.bounds()), [[-1] * 3, [1] * 3], atol=1e-6)
+    turned = turned_ahead(EYE, seen)
+    np.testing.assert_allclose(turned.origin, EYE.origin)
+    assert np.abs(turned.target).max() == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("depths, length", [((0, 0), 1), ((0, 4), 4), ((3, 5), 3)], ids=["within", "beside", "before"])
+def test_observers_within_matter_are_turned_ahead(depths, length):
+    """They meet it at once; what they are turned to still lies before them, at a distance of what is met elsewhere."""
+    directions = np.array([[0.6, 0.8, 0], *[[0, 0, 1.0]] * 3])
+    depth = np.array([depths[0], *[depths[1]] * 3], float)
+    seen = SeenSurfaces(EYE.origin, directions, depth, np.ones(4, bool), np.array([9.0, 0, 0, 0]), np.ones(4))
+    np.testing.assert_allclose(turned_ahead(EYE, seen).target, EYE.origin + length * directions[0])
+
+
+def test_points_and_ups():
+    assert given_point(None, "--to") is None and given_point((1, 2, 3), "--to").tolist() == [1, 2, 3]
+    with pytest.raises(NergError, match="--to is three numbers"):
+        given_point((1.0, 2.0), "--to")
+    up = np.array([0.0, 0, 1])
+    assert upright(EYE, up) is EYE
+    down = upright(Eye(np.zeros(3), np.array([0, 0, -2.0])), up)
+    assert abs(down.up @ up) < 1e-9
+    far = upright(Eye(np.array([-1e7, 0, 1e7]), np.array([-1e7, 1.0, 1e7])), up)
+    assert np.allclose(np.float32(far.target) - np.float32(far.origin), [0, 1000, 0])
+    with pytest.raises(NergError, match="cannot look at the point"):
+        upright(Eye(np.ones(3), np.ones(3)), up)
+
+
+def test_the_best_photo(probe):
+    # Of three cameras in the cube one has the whole of it before it, one a wall, and one looks out of it.
+    looks = [((0.9, 0, 0), (1, 0, 0)), ((-0.9, 0.1, 0.1), (0, 0.1, 0.1)), ((3, 0, 0), (4, 0, 0))]
+    eyes = [Eye(np.array(o, float), np.array(t, float)) for o, t in looks]
+    cameras = [PhotoCamera(str(k), eye, Lens(), False) for k, eye in enumerate(eyes)]
+    assert best_photo(probe, None, cameras).name == "1"
+
+
+@pytest.mark.parametrize("room", [False, True], ids=["a thing", "a room"])
+def test_a_thing_is_seen_from_outside_and_a_room_from_within(rgb, tmp_path, room):
+    """A cube whose faces look outwards is a thing, one whose faces look inwards a room."""
+    place = SceneContent(
+        beside=(element("shape", element("boolean", name="flip_normals", value=str(room)), type="cube"),)
+    )
+    up = np.array([0.0, 0, 1])
+    (tmp_path / "a.xml").write_text(SceneText(place, GazeFiles(), EYE, EYE, up).xml())
+    probe = Probe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
+    assert probe.within(np.array([[0, 0, 0], [0.9, -0.5, 0.3], [3, 0, 0], [0, 0, -1.1]])).tolist() == [
+        not room,
+        not room,
+        False,
+        False,
+    ]
+    shot = best_camera(probe, None, PinholeFrame(70, 1.5, up), None)
+    assert (np.abs(shot.origin).max() < 1) == room and shot.opaque > 0.2
+
+
+# ---- Who looks: people at a time, walks, and where most rays are ----
+
+
+# Half as large, turned by 90 degrees about z, moved.
+ALIGN = Similarity(np.array([[0, -0.5, 0, 1.0], [0.5, 0, 0, 2], [0, 0, 0.5, 3], [0, 0, 0, 1]]))
+
+
+@pytest.fixture
+def rays():
+    t = np.array([0, 1, 2, 10, 11, 0.5])
+    origin = np.array([[0, 0, 1], [1, 0, 1], [2, 0, 1], [5, 0, 1], [6, 0, 1], [9, 9, 9]], float)
+    direction = np.array([[1, 0, 0], [0, 1, 0], [0, 1, 0], [1, 0, 0], [-1, 0, 0], [0, 0, 1]], float)
+    return Rays(t, [0, 0, 0, 0, 0, 1], ("Ada", "Bob", "Cy"), origin, direction, np.ones(6))
+
+
+def test_the_nearest_ray_of_a_person(rays):
+    eye, when = eye_of_person(rays, "Ada", 1.2, 0.5, ALIGN)
+    assert when == 1
+    np.testing.assert_allclose(eye.origin, [1, 2.5, 3.5])  # (1, 0, 1) turned is (0, 1, 1), half of it, moved
+    np.testing.assert_allclose(eye.target - eye.origin, [-0.5, 0, 0])  # +y turned is -x, a metre is half a unit
+    np.testing.assert_allclose(to_place([[1, 0, 1]], ALIGN)[0], eye.origin)
+
+
+@pytest.mark.parametrize(
+    "person, time, said",
+    [("Eve", 0, '"Eve"'), ("Cy", 0, '"Cy" has no rays any more'), ("Ada", 5.0, "0.5.*5.*0.*11.*--gap")],
+)
+def test_nobody_then(rays, person, time, said):
+    with pytest.raises(NergError, match=said):
+        eye_of_person(rays, person, time, 0.5, Similarity())
+
+
+def test_a_walk_is_interpolated(rays):
+    walk = walk_of_person(rays, "Ada", 0, 2, 4, 1.0, Similarity())
+    np.testing.assert_allclose(walk.times, np.arange(9) / 4)
+    np.testing.assert_allclose([e.origin[0] for e in walk.eyes], np.arange(9) / 4)
+    ahead = np.array([e.target - e.origin for e in walk.eyes])
+    np.testing.assert_allclose(np.linalg.norm(ahead, axis=1), 1)
+    np.testing.assert_allclose(ahead[2], np.array([1, 1, 0]) / np.sqrt(2))
+    assert walk.missing == 0
+
+
+def test_pauses_have_no_frames(rays):
+    walk = walk_of_person(rays, "Ada", 1, 12, 1, 1.0, Similarity())
+    assert walk.times.tolist() == [1, 2, 10, 11, 12] and walk.missing == 7
+    # Opposite directions have no mean.
+    turned = walk_of_person(rays, "Ada", 10, 11, 2, 1.0, Similarity())
+    assert np.abs(turned.eyes[1].target - turned.eyes[1].origin).max() == 1
+    with pytest.raises(NergError, match="within 1 s from 4 to 6 s"):
+        walk_of_person(rays, "Ada", 4, 6, 1, 1.0, Similarity())
+    with pytest.raises(NergError, match="the earlier first"):
+        walk_of_person(rays, "Ada", 2, 1, 1, 1.0, Similarity())
+    with pytest.raises(NergError, match="at most 100,000 frames"):
+        walk_of_person(rays, "Ada", 0, 11, 1e5, 1.0, Similarity())
+
+
+def test_where_most_rays_are():
+    rng = np.random.default_rng(0)
+    origin = np.concatenate([rng.normal((1, 2, 1.6), 0.1, (300, 3)), rng.normal((5, 5, 1.6), 0.1, (900, 3))])
+    n = len(origin)
+    rays = Rays(np.arange(n), np.zeros(n, int), ("a",), origin, np.tile([1.0, 0, 0], (n, 1)), np.ones(n))
+    assert np.linalg.norm(support_of_rays(rays).densest() - (5, 5, 1.6)) < 0.15
+
+
+# ---- What files are, by what is in them, and what goes together ----
+
+
+ONE = {"a": np.zeros(1, np.float32)}
+
+
+def some_rays(hit):
+    end = None if not hit else [[2.0, 0, 0]]
+    return Rays([0.0], [0], ("a",), [[0.0, 0, 0]], [[1.0, 0, 0]], [1.0], end)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_checkpoint(tmp_path / "field.safetensors", "radiance", ONE, {"provenance": {"up": [0, 0, 1]}})
+    place = {"field_file": file_identity(tmp_path / "field.safetensors")}
+    align = np.diag([2.0, 2, 2, 1]).tolist()
+    write_checkpoint(tmp_path / "gaze.safetensors", "gaze", ONE, {"provenance": {**place, "align": align}})
+    write_checkpoint(tmp_path / "nowhere.safetensors", "gaze", ONE, {"provenance": {"geometry": "none"}})
+    write_checkpoint(tmp_path / "odd.safetensors", "sound", ONE, {})
+    some_rays(True).save(tmp_path / "hits.npz")
+    some_rays(False).save(tmp_path / "rays.npz")
+    for name in ("a.ply", "a.obj", "a.xml", "a.vol", "a.pth", "a.jpg"):
+        (tmp_path / name).write_text("x")
+    return tmp_path
+
+
+def test_kinds(folder):
+    kinds = {
+        "field.safetensors": "field",
+        "gaze.safetensors": "gaze",
+        "rays.npz": "rays",
+        "a.ply": "mesh",
+        "a.obj": "mesh",
+        "a.xml": "scene",
+        "a.vol": "hits",
+    }
+    assert {name: kind_of_file(folder / name) for name in kinds} == kinds
+    for name, said in (
+        ("odd.safetensors", "holds a sound field"),
+        ("a.pth", 'make fields of it with "nerg import"'),
+        ("a.jpg", "is none of these"),
+        ("a.png", "there is no file"),
+    ):
+        with pytest.raises(NergError, match=said):
+            kind_of_file(folder / name)
+
+
+def test_splats_are_a_field_and_a_mesh_is_not(folder):
+    write_inria(folder / "place.ply", random_splats(3))
+    given = recognise([folder / "place.ply", folder / "nowhere.safetensors"], None, Recorder())
+    assert given.kind == "field" and given.field_about == {}
+    place = place_of_files(given, folder / "scene.xml")
+    (volume,) = place.make(folder, {}).inside
+    assert place.words == "The Gaussian splats place.ply" and 'type="splats"' in document([volume], "h")
+    assert kind_of_file(folder / "a.ply") == "mesh"
+
+
+def test_the_place_of_a_gaze_field_is_beside_it(folder):
+    given = recognise([folder / "gaze.safetensors"], None, Recorder())
+    assert (given.kind, given.place) == ("field", folder / "field.safetensors")
+    assert given.align.scale == pytest.approx(2) and given.field_about["provenance"] == {"up": [0, 0, 1]}
+    assert recognise([folder / "nowhere.safetensors"], None, Recorder()).kind == "none"
+    (folder / "field.safetensors").rename(folder / "moved.safetensors")
+    with pytest.raises(NergError, match="does not exist; put"):
+        recognise([folder / "gaze.safetensors"], None, Recorder())
+    told = Recorder()
+    given = recognise([folder / "gaze.safetensors", folder / "moved.safetensors"], None, told)
+    assert given.place == folder / "moved.safetensors" and not told.warnings
+
+
+def test_another_place_is_warned_of(folder):
+    for gaze, said in (("gaze", "in another file than"), ("nowhere", "without a place")):
+        told = Recorder()
+        recognise([folder / "a.ply", folder / f"{gaze}.safetensors"], None, told)
+        assert said in told.warnings[0]
+
+
+def test_rays_alone(folder):
+    kind = lambda name, geometry=None: recognise([folder / name], geometry, Recorder()).kind
+    assert (kind("hits.npz"), kind("rays.npz"), kind("hits.npz", "none")) == ("hits", "none", "none")
+
+
+def test_provenance_is_not_believed(folder):
+    for about in ({"field_file": {"file": "a.ply", "sha256": "0"}}, {}):
+        write_checkpoint(folder / "b.safetensors", "gaze", ONE, {"provenance": json.loads(json.dumps(about))})
+        with pytest.raises(NergError, match="nerg scene PLACE GAZE"):
+            recognise([folder / "b.safetensors"], None, Recorder())
+
+
+# ---- The camera of a photo, against the pose in its file, in the coordinates in which a field was trained ----
+
+
+POSE = np.array([[1, 0, 0, 0.5], [0, 0, -1, -3], [0, 1, 0, 1.2], [0, 0, 0, 1]], float)  # looks along +y, up is +z
+
+
+@pytest.fixture
+def photos(rgb, tmp_path):
+    frames = []
+    for k in range(3):
+        rgb.Bitmap(np.full((20, 30, 3), 99, np.uint8)).write(str(tmp_path / f"p{k}.png"))
+        pose = POSE.copy()
+        pose[0, 3] += k
+        frames.append({"file_path": f"p{k}.png", "transform_matrix": pose.tolist()})
+    lens = {"w": 30, "h": 20, "fl_x": 25.0, "fl_y": 25.0, "cx": 12.0, "cy": 10.0}
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+    return tmp_path
+
+
+@pytest.mark.parametrize("photo", ["1", "p1", "p1.png"])
+def test_pose_and_lens(photos, photo):
+    found = camera_of_photo(photos, photo, {})
+    assert found.name == "p1.png" and not found.bent
+    np.testing.assert_allclose(found.eye.origin, [1.5, -3, 1.2])
+    np.testing.assert_allclose(found.eye.target - found.eye.origin, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(found.eye.up, [0, 0, 1], atol=1e-12)
+    assert found.lens.fov == pytest.approx(np.degrees(2 * np.arctan(15 / 25))) and found.lens.aspect == 1.5
+    assert found.lens.offset == pytest.approx((0.1, 0))
+
+
+def test_coordinates_of_the_training(photos):
+    # The field is twice as large as the file, and moved.
+    to_file = np.diag([0.5, 0.5, 0.5, 1.0])
+    to_file[:3, 3] = -1
+    about = {"sha256": file_sha256(photos / "transforms.json"), "to_file": to_file.tolist()}
+    found = camera_of_photo(photos, "0", about)
+    np.testing.assert_allclose(to_file[:3, :3] @ found.eye.origin + to_file[:3, 3], POSE[:3, 3])
+    np.testing.assert_allclose(found.eye.target - found.eye.origin, [0, 1, 0], atol=1e-12)
+
+
+def test_other_photos(photos):
+    with pytest.raises(NergError, match="field was trained"):
+        camera_of_photo(photos, "0", {"sha256": "0" * 64})
+    for photo in ("3", "p9", "-1"):
+        with pytest.raises(NergError, match='--photo.*0.*2.*"p0.png"'):
+            camera_of_photo(photos, photo, {})
+
+
+def test_all_of_them(photos):
+    assert [c.name for c in cameras_of_photos(photos, {})] == ["p0.png", "p1.png", "p2.png"]
+    assert [c.name for c in cameras_of_photos(photos, {}, most=2)] == ["p0.png", "p2.png"]
+    for k, camera in enumerate(cameras_of_photos(photos, {})):
+        np.testing.assert_array_equal(camera.eye.origin, camera_of_photo(photos, str(k), {}).eye.origin)
+
+
+# ---- Places as parts of a scene: colours of meshes, lamps, and files that are no such place ----
+
+
+PLY = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+{colors}
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0 {a}
+1 0 0 {a}
+0 1 0 {a}
+3 0 1 2
+"""
+
+
+def given(path, kind):
+    return GivenFiles(path, kind, None, None, {}, {})
+
+
+def text_of(folder, path, kind, lamps=None):
+    place = place_of_files(given(path, kind), folder / "out.xml").make(folder, lamps or {"eye": 3.0, "camera": 1.5})
+    return place, document([*place.inside, *place.beside], "h")
+
+
+@pytest.mark.parametrize(
+    "names, values, said",
+    [
+        ("", "", 'name="reflectance" value="0.5"'),
+        ("rgb", "0.2 0.4 0.6", 'value="vertex_color"'),
+        (("color_0", "color_1", "color_2"), "0.2 0.4 0.6", 'value="vertex_color"'),
+    ],
+    ids=["grey", "rgb", "of Mitsuba"],
+)
+def test_colours_of_a_mesh(rgb, tmp_path, names, values, said):
+    colors = "\n".join(f"property float {name}" for name in names) or "comment grey"
+    (tmp_path / "a.ply").write_text(PLY.format(colors=colors, a=values))
+    place, text = text_of(tmp_path, tmp_path / "a.ply", "mesh")
+    assert said in text
+    assert place.files == {"place": "a.ply"} and text.count('<emitter type="point">') == 2
+    assert 'value="$eye"' in text and 'value="$camera"' in text
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        (
+            "a.ply",
+            PLY.format(
+                colors="property uchar red\nproperty uchar green\nproperty uchar blue\nproperty uchar alpha",
+                a="51 102 153 9",
+            ),
+        ),
+        (
+            "a.ply",
+            PLY.format(colors="property float r\nproperty float g\nproperty float b", a="51 102 153").replace(
+                "3 0 1 2", "4 0 1 2 0"
+            ),
+        ),
+        ("a.ply", PLY.format(colors="property uchar red\nproperty uchar green\nproperty uchar blue", a="51 102 153")),
+        ("a.obj", "".join(f"v {p} 0.2 0.4 0.6\n" for p in ("0 0 0", "1 0 0", "0 1 0")) + "f -3 -2 -1"),
+        ("a.obj", "".join(f"v {p} 51 102 153\n" for p in ("0 0 0", "1 0 0", "0 1 0")) + "f 1 2 \\\n3"),
+    ],
+    ids=["RGBA", "quads", "RGB", "negative", "continued"],
+)
+def test_a_mesh_that_mitsuba_does_not_show_is_written_again(rgb, tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    written = place_of_files(given(tmp_path / name, "mesh"), tmp_path / "out.xml")
+    place, xml = text_of(tmp_path, tmp_path / name, "mesh")
+    assert written.files == (tmp_path / "out.mesh.ply",) and place.files == {"place": "out.mesh.ply"}
+    assert '"vertex_color"' in xml and 'type="ply"' in xml
+    params = rgb.traverse(rgb.load_dict({"type": "ply", "filename": str(tmp_path / "out.mesh.ply")}))
+    shown = np.array(params["vertex_color"]).reshape(-1, 3)
+    assert np.allclose(encode_srgb(shown), (0.2, 0.4, 0.6), atol=1e-6)
+    assert np.array(params["faces"])[:3].tolist() == [0, 1, 2]
+
+
+def test_the_given_mesh_is_not_written_over(tmp_path):
+    text = PLY.format(colors="comment grey", a="").replace("3 0 1 2", "4 0 1 2 0")
+    (tmp_path / "out.mesh.ply").write_text(text)
+    with pytest.raises(NergError, match="another name"):
+        place_of_files(given(tmp_path / "out.mesh.ply", "mesh"), tmp_path / "out.xml")
+    assert (tmp_path / "out.mesh.ply").read_text() == text
+
+
+@pytest.mark.parametrize("shape", [(1, 6, 8), (6, 1, 8), (6, 8, 1), (2, 2, 2), (1, 1, 1)])
+def test_hit_points_of_one_cell_are_shaded(tmp_path, shape):
+    write_volume(tmp_path / "a.vol", np.full(shape, 100.0), (0, 0, 0), (1, 1, 1))
+    place_of_files(given(tmp_path / "a.vol", "hits"), tmp_path / "out.xml")
+    colors = np.fromfile(colors_of(tmp_path / "out.xml"), "<f4", offset=48)
+    assert np.isfinite(colors).all() and (colors > 0.1).all()
+    if shape.count(1) == 1:
+        # A sheet faces along the axis in which it has no extent.
+        assert np.allclose(colors, [0.55, 0.16, 0.34][shape.index(1)], atol=0.02)
+
+
+def test_splats_that_cannot_be_read_are_refused_by_their_own_name(tmp_path):
+    splats = random_splats(degree=0)
+    splats.centers[0] = np.nan
+    write_inria(tmp_path / "a.ply", splats)
+    with pytest.raises(NergError, match=r'"[^"]*a\.ply" cannot be read: some of the centers'):
+        place_of_files(given(tmp_path / "a.ply", "field"), tmp_path / "out.xml")
+
+
+def test_hit_points_get_colours_beside_the_scene(rgb, tmp_path):
+    density = np.zeros((6, 8, 10), np.float32)
+    density[2:4] = 100
+    write_volume(tmp_path / "a.vol", density, (0, 0, 0), (1, 0.8, 0.6))
+    place, text = text_of(tmp_path, tmp_path / "a.vol", "hits")
+    assert place.files == {"density": "a.vol", "color": "out.color.vol"} and '"nearest"' in text
+    colors = rgb.load_dict({"type": "gridvolume", "filename": str(colors_of(tmp_path / "out.xml")), "raw": True})
+    assert tuple(np.array(rgb.traverse(colors)["data"]).shape) == (3, 4, 5, 3)
+    write_volume(tmp_path / "rgb.vol", np.zeros((2, 2, 2, 3)), (0, 0, 0), (1, 1, 1))
+    with pytest.raises(NergError, match="is no place of hit points"):
+        place_of_files(given(tmp_path / "rgb.vol", "hits"), tmp_path / "out.xml")
+
+
+def test_a_sphere_where_nothing_is_known(tmp_path):
+    place, text = text_of(tmp_path, None, "none")
+    assert 'name="center" value="$eye"' in text and 'name="radius" value="2"' in text and not place.files

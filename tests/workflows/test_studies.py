@@ -1,0 +1,234 @@
+"""Studies, the demo, and alignments."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nerg_mi.alignment.check import Check
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation.study import measure, settings
+from nerg_mi.evaluation.study_subject import open_subject
+from nerg_mi.maths.geometry import Box
+from nerg_mi.rays.rays import Rays
+from nerg_mi.train.geometry import GazePlace
+from nerg_mi.workflows import align as alignment
+from nerg_mi.workflows import demo, geometry, study
+from nerg_mi.workflows.align import align
+from nerg_mi.workflows.demo import STAGES, make_demo
+from nerg_mi.workflows.geometry import check_place
+from nerg_mi.workflows.rays_commands import AlignOptions
+from nerg_mi.workflows.scene_commands import DemoOptions, StudyOptions
+from nerg_mi.workflows.study import measure_part, planned_study, run_study, twin_beside
+from tests.alignment import rooms
+from tests.evaluation.test_study_subject import SCENE, TWIN
+from tests.figures.standins import write_standins
+from tests.tasks.clusters import ClusterOfProcesses, wait_until
+from tests.tasks.works import laid_out
+from tests.workflows.recorder import Recorder
+
+# ---- The study as a job: which settings it takes, and what it tells meanwhile ----
+
+
+@pytest.mark.nightly
+def test_only_some_settings(tmp_path):
+    told = Recorder()
+    options = StudyOptions(width=12, height=8, quick=True, only="jitter|paper, 1024 steps$", mode="llvm_ad_rgb")
+    result = run_study("slab", tmp_path, options, told)
+    report = result.report
+    assert [r["setting"] for r in report["rows"]] == ["default", "jitter", "paper, 1024 steps"]
+    # Of the share done the first renders have as much as the times, and the cost against size the rest.
+    shares = [share for share, _ in told.steps]
+    assert shares == sorted(shares) and shares[0] == 0 and shares[-1] < 1
+    assert 0.4 < told.share_at("time of default") < 0.5 and 0.8 < told.share_at("pixels 16") < 1
+    assert told.messages[-len(result.files) :] == [f"wrote {path}" for path in result.files]
+    assert all(path.is_file() for path in result.files) and told.messages[0].startswith("default: ")
+
+
+# ---- A study in parts: errors of two workers are those of this process, and who took the times is said ----
+
+
+SMALL = {"width": 12, "height": 8, "quick": True, "mode": "llvm_ad_rgb"}
+SMALL |= {"only": "jitter|spp 2|no colour|visibility transmittance|paper, 64 steps$"}
+TIMES = {"seconds", "cpu_seconds", "peak_mb", "pareto"}
+BESIDE = {"default_seconds", "default_cpu_seconds", "timed_by"}
+
+
+def errors(report):
+    rows = [{k: v for k, v in row.items() if k not in TIMES | BESIDE} for row in report["rows"]]
+    return json.dumps([rows, [{**row, "seconds": 0} for row in report["scaling"]]])
+
+
+def test_two_workers_find_the_errors_of_this_process(tmp_path, rgb, monkeypatch):
+    pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
+    monkeypatch.setattr(study, "ROWS", 2)
+    here = run_study("sphere", tmp_path / "here", StudyOptions(**SMALL)).report
+    with ClusterOfProcesses(tmp_path) as cluster:
+        cluster.start_worker(), cluster.start_worker()
+        wait_until(lambda: all("works for" in cluster.log(f"worker{k}") for k in (0, 1)), "both workers are there")
+        options = StudyOptions(**SMALL, scheduler=cluster.address)
+        there = run_study("sphere", tmp_path / "there", options).report
+    assert errors(there) == errors(here) and len(here["rows"]) == 6
+    who = there["timed_by"]
+    # Dask may give one worker the scaling, and the other one all settings.
+    assert [w["process"] for w in who] == [1, 2][: len(who)] and sum(w["rows"] for w in who) == len(there["rows"])
+    assert all(w["threads"] == 1 and w["processor"] and 0 < w["seconds"][0] <= w["seconds"][1] for w in who)
+    assert {row["timed_by"] for row in there["rows"]} == {w["process"] for w in who} and here["timed_by"] == []
+    assert all(row["default_seconds"] > 0 for row in there["rows"])
+    heads = [set((tmp_path / k / "study.csv").read_text().split("\n")[0].split(",")) for k in ("here", "there")]
+    assert heads[1] - heads[0] == BESIDE
+    assert "Times are those of whoever measured a setting: process 1 (" in (tmp_path / "there" / "study.md").read_text()
+    # Started again, all of it is there, times as well.
+    again = run_study("sphere", tmp_path / "there", StudyOptions(**SMALL, store=tmp_path / "there.tasks")).report
+    assert again["rows"] == there["rows"] and again["scaling"] == there["scaling"]
+
+
+def test_a_scene_file_is_measured_with_its_twin_where_a_worker_has_laid_them(rgb, tmp_path):
+    (tmp_path / "scene.xml").write_text(SCENE.format(eye="-2, -1, $height"))
+    (tmp_path / "twin.xml").write_text(TWIN)
+    subject = open_subject(str(tmp_path / "scene.xml"), "auto", 12, 8, {"height": "3"}, twin_beside)
+    every = settings(subject, True)
+    (number,) = (k for k, row in enumerate(every) if row.name == "jitter")
+    options = StudyOptions(**SMALL, defaults={"height": "3"})
+    common = planned_study(subject, tmp_path / "scene.xml", options)
+    measure_part(laid_out(common, tmp_path / "elsewhere"), (number,), tmp_path / "rows.json")
+    found = json.loads((tmp_path / "rows.json").read_text())
+    here = {"rows": measure(subject, [every[0], every[number]], 1, 16), "scaling": []}
+    assert errors(found | {"scaling": []}) == errors(here) and found["rows"][1]["surface_mae"] > 0
+
+
+# ---- The demo as a job: its stages, and its result. `tests/cli/test_scenes` looks at the pictures ----
+
+
+@pytest.mark.nightly
+def test_every_stage_is_told_and_every_file_is_there(tmp_path):
+    told = Recorder()
+    options = DemoOptions(defaults=write_standins(tmp_path), width=24, spp=1, mode="llvm_ad_rgb")
+    result = make_demo(tmp_path / "demo", options, told)
+    assert [text for _, text in told.steps] == list(STAGES) == list(result.seconds)
+    assert [share for share, _ in told.steps] == [k / len(STAGES) for k in range(len(STAGES))]
+    assert set(result.files) == set((tmp_path / "demo").iterdir()) and result.report["variant"] == "llvm_ad_rgb"
+    assert told.messages == [f"wrote {path}" for path in result.files]
+
+
+@pytest.mark.nightly
+def test_its_report_has_the_tracked_gaze(tmp_path):
+    """Of the store's own field; what is written of the observer is theirs alone, as without."""
+    result = make_demo(tmp_path, DemoOptions(width=24, spp=1, mode="llvm_ad_rgb"))
+    text = (tmp_path / "report.html").read_text("utf-8")
+    rays = Rays.load(tmp_path / demo.TRACKED)
+    assert tmp_path / demo.TRACKED in result.files and len(rays.persons) == 100 and len(rays) > 10_000
+    assert "Where people were" in text and "not at hand" not in text and f"{len(rays):,} of 150,021 rows" in text
+    assert "places where they stood" in text
+    with (tmp_path / "aoi.csv").open() as file:
+        shares = np.array([float(row["observer_share"]) for row in csv.DictReader(file)])
+    # Of one observer, who sees some of the shelves: of three people together hardly any would have none.
+    assert len(shares) == 30 and (shares == 0).sum() > 8 and 0 < shares.sum() < 1
+
+
+# ---- The job: which evidence is taken, what is refused, what is written ----
+
+
+RAYS = rooms.people(300)
+
+
+def pairs(folder, noise=0.0, mirror=1.0):
+    rng = np.random.default_rng(0)
+    truth, x = rooms.similarity(rng, scale=2.0), rng.uniform(0, 4, (6, 3))
+    y = rooms.carried(truth, x + rng.normal(0, noise, x.shape))
+    rows = np.c_[x * (mirror, 1, 1), y].tolist()
+    path = folder / "pairs.csv"
+    path.write_text("x,y,z,place_x,place_y,place_z\n" + "".join(",".join(map(str, r)) + "\n" for r in rows))
+    return truth, path
+
+
+def test_what_was_found_is_written_with_its_picture(tmp_path):
+    truth, path = pairs(tmp_path)
+    reporter = Recorder()
+    result = align(None, tmp_path / "a.json", AlignOptions(pairs=path), reporter)
+    np.testing.assert_allclose(result.alignment.matrix, truth, atol=1e-6)
+    about = json.loads((tmp_path / "a.json").read_text())
+    assert about["files"]["pairs"]["file"] == "pairs.csv" and about["forced"] is False
+    assert (tmp_path / "a.png").is_file() and "--align" in reporter.messages[-1]
+
+
+def test_bad_and_mirrored_fits_are_refused_unless_forced(tmp_path):
+    _, path = pairs(tmp_path, noise=0.5)
+    with pytest.raises(NergError, match=r"the residual is \d+.* cm \(median\), beyond --max-residual 10"):
+        align(None, tmp_path / "a.json", AlignOptions(pairs=path))
+    assert not (tmp_path / "a.json").exists()
+    assert align(None, tmp_path / "a.json", AlignOptions(pairs=path, force=True)).alignment.forced
+    _, path = pairs(tmp_path, mirror=-1)
+    with pytest.raises(NergError, match="--hand"):
+        align(None, None, AlignOptions(pairs=path))
+
+
+@pytest.mark.parametrize(
+    "options, rays, why",
+    [
+        ({}, None, "say what to align by"),
+        ({}, RAYS, "the place is missing"),
+        ({"cameras": "a"}, None, "give both"),
+        ({"pairs": "a", "twin": "b"}, None, "different evidence"),
+        ({"pairs": "a", "start": "b"}, None, "different evidence"),
+        ({"pairs": "PAIRS", "refine": True}, None, "--refine needs the tracking"),
+        ({"pairs": "PAIRS", "up": "north"}, None, "--up is numbers"),
+        ({"pairs": "PAIRS", "up": "0,0,0"}, None, "--up is an axis"),
+        ({"pairs": "PAIRS", "scale": -1.0}, None, "--scale must lie in"),
+        ({"pairs": "PAIRS", "field": "a", "scene": "b"}, None, "the place is one"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(tmp_path, options, rays, why):
+    _, path = pairs(tmp_path)
+    given = {k: path if v == "PAIRS" else v for k, v in options.items()}
+    with pytest.raises(NergError, match=why):
+        align(rays, None, AlignOptions(**given))
+
+
+def test_another_up_axis_and_a_start_lead_to_the_same_frame(tmp_path, monkeypatch):
+    truth, path = pairs(tmp_path)
+    np.save(tmp_path / "points.npy", rooms.carried(truth, rooms.traces(8000).end))
+    aligned = align(None, tmp_path / "a.json", AlignOptions(pairs=path))
+    options = AlignOptions(start=tmp_path / "a.json", surface=tmp_path / "points.npy")
+    again = align(RAYS, None, options).alignment
+    off = rooms.carried(again.matrix, RAYS.origin) - rooms.carried(aligned.alignment.matrix, RAYS.origin)
+    assert np.linalg.norm(off, axis=1).max() < 0.1 and again.evidence["kind"] == "tracking"
+    assert alignment._turn("-y")[:3, :3] @ [0, -1, 0] == pytest.approx([0, 0, 1])
+
+
+def place(found, monkeypatch):
+    monkeypatch.setattr(geometry, "check_alignment", lambda *_: found)
+    return GazePlace(object(), Box((0, 0, 0), (1, 1, 1)), "field")  # pyright: ignore[reportArgumentType] # not asked
+
+
+def test_gaze_that_meets_nothing_is_refused_and_doubts_are_told_with_the_next_command(monkeypatch):
+    reporter = Recorder()
+    nowhere = place(Check(1.0, 0.0, 0.0), monkeypatch)
+    with pytest.raises(NergError, match="100.0.*--field.*--force"):
+        check_place(nowhere, RAYS, "--field f", False, reporter)
+    check_place(nowhere, RAYS, "--field f", True, reporter)
+    check_place(place(Check(0.4, 0.3, 0.2), monkeypatch), RAYS, "--scene s", False, reporter)
+    assert len(reporter.warnings) == 2 and "30 % of the heads are inside of something" in reporter.warnings[1]
+    assert "nerg align RAYS --scene s -o alignment.json" in reporter.warnings[1]
+    check_place(place(Check(0.05, 0.0, 0.0), monkeypatch), RAYS, "--field f", False, reporter)
+    for kind in ("hits", "none"):
+        bare = replace(nowhere, kind=kind, medium=None if kind == "none" else nowhere.medium)
+        check_place(bare, RAYS, "", False, reporter)
+    assert len(reporter.warnings) == 2
+
+
+@pytest.mark.parametrize("option", ["surface", "scene", "twin"])
+def test_what_of_a_mesh_is_not_used_is_named(tmp_path, option):
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
+    options, reporter = AlignOptions(**{option: tmp_path / "a.obj"}), Recorder()
+    if option == "twin":
+        alignment._evidence(options, None, reporter)
+    else:
+        alignment._target(options, "tracking", reporter)
+    assert [m for m in reporter.messages if "mtllib" in m] == [
+        f"of {tmp_path / 'a.obj'}: statements that are not used: mtllib"
+    ]
