@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.alignment.constraints import Evidence, PlaceTraces, Target, read_surface, trace_place
+from nerg_mi.alignment.constraints import AlignmentTarget, Evidence, PlaceTraces, read_surface, trace_place
 from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.points import Cameras, Pairs
 from nerg_mi.alignment.similarity import MIRROR, errors, move, scale_of
@@ -82,7 +82,7 @@ def random_similarity(rng: np.random.Generator, upright: bool) -> np.ndarray:
 # Evidence: what it is, given the truth from the tracking to the place
 # ----------------------------------------------------------------------------
 
-Maker = Callable[[World, np.ndarray, np.random.Generator, bool], tuple[Evidence, Target]]
+Maker = Callable[[World, np.ndarray, np.random.Generator, bool], tuple[Evidence, AlignmentTarget]]
 
 
 def pairs(count: int, upright: bool) -> Maker:
@@ -90,7 +90,7 @@ def pairs(count: int, upright: bool) -> Maker:
         x = world.mesh[rng.permutation(len(world.mesh))[:count]]
         y = move(truth, x + rng.normal(0, 0.01, x.shape))
         x = x + rng.normal(0, 0.01, x.shape)
-        return Pairs(move(MIRROR, x) if mirrored else x, y), Target(upright=upright)
+        return Pairs(move(MIRROR, x) if mirrored else x, y), AlignmentTarget(upright=upright)
 
     return make
 
@@ -98,7 +98,9 @@ def pairs(count: int, upright: bool) -> Maker:
 def twin(upright: bool) -> Maker:
     def make(world, truth, rng, mirrored):
         mesh = world.mesh + rng.normal(0, 0.005, world.mesh.shape)
-        return Twin(move(MIRROR, mesh) if mirrored else mesh), Target(traces=world.traces.moved(truth), upright=upright)
+        return Twin(move(MIRROR, mesh) if mirrored else mesh), AlignmentTarget(
+            traces=world.traces.moved(truth), upright=upright
+        )
 
     return make
 
@@ -117,7 +119,7 @@ def cameras(world, truth, rng, mirrored):
     other[:4, :3, :3] = Rotation.random(4, random_state=rng).as_matrix()
     if mirrored:
         poses[:, :3, 3] = move(MIRROR, poses[:, :3, 3])
-    return Cameras(poses, other), Target(upright=False)
+    return Cameras(poses, other), AlignmentTarget(upright=False)
 
 
 def tracking(hits: bool) -> Maker:
@@ -132,7 +134,9 @@ def tracking(hits: bool) -> Maker:
                 direction=move(MIRROR, rays.direction),
                 hit=None if rays.hit is None else move(MIRROR, rays.hit),
             )
-        return Tracking(rays), Target(traces=world.traces.moved(truth), scale=None if hits else scale_of(truth))
+        return Tracking(rays), AlignmentTarget(
+            traces=world.traces.moved(truth), scale=None if hits else scale_of(truth)
+        )
 
     return make
 
@@ -231,7 +235,7 @@ def measure_fox(trials: int) -> list[list[str]] | None:
         picked = centers.mean(axis=0) + rng.uniform(-0.7, 0.7, (5, 3)) * size
         noisy = picked + rng.normal(0, 0.01 * size, picked.shape)
         back = np.linalg.inv(truth)
-        fit = Pairs(move(back, picked), noisy).fit(Target(upright=False), lambda *_: None)
+        fit = Pairs(move(back, picked), noisy).fit(AlignmentTarget(upright=False), lambda *_: None)
         off.append(np.linalg.norm(move(fit.matrix, move(back, heads)) - heads, axis=1) / size)
         turned = fit.matrix[:3, :3] @ truth[:3, :3].T / scale_of(fit.matrix) / scale_of(truth)
         angle.append(np.degrees(Rotation.from_matrix(turned).magnitude()))

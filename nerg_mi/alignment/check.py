@@ -19,20 +19,15 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.transport.geometry import Place, trace_depth
 from nerg_mi.transport.medium import Medium
 
-from .constraints import Fit
+from .constraints import AlignmentFit
 from .similarity import move, scale_of
 
 # ---- Check ----
 #
 # Whether rays lie in a place as people's do: asked of every training and evaluation, before time is spent on it.
 
-
-RAYS, HEADS = 2048, 256
-"""So many rays, and heads, are asked about."""
-
-NOTHING = 0.98
-"""Where more of the gaze than this meets no surface, the alignment is certainly wrong."""
-
+RAYS, HEADS = 2048, 256  # So many rays, and heads, are asked about
+NOTHING = 0.98  # Where more of the gaze than this meets no surface, the alignment is certainly wrong
 DOUBTFUL = {"escaped": 0.3, "inside": 0.1, "below": 0.1}
 """Shares from which on it is doubtful: of gaze that meets nothing, of heads inside of something and below the floor."""
 
@@ -42,7 +37,7 @@ _TIGHT, _MOSTLY, _DIRECTIONS = 0.06, 0.8, 16
 
 
 @dataclass(frozen=True)
-class Check:
+class AlignmentCheck:
     """Shares, from 0 to 1: ``escaped`` of the gaze, which meets no surface; ``inside`` of the heads, which are in
     something solid; ``below`` of the heads, which are below the floor. ``mirrored``: a sentence where more of the gaze
     ends on surfaces with an axis negated."""
@@ -68,12 +63,12 @@ class Check:
         return [*found, self.mirrored] if self.mirrored else found
 
 
-def check_alignment(subject: Medium | Place, rays: Rays, align: Similarity, seed: int = 0) -> Check:
+def check_alignment(subject: Medium | Place, rays: Rays, align: Similarity, seed: int = 0) -> AlignmentCheck:
     """Trace some of ``rays``, which ``align`` carries into the place ``subject``, and directions all
     around some heads."""
     some = np.random.default_rng(seed).permutation(len(rays))[:RAYS]
     if not len(some):
-        return Check(0.0, 0.0, 0.0)
+        return AlignmentCheck(0.0, 0.0, 0.0)
     turn = align.matrix[:3, :3] / align.scale
     origin, direction = move(align.matrix, rays.origin[some]), rays.direction[some] @ turn.T
     _, opacity = trace_depth(subject, origin, direction)
@@ -94,7 +89,7 @@ def check_alignment(subject: Medium | Place, rays: Rays, align: Similarity, seed
             return np.where(met >= _SURFACE_OPACITY, depth, np.inf)
 
         mirrored = mirror_warning(hit_shares(trace, origin, direction, turn.T), len(origin))
-    return Check(escaped, float((tight >= _MOSTLY).mean()), float(below.mean()), mirrored)
+    return AlignmentCheck(escaped, float((tight >= _MOSTLY).mean()), float(below.mean()), mirrored)
 
 
 # ---- Record ----
@@ -103,7 +98,6 @@ def check_alignment(subject: Medium | Place, rays: Rays, align: Similarity, seed
 #
 # Whatever takes an alignment (``--align``) reads this file, and as well a plain JSON list of the four rows of the
 # matrix.
-
 
 KIND, VERSION = "alignment", 1
 
@@ -125,7 +119,7 @@ class Alignment:
     forced: bool = False
 
     @classmethod
-    def of_fit(cls, kind: str, fit: Fit, files: Mapping[str, Any], forced: bool) -> Alignment:
+    def of_fit(cls, kind: str, fit: AlignmentFit, files: Mapping[str, Any], forced: bool) -> Alignment:
         """What is recorded of a fit."""
         residuals = {"count": len(fit.centimetres), **_spread(fit.centimetres, "cm"), **_spread(fit.degrees, "degrees")}
         return cls(fit.matrix, {"kind": kind, **fit.about}, residuals, _uncertainty(fit), dict(files), forced)
@@ -179,7 +173,7 @@ def _spread(values: np.ndarray, unit: str) -> dict[str, float | None]:
     return {f"median_{unit}": at(50), f"p95_{unit}": at(95)}
 
 
-def _uncertainty(fit: Fit) -> dict[str, float] | None:
+def _uncertainty(fit: AlignmentFit) -> dict[str, float] | None:
     covariance = fit.covariance
     if covariance is None or not np.isfinite(covariance).all():
         return None

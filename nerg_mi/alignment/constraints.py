@@ -77,16 +77,10 @@ class DistanceGrid:
         return value + far, slope
 
 
-# ---- Point file ----
-#
-# Surfaces in files, as points: meshes and clouds (PLY, OBJ), tables (CSV, Project Aria's too), arrays (.npy).
+# ---- Surfaces in files, as points: meshes and clouds (PLY, OBJ), tables (CSV, Project Aria's too), arrays (.npy) ----
 
-
-SUFFIXES = (*READERS, ".csv", ".csv.gz", ".npy")
-"""Files that are read."""
-
-POINTS = 200_000
-"""Points that are taken of a mesh, evenly by area, or of a larger cloud."""
+SUFFIXES = (*READERS, ".csv", ".csv.gz", ".npy")  # Files that are read
+POINTS = 200_000  # Points that are taken of a mesh, evenly by area, or of a larger cloud
 
 
 def read_surface(path: Path, count: int = POINTS, on_note: Callable[[str], None] = lambda note: None) -> np.ndarray:
@@ -145,20 +139,13 @@ def _sampled(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
     return a[which] + u * (b[which] - a[which]) + v * (c[which] - a[which])
 
 
-# ---- Surface ----
-#
-# A place as alignments see it: points on its surfaces, where people can be, and the distances to both.
+# ---- A place as alignments see it: points on its surfaces, where people can be, and the distances to both ----
 #
 # What rays end on is a surface, and what they pass on their way is free. Insides of hollow things are reached by rays
 # that begin there; they are pockets that no passage leads to, and count as solid.
 
-
-RAYS = 150_000
-"""Rays by which a place is traced."""
-
-VOXELS = 1 << 20
-"""Voxels of its lattice, about."""
-
+RAYS = 150_000  # Rays by which a place is traced
+VOXELS = 1 << 20  # Voxels of its lattice, about
 _SURFACE_OPACITY = 0.5
 # Voxels around the place; a pocket has less than this share of the room of the largest.
 _PAD, _POCKET = 3, 0.2
@@ -322,19 +309,15 @@ def _finished(means, solid, free, lower, step, bounded: bool) -> PlaceSurface:
     return PlaceSurface(means[solid], grids[0], grids[1], bounded)
 
 
-# ---- Evidence ----
-#
-# What an alignment is found from: one file a kind, each a class that fulfils `Evidence`.
+# ---- What an alignment is found from: one file a kind, each a class that fulfils `Evidence` ----
 #
 # Another kind is another such file, and a line where the job chooses among them (`nerg_mi.workflows.align`).
 
-
-Progress = Callable[[float, str], None]
-"""Told of a share of the work that is done, and of what is being done."""
+Progress = Callable[[float, str], None]  # Told of a share of the work that is done, and of what is being done
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class AlignmentTarget:
     """The place that tracking is aligned with, and what is known beforehand.
 
     ``traces``: what rays found of it, or ``points`` (N, 3) on its surfaces; neither where only its frame is needed.
@@ -374,7 +357,7 @@ class Target:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class AlignmentFit:
     """An alignment that was found.
 
     ``matrix``: (4, 4) from the tracking to the place. ``centimetres`` (N,) and ``degrees`` (M,): residuals, in metres
@@ -404,10 +387,15 @@ class Evidence(Protocol):
         """Its name, as alignment.json has it."""
         ...
 
-    def fit(self, target: Target, progress: Progress) -> Fit:
+    def fit(self, target: AlignmentTarget, progress: Progress) -> AlignmentFit:
         """The similarity from the tracking to the place of ``target``. Raises `NergError` where the evidence leaves it
         open, saying what would settle it."""
         ...
+
+
+def mirror_sentence(what: str, mirrored: float, declared: float) -> str:
+    """That ``what`` happens is so many metres nearer where the tracking is mirrored than as it was declared."""
+    return f"with the x axis negated {what} to {100 * mirrored:.3g} cm, as declared to {100 * declared:.3g} cm only"
 
 
 def angles(viewpoint: np.ndarray, at: np.ndarray, to: np.ndarray) -> np.ndarray:

@@ -15,12 +15,13 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError
 
 from .constraints import (
+    AlignmentFit,
+    AlignmentTarget,
     DistanceGrid,
-    Fit,
     PlaceSurface,
     Progress,
-    Target,
     angles,
+    mirror_sentence,
     pair_covariance,
     surface_of_points,
     thinned,
@@ -35,7 +36,6 @@ from .similarity import ALL, MIRROR, Chart, fit_similarity, move, scale_of, upri
 # space and ends on surfaces, at its hit points where these are known. Residuals are lengths in units of the tracking
 # (metres of people), so that a smaller place is no better than a larger one; their derivatives are with respect to the
 # numbers of a chart (`Chart`). Another score is another class with these methods.
-
 
 NEAR, FAR, STEPS = 0.3, 12.0, 32
 """Gaze without a hit point ends between so many metres; at so many places along it a surface is looked for."""
@@ -135,16 +135,13 @@ def _of_grid(grid: DistanceGrid, points: np.ndarray, chart: Chart, q: np.ndarray
     return value / s, (chart.pulled(q, moved, slope) - value[:, None] * chart.basis[6]) / s
 
 
-# ---- Refine ----
-#
-# The similarity that agrees best with several scores, near one that is given, and how well it is determined.
-
+# ---- The similarity that agrees best with several scores, near one that is given, and how well it is determined ----
 
 _FEW = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class RefinedAlignment:
     """``matrix`` (4, 4); ``cost``: the robust mean over all scores, 0 where all is well, below 1; ``covariance`` (7, 7)
     of rotation vector, translation and logarithm of the scale about the chart's ``center``."""
 
@@ -156,7 +153,7 @@ class Refined:
 
 def refine(
     scores: Sequence[Score], base: np.ndarray, center: np.ndarray, basis: np.ndarray, wide: float = 1.0, most: int = 60
-) -> Refined:
+) -> RefinedAlignment:
     """Minimise the robust residuals of ``scores`` by Gauss-Newton steps in a trust region (SciPy's least_squares with a
     Cauchy loss), from the similarity ``base`` (4, 4) on.
 
@@ -201,7 +198,7 @@ def refine(
     z = r * r * counts
     group = np.concatenate([s.group for s in scores])
     covariance = _sandwich(r, by, 1 / (1 + z), group)
-    return Refined(
+    return RefinedAlignment(
         chart.matrix(q), float(np.sum(np.log1p(z) / counts)), chart.basis @ covariance @ chart.basis.T, center
     )
 
@@ -237,7 +234,6 @@ def groups_of(person: np.ndarray, t: np.ndarray) -> np.ndarray:
 # Besl, N. McKay, 1992; scale after T. Zinsser et al., 2005), in both directions for the same reason, trimmed of what
 # only one of them has (D. Chetverikov et al., 2002); and at last steps on the place's distance field (`refine`).
 
-
 _TURNS, _COARSE, _FINE = 1000, 150, 2000
 _SCALES = np.exp(np.linspace(-0.25, 0.25, 5))
 _STARTS, _LAST = 30, 3
@@ -259,10 +255,9 @@ class Twin:
 
     kind = "twin"
 
-    def fit(self, target: Target, progress: Progress) -> Fit:
+    def fit(self, target: AlignmentTarget, progress: Progress) -> AlignmentFit:
         """The best placement. Raises `NergError` for a twin of too few points."""
-        place = target.surface
-        twin = _even(self.points, self.source)
+        twin, place = _even(self.points, self.source), target.surface
         found: dict[bool, list[_Placed]] = {}
         for flip in (False, True):
             progress(0.1 + 0.4 * flip, "placing the mirrored twin" if flip else "placing the twin")
@@ -280,13 +275,10 @@ class Twin:
         mirrored = None
         if found[True][0].cost < _CLEAR * best.cost:
             flipped = found[True][0].cost / scale_of(found[True][0].matrix)
-            mirrored = (
-                f"with the x axis negated the twin fits to {100 * flipped:.3g} cm, as it is to "
-                f"{100 * best.cost / s:.3g} cm only"
-            )
+            mirrored = mirror_sentence("the twin fits", flipped, best.cost / s)
         about = {"points": len(twin), "overlap": _OVERLAP, "mean_cm": 100 * best.cost / s}
         covariance = pair_covariance(x[forth], y[forth], best.matrix, basis)
-        return Fit(
+        return AlignmentFit(
             target.to_place(best.matrix),
             100 * kept,
             angles(move(best.matrix, x.mean(axis=0)), move(best.matrix, x[forth]), y[forth]),
@@ -318,7 +310,7 @@ def _even(points: np.ndarray, source: str) -> np.ndarray:
     return thinned(points, float(size) / 250)
 
 
-def _placed(twin: np.ndarray, place: PlaceSurface, target: Target) -> list[_Placed]:
+def _placed(twin: np.ndarray, place: PlaceSurface, target: AlignmentTarget) -> list[_Placed]:
     """The best placements of the points ``twin``, best first."""
     own = surface_of_points(twin, 1 << 19).distance
     rng = np.random.default_rng(0)
@@ -358,7 +350,7 @@ def _turns(upright: bool) -> list[np.ndarray]:
     return list(Rotation.from_quat(np.random.default_rng(0).normal(size=(_TURNS, 4))).as_matrix())
 
 
-def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: Target, most: int) -> _Placed:
+def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: AlignmentTarget, most: int) -> _Placed:
     tree, own = KDTree(y), KDTree(x)
     cost = np.inf
     for k in range(most):
@@ -374,7 +366,7 @@ def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: Target, most:
 
 
 def _settled(
-    x: np.ndarray, y: np.ndarray, matrix: np.ndarray, place: PlaceSurface, twin: DistanceGrid, target: Target
+    x: np.ndarray, y: np.ndarray, matrix: np.ndarray, place: PlaceSurface, twin: DistanceGrid, target: AlignmentTarget
 ) -> _Placed:
     """Closest points slide along surfaces by small steps; the distance field has the slope that leads there at once.
 

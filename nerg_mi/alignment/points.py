@@ -16,17 +16,14 @@ from nerg_mi.photos.images import read_posed
 from nerg_mi.photos.posed import PosedImages
 from nerg_mi.rays.readers.tables import iterate_table, table_columns
 
-from .constraints import Fit, Progress, Target, angles, pair_covariance
+from .constraints import AlignmentFit, AlignmentTarget, Progress, angles, mirror_sentence, pair_covariance
 from .similarity import ALL, MIRROR, check_points, errors, fit_similarity, in_plane, leave_one_out, move, upright_basis
 
-# ---- Camera poses ----
-#
-# Alignment from cameras whose poses are known in both frames: two models of the same pictures.
+# ---- Alignment from cameras whose poses are known in both frames: two models of the same pictures ----
 #
 # Each camera gives the rotation by itself, of which the robust mean counts (L1 on the rotation group: R. Hartley et
 # al., 2011); scale and shift follow from the centres, robustly too, so that some wrong poses do no harm and two cameras
 # are enough.
-
 
 _ROUNDS = 50
 _CLEAR = 0.5
@@ -45,7 +42,7 @@ class Cameras:
 
     kind = "cameras"
 
-    def fit(self, target: Target, progress: Progress) -> Fit:
+    def fit(self, target: AlignmentTarget, progress: Progress) -> AlignmentFit:
         """The robust mean. Raises `NergError` where all cameras stand at one place."""
         a, b = self.tracking, self.place
         if len(a) < 2:
@@ -83,14 +80,11 @@ class Cameras:
         if len(x) > 3 and not in_plane(x):
             off_flipped = errors(fit_similarity(flipped, y), flipped, y)
             if np.median(off_flipped) < _CLEAR * np.median(errors(fit_similarity(x, y), x, y)):
-                mirrored = (
-                    f"with the x axis negated the centres meet to {100 * np.median(off_flipped):.3g} cm, as they are "
-                    f"to {100 * np.median(off):.3g} cm only"
-                )
+                mirrored = mirror_sentence("the centres meet", np.median(off_flipped), np.median(off))
         about = {"cameras": len(a), "agreeing": int(inliers.sum())}
         kept = inliers if inliers.sum() > 2 else np.ones(len(x), bool)
         covariance = pair_covariance(x[kept], y[kept], matrix, ALL)
-        return Fit(matrix, 100 * off, angle, covariance, mirrored, x, y, about, notes, doubts)
+        return AlignmentFit(matrix, 100 * off, angle, covariance, mirrored, x, y, about, notes, doubts)
 
 
 def mean_rotation(rotations: np.ndarray) -> np.ndarray:
@@ -166,9 +160,7 @@ def _last(name: str) -> str:
 
 # ---- Alignment from points that somebody picked in both frames ----
 
-PAIRS_BYTES = 4 << 20
-"""A file of pairs may have so many bytes; nobody picks so many points."""
-
+PAIRS_BYTES = 4 << 20  # A file of pairs may have so many bytes; nobody picks so many points
 _COLUMNS = ("x", "y", "z", "place_x", "place_y", "place_z")
 _SHAPE = (
     'CSV with the columns x,y,z (tracking, metres) and place_x,place_y,place_z, or JSON [{"tracking": [x, y, z], '
@@ -189,7 +181,7 @@ class Pairs:
 
     kind = "pairs"
 
-    def fit(self, target: Target, progress: Progress) -> Fit:
+    def fit(self, target: AlignmentTarget, progress: Progress) -> AlignmentFit:
         """Umeyama's solution. Raises `NergError` for points that are too few or degenerate."""
         x, y = self.tracking, move(target.turn, self.place)
         check_points(x, y, self.source, upright=target.upright)
@@ -203,16 +195,13 @@ class Pairs:
         if not target.upright and in_plane(x):
             notes.append("the points lie in a plane, so that they do not tell a mirrored frame; add one off the plane")
         elif _rms(errors(turned, flipped, y)) < _CLEAR * _rms(off):
-            mirrored = (
-                f"with the x axis negated the pairs meet to {100 * _rms(errors(turned, flipped, y)):.3g} cm, as they "
-                f"are to {100 * _rms(off):.3g} cm only"
-            )
+            mirrored = mirror_sentence("the pairs meet", _rms(errors(turned, flipped, y)), _rms(off))
         basis = upright_basis(False) if target.upright else ALL
         if target.scale is not None:
             basis = basis[:, :-1]
         known = left_out[np.isfinite(left_out)]
         about = {"pairs": len(x), "leave_one_out_cm": {"median": _cm(known, 50), "largest": _cm(known, 100)}}
-        return Fit(
+        return AlignmentFit(
             target.to_place(matrix),
             100 * off,
             angles(y.mean(axis=0), move(matrix, x), y),

@@ -15,10 +15,7 @@ from nerg_mi.maths.coordinates import check_coordinates
 # S. Umeyama: Least-squares estimation of transformation parameters between two point patterns, PAMI 13 (1991). Where up
 # is known in both frames, what is left is a turn about it: the same in the plane.
 
-
-LINE = 0.01
-"""Points lie on a line where their second extent is less than this share of the first."""
-
+LINE = 0.01  # Points lie on a line where their second extent is less than this share of the first
 PLANE = 0.02
 """Points lie in a plane, which looks the same in a mirror, where their third extent is less than this share."""
 
@@ -131,18 +128,14 @@ def in_plane(points: np.ndarray) -> bool:
     return len(size) < 3 or bool(size[2] < PLANE * size[0])
 
 
-# ---- Chart ----
-#
-# Similarities near one that is given, by seven numbers, and the derivatives of points with respect to these.
+# ---- Similarities near one that is given, by seven numbers, and the derivatives of points with respect to these ----
 #
 # A point x goes to c + exp(l) exp([w]) (S x - c) + t: S the given similarity, c a centre in the place, w a rotation
 # vector (radians), t a translation (units of the place), l the logarithm of a scale. The derivative of a rotated y by
 # the vector has the closed form -exp([w]) [y] Jr(w) with the right Jacobian Jr of the rotation group (J. Sola, J.
 # Deray, D. Atchuthan: A micro Lie theory for state estimation in robotics, 2018, eq. 143 and 184).
 
-
-ALL = np.eye(7)
-"""Any similarity: (w, t, l)."""
+ALL = np.eye(7)  # Any similarity: (w, t, l)
 
 
 def upright_basis(floor: bool) -> np.ndarray:

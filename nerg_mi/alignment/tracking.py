@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from scipy import fft
@@ -14,8 +14,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.direction_checks import DECLARED, EXCHANGES, head_frames
 from nerg_mi.rays.rays import Rays
 
-from .constraints import Fit, PlaceSurface, Progress, Target
-from .icp import AtZero, GazeEnds, HeadHeight, Refined, Score, groups_of, refine
+from .constraints import AlignmentFit, AlignmentTarget, PlaceSurface, Progress
+from .icp import AtZero, GazeEnds, HeadHeight, RefinedAlignment, Score, groups_of, refine
 from .similarity import ALL, MIRROR, move, scale_of, upright_basis
 
 # ---- Flips ----
@@ -25,9 +25,7 @@ from .similarity import ALL, MIRROR, move, scale_of, upright_basis
 # Rooms are closed: nearly every ray ends on a surface, negated or not. But points, as cameras triangulate them, lie on
 # what there is to see, and gaze passes within a fraction of a degree of one.
 
-
-RAYS, POINTS = 400, 100_000
-"""So many rays are looked at, and so many points."""
+RAYS, POINTS = 400, 100_000  # So many rays are looked at, and so many points
 
 # A flip is told where it is so much better at the median, and better in more rays than chance would have it.
 _BETTER, _CHANCE = 0.75, 1e-4
@@ -101,10 +99,7 @@ def compare_flips(
 # and correlated, by fast Fourier transforms level by level, with how near its surfaces are; heads likewise with free
 # space.
 
-
-NEAR = 0.25
-"""Metres within which a hit point counts as on a surface, at this stage."""
-
+NEAR = 0.25  # Metres within which a hit point counts as on a surface, at this stage
 _TURNS, _CELLS, _KEPT = 36, 48, 16
 _MOST = 4000
 
@@ -165,7 +160,8 @@ class _Maps:
         on = np.exp(-0.5 * (surface.distance.at(nodes) / wide) ** 2)
         open_ = np.exp(-0.5 * (surface.blocked.at(nodes) / wide) ** 2)
         # Twice as wide, so that what leaves it on one side does not come in on the other.
-        self.size = [_fast(2 * int(n)) for n in self.shape[:2]]
+        next_length: Any = fft.next_fast_len  # the stubs know no result
+        self.size = [next_length(2 * int(n), real=True) for n in self.shape[:2]]
         levels = lambda v: np.asarray(fft.rfft2(_by_level(v.reshape(self.shape)), self.size, axes=(1, 2)))
         self.on, self.open = levels(on), levels(open_)
 
@@ -211,18 +207,6 @@ class _Maps:
         return np.asarray(fft.irfft2(joint, self.size)) / max(len(moved), 1)
 
 
-def _fast(length: int) -> int:
-    """The next length that factors into 2, 3 and 5, which transforms are fast at."""
-    while True:
-        rest = length
-        for p in (2, 3, 5):
-            while rest % p == 0:
-                rest //= p
-        if rest == 1:
-            return length
-        length += 1
-
-
 def _by_level(values: np.ndarray) -> np.ndarray:
     """(nx, ny, nz) as (nz, nx, ny); single precision is enough for a guess."""
     return np.ascontiguousarray(np.moveaxis(values, 2, 0), np.float32)
@@ -251,10 +235,7 @@ def _apart(found: list[Guess], count: int, distance: float) -> list[Guess]:
 # Alignment from the tracking alone: heads in free space above the floor, gaze that ends on surfaces, hit points on
 # them.
 
-
-MOST = 4000
-"""Rays that are looked at, evenly chosen over people."""
-
+MOST = 4000  # Rays that are looked at, evenly chosen over people
 _FEW = 400
 # Gaze without hit points is looked along for one of so many rays: it tells little, and takes long.
 _SPARED = 5
@@ -276,14 +257,13 @@ class Tracking:
 
     kind = "tracking"
 
-    def fit(self, target: Target, progress: Progress) -> Fit:
+    def fit(self, target: AlignmentTarget, progress: Progress) -> AlignmentFit:
         """The best placement. Raises `NergError` where the rays leave it open."""
-        surface = target.surface
         some = _sample(self.rays)
         if self.start is not None:
             progress(0.5, "refining")
-            coarse = _refined(some, surface, target, target.turn @ self.start, 3.0, 30)
-            return self._fit_of(_refined(some, surface, target, coarse.matrix, 1.0, 60), some, target, [], None)
+            coarse = _refined(some, target, target.turn @ self.start, 3.0, 30)
+            return self._fit_of(_refined(some, target, coarse.matrix, 1.0, 60), some, target, [], None)
         if not target.upright:
             raise NergError(
                 "from the tracking alone only its turn about the vertical is looked for: say which way is up in the "
@@ -297,15 +277,15 @@ class Tracking:
                 "metres), or other evidence (--pairs)"
             )
         progress(0.1, "looking for the place of the tracking")
-        proper = _searched(some, surface, target)
+        proper = _searched(some, target)
         if not len(some.hits):
             # Free space has room for many placements, mirrored ones too: heads cannot tell them apart.
             return self._fit_of(proper[0], some, target, [], None)
         progress(0.55, "looking for the place of the mirrored tracking")
-        mirrored = _searched(some.mirrored(), surface, target)
+        mirrored = _searched(some.mirrored(), target)
         doubts = []
         for other in proper[1:]:
-            alike = close(proper[0].matrix, other.matrix, 0.05 * surface.diagonal)
+            alike = close(proper[0].matrix, other.matrix, 0.05 * target.surface.diagonal)
             if not alike and other.cost < _RIVAL * proper[0].cost:
                 doubts.append(
                     f"another placement agrees almost as well (cost {other.cost:.3f}, the best {proper[0].cost:.3f}): "
@@ -320,7 +300,9 @@ class Tracking:
             )
         return self._fit_of(proper[0], some, target, doubts, sentence)
 
-    def _fit_of(self, best: Refined, some: _Sample, target: Target, doubts: list[str], mirrored: str | None) -> Fit:
+    def _fit_of(
+        self, best: RefinedAlignment, some: _Sample, target: AlignmentTarget, doubts: list[str], mirrored: str | None
+    ) -> AlignmentFit:
         surface, s = target.surface, scale_of(best.matrix)
         points = some.hits if len(some.hits) else some.heads
         grid = surface.distance if len(some.hits) else surface.blocked
@@ -343,7 +325,7 @@ class Tracking:
         ]
         if not len(some.hits):
             doubts = [*doubts, "without hit points only heads tell: look at the picture before you trust it"]
-        return Fit(
+        return AlignmentFit(
             target.to_place(best.matrix),
             100 * off,
             degrees,
@@ -397,8 +379,9 @@ class _Sample:
             new[self.of[way]],
         )
 
-    def scores(self, surface: PlaceSurface, target: Target) -> list[Score]:
+    def scores(self, target: AlignmentTarget) -> list[Score]:
         """What is known of them in the place; free space is not, where the place is bare points."""
+        surface = target.surface
         out: list[Score] = [HeadHeight(target.place_level, self.heads, self.group)] if target.upright else []
         if len(self.hits):
             out.append(AtZero(surface.distance, self.hits, self.group[self.at], "hit points on surfaces"))
@@ -429,25 +412,25 @@ def _sample(rays: Rays) -> _Sample:
     return _Sample(heads, directions, group, hits, at, np.concatenate(passed), of)
 
 
-def _searched(some: _Sample, surface: PlaceSurface, target: Target) -> list[Refined]:
+def _searched(some: _Sample, target: AlignmentTarget) -> list[RefinedAlignment]:
     """The best placements, best first."""
     assert target.floor is not None
-    floor = (target.floor, target.place_level)
+    surface, floor = target.surface, (target.floor, target.place_level)
     free = np.concatenate([some.heads, some.passed]) if surface.bounded else some.heads
     scales = np.array([target.scale]) if target.scale is not None else scale_range(surface, some.hits)
     guesses: list[Guess] = search(surface, some.hits, free, scales, floor)
     few = some.few(_FEW)
-    found = [_refined(few, surface, target, g.matrix, 4.0, 12) for g in guesses]
-    found = [_refined(few, surface, target, f.matrix, 1.5, 20) for f in sorted(found, key=lambda f: f.cost)[:6]]
-    last = [_refined(some, surface, target, f.matrix, 1.0, 30) for f in sorted(found, key=lambda f: f.cost)[:2]]
+    found = [_refined(few, target, g.matrix, 4.0, 12) for g in guesses]
+    found = [_refined(few, target, f.matrix, 1.5, 20) for f in sorted(found, key=lambda f: f.cost)[:6]]
+    last = [_refined(some, target, f.matrix, 1.0, 30) for f in sorted(found, key=lambda f: f.cost)[:2]]
     return sorted(last, key=lambda f: f.cost)
 
 
-def _refined(some: _Sample, surface: PlaceSurface, target: Target, base: np.ndarray, wide: float, most: int) -> Refined:
+def _refined(some: _Sample, target: AlignmentTarget, base: np.ndarray, wide: float, most: int) -> RefinedAlignment:
     center = move(base, np.median(some.heads, axis=0))
     if target.upright and target.floor is not None:
         center[2] = target.place_level
     basis = upright_basis(target.floor is not None) if target.upright else ALL
     if target.scale is not None:
         basis = basis[:, :-1]
-    return refine(some.scores(surface, target), base, center, basis, wide, most)
+    return refine(some.scores(target), base, center, basis, wide, most)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.alignment.check import Alignment, check_alignment, read_similarity
-from nerg_mi.alignment.constraints import Evidence, Fit, Target, read_surface, trace_place
+from nerg_mi.alignment.constraints import AlignmentFit, AlignmentTarget, Evidence, read_surface, trace_place
 from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.points import read_cameras, read_pairs
 from nerg_mi.alignment.similarity import move
@@ -123,7 +123,7 @@ def _path(path: Path | None) -> Path:
     return path
 
 
-def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazePlace | None, Target]:
+def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazePlace | None, AlignmentTarget]:
     given = [n for n in ("field", "scene", "surface") if getattr(options, n) is not None]
     if len(given) > 1:
         raise NergError(f"the place is one: give --{' or --'.join(given)}")
@@ -142,9 +142,9 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazeP
             raise NergError(
                 "the place is missing: give --field FILE, --scene FILE or --surface FILE (a mesh or points)"
             )
-        return None, Target(**common)
+        return None, AlignmentTarget(**common)
     if options.surface is not None:
-        return None, Target(points=read_surface(options.surface, on_note=reporter.message), **common)
+        return None, AlignmentTarget(points=read_surface(options.surface, on_note=reporter.message), **common)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.02, "tracing the place")
     place = (
@@ -157,7 +157,7 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazeP
     assert place.medium is not None
     core = place.box.core
     traces = trace_place(place.medium, np.array(core.lower), np.array(core.upper), seed=options.seed)
-    return place, Target(traces=traces, **common)
+    return place, AlignmentTarget(traces=traces, **common)
 
 
 def _turn(up: str | None) -> np.ndarray:
@@ -186,7 +186,7 @@ def _identity(path: Path) -> dict[str, str]:
     return {"file": path.name, "sha256": file_sha256(path)}
 
 
-def _refusal(fit: Fit, options: AlignOptions) -> str:
+def _refusal(fit: AlignmentFit, options: AlignOptions) -> str:
     """Why a fit is refused; empty where it is not."""
     if fit.mirrored is not None:
         return (
@@ -202,7 +202,7 @@ def _refusal(fit: Fit, options: AlignOptions) -> str:
     return ""
 
 
-def _report_notes(fit: Fit, reporter: Reporter) -> None:
+def _report_notes(fit: AlignmentFit, reporter: Reporter) -> None:
     for line in fit.notes:
         reporter.message(line)
     for line in fit.doubts:
@@ -245,7 +245,7 @@ def _report_flips(points: np.ndarray, rays: Rays, matrix: np.ndarray, reporter: 
         reporter.warn(said)
 
 
-def _figure(fit: Fit, target: Target, heads: np.ndarray | None, found: Alignment):
+def _figure(fit: AlignmentFit, target: AlignmentTarget, heads: np.ndarray | None, found: Alignment):
     """Before and after, z up."""
     surface = None if target.traces is None and target.points is None else target.surface
     points = np.zeros((0, 3)) if fit.points is None else fit.points

@@ -1,15 +1,19 @@
+"""Tests of `nerg_mi.alignment.check`."""
+
+import json
 from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.check import Check, check_alignment
+from nerg_mi.alignment.check import Alignment, AlignmentCheck, check_alignment, read_similarity
+from nerg_mi.alignment.constraints import AlignmentFit
+from nerg_mi.errors import NergError
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.transport.geometry import Place
 from nerg_mi.transport.volume_medium import VolumeMedium
-
-from . import rooms
+from tests.alignment import rooms
 
 mi.set_variant("llvm_ad_rgb")
 RAYS = rooms.people(600)
@@ -35,7 +39,7 @@ def room():
 
 def test_people_in_their_place_give_no_doubts(room):
     found = check_alignment(room, RAYS, moved(0, 0, 0))
-    assert found == Check(0.0, 0.0, 0.0) and not found.doubts() and not found.impossible
+    assert found == AlignmentCheck(0.0, 0.0, 0.0) and not found.doubts() and not found.impossible
 
 
 def test_people_elsewhere_below_the_floor_and_in_walls_are_told(room):
@@ -54,7 +58,6 @@ def test_heads_within_matter_are_inside_of_something():
 
 def test_no_rays_are_no_doubt(room):
     assert check_alignment(room, RAYS.select(np.zeros(len(RAYS), bool)), moved(0, 0, 0)).doubts() == []
-    assert len(replace(RAYS, hit=None)) == len(RAYS)
 
 
 def test_gaze_that_would_meet_more_with_an_axis_negated_is_told():
@@ -62,6 +65,51 @@ def test_gaze_that_would_meet_more_with_an_axis_negated_is_told():
     place = mi.ScalarTransform4f().translate([20, 0, 0]).scale([0.1, 60, 60])
     wall = Place(None, mi.load_dict({"type": "scene", "wall": {"type": "cube", "to_world": place}}))
     rays = replace(RAYS, direction=np.tile([0.8, 0.6, 0.0], (len(RAYS), 1)))
-    assert check_alignment(wall, rays, moved(0, 0, 0)) == Check(0.0, 0.0, 0.0)
+    assert check_alignment(wall, rays, moved(0, 0, 0)) == AlignmentCheck(0.0, 0.0, 0.0)
     mirrored = check_alignment(wall, replace(rays, direction=rays.direction * (-1, 1, 1)), moved(0, 0, 0))
     assert "with x of the directions negated" in mirrored.doubts()[-1] and mirrored.escaped > 0.9
+
+
+# ---- The record of an alignment ----
+
+
+def written(path):
+    fit = AlignmentFit(
+        np.diag([2.0, 2, 2, 1]),
+        np.arange(5.0),
+        np.array([1.0, np.nan]),
+        np.diag([1e-4] * 3 + [4e-4] * 3 + [1e-4]),
+        about={"pairs": 5},
+    )
+    found = Alignment.of_fit("pairs", fit, {"rays": {"file": "a.npz", "sha256": "00"}}, False)
+    found.save(path)
+    return found
+
+
+def test_what_is_written_is_read_by_every_command(tmp_path):
+    path = tmp_path / "alignment.json"
+    found = written(path)
+    assert read_similarity(path, "--align", "rays to field").scale == pytest.approx(2)
+    about = json.loads(path.read_text())
+    assert about["evidence"] == {"kind": "pairs", "pairs": 5} and about["residuals"]["median_cm"] == 2
+    assert about["uncertainty"]["cm"] == pytest.approx(100 * np.sqrt(12e-4) / 2)
+    assert about["uncertainty"]["scale_percent"] == pytest.approx(1) and found.residuals["median_degrees"] == 1
+    assert about["uncertainty"]["degrees"] == pytest.approx(np.degrees(np.sqrt(3e-4)))
+
+
+@pytest.mark.parametrize(
+    "change, why",
+    [
+        ({"version": 99}, "version 99, and up to 1 is read"),
+        ({"version": True}, "version True"),
+        ({"kind": "x"}, "neither that"),
+        ({"matrix": [[1, 2]]}, "--align"),
+        ({"matrix": np.diag([1.0, 2, 1, 1]).tolist()}, "--align"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, change, why):
+    path = tmp_path / "alignment.json"
+    written(path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(NergError, match=why):
+        read_similarity(path, "--align", "rays to field")

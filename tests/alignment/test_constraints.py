@@ -8,9 +8,9 @@ import trimesh
 from scipy.interpolate import RegularGridInterpolator
 
 from nerg_mi.alignment.constraints import (
+    AlignmentTarget,
     DistanceGrid,
     PlaceTraces,
-    Target,
     angles,
     pair_covariance,
     read_surface,
@@ -51,18 +51,10 @@ def test_the_covariance_is_that_of_many_fits():
 
 def test_a_place_is_needed_by_what_asks_for_it():
     with pytest.raises(NergError, match="--field"):
-        _ = Target().surface
-
-
-def test_a_turned_place_is_turned_back():
-    rng = np.random.default_rng(1)
-    turn, matrix = similarity(rng, scale=1.0), similarity(rng)
-    turn[:3, 3] = 0
-    np.testing.assert_allclose(turn @ Target(turn=turn).to_place(matrix), matrix, atol=1e-12)
+        _ = AlignmentTarget().surface
 
 
 # ---- Grid ----
-
 
 GRID = DistanceGrid(np.random.default_rng(0).random((6, 7, 5)), np.array([-1.0, 0, 2]), 0.5)
 
@@ -71,11 +63,11 @@ def test_inside_it_is_the_trilinear_interpolation():
     axes = [GRID.lower[a] + GRID.step * np.arange(n) for a, n in enumerate(GRID.values.shape)]
     p = np.random.default_rng(1).uniform(GRID.lower, GRID.upper, (300, 3))
     np.testing.assert_allclose(GRID.at(p), RegularGridInterpolator(axes, GRID.values)(p), atol=1e-12)
-
-
-def test_beyond_it_the_distance_to_it_is_added():
+    # Beyond it the distance to it is added, and a lattice of one layer has no slope across.
     p = GRID.upper + np.array([[3.0, 4, 0], [0, 0, 2]])
     np.testing.assert_allclose(GRID.at(p), GRID.values[-1, -1, -1] + np.array([5, 2]))
+    value, slope = DistanceGrid(np.arange(4.0).reshape(4, 1, 1), np.zeros(3), 1.0).with_slope(np.array([[1.5, 0, 0]]))
+    assert value[0] == 1.5 and slope[0].tolist() == [1, 0, 0]
 
 
 def test_gradients_are_those_of_central_differences():
@@ -83,12 +75,6 @@ def test_gradients_are_those_of_central_differences():
     slope = GRID.with_slope(p)[1]
     for a, e in enumerate(1e-7 * np.eye(3)):
         np.testing.assert_allclose(slope[:, a], (GRID.at(p + e) - GRID.at(p - e)) / 2e-7, atol=1e-6)
-
-
-def test_a_lattice_of_one_layer_has_no_slope_across():
-    flat = DistanceGrid(np.arange(4.0).reshape(4, 1, 1), np.zeros(3), 1.0)
-    value, slope = flat.with_slope(np.array([[1.5, 0, 0]]))
-    assert value[0] == 1.5 and slope[0].tolist() == [1, 0, 0]
 
 
 # ---- Point file ----
@@ -127,33 +113,20 @@ def test_clouds_tables_and_arrays(tmp_path):
         ("a.obj", b"", "no vertices"),
         ("a.csv", b"x,y,z\n", "no points"),
         ("a.csv", b"a,b\n1,2\n", "x"),
+        ("a.csv", b"x,y,z\n1,2,3\n1,2,3,4,5\n", "line 3: 5 cells, the header has 3"),
+        ("a.csv", b"x,y,z\n0,0,0\n1,1.1e7,0\n", "the points of .*a.csv.* must have coordinates from"),
+        ("a.csv", b"x,y,z\n0,0,0\n1,1e308,0\n", "the points of .*a.csv.* must have coordinates from"),
+        ("a.npy", None, r"shape \(3, 2\)"),
+        ("a/no.ply", None, "there is no surface"),
     ],
 )
 def test_other_files_are_refused(tmp_path, name, data, why):
-    (tmp_path / name).write_bytes(data)
+    if data is None:
+        np.save(tmp_path / "a.npy", np.zeros((3, 2)))
+    else:
+        (tmp_path / name).write_bytes(data)
     with pytest.raises(NergError, match=why):
         read_surface(tmp_path / name)
-    with pytest.raises(NergError, match="there is no surface"):
-        read_surface(tmp_path / "no.ply")
-
-
-def test_arrays_of_another_shape_are_refused(tmp_path):
-    np.save(tmp_path / "a.npy", np.zeros((3, 2)))
-    with pytest.raises(NergError, match=r"shape \(3, 2\)"):
-        read_surface(tmp_path / "a.npy")
-
-
-def test_rows_that_do_not_match_the_header_are_refused(tmp_path):
-    (tmp_path / "points.csv").write_text("x,y,z\n1,2,3\n1,2,3,4,5\n")
-    with pytest.raises(NergError, match="line 3: 5 cells, the header has 3"):
-        read_surface(tmp_path / "points.csv")
-
-
-@pytest.mark.parametrize("far", ["1.1e7", "-1e30", "1e308"])
-def test_points_beyond_all_places_are_refused(tmp_path, far):
-    (tmp_path / "a.csv").write_text(f"x,y,z\n0,0,0\n1,{far},0\n")
-    with pytest.raises(NergError, match="the points of .*a.csv.* must have coordinates from"):
-        read_surface(tmp_path / "a.csv")
 
 
 # ---- Surface ----

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.constraints import Target, surface_of_traces
+from nerg_mi.alignment.constraints import AlignmentTarget, surface_of_traces
 from nerg_mi.alignment.icp import AtZero, GazeEnds, HeadHeight, Twin, groups_of, refine
 from nerg_mi.alignment.similarity import ALL, MIRROR, Chart, errors
 from nerg_mi.errors import NergError
@@ -11,7 +11,6 @@ from nerg_mi.errors import NergError
 from . import rooms
 
 # ---- Icp ----
-
 
 PLACE = rooms.traces(12_000).end
 
@@ -24,7 +23,7 @@ def quiet(share, text):
 def test_a_twin_in_millimetres_is_placed_and_a_mirrored_one_named():
     truth = rooms.similarity(np.random.default_rng(1), upright=True, scale=0.001)
     twin = rooms.carried(np.linalg.inv(truth), rooms.traces(9000).end)
-    target = Target(points=PLACE, upright=True)
+    target = AlignmentTarget(points=PLACE, upright=True)
     fit = Twin(twin).fit(target, quiet)
     off = errors(fit.matrix, twin, rooms.carried(truth, twin))
     assert np.median(off) < 30 and fit.mirrored is None  # millimetres
@@ -35,7 +34,7 @@ def test_a_twin_in_millimetres_is_placed_and_a_mirrored_one_named():
 @pytest.mark.parametrize("points, why", [(np.zeros((5, 3)), "5 usable points"), (np.ones((200, 3)), "are one")])
 def test_a_twin_that_is_none_is_refused(points, why):
     with pytest.raises(NergError, match=why):
-        Twin(points).fit(Target(points=PLACE), quiet)
+        Twin(points).fit(AlignmentTarget(), quiet)
 
 
 # ---- Refine ----
@@ -68,9 +67,7 @@ def test_groups_are_people_or_stretches_of_few():
 
 # ---- Scores ----
 
-
 RAYS = rooms.people(400, 0.0)
-
 
 GROUP = RAYS.person
 

@@ -15,7 +15,6 @@ from nerg_mi.alignment.similarity import (
     fit_similarity,
     in_plane,
     leave_one_out,
-    move,
     right_jacobian,
     scale_of,
     upright_basis,
@@ -129,9 +128,3 @@ def test_points_that_tell_nothing_are_refused(points, why):
         check_points(points, points, "the pairs")
     with pytest.raises(NergError, match="above one another"):
         check_points(*[np.outer(np.arange(4.0), [0, 0, 1])] * 2, "the pairs", upright=True)
-
-
-def test_moving_is_that_of_homogeneous_coordinates():
-    rng = np.random.default_rng(5)
-    m, x = similarity(rng), rng.normal(size=(6, 3))
-    np.testing.assert_allclose(move(m, x), carried(m, x))

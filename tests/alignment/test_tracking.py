@@ -5,21 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.constraints import Target, surface_of_traces
+from nerg_mi.alignment.constraints import AlignmentTarget, surface_of_traces
 from nerg_mi.alignment.similarity import MIRROR, errors
 from nerg_mi.alignment.tracking import DECLARED, Tracking, close, compare_flips, scale_range, search
 from nerg_mi.errors import NergError
-
-from . import rooms
+from nerg_mi.photos.posed import read_semidense
+from nerg_mi.rays.readers.registry import read_rays
+from tests.alignment import rooms
 
 # ---- Flips ----
 
-
 RNG = np.random.default_rng(3)
 
-
 POINTS = RNG.uniform([0, 0, 0], [6, 4, 2.5], (400, 3))
-
 
 TURN = np.array([[0, -2, 0, 5], [2, 0, 0, -1], [0, 0, 2, 3], [0, 0, 0, 1.0]])  # by 90 degrees, to twice the size
 
@@ -110,7 +108,6 @@ def test_turn_shift_and_scale_are_guessed_from_hit_points_and_heads():
 
 # ---- Tracking ----
 
-
 RAYS = rooms.people(1200)
 
 
@@ -121,7 +118,7 @@ def quiet(share, text):
 @pytest.mark.nightly
 def test_the_tracking_alone_finds_its_place_and_a_mirrored_one_is_named():
     truth = rooms.similarity(np.random.default_rng(7), upright=True)
-    target = Target(traces=rooms.traces(25_000).moved(truth))
+    target = AlignmentTarget(traces=rooms.traces(25_000).moved(truth))
     fit = Tracking(RAYS).fit(target, quiet)
     off = errors(fit.matrix, RAYS.origin, rooms.carried(truth, RAYS.origin))
     assert np.median(off) < 0.03 and fit.mirrored is None and np.median(fit.centimetres) < 6
@@ -139,7 +136,9 @@ def test_a_start_is_refined_to_any_rotation():
     truth = rooms.similarity(np.random.default_rng(8))
     nudge = np.eye(4)
     nudge[:3, 3] = 0.08, -0.06, 0.05
-    fit = Tracking(RAYS, truth @ nudge).fit(Target(traces=rooms.traces(25_000).moved(truth), upright=False), quiet)
+    fit = Tracking(RAYS, truth @ nudge).fit(
+        AlignmentTarget(traces=rooms.traces(25_000).moved(truth), upright=False), quiet
+    )
     assert np.median(errors(fit.matrix, RAYS.origin, rooms.carried(truth, RAYS.origin))) < 0.02
 
 
@@ -149,13 +148,28 @@ def test_a_start_is_refined_to_any_rotation():
         ({}, {"upright": False}, "say which way is up"),
         ({}, {"floor": None}, "give it with --floor"),
         ({"hit": None}, {}, "without hit points do not tell how large"),
+        (None, {}, "no rays to align"),
     ],
 )
 def test_rays_that_leave_it_open_are_refused(changes, known, why):
+    rays = RAYS.select(RAYS.t < 0) if changes is None else replace(RAYS, **changes)
     with pytest.raises(NergError, match=why):
-        Tracking(replace(RAYS, **changes)).fit(Target(traces=rooms.traces(5000), **known), quiet)
+        Tracking(rays).fit(AlignmentTarget(**known), quiet)
 
 
-def test_no_rays_are_no_evidence():
-    with pytest.raises(NergError, match="no rays to align"):
-        Tracking(RAYS.select(np.zeros(len(RAYS), bool))).fit(Target(traces=rooms.traces(5000)), quiet)
+# ---- Recorded gaze of Aria's glasses against the points that they triangulated ----
+
+
+@pytest.mark.parametrize("file", ["eye_gaze/generalized_eye_gaze.csv", "eye_gaze_vergence/generalized_gaze.csv"])
+def test_each_planted_mistake_is_named(file, recorded):
+    sample = recorded("aria") / "gen1" / "mps_sample"
+    rays, points = read_rays("aria", sample / file), read_semidense(sample / "trajectory" / "global_points.csv.gz")
+    flips = compare_flips(points, np.eye(4), rays.origin, rays.direction, rays.head)
+    assert flips.warning() is None and np.median(flips.degrees[DECLARED]) < 0.2
+    left = np.cross((0, 0, 1), rays.head)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    mistakes = {f"{'xyz'[k]} of the directions negated": np.eye(3)[k][None] for k in range(3)}
+    mistakes |= {"left and right of the eyes": left, "up and down of the eyes": np.cross(rays.head, left)}
+    for name, axis in mistakes.items():
+        wrong = rays.direction - 2 * np.sum(rays.direction * axis, axis=1, keepdims=True) * axis
+        assert name in str(compare_flips(points, np.eye(4), rays.origin, wrong, rays.head).warning())

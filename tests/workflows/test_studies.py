@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.check import Check
+from nerg_mi.alignment.check import AlignmentCheck
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.study import measure, settings
 from nerg_mi.evaluation.study_subject import open_subject
@@ -207,14 +207,14 @@ def place(found, monkeypatch):
 
 def test_gaze_that_meets_nothing_is_refused_and_doubts_are_told_with_the_next_command(monkeypatch):
     reporter = Recorder()
-    nowhere = place(Check(1.0, 0.0, 0.0), monkeypatch)
+    nowhere = place(AlignmentCheck(1.0, 0.0, 0.0), monkeypatch)
     with pytest.raises(NergError, match="100.0.*--field.*--force"):
         check_place(nowhere, RAYS, "--field f", False, reporter)
     check_place(nowhere, RAYS, "--field f", True, reporter)
-    check_place(place(Check(0.4, 0.3, 0.2), monkeypatch), RAYS, "--scene s", False, reporter)
+    check_place(place(AlignmentCheck(0.4, 0.3, 0.2), monkeypatch), RAYS, "--scene s", False, reporter)
     assert len(reporter.warnings) == 2 and "30 % of the heads are inside of something" in reporter.warnings[1]
     assert "nerg align RAYS --scene s -o alignment.json" in reporter.warnings[1]
-    check_place(place(Check(0.05, 0.0, 0.0), monkeypatch), RAYS, "--field f", False, reporter)
+    check_place(place(AlignmentCheck(0.05, 0.0, 0.0), monkeypatch), RAYS, "--field f", False, reporter)
     for kind in ("hits", "none"):
         bare = replace(nowhere, kind=kind, medium=None if kind == "none" else nowhere.medium)
         check_place(bare, RAYS, "", False, reporter)
