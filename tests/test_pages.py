@@ -28,7 +28,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").g
 
 RUN_ELSEWHERE = {
     ("splats.md", "python"): "tests/plugins/test_splats.py",
-    ("rays.md", "python"): "tests/rays/test_manual.py",
+    ("rays.md", "python"): "tests/rays/test_rays.py",
 }
 """All blocks of a language on a page -> the tests elsewhere that run them."""
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
-from nerg_mi.rays.dataset import RayDataset, is_dataset, merge_rays
+from nerg_mi.rays.dataset import RayDataset, is_dataset
 from nerg_mi.rays.filters import time_order
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.rays import Rays, merge_rays
 from nerg_mi.statistics.shares import CellsInView
 from nerg_mi.statistics.visits import (
     ALL,

@@ -250,7 +250,7 @@ def load_rays(path: FilePath) -> Rays:
     >>> len(nerg.load_rays(folder / "rays.npz"))
     2
     """
-    from nerg_mi.rays.dataset_open import load_rays as load
+    from nerg_mi.rays.dataset import load_rays as load
 
     return load(_existing(path))
 

@@ -157,7 +157,7 @@ def provenance(
 def _digest(path: Path) -> str:
     if not path.is_dir():
         return file_sha256(path)
-    from nerg_mi.rays.dataset_open import rays_digest
+    from nerg_mi.rays.dataset import rays_digest
 
     return rays_digest(path)
 

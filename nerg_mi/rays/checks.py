@@ -7,7 +7,7 @@ To add one, write ``@check("what it looks for") def check_NAME(figures)`` here o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,12 +19,8 @@ from .readers.base import UNITS
 
 # ---- What checks of rays are given, and what several of them need ----
 
-MOST = 200_000
-"""Rays looked at, where a part of them says as much as all."""
-
-ENOUGH = 50
-"""Rays from which on something can be said of what most of them do: a second of a recording."""
-
+MOST = 200_000  # Rays looked at, where a part of them says as much as all
+ENOUGH = 50  # Rays from which on something can be said of what most of them do: a second of a recording
 _NAMED = 3  # people
 
 
@@ -83,11 +79,12 @@ def name_some(names: Sequence[str]) -> str:
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
+def name_persons(rays: Rays, persons: Iterable[int]) -> str:
+    """As `name_some`, of numbers of persons."""
+    return name_some([rays.persons[person] for person in persons])
+
+
 # ---- What a check of rays is ----
-#
-# To add one, write ``@check("what it looks for") def check_NAME(figures)`` in a module of this folder, and add it to
-# the list of checks of recordings (:mod:`nerg_mi.rays.checks`) or of directions (:mod:`nerg_mi.rays.direction_checks`).
-# The sanity card shows what it finds.
 
 
 @dataclass(frozen=True)
@@ -158,7 +155,7 @@ def _check_jumps(figures: Figures) -> list[str]:
     if not found:
         return []
     longest = max((s for steps in found.values() for s in steps), key=abs)
-    count, names = sum(map(len, found.values())), name_some([rays.persons[p] for p in found])
+    count, names = sum(map(len, found.values())), name_persons(rays, found)
     return [
         f"the clock of {names} jumps {'once' if count == 1 else f'{count} times'}, by {longest:+,.0f} s at most, while "
         "the head goes on as if there were no gap: mend the times of the file"
@@ -194,7 +191,7 @@ def _check_overlaps(figures: Figures) -> list[str]:
     overlap = (person[1:] == person[:-1]) & (first[1:] < last[:-1])
     if not overlap.any():
         return []
-    names = name_some([rays.persons[p] for p in np.unique(person[1:][overlap])])
+    names = name_persons(rays, np.unique(person[1:][overlap]))
     return [
         f"recordings of {names} overlap in time: do several people, or several clocks, share a name? "
         "(--person-from filename, or --map person=...)"
@@ -217,7 +214,7 @@ def _check_duplicates(figures: Figures) -> list[str]:
     a, b = (pairs + k if order is None else order[pairs + k] for k in (0, 1))
     apart = np.linalg.norm(rays.origin[a] - rays.origin[b], axis=1)
     turned = np.linalg.norm(rays.direction[a] - rays.direction[b], axis=1)
-    names = lambda mask: name_some([rays.persons[p] for p in np.unique(rays.person[a][mask])])
+    names = lambda mask: name_persons(rays, np.unique(rays.person[a][mask]))
     out = []
     if np.mean(twice := (apart < 1e-3) & (turned < 1e-3)) > 0.5:
         out.append(f"rays of {names(twice)} are there twice: was a file imported two times?")
@@ -250,7 +247,7 @@ def _check_pace(figures: Figures) -> list[str]:
     out, usual = [], np.nanmedian(of_person)
     other = lambda ratio: (ratio > _PACE) | (ratio < 1 / _PACE)
     for p in np.flatnonzero(other(of_person / usual))[:1]:
-        names = name_some([rays.persons[q] for q in np.flatnonzero(other(of_person / usual))])
+        names = name_persons(rays, np.flatnonzero(other(of_person / usual)))
         out.append(
             f"a ray of {names} comes every {of_person[p]:.3g} s, and of others every {usual:.3g} s: does their clock "
             "count in another unit? Import them apart (--tick)"
@@ -260,7 +257,7 @@ def _check_pace(figures: Figures) -> list[str]:
     if changes.any():
         share = 100 * odd[changes[person]].mean()
         out.append(
-            f"the clock of {name_some([rays.persons[p] for p in np.flatnonzero(changes)])} changes its pace by more "
+            f"the clock of {name_persons(rays, np.flatnonzero(changes))} changes its pace by more "
             f"than {_PACE:.0f} times for {share:.0f} % of the rays: does it count in two units? Mend the file's times"
         )
     return out
@@ -276,7 +273,7 @@ def _check_epochs(figures: Figures) -> list[str]:
     if not cut or when[cut] - when[cut - 1] < _EPOCH:
         return []
     fewer = np.unique(min(person[cut:], person[:cut], key=len))
-    names = name_some([rays.persons[p] for p in fewer])
+    names = name_persons(rays, fewer)
     return [
         f"the clock of {names} counts from another moment than that of others: split by time for each person by itself "
         "(--clock person)"
@@ -285,9 +282,7 @@ def _check_epochs(figures: Figures) -> list[str]:
 
 # ---- The unit of length, by how far the eyes are apart ----
 
-USUAL = 0.063
-"""Metres between the eyes of adults, on average; 95 % of them lie between 0.055 and 0.071 (Dodgson 2004)."""
-
+USUAL = 0.063  # Metres between the eyes of adults, on average; 95 % of them lie between 0.055 and 0.071 (Dodgson 2004)
 _BOUNDS = (0.050, 0.078), (0.055, 0.072)  # metres, of one, and of the median of several
 _SEVERAL = 5
 _LIKE = 1.25  # factor up to which a unit fits
@@ -360,7 +355,6 @@ def check_frozen(figures: Figures) -> list[str]:
 #
 # The bounds are wide: they catch a wrong unit or axis, not an unusual shop.
 
-
 _HEADS = 0.4, 2.3  # metres over the floor between which the median of all heads is
 
 
@@ -408,10 +402,7 @@ def _standing_axis(rays: Rays) -> str | None:
     return None if len(found) != 1 else ("-" if mid[found[0]] < 0 else "") + "xyz"[found[0]]
 
 
-# ---- Participants ----
-#
-# Participants who are rows of a table: its column of them counts rows, or names each sample.
-
+# ---- Participants who are rows of a table: its column of them counts rows, or names each sample ----
 
 _PARTICIPANTS_FEW = 2  # rays of a participant, by the median
 
@@ -460,10 +451,7 @@ def check_times(figures: Figures) -> list[str]:
     return out
 
 
-# ---- Recording checks ----
-#
-# The checks of recordings, in the order of the card: who, how large, and when.
-
+# ---- The checks of recordings, in the order of the card: who, how large, and when ----
 
 RECORDING_CHECKS: tuple[Check, ...] = (
     check_files,

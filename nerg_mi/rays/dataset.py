@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -18,49 +18,12 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import write_text
+from nerg_mi.files.atomic import file_sha256, write_text
 from nerg_mi.files.safe_read import inflated_limit, is_count, read_json, reading, size_of
 
 from .filters import select_mask
-from .rays import COLUMNS, FRAME, Rays, pyarrow_modules, read_metadata
+from .rays import FRAME, Rays, column_parts, merge_rays, pyarrow_modules, read_metadata, sample_rows
 from .rays import VERSION as RAYS_VERSION
-
-# ---- Which of very many rays are taken as a sample, without room for all of their numbers ----
-
-
-def sample_rows(count: int, n: int, seed: int = 0, runs: int | None = None) -> np.ndarray:
-    """``n`` of the numbers from 0 to ``count`` - 1, sorted (n,) int64; all, where there are no more.
-
-    Every number is as likely as any other. Without ``runs`` so is every set of ``n`` of them. With it they are so many
-    runs of neighbours, wherever these begin: less has to be read for them, and they tell less, since neighbours are
-    alike.
-    """
-    rng = np.random.default_rng(seed)
-    if n >= count:
-        return np.arange(count)
-    if runs is not None and runs < n:
-        length = n // runs
-        # Cells of equal length on a circle that is turned at random.
-        cells = _distinct(count // length, runs, rng)
-        start = (rng.integers(count) + cells * length) % count
-        return np.sort((start[:, None] + np.arange(length)).ravel() % count)
-    if n > count // 2:
-        keep = np.ones(count, bool)
-        keep[_distinct(count, count - n, rng)] = False
-        return np.flatnonzero(keep)
-    return _distinct(count, n, rng)
-
-
-def _distinct(count: int, n: int, rng: np.random.Generator) -> np.ndarray:
-    """``n`` different numbers below ``count``, sorted: drawn until there are enough, and of too many some are left out
-    at random."""
-    found = np.zeros(0, np.int64)
-    while len(found) < n:
-        # Sorted, where numpy.unique would make a table of hashes: several times as fast.
-        found = np.sort(np.concatenate([found, rng.integers(0, count, n - len(found) + 16)]))
-        found = found[np.r_[True, found[1:] != found[:-1]]]
-    return np.delete(found, rng.choice(len(found), len(found) - n, replace=False))
-
 
 # ---- Where the parts of a dataset lie, and which columns they have ----
 #
@@ -73,29 +36,12 @@ def _distinct(count: int, n: int, rng: np.random.Generator) -> np.ndarray:
 # float64 seconds, as those of rays: exact for any clock that a reader can give, where whole nanoseconds would round
 # some times and end after 292 years. Origins, directions, hit points and heads are float32, NaN where they are unknown.
 
-
-SUFFIX = ".rays"
-"""How the name of a dataset ends where one is made."""
-
+SUFFIX = ".rays"  # How the name of a dataset ends where one is made
 HEAD = "_dataset.json"
 SOURCES = "_sources"
-UNKNOWN = "unknown"
-"""The day of a clock that does not tell it, and the place that nobody has named."""
-
-BUCKETS = 16
-"""People of a day are in so many buckets, by a hash of their names."""
-
-PART_ROWS = 1 << 20
-"""A part has so many rays at most: it is read as a whole."""
-
-GROUP_ROWS = 1 << 17
-"""And a row group so many: the least that is decoded to find some of them."""
-
-REACH = 8192.0
-"""Origins lie within so many metres of zero: float32 places them there to half a millimetre."""
-
-VECTORS = ("origin", "direction", "hit", "head")
-_EPOCH = 946_684_800.0, 4_102_444_800.0  # the years 2000 to 2100
+UNKNOWN = "unknown"  # The day of a clock that does not tell it, and the place that nobody has named
+PART_ROWS = 1 << 20  # A part has so many rays at most: it is read as a whole
+GROUP_ROWS = 1 << 17  # And a row group so many: the least that is decoded to find some of them
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
 _PLACE = 64  # characters
 
@@ -103,14 +49,6 @@ _PLACE = 64  # characters
 def bucket_of(person: str, buckets: int) -> int:
     """The bucket of somebody's rays."""
     return int(hashlib.sha256(person.encode("utf-8", "surrogatepass")).hexdigest()[:15], 16) % buckets
-
-
-def days_of(t: np.ndarray) -> np.ndarray | None:
-    """Days since 1970 (N,) int64 of times (N,), where all of them are seconds since then in the years 2000 to 2099;
-    None for another clock. Days are those of UTC."""
-    if not len(t) or t.min() < _EPOCH[0] or t.max() >= _EPOCH[1]:
-        return None
-    return (t // 86_400).astype(np.int64)
 
 
 def check_place(place: str) -> str:
@@ -150,57 +88,10 @@ def is_dataset(path: str | os.PathLike) -> bool:
     return (split_path(path)[0] / HEAD).is_file()
 
 
-def schema() -> Any:
-    """The columns of a part, as pyarrow has them."""
-    pa, _ = pyarrow_modules()
-    names = pa.dictionary(pa.int32(), pa.string())
-    vector = lambda name: [(f"{name}_{axis}", pa.float32()) for axis in "xyz"]
-    return pa.schema(
-        [
-            ("t", pa.float64()),
-            ("person", names),
-            *vector("origin"),
-            *vector("direction"),
-            ("confidence", pa.float64()),
-            *vector("hit"),
-            ("cohort", names),
-            *vector("head"),
-        ]
-    )
-
-
-def table_of(rays: Rays, rows: np.ndarray) -> Any:
-    """The rays ``rows`` (n,), in this order, as a table of `schema`."""
-    pa, _ = pyarrow_modules()
-    columns: dict[str, Any] = {"t": rays.t[rows], "confidence": rays.confidence[rows]}
-    for name in VECTORS:
-        value = getattr(rays, name)
-        for k, axis in enumerate("xyz"):
-            part = np.full(len(rows), np.nan, np.float32) if value is None else value[rows, k].astype(np.float32)
-            columns[f"{name}_{axis}"] = part
-    columns["person"] = _names(pa, rays.person[rows], rays.persons)
-    if rays.cohort is None:
-        columns["cohort"] = pa.nulls(len(rows), schema().field("cohort").type)
-    else:
-        columns["cohort"] = _names(pa, rays.cohort[rows], rays.cohorts)
-    kinds = schema()
-    return pa.table([columns[name] for name in kinds.names], schema=kinds)
-
-
-def _names(pa: Any, codes: np.ndarray, names: tuple[str, ...]) -> Any:
-    """Names as a dictionary of those that occur."""
-    there = np.bincount(codes, minlength=len(names)) > 0
-    known = pa.array([names[k] for k in np.flatnonzero(there)], pa.string())
-    return pa.DictionaryArray.from_arrays(pa.array((np.cumsum(there) - 1)[codes].astype(np.int32)), known)
-
-
-# ---- Manifest ----
-#
-# The account of a dataset, in JSON: what it is, and what became of each source that was imported.
+# ---- The account of a dataset, in JSON: what it is, and what became of each source that was imported ----
 #
 # An account of a source is written after all of its parts, whole or not at all: what no account names does not belong
 # to the dataset. Nothing in it is the path of a file: where a part lies follows from its place, day, bucket and number.
-
 
 VERSION = 1
 _ID = re.compile(r"[0-9a-f]{32}")
@@ -219,7 +110,7 @@ class Head:
 
 
 @dataclass(frozen=True)
-class Part:
+class PartFile:
     """A file of rays of one source, place, day and bucket."""
 
     place: str
@@ -257,7 +148,7 @@ class Source:
     generation: int  # of the accounts of this path the latest counts
     persons: dict[str, int]  # rays of each
     cohorts: dict[str, int]
-    parts: list[Part]
+    parts: list[PartFile]
     metadata: dict[str, Any] = field(default_factory=dict)  # of its rays: frame, sources, rows_read, dropped, ...
 
     @property
@@ -273,15 +164,12 @@ def write_head(folder: Path, head: Head) -> None:
 def read_head(folder: Path) -> Head:
     """What holds for the dataset ``folder``. Raises `NergError` for a folder that is none."""
     path = folder / HEAD
-    found = _document(path)
-    salt = found.get("salt")
-    if not (is_count(found.get("buckets")) and 0 < found["buckets"] <= _MOST_BUCKETS):
-        raise _damaged(path, '"buckets" is no number of buckets')
-    if salt is not None and not isinstance(salt, str):
-        raise _damaged(path, '"salt" is no text')
-    if not isinstance(found.get("closed"), bool):
-        raise _damaged(path, '"closed" is neither yes nor no')
-    return Head(found["buckets"], salt, found["closed"])
+    content = _document(path)
+    head: dict[str, Any] = {key: content.get(key) for key in ("buckets", "salt", "closed")}
+    _check(path, "buckets", is_count(head["buckets"]) and 0 < head["buckets"] <= _MOST_BUCKETS, "number of buckets")
+    _check(path, "salt", head["salt"] is None or isinstance(head["salt"], str), "text")
+    _check(path, "closed", isinstance(head["closed"], bool), "yes or no")
+    return Head(**head)
 
 
 def source_path(folder: Path, source: str) -> Path:
@@ -306,53 +194,39 @@ def read_sources(folder: Path, head: Head) -> list[Source]:
 
 def read_source(path: Path, head: Head) -> Source:
     """The account ``path`` of a source, checked. Raises `NergError` for one that is damaged."""
-    found = _document(path)
-    found.pop("version")
-    if set(found) != {f.name for f in fields(Source)}:
+    content = _document(path)
+    content.pop("version")
+    if set(content) != {f.name for f in fields(Source)}:
         raise _damaged(path, "its keys are not those of an account")
-    if found["id"] != path.stem or not _ID.fullmatch(path.stem):
+    if content["id"] != path.stem or not _ID.fullmatch(path.stem):
         raise _damaged(path, '"id" is not that of its name')
-    for key in ("file", "where", "recipe"):
-        _check(path, key, isinstance(found[key], str), "text")
-    _check(path, "stamp", found["stamp"] is None or isinstance(found["stamp"], str), "text")
-    _check(path, "generation", is_count(found["generation"]), "count")
-    for key in ("persons", "cohorts"):
-        _check(path, key, isinstance(found[key], dict) and all(map(is_count, found[key].values())), "counts")
-    _check(path, "metadata", isinstance(found["metadata"], dict), "object")
+    for key, (holds, what) in _SOURCE_KINDS.items():
+        _check(path, key, holds(content[key]), what)
     # The same of them is relied on as of a file's.
-    about = {"version": RAYS_VERSION, "persons": [], **found["metadata"]}
-    read_metadata(json.dumps(about), path)
-    _check(path, "parts", _all(found["parts"], lambda v: isinstance(v, dict)), "list of parts")
-    parts = [_part(path, part, head, found["persons"]) for part in found["parts"]]
-    if sum(found["persons"].values()) != sum(part.rays for part in parts):
+    read_metadata(json.dumps({"version": RAYS_VERSION, "persons": [], **content["metadata"]}), path)
+    parts = [_part(path, part, head, content["persons"]) for part in content["parts"]]
+    if sum(content["persons"].values()) != sum(part.rays for part in parts):
         raise _damaged(path, "its persons have not as many rays as its parts")
     if len({part.number for part in parts}) != len(parts):
         raise _damaged(path, "two of its parts have the same number")
-    return Source(**{**found, "parts": parts})
+    return Source(**{**content, "parts": parts})
 
 
-def _part(path: Path, found: dict[str, Any], head: Head, persons: dict[str, int]) -> Part:
-    if set(found) != {f.name for f in fields(Part)}:
+def _part(path: Path, content: dict[str, Any], head: Head, persons: dict[str, int]) -> PartFile:
+    if set(content) != {f.name for f in fields(PartFile)}:
         raise _damaged(path, "the keys of a part are not those of one")
-    for key in ("bucket", "number", "rays", "bytes", "duplicates", "hits"):
-        _check(path, key, is_count(found[key]), "count")
-    _check(path, "bucket", found["bucket"] < head.buckets, "bucket of this dataset")
-    _check(path, "rays", 0 < found["rays"] <= PART_ROWS, "number of rays of a part")
-    for key in ("cohorts", "heads"):
-        _check(path, key, isinstance(found[key], bool), "yes or no")
-    for key in ("start", "end", "recorded"):
-        _check(path, key, _number(found[key]), "number")
-    for key in ("low", "high"):
-        _check(path, key, _all(found[key], _number) and len(found[key]) == 3, "point")
+    for key, (holds, what) in _PART_KINDS.items():
+        _check(path, key, holds(content[key]), what)
+    _check(path, "bucket", content["bucket"] < head.buckets, "bucket of this dataset")
+    _check(path, "rays", 0 < content["rays"] <= PART_ROWS, "number of rays of a part")
     for key in ("first", "last"):
-        _check(path, key, isinstance(found[key], str) and found[key] in persons, "person of this source")
-    for key, check in (("place", check_place), ("day", check_day)):
-        _check(path, key, isinstance(found[key], str), "text")
-        try:
-            check(found[key])
-        except NergError as error:
-            raise _damaged(path, str(error)) from error
-    return Part(**found)
+        _check(path, key, content[key] in persons, "person of this source")
+    try:
+        check_place(content["place"])
+        check_day(content["day"])
+    except NergError as error:
+        raise _damaged(path, str(error)) from error
+    return PartFile(**content)
 
 
 def _document(path: Path) -> dict[str, Any]:
@@ -374,101 +248,70 @@ def _damaged(path: Path, why: str) -> NergError:
     return NergError(f'the account "{path}" of a dataset is damaged ({why}); {remedy}')
 
 
-def _all(value: object, test: Any) -> bool:
-    return isinstance(value, list) and all(map(test, value))
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
 
 
-def _number(value: object) -> bool:
+def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
-# ---- Rays of several blocks or sources as one, and what their metadata say of all of them ----
+def _is_point(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
+
+
+def _are_counts(value: object) -> bool:
+    return isinstance(value, dict) and all(map(is_count, value.values()))
+
+
+_SOURCE_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    **dict.fromkeys(("file", "where", "recipe"), (_is_text, "text")),
+    "stamp": (lambda value: value is None or _is_text(value), "text"),
+    "generation": (is_count, "count"),
+    **dict.fromkeys(("persons", "cohorts"), (_are_counts, "counts")),
+    "metadata": (lambda value: isinstance(value, dict), "object"),
+    "parts": (lambda value: isinstance(value, list) and all(isinstance(v, dict) for v in value), "list of parts"),
+}
+_PART_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    **dict.fromkeys(("bucket", "number", "rays", "bytes", "duplicates", "hits"), (is_count, "count")),
+    **dict.fromkeys(("cohorts", "heads"), (lambda value: isinstance(value, bool), "yes or no")),
+    **dict.fromkeys(("start", "end", "recorded"), (_is_number, "number")),
+    **dict.fromkeys(("low", "high"), (_is_point, "point")),
+    **dict.fromkeys(("place", "day", "first", "last"), (_is_text, "text")),
+}
+"""What each value of an account is: whether it is one, and its name."""
+
 
 _MERGED = ("sources", "dropped", "rows_read", "complaints", "eye_distance", "missing", "unused_columns")
-_EMPTY = np.zeros((0, 3))
-
-
-def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -> Rays:
-    """The rays of all ``blocks``, in this order, with the sorted persons and cohorts that occur.
-
-    Blocks without hit points or heads get NaN, and those without cohorts the cohort "unknown", where others have some.
-    """
-    held = [(block.columns(), block.persons, block.cohorts, len(block)) for block in map(_compact, blocks)]
-    metadata = {"frame": dict(FRAME)} if metadata is None else metadata
-    if not held:
-        none = _EMPTY[:, 0]
-        return Rays(none, np.zeros(0, np.int32), (), _EMPTY, _EMPTY, none, metadata=metadata)
-    persons = tuple(sorted({name for _, names, _, _ in held for name in names}))
-    grouped = any("cohort" in columns for columns, *_ in held)
-    alike = {"unknown"} if any("cohort" not in columns for columns, *_ in held) else set()
-    cohorts = tuple(sorted({name for _, _, names, _ in held for name in names} | alike)) if grouped else ()
-    place, group = ({name: k for k, name in enumerate(names)} for names in (persons, cohorts))
-    for columns, known, groups, n in held:
-        columns["person"] = _renumbered(columns["person"], known, place)
-        if grouped:
-            codes, groups = (
-                (columns["cohort"], groups) if "cohort" in columns else (np.zeros(n, np.int32), ("unknown",))
-            )
-            columns["cohort"] = _renumbered(codes, groups, group)
-        for name, kind in (("hit", np.float64), ("head", np.float32)):
-            if name not in columns and any(name in other for other, *_ in held):
-                columns[name] = np.full((n, 3), np.nan, kind)
-    # Column by column, so that no more than one is there twice.
-    joined = {
-        name: np.concatenate([columns.pop(name) for columns, *_ in held]) for name in COLUMNS if name in held[0][0]
-    }
-    return Rays(**joined, persons=persons, cohorts=cohorts, metadata=metadata)
-
-
-def _compact(rays: Rays) -> Rays:
-    """The same rays, without the names of people and cohorts that have none of them."""
-    persons, cohorts = _used(rays.person, rays.persons), _used(rays.cohort, rays.cohorts)
-    if persons == rays.persons and cohorts == rays.cohorts:
-        return rays
-    cohort = None if rays.cohort is None else _places(rays.cohort)
-    return replace(rays, person=_places(rays.person), persons=persons, cohort=cohort, cohorts=cohorts)
-
-
-def _used(codes: np.ndarray | None, names: tuple[str, ...]) -> tuple[str, ...]:
-    return () if codes is None else tuple(names[k] for k in np.flatnonzero(np.bincount(codes)).tolist())
-
-
-def _places(codes: np.ndarray) -> np.ndarray:
-    """The codes (N,) among those that occur."""
-    return (np.cumsum(np.bincount(codes) > 0) - 1)[codes]
-
-
-def _renumbered(codes: np.ndarray, names: Sequence[str], place: dict[str, int]) -> np.ndarray:
-    return np.array([place[name] for name in names], np.int32)[codes]
 
 
 def merge_metadata(sources: Sequence[Source]) -> dict[str, Any]:
     """What holds for all sources, what was dropped of any, and how many rows were read; ``steps`` that all have had."""
-    about = [source.metadata for source in sources]
-    first = about[0] if about else {"frame": dict(FRAME)}
-    same = {k: v for k, v in first.items() if k not in _MERGED and all(other.get(k) == v for other in about)}
-    eyes = {name: metres for other in about for name, metres in other.get("eye_distance", {}).items()}
-    complaints = list(dict.fromkeys(sentence for other in about for sentence in other.get("complaints", [])))
-    missing = merge_counts(other.get("missing", {}) for other in about)
-    unused = list(dict.fromkeys(name for other in about for name in other.get("unused_columns", [])))
+    each = [source.metadata for source in sources]
+    first = each[0] if each else {"frame": dict(FRAME)}
+    same = {k: v for k, v in first.items() if k not in _MERGED and all(other.get(k) == v for other in each)}
+    listed = lambda key: [entry for other in each for entry in other.get(key, [])]
+    where_any = {
+        "missing": merge_counts(other.get("missing", {}) for other in each),
+        "unused_columns": list(dict.fromkeys(listed("unused_columns"))),
+        "complaints": list(dict.fromkeys(listed("complaints"))),
+        "eye_distance": {name: metres for other in each for name, metres in other.get("eye_distance", {}).items()},
+    }
     return {
         **same,
-        **({"missing": missing} if missing else {}),
-        **({"unused_columns": unused} if unused else {}),
-        **({"complaints": complaints} if complaints else {}),
-        **({"eye_distance": eyes} if eyes else {}),
+        **{key: value for key, value in where_any.items() if value},
         "frame": first["frame"],
-        "sources": [entry for other in about for entry in other.get("sources", [])],
-        "rows_read": sum(other.get("rows_read", 0) for other in about),
-        "dropped": [entry for other in about for entry in other.get("dropped", [])],
+        "sources": listed("sources"),
+        "rows_read": sum(other.get("rows_read", 0) for other in each),
+        "dropped": listed("dropped"),
     }
 
 
 def merge_counts(counts: Iterable[dict[str, int]]) -> dict[str, int]:
     """Sums by name, in the order of names."""
     total: Counter[str] = Counter()
-    for found in counts:
-        total.update(found)
+    for each in counts:
+        total.update(each)
     return dict(sorted(total.items()))
 
 
@@ -499,7 +342,7 @@ class Conditions:
         """Whether any is given."""
         return self != Conditions()
 
-    def may_hold(self, part: Part, buckets: int) -> bool:
+    def may_hold(self, part: PartFile, buckets: int) -> bool:
         """Whether rays of a part may meet them, by its account."""
         if self.with_hit and not part.hits:
             return False
@@ -550,8 +393,7 @@ class Conditions:
         return rays if mask.all() else rays.select(mask)
 
 
-EVERYTHING = Conditions()
-"""What all rays meet."""
+EVERYTHING = Conditions()  # What all rays meet
 
 
 # ---- Reading the parts of a dataset, row group by row group, each checked against the account ----
@@ -564,7 +406,7 @@ _WHAT = "part of a dataset"
 def read_groups(
     folder: Path,
     source: Source,
-    part: Part,
+    part: PartFile,
     wanted: Callable[[int, int, dict[str, tuple[Any, Any]]], bool],
     hits: bool = True,
 ) -> Iterator[tuple[int, Rays]]:
@@ -615,7 +457,7 @@ def _needed(pa: Any, schema: Any, path: Path, names: list[str]) -> list[str]:
     their kinds."""
     found = []
     for name in names:
-        for column in [f"{name}_{axis}" for axis in "xyz"] if name in VECTORS else [name]:
+        for column in column_parts(name):
             if schema.names.count(column) != 1:
                 raise _foreign(path, f'it has no column "{column}"')
             type_ = schema.field(column).type
@@ -638,7 +480,7 @@ def _bounds(group: Any) -> dict[str, tuple[Any, Any]]:
 def _rays(pa: Any, table: Any, path: Path, source: Source) -> Rays:
     """The rays of a row group."""
     number = lambda name: table.column(name).to_numpy()
-    vector = lambda name: np.stack([number(f"{name}_{axis}") for axis in "xyz"], axis=1)
+    vector = lambda name: np.stack([number(part) for part in column_parts(name)], axis=1)
     names = table.schema.names
     person, persons = _codes(pa, table.column("person"), path)
     strangers = [name for name in persons if name not in source.persons]
@@ -681,16 +523,10 @@ def _codes(pa: Any, column: Any, path: Path) -> tuple[np.ndarray, tuple[str, ...
     return to[codes], persons
 
 
-# ---- Dataset ----
-#
-# A dataset of rays that was written: scanned block by block, loaded as far as it fits, or sampled.
+# ---- A dataset of rays that was written: scanned block by block, loaded as far as it fits, or sampled ----
 
-
-MOST = 50_000_000
-"""So many rays are loaded at once, unless another bound is given."""
-
-RAY_BYTES = 110
-"""Memory of a ray that is loaded, roughly."""
+MOST = 50_000_000  # So many rays are loaded at once, unless another bound is given
+RAY_BYTES = 110  # Memory of a ray that is loaded, roughly
 
 
 @dataclass(frozen=True, eq=False)
@@ -703,7 +539,7 @@ class RayDataset:
     folder: Path
     head: Head
     sources: tuple[Source, ...]  # those that have rays in it, or that gave none at all
-    parts: tuple[tuple[Source, Part], ...]  # in the order in which they are read: place, day, bucket, source, number
+    parts: tuple[tuple[Source, PartFile], ...]  # in the order of reading: place, day, bucket, source, number
 
     @classmethod
     def open(cls, path: str | os.PathLike) -> RayDataset:
@@ -810,18 +646,14 @@ class RayDataset:
     def _check(self, conditions: Conditions) -> None:
         """Raise `NergError` for names that are not known, and a box that is none."""
         conditions.check()
-        for what, names in (
-            ("person", conditions.persons),
-            ("person", conditions.without_persons),
-            ("cohort", conditions.cohorts),
+        for what, known, names in (
+            ("person", self.persons, conditions.persons),
+            ("person", self.persons, conditions.without_persons),
+            ("cohort", sorted({*self.cohorts, "unknown"}), conditions.cohorts),
         ):
-            if names is None:
-                continue
-            known = set(self.persons) if what == "person" else {*self.cohorts, "unknown"}
-            unknown = [name for name in names if name not in known]
+            unknown = [name for name in names or () if name not in known]
             if unknown:
-                some = sorted(known)
-                listed = ", ".join(some[:20]) + (", ..." if len(some) > 20 else "")
+                listed = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
                 raise NergError(f"no {what} is called {', '.join(map(repr, unknown))}; there are {listed}")
 
     def load(self, conditions: Conditions = EVERYTHING, *, most: int = MOST, hits: bool = True) -> Rays:
@@ -862,7 +694,7 @@ class RayDataset:
             start += part.rays
             if not len(here):
                 continue
-            wanted = partial(_some, here)
+            wanted = lambda first, count, bounds, here=here: len(_within(here, first, count)) > 0
             for first, block in read_groups(self.folder, source, part, wanted, hits):
                 chosen = _within(here, first, len(block)) - first
                 blocks.append(block if len(chosen) == len(block) else block.select(chosen))
@@ -880,5 +712,20 @@ def _within(rows: np.ndarray, first: int, count: int) -> np.ndarray:
     return rows[np.searchsorted(rows, first) : np.searchsorted(rows, first + count)]
 
 
-def _some(rows: np.ndarray, first: int, count: int, bounds: dict[str, tuple[Any, Any]]) -> bool:
-    return len(_within(rows, first, count)) > 0
+def load_rays(path: str | os.PathLike, most: int | None = None, seed: int = 0) -> Rays:
+    """The rays of a file, or of a dataset or a part of it (``shop.rays/place=north``).
+
+    ``most``: of a dataset, take so many at most: of more, a sample by ``seed`` in which each is as likely as any other.
+    None: all, of which there may be 50 million. Raises `NergError` for what is neither, or damaged.
+    """
+    if not Path(path).is_dir():
+        return Rays.load(path)
+    dataset = RayDataset.open(path)
+    if most is not None and len(dataset) > most:
+        return dataset.sample(most, seed)
+    return dataset.load(most=MOST if most is None else most)
+
+
+def rays_digest(path: str | os.PathLike) -> str:
+    """SHA-256 of a file of rays, or that of which rays a dataset holds."""
+    return RayDataset.open(path).digest if is_dataset(path) else file_sha256(Path(path))

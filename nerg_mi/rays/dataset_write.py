@@ -24,31 +24,27 @@ from nerg_mi.files.safe_read import reading
 from nerg_mi.tasks.engines import process_pool
 
 from .dataset import (
-    BUCKETS,
     GROUP_ROWS,
     HEAD,
     PART_ROWS,
-    REACH,
     SOURCES,
     UNKNOWN,
     Head,
-    Part,
+    PartFile,
     Source,
     bucket_of,
     check_day,
     check_place,
-    days_of,
     read_head,
     read_source,
     read_sources,
     source_path,
-    table_of,
     write_head,
     write_source,
 )
 from .pseudonyms import pseudonymise
 from .quality import GAP
-from .rays import Rays, pyarrow_modules
+from .rays import VECTORS, Rays, column_parts, pyarrow_modules
 from .readers.base import Reader
 from .readers.registry import read_rays
 
@@ -58,7 +54,6 @@ from .readers.registry import read_rays
 #
 # Where people have pseudonyms, marks are HMACs under their salt: without it nobody can find out by a mark whether some
 # file was among the sources.
-
 
 _FRESH = 2.0  # seconds: a file that was written just now may change without showing it in its time
 _MOST_FILES = 100_000  # of a folder that is a source
@@ -122,14 +117,12 @@ def _files(source: Path) -> list[tuple[Path, os.stat_result]]:
         return [(path.relative_to(source), os.stat(path)) for path in found if path.is_file()]
 
 
-# ---- Writing ----
-#
-# Writing the parts of one source: rays by place, day and bucket, in the order of persons and times.
+# ---- Writing the parts of one source: rays by place, day and bucket, in the order of persons and times ----
 
-
-_RUNS = 1000
-"""So many runs of dropped rows are named of a source: accounts of thousands of sources are read at once."""
-
+BUCKETS = 16  # People of a day are in so many buckets, by a hash of their names
+REACH = 8192.0  # Origins lie within so many metres of zero: float32 places them there to half a millimetre
+_EPOCH = 946_684_800.0, 4_102_444_800.0  # the years 2000 to 2100
+_RUNS = 1000  # So many runs of dropped rows are named of a source: accounts of thousands of sources are read at once
 _WORDS = ["person", "cohort", "confidence"]
 
 
@@ -141,19 +134,9 @@ class SourceWriter:
 
     def __init__(self, folder: Path, source: str, buckets: int) -> None:
         self._folder, self.source, self._buckets = folder, source, buckets
-        self._parts: list[Part] = []
+        self._parts: list[PartFile] = []
         self._persons: Counter[str] = Counter()
         self._cohorts: Counter[str] = Counter()
-
-    @property
-    def persons(self) -> tuple[str, ...]:
-        """Those whose rays were taken."""
-        return tuple(sorted(self._persons))
-
-    @property
-    def rays(self) -> int:
-        """How many were taken."""
-        return sum(part.rays for part in self._parts)
 
     def add(self, rays: Rays, place: str = UNKNOWN, day: str | None = None) -> None:
         """Write more rays of the source. ``day``: None: by their times, if these are seconds since 1970, else unknown.
@@ -212,7 +195,7 @@ class SourceWriter:
             "cohorts": rays.cohort is not None,
             "heads": rays.head is not None and bool(np.isfinite(rays.head[rows]).any()),
         }
-        path = self._folder / Part(**about).path(self.source)
+        path = self._folder / PartFile(**about).path(self.source)
         table = table_of(rays, rows)
         floats = {name: "BYTE_STREAM_SPLIT" for name in table.schema.names if name not in _WORDS}
         with replacing(path) as temporary:
@@ -225,7 +208,7 @@ class SourceWriter:
                 column_encoding=floats,
             )
             about["bytes"] = temporary.stat().st_size
-        self._parts.append(Part(**about))
+        self._parts.append(PartFile(**about))
         self._persons += persons
         self._cohorts += cohorts
 
@@ -247,6 +230,47 @@ class SourceWriter:
         )
         write_source(self._folder, source)
         return source
+
+
+def days_of(t: np.ndarray) -> np.ndarray | None:
+    """Days since 1970 (N,) int64 of times (N,), where all of them are seconds since then in the years 2000 to 2099;
+    None for another clock. Days are those of UTC."""
+    if not len(t) or t.min() < _EPOCH[0] or t.max() >= _EPOCH[1]:
+        return None
+    return (t // 86_400).astype(np.int64)
+
+
+def schema() -> Any:
+    """The columns of a part, as pyarrow has them."""
+    pa, _ = pyarrow_modules()
+    names = pa.dictionary(pa.int32(), pa.string())
+    kinds = dict(t=pa.float64(), person=names, origin=pa.float32(), direction=pa.float32(), confidence=pa.float64())
+    kinds |= dict(hit=pa.float32(), cohort=names, head=pa.float32())
+    return pa.schema([(part, kind) for name, kind in kinds.items() for part in column_parts(name)])
+
+
+def table_of(rays: Rays, rows: np.ndarray) -> Any:
+    """The rays ``rows`` (n,), in this order, as a table of `schema`."""
+    pa, _ = pyarrow_modules()
+    columns: dict[str, Any] = {"t": rays.t[rows], "confidence": rays.confidence[rows]}
+    for name in VECTORS:
+        value = getattr(rays, name)
+        value = np.full((len(rows), 3), np.nan) if value is None else value[rows]
+        columns |= dict(zip(column_parts(name), np.ascontiguousarray(value.T, np.float32)))
+    columns["person"] = _names(pa, rays.person[rows], rays.persons)
+    if rays.cohort is None:
+        columns["cohort"] = pa.nulls(len(rows), schema().field("cohort").type)
+    else:
+        columns["cohort"] = _names(pa, rays.cohort[rows], rays.cohorts)
+    kinds = schema()
+    return pa.table([columns[name] for name in kinds.names], schema=kinds)
+
+
+def _names(pa: Any, codes: np.ndarray, names: tuple[str, ...]) -> Any:
+    """Names as a dictionary of those that occur."""
+    there = np.bincount(codes, minlength=len(names)) > 0
+    known = pa.array([names[k] for k in np.flatnonzero(there)], pa.string())
+    return pa.DictionaryArray.from_arrays(pa.array((np.cumsum(there) - 1)[codes].astype(np.int32)), known)
 
 
 def _is_text(name: str) -> bool:
@@ -271,13 +295,13 @@ def _shortened(entry: dict[str, Any]) -> dict[str, Any]:
     return {**entry, "rows": rows[:_RUNS], "rows_not_named": entry.get("rows_not_named", 0) + more}
 
 
-# ---- Importing ----
+# ---- The import of one source into a dataset: what a process of the pool does ----
 #
-# The import of one source into a dataset: what a process of the pool does. Neither Mitsuba nor Dr.Jit is loaded.
+# Neither Mitsuba nor Dr.Jit is loaded.
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe:
+class ImportRecipe:
     """How sources become rays."""
 
     reader: Reader[Any]
@@ -297,13 +321,13 @@ class Recipe:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Task:
+class ImportTask:
     """One source to be imported into the dataset ``folder``."""
 
     folder: Path
     head: Head
     path: Path
-    recipe: Recipe
+    recipe: ImportRecipe
     mark: str  # of the recipe
     where: str  # mark of the path
     known: tuple[str, int] | None = None  # id and generation of the account of this path, if there is one
@@ -322,33 +346,30 @@ class Outcome:
     error: str | None = None
 
 
-def import_source(task: Task) -> Outcome:
+def import_source(task: ImportTask) -> Outcome:
     """Import one source: its parts, then its account. What a user can mend is told in the outcome; nothing else that is
     raised is held back."""
+    marks, recipe = Marks(task.recipe.key), task.recipe
+    before, generation = task.known or ("", -1)
+    stamp: str | None = None
     try:
-        return _import_source(task)
+        # Before it is read: what changes meanwhile is then found by the next import.
+        stamp = marks.stamp(task.path)
+        writer, rest, names = _write_parts(task, marks)
+        generation += writer.source != before
+        metadata, name = rest.metadata, task.path.name
+        if recipe.key is not None:
+            metadata, name = _without_names(rest, names, recipe, name)
+        about = {"where": task.where, "stamp": stamp, "recipe": task.mark, "generation": generation}
+        source = writer.finish(metadata, file=name, **about)
+    except _Unchanged as unchanged:
+        source = unchanged.source
+        about = replace(source, where=task.where, stamp=stamp, generation=generation + (source.id != before))
+        if about != source:
+            write_source(task.folder, about)
+        return Outcome(task.path, source.id, source.rays, unchanged=True)
     except NergError as error:
         return Outcome(task.path, "", 0, error=str(error))
-
-
-def _import_source(task: Task) -> Outcome:
-    marks, recipe = Marks(task.recipe.key), task.recipe
-    # Before it is read: what changes meanwhile is then found by the next import.
-    stamp = marks.stamp(task.path)
-    before, generation = task.known or ("", -1)
-    try:
-        writer, rest, names = _write_parts(task, marks)
-    except _Unchanged as unchanged:
-        found = unchanged.source
-        about = replace(found, where=task.where, stamp=stamp, generation=generation + (found.id != before))
-        if about != found:
-            write_source(task.folder, about)
-        return Outcome(task.path, found.id, found.rays, unchanged=True)
-    generation += writer.source != before
-    metadata, name = rest.metadata, task.path.name
-    if recipe.key is not None:
-        metadata, name = _without_names(rest, names, recipe, name)
-    source = writer.finish(metadata, file=name, where=task.where, stamp=stamp, recipe=task.mark, generation=generation)
     return Outcome(task.path, source.id, source.rays)
 
 
@@ -360,7 +381,7 @@ class _Unchanged(Exception):
         self.source = source
 
 
-def _begin(task: Task, marks: Marks) -> SourceWriter:
+def _begin(task: ImportTask, marks: Marks) -> SourceWriter:
     """The writer of the source's parts, by its id, for which all of it is read. Raises `_Unchanged`."""
     id = marks.source(task.path, task.mark)
     found = _whole_source(task.folder, id, task.head)
@@ -369,7 +390,7 @@ def _begin(task: Task, marks: Marks) -> SourceWriter:
     return SourceWriter(task.folder, id, task.head.buckets)
 
 
-def _write_parts(task: Task, marks: Marks) -> tuple[SourceWriter, Rays, tuple[str, ...]]:
+def _write_parts(task: ImportTask, marks: Marks) -> tuple[SourceWriter, Rays, tuple[str, ...]]:
     """Write the rays of a source, but for the account.
 
     Returns the writer, the last rays, with the metadata of all, and the names of the people. Raises `_Unchanged`.
@@ -395,7 +416,7 @@ def _write_parts(task: Task, marks: Marks) -> tuple[SourceWriter, Rays, tuple[st
     return writer, rest, tuple(sorted(names))
 
 
-def _without_names(rest: Rays, names: tuple[str, ...], recipe: Recipe, name: str) -> tuple[dict[str, Any], str]:
+def _without_names(rest: Rays, names: tuple[str, ...], recipe: ImportRecipe, name: str) -> tuple[dict[str, Any], str]:
     """The metadata of a source and its name, without the names of its people."""
     # What is not among the files that were read, as a folder's name, gets an alias with them.
     sources = [*rest.metadata.get("sources", []), {"file": name}]
@@ -433,7 +454,7 @@ def has_parts(folder: Path, source: Source) -> bool:
 # ---- Processes that import sources beside each other, and end with the one that has started them ----
 
 
-def run_tasks(tasks: Sequence[Task], workers: int) -> Iterator[Outcome]:
+def run_tasks(tasks: Sequence[ImportTask], workers: int) -> Iterator[Outcome]:
     """The outcomes of tasks as they come, from ``workers`` processes, or from this one where that is one.
 
     Raises `NergError` where a process was ended from outside.
@@ -468,9 +489,7 @@ def _set_threads(count: int) -> None:
 # Each source is imported on its own, so that an import may end at any time: the next one goes on with the sources that
 # have no account yet. Sources that are not named stay as they are.
 
-
-_RANDOM = ""
-"""The mark of a salt that nobody has kept."""
+_RANDOM = ""  # The mark of a salt that nobody has kept
 
 
 @dataclass
@@ -486,7 +505,11 @@ class Update:
 
 
 def update_dataset(
-    folder: Path, files: Sequence[Path], recipe: Recipe, workers: int = 1, on_done: Callable[[str], None] | None = None
+    folder: Path,
+    files: Sequence[Path],
+    recipe: ImportRecipe,
+    workers: int = 1,
+    on_done: Callable[[str], None] | None = None,
 ) -> Update:
     """Import ``files``, each a source, into the dataset ``folder``, which is made if it is not there.
 
@@ -509,7 +532,9 @@ def update_dataset(
     done, is_new = Update(), not (folder / HEAD).is_file()
     with ExitStack() as ends:
         ends.enter_context(removing_empty_parents(folder / HEAD))
-        head = _opened(folder, recipe)
+        if is_new:
+            write_head(folder, Head(BUCKETS, _salt(recipe)))
+        head = read_head(folder)
         ends.enter_context(locked(folder / HEAD, f'another import into "{folder}" is at work; wait for its end'))
         if is_new:
             ends.callback(_remove_if_empty, folder, head)
@@ -518,11 +543,15 @@ def update_dataset(
         tasks = []
         for where, path in named.items():
             found = known.get(where)
-            if found is not None and _is_same(found, mark, stamps[where]) and has_parts(folder, found):
+            stamp = stamps[where]
+            same = found is not None and found.recipe == mark and stamp is not None and found.stamp == stamp
+            if found is not None and same and has_parts(folder, found):
                 done.unchanged += 1
                 continue
             before = None if found is None else (found.id, found.generation)
-            tasks.append(Task(folder=folder, head=head, path=path, recipe=recipe, mark=mark, where=where, known=before))
+            tasks.append(
+                ImportTask(folder=folder, head=head, path=path, recipe=recipe, mark=mark, where=where, known=before)
+            )
         seen: set[str] = set()
         for outcome in run_tasks(tasks, workers):
             _count(done, outcome, seen)
@@ -530,11 +559,6 @@ def update_dataset(
                 on_done(outcome.path.name)
         done.replaced = _clean(folder, read_sources(folder, head))
     return done
-
-
-def _is_same(source: Source, mark: str, stamp: str | None) -> bool:
-    """Whether a source is as it was imported, as far as its time of change tells."""
-    return source.recipe == mark and stamp is not None and source.stamp == stamp
 
 
 def _count(done: Update, outcome: Outcome, seen: set[str]) -> None:
@@ -558,7 +582,7 @@ def check_target(folder: Path) -> None:
             raise NergError(f'the folder "{folder}" is there and no dataset of rays: choose another name, or remove it')
 
 
-def _check_head(folder: Path, recipe: Recipe) -> None:
+def _check_head(folder: Path, recipe: ImportRecipe) -> None:
     """Raise `NergError` where nothing can be added to the dataset, or people would have other names than there."""
     if not (folder / HEAD).is_file():
         return
@@ -575,17 +599,10 @@ def _check_head(folder: Path, recipe: Recipe) -> None:
         raise NergError(f'the people of "{folder}" would be called otherwise than those there: {remedy}')
 
 
-def _salt(recipe: Recipe) -> str | None:
+def _salt(recipe: ImportRecipe) -> str | None:
     if recipe.key is None:
         return None
     return Marks(recipe.key).of("salt") if recipe.kept_salt else _RANDOM
-
-
-def _opened(folder: Path, recipe: Recipe) -> Head:
-    """The head of a dataset, which is written if there is none."""
-    if not (folder / HEAD).is_file():
-        write_head(folder, Head(BUCKETS, _salt(recipe)))
-    return read_head(folder)
 
 
 def _remove_if_empty(folder: Path, head: Head) -> None:

@@ -4,12 +4,12 @@ frames that differ between people."""
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from .checks import ENOUGH, MOST, Check, Figures, check, group_medians, name_some, to_source
+from .checks import ENOUGH, MOST, Check, Figures, check, group_medians, name_persons, name_some, to_source
 from .filters import time_order
 from .rays import Rays
 
@@ -164,10 +164,7 @@ def _flipped(cells: np.ndarray, a: int, b: int, sign_a: int, sign_b: int) -> lis
     return [cells[:, i] if sign > 0 else -1 - cells[:, i] for i, sign in ((a, sign_a), (b, sign_b))]
 
 
-# ---- Head ----
-#
-# Gaze against the head: eyes turn by 50 degrees at most, and rarely by more than 30.
-
+# ---- Gaze against the head: eyes turn by 50 degrees at most, and rarely by more than 30 ----
 
 _COSINE = 0.5  # of 60 degrees
 _SHARE, _HEAD_FEW = 0.02, 20  # of a person's rays; in 44 recordings that are right it is 0
@@ -176,6 +173,23 @@ _AGAINST, _FOLLOWS = (-0.3, 0.2)  # correlations of gaze and head along an axis;
 _SPREAD = 0.1, 0.2  # of heads along that axis, for each; of those that stay, eyes may turn as they like
 _ENOUGH = 200  # rays of a person
 _BLOCK = 1 << 18
+
+
+def _spread_runs(n: int, most: int, run: int) -> np.ndarray:
+    """Rows of ``n``: all of them, or, of more than ``most``, runs of ``run`` neighbours, evenly spread."""
+    if n <= most:
+        return np.arange(n)
+    first = np.linspace(0, n - run, most // run).astype(np.int64)
+    return (first[:, None] + np.arange(run)).ravel()
+
+
+def _axes_negated(signs: Sequence[float]) -> str:
+    """``x and z`` of (-1, 1, -1)."""
+    return " and ".join(axis for axis, sign in zip("xyz", signs) if sign < 0)
+
+
+_SIGNS = sorted(itertools.product((1.0, -1.0), repeat=3), key=lambda signs: -sum(signs))
+"""Of all axes, those with the fewest negated first."""
 
 
 @check(
@@ -204,7 +218,7 @@ def check_head(figures: Figures) -> list[str]:
     wrong = np.zeros(count, bool)
     wrong[who] = True
     share = 100 * off[who].sum() / all_[who].sum()
-    whose = "" if len(who) == np.count_nonzero(all_) else f" of {name_some([rays.persons[p] for p in who])}"
+    whose = "" if len(who) == np.count_nonzero(all_) else f" of {name_persons(rays, who)}"
     rows = np.flatnonzero(known & wrong[rays.person])
     return [
         f"{share:.0f} % of the directions{whose} lie more than 60 degrees from where the head points; "
@@ -227,14 +241,14 @@ def _check_following(figures: Figures, heads: np.ndarray, known: np.ndarray) -> 
     aloof = (n >= _ENOUGH) & (spread > _SPREAD[1]) & (r < _FOLLOWS) & ~against
     out = []
     for axes in np.unique(against[:, against.any(axis=0)].T, axis=0):
-        names = name_some([rays.persons[p] for p in np.flatnonzero((against.T == axes).all(axis=1))])
+        names = name_persons(rays, np.flatnonzero((against.T == axes).all(axis=1)))
         which = " and ".join("xyz"[i] for i in np.flatnonzero(axes))
         out.append(
             f"along {which} of the file the gaze of {names} goes where the head turns away from: negate {which} of the "
             "directions, or check their frame (--hand)"
         )
     if aloof.any():
-        names = name_some([rays.persons[p] for p in np.flatnonzero(aloof.any(axis=0))])
+        names = name_persons(rays, np.flatnonzero(aloof.any(axis=0)))
         out.append(
             f"the gaze of {names} does not follow the head: check whether it is in the head's frame "
             "(--preset unity_local, or the head's pose in --map), and whose head it is"
@@ -247,10 +261,10 @@ def _mirror(figures: Figures, heads: np.ndarray, rows: np.ndarray) -> str:
     rays, rows = figures.rays, rows[:: max(1, len(rows) // MOST)]
     R = to_source(rays)
     head, d = heads[rows] @ R.T, rays.direction[rows] @ R.T
-    for signs in sorted(itertools.product((1.0, -1.0), repeat=3), key=lambda s: -sum(s))[1:]:
+    for signs in _SIGNS[1:]:
         if np.mean(np.einsum("ij,ij->i", head, d * signs) < _COSINE) < 0.5 * _SHARE:
-            axes = " and ".join("xyz"[i] for i in range(3) if signs[i] < 0)
-            return f"with {axes} of the directions negated they would not: check their frame (--hand, --forward)"
+            which = f"{_axes_negated(signs)} of the directions"
+            return f"with {which} negated they would not: check their frame (--hand, --forward)"
     return ""
 
 
@@ -292,13 +306,10 @@ def head_frames(head: np.ndarray) -> np.ndarray:
     return np.stack([head, right, np.cross(right, head)], axis=1)
 
 
-# ---- Holding ----
-#
-# Gaze mirrored in the head's frame: eyes turn against the head, so that gaze holds still in the world.
+# ---- Gaze mirrored in the head's frame: eyes turn against the head, so that gaze holds still in the world ----
 #
 # The vestibulo-ocular reflex. With left and right, or up and down, of the eyes exchanged, gaze would turn with the head
 # in place of against it, and twice as fast as the head does.
-
 
 _LAG = 0.08  # seconds between two directions that are compared; a fixation takes 0.2 and more
 _TURNS = 20.0, 200.0  # degrees a second of heads that are looked at
@@ -340,11 +351,7 @@ def _best_exchange(turned: np.ndarray) -> str:
 
 def _turned(figures: Figures, heads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How far gaze turns (4, n) while the head does, as it is and with each of `EXCHANGES`; and the persons (n,)."""
-    rays, n, (most, run) = figures.rays, len(figures.rays), _MOST
-    rows = np.arange(n)
-    if n > most:
-        first = np.linspace(0, n - run, most // run).astype(np.int64)
-        rows = (first[:, None] + np.arange(run)).ravel()
+    rays, rows = figures.rays, _spread_runs(len(figures.rays), *_MOST)
     rows = rows if figures.order is None else figures.order[rows]
     t, person = rays.t[rows], rays.person[rows]
     step = np.diff(t)[np.diff(person) == 0]
@@ -370,10 +377,7 @@ def _turned(figures: Figures, heads: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return np.array(turned), person[first]
 
 
-# ---- Locked ----
-#
-# Gaze that stays at one place in the head: the head's direction, some time later or turned by some degrees.
-
+# ---- Gaze that stays at one place in the head: the head's direction, some time later or turned by some degrees ----
 
 _STILL = 4.0  # degrees from its mean direction in the head, by the median; 44 people who look about have 7 and more
 _TURNED = 0.25  # of heads, whose mean directions are shorter by that than one: they look about in a cone of 40 degrees
@@ -401,7 +405,7 @@ def check_locked(figures: Figures) -> list[str]:
     if not who.size:
         return []
     return [
-        f"the gaze of {name_some([rays.persons[p] for p in who])} stays at one place in the head, within "
+        f"the gaze of {name_persons(rays, who)} stays at one place in the head, within "
         f"{_STILL:g} degrees, as if it were the head's direction: were the eyes tracked? Leave them out "
         "(nerg rays filter --without-person)"
     ]
@@ -411,13 +415,10 @@ def check_locked(figures: Figures) -> list[str]:
 #
 # Directions mirrored against a place: more of the gaze ends on its surfaces as it is than with an axis negated.
 
-
 Trace = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Distances (N,) along unit directions (N, 3) from origins (N, 3) to what they meet; not finite for nothing."""
 
-DECLARED = "as declared"
-"""Name of the directions without an axis negated."""
-
+DECLARED = "as declared"  # Name of the directions without an axis negated
 _MIRROR_BETTER = 0.02  # share by which a mirror must be better, besides three standard errors
 
 
@@ -432,10 +433,9 @@ def hit_shares(
     """
     R = np.eye(3) if to_source is None else to_source
     shares = {}
-    for signs in sorted(itertools.product((1.0, -1.0), repeat=3), key=lambda s: -sum(s)):
-        axes = " and ".join("xyz"[i] for i in range(3) if signs[i] < 0)
+    for signs in _SIGNS:
         turned = directions @ (R.T * signs) @ np.linalg.inv(R).T
-        shares[axes or DECLARED] = float(np.mean(np.isfinite(trace(origins, turned))))
+        shares[_axes_negated(signs) or DECLARED] = float(np.mean(np.isfinite(trace(origins, turned))))
     return shares
 
 
@@ -457,10 +457,7 @@ def mirror_warning(shares: dict[str, float], count: int) -> str | None:
     )
 
 
-# ---- Walking ----
-#
-# The frame of the directions, by walking: people look ahead.
-
+# ---- The frame of the directions, by walking: people look ahead ----
 
 _AHEAD = 0.2  # correlation of gaze and walking along an axis
 _WALKED = 1 << 19, 1 << 11  # rays looked at in runs of so many, where it matters which comes after which
@@ -470,7 +467,7 @@ _WALKING_ONE_WAY, _ANY_WAY = 0.85, 0.5  # lengths of mean directions: of gaze th
 
 
 @dataclass(frozen=True, eq=False)
-class _Steps:
+class WalkingSteps:
     """Steps of half a second of people who walk: W of them, along the axes of the file, without their heights."""
 
     way: np.ndarray  # (W, 3) unit
@@ -495,7 +492,7 @@ def find_against_walking(figures: Figures) -> list[str]:
     by_person, stay = {}, []
     for p in np.flatnonzero(np.bincount(steps.person) >= _ALONE[1]):
         mine = steps.person == p
-        own = _Steps(steps.way[mine], steps.gaze[mine], steps.person[mine])
+        own = WalkingSteps(steps.way[mine], steps.gaze[mine], steps.person[mine])
         if rays.head is None and _stays(own):
             stay.append(rays.persons[p])
         elif found := _name_disagreement(_correlate(own), "{}", _ALONE[0]):
@@ -523,12 +520,12 @@ def _name_disagreement(agree: np.ndarray, who: str, least: float) -> str:
     return ""
 
 
-def _stays(steps: _Steps) -> bool:
+def _stays(steps: WalkingSteps) -> bool:
     """Whether gaze stays about one direction while people walk in many, and turns neither with them nor against."""
     length = np.maximum(np.linalg.norm(steps.gaze, axis=1, keepdims=True), 1e-12)
     gaze, way = steps.gaze / length, steps.way
     mean_gaze, mean_way = gaze.mean(axis=0), way.mean(axis=0)
-    turns = _correlate(_Steps(way - mean_way, gaze - mean_gaze, steps.person))
+    turns = _correlate(WalkingSteps(way - mean_way, gaze - mean_gaze, steps.person))
     lengths = np.linalg.norm(mean_gaze), np.linalg.norm(mean_way)
     return bool(lengths[0] > _WALKING_ONE_WAY and lengths[1] < _ANY_WAY and (np.abs(turns) < _AHEAD).all())
 
@@ -545,7 +542,7 @@ def walking_agreement(rays: Rays, order: np.ndarray | None = None) -> np.ndarray
     return None if len(steps.way) < _STEPS else _correlate(steps)
 
 
-def _correlate(steps: _Steps) -> np.ndarray:
+def _correlate(steps: WalkingSteps) -> np.ndarray:
     v, d = steps.way, steps.gaze
     norm = np.sqrt((v**2).mean(axis=0) * (d**2).mean(axis=0))
     # An axis on which hardly anybody walks says nothing.
@@ -553,13 +550,8 @@ def _correlate(steps: _Steps) -> np.ndarray:
     return np.where(share > 0.05, (v * d).mean(axis=0) / np.maximum(norm, 1e-12), 0.0)
 
 
-def _find_steps(rays: Rays, order: np.ndarray | None, without: np.ndarray | None = None) -> _Steps:
-    n, (most, run) = len(rays), _WALKED
-    if n <= most:
-        rows = np.arange(n)
-    else:
-        first = np.linspace(0, n - run, most // run).astype(np.int64)
-        rows = (first[:, None] + np.arange(run)).ravel()
+def _find_steps(rays: Rays, order: np.ndarray | None, without: np.ndarray | None = None) -> WalkingSteps:
+    rows = _spread_runs(len(rays), *_WALKED)
     order = rows if order is None else order[rows]
     t, person = rays.t[order], rays.person[order]
     starts = np.r_[np.flatnonzero(np.r_[True, np.diff(person) != 0]), len(t)]
@@ -575,7 +567,7 @@ def _find_steps(rays: Rays, order: np.ndarray | None, without: np.ndarray | None
     R = to_source(rays)
     d = rays.direction[order[same]][walks] * (1, 1, 0)
     v = moved[walks] / np.linalg.norm(moved[walks], axis=1, keepdims=True)
-    return _Steps(v @ R.T, d @ R.T, person[same][walks])
+    return WalkingSteps(v @ R.T, d @ R.T, person[same][walks])
 
 
 def _lag(t: np.ndarray, starts: np.ndarray) -> int:
@@ -592,7 +584,6 @@ def _lag(t: np.ndarray, starts: np.ndarray) -> int:
 # A mirrored or reversed direction shows where it disagrees with the hit point, or with where people walk: people look
 # ahead. A frame mirrored as a whole, positions with directions, contradicts nothing and cannot be seen without the
 # place itself.
-
 
 _OFF = 5.0, 10.0  # degrees between direction and hit point: of half of the rays, and of some
 _SOME = 0.05  # share of the rays that are some
@@ -630,15 +621,11 @@ def _check_hits(rays: Rays) -> list[str]:
         if not off.mean() > _SOME:
             return []
         wrong = np.bincount(person, weights=off) > 0.5 * np.maximum(np.bincount(person), 1)
-        of = f" of {name_some([rays.persons[p] for p in np.flatnonzero(wrong)])}" if wrong.any() else ""
-        whose = (
-            f"{100 * off.mean():.0f} % of the directions, those{of}, miss"
-            if of
-            else (f"{100 * off.mean():.0f} % of the directions miss")
-        )
+        of = f", those of {name_persons(rays, np.flatnonzero(wrong))}," if wrong.any() else ""
+        whose = f"{100 * off.mean():.0f} % of the directions{of} miss"
     now = float(np.median(found[off]))
-    signs = np.array(list(itertools.product((1.0, -1.0), repeat=3)))[1:]
-    tried = {" and ".join("xyz"[i] for i in np.flatnonzero(s < 0)): float(np.median(angles(d * s)[off])) for s in signs}
+    tried = {_axes_negated(s): float(np.median(angles(d * s)[off])) for s in itertools.product((1.0, -1.0), repeat=3)}
+    del tried[""]
     best = min(tried, key=tried.__getitem__)
     remedy = "check that they are of one frame and one unit"
     if tried[best] < min(_OFF[0], 0.5 * now):

@@ -14,9 +14,7 @@ from nerg_mi.maths import vmf
 
 from .rays import RayIndex, Rays
 
-# ---- Filters ----
-#
-# Choosing among rays: by time, person, cohort, place and confidence; and fewer of those who stand still.
+# ---- Choosing among rays: by time, person, cohort, place and confidence; and fewer of those who stand still ----
 
 
 def select_mask(
@@ -34,8 +32,7 @@ def select_mask(
 
     ``time``: from (inclusive) and to (exclusive), seconds, either may be ``None``. ``persons``, ``without_persons``,
     ``cohorts``: names. ``box``: x0, x1, y0, y1, z0, z1 in metres that hold the origin. ``min_confidence``: at least
-    this.
-    ``with_hit``: a hit point is known. Raises `NergError` for an unknown name or a box that is none.
+    this. ``with_hit``: a hit point is known. Raises `NergError` for an unknown name or a box that is none.
     """
     keep = np.ones(len(rays), bool)
     if time is not None:
@@ -140,13 +137,12 @@ def thin_mask(rays: Rays, seconds: float = 2.0, distance: float = 0.1, gap: floa
     return out
 
 
-# ---- Fixations ----
+# ---- Fixations: when gaze rests ----
 #
-# Fixations: when gaze rests. I-VT and I-DT of Salvucci and Goldberg (2000), on directions in the world.
+# I-VT and I-DT of Salvucci and Goldberg (2000), on directions in the world.
 #
 # Angles are in degrees, times in seconds. A pause of a person longer than ``gap`` ends a fixation. Both return for each
 # ray the number of its fixation, or -1; numbers run person after person in time.
-
 
 _GAP = 0.1
 
@@ -310,14 +306,9 @@ def _positive(**values: float) -> None:
             raise NergError(f"{name} must be positive, got {value}")
 
 
-# ---- Sessions ----
-#
-# Recordings of people among rays: what one person did in one go, as it was stored.
+# ---- Recordings of people among rays: what one person did in one go, as it was stored ----
 
-
-PAUSE = 60.0
-"""Seconds: a longer pause ends a recording."""
-
+PAUSE = 60.0  # Seconds: a longer pause ends a recording
 _BACK = 1.0  # seconds by which time goes back where another recording begins; less is a row in the wrong place
 _MIXED = 10, 0.01  # rows, and share of them, at which time goes back in an order in which nobody recorded
 
@@ -360,10 +351,7 @@ def find_sessions(rays: Rays) -> Sessions:
     return Sessions(order, starts, sorted_(person)[starts[:-1]], np.r_[False, back[new - 1]])
 
 
-# ---- Frozen ----
-#
-# Gaze that stands still while the head does not: what trackers write that have lost the eyes.
-
+# ---- Gaze that stands still while the head does not: what trackers write that have lost the eyes ----
 
 _STILL = 2e-4  # radians between one ray and the next; trackers that see the eyes make more noise
 _LASTS = 1.0  # seconds; such trackers reach 0.4 at most in 58 recordings
@@ -414,9 +402,8 @@ def _still_steps(rays: Rays, sessions: Sessions) -> list[np.ndarray]:
 
 # ---- Splits of rays into training and test that share no ray ----
 #
-# Neighbouring probes hold the same rays: a random choice of test probes is tested
-# on what it was trained on. So positions are held out in zones, with every ray
-# within reach of a test probe purged, and people are held out whole.
+# Neighbouring probes hold the same rays: a random choice of test probes is tested on what it was trained on. So
+# positions are held out in zones, with every ray within reach of a test probe purged, and people are held out whole.
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,13 +440,11 @@ def split_by_position(
 ) -> PositionSplit:
     """Hold out zones of positions for probes of ``radius`` R (metres).
 
-    Zones are vertical cylinders of ``zone_radius`` metres around ray origins,
-    chosen far from each other; the test centres are up to ``test_probes`` ray
-    origins inside them with at least ``min_rays`` rays within R. Training rays
-    lie farther than 2R from each test centre, so that no probe of radius R on
-    the training side comes within R of a test centre. A few zones purge far
-    less than scattered centres would. ``min_train``: training rays that are left at least (``min_rays``). The same seed
-    gives the same split.
+    Zones are vertical cylinders of ``zone_radius`` metres around ray origins, chosen far from each other; the test
+    centres are up to ``test_probes`` ray origins inside them with at least ``min_rays`` rays within R. Training rays
+    lie farther than 2R from each test centre, so that no probe of radius R on the training side comes within R of a
+    test centre. A few zones purge far less than scattered centres would. ``min_train``: training rays that are left at
+    least (``min_rays``). The same seed gives the same split.
 
     Raises `NergError` when the rays hold no such zone or too little is left.
     """
@@ -514,9 +499,8 @@ def split_by_person(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Hold out people: masks (N,) of training and test rays.
 
-    ``test_persons`` by name, or a random ``test_share`` of those who have rays,
-    at least one on each side. Raises `NergError` for an unknown name or when
-    a side is empty.
+    ``test_persons`` by name, or a random ``test_share`` of those who have rays, at least one on each side. Raises
+    `NergError` for an unknown name or when a side is empty.
     """
     present = np.unique(rays.person)
     if test_persons is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,139 +14,26 @@ import numpy as np
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import line_blocks
 
-from .readers import columns as usual
 from .readers import poses
 from .readers.base import BAD_LINES, UNITS, Reader
-from .readers.columns import ColumnFinder, ColumnMap, column_words, is_counter, is_validity, valid_values
-from .readers.registry import readers
-from .readers.tables import iterate_table
-from .readers.values import clock_seconds
-
-# ---- Column roles ----
-#
-# What the columns of a table are by their names: vectors, quaternions, matrices, angles, times, people.
-
-
-# What may stand before the letter of an axis in one word: tx, posX, GazeQX.
-_BEFORE = ("", "t", "q", "p", "d", "h", "v", "g", "pos", "rot", "dir", "vec", "quat", "gaze", "head", "hit", "eye")
-_NEVER = (
-    *("velocity", "vel", "speed", "acceleration", "accel", "gyro", "gravity", "magnetic", "angular", "linear"),
-    *("ecef", "scale", "size", "color", "uv", "std", "var", "screen", "webcam", "px", "pixel", "norm2d", "pupil"),
-    *("target", "aoi", "hand", "controller", "screenpoint", "velo"),
+from .readers.columns import (
+    ColumnFinder,
+    ColumnMap,
+    Roles,
+    find_roles,
+    in_degrees,
+    is_counter,
+    is_validity,
+    time_unit,
+    valid_values,
 )
-_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0, "seconds": 1.0, "µs": 1e-6, "100ns": 1e-7}
-_PEOPLE = (*usual.PERSONS, "pid", "participant_name", "subject_name", "user_name", "person_id", "player")
-_SURE = ("confidence", "gaze_confidence", "conf", "quality")
-
-
-@dataclass
-class Roles:
-    """Columns of a table by what they may be, each kind by its stem: the words around the letters of the axes."""
-
-    vectors: dict[str, tuple[str, ...]] = field(default_factory=dict)  # x, y, z
-    quaternions: dict[str, tuple[str, ...]] = field(default_factory=dict)  # x, y, z, w
-    matrices: dict[str, tuple[str, ...]] = field(default_factory=dict)  # 12 or 16, row by row
-    gravity: tuple[str, str, str] | None = None
-    azel: tuple[str, str] | None = None
-    yaw_pitch_roll: tuple[str, ...] | None = None  # two or three
-    times: list[str] = field(default_factory=list)  # the most likely first
-    person: str | None = None
-    confidence: str | None = None
-
-
-def find_roles(columns: Sequence[str]) -> Roles:
-    """The roles that the names of ``columns`` tell; those with a comma or an equals sign, which no map can name, have
-    none."""
-    words = {c: column_words(c) for c in columns if c and not set(c) & set(",=")}
-    roles, every = Roles(), set(words.values())
-    groups: dict[str, dict[str, str]] = {}
-    cells: dict[str, dict[str, str]] = {}
-    gravity: dict[str, str] = {}
-    for column, name in words.items():
-        parts = name.split("_")
-        if "gravity" in parts:
-            for _, axis in _axes(parts):
-                gravity.setdefault(axis, column)
-        if any(part in _NEVER and not (part == "px" and name.replace("px", "pz") in every) for part in parts):
-            continue
-        for stem, axis in _axes(parts):
-            groups.setdefault(stem, {}).setdefault(axis, column)
-        found = re.fullmatch(r"(.*?)_?m?([0-3])_?([0-3])", name)
-        if found:
-            cells.setdefault(found[1], {})[found[2] + found[3]] = column
-    for stem, found in groups.items():
-        if set("xyzw") <= set(found):
-            roles.quaternions[stem] = tuple(found[a] for a in "xyzw")
-        elif set("xyz") <= set(found):
-            roles.vectors[stem] = tuple(found[a] for a in "xyz")
-    for stem, found in cells.items():
-        rows = 4 if "33" in found else 3
-        names = [f"{r}{c}" for r in range(rows) for c in range(4)]
-        if all(n in found for n in names):
-            roles.matrices[stem] = tuple(found[n] for n in names)
-    if set("xyz") <= set(gravity):
-        roles.gravity = gravity["x"], gravity["y"], gravity["z"]
-    _find_angles(words, roles)
-    ranks = {column: rank for column, name in words.items() if (rank := _time_rank(name)) is not None}
-    roles.times = sorted(ranks, key=ranks.__getitem__)
-    roles.person = next((c for p in _PEOPLE for c, w in words.items() if w == p), None)
-    roles.confidence = next((c for p in _SURE for c, w in words.items() if w == p), None)
-    return roles
-
-
-def time_unit(column: str) -> float | None:
-    """Seconds of the unit that a column's name states; None where it states none."""
-    bracket = re.search(r"[(\[]([^)\]]{1,12})[)\]]", column)
-    last = column_words(column).split("_")[-1]
-    return _UNITS.get(bracket[1].strip().lower() if bracket else last)
-
-
-def in_degrees(columns: Sequence[str]) -> bool | None:
-    """Whether the names of angles state degrees; None where they state nothing."""
-    text = " ".join(columns).lower()
-    if "rad" in text:
-        return False
-    return True if "deg" in text else None
-
-
-def _axes(parts: list[str]) -> list[tuple[str, str]]:
-    """Stems and axes that a name may mean: of the last word that is, or ends with, the letter of an axis."""
-    for k in range(len(parts) - 1, -1, -1):
-        part = parts[k]
-        if part and part[-1] in "xyzw" and part[:-1] in _BEFORE:
-            return [("_".join([*parts[:k], part[:-1] + "*", *parts[k + 1 :]]), part[-1])]
-    return []
-
-
-def _find_angles(words: dict[str, str], roles: Roles) -> None:
-    def one(what: str, avoid: tuple[str, ...] = ("left", "right", "low", "high", "std")) -> str | None:
-        fits = [c for c, w in words.items() if what in w.split("_") and not set(avoid) & set(w.split("_"))]
-        return fits[0] if fits else None
-
-    azimuth, elevation = one("azimuth") or one("az"), one("elevation") or one("el")
-    if azimuth and elevation:
-        roles.azel = azimuth, elevation
-    yaw, pitch, roll = one("yaw"), one("pitch"), one("roll")
-    if yaw and pitch:
-        roles.yaw_pitch_roll = (yaw, pitch, roll) if roll else (yaw, pitch)
-
-
-def _time_rank(words: str) -> int | None:
-    """How likely a name is that of the time, the smaller the more; None: it is none."""
-    exact = ("t", "time", "timestamp", "time_s", "sample_time", "unity_time", "utc_timestamp", "timestep")
-    if words in exact:
-        return exact.index(words)
-    parts = words.split("_")
-    if not any(p in ("time", "timestamp", "timestamps", "clock", "utc") for p in parts):
-        return None
-    return 20 + 5 * len({"relative", "frame", "device", "raw", "duration", "delta", "dt"} & set(parts)) + len(parts)
-
+from .readers.registry import readers
+from .readers.tables import clock_seconds, iterate_table
 
 # ---- Row evidence ----
 #
 # What the rows of a table tell of its frame: the up axis and the unit by where heads are, the clock by its steps, the
 # way heads look by where they walk, and whether gaze is the head's or the world's by how far it is from the head.
-
 
 _LOW, _HIGH = 0.7, 2.3  # metres: so high are eyes, of people who sit or stand
 _STAYS = 1.2  # metres: they hardly vary more in height
@@ -264,9 +150,7 @@ def _level(up: str) -> np.ndarray:
     return (np.arange(3) != "xyz".index(up[-1])).astype(np.float64)
 
 
-# ---- Signatures ----
-#
-# Presets by what tells their files from others (`nerg_mi.rays.readers.base.Signature`).
+# ---- Presets by what tells their files from others (`nerg_mi.rays.readers.base.Signature`) ----
 
 
 def preset_of_files(path: Path) -> tuple[Reader[Any], str] | None:
@@ -301,16 +185,7 @@ def preset_of_columns(table: ColumnFinder) -> tuple[Reader[Any], str] | None:
     return next(((reader, why) for reader in readers() if (why := reader.signature.table(table))), None)
 
 
-def check_is_table(path: Path) -> None:
-    """Raise `NergError` for what is neither a table nor a folder that is known."""
-    if path.is_dir():
-        names = ", ".join(f"{file} and {beside}" for reader in readers() for file, beside in reader.signature.files)
-        raise NergError(f"the folder {path} is of no recording that is known by its files ({names}); name a file of it")
-
-
-# ---- Table sample ----
-#
-# The first rows of a table: which of its columns hold numbers or times, and these.
+# ---- The first rows of a table: which of its columns hold numbers or times, and these ----
 
 
 _PEEKED = 40  # lines that tell which columns hold numbers
@@ -397,13 +272,10 @@ def _parquet_kind(path: Path, name: str) -> bool | None:
     return None
 
 
-# ---- Proposal ----
-#
-# A proposal of how to import an unknown table: a preset, or a column map with the frame that it needs.
+# ---- A proposal of how to import an unknown table: a preset, or a column map with the frame that it needs ----
 #
 # Nothing is applied: the proposal says what is sure, what is a guess and what no file says, and gives the command to
 # run.
-
 
 _DIRECTION = {"dir", "direct", "direction", "forward", "vec", "vector", "ray", "normal", "look", "gazedir"}
 _HIT = {"hit", "point", "intersection", "target", "fixation", "poi", "collision"}
@@ -475,11 +347,14 @@ def propose_import(path: str | Path) -> Proposal:
     out = Proposal([path])
     found = preset_of_files(path)
     if found is None:
-        check_is_table(path)
+        if path.is_dir():
+            names = ", ".join(f"{file} and {beside}" for reader in readers() for file, beside in reader.signature.files)
+            raise NergError(
+                f"the folder {path} is of no recording that is known by its files ({names}); name a file of it"
+            )
         found = preset_of_text(path) if path.suffix.lower() != ".parquet" else None
-    table = None
-    if found is None:
-        table = ColumnFinder(path)
+    table = ColumnFinder(path) if found is None else None
+    if table is not None:
         found = preset_of_columns(table)
     if found is not None:
         _use_preset(out, *found)

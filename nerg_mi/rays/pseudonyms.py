@@ -22,9 +22,7 @@ from nerg_mi.files.safe_read import read_bytes
 
 from .rays import Rays
 
-SALT_BYTES = 16
-"""A salt has at least so many bytes: fewer can be tried out one after the other."""
-
+SALT_BYTES = 16  # A salt has at least so many bytes: fewer can be tried out one after the other
 _MOST_SALT = 1 << 20
 # Hexadecimal digits of a pseudonym: 64 bits, of which no two people share one.
 _DIGITS = 16

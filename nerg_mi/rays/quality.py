@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -12,14 +12,14 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import plain
 
 from .checks import RECORDING_CHECKS, Figures
+from .dataset import RayDataset
 from .direction_checks import DIRECTION_CHECKS
 from .filters import time_order
 from .rays import Rays
 
 # ---- Which checks there are, and what all of them find ----
 
-CHECKS = (*RECORDING_CHECKS, *DIRECTION_CHECKS)
-"""What is looked for, in the order of the card."""
+CHECKS = (*RECORDING_CHECKS, *DIRECTION_CHECKS)  # What is looked for, in the order of the card
 
 
 def find_warnings(figures: Figures) -> list[str]:
@@ -34,10 +34,7 @@ def check_table() -> str:
     return "\n".join([*rows, *(f"| {check.name} | {check.looks_for} |" for check in CHECKS)]) + "\n"
 
 
-# ---- Summary ----
-#
-# The sanity card of a set of rays: what came in, and whether it is plausible.
-
+# ---- The sanity card of a set of rays: what came in, and whether it is plausible ----
 
 _BLOCK = 1 << 18  # rays looked at at a time: a summary takes little memory besides the rays
 GAP = 1.0  # seconds: a longer pause of a person does not count as recorded time
@@ -86,10 +83,6 @@ def summarise(rays: Rays) -> RaysSummary:
     rate = 1.0 / (float(np.median(step)) if step.size else median_step)
 
     known, distance = _hits(rays)
-    dropped: dict[str, int] = defaultdict(int)
-    for entry in rays.metadata.get("dropped", []):
-        dropped[entry["reason"]] += entry["count"]
-
     height = np.percentile(rays.origin[:, 2], [5, 50, 95])
     low, high = rays.origin.min(axis=0), rays.origin.max(axis=0)
     figures = Figures(rays, height, high - low, speed_p95, median_step if some else None, order)
@@ -106,10 +99,8 @@ def summarise(rays: Rays) -> RaysSummary:
         hit_distance=distance,
         duplicates=duplicates,
         rows_read=int(rays.metadata.get("rows_read", len(rays))),
-        dropped=dict(dropped),
-        cohorts={}
-        if rays.cohort is None
-        else dict(zip(rays.cohorts, np.bincount(rays.cohort, minlength=len(rays.cohorts)).tolist())),
+        dropped=_count_dropped(rays.metadata),
+        cohorts={name: int(np.count_nonzero(rays.cohort == k)) for k, name in enumerate(rays.cohorts)},
         warnings=tuple(find_warnings(figures)),
     )
 
@@ -129,6 +120,14 @@ def _steps(rays: Rays, order: np.ndarray | None) -> tuple[np.ndarray, np.ndarray
     return step[:count], walked[:count]
 
 
+def _count_dropped(metadata: dict[str, Any]) -> dict[str, int]:
+    """Rows that an import left out, by reason."""
+    total: dict[str, int] = {}
+    for entry in metadata.get("dropped", []):
+        total[entry["reason"]] = total.get(entry["reason"], 0) + entry["count"]
+    return total
+
+
 def _hits(rays: Rays) -> tuple[int, float]:
     """How many hit points are known, and their median distance (NaN without any)."""
     if rays.hit is None:
@@ -143,14 +142,9 @@ def _hits(rays: Rays) -> tuple[int, float]:
     return count, float(np.median(distance[:count], overwrite_input=True)) if count else float("nan")
 
 
-# ---- Card ----
-#
-# The sanity card of a set of rays in words: what `nerg_mi.rays.quality` found, line by line.
+# ---- The sanity card of a set of rays in words: what `nerg_mi.rays.quality` found, line by line ----
 
-
-WARNING = "implausible"
-"""Name of the lines that say what is likely wrong."""
-
+WARNING = "implausible"  # Name of the lines that say what is likely wrong
 _PERSONS = 8  # named
 _RUNS = 3  # of dropped lines, named
 
@@ -234,3 +228,50 @@ def _dropped_lines(rays: Rays, reason: str) -> str:
     text = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:_RUNS])
     more = f" and of {len(lost) - 1} more" if len(lost) > 1 else ""
     return f"lines {text}{', ...' if len(runs) > _RUNS else ''} of {lost[0].get('file', '')}{more}"
+
+
+# ---- The sanity card of a dataset: what its accounts count exactly, and the rest of a stated sample ----
+
+SAMPLE = 1 << 20  # Of so many rays at most are the figures that no account has
+_SAMPLE_RUNS = 64
+
+
+def summarise_dataset(dataset: RayDataset, most: int = SAMPLE) -> tuple[Rays, RaysSummary, tuple[tuple[str, str], ...]]:
+    """Rays of a dataset of one place, its figures, and lines of the card that a file has not.
+
+    The rays are all of them, or of more than ``most`` 64 runs of neighbours: of these are the heights, the speed, the
+    rate, the distance of hit points, and what is implausible. All counts, the box and the recorded time are of the
+    whole dataset, those of people, cohorts and rows of all its sources. Raises `NergError` as `RayDataset.sample` does.
+    """
+    parts = [part for _, part in dataset.parts]
+    count = len(dataset)
+    rays = dataset.sample(most, runs=_SAMPLE_RUNS)
+    found = summarise(rays)
+    whole = replace(
+        found,
+        rays=count,
+        persons=len(dataset.persons),
+        duration=sum(part.recorded for part in parts),
+        box_low=np.min([part.low for part in parts], axis=0),
+        box_high=np.max([part.high for part in parts], axis=0),
+        hit_share=sum(part.hits for part in parts) / count,
+        duplicates=sum(part.duplicates for part in parts),
+        rows_read=max(count, dataset.metadata["rows_read"]),
+        dropped=_count_dropped(dataset.metadata),
+        cohorts=dataset.cohorts,
+    )
+    lines = [("dataset", _extent(dataset))]
+    if len(rays) < count:
+        which = f"{len(rays):,} rays in {_SAMPLE_RUNS} runs"
+        lines.append(("sampled", f"eye height, speed, rate, distances and what is implausible are of {which}"))
+    return rays, whole, tuple(lines)
+
+
+def _extent(dataset: RayDataset) -> str:
+    days = dataset.days
+    spanned = days[0] if len(days) == 1 else f"{len(days)} from {days[0]} to {days[-1]}"
+    some = lambda found, what: f"{len(found):,} {what}{'' if len(found) == 1 else 's'}"
+    return (
+        f"{some(dataset.sources, 'source')} in {some(dataset.parts, 'part')} ({dataset.bytes / 1e6:,.1f} MB), "
+        f"place {', '.join(dataset.places)}, day {spanned}"
+    )

@@ -1,4 +1,4 @@
-"""Sets of rays: the arrays with their metadata, files of them (.npz, .parquet), and selection without copies."""
+"""Sets of rays: the arrays with their metadata, files of them (.npz, .parquet), selection, joining and samples."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import os
 import zipfile
 import zlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,10 +20,7 @@ from nerg_mi.files.atomic import replacing
 from nerg_mi.files.safe_read import JSON_BYTES, inflated_limit, is_count, open_npz, parse_json, reading, size_of
 from nerg_mi.ranges import FARTHEST
 
-# ---- Metadata ----
-#
-# The JSON document of a rays file: what of it the rest of the package relies on is checked here, once.
-
+# ---- The JSON document of a rays file: what of it the rest of the package relies on is checked here, once ----
 
 VERSION = 1
 
@@ -143,21 +141,16 @@ _KNOWN = {
 }
 
 
-# ---- Io ----
+# ---- Rays on disk: ``.npz`` (NumPy alone) or ``.parquet`` (through pyarrow) ----
 #
-# Rays on disk: ``.npz`` (NumPy alone) or ``.parquet`` (through pyarrow).
-#
-# Both hold the same columns and one JSON document of metadata. Vectors are
-# (N, 3) arrays in the ``.npz`` and three columns ``name_x, name_y, name_z`` in
-# the Parquet table, where other tools expect them.
-
+# Both hold the same columns and one JSON document of metadata. Vectors are (N, 3) arrays in the ``.npz`` and three
+# columns ``name_x, name_y, name_z`` in the Parquet table, where other tools expect them.
 
 SUFFIXES = (".npz", ".parquet")
 _REQUIRED = ("t", "person", "origin", "direction", "confidence")
 _OPTIONAL = ("hit", "cohort", "head")
-COLUMNS = (*_REQUIRED, *_OPTIONAL)
-"""Columns of rays, one row each; hit points, cohorts and heads may be missing."""
-_VECTORS = ("origin", "direction", "hit", "head")
+COLUMNS = (*_REQUIRED, *_OPTIONAL)  # Columns of rays, one row each; hit points, cohorts and heads may be missing
+VECTORS = ("origin", "direction", "hit", "head")
 # Columns of numbers of names; all others are measurements.
 _CODES = ("person", "cohort")
 # Memory of a ray with all columns.
@@ -191,7 +184,7 @@ def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], met
     pa, pq = pyarrow_modules()
     table = {}
     for name, value in columns.items():
-        if name in _VECTORS:
+        if name in VECTORS:
             table.update({f"{name}_{axis}": value[:, i] for i, axis in enumerate("xyz")})
         else:
             table[name] = value
@@ -235,18 +228,14 @@ def _read_npz(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], str]:
 
 
 def _read_parquet(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bytes]:
-    pa, pq = pyarrow_modules()
-    size = size_of(path, "rays file")
-    with reading(path, "rays file", also=(pa.ArrowException,)), pq.ParquetFile(path) as table:
+    pa, _ = pyarrow_modules()
+    with reading(path, "rays file", also=(pa.ArrowException,)), open_parquet(path, "rays file") as table:
         about, schema = table.metadata, table.schema_arrow
-        claimed = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
-        if claimed > inflated_limit(size):
-            raise _not_warranted(path, about.num_rows, size)
         there = {}
         for name in COLUMNS:
-            if all(part in schema.names for part in _parts(name)):
-                kinds = "".join(sorted({_arrow_kind(pa, schema.field(part).type) for part in _parts(name)}))
-                shape = (about.num_rows, 3) if name in _VECTORS else (about.num_rows,)
+            if all(part in schema.names for part in column_parts(name)):
+                kinds = "".join(sorted({_arrow_kind(pa, schema.field(part).type) for part in column_parts(name)}))
+                shape = (about.num_rows, 3) if name in VECTORS else (about.num_rows,)
                 there[name] = shape, {"fi": "f"}.get(kinds, kinds)
         _check_columns(path, there)
         document = (schema.metadata or {}).get(b"nerg_mi")
@@ -256,23 +245,25 @@ def _read_parquet(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bytes
             name: np.empty(shape, np.int64 if name in _CODES else np.float64) for name, (shape, _) in there.items()
         }
         at = 0
-        for batch in table.iter_batches(batch_size=1 << 17, columns=[part for name in there for part in _parts(name)]):
+        for batch in table.iter_batches(
+            batch_size=1 << 17, columns=[part for name in there for part in column_parts(name)]
+        ):
             for name, column in columns.items():
-                for i, part in enumerate(_parts(name)):
+                for i, part in enumerate(column_parts(name)):
                     values = batch.column(batch.schema.get_field_index(part))
                     if values.null_count and name in _CODES:
                         raise not_rays(path, f'its column "{part}" has cells without a value')
                     into = column[at : at + batch.num_rows]
-                    (into[:, i] if name in _VECTORS else into)[...] = values.to_numpy(zero_copy_only=False)
+                    (into[:, i] if name in VECTORS else into)[...] = values.to_numpy(zero_copy_only=False)
             at += batch.num_rows
         if at != about.num_rows:
             raise not_rays(path, f"it holds {at:,} of the {about.num_rows:,} rays that it claims")
     return columns, document
 
 
-def _parts(name: str) -> list[str]:
-    """Columns of a Parquet table that hold the column ``name``."""
-    return [f"{name}_{axis}" for axis in "xyz"] if name in _VECTORS else [name]
+def column_parts(name: str) -> list[str]:
+    """Columns of a Parquet table that hold the column ``name`` of rays."""
+    return [f"{name}_{axis}" for axis in "xyz"] if name in VECTORS else [name]
 
 
 def _arrow_kind(pa: Any, kind: Any) -> str:
@@ -287,7 +278,7 @@ def _check_columns(path: str | os.PathLike, there: dict[str, tuple[tuple[int, ..
         raise not_rays(path, f"it lacks {', '.join(missing)}")
     n = (there["t"][0] or (0,))[0]
     for name, (shape, kind) in there.items():
-        wanted = (n, 3) if name in _VECTORS else (n,)
+        wanted = (n, 3) if name in VECTORS else (n,)
         if shape != wanted:
             raise not_rays(path, f"{name} has the shape {shape}, where {wanted} is expected")
         if kind not in (("i", "u") if name in _CODES else ("f", "i", "u")):
@@ -295,12 +286,27 @@ def _check_columns(path: str | os.PathLike, there: dict[str, tuple[tuple[int, ..
     # Narrow numbers become wide ones, and equal values may be stored once: what counts is the memory that rays take.
     size = size_of(path, "rays file")
     if _BYTES * n > inflated_limit(size):
-        raise _not_warranted(path, n, size)
+        raise _not_warranted(path, "rays file", n, size)
 
 
-def _not_warranted(path: str | os.PathLike, rays: int, size: int) -> NergError:
+def open_parquet(path: str | os.PathLike, what: str, row_bytes: int = 0) -> Any:
+    """The open Parquet file ``path``; `NergError` for one that is damaged, or claims more than its bytes warrant: equal
+    values are stored once, so that what counts is also what its rows, of ``row_bytes`` or more, become."""
+    pa, pq = pyarrow_modules()
+    size = size_of(path, what)
+    with reading(path, what, also=(pa.ArrowException,)):
+        table = pq.ParquetFile(path)
+        about = table.metadata
+        claimed = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
+    if max(claimed, row_bytes * about.num_rows) > inflated_limit(size):
+        raise _not_warranted(path, what, about.num_rows, size)
+    return table
+
+
+def _not_warranted(path: str | os.PathLike, what: str, rows: int, size: int) -> NergError:
+    kind = "rays" if what == "rays file" else "rows"
     return NergError(
-        f'the rays file "{path}" claims {rays:,} rays, which its {size:,} bytes do not warrant; copy it again'
+        f'the {what} "{path}" claims {rows:,} {kind}, which its {size:,} bytes do not warrant; copy it again'
     )
 
 
@@ -322,13 +328,10 @@ def pyarrow_modules() -> tuple[Any, Any]:
     return pyarrow, pyarrow.parquet
 
 
-# ---- Rays ----
-#
-# Rays of attention: who looked from where to where, and when.
+# ---- Rays of attention: who looked from where to where, and when ----
 #
 # Frame of every :class:`Rays`: right-handed, z up, metres, seconds. Readers convert into it
 # (:mod:`nerg_mi.rays.readers`) and record the transform that they applied in the metadata.
-
 
 # Rows moved at a time.
 _BLOCK = 1 << 18
@@ -381,18 +384,9 @@ class Rays:
                 put(name, _floats(value, name, np.float32 if name == "head" else np.float64))
 
         n = len(self.t)
-        shapes = {
-            "person": (n,),
-            "origin": (n, 3),
-            "direction": (n, 3),
-            "confidence": (n,),
-            "hit": (n, 3),
-            "cohort": (n,),
-            "head": (n, 3),
-        }
-        for name, shape in shapes.items():
-            value = getattr(self, name)
-            if value is not None and value.shape != shape:
+        for name, value in self.columns().items():
+            shape = (n, 3) if name in VECTORS else (n,)
+            if value.shape != shape:
                 raise ValueError(f"{name} has shape {value.shape}, expected {shape}: one row for each of {n} times")
         if "frame" not in self.metadata:
             raise ValueError(
@@ -426,8 +420,7 @@ class Rays:
 
     def columns(self) -> dict[str, np.ndarray]:
         """The arrays with a row a ray, by name; without those that are not there."""
-        found = {name: getattr(self, name) for name in COLUMNS}
-        return {name: column for name, column in found.items() if column is not None}
+        return {name: column for name in COLUMNS if (column := getattr(self, name)) is not None}
 
     def select(self, which: np.ndarray) -> Rays:
         """The rays of a boolean mask (N,) or an index array; persons and metadata are kept, so that codes and
@@ -497,10 +490,7 @@ def _refuse(bad: np.ndarray | np.bool_, what: str, remedy: str) -> None:
         raise NergError(f"{rows.size} of {bad.size} rays have {what} (rays {listed}); {remedy}")
 
 
-# ---- Index ----
-#
-# Which rays start near a place: a spatial index of millions of origins.
-
+# ---- Which rays start near a place: a spatial index of millions of origins ----
 
 _INDEX_BLOCK = 1 << 21  # neighbours held at a time: memory stays bounded
 
@@ -547,3 +537,99 @@ class RayIndex:
         offsets = np.concatenate([[0], np.cumsum(np.concatenate(counts))]) if counts else np.zeros(1, np.int64)
         join = lambda parts, kind: np.concatenate(parts) if parts else np.empty(0, kind)
         return Neighbours(join(indices, np.int64), join(distances, np.float64), offsets.astype(np.int64))
+
+
+# ---- Rays of several blocks as one ----
+
+_EMPTY = np.zeros((0, 3))
+
+
+def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -> Rays:
+    """The rays of all ``blocks``, in this order, with the sorted persons and cohorts that occur.
+
+    Blocks without hit points or heads get NaN, and those without cohorts the cohort "unknown", where others have some.
+    """
+    held = [(block.columns(), block.persons, block.cohorts, len(block)) for block in map(_compact, blocks)]
+    metadata = {"frame": dict(FRAME)} if metadata is None else metadata
+    if not held:
+        none = _EMPTY[:, 0]
+        return Rays(none, np.zeros(0, np.int32), (), _EMPTY, _EMPTY, none, metadata=metadata)
+    persons = tuple(sorted({name for _, names, _, _ in held for name in names}))
+    grouped = any("cohort" in columns for columns, *_ in held)
+    alike = {"unknown"} if any("cohort" not in columns for columns, *_ in held) else set()
+    cohorts = tuple(sorted({name for _, _, names, _ in held for name in names} | alike)) if grouped else ()
+    place, group = ({name: k for k, name in enumerate(names)} for names in (persons, cohorts))
+    for columns, known, groups, n in held:
+        columns["person"] = _renumbered(columns["person"], known, place)
+        if grouped:
+            codes, groups = (
+                (columns["cohort"], groups) if "cohort" in columns else (np.zeros(n, np.int32), ("unknown",))
+            )
+            columns["cohort"] = _renumbered(codes, groups, group)
+        for name, kind in (("hit", np.float64), ("head", np.float32)):
+            if name not in columns and any(name in other for other, *_ in held):
+                columns[name] = np.full((n, 3), np.nan, kind)
+    # Column by column, so that no more than one is there twice.
+    joined = {
+        name: np.concatenate([columns.pop(name) for columns, *_ in held]) for name in COLUMNS if name in held[0][0]
+    }
+    return Rays(**joined, persons=persons, cohorts=cohorts, metadata=metadata)
+
+
+def _compact(rays: Rays) -> Rays:
+    """The same rays, without the names of people and cohorts that have none of them."""
+    persons, cohorts = _used(rays.person, rays.persons), _used(rays.cohort, rays.cohorts)
+    if persons == rays.persons and cohorts == rays.cohorts:
+        return rays
+    cohort = None if rays.cohort is None else _places(rays.cohort)
+    return replace(rays, person=_places(rays.person), persons=persons, cohort=cohort, cohorts=cohorts)
+
+
+def _used(codes: np.ndarray | None, names: tuple[str, ...]) -> tuple[str, ...]:
+    return () if codes is None else tuple(names[k] for k in np.flatnonzero(np.bincount(codes)).tolist())
+
+
+def _places(codes: np.ndarray) -> np.ndarray:
+    """The codes (N,) among those that occur."""
+    return (np.cumsum(np.bincount(codes) > 0) - 1)[codes]
+
+
+def _renumbered(codes: np.ndarray, names: Sequence[str], place: dict[str, int]) -> np.ndarray:
+    return np.array([place[name] for name in names], np.int32)[codes]
+
+
+# ---- Which of very many rays are taken as a sample, without room for all of their numbers ----
+
+
+def sample_rows(count: int, n: int, seed: int = 0, runs: int | None = None) -> np.ndarray:
+    """``n`` of the numbers from 0 to ``count`` - 1, sorted (n,) int64; all, where there are no more.
+
+    Every number is as likely as any other. Without ``runs`` so is every set of ``n`` of them. With it they are so many
+    runs of neighbours, wherever these begin: less has to be read for them, and they tell less, since neighbours are
+    alike.
+    """
+    rng = np.random.default_rng(seed)
+    if n >= count:
+        return np.arange(count)
+    if runs is not None and runs < n:
+        length = n // runs
+        # Cells of equal length on a circle that is turned at random.
+        cells = _distinct(count // length, runs, rng)
+        start = (rng.integers(count) + cells * length) % count
+        return np.sort((start[:, None] + np.arange(length)).ravel() % count)
+    if n > count // 2:
+        keep = np.ones(count, bool)
+        keep[_distinct(count, count - n, rng)] = False
+        return np.flatnonzero(keep)
+    return _distinct(count, n, rng)
+
+
+def _distinct(count: int, n: int, rng: np.random.Generator) -> np.ndarray:
+    """``n`` different numbers below ``count``, sorted: drawn until there are enough, and of too many some are left out
+    at random."""
+    found = np.zeros(0, np.int64)
+    while len(found) < n:
+        # Sorted, where numpy.unique would make a table of hashes: several times as fast.
+        found = np.sort(np.concatenate([found, rng.integers(0, count, n - len(found) + 16)]))
+        found = found[np.r_[True, found[1:] != found[:-1]]]
+    return np.delete(found, rng.choice(len(found), len(found) - n, replace=False))

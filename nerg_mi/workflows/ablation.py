@@ -26,7 +26,7 @@ from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.formats.splats import is_splats
-from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan

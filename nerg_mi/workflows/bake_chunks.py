@@ -26,7 +26,7 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.ranges import VALUES
-from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.tables import iterate_table, table_columns
 from nerg_mi.rendering.bands import is_nerg

@@ -18,7 +18,7 @@ from nerg_mi.figures.maps import PersonWalk, SightLines, Walls, floor_figure
 from nerg_mi.figures.overlay import Overlay, OverlayLayers, find_overlay, occlusion_figure, shared_limits, unknown_of
 from nerg_mi.figures.sphere import find_projection, sphere_figure
 from nerg_mi.interruption import Interruption
-from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import nerg_of

@@ -31,8 +31,7 @@ from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.probes.probes import LEVELS, level_name
-from nerg_mi.rays.dataset import is_dataset
-from nerg_mi.rays.dataset_open import load_rays, rays_digest
+from nerg_mi.rays.dataset import is_dataset, load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan
 from nerg_mi.threads import set_thread_count

@@ -17,13 +17,12 @@ from nerg_mi.figures.style import files_among, provenance
 from nerg_mi.files.atomic import check_new_folder, check_writable, replacing_folder
 from nerg_mi.files.tables import write_json
 from nerg_mi.rays import filters
-from nerg_mi.rays.dataset import MOST, RAY_BYTES, UNKNOWN, Conditions, RayDataset, is_dataset, merge_rays, write_head
-from nerg_mi.rays.dataset_open import load_rays, summarise_dataset
-from nerg_mi.rays.dataset_write import Recipe, SourceWriter, Update, update_dataset
+from nerg_mi.rays.dataset import MOST, RAY_BYTES, UNKNOWN, Conditions, RayDataset, is_dataset, load_rays, write_head
+from nerg_mi.rays.dataset_write import ImportRecipe, SourceWriter, Update, update_dataset
 from nerg_mi.rays.guess import Proposal, propose_imports
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
-from nerg_mi.rays.quality import RaysSummary, card_table, summarise
-from nerg_mi.rays.rays import SUFFIXES, Rays
+from nerg_mi.rays.quality import RaysSummary, card_table, summarise, summarise_dataset
+from nerg_mi.rays.rays import SUFFIXES, Rays, merge_rays
 from nerg_mi.rays.readers.registry import TABLE, parse_options, read_rays, reader_named
 
 from .base import SILENT, Reporter
@@ -139,7 +138,7 @@ def import_dataset(files: Sequence[FileName], options: RaysImportOptions, report
     key = None
     if options.pseudonyms:
         key = secrets.token_bytes(32) if options.salt is None else read_salt(options.salt)
-    recipe = Recipe(
+    recipe = ImportRecipe(
         reader=reader_named(options.reader),
         settings=options.settings,
         skip_bad_lines=options.skip_bad_lines,

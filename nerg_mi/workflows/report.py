@@ -26,8 +26,7 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rays.dataset import is_dataset
-from nerg_mi.rays.dataset_open import load_rays, rays_digest
+from nerg_mi.rays.dataset import is_dataset, load_rays, rays_digest
 from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import Channels, render_channels

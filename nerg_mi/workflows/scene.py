@@ -15,8 +15,7 @@ from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.rays.dataset import Conditions, RayDataset, is_dataset
-from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.dataset import Conditions, RayDataset, is_dataset, load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import write_frames
 from nerg_mi.rendering.scene import load_scene

@@ -19,8 +19,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.photos.colmap import find_source
 from nerg_mi.photos.images import read_photo, read_posed
 from nerg_mi.photos.posed import PosedFrame, PosedImages
-from nerg_mi.rays.dataset import is_dataset
-from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.dataset import is_dataset, load_rays
 from nerg_mi.rendering.files import check_vol, write_mesh
 from nerg_mi.rendering.nested_scene import nested_place
 from nerg_mi.rendering.scene_writer import (

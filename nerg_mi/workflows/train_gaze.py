@@ -19,8 +19,7 @@ from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.photos.salience import SalienceSet, open_salience
-from nerg_mi.rays.dataset import is_dataset
-from nerg_mi.rays.dataset_open import load_rays, rays_digest
+from nerg_mi.rays.dataset import is_dataset, load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train import gaze_run
 from nerg_mi.train.gaze_data import Supervision, TargetNeeds, check_kernels, far_views, hold_out

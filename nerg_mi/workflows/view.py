@@ -15,8 +15,7 @@ from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.splats import READERS, is_splats
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.rays.dataset import is_dataset
-from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.dataset import is_dataset, load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.nested_scene import gaze_of_scene, with_gaze

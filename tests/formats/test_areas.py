@@ -22,7 +22,7 @@ from nerg_mi.formats.areas import (
     read_twin_objects,
     to_json,
 )
-from nerg_mi.rays.readers.base import Frame
+from nerg_mi.rays.readers.base import TrackingFrame
 from nerg_mi.workflows import demo
 
 # ---- What an area can be, and how groups resolve ----
@@ -244,7 +244,7 @@ def test01_boxes_lie_where_the_twin_has_them(tmp_path):
     # Written out: the twin's y is up. A quarter turn about y takes x to -z and z to x.
     corners = np.array([[x, y, z] for x in (-0.2, 0.4) for y in (0, 1) for z in (-0.1, 0.1)])
     in_twin = np.stack([corners[:, 2], corners[:, 1], -corners[:, 0]], axis=1) + (2, 0, 3)
-    in_rays = in_twin @ Frame(up="y").to_rays()[:3, :3].T
+    in_rays = in_twin @ TrackingFrame(up="y").to_rays()[:3, :3].T
     assert np.allclose(chair.bounds, [in_rays.min(axis=0), in_rays.max(axis=0)])
     assert chair.holds(in_rays, 1e-9).all() and not chair.holds(in_rays + (0, 0, 0.3)).all()
     assert np.allclose(found[1].bounds, [[0, -0.1, 1], [0.1, 0, 1.1]])

@@ -171,10 +171,10 @@ def _make_pairs(folder: Path) -> None:
 
 def _pairs(name: str, kind: str) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.alignment.constraints import Target
+        from nerg_mi.alignment.constraints import AlignmentTarget
         from nerg_mi.alignment.points import read_pairs
 
-        read_pairs(folder / name).fit(Target(upright=False), lambda *_: None)
+        read_pairs(folder / name).fit(AlignmentTarget(upright=False), lambda *_: None)
 
     return Reader(f"alignment {name}", _make_pairs, {name: (kind,)}, read)
 

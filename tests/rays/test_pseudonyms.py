@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.columns import ColumnMap
-from tests.rays.readers.reading import read
+from tests.rays.readers.examples import read
 
 SALT = bytes(range(16))
 NAMES = ("Zoe Ames", "anna", "anna2", "bo")
@@ -49,11 +49,8 @@ def test_no_name_is_left_anywhere(rays, tmp_path):
     for digest in (s["sha256"] for s in rays.metadata["sources"]):
         assert digest not in text
     step, split = back.metadata["steps"]
-    assert (
-        step["step"] == "filter"
-        and set(step["persons"]) <= set(back.persons)
-        and split["by"]["person"]["test"][0] in back.persons
-    )
+    assert step["step"] == "filter" and set(step["persons"]) <= set(back.persons)
+    assert split["by"]["person"]["test"][0] in back.persons
 
 
 def test_rays_stay_those_of_the_same_people(rays):
@@ -65,10 +62,8 @@ def test_rays_stay_those_of_the_same_people(rays):
         mine = hidden.person == p
         assert len(set(hidden.origin[mine, 2])) == 1
         assert np.array_equal(hidden.t[mine], by_name[hidden.origin[mine, 2][0]])
-    assert (
-        hidden.metadata["rows_read"] == rays.metadata["rows_read"]
-        and hidden.metadata["transform"] == rays.metadata["transform"]
-    )
+    assert hidden.metadata["rows_read"] == rays.metadata["rows_read"]
+    assert hidden.metadata["transform"] == rays.metadata["transform"]
 
 
 def test_the_salt_decides(rays):
@@ -82,25 +77,21 @@ def test_the_salt_decides(rays):
     assert some.persons[some.person[0]] == one.persons[at[some.origin[0, 2]]]
 
 
+def one_ray(name, note):
+    rays = Rays([0.0], [0], (name,), np.zeros((1, 3)), [[1.0, 0, 0]], [1.0])
+    return replace(rays, metadata={**rays.metadata, "note": note})
+
+
 def test_a_letter_or_two_are_no_word_to_look_for():
     """A person called "a" does not change the words of the metadata."""
-    rays = Rays(
-        [0.0],
-        [0],
-        ("a",),
-        np.zeros((1, 3)),
-        [[1.0, 0, 0]],
-        [1.0],
-        metadata={"frame": {"units": "m", "up": "z", "handedness": "right"}, "note": "a draft"},
-    )
+    rays = one_ray("a", "a draft")
     hidden = pseudonymise(rays, SALT)
     assert hidden.metadata["note"] == "a draft" and hidden.metadata["frame"] == rays.metadata["frame"]
 
 
 def test_letters_of_other_alphabets():
-    rays = Rays([0.0], [0], ("Straße",), np.zeros((1, 3)), [[1.0, 0, 0]], [1.0])
-    rays = replace(rays, metadata={**rays.metadata, "note": "STRAßE and \u017ftra\u00dfe"})
-    assert "stra" not in json.dumps(pseudonymise(rays, SALT).metadata, ensure_ascii=False).lower()
+    hidden = pseudonymise(one_ray("Straße", "STRAßE and \u017ftra\u00dfe"), SALT)
+    assert "stra" not in json.dumps(hidden.metadata, ensure_ascii=False).lower()
 
 
 def test_salts(tmp_path):
@@ -112,4 +103,4 @@ def test_salts(tmp_path):
     with pytest.raises(NergError, match="absent"):
         read_salt(tmp_path / "absent")
     with pytest.raises(NergError, match="at least 16"):
-        pseudonymise(Rays([0.0], [0], ("a",), np.zeros((1, 3)), [[1.0, 0, 0]], [1.0]), b"x")
+        pseudonymise(one_ray("a", ""), b"x")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.rays import quality
 from nerg_mi.rays.quality import WARNING, card_lines, card_table, summarise
 from nerg_mi.rays.rays import FRAME, Rays
@@ -83,21 +84,13 @@ def test_figures_of_a_walk():
     assert np.isclose(s.hit_distance, 2) and s.hit_share == 1 and np.isclose(s.eye_height[1], 1.6)
 
 
-@pytest.mark.parametrize(
-    "rays, word",
-    [
-        (walk(1000, 1600.0), "units mm"),
-        (walk(1, 0.0), "up axis"),
-        (walk(20), "walking pace"),
-        (walk(0.001, 0.0016), "larger"),
-    ],
-)
+@pytest.mark.parametrize("rays, word", [(walk(20), "walking pace"), (walk(0.001, 0.0016), "larger")])
 def test_names_the_likely_mistake(rays, word):
     assert any(word in w for w in summarise(rays).warnings)
 
 
 def test_no_rays():
-    with pytest.raises(ValueError, match="no rays"):
+    with pytest.raises(NergError, match="no rays"):
         summarise(walk().select(np.zeros(100, dtype=bool)))
 
 
@@ -133,12 +126,10 @@ def test_figures_do_not_depend_on_order_or_blocks(monkeypatch, block):
 
 def test_rate_of_rays_far_apart():
     """Rays every two seconds have a rate, although no recorded time."""
-    rays = Rays(
-        np.arange(9) * 2.0, np.zeros(9, int), ("a",), np.full((9, 3), 1.6), np.tile([1.0, 0, 0], (9, 1)), np.ones(9)
-    )
+    ahead = np.tile([1.0, 0, 0], (9, 1))
+    rays = Rays(np.arange(9) * 2.0, np.zeros(9, int), ("a",), np.full((9, 3), 1.6), ahead, np.ones(9))
     found = summarise(rays)
-    assert (
-        found.rate == 0.5 and found.duration == 0 and np.isnan(found.speed_p95) and "--tick 0.001" in found.warnings[-1]
-    )
+    assert found.rate == 0.5 and found.duration == 0 and np.isnan(found.speed_p95)
+    assert "--tick 0.001" in found.warnings[-1]
     alone = summarise(rays.select([0]))
     assert np.isnan(alone.rate) and alone.duplicates == 0 and not any("tick" in w or "t=" in w for w in alone.warnings)

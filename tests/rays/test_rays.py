@@ -1,14 +1,17 @@
-"""Tests of `nerg_mi.rays.rays`."""
+"""Tests of `nerg_mi.rays.rays`, and the example of docs/rays.md."""
 
 import importlib.util
 import json
+import re
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays import rays as module
 from nerg_mi.rays.rays import FRAME, VERSION, RayIndex, Rays, read_metadata, write_rays_file
 
@@ -48,7 +51,6 @@ def test_rays_that_are_equally_far_keep_their_order():
 
 # ---- Io ----
 
-
 ENDINGS = [
     "npz",
     pytest.param(
@@ -60,23 +62,26 @@ ENDINGS = [
 ]
 
 
-def some(hit):
+def some_rays(n=6, **change):
     rng = np.random.default_rng(0)
-    d = rng.normal(size=(9, 3))
-    points = rng.random((9, 3))
+    d = rng.normal(size=(n, 3))
+    values = dict(
+        t=np.arange(n) / 7,
+        person=np.arange(n) % 2,
+        persons=("ann", "bo"),
+        origin=rng.random((n, 3)),
+        direction=d / np.linalg.norm(d, axis=1, keepdims=True),
+        confidence=np.ones(n),
+    )
+    return Rays(**{**values, **change})
+
+
+def some(hit):
+    points = np.random.default_rng(1).random((9, 3))
     points[4] = np.nan
     heads = np.where(np.isnan(points), points, np.float32([0.6, 0.0, 0.8]))
-    return Rays(
-        np.arange(9) / 7,
-        np.arange(9) % 2,
-        ("ann", "bo"),
-        rng.random((9, 3)),
-        d / np.linalg.norm(d, axis=1, keepdims=True),
-        rng.random(9),
-        points if hit else None,
-        {"frame": dict(FRAME), "dropped": [{"reason": "blink", "count": 2, "rows": [[3, 4]]}]},
-        head=heads if hit else None,
-    )
+    about = {"frame": dict(FRAME), "dropped": [{"reason": "blink", "count": 2, "rows": [[3, 4]]}]}
+    return some_rays(9, metadata=about, **({"hit": points, "head": heads} if hit else {}))
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -94,16 +99,11 @@ def test_round_trip(tmp_path, ending, hit):
 
 
 def test_refusals(tmp_path):
-    with pytest.raises(ValueError, match=".npz or .parquet"):
+    with pytest.raises(NergError, match=".npz or .parquet"):
         some(False).save(tmp_path / "rays.csv")
-    np.savez(tmp_path / "other.npz", t=np.zeros(3))
-    with pytest.raises(ValueError, match="not a rays file .*person.*nerg rays import"):
-        Rays.load(tmp_path / "other.npz")
     (tmp_path / "text.npz").write_text("hello")
     with pytest.raises(NergError, match="text.npz.*not a zip archive"):
         Rays.load(tmp_path / "text.npz")
-    with pytest.raises(NergError, match='no rays file "'):
-        Rays.load(tmp_path / "absent.npz")
 
 
 def test_parquet_without_pyarrow(tmp_path, monkeypatch):
@@ -138,16 +138,10 @@ def stored(path, **changes):
 @pytest.mark.parametrize(
     "changes, why",
     [
-        ({"person": np.full(9, 2)}, "unknown person"),
         ({"person": np.full(9, -1)}, "unknown person"),
         ({"person": np.full(9, 1 << 32)}, "unknown person"),
         ({"person": np.zeros(9)}, "person is not whole numbers"),
-        ({"direction": np.full((9, 3), np.nan)}, "direction that is not finite"),
-        ({"direction": np.zeros((9, 3))}, "zero direction"),
-        ({"direction": np.full((9, 3), np.inf)}, "not finite"),
-        ({"origin": np.full((9, 3), np.inf)}, "origin that is not finite"),
-        ({"t": np.full(9, np.nan)}, "time that is not finite"),
-        ({"confidence": np.full(9, 2.0)}, "confidence outside"),
+        ({"direction": np.full((9, 3), np.inf)}, "direction that is not finite"),
         ({"origin": np.zeros((9, 2))}, r"origin has the shape \(9, 2\)"),
         ({"t": np.zeros(8)}, "expected"),
         ({"t": np.zeros((3, 3))}, "expected"),
@@ -157,30 +151,9 @@ def stored(path, **changes):
         ({"t": np.arange(9).astype("M8[s]")}, "not numbers"),
         ({"hit": None, "cohort": np.zeros(9, int)}, "unknown cohort"),
         ({"t": None}, "lacks t"),
-        ({"metadata": np.array("[1, 2]")}, "no JSON object"),
-        ({"metadata": np.array("{")}, "not valid JSON"),
         ({"metadata": np.array("[" * 5000)}, "nested"),
         ({"metadata": np.zeros(3)}, "no text"),
-        ({"metadata": np.array("{}")}, 'lack "version"'),
         ({"version": None}, 'lack "version"'),
-        ({"version": 2}, "another version"),
-        ({"version": "1"}, "another version"),
-        ({"persons": None}, 'lack "persons"'),
-        ({"persons": "ann"}, "no list of names"),
-        ({"persons": [1, 2]}, "no list of names"),
-        ({"frame": None}, 'lack "frame"'),
-        ({"frame": []}, "no frame"),
-        ({"transform": np.zeros((4, 4)).tolist()}, "inverted"),
-        ({"transform": [[1e400]]}, "inverted"),
-        ({"transform": 3}, "inverted"),
-        ({"rows_read": "x"}, "number of rows"),
-        ({"rows_read": -1}, "number of rows"),
-        ({"dropped": [{"reason": "x"}]}, "reasons and counts"),
-        ({"dropped": [{"reason": "x", "count": 1, "rows": [3]}]}, "reasons and counts"),
-        ({"steps": [{}]}, "steps"),
-        ({"steps": [{"step": "split", "kept": 1, "of": 2, "by": {"position": {"test_centres": [[0, 0]]}}}]}, "steps"),
-        ({"source_frame": {"up": "y"}}, "no frame"),
-        ({"tick": 0}, "time in seconds"),
     ],
 )
 def test_what_is_no_rays_file_is_one_sentence(tmp_path, changes, why):
@@ -227,14 +200,9 @@ def test_a_small_file_does_not_become_a_large_array(tmp_path):
     """Zeros take no room in the file: 8 million rays would be three quarters of a gigabyte."""
     n, path = 8_000_000, tmp_path / "zeros.npz"
     metadata = {"version": 1, "persons": ["a"], "frame": dict(FRAME)}
-    half = {
-        "origin": np.zeros((n, 3), np.float16),
-        "direction": np.zeros((n, 3), np.float16),
-        "confidence": np.zeros(n, np.float16),
-    }
-    np.savez_compressed(
-        path, metadata=np.array(json.dumps(metadata)), t=np.zeros(n, np.float16), person=np.zeros(n, np.int8), **half
-    )
+    small = {name: np.zeros(n, np.int8) for name in ("t", "person", "confidence")}
+    small |= {name: np.zeros((n, 3), np.int8) for name in ("origin", "direction")}
+    np.savez_compressed(path, metadata=np.array(json.dumps(metadata)), **small)
     assert path.stat().st_size < 1 << 20
     with pytest.raises(NergError, match="8,000,000 rays, which its .* bytes do not warrant"):
         Rays.load(path)
@@ -260,18 +228,13 @@ def test_parquet_of_other_types(tmp_path, column, value):
 
 def test_what_does_not_shrink_is_stored(tmp_path):
     """Random digits are not worth the time of deflating them, and of inflating them each time."""
-    rng = np.random.default_rng(0)
     n = 50_000  # of a column more than the sample that is looked at
-    d = rng.normal(size=(n, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    rays = Rays(np.arange(n) * 0.02, np.zeros(n, int), ("a",), np.zeros((n, 3)), d, np.ones(n))
+    rays = some_rays(n, t=np.arange(n) * 0.02, origin=np.zeros((n, 3)))
     rays.save(tmp_path / "r.npz")
     with zipfile.ZipFile(tmp_path / "r.npz") as archive:
-        kinds = {m.filename: m.compress_type for m in archive.infolist()}
-    assert kinds["direction.npy"] == zipfile.ZIP_STORED
-    assert all(
-        kind == zipfile.ZIP_DEFLATED for name, kind in kinds.items() if name not in ("direction.npy", "metadata.npy")
-    )
+        kinds = {m.filename.removesuffix(".npy"): m.compress_type for m in archive.infolist()}
+    assert kinds.pop("direction") == zipfile.ZIP_STORED and kinds.pop("metadata") is not None
+    assert set(kinds.values()) == {zipfile.ZIP_DEFLATED}
     assert np.array_equal(Rays.load(tmp_path / "r.npz").direction, rays.direction)
 
 
@@ -285,7 +248,6 @@ def test_nothing_is_written_that_could_not_be_read(tmp_path, metadata):
 
 
 # ---- The JSON document of a rays file: what is read, and what is refused ----
-
 
 GOOD = {
     "version": VERSION,
@@ -327,6 +289,9 @@ def test_what_is_known_and_what_is_not():
         ({"frame": ...}, 'lack "frame"'),
         ({"frame": {"units": "m", "up": "z"}}, '"frame" .*frame of units'),
         ({"persons": ["ann", 2]}, '"persons" .*list of names'),
+        ({"persons": "ann"}, '"persons" .*list of names'),
+        ({"transform": [[1e400]]}, "can be inverted"),
+        ({"transform": 3}, "can be inverted"),
         ({"transform": np.zeros((4, 4)).tolist()}, "can be inverted"),
         ({"transform": np.eye(3).tolist()}, "can be inverted"),
         ({"transform": (np.arange(16).reshape(4, 4) + 1).tolist()}, "can be inverted"),
@@ -350,27 +315,13 @@ def test_metadata_refusals(change, message):
         read(**change)
 
 
-def test_what_is_no_document():
-    for text in ("[]", "1", "{", ""):
-        with pytest.raises(NergError, match=r"r\.npz"):
-            read_metadata(text, "r.npz")
+@pytest.mark.parametrize("text", ["[]", "1", "{", ""])
+def test_what_is_no_document(text):
+    with pytest.raises(NergError, match=r"r\.npz"):
+        read_metadata(text, "r.npz")
 
 
 # ---- Rays ----
-
-
-def some_rays(n=6, **change):
-    rng = np.random.default_rng(0)
-    d = rng.normal(size=(n, 3))
-    values = dict(
-        t=np.arange(n) * 0.1,
-        person=np.arange(n) % 2,
-        persons=("ann", "bo"),
-        origin=rng.random((n, 3)),
-        direction=d / np.linalg.norm(d, axis=1, keepdims=True),
-        confidence=np.ones(n),
-    )
-    return Rays(**{**values, **change})
 
 
 def broken(name, row, value):
@@ -416,36 +367,22 @@ def test_people_may_be_named(kind):
 
 
 def test_whole_numbers_are_taken_as_what_they_stand_for():
-    n = 4
-    rays = Rays(
-        np.arange(n),
-        np.zeros(n, np.int8),
-        ("ann",),
-        np.zeros((n, 3), int),
-        np.tile([0, 0, 1], (n, 1)),
-        np.ones(n, int),
-        np.ones((n, 3), int),
-    )
-    assert {a.dtype for a in (rays.t, rays.origin, rays.direction, rays.hit)} == {np.dtype(float)} and (
-        rays.t + 0.5
-    ).tolist() == [0.5, 1.5, 2.5, 3.5]
+    ones = np.ones((4, 3), int)
+    rays = Rays(np.arange(4), np.zeros(4, np.int8), ("ann",), 0 * ones, ones * [0, 0, 1], ones[:, 0], ones)
+    assert {a.dtype for a in (rays.t, rays.origin, rays.direction, rays.hit)} == {np.dtype(float)}
+    assert (rays.t + 0.5).tolist() == [0.5, 1.5, 2.5, 3.5]
 
 
 def test_select_keeps_codes_and_provenance():
-    rays = some_rays()
-    part = rays.select(rays.person == 1)
-    assert len(part) == 3 and part.persons == rays.persons and part.metadata == rays.metadata
-    assert np.array_equal(part.origin, rays.origin[1::2])
+    part = some_rays().select(some_rays().person == 1)
+    assert len(part) == 3 and part.persons == ("ann", "bo") and part.metadata == some_rays().metadata
 
 
 def test_kept_in_place():
     """The same rays as selected, in the memory of all of them."""
     rng = np.random.default_rng(0)
     n = 700_000  # more than are moved at a time
-    d = np.tile([1.0, 0, 0], (n, 1))
-    rays = Rays(
-        rng.random(n), rng.integers(0, 3, n), tuple("abc"), rng.random((n, 3)), d, rng.random(n), rng.random((n, 3))
-    )
+    rays = some_rays(n, t=rng.random(n), confidence=rng.random(n), hit=rng.random((n, 3)))
     mask = rng.random(n) < 0.6
     want = rays.select(mask)
     kept = rays.keep_in_place(mask)
@@ -453,3 +390,25 @@ def test_kept_in_place():
         assert np.array_equal(getattr(kept, name), getattr(want, name))
         assert np.shares_memory(getattr(kept, name), getattr(rays, name))
     assert kept.cohort is None and len(kept) == mask.sum()
+
+
+# ---- The example of docs/rays.md runs ----
+
+MANUAL = Path(__file__).resolve().parents[2] / "docs" / "rays.md"
+
+
+def test_example_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    origin = rng.uniform([0, 0, 1.5], [1, 1, 1.7], (3000, 3))
+    some_rays(3000, t=np.arange(3000) * 0.1, person=np.arange(3000) % 3, persons=tuple("abc"), origin=origin).save(
+        "day.npz"
+    )
+    names = {
+        "directions": fibonacci_directions(500),
+        "observer": np.array([0.5, 0.5, 1.6]),
+        "position": rng.uniform(2, 3, (6, 8, 3)),
+    }
+    (example,) = re.findall(r"```python\n(.*?)```", MANUAL.read_text(), re.S)
+    exec(compile(example, str(MANUAL), "exec"), names)
+    assert np.allclose(names["density"].mean(axis=1) * 4 * np.pi, 1, atol=0.05) and names["picture"].shape == (6, 8)

@@ -9,8 +9,7 @@ import pytest
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
-from nerg_mi.rays.dataset import Head, RayDataset, write_head
-from nerg_mi.rays.dataset_open import load_rays
+from nerg_mi.rays.dataset import Head, RayDataset, load_rays, write_head
 from nerg_mi.rays.dataset_write import SourceWriter
 from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.rays.readers.registry import make_options

@@ -15,18 +15,15 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import OnBadLine
 
 from . import poses
-from .base import RECORDINGS, Frame, RaysBuilder, Signature, option
+from .base import RECORDINGS, RaysBuilder, Signature, TrackingFrame, option
 from .poses import PoseTrack
 from .tables import TableBlock, iterate_table, table_columns
 
-# ---- Aria gaze ----
-#
-# Gaze files of Project Aria: three schemas told apart by their headers, and directions of their angles.
+# ---- Gaze files of Project Aria: three schemas told apart by their headers, and directions of their angles ----
 #
 # Angles are in the central pupil frame (CPF), whose origin lies midway between the eyes: x left, y up, z forward,
 # metres. Where that frame is on the glasses is known from their construction alone. After projectaria_tools
 # (``core/mps/EyeGazeReader``, ``core/calibration/DeviceCadExtrinsics``).
-
 
 TIME = "tracking_timestamp_us"
 
@@ -132,12 +129,8 @@ def cpf_in_device(device: str) -> tuple[np.ndarray, np.ndarray]:
     return device_in_cpf.T, -device_in_cpf.T @ np.array(origin)
 
 
-# ---- Aria trajectory ----
-#
-# Trajectories of Project Aria: poses of the glasses, world by world, and which way is up in them.
+# ---- Trajectories of Project Aria: poses of the glasses, world by world, and which way is up in them ----
 
-
-_TIME = "tracking_timestamp_us"
 _PLACE = [f"t{axis}_world_device" for axis in "xyz"]
 _TURN = [f"q{axis}_world_device" for axis in "xyzw"]
 _GRAVITY = [f"gravity_{axis}_world" for axis in "xyz"]
@@ -189,7 +182,7 @@ class Trajectory:
         self.path, self.lines = path, 0
         self._times = np.sort(times[np.isfinite(times)])
         self._worlds: dict[str, _World] = {}
-        for block in iterate_table(path, [_TIME, *_PLACE, *_TURN, *_GRAVITY], ["graph_uid"], on_bad=on_bad):
+        for block in iterate_table(path, [TIME, *_PLACE, *_TURN, *_GRAVITY], ["graph_uid"], on_bad=on_bad):
             self._keep(block)
             self.lines += len(block.lines)
         self.tracks = {uid: track for uid, w in self._worlds.items() if (track := _track(w)) is not None}
@@ -246,10 +239,7 @@ def poses_at(track: PoseTrack, t: np.ndarray, gap: float) -> tuple[np.ndarray, n
     return track.at(np.where(np.abs(t - near) <= _EDGE, near, t), gap)
 
 
-# ---- Aria ----
-#
-# Recordings of Project Aria's glasses, as Machine Perception Services (MPS) and Aria Digital Twin give them.
-
+# ---- Recordings of Project Aria's glasses, as Machine Perception Services (MPS) and Aria Digital Twin give them ----
 
 _GAP = 0.05  # seconds: gaze farther than this from a pose is left out
 _SUFFIXES = (".csv", ".csv.gz")
@@ -312,10 +302,10 @@ class Aria:
     signature = Signature(columns=(("tracking_timestamp_us", "pitch_rads_cpf"),))
     Options = AriaOptions
 
-    def frame(self, files: Sequence[Path], options: AriaOptions) -> Frame:
+    def frame(self, files: Sequence[Path], options: AriaOptions) -> TrackingFrame:
         if not files:
-            return Frame()
-        return Frame(up=up_axis(_find_trajectory(_find_gaze(files[0]))))
+            return TrackingFrame()
+        return TrackingFrame(up=up_axis(_find_trajectory(_find_gaze(files[0]))))
 
     def read(self, files: Sequence[Path], options: AriaOptions, builder: RaysBuilder) -> None:
         recordings = [_open(_find_gaze(given), options, builder) for given in files]

@@ -22,8 +22,8 @@ from nerg_mi.ranges import FARTHEST, FLAG, RANGE, TICKS, Checked, Range
 from nerg_mi.rays.rays import COLUMNS, FRAME, Rays
 
 from .columns import ColumnFinder, looks_like_validity
+from .poses import FilledOrigins, fill_values, is_aimed
 from .tables import TableBlock, iterate_table, table_columns
-from .values import FilledOrigins, fill_values, is_aimed
 
 # ---- Frames ----
 #
@@ -31,16 +31,13 @@ from .values import FilledOrigins, fill_values, is_aimed
 #
 # The frame of rays is right-handed with z up, in metres.
 
-
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Units of length by name, in metres."""
-
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # Units of length by name, in metres
 UPS = ("y", "z", "x", "-y", "-z", "-x")
 HANDS = ("right", "left")
 
 
 @dataclass(frozen=True)
-class Frame:
+class TrackingFrame:
     """The frame of tracking data. Raises `NergError` for a word that is not known."""
 
     up: str = "z"  # the axis that points up: x, y, z, -x, -y or -z
@@ -78,30 +75,16 @@ class Frame:
         return matrix + 0.0  # no negative zeros
 
 
-RAYS = Frame()
-"""The frame of rays."""
-
-UNITY = Frame(up="y", handedness="left")
-"""Unity's world."""
-
-OPENGL = Frame(up="y")
-"""A world with y up as OpenGL, OpenXR and HoloLens have it."""
+RAYS = TrackingFrame()  # The frame of rays
+UNITY = TrackingFrame(up="y", handedness="left")  # Unity's world
+OPENGL = TrackingFrame(up="y")  # A world with y up as OpenGL, OpenXR and HoloLens have it
 
 
-# ---- Builder ----
-#
-# Building rays of what readers find: one frame for all, what cannot be used dropped, with an account of it.
+# ---- Building rays of what readers find: one frame for all, what cannot be used dropped, with an account of it ----
 
-
-BAD_LINES = 0.01
-"""Share of a file's lines that may be left out since they cannot be read."""
-
-SOURCE_BYTES = 16 << 30
-"""A file may have so many bytes, for its checksum takes a second for each of some 10^9."""
-
-STREAMED = 1 << 20
-"""So many rays are kept at a time where somebody takes them as they come."""
-
+BAD_LINES = 0.01  # Share of a file's lines that may be left out since they cannot be read
+SOURCE_BYTES = 16 << 30  # A file may have so many bytes, for its checksum takes a second for each of some 10^9
+STREAMED = 1 << 20  # So many rays are kept at a time where somebody takes them as they come
 NAMED_RUNS = 500_000
 """So many runs of dropped rows are named; of more, as where every other row is a blink, only the number is kept."""
 
@@ -146,7 +129,7 @@ class RaysBuilder:
 
     def __init__(
         self,
-        frame: Frame = RAYS,
+        frame: TrackingFrame = RAYS,
         *,
         skip_bad_lines: bool = False,
         on_source: Callable[[str], None] | None = None,
@@ -157,7 +140,7 @@ class RaysBuilder:
         self._notes: dict[str, Any] = {}
         self._parts: list[dict[str, np.ndarray]] = []
         self._kept: list[int] = []
-        self._persons, self._cohorts = _Names(), _Names()
+        self._persons, self._cohorts = NameCodes(), NameCodes()
         self._sources: list[dict[str, Any]] = []
         self._path = Path()  # of the present source
         self._dropped: list[dict[str, Any]] = []
@@ -195,6 +178,13 @@ class RaysBuilder:
         self.note_unused(name for name in there if name and name not in used)
         how = {"first_line": first_line, "clocks": clocks, "on_note": self.note}
         return iterate_table(path, numbers, texts, header, self.on_bad, **how)
+
+    def read_whole(self, path: Path, numbers: Sequence[str]) -> np.ndarray:
+        """Columns (n, C) of a table that gives no rays, whose lines are counted, as `read_table` reads them."""
+        blocks = [block.numbers for block in self.read_table(path, numbers)]
+        values = np.concatenate(blocks or [np.empty((0, len(numbers)))])
+        self.count_lines(len(values))
+        return values
 
     def note_unused(self, columns: Iterable[str]) -> None:
         """Name columns of the files that are not used on the card of the rays."""
@@ -428,7 +418,7 @@ class RaysBuilder:
         )
 
 
-class _Names:
+class NameCodes:
     """Numbers for names, in the order met: texts of millions of rows are not kept."""
 
     def __init__(self) -> None:
@@ -463,7 +453,6 @@ class _Names:
 # ---- Options ----
 #
 # Typed options of a reader: fields of a frozen dataclass, from which the command line and the manual are made.
-
 
 _KEY = "nerg_mi.reader_option"
 
@@ -590,13 +579,10 @@ def _number(value: Any) -> str:
 # takes files apart and says in which frame they are; dropping rows, converting the frame and keeping the account is the
 # builder's work, the same for all.
 
-
 O = TypeVar("O")
 """The type of a reader's options: a frozen dataclass whose fields are made by `nerg_mi.rays.readers.base.option`."""
 
-RECORDINGS = "recordings"
-"""Of a reader that was checked on recordings of people."""
-
+RECORDINGS = "recordings"  # Of a reader that was checked on recordings of people
 DESCRIPTION = "generated files"
 """Of one that was checked on files made after the source or manual of the program that writes them."""
 
@@ -627,6 +613,16 @@ class Signature:
     """What these are."""
 
 
+class InFrame:
+    """A base of readers whose files are always in one frame, and who have no options unless they say so."""
+
+    fixed: TrackingFrame
+    Options: type[Any] = NoOptions
+
+    def frame(self, files: Sequence[Path], options: Any) -> TrackingFrame:
+        return self.fixed
+
+
 class Reader(Protocol[O]):
     """A format of tracking files."""
 
@@ -648,7 +644,7 @@ class Reader(Protocol[O]):
     Options: type[O]
     """Its options; `nerg_mi.rays.readers.base.NoOptions` where it has none."""
 
-    def frame(self, files: Sequence[Path], options: O) -> Frame:
+    def frame(self, files: Sequence[Path], options: O) -> TrackingFrame:
         """The frame of what `read` adds: fixed, declared by ``options``, or found in ``files``; one for all of them."""
         ...
 

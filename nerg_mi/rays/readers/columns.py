@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,13 @@ class ColumnFinder:
         known = next((known for known in (self._by_name, self._by_words) if any(n in known for n in names)), {})
         return next((known[n] for n in names if n in known), None)
 
+    def time(self, *names: str) -> str:
+        """As `find`; raises `NergError` where there is no time."""
+        found = self.find(*names)
+        if found is None:
+            raise NergError(f"{self.path} has no time; name its columns with --map")
+        return found
+
 
 def is_counter(values: Sequence[str] | np.ndarray) -> bool:
     """Whether values (n,) of rows are hardly ever the same, as those of a counter are, and not those of people."""
@@ -83,22 +90,15 @@ def column_words(column: str) -> str:
 # checks: ``head=fx,fy,fz`` or ``head=qx,qy,qz,qw``, where the head points while the direction is in the table's frame,
 # and ``eyes=lx,ly,lz,rx,ry,rz``, where both eyes are.
 
-
 _COUNTS = {
-    "origin": (3,),
-    "direction": (3,),
+    **dict.fromkeys(("origin", "direction", "eye", "hit"), (3,)),
     "azel": (2,),
     "yawpitch": (2,),
     "xyzw": (4,),
     "wxyz": (4,),
     "ypr": (2, 3),
     "matrix": (12, 16),
-    "eye": (3,),
-    "hit": (3,),
-    "t": (1,),
-    "person": (1,),
-    "confidence": (1,),
-    "cohort": (1,),
+    **dict.fromkeys(("t", "person", "confidence", "cohort"), (1,)),
     "head": (3, 4),
     "eyes": (6,),
 }
@@ -159,16 +159,16 @@ class ColumnMap:
                 + (" or ".join(["head", *poses]) if poses else "head, or add direction")
             )
 
-        names = [name for field in fields(self) for name in self._columns_of(field.name)]
+        names = [name for role in fields(self) for name in self._columns_of(role.name)]
         repeated = next((name for name in names if names.count(name) > 1), None)
         if repeated is not None:
             raise NergError(f"column map: the column {repeated!r} has two roles; name another one for each of them")
 
-    def _columns_of(self, field: str) -> tuple[str, ...]:
-        """The names of a field's columns, without the signs of angles."""
-        value = getattr(self, field) or ()
+    def _columns_of(self, role: str) -> tuple[str, ...]:
+        """The names of a role's columns, without the signs of angles."""
+        value = getattr(self, role) or ()
         names = (value,) if isinstance(value, str) else value
-        return tuple(name.removeprefix("-") for name in names) if field in ANGLES else names
+        return tuple(name.removeprefix("-") for name in names) if role in ANGLES else names
 
     @property
     def pose(self) -> str | None:
@@ -206,12 +206,10 @@ class ColumnMap:
         return cls(**found)
 
     def __str__(self) -> str:
-        words = []
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is not None:
-                words.append(_quoted(f"{field.name}={value if isinstance(value, str) else ','.join(value)}"))
-        return " ".join(words)
+        given = {name: value for name, value in vars(self).items() if value is not None}
+        return " ".join(
+            _quoted(f"{name}={value if isinstance(value, str) else ','.join(value)}") for name, value in given.items()
+        )
 
 
 def _quoted(word: str) -> str:
@@ -225,20 +223,9 @@ def _quoted(word: str) -> str:
 #
 # Names that columns of headsets' logs usually have, in lower case with underscores; the earlier ones are preferred.
 
-
 TIMES = ("t", "time", "timestamp", "time_s", "unity_time", "utc_timestamp", "raw_timestamp", "sender_time")
-PERSONS = (
-    "person",
-    "participant",
-    "participant_id",
-    "participantid",
-    "user",
-    "user_id",
-    "userid",
-    "subject",
-    "subject_id",
-    "id",
-)
+PERSONS = ("person", "participant", "participant_id", "participantid", "user", "user_id", "userid")
+PERSONS += ("subject", "subject_id", "id")
 HITS = ("hit", "gaze_hit", "hit_point", "hit_pos", "hit_position")
 DIRECTIONS = ("gaze_dir", "gaze_direction", "gaze_forward")
 EYES = ("gaze_origin", "gaze_position", "eye_position")
@@ -255,10 +242,7 @@ MORE_HEADS = (*HEADS, "hmd_position", "camera_pos", "camera_position", "cam_pos"
 MORE_ROTATIONS = (*ROTATIONS, "hmd_rotation", "camera_rot", "camera_rotation", "cam_rot", "cam_rotation")
 
 
-# ---- Validity ----
-#
-# Columns that say whether the gaze of a row is valid: how they are named, and what their values mean.
-
+# ---- Columns that say whether the gaze of a row is valid: how they are named, and what their values mean ----
 
 # Of the gaze as a whole, as one word: isvalid, gazevalidity, combinedgazestatus. Those of one eye are none.
 _OF_GAZE = re.compile(
@@ -353,3 +337,121 @@ def parse_valid(text: str | None) -> dict[str, tuple[str, ...]] | None:
     if any(not name or not any(values) for name, values in pairs.items()) or (not pairs and "none" not in text.lower()):
         raise NergError(f'--valid is {plain(text, 60)!r}; it is COLUMN=VALUE,VALUE (several between spaces), or "none"')
     return pairs
+
+
+# ---- What the columns of a table are by their names: vectors, quaternions, matrices, angles, times, people ----
+
+# What may stand before the letter of an axis in one word: tx, posX, GazeQX.
+_BEFORE = ("", "t", "q", "p", "d", "h", "v", "g", "pos", "rot", "dir", "vec", "quat", "gaze", "head", "hit", "eye")
+_NEVER = (
+    *("velocity", "vel", "speed", "acceleration", "accel", "gyro", "gravity", "magnetic", "angular", "linear"),
+    *("ecef", "scale", "size", "color", "uv", "std", "var", "screen", "webcam", "px", "pixel", "norm2d", "pupil"),
+    *("target", "aoi", "hand", "controller", "screenpoint", "velo"),
+)
+_TIME_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0, "seconds": 1.0, "µs": 1e-6, "100ns": 1e-7}
+_PEOPLE = (*PERSONS, "pid", "participant_name", "subject_name", "user_name", "person_id", "player")
+_SURE = ("confidence", "gaze_confidence", "conf", "quality")
+
+
+@dataclass
+class Roles:
+    """Columns of a table by what they may be, each kind by its stem: the words around the letters of the axes."""
+
+    vectors: dict[str, tuple[str, ...]] = field(default_factory=dict)  # x, y, z
+    quaternions: dict[str, tuple[str, ...]] = field(default_factory=dict)  # x, y, z, w
+    matrices: dict[str, tuple[str, ...]] = field(default_factory=dict)  # 12 or 16, row by row
+    gravity: tuple[str, str, str] | None = None
+    azel: tuple[str, str] | None = None
+    yaw_pitch_roll: tuple[str, ...] | None = None  # two or three
+    times: list[str] = field(default_factory=list)  # the most likely first
+    person: str | None = None
+    confidence: str | None = None
+
+
+def find_roles(columns: Sequence[str]) -> Roles:
+    """The roles that the names of ``columns`` tell; those with a comma or an equals sign, which no map can name, have
+    none."""
+    words = {c: column_words(c) for c in columns if c and not set(c) & set(",=")}
+    roles, every = Roles(), set(words.values())
+    groups: dict[str, dict[str, str]] = {}
+    cells: dict[str, dict[str, str]] = {}
+    gravity: dict[str, str] = {}
+    for column, name in words.items():
+        parts = name.split("_")
+        if "gravity" in parts:
+            for _, axis in _axes(parts):
+                gravity.setdefault(axis, column)
+        if any(part in _NEVER and not (part == "px" and name.replace("px", "pz") in every) for part in parts):
+            continue
+        for stem, axis in _axes(parts):
+            groups.setdefault(stem, {}).setdefault(axis, column)
+        found = re.fullmatch(r"(.*?)_?m?([0-3])_?([0-3])", name)
+        if found:
+            cells.setdefault(found[1], {})[found[2] + found[3]] = column
+    for stem, found in groups.items():
+        if set("xyzw") <= set(found):
+            roles.quaternions[stem] = tuple(found[a] for a in "xyzw")
+        elif set("xyz") <= set(found):
+            roles.vectors[stem] = tuple(found[a] for a in "xyz")
+    for stem, found in cells.items():
+        rows = 4 if "33" in found else 3
+        names = [f"{r}{c}" for r in range(rows) for c in range(4)]
+        if all(n in found for n in names):
+            roles.matrices[stem] = tuple(found[n] for n in names)
+    if set("xyz") <= set(gravity):
+        roles.gravity = gravity["x"], gravity["y"], gravity["z"]
+    _find_angles(words, roles)
+    ranks = {column: rank for column, name in words.items() if (rank := _time_rank(name)) is not None}
+    roles.times = sorted(ranks, key=ranks.__getitem__)
+    roles.person = next((c for p in _PEOPLE for c, w in words.items() if w == p), None)
+    roles.confidence = next((c for p in _SURE for c, w in words.items() if w == p), None)
+    return roles
+
+
+def time_unit(column: str) -> float | None:
+    """Seconds of the unit that a column's name states; None where it states none."""
+    bracket = re.search(r"[(\[]([^)\]]{1,12})[)\]]", column)
+    last = column_words(column).split("_")[-1]
+    return _TIME_UNITS.get(bracket[1].strip().lower() if bracket else last)
+
+
+def in_degrees(columns: Sequence[str]) -> bool | None:
+    """Whether the names of angles state degrees; None where they state nothing."""
+    text = " ".join(columns).lower()
+    if "rad" in text:
+        return False
+    return True if "deg" in text else None
+
+
+def _axes(parts: list[str]) -> list[tuple[str, str]]:
+    """Stems and axes that a name may mean: of the last word that is, or ends with, the letter of an axis."""
+    for k in range(len(parts) - 1, -1, -1):
+        part = parts[k]
+        if part and part[-1] in "xyzw" and part[:-1] in _BEFORE:
+            return [("_".join([*parts[:k], part[:-1] + "*", *parts[k + 1 :]]), part[-1])]
+    return []
+
+
+def _find_angles(words: dict[str, str], roles: Roles) -> None:
+    def one(*names: str) -> str | None:
+        avoid = {"left", "right", "low", "high", "std"}
+        fits = (c for what in names for c, w in words.items() if what in w.split("_") and not avoid & set(w.split("_")))
+        return next(fits, None)
+
+    azimuth, elevation = one("azimuth", "az"), one("elevation", "el")
+    if azimuth and elevation:
+        roles.azel = azimuth, elevation
+    yaw, pitch, roll = one("yaw"), one("pitch"), one("roll")
+    if yaw and pitch:
+        roles.yaw_pitch_roll = (yaw, pitch, roll) if roll else (yaw, pitch)
+
+
+def _time_rank(words: str) -> int | None:
+    """How likely a name is that of the time, the smaller the more; None: it is none."""
+    exact = ("t", "time", "timestamp", "time_s", "sample_time", "unity_time", "utc_timestamp", "timestep")
+    if words in exact:
+        return exact.index(words)
+    parts = words.split("_")
+    if not any(p in ("time", "timestamp", "timestamps", "clock", "utc") for p in parts):
+        return None
+    return 20 + 5 * len({"relative", "frame", "device", "raw", "duration", "delta", "dt"} & set(parts)) + len(parts)

@@ -12,14 +12,13 @@ import numpy as np
 from nerg_mi.errors import NergError, plain
 
 from . import poses
-from .base import OPENGL, RECORDINGS, Frame, RaysBuilder, Signature, option
+from .base import OPENGL, RECORDINGS, InFrame, RaysBuilder, Signature, option
 from .poses import rotations_from_quaternions
 from .tables import TableBlock, iterate_table, table_columns
 
 # ---- Scene settings ----
 #
 # How EyeNavGS put places into VR: their scale, what stands them upright, and where the play area lies in them.
-
 
 # From the viewer's axes (OpenXR's: y up, -z ahead) to those of splats (y down, z ahead), as the viewer turns cameras.
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -84,10 +83,7 @@ def _numbers(text: str, count: int) -> tuple[float, ...] | None:
     return found if len(found) == count and all(abs(v) < 1e6 for v in found) else None
 
 
-# ---- Eyenavgs ----
-#
-# EyeNavGS: gaze of people in VR in real places that were kept as Gaussian splats (arXiv 2506.02380).
-
+# ---- EyeNavGS: gaze of people in VR in real places that were kept as Gaussian splats (arXiv 2506.02380) ----
 
 _TICK = 1e-3  # seconds
 _TURNED = 5.0, 30.0  # degrees: a head that turned farther has eyes that turn in the world, and in the head
@@ -116,7 +112,7 @@ class EyeNavGSOptions:
             raise NergError(f'--eye is "{plain(self.eye, 40)}"; it is both, left or right')
 
 
-class EyeNavGS:
+class EyeNavGS(InFrame):
     """``userN_PLACE.csv`` of both sites, whose columns have two orders, or folders of them; all of one place.
 
     A frame has a row of each eye, the left one first; positions are the eyes', ``Quaternion`` is the head's, ``GazeQ``
@@ -136,11 +132,9 @@ class EyeNavGS:
     files = "`userN_PLACE.csv` of EyeNavGS (or folders of them), of one place; `scene_setting.csv` beside them or above"
     world = "right-handed, y up and in metres after the place's rotation and scale"
     checked_on = f"{RECORDINGS} of Rutgers; of NTHU generated files"
+    fixed = OPENGL
     signature = Signature(columns=(("ViewIndex", "PositionX", "QuaternionX", "GazeQX"),))
     Options = EyeNavGSOptions
-
-    def frame(self, files: Sequence[Path], options: EyeNavGSOptions) -> Frame:
-        return OPENGL
 
     def read(self, files: Sequence[Path], options: EyeNavGSOptions, builder: RaysBuilder) -> None:
         recordings = [path for given in files for path in _recordings(given)]

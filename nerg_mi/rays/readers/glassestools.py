@@ -92,9 +92,7 @@ def _frame_times(folder: Path, builder: RaysBuilder) -> np.ndarray | None:
     if not path.is_file():
         return None
     builder.source(path)
-    blocks = builder.read_table(path, ["frame_idx", "timestamp"])
-    rows = np.concatenate([block.numbers for block in blocks] or [np.empty((0, 2))])
-    builder.count_lines(len(rows))
+    rows = builder.read_whole(path, ["frame_idx", "timestamp"])
     if not np.array_equal(rows[:, 0], np.arange(len(rows))):
         raise NergError(f'"{path}" does not count its frames 0, 1, 2, ...; convert the recording again')
     return rows[:, 1] * _MILLISECOND

@@ -1,4 +1,4 @@
-"""HoloLens 2's StreamRecorder (github: microsoft/HoloLens2ForCV)."""
+"""HoloLens 2: StreamRecorder (github: microsoft/HoloLens2ForCV) and ARETT (github: AR-Eye-Tracking-Toolkit/ARETT)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .base import DESCRIPTION, OPENGL, Frame, NoOptions, RaysBuilder, Signature
+from .base import DESCRIPTION, OPENGL, UNITY, InFrame, NoOptions, RaysBuilder, Signature
 from .table import person_from_filename
 from .tables import iterate_table
 
@@ -20,7 +20,7 @@ _BACK = ["head2", "head6", "head10"]  # the third column of the matrix, row by r
 _HEADER = ["t", *(f"head{i}" for i in range(16)), *(f"hand{i}" for i in range(_HANDS)), *_GAZE]
 
 
-class HoloLens:
+class HoloLens(InFrame):
     """``*_head_hand_eye.csv``, which has no header.
 
     A line: time in ticks of 100 ns; the head's 4x4 matrix, row by row, which looks along minus its third column; for
@@ -34,11 +34,8 @@ class HoloLens:
     files = "`*_head_hand_eye.csv` of HoloLens 2's StreamRecorder"
     world = "y up, right, m"
     checked_on = DESCRIPTION
+    fixed = OPENGL
     signature = Signature(ending="_head_hand_eye.csv")
-    Options = NoOptions
-
-    def frame(self, files: Sequence[Path], options: NoOptions) -> Frame:
-        return OPENGL
 
     def read(self, files: Sequence[Path], options: NoOptions, builder: RaysBuilder) -> None:
         builder.note(tick=_TICK)
@@ -63,4 +60,44 @@ class HoloLens:
                 )
 
 
-READERS = (HoloLens(),)
+_MILLISECOND = 1e-3
+_VECTORS = [f"{what}_{axis}" for what in ("gazeOrigin", "gazeDirection", "gazePoint") for axis in "xyz"]
+_TRUTHS = ["isCalibrationValid", "gazeHasValue", "gazePointHit"]
+
+
+class Arett(InFrame):
+    """A recording's gaze data, in Unity's world (y up, left-handed, metres).
+
+    ``gazeOrigin`` and ``gazeDirection`` are kept where ``gazeHasValue`` and ``isCalibrationValid`` are true;
+    ``gazePoint`` is the point looked at where ``gazePointHit`` is. ``eyeDataTimestamp`` counts milliseconds. The file
+    is the person.
+    """
+
+    name = "arett"
+    files = "gaze data of ARETT on HoloLens 2"
+    world = "Unity"
+    checked_on = DESCRIPTION
+    fixed = UNITY
+    signature = Signature(
+        columns=(("eyeDataTimestamp", "gazeHasValue", "isCalibrationValid", "gazeOrigin_x", "gazeDirection_x"),)
+    )
+
+    def read(self, files: Sequence[Path], options: NoOptions, builder: RaysBuilder) -> None:
+        builder.note(tick=_MILLISECOND)
+        for path in files:
+            builder.source(path)
+            for block in builder.read_table(path, ["eyeDataTimestamp", *_VECTORS], _TRUTHS):
+                v = block.numbers
+                calibrated, seen, met = (np.char.lower(block.texts) == "true").T
+                builder.add(
+                    v[:, 0] * _MILLISECOND,
+                    person_from_filename(path),
+                    v[:, 1:4],
+                    v[:, 4:7],
+                    rows=block.lines,
+                    hit=np.where(met[:, None], v[:, 7:10], np.nan),
+                    drop={"gazeHasValue is not true": ~seen, "isCalibrationValid is not true": ~calibrated},
+                )
+
+
+READERS = (HoloLens(), Arett())

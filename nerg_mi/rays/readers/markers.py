@@ -17,10 +17,10 @@ from nerg_mi.files.safe_read import reading, size_of
 from nerg_mi.ranges import ANGLES, Checked
 
 from . import poses
-from .base import DESCRIPTION, UNITS, UPS, Frame, RaysBuilder, Signature, option
+from .base import DESCRIPTION, UNITS, UPS, RaysBuilder, Signature, TrackingFrame, option
+from .poses import fill_values
 from .skeleton import FACE, MISSING, PITCH, PlaceChecks, Places, head_poses, median_of, parse_keypoints
 from .table import person_from_filename
-from .values import fill_values
 
 # ---- C3D files of motion capture, read by the package c3d, an optional extra ----
 
@@ -110,10 +110,7 @@ def _without_warnings() -> Iterator[None]:
         yield
 
 
-# ---- Markers ----
-#
-# Heads by the markers of a motion capture system: C3D files.
-
+# ---- Heads by the markers of a motion capture system: C3D files ----
 
 # Of Plug-in Gait (Vicon), and of Qualisys' markers of gait and of animation. Underscores are not compared.
 _HEADS: tuple[Places, ...] = (
@@ -156,11 +153,11 @@ class C3d:
     signature = Signature(ending=".c3d")
     Options = MarkerOptions
 
-    def frame(self, files: Sequence[Path], options: MarkerOptions) -> Frame:
+    def frame(self, files: Sequence[Path], options: MarkerOptions) -> TrackingFrame:
         ups = {options.up} if options.up else {_up(read_header(path)) or "z" for path in files}
         if len(ups) > 1:
             raise NergError(f"the files differ in which axis points up ({', '.join(sorted(ups))}); import them apart")
-        return Frame(up=next(iter(ups), "z"))
+        return TrackingFrame(up=next(iter(ups), "z"))
 
     def read(self, files: Sequence[Path], options: MarkerOptions, builder: RaysBuilder) -> None:
         for path in files:

@@ -15,7 +15,7 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import line_blocks
 
 from . import poses
-from .base import DESCRIPTION, Frame, RaysBuilder, Signature, option
+from .base import DESCRIPTION, RaysBuilder, Signature, TrackingFrame, option
 from .table import person_from_filename
 
 _HEAD_LINES = 40
@@ -43,7 +43,7 @@ class MotiveOptions:
 
 
 @dataclass(frozen=True)
-class _Layout:
+class MotiveLayout:
     columns: list[str]  # names made of the lines above
     bodies: dict[str, list[str]]  # columns of the pose (7) of each rigid body
     units: str
@@ -71,11 +71,11 @@ class Motive:
     )
     Options = MotiveOptions
 
-    def frame(self, files: Sequence[Path], options: MotiveOptions) -> Frame:
+    def frame(self, files: Sequence[Path], options: MotiveOptions) -> TrackingFrame:
         units = {_read_layout(path).units for path in files} or {"m"}
         if len(units) > 1:
             raise NergError(f"the files are in {' and '.join(sorted(units))}; import them apart")
-        return Frame(up=options.up, units=units.pop())
+        return TrackingFrame(up=options.up, units=units.pop())
 
     def read(self, files: Sequence[Path], options: MotiveOptions, builder: RaysBuilder) -> None:
         forward = poses.axis(options.looks_along, "forward")
@@ -107,7 +107,7 @@ class Motive:
 READERS = (Motive(),)
 
 
-def _choose(path: Path, layout: _Layout, wanted: str | None) -> str:
+def _choose(path: Path, layout: MotiveLayout, wanted: str | None) -> str:
     names = list(layout.bodies)
     fits = [n for n in names if n == wanted] if wanted else names
     if not wanted and len(fits) > 1:
@@ -118,7 +118,7 @@ def _choose(path: Path, layout: _Layout, wanted: str | None) -> str:
     raise NergError(f"{path} has the rigid bodies {shown}; name the head's with --rigid-body, or export its rotation")
 
 
-def _read_layout(path: Path) -> _Layout:
+def _read_layout(path: Path) -> MotiveLayout:
     """What the lines above the samples tell. Raises `NergError` for another file, or another export."""
     with closing(line_blocks(path, "table", _HEAD_LINES)) as blocks:
         rows = list(csv.reader(line.lstrip("\ufeff") for line in next(blocks, [])))
@@ -153,4 +153,4 @@ def _read_layout(path: Path) -> _Layout:
         if kind in ("Rigid Body", "Bone"):
             bodies.setdefault(name, {})[what, axis] = columns[-1]
     whole = {name: [cells[key] for key in _POSE] for name, cells in bodies.items() if set(_POSE) <= set(cells)}
-    return _Layout(columns, whole, units, at + 2)
+    return MotiveLayout(columns, whole, units, at + 2)

@@ -161,7 +161,4 @@ def _frame_times(folder: Path, builder: RaysBuilder) -> np.ndarray | None:
     if not path.is_file():
         return None
     builder.source(path)
-    blocks = builder.read_table(path, [_TIME])
-    times = np.concatenate([block.numbers[:, 0] for block in blocks] or [np.empty(0)])
-    builder.count_lines(len(times))
-    return times
+    return builder.read_whole(path, [_TIME])[:, 0]

@@ -9,11 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-
 from . import columns as names
 from . import poses
-from .base import DESCRIPTION, OPENGL, Frame, RaysBuilder, Signature, TickOption, tick_option
+from .base import DESCRIPTION, OPENGL, InFrame, RaysBuilder, Signature, TickOption, tick_option
 from .columns import ColumnFinder, mark_valid, require_valid_values
 from .table import find_person, person_from_filename
 
@@ -43,7 +41,7 @@ def _recognize(table: ColumnFinder) -> str | None:
     return "it has gaze_orientation and location_flags" if turn and table.find("location_flags") else None
 
 
-class OpenXr:
+class OpenXr(InFrame):
     """Tables of the gaze's pose: right-handed, y up, metres, looking along -z.
 
     A place (``gaze_position_*``, ``pose_position_*``, ``position_*`` or x, y, z) and a quaternion
@@ -60,20 +58,16 @@ class OpenXr:
     )
     world = "OpenXR: y up, right, m, forward -z"
     checked_on = DESCRIPTION
+    fixed = OPENGL
     signature = Signature(table=_recognize)
     Options = OpenXrOptions
-
-    def frame(self, files: Sequence[Path], options: OpenXrOptions) -> Frame:
-        return OPENGL
 
     def read(self, files: Sequence[Path], options: OpenXrOptions, builder: RaysBuilder) -> None:
         for path in files:
             table = ColumnFinder(path)
             place, turn = table.vector(*_PLACES), table.vector(*_TURNS, axes="xyzw")
-            time, flags = table.find(*_TIMES), table.find(*_FLAGS)
+            time, flags = table.time(*_TIMES), table.find(*_FLAGS)
             active, person = table.find(*_ACTIVE), find_person(table, builder)
-            if time is None:
-                raise NergError(f"{path} has no time; name its columns with --map")
             builder.source(path)
             numbers = [time, *place, *turn, *([flags] if flags else [])]
             texts = [name for name in (active, person) if name]

@@ -1,143 +1,13 @@
-"""Poses along time: rotations, gaze vectors in them, and tracks that are interpolated."""
+"""Vectors of tracking: heads' rotations, tracks of poses that are interpolated, and fill values in their place."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
-from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine, line_blocks
+from nerg_mi.errors import NergError
 from nerg_mi.ranges import FARTHEST, TIMES
-
-from .values import fill_values, is_filled_angles
-
-# ---- Gaze vectors ----
-#
-# Gaze vectors as Qualisys Track Manager exports them: a header of words and values, then numbers between tabs.
-#
-# After QTM's manual ("Gaze vector data (_g.tsv)"). The header, the names of the columns and the time are options of the
-# export, so that each may be missing.
-
-
-_COLUMNS = ("x pos", "y pos", "z pos", "x vec", "y vec", "z vec")
-_BLOCK = 1 << 16  # lines converted at a time
-_HEADER_LINES = 200
-_MISSING = {"", "nan", "null", "-"}
-_WHAT = "file of gaze vectors"
-
-
-class GazeVectors(NamedTuple):
-    """A run of n samples."""
-
-    times: np.ndarray  # (n,) seconds
-    vectors: np.ndarray  # (n, 6) position in mm and direction, NaN where a cell is empty
-    samples: np.ndarray  # (n,) which of the file they are, from 0
-    lines: np.ndarray  # (n,) of the file, from 1
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Where samples begin, and what stands in their cells."""
-
-    first: int  # line of the first sample
-    cells: tuple[int, ...]  # of `_COLUMNS`
-    time: int | None  # cell of the seconds
-    step: float  # seconds from sample to sample, where no cell tells
-    start: float  # seconds of the first
-    width: int  # cells of a line
-
-
-def iterate_gaze_vectors(path: Path, on_bad: OnBadLine | None = None) -> Iterator[GazeVectors]:
-    """The samples of ``path`` in blocks.
-
-    Raises `NergError` for what is no such file, for times that nothing tells, and, unless ``on_bad`` is given, for a
-    line that cannot be read; ``on_bad`` is told of such lines, which are left out.
-    """
-    layout, count, sample = _read_layout(path), 0, 0
-    with closing(line_blocks(path, _WHAT, _BLOCK)) as blocks:
-        for lines in blocks:
-            found: list[tuple[float, list[float], int, int]] = []
-            for number, line in enumerate(lines, count + 1):
-                if number < layout.first or not line.strip("\r\n "):
-                    continue
-                try:
-                    cells = _cells(line)
-                    if not layout.width <= len(cells) <= layout.width + (not cells[-1]):
-                        raise ValueError(f"{len(cells)} cells, not {layout.width}")
-                    time = layout.start + sample * layout.step if layout.time is None else _number(cells[layout.time])
-                    found.append((time, [_number(cells[i]) for i in layout.cells], sample, number))
-                except ValueError as error:
-                    why = f": {plain(line, 60)!r} is no sample ({plain(error)}); correct or remove the line"
-                    if on_bad is None:
-                        raise NergError(
-                            f"{path}, line {number}{why}, or leave such lines out with --skip-bad-lines"
-                        ) from None
-                    on_bad(number, why)
-                sample += 1
-            count += len(lines)
-            if found:
-                times, vectors, samples, numbers = zip(*found)
-                yield GazeVectors(np.array(times), np.array(vectors), np.array(samples), np.array(numbers))
-
-
-def _read_layout(path: Path) -> _Layout:
-    """What the head of the file, or its first sample, tells."""
-    with closing(line_blocks(path, _WHAT, _HEADER_LINES)) as blocks:
-        head = next(blocks, [])
-    about: dict[str, str] = {}
-    for number, line in enumerate(head, 1):
-        cells = _cells(line)
-        names = [re.sub(r"\s+", " ", cell).lower() for cell in cells]
-        where = [next((i for i, name in enumerate(names) if name.endswith(wanted)), None) for wanted in _COLUMNS]
-        if all(i is not None for i in where):
-            time = names.index("time") if "time" in names else None
-            return _layout(
-                path, number + 1, tuple(i for i in where if i is not None), time, about, len(cells) - (not cells[-1])
-            )
-        if re.match(r"[A-Za-z_]", cells[0]) and cells[0].lower() not in _MISSING:
-            about[cells[0].upper()] = cells[1] if len(cells) > 1 else ""
-        elif len(cells) in (6, 8):
-            # Without names: six numbers, or a sample's number and its time before them.
-            time = 1 if len(cells) == 8 else None
-            return _layout(path, number, tuple(range(len(cells) - 6, len(cells))), time, about, len(cells))
-        elif line.strip():
-            break
-    raise NergError(
-        f"{path} has no gaze vectors (X Pos, Y Pos, Z Pos, X Vec, Y Vec, Z Vec between tabs); export them from QTM "
-        "(TSV, eye tracker), with column headers"
-    )
-
-
-def _layout(
-    path: Path, first: int, cells: tuple[int, ...], time: int | None, about: dict[str, str], width: int
-) -> _Layout:
-    if time is not None:
-        return _Layout(first, cells, time, 0.0, 0.0, width)
-    try:
-        rate, offset = float(about.get("FREQUENCY", "")), float(about.get("START_OFFSET", "") or 0)
-    except ValueError:
-        rate, offset = 0.0, 0.0
-    if not (0 < rate < 1e6 and abs(offset) < 1e9):
-        raise NergError(
-            f"{path} tells no time: neither a column Time nor a FREQUENCY in its header; export it from QTM with "
-            "its header"
-        )
-    return _Layout(first, cells, None, 1 / rate, -offset, width)
-
-
-def _cells(line: str) -> list[str]:
-    return [cell.strip().strip('"') for cell in line.lstrip("\ufeff").rstrip("\r\n").split("\t")]
-
-
-def _number(cell: str) -> float:
-    return np.nan if cell.lower() in _MISSING else float(cell)
-
 
 # ---- Where something was and how it was turned, sample by sample, and in between ----
 
@@ -176,19 +46,15 @@ class PoseTrack:
         return turn, place, lost
 
 
-# ---- Poses ----
-#
-# Heads' poses: from quaternions, angles and matrices to rotations, and on to rays.
+# ---- Heads' poses: from quaternions, angles and matrices to rotations, and on to rays ----
 #
 # A rotation takes the head's frame to the table's. ``forward`` names the axis of the head's frame along which it looks:
 # ``z`` in Unity, ``-z`` of an OpenGL camera and in OpenXR, ``x`` in ROS and Unreal.
 
-
 AXES = {f"{sign}{axis}": s * np.eye(3)[i] for i, axis in enumerate("xyz") for sign, s in (("", 1.0), ("-", -1.0))}
 """Unit vectors by name: x, -x, y, -y, z, -z."""
 
-MIRRORED = "the head's matrix is mirrored (its determinant is negative)"
-"""Why a row is dropped."""
+MIRRORED = "the head's matrix is mirrored (its determinant is negative)"  # Why a row is dropped
 
 
 def axis(name: str, what: str) -> np.ndarray:
@@ -302,3 +168,84 @@ def _where(good: np.ndarray | np.bool_, values: np.ndarray, make) -> np.ndarray:
     if good.any():
         out[good] = make(Rotation, values[good]).as_matrix()
     return out
+
+
+# ---- Fill values ----
+#
+# Vectors whose components are all one fill value, as 0, 0, 0 or -1, -1, -1 where a program had nothing to write.
+
+_FILLS = np.array(
+    [
+        *(0.0, -1.0, *(sign * 10.0**k - sign for k in range(2, 7) for sign in (1, -1))),
+        *(limit for bits in (16, 32) for limit in (-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1, 2.0**bits - 1)),
+    ]
+)
+_LIMIT = 1e30  # of floats that are lengths or directions; a fill beyond is the largest of its type, however rounded
+_APART = 0.1  # metres between a fill value and the nearest place of a person who was never there
+_AIMED = np.cos(np.radians(2.0))  # of a ray that points at its hit point
+
+
+def fill_values(v: np.ndarray) -> np.ndarray:
+    """The fill value of vectors (..., C), (...); NaN of those that are none."""
+    first = v[..., 0]
+    is_fill = np.isin(first, _FILLS) | (np.isfinite(first) & (np.abs(first) > _LIMIT))
+    return np.where((v == v[..., :1]).all(axis=-1) & is_fill, first, np.nan)
+
+
+def is_filled_angles(angles: np.ndarray) -> np.ndarray:
+    """Whether angles (n, C) of a head or of gaze, in degrees or radians, are one fill value, (n,) bool; 0 and -1 may be
+    true."""
+    return np.abs(fill_values(angles)) > 90
+
+
+def is_aimed(origin: np.ndarray, direction: np.ndarray, hit: np.ndarray) -> np.ndarray:
+    """Whether rays (n, 3) point at their hit points, to 2 degrees, (n,) bool."""
+    way = hit - origin
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cosine = np.einsum("ij,ij->i", way, direction) / np.linalg.norm(way, axis=1) / np.linalg.norm(direction, axis=1)
+    return cosine > _AIMED
+
+
+class FilledOrigins:
+    """Finds origins of one source that are fill values, block by block.
+
+    A place at exactly 0, 0, 0 may be true: somebody sits there, or a track begins there. It is a fill value where it is
+    repeated and the same person is otherwise never within 0.1 m of it. ``metre``: of a unit of length.
+    """
+
+    def __init__(self, metre: float) -> None:
+        self._apart = _APART / metre
+        self._last: dict[int, np.ndarray] = {}  # the last place of each person that is none
+        self._count: dict[tuple[int, float], int] = {}
+        self.undecided: dict[int, int] = {}
+        """Rows of a person that were let through since no other place was known yet, and turned out to be filled."""
+
+    def find(self, origin: np.ndarray, person: np.ndarray) -> np.ndarray:
+        """Which rows (n,) bool are filled, of origins (n, 3) and numbers of persons (n,)."""
+        fill = fill_values(origin)
+        filled, out = np.isfinite(fill), np.zeros(len(fill), bool)
+        good = np.flatnonzero(np.isfinite(origin).all(axis=1) & ~filled)
+        if filled.any():
+            order = np.argsort(person, kind="stable")
+            codes, starts = np.unique(person[order], return_index=True)
+            for code, rows in zip(codes.tolist(), np.split(order, starts[1:])):
+                if filled[rows].any():
+                    out[rows] = self._find_of(code, origin[rows], fill[rows])
+        if len(good):
+            codes, at = np.unique(person[good][::-1], return_index=True)
+            self._last.update(zip(codes.tolist(), origin[good[::-1][at]]))
+        return out
+
+    def _find_of(self, code: int, origin: np.ndarray, fill: np.ndarray) -> np.ndarray:
+        others = origin[np.isnan(fill) & np.isfinite(origin).all(axis=1)]
+        if code in self._last:
+            others = np.vstack([others, self._last[code]])
+        out = np.zeros(len(fill), bool)
+        for value in np.unique(fill[np.isfinite(fill)]).tolist():
+            before = self._count.get((code, value), 0)
+            count = self._count[code, value] = before + int(np.count_nonzero(fill == value))
+            if len(others) and count > 1 and np.linalg.norm(others - value, axis=1).min() > self._apart:
+                out |= fill == value
+                if before and code not in self._last:
+                    self.undecided[code] = before
+        return out

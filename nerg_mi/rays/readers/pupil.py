@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import LENGTHS, Checked, Range
 
 from . import poses
-from .base import DESCRIPTION, Frame, RaysBuilder, Signature, option
+from .base import DESCRIPTION, RaysBuilder, Signature, TrackingFrame, option
 from .poses import PoseTrack
 
 _GAP = 0.1  # seconds: between head poses farther apart than this nothing is interpolated
@@ -52,8 +50,8 @@ class Pupil:
     )
     Options = PupilOptions
 
-    def frame(self, files: Sequence[Path], options: PupilOptions) -> Frame:
-        return Frame(up=options.up)
+    def frame(self, files: Sequence[Path], options: PupilOptions) -> TrackingFrame:
+        return TrackingFrame(up=options.up)
 
     def read(self, files: Sequence[Path], options: PupilOptions, builder: RaysBuilder) -> None:
         if options.marker is None or not options.marker > 0:
@@ -95,9 +93,7 @@ def _read_heads(path: Path, person: str, builder: RaysBuilder) -> PoseTrack:
     if not path.is_file():
         raise NergError(f"there is no {path}; run the head pose tracker in Pupil Player and export again")
     builder.source(path, f"{person}/{path.name}")
-    blocks = builder.read_table(path, _POSES)
-    track = np.concatenate([block.numbers for block in blocks] or [np.empty((0, 7))])
-    builder.count_lines(len(track))
+    track = builder.read_whole(path, _POSES)
     heads = PoseTrack.of_samples(track[:, 0], track[:, 1:4], track[:, 4:])
     if heads is None:
         raise NergError(f"{path} holds {len(track)} head poses; two that are whole are needed to interpolate between")

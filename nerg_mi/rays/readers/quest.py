@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
 from nerg_mi.ranges import Range
 
 from . import columns as names
 from . import poses
-from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, Signature, TickOption, option
+from .base import DESCRIPTION, UNITY, InFrame, RaysBuilder, Signature, TickOption, option
 from .columns import ColumnFinder
+from .poses import fill_values
 from .table import find_person, person_from_filename
-from .values import fill_values
 
 _POSITION, _ROTATION = ("position", "pos"), ("rotation", "rot", "orientation")
 _ONE = ("eye_gaze_", "eye_", "gaze_pose_", "gaze_", "pose_", "")
@@ -35,7 +34,7 @@ def _recognize(table: ColumnFinder) -> str | None:
     return f"it has a pose of each eye ({left[0]})" if left else None
 
 
-class Quest:
+class Quest(InFrame):
     """Poses of the eyes in tracking space: Unity's, y up, left-handed, metres, looking along z.
 
     Of each eye ``left_eye_position_*`` and ``left_eye_rotation_*`` (x, y, z, w; ``right_`` too), or of one gaze
@@ -51,23 +50,19 @@ class Quest:
     )
     world = "Unity"
     checked_on = DESCRIPTION
+    fixed = UNITY
     signature = Signature(table=_recognize)
     Options = QuestOptions
-
-    def frame(self, files: Sequence[Path], options: QuestOptions) -> Frame:
-        return UNITY
 
     def read(self, files: Sequence[Path], options: QuestOptions, builder: RaysBuilder) -> None:
         for path in files:
             table = ColumnFinder(path)
             eyes = [_pose(table, _sides(side)) for side in ("left", "right")]
             eyes = [e for e in eyes if e] if all(eyes) else [_needed(table)]
-            rig, time, person = _pose(table, _RIG), table.find(*names.TIMES), find_person(table, builder)
+            rig, time, person = _pose(table, _RIG), table.time(*names.TIMES), find_person(table, builder)
             each = [table.find(*(f"{b}confidence" for b in _sides(side))) for side in ("left", "right")]
             one = table.find("confidence", "gaze_confidence", "eye_confidence")
             sure = [c for c in each if c] or [c for c in [one] if c]
-            if time is None:
-                raise NergError(f"{path} has no time; name its columns with --map")
             builder.source(path)
             numbers = [time, *(name for pose in (*eyes, *([rig] if rig else [])) for name in pose), *sure]
             texts, clocks = [person] if person else [], {time: options.tick}

@@ -76,25 +76,20 @@ def make_options(name: str, given: Mapping[str, Any]) -> Any:
 
     Raises `NergError` for an option that the reader does not have, naming its flag, or a value that it refuses.
     """
-    _refuse_foreign(name, given)
-    return reader_named(name).Options(**given)
-
-
-def parse_options(name: str, given: Mapping[str, Any]) -> Any:
-    """As :func:`make_options`, of values as the command line has them: texts where an option makes its value of one."""
-    _refuse_foreign(name, given)
-    parse = {o.name: o.parse for o in options_of(reader_named(name).Options)}
-    return make_options(name, {key: f(value) if (f := parse[key]) else value for key, value in given.items()})
-
-
-def _refuse_foreign(name: str, given: Mapping[str, Any]) -> None:
-    known = {o.name for o in options_of(reader_named(name).Options)}
-    flags = {o.name: o.flag for o in shared_options()}
+    reader = reader_named(name)
+    known, flags = {o.name for o in options_of(reader.Options)}, {o.name: o.flag for o in shared_options()}
     foreign = ", ".join(flags.get(key, key) for key in given if key not in known)
     if foreign and name == TABLE:
         raise NergError(f"{foreign} belongs to a preset; leave it out, or give --preset in place of --map")
     if foreign:
         raise NergError(f"preset {name} knows its own conventions; leave out {foreign}")
+    return reader.Options(**given)
+
+
+def parse_options(name: str, given: Mapping[str, Any]) -> Any:
+    """As :func:`make_options`, of values as the command line has them: texts where an option makes its value of one."""
+    parse = {o.name: o.parse for o in options_of(reader_named(name).Options)}
+    return make_options(name, {key: f(value) if (f := parse.get(key)) else value for key, value in given.items()})
 
 
 def read_rays(
@@ -155,44 +150,29 @@ def shared_options() -> tuple[SharedOption, ...]:
 def _shared(of: dict[str, Option]) -> tuple[str, type, str]:
     """Flag, type and help of an option by the readers that have it."""
     first = next(iter(of.values()))
-    texts = {option.help: [name for name, o in of.items() if o.help == option.help] for option in of.values()}
+    texts, defaults = ({getattr(o, of_what): [] for o in of.values()} for of_what in ("help", "shown"))
+    for name, option in of.items():
+        texts[option.help].append(name)
+        defaults[option.shown].append(name)
     # What tables know is there for files of any kind, and said without a name.
     words = [text if names[0] == TABLE else f"{', '.join(names)}: {text}" for text, names in texts.items()]
-    defaults = {option.shown: [name for name, o in of.items() if o.shown == option.shown] for option in of.values()}
     shown = [
         text if i == 0 else f"{', '.join(names)}: {text}" for i, (text, names) in enumerate(defaults.items()) if text
     ]
     return first.flag, first.kind, " ".join(words) + (f"  [default: {'; '.join(shown)}]" if shown else "")
 
 
-def describe_readers() -> list[dict[str, str]]:
-    """Of each reader its ``name``, ``files``, ``world``, ``options`` and ``checked_on``, in Markdown."""
-    rows = []
-    for reader in _READERS.values():
+def preset_table() -> str:
+    """The readers that know their columns as a table in Markdown, for the manual."""
+    rows = ["| preset | files | frame | checked on |", "|---|---|---|---|"]
+    for reader in map(reader_named, preset_names()):
         options = "; ".join(
             f"`{o.flag}`: {o.help[:1].lower()}{o.help[1:].rstrip('.')}" + (f" ({o.shown})" if o.shown else "")
             for o in options_of(reader.Options)
         )
-        rows.append(
-            {
-                "name": reader.name,
-                "files": reader.files,
-                "world": reader.world,
-                "options": options,
-                "checked_on": reader.checked_on,
-            }
-        )
-    return rows
-
-
-def preset_table() -> str:
-    """The readers that know their columns as a table in Markdown, for the manual."""
-    rows = ["| preset | files | frame | checked on |", "|---|---|---|---|"]
-    for row in describe_readers():
-        if row["name"] != TABLE:
-            files = row["files"] + (f". {row['options']}" if row["options"] else "")
-            cells = [f"`{row['name']}`", files, row["world"], row["checked_on"]]
-            rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
+        files = f"{reader.files}. {options}" if options else reader.files
+        cells = [f"`{reader.name}`", files, reader.world, reader.checked_on]
+        rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
     return "\n".join(rows) + "\n"
 
 

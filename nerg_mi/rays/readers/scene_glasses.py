@@ -15,11 +15,11 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import OnBadLine, read_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.photos.cameras import Intrinsics, undistort_where
-from nerg_mi.photos.colmap import NamedPoses, find_source, find_up, read_named_poses
+from nerg_mi.photos.colmap import find_source, find_up, read_named_poses
 from nerg_mi.ranges import LENGTHS, RATES, Checked, Range
 
 from . import poses
-from .base import Frame, RaysBuilder, option
+from .base import RaysBuilder, TrackingFrame, option
 from .poses import PoseTrack
 from .tables import iterate_table
 
@@ -182,10 +182,7 @@ class PlaceFrame:
         return self.scale * points @ self.rotation.T + self.shift
 
 
-# ---- Scene camera ----
-#
-# Where a pixel, or a pair of angles, of a scene camera looks, in OpenCV's frame: x right, y down, z forward.
-
+# ---- Where a pixel, or a pair of angles, of a scene camera looks, in OpenCV's frame: x right, y down, z forward ----
 
 _COEFFICIENTS = 8  # k1 k2 p1 p2 k3 k4 k5 k6
 _LARGEST = 1e6  # of a calibration's numbers
@@ -256,7 +253,6 @@ def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 # no known unit. Seconds count from the recording's start. ``poses.p``, which the same tools keep, runs code when it is
 # opened, and is never read.
 
-
 _PLACE = tuple(f"translation_{a}" for a in "xyz")
 _QUATERNION = tuple(f"rotation_{a}" for a in "xyzw")
 _VECTOR = _QUATERNION[:3]
@@ -318,7 +314,6 @@ def _of_json(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 # The poses come from a model in which frames of the scene video were registered together with the photos of the place,
 # so that nothing has to be aligned: rays are in the coordinates that the place was trained in.
 
-
 _OPENCV = np.diag([1.0, -1.0, -1.0])  # from an OpenCV camera's frame to an OpenGL one's
 _AT_A_FRAME = 1e-6  # seconds: so near to a posed frame nothing has to be interpolated
 _LEVEL = 25.0  # degrees between up as the place tells it and as it is declared
@@ -327,7 +322,7 @@ _COMPARED = 1 << 20  # rows of a recording whose two accounts are compared
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions(Checked):
+class SceneCameraOptions(Checked):
     """Where the scene camera was. Raises `NergError` for a scale beside a place, or a rate or gap that is none."""
 
     poses: Path | None = option(  # needed
@@ -364,9 +359,9 @@ class SceneOptions(Checked):
             raise NergError("the checkpoint of the place knows its scale; leave out --scale, or --place")
 
     @property
-    def frame(self) -> Frame:
+    def frame(self) -> TrackingFrame:
         """The frame of the place, whose up is declared."""
-        return Frame(up=self.up)
+        return TrackingFrame(up=self.up)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -400,7 +395,7 @@ class SceneGaze:
     """Gaze of one recording, to be added block by block, with the camera's poses in the place's coordinates."""
 
     def __init__(
-        self, options: SceneOptions, recording: Recording, builder: RaysBuilder, about: list[dict[str, Any]]
+        self, options: SceneCameraOptions, recording: Recording, builder: RaysBuilder, about: list[dict[str, Any]]
     ) -> None:
         """``about``: what is known of the recordings before, to which this one is added."""
         self._builder, self._options, self._about = builder, options, about
@@ -451,8 +446,10 @@ class SceneGaze:
         return turn, place, lost | (apart & (nearest > _AT_A_FRAME))
 
 
-def _camera_track(options: SceneOptions, recording: Recording, builder: RaysBuilder) -> PoseTrack:
+def _camera_track(options: SceneCameraOptions, recording: Recording, builder: RaysBuilder) -> PoseTrack:
     """Where the camera was in the place, OpenCV's axes to the place's."""
+    from scipy.spatial.transform import Rotation
+
     if options.poses is None:
         raise NergError(
             "the scene camera's poses are needed: name the model in which frames of its video were registered with the "
@@ -475,13 +472,16 @@ def _camera_track(options: SceneOptions, recording: Recording, builder: RaysBuil
     else:
         track, up = _of_model(options, recording, to_place, builder)
     _check_up(up, options, builder)
-    return _moved(track, to_place)
+    turned = Rotation.from_matrix(to_place.rotation) * Rotation.from_rotvec(track.vectors)
+    return PoseTrack(track.times, turned.as_rotvec(), to_place.points(track.places))
 
 
 def _of_model(
-    options: SceneOptions, recording: Recording, to_place: PlaceFrame, builder: RaysBuilder
+    options: SceneCameraOptions, recording: Recording, to_place: PlaceFrame, builder: RaysBuilder
 ) -> tuple[PoseTrack, np.ndarray | None]:
     """The track of the model's frames in its own coordinates, and up in the place."""
+    from scipy.spatial.transform import Rotation
+
     assert options.poses is not None
     model = read_named_poses(find_source(options.poses))
     builder.source(model.path)
@@ -499,7 +499,8 @@ def _of_model(
             f"the recording has no times of its video's frames: they are counted from the start of its clock{rate}; "
             "put the file that has them beside the gaze (Tobii: the scene video, Neon: world_timestamps.csv)"
         )
-    track = _track(model, times)
+    turns = Rotation.from_matrix(model.to_world[:, :3, :3] @ _OPENCV)
+    track = PoseTrack.of_samples(times, turns.as_rotvec(), model.to_world[:, :3, 3])
     if track is None:
         raise NergError(
             f'one image of "{model.path}" alone is a frame of the recording "{plain(recording.name, 60)}"; two are '
@@ -518,21 +519,7 @@ def _of_model(
     return track, up
 
 
-def _track(model: NamedPoses, times: np.ndarray) -> PoseTrack | None:
-    from scipy.spatial.transform import Rotation
-
-    vectors = Rotation.from_matrix(model.to_world[:, :3, :3] @ _OPENCV).as_rotvec()
-    return PoseTrack.of_samples(times, vectors, model.to_world[:, :3, 3])
-
-
-def _moved(track: PoseTrack, to_place: PlaceFrame) -> PoseTrack:
-    from scipy.spatial.transform import Rotation
-
-    turned = Rotation.from_matrix(to_place.rotation) * Rotation.from_rotvec(track.vectors)
-    return PoseTrack(track.times, turned.as_rotvec(), to_place.points(track.places))
-
-
-def _check_up(up: np.ndarray | None, options: SceneOptions, builder: RaysBuilder) -> None:
+def _check_up(up: np.ndarray | None, options: SceneCameraOptions, builder: RaysBuilder) -> None:
     if up is None:
         return
     up = up / np.linalg.norm(up)
@@ -549,9 +536,7 @@ def _check_up(up: np.ndarray | None, options: SceneOptions, builder: RaysBuilder
 #
 # What readers of glasses with a scene camera share: a folder a recording, read against the poses of its camera.
 
-
-R = TypeVar("R", bound=Recording)
-"""What a reader knows of a recording."""
+R = TypeVar("R", bound=Recording)  # What a reader knows of a recording
 
 
 POSES = {"--poses": "MODEL", "--frames": "frame_{frame1}"}
@@ -578,7 +563,7 @@ class SceneReader(ABC, Generic[R]):
     """The two accounts of one gaze that are compared, as "pixels and angles"; empty where there is one."""
 
     world = "the place's, whose axis `--up` points up"
-    Options = SceneOptions
+    Options = SceneCameraOptions
 
     @abstractmethod
     def open(self, folder: Path, builder: RaysBuilder) -> R:
@@ -588,34 +573,23 @@ class SceneReader(ABC, Generic[R]):
     def blocks(self, gaze: Path, recording: R, builder: RaysBuilder) -> Iterable[GazeBlock]:
         """The rows of the file ``gaze`` of an open recording."""
 
-    def frame(self, files: Sequence[Path], options: SceneOptions) -> Frame:
+    def frame(self, files: Sequence[Path], options: SceneCameraOptions) -> TrackingFrame:
         return options.frame
 
-    def read(self, files: Sequence[Path], options: SceneOptions, builder: RaysBuilder) -> None:
-        _check_recordings(files, options)
+    def read(self, files: Sequence[Path], options: SceneCameraOptions, builder: RaysBuilder) -> None:
+        if len(files) > 1 and (options.frames is None or not options.frames.of_recording):
+            raise NergError(
+                "frames of several recordings are told apart by {recording} in their names (--frames); import them one "
+                'by one, or name them as in --frames "{recording}/frame_{frame1}"'
+            )
         about: list[dict[str, Any]] = []
         for given in files:
-            folder, gaze = _recording_folder(given, self.gaze_file)
-            recording = self.open(folder, builder)
+            gaze = given / self.gaze_file if given.is_dir() else given
+            if not gaze.is_file():
+                raise NergError(f"there is no {gaze}; give the folder of a recording, or the {self.gaze_file} in it")
+            recording = self.open(gaze.parent, builder)
             scene = SceneGaze(options, recording, builder, about)
             builder.source(gaze, f"{recording.person}/{gaze.name}")
             for block in self.blocks(gaze, recording, builder):
                 scene.add(block)
             scene.finish(self.accounts)
-
-
-def _recording_folder(given: Path, gaze: str) -> tuple[Path, Path]:
-    """The folder of a recording and the file of its gaze, where either was ``given``; ``gaze``: the file's name."""
-    path = given / gaze if given.is_dir() else given
-    if not path.is_file():
-        raise NergError(f"there is no {path}; give the folder of a recording, or the {gaze} in it")
-    return path.parent, path
-
-
-def _check_recordings(files: Sequence[Path], options: SceneOptions) -> None:
-    """Raise `NergError` for several recordings whose frames the model's names do not tell apart."""
-    if len(files) > 1 and (options.frames is None or not options.frames.of_recording):
-        raise NergError(
-            "frames of several recordings are told apart by {recording} in their names (--frames); import them one by "
-            'one, or name them as in --frames "{recording}/frame_{frame1}"'
-        )

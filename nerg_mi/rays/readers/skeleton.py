@@ -20,19 +20,15 @@ from nerg_mi.files.atomic import replacing
 from nerg_mi.files.safe_read import OnBadLine, line_blocks
 from nerg_mi.ranges import ANGLES
 
-from .base import DESCRIPTION, UNITS, Frame, RaysBuilder, Signature, TickOption, option
-from .values import fill_values
+from .base import DESCRIPTION, UNITS, RaysBuilder, Signature, TickOption, TrackingFrame, option
+from .poses import fill_values
 
-# ---- Skeleton file ----
+# ---- The skeleton file: one pose a line, ``id|time|[numbers]`` ----
 #
-# The skeleton file: one pose a line, ``id|time|[numbers]``.
-#
-# The tracking format of the NeRG paper (Section 5.1): a person's id, an integer
-# time or frame number, and keypoints (there 22) of three coordinates each, or of
-# three and a confidence. A keypoint that was not seen is ``nan``, lies at exactly
-# 0, 0, 0 or another fill value, or has no confidence. What the keypoints mean is the business of
+# The tracking format of the NeRG paper (Section 5.1): a person's id, an integer time or frame number, and keypoints
+# (there 22) of three coordinates each, or of three and a confidence. A keypoint that was not seen is ``nan``, lies at
+# exactly 0, 0, 0 or another fill value, or has no confidence. What the keypoints mean is the business of
 # :mod:`nerg_mi.rays.readers.skeleton`.
-
 
 KEYPOINTS = 22
 _SNIFFED = 1000  # lines, of which the first one that is whole says how many numbers there are
@@ -70,11 +66,10 @@ def write_skeleton(
 ) -> None:
     """Write poses in the order given; a name ending in ``.gz`` is compressed.
 
-    ``ids``: N names without ``|`` or line breaks. ``times``: (N,) integers.
-    ``keypoints``: (N, K, 3), NaN where unseen, or (N, K, 4) with confidences.
-    ``decimals``: digits after the point; 6 (a micrometre) turns a head by at most 1e-5 rad.
-    Equal input gives equal bytes. Raises ``ValueError`` for wrong shapes, times
-    that are not integers, or an id that the format cannot hold.
+    ``ids``: N names without ``|`` or line breaks. ``times``: (N,) integers. ``keypoints``: (N, K, 3), NaN where unseen,
+    or (N, K, 4) with confidences. ``decimals``: digits after the point; 6 (a micrometre) turns a head by at most 1e-5
+    rad. Equal input gives equal bytes. Raises ``ValueError`` for wrong shapes, times that are not integers, or an id
+    that the format cannot hold.
     """
     keypoints = np.asarray(keypoints, dtype=np.float64)
     times = np.asarray(times)
@@ -115,10 +110,9 @@ def iterate_skeleton(
     """Yield the poses of a file in runs of at most ``chunk`` lines, so that
     memory stays bounded (a day of a store is some 2.6 million lines).
 
-    ``keypoints``: which of those of the ``layout`` are wanted; the others are counted but not
-    converted, and come out NaN. Empty lines are skipped. Raises `NergError` for a damaged file and, naming file and
-    line, for a line that does not follow the format; where ``on_bad`` is given, that is told of such lines, which are
-    left out.
+    ``keypoints``: which of those of the ``layout`` are wanted; the others are counted but not converted, and come out
+    NaN. Empty lines are skipped. Raises `NergError` for a damaged file and, naming file and line, for a line that does
+    not follow the format; where ``on_bad`` is given, that is told of such lines, which are left out.
     """
     wanted = range(layout.keypoints) if keypoints is None else sorted(set(keypoints))
     columns = [layout.width * k + i for k in wanted for i in range(layout.width)]
@@ -246,13 +240,9 @@ def _written(path: Path, name: str) -> Iterator[IO[str]]:
             yield out
 
 
-# ---- Bodies ----
+# ---- Skeletons by the names of their keypoints, the head poses that they give, and bodies for given head poses ----
 #
-# Skeletons by the names of their keypoints, the head poses that they give, and bodies for given head poses.
-#
-# The paper's proxy for gaze (Section 5.1): a ray from the midpoint of the ears
-# through the nose.
-
+# The paper's proxy for gaze (Section 5.1): a ray from the midpoint of the ears through the nose.
 
 # Of the paper's skeleton these are documented: columns 6:9, 39:42 and 33:36 of the file.
 LEFT_EAR, RIGHT_EAR, NOSE = 2, 13, 11
@@ -395,12 +385,10 @@ def keypoints_from_head(
 ) -> np.ndarray:
     """Standing bodies whose ears and nose give exactly these head poses.
 
-    ``origin``: (N, 3) metres, z up, the midpoint of the ears. ``direction``:
-    (N, 3), need not be unit. ``floor``: height of the floor in metres. Returns
-    keypoints (N, 22, 3) with :func:`head_poses` of them equal to the input to
-    rounding. The head is not tilted sideways; the body faces where the head
-    faces and is scaled to its height. Raises ``ValueError`` for a zero or
-    non-finite direction.
+    ``origin``: (N, 3) metres, z up, the midpoint of the ears. ``direction``: (N, 3), need not be unit. ``floor``:
+    height of the floor in metres. Returns keypoints (N, 22, 3) with :func:`head_poses` of them equal to the input to
+    rounding. The head is not tilted sideways; the body faces where the head faces and is scaled to its height. Raises
+    ``ValueError`` for a zero or non-finite direction.
     """
     origin = np.atleast_2d(np.asarray(origin, dtype=np.float64))
     direction = np.atleast_2d(np.asarray(direction, dtype=np.float64))
@@ -410,8 +398,7 @@ def keypoints_from_head(
         raise ValueError(f"head pose {bad[0]} has a zero or non-finite direction or origin; drop it first")
     forward = direction / length
 
-    # Left is horizontal; a head that looks straight up or down has no heading of
-    # its own, and faces +x.
+    # Left is horizontal; a head that looks straight up or down has no heading of its own, and faces +x.
     flat = forward * (1.0, 1.0, 0.0)
     flat_length = np.linalg.norm(flat, axis=1, keepdims=True)
     heading = np.where(flat_length > 1e-9, flat / np.maximum(flat_length, 1e-9), (1.0, 0.0, 0.0))
@@ -433,10 +420,7 @@ def keypoints_from_head(
     return out
 
 
-# ---- Skeleton ----
-#
-# Tracked bodies as skeletons of keypoints: their heads' rays, from between the ears through the nose.
-
+# ---- Tracked bodies as skeletons of keypoints: their heads' rays, from between the ears through the nose ----
 
 Places = tuple[int | str, int | str, int | str]
 """The left and the right side of a head, and its front: keypoints or markers, or means of some, joined by "+"."""
@@ -511,8 +495,8 @@ class SkeletonFile:
     )
     Options = SkeletonOptions
 
-    def frame(self, files: Sequence[Path], options: SkeletonOptions) -> Frame:
-        return Frame(options.up, options.handedness, options.units)
+    def frame(self, files: Sequence[Path], options: SkeletonOptions) -> TrackingFrame:
+        return TrackingFrame(options.up, options.handedness, options.units)
 
     def read(self, files: Sequence[Path], options: SkeletonOptions, builder: RaysBuilder) -> None:
         for path in files:

@@ -12,10 +12,10 @@ from nerg_mi.errors import NergError
 
 from . import columns as names
 from . import poses
-from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, Signature, TickOption, tick_option
+from .base import DESCRIPTION, UNITY, InFrame, RaysBuilder, Signature, TickOption, tick_option
 from .columns import ColumnFinder
+from .poses import fill_values
 from .table import find_person, person_from_filename
-from .values import fill_values
 
 _MILLIMETRE = 1e-3
 # The SDK's head frame is right-handed, Unity's is not: SRanipal_Eye.GetGazeRay negates x of both.
@@ -38,7 +38,7 @@ class SranipalOptions(TickOption):
 
 
 @dataclass(frozen=True)
-class _Columns:
+class SdkColumns:
     """Names of a table's columns. ``eyes``: of the combined eye, or of the left and the right one, origin (3),
     direction (3) and mask (or None)."""
 
@@ -62,7 +62,7 @@ def _recognize(table: ColumnFinder) -> str | None:
     return f"it has {origin[0]} beside {head[0]}" if origin and head else None
 
 
-class Sranipal:
+class Sranipal(InFrame):
     """Tables with the SDK's own values beside the head's pose in Unity's world.
 
     ``gaze_origin_mm`` and ``gaze_direction_normalized`` (of ``combined``, or the mean of ``left`` and ``right``) are in
@@ -79,11 +79,9 @@ class Sranipal:
     )
     world = "Unity; gaze in the right-handed head frame of the SDK"
     checked_on = DESCRIPTION
+    fixed = UNITY
     signature = Signature(table=_recognize)
     Options = SranipalOptions
-
-    def frame(self, files: Sequence[Path], options: SranipalOptions) -> Frame:
-        return UNITY
 
     def read(self, files: Sequence[Path], options: SranipalOptions, builder: RaysBuilder) -> None:
         for path in files:
@@ -114,7 +112,7 @@ class Sranipal:
 READERS = (Sranipal(),)
 
 
-def _eyes(columns: _Columns, vector, value) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _eyes(columns: SdkColumns, vector, value) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Origin and direction (n, 3) in the SDK's frame, the mean of the eyes that are valid, and where one is, (n,)."""
     found, seen = [], []
     for origin, direction, mask in columns.eyes:
@@ -131,20 +129,19 @@ def _eyes(columns: _Columns, vector, value) -> tuple[np.ndarray, np.ndarray, np.
     return origin, direction, np.any(seen, axis=0)
 
 
-def _find(table: ColumnFinder, person: str | None) -> _Columns:
+def _find(table: ColumnFinder, person: str | None) -> SdkColumns:
     """The columns of a table; `NergError` for those that are missing."""
     eyes = [_eye(table, _COMBINED, "c")]
     if eyes[0] is None:
         eyes = [_eye(table, tuple(f"{a}{side}_" for a in _WITHIN), side[0]) for side in ("left", "right")]
     whole = [eye for eye in eyes if eye is not None]
-    time = table.find(*_TIMES)
-    lacks = "gaze_origin_mm_{x,y,z} or no gaze_direction_normalized_{x,y,z}" if len(whole) < len(eyes) else ""
-    lacks = lacks or ("" if time else "time")
-    if lacks or time is None:
-        raise NergError(f"{table.path} has no {lacks}; name its columns with --map, or is it a log of another device?")
-    head = table.vector(*names.MORE_HEADS)
-    turn = table.vector(*names.MORE_ROTATIONS, axes="xyzw")
-    return _Columns(whole, head, turn, time, person)
+    if len(whole) < len(eyes):
+        raise NergError(
+            f"{table.path} has no gaze_origin_mm_{{x,y,z}} or no gaze_direction_normalized_{{x,y,z}}; name its columns "
+            "with --map, or is it a log of another device?"
+        )
+    head, turn = table.vector(*names.MORE_HEADS), table.vector(*names.MORE_ROTATIONS, axes="xyzw")
+    return SdkColumns(whole, head, turn, table.time(*_TIMES), person)
 
 
 def _eye(

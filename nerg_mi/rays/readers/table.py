@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.ranges import Checked, Range
 
 from . import poses
-from .base import RECORDINGS, Frame, RaysBuilder, Signature, option, tick_option, valid_option
+from .base import RECORDINGS, RaysBuilder, Signature, TrackingFrame, option, tick_option, valid_option
 from .columns import PERSONS, ColumnFinder, ColumnMap, is_counter, mark_valid, parse_valid, require_valid_values
 from .tables import TableBlock, iterate_table
 
@@ -54,9 +54,9 @@ class TableOptions(Checked):
             raise NergError(f'persons are named by "column" or "filename" (--person-from), not by "{self.person_from}"')
 
     @property
-    def frame(self) -> Frame:
+    def frame(self) -> TrackingFrame:
         """The frame that was declared. Raises `NergError` for words that are not known."""
-        return Frame(self.up, self.handedness, self.units)
+        return TrackingFrame(self.up, self.handedness, self.units)
 
     @property
     def looks_along(self) -> str:
@@ -82,7 +82,7 @@ class Table:
     signature = Signature()
     Options = TableOptions
 
-    def frame(self, files: Sequence[Path], options: TableOptions) -> Frame:
+    def frame(self, files: Sequence[Path], options: TableOptions) -> TrackingFrame:
         return options.frame
 
     def read(self, files: Sequence[Path], options: TableOptions, builder: RaysBuilder) -> None:
@@ -109,7 +109,7 @@ def add_tables(
     valid = parse_valid(options.valid)
     if valid is None:
         valid = {name: require_valid_values(files[0].name, name, _count_values(files, name)) for name in validity}
-    rows = _Rows(options.columns, options, valid)
+    rows = MappedRows(options.columns, options, valid)
     builder.note(columns=str(rows.columns), min_confidence=options.min_confidence, tick=options.tick)
     if rows.columns.pose or rows.columns.angles:
         builder.note(forward=options.looks_along)
@@ -149,7 +149,7 @@ def person_from_filename(path: Path) -> str:
     return path.name.split(".")[0]
 
 
-class _Rows:
+class MappedRows:
     """Rows of tables that have the same columns, as rays."""
 
     def __init__(self, columns: ColumnMap, options: TableOptions, valid: Mapping[str, Sequence[str]]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import datetime
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,18 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine, inflated_limit, line_blocks, reading, size_of
-from nerg_mi.rays.rays import pyarrow_modules
-
-from .values import DayCounter, clock_seconds
+from nerg_mi.files.safe_read import OnBadLine, line_blocks, reading
+from nerg_mi.rays.rays import open_parquet
 
 BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
-
-COLUMNS = 1 << 14
-"""A table may have so many columns."""
-
-TEXT_CHARACTERS = 1000
-"""So many characters may a cell have that is read as text."""
+COLUMNS = 1 << 14  # A table may have so many columns
+TEXT_CHARACTERS = 1000  # So many characters may a cell have that is read as text
 
 # Cells of an array of text all take the space of the longest: rows times its characters, at four bytes each.
 _TEXT_BLOCK = 1 << 26
@@ -50,7 +45,7 @@ class TableBlock(NamedTuple):
 def table_columns(path: str | os.PathLike) -> list[str]:
     """Names of a table's columns; of a CSV those of its first line. Raises `NergError` for a damaged file."""
     if str(path).lower().endswith(".parquet"):
-        with _parquet(path) as table:
+        with open_parquet(path, "table", _ROW_BYTES) as table:
             return list(table.schema_arrow.names)
     with closing(line_blocks(path, "table", 1)) as blocks:
         return _header(path, next(blocks, [""])[0])[0]
@@ -105,7 +100,9 @@ def iterate_table(
             columns, separator = (list(header), ",") if header is not None else _header(path, raw[0])
             if header is None:
                 raw, count = raw[1:], count + 1
-            layout = _layout(path, separator, columns, numbers, texts)
+            check_columns(path, [*numbers, *texts], columns)
+            number_at, text_at = ([columns.index(name) for name in names] for names in (numbers, texts))
+            layout = _Layout(separator, columns, number_at, text_at, ".", {}, len(columns))
         blank = [line.isspace() for line in raw]
         lines = count + 1 + np.flatnonzero(~np.array(blank, dtype=bool))
         rows = raw if len(lines) == len(raw) else [line for line, gone in zip(raw, blank) if not gone]
@@ -147,15 +144,6 @@ class _Layout(NamedTuple):
     def accepts(self, cells: int, last: str) -> bool:
         """Whether a row of so many cells, the last of which is ``last``, is one of the header's."""
         return cells in (self.width, len(self.columns)) or (cells == self.width + 1 and not last.strip())
-
-
-def _layout(
-    path: str | os.PathLike, separator: str, columns: list[str], numbers: Sequence[str], texts: Sequence[str]
-) -> _Layout:
-    """Raises `NergError` where a column is missing or repeated."""
-    check_columns(path, [*numbers, *texts], columns)
-    where = {c: i for i, c in enumerate(columns)}
-    return _Layout(separator, columns, [where[c] for c in numbers], [where[c] for c in texts], ".", {}, len(columns))
 
 
 def _with_spelling(layout: _Layout, rows: list[str], clocks: Mapping[str, float]) -> _Layout:
@@ -393,22 +381,6 @@ def _why_other_width(cells: list[str], layout: _Layout) -> str:
     return f"{why}; correct or remove the line"
 
 
-def _parquet(path: str | os.PathLike) -> Any:
-    """The open Parquet file ``path``; `NergError` for one that is damaged or claims more than its bytes warrant."""
-    pa, pq = pyarrow_modules()
-    size = size_of(path, "table")
-    with reading(path, "table", also=(pa.ArrowException,)):
-        table = pq.ParquetFile(path)
-        about = table.metadata
-        claimed = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
-    # Equal values are stored once: what counts is also what they become.
-    if max(claimed, _ROW_BYTES * about.num_rows) > inflated_limit(size):
-        raise NergError(
-            f'the table "{path}" claims {about.num_rows:,} rows, which its {size:,} bytes do not warrant; copy it again'
-        )
-    return table
-
-
 def _iterate_parquet(
     path: str | os.PathLike,
     numbers: Sequence[str],
@@ -419,7 +391,7 @@ def _iterate_parquet(
     import pyarrow as pa
 
     days = {name: DayCounter(tick, on_note) for name, tick in clocks.items()}
-    with _parquet(path) as table:
+    with open_parquet(path, "table", _ROW_BYTES) as table:
         names = table.schema_arrow.names
         check_columns(path, [*numbers, *texts], names)
         first, wanted = 1, [*numbers, *texts]
@@ -487,3 +459,80 @@ def check_columns(path: str | os.PathLike, wanted: Sequence[str], there: Sequenc
     twice = next((c for c in wanted if wanted.count(c) > 1), None)
     if twice is not None:
         raise NergError(f"the column {plain(twice, 40)!r} of {path} is used in two roles; name another one in --map")
+
+
+# ---- Times of day, and dates with one, as text: ISO 8601 and what is close to it ----
+
+_CLOCK = re.compile(
+    r"(?:(?:(?P<year>\d{4})[-/](?P<month>\d\d)[-/](?P<day>\d\d)|"
+    r"(?P<day_>\d\d)\.(?P<month_>\d\d)\.(?P<year_>\d{4}))(?:T|,? +))?"
+    r"(?P<hour>\d\d?):(?P<minute>\d\d):(?P<second>\d\d)(?:[.,](?P<fraction>\d+))?"
+    r"(?: ?(?P<half>[AaPp])\.?[Mm]\.?)? ?(?P<zone>Z|(?P<sign>[+-])(?P<zone_hour>\d\d):?(?P<zone_minute>\d\d))?"
+)
+# ISO 8601's basic format; its time alone would be a number.
+_BASIC = re.compile(r"(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)(?=\D|$)")
+_EPOCH = datetime.date(1970, 1, 1).toordinal()
+
+
+def clock_seconds(text: str) -> tuple[float, bool] | None:
+    """Seconds of a time such as ``2024-05-01T12:00:00.25+02:00`` or ``12:00:00.25``, and whether it has a date.
+
+    With a date they count from 1970 in UTC, as which a time without an offset is taken; else from midnight. None for
+    any other text. Dates are year-month-day or day.month.year, and hours count to 24 or have AM or PM, so that no order
+    has to be guessed.
+    """
+    match = _CLOCK.fullmatch(_BASIC.sub(r"\1-\2-\3T\4:\5:\6", text.strip()[:64]))
+    if match is None:
+        return None
+    hour, minute, second = int(match["hour"]), int(match["minute"]), int(match["second"])
+    if match["half"]:
+        if not 1 <= hour <= 12:
+            return None
+        hour = hour % 12 + 12 * (match["half"] in "Pp")
+    if hour > 23 or minute > 59 or second > 60:
+        return None
+    seconds = 3600.0 * hour + 60 * minute + second + (float(f"0.{match['fraction']}") if match["fraction"] else 0.0)
+    if match["sign"]:
+        offset = 3600 * int(match["zone_hour"]) + 60 * int(match["zone_minute"])
+        seconds -= offset if match["sign"] == "+" else -offset
+    year, month, day = (match[name] or match[f"{name}_"] for name in ("year", "month", "day"))
+    if year is None:
+        return seconds, False
+    try:
+        days = datetime.date(int(year), int(month), int(day)).toordinal() - _EPOCH
+    except ValueError:
+        return None
+    return 86400.0 * days + seconds, True
+
+
+_DAY = 86400.0
+_PAUSE = 3600.0  # seconds between two times of one recording, at most, of which one is before midnight
+
+
+class DayCounter:
+    """Lets times of day without a date go on past midnight, block by block of one column.
+
+    Midnight lies between two times of which the second is earlier, and within an hour of the first on the next day.
+    Other steps back lead from one recording to another, as in a table of several participants, and steps forth of more
+    than half a day to the day before. ``tick``: seconds of a unit; ``on_note(passes_midnight=True)`` is called where a
+    block has times of another day.
+    """
+
+    def __init__(self, tick: float, on_note: Callable[..., None] | None = None) -> None:
+        self.tick, self._on_note = tick, on_note
+        self._last, self._day = np.nan, 0
+
+    def unwrap(self, times: np.ndarray) -> np.ndarray:
+        """Units since the first midnight, (n,), of units since the last one; NaN stays."""
+        valid = np.isfinite(times)
+        if not valid.any():
+            return times
+        steps = self.tick * np.diff(times[valid], prepend=self._last)
+        days = self._day + np.cumsum((steps < _PAUSE - _DAY).astype(int) - (steps > _DAY / 2))
+        days -= np.minimum(np.minimum.accumulate(days), 0)
+        self._last, self._day = times[valid][-1], int(days[-1])
+        if days.any() and self._on_note is not None:
+            self._on_note(passes_midnight=True)
+        out = times.copy()
+        out[valid] += days * (_DAY / self.tick)
+        return out

@@ -23,7 +23,7 @@ _JSON = 1 << 20  # bytes of recording.g3, at most
 
 
 @dataclass(frozen=True, eq=False)
-class _Glasses:
+class CalibratedGlasses:
     """``camera``, ``size`` of its pictures in pixels, and how the head unit's axes lie in it."""
 
     camera: SceneCamera
@@ -34,7 +34,7 @@ class _Glasses:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Tobii(Recording):
-    glasses: _Glasses
+    glasses: CalibratedGlasses
 
 
 class Tobii3(SceneReader[_Tobii]):
@@ -75,7 +75,7 @@ class Tobii3(SceneReader[_Tobii]):
 READERS = (Tobii3(),)
 
 
-def _seen_from_camera(points: np.ndarray, glasses: _Glasses, direction: np.ndarray) -> np.ndarray:
+def _seen_from_camera(points: np.ndarray, glasses: CalibratedGlasses, direction: np.ndarray) -> np.ndarray:
     """Points (n, 3) of the head unit, millimetres, in the camera. Whether ``position`` is the camera's in the head unit
     or the head unit's in the camera is not documented: what fits the ``direction`` (n, 3) better."""
     turned = points @ glasses.rotation.T
@@ -104,7 +104,7 @@ def _frames(folder: Path, camera: dict[str, Any], builder: RaysBuilder) -> np.nd
     return frame_times(video, "scene video")
 
 
-def _calibration(folder: Path, camera: dict[str, Any]) -> _Glasses:
+def _calibration(folder: Path, camera: dict[str, Any]) -> CalibratedGlasses:
     path = folder / _RECORDING
     try:
         c = camera["camera-calibration"]
@@ -121,7 +121,7 @@ def _calibration(folder: Path, camera: dict[str, Any]) -> _Glasses:
     if not (np.isfinite(position).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-2):
         raise NergError(f'the calibration in "{path}" turns the camera by no rotation; copy the recording again')
     lens = SceneCamera.of_opencv(matrix, [k1, k2, p1, p2, k3], size, f'the calibration in "{path}"')
-    return _Glasses(lens, size, rotation, position)
+    return CalibratedGlasses(lens, size, rotation, position)
 
 
 def _samples(path: Path, builder: RaysBuilder) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from nerg_mi.errors import NergError, plain
 
 from . import columns as names
-from .base import DESCRIPTION, UNITY, Frame, RaysBuilder, Signature, TickOption, valid_option
+from .base import DESCRIPTION, UNITY, InFrame, RaysBuilder, Signature, TickOption, valid_option
 from .columns import ColumnFinder, ColumnMap, is_validity, parse_valid
 from .table import TableOptions, add_tables, find_person
 
@@ -25,7 +25,7 @@ class UnityOptions(TickOption):
         parse_valid(self.valid)
 
 
-class UnityReader:
+class UnityReader(InFrame):
     """Tables of Unity's world (y up, left-handed, metres), whose columns are found by name.
 
     Where there are, ``hit_*`` (or ``gaze_hit_*``, ``hit_point_*``), a time, a person, ``confidence`` and columns of
@@ -35,15 +35,13 @@ class UnityReader:
 
     world = "Unity: y up, left, m"
     checked_on = DESCRIPTION
+    fixed = UNITY
     # What projects call the gaze does not say of which frame it is: a column map is proposed.
     signature = Signature()
     Options = UnityOptions
 
     def __init__(self, name: str, files: str, columns_of: Callable[[ColumnFinder], dict]) -> None:
         self.name, self.files, self._columns_of = name, files, columns_of
-
-    def frame(self, files: Sequence[Path], options: UnityOptions) -> Frame:
-        return UNITY
 
     def read(self, files: Sequence[Path], options: UnityOptions, builder: RaysBuilder) -> None:
         first, *others = (ColumnFinder(path) for path in files)

@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.safe_read import OnBadLine
 
 from . import poses
-from .base import DESCRIPTION, UNITY, Frame, NoOptions, RaysBuilder, Signature
+from .base import DESCRIPTION, UNITY, InFrame, NoOptions, RaysBuilder, Signature
 from .table import person_from_filename
 
 _TICK = 1e-9  # seconds: what CaptureTime counts
@@ -19,7 +19,7 @@ _STATUS = ("INVALID", "0", "ADJUST", "1", "VALID", "2")
 _VECTORS = {"HMDPosition": 3, "HMDRotation": 4, "CombinedGazePosition": 3, "CombinedGazeForward": 3}
 
 
-class Varjo:
+class Varjo(InFrame):
     """Semicolons between cells, vectors as ``(x, y, z)``.
 
     ``HMDPosition`` and ``HMDRotation`` (x, y, z, w) are the camera's pose in Unity's world, ``CombinedGazePosition``
@@ -32,11 +32,8 @@ class Varjo:
     files = "the log of Varjo's eye tracking example for Unity"
     world = "Unity"
     checked_on = DESCRIPTION
+    fixed = UNITY
     signature = Signature(columns=(("CaptureTime", "HMDPosition", "HMDRotation", "CombinedGazeForward", "GazeStatus"),))
-    Options = NoOptions
-
-    def frame(self, files: Sequence[Path], options: NoOptions) -> Frame:
-        return UNITY
 
     def read(self, files: Sequence[Path], options: NoOptions, builder: RaysBuilder) -> None:
         builder.note(tick=_TICK)

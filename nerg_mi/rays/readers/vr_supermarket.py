@@ -15,7 +15,7 @@ import numpy as np
 from nerg_mi.ranges import Checked, Range
 
 from . import poses
-from .base import RECORDINGS, UNITY, Frame, RaysBuilder, Signature, option
+from .base import RECORDINGS, UNITY, InFrame, RaysBuilder, Signature, option
 from .table import person_from_filename
 
 _MATRIX = [f"ctw_{i}{j}" for i in range(3) for j in range(4)]
@@ -37,7 +37,7 @@ class SupermarketOptions(Checked):
     )
 
 
-class VrSupermarket:
+class VrSupermarket(InFrame):
     """``ctw_ij`` is camera-to-world in Unity's world (y up, left-handed, metres), whose camera looks along minus
     column 2.
 
@@ -51,11 +51,9 @@ class VrSupermarket:
     files = "one CSV a person of the VR supermarket (github: ryuryu0226)"
     world = "Unity"
     checked_on = RECORDINGS
+    fixed = UNITY
     signature = Signature(columns=(("ctw_00", "ctw_23", "ray_x", "eye_x", "opennessl", "opennessr", "xc"),))
     Options = SupermarketOptions
-
-    def frame(self, files: Sequence[Path], options: SupermarketOptions) -> Frame:
-        return UNITY
 
     def read(self, files: Sequence[Path], options: SupermarketOptions, builder: RaysBuilder) -> None:
         least = options.min_openness

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.rays.dataset import RayDataset
-from nerg_mi.rays.dataset_write import Recipe, update_dataset
+from nerg_mi.rays.dataset_write import ImportRecipe, update_dataset
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.columns import ColumnMap
 from nerg_mi.rays.readers.registry import make_options, read_rays, reader_named
@@ -37,8 +37,8 @@ def settings():
     return make_options("table", {"columns": ColumnMap.parse(MAP)})
 
 
-def recipe(**changes) -> Recipe:
-    return Recipe(**{"reader": reader_named("table"), "settings": settings(), "place": "shop", **changes})
+def recipe(**changes) -> ImportRecipe:
+    return ImportRecipe(**{"reader": reader_named("table"), "settings": settings(), "place": "shop", **changes})
 
 
 def write_dataset(folder: Path, files: int = 3, **changes) -> tuple[RayDataset, Rays]:

@@ -1,21 +1,25 @@
-"""What is asked of a dataset, against the rays of the same files in memory."""
+"""Tests of `nerg_mi.rays.dataset`: what is asked of a dataset, against the rays of the same files in memory."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
+from datetime import datetime, timezone
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays import dataset_write
-from nerg_mi.rays.dataset import Conditions, RayDataset, read_groups
+from nerg_mi.files.atomic import file_sha256
+from nerg_mi.rays import dataset, dataset_write
+from nerg_mi.rays.dataset import Conditions, RayDataset, is_dataset, load_rays, rays_digest, read_groups
 from nerg_mi.rays.dataset_write import update_dataset
 from nerg_mi.rays.filters import select_mask
-
-from .making import DAY, assert_same, recipe, write_dataset, write_source
+from nerg_mi.rays.quality import summarise, summarise_dataset
+from nerg_mi.rays.rays import Rays
+from tests.rays.dataset.making import DAY, assert_same, recipe, write_dataset, write_source
 
 pytest.importorskip("pyarrow")
 
@@ -202,3 +206,120 @@ def test_damaged_parts(tmp_path):
     path.mkdir()
     with pytest.raises(NergError, match="is a folder"):
         dataset.load()
+
+
+# ---- Row groups of a part ----
+
+
+def test_groups_their_rows_and_bounds(tmp_path, monkeypatch):
+    monkeypatch.setattr(dataset_write, "GROUP_ROWS", 50)
+    dataset, _ = write_dataset(tmp_path, 1)
+    source, part = max(dataset.parts, key=lambda found: found[1].rays)
+    seen = []
+
+    def wanted(first, count, bounds):
+        seen.append((first, count, bounds))
+        return first != 50
+
+    groups = list(read_groups(dataset.folder, source, part, wanted))
+    assert [first for first, _ in groups] == [first for first, *_ in seen if first != 50]
+    assert sum(count for _, count, _ in seen) == part.rays > 100
+    for first, rays in groups:
+        _, count, bounds = next(entry for entry in seen if entry[0] == first)
+        assert len(rays) == count and bounds["t"] == (rays.t.min(), rays.t.max())
+        assert bounds["origin_y"] == (np.float32(rays.origin[:, 1].min()), np.float32(rays.origin[:, 1].max()))
+        assert bounds["person"] == (rays.persons[0], rays.persons[-1])
+    (_, bare), *_ = read_groups(dataset.folder, source, part, lambda *_: True, hits=False)
+    assert bare.hit is None and bare.cohort is not None
+
+
+# ---- Rays from what is named: a file, a dataset, or a place of one ----
+
+
+def test_files_and_datasets(tmp_path):
+    dataset, rays = write_dataset(tmp_path)
+    rays.save(tmp_path / "rays.npz")
+    for path in (tmp_path / "rays.npz", dataset.folder, dataset.folder / "place=shop"):
+        assert_same(load_rays(path), rays)
+        assert is_dataset(path) is (path.suffix != ".npz")
+    assert rays_digest(tmp_path / "rays.npz") == file_sha256(tmp_path / "rays.npz")
+    assert rays_digest(dataset.folder) == dataset.digest
+    some = load_rays(dataset.folder, 100, seed=2)
+    assert np.array_equal(some.t, dataset.sample(100, 2).t) and len(load_rays(dataset.folder, 5000)) == len(rays)
+    assert len(load_rays(tmp_path / "rays.npz", 100)) == len(rays)
+
+
+# ---- The report of a dataset: that of the same rays in a file, but for what it says is of a sample ----
+
+EXACT = ("rays", "persons", "duplicates", "rows_read", "dropped", "cohorts")
+
+
+@pytest.mark.parametrize("most", [10_000, 640])
+def test_the_report_of_a_dataset(made, most):
+    dataset, rays = made
+    some, found, lines = summarise_dataset(dataset, most)
+    whole = summarise(rays)
+    assert [getattr(found, name) for name in EXACT] == [getattr(whole, name) for name in EXACT]
+    exact = ("duration", "box_low", "box_high", "hit_share")
+    for name in exact if most == 640 else (*exact, "eye_height", "speed_p95", "hit_distance", "rate"):
+        assert np.allclose(getattr(found, name), getattr(whole, name), rtol=1e-5), name
+    assert abs(found.eye_height[1] - whole.eye_height[1]) < 0.1 and len(some) == min(most, len(rays))
+    assert lines[0][0] == "dataset" and lines[0][1].startswith("3 sources in ")
+    assert lines[0][1].endswith("place shop, day 2 from 2024-10-04 to 2024-10-05")
+    assert [text for _, text in lines[1:]] == ([] if most > 640 else [lines[1][1]]) and (
+        most > 640 or "640 rays in 64 runs" in lines[1][1]
+    )
+
+
+# ---- Where parts lie, and what their columns are ----
+
+
+def test_days_are_those_of_utc():
+    moments = [datetime(2024, 2, 29, 23, 59, 59, tzinfo=timezone.utc), datetime(2024, 3, 1, tzinfo=timezone.utc)]
+    days = dataset_write.days_of(np.array([m.timestamp() for m in moments]))
+    assert [str(np.datetime64(int(d), "D")) for d in days] == ["2024-02-29", "2024-03-01"]
+
+
+@pytest.mark.parametrize("t", [[0.0, 12.5], [1.7e9, 3.0], [1.7e18], [], [-5.0]])
+def test_other_clocks_tell_no_day(t):
+    assert dataset_write.days_of(np.array(t)) is None
+
+
+def test_buckets_depend_on_the_name_alone_and_are_even():
+    found = [dataset.bucket_of(f"user{k}", 16) for k in range(4000)]
+    counts = np.bincount(found, minlength=16)
+    assert len(counts) == 16 and counts.min() > 180 and counts.max() < 320
+    # They stand in folders for good.
+    assert [dataset.bucket_of(name, 16) for name in ("ann", "bo", "名")] == [2, 0, 3]
+
+
+def test_a_place_may_be_called_as_its_people_do():
+    for place in ("北 hall", "a/b", "..", "x=1", "100 %"):
+        folder = Path("d.rays") / dataset.folder_of(dataset.check_place(place), "unknown", 3)
+        assert len(folder.parts) == 4 and ".." not in folder.parts
+        assert dataset.split_path(folder) == (Path("d.rays"), {"place": place, "day": "unknown", "bucket": "3"})
+
+
+@pytest.mark.parametrize("place", ["", " a", "a\n", "x" * 65, "\x1b[2J"])
+def test_what_is_no_place(place):
+    with pytest.raises(NergError, match="--place-name"):
+        dataset.check_place(place)
+
+
+@pytest.mark.parametrize("day", ["", "2024-13-01", "2023-02-29", "today", "2024-1-1", "../x"])
+def test_what_is_no_day(day):
+    with pytest.raises(NergError, match="--day"):
+        dataset.check_day(day)
+    assert dataset.check_day("2024-02-29") == "2024-02-29" and dataset.check_day("unknown") == "unknown"
+
+
+def test_columns():
+    ahead = np.tile([0.0, 1.0, 0.0], (3, 1))
+    rays = Rays([1.7e9 + 1e-6, 0.1, 2.0], [2, 0, 2], ("a", "b", "c"), ahead * 0.1, ahead, [0.7, 1, 1])
+    table = dataset_write.table_of(rays, np.array([2, 0]))
+    assert table.schema == dataset_write.schema()
+    assert table.column("person").to_pylist() == ["c", "c"] and table.column("t").to_pylist() == [2.0, 1.7e9 + 1e-6]
+    # Exact, so that rays of just the least confidence are still there.
+    assert table.column("confidence").to_pylist() == [1.0, 0.7]
+    assert table.column("cohort").null_count == 2 and np.isnan(table.column("hit_x").to_numpy()).all()
+    assert table.column("origin_y").to_pylist() == [float(np.float32(0.1))] * 2

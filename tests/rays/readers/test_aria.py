@@ -1,13 +1,13 @@
 """Tests of `nerg_mi.rays.readers.aria`."""
 
-import csv
-import gzip
 import math
 import shutil
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from nerg_mi.errors import NergError
 from nerg_mi.photos.posed import read_semidense
 from nerg_mi.rays.readers import aria
 from nerg_mi.rays.readers.aria import (
@@ -20,53 +20,18 @@ from nerg_mi.rays.readers.aria import (
     gaze_in_cpf,
     poses_at,
     schema_of,
-    up_axis,
 )
-from tests.rays.readers.examples import ARIA_POSES, aria_pose, lines
-from tests.rays.readers.reading import dropped, read
+from tests.rays.readers.examples import ARIA_POSES, aria_pose, csv_rows, dropped, lines, read, slerp
 
 # ---- Recordings of Project Aria's glasses ----
 
-
 SAMPLE = "gen1/mps_sample"
-
 
 ARIA_VERGENCE = f"{SAMPLE}/eye_gaze_vergence/generalized_gaze.csv"
 
-
 GEN1 = [0.793353, 0, -0.608761], [0.607927, -0.052336, 0.792266], [0.071351, 0.002372, 0.008454]
 
-
 ARIA_GEN2 = [-0.138127, -0.912873, -0.384166], [0.308866, -0.40824, 0.859034], [0.07107883, 0.005719893, 0.01155452]
-
-
-def rows_of(path) -> list[dict[str, str]]:
-    with gzip.open(path, "rt") if str(path).endswith(".gz") else open(path) as file:
-        return list(csv.DictReader(file))
-
-
-def matrix(q, t) -> np.ndarray:
-    """4x4 of a unit quaternion x, y, z, w and a translation, element by element."""
-    x, y, z, w = q
-    m = np.eye(4)
-    m[0, :3] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
-    m[1, :3] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
-    m[2, :3] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
-    m[:3, 3] = t
-    return m
-
-
-def between(a, b, s) -> np.ndarray:
-    """Spherical interpolation of two unit quaternions."""
-    a, b = np.array(a) / np.linalg.norm(a), np.array(b) / np.linalg.norm(b)
-    b = b if a @ b >= 0 else -b
-    angle = math.acos(min(a @ b, 1.0))
-    q = (
-        a * (1 - s) + b * s
-        if angle < 1e-9
-        else (a * math.sin((1 - s) * angle) + b * math.sin(s * angle)) / math.sin(angle)
-    )
-    return q / np.linalg.norm(q)
 
 
 def rays_by_hand(gaze, trajectory, cad, direction) -> dict[float, tuple[np.ndarray, np.ndarray]]:
@@ -77,12 +42,13 @@ def rays_by_hand(gaze, trajectory, cad, direction) -> dict[float, tuple[np.ndarr
     device_to_cpf = np.eye(4)
     device_to_cpf[:3, :3], device_to_cpf[:3, 3] = np.column_stack([np.cross(y, z), y, z]), t
     cpf_to_device = np.linalg.inv(device_to_cpf)
-    poses = [(int(r["tracking_timestamp_us"]), r) for r in rows_of(trajectory)]
+    unit = lambda v: np.array(v) / np.linalg.norm(v)
+    poses = [(int(r["tracking_timestamp_us"]), r) for r in csv_rows(trajectory)]
     times = np.array([time for time, _ in poses])
-    quaternion = lambda r: [float(r[f"q{a}_world_device"]) for a in "xyzw"]
+    quaternion = lambda r: unit([float(r[f"q{a}_world_device"]) for a in "xyzw"])
     place = lambda r: np.array([float(r[f"t{a}_world_device"]) for a in "xyz"])
     found = {}
-    for row in rows_of(gaze):
+    for row in csv_rows(gaze):
         at = int(row["tracking_timestamp_us"])
         inside = min(max(at, times[0]), times[-1])
         if abs(inside - at) > 1000:
@@ -90,7 +56,9 @@ def rays_by_hand(gaze, trajectory, cad, direction) -> dict[float, tuple[np.ndarr
         i = min(max(np.searchsorted(times, inside, side="right") - 1, 0), len(times) - 2)
         (start, before), (end, after) = poses[i], poses[i + 1]
         s = (inside - start) / (end - start)
-        pose = matrix(between(quaternion(before), quaternion(after), s), (1 - s) * place(before) + s * place(after))
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(slerp(quaternion(before), quaternion(after), s)).as_matrix()
+        pose[:3, 3] = (1 - s) * place(before) + s * place(after)
         pose = pose @ cpf_to_device
         found[at * 1e-6] = pose[:3, 3], pose[:3, :3] @ direction(row)
     return found
@@ -178,7 +146,7 @@ def test_each_eye_of_the_second_generation_agrees_with_the_combined_gaze(recorde
     are of tangents: so that the file itself tells which it has."""
     gaze = recorded("aria") / "gen2/mps_sample/eye_gaze/general_eye_gaze.csv"
     one = lambda row, side: by_turns({f"{a}_rads_cpf": row[f"{side}_{a}_rads_cpf"] for a in ("yaw", "pitch")})
-    rows = rows_of(gaze)
+    rows = csv_rows(gaze)
     fused = np.array([one(row, "left") + one(row, "right") for row in rows])
     fused /= np.linalg.norm(fused, axis=1, keepdims=True)
     schema = schema_of(gaze)
@@ -206,7 +174,7 @@ def test_gaze_meets_what_the_glasses_saw(recorded, tmp_path, gaze, median):
     assert np.median(angles) < median and np.percentile(angles, 90) < 0.7
     given = folder / (gaze or "eye_gaze/generalized_eye_gaze.csv")
     for which, farther in (("pitch", 1.5), ("yaw", np.median(angles) * 1.3)):
-        table = rows_of(given)
+        table = csv_rows(given)
         for row in table:
             row.update({name: -float(value) for name, value in row.items() if f"{which}_rads" in name})
         copy = tmp_path / which / "eyegaze.csv"
@@ -286,12 +254,12 @@ def test_worlds(tmp_path):
         "the pose is in another world (graph_uid)": [[7, 9]],
         "there is no pose of the glasses at that time": [[10, 11]],
     }
-    with pytest.raises(ValueError, match='"three"'):
+    with pytest.raises(NergError, match='"three"'):
         read("aria", tmp_path / "ann", world="three")
     # Two people of different worlds are not in one place, unless one world is asked for.
     write_gaze(tmp_path / "bo/eyegaze.csv", [0, 10_000])
     write_trajectory(tmp_path / "bo/closed_loop_trajectory.csv", range(0, 20_000, 1000), world="three")
-    with pytest.raises(ValueError, match="bo.eyegaze.csv was recorded in another world.*Multi-SLAM"):
+    with pytest.raises(NergError, match="bo.eyegaze.csv was recorded in another world.*Multi-SLAM"):
         read("aria", tmp_path / "ann", tmp_path / "bo")
     both = read("aria", tmp_path / "ann", tmp_path / "bo", world="one")
     assert both.persons == ("ann",) and sum(d["count"] for d in both.metadata["dropped"]) == 7
@@ -302,34 +270,35 @@ def test_up_is_against_gravity(tmp_path):
         write_gaze(tmp_path / up / "eyegaze.csv", [0, 10_000])
         write_trajectory(tmp_path / up / "aria_trajectory.csv", range(0, 20_000, 1000), gravity=gravity)
         assert read("aria", tmp_path / up).metadata["source_frame"]["up"] == up
-    with pytest.raises(ValueError, match="y up in the world.*begins with z up"):
+    with pytest.raises(NergError, match="y up in the world.*begins with z up"):
         read("aria", tmp_path / "z", tmp_path / "y")
-    for gravity in ((0, -7, -7), (0, 0, 0)):
+    for gravity, message in (
+        ((0, -7, -7), "lies along no axis"),
+        ((0, 0, 0), "lies along no axis"),
+        (("", "", ""), "no poses with their gravity"),
+    ):
         write_trajectory(tmp_path / "z/aria_trajectory.csv", range(0, 20_000, 1000), gravity=gravity)
-        with pytest.raises(ValueError, match="lies along no axis"):
+        with pytest.raises(NergError, match=message):
             read("aria", tmp_path / "z")
 
 
 def test_what_is_refused(tmp_path):
     gaze = write_gaze(tmp_path / "ann/eyegaze.csv", [0, 10_000])
-    with pytest.raises(ValueError, match="there is no trajectory"):
+    with pytest.raises(NergError, match="there is no trajectory"):
         read("aria", gaze)
     poses = write_trajectory(tmp_path / "ann/slam/open_loop_trajectory.csv", range(0, 20_000, 1000))
-    with pytest.raises(ValueError, match="open loop trajectory alone, which drifts"):
-        read("aria", gaze)
-    with pytest.raises(ValueError, match="holds no gaze"):
-        read("aria", poses)
+    for given, message in (
+        (gaze, "open loop trajectory alone, which drifts"),
+        (poses, "holds no gaze"),
+        (tmp_path / "ann/slam", "no gaze file"),
+        (tmp_path / "missing.csv", "there is no .*missing.csv"),
+    ):
+        with pytest.raises(NergError, match=message):
+            read("aria", given)
     poses.rename(poses.with_name("closed_loop_trajectory.csv"))
     assert len(read("aria", gaze)) == 2
-    for device, why in (("DVT-SS", "of the other generation"), ("Gen3", "no model of Aria")):
-        with pytest.raises(ValueError, match=f"{why}.*DVT-S, DVT-L"):
-            read("aria", gaze, device=device)
-    with pytest.raises(ValueError, match="no gaze file"):
-        read("aria", tmp_path / "ann/slam")
-    with pytest.raises(ValueError, match="there is no .*missing.csv"):
-        read("aria", tmp_path / "missing.csv")
     gaze.write_text("time,x,y\n0,1,2\n")
-    with pytest.raises(ValueError, match="no columns of gaze angles"):
+    with pytest.raises(NergError, match="no columns of gaze angles"):
         read("aria", gaze)
 
 
@@ -359,9 +328,6 @@ def test_schemas_by_their_headers(tmp_path):
     for header, schema in ((legacy, LEGACY), (vergence, VERGENCE), (gen2, GEN2), (f"{legacy},session_uid", LEGACY)):
         (tmp_path / "gaze.csv").write_text(header + "\n")
         assert schema_of(tmp_path / "gaze.csv") is schema
-    (tmp_path / "gaze.csv").write_text("time,x\n")
-    with pytest.raises(ValueError, match="gaze.csv"):
-        schema_of(tmp_path / "gaze.csv")
 
 
 def test_directions_of_tangents():
@@ -393,10 +359,9 @@ def test_the_eyes_are_behind_the_camera(name):
 def test_names_of_models():
     assert device_named(None, 1) == "DVT-L" and device_named(None, 2) == "DVT-LL"
     assert device_named("dvt_s", 1) == "DVT-S" and device_named("DVT-SL", 2) == "DVT-SL"
-    with pytest.raises(ValueError, match='"dvt-s"'):
-        device_named("dvt-s", 2)
-    with pytest.raises(ValueError, match='"Neon" is no model'):
-        device_named("Neon", 1)
+    for name, why in (("dvt-ss", "of the other generation"), ("Neon", "no model of Aria")):
+        with pytest.raises(NergError, match=f'"{name}" is {why}.*DVT-S, DVT-L'):
+            device_named(name, 1)
 
 
 # ---- Trajectories of Aria's glasses ----
@@ -421,23 +386,13 @@ def test_a_little_outside(tmp_path):
     assert poses_at(track, np.array([-0.0009, -0.0011, 0.0499, 0.0501]), 0.05)[2].tolist() == [False, True, False, True]
 
 
-def test_up(tmp_path):
-    for name, gravity in (("z", (0, 0, -9.81)), ("-y", (0.1, 9.81, 0)), ("x", (-1, 0, 0))):
-        assert up_axis(write(tmp_path / "t.csv", lambda k, g=gravity: aria_pose(k, gravity=g))) == name
-    write(tmp_path / "t.csv", lambda k: aria_pose(k, gravity=("", "", "")))
-    with pytest.raises(ValueError, match="no poses with their gravity"):
-        up_axis(tmp_path / "t.csv")
-
-
 def test_what_is_no_trajectory(tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="holds 1 poses; two of one world"):
-        Trajectory(write(tmp_path / "t.csv", aria_pose, count=1), np.array([0.0]), None)
-    path = write(tmp_path / "t.csv", lambda k: aria_pose(k, gravity=(0, -0.1 * k, -9.81)))
-    with pytest.raises(ValueError, match="gravity of the world"):
-        Trajectory(path, np.array([0.0]), None)
     monkeypatch.setattr(aria, "_WORLDS", 8)
-    with pytest.raises(ValueError, match="more than 8 worlds"):
-        Trajectory(write(tmp_path / "t.csv", lambda k: aria_pose(k, world=k)), np.array([0.0]), None)
-    still = write(tmp_path / "t.csv", lambda k: aria_pose(k, turn=(0, 0, 0, 0)))
-    with pytest.raises(ValueError, match="two of one world"):
-        Trajectory(still, np.array([0.0]), None)
+    for row, count, message in (
+        (aria_pose, 1, "holds 1 poses; two of one world"),
+        (lambda k: aria_pose(k, turn=(0, 0, 0, 0)), 50, "two of one world"),
+        (lambda k: aria_pose(k, gravity=(0, -0.1 * k, -9.81)), 50, "gravity of the world"),
+        (lambda k: aria_pose(k, world=k), 50, "more than 8 worlds"),
+    ):
+        with pytest.raises(NergError, match=message):
+            Trajectory(write(tmp_path / "t.csv", row, count), np.array([0.0]), None)

@@ -1,29 +1,21 @@
 """Tests of `nerg_mi.rays.readers.eyenavgs`."""
 
-import csv
-import gzip
 import math
 
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.rays.readers import tables
 from nerg_mi.rays.readers.eyenavgs import read_scene_settings
-from tests.rays.readers.reading import dropped, read
+from tests.rays.readers.examples import csv_rows, dropped, read
 
 # ---- EyeNavGS's recordings of both sites ----
 
-
-RUTGERS = "ViewIndex FOV1 FOV2 FOV3 FOV4 PositionX PositionY PositionZ QuaternionX QuaternionY QuaternionZ QuaternionW "
-
-
-RUTGERS += "GazePosX GazePosY GazePosZ GazeQX GazeQY GazeQZ GazeQW Timestamp"
-
-
-NTHU = "ViewIndex FOV1 FOV2 FOV3 FOV4 PositionX PositionY PositionZ QuaternionX QuaternionY QuaternionZ QuaternionW "
-
-
-NTHU += "GazeQX GazeQY GazeQZ GazeQW GazePosX GazePosY GazePosZ timestep"
+COMMON = [f"FOV{k}" for k in range(1, 5)] + [f"Position{a}" for a in "XYZ"] + [f"Quaternion{a}" for a in "XYZW"]
+PLACE, TURN = [f"GazePos{a}" for a in "XYZ"], [f"GazeQ{a}" for a in "XYZW"]
+RUTGERS = ["ViewIndex", *COMMON, *PLACE, *TURN, "Timestamp"]
+NTHU = ["ViewIndex", *COMMON, *TURN, *PLACE, "timestep"]
 
 
 # Of Rutgers: units a metre, the angle about x that stands the place upright (degrees), and the play area's start.
@@ -34,9 +26,8 @@ PLACES = {
 }
 
 
-def rows_of(path) -> np.ndarray:
-    with gzip.open(path, "rt") if path.name.endswith(".gz") else open(path) as file:
-        return np.array([[float(v) for v in row.values()] for row in csv.DictReader(file)])
+def numbers_of(path) -> np.ndarray:
+    return np.array([[float(v) for v in row.values()] for row in csv_rows(path)])
 
 
 def about_x(degrees: float) -> np.ndarray:
@@ -60,7 +51,7 @@ def test_recordings_against_a_computation_by_hand(recorded, place, user):
     path = recorded("eyenavgs") / place / f"{user}_{place}.csv.gz"
     rays = read("eyenavgs", path)
     scale, degrees, start = PLACES[place]
-    left, right = rows_of(path)[0::2], rows_of(path)[1::2]
+    left, right = numbers_of(path)[0::2], numbers_of(path)[1::2]
     assert not left[:, 0].any() and (right[:, 0] == 1).all()  # nothing is missing in these
     upright = about_x(degrees)
     middle = 0.5 * (left[:, 5:8] + right[:, 5:8])
@@ -101,7 +92,7 @@ def test_all_recordings(recorded, place):
     scale, degrees, _ = PLACES[place]
     up = np.zeros(3)
     for path in sorted(folder.glob("*.gz"))[::5]:
-        v = rows_of(path)
+        v = numbers_of(path)
         pairs = np.flatnonzero((v[:-1, 0] == 0) & (v[1:, 0] == 1))
         apart = np.linalg.norm(v[pairs, 5:8] - v[pairs + 1, 5:8], axis=1) / scale
         assert 0.055 < np.percentile(apart, 1) and np.percentile(apart, 99) < 0.075
@@ -129,22 +120,25 @@ def write(
         cells |= dict(zip((f"Quaternion{a}" for a in "XYZW"), quaternion(head(k // 2))))
         cells |= dict(zip((f"GazeQ{a}" for a in "XYZW"), quaternion(gaze(k // 2) + (1.5 if eye else -1.5))))
         cells |= {"Timestamp": 14 * (k // 2), "timestep": 14 * (k // 2)}
-        rows.append(",".join(str(cells.get(name, 0)) for name in site.split()))
+        rows.append(",".join(str(cells.get(name, 0)) for name in site))
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / name).write_text("\n".join([site.replace(" ", ","), *rows]) + "\n")
+    (folder / name).write_text("\n".join([",".join(site), *rows]) + "\n")
     return folder / name
+
+
+def settings(folder, *rows, head=""):
+    text = "\n".join([f"Scene_Name,Quaternion,Scale{head}", *(rows or ['room,"0, 0, 0, 1",2'])])
+    (folder / "scene_setting.csv").write_text(text + "\n")
 
 
 @pytest.mark.parametrize("site", [RUTGERS, NTHU])
 def test_the_columns_of_both_sites(tmp_path, site):
-    (tmp_path / "scene_setting.csv").write_text('\ufeffScene_Name,Quaternion,Scale\nroom,"0, 0, 0, 1",2\n\n')
+    settings(tmp_path)
+    (tmp_path / "scene_setting.csv").write_text("\ufeff" + (tmp_path / "scene_setting.csv").read_text() + "\n")
     rays = read("eyenavgs", write(tmp_path / "dataset/room", site=site))
     # No start: the origin is the splats'.
-    assert (
-        rays.persons == ("user7",)
-        and np.allclose(rays.origin, [0.1, 0.3, 0.2])
-        and np.allclose(rays.t, 0.014 * np.arange(6))
-    )
+    assert rays.persons == ("user7",) and np.allclose(rays.origin, [0.1, 0.3, 0.2])
+    assert np.allclose(rays.t, 0.014 * np.arange(6))
     turned = np.radians(2.0 * np.arange(6))
     assert np.allclose(rays.direction, np.stack([-np.sin(turned), np.cos(turned), 0 * turned], axis=1))
     assert [s["file"] for s in rays.metadata["sources"]] == ["scene_setting.csv", "user7_room.csv"]
@@ -155,16 +149,16 @@ def test_the_columns_of_both_sites(tmp_path, site):
 @pytest.mark.parametrize("block", [1 << 16, 3, 1])
 def test_rows_without_the_other_eye(tmp_path, monkeypatch, block):
     monkeypatch.setattr(tables, "BLOCK", block)
-    (tmp_path / "scene_setting.csv").write_text('Scene_Name,Quaternion,Scale\nroom,"0, 0, 0, 1",2\n')
+    settings(tmp_path)
     rays = read("eyenavgs", write(tmp_path, eyes=(1, 0, 1, 0, 0, 1, 1, 0, 1, 0)))
     assert len(rays) == 3 and rays.metadata["rows_read"] == 7
     assert dropped(rays) == {"the other eye's row is missing": [[2, 2], [5, 5], [8, 8], [11, 11]]}
 
 
 def test_frozen_gaze(tmp_path):
-    (tmp_path / "scene_setting.csv").write_text('Scene_Name,Quaternion,Scale\ntrain,"0, 0, 0, 1",2\n')
+    settings(tmp_path, 'train,"0, 0, 0, 1",2')
     still = write(tmp_path, "user1_train.csv", gaze=lambda k: 5.0)
-    with pytest.raises(ValueError, match="user1_train.csv"):
+    with pytest.raises(NergError, match="user1_train.csv"):
         read("eyenavgs", still)
     # Spelt as one of the sites has it. Who keeps their head still as well may have looked at one thing.
     moving, resting = (
@@ -179,7 +173,7 @@ def test_frozen_gaze(tmp_path):
 
 def test_gaze_that_is_locked_to_the_head(tmp_path):
     """It follows the head five rows later, which no eye does; a head that hardly turns tells nothing."""
-    (tmp_path / "scene_setting.csv").write_text('Scene_Name,Quaternion,Scale\nroom,"0, 0, 0, 1",2\n')
+    settings(tmp_path)
     turn = lambda k: 40 * math.sin(0.02 * k)
     looks = lambda k: turn(k) + 12 * math.sin(0.4 * k)
     behind = write(tmp_path, "user1_room.csv", eyes=(0, 1) * 400, head=turn, gaze=lambda k: 8 + turn(k - 5))
@@ -191,31 +185,26 @@ def test_gaze_that_is_locked_to_the_head(tmp_path):
     assert rays.persons == ("user2", "user3") and len(rays) == 800
     (lost,) = rays.metadata["dropped"]
     assert "locked to the head" in lost["reason"] and lost["file"] == behind.name and lost["count"] == 400
-    with pytest.raises(ValueError, match="nobody's eyes were tracked"):
+    with pytest.raises(NergError, match="nobody's eyes were tracked"):
         read("eyenavgs", behind)
 
 
 def test_what_is_refused(tmp_path):
     path = write(tmp_path / "a/b")
-    with pytest.raises(ValueError, match="scene_setting.csv.*user7_room.csv"):
+    with pytest.raises(NergError, match="scene_setting.csv.*user7_room.csv"):
         read("eyenavgs", path)
-    (tmp_path / "scene_setting.csv").write_text(
-        'Scene_Name,Quaternion,Scale\nroom,"0, 0, 0, 1",2\nnyc,"0, 0, 0, 1",1\n'
-    )
-    with pytest.raises(ValueError, match="user9_nyc.csv.*user7_room.csv"):
+    settings(tmp_path, 'room,"0, 0, 0, 1",2', 'nyc,"0, 0, 0, 1",1')
+    with pytest.raises(NergError, match="user9_nyc.csv.*user7_room.csv"):
         read("eyenavgs", path, write(tmp_path, "user9_nyc.csv"))
-    with pytest.raises(ValueError, match='"moon"'):
-        read("eyenavgs", write(tmp_path, "user9_moon.csv"))
-    with pytest.raises(ValueError, match="there is no recording"):
-        read("eyenavgs", tmp_path / "a")
-    with pytest.raises(ValueError, match="there is no .*gone_room.csv"):
-        read("eyenavgs", tmp_path / "gone_room.csv")
-    with pytest.raises(ValueError, match='--eye is "third"'):
+    for given, message in (
+        (write(tmp_path, "user9_moon.csv"), '"moon"'),
+        (tmp_path / "a", "there is no recording"),
+        (tmp_path / "gone_room.csv", "there is no .*gone_room.csv"),
+    ):
+        with pytest.raises(NergError, match=message):
+            read("eyenavgs", given)
+    with pytest.raises(NergError, match='--eye is "third"'):
         read("eyenavgs", path, eye="third")
-    for row in ('room,"0, 0, 0",2', 'room,"0, 0, 0, 1",0', 'room,"0, 0, 0, 0",1', "room,x,1"):
-        (tmp_path / "scene_setting.csv").write_text(f"Scene_Name,Quaternion,Scale\n{row}\n")
-        with pytest.raises(ValueError, match="2.*'room'.*0"):
-            read_scene_settings(tmp_path / "scene_setting.csv")
 
 
 # ---- Settings of EyeNavGS's places ----
@@ -234,10 +223,8 @@ def test_there_and_back(tmp_path):
     assert np.allclose(there, np.c_[x * (1, -1, -1), [1, 1]])
 
 
-def test_scene_settings_what_is_refused(tmp_path):
-    (tmp_path / "s.csv").write_text('Scene_Name,Quaternion,Scale,Initial_Position\nhall,"0, 0, 0, 1",2,"1, 0"\n')
-    with pytest.raises(ValueError, match="s.csv.*2.*'hall'"):
-        read_scene_settings(tmp_path / "s.csv")
-    (tmp_path / "s.csv").write_text("Place,Scale\nhall,2\n")
-    with pytest.raises(ValueError, match="no column Scene_Name, Quaternion"):
-        read_scene_settings(tmp_path / "s.csv")
+@pytest.mark.parametrize("row", ['"0, 0, 0",2', '"0, 0, 0, 1",0', '"0, 0, 0, 0",1', "x,1", '"0, 0, 0, 1",2,"1, 0"'])
+def test_scene_settings_that_are_none(tmp_path, row):
+    settings(tmp_path, f"room,{row}", head=",Initial_Position" * (row.count('"') > 2))
+    with pytest.raises(NergError, match="2.*'room'.*0"):
+        read_scene_settings(tmp_path / "scene_setting.csv")

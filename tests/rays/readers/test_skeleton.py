@@ -1,13 +1,169 @@
-"""Skeleton files as rays."""
+"""Tests of `nerg_mi.rays.readers.skeleton`."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers.skeleton import RIGHT_EAR, SKELETONS, keypoints_from_head, parse_keypoints, write_skeleton
-from tests.rays.readers.reading import dropped, read
-from tests.rays.readers.test_skeleton_skeleton_file import heads, poses_of
+from nerg_mi.rays.readers import skeleton
+from nerg_mi.rays.readers.skeleton import (
+    RIGHT_EAR,
+    SKELETONS,
+    iterate_skeleton,
+    keypoints_from_head,
+    parse_keypoints,
+    read_skeleton,
+    write_skeleton,
+)
+from tests.rays.readers.examples import dropped, read
+
+# ---- Head poses of skeletons, and bodies for given ones ----
+
+
+def heads(n=200, seed=0):
+    rng = np.random.default_rng(seed)
+    d = rng.normal(size=(n, 3))
+    d[0], d[1] = (0, 0, -1), (0, 0, 1)  # straight down and up
+    return rng.uniform([0, 0, 1.2], [8, 6, 1.9], (n, 3)), d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def poses_of(body, ears=(skeleton.LEFT_EAR, skeleton.RIGHT_EAR), nose=skeleton.NOSE, pitch=0.0):
+    return skeleton.head_poses(*(body[:, k] for k in (*ears, nose)), pitch=pitch)
+
+
+def test_body_gives_exactly_its_head_pose():
+    origin, direction = heads()
+    body = skeleton.keypoints_from_head(origin, direction)
+    o, d = poses_of(body)
+    assert np.abs(o - origin).max() < 1e-6 and np.abs(d - direction).max() < 1e-6
+    assert np.isfinite(body).all() and body[..., 2].min() > -0.05
+    # The left ear is on the left of where the head looks.
+    side = body[2:, skeleton.LEFT_EAR] - body[2:, skeleton.RIGHT_EAR]
+    left = np.cross([0, 0, 1.0], direction[2:])
+    assert np.all(np.sum(side * left, axis=1) > 0)
+    assert np.allclose(np.linalg.norm(side, axis=1), skeleton.EAR_DISTANCE)
+
+
+def test_unseen_keypoints_and_bad_heads():
+    origin, direction = heads(3)
+    body = skeleton.keypoints_from_head(origin, direction)
+    body[0, skeleton.NOSE] = np.nan
+    body[1, skeleton.NOSE] = 0.5 * (body[1, skeleton.LEFT_EAR] + body[1, skeleton.RIGHT_EAR])
+    _, d = poses_of(body)
+    assert np.isnan(d[:2]).all() and np.isfinite(d[2]).all()
+    with pytest.raises(ValueError, match="head pose 1"):
+        skeleton.keypoints_from_head(origin, direction * [[1], [0], [1]])
+
+
+def test_a_body_is_the_same_on_both_sides():
+    origin, heading = np.array([[2.0, 3.0, 1.58], [0.0, -1.0, 0.79], [0.5, 0.0, 1.7]]), np.array([0.3, 2.0, -1.1])
+    direction = np.stack([np.cos(heading), np.sin(heading), np.zeros(3)], axis=1)
+    body = skeleton.keypoints_from_head(origin, direction)
+    left = np.cross([0, 0, 1.0], direction)
+    eyes, ears = (4, 15), (skeleton.LEFT_EAR, skeleton.RIGHT_EAR)
+    pairs = np.array([ears, eyes, (0, 12), (3, 14), (5, 16), (6, 17), (7, 18), (8, 19), (9, 20)])
+    # Mirrored in the plane through the middle of the ears in which the head looks.
+    aside = np.einsum("nkj,nj->nk", body - origin[:, None], left)[..., None]
+    mirrored = body - 2 * aside * left[:, None]
+    assert np.allclose(body[:, pairs[:, 0]], mirrored[:, pairs[:, 1]], atol=1e-12)
+    assert (aside[:, pairs[:, 0], 0] > 0.01).all()
+    assert np.allclose(aside[:, [10, skeleton.NOSE, 21]], 0)
+    # The eyes lie between the ears; heels, knees, hips and shoulders one above the other, in proportion to the height.
+    between_eyes, between_ears = (np.linalg.norm(body[:, i] - body[:, j], axis=1) for i, j in (eyes, ears))
+    assert (between_eyes < 0.6 * between_ears).all()
+    heights = body[:, [5, 7, 6, 8], 2] / origin[:, 2:]
+    assert (np.diff(heights, axis=1) > 0.1).all() and np.allclose(heights, heights[0])
+
+
+def test_a_head_may_be_at_zero_but_not_nowhere():
+    for origin in ((0, 0, 1.6), (1, 0, 0)):
+        assert np.allclose(poses_of(skeleton.keypoints_from_head([origin], [(1, 0, 0)]))[0], [origin])
+    for origin in ((np.nan, 1, 1.6), (1, 1, np.inf)):
+        with pytest.raises(ValueError, match="head pose 0"):
+            skeleton.keypoints_from_head([origin], [(1, 0, 0)])
+
+
+# ---- Skeleton file ----
+
+
+@pytest.fixture
+def poses():
+    keypoints = np.random.default_rng(0).uniform(-9, 9, (7, 22, 3))
+    keypoints[3, 11] = np.nan
+    return list("abcabca"), np.arange(7) * 40, keypoints
+
+
+@pytest.mark.parametrize("name", ["day.csv", "day.csv.gz"])
+def test_round_trip(tmp_path, poses, name):
+    ids, times, keypoints = poses
+    path = tmp_path / name
+    write_skeleton(path, ids, times, keypoints)
+    rows = read_skeleton(path)
+    assert list(rows.ids) == ids and np.array_equal(rows.times, times) and np.array_equal(rows.lines, np.arange(1, 8))
+    assert np.allclose(rows.keypoints, keypoints, atol=5.1e-7, equal_nan=True)
+    first = path.read_bytes()
+    write_skeleton(path, ids, times, keypoints)
+    assert path.read_bytes() == first  # no clock in the file
+    assert [len(run.ids) for run in iterate_skeleton(path, chunk=3)] == [3, 3, 1]
+
+
+def test_reads_the_published_layout(tmp_path):
+    numbers = [float(i) for i in range(66)]
+    numbers[4] = float("nan")
+    path = tmp_path / "2023.csv"
+    path.write_text(f"person 1|1698822000|{numbers}\n\n")
+    rows = read_skeleton(path)
+    assert rows.ids[0] == "person 1" and rows.times[0] == 1698822000
+    assert np.array_equal(rows.keypoints[0, 11], [33, 34, 35]) and np.isnan(rows.keypoints[0, 1, 1])
+
+
+def test_writer_refuses(tmp_path, poses):
+    ids, times, keypoints = poses
+    path = tmp_path / "day.csv"
+    for wrong, message in (
+        ((ids[:3], times, keypoints), "one pose for each id"),
+        ((ids, times * 0.5, keypoints), "integers"),
+        ((["a|b", *ids[1:]], times, keypoints), "rename the person"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_skeleton(path, *wrong)
+    path.write_text("")
+    with pytest.raises(NergError, match="no poses"):
+        read_skeleton(path)
+
+
+@pytest.mark.parametrize("keypoints", [None, (21, 2, 13)])
+def test_bad_lines_are_told_and_left_out(tmp_path, poses, keypoints):
+    path, told = tmp_path / "day.csv", {}
+    write_skeleton(path, *poses)
+    good, zeros = path.read_text().splitlines(keepends=True), ", ".join(["0"] * 65)
+    bad = {
+        f"a|1|[{zeros}, x]\n": "'x' is not a number",
+        "a|1\n": ": 2 fields",
+        f"a|1.5|[{zeros}, 0]\n": "'1.5' is not an integer",
+        f"a|{1 << 63}|[{zeros}, 0]\n": "too large",
+        f"a|1|{zeros}, 0\n": "not enclosed",
+        "a|1|[0, 1]\n": ": 2 numbers, expected 66",
+        good[0][:300]: "not enclosed",
+    }
+    path.write_text("".join(line for pair in zip(good, bad) for line in pair))
+    (rows,) = iterate_skeleton(path, keypoints=keypoints, on_bad=told.__setitem__)
+    assert list(rows.ids) == poses[0] and rows.lines.tolist() == [1, 3, 5, 7, 9, 11, 13]
+    assert sorted(told) == [2, 4, 6, 8, 10, 12, 14]
+    assert all(why in told[line] for line, why in zip(sorted(told), bad.values()))
+    with pytest.raises(NergError, match="4.*2.*--skip-bad-lines"):
+        read_skeleton(path)
+
+
+@pytest.mark.parametrize("keypoints", [None, (0, 1, 2)])
+def test_numbers_that_only_python_spells_so(tmp_path, keypoints):
+    path = tmp_path / "day.csv"
+    path.write_text("a|1|[" + ", ".join(["1_0"] * 66) + "]\n")
+    (rows,) = iterate_skeleton(path, keypoints=keypoints)
+    assert rows.keypoints[0, 0].tolist() == [10, 10, 10]
+
+
+# ---- Skeleton files as rays ----
 
 # A head that looks along x, with y to its left and z up, in metres from between the ears; and its trunk.
 FORWARD = np.array([1.0, 0, 0])

@@ -6,7 +6,7 @@ import numpy as np
 
 from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import FRAME, Rays
-from nerg_mi.rays.readers.base import Frame
+from nerg_mi.rays.readers.base import TrackingFrame
 
 
 def walk(hit=True, frame=None, seed=0):
@@ -20,7 +20,7 @@ def walk(hit=True, frame=None, seed=0):
     turned = heading + rng.normal(0, 0.6, n)
     d = np.stack([np.cos(turned), np.sin(turned), rng.normal(-0.2, 0.2, n)], axis=1)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    metadata = {"frame": dict(FRAME), "transform": Frame(**(frame or {})).to_rays().tolist()}
+    metadata = {"frame": dict(FRAME), "transform": TrackingFrame(**(frame or {})).to_rays().tolist()}
     return Rays(t, np.zeros(n), ("ann",), origin, d, np.ones(n), origin + 2 * d if hit else None, metadata)
 
 

@@ -5,15 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.rays.checks import group_medians, name_some
+from nerg_mi.rays.checks import group_medians
+from nerg_mi.rays.direction_checks import walking_agreement
 from nerg_mi.rays.rays import FRAME
-from tests.rays.checks.people import change, walk, warnings_of, watch
-
-from .people import walk as walk_participants
-from .people import warnings_of as warnings_of_participants
+from tests.rays.people import change, walk, warnings_of, watch
 
 # ---- Clocks ----
-
 
 BO = slice(3000, 6000)
 
@@ -116,14 +113,6 @@ def test_medians_of_groups(seed):
     assert np.isnan(group_medians(np.empty(0), np.empty(0, int), 3)).all()
 
 
-def test_names():
-    assert (
-        name_some(["ann"]) == "ann"
-        and name_some(list("abc")) == "a, b, c"
-        and name_some(list("abcd")) == "a, b, c and 1 more"
-    )
-
-
 # ---- Files ----
 
 
@@ -196,12 +185,12 @@ def test_a_moment_says_nothing_of_extents_and_elevations():
 
 @pytest.mark.parametrize("of_each, is_counter", [(1, True), (2, True), (10, False), (6000, False)])
 def test_one_participant_a_row(of_each, is_counter):
-    rays = walk_participants(hit=False)
+    rays = walk(hit=False)
     person = np.arange(len(rays)) // of_each
     rays = replace(rays, person=person, persons=tuple(map(str, range(person.max() + 1))))
-    assert ("does their column count rows" in warnings_of_participants(rays)) == is_counter
+    assert ("does their column count rows" in warnings_of(rays)) == is_counter
     thinned = replace(rays, metadata={"frame": dict(FRAME), "steps": [{"step": "thin", "kept": 6000, "of": 9000}]})
-    assert "does their column" not in warnings_of_participants(thinned)
+    assert "does their column" not in warnings_of(thinned)
 
 
 # ---- Times ----
@@ -212,3 +201,11 @@ def test_times_and_steep_gaze():
     assert "a ray comes every 20 s" in warnings_of(replace(rays, t=rays.t * 1000))
     down = np.tile([0.1, 0.1, -1.0], (len(rays), 1)) / np.linalg.norm([0.1, 0.1, -1.0])
     assert "degrees down" in warnings_of(replace(rays, direction=down))
+
+
+# ---- The list of checks ----
+
+
+def test_nothing_to_say_of_a_plausible_walk():
+    assert warnings_of(walk()) == "" and warnings_of(walk(hit=False)) == ""
+    assert (walking_agreement(walk())[:2] > 0.5).all()

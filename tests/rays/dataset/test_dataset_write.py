@@ -1,0 +1,514 @@
+"""Tests of `nerg_mi.rays.dataset_write`."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import file_sha256, locked
+from nerg_mi.rays import dataset, dataset_write
+from nerg_mi.rays.dataset import Head, RayDataset, read_sources, write_head
+from nerg_mi.rays.dataset_write import ImportTask, Marks, SourceWriter, has_parts, import_source, update_dataset
+from nerg_mi.rays.pseudonyms import pseudonymise
+from nerg_mi.rays.rays import FRAME, Rays
+from nerg_mi.rays.readers.base import NoOptions, Signature, TrackingFrame
+from nerg_mi.rays.readers.registry import read_rays
+from tests.conftest import ROOT
+from tests.rays.dataset.making import DAY, assert_same, crowd, recipe, settings, write_source
+
+pq = pytest.importorskip("pyarrow.parquet")
+
+# ---- Imports again: what is there is left, what has changed is replaced, and what was broken off goes on ----
+
+
+def sources(folder: Path, count: int = 3) -> list[Path]:
+    paths = [write_source(folder / f"{k}.csv", k, 60) for k in range(count)]
+    for path in paths:
+        os.utime(path, (1e9, 1e9))
+    return paths
+
+
+def content(folder: Path) -> dict[str, str]:
+    """The files of a dataset by their names, but for when its sources were changed and where they lie."""
+    found = {str(p.relative_to(folder)): file_sha256(p) for p in folder.rglob("*.parquet")}
+    for path in folder.rglob("*.json"):
+        about = json.loads(path.read_text())
+        found[str(path.relative_to(folder))] = str({**about, "where": "", "stamp": ""})
+    return found
+
+
+def test_again_does_nothing(tmp_path, monkeypatch):
+    files, dataset, names = sources(tmp_path), tmp_path / "shop.rays", []
+    one = update_dataset(dataset, files, recipe(), on_done=names.append)
+    assert (one.imported, one.rays, one.unchanged) == (3, 177, 0) and sorted(names) == ["0.csv", "1.csv", "2.csv"]
+    before = {p: p.stat().st_mtime_ns for p in dataset.rglob("*") if p.is_file()}
+    monkeypatch.setattr(dataset_write, "import_source", lambda task: pytest.fail("work"))
+    two = update_dataset(dataset, files, recipe())
+    assert (two.imported, two.unchanged, two.replaced) == (0, 3, 0)
+    assert {p: p.stat().st_mtime_ns for p in dataset.rglob("*") if p.is_file()} == before
+
+
+def test_the_same_content_is_not_imported_again(tmp_path):
+    files, dataset = sources(tmp_path), tmp_path / "shop.rays"
+    update_dataset(dataset, files, recipe())
+    parts = content(dataset)
+    os.utime(files[0])  # touched
+    (tmp_path / "moved").mkdir()
+    files[1] = files[1].rename(tmp_path / "moved" / files[1].name)
+    found = update_dataset(dataset, files, recipe())
+    assert (found.imported, found.unchanged, found.replaced) == (0, 3, 0) and content(dataset) == parts
+    # From its new place it is known again.
+    write_source(files[1], 9, 60)
+    assert update_dataset(dataset, files, recipe()).replaced == 1
+    (tmp_path / "twice").mkdir()
+    (tmp_path / "twice" / "0.csv").write_bytes(files[0].read_bytes())
+    found = update_dataset(tmp_path / "other.rays", [files[0], tmp_path / "twice" / "0.csv"], recipe())
+    assert (found.imported, found.alike) == (1, 1) and len(RayDataset.open(tmp_path / "other.rays")) == 59
+
+
+def test_what_has_changed_is_replaced(tmp_path):
+    files, dataset = sources(tmp_path), tmp_path / "shop.rays"
+    update_dataset(dataset, files, recipe())
+    write_source(files[1], 8, 90)
+    found = update_dataset(dataset, files, recipe())
+    assert (found.imported, found.rays, found.unchanged, found.replaced) == (1, 89, 2, 1)
+    assert_same(RayDataset.open(dataset).load(), read_rays("table", files, settings()))
+    # And back again; read in another way; at another place.
+    write_source(files[1], 1, 60)
+    assert update_dataset(dataset, files, recipe()).replaced == 1
+    assert update_dataset(dataset, files, recipe(day="2024-01-01")).replaced == 3
+    assert RayDataset.open(dataset).days == ("2024-01-01",)
+    assert update_dataset(dataset, files[:1], recipe(place="north")).replaced == 1
+    assert RayDataset.open(dataset).places == ("north", "shop")
+    (tmp_path / "new").mkdir()
+    update_dataset(tmp_path / "new" / "shop.rays", files, recipe())
+    assert len(RayDataset.open(dataset)) == len(RayDataset.open(tmp_path / "new" / "shop.rays")) == 177
+
+
+def test_what_is_missing_is_imported_again(tmp_path):
+    files, dataset = sources(tmp_path), tmp_path / "shop.rays"
+    update_dataset(dataset, files, recipe())
+    before = content(dataset)
+    next(dataset.rglob("part-*.parquet")).unlink()
+    assert update_dataset(dataset, files, recipe()).imported == 1 and content(dataset) == before
+
+
+def test_one_that_cannot_be_read_does_not_stop_the_others(tmp_path):
+    files, dataset = sources(tmp_path), tmp_path / "shop.rays"
+    files[1].write_text("t,p\n1,2\n")
+    found = update_dataset(dataset, files, recipe())
+    assert found.imported == 2 and len(found.errors) == 1 and "1.csv" in found.errors[0]
+    assert len(list(dataset.rglob("_sources/*.json"))) == 2
+    # Broken in its last line: what was written of it is not left.
+    write_source(files[1], 1, 60)
+    with files[1].open("a") as file:
+        file.write("x\n")
+    assert len(update_dataset(dataset, files, recipe()).errors) == 1
+    assert len(list(dataset.rglob("part-*"))) == len(RayDataset.open(dataset).parts)
+
+
+def test_leftovers_are_removed(tmp_path):
+    files, dataset = sources(tmp_path), tmp_path / "shop.rays"
+    update_dataset(dataset, files, recipe())
+    before, part = content(dataset), next(dataset.rglob("part-*.parquet"))
+    for name in (part.with_name(".part-x.1-ab.part.parquet"), part.with_name("part-x-0.parquet")):
+        name.write_bytes(b"x")
+    (dataset / "_sources" / ".x.1-ab.part.json").write_text("{")
+    (dataset / "notes.txt").write_text("mine")
+    update_dataset(dataset, files, recipe())
+    assert content(dataset) == before and (dataset / "notes.txt").exists()
+    assert not [p for p in dataset.rglob(".*") if p.is_file()]
+
+
+def test_under_pseudonyms(tmp_path):
+    """Equal people have equal names in all sources and imports, and nothing tells the names or the files."""
+    files, dataset, key = sources(tmp_path, 2), tmp_path / "shop.rays", bytes(range(32))
+    update_dataset(dataset, files[:1], recipe(key=key))
+    write_source(files[1], 0, 90)  # the same people
+    assert update_dataset(dataset, files, recipe(key=key)).unchanged == 1
+    opened = RayDataset.open(dataset)
+    assert len(opened.persons) == 3 and all(name.startswith("p") and len(name) == 17 for name in opened.persons)
+    assert len(opened.load()) == 59 + 89 and opened.metadata["pseudonyms"] == "HMAC-SHA256, salt of a file"
+    assert pseudonymise(read_rays("table", files[:1], settings()), key).persons == opened.persons
+    written = "".join(p.read_text() for p in dataset.rglob("*.json")) + " ".join(map(str, dataset.rglob("*")))
+    for name in ("p0_0", "p0_1", "0.csv", "1.csv", file_sha256(files[0])):
+        assert name not in written.replace("f0.csv", "")
+
+
+@pytest.mark.parametrize(
+    "before, after, remedy",
+    [
+        ({"key": bytes(16)}, {}, "same --pseudonyms --salt"),
+        ({"key": bytes(16)}, {"key": bytes(range(16))}, "same --pseudonyms --salt"),
+        ({"key": bytes(16), "kept_salt": False}, {"key": bytes(16), "kept_salt": False}, "random salt that nobody"),
+        ({}, {"key": bytes(16)}, "leave out --pseudonyms"),
+    ],
+)
+def test_people_under_other_names_than_those_there(tmp_path, before, after, remedy):
+    files = sources(tmp_path, 1)
+    update_dataset(tmp_path / "a.rays", files, recipe(**before))
+    with pytest.raises(NergError, match=remedy):
+        update_dataset(tmp_path / "a.rays", files, recipe(**after))
+
+
+def test_what_stands_in_the_way_of_all(tmp_path):
+    files = sources(tmp_path)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a.txt").write_text("x")
+    for folder, given, how, message in (
+        ("mine", files, {}, "is there and no dataset"),
+        ("a.rays", [*files, tmp_path / "absent.csv"], {}, "no tracking file"),
+        ("a.rays", files, {"day": "monday"}, "--day"),
+        ("a.rays", [], {}, "name one or more"),
+    ):
+        with pytest.raises(NergError, match=message):
+            update_dataset(tmp_path / folder, given, recipe(**how))
+    assert not (tmp_path / "a.rays").exists()
+    update_dataset(tmp_path / "a.rays", files, recipe())
+    with locked(tmp_path / "a.rays" / dataset.HEAD, "busy"), pytest.raises(NergError, match="another import"):
+        update_dataset(tmp_path / "a.rays", files, recipe())
+
+
+def test_an_import_of_nothing_leaves_no_dataset(tmp_path):
+    bad, good = tmp_path / "bad.csv", sources(tmp_path, 1)
+    bad.write_text("a,b\n1,2\n")
+    for folder in (tmp_path / "new" / "a.rays", tmp_path / "b.rays"):
+        assert update_dataset(folder, [bad], recipe()).errors
+        assert not (tmp_path / "new").exists() and not (tmp_path / "b.rays").exists()
+    # A folder that was there stays, and so does a dataset with a source.
+    (tmp_path / "c.rays").mkdir()
+    assert update_dataset(tmp_path / "c.rays", [bad], recipe()).errors and not any((tmp_path / "c.rays").iterdir())
+    done = update_dataset(tmp_path / "c.rays", [bad, *good], recipe())
+    assert done.imported == 1 and done.errors
+    assert update_dataset(tmp_path / "c.rays", [bad], recipe()).errors
+    assert update_dataset(tmp_path / "c.rays", good, recipe()).unchanged == 1
+
+
+def test_an_import_that_is_interrupted_leaves_no_empty_dataset(tmp_path, monkeypatch):
+    def interrupt(*_):
+        (tmp_path / "a.rays" / "place=x" / "day=y").mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(dataset_write, "run_tasks", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        update_dataset(tmp_path / "a.rays", sources(tmp_path), recipe())
+    assert not (tmp_path / "a.rays").exists()
+
+
+IMPORT = """
+import sys
+from pathlib import Path
+from nerg_mi.rays.dataset_write import update_dataset
+from tests.rays.dataset.making import recipe
+
+if __name__ == "__main__":
+    update_dataset(Path(sys.argv[1]), sorted(Path(sys.argv[2]).iterdir()), recipe(), workers=2)
+"""
+
+
+def test_killed_in_the_middle_it_goes_on(tmp_path):
+    """SIGKILL of the process that imports: its workers end, and the next import gives what one that nobody has
+    disturbed gives, to the byte."""
+    files = [write_source(tmp_path / "files" / f"{k:02d}.csv", k, 3000) for k in range(16)]
+    (tmp_path / "import.py").write_text(IMPORT)
+    dataset = tmp_path / "shop.rays"
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "import.py"), str(dataset), str(tmp_path / "files")],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        start_new_session=True,
+    )
+    accounts = lambda: len([p for p in dataset.glob("_sources/*.json") if not p.name.startswith(".")])
+    begun = time.monotonic()
+    while accounts() < 3:
+        assert process.poll() is None and time.monotonic() - begun < 300, "it came to an end"
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    ended = time.monotonic()
+    while _alive(process.pid):
+        assert time.monotonic() - ended < 60, "processes were left"
+        time.sleep(0.05)
+    there = accounts()
+    assert 3 <= there < len(files)
+    # What has an account is whole meanwhile.
+    opened = RayDataset.open(dataset)
+    assert len(opened.load()) == len(opened) == 2999 * there
+    found = update_dataset(dataset, files, recipe())
+    assert (found.imported, found.unchanged) == (len(files) - there, there)
+    update_dataset(tmp_path / "undisturbed.rays", files, recipe())
+    assert content(dataset) == content(tmp_path / "undisturbed.rays")
+    assert not list(dataset.rglob("*.part.*"))
+
+
+def _alive(session: int) -> bool:
+    """Whether a process of a session is left."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[3]) == session and fields[0] != "Z":
+            return True
+    return False
+
+
+# ---- Processes beside each other: the same dataset as from one, and neither Mitsuba nor Dr.Jit in them ----
+
+
+def test_two_processes_give_what_one_does(tmp_path):
+    files = sources(tmp_path, 4)
+    files[2].write_text("nothing\n")
+    one = update_dataset(tmp_path / "one.rays", files, recipe())
+    two = update_dataset(tmp_path / "two.rays", files, recipe(), workers=2)
+    assert content(tmp_path / "one.rays") == content(tmp_path / "two.rays")
+    assert (two.imported, two.rays) == (one.imported, one.rays) == (3, 177) and len(two.errors) == 1 == len(one.errors)
+
+
+def ended(task):
+    os._exit(1)
+
+
+def test_a_process_that_is_ended_from_outside(tmp_path, monkeypatch):
+    monkeypatch.setattr(dataset_write, "import_source", ended)
+    with pytest.raises(NergError, match="--workers"):
+        update_dataset(tmp_path / "a.rays", sources(tmp_path, 2), recipe(), workers=2)
+
+
+# ---- The import of one source: block by block, under pseudonyms, and without any ray ----
+HEAD = Head(4)
+
+
+def task(folder, path, **changes) -> ImportTask:
+    how = recipe(**changes)
+    return ImportTask(folder=folder, head=HEAD, path=path, recipe=how, mark=how.mark, where=Marks(how.key).where(path))
+
+
+@pytest.mark.parametrize("key", [None, bytes(range(16))])
+def test_in_blocks_as_at_once(tmp_path, monkeypatch, key):
+    monkeypatch.setattr("nerg_mi.rays.readers.tables.BLOCK", 50)
+    monkeypatch.setattr("nerg_mi.rays.readers.base.STREAMED", 120)
+    path, folder = write_source(tmp_path / "a.csv", people=5), tmp_path / "a.rays"
+    write_head(folder, HEAD)
+    found = import_source(task(folder, path, key=key))
+    assert (found.rays, found.unchanged, found.error) == (399, False, None)
+    (source,) = read_sources(folder, HEAD)
+    assert source.id == found.source and len(source.parts) > 4 and has_parts(folder, source)
+    assert sum(d["count"] for d in source.metadata["dropped"]) == 1 and source.metadata["rows_read"] == 400
+    rays = read_rays("table", path, settings())
+    if key is not None:
+        rays = pseudonymise(rays, key)
+        assert all(source.metadata[key] == rays.metadata[key] for key in ("sources", "dropped"))
+        assert source.file == rays.metadata["sources"][0]["file"]
+    assert_same(RayDataset.open(folder).load(), rays)
+    assert import_source(task(folder, path, key=key)).unchanged
+
+
+class Headset:
+    """A reader of heads and distances of eyes, in cm, that makes its rays itself."""
+
+    name, files, world, checked_on, Options = "headset", "", "", "", NoOptions
+    signature = Signature()
+
+    def frame(self, files, options):
+        return TrackingFrame(units="cm")
+
+    def read(self, files, options, builder):
+        builder.source(files[0])
+        for k, (name, metres) in enumerate((("ann", 6.0), ("bo", 6.4), ("ann", 7.0))):
+            ahead = np.tile([0.0, 2.0, 0.0], (50, 1))
+            heads = np.where(np.arange(50)[:, None] < 25, ahead, np.nan)
+            t, eyes = np.arange(50) + 50.0 * k, np.full(50, metres)
+            builder.add(t, name, ahead, ahead, rows=np.arange(50), head=heads, eye_distance=eyes)
+        builder.complain("the headset was put on askew")
+
+
+@pytest.mark.parametrize("key", [None, bytes(range(16))])
+def test_heads_eyes_and_complaints(tmp_path, monkeypatch, key):
+    monkeypatch.setattr("nerg_mi.rays.readers.base.STREAMED", 40)
+    (tmp_path / "a.bin").write_bytes(b"x")
+    write_head(tmp_path / "a.rays", HEAD)
+    given = task(tmp_path / "a.rays", tmp_path / "a.bin", reader=Headset(), settings=None, key=key)
+    assert import_source(given).rays == 150
+    rays = RayDataset.open(tmp_path / "a.rays").load()
+    assert rays.metadata["complaints"] == ["the headset was put on askew"]
+    known = np.isfinite(rays.head).all(axis=1)
+    assert rays.head.dtype == np.float32 and (rays.head[known] == [0, 1, 0]).all()
+    assert np.array_equal(known, rays.t % 50 < 25)
+    # Of the first block of each.
+    eyes = rays.metadata["eye_distance"]
+    assert set(eyes) == set(rays.persons) and np.allclose(sorted(eyes.values()), [0.06, 0.064])
+    assert (set(eyes) == {"ann", "bo"}) is (key is None)
+
+
+def test_a_source_without_a_ray_has_an_account(tmp_path):
+    path, folder = write_source(tmp_path / "a.csv", count=1), tmp_path / "a.rays"
+    path.write_text(path.read_text().replace("0.000,", ",", 1))
+    write_head(folder, HEAD)
+    assert import_source(task(folder, path)).rays == 0
+    (source,) = read_sources(folder, HEAD)
+    assert source.parts == [] and source.metadata["dropped"][0]["reason"] == "time is missing"
+
+
+def test_what_is_no_recording_is_refused_before_all_of_it_is_read(tmp_path, monkeypatch):
+    folder, path = tmp_path / "a.rays", tmp_path / "a.csv"
+    write_head(folder, HEAD)
+    monkeypatch.setattr(Marks, "source", lambda *_: pytest.fail("it was read to its end"))
+    with path.open("wb") as out:
+        out.truncate(3 << 30)
+    assert "characters that are read" in (import_source(task(folder, path)).error or "")
+
+
+def test_a_copy_of_an_imported_source_is_known_by_its_first_rays(tmp_path, monkeypatch):
+    monkeypatch.setattr("nerg_mi.rays.readers.tables.BLOCK", 50)
+    monkeypatch.setattr("nerg_mi.rays.readers.base.STREAMED", 120)
+    path, folder = write_source(tmp_path / "a.csv", people=5), tmp_path / "a.rays"
+    write_head(folder, HEAD)
+    first = import_source(task(folder, path))
+    (tmp_path / "b").mkdir()
+    copy = write_source(tmp_path / "b" / "a.csv", people=5)
+    monkeypatch.setattr("nerg_mi.rays.dataset_write.SourceWriter", lambda *_: pytest.fail("it was written again"))
+    again = import_source(task(folder, copy))
+    assert again.unchanged and again.source == first.source and len(read_sources(folder, HEAD)) == 1
+
+
+# ---- By what a source is known again ----
+
+
+@pytest.fixture
+def source(tmp_path) -> Path:
+    (tmp_path / "a.csv").write_text("x")
+    os.utime(tmp_path / "a.csv", (1e9, 1e9))
+    return tmp_path / "a.csv"
+
+
+def test_path_content_and_name(source, tmp_path):
+    marks = Marks()
+    before = marks.where(source), marks.stamp(source), marks.source(source, "r")
+    assert len(set(before)) == 3 and all(len(mark) == 32 for mark in before)
+    source.write_text("y")
+    os.utime(source, (1e9, 1e9))
+    # What the time of change does not tell the content does.
+    assert marks.stamp(source) == before[1] and marks.source(source, "r") != before[2]
+    (tmp_path / "b.csv").write_text("y")
+    assert marks.source(tmp_path / "b.csv", "r") != marks.source(source, "r") != marks.source(source, "s")
+    (tmp_path / "link.csv").symlink_to(source)
+    assert marks.where(tmp_path / "link.csv") == before[0]
+    with pytest.raises(NergError, match="no tracking file"):
+        marks.stamp(tmp_path / "absent.csv")
+
+
+def test_what_was_changed_just_now_has_no_stamp(source):
+    os.utime(source)
+    assert Marks().stamp(source) is None
+
+
+def test_folders(tmp_path):
+    for name in ("b/2.csv", "a.csv"):
+        (tmp_path / "session" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "session" / name).write_text(name)
+        os.utime(tmp_path / "session" / name, (1e9, 1e9))
+    marks, folder = Marks(), tmp_path / "session"
+    one = marks.stamp(folder), marks.source(folder, "r")
+    os.utime(folder / "b/2.csv", (1e9, 2e8))
+    assert marks.stamp(folder) != one[0] and marks.source(folder, "r") == one[1]
+    (folder / "b/2.csv").rename(folder / "b/3.csv")
+    assert marks.source(folder, "r") != one[1]
+
+
+def test_how_sources_are_read(tmp_path):
+    marks = Marks()
+    assert marks.recipe("table", settings()) == marks.recipe("table", settings())
+    found = {marks.recipe("table", settings()), marks.recipe("other", settings()), marks.recipe("table", NoOptions())}
+    assert len(found | {marks.recipe("table", settings(), day="2024-01-01")}) == 4
+
+
+def test_marks_under_a_salt_tell_nothing_to_those_without(source):
+    one, two = Marks(bytes(16)), Marks(bytes(range(16)))
+    for name in ("where", "stamp"):
+        assert len({getattr(marks, name)(source) for marks in (Marks(), one, two)}) == 3
+    assert len({marks.source(source, "r") for marks in (Marks(), one, two)}) == 3
+
+
+# ---- The parts of a source, as other programs read them ----
+
+ID = "0" * 32
+ABOUT = {"file": "a.csv", "where": "w", "stamp": None, "recipe": "r", "generation": 0}
+
+
+def test_parts_by_day_and_bucket_in_the_order_of_people_and_times(tmp_path):
+    import pyarrow.dataset
+
+    rays = crowd(start=DAY + 86_350)  # fifty seconds before midnight
+    writer = SourceWriter(tmp_path, ID, 4)
+    writer.add(rays, "shop / 1")
+    writer.add(rays.select(rays.t < 0))
+    source = writer.finish({"frame": dict(FRAME)}, **ABOUT)
+    write_head(tmp_path, Head(4))
+    assert read_sources(tmp_path, Head(4)) == [source] and source.rays == 1000
+    names = np.array(rays.persons)[rays.person]
+    assert source.persons == {name: int((names == name).sum()) for name in sorted(rays.persons)}
+    for part in source.parts:
+        path = tmp_path / part.path(ID)
+        table = pq.read_table(path, partitioning=None)
+        who, t = table.column("person").to_pylist(), table.column("t").to_pylist()
+        assert list(zip(who, t)) == sorted(zip(who, t)) and len(t) == part.rays
+        assert {dataset.bucket_of(name, 4) for name in who} == {part.bucket} and (part.first, part.last) == (
+            who[0],
+            who[-1],
+        )
+        assert (part.start, part.end, part.bytes) == (min(t), max(t), path.stat().st_size)
+        same = np.array(who[1:]) == np.array(who[:-1])
+        steps = np.diff(t)[same]
+        assert np.isclose(part.recorded, steps[steps <= 1].sum()) and part.duplicates == 0 and part.hits == 0
+        for k, axis in enumerate("xyz"):
+            column = table.column(f"origin_{axis}").to_numpy()
+            assert (part.low[k], part.high[k]) == (column.min(), column.max())
+    # Others see the folders as columns.
+    found = pyarrow.dataset.dataset(tmp_path, format="parquet", partitioning="hive").to_table()
+    assert set(found.column("day").to_pylist()) == {"2024-10-04", "2024-10-05"}
+    assert set(found.column("place").to_pylist()) == {"shop / 1"} and found.num_rows == 1000
+
+
+def test_a_day_that_is_given_and_one_that_nobody_knows(tmp_path):
+    for id, given, there in (("0" * 32, "2020-01-01", "2020-01-01"), ("1" * 32, None, "unknown")):
+        writer = SourceWriter(tmp_path, id, 4)
+        writer.add(crowd(start=DAY if given else 0.0), day=given)
+        assert {part.day for part in writer.finish({"frame": dict(FRAME)}, **ABOUT).parts} == {there}
+
+
+def test_parts_and_groups_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(dataset_write, "PART_ROWS", 300)
+    monkeypatch.setattr(dataset_write, "GROUP_ROWS", 100)
+    writer = SourceWriter(tmp_path, ID, 1)
+    writer.add(crowd())
+    parts = writer.finish({"frame": dict(FRAME)}, **ABOUT).parts
+    assert [part.rays for part in parts] == [300, 300, 300, 100] and [part.number for part in parts] == [0, 1, 2, 3]
+    assert pq.ParquetFile(tmp_path / parts[0].path(ID)).metadata.num_row_groups == 3
+
+
+def test_what_a_dataset_does_not_take(tmp_path):
+    rays = crowd(3)
+    far = Rays(rays.t, rays.person, rays.persons, rays.origin * 0 + 9000, rays.direction, rays.confidence)
+    with pytest.raises(NergError, match=r"9e\+03 m from zero.*--units"):
+        SourceWriter(tmp_path, ID, 1).add(far)
+    odd = Rays(rays.t, rays.person, ("a", "b", "c", "\udce4"), rays.origin, rays.direction, rays.confidence)
+    with pytest.raises(NergError, match="is no text"):
+        SourceWriter(tmp_path, ID, 1).add(odd)
+    assert not list(tmp_path.iterdir())
+
+
+def test_many_runs_of_dropped_rows_are_counted(tmp_path):
+    rows = [[2 * k, 2 * k] for k in range(1500)]
+    dropped = [{"reason": "blink", "file": "a", "count": 1500, "rows": rows}]
+    found = SourceWriter(tmp_path, ID, 1).finish({"frame": dict(FRAME), "dropped": dropped}, **ABOUT)
+    (entry,) = found.metadata["dropped"]
+    assert len(entry["rows"]) == 1000 and entry["rows_not_named"] == 500 and entry["count"] == 1500
