@@ -7,8 +7,7 @@ import json
 import math
 import os
 import re
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,8 +21,17 @@ from nerg_mi.files.atomic import file_sha256, write_text
 from nerg_mi.files.safe_read import inflated_limit, is_count, read_json, reading, size_of
 
 from .filters import select_mask
-from .rays import FRAME, Rays, column_parts, merge_rays, pyarrow_modules, read_metadata, sample_rows
 from .rays import VERSION as RAYS_VERSION
+from .rays import (
+    Rays,
+    column_parts,
+    merge_counts,
+    merge_metadata,
+    merge_rays,
+    pyarrow_modules,
+    read_metadata,
+    sample_rows,
+)
 
 # ---- Where the parts of a dataset lie, and which columns they have ----
 #
@@ -280,39 +288,6 @@ _PART_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     **dict.fromkeys(("place", "day", "first", "last"), (_is_text, "text")),
 }
 """What each value of an account is: whether it is one, and its name."""
-
-
-_MERGED = ("sources", "dropped", "rows_read", "complaints", "eye_distance", "missing", "unused_columns")
-
-
-def merge_metadata(sources: Sequence[Source]) -> dict[str, Any]:
-    """What holds for all sources, what was dropped of any, and how many rows were read; ``steps`` that all have had."""
-    each = [source.metadata for source in sources]
-    first = each[0] if each else {"frame": dict(FRAME)}
-    same = {k: v for k, v in first.items() if k not in _MERGED and all(other.get(k) == v for other in each)}
-    listed = lambda key: [entry for other in each for entry in other.get(key, [])]
-    where_any = {
-        "missing": merge_counts(other.get("missing", {}) for other in each),
-        "unused_columns": list(dict.fromkeys(listed("unused_columns"))),
-        "complaints": list(dict.fromkeys(listed("complaints"))),
-        "eye_distance": {name: metres for other in each for name, metres in other.get("eye_distance", {}).items()},
-    }
-    return {
-        **same,
-        **{key: value for key, value in where_any.items() if value},
-        "frame": first["frame"],
-        "sources": listed("sources"),
-        "rows_read": sum(other.get("rows_read", 0) for other in each),
-        "dropped": listed("dropped"),
-    }
-
-
-def merge_counts(counts: Iterable[dict[str, int]]) -> dict[str, int]:
-    """Sums by name, in the order of names."""
-    total: Counter[str] = Counter()
-    for each in counts:
-        total.update(each)
-    return dict(sorted(total.items()))
 
 
 # ---- Conditions ----
@@ -596,7 +571,7 @@ class RayDataset:
     @property
     def metadata(self) -> dict[str, Any]:
         """What the metadata of its rays say of all of them."""
-        return merge_metadata(self.sources)
+        return merge_metadata([source.metadata for source in self.sources])
 
     @cached_property
     def digest(self) -> str:

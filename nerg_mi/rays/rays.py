@@ -7,6 +7,7 @@ import math
 import os
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -574,6 +575,38 @@ def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -
         name: np.concatenate([columns.pop(name) for columns, *_ in held]) for name in COLUMNS if name in held[0][0]
     }
     return Rays(**joined, persons=persons, cohorts=cohorts, metadata=metadata)
+
+
+_MERGED = ("sources", "dropped", "rows_read", "complaints", "eye_distance", "missing", "unused_columns")
+
+
+def merge_metadata(each: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What holds for all of several, what was dropped of any, and how many rows were read; ``steps`` that all have."""
+    first = each[0] if each else {"frame": dict(FRAME)}
+    same = {k: v for k, v in first.items() if k not in _MERGED and all(other.get(k) == v for other in each)}
+    listed = lambda key: [entry for other in each for entry in other.get(key, [])]
+    where_any = {
+        "missing": merge_counts(other.get("missing", {}) for other in each),
+        "unused_columns": list(dict.fromkeys(listed("unused_columns"))),
+        "complaints": list(dict.fromkeys(listed("complaints"))),
+        "eye_distance": {name: metres for other in each for name, metres in other.get("eye_distance", {}).items()},
+    }
+    return {
+        **same,
+        **{key: value for key, value in where_any.items() if value},
+        "frame": first["frame"],
+        "sources": listed("sources"),
+        "rows_read": sum(other.get("rows_read", 0) for other in each),
+        "dropped": listed("dropped"),
+    }
+
+
+def merge_counts(counts: Iterable[dict[str, int]]) -> dict[str, int]:
+    """Sums by name, in the order of names."""
+    total: Counter[str] = Counter()
+    for each in counts:
+        total.update(each)
+    return dict(sorted(total.items()))
 
 
 def _compact(rays: Rays) -> Rays:

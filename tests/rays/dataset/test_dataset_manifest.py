@@ -16,54 +16,14 @@ from nerg_mi.rays.dataset import (
     PartFile,
     Source,
     bucket_of,
-    merge_metadata,
     read_head,
     read_sources,
     write_head,
     write_source,
 )
-from nerg_mi.rays.rays import FRAME, Rays, merge_rays, sample_rows
+from nerg_mi.rays.rays import FRAME
 
 from .making import crowd
-
-# ---- Samples: each row as likely as any other, without room for all ----
-
-
-@pytest.mark.parametrize("n, runs", [(7, None), (20, None), (33, None), (8, 4), (20, 3)])
-def test_every_row_is_as_likely(n, runs):
-    counts, each = np.zeros(40), None
-    for seed in range(1000):
-        rows = sample_rows(40, n, seed, runs)
-        assert (np.diff(rows) > 0).all() and rows[0] >= 0 and rows[-1] < 40
-        assert each in (None, len(rows))
-        each = len(rows)
-        counts[rows] += 1
-    assert each == (n if runs is None else n // runs * runs)
-    # Chi-square of 39 degrees of freedom: 72.1 at one in a thousand; samples without repeats spread less.
-    expected = 1000 * each / 40
-    assert ((counts - expected) ** 2 / expected).sum() < 72.1
-
-
-def test_pairs_are_as_likely_too():
-    together = np.zeros((6, 6))
-    for seed in range(1500):
-        rows = sample_rows(6, 2, seed)
-        together[rows[0], rows[1]] += 1
-    found = together[np.triu_indices(6, 1)]
-    assert found.sum() == 1500 and ((found - 100) ** 2 / 100).sum() < 36.1
-
-
-def test_runs_are_of_neighbours():
-    rows = sample_rows(10_000, 600, 1, runs=6)
-    jumps = np.count_nonzero(np.diff(rows) > 1)
-    assert len(rows) == 600 and jumps <= 6
-
-
-def test_all_and_equal_seeds():
-    assert sample_rows(5, 5).tolist() == sample_rows(5, 9, 3, runs=2).tolist() == [0, 1, 2, 3, 4]
-    assert np.array_equal(sample_rows(10**12, 50, 4), sample_rows(10**12, 50, 4))
-    assert not np.array_equal(sample_rows(10**12, 50, 4), sample_rows(10**12, 50, 5))
-
 
 # ---- The accounts of a dataset: written and read again, and refused where they are damaged ----
 
@@ -202,50 +162,3 @@ def test_rays_of_a_block():
 def test_a_box_that_is_none():
     with pytest.raises(NergError, match="a box is"):
         Conditions(box=[0, 1]).check()
-
-
-# ---- Rays of several blocks as one, and what is said of all of their sources ----
-
-AHEAD = np.array([[0.0, 1.0, 0.0]])
-
-
-def ray(t: float, name: str, others=(), **more) -> Rays:
-    persons = tuple(sorted({name, *others}))
-    return Rays([t], [persons.index(name)], persons, AHEAD, AHEAD, [1.0], **more)
-
-
-def test_people_who_occur_and_what_some_lack():
-    blocks = [ray(0, "b", ["a", "z"]), ray(1, "a", hit=2 * AHEAD, cohort=[1], cohorts=("x", "y")), ray(2, "b")]
-    found = merge_rays(blocks)
-    assert found.persons == ("a", "b") and [found.persons[k] for k in found.person] == ["b", "a", "b"]
-    assert found.t.tolist() == [0, 1, 2] and np.isnan(found.hit[[0, 2]]).all() and found.hit[1].tolist() == [0, 2, 0]
-    assert [found.cohorts[k] for k in found.cohort] == ["unknown", "y", "unknown"]
-    assert found.metadata == {"frame": FRAME}
-    headed = merge_rays([ray(0, "b"), ray(1, "b", head=AHEAD)])
-    assert headed.head.dtype == np.float32 and np.isnan(headed.head[0]).all() and headed.head[1].tolist() == [0, 1, 0]
-    without = merge_rays([ray(0, "b"), ray(1, "b")])
-    assert without.hit is None and without.cohort is None and without.cohorts == ()
-
-
-def test_metadata_are_what_holds_for_all():
-    about = {"frame": dict(FRAME), "preset": "table", "tick": 1.0, "rows_read": 4, "sources": [{"file": "a"}]}
-    about["dropped"] = [{"reason": "blink", "file": "a", "count": 1, "rows": [[1, 1]]}]
-    about["eye_distance"] = {"ann": 0.06}
-    about["complaints"] = ["the frame is mirrored", "the clock jumps"]
-    other = {
-        **about,
-        "complaints": ["the clock jumps", "the gaze is frozen"],
-        "eye_distance": {"bo": 0.07},
-        "tick": 2.0,
-        "rows_read": 5,
-        "sources": [{"file": "b"}],
-        "dropped": [],
-        "missing": {"hit points": 2},
-    }
-    fields = dict(where="", stamp=None, recipe="", generation=0, persons={}, cohorts={}, parts=[])
-    found = merge_metadata([Source(id=n, file=n, metadata=m, **fields) for n, m in (("a", about), ("b", other))])
-    assert found["rows_read"] == 9 and found["sources"] == [{"file": "a"}, {"file": "b"}]
-    assert found["eye_distance"] == {"ann": 0.06, "bo": 0.07}
-    assert found["complaints"] == ["the frame is mirrored", "the clock jumps", "the gaze is frozen"]
-    assert found["dropped"] == about["dropped"] and found["preset"] == "table" and "tick" not in found
-    assert found["missing"] == {"hit points": 2}
