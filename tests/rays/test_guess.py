@@ -14,17 +14,14 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays import guess as rows
 from nerg_mi.rays.guess import (
     TableSample,
-    find_roles,
-    in_degrees,
     preset_of_columns,
     preset_of_files,
     preset_of_text,
     propose_import,
     propose_imports,
-    time_unit,
 )
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.columns import ColumnFinder
+from nerg_mi.rays.readers.columns import ColumnFinder, find_roles, in_degrees, time_unit
 from tests.cli.rays.running import run
 from tests.rays.readers.examples import EXAMPLES
 
@@ -228,11 +225,11 @@ def test_heads_alone_and_matrices(tmp_path, monkeypatch):
 
 
 def test_people_confidence_and_hits(tmp_path, monkeypatch):
-    finder = gaze_in_world("z right", 1.0, 1.0)
-    finder |= {"participant_id": np.repeat(["ann", "bo"], N // 2), "confidence": np.full(N, 0.5)}
-    finder |= xyz("hit_point_", WALK.eye + 2 * WALK.gaze)
+    table = gaze_in_world("z right", 1.0, 1.0)
+    table |= {"participant_id": np.repeat(["ann", "bo"], N // 2), "confidence": np.full(N, 0.5)}
+    table |= xyz("hit_point_", WALK.eye + 2 * WALK.gaze)
     path = tmp_path / "log.tsv"
-    path.write_text(csv(**finder).replace(",", "\t"))
+    path.write_text(csv(**table).replace(",", "\t"))
     rays = imported(path, monkeypatch)
     assert rays.persons == ("ann", "bo") and np.all(rays.confidence == 0.5)
     assert rays.hit is not None and np.allclose(rays.hit, rays.origin + 2 * rays.direction, atol=1e-5)
@@ -280,10 +277,10 @@ def test_what_is_not_known_is_to_be_said(tmp_path):
 
 
 def test_gravity_says_what_is_up(tmp_path):
-    finder = {**gaze_in_world("y right", 1.0, 1.0), **xyz("gravity_", np.tile([0, -9.81, 0], (N, 1)))}
-    finder = {name: v + (50 if name == "gaze_origin_y" else 0) for name, v in finder.items()}
+    table = {**gaze_in_world("y right", 1.0, 1.0), **xyz("gravity_", np.tile([0, -9.81, 0], (N, 1)))}
+    table = {name: v + (50 if name == "gaze_origin_y" else 0) for name, v in table.items()}
     path = tmp_path / "log.csv"
-    path.write_text(csv(**{k.replace("gaze_direction", "d"): v for k, v in finder.items()}))
+    path.write_text(csv(**{k.replace("gaze_direction", "d"): v for k, v in table.items()}))
     proposal = propose_import(path)
     assert proposal.options["--up"] == "y" and any("gravity" in s for s in proposal.sure)
 
@@ -324,8 +321,8 @@ def test_hands_of_worlds(tmp_path, monkeypatch, to, hand):
 @pytest.mark.parametrize("name, cell", [("time", "12:00"), ("timestamp", "5/1/2024 12:00:00"), ("utc", "noon")])
 def test_times_that_are_not_read_are_named(tmp_path, name, cell):
     eye, gaze, _ = frame(WALK, "y left")
-    finder = {name: [cell] * N, **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
-    (tmp_path / "log.csv").write_text(csv(**finder))
+    table = {name: [cell] * N, **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
+    (tmp_path / "log.csv").write_text(csv(**table))
     (sentence,) = (s for s in propose_import(tmp_path / "log.csv").open if "the time" in s)
     assert f"{name!r} holds {cell!r}" in sentence
 
@@ -345,8 +342,8 @@ def test_what_differs_in_each_row_is_no_participant(tmp_path, ids):
 @pytest.mark.parametrize("form", ["2024-05-01T12:00:{:08.5f}", "12:00:{:08.5f}", "2024/05/01 12:00:{:08.5f}Z"])
 def test_times_as_text(tmp_path, monkeypatch, form):
     eye, gaze, _ = frame(WALK, "y left")
-    finder = {"when": [form.format(t - 100) for t in WALK.t], **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
-    (tmp_path / "log.csv").write_text(csv(**finder))
+    table = {"when": [form.format(t - 100) for t in WALK.t], **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
+    (tmp_path / "log.csv").write_text(csv(**table))
     assert np.allclose(np.diff(imported(tmp_path / "log.csv", monkeypatch).t), 0.02, atol=1e-5)
     assert "'when' holds times of day" in propose_import(tmp_path / "log.csv").sure[0]
 
@@ -386,7 +383,7 @@ def test_several_files_and_folders(tmp_path):
     for name in ("a.csv", "data/b.csv", "data/c.csv"):
         (tmp_path / name).write_text(alike(eye, gaze))
     (tmp_path / "data" / "d.csv").write_text(alike(100 * WALK.eye, WALK.gaze))
-    (tmp_path / "data" / "notes.md").write_text("no finder")
+    (tmp_path / "data" / "notes.md").write_text("no table")
     metres, centimetres = propose_imports([tmp_path / "a.csv", tmp_path / "data"])
     assert [p.name for p in metres.paths] == ["a.csv", "b.csv", "c.csv"] and "--units cm" in centimetres.command
     assert shlex.split(metres.command)[3:6] == [str(p) for p in metres.paths]
@@ -397,13 +394,13 @@ def test_several_files_and_folders(tmp_path):
 
 # ---- What rows tell of their frame ----
 
-ROW_EVIDENCE_WALK = walk(3)
+OTHER_WALK = walk(3)
 
 
 @pytest.mark.parametrize("to, up", [("z right", "z"), ("y left", "y"), ("y right", "y")])
 @pytest.mark.parametrize("units", ["m", "cm", "mm"])
 def test_heads_stand(to, up, units):
-    eye, _, _ = frame(ROW_EVIDENCE_WALK, to, rows.UNITS[units])
+    eye, _, _ = frame(OTHER_WALK, to, rows.UNITS[units])
     found = rows.find_standing(eye)
     assert found is not None and (found.up, found.units) == (up, units) and abs(found.height - 1.62) < 0.02
     upside_down = rows.find_standing(-eye)
@@ -411,7 +408,7 @@ def test_heads_stand(to, up, units):
 
 
 def test_rows_that_tell_nothing():
-    eye = frame(ROW_EVIDENCE_WALK, "z right")[0]
+    eye = frame(OTHER_WALK, "z right")[0]
     assert rows.find_standing(eye + [0, 0, 40]) is None and rows.find_standing(np.full((5, 3), np.nan)) is None
     assert rows.find_standing(np.tile([0.0, 0.0, 1.6], (9, 1))) is None  # nothing moves
     # Somebody who sits at 1.3 m along two axes.
@@ -431,12 +428,12 @@ def test_clocks(rate, tick):
 
 @pytest.mark.parametrize("to", FORWARD)
 def test_heads_look_where_they_walk(to):
-    eye, gaze, head = frame(ROW_EVIDENCE_WALK, to)
+    eye, gaze, head = frame(OTHER_WALK, to)
     turns, up = head.as_matrix(), "z" if to.startswith("z") else "y"
-    name = rows.find_forward(turns, eye, ROW_EVIDENCE_WALK.t, up, 1.0)
+    name = rows.find_forward(turns, eye, OTHER_WALK.t, up, 1.0)
     assert name is not None and np.allclose(rows.poses.AXES[name], FORWARD[to])
-    assert rows.find_forward(turns, eye * 0, ROW_EVIDENCE_WALK.t, up, 1.0) is None
-    assert rows.find_forward(turns[:20], eye[:20], ROW_EVIDENCE_WALK.t[:20], up, 1.0) is None
+    assert rows.find_forward(turns, eye * 0, OTHER_WALK.t, up, 1.0) is None
+    assert rows.find_forward(turns[:20], eye[:20], OTHER_WALK.t[:20], up, 1.0) is None
     assert rows.find_local(head.inv().apply(gaze), turns, name) is True
     assert rows.find_local(gaze, turns, name) is False
     assert rows.find_local(gaze, np.tile(np.eye(3), (len(gaze), 1, 1)), name) is None
@@ -464,7 +461,7 @@ def test_files_and_first_lines(tmp_path):
     assert preset_of_text(tmp_path / "a.csv") is None and preset_of_files(tmp_path / "a.csv") is None
 
 
-# ---- The first rows of a finder ----
+# ---- The first rows of a table ----
 
 NAMES = ["a", "word", "b", "empty", "late"]
 
