@@ -24,7 +24,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation.ablation import frame_timer
 from nerg_mi.evaluation.metrics import Renderer
 from nerg_mi.formats.surfaces import write_volume
-from nerg_mi.photos.cameras import Camera, Intrinsics
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera
 from nerg_mi.ranges import FARTHEST, FLAG, RANGE, Checked, Range, check_number, ranged
 from nerg_mi.rays.readers.registry import shared_options
 from nerg_mi.train import gaze_settings, radiance_settings
@@ -337,7 +337,7 @@ def _timer(folder):
 def _camera_of_photo(folder):
     renderer = Renderer.__new__(Renderer)
     renderer.spp = 1
-    return lambda: renderer(Camera(Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.5), np.eye(4)))
+    return lambda: renderer(PosedCamera(Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.5), np.eye(4)))
 
 
 def _camera_of_scene(folder):

@@ -83,7 +83,7 @@ def radiance_steps() -> Callable[[int], None]:
     from nerg_mi.fields.encoding import HashGridConfig
     from nerg_mi.fields.radiance import RadianceConfig
     from nerg_mi.maths.geometry import Box
-    from nerg_mi.photos.cameras import Camera, Intrinsics
+    from nerg_mi.photos.cameras import Intrinsics, PosedCamera
     from nerg_mi.photos.images import PhotoView
     from nerg_mi.train.radiance_settings import RadianceSettings
     from nerg_mi.train.radiance_trainer import RadianceTrainer
@@ -93,7 +93,7 @@ def radiance_steps() -> Callable[[int], None]:
     for k in range(12):
         center = rng.normal(size=3) * [1, 1, 0.5]
         pose = tiny.ball_pose(2 * center / np.linalg.norm(center))
-        views.append(PhotoView(str(k), Camera(lens, pose), tiny.ball_photo(pose).astype(np.float32)))
+        views.append(PhotoView(str(k), PosedCamera(lens, pose), tiny.ball_photo(pose).astype(np.float32)))
     config = RadianceConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=4, finest=16), width=16, color_hidden=1)
     settings = RadianceSettings(steps=20_000, batch=2**10, resolution=16, march_step=1 / 32)
     trainer = RadianceTrainer(views, Box(*tiny.CORNERS), config, settings, ns)

@@ -14,7 +14,7 @@ from nerg_mi.figures.overlay import srgb, write_png
 from nerg_mi.figures.style import provenance
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.maths.color import mean_score, psnr, psnr_of_fitted_half
-from nerg_mi.photos.cameras import Camera, pixel_directions, sensor_dict
+from nerg_mi.photos.cameras import PosedCamera, pixel_directions, sensor_dict
 from nerg_mi.photos.images import PhotoView, pinhole, through_lens
 
 # ---- Images ----
@@ -108,7 +108,7 @@ class Renderer:
         with mitsuba_says(field):
             self.scene = mi.load_dict({"type": "scene", "integrator": integrator})
 
-    def __call__(self, camera: Camera, seed: int = 0) -> Rendered:
+    def __call__(self, camera: PosedCamera, seed: int = 0) -> Rendered:
         """``camera``'s picture, ``spp`` rays a pixel."""
         import drjit as dr
         import mitsuba as mi

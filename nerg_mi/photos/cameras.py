@@ -236,7 +236,7 @@ _WIDEST = float(np.tan(np.radians(85)))
 
 
 @dataclass(frozen=True)
-class Camera:
+class PosedCamera:
     """A posed camera. ``to_world``: (4, 4) rigid OpenGL camera-to-world."""
 
     intrinsics: Intrinsics
@@ -282,7 +282,7 @@ def view_tangents(intrinsics: Intrinsics) -> tuple[float, float, float, float]:
     return float(left), float(right), float(up), float(down)
 
 
-def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def project(points: np.ndarray, camera: PosedCamera) -> tuple[np.ndarray, np.ndarray]:
     """Pixel coordinates (N, 2) of world ``points`` (N, 3), and a mask (N,) of those that the lens can show."""
     i = camera.intrinsics
     local = (np.asarray(points) - camera.center) @ camera.to_world[:3, :3]
@@ -290,7 +290,7 @@ def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
     return xy * [i.fx, i.fy] + [i.cx, i.cy], shown
 
 
-def sensor_dict(camera: Camera) -> dict:
+def sensor_dict(camera: PosedCamera) -> dict:
     """A Mitsuba ``perspective`` sensor (dict for ``mi.load_dict``) that takes this camera's picture.
 
     Box filter, float32 RGB, one ray through each pixel's footprint. Raises `NergError` for what

@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, box_interval
 
 from . import cameras
-from .cameras import Camera, pixel_directions, project
+from .cameras import PosedCamera, pixel_directions, project
 from .colmap import Up
 from .images import PhotoView, load_usable, read_split, up_of
 from .posed import PosedImages, Unused
@@ -61,7 +61,7 @@ class Extent:
 
 
 def place_extent(
-    cameras: list[Camera], object_only: bool = False, points: np.ndarray | None = None, complete: bool = False
+    cameras: list[PosedCamera], object_only: bool = False, points: np.ndarray | None = None, complete: bool = False
 ) -> Extent:
     """The box around what ``cameras`` looked at, as `scene_box` finds it, and whether the place ends there.
 
@@ -96,7 +96,7 @@ def place_extent(
     return Extent(box, how, "room", why) if complete else _with_cameras(box, cameras, how, why)
 
 
-def _with_cameras(box: Box, cameras: list[Camera], how: str, why: str) -> Extent:
+def _with_cameras(box: Box, cameras: list[PosedCamera], how: str, why: str) -> Extent:
     """A place whose points lie within ``box``, and its ``cameras``: what stands between them and the points may have
     none, and is seen."""
     centers = np.array([c.center for c in cameras])
@@ -109,7 +109,9 @@ def _with_cameras(box: Box, cameras: list[Camera], how: str, why: str) -> Extent
     return Extent(whole, f"{how} and the cameras" if grown else how, "room", why)
 
 
-def scene_box(cameras: list[Camera], object_only: bool = False, points: np.ndarray | None = None) -> tuple[Box, str]:
+def scene_box(
+    cameras: list[PosedCamera], object_only: bool = False, points: np.ndarray | None = None
+) -> tuple[Box, str]:
     """A box in the cameras' coordinates, and a sentence saying how it was found.
 
     ``points`` (N, 3) on surfaces: the box that holds them but for strays, with a margin; cameras that stand around
@@ -166,12 +168,12 @@ def _focus(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return focus, np.arccos(np.clip(np.sum(to * axes, axis=1) / length, -1, 1))
 
 
-def _half_angle_tangent(camera: Camera) -> float:
+def _half_angle_tangent(camera: PosedCamera) -> float:
     i = camera.intrinsics
     return min(i.width / (2 * i.fx), i.height / (2 * i.fy))
 
 
-def unmatched(cameras: list[Camera], box: AnyBox, grid: int = 4, depths: int = 12) -> list[int]:
+def unmatched(cameras: list[PosedCamera], box: AnyBox, grid: int = 4, depths: int = 12) -> list[int]:
     """Cameras that share nothing within ``box`` with any other: no sample point of their pictures is in another's.
 
     ``grid`` by ``grid`` pixels of each are followed through the box and looked for at ``depths`` places.
@@ -188,7 +190,7 @@ def unmatched(cameras: list[Camera], box: AnyBox, grid: int = 4, depths: int = 1
     return out
 
 
-def _samples(camera: Camera, box: AnyBox, grid: int, depths: int) -> np.ndarray:
+def _samples(camera: PosedCamera, box: AnyBox, grid: int, depths: int) -> np.ndarray:
     """Points (N, 3) within the box on rays of the picture."""
     i = camera.intrinsics
     u, v = np.meshgrid((np.arange(grid) + 0.5) / grid * i.width, (np.arange(grid) + 0.5) / grid * i.height)
@@ -201,7 +203,7 @@ def _samples(camera: Camera, box: AnyBox, grid: int, depths: int) -> np.ndarray:
     return (camera.center + t[..., None] * d[hit, None]).reshape(-1, 3)
 
 
-def _sees(camera: Camera, points: np.ndarray) -> bool:
+def _sees(camera: PosedCamera, points: np.ndarray) -> bool:
     if not len(points):
         return False
     at, shown = project(points, camera)
@@ -209,7 +211,7 @@ def _sees(camera: Camera, points: np.ndarray) -> bool:
     return bool(np.any(shown & np.all((at >= 0) & (at <= [i.width, i.height]), axis=1)))
 
 
-def explain_wrong_depth(seen: list[tuple[Camera, np.ndarray]]) -> str | None:
+def explain_wrong_depth(seen: list[tuple[PosedCamera, np.ndarray]]) -> str | None:
     """Why depth is in other units than its camera; None where it may be in the same. ``seen``: cameras, each with its
     depth (h, w), distances along its rays.
 
@@ -233,7 +235,7 @@ def explain_wrong_depth(seen: list[tuple[Camera, np.ndarray]]) -> str | None:
     return None
 
 
-def _agreement(views: list[tuple[Camera, np.ndarray, np.ndarray]], factor: float) -> float:
+def _agreement(views: list[tuple[PosedCamera, np.ndarray, np.ndarray]], factor: float) -> float:
     """Of the points that one of ``views`` sees by its depth times ``factor``, and that are within the picture of
     another, the fraction that lies where this sees something by its own. Of each view: camera, depth (h, w), and
     points (N, 3) that it sees, from its centre."""
@@ -250,7 +252,7 @@ def _agreement(views: list[tuple[Camera, np.ndarray, np.ndarray]], factor: float
     return agreeing / count if count else 0.0
 
 
-def depth_points(camera: Camera, depth: np.ndarray, most: int) -> np.ndarray:
+def depth_points(camera: PosedCamera, depth: np.ndarray, most: int) -> np.ndarray:
     """World points (N, 3) that ``camera`` sees by its ``depth`` (h, w), some ``most`` evenly over its pixels."""
     step = max(1, int(np.sqrt(depth.size / most)))
     t = depth[::step, ::step]

@@ -19,8 +19,8 @@ from nerg_mi.ranges import LENGTHS, check_number
 
 from . import cameras
 from .cameras import (
-    Camera,
     Intrinsics,
+    PosedCamera,
     all_used,
     area_average,
     nearest,
@@ -253,7 +253,7 @@ class PhotoView:
     """
 
     name: str
-    camera: Camera
+    camera: PosedCamera
     pixels: np.ndarray
     depth: np.ndarray | None = None
     mask: np.ndarray | None = None
@@ -353,7 +353,7 @@ def load_view(
     if pixels.dtype == np.float32:
         # 16 bits tell more than the photo and take half the room.
         pixels = np.round(pixels * 65535).astype(np.uint16)
-    return PhotoView(frame.name, Camera(intrinsics, frame.to_world), pixels, distance, mask, left_out)
+    return PhotoView(frame.name, PosedCamera(intrinsics, frame.to_world), pixels, distance, mask, left_out)
 
 
 def _as_floats(pixels: np.ndarray) -> np.ndarray:
@@ -589,11 +589,11 @@ def undistorted(view: PhotoView) -> Undistorted:
     return Undistorted(
         np.where(inside[..., None], _resample(color, at), 0).astype(np.float32),
         inside,
-        sensor_dict(Camera(plain, view.camera.to_world)),
+        sensor_dict(PosedCamera(plain, view.camera.to_world)),
     )
 
 
-def pinhole(camera: Camera, oversample: float = 1.0) -> Camera:
+def pinhole(camera: PosedCamera, oversample: float = 1.0) -> PosedCamera:
     """The smallest pinhole camera at the same place that sees all that ``camera`` does, up to 75 degrees off its axis.
 
     ``oversample``: its pixels to one of ``camera``'s at the centre.
@@ -605,10 +605,10 @@ def pinhole(camera: Camera, oversample: float = 1.0) -> Camera:
     # One pixel more on every side: the outermost centres of the photo lie between pixels here.
     left, top = (int(np.floor(focal * v.min())) - 2 for v in (x, y))
     right, bottom = (int(np.ceil(focal * v.max())) + 2 for v in (x, y))
-    return Camera(Intrinsics(right - left, bottom - top, focal, focal, float(-left), float(-top)), camera.to_world)
+    return PosedCamera(Intrinsics(right - left, bottom - top, focal, focal, float(-left), float(-top)), camera.to_world)
 
 
-def through_lens(picture: np.ndarray, source: Camera, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def through_lens(picture: np.ndarray, source: PosedCamera, camera: PosedCamera) -> tuple[np.ndarray, np.ndarray]:
     """A rendered ``picture`` (h, w, c) of the pinhole ``source`` as ``camera``, at the same place, would have taken it.
 
     Returns it (camera's height, width, c), float32, resampled by cubic splines, and a mask of the pixels that

@@ -13,7 +13,7 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.safe_read import read_npy
 
 from . import cameras
-from .cameras import Camera, Intrinsics, all_used, area_average, nearest, overlap
+from .cameras import Intrinsics, PosedCamera, all_used, area_average, nearest, overlap
 from .colmap import find_source
 from .images import open_bitmap, read_mask, read_photo, read_posed
 from .posed import MaskFile, PosedFrame, inside
@@ -123,7 +123,7 @@ class SalienceView:
     none."""
 
     name: str
-    camera: Camera
+    camera: PosedCamera
     share: np.ndarray
     solid_angle: np.ndarray
 
@@ -146,7 +146,7 @@ class SalienceView:
             return self
         factor = np.sqrt(pixels / (h * w))
         width, height = max(1, int(w * factor)), max(1, int(h * factor))
-        camera = Camera(self.camera.intrinsics.resized(width, height), self.camera.to_world)
+        camera = PosedCamera(self.camera.intrinsics.resized(width, height), self.camera.to_world)
         rows, columns = overlap(h, height) * np.float32(h / height), overlap(w, width) * np.float32(w / width)
         total = lambda v: np.asarray((columns @ (rows @ v).T).T, np.float64)
         share = total(self.share)
@@ -341,7 +341,7 @@ def _view(frame: PosedFrame, path: Path | None, model, per: str) -> SalienceView
             f"{what} is zero wherever the lens and the mask of its frame show anything; "
             "leave it out, or correct the mask"
         )
-    view = SalienceView(frame.name, Camera(intrinsics, frame.to_world), share / share.sum(), solid).reduced(_KEPT)
+    view = SalienceView(frame.name, PosedCamera(intrinsics, frame.to_world), share / share.sum(), solid).reduced(_KEPT)
     return SalienceView(view.name, view.camera, view.share.astype(np.float32), view.solid_angle.astype(np.float32))
 
 

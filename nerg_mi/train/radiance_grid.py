@@ -12,7 +12,7 @@ from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cell_corner, co
 from nerg_mi.maths.arrays import aligned
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f
-from nerg_mi.photos.cameras import Camera, view_tangents
+from nerg_mi.photos.cameras import PosedCamera, view_tangents
 
 # ---- Where density may be while a field trains, and the bound that is stored when it is done ----
 #
@@ -40,7 +40,7 @@ class DensityGrid:
         box: AnyBox,
         resolution: int,
         step: float,
-        cameras: list[Camera],
+        cameras: list[PosedCamera],
         min_views: int,
         threshold: float = 0.01,
         near: float = 0.0,
@@ -82,7 +82,7 @@ class DensityGrid:
         inner = 2 if self.box.contracted else 1
         return self.box.distance_scale(p) * (inner * self.box.side / self.resolution)
 
-    def _seen(self, cameras: list[Camera], min_views: int, near: float):
+    def _seen(self, cameras: list[PosedCamera], min_views: int, near: float):
         """Cells whose centre lies within the box and in at least ``min_views`` pictures.
 
         Occlusion is not considered, and pictures are taken to be 10 % wider than their borders' rays.

@@ -50,13 +50,13 @@ def _groups(mi: Any, scene: Any) -> list[Any]:
     """What instances repeat: no shapes of the scene itself."""
     found = []
 
-    class Collect(mi.TraversalCallback):
+    class GroupCollector(mi.TraversalCallback):
         def put(self, name, value, *rest):
             if isinstance(value, mi.Shape) and value.class_name().startswith("ShapeGroup"):
                 found.append(value)
 
     if any(shape.class_name() == "Instance" for shape in scene.shapes()):
-        scene.traverse(Collect())
+        scene.traverse(GroupCollector())
     return found
 
 

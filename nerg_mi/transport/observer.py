@@ -189,12 +189,12 @@ def _members(sensor: mi.Sensor) -> list[mi.Sensor]:
 
     found = []
 
-    class Collect(mi.TraversalCallback):
+    class SensorCollector(mi.TraversalCallback):
         def put(self, name, value, *rest):
             if isinstance(value, mi.Sensor):
                 found.extend(_members(value))
 
-    sensor.traverse(Collect())
+    sensor.traverse(SensorCollector())
     return found
 
 

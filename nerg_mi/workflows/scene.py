@@ -33,7 +33,7 @@ from nerg_mi.train.geometry import place_of_hits
 
 from .base import SILENT, Reporter, select_backend
 from .scene_cameras import (
-    PersonWalk,
+    ObserverPath,
     Probe,
     best_camera,
     best_photo,
@@ -303,7 +303,7 @@ def _up(given: GivenFiles, align: Similarity, options: SceneOptions) -> np.ndarr
 
 def _observer(
     given: GivenFiles, rays: Rays | None, align: Similarity, ns, options: SceneOptions, reporter: Reporter
-) -> tuple[Eye | None, PersonWalk | None, str]:
+) -> tuple[Eye | None, ObserverPath | None, str]:
     """The observer, the walk of one, and a sentence on them."""
     point = given_point(options.observer, "--observer")
     if point is not None:
@@ -404,7 +404,7 @@ def _about(output: Path, text: SceneText, place: WrittenPlace, scene: _Draft) ->
     )
 
 
-def _frames(walk: PersonWalk, own: bool, taken: frozenset[str]) -> list[dict[str, str]]:
+def _frames(walk: ObserverPath, own: bool, taken: frozenset[str]) -> list[dict[str, str]]:
     names = ["eye", "ahead", *(["camera", "target"] if own else [])]
     rows = []
     for eye in walk.eyes:

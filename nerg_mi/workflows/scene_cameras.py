@@ -193,7 +193,7 @@ _NAMED = 8
 
 
 @dataclass(frozen=True)
-class PersonWalk:
+class ObserverPath:
     """Where somebody was, and looked, at moments of equal distance: ``eyes`` of each frame, at ``times`` (F,) in
     seconds; ``missing``: how many more frames there would be where nothing is known of them."""
 
@@ -218,7 +218,7 @@ def eye_of_person(rays: Rays, person: str, time: float, gap: float, align: Simil
 
 def walk_of_person(
     rays: Rays, person: str, first: float, last: float, fps: float, gap: float, align: Similarity
-) -> PersonWalk:
+) -> ObserverPath:
     """Where ``person`` was from ``first`` to ``last`` (seconds), ``fps`` times a second.
 
     Positions are linear between two rays, directions the mean of theirs, weighted alike. A moment between two rays
@@ -251,7 +251,7 @@ def walk_of_person(
     # Two opposite directions have no mean: that of the nearer ray.
     nearer = np.where(share < 0.5, rays.direction[own[before]], rays.direction[own[after]])[known]
     direction = np.where(length > 1e-3, direction / np.maximum(length, 1e-3), nearer)
-    return PersonWalk(times[known], _eyes(origin, direction, align), int(np.sum(~known)))
+    return ObserverPath(times[known], _eyes(origin, direction, align), int(np.sum(~known)))
 
 
 def support_of_rays(rays: Rays) -> RaySupport:

@@ -6,7 +6,7 @@ import numpy as np
 from nerg_mi.scenes.tabletop.layout import stream
 from nerg_mi.scenes.tabletop.table import CENTRE
 
-from nerg_mi.photos.cameras import Camera, Intrinsics
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera
 
 RINGS = ((1.08, 1.42, 0.14), (1.42, 1.62, 0.06), (1.68, 1.58, 0.16))
 """Of each ring: height of the camera, distance from the object's axis, and how far above the object's middle it aims;
@@ -17,7 +17,7 @@ FIELD_OF_VIEW = 60.0
 _STEP, _AIM, _ROLL = 0.05, 0.05, 2.0
 
 
-def walk(seed: int = 0, count: int = 64, width: int = 320, height: int = 240) -> list[Camera]:
+def walk(seed: int = 0, count: int = 64, width: int = 320, height: int = 240) -> list[PosedCamera]:
     """``count`` cameras in the order in which the photos are taken, ring after ring.
 
     Every `PORTRAIT_EVERY`-th photo is ``height`` pixels wide and ``width`` high. Hands shake: positions and aims
@@ -35,7 +35,7 @@ def walk(seed: int = 0, count: int = 64, width: int = 320, height: int = 240) ->
         aim = CENTRE + (0, 0, above) + rng.normal(0, _AIM, 3)
         w, h = (height, width) if k % PORTRAIT_EVERY == PORTRAIT_EVERY - 1 else (width, height)
         pose = look_at(position, aim, np.radians(rng.normal(0, _ROLL)))
-        out.append(Camera(Intrinsics(w, h, focal, focal, w / 2, h / 2), pose))
+        out.append(PosedCamera(Intrinsics(w, h, focal, focal, w / 2, h / 2), pose))
     return out
 
 

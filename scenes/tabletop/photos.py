@@ -21,7 +21,7 @@ from nerg_mi.files.atomic import replacing
 from nerg_mi.files.images import write_png
 from nerg_mi.files.tables import write_json
 from nerg_mi.maths.color import encode_srgb
-from nerg_mi.photos.cameras import Camera, pixel_directions, sensor_dict
+from nerg_mi.photos.cameras import PosedCamera, pixel_directions, sensor_dict
 
 DEPTH_FILE = "transforms_depth.json"
 """The same photos, with their depth."""
@@ -36,7 +36,7 @@ class Photo(NamedTuple):
     """``pixels`` (h, w, 3) uint8, sRGB; ``depth`` (h, w) float32, metres along the rays, 0 where only sky is seen."""
 
     name: str
-    camera: Camera
+    camera: PosedCamera
     pixels: np.ndarray
     depth: np.ndarray
 
@@ -51,24 +51,24 @@ class Photographer:
         self.guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal,position:position"})
         self.albedo = mi.load_dict({"type": "aov", "aovs": "albedo:albedo"})
 
-    def radiance(self, camera: Camera, seed: int, times: int = 1) -> np.ndarray:
+    def radiance(self, camera: PosedCamera, seed: int, times: int = 1) -> np.ndarray:
         """Linear radiance (h, w, 3); ``times`` as many samples."""
         light = self._render(camera, seed, times * self.spp)
         # Equal seeds and numbers of samples: the same points of the film.
         guides = self._render(camera, seed, times * self.spp, self.guides)
         return denoise(light, guides, self.paint(camera, seed + 1))
 
-    def paint(self, camera: Camera, seed: int, spp: int = SHARP) -> np.ndarray:
+    def paint(self, camera: PosedCamera, seed: int, spp: int = SHARP) -> np.ndarray:
         """Albedo (h, w, 3)."""
         return self._render(camera, seed, spp, self.albedo, "multijitter")
 
-    def depth(self, camera: Camera) -> np.ndarray:
+    def depth(self, camera: PosedCamera) -> np.ndarray:
         """Exact distances (h, w) float32 along the rays through the pixels' centres; 0 where nothing is hit."""
         directions = pixel_directions(camera.intrinsics) @ camera.to_world[:3, :3].T
         t = twin.cast(camera.center, directions.reshape(-1, 3), self.scene)
         return np.where(np.isfinite(t), t, 0).astype(np.float32).reshape(directions.shape[:2])
 
-    def _render(self, camera: Camera, seed: int, spp: int, integrator=None, sampler="independent") -> np.ndarray:
+    def _render(self, camera: PosedCamera, seed: int, spp: int, integrator=None, sampler="independent") -> np.ndarray:
         import drjit as dr
         import mitsuba as mi
 
@@ -83,7 +83,7 @@ class Photographer:
         return np.array(mi.render(self.scene, sensor=sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed)))
 
 
-def take_photos(scene, cameras: list[Camera], spp: int = 24, seed: int = 0, say=print) -> list[Photo]:
+def take_photos(scene, cameras: list[PosedCamera], spp: int = 24, seed: int = 0, say=print) -> list[Photo]:
     """A photo of ``scene`` by each camera; ``say``: where progress goes."""
     photographer, out, start = Photographer(scene, spp), [], time.perf_counter()
     for k, camera in enumerate(cameras):

@@ -15,7 +15,7 @@ import numpy as np
 from nerg_mi.scenes.tabletop.photos import Photo
 
 from nerg_mi.files.atomic import write_text
-from nerg_mi.photos.cameras import Camera, project
+from nerg_mi.photos.cameras import PosedCamera, project
 
 CORNERS = 700
 """Corners of a photo at most, the strongest."""
@@ -78,7 +78,7 @@ def find_points(photos: Sequence[Photo]) -> tuple[list[np.ndarray], list[Point]]
     return found, points
 
 
-def _rays(at: np.ndarray, camera: Camera) -> np.ndarray:
+def _rays(at: np.ndarray, camera: PosedCamera) -> np.ndarray:
     """Unit directions (N, 3) through pixel coordinates (N, 2)."""
     i = camera.intrinsics
     d = np.stack([(at[:, 0] - i.cx) / i.fx, (i.cy - at[:, 1]) / i.fy, -np.ones(len(at))], axis=-1)

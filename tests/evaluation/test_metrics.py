@@ -14,7 +14,7 @@ from nerg_mi.formats.fields import save_radiance
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import latlong_grid
-from nerg_mi.photos.cameras import Camera, Intrinsics
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera
 from nerg_mi.photos.images import PhotoView
 
 # ---- Images ----
@@ -72,7 +72,7 @@ def fog(tmp_path):
 def camera(k1=0.0):
     pose = np.eye(4)
     pose[2, 3] = 3.0
-    return Camera(Intrinsics(16, 12, 40.0, 40.0, 8.0, 6.0, k1), pose)
+    return PosedCamera(Intrinsics(16, 12, 40.0, 40.0, 8.0, 6.0, k1), pose)
 
 
 def test_ctrl_c_ends_a_picture_between_two_parts(fog, monkeypatch):

@@ -7,8 +7,8 @@ import pytest
 
 from nerg_mi.photos import cameras
 from nerg_mi.photos.cameras import (
-    Camera,
     Intrinsics,
+    PosedCamera,
     all_used,
     area_average,
     nearest,
@@ -37,7 +37,7 @@ def pose(rng):
 
 
 def test_pixel_rays_project_back_to_their_pixels():
-    camera = Camera(FOX, pose(np.random.default_rng(1)))
+    camera = PosedCamera(FOX, pose(np.random.default_rng(1)))
     d = pixel_directions(FOX) @ camera.to_world[:3, :3].T
     points = camera.center + d.reshape(-1, 3) * np.random.default_rng(2).uniform(0.5, 5, (d.size // 3, 1))
     pixel, front = project(points, camera)
@@ -62,13 +62,13 @@ def test_view_tangents_hold_every_pixel(fisheye):
 
 
 def test_points_behind_a_camera_are_not_in_front():
-    camera = Camera(FOX, np.eye(4))
+    camera = PosedCamera(FOX, np.eye(4))
     assert not project(np.array([[0.0, 0.0, 1.0]]), camera)[1][0]
     assert project(np.array([[0.0, 0.0, -1.0]]), camera)[1][0]
 
 
 def test_a_fisheye_shows_points_behind_its_plane():
-    camera = Camera(Intrinsics(64, 64, 16.0, 16.0, 32.0, 32.0, fisheye=True), np.eye(4))
+    camera = PosedCamera(Intrinsics(64, 64, 16.0, 16.0, 32.0, 32.0, fisheye=True), np.eye(4))
     pixel, shown = project(np.array([[1.0, 0.0, 0.1]]), camera)
     assert shown[0] and np.allclose(pixel, [[32 + 16 * np.arctan2(1, -0.1), 32]])
 
@@ -76,7 +76,7 @@ def test_a_fisheye_shows_points_behind_its_plane():
 def test_mitsuba_sensor_sends_the_same_rays(rgb):
     """Principal point off the centre, no square picture."""
     i = Intrinsics(32, 20, 25.0, 25.0, 14.0, 11.5)
-    camera = Camera(i, pose(np.random.default_rng(3)))
+    camera = PosedCamera(i, pose(np.random.default_rng(3)))
     sensor = rgb.load_dict(sensor_dict(camera))
     x, y = np.meshgrid((np.arange(32) + 0.5) / 32, (np.arange(20) + 0.5) / 20)
     ray, _ = sensor.sample_ray(0.0, 0.5, rgb.Point2f(x.ravel(), y.ravel()), rgb.Point2f(0.5, 0.5))
@@ -86,11 +86,11 @@ def test_mitsuba_sensor_sends_the_same_rays(rgb):
 
 def test_sensor_refuses_what_it_cannot_express():
     with pytest.raises(ValueError, match="distortion"):
-        sensor_dict(Camera(FOX, np.eye(4)))
+        sensor_dict(PosedCamera(FOX, np.eye(4)))
     with pytest.raises(ValueError, match="fisheye"):
-        sensor_dict(Camera(Intrinsics(8, 8, 10.0, 10.0, 4.0, 4.0, fisheye=True), np.eye(4)))
+        sensor_dict(PosedCamera(Intrinsics(8, 8, 10.0, 10.0, 4.0, 4.0, fisheye=True), np.eye(4)))
     with pytest.raises(ValueError, match="square pixels"):
-        sensor_dict(Camera(Intrinsics(8, 8, 10.0, 11.0, 4.0, 4.0), np.eye(4)))
+        sensor_dict(PosedCamera(Intrinsics(8, 8, 10.0, 11.0, 4.0, 4.0), np.eye(4)))
 
 
 # ---- A lens on images of other sizes ----

@@ -8,7 +8,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.geometry import Box
-from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.dataset import explain_wrong_depth, open_dataset, place_extent, scene_box, unmatched
 from tests.photos.written_sets import (
     COUNT,
@@ -43,7 +43,7 @@ def looking(center, at):
     x /= np.linalg.norm(x)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), center
-    return Camera(LENS, pose)
+    return PosedCamera(LENS, pose)
 
 
 def directions(count, seed=4):
@@ -347,7 +347,7 @@ def seen_by_depth():
         x = np.cross(z, [0, 0, 1.0])
         x /= np.linalg.norm(x)
         pose = np.column_stack([np.stack([x, np.cross(z, x), z], axis=1), [2 + np.cos(a), 1.5 + 0.7 * np.sin(a), 1.2]])
-        camera = Camera(Intrinsics(24, 18, 15.0, 15.0, 12.0, 9.0), opengl(pose))
+        camera = PosedCamera(Intrinsics(24, 18, 15.0, 15.0, 12.0, 9.0), opengl(pose))
         d = pixel_directions(camera.intrinsics) @ camera.to_world[:3, :3].T
         with np.errstate(divide="ignore"):
             walls = np.maximum((0 - camera.center) / d, ([4, 3, 2.5] - camera.center) / d)

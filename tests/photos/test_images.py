@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.images import write_bitmap_exr, write_exr
-from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.images import (
     PhotoView,
@@ -510,7 +510,7 @@ def picture_undistort(intrinsics):
 def test_an_undistorted_photo_shows_what_its_sensor_renders(name, rgb):
     """The directions are those of the sensor's own rays, not of this module's idea of them."""
     i = LENSES[name]
-    image, mask, sensor = undistorted(PhotoView("a", Camera(i, POSE), picture_undistort(i)))
+    image, mask, sensor = undistorted(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i)))
     rays = rgb.load_dict(sensor)
     x, y = np.meshgrid((np.arange(90) + 0.5) / 90, (np.arange(70) + 0.5) / 70)
     ray, _ = rays.sample_ray(0.0, 0.5, rgb.Point2f(x.ravel(), y.ravel()), rgb.Point2f(0.5, 0.5))
@@ -522,14 +522,14 @@ def test_an_undistorted_photo_shows_what_its_sensor_renders(name, rgb):
 
 def test_an_undistorted_photo_of_a_plain_lens_is_the_photo():
     photo = picture_undistort(PLAIN)
-    image, mask, sensor = undistorted(PhotoView("a", Camera(PLAIN, POSE), photo))
+    image, mask, sensor = undistorted(PhotoView("a", PosedCamera(PLAIN, POSE), photo))
     assert np.array_equal(image, photo) and mask.all() and sensor["film"]["width"] == 90
 
 
 def test_what_the_photo_does_not_show_is_masked():
     """A pincushion photo holds less than the pinhole picture of its size; the mask says so pixel by pixel."""
     i = replace(PLAIN, k1=0.3)
-    _, mask, _ = undistorted(PhotoView("a", Camera(i, POSE), picture_undistort(i)))
+    _, mask, _ = undistorted(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i)))
     d = pixel_directions(PLAIN)
     x, y = d[..., 0] / -d[..., 2], d[..., 1] / d[..., 2]
     grow = 1 + 0.3 * (x * x + y * y)
@@ -542,19 +542,17 @@ def test_transparent_pixels_lend_no_colour():
     i = LENSES["barrel"]
     color = np.concatenate([picture_undistort(i), np.ones((70, 90, 1), np.float32)], axis=2)
     color[:, 45:] = [1, 0, 1, 0]
-    image, mask, _ = undistorted(PhotoView("a", Camera(i, POSE), color))
+    image, mask, _ = undistorted(PhotoView("a", PosedCamera(i, POSE), color))
     clear = mask & (image[..., 3] > 0.5)
-    assert (
-        np.abs(image[..., :3] - undistorted(PhotoView("a", Camera(i, POSE), picture_undistort(i))).image)[clear].max()
-        < 0.15
-    )
+    plain = undistorted(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i))).image
+    assert np.abs(image[..., :3] - plain)[clear].max() < 0.15
     assert np.all(image[..., 3][:, 50:] < 0.3)
 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_a_rendering_bent_to_the_lens_equals_the_photo(name):
     i = LENSES[name]
-    camera = Camera(i, POSE)
+    camera = PosedCamera(i, POSE)
     source = pinhole(camera, oversample=2.0)
     bent, mask = through_lens(picture_undistort(source.intrinsics), source, camera)
     assert mask.all() and bent.shape == (70, 90, 3)
@@ -563,7 +561,7 @@ def test_a_rendering_bent_to_the_lens_equals_the_photo(name):
 
 def test_a_wide_fisheye_is_covered_as_far_as_a_pinhole_reaches():
     i = Intrinsics(80, 80, 26.0, 26.0, 40.0, 40.0, fisheye=True)
-    camera = Camera(i, POSE)
+    camera = PosedCamera(i, POSE)
     source = pinhole(camera)
     bent, mask = through_lens(picture_undistort(source.intrinsics), source, camera)
     angle = np.degrees(np.arccos(-pixel_directions(i)[..., 2]))
@@ -572,9 +570,9 @@ def test_a_wide_fisheye_is_covered_as_far_as_a_pinhole_reaches():
 
 
 def test_errors_of_through_lens():
-    camera = Camera(LENSES["barrel"], POSE)
+    camera = PosedCamera(LENSES["barrel"], POSE)
     source = pinhole(camera)
     with pytest.raises(ValueError, match="pixels"):
         through_lens(np.zeros((3, 3, 3)), source, camera)
     with pytest.raises(ValueError, match="same place"):
-        through_lens(picture_undistort(source.intrinsics), source, Camera(LENSES["barrel"], np.eye(4)))
+        through_lens(picture_undistort(source.intrinsics), source, PosedCamera(LENSES["barrel"], np.eye(4)))

@@ -7,7 +7,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions, pixel_grid
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions, pixel_grid
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.train.radiance_data import LensTable, PixelBank
 
@@ -56,7 +56,7 @@ def view(lens, rng, dtype=np.uint8, channels=3, depth=False, mask=False):
         else pixels / np.float32(255)
     )
     distance = rng.uniform(0.5, 9, shape).astype(np.float32) * (rng.random(shape) > 0.2) if depth else None
-    return PhotoView("v", Camera(lens, pose), pixels, distance, rng.random(shape) > 0.3 if mask else None)
+    return PhotoView("v", PosedCamera(lens, pose), pixels, distance, rng.random(shape) > 0.3 if mask else None)
 
 
 def expected(views):

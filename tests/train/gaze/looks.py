@@ -9,7 +9,7 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig
 from nerg_mi.fields.gaze_product import GazeConfig
 from nerg_mi.maths.geometry import Box
-from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.salience import SalienceView, pixel_solid_angles
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
@@ -89,7 +89,7 @@ def pose(centre, towards):
 
 def view(density, centre, towards, lens=LENS, name="a"):
     """What an observer with ``density(p, d)`` sees of it through a lens."""
-    camera = Camera(lens, pose(centre, towards))
+    camera = PosedCamera(lens, pose(centre, towards))
     directions = pixel_directions(lens) @ camera.to_world[:3, :3].T
     solid = pixel_solid_angles(lens)
     share = density(camera.center, directions.reshape(-1, 3)).reshape(solid.shape) * solid

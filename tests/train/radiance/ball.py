@@ -8,7 +8,7 @@ import numpy as np
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.radiance import RadianceConfig
 from nerg_mi.maths.geometry import Box
-from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.dataset import Dataset
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.train.radiance_settings import RadianceSettings
@@ -34,7 +34,7 @@ def ball(pose, depth=True):
     color = np.concatenate([np.where(hit[:, None], rgb, 0), hit[:, None]], axis=1)
     return PhotoView(
         "ball",
-        Camera(LENS, pose),
+        PosedCamera(LENS, pose),
         color.reshape(24, 24, 4).astype(np.float32),
         t.reshape(24, 24).astype(np.float32) if depth else None,
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.maths.geometry import Box, ContractedBox
-from nerg_mi.photos.cameras import Camera, Intrinsics
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera
 from nerg_mi.train.radiance_grid import DensityGrid, Settling
 
 # ---- Density grid ----
@@ -21,7 +21,7 @@ def camera_at(x, y, z):
     """It looks along -z of the world and sees 45 degrees (and a tenth) to each side."""
     pose = np.eye(4)
     pose[:3, 3] = x, y, z
-    return Camera(Intrinsics(20, 20, 10.0, 10.0, 10.0, 10.0), pose)
+    return PosedCamera(Intrinsics(20, 20, 10.0, 10.0, 10.0, 10.0), pose)
 
 
 def above():

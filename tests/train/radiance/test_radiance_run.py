@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import load_radiance, save_radiance
 from nerg_mi.maths.color import psnr, psnr_of_fitted_half
 from nerg_mi.maths.geometry import Box, ContractedBox
-from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.train import radiance_run
 from nerg_mi.train.radiance_run import complaints, measure, share_beyond, train_field, warm_up, write_preview
@@ -33,7 +33,7 @@ def made(x, opacity=1.0):
     pose = np.eye(4)
     pose[0, 3] = x
     depth = 4 / -pixel_directions(WIDE)[..., 2]
-    view = PhotoView("plane", Camera(WIDE, pose), np.zeros((20, 40, 3), np.float32))
+    view = PhotoView("plane", PosedCamera(WIDE, pose), np.zeros((20, 40, 3), np.float32))
     return view, Preview(np.zeros((20, 40, 3)), np.full((20, 40), opacity), depth)
 
 

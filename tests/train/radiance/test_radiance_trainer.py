@@ -10,7 +10,7 @@ import pytest
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box, ContractedBox
-from nerg_mi.photos.cameras import Camera, Intrinsics, pixel_directions
+from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.train import radiance_trainer
 from nerg_mi.train.radiance_data import PixelBank
@@ -53,7 +53,7 @@ class Lump:
 def view():
     pose = np.eye(4)
     pose[:3, 3] = 0.1, -0.2, 2.5
-    return PhotoView("v", Camera(LENS, pose), np.zeros((9, 13, 3), np.uint8))
+    return PhotoView("v", PosedCamera(LENS, pose), np.zeros((9, 13, 3), np.uint8))
 
 
 def expected():
