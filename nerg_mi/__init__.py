@@ -32,15 +32,22 @@ if TYPE_CHECKING:
     from .api.workflows import (
         ablate,
         align,
+        bake,
         evaluate_gaze,
         evaluate_radiance,
         import_rays,
+        stats,
         study,
         train_gaze,
+        train_prior,
         train_radiance,
     )
     from .errors import NergError
     from .rays.rays import Rays
+    from .rays.readers.registry import register_reader
+    from .train.gaze_recipes import register_recipe
+    from .transport.quadrature import register_quadrature
+    from .workflows.draw import draw
 
 __version__ = "0.1.0"
 
@@ -52,6 +59,8 @@ _WHERE = {
     "ablate": "nerg_mi.api.workflows",
     "align": "nerg_mi.api.workflows",
     "attention": "nerg_mi.api.query",
+    "bake": "nerg_mi.api.workflows",
+    "draw": "nerg_mi.workflows.draw",
     "evaluate_gaze": "nerg_mi.api.workflows",
     "evaluate_radiance": "nerg_mi.api.workflows",
     "import_rays": "nerg_mi.api.workflows",
@@ -60,10 +69,15 @@ _WHERE = {
     "load_rays": "nerg_mi.api.scene",
     "make_scene": "nerg_mi.api.scene",
     "observe": "nerg_mi.api.query",
+    "register_quadrature": "nerg_mi.transport.quadrature",
+    "register_reader": "nerg_mi.rays.readers.registry",
+    "register_recipe": "nerg_mi.train.gaze_recipes",
     "render": "nerg_mi.api.render",
+    "stats": "nerg_mi.api.workflows",
     "study": "nerg_mi.api.workflows",
     "trace": "nerg_mi.api.query",
     "train_gaze": "nerg_mi.api.workflows",
+    "train_prior": "nerg_mi.api.workflows",
     "train_radiance": "nerg_mi.api.workflows",
 }
 """The public names, and the module of each."""
@@ -76,6 +90,8 @@ __all__ = [
     "ablate",
     "align",
     "attention",
+    "bake",
+    "draw",
     "evaluate_gaze",
     "evaluate_radiance",
     "import_rays",
@@ -84,10 +100,15 @@ __all__ = [
     "load_rays",
     "make_scene",
     "observe",
+    "register_quadrature",
+    "register_reader",
+    "register_recipe",
     "render",
+    "stats",
     "study",
     "trace",
     "train_gaze",
+    "train_prior",
     "train_radiance",
 ]
 

@@ -373,7 +373,7 @@ def test16_pictures(tmp_path, rgb, monkeypatch):
     names = {"nerg": nerg, "scene": nerg.Scene.load(str(path))}
     for block in blocks("py", page="pictures.md"):
         if "from PIL" in block.text:
-            names["draw"]("floor", "rays.npz", "gaze.png")
+            nerg.draw("floor", "rays.npz", "gaze.png")
         smaller = block.text.replace("scenes/store/scene.xml", "scene.xml").replace("width=480", "width=64, spp=1")
         run(smaller, block.page, names)
     assert {"floor.svg", "gaze.svg"} <= set(os.listdir("."))

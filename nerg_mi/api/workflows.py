@@ -12,7 +12,7 @@ from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.base import SILENT, Reporter
-from nerg_mi.workflows.gaze_commands import AblationOptions, GazeEvaluationOptions, GazeOptions
+from nerg_mi.workflows.gaze_commands import AblationOptions, GazeEvaluationOptions, GazeOptions, PriorOptions
 from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOptions
 from nerg_mi.workflows.rays_commands import AlignOptions, RaysImportOptions
 from nerg_mi.workflows.scene_commands import BakeOptions, StudyOptions
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from nerg_mi.fields.radiance import RadianceField
     from nerg_mi.workflows.ablation import AblationResult
     from nerg_mi.workflows.bake import Bake
+    from nerg_mi.workflows.bake_splats import SplatBake
     from nerg_mi.workflows.evaluate import GazeEvaluation
     from nerg_mi.workflows.study import StudyResult
 
@@ -75,18 +76,19 @@ def bake(
     options: BakeOptions | None = None,
     reporter: Reporter = SILENT,
     **changes: Any,
-) -> Bake:
-    """How much gaze each square metre of ``surface`` receives: a mesh file, a scene file, or a radiance field's.
+) -> Bake | SplatBake:
+    """How much gaze each square metre of ``surface`` receives: a mesh file, a scene file, a radiance field's surface,
+    or a file of Gaussian splats.
 
     ``rays``: what `load_rays` gave, or a file of them; the people whose places a gaze field is asked for, or whose gaze
     it is. ``outputs``: files to write (.ply, .glb, .csv, .json). ``changes``: options one by one
     (``gaze="gaze.safetensors"``, ``observer=(4.4, 2.8, 1.6)``, ``smooth=0.05``, ...) on top of ``options``;
     `nerg_mi.workflows.scene_commands.BakeOptions` says what there is. Raises `NergError`.
 
+    >>> import nerg_mi as nerg
     >>> from importlib.resources import files
-    >>> from nerg_mi.api.workflows import bake
     >>> store = files("nerg_mi.scenes.store")
-    >>> baked = bake(store / "twin.ply", gaze=store / "shoppers.safetensors", observer=(4.4, 2.8, 1.6), detail=1.0)
+    >>> baked = nerg.bake(store / "twin.ply", gaze=store / "shoppers.safetensors", observer=(4.4, 2.8, 1.6), detail=1.0)
     >>> 0.9 < baked.on_surface < 1, abs(baked.unaccounted) < 0.01
     (True, True)
     """
@@ -98,7 +100,7 @@ def bake(
         changes = {**changes, "rays": rays}
     job = options_of(BakeOptions, "bake", options, changes)
     files = [outputs] if isinstance(outputs, (str, Path)) or not isinstance(outputs, Sequence) else list(outputs)
-    return baking.bake(file_of(surface, "surface"), [Path(str(f)) for f in files], job, reporter, in_memory)
+    return baking.bake_any(file_of(surface, "surface"), [Path(str(f)) for f in files], job, reporter, in_memory)
 
 
 # ---- Scores of fields, and what settings cost ----
@@ -237,11 +239,10 @@ def stats(
     `nerg_mi.aoi.output.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
 
     >>> import json, nerg_mi as nerg
-    >>> from nerg_mi.api.workflows import stats
     >>> _ = (folder / "areas.json").write_text(json.dumps({"shelf": [[2, -1, 0], [3, 1, 2]]}))
     >>> eye, ahead = [[0.0, 0.0, 1.6]] * 3, [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     >>> rays = nerg.Rays([0.0, 0.2, 0.4], [0, 0, 0], ("Ada",), origin=eye, direction=ahead, confidence=[1.0] * 3)
-    >>> row = stats(rays, folder / "areas.json").things[0]
+    >>> row = nerg.stats(rays, folder / "areas.json").things[0]
     >>> row["thing"], round(row["share"], 3), row["reach"], row["distance"]
     ('shelf', 0.667, 1.0, 2.0)
     """
@@ -366,6 +367,34 @@ def train_gaze(
 
     job = options_of(GazeOptions, "train_gaze", options, changes)
     result = gaze.train_gaze(None if rays is None else rays_of(rays), output, job, reporter)
+    return _trained(result.field, result.provenance, output)
+
+
+def train_prior(
+    rays: Rays | FilePath | Sequence[Rays | FilePath],
+    output: FilePath | None = None,
+    *,
+    options: PriorOptions | None = None,
+    reporter: Reporter = SILENT,
+    **changes: Any,
+) -> TrainedField[AnyGazeField]:
+    """Make a gaze field for a place where nobody was tracked, of how high people look in others.
+
+    ``rays``: those of each other place, in memory or their files; places count alike. ``output``: checkpoint to write
+    besides (.safetensors). ``changes``: options one by one (``seed=1``, ...) on top of ``options``;
+    `nerg_mi.workflows.gaze_commands.PriorOptions` says what there is. Raises `NergError`.
+
+    >>> import nerg_mi as nerg
+    >>> prior = nerg.train_prior(rays)  # or a list of them, one a place
+    >>> prior.kind, len(prior.provenance["places"])
+    ('gaze', 1)
+    """
+    from nerg_mi.workflows import train_gaze as gaze
+
+    job = options_of(PriorOptions, "train_prior", options, changes)
+    several = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
+    places = [place if isinstance(place, Rays) else file_of(place, "rays") for place in several]
+    result = gaze.learn_prior(places, output, job, reporter)
     return _trained(result.field, result.provenance, output)
 
 

@@ -22,7 +22,7 @@ from nerg_mi.probes.probes import person_weights
 from nerg_mi.rays.rays import Rays
 
 from .gaze_data import Batch, GazeTargets, heads_box
-from .gaze_recipes import DEFAULT, FieldChoices, Recipe, register
+from .gaze_recipes import DEFAULT, FieldChoices, Recipe, register_recipe
 from .gaze_trainer import GazeTrainer
 from .radiance_losses import stack
 
@@ -216,7 +216,7 @@ def surroundings(place: str) -> dict[str, Any]:
     }
 
 
-register(
+register_recipe(
     Recipe(
         name=DEFAULT,
         summary="a log density, normalised over the sphere, trained by the likelihood of rays; generalises best",

@@ -20,7 +20,7 @@ from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
 
 from .gaze_data import Batch
-from .gaze_recipes import DEFAULT, FieldChoices, Recipe, register
+from .gaze_recipes import DEFAULT, FieldChoices, Recipe, register_recipe
 from .gaze_settings import LOSSES
 from .gaze_trainer import GazeTrainer, gaze_loss
 from .radiance_losses import stack, unstack
@@ -217,7 +217,7 @@ def _product(size: str, activation: str) -> Callable[[FieldChoices], GazeConfig]
 
 _OF_PRODUCTS = frozenset({"activation", "size", "normalized", "semantic", "begin", "loss", "integral"})
 
-register(
+register_recipe(
     Recipe(
         name="small",
         summary="emit times capture on a small grid, on the paper's losses and the integral over the sphere",
@@ -229,7 +229,7 @@ register(
         takes=_OF_PRODUCTS,
     )
 )
-register(
+register_recipe(
     Recipe(
         name="paper",
         summary="the paper's networks, losses and probes, as many steps as 50 epochs have",

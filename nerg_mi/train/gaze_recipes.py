@@ -130,8 +130,18 @@ def default_variants(place: str) -> tuple[str, ...]:
 RECIPES: dict[str, Recipe] = {}  # Recipes that are registered so far; see `recipes`
 
 
-def register(recipe: Recipe) -> Recipe:
-    """Make ``recipe`` one that can be chosen by its name. Raises ``ValueError`` for a name that is taken."""
+def register_recipe(recipe: Recipe) -> Recipe:
+    """Make ``recipe`` one that can be chosen by its name. Raises ``ValueError`` for a name that is taken.
+
+    >>> import nerg_mi as nerg
+    >>> from dataclasses import replace
+    >>> from nerg_mi.train.gaze_recipes import RECIPES, gaze_recipe
+    >>> usual = gaze_recipe("default")
+    >>> longer = replace(usual, name="longer", settings={**usual.settings, "steps": 5000})
+    >>> nerg.register_recipe(longer).name  # for train_gaze(..., recipe="longer"), and for nerg ablate
+    'longer'
+    >>> del RECIPES["longer"]
+    """
     if recipe.name in RECIPES:
         raise ValueError(f'there is a recipe "{recipe.name}" already')
     RECIPES[recipe.name] = recipe

@@ -225,7 +225,7 @@ class Registry(Generic[Kind]):
 #
 # A rule is one object of the protocol ``Rule``, registered in ``RULES``: the integrator's parameter ``quadrature``, its
 # manual and the study offer whatever stands there. Another rule is a class like those below and one line
-# ``RULES.register(...)``, here or in any module that is imported.
+# ``register_quadrature(...)``, here or in any module that is imported.
 
 
 # Where the two Gauss-Legendre samples of an interval lie, from its middle and as a share of its length.
@@ -296,6 +296,21 @@ class Rule(Protocol):
 
 
 RULES: Registry[Rule] = Registry("quadrature")
+
+
+def register_quadrature(rule: Rule) -> Rule:
+    """Make ``rule`` one that the integrator's parameter ``quadrature`` can name. Raises ``ValueError`` for a name that
+    is taken.
+
+    >>> import nerg_mi as nerg
+    >>> from nerg_mi.transport.quadrature import RULES
+    >>> class OurRule(type(RULES.find("constant"))):
+    ...     name = "ours"
+    >>> nerg.register_quadrature(OurRule()).name
+    'ours'
+    >>> RULES.unregister("ours")
+    """
+    return RULES.register(rule)
 
 
 def boundaries(rule: Rule, medium: Medium) -> VoxelCells | None:
@@ -433,4 +448,4 @@ class Cells:
 
 
 for _rule in (Constant(), Linear(), Cells()):
-    RULES.register(_rule)
+    register_quadrature(_rule)

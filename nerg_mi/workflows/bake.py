@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -46,6 +46,9 @@ from .base import SILENT, Reporter, select_backend
 from .scene_commands import BakeOptions
 
 # ---- Files of a bake: meshes with colours (.ply, .glb), a table of faces (.csv), and a summary (.json) ----
+
+if TYPE_CHECKING:
+    from .bake_splats import SplatBake
 
 
 SUFFIXES = (".ply", ".glb", ".csv", ".json")
@@ -266,11 +269,13 @@ def bake(
     return Bake(mesh, density, share, on, elsewhere, escaped, total, summary, tuple(paths))
 
 
-def bake_any(surface: Path, output: list[Path], options: BakeOptions, reporter: Reporter) -> None:
+def bake_any(
+    surface: Path, output: Sequence[Path], options: BakeOptions, reporter: Reporter, rays: Rays | None = None
+) -> Bake | SplatBake:
     """`bake` on a mesh, and `bake_splats.bake_splats` on Gaussian splats."""
     from .bake_splats import bake_splats
 
-    (bake_splats if is_splats(surface) else bake)(surface, output, options, reporter)
+    return (bake_splats if is_splats(surface) else bake)(surface, output, options, reporter, rays)
 
 
 def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:

@@ -8,7 +8,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,6 +39,9 @@ from .base import SILENT, Reporter, imported
 from .draw_scenes import Drawing
 from .scene_cameras import given_point
 from .scene_commands import KINDS, BakedFigureOptions, DifferenceOptions, Kind, SheetOptions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # ---- Pictures in files: colour, and quantities that were rendered with it ----
 
@@ -306,13 +309,25 @@ def draw(
     output: FileName | None = None,
     reporter: Reporter = SILENT,
     **options: Any,
-) -> Any:
-    """The figure of matplotlib that the command ``nerg draw KIND FILES`` draws, with its options as keywords.
+) -> Figure:
+    """The figure of matplotlib that the command ``nerg draw KIND FILES`` draws, with its options as keywords, in the
+    Mitsuba variant that is set.
 
-    ``output``: where it is written, too (.png or .svg). Raises `NergError` for what the user can mend.
+    ``output``: where it is written, too (.png or .svg). Raises `NergError` for another kind or option, and for files
+    that it cannot be drawn of.
+
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> figure = nerg.draw("sphere", files("nerg_mi.scenes.store") / "scene.xml", width=64, spp=1)
+    >>> len(figure.axes) > 0  # a figure of matplotlib, which a notebook shows by itself
+    True
     """
+    import mitsuba as mi
+
     chosen = find_kind(kind)
     types = {f.name: str(f.type) for f in fields(chosen.options)}
+    if "mode" in types and mi.variant() is not None:
+        options.setdefault("mode", mi.variant())
     unknown = next((name for name in options if name not in types), None)
     if unknown is not None:
         raise NergError(f'a figure "{kind}" has no option "{unknown}"; it has {", ".join(types)}')

@@ -29,6 +29,7 @@ from nerg_mi.transport.quadrature import (
     linear_crossing,
     linear_share,
     mean_depth_share,
+    register_quadrature,
 )
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.plugins.scenes import camera, channels, constant, named, render
@@ -533,7 +534,7 @@ class Simpson:
 
 @pytest.fixture
 def simpson():
-    rule = RULES.register(Simpson())
+    rule = register_quadrature(Simpson())
     yield rule
     RULES.unregister("simpson")
 

@@ -18,7 +18,7 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.train import gaze_recipes
 from nerg_mi.train.gaze_data import surface_distances
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer, surroundings
-from nerg_mi.train.gaze_recipes import Recipe, register
+from nerg_mi.train.gaze_recipes import Recipe, register_recipe
 from nerg_mi.train.geometry import GazePlace, place_of_scene
 from nerg_mi.workflows.gaze_commands import GazeOptions
 from nerg_mi.workflows.train_gaze import check_plan, plan_gaze, train_gaze
@@ -153,7 +153,7 @@ def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, mo
 
     monkeypatch.setattr(gaze_recipes, "RECIPES", dict(gaze_recipes.RECIPES))
     grid = HashGridConfig(levels=2, log2_rows=8, base=2, finest=4)
-    register(
+    register_recipe(
         Recipe(
             name="coarse",
             summary="a log density on two levels",

@@ -24,11 +24,21 @@ _READERS: dict[str, Reader[Any]] = {}
 _FORMER_NAMES = {"skeleton22": skeleton.SkeletonFile.name}
 
 
-def register(reader: Reader[Any]) -> None:
-    """Make a reader known by its name, to the library and to the command line.
+def register_reader(reader: Reader[Any]) -> None:
+    """Make ``reader`` known by its name, to `import_rays` and to the command line.
 
     Raises ``ValueError`` for a name that is taken or is no word, or for an option whose flag stands for another field
     or type with another reader: on the command line it is one option for all.
+
+    >>> import nerg_mi as nerg
+    >>> from nerg_mi.rays.readers.hololens import Arett
+    >>> from nerg_mi.rays.readers.registry import reader_names, unregister
+    >>> class OfOurLab(Arett):
+    ...     name = "our_lab"
+    >>> nerg.register_reader(OfOurLab())
+    >>> "our_lab" in reader_names()
+    True
+    >>> unregister("our_lab")
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", reader.name) or reader.name in _READERS:
         raise ValueError(f'a reader cannot be called "{reader.name}": the name is taken, or no word in lower case')
@@ -180,4 +190,4 @@ def preset_table() -> str:
 for _name in sorted(module.name for module in pkgutil.iter_modules([os.path.dirname(__file__)])):
     if f"{__package__}.{_name}" != __name__:
         for _reader in getattr(importlib.import_module(f"{__package__}.{_name}"), "READERS", ()):
-            register(_reader)
+            register_reader(_reader)

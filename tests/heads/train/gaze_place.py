@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 from nerg_mi.fields.gaze_place import PlaceConfig, PlaceField
 
-from .gaze_recipes import Recipe, register
+from .gaze_recipes import Recipe, register_recipe
 from .gaze_trainer import GazeTrainer, gaze_loss
 
 
@@ -30,7 +30,7 @@ class PlaceTrainer(GazeTrainer):
         return kld
 
 
-register(
+register_recipe(
     Recipe(
         name="place",
         summary="what a place attracts, times how often a direction is looked in",

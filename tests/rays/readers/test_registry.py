@@ -76,7 +76,7 @@ def write_recording(folder: Path) -> tuple[Path, Path]:
 
 @pytest.fixture
 def made_up():
-    registry.register(MadeUp())
+    registry.register_reader(MadeUp())
     yield
     registry.unregister("made_up")
 
@@ -120,7 +120,7 @@ def test_what_cannot_be_registered(made_up):
         reader = MadeUp()
         reader.name, reader.Options = name, options
         with pytest.raises(ValueError, match=message):
-            registry.register(reader)
+            registry.register_reader(reader)
     assert "other" not in registry.reader_names()
     with pytest.raises(KeyError):
         registry.unregister("other")

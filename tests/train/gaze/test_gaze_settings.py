@@ -15,7 +15,7 @@ from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import latlong_grid
 from nerg_mi.train.gaze_product import sized_gaze_config
-from nerg_mi.train.gaze_recipes import DEFAULT, FieldChoices, gaze_recipe, recipes, register
+from nerg_mi.train.gaze_recipes import DEFAULT, FieldChoices, gaze_recipe, recipes, register_recipe
 from nerg_mi.train.gaze_settings import CODE, LOSSES, PAPER, GazeSettings
 from nerg_mi.train.gaze_trainer import KLD_EPS, gaze_loss
 from nerg_mi.train.geometry import GazePlace
@@ -163,7 +163,7 @@ def test_there_are_three():
     with pytest.raises(NergError, match='one of default, small, paper.*, got "best"'):
         gaze_recipe("best")
     with pytest.raises(ValueError, match="already"):
-        register(gaze_recipe())
+        register_recipe(gaze_recipe())
 
 
 @pytest.mark.parametrize("name", recipes())
