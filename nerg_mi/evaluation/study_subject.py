@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.safe_read import real_path
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.depth import DEPTHS
@@ -275,7 +276,7 @@ class FileSubject(Subject):
 
     def __init__(self, path: Path, loaded, width: int, height: int, surfaces: ExactSurfaces | None = None):
         integrator, sensor = loaded.integrator(), loaded.sensors()[0]
-        self.name = path.stem if path.stem != "scene" else path.resolve().parent.name
+        self.name = path.stem if path.stem != "scene" else real_path(path).parent.name
         self.surfaces, self.opaque = surfaces, surfaces is not None
         children = integrator.children
         self.has_gaze, medium = "gaze" in children, integrator.medium

@@ -151,6 +151,12 @@ def is_ordinary(path: Path, what: str = "file") -> bool:
     return False
 
 
+def real_path(path: str | os.PathLike) -> Path:
+    """``path``, absolute and without links. Links that lead in a circle stay: what opens them says so, where
+    `Path.resolve` of Python before 3.13 raises a ``RuntimeError``."""
+    return Path(os.path.realpath(path))
+
+
 @contextmanager
 def open_file(
     path: str | os.PathLike, what: str = "file", remedy: str = _REMEDY, most: int | None = None

@@ -315,7 +315,8 @@ def _box(state: StateDict) -> tuple[Box, float]:
     aabb = decimals(state["aabb_infer"]) if "aabb_infer" in state else train
     bound = float(np.abs(train).max())
     if train.shape != (6,) or aabb.shape != (6,) or not bound >= 1:
-        raise NergError(f'the boxes of "{state.path}", {train} and {aabb}, are not those of a bound of at least 1')
+        boxes = " and ".join(plain(repr(box.tolist()), 80) for box in (train, aabb))
+        raise NergError(f'the boxes of "{state.path}", {boxes}, are not those of a bound of at least 1')
     return Box(tuple(aabb[:3].tolist()), tuple(aabb[3:].tolist()), bound), bound
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, plain, sentence
 from nerg_mi.files.atomic import file_sha256
-from nerg_mi.files.safe_read import is_ordinary, open_file, size_of
+from nerg_mi.files.safe_read import is_ordinary, open_file, real_path, size_of
 
 from .posed import FARTHEST, FileFinder, MaskFile, PosedFrame, PosedImages, Unused, name_some, settled
 from .transforms import read_frame_poses
@@ -473,7 +473,7 @@ def _list_models(folder: Path) -> list[Path]:
 def describe_other_models(model: Path) -> list[str]:
     """A sentence on the models of the same reconstruction that are not used where the COLMAP ``model`` is."""
     models = _list_models(model.parent if model.name.isdecimal() else model)
-    others = [p for p in models if p.resolve() != model.resolve()]
+    others = [p for p in models if real_path(p) != real_path(model)]
     if not others:
         return []
     describe = lambda p: f'"{p.name}" ({count_images(p):,} images)'

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.safe_read import real_path
 from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, box_interval
 
 from . import cameras
@@ -352,7 +353,7 @@ def open_dataset(
         extent = _extent(split.posed, train, aabb, unbounded)
     unused = [*split.posed.unused, *bad, *bad_held]
     source = {
-        "dataset": split.posed.path.resolve().parent.name,
+        "dataset": real_path(split.posed.path).parent.name,
         "transforms": split.posed.path.name,
         "sha256": split.posed.sha256,
         "training_frames": len(train),

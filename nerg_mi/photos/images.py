@@ -13,7 +13,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, plain
 from nerg_mi.files.images import check_image, read_exr
-from nerg_mi.files.safe_read import is_ordinary, read_npy, reading
+from nerg_mi.files.safe_read import is_ordinary, read_npy, reading, real_path
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import LENGTHS, check_number
 
@@ -402,7 +402,7 @@ def read_posed(source: Path, allow_outside: bool = False) -> PosedImages:
     one that holds its images), to which names and links in it may lead."""
     if source.is_file():
         return read_transforms(source, allow_outside)
-    folders = [source, *list(source.resolve().parents)[:3]]
+    folders = [source, *list(real_path(source).parents)[:3]]
     images = next((f / "images" for f in folders if (f / "images").is_dir()), None)
     if images is None:
         raise MissingFile(
@@ -447,9 +447,9 @@ def read_split(
     posed = replace(posed, notes=[*posed.notes, *_describe_leftovers([whole, *([] if test is None else [test])])])
     if test is not None and other is not None:
         test = test.moved(similarity)
-        hidden = {f.image.resolve() for f in test.frames}
-        both = [f for f in posed.frames if f.image.resolve() in hidden]
-        train = [f for f in posed.frames if f.image.resolve() not in hidden]
+        hidden = {real_path(f.image) for f in test.frames}
+        both = [f for f in posed.frames if real_path(f.image) in hidden]
+        train = [f for f in posed.frames if real_path(f.image) not in hidden]
         if not train:
             raise NergError(
                 f'all frames of "{posed.path}" are also in "{other.name}", which holds them out; use holdout 0'
@@ -479,7 +479,7 @@ def up_of(posed: PosedImages) -> Up:
 def _describe_leftovers(sets: list[PosedImages]) -> list[str]:
     """What lies in the folder of a data set, described by the files of ``sets``, and is not used: photos beside those
     that the files list, and what else the folder holds."""
-    resolve = cache(Path.resolve)
+    resolve = cache(real_path)
     locate = lambda path: resolve(path.parent) / path.name
     listed = {locate(p) for posed in sets for p in posed.images}
     others = {locate(x.path) for posed in sets for f in posed.frames for x in (f.depth, f.mask) if x is not None}
@@ -495,9 +495,9 @@ def _describe_leftovers(sets: list[PosedImages]) -> list[str]:
             f"{len(stray)} of {len(photos)} photos have no pose in {sets[0].path.name} and are not used: "
             f"{name_some(p.name for p in stray)}"
         )
-    root = sets[0].root.resolve()
+    root = real_path(sets[0].root)
     used = {*listed, *others, *stray, *(locate(posed.path) for posed in sets)}
-    used = {p.relative_to(root).parts[0] for p in used if p.is_relative_to(root)}
+    used = {name for p in used if p.is_relative_to(root) for name in p.relative_to(root).parts[:1]}
     rest = {p.name for p in root.iterdir() if not (p.name.startswith(".") or p.name.endswith(_WRITTEN))} - used
     if rest:
         notes.append(f'not used of "{plain(root.name)}": {name_some(sorted(rest))}')

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import is_ordinary, line_blocks
+from nerg_mi.files.safe_read import is_ordinary, line_blocks, real_path
 from nerg_mi.maths.coordinates import check_near_origin
 
 from .cameras import Intrinsics
@@ -310,7 +310,7 @@ def drop_repeated(frames: list[PosedFrame]) -> tuple[list[PosedFrame], list[Unus
     first: dict[Path, PosedFrame] = {}
     kept, unused = [], []
     for frame in frames:
-        key = frame.image.resolve()
+        key = real_path(frame.image)
         if key not in first:
             first[key] = frame
             kept.append(frame)

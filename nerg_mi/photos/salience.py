@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.files.safe_read import read_npy
+from nerg_mi.files.safe_read import read_npy, real_path
 
 from . import cameras
 from .cameras import Intrinsics, PosedCamera, all_used, area_average, nearest, overlap
@@ -229,7 +229,7 @@ def open_salience(
     about = {
         "views": posed.path.name,
         "sha256": posed.sha256,
-        "salience": str(source) if model else Path(source).resolve().name,
+        "salience": str(source) if model else real_path(source).name,
         "per": per,
         "used": len(views),
         "missing": len(missing),

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import line_blocks
+from nerg_mi.files.safe_read import line_blocks, real_path
 
 from .readers import poses
 from .readers.base import BAD_LINES, UNITS, Reader
@@ -303,7 +303,7 @@ class Proposal:
         if self.preset is None and self.columns is None:
             return None
         what = ["--preset", self.preset] if self.preset else ["--map", str(self.columns)]
-        stem = self.paths[0].resolve().name.split(".")[0] or "rays"
+        stem = real_path(self.paths[0]).name.split(".")[0] or "rays"
         words = ["nerg", "rays", "import", *map(str, self.paths), "-o", f"{stem}.npz", *what]
         for flag, value in self.options.items():
             words += [flag, value] if value else [flag]

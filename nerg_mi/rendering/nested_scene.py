@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import reading, size_of
+from nerg_mi.files.safe_read import reading, real_path, size_of
 
 from .scene import check_scene_file
 from .scene_writer import Blank, Comment, Node, SceneContent, Verbatim, document, element, relative_name, value_of
@@ -80,7 +80,7 @@ def name_files(elements: list[ElementTree.Element], path: Path, children: list[E
             continue
         there = next((f / value for f in folders if (f / value).is_file()), None)
         if there is not None:
-            one.set("value", value_of(str(there.resolve())))
+            one.set("value", value_of(str(real_path(there))))
 
 
 def verbatim(found: ElementTree.Element) -> Verbatim:
@@ -173,7 +173,7 @@ def with_gaze(path: Path, gaze: Path) -> str:
     if volume is not None:
         integrator.remove(volume)
     volume = SubElement(integrator, "volume", name=ROLE, type="gazefield")
-    SubElement(volume, "string", name="filename", value=value_of(str(gaze.resolve())))
+    SubElement(volume, "string", name="filename", value=value_of(str(real_path(gaze))))
     return document(list(map(verbatim, own)), f"{path.name} with the gaze field {gaze.name}.", version)
 
 

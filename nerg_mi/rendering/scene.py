@@ -14,7 +14,7 @@ import numpy as np
 from nerg_mi import llvm
 from nerg_mi.errors import NergError, UnusableLLVM, mitsuba_says, sentence
 from nerg_mi.files.images import check_image, threads_for_mitsuba
-from nerg_mi.files.safe_read import open_file, size_of
+from nerg_mi.files.safe_read import open_file, real_path, size_of
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.properties import resolved
@@ -110,7 +110,7 @@ class _Scene:
             check_mesh(mesh, kind, self._colored)
 
     def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
-        whole = path.resolve()
+        whole = real_path(path)
         if whole in within:
             raise NergError(f'the scene file "{path}" includes itself; take that <include> out')
         if len(within) > INCLUDES:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.safe_read import real_path
 from nerg_mi.files.tables import markdown_table
 from nerg_mi.rendering.scene import files_of_scene
 from nerg_mi.tasks.engines import Output, PlanProgress, open_engine, run_plan
@@ -62,9 +63,9 @@ class PlannedScene:
     def checked(self) -> Path:
         """The scene file. Raises `NergError` where it reads other files than the job was planned with, as on a worker
         where a whole path leads to somebody else's file."""
-        planned = {path.resolve() for path in self.files.all}
+        planned = {real_path(path) for path in self.files.all}
         for file in files_of_scene(self.files.path, self.defaults):
-            if file.resolve() not in planned:
+            if real_path(file) not in planned:
                 raise NergError(
                     f'the scene "{self.files.path.name}" reads "{file}", which is not the file that the job was '
                     "planned with; name files relative to the scene, so that workers find the same ones"

@@ -21,6 +21,7 @@ from nerg_mi.figures.style import Provenance, encode
 from nerg_mi.figures.style import versions as programs
 from nerg_mi.files.atomic import check_writable, file_sha256, write_text
 from nerg_mi.files.images import encode_png
+from nerg_mi.files.safe_read import real_path
 from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.interruption import Interruption
@@ -115,7 +116,7 @@ def sort_files(files: Sequence[Path]) -> ReportFiles:
             continue
         kind = "rays" if is_dataset(path) else kind_of_file(path)
         role = "place" if kind in PLACES else kind
-        if role in found and found[role].resolve() != path.resolve():
+        if role in found and real_path(found[role]) != real_path(path):
             raise NergError(
                 f'"{found[role]}" and "{path}" are both a {role}; a report is of one of them: name the files'
             )

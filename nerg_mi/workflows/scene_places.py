@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, plain
-from nerg_mi.files.safe_read import reading, size_of
+from nerg_mi.files.safe_read import reading, real_path, size_of
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import is_field
 from nerg_mi.formats.meshes import GREY, READERS, MeshFile, read_mesh_file
@@ -335,7 +335,7 @@ def _mesh(path: Path, output: Path, words: str) -> WrittenPlace:
     mesh, shown = read_mesh_file(path), path
     if not mesh.is_plain:
         shown = mesh_of(output)
-        if shown.resolve() == path.resolve():
+        if real_path(shown) == real_path(path):
             raise NergError(f'"{path}" would be written over by what Mitsuba shows of it; give the scene another name')
         write_mesh(shown, mesh)
     kind = shown.suffix.lower().lstrip(".")

@@ -474,6 +474,14 @@ def test_files_of_frames_and_of_held_out_frames_are_no_leftovers(ring):
     assert read_split(ring).posed.notes == []
 
 
+@pytest.mark.parametrize("name", [".", "..", "images", "images/.", "images/..", "", "/", "no/../1.png"])
+def test_a_folder_in_the_place_of_a_photo_is_no_photo(ring, name):
+    content = json.loads((ring / "transforms.json").read_text())
+    content["frames"][0]["file_path"] = name
+    (ring / "transforms.json").write_text(json.dumps(content))
+    assert len(read_split(ring).posed.unused) == 1
+
+
 # ---- Undistort ----
 #
 # Photos made pinhole and renderings bent to a lens, against a smooth picture of the sky known in every direction.

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine
+from nerg_mi.files.safe_read import OnBadLine, real_path
 
 from . import poses
 from .base import RECORDINGS, RaysBuilder, Signature, TrackingFrame, option
@@ -449,5 +449,5 @@ def _first(paths: Iterator[Path]) -> Path | None:
 
 def _person(gaze: Path) -> str:
     """The recording's folder: the first above ``gaze`` that is not one of MPS."""
-    folders = (re.sub(r"^mps_(.+)_vrs$", r"\1", p) for p in reversed(gaze.resolve().parent.parts))
+    folders = (re.sub(r"^mps_(.+)_vrs$", r"\1", p) for p in reversed(real_path(gaze).parent.parts))
     return next((p for p in folders if p not in (*_GAZE_FOLDERS, "mps")), gaze.stem)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
+from nerg_mi.files.safe_read import real_path
 
 from . import poses
 from .base import OPENGL, RECORDINGS, InFrame, RaysBuilder, Signature, option
@@ -263,7 +264,7 @@ def _person_and_place(path: Path) -> tuple[str, str]:
 def _find_settings(path: Path) -> Path:
     if not path.is_file():
         raise NergError(f"there is no {path}; correct its name")
-    for folder in list(path.resolve().parents)[: _ABOVE + 1]:
+    for folder in list(real_path(path).parents)[: _ABOVE + 1]:
         if (folder / _SETTINGS).is_file():
             return folder / _SETTINGS
     raise NergError(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import read_json
+from nerg_mi.files.safe_read import read_json, real_path
 
 from .base import DESCRIPTION, RaysBuilder, Signature
 from .scene_glasses import POSES, WHERE_CAMERA, GazeBlock, Recording, SceneCamera, SceneReader, directions_from_angles
@@ -70,7 +70,7 @@ class Neon(SceneReader[_Neon]):
     accounts = "pixels and angles"
 
     def open(self, folder: Path, builder: RaysBuilder) -> _Neon:
-        name = folder.resolve().name
+        name = real_path(folder).name
         frames = _frame_times(folder, builder)
         start, person = _info(folder, builder)
         starts_with_video = start is None

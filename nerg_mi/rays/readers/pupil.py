@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.safe_read import real_path
 from nerg_mi.ranges import LENGTHS, Checked, Range
 
 from . import poses
@@ -102,5 +103,5 @@ def _read_heads(path: Path, person: str, builder: RaysBuilder) -> PoseTrack:
 
 def _person(gaze: Path) -> str:
     """The recording's folder: the first above ``gaze`` that is neither a number nor ``exports``."""
-    folders = reversed(gaze.resolve().parent.parts)
+    folders = reversed(real_path(gaze).parent.parts)
     return next((p for p in folders if not p.isdigit() and p != "exports"), gaze.stem)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine, line_blocks
+from nerg_mi.files.safe_read import OnBadLine, line_blocks, real_path
 
 from .base import DESCRIPTION, RaysBuilder, Signature, TrackingFrame, option
 from .columns import ColumnFinder
@@ -273,7 +273,7 @@ class NeonMocap:
             names = [time, *columns.vector("gaze_origin"), *columns.vector("gaze_dir")]
             builder.source(path)
             usual = path.name.startswith("gaze_in_mocap_space")
-            person = path.resolve().parent.name if usual else person_from_filename(path)
+            person = real_path(path).parent.name if usual else person_from_filename(path)
             for v, _, lines in builder.read_table(path, names):
                 lost = np.asarray(np.isnan(v[:, 1:]).any(axis=1))
                 builder.add(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine, line_blocks, parse_json, read_json
+from nerg_mi.files.safe_read import OnBadLine, line_blocks, parse_json, read_json, real_path
 from nerg_mi.files.video import frame_times
 
 from .base import DESCRIPTION, RaysBuilder, Signature
@@ -57,7 +57,7 @@ class Tobii3(SceneReader[_Tobii]):
     accounts = "gaze2d and gaze3d"
 
     def open(self, folder: Path, builder: RaysBuilder) -> _Tobii:
-        name = folder.resolve().name
+        name = real_path(folder).name
         camera = _scene_camera(folder, builder)
         return _Tobii(
             name=name, person=name, frames=_frames(folder, camera, builder), glasses=_calibration(folder, camera)
