@@ -427,7 +427,7 @@ def texture_rows(
         with dr.suspend_grad():
             found = scene.ray_intersect_preliminary(mi.Ray3f(above, mi.Vector3f(0, 0, -1)), coherent=True)
             hit, face = np.array(found.is_valid()).astype(bool), np.array(found.prim_index).astype(np.int64)
-            b, c = (np.array(x, np.float64) for x in (found.prim_uv.x, found.prim_uv.y))
+            b, c = np.where(hit, np.array(found.prim_uv), 0).astype(np.float64)
         of_corners = values[refined.mesh.faces[np.where(hit, face, 0)]]
         out = np.where(hit, of_corners[:, 0] * (1 - b - c) + of_corners[:, 1] * b + of_corners[:, 2] * c, 0.0)
         out, hit = out.reshape(-1, pixels), hit.reshape(-1, pixels)

@@ -245,7 +245,8 @@ def _seen(mesh: Mesh, values: np.ndarray, up: np.ndarray, options: BakedFigureOp
     found = scene.ray_intersect_preliminary(ray)
     met = np.array(found.is_valid(), bool)
     face = mesh.faces[np.where(met, np.array(found.prim_index, np.int64), 0)]
-    u, v = np.array(found.prim_uv, np.float64)
+    # Of rays that met nothing they hold anything.
+    u, v = np.where(met, np.array(found.prim_uv), 0).astype(np.float64)
     weights = np.stack([1 - u - v, u, v], axis=1)
     a, b, c = (mesh.vertices[face[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)

@@ -417,7 +417,7 @@ def test_a_file_that_is_none_of_theirs(tmp_path, name):
         registry.read_rays(name, given, registry.make_options(name, example.options_in(tmp_path)))
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("name", READABLE)
 def test_a_link_in_a_circle_is_no_file(name, tmp_path):
     """In the place of each file of a recording: it is refused, or missing where it may be. `Path.resolve` of Python
     before 3.13 raises a ``RuntimeError`` for it."""
