@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,7 @@ def failing(monkeypatch, error):
     def command(reporter):
         raise error
 
+    import_module("nerg_mi.cli.machine")  # which declares it
     monkeypatch.setitem(COMMANDS, "doctor", replace(COMMANDS["doctor"], run=command))
 
 
