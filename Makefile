@@ -22,7 +22,7 @@
 #   make packages  build the packages, install and try them with every Python that is here (nox)
 #
 # Set-up is done once: the second run of any of these only does its own work. `make fuzz`, `make faults` and `make bench` print
-# tables; ARGS="--update docs/trust.md" puts those of the first two there, ARGS="--page docs/performance.md" those of the third.
+# tables; ARGS="--update docs/explanation/robustness.md" puts those of the first two there, ARGS="--page docs/explanation/performance.md" those of the third.
 
 # Tests start many processes: byte code that is kept spares each of them compiling the package, and pytest its rewriting.
 export PYTHONDONTWRITEBYTECODE =

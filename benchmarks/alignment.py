@@ -1,6 +1,6 @@
 """How well each kind of evidence finds where tracking lies in a place whose frame is another one.
 
-    python benchmarks/alignment.py [--trials 50] [--only KIND] [--seed 0] [--shoppers 12] [--update docs/tracking.md]
+    python benchmarks/alignment.py [--trials 50] [--only KIND] [--seed 0] [--shoppers 12] [--update docs/explanation/accuracy.md]
 
 The place is the demo store's trained field, carried into another frame by a random similarity: scale from 0.14 to 7.4,
 a shift of some ten metres, and any rotation, or, where up has to be known, any turn about it. The tracking is of
@@ -25,10 +25,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.alignment.constraints import AlignmentTarget, Evidence, PlaceTraces, read_surface, trace_place
+from nerg_mi.alignment.constraints import AlignmentTarget, Evidence, SceneTraces, read_surface, trace_scene
 from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.points import Cameras, Pairs
-from nerg_mi.alignment.similarity import MIRROR, errors, move, scale_of
+from nerg_mi.alignment.similarity import MIRROR, residual_distances, transform_points, similarity_scale
 from nerg_mi.alignment.tracking import Tracking
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
@@ -46,27 +46,27 @@ HEAD = "evidence|known besides|right|error cm|95 %|degrees|scale %|residual cm|m
 class World:
     """The store: what rays found of its field, its mesh as points, and its shoppers with their hit points."""
 
-    traces: PlaceTraces
+    traces: SceneTraces
     mesh: np.ndarray
     rays: Rays
 
 
 def make_world(shoppers: int, rays: int) -> World:
     from nerg_mi.scenes.store import twin
-    from nerg_mi.scenes.store.layout import build
-    from nerg_mi.scenes.store.shoppers import simulate
-    from nerg_mi.train.geometry import place_of_field
+    from nerg_mi.scenes.store.layout import build_store
+    from nerg_mi.scenes.store.shoppers import simulate_shoppers
+    from nerg_mi.train.geometry import load_field_geometry
     from nerg_mi.workflows.base import select_backend
 
     ns, folder = select_backend("llvm_ad_rgb"), Path(twin.__file__).parent
-    ids, times, origin, direction = simulate(build(0), shoppers=shoppers, seed=5)
+    ids, times, origin, direction = simulate_shoppers(build_store(0), shoppers=shoppers, seed=5)
     persons, person = np.unique(ids, return_inverse=True)
-    hit = origin + direction * twin.cast(origin, direction)[:, None]
+    hit = origin + direction * twin.cast_rays(origin, direction)[:, None]
     hit += np.random.default_rng(1).normal(0, 0.02, hit.shape)
     walked = Rays(times / 1000, person, tuple(persons), origin, direction, np.ones(len(ids)), hit)
-    place = place_of_field(folder / "store.safetensors", ns)
+    place = load_field_geometry(folder / "store.safetensors", ns)
     assert place.medium is not None
-    traces = trace_place(place.medium, np.array(place.box.lower), np.array(place.box.upper), rays)
+    traces = trace_scene(place.medium, np.array(place.box.lower), np.array(place.box.upper), rays)
     return World(traces, read_surface(folder / "twin.ply"), walked)
 
 
@@ -88,9 +88,9 @@ Maker = Callable[[World, np.ndarray, np.random.Generator, bool], tuple[Evidence,
 def pairs(count: int, upright: bool) -> Maker:
     def make(world, truth, rng, mirrored):
         x = world.mesh[rng.permutation(len(world.mesh))[:count]]
-        y = move(truth, x + rng.normal(0, 0.01, x.shape))
+        y = transform_points(truth, x + rng.normal(0, 0.01, x.shape))
         x = x + rng.normal(0, 0.01, x.shape)
-        return Pairs(move(MIRROR, x) if mirrored else x, y), AlignmentTarget(upright=upright)
+        return Pairs(transform_points(MIRROR, x) if mirrored else x, y), AlignmentTarget(is_upright=upright)
 
     return make
 
@@ -98,8 +98,8 @@ def pairs(count: int, upright: bool) -> Maker:
 def twin(upright: bool) -> Maker:
     def make(world, truth, rng, mirrored):
         mesh = world.mesh + rng.normal(0, 0.005, world.mesh.shape)
-        return Twin(move(MIRROR, mesh) if mirrored else mesh), AlignmentTarget(
-            traces=world.traces.moved(truth), upright=upright
+        return Twin(transform_points(MIRROR, mesh) if mirrored else mesh), AlignmentTarget(
+            traces=world.traces.moved(truth), is_upright=upright
         )
 
     return make
@@ -110,16 +110,16 @@ def cameras(world, truth, rng, mirrored):
     poses[:, :3, :3] = Rotation.random(40, random_state=rng).as_matrix()
     poses[:, :3, 3] = rng.uniform((0.5, 0.5, 1.2), (7.5, 5.5, 1.9), (40, 3))
     other = poses.copy()
-    turn = truth[:3, :3] / scale_of(truth)
+    turn = truth[:3, :3] / similarity_scale(truth)
     noise = Rotation.from_rotvec(rng.normal(0, np.radians(0.5), (40, 3))).as_matrix()
     other[:, :3, :3] = noise @ (turn @ poses[:, :3, :3])
-    other[:, :3, 3] = move(truth, poses[:, :3, 3] + rng.normal(0, 0.02, (40, 3)))
+    other[:, :3, 3] = transform_points(truth, poses[:, :3, 3] + rng.normal(0, 0.02, (40, 3)))
     # One in ten is somewhere else.
-    other[:4, :3, 3] += rng.normal(0, 5 * scale_of(truth), (4, 3))
+    other[:4, :3, 3] += rng.normal(0, 5 * similarity_scale(truth), (4, 3))
     other[:4, :3, :3] = Rotation.random(4, random_state=rng).as_matrix()
     if mirrored:
-        poses[:, :3, 3] = move(MIRROR, poses[:, :3, 3])
-    return Cameras(poses, other), AlignmentTarget(upright=False)
+        poses[:, :3, 3] = transform_points(MIRROR, poses[:, :3, 3])
+    return Cameras(poses, other), AlignmentTarget(is_upright=False)
 
 
 def tracking(hits: bool) -> Maker:
@@ -130,12 +130,12 @@ def tracking(hits: bool) -> Maker:
         if mirrored:
             rays = replace(
                 rays,
-                origin=move(MIRROR, rays.origin),
-                direction=move(MIRROR, rays.direction),
-                hit=None if rays.hit is None else move(MIRROR, rays.hit),
+                origin=transform_points(MIRROR, rays.origin),
+                direction=transform_points(MIRROR, rays.direction),
+                hit=None if rays.hit is None else transform_points(MIRROR, rays.hit),
             )
         return Tracking(rays), AlignmentTarget(
-            traces=world.traces.moved(truth), scale=None if hits else scale_of(truth)
+            traces=world.traces.moved(truth), scale=None if hits else similarity_scale(truth)
         )
 
     return make
@@ -170,15 +170,15 @@ def measure(world: World, kind: str, trials: int, mirrors: int, seed: int = 0) -
         except NergError as error:
             print(f"{kind} {k}: {error}", flush=True)
             continue
-        each = 100 * errors(fit.matrix, world.rays.origin, move(truth, world.rays.origin))
-        turned = fit.matrix[:3, :3] @ truth[:3, :3].T / scale_of(fit.matrix) / scale_of(truth)
+        each = 100 * residual_distances(fit.matrix, world.rays.origin, transform_points(truth, world.rays.origin))
+        turned = fit.matrix[:3, :3] @ truth[:3, :3].T / similarity_scale(fit.matrix) / similarity_scale(truth)
         angle = float(np.degrees(Rotation.from_matrix(turned).magnitude()))
-        scale = 100 * abs(scale_of(fit.matrix) / scale_of(truth) - 1)
-        residual = float(np.median(fit.centimetres))
+        scale = 100 * abs(similarity_scale(fit.matrix) / similarity_scale(truth) - 1)
+        residual = float(np.median(fit.residuals_cm))
         right = np.median(each) < 10 and angle < 2 and residual < 10 and fit.mirrored is None
         if not right:
             print(
-                f"{kind} {k}: {np.median(each):.1f} cm, {angle:.1f} degrees, {fit.mirrored}, {fit.doubts}", flush=True
+                f"{kind} {k}: {np.median(each):.1f} cm, {angle:.1f} degrees, {fit.mirrored}, {fit.warnings}", flush=True
             )
         else:
             found.append((np.median(each), angle, scale, residual))
@@ -235,11 +235,11 @@ def measure_fox(trials: int) -> list[list[str]] | None:
         picked = centers.mean(axis=0) + rng.uniform(-0.7, 0.7, (5, 3)) * size
         noisy = picked + rng.normal(0, 0.01 * size, picked.shape)
         back = np.linalg.inv(truth)
-        fit = Pairs(move(back, picked), noisy).fit(AlignmentTarget(upright=False), lambda *_: None)
-        off.append(np.linalg.norm(move(fit.matrix, move(back, heads)) - heads, axis=1) / size)
-        turned = fit.matrix[:3, :3] @ truth[:3, :3].T / scale_of(fit.matrix) / scale_of(truth)
+        fit = Pairs(transform_points(back, picked), noisy).fit(AlignmentTarget(is_upright=False), lambda *_: None)
+        off.append(np.linalg.norm(transform_points(fit.matrix, transform_points(back, heads)) - heads, axis=1) / size)
+        turned = fit.matrix[:3, :3] @ truth[:3, :3].T / similarity_scale(fit.matrix) / similarity_scale(truth)
         angle.append(np.degrees(Rotation.from_matrix(turned).magnitude()))
-        stated.append(np.median(fit.centimetres) / 100 * scale_of(fit.matrix) / size)
+        stated.append(np.median(fit.residuals_cm) / 100 * similarity_scale(fit.matrix) / size)
     error = np.concatenate(off)
     percent = [f"{100 * v:.2g}" for v in (np.median(error), np.percentile(error, 95), np.median(stated))]
     return [[str(trials), *percent[:2], f"{np.median(angle):.2g}", f"{np.percentile(angle, 95):.2g}", percent[2]]]

@@ -1,7 +1,7 @@
 """All that is said of speed, in one run: frames and their stages beside PyTorch, densities beside SciPy, volumes beside
 `volpath`, and how each cost grows.
 
-    python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb] [--update docs/performance.md]
+    python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb] [--update docs/explanation/performance.md]
     [--out out/benchmarks/bench]
 
 Parts: ``frames``, ``stages``, ``kde``, ``volume``, ``growth``, ``memory``, ``start``; else all.
@@ -31,7 +31,7 @@ import torch_frames
 from nerg_mi.figures.style import save
 from nerg_mi.llvm import has_cuda
 from nerg_mi.probes.kde import SphericalKde
-from nerg_mi.workflows.demo import store_scene
+from nerg_mi.workflows.demo import find_store_scene
 from timing import at_the_end, exponent, in_turns, median, print_table, spread, write_rows
 
 import numpy as np
@@ -148,7 +148,7 @@ class Run:
         self.long, self.out, self.page, self.threads = args.long, args.out, args.update, args.threads
         self.runs = args.runs or (9 if args.long else 5)
         self.cuda = mi.variant().startswith("cuda")
-        folder, ns = store_scene().parent, namespace(mi.variant())
+        folder, ns = find_store_scene().parent, namespace(mi.variant())
         self.field = load_radiance(folder / "store.safetensors", ns)[0]
         self.gaze = load_gaze(folder / "shoppers.safetensors", ns)[0]
 
@@ -161,7 +161,7 @@ class Run:
         write_rows(self.out / f"{name}.csv", [dict(zip(head, row)) for row in rows])
 
     def figure(self, figure, name: str) -> None:
-        path = (self.page.parent / "images" if self.page else self.out) / f"performance-{name}.png"
+        path = (self.page.parents[1] / "images" if self.page else self.out) / f"performance-{name}.png"
         save(figure, path, {"Software": "benchmarks/bench.py"})
         print(f"wrote {path}\n")
 
@@ -194,7 +194,7 @@ def peers_of(run: Run, compiled: bool) -> dict[str, torch_frames.TorchRenderer]:
     import torch
 
     torch.set_num_threads(run.threads)
-    scene = nerg.Scene.load(store_scene())
+    scene = nerg.Scene.load(find_store_scene())
     falloff = float(np.ravel(np.array(scene.integrator.falloff))[0])
     made = {
         "PyTorch, eager": {"model": torch_frames.TorchModel},
@@ -261,7 +261,7 @@ def peer_stages(run: Run, width: int, height: int) -> dict[str, float]:
     import torch
 
     torch.set_num_threads(run.threads)
-    scene = nerg.Scene.load(store_scene())
+    scene = nerg.Scene.load(find_store_scene())
     falloff = float(np.ravel(np.array(scene.integrator.falloff))[0])
     peer = torch_frames.TorchRenderer(run.field, run.gaze, falloff, torch_frames.TorchModel)
     o, d = torch_frames.camera_rays(width, height)

@@ -1,7 +1,7 @@
 """How many evaluations of density a frame takes, and what each way of saving them costs in time and in error.
 
     python benchmarks/evaluations.py SCENE.xml [-D KEY=VALUE] [--width 640] [--height 360] [--repeats 7]
-    [--out out/benchmarks/evaluations.csv] [--update docs/error-and-time.md]
+    [--out out/benchmarks/evaluations.csv] [--update docs/explanation/error-and-time.md]
 
 Each row is the scene with some parameters, against the first row: all occupied cells are marched, and each observer's
 ray to its end. Times are processor time of both passes, colour and gaze, medians of rounds over all rows in turn.
@@ -62,8 +62,8 @@ def main(argv=None) -> None:
     made, rows, first = [], [], None
     for name, wanted, params in ROWS:
         counts = f"{aovs(wanted)},density_evals,color_evals"
-        seen = subject.channels(subject.integrator({**params, "aovs": counts}), 1, 1)
-        integrator = subject.integrator({**params, "aovs": aovs(wanted)})
+        seen = subject.render_channels(subject.make_integrator({**params, "aovs": counts}), 1, 1)
+        integrator = subject.make_integrator({**params, "aovs": aovs(wanted)})
         for _ in range(2):  # the second frame reads what the first keeps of the observer, and is another kernel
             subject.render(integrator, 1, 1)
         made.append(integrator)

@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.files.tables import markdown_table
+from nerg_mi.files.tables import format_markdown_table
 
 import numpy as np
 
@@ -32,11 +32,11 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze
-    from nerg_mi.train.geometry import place_of_field, place_of_volume
-    from nerg_mi.transport.geometry import Place, default_settings
+    from nerg_mi.train.geometry import load_field_geometry, load_volume_geometry
+    from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
     from nerg_mi.transport.observer import DIRECTIONS as COUNT
     from nerg_mi.transport.observer import ObserverSettings
-    from nerg_mi.transport.observer_gaze import PlacedGaze
+    from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("gaze", type=Path)
@@ -47,15 +47,15 @@ def main(argv=None) -> None:
     args = parser.parse_args(argv)
     ns = namespace("llvm_ad_rgb")
     field, _ = load_gaze(args.gaze, ns)
-    medium = (place_of_volume(args.place) if args.place.suffix == ".vol" else place_of_field(args.place, ns)).medium
-    gaze, place, settings = PlacedGaze(field), Place(medium), ObserverSettings(march=default_settings(medium))
+    medium = (load_volume_geometry(args.place) if args.place.suffix == ".vol" else load_field_geometry(args.place, ns)).medium
+    gaze, place, settings = GazeFieldInstance(field), SceneGeometry(medium), ObserverSettings(march=default_march_settings(medium))
 
     def integral(p: list[float], count: int = COUNT, tolerance: float = 0.0) -> float:
         p_o = mi.Point3f(*p)
         # As of a scene: a constant of the kernel would be compiled anew.
         dr.make_opaque(p_o)
         asked = replace(settings, directions=count, integral_tolerance=tolerance)
-        return float(gaze.at([p_o], place, asked).integrals(p_o)[0][0])
+        return float(gaze.for_observers([p_o], place, asked).integrals(p_o)[0][0])
 
     low, high = np.array(field.config.heads)
     rng, rows = np.random.default_rng(0), []
@@ -99,7 +99,7 @@ def sweep(integral, positions: list[list[float]]) -> None:
         off, (wall, cpu) = np.abs(found[:, 0] / true - 1), 1e3 * np.median(found[:, 1:], axis=0)
         errors = (f"{v:.1e}" for v in (off.mean(), np.quantile(off, 0.99), off.max()))
         rows.append((name, *errors, f"{wall:.0f} ms", f"{cpu:.0f} ms"))
-    print(markdown_table(("directions", "mean", "99 %", "most", "time", "CPU"), rows))
+    print(format_markdown_table(("directions", "mean", "99 %", "most", "time", "CPU"), rows))
 
 
 if __name__ == "__main__":

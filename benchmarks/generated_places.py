@@ -154,13 +154,13 @@ class GeneratedPlace:
     @staticmethod
     def _seen(twin, p: np.ndarray, middles: np.ndarray) -> np.ndarray:
         """Whether nothing lies between (N, K); a thing itself is not in its own way."""
-        from nerg_mi.maths.arrays import vector_of
+        from nerg_mi.maths.arrays import to_vector
 
         import mitsuba as mi
 
         a, b = np.repeat(p, len(middles), axis=0), np.tile(middles, (len(p), 1))
         way = b - a
-        ray = mi.Ray3f(vector_of(mi.Point3f, a), vector_of(mi.Vector3f, way))
+        ray = mi.Ray3f(to_vector(mi.Point3f, a), to_vector(mi.Vector3f, way))
         ray.maxt = mi.Float(0.97)
         return ~np.array(twin.ray_test(ray)).reshape(len(p), len(middles))
 

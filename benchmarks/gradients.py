@@ -1,6 +1,6 @@
 """Derivatives of pictures against central differences, for every quantity and parameter.
 
-    python benchmarks/gradients.py [--depth median] [--case NAME] [--update docs/gradients.md]
+    python benchmarks/gradients.py [--depth median] [--case NAME] [--update docs/explanation/numerics.md]
 
 One number moves each parameter along a fixed line. Forward: derivatives of all pixels at once,
 as ``mi.render`` gives them. Reverse: derivative of one weighted sum of the pixels of one quantity. Both against central
@@ -280,7 +280,7 @@ def cases() -> list[Case]:
     ]
 
 
-# Where derivatives miss what moves: (1), (2), ... stand below the table in docs/gradients.md.
+# Where derivatives miss what moves: (1), (2), ... stand below the table in docs/explanation/numerics.md.
 EXCLUDED = {
     "shape: its silhouette": dict.fromkeys(
         ("colour", "depth", "opacity", "position", "gaze", "emit", "capture", "visibility", "observer depth"),

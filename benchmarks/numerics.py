@@ -1,6 +1,6 @@
 """Largest numerical errors of a march: slabs, single steps, sheets, profiles and densities that are hard to march.
 
-    python benchmarks/numerics.py [--update docs/numerics.md]
+    python benchmarks/numerics.py [--update docs/explanation/numerics.md]
 
 Every case is compared with a closed form or with float64, forwards and for its derivative, and gives one row: case,
 range, quantity, largest error found, reference. Prints markdown; `--update` puts the tables
@@ -21,7 +21,7 @@ from nerg_mi.transport.depth import surface_depth
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.medium import LocalRay
-from nerg_mi.transport.quadrature import RULES, absorbed_share, linear_crossing, linear_share, mean_depth_share
+from nerg_mi.transport.quadrature import RULES, absorbed_fraction, linear_crossing, linear_share, mean_depth_fraction
 from nerg_mi.transport.volume_medium import VolumeMedium
 from timing import print_table
 
@@ -154,7 +154,7 @@ def grid(mi, data, **more):
 def through(mi, medium, o, d, settings):
     """March of rays (N, 3) through a medium, and the ray and its ends."""
     o, d = (np.atleast_2d(np.asarray(v, np.float32)) for v in (o, d))
-    ray = medium.local(mi.Point3f(o.T), mi.Vector3f(d.T))
+    ray = medium.ray_to_local(mi.Point3f(o.T), mi.Vector3f(d.T))
     t0, t1 = dr.maximum(ray.t_near, 0), ray.t_far
     return march(medium, ray, t0, t1, True, settings, count=True), ray, t0, t1
 
@@ -191,7 +191,7 @@ def sheets_in_a_grid(mi):
     front = to(0.3) + THIN / d[:, 2] * share(1e3 * THIN / d[:, 2].astype(float))
     expected = a * front + (1 - a) * to(0.7)
     for kind in RULES.names():
-        settings = MarchSettings(medium.step, quadrature=kind)
+        settings = MarchSettings(medium.default_step, quadrature=kind)
         r, *_ = through(mi, medium, o, d, settings)
         error = worst(r.expected_depth, expected, False)
         found = np.mean(values(r.opacity) > 0.999)
@@ -403,12 +403,12 @@ def slabs(mi):
 def one_step(mi):
     x = np.float32(np.logspace(-7, 6, 400))
     x64 = x.astype(float)
-    y, dy = gradient(mi.Float(x), absorbed_share)
+    y, dy = gradient(mi.Float(x), absorbed_fraction)
     counts = x64 < 80  # beyond, exp(-x) is below what single precision holds
     reference, ends = "closed form", "1e-7 .. 1e6 a step"
     yield Row("optical depth of a step", ends, "opacity", worst(y, -np.expm1(-x64)), reference)
     yield Row("", "1e-7 .. 80", "its derivative", worst(dy[counts], np.exp(-x64[counts])), reference)
-    y, dy = gradient(mi.Float(x), mean_depth_share)
+    y, dy = gradient(mi.Float(x), mean_depth_fraction)
     yield Row("", ends, "mean depth in the step", worst(y, share(x64)), reference)
     yield Row("", ends, "its derivative", worst(dy, share_slope(x64)), reference)
     y, dy = gradient(mi.Float(x), lambda v: linear_share(v, v))

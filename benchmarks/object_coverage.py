@@ -18,8 +18,8 @@ from collections import defaultdict
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.statistics.estimates import adjusted
-from nerg_mi.statistics.tables import BY_NAME, COMPARED, MEASURES
+from nerg_mi.statistics.estimates import adjust_p_values
+from nerg_mi.statistics.tables import MEASURES_BY_NAME, COMPARED_MEASURES, MEASURES
 from object_statistics import Walks, counting_of, made_store
 
 import numpy as np
@@ -57,7 +57,7 @@ class Population:
 
 def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     from nerg_mi.aoi.measured import count_block
-    from nerg_mi.aoi.scene import things_of
+    from nerg_mi.aoi.scene import make_aois
     from nerg_mi.formats.areas import AreaSet, Region
     from nerg_mi.statistics.tables import Participants
     from nerg_mi.statistics.visits import ALL
@@ -65,17 +65,17 @@ def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     around, goods, _ = made_store()
     labels = []
     for box in goods.boxes[::2]:
-        middle, size = box.middle, np.subtract(box.upper, box.lower)
+        middle, size = box.center, np.subtract(box.upper, box.lower)
         half = np.where(size == size.min(), size / 2, np.minimum(size / 2, 0.06))
-        labels.append(Region.of(f"label of {box.name}", middle - half, middle + half))
+        labels.append(Region.create(f"label of {box.name}", middle - half, middle + half))
     areas = AreaSet((*goods.areas, *labels))
-    counting = counting_of(around, areas, things_of(areas.things, {}))
+    counting = counting_of(around, areas, make_aois(areas.elements, {}))
     walks, rng = Walks(WALKS), np.random.default_rng(3)
     found: dict[str, list] = defaultdict(list)
     for _ in range(VISITS):
-        people = Participants.of(count_block(walks.rays(np.arange(WALKS), rng), counting), ALL, True)
+        people = Participants.from_sums(count_block(walks.rays(np.arange(WALKS), rng), counting), ALL, True)
         for m in MEASURES:
-            found[m.name].append(m.pair(people))
+            found[m.name].append(m.numerator_denominator(people))
     made = {k: [np.concatenate(w).astype(float) for w in zip(*v)] for k, v in found.items()}
     return {k: (x, y) for k, (x, y) in made.items()}
 
@@ -99,7 +99,7 @@ def shares(people: tuple[int, ...]) -> None:
 
 
 def _share_intervals() -> dict:
-    from nerg_mi.statistics.estimates import mid_p
+    from nerg_mi.statistics.estimates import mid_p_interval
 
     z = stats.norm.ppf(0.975)
     cut = lambda low, high: (np.maximum(low, 0), np.minimum(high, 1))
@@ -132,13 +132,13 @@ def _share_intervals() -> dict:
         "Agresti and Coull (1998)": agresti_coull,
         "Jeffreys": beta(0.5),
         "Clopper and Pearson (1934)": beta(0.0),
-        "mid-p (kept)": mid_p,
+        "mid-p (kept)": mid_p_interval,
     }
 
 
 def ratio_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     """Ends of the intervals (K,) of Σ x / Σ y in several ways."""
-    from nerg_mi.statistics.estimates import ratios
+    from nerg_mi.statistics.estimates import estimate_ratios
 
     n, count = (y > 0).sum(axis=0), len(x)
     m = x.sum(axis=0) / y.sum(axis=0)
@@ -163,7 +163,7 @@ def ratio_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     out["bootstrap, percentiles"] = tuple(np.nanquantile(star, (0.025, 0.975), axis=0))
     out["BCa bootstrap"] = _bca(star, m, without)
     out["bootstrap-t, two tails"] = (m - high * s, m - low * s)
-    kept = ratios(x, y, resamples=RESAMPLES, seed=seed)
+    kept = estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
     out["symmetric bootstrap-t, jackknife (kept)"] = (kept.low, kept.high)
     return out
 
@@ -216,7 +216,7 @@ HEAD = (
 
 def compare(population: Population, sets: int, people: tuple[int, ...], names: tuple[str, ...], ways=ratio_intervals):
     for name in names:
-        print(f"\n{BY_NAME[name].title}\n\n| interval {HEAD}")
+        print(f"\n{MEASURES_BY_NAME[name].title}\n\n| interval {HEAD}")
         for n in people:
             rng, found = np.random.default_rng(n), {}
             for _ in range(sets):
@@ -225,7 +225,7 @@ def compare(population: Population, sets: int, people: tuple[int, ...], names: t
                     made = ways(x, y, int(rng.integers(1 << 30)))
                 known = np.isfinite(next(ends for way, ends in made.items() if "kept" in way)[0])
                 for way, (low, high) in made.items():
-                    held = Held(population.truth[name], population.common, BY_NAME[name].most)
+                    held = Held(population.truth[name], population.common, MEASURES_BY_NAME[name].upper_limit)
                     found.setdefault(way, held).add(low, high, known)
             for way, held in found.items():
                 print(f"| {way} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
@@ -234,9 +234,9 @@ def compare(population: Population, sets: int, people: tuple[int, ...], names: t
 def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     """Ends of the intervals (K,) with other factors of the error where few people decide a number."""
     from nerg_mi.statistics import estimates
-    from nerg_mi.statistics.estimates import ratios
+    from nerg_mi.statistics.estimates import estimate_ratios
 
-    kept = ratios(x, y, resamples=RESAMPLES, seed=seed)
+    kept = estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
     value, _, people = estimates._linear(x, y)
     apart = estimates._left_out(x, y, value, people)
     error, square = np.sqrt((apart**2).sum(axis=0)), apart**2
@@ -257,17 +257,17 @@ def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
 
 
 def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
-    from nerg_mi.statistics.estimates import proportions, ratios
+    from nerg_mi.statistics.estimates import estimate_proportions, estimate_ratios
 
     print(f"\n| number {HEAD}")
     for n in people:
         rng = np.random.default_rng(n)
-        found = {m.name: Held(population.truth[m.name], population.common, m.most) for m in MEASURES}
+        found = {m.name: Held(population.truth[m.name], population.common, m.upper_limit) for m in MEASURES}
         for _ in range(sets):
             who, seed = rng.integers(0, population.count, n), int(rng.integers(1 << 30))
             for m in MEASURES:
                 x, y = population.draw(m.name, who)
-                e = proportions(x, y) if m.counts else ratios(x, y, resamples=RESAMPLES, seed=seed, most=m.most)
+                e = estimate_proportions(x, y) if m.is_proportion else estimate_ratios(x, y, resamples=RESAMPLES, seed=seed, upper_limit=m.upper_limit)
                 found[m.name].add(e.low, e.high, np.isfinite(e.low))
         for name, held in found.items():
             print(f"| {name} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
@@ -275,7 +275,7 @@ def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
 
 def differences(population: Population, sets: int, pairs: tuple[tuple[int, int], ...]) -> None:
     """How often two groups of one population are found to differ, p <= 0.05, and how often after the adjustment."""
-    from nerg_mi.statistics.estimates import proportion_differences, ratio_differences
+    from nerg_mi.statistics.estimates import estimate_proportion_differences, estimate_ratio_differences
 
     print("\n| people | number | p <= 0.05 | most of a thing | rare | most | a set has a false discovery |")
     print("| --- | --- | ---: | ---: | ---: | ---: | ---: |")
@@ -285,16 +285,16 @@ def differences(population: Population, sets: int, pairs: tuple[tuple[int, int],
         for _ in range(sets):
             who, seed = rng.integers(0, population.count, m + n), int(rng.integers(1 << 30))
             every = []
-            for name in COMPARED:
+            for name in COMPARED_MEASURES:
                 x, y = population.draw(name, who)
                 a, b = (x * first, y * first), (x * (1 - first), y * (1 - first))
-                if BY_NAME[name].counts:
-                    d = proportion_differences(a, b)
+                if MEASURES_BY_NAME[name].is_proportion:
+                    d = estimate_proportion_differences(a, b)
                 else:
-                    d = ratio_differences(a, b, resamples=RESAMPLES, seed=seed)
+                    d = estimate_ratio_differences(a, b, resamples=RESAMPLES, seed=seed)
                 found[name].append(d.p)
                 every.append(d.p)
-            wrong.append(bool((adjusted(np.concatenate(every)) <= 0.05).any()))
+            wrong.append(bool((adjust_p_values(np.concatenate(every)) <= 0.05).any()))
         for name, p in found.items():
             rate = (np.array(p) <= 0.05).mean(axis=0)
             cells = [f"{100 * f(rate[population.common == c]):.1f} %" for c in (True, False) for f in (np.mean, np.max)]

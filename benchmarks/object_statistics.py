@@ -1,7 +1,7 @@
 """Numbers of attention on things against what is true: errors (coverage of intervals: object_coverage.py).
 
     python benchmarks/object_statistics.py errors      # the store's law and brute-force ray casts
-    python benchmarks/object_statistics.py shop        # the rays of docs/shop.md, as shop.npz in this folder
+    python benchmarks/object_statistics.py shop        # the rays of docs/tutorials/store.md, as shop.npz in this folder
 
 The shoppers' walks are those of the demo store (`nerg_mi.scenes.store.shoppers`), each tracked once in 0.8 s (in
 the shop five times a second); where they look is drawn from the store's law.
@@ -23,26 +23,26 @@ def made_store():
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.aoi.scene import shapes_of, surroundings_of_scene, things_of
+    from nerg_mi.aoi.scene import shapes_by_id, load_scene_file, make_aois
     from nerg_mi.formats.areas import read_areas
-    from nerg_mi.workflows.demo import store_scene
+    from nerg_mi.workflows.demo import find_store_scene
 
-    folder = store_scene().parent
-    around = surroundings_of_scene(folder / "shapes.xml", None, None, None)
+    folder = find_store_scene().parent
+    around = load_scene_file(folder / "shapes.xml", None, None, None)
     areas = read_areas(folder / "regions.json")
-    return around, areas, things_of(areas.things, shapes_of(around.scene))
+    return around, areas, make_aois(areas.elements, shapes_by_id(around.scene))
 
 
 def counting_of(around, areas, things, seen: bool = True):
     from nerg_mi.aoi.measured import AoiContext
-    from nerg_mi.statistics.shares import CellsInView, SamplePoints
+    from nerg_mi.statistics.shares import VisibilityCache, SamplePoints
     from nerg_mi.statistics.visits import VisitRules
 
-    in_view = CellsInView(SamplePoints.of(things, 48), around.depth, 0.1, 0.03) if seen else None
+    in_view = VisibilityCache(SamplePoints.sample(things, 48), around.depth, 0.1, 0.03) if seen else None
     members = list(areas.members().values())
-    rules = VisitRules(gap=2.0, pause=60.0, merge=0.15, least=0.1)
+    rules = VisitRules(max_gap=2.0, session_pause=60.0, merge_gap=0.15, min_visit=0.1)
     return AoiContext(
-        around, things, areas.names, members, range(len(members)), rules, 0.03, view=120.0, cells_in_view=in_view
+        around, things, areas.names, members, range(len(members)), rules, 0.03, fov=120.0, visibility_cache=in_view
     )
 
 
@@ -53,13 +53,13 @@ class Walks:
         from nerg_mi.scenes.store import layout, shoppers
         from nerg_mi.scenes.store.attention_law import AttentionLaw
 
-        plan = layout.build()
+        plan = layout.build_store()
         self.law = AttentionLaw()
-        store, rng = shoppers.Store(plan), np.random.default_rng([seed, 1])
+        store, rng = shoppers.WaypointGraph(plan), np.random.default_rng([seed, 1])
         weights = 0.5 + self.law.attractiveness
         self.heads, self.times = [], []
         for _ in range(count):
-            visit = shoppers.walk(store, rng, int(rng.integers(8, 21)), weights)
+            visit = shoppers.simulate_visit(store, rng, int(rng.integers(8, 21)), weights)
             self.heads.append(visit.head[::every])
             self.times.append(visit.time[::every])
         self.lengths = np.array([len(h) for h in self.heads])
@@ -93,12 +93,12 @@ class Walks:
 
 def errors() -> None:
     from nerg_mi.aoi.measured import Viewpoints, count_block
-    from nerg_mi.aoi.predicted import foretell
+    from nerg_mi.aoi.predicted import predict_attention
     from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.scenes.store import twin
     from nerg_mi.statistics.shares import SamplePoints
     from nerg_mi.statistics.tables import Participants
-    from nerg_mi.statistics.visits import ALL, land
+    from nerg_mi.statistics.visits import ALL, assign_hits
     from nerg_mi.workflows.base import SILENT
 
     around, areas, things = made_store()
@@ -106,9 +106,9 @@ def errors() -> None:
     counting = counting_of(around, areas, things)
     rng = np.random.default_rng(1)
     rays = walks.rays(np.arange(12), rng)
-    people = Participants.of(count_block(rays, counting), ALL, True)
+    people = Participants.from_sums(count_block(rays, counting), ALL, True)
     # Brute force: a ray at a time to the twin, every box by its six planes, sums by plain loops.
-    depth = twin.cast(rays.origin, rays.direction)
+    depth = twin.cast_rays(rays.origin, rays.direction)
     dwell = np.zeros((12, len(areas.names)))
     reached = np.zeros_like(dwell)
     for i in range(len(rays)):
@@ -124,9 +124,9 @@ def errors() -> None:
                 dwell[rays.person[i], k] += weight
                 reached[rays.person[i], k] = 1
     print("| number | against | largest error |\n| --- | --- | ---: |")
-    largest = np.abs(people.on_time - dwell).max()
+    largest = np.abs(people.dwell_time - dwell).max()
     print(f"| dwell [s], each person and thing | plain loops, ray casts to the twin | {largest:.2g} |")
-    print(f"| reach, each person and thing | the same | {np.abs(people.reached - reached).max():.2g} |")
+    print(f"| reach, each person and thing | the same | {np.abs(people.hit_probability - reached).max():.2g} |")
     # The law's own share, by quadrature over the sphere at some positions, beside the field's and a large draw.
     rows = np.linspace(0, len(walks.origin) - 1, 160).round().astype(int)
     d = fibonacci_directions(8192)
@@ -137,7 +137,7 @@ def errors() -> None:
     far = np.zeros_like(law)
     for a in range(0, len(eyes), 40):
         part = slice(a * len(d), (a + 40) * len(d))
-        found = land(things, o[part], along[part], twin.cast(o[part], along[part]), 0.03)
+        found = assign_hits(things, o[part], along[part], twin.cast_rays(o[part], along[part]), 0.03)
         weight = density[a : a + 40].ravel() * (4 * np.pi / len(d))
         for k, (at, distance) in enumerate(zip(found.rows, found.distance)):
             law[a : a + 40, k] = np.bincount(at // len(d), weights=weight[at], minlength=40)
@@ -156,7 +156,7 @@ def errors() -> None:
         directions,
         np.ones(len(many)),
     )
-    landed = counting.land(sampled)
+    landed = counting.assign_hits(sampled)
     counted = np.array([len(at) for at in landed.rows]) / len(many)
     shares = law.mean(axis=0)
     sigma = np.sqrt(shares * (1 - shares) / len(many))
@@ -172,7 +172,7 @@ def errors() -> None:
     at = Viewpoints(
         eyes, np.tile([1.0, 0, 0], (len(eyes), 1)), tuple(map(str, range(len(eyes)))), (frozenset([ALL]),) * len(eyes)
     )
-    told = foretell(around, at, things, counting.members, 0.03, 360.0, 48, 8192, SILENT)
+    told = predict_attention(around, at, things, counting.members, 0.03, 360.0, 48, 8192, SILENT)
     error = np.abs(told.share.mean(axis=0) - shares)
     r = np.corrcoef(told.share.mean(axis=0), shares)[0, 1]
     print(
@@ -184,8 +184,8 @@ def errors() -> None:
     # What could be seen: exact ray casts from where people stood, against cells of 10 cm.
     some = np.linspace(0, len(rays) - 1, 1500).round().astype(int)
     chosen = rays.select(some)
-    seen = counting.visible(chosen)
-    targets = SamplePoints.of(things, 48)
+    seen = counting.visibility(chosen)
+    targets = SamplePoints.sample(things, 48)
     exact = np.zeros_like(seen)
     for n in range(len(chosen)):
         away = targets.points - chosen.origin[n]
@@ -195,8 +195,8 @@ def errors() -> None:
         free = np.zeros(len(length), bool)
         ask = np.flatnonzero(front & within)
         if len(ask):
-            free[ask] = twin.visible(chosen.origin[n], targets.points[ask], tolerance=0.03)
-        exact[n] = np.bincount(targets.thing, weights=free, minlength=exact.shape[1]) > 0
+            free[ask] = twin.is_visible(chosen.origin[n], targets.points[ask], tolerance=0.03)
+        exact[n] = np.bincount(targets.aoi_index, weights=free, minlength=exact.shape[1]) > 0
     agree = (seen == exact).mean()
     print(
         f"| visible or not, {seen.size:,} pairs | ray casts from where they stood | {100 * (1 - agree):.2f} % differ |"

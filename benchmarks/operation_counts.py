@@ -2,7 +2,7 @@
 
     python benchmarks/operation_counts.py [--width 240] [--runs 5]
 
-Prints the table of docs/leave-out.md and writes it as CSV. Counts do not depend on the machine; processor seconds
+Prints the table of docs/explanation/performance.md and writes it as CSV. Counts do not depend on the machine; processor seconds
 are medians of several runs, and only their ratios mean anything.
 """
 
@@ -16,8 +16,8 @@ from pathlib import Path
 
 import nerg_mi
 import nerg_mi.scenes.store
-from nerg_mi.evaluation.study import traced_operations
-from nerg_mi.files.tables import markdown_table
+from nerg_mi.evaluation.study import count_traced_operations
+from nerg_mi.files.tables import format_markdown_table
 from timing import write_rows
 
 import mitsuba as mi
@@ -104,7 +104,7 @@ def main() -> None:
         place = scene(args.width, options)
         if "first" not in name:
             mi.render(place, spp=1).numpy()
-        operations = traced_operations(partial(mi.render, place, spp=1))
+        operations = count_traced_operations(partial(mi.render, place, spp=1))
         seconds = []
         for run in range(args.runs):
             if "first" in name:
@@ -118,7 +118,7 @@ def main() -> None:
         [name, f"{operations:,}", f"{density:.1f}", f"{color:.1f}", f"{gaze:.2f}", f"{seconds:.3f}"]
         for name, operations, density, color, gaze, seconds in rows
     ]
-    print(markdown_table(["what", "operations traced", "density evals", "colour evals", "gaze evals", "CPU s"], shown))
+    print(format_markdown_table(["what", "operations traced", "density evals", "colour evals", "gaze evals", "CPU s"], shown))
     names = ("what", "operations", "density_evals", "color_evals", "gaze_evals", "seconds")
     write_rows(Path("out/benchmarks/operation_counts.csv"), [dict(zip(names, row)) for row in rows])
 

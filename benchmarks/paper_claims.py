@@ -46,12 +46,12 @@ def main(argv=None) -> None:
                 **{k: v for k, v in where.items() if k in known},
                 recipes=args.recipes,
                 variant=tuple(args.variant),
-                first=fold,
+                seed=fold,
                 seeds=1,
                 steps=args.steps,
-                people=0.5,
+                test_participants=0.5,
                 refit=False,
-                cameras=0,
+                timing_cameras=0,
                 threads=args.threads,
             )
             with TerminalReporter() as reporter:

@@ -115,7 +115,7 @@ def store(folder: Path) -> tuple[Path, dict]:
         make.main(["--stage", "shoppers"])
     path = folder / "rays.npz"
     import_rays([csv], RaysImportOptions(reader="skeleton", settings=SkeletonOptions(tick=0.001), output=path))
-    return path, {"field": demo.store_scene().parent / "store.safetensors"}
+    return path, {"field": demo.find_store_scene().parent / "store.safetensors"}
 
 
 def generated(place, folder: Path) -> tuple[Path, dict]:
@@ -178,7 +178,7 @@ def evaluate(name: str, make: Make, args: argparse.Namespace):
         recipe=args.recipe,
         variant=args.variant,
         folds=args.folds,
-        first=args.first,
+        seed=args.first,
         zones=args.zones,
         splits="both,people" if args.uncertainty else "both",
         ensemble=args.ensemble,

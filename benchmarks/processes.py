@@ -1,7 +1,7 @@
 """What is measured in processes of their own, for `bench.py`: the memory of a frame, and how long it takes to start.
 
-    python benchmarks/processes.py memory [--sizes 640x360,1280x720,1920x1080] [--update docs/performance.md]
-    python benchmarks/processes.py start [--runs 5] [--update docs/performance.md]
+    python benchmarks/processes.py memory [--sizes 640x360,1280x720,1920x1080] [--update docs/explanation/performance.md]
+    python benchmarks/processes.py start [--runs 5] [--update docs/explanation/performance.md]
 
 Memory: the demo store, colour, depth and gaze of an observer who is not the camera, one sample a pixel. Resident: the
 most memory of the process (high-water mark of its resident set) beyond what it held with the package imported and the
@@ -27,7 +27,7 @@ import time
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.workflows.demo import store_scene
+from nerg_mi.workflows.demo import find_store_scene
 from timing import median, print_table, spread
 
 SIZES = ((320, 180), (1280, 720), (1920, 1080))
@@ -66,11 +66,11 @@ def peak(way: str, width: int, height: int) -> dict[str, float]:
     before = status("VmRSS")
     values = {"width": str(width), "height": str(height), "spp": "1", "aovs": "depth,gaze"}
     if way == "mi.render":
-        np.array(mi.render(load_scene(store_scene(), values), spp=1))
+        np.array(mi.render(load_scene(find_store_scene(), values), spp=1))
     else:
         with tempfile.TemporaryDirectory() as folder:
             options = PictureOptions(spp=1, defaults=values, mode="llvm_ad_rgb")
-            render_file(store_scene(), Path(folder) / "a.exr", options)
+            render_file(find_store_scene(), Path(folder) / "a.exr", options)
     arrays = dr.detail.malloc_watermark(dr.JitBackend.LLVM) / 1e6
     return {"resident": status("VmHWM") - before, "arrays": arrays}
 
@@ -91,7 +91,7 @@ def memory(sizes=SIZES) -> list[list[str]]:
 
 def works(folder: Path) -> dict[str, tuple[list[str], bool]]:
     """What is run, and whether it begins with no kernels compiled, by name; files are written into ``folder``."""
-    picture = [*COMMAND, "render", str(store_scene()), "-o", str(folder / "a.png"), "-m", "llvm_ad_rgb"]
+    picture = [*COMMAND, "render", str(find_store_scene()), "-o", str(folder / "a.png"), "-m", "llvm_ad_rgb"]
     demo = [*COMMAND, "demo", "-o", str(folder / "demo"), "-m", "llvm_ad_rgb"]
     return {
         "`import nerg_mi`": ([sys.executable, "-c", "import nerg_mi"], False),

@@ -1,6 +1,6 @@
 """Radiance fields trained on photos: PSNR, SSIM and depth of views that were held out, rendered by the integrator.
 
-    python benchmarks/radiance.py fox [--minutes 1,2,4,7,10] [--width 135] [--deferred] [--validate] [--set hold=0.5]
+    python benchmarks/radiance.py fox [--minutes 1,2,4,7,10] [--width 135] [--deferred] [--validate] [--set lr_hold_fraction=0.5]
     python -m nerg_mi.scenes.store.make --stage views          # once: pictures of the store, rendered from the twin
     python benchmarks/radiance.py store [--minutes 10] [--size medium] [--only images|depth]
     python -m nerg_mi.scenes.tabletop.make                     # once: photos, rendered from a place made of a seed
@@ -68,7 +68,7 @@ def fields(data, stops: list[float], args: argparse.Namespace, name: str, depth:
     begins with ``name``."""
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.train.radiance_run import warm_up
-    from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
+    from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
     from nerg_mi.train.radiance_trainer import RadianceTrainer
     from nerg_mi.workflows.base import select_backend
 
@@ -77,7 +77,7 @@ def fields(data, stops: list[float], args: argparse.Namespace, name: str, depth:
     settings = RadianceSettings(
         minutes=stops[-1], seed=args.seed, **{key: ast.literal_eval(value) for key, value in pairs}
     )
-    config = replace(sized_config(args.size, data.box), deferred=deferred)
+    config = replace(make_radiance_config(args.size, data.box), deferred=deferred)
     trainer = RadianceTrainer(data.train, data.box, config, settings, ns, depth=depth)
     warm_up(trainer)
     for stop in stops:
@@ -85,11 +85,11 @@ def fields(data, stops: list[float], args: argparse.Namespace, name: str, depth:
             trainer.step()
         seconds = trainer.seconds
         path = args.out / f"{name}_{stop:g}.safetensors"
-        save_radiance(trainer.field(), path, {"minutes": stop, "settings": settings.to_dict()})
+        save_radiance(trainer.make_field(), path, {"minutes": stop, "settings": settings.to_dict()})
         row = {"minutes": stop, "steps": trainer.steps, "ms a step": 1e3 * seconds / trainer.steps}
         yield trainer, path, row | {"load": os.getloadavg()[0]}
         # What was spent on looking is no training.
-        trainer.restore(seconds, trainer.hard)
+        trainer.restore(seconds, trainer.hard_pixels)
     speed = trainer.clock.summary()
     print(f"{speed['evaluations_a_second']:.3g} field evaluations a second; step in ms: {speed['step_ms']}")
 
@@ -111,13 +111,13 @@ def cells(row: dict) -> list[str]:
 
 def fox(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
     """Title, head and cells of the table, and the rows of the CSV."""
-    from nerg_mi.train.radiance_run import measure
+    from nerg_mi.train.radiance_run import evaluate_views
 
     data = open_views(args.data, args, args.width)
     stops = sorted(float(m) for m in args.minutes.split(","))
     rows = []
     for trainer, path, row in fields(data, stops, args, f"fox_{args.width}", False, args.deferred):
-        rows.append(row | {"training views, dB": measure(trainer, data.train[::8], 2).mean, "file": path})
+        rows.append(row | {"training views, dB": evaluate_views(trainer, data.train[::8], 2).mean, "file": path})
     for row in rows:
         row |= scored(row["file"], data.held_out, args.spp)[1]
     table = [[*cells(row), f"{row['training views, dB']:.1f}"] for row in rows]
@@ -131,10 +131,10 @@ def store(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], li
             scores, columns = scored(path, data.held_out, args.spp)
             depth = scores.depth
             row |= {"from": source, **columns, "depth_median": depth.median, "depth_mean": depth.mean}
-            row |= {"depth_off": depth.off, "opacity": depth.opacity, "translucent": depth.translucent}
+            row |= {"depth_off": depth.outlier_fraction, "opacity": depth.opacity, "translucent": depth.translucent_fraction}
             rows.append(row)
             name = "images alone" if source == "images" else "images and depth"
-            more = [f"{100 * depth.median:.2f} cm", f"{depth.off:.1%}", f"{depth.opacity:.4f}"]
+            more = [f"{100 * depth.median:.2f} cm", f"{depth.outlier_fraction:.1%}", f"{depth.opacity:.4f}"]
             table.append([name, *cells(row), *more])
     return "The store", ["from", *SCORES, "depth off, median", "by more than a tenth", "opacity"], table, rows
 
@@ -142,7 +142,7 @@ def store(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], li
 def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
     from nerg_mi.photos.dataset import open_dataset
     from nerg_mi.scenes.tabletop.photos import DEPTH_FILE
-    from nerg_mi.scenes.tabletop.table import CENTRE
+    from nerg_mi.scenes.tabletop.table import OBJECT_CENTER
     from nerg_mi.workflows.radiance_commands import RadianceOptions
     from nerg_mi.workflows.train_radiance import train_radiance
 
@@ -158,9 +158,9 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
         raise SystemExit(f"{args.data / DEPTH_FILE} holds out other photos than the capture beside it")
     for line in about["complaints"]:
         print(line)
-    s = score_depths(path, held_out, box, CENTRE, args.spp, args.out / "pictures")
+    s = score_depths(path, held_out, box, OBJECT_CENTER, args.spp, args.out / "pictures")
     size = " x ".join(f"{u - l:.1f}" for l, u in zip(box.lower, box.upper)) + " m"
-    size += ", contracted" if result.field.box.contracted else ""
+    size += ", contracted" if result.field.box.is_contracted else ""
     table = [f"{minutes:g}", f"{about['seconds']:.0f}", f"{about['steps']:,}", f"{s['psnr']:.2f}", f"{s['ssim']:.3f}"]
     table += [f"{s['psnr_within']:.2f}, {s['psnr_beyond']:.2f}", f"{s['beyond']:.1%}"]
     table += [f"{100 * s['near_median']:.2f} cm, {s['near_off']:.1%}", f"{s['far_median']:.1%}, {s['far_off']:.1%}"]
@@ -173,14 +173,14 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
 def score_depths(field: Path, views: list, box, center, spp: int, pictures: Path) -> dict[str, float]:
     """Means over ``views`` of PSNR in dB and SSIM, and over all of their pixels: PSNR within and ``beyond`` the
     ``box``, and errors of depth near ``center`` and far."""
-    from nerg_mi.evaluation.metrics import Renderer, ssim
+    from nerg_mi.evaluation.metrics import FieldRenderer, ssim
     from nerg_mi.figures.overlay import write_png
     from nerg_mi.files.atomic import make_folder
-    from nerg_mi.maths.color import decibels, psnr
+    from nerg_mi.maths.color import psnr_from_mse, psnr
     from nerg_mi.photos.cameras import pixel_directions
 
     make_folder(pictures)
-    render, rows, parts = Renderer(field, spp), [], []
+    render, rows, parts = FieldRenderer(field, spp), [], []
     for k, view in enumerate(views):
         seen, truth = render(view.camera, k), view.over(0)
         rows.append((psnr(seen.color, truth), ssim(seen.color, truth)))
@@ -197,7 +197,7 @@ def score_depths(field: Path, views: list, box, center, spp: int, pictures: Path
     share = error / np.maximum(depth, 1e-9)
     out = {"psnr": float(np.mean([p for p, _ in rows])), "ssim": float(np.mean([s for _, s in rows]))}
     for name, which in (("within", ~beyond), ("beyond", beyond)):
-        out[f"psnr_{name}"] = decibels(float(squares[which].mean())) if which.any() else float("nan")
+        out[f"psnr_{name}"] = psnr_from_mse(float(squares[which].mean())) if which.any() else float("nan")
     return out | {
         "beyond": float(beyond.mean()),
         "near_median": float(np.median(error[near])),

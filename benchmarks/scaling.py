@@ -71,7 +71,7 @@ def count(folder: Path, name: str, **more) -> tuple[int, bytes]:
     from nerg_mi.aoi.options import StatisticsOptions
     from nerg_mi.workflows.statistics import statistics as stats
 
-    options = StatisticsOptions(areas=folder / "areas.json", resamples=199, names=True, mode="llvm_ad_rgb", **more)
+    options = StatisticsOptions(aois=folder / "areas.json", resamples=199, show_names=True, mode="llvm_ad_rgb", **more)
     stats([folder / "scene.xml", folder / "rays.npz"], folder / name, options)
     return 0, (folder / name / "things.csv").read_bytes()
 
@@ -107,7 +107,7 @@ def main() -> None:
                     start = time.perf_counter()
                     faces, made = work(f"{what} {workers}", **given, store=store)
                     seconds = time.perf_counter() - start
-                    receipts = list(Store(store).receipts())
+                    receipts = list(Store(store).iter_manifests())
                     each = [r.seconds for r in receipts]
                     size = sum(r.size for r in receipts) / len(receipts)
                     if made != whole[what][1]:

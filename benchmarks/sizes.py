@@ -11,7 +11,7 @@ from functools import partial
 
 import nerg_mi as nerg
 from nerg_mi.figures.style import INK, new_page
-from nerg_mi.workflows.demo import store_scene
+from nerg_mi.workflows.demo import find_store_scene
 from torch_frames import camera_rays
 
 import numpy as np
@@ -35,7 +35,7 @@ def frames(width: int, height: int, spp: int = 1, **values) -> Callable[[], np.n
     """A function that renders colour, depth and gaze of the store in ``spp`` samples."""
     import mitsuba as mi
 
-    scene = nerg.Scene.load(store_scene(), width=width, height=height, aovs="depth,gaze", **values).mitsuba
+    scene = nerg.Scene.load(find_store_scene(), width=width, height=height, aovs="depth,gaze", **values).mitsuba
     return lambda: np.array(mi.render(scene, sensor=0, spp=spp))
 
 
@@ -51,7 +51,7 @@ def samples(long: bool) -> Growth:
 
 
 def observers(long: bool) -> Growth:
-    scene = nerg.Scene.load(store_scene(), width=320, height=180)
+    scene = nerg.Scene.load(find_store_scene(), width=320, height=180)
     some = np.asarray(OBSERVER) + np.random.default_rng(0).uniform(-0.4, 0.4, (32, 3)) * (1, 1, 0.2)
     counts = (1, 2, 4, 8, *((16, 32) if long else ()))
     asked = partial(nerg.render, scene, quantities=["depth", "gaze"], spp=1)
@@ -59,7 +59,7 @@ def observers(long: bool) -> Growth:
 
 
 def rays(long: bool) -> Growth:
-    scene = nerg.Scene.load(store_scene(), width=320, height=180)
+    scene = nerg.Scene.load(find_store_scene(), width=320, height=180)
     o, d = camera_rays(640, 360)
     order = np.random.default_rng(0).permutation(len(o))
     counts = (1 << 13, 1 << 15, 1 << 17, *((len(o),) if long else ()))
@@ -138,7 +138,7 @@ def table(long: bool) -> Growth:
     import mitsuba as mi
 
     ns = namespace(mi.variant())
-    store = load_radiance(store_scene().parent / "store.safetensors", ns)[0]
+    store = load_radiance(find_store_scene().parent / "store.safetensors", ns)[0]
     p, works = random_points(store, 1 << 17), {}
     for log2_rows in (12, 14, 16, 18, *((20, 22) if long else ())):
         grid = HashGridConfig(levels=8, log2_rows=log2_rows, base=32, finest=512)

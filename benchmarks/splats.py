@@ -41,20 +41,20 @@ COLUMNS = {
 
 def make(path: Path, resolution: int) -> None:
     """Splats of the store's field."""
-    from nerg_mi.workflows.demo import store_scene
+    from nerg_mi.workflows.demo import find_store_scene
     from nerg_mi.workflows.export import export_splats
     from nerg_mi.workflows.radiance_commands import SplatOptions
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    export_splats(store_scene().parent / "store.safetensors", path, SplatOptions(resolution=resolution))
+    export_splats(find_store_scene().parent / "store.safetensors", path, SplatOptions(resolution=resolution))
 
 
 def splat_scene(folder: Path) -> Path:
     """The store's scene with splats for a field, written to ``folder``."""
-    from nerg_mi.workflows.demo import store_scene
+    from nerg_mi.workflows.demo import find_store_scene
 
     path = folder / "splats.xml"
-    text = store_scene().read_text()
+    text = find_store_scene().read_text()
     path.write_text(text.replace('name="field" type="nerf"', 'name="field" type="splats"'))
     return path
 
@@ -168,14 +168,14 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.workflows.demo import store_scene
+    from nerg_mi.workflows.demo import find_store_scene
 
     folder = args.out.parent
     folder.mkdir(parents=True, exist_ok=True)
     if args.splats is None:
         args.splats = folder / "store.ply"
         make(args.splats, args.resolution)
-    store = store_scene()
+    store = find_store_scene()
     gaze = {"gaze": str((store.parent / "shoppers.safetensors").resolve())}
     files = gaze | {"field": str(args.splats.resolve())}
     scenes = {"field": (store, gaze), "splats": (splat_scene(folder), files)}

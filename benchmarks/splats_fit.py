@@ -1,7 +1,7 @@
 """Gaussian splats fitted to photos through ``mi.render``: PSNR of held-out views before and after, time, memory.
 
     python benchmarks/splats_fit.py [--resolution 96] [--views 24] [--width 96] [--steps 150] [--rays 8192] [--seeds 3]
-    [--update docs/splats.md]
+    [--update docs/explanation/accuracy.md]
 
 Photos are those that a photographer takes of the demo store's twin, at cameras chosen as for the store's field; eight
 others, a shopper's, say which learning rates are taken (`RATES` times one of `FACTORS`, by the disturbed splats of seed
@@ -32,9 +32,9 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
 # BLAS threads wait in a busy loop, in the way of the others.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from nerg_mi.fields.splats import Splats, harmonics_of, multiply_quaternions
+from nerg_mi.fields.splats import Splats, harmonics_from_colors, multiply_quaternions
 from nerg_mi.figures.overlay import srgb
-from nerg_mi.registration import plugin_class
+from nerg_mi.registration import get_plugin_class
 from timing import print_table
 
 import drjit as dr
@@ -70,15 +70,15 @@ class Photos:
         from nerg_mi.scenes.store import cameras, layout, views
 
         camera = cameras.Pinhole(width, 3 * width // 4)
-        plan = layout.build(0)
+        plan = layout.build_store(0)
         poses = [*cameras.choose_views(plan, camera, count, 8), cameras.choose_views(plan, camera, 1, 8, seed=1)[1]]
-        photographer = views.Photographer(camera)
+        photographer = views.StorePhotographer(camera)
         film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
         film["component_format"] = "float32"
         sensor = {"type": "perspective", "fov": camera.fov_x, "fov_axis": "x", "near_clip": 0.01, "film": film}
         self.fitted, self.choosing, self.held_out = (
             (
-                [mi.load_dict(sensor | {"to_world": mi.ScalarTransform4f(views.mitsuba_pose(p))}) for p in group],
+                [mi.load_dict(sensor | {"to_world": mi.ScalarTransform4f(views.to_mitsuba_pose(p))}) for p in group],
                 [srgb(photographer.picture(pose, seed, spp)) for seed, pose in enumerate(group)],
             )
             for group, spp in zip(poses, (16, 64, 64))
@@ -87,7 +87,7 @@ class Photos:
 
 def scene_of(splats: Splats):
     """Their place, colour alone."""
-    integrator = {"type": "nerg", "field": plugin_class("splats").of(splats), "occlusion": False, "id": "integrator"}
+    integrator = {"type": "nerg", "field": get_plugin_class("splats").of(splats), "occlusion": False, "id": "integrator"}
     return mi.load_dict({"type": "scene", "integrator": integrator})
 
 
@@ -137,7 +137,7 @@ def stack(hits: int) -> Splats:
     centers = np.stack([np.where(np.arange(n) < hits, 0, 50), np.zeros(n), np.linspace(-1, 1, n)], axis=1)
     scales, turned = np.tile([2, 2, 1e-4], (n, 1)), np.tile([1, 0, 0, 0], (n, 1))
     # Light is left behind the last, so that all are met.
-    return Splats(centers, scales, turned, np.full(n, 4 / n), harmonics_of(np.full((n, 3), 0.3)))
+    return Splats(centers, scales, turned, np.full(n, 4 / n), harmonics_from_colors(np.full((n, 3), 0.3)))
 
 
 def peak(hits: int) -> float:

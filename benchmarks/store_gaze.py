@@ -43,7 +43,7 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.evaluation.gaze import EPS, FieldDensity, map_scores, nearest_probes, nearest_rays, position_blind
+    from nerg_mi.evaluation.gaze import EPS, FieldDensity, compute_map_scores, make_nearest_probes_baseline, make_nearest_rays_baseline, make_position_blind_baseline
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze, load_radiance
     from nerg_mi.maths.sphere import fibonacci_directions
@@ -78,29 +78,29 @@ def main(argv=None) -> None:
     # Of the silverman and loo rules there is no single kappa; the default stands for them.
     narrow = probe_settings["kappa"]
     methods = {
-        "gaze field": FieldDensity(gaze, medium, kind=probe_settings["depth"]),
-        "position-blind, kappa 50": position_blind(train, kappa=50),
+        "gaze field": FieldDensity(gaze, medium, depth_kind=probe_settings["depth"]),
+        "position-blind, kappa 50": make_position_blind_baseline(train, kappa=50),
     }
     for kappa in (narrow, args.wide):
         probes = place_probes(
             train,
             radius,
             count=probe_settings["count"],
-            cap=probe_settings["cap"],
+            max_rays=probe_settings["cap"],
             min_rays=probe_settings["min_rays"],
             kappa_rule="fixed",
             kappa=kappa,
             seed=0,
         )
-        methods |= {f"{k} nearest probe{'s' * (k > 1)}, kappa {kappa:g}": nearest_probes(probes, k) for k in (1, 16)}
-        methods[f"4,096 nearest rays, kappa {kappa:g}"] = nearest_rays(train, 4096, kappa=kappa)
+        methods |= {f"{k} nearest probe{'s' * (k > 1)}, kappa {kappa:g}": make_nearest_probes_baseline(probes, k) for k in (1, 16)}
+        methods[f"4,096 nearest rays, kappa {kappa:g}"] = make_nearest_rays_baseline(train, 4096, kappa=kappa)
     methods[f"law, seen by {probe_settings['cap']:,} rays, kappa {narrow:g}"] = fresh_draws(
         law, probe_settings["cap"], narrow
     )
     rows = []
     for name, method in methods.items():
         maps = method(positions, directions)
-        rows.append({"method": name, **map_scores(truth, maps), "integral": float(4 * np.pi * np.mean(maps))})
+        rows.append({"method": name, **compute_map_scores(truth, maps), "integral": float(4 * np.pi * np.mean(maps))})
     title = f"{len(positions)} held-out positions against the law ({len(train):,} of {len(rays):,} rays trained on)"
     table = [[r["method"], *(f"{r[k]:.3f}" for k in ("KLD", "CC", "SIM")), f"{r['MAE']:.4f}"] for r in rows]
     print_table(title, ("", "KLD", "CC", "SIM", "MAE, 1/sr"), table)

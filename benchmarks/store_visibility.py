@@ -90,11 +90,11 @@ def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, wid
     depth = np.linalg.norm(p - o, axis=-1)
     d = (p - o) / np.maximum(depth[..., None], 1e-9)
     exact = np.full(depth.shape, np.nan)
-    exact[surface] = twin.cast(o, d[surface])
+    exact[surface] = twin.cast_rays(o, d[surface])
     # A millimetre before the surface: the point itself must not hide itself.
     truth, own = np.zeros(depth.shape, bool), np.zeros(depth.shape, bool)
-    truth[surface] = twin.visible(e, (o + (exact[surface, None] - 1e-3) * d[surface]))
-    own[surface] = twin.visible(e, p[surface], tolerance=0.05)
+    truth[surface] = twin.is_visible(e, (o + (exact[surface, None] - 1e-3) * d[surface]))
+    own[surface] = twin.is_visible(e, p[surface], tolerance=0.05)
 
     far = surface & ~near_edges(np.nan_to_num(exact, nan=1e3), truth, margin)
     shown = seen > 0.5
@@ -154,13 +154,13 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.workflows.demo import store_scene
+    from nerg_mi.workflows.demo import find_store_scene
 
     files = {k: str(v.resolve()) for k, v in (("field", args.field), ("gaze", args.gaze)) if v is not None}
     rows = [
-        measure(store_scene(), pair, kind, visibility, files, args.width, args.margin)
+        measure(find_store_scene(), pair, kind, visibility, files, args.width, args.margin)
         for visibility in args.visibility.split(",")
-        for kind in args.kinds.split(",")
+        for kind in args.dtypes.split(",")
         for pair in args.pair or PAIRS
     ]
     head = ("depth", "visibility", "wrong %, away", "wrong %, all", "kept", *CENTIMETRES)

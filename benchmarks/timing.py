@@ -8,12 +8,12 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from nerg_mi.files.tables import markdown_table, write_csv
+from nerg_mi.files.tables import format_markdown_table, write_csv
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from tools.page import update
+from tools.page import update_table
 
 
 def write_rows(path: Path, rows: list[dict]) -> None:
@@ -25,7 +25,7 @@ def write_rows(path: Path, rows: list[dict]) -> None:
 def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence], page: Path | None = None) -> None:
     """Print a table below its heading, and put it into the ``page`` of the documentation that has this heading."""
     print(f"### {title}\n")
-    update(page, title, markdown_table(head, rows))
+    update_table(page, title, format_markdown_table(head, rows))
     print(flush=True)
 
 

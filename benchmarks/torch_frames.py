@@ -27,7 +27,7 @@ if "drjit" not in sys.modules:
 import nerg_mi as nerg
 from nerg_mi.figures.overlay import srgb
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.workflows.demo import store_scene
+from nerg_mi.workflows.demo import find_store_scene
 from timing import in_turns, median, spread
 from torch_radiance import _PRIMES, TorchModel, harmonics
 
@@ -47,7 +47,7 @@ class Attention:
         self.low, self.scale = low, 2 / (high - low).max()
         self.end = (high - low) * self.scale - 1
 
-    def log_blind(self, r_o):
+    def log_prior(self, r_o):
         """Log of the density that knows no positions, bilinear in its table of latitudes and longitudes."""
         import torch
 
@@ -76,12 +76,12 @@ class Attention:
         u = torch.minimum((p_o - self.low) * self.scale - 1, self.end).clamp(min=-1)
         waves = [u, (u * (np.pi / 2)).sin(), (u * (np.pi / 2)).cos()]
         capture = self.model._net("capture_net", torch.cat([ones, harmonics(r_o)[:, : self.degree], *waves], 1))
-        return (self.log_blind(r_o) + emit).clamp(max=30).exp() * capture[:, 0].sigmoid()
+        return (self.log_prior(r_o) + emit).clamp(max=30).exp() * capture[:, 0].sigmoid()
 
     def gaze(self, p_od, p_o, r_o, integral):
         """Gaze in 1/sr of observers whose ``integral`` is known."""
         mix = self.config.mix
-        return (1 - mix) / integral * self.unnormalized(p_od, p_o, r_o) + mix * self.log_blind(r_o).exp()
+        return (1 - mix) / integral * self.unnormalized(p_od, p_o, r_o) + mix * self.log_prior(r_o).exp()
 
 
 SLAB = 16
@@ -242,7 +242,7 @@ def camera_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Origins and unit directions (width * height, 3) of the pixels' middles, seen by the scene's first sensor."""
     import mitsuba as mi
 
-    sensor = nerg.Scene.load(store_scene(), width=width, height=height).mitsuba.sensors()[0]
+    sensor = nerg.Scene.load(find_store_scene(), width=width, height=height).mitsuba.sensors()[0]
     x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
     at = mi.Point2f(x.ravel().astype(np.float32), y.ravel().astype(np.float32))
     ray, _ = sensor.sample_ray(0, 0.5, at, mi.Point2f(0.5), True)
@@ -275,7 +275,7 @@ class Ours:
     def __init__(self, values: dict, visibility: str, constant: bool = False):
         import mitsuba as mi
 
-        scene = nerg.Scene.load(store_scene(), **values, visibility=visibility)
+        scene = nerg.Scene.load(find_store_scene(), **values, visibility=visibility)
         if constant:
             scene.set_constant_weights()
         self.render = partial(mi.render, scene.mitsuba, sensor=0, spp=1)

@@ -50,7 +50,7 @@ def take_turns(ours, peer, turns: int, steps: int = 8, before: int = 100) -> Non
 
 _PRIMES = (1, 2654435761, 805459861)
 
-OFF = {"settle": 2.0, "empty_weight": 0.0, "grid_decay": 0.0, "thin_least": 1.0, "reach": 0.0, "photo_colors": False}
+OFF = {"extraction_start": 2.0, "empty_weight": 0.0, "grid_decay": 0.0, "rr_min_probability": 1.0, "damping_distance": 0.0, "photo_colors": False}
 """Settings without what the peer does not have."""
 
 
@@ -141,7 +141,7 @@ class TorchTrainer:
         import torch
 
         self.torch, self.s, self.ours = torch, ours.settings, ours
-        self.model = TorchModel(ours.live)
+        self.model = TorchModel(ours.current_field)
         self.averaged = {k: v.detach().clone() for k, v in self.model.weights.items()}
         self.optimiser = torch.optim.Adam(
             self.model.weights.values(), lr=self.s.learning_rate, betas=(0.9, 0.99), eps=1e-15
@@ -224,7 +224,7 @@ class TorchTrainer:
 
     def step(self):
         torch, s = self.torch, self.s
-        if self.steps % s.grid_every == 0 and self.steps:
+        if self.steps % s.grid_interval == 0 and self.steps:
             self.update()
         index = torch.randint(len(self.o), (self.rays,), generator=self.generator)
         o, d, truth = self.o[index], self.d[index], self.c[index]
@@ -249,21 +249,21 @@ class TorchTrainer:
         opacity = torch.zeros(covered).index_add(0, ray, weight)
         background = torch.rand(covered, 3, generator=self.generator)
         error = (color + (1 - opacity)[:, None] * background - truth[:covered]).abs()
-        loss = torch.where(error < s.huber, 0.5 * error**2, s.huber * (error - 0.5 * s.huber)).mean(1).mean()
+        loss = torch.where(error < s.huber_delta, 0.5 * error**2, s.huber_delta * (error - 0.5 * s.huber_delta)).mean(1).mean()
         self.optimiser.zero_grad()
         loss.backward()
         for group in self.optimiser.param_groups:
             group["lr"] = s.rate(self.progress)
         self.optimiser.step()
         if self.steps % 4 == 0:
-            decay = min(s.average, (1 + self.steps) / (10 + self.steps)) ** 4
+            decay = min(s.ema_decay, (1 + self.steps) / (10 + self.steps)) ** 4
             for k, v in self.averaged.items():
                 v.lerp_(self.model.weights[k].detach(), 1 - decay)
 
 
 def same_model(trainer, peer) -> float:
     """Largest relative difference of densities, and of colours, at random points."""
-    from nerg_mi.train.radiance_losses import density_summand
+    from nerg_mi.train.radiance_losses import evaluate_samples
 
     import drjit as dr
     import torch
@@ -273,13 +273,13 @@ def same_model(trainer, peer) -> float:
     d = rng.normal(size=p.shape).astype(np.float32)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     ns = trainer.ns
-    scaled = {k: dr.detach(v) * (3e3 if k == "grid.table" else 1) for k, v in trainer.live.parameters().items()}
+    scaled = {k: dr.detach(v) * (3e3 if k == "grid.table" else 1) for k, v in trainer.current_field.parameters().items()}
     old = {k: v.detach().clone() for k, v in peer.weights.items()}
     with torch.no_grad():
         peer.weights["grid.table"] *= 3e3
         theirs = peer.sigma_color(torch.from_numpy(p), harmonics(torch.from_numpy(d)))
         peer.weights["grid.table"].copy_(old["grid.table"])
-    ours = density_summand(trainer.config, trainer.box, scaled, ns.Array3f(p.T), ns.Array3f(d.T), ns)
+    ours = evaluate_samples(trainer.config, trainer.box, scaled, ns.Array3f(p.T), ns.Array3f(d.T), ns)
     a, b = ours[0].numpy(), np.stack([c.numpy() for c in ours[1]], 1)
     return max(float(np.abs(a / theirs[0].numpy() - 1).max()), float(np.abs(b - theirs[1].numpy()).max()))
 
@@ -300,7 +300,7 @@ def main(argv=None) -> None:
 
     from nerg_mi.evaluation.metrics import score_views
     from nerg_mi.formats.fields import save_radiance
-    from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
+    from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
     from nerg_mi.train.radiance_trainer import RadianceTrainer
     from nerg_mi.workflows.base import select_backend
 
@@ -313,7 +313,7 @@ def main(argv=None) -> None:
         raise SystemExit("the peer knows neither alpha nor masks; give a set of plain photos")
     fine = {"strides": ()} if args.turns else {}
     settings = RadianceSettings(minutes=args.minutes, **OFF, **fine)
-    make = lambda: RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
+    make = lambda: RadianceTrainer(data.train, data.box, make_radiance_config(args.size, data.box), settings, ns, depth=False)
     args.out.mkdir(parents=True, exist_ok=True)
     ours, judge = make(), make()
     peer = TorchTrainer(judge, data.train)
@@ -336,7 +336,7 @@ def main(argv=None) -> None:
         if trainer is peer:
             judge.averaged = {k: type(v)(peer.averaged[k].numpy()) for k, v in judge.averaged.items()}
         path = args.out / f"{name}.safetensors"
-        save_radiance((judge if trainer is peer else ours).field(), path, {"trainer": name})
+        save_radiance((judge if trainer is peer else ours).make_field(), path, {"trainer": name})
         scores = score_views(path, data.held_out, 4)
         rows.append(
             {

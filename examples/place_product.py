@@ -48,10 +48,10 @@ def stream(count: int, seed: int) -> np.ndarray:
     """Head positions (count, 3) in metres of shoppers at random moments of their visits."""
     from nerg_mi.scenes.store import attention_law, layout, shoppers
 
-    place = layout.build(0)
-    store, rng = shoppers.Store(place), np.random.default_rng([seed, 0xB0C5])
+    place = layout.build_store(0)
+    store, rng = shoppers.WaypointGraph(place), np.random.default_rng([seed, 0xB0C5])
     weights = 0.5 + attention_law.AttentionLaw().attractiveness
-    visits = [shoppers.walk(store, rng, int(rng.integers(8, 21)), weights).head for _ in range(max(2, count // 16))]
+    visits = [shoppers.simulate_visit(store, rng, int(rng.integers(8, 21)), weights).head for _ in range(max(2, count // 16))]
     heads = np.concatenate(visits)
     return heads[rng.choice(len(heads), count, replace=False)]
 
@@ -97,31 +97,31 @@ class Attention:
     """Expected attention of a stream of observers to a box on a shelf, and its derivative."""
 
     def __init__(self, shelf: Shelf, heads: np.ndarray, settings: Settings, falloff: float = 0.05):
-        from nerg_mi.probes.surface_attention import patches
-        from nerg_mi.scenes.store.attention_law import HERE
-        from nerg_mi.transport.geometry import Place
+        from nerg_mi.probes.surface_attention import make_patches
+        from nerg_mi.scenes.store.attention_law import FOLDER
+        from nerg_mi.transport.geometry import SceneGeometry
 
         import mitsuba as mi
 
         self.shelf, self.falloff = shelf, falloff
-        self.scene = mi.load_file(str(HERE / "shapes.xml"))
-        integrator, self.place = self.scene.integrator(), Place(None, self.scene)
+        self.scene = mi.load_file(str(FOLDER / "shapes.xml"))
+        integrator, self.place = self.scene.integrator(), SceneGeometry(None, self.scene)
         each = [mi.Point3f(*head) for head in heads.tolist()]
-        self.gaze = integrator.gaze.at(each, self.place, integrator.observer_settings)
+        self.gaze = integrator.gaze.for_observers(each, self.place, integrator.observer_settings)
         self.observers = mi.Point3f(np.ascontiguousarray(heads.T, np.float32))
-        self.surface = patches(mi.load_dict(shelf.box()), settings.divisions)
+        self.surface = make_patches(mi.load_dict(shelf.box()), settings.divisions)
 
     def density(self, p_od, p_o, r_o, active):
         return self.gaze.evaluate(p_od, p_o, r_o, active)[0]
 
     def _each(self, at, density):
-        from nerg_mi.probes.surface_attention import contributions
+        from nerg_mi.probes.surface_attention import attention_per_patch
 
         import mitsuba as mi
 
         offset = [mi.Float(0)] * 3
         offset[self.shelf.along] = at
-        return contributions(self.place, density, self.observers, self.surface.moved(mi.Vector3f(offset)), self.falloff)
+        return attention_per_patch(self.place, density, self.observers, self.surface.translate(mi.Vector3f(offset)), self.falloff)
 
     def expected(self, at):
         """Attention (Float) with the box at ``at`` (Float) along the shelf: a probability, at any moment of a visit."""
@@ -189,9 +189,9 @@ def uphill(values: np.ndarray, start: int, window: int = 2) -> int:
 def elevation(attention: Attention, at: float, spacing: float):
     """The shelf seen from the front with the box at ``at``: albedo (h, w, 3), attention (h, w) in 1/m², extent in
     metres."""
-    from nerg_mi.probes.surface_attention import Patches, contributions
-    from nerg_mi.scenes.store.attention_law import HERE
-    from nerg_mi.transport.geometry import Place
+    from nerg_mi.probes.surface_attention import Patches, attention_per_patch
+    from nerg_mi.scenes.store.attention_law import FOLDER
+    from nerg_mi.transport.geometry import SceneGeometry
 
     import drjit as dr
     import mitsuba as mi
@@ -199,7 +199,7 @@ def elevation(attention: Attention, at: float, spacing: float):
     shelf = attention.shelf
     store = {
         "type": "ply",
-        "filename": str(HERE / "twin.ply"),
+        "filename": str(FOLDER / "twin.ply"),
         "face_normals": True,
         "bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_color"}},
     }
@@ -218,13 +218,13 @@ def elevation(attention: Attention, at: float, spacing: float):
     dr.eval(points.p, points.n)
     total, place, count = (
         dr.zeros(mi.Float, len(grid.reshape(-1, 3))),
-        Place(None, scene),
+        SceneGeometry(None, scene),
         dr.width(attention.observers),
     )
     for a in range(0, count, 16):
         some = dr.arange(mi.UInt32, min(16, count - a)) + dr.opaque(mi.UInt32, a)
         people = dr.gather(mi.Point3f, attention.observers, some)
-        each = contributions(place, attention.density, people, points, attention.falloff)
+        each = attention_per_patch(place, attention.density, people, points, attention.falloff)
         for k in range(dr.width(people)):
             total += dr.gather(mi.Float, each, dr.arange(mi.UInt32, dr.width(total)) + k * dr.width(total))
         dr.eval(total)
@@ -235,7 +235,7 @@ def elevation(attention: Attention, at: float, spacing: float):
 
 def figure(attention: Attention, sweep, paths, checks, settings: Settings):
     """The shelf before and after, the sweep with the ascents, and the derivatives, above one common axis."""
-    from nerg_mi.figures.overlay import Heat, overlay, top_of
+    from nerg_mi.figures.overlay import Heat, overlay, robust_max
 
     from matplotlib.figure import Figure
 
@@ -245,7 +245,7 @@ def figure(attention: Attention, sweep, paths, checks, settings: Settings):
     sheet = Figure(figsize=(7.2, 9.6), layout="constrained")
     axes = sheet.subplots(4, 1, sharex=True, height_ratios=(1.9, 1.9, 1.4, 1.2))
     shown = [elevation(attention, x, settings.pixels) for x in (best[0], best[-1])]
-    heat = Heat(top_of(shown[1][1], shown[1][1] >= 0))
+    heat = Heat(robust_max(shown[1][1], shown[1][1] >= 0))
     for ax, (color, gaze, extent), x, what in zip(axes, shown, (best[0], best[-1]), ("start", "end")):
         ax.imshow(overlay(color, gaze, heat, gaze >= 0), extent=extent, aspect="equal", interpolation="nearest")
         ax.set_ylabel("height [m]")

@@ -54,11 +54,11 @@ class Pictures:
     """Gaze of an observer at a position, as cameras in the demo store see it: (cameras, h, w) in 1/sr."""
 
     def __init__(self, size, cameras=CAMERAS, file="shapes.xml"):
-        from nerg_mi.scenes.store.attention_law import HERE
+        from nerg_mi.scenes.store.attention_law import FOLDER
 
         import mitsuba as mi
 
-        self.scene = mi.load_file(str(HERE / file), aovs="gaze", radiance="false")
+        self.scene = mi.load_file(str(FOLDER / file), aovs="gaze", radiance="false")
         self.params = mi.traverse(self.scene)
         self.params.keep([OBSERVER])
         self.size, self.cameras = size, cameras
@@ -185,7 +185,7 @@ def standing(points, clearance: float) -> np.ndarray:
     """Which of the floor's points (N, 2) keep that distance from all furniture and walls."""
     from nerg_mi.scenes.store import layout, shoppers
 
-    return shoppers.floor_clearance(layout.build(0), points) > clearance
+    return shoppers.compute_floor_clearance(layout.build_store(0), points) > clearance
 
 
 def first_guesses(spacing: float) -> np.ndarray:
@@ -205,7 +205,7 @@ def true_observers(count: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng([seed, 0x0B5E])
     floor = rng.uniform((0, 0), layout.ROOM[:2], (100 * count, 2))
     heights = rng.uniform(*shoppers.EYE_HEIGHT, count)
-    return np.column_stack([floor[standing(floor, shoppers.BODY)][:count], heights])
+    return np.column_stack([floor[standing(floor, shoppers.BODY_RADIUS)][:count], heights])
 
 
 def search(pictures: Pictures, given, guesses, known, settings: Settings) -> list:
@@ -243,7 +243,7 @@ def figure(shown, truths, searches):
         axes[name].set_ylabel(title, fontsize=8)
         axes[name].set(xticks=[], yticks=[])
     plan, off = axes["plan"], axes["off"]
-    for low, high in layout.build(0).solids:
+    for low, high in layout.build_store(0).solids:
         plan.add_patch(Rectangle(low[:2], *(high - low)[:2], color="0.85", lw=0))
     for n, (truth, descents) in enumerate(zip(truths, searches)):
         for k, descent in enumerate(descents):

@@ -5,7 +5,7 @@
     scene = nerg.make_scene("store.safetensors", "shoppers.safetensors", camera=nerg.Camera((7, 3, 2), (5, 4, 1)))
     pictures = nerg.render(scene, observers=[(4.4, 2.8, 1.6)])
 
-`docs/python.md` leads through what can be done; every name of `__all__` has an example in its docstring. A Mitsuba
+`docs/reference/python.md` leads through what can be done; every name of `__all__` has an example in its docstring. A Mitsuba
 variant that is set stays set; where none is, the first call that needs one sets ``cuda_ad_rgb`` if it works and
 ``llvm_ad_rgb`` otherwise.
 
@@ -134,5 +134,5 @@ _root = _Path(__file__).resolve().parents[1]
 if not (_root / "nerg_mi" / "plugins").is_dir() and (_root / "plugins" / "__init__.py").is_file():
     # In a checkout the plugins and the scenes lie beside the package, and an installation maps them into it.
     __path__.append(str(_root))
-_llvm.prepare()
+_llvm.select_library()
 _registration.install()

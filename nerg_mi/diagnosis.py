@@ -13,7 +13,7 @@ import sys
 from dataclasses import dataclass, field
 
 from . import __version__, llvm
-from .errors import sentence
+from .errors import format_error
 
 EXTRAS = {
     "torch": 'checkpoints of torch-ngp, fields as torch modules: pip install "nerg-mi[torch]"',
@@ -25,7 +25,7 @@ EXTRAS = {
 }
 """Optional distributions, each with what it is for and how to get it."""
 
-CUDA_MINIMUM = (12, 8)
+MIN_CUDA_VERSION = (12, 8)
 """CUDA version of the oldest NVIDIA driver (R570) on which drjit.nn works."""
 
 # dr.maximum is the operation on which libLLVM 15 and 16 abort; the rest of a kernel tells nothing more.
@@ -58,7 +58,7 @@ class Finding:
 
     topic: str
     text: str
-    trouble: str = ""
+    problem: str = ""
 
 
 @dataclass
@@ -66,15 +66,15 @@ class Diagnosis:
     """All findings, and whether the machine can render at all (`usable`: some compiled variant works)."""
 
     findings: list[Finding] = field(default_factory=list)
-    usable: bool = False
+    is_usable: bool = False
 
     def __str__(self) -> str:
         wide = max(len(f.topic) for f in self.findings)
         lines = []
         for f in self.findings:
             lines.append(f"{f.topic:<{wide}}  {f.text}".rstrip())
-            if f.trouble:
-                lines.append(f"{'':<{wide}}  -> {f.trouble}")
+            if f.problem:
+                lines.append(f"{'':<{wide}}  -> {f.problem}")
         return "\n".join(lines)
 
 
@@ -91,14 +91,14 @@ def try_backend(backend: str) -> dict:
     return {"variants": [], "failed": {backend: words}}
 
 
-def examine() -> Diagnosis:
+def run_diagnosis() -> Diagnosis:
     """Try everything and report it; takes a few seconds."""
     diagnosis = Diagnosis()
     add = diagnosis.findings.append
     core = (f"{name} {_version(name) or 'not installed'}" for name in ("mitsuba", "drjit"))
     add(Finding("versions", ", ".join((f"nerg {__version__}", f"Python {platform.python_version()}", *core))))
 
-    library, trouble = llvm.current(), llvm.problem()
+    library, trouble = llvm.find_current(), llvm.find_problem()
     add(Finding("libLLVM", str(library) if library else "none", trouble or ""))
     # Mitsuba itself may be what is broken, so the variants without a backend come first.
     results = {"scalar": try_backend("scalar")}
@@ -113,7 +113,7 @@ def examine() -> Diagnosis:
         said = next(iter(cuda["failed"].values()), "no reason was given")
         add(Finding("CUDA", "does not work", f"install an NVIDIA driver R570 or newer; Dr.Jit said: {_one_line(said)}"))
     else:
-        old = tuple(cuda["version"]) < CUDA_MINIMUM
+        old = tuple(cuda["version"]) < MIN_CUDA_VERSION
         said = "neural fields need an NVIDIA driver R570 or newer: update it." if old else ""
         add(Finding("CUDA", ".".join(map(str, cuda["version"])), said))
 
@@ -130,8 +130,8 @@ def examine() -> Diagnosis:
     for name, purpose in EXTRAS.items():
         add(Finding(name, _version(name) or f"not installed ({purpose})"))
 
-    diagnosis.usable = any(not v.startswith("scalar") for result in results.values() for v in result["variants"])
-    if not diagnosis.usable:
+    diagnosis.is_usable = any(not v.startswith("scalar") for result in results.values() for v in result["variants"])
+    if not diagnosis.is_usable:
         said = "mend libLLVM or CUDA as said above."
         add(Finding("verdict", "nothing can be rendered: no llvm and no cuda variant works", said))
     else:
@@ -147,4 +147,4 @@ def _version(distribution: str) -> str | None:
 
 
 def _one_line(text: str) -> str:
-    return sentence(RuntimeError(text))
+    return format_error(RuntimeError(text))

@@ -35,7 +35,7 @@ class UnusableLLVM(ImportError):
 
 
 @contextmanager
-def chosen(options: str) -> Iterator[None]:
+def blame_options(options: str) -> Iterator[None]:
     """A block whose values a user gave by ``options`` ("--aabb"): a `ValueError` of it is theirs to mend, as a
     `NergError`.
 
@@ -49,16 +49,16 @@ def chosen(options: str) -> Iterator[None]:
         raise NergError(f"{str(error).rstrip('.')}; give other values by {options}") from error
 
 
-def import_extra(name: str, need: str, extra: str) -> Any:
+def import_extra(module: str, reason: str, extra: str) -> Any:
     """The module ``name`` of a library that an ``extra`` installs. Raises `ImportError`, which begins with the ``need``
     ("a mesh needs scikit-image"), where it is not installed."""
     try:
-        return importlib.import_module(name)
+        return importlib.import_module(module)
     except ImportError:
-        raise ImportError(f'{need}, which is not installed: pip install "nerg-mi[{extra}]"') from None
+        raise ImportError(f'{reason}, which is not installed: pip install "nerg-mi[{extra}]"') from None
 
 
-def expected(error: BaseException) -> bool:
+def is_user_error(error: BaseException) -> bool:
     """Whether ``error`` is one that the user can mend, or the machine's, and not a mistake in the program.
 
     The former are `NergError`, a library that is missing or cannot be used, what the system says of files and devices,
@@ -90,7 +90,7 @@ _MENDABLE = (
 
 
 @contextmanager
-def mitsuba_says(file: str | PathLike[str] | None = None) -> Iterator[None]:
+def translate_mitsuba_errors(file: str | PathLike[str] | None = None) -> Iterator[None]:
     """A block whose `RuntimeError`s are Mitsuba's, about a scene or about ``file``, as `NergError` that names it.
 
     It makes one of whatever a plugin's constructor raises, with the traceback as text. Where that ends in an exception
@@ -104,10 +104,10 @@ def mitsuba_says(file: str | PathLike[str] | None = None) -> Iterator[None]:
         if kind is not None and kind not in _MENDABLE:
             raise
         # Mitsuba quotes most files that it cannot read, but none whose content it gets as arrays.
-        said = sentence(error)
+        said = format_error(error)
         if file is not None and Path(file).name not in said:
             said = f'"{file}" cannot be used by Mitsuba: {said}'
-        raise NergError(plain(said, 1000)) from error
+        raise NergError(sanitize(said, 1000)) from error
     except UnicodeDecodeError as error:
         # And what it quotes may be no text.
         raise NergError(
@@ -115,7 +115,7 @@ def mitsuba_says(file: str | PathLike[str] | None = None) -> Iterator[None]:
         ) from error
 
 
-def sentence(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """What `error` says, on one line.
 
     Mitsuba embeds the whole Python traceback of a plugin's constructor in its message. Kept are where in the scene it
@@ -138,12 +138,12 @@ def sentence(error: BaseException) -> str:
     return " ".join(text.split()) or type(error).__name__
 
 
-def plain(text: object, most: int = 300) -> str:
+def sanitize(text: object, max_length: int = 300) -> str:
     """``text`` from a file, fit for one line of a message: control characters and what lies beyond ``most`` left
     out.
     """
-    kept = "".join(c if c.isprintable() else "?" for c in str(text)[: most + 1])
-    return kept if len(kept) <= most else kept[:most] + "..."
+    kept = "".join(c if c.isprintable() else "?" for c in str(text)[: max_length + 1])
+    return kept if len(kept) <= max_length else kept[:max_length] + "..."
 
 
 def _raised(trace: str) -> str:

@@ -15,7 +15,7 @@ class Interruption:
     """
 
     def __enter__(self) -> Interruption:
-        self.asked = False
+        self.is_requested = False
         # Signals can only be dealt with in the main thread; a handler that is not Python's could not be put back; and
         # where the signal is ignored, as for what a script runs in the background, it is meant for somebody else.
         main = threading.current_thread() is threading.main_thread()
@@ -25,13 +25,13 @@ class Interruption:
         return self
 
     def _note(self, *_) -> None:
-        if self.asked:
+        if self.is_requested:
             raise KeyboardInterrupt
-        self.asked = True
+        self.is_requested = True
 
     def check(self) -> None:
         """Raise ``KeyboardInterrupt`` if there was one."""
-        if self.asked:
+        if self.is_requested:
             raise KeyboardInterrupt
 
     def __exit__(self, *error) -> None:
@@ -39,7 +39,7 @@ class Interruption:
             signal.signal(signal.SIGINT, self._before)
 
 
-def give_back_ctrl_c() -> None:
+def restore_interrupt_handler() -> None:
     """Let Python hear Ctrl-C again, where Mitsuba has taken it.
 
     Mitsuba takes the signal while a picture is rendered and remembers one handler to put back. An integrator in Python

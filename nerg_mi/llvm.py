@@ -18,10 +18,10 @@ from typing import NamedTuple
 
 from .errors import UnusableLLVM
 
-MINIMUM = 17
+MIN_VERSION = 17
 """Oldest major version of LLVM whose code generator knows every operation that Dr.Jit emits."""
 
-VARIABLE = "DRJIT_LIBLLVM_PATH"
+PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
 """Environment variable that names the library to Dr.Jit; a value set by the user is never replaced."""
 
 _FOLDERS = {
@@ -59,27 +59,27 @@ class Library(NamedTuple):
     version: tuple[int, ...]
 
     @property
-    def usable(self) -> bool:
-        return self.version[0] >= MINIMUM
+    def is_usable(self) -> bool:
+        return self.version[0] >= MIN_VERSION
 
     def __str__(self) -> str:
         number = ".".join(map(str, self.version))
         return f"LLVM {number} ({self.path})" if self.path else f"LLVM {number}"
 
 
-def remedy() -> str:
+def suggest_fix() -> str:
     """How to get a usable library on this machine: the end of a sentence."""
-    best = next(iter(installed()), None)
-    if VARIABLE in os.environ and best is not None and best.usable:
-        return f"unset {VARIABLE}, since {best} is installed"
+    best = next(iter(find_installed()), None)
+    if PATH_VARIABLE in os.environ and best is not None and best.is_usable:
+        return f"unset {PATH_VARIABLE}, since {best} is installed"
     if sys.platform == "darwin":
-        return f'"brew install llvm", or set {VARIABLE} to a libLLVM.dylib of version {MINIMUM} or newer'
+        return f'"brew install llvm", or set {PATH_VARIABLE} to a libLLVM.dylib of version {MIN_VERSION} or newer'
     if sys.platform == "win32":
-        return f"install LLVM {MINIMUM} or newer, or set {VARIABLE} to its LLVM-C.dll"
-    return f'"sudo apt install libllvm19" (any from {MINIMUM} up), or set {VARIABLE} to such a libLLVM'
+        return f"install LLVM {MIN_VERSION} or newer, or set {PATH_VARIABLE} to its LLVM-C.dll"
+    return f'"sudo apt install libllvm19" (any from {MIN_VERSION} up), or set {PATH_VARIABLE} to such a libLLVM'
 
 
-def version_of(path: str) -> tuple[int, ...] | None:
+def find_version(path: str) -> tuple[int, ...] | None:
     """Version of the libLLVM at `path`, or None if it is none.
 
     Distributions write it into the file's name. Only where they do not, the library is asked, in a process of its own:
@@ -99,7 +99,7 @@ def version_of(path: str) -> tuple[int, ...] | None:
     return tuple(map(int, answer.stdout.split()))
 
 
-def installed() -> list[Library]:
+def find_installed() -> list[Library]:
     """Every libLLVM in the places where systems keep them, newest first, each file once."""
     folders = [*_FOLDERS.get(sys.platform, ()), os.path.join(sys.prefix, "lib")]
     suffix = "*.dylib" if sys.platform == "darwin" else "*.so*"
@@ -109,7 +109,7 @@ def installed() -> list[Library]:
             real = os.path.realpath(path)
             if real in found or not os.path.isfile(real):
                 continue
-            version = version_of(real)
+            version = find_version(real)
             if version is not None:
                 found[real] = Library(path, version)
     return sorted(found.values(), key=lambda library: library.version, reverse=True)
@@ -127,51 +127,51 @@ def has_cuda() -> bool:
     return False
 
 
-def prepare() -> None:
+def select_library() -> None:
     """Point Dr.Jit to the newest usable libLLVM, unless the user has named one or Dr.Jit is loaded already."""
-    if VARIABLE in os.environ or "drjit" in sys.modules:
+    if PATH_VARIABLE in os.environ or "drjit" in sys.modules:
         return
-    best = next(iter(installed()), None)
-    if best is not None and best.usable:
-        os.environ[VARIABLE] = best.path
+    best = next(iter(find_installed()), None)
+    if best is not None and best.is_usable:
+        os.environ[PATH_VARIABLE] = best.path
 
 
 def _loaded() -> Library | None:
     """The libLLVM inside a Dr.Jit that is loaded already; None if drjit is not loaded or found none it accepts."""
-    detail = getattr(sys.modules.get("drjit"), "detail", None)
+    detail = getattr(sys.modules.get("drjit"), "max_edge", None)
     ask = getattr(detail, "llvm_version", None)
     version = ask() if ask else (-1,)
-    return Library(os.environ.get(VARIABLE, ""), tuple(version)) if version[0] > 0 else None
+    return Library(os.environ.get(PATH_VARIABLE, ""), tuple(version)) if version[0] > 0 else None
 
 
-def current() -> Library | None:
+def find_current() -> Library | None:
     """The libLLVM that Dr.Jit has loaded or will load; None if there is none."""
     loaded = _loaded()
     if loaded is not None:
         return loaded
-    named = os.environ.get(VARIABLE)
+    named = os.environ.get(PATH_VARIABLE)
     if named is not None:
-        version = version_of(named) if os.path.isfile(named) else None
+        version = find_version(named) if os.path.isfile(named) else None
         return Library(named, version) if version else None
-    return next(iter(installed()), None)
+    return next(iter(find_installed()), None)
 
 
-def problem() -> str | None:
+def find_problem() -> str | None:
     """What is wrong with the libLLVM that Dr.Jit has or will have, as one sentence with the remedy; None if nothing."""
-    library = current()
-    if library is not None and not library.usable:
-        return f"{library} cannot run the kernels of Dr.Jit, which need LLVM {MINIMUM} or newer: {remedy()}."
+    library = find_current()
+    if library is not None and not library.is_usable:
+        return f"{library} cannot run the kernels of Dr.Jit, which need LLVM {MIN_VERSION} or newer: {suggest_fix()}."
     if library is not None:
         return None
-    named = os.environ.get(VARIABLE)
+    named = os.environ.get(PATH_VARIABLE)
     if named is not None and not os.path.isfile(named):
-        return f'{VARIABLE} names "{named}", which is no file, and LLVM {MINIMUM} or newer is needed: {remedy()}.'
+        return f'{PATH_VARIABLE} names "{named}", which is no file, and LLVM {MIN_VERSION} or newer is needed: {suggest_fix()}.'
     if named is not None:
-        return f'{VARIABLE} names "{named}", which is no libLLVM that can be used: {remedy()}.'
-    return f"No libLLVM was found, and the llvm variants need version {MINIMUM} or newer: {remedy()}."
+        return f'{PATH_VARIABLE} names "{named}", which is no libLLVM that can be used: {suggest_fix()}.'
+    return f"No libLLVM was found, and the llvm variants need version {MIN_VERSION} or newer: {suggest_fix()}."
 
 
-def require(variant: str | None = None) -> None:
+def require_usable(variant: str | None = None) -> None:
     """Raise `UnusableLLVM` (an ImportError) where going on would abort the process or could not work.
 
     Without a `variant`, a machine without any libLLVM passes (what needs no kernels works there), and so does one with
@@ -180,9 +180,9 @@ def require(variant: str | None = None) -> None:
     """
     if variant is not None and not variant.startswith("llvm"):
         return
-    trouble = problem()
+    trouble = find_problem()
     if trouble is None:
         return
-    if variant is None and VARIABLE not in os.environ and (current() is None or has_cuda()):
+    if variant is None and PATH_VARIABLE not in os.environ and (find_current() is None or has_cuda()):
         return
     raise UnusableLLVM(trouble)

@@ -8,26 +8,26 @@ from typing import Any, cast
 
 import numpy as np
 
-from .errors import NergError, plain
-from .ranges import FARTHEST, VALUES, Range, check_number
+from .errors import NergError, sanitize
+from .ranges import MAX_COORDINATE, POSITIVE_VALUES, Range, check_number
 
 
-def number(props, name: str, default: float, within: Range) -> float:
+def read_number(props, name: str, default: float, allowed: Range) -> float:
     """A number ``within`` a range."""
     value = props.get(name, default)
-    check_number(value, within, f'"{name}"')
+    check_number(value, allowed, f'"{name}"')
     return float(value)
 
 
-def integer(props, name: str, default: int, within: Range) -> int:
+def read_integer(props, name: str, default: int, allowed: Range) -> int:
     """A whole number ``within`` a range."""
-    value = number(props, name, default, within)
+    value = read_number(props, name, default, allowed)
     if value != int(value):
         raise NergError(f'"{name}" must be a whole number, got {value}')
     return int(value)
 
 
-def boolean(props, name: str, default: bool) -> bool:
+def read_boolean(props, name: str, default: bool) -> bool:
     """true or false, and nothing that merely looks like it."""
     value = props.get(name, default)
     if not isinstance(value, bool):
@@ -35,7 +35,7 @@ def boolean(props, name: str, default: bool) -> bool:
     return value
 
 
-def choice(props, name: str, default: str, choices: tuple[str, ...]) -> str:
+def read_choice(props, name: str, default: str, choices: tuple[str, ...]) -> str:
     """One of ``choices``."""
     value = props.get(name, default)
     if value not in choices:
@@ -43,7 +43,7 @@ def choice(props, name: str, default: str, choices: tuple[str, ...]) -> str:
     return value
 
 
-def text(props, name: str, default: str | None = None) -> str:
+def read_string(props, name: str, default: str | None = None) -> str:
     """A string; required where there is no default."""
     value = props.get(name, default)
     if not isinstance(value, str):
@@ -52,7 +52,7 @@ def text(props, name: str, default: str | None = None) -> str:
     return value
 
 
-def color(props, name: str, default: float) -> list[float]:
+def read_color(props, name: str, default: float) -> list[float]:
     """A linear rgb colour that is finite in single precision and not negative; a number is a grey."""
     import mitsuba as mi
 
@@ -63,27 +63,27 @@ def color(props, name: str, default: float) -> list[float]:
         raise NergError(f'"{name}" must be a number or an rgb colour, got {value!r}')
     rgb = [float(c) for c in np.ravel(value)]
     rgb = rgb * 3 if len(rgb) == 1 else rgb
-    if len(rgb) != 3 or not all(0 <= c <= VALUES.high for c in rgb):
+    if len(rgb) != 3 or not all(0 <= c <= POSITIVE_VALUES.high for c in rgb):
         raise NergError(f'"{name}" must be one number or three, finite and not negative, got {value}')
     return rgb
 
 
-def vector(props, name: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
+def read_vector(props, name: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
     """Three coordinates."""
     value = props.get(name, None)
     try:
         found = np.asarray(default if value is None else value, float).ravel()
     except (TypeError, ValueError):
         found = np.empty(0)
-    if found.shape != (3,) or not (np.abs(found) <= FARTHEST).all():
+    if found.shape != (3,) or not (np.abs(found) <= MAX_COORDINATE).all():
         raise NergError(
-            f'"{name}" must be three numbers from {-FARTHEST:g} to {FARTHEST:g}, got {plain(repr(value), 60)}'
+            f'"{name}" must be three numbers from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}, got {sanitize(repr(value), 60)}'
         )
     x, y, z = found.tolist()
     return x, y, z
 
 
-def resolved(filename: str) -> str:
+def resolve_scene_file(filename: str) -> str:
     """The path of the file that a scene calls ``filename``, where it is in one of the folders that Mitsuba looks in."""
     import mitsuba as mi
 
@@ -92,7 +92,7 @@ def resolved(filename: str) -> str:
     return str(file_resolver().resolve(filename))
 
 
-def trained(props, network, load: Callable, ns: ModuleType) -> tuple[Any, dict, str]:
+def load_network(props, network, load: Callable, ns: ModuleType) -> tuple[Any, dict, str]:
     """The field of a volume, its metadata and the name of its file ("" without one).
 
     It is ``network``, a field in memory, whose arrays must belong to the backend ``ns``; where that is None, it is read
@@ -101,14 +101,14 @@ def trained(props, network, load: Callable, ns: ModuleType) -> tuple[Any, dict, 
     import mitsuba as mi
 
     if network is None:
-        filename = resolved(text(props, "filename"))
+        filename = resolve_scene_file(read_string(props, "filename"))
         return *load(filename, ns), filename
     if any(not type(value).__module__.startswith(ns.__name__) for value in network.parameters().values()):
         raise NergError(f'the field in memory was made for another variant than "{mi.variant()}"; load it again')
     return network, {}, ""
 
 
-def volume_class() -> Any:
+def make_volume_class() -> Any:
     """The base class of plugins that are volumes of one ``field``, whose ``parameters()`` can be trained: made for the
     variant in use, as all classes of Mitsuba are."""
     import mitsuba as mi
@@ -123,7 +123,7 @@ def volume_class() -> Any:
             raise NotImplementedError
 
         @classmethod
-        def of(cls, network, to_world=None, name: str = "in memory"):
+        def from_network(cls, network, to_world=None, name: str = "in memory"):
             """The volume of a field in memory, for a scene that is made from Python; ``to_world``: a Mitsuba transform,
             ``name``: what it is called where others have a file's name."""
             cls.check(network)
@@ -166,7 +166,7 @@ def volume_class() -> Any:
     return FieldVolume
 
 
-def transform(props, name: str) -> np.ndarray:
+def read_transform(props, name: str) -> np.ndarray:
     """The matrix (4, 4) of a transform; the identity where there is none."""
     value = props.get(name, None)
     if value is None:

@@ -35,7 +35,7 @@ _REGISTRY = {"volume": "texture"}
 _classes: dict[str, type] = {}
 
 
-def plugin_class(name: str) -> Any:
+def get_plugin_class(name: str) -> Any:
     """The class of the plugin ``name`` for the active variant, which must not be a scalar one."""
     return _classes[name]
 
@@ -77,7 +77,7 @@ def _on_variant(old: str | None, new: str | None) -> None:
     """Called by Mitsuba after each change of variant."""
     if new is None:
         return
-    llvm.require(new)
+    llvm.require_usable(new)
     if new.startswith("scalar"):
         mi = sys.modules["mitsuba"]
         names = ", ".join(f'"{name}"' for name, _ in PLUGINS)
@@ -96,7 +96,7 @@ def _on_variant(old: str | None, new: str | None) -> None:
 
 def _attach() -> None:
     """Follow the variants of the Mitsuba that is loaded, starting with the active one."""
-    llvm.require()
+    llvm.require_usable()
     mi = sys.modules["mitsuba"]
     mi.detail.add_variant_callback(_on_variant)
     _on_variant(None, mi.variant())
@@ -120,7 +120,7 @@ class _Watcher:
 
         def exec_module(module):
             if fullname == "drjit":
-                llvm.require()
+                llvm.require_usable()
                 execute(module)
                 return
             execute(module)
@@ -139,7 +139,7 @@ def install() -> None:
     is not loaded yet, importing it does.
     """
     if "drjit" in sys.modules:
-        llvm.require()
+        llvm.require_usable()
     if "mitsuba" in sys.modules:
         _attach()
     elif not any(isinstance(entry, _Watcher) for entry in sys.meta_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-VARIABLE = "NERG_THREADS"
+THREADS_VARIABLE = "NERG_THREADS"
 """Environment variable by which `nerg worker` hands its share of the cores to the process that computes."""
 
 
@@ -21,13 +21,13 @@ def set_thread_count(count: int) -> None:
         dr.set_thread_count(count)
 
 
-def threads_of_worker() -> int:
+def get_worker_threads() -> int:
     """The threads that this process was given by whoever started it as a worker; 0 for all."""
-    text = os.environ.get(VARIABLE, "")
+    text = os.environ.get(THREADS_VARIABLE, "")
     return int(text) if text.isdigit() else 0
 
 
-def share(own: int, asked: int) -> int:
+def limit_threads(available: int, requested: int) -> int:
     """Threads of a worker for a job that has ``asked`` for so many, of which it may use its ``own``; 0 for all."""
-    wanted = [count for count in (own, asked) if count]
+    wanted = [count for count in (available, requested) if count]
     return min(wanted) if wanted else os.cpu_count() or 1

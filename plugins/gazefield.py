@@ -19,7 +19,7 @@ Trained gaze field (:monosp:`gazefield`)
  * - constant_weights
    - |bool|
    - Write the weights of the networks into the kernels, for many large frames of one field: the same pictures to the
-     bit in less time, after some seconds of compilation for each size of picture (docs/performance.md, "Weights as
+     bit in less time, after some seconds of compilation for each size of picture (docs/explanation/performance.md, "Weights as
      constants"). Only on processors, and where nothing is differentiated; weights that change often are not for it.
      (Default: false)
 
@@ -74,21 +74,21 @@ from nerg_mi.fields.gaze_base import AnyGazeField, kinds
 from nerg_mi.fields.mlp import namespace, set_constant_weights
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.properties import boolean, trained, transform, volume_class
+from nerg_mi.properties import read_boolean, load_network, read_transform, make_volume_class
 from nerg_mi.registration import register
-from nerg_mi.transport.observer_gaze import PlacedGaze
+from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
 
-class GazeFieldVolume(volume_class()):
+class GazeFieldVolume(make_volume_class()):
     __doc__ = __doc__
     plugin = "gazefield"
 
     def __init__(self, props, network=None):
         # ``network``: a field in memory in place of a file; see ``of``.
         super().__init__(props)
-        self.field, self.metadata, self.filename = trained(props, network, load_gaze, namespace(mi.Float))
-        self._similarity = Similarity(transform(props, "to_world"))
-        if boolean(props, "constant_weights", False):
+        self.field, self.metadata, self.filename = load_network(props, network, load_gaze, namespace(mi.Float))
+        self._similarity = Similarity(read_transform(props, "to_world"))
+        if read_boolean(props, "constant_weights", False):
             set_constant_weights(self.field)
 
     @staticmethod
@@ -96,9 +96,9 @@ class GazeFieldVolume(volume_class()):
         if getattr(network, "kind", None) not in kinds():
             raise NergError(f"a gaze field in memory is needed, got {type(network).__name__}; load one from its file")
 
-    def placed_gaze(self) -> PlacedGaze:
+    def placed_gaze(self) -> GazeFieldInstance:
         """The gaze field as the integrator sees it."""
-        return PlacedGaze(self.field, self._similarity)
+        return GazeFieldInstance(self.field, self._similarity)
 
     def bounds(self):
         return self._similarity.bounds(self.field.box.lower, self.field.box.upper)

@@ -56,7 +56,7 @@ import mitsuba as mi
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.probes.kde_view import KdeView
-from nerg_mi.properties import integer, number, resolved, text, transform
+from nerg_mi.properties import read_integer, read_number, resolve_scene_file, read_string, read_transform
 from nerg_mi.ranges import Range
 from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import register
@@ -67,9 +67,9 @@ class GazeKdeVolume(mi.Volume):
 
     def __init__(self, props):
         super().__init__(props)
-        self.filename = resolved(text(props, "filename"))
-        count, kappa = integer(props, "count", 4096, Range(1, 1 << 24)), number(props, "kappa", 20.0, Range(0, 1e8))
-        to_world = Similarity(transform(props, "to_world"))
+        self.filename = resolve_scene_file(read_string(props, "filename"))
+        count, kappa = read_integer(props, "count", 4096, Range(1, 1 << 24)), read_number(props, "kappa", 20.0, Range(0, 1e8))
+        to_world = Similarity(read_transform(props, "to_world"))
         rays = Rays.load(self.filename)
         self.rays = len(rays)
         self._view = KdeView(rays, count, kappa, to_world, namespace(mi.Float))

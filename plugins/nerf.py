@@ -25,7 +25,7 @@ Trained radiance field (:monosp:`nerf`)
  * - constant_weights
    - |bool|
    - Write the weights of the networks into the kernels, for many large frames of one field: the same pictures to the
-     bit in less time, after some seconds of compilation for each size of picture (docs/performance.md, "Weights as
+     bit in less time, after some seconds of compilation for each size of picture (docs/explanation/performance.md, "Weights as
      constants"). Only on processors, and where nothing is differentiated; weights that change often are not for it.
      (Default: false)
 
@@ -71,27 +71,27 @@ from nerg_mi.fields.mlp import namespace, set_constant_weights
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.properties import boolean, number, trained, transform, volume_class
-from nerg_mi.ranges import VALUES, Range
+from nerg_mi.properties import read_boolean, read_number, load_network, read_transform, make_volume_class
+from nerg_mi.ranges import POSITIVE_VALUES, Range
 from nerg_mi.registration import register
 from nerg_mi.transport.field_medium import FieldMedium
 
 
-class NerfVolume(volume_class()):
+class NerfVolume(make_volume_class()):
     __doc__ = __doc__
     plugin = "nerf"
 
     def __init__(self, props, network=None):
         # ``network``: a field in memory in place of a file; see ``of``.
-        similarity = Similarity(transform(props, "to_world"))
-        field, metadata, filename = trained(props, network, load_radiance, namespace(mi.Float))
+        similarity = Similarity(read_transform(props, "to_world"))
+        field, metadata, filename = load_network(props, network, load_radiance, namespace(mi.Float))
         # Mitsuba's own media ask the base class, not bbox(): it makes its box from the unit cube.
         lower, upper = similarity.bounds(field.box.lower, field.box.upper)
         props["to_world"] = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
         super().__init__(props)
         self.filename, self.field, self.metadata, self._similarity = filename, field, metadata, similarity
-        self.max_density = number(props, "max_density", 0, Range(0, VALUES.high))
-        if boolean(props, "constant_weights", False):
+        self.max_density = read_number(props, "max_density", 0, Range(0, POSITIVE_VALUES.high))
+        if read_boolean(props, "constant_weights", False):
             set_constant_weights(field)
 
     @staticmethod

@@ -133,7 +133,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
    - |bool|
    - Shift the steps of each sample by a random share of a step, for noise in place of bands. (Default: false)
 
-What each of the defaults gains and costs is measured in docs/error-and-time.md ("Defaults").
+What each of the defaults gains and costs is measured in docs/explanation/error-and-time.md ("Defaults").
 
 This integrator marches a radiance field, or any pair of volumes, and evaluates a gaze field on the surface that each
 ray meets: :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o)\,\mathrm{sigmoid}(F_c(p_o, r_o))` (equation 1 of the paper), with
@@ -213,10 +213,10 @@ import drjit as dr
 import mitsuba as mi
 
 from nerg_mi.errors import NergError
-from nerg_mi.interruption import give_back_ctrl_c
+from nerg_mi.interruption import restore_interrupt_handler
 from nerg_mi.maths.types import variant_types
-from nerg_mi.properties import boolean, choice, color, integer, number, text, vector
-from nerg_mi.ranges import COORDINATES, FARTHEST, VALUES, Range
+from nerg_mi.properties import read_boolean, read_choice, read_color, read_integer, read_number, read_string, read_vector
+from nerg_mi.ranges import COORDINATES, MAX_COORDINATE, POSITIVE_VALUES, Range
 from nerg_mi.registration import register
 from nerg_mi.transport import aovs as nerg_aovs
 from nerg_mi.transport import observer
@@ -225,8 +225,8 @@ from nerg_mi.transport.geometry import Ceiling, Shading
 from nerg_mi.transport.jit import no_collection, recording
 from nerg_mi.transport.march_primal import MarchSettings, default_growth, default_step, default_stop
 from nerg_mi.transport.medium import Medium
-from nerg_mi.transport.observer import VISIBILITIES, ObserverCache, ObserverSettings, center, require_center
-from nerg_mi.transport.observer_gaze import PlacedGaze
+from nerg_mi.transport.observer import VISIBILITIES, ObserverCache, ObserverSettings, sensor_center, check_center
+from nerg_mi.transport.observer_gaze import GazeFieldInstance
 from nerg_mi.transport.quadrature import RULES, boundaries
 from nerg_mi.transport.volume_medium import KnownEmpty, VolumeMedium
 
@@ -258,7 +258,7 @@ TEXTS = {
 
 def complete(manual: str) -> str:
     """The ``manual`` with the kinds of depth and of quadrature that are registered, and what else is said here."""
-    texts = {"quadratures": RULES.manual(), "depths": DEPTHS.manual(), **TEXTS}
+    texts = {"quadratures": RULES.format_manual(), "depths": DEPTHS.format_manual(), **TEXTS}
     for name, sentence in texts.items():
         manual = manual.replace(f"{{{name}}}", sentence)
     return manual
@@ -289,10 +289,10 @@ def _nested(props):
 def check_observer(observer) -> None:
     """Raise ``NergError`` for an observer (a sensor, or None) who stands nowhere, or too far away."""
     if observer is not None:
-        require_center(observer, '"observer"')
-        if not dr.all(dr.abs(dr.detach(center(observer))) <= FARTHEST, axis=None):
+        check_center(observer, '"observer"')
+        if not dr.all(dr.abs(dr.detach(sensor_center(observer))) <= MAX_COORDINATE, axis=None):
             raise NergError(
-                f'"observer" stands at a position that is not finite, or beyond {FARTHEST:g}; correct its to_world'
+                f'"observer" stands at a position that is not finite, or beyond {MAX_COORDINATE:g}; correct its to_world'
             )
 
 
@@ -320,7 +320,7 @@ def medium_of(children: dict) -> tuple[Medium | None, KnownEmpty | None]:
     return medium, KnownEmpty(medium)
 
 
-def gaze_of(children: dict, medium: Medium | None) -> PlacedGaze | None:
+def gaze_of(children: dict, medium: Medium | None) -> GazeFieldInstance | None:
     """The gaze field, whose features the medium must have."""
     if children["gaze"] is None:
         return None
@@ -334,15 +334,15 @@ def gaze_of(children: dict, medium: Medium | None) -> PlacedGaze | None:
 
 def march_settings(props, medium: Medium | None) -> MarchSettings:
     """Of the camera's and the observer's rays."""
-    step = number(props, "step", 0, Range(0, FARTHEST))
+    step = read_number(props, "step", 0, Range(0, MAX_COORDINATE))
     settings = MarchSettings(
         step=step or default_step(medium),
-        dt_gamma=number(props, "dt_gamma", default_growth(medium), Range(0, 1)),
-        stop=number(props, "stop", default_stop(medium), Range(0, 1)),
-        color_cutoff=number(props, "color_cutoff", MarchSettings.color_cutoff, Range(0, 1)),
-        quadrature=choice(props, "quadrature", MarchSettings.quadrature, RULES.names()),
-        coarse=number(props, "coarse", MarchSettings.coarse, Range(1, 1e6)),
-        refined=boolean(props, "refined", MarchSettings.refined),
+        dt_gamma=read_number(props, "dt_gamma", default_growth(medium), Range(0, 1)),
+        stop=read_number(props, "stop", default_stop(medium), Range(0, 1)),
+        color_cutoff=read_number(props, "color_cutoff", MarchSettings.color_cutoff, Range(0, 1)),
+        quadrature=read_choice(props, "quadrature", MarchSettings.quadrature, RULES.names()),
+        coarse=read_number(props, "coarse", MarchSettings.coarse, Range(1, 1e6)),
+        refined=read_boolean(props, "refined", MarchSettings.refined),
         cell_step=step or math.inf,
     )
     if medium is not None:
@@ -355,25 +355,25 @@ def observer_settings(props, march: MarchSettings) -> ObserverSettings:
     defaults = ObserverSettings(march=march)
     return ObserverSettings(
         march=march,
-        depth=choice(props, "depth", defaults.depth, DEPTHS.names()),
-        surface_opacity=number(props, "surface_opacity", defaults.surface_opacity, Range(0, 1)),
-        visibility=choice(props, "visibility", defaults.visibility, VISIBILITIES),
-        tolerance=number(props, "tolerance", defaults.tolerance, Range(0, VALUES.high)),
-        map_height=integer(props, "map_height", defaults.map_height, Range(2, 16384)),
-        directions=integer(props, "directions", defaults.directions, Range(64, 1 << 24)),
-        integral_tolerance=number(props, "integral_tolerance", defaults.integral_tolerance, Range(0, 1)),
+        depth=read_choice(props, "depth", defaults.depth, DEPTHS.names()),
+        surface_opacity=read_number(props, "surface_opacity", defaults.surface_opacity, Range(0, 1)),
+        visibility=read_choice(props, "visibility", defaults.visibility, VISIBILITIES),
+        tolerance=read_number(props, "tolerance", defaults.tolerance, Range(0, POSITIVE_VALUES.high)),
+        map_height=read_integer(props, "map_height", defaults.map_height, Range(2, 16384)),
+        directions=read_integer(props, "directions", defaults.directions, Range(64, 1 << 24)),
+        integral_tolerance=read_number(props, "integral_tolerance", defaults.integral_tolerance, Range(0, 1)),
     )
 
 
 def ceiling_of(props) -> Ceiling | None:
     """What is left out of views from above."""
-    up = vector(props, "up", (0.0, 0.0, 1.0))
-    return Ceiling(number(props, "ceiling", 0, COORDINATES), up) if "ceiling" in props else None
+    up = read_vector(props, "up", (0.0, 0.0, 1.0))
+    return Ceiling(read_number(props, "ceiling", 0, COORDINATES), up) if "ceiling" in props else None
 
 
 def background_of(props):
     """Radiance (Spectrum) behind everything."""
-    background = mi.Color3f(color(props, "background", 0.0))
+    background = mi.Color3f(read_color(props, "background", 0.0))
     return mi.Spectrum(mi.luminance(background) if mi.is_monochromatic else background)
 
 
@@ -383,7 +383,7 @@ def describe(nerg) -> str:
         k: str(v).replace("\n", "\n  ") for k, v in nerg.children.items() if k not in ("observer", "integrator")
     }
     if nerg.observer is not None:
-        body["observer"] = center(nerg.observer)
+        body["observer"] = sensor_center(nerg.observer)
     march, seen = nerg.settings, nerg.observer_settings
     body |= {
         "occlusion": nerg.occlusion,
@@ -443,16 +443,16 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.observer, self.shading = self._given["observer"], Shading(self._given["integrator"])
         check_observer(self.observer)
 
-        self.occlusion = boolean(props, "occlusion", True)
-        self.falloff: Any = mi.Float(number(props, "falloff", 0.1, Range(0, VALUES.high)))
-        self.radiance = boolean(props, "radiance", True)
+        self.occlusion = read_boolean(props, "occlusion", True)
+        self.falloff: Any = mi.Float(read_number(props, "falloff", 0.1, Range(0, POSITIVE_VALUES.high)))
+        self.radiance = read_boolean(props, "radiance", True)
         self.background = background_of(props)
         self.ceiling = ceiling_of(props)
-        self.jitter = boolean(props, "jitter", False)
+        self.jitter = read_boolean(props, "jitter", False)
         self.settings = march_settings(props, self.medium)
         self.observer_settings = observer_settings(props, self.settings)
 
-        self.aovs = nerg_aovs.read_aovs(text(props, "aovs", "depth,opacity"), self)
+        self.aovs = nerg_aovs.read_aovs(read_string(props, "aovs", "depth,opacity"), self)
         self.demands = nerg_aovs.demands_of(self.aovs)
         self.views = nerg_aovs.views_of(self.aovs, self)
         self.cache = ObserverCache()
@@ -464,15 +464,15 @@ class NergIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed: Any = 0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        give_back_ctrl_c()
-        with self.seen_by(sensor, scene), no_collection():
+        restore_interrupt_handler()
+        with self.rendering_from(sensor, scene), no_collection():
             image = super().render(scene, sensor, seed, spp, develop, evaluate)
         if self.should_stop():
             raise KeyboardInterrupt  # Mitsuba has heard Ctrl-C, and told nobody.
         return image
 
     @contextmanager
-    def seen_by(self, sensor, scene):
+    def rendering_from(self, sensor, scene):
         """While this is open the rays that ``sample`` is given come from ``sensor``."""
         self.context().check_place(scene)
         if 0 in sensor.film().crop_size():
@@ -486,7 +486,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     def render_forward(self, scene, params, sensor, seed: Any = 0, spp=0):
         # Mitsuba 3.9.1 ends the process instead, also with its own integrators: a batch calls its cameras through a
         # table of all sensors, the observer among them.
-        eyes = observer.centers([sensor]) + ([] if self.observer is None else [observer.center(self.observer)])
+        eyes = observer.centers([sensor]) + ([] if self.observer is None else [observer.sensor_center(self.observer)])
         if observer.is_batch(sensor) and any(dr.grad_enabled(c) for c in eyes):
             raise NergError(
                 'a "batch" of cameras has no forward derivatives with respect to the pose of an observer or a camera; '
@@ -497,8 +497,8 @@ class NergIntegrator(mi.SamplingIntegrator):
     def sample(self, scene, sampler, ray: Any, medium=None, active: Any = True):
         active = variant_types().Bool(active)
         camera = self.context().trace(scene, self._sensors or scene.sensors(), sampler, ray, active)
-        aovs = camera.for_observer().channels(self.aovs)
-        L, shown, nested = camera.radiance(scene, sampler, medium)
+        aovs = camera.make_pixel().compute_channels(self.aovs)
+        L, shown, nested = camera.compute_radiance(scene, sampler, medium)
         return dr.select(active, L, 0), shown, aovs + nested
 
     def context(self) -> RenderContext:
@@ -523,7 +523,7 @@ class NergIntegrator(mi.SamplingIntegrator):
             jitter=self.jitter,
         )
 
-    def for_aovs(self, aovs: Sequence[str], radiance: bool) -> RenderContext:
+    def make_context(self, aovs: Sequence[str], radiance: bool) -> RenderContext:
         """The same for other AOVs, with colour or without. Raises ``NergError`` for those that it cannot compute."""
         names = nerg_aovs.read_aovs(",".join(aovs), self)
         views = nerg_aovs.views_of(names, self)
@@ -547,7 +547,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     def parameters_changed(self, keys=()):
         if not keys or {"field", "density", "color"} & set(keys):
             # Of a volume that shows no arrays only this tells that it is another one.
-            self.cache.forget()
+            self.cache.clear()
         if self.medium is not None:
             self.medium.refresh(anyway=not keys or "density" in keys)
         # Of the scene's parameters, and of this integrator's alone.

@@ -16,13 +16,13 @@ from nerg_mi.maths.color import composite_to_linear
 from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f
 from nerg_mi.transport import aovs as nerg_aovs
 from nerg_mi.transport import observer
-from nerg_mi.transport.field_medium import FeaturePainter, color_painter
-from nerg_mi.transport.geometry import Ceiling, Place, Shading
+from nerg_mi.transport.field_medium import FeaturePainter, make_color_shader
+from nerg_mi.transport.geometry import Ceiling, SceneGeometry, Shading
 from nerg_mi.transport.march_primal import MarchResult, MarchSettings
 from nerg_mi.transport.medium import Medium, Painter
-from nerg_mi.transport.observer import ObserverCache, ObserverSettings, ObserverView, view_along
-from nerg_mi.transport.observer_gaze import ObservedGaze, PlacedGaze
-from nerg_mi.transport.occlusion import Sight, trace_sight
+from nerg_mi.transport.observer import ObserverCache, ObserverSettings, ObserverView, evaluate_view
+from nerg_mi.transport.observer_gaze import ObservedGaze, GazeFieldInstance
+from nerg_mi.transport.occlusion import Sight, trace_from_observer
 
 # Mitsuba with its arrays as `maths.types` has them.
 arrays: Any = mi
@@ -48,9 +48,9 @@ class RenderContext:
     # Whether colour is computed.
     radiance: bool
     medium: Medium | None
-    gaze: PlacedGaze | None
+    gaze: GazeFieldInstance | None
     shading: Shading
-    # Whose gaze it is where `CameraView.for_observer` names nobody; None: the camera's.
+    # Whose gaze it is where `CameraView.make_pixel` names nobody; None: the camera's.
     observer: mi.Sensor | None
     cache: ObserverCache
     occlusion: bool
@@ -63,16 +63,16 @@ class RenderContext:
     jitter: bool
 
     @property
-    def shared(self) -> list[str]:
+    def shared_aovs(self) -> list[str]:
         """Those of the AOVs that all observers have in common."""
-        return [name for name in self.aovs if not nerg_aovs.AOVS[name].of_observer]
+        return [name for name in self.aovs if not nerg_aovs.AOVS[name].is_per_observer]
 
     @property
-    def own(self) -> list[str]:
+    def observer_aovs(self) -> list[str]:
         """Those that depend on the observer."""
-        return [name for name in self.aovs if nerg_aovs.AOVS[name].of_observer]
+        return [name for name in self.aovs if nerg_aovs.AOVS[name].is_per_observer]
 
-    def channels(self, aovs: Sequence[str]) -> list[str]:
+    def channel_names(self, aovs: Sequence[str]) -> list[str]:
         """Names of the channels of some of the AOVs."""
         return nerg_aovs.channel_names(aovs, self.medium)
 
@@ -89,7 +89,7 @@ class RenderContext:
         offset = cast("Any", sampler).next_1d(active) if self.jitter else None
         return CameraView(self, scene, sensors, ray, active, offset)
 
-    def observer_at(self, position: Sequence[float], alone: bool = False) -> Observer:
+    def make_observer(self, position: Sequence[float], alone: bool = False) -> Observer:
         """The observer at ``position`` (3,). ``alone``: the only one, whom the integrator remembers."""
         p_o = arrays.Point3f(*map(float, position))
         # A position that is a constant of the kernel would be compiled again for every observer.
@@ -107,11 +107,11 @@ class Observer:
     cache: ObserverCache
     _gaze: ObservedGaze | None = None
 
-    def gaze(self, context: RenderContext, place: Place) -> ObservedGaze:
+    def gaze(self, context: RenderContext, place: SceneGeometry) -> ObservedGaze:
         """The gaze field for these positions, prepared once. ``context``: one that has a gaze field."""
         if self._gaze is None:
-            placed = cast("PlacedGaze", context.gaze)
-            self._gaze = placed.at(self.positions, place, context.observer_settings, self.cache)
+            placed = cast("GazeFieldInstance", context.gaze)
+            self._gaze = placed.for_observers(self.positions, place, context.observer_settings, self.cache)
         return self._gaze
 
 
@@ -135,12 +135,12 @@ class CameraView:
         # What is traced, and how far the camera's ray went before it.
         self.ray, self.ahead = (ray, None) if context.ceiling is None else context.ceiling.cut(ray)
         medium = context.medium
-        self.place = Place(medium, scene)
+        self.place = SceneGeometry(medium, scene)
         self.lit = context.radiance and medium is not None and medium.has_color
         painter, features = None, "features" in context.demands
         if medium is not None and self.lit:
             color_type = mi.Spectrum if medium.color_space == "spectrum" else mi.Color3f
-            painter = color_painter(medium, color_type, features)
+            painter = make_color_shader(medium, color_type, features)
         elif medium is not None and features:
             painter = FeaturePainter(medium)
         self.painter = painter
@@ -150,20 +150,20 @@ class CameraView:
         )
         self.some = active & (self.view.opacity > 0)
 
-    def for_observer(self, who: Observer | None = None, aligned: bool = False) -> Pixel:
+    def make_pixel(self, who: Observer | None = None, aligned: bool = False) -> Pixel:
         """These rays as ``who`` sees them; None: the context's own observer. ``aligned``: whether they are known to
         stand where the camera does."""
         return Pixel(self, who, aligned)
 
-    def for_origins(self) -> Pixel:
+    def make_pixel_per_origin(self) -> Pixel:
         """Each ray for an observer at its own origin: of fields that need not be normalised for them."""
         return Pixel(self, Observer(self.camera_ray.o, [], ObserverCache()), True)
 
-    def channels(self, aovs: Sequence[str]) -> list[Float]:
+    def compute_channels(self, aovs: Sequence[str]) -> list[Float]:
         """All channels of AOVs that observers have in common."""
-        return nerg_aovs.compute(aovs, self.for_observer())
+        return nerg_aovs.compute(aovs, self.make_pixel())
 
-    def settle(self, *more: Any) -> None:
+    def eval_shared(self, *more: Any) -> None:
         """Compute now what observers have in common, and ``more``, so that their kernels begin with it."""
         rays = [self.camera_ray.o, self.ray.o, self.ray.d]
         common = [*rays, self.active, self.depth, self.surface, self.p_d, self.penetration]
@@ -177,9 +177,9 @@ class CameraView:
         medium = self.context.medium
         if medium is None or not self.lit:
             return None
-        ray = medium.local(self.ray.o, self.ray.d)
+        ray = medium.ray_to_local(self.ray.o, self.ray.d)
         painter, sums = cast("Painter", self.painter), cast("MarchResult", self.view.march).color
-        return painter.color(medium, sums, self.view.front, ray, self.active)
+        return painter.resolve_color(medium, sums, self.view.medium_opacity, ray, self.active)
 
     @property
     def accumulated_features(self) -> list[Float]:
@@ -200,7 +200,7 @@ class CameraView:
     @cached_property
     def surface(self) -> Bool:
         """Whether the ray meets a surface."""
-        return self.active & self.view.meets(self.context.observer_settings.surface_opacity)
+        return self.active & self.view.has_surface(self.context.observer_settings.surface_opacity)
 
     @cached_property
     def p_d(self) -> Point3f:
@@ -212,10 +212,10 @@ class CameraView:
         """How far light goes into the matter before the surface."""
         return self.view.penetration(self.context.observer_settings.depth, self.depth)
 
-    def radiance(self, scene: mi.Scene, sampler: mi.Sampler, medium: mi.Medium | None) -> tuple[Color, Bool, list]:
+    def compute_radiance(self, scene: mi.Scene, sampler: mi.Sampler, medium: mi.Medium | None) -> tuple[Color, Bool, list]:
         """``(radiance, shown, AOVs of the nested integrator)``: of the field, and of what shows through it; whether
         there is anything but the background. ``medium``: Mitsuba's, that the camera stands in (or None)."""
-        context, view, front, color = self.context, self.view, self.view.front, self.color
+        context, view, front, color = self.context, self.view, self.view.medium_opacity, self.color
         if not context.radiance:
             # A nested integrator has its AOVs also where it lights nothing.
             return mi.Spectrum(0), self.some, [arrays.Float(0)] * len(context.shading.aov_names())
@@ -228,8 +228,8 @@ class CameraView:
         learnt = field.background(self.ray.o, self.ray.d) if scene.environment() is None else None
         if learnt is not None:
             # Trained together, composited together: in the field's colour space.
-            color = dr.select(view.hit, color, dr.fma(1 - front, mi.Color3f(learnt), color))
-            front = dr.select(view.hit, front, 1)
+            color = dr.select(view.hits_shape, color, dr.fma(1 - front, mi.Color3f(learnt), color))
+            front = dr.select(view.hits_shape, front, 1)
         L = (1 - front) * behind + composite_to_linear(color, front, field.color_space)
         return L, self.some | shown, nested
 
@@ -248,14 +248,14 @@ class SurfaceGaze:
 
 class Pixel:
     """What an observer makes of what ``camera`` sees: found, part by part, when it is first read. Another observer is
-    another object. ``who``, ``aligned``: see `CameraView.for_observer`."""
+    another object. ``who``, ``aligned``: see `CameraView.make_pixel`."""
 
     def __init__(self, camera: CameraView, who: Observer | None, aligned: bool):
         self.camera, self.context = camera, camera.context
         self._who, self._aligned = who, aligned
         self._evaluations: Float = arrays.Float(0)
 
-    def channels(self, aovs: Sequence[str]) -> list[Float]:
+    def compute_channels(self, aovs: Sequence[str]) -> list[Float]:
         """All channels of some of the AOVs."""
         return nerg_aovs.compute(aovs, self)
 
@@ -268,7 +268,7 @@ class Pixel:
         if context.observer is None:
             p_o = observer.center_of_ray(camera.sensors, camera.camera_ray)
             return Observer(p_o, observer.centers(camera.sensors), context.cache)
-        p_o = observer.center(context.observer)
+        p_o = observer.sensor_center(context.observer)
         return Observer(p_o, [p_o], context.cache)
 
     @cached_property
@@ -294,7 +294,7 @@ class Pixel:
         context, camera = self.context, self.camera
         if not context.occlusion or self.aligned:
             return Sight(camera.p_d, self.distance_and_direction[0], arrays.Float(1), arrays.Float(0))
-        sight = trace_sight(
+        sight = trace_from_observer(
             camera.place,
             camera.ray,
             camera.p_d,
@@ -306,7 +306,7 @@ class Pixel:
             count=camera.counting,
             gaze=self.gaze if self._may_look_gaze_up else None,
             cache=self.observer.cache,
-            whole=bool(context.demands & {"factors", "observer_depth"}),
+            needs_depth=bool(context.demands & {"factors", "observer_depth"}),
         )
         if sight.density_evals is not None:
             self._evaluations = sight.density_evals
@@ -357,7 +357,7 @@ class Pixel:
         """``(gaze, emit, capture)``, and the spread if it is demanded, where they are ``needed``."""
         gaze, p_od, p_o, r_o = self.gaze, self.sight.p_od, self.observer.p_o, self.r_o
         with_spread = "spread" in self.context.demands
-        evaluate = gaze.spread if with_spread else gaze.evaluate
+        evaluate = gaze.evaluate_with_std if with_spread else gaze.evaluate
         if gaze.field.config.features or dr.grad_enabled(p_od, p_o, r_o, *gaze.parameters()):
             return evaluate(p_od, p_o, r_o, needed)
         # What is hidden lies together: where none of a packet is needed its networks are passed over.
@@ -372,8 +372,8 @@ class Pixel:
     def view_of_observer(self, name: str) -> Float:
         """The observer's view of this name on the surface, 0 elsewhere."""
         view, who = self.context.views[name], self.observer
-        value = view_along(view, who.positions, who.p_o, self.r_o, who.cache)
-        return dr.select(self.camera.surface, value * self.sight.visibility if view.occluded else value, 0)
+        value = evaluate_view(view, who.positions, who.p_o, self.r_o, who.cache)
+        return dr.select(self.camera.surface, value * self.sight.visibility if view.is_occluded else value, 0)
 
     def density_evaluations(self) -> Float:
         """Evaluations of density so far, when ``counts`` is among the demands."""

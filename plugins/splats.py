@@ -73,26 +73,26 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.splats import read_splats
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.properties import choice, number, resolved, text, transform, volume_class
+from nerg_mi.properties import read_choice, read_number, resolve_scene_file, read_string, read_transform, make_volume_class
 from nerg_mi.ranges import Range
 from nerg_mi.registration import register
 from nerg_mi.transport.jit import recording
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 
 
-class SplatsVolume(volume_class()):
+class SplatsVolume(make_volume_class()):
     __doc__ = __doc__
     plugin = "splats"
 
     def __init__(self, props, splats=None):
         # ``splats``: Gaussians in memory in place of a file; see ``of``.
-        self._similarity = Similarity(transform(props, "to_world"))
-        color_space = choice(props, "color_space", "file", ("file", "srgb", "linear"))
-        extent = number(props, "extent", 3, Range(0.1, 10))
-        self.filename = "" if splats is not None else resolved(text(props, "filename"))
+        self._similarity = Similarity(read_transform(props, "to_world"))
+        color_space = read_choice(props, "color_space", "file", ("file", "srgb", "linear"))
+        extent = read_number(props, "extent", 3, Range(0.1, 10))
+        self.filename = "" if splats is not None else resolve_scene_file(read_string(props, "filename"))
         super().__init__(props)
         self.splats = splats if splats is not None else read_splats(self.filename)
-        for note in (*self.splats.guesses, *self.splats.notes):
+        for note in (*self.splats.assumptions, *self.splats.notes):
             log: Any = mi.Log  # of which the stubs know nothing
             log(mi.LogLevel.Warn, f"{self.filename}: {note}")
         self.color_space = self.splats.color_space if color_space == "file" else color_space

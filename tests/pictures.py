@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nerg_mi.files.images import threads_for_mitsuba
+from nerg_mi.files.images import ensure_two_threads
 
 SCENE = """
 <scene version="3.0.0">
@@ -30,7 +30,7 @@ def mitsuba_bitmap(path):
     """A Mitsuba bitmap of the file ``path``."""
     import mitsuba as mi
 
-    with threads_for_mitsuba():
+    with ensure_two_threads():
         return mi.Bitmap(str(path))
 
 

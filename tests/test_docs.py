@@ -35,7 +35,7 @@ def options() -> set[str]:
     found = {"--help"}
 
     root = typer.main.get_command(nerg_mi.cli.build_app())
-    for command in (root, *(command for _, command, _ in command_pages.commands())):
+    for command in (root, *(command for _, command, _ in command_pages.iter_commands())):
         for parameter in command.params:
             found.update(parameter.opts + parameter.secondary_opts)
     for folder in ("benchmarks", "examples", "tools", "scenes/store", "scenes/tabletop", "tests/renders"):
@@ -130,10 +130,10 @@ def test09_files_that_are_named_exist(page):
 
 def test10_settings_of_the_study_are_the_studys():
     subject = SimpleNamespace(marched=True, hits=False, extent=1.0, has_gaze=True, normalized=True, resampled=True)
-    names = {setting.name for setting in study_settings.settings(subject)}
+    names = {setting.name for setting in study_settings.list_rows(subject)}
     told = set()
     for table in re.findall(
-        r"^\| setting .*\n\|.*\n((?:\|.*\n)+)", (ROOT / "docs/error-and-time.md").read_text(), re.M
+        r"^\| setting .*\n\|.*\n((?:\|.*\n)+)", (ROOT / "docs/explanation/error-and-time.md").read_text(), re.M
     ):
         told |= {line.split("|")[1].strip() for line in table.splitlines()}
     assert len(told) > 50 and told <= names
@@ -153,7 +153,7 @@ def test12_links_lead_somewhere(page):
         assert (ROOT / target).exists(), target
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/rays.md", "docs/trust.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/how-to/recordings.md", "docs/explanation/robustness.md"])
 def test13_every_way_to_another_machine_is_named(page):
     """A page that says what leaves the machine names the commands that connect (`tests/cli/test_outputs.py` has the
     others open none)."""

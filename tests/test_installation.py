@@ -196,8 +196,8 @@ def machine(tmp_path, monkeypatch):
     monkeypatch.setattr(llvm, "_loaded", lambda: None)
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
     # Set first, so that what a test makes of it is undone also where it was not set.
-    monkeypatch.setenv(llvm.VARIABLE, "")
-    monkeypatch.delenv(llvm.VARIABLE)
+    monkeypatch.setenv(llvm.PATH_VARIABLE, "")
+    monkeypatch.delenv(llvm.PATH_VARIABLE)
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
     return tmp_path
 
@@ -214,17 +214,17 @@ def machine(tmp_path, monkeypatch):
 )
 def test01_version_from_name(tmp_path, name, version):
     fake(tmp_path, name)
-    assert llvm.version_of(str(tmp_path / name)) == version
+    assert llvm.find_version(str(tmp_path / name)) == version
 
 
 def test02_version_of_link_is_that_of_its_target(tmp_path):
     fake(tmp_path, "libLLVM-15.so.1")
     (tmp_path / "libLLVM.so").symlink_to("libLLVM-15.so.1")
-    assert llvm.version_of(str(tmp_path / "libLLVM.so")) == (15,)
+    assert llvm.find_version(str(tmp_path / "libLLVM.so")) == (15,)
 
 
 def test03_nameless_library_is_asked(tmp_path):
-    good = next((library for library in llvm.installed() if library.usable), None)
+    good = next((library for library in llvm.find_installed() if library.is_usable), None)
     if good is None:
         pytest.skip("no usable libLLVM in the usual places of this machine")
     # A hard copy would be 100 MB; a file name without a number that is no link will do where hard links are possible.
@@ -233,73 +233,73 @@ def test03_nameless_library_is_asked(tmp_path):
         os.link(os.path.realpath(good.path), nameless)
     except OSError:
         pytest.skip("the temporary folder is on another file system than libLLVM")
-    assert llvm.version_of(str(nameless))[0] == good.version[0]
+    assert llvm.find_version(str(nameless))[0] == good.version[0]
 
 
 def test04_no_library_has_no_version(tmp_path):
     (tmp_path / "libLLVM.so").write_text("not a library")
-    assert llvm.version_of(str(tmp_path / "libLLVM.so")) is None
-    assert llvm.version_of(str(tmp_path / "missing.so")) is None
+    assert llvm.find_version(str(tmp_path / "libLLVM.so")) is None
+    assert llvm.find_version(str(tmp_path / "missing.so")) is None
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the names of the files are those of Linux")
 def test05_newest_usable_is_taken(machine):
     fake(machine, "libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1")
-    llvm.prepare()
-    assert os.environ[llvm.VARIABLE] == str(machine / "libLLVM.so.19.1")
-    assert llvm.problem() is None
-    llvm.require()
+    llvm.select_library()
+    assert os.environ[llvm.PATH_VARIABLE] == str(machine / "libLLVM.so.19.1")
+    assert llvm.find_problem() is None
+    llvm.require_usable()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the names of the files are those of Linux")
 def test06_only_bad_ones(machine, monkeypatch):
     fake(machine, "libLLVM-15.so.1", "libLLVM-16.so.1")
-    llvm.prepare()
-    assert llvm.VARIABLE not in os.environ
+    llvm.select_library()
+    assert llvm.PATH_VARIABLE not in os.environ
     with pytest.raises(UnusableLLVM, match="16.*17.*libllvm19"):
-        llvm.require()
+        llvm.require_usable()
     # With an NVIDIA driver the package is of use, and only an llvm variant is refused.
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)
-    llvm.require()
-    llvm.require("cuda_ad_rgb")
+    llvm.require_usable()
+    llvm.require_usable("cuda_ad_rgb")
     with pytest.raises(UnusableLLVM, match="LLVM 16"):
-        llvm.require("llvm_ad_rgb")
+        llvm.require_usable("llvm_ad_rgb")
 
 
 def test07_none_at_all_is_refused_only_by_an_llvm_variant(machine):
-    llvm.prepare()
-    llvm.require()
-    llvm.require("scalar_rgb")
+    llvm.select_library()
+    llvm.require_usable()
+    llvm.require_usable("scalar_rgb")
     with pytest.raises(UnusableLLVM, match="No libLLVM was found"):
-        llvm.require("llvm_ad_rgb")
+        llvm.require_usable("llvm_ad_rgb")
 
 
 def test08_named_by_the_user_is_never_replaced(machine, monkeypatch):
     fake(machine, "libLLVM.so.19.1", "libLLVM-15.so.1")
     for bad, said in (("libLLVM-15.so.1", "LLVM 15"), ("missing.so", "is no file")):
-        monkeypatch.setenv(llvm.VARIABLE, str(machine / bad))
+        monkeypatch.setenv(llvm.PATH_VARIABLE, str(machine / bad))
         monkeypatch.setattr(llvm, "has_cuda", lambda: True)
-        llvm.prepare()
-        assert os.environ[llvm.VARIABLE] == str(machine / bad)
+        llvm.select_library()
+        assert os.environ[llvm.PATH_VARIABLE] == str(machine / bad)
         with pytest.raises(UnusableLLVM, match=said):
-            llvm.require()
+            llvm.require_usable()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the names of the files are those of Linux")
 def test09_remedy_names_the_good_one_that_is_there(machine, monkeypatch):
     fake(machine, "libLLVM.so.19.1", "libLLVM-15.so.1")
-    monkeypatch.setenv(llvm.VARIABLE, str(machine / "libLLVM-15.so.1"))
-    assert f"unset {llvm.VARIABLE}, since LLVM 19.1" in llvm.problem()
+    monkeypatch.setenv(llvm.PATH_VARIABLE, str(machine / "libLLVM-15.so.1"))
+    assert f"unset {llvm.PATH_VARIABLE}, since LLVM 19.1" in llvm.find_problem()
 
 
 def test10_real_old_library_is_refused_and_never_aborts():
-    old = next((library for library in llvm.installed() if library.version[0] in (15, 16)), None)
+    old = next((library for library in llvm.find_installed() if library.version[0] in (15, 16)), None)
     if old is None:
         pytest.skip("no libLLVM 15 or 16 on this machine")
     orders = "import nerg_mi, drjit", "import nerg_mi, mitsuba", "import drjit, nerg_mi", "import mitsuba, nerg_mi"
     for code in orders:
         run = subprocess.run(
-            [sys.executable, "-c", code], env={**os.environ, llvm.VARIABLE: old.path}, capture_output=True, text=True
+            [sys.executable, "-c", code], env={**os.environ, llvm.PATH_VARIABLE: old.path}, capture_output=True, text=True
         )
         assert run.returncode == 1, code
         last = run.stderr.strip().splitlines()[-1]
@@ -309,10 +309,10 @@ def test10_real_old_library_is_refused_and_never_aborts():
 def test11_loaded_version_counts(monkeypatch):
     import drjit as dr
 
-    assert llvm.current().version == tuple(dr.detail.llvm_version())
+    assert llvm.find_current().version == tuple(dr.detail.llvm_version())
     # What is set after Dr.Jit was loaded has no effect on it.
-    monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM-15.so.1")
-    assert llvm.problem() is None
+    monkeypatch.setenv(llvm.PATH_VARIABLE, "/nowhere/libLLVM-15.so.1")
+    assert llvm.find_problem() is None
 
 
 @pytest.mark.parametrize("late", ["drjit", "mitsuba"])
@@ -323,7 +323,7 @@ def test12_refused_when_drjit_is_imported_and_not_before(late, tmp_path):
         "import nerg_mi.diagnosis\nprint('imported')\n"
         f"try: import {late}\nexcept ImportError as error: print(type(error).__name__)\nimport {late}"
     )
-    bad = {**os.environ, llvm.VARIABLE: str(tmp_path / "libLLVM-15.so.1")}
+    bad = {**os.environ, llvm.PATH_VARIABLE: str(tmp_path / "libLLVM-15.so.1")}
     run = subprocess.run([sys.executable, "-c", code], env=bad, capture_output=True, text=True)
     assert run.returncode == 1 and run.stdout.split() == ["imported", "UnusableLLVM"]
     assert run.stderr.strip().splitlines()[-1].startswith("nerg_mi.errors.UnusableLLVM: LLVM 15")
@@ -348,7 +348,7 @@ def test_extras_by_their_names(monkeypatch):
 
 def test_a_trouble_stands_below_its_topic():
     found = diagnosis.Diagnosis(
-        [diagnosis.Finding("LLVM", "none", "install it"), diagnosis.Finding("threads", "2")], usable=False
+        [diagnosis.Finding("LLVM", "none", "install it"), diagnosis.Finding("threads", "2")], is_usable=False
     )
     assert str(found) == "LLVM     none\n         -> install it\nthreads  2"
 
@@ -362,9 +362,9 @@ def test_the_verdict(monkeypatch, found, verdict):
     scalar = {"variants": ["scalar_rgb"], "failed": {}}
     monkeypatch.setattr(diagnosis, "try_backend", lambda backend: scalar if backend == "scalar" else found)
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
-    monkeypatch.setattr(llvm, "problem", lambda: None)
-    told = diagnosis.examine()
-    assert told.usable is (found is WORKS) and verdict in str(told)
+    monkeypatch.setattr(llvm, "find_problem", lambda: None)
+    told = diagnosis.run_diagnosis()
+    assert told.is_usable is (found is WORKS) and verdict in str(told)
     assert ("it died" in str(told)) is (found is NOTHING)
 
 
@@ -372,4 +372,4 @@ def test_the_verdict(monkeypatch, found, verdict):
 def test_an_old_driver_is_named(monkeypatch, version, old):
     monkeypatch.setattr(diagnosis, "try_backend", lambda backend: {**WORKS, "version": version})
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)
-    assert ("R570" in str(diagnosis.examine())) is old
+    assert ("R570" in str(diagnosis.run_diagnosis())) is old

@@ -123,7 +123,7 @@ def test04_areas_are_read(tmp_path):
 
     for block in blocks("json", page="report.md"):
         (tmp_path / "a.json").write_text(block.text)
-        assert all(region.holds(region.corners).all() for region in read_regions(tmp_path / "a.json"))
+        assert all(region.contains(region.corners).all() for region in read_regions(tmp_path / "a.json"))
 
 
 XML_PAGES = ("gaze-training.md", "performance.md", "plugins.md", "shapes-and-fields.md", "splats.md")
@@ -137,7 +137,7 @@ def place(rgb, standins, tmp_path, monkeypatch):
 
     for file in standins.values():
         shutil.copy(file, tmp_path)
-    shutil.copy(demo.store_scene(), tmp_path)
+    shutil.copy(demo.find_store_scene(), tmp_path)
     shutil.copy(tmp_path / "store.safetensors", tmp_path / "field.safetensors")
     crowd().save(tmp_path / "day.npz")
     write_inria(tmp_path / "store.ply", random_splats())
@@ -220,7 +220,7 @@ def test09_from_recordings(rgb, place, monkeypatch):
         assert text.count(long) == 1
         text = text.replace(long, short)
     write_photos(place / "photos", nerg)
-    names = run(text, "docs/python.md", {"nerg": nerg})
+    names = run(text, "docs/reference/python.md", {"nerg": nerg})
     assert names["field"].kind == "radiance" and names["gaze"].kind == "gaze" and names["scores"].rows
 
 
@@ -254,7 +254,7 @@ def clone(rgb, tmp_path, monkeypatch):
         store = tmp_path / "scenes" / "store"
         store.mkdir(parents=True)
         for name in names:
-            shutil.copy(demo.store_scene().with_name(name), store)
+            shutil.copy(demo.find_store_scene().with_name(name), store)
         monkeypatch.chdir(tmp_path)
         return store
 
@@ -273,7 +273,7 @@ def of_readme(text: str) -> str:
 def readme(clone):
     """The scene and the checkpoints; random ones where the store has none."""
     own = list(demo.CHECKPOINTS.values())
-    has_own = all(demo.store_scene().with_name(name).is_file() for name in own)
+    has_own = all(demo.find_store_scene().with_name(name).is_file() for name in own)
     store = clone("scene.xml", *(own if has_own else ()))
     if not has_own:
         write_standins(store)
@@ -342,7 +342,7 @@ def test14_a_shop(rgb, tmp_path, monkeypatch):
     """The page's own settings, on fewer people, places and directions."""
     monkeypatch.chdir(tmp_path)
     for name in ("shapes.xml", "twin.ply", "twin_lights.ply", "shoppers.safetensors"):
-        shutil.copy(demo.store_scene().with_name(name), tmp_path)
+        shutil.copy(demo.find_store_scene().with_name(name), tmp_path)
     for name, block in zip(("areas", "zones", "changes"), blocks("json", page="shop.md")):
         (tmp_path / f"{name}.json").write_text(block.text)
     shoppers().save(tmp_path / "shop.npz")
@@ -399,7 +399,7 @@ def test18_python(rgb, tmp_path, monkeypatch):
     for text in texts[:4]:
         small = text.replace("width=480, height=320", "width=24, height=16").replace("4.6, 10)", "4.6, 8)")
         assert small.count("width=24") == text.count("width=480")
-        run(small.replace("spp=4", "spp=1"), "docs/python.md", names)
+        run(small.replace("spp=4", "spp=1"), "docs/reference/python.md", names)
         if text is texts[0]:
             share = np.array(list(names["share"].values()))
             assert share.shape == (4, 8) and (share >= 0).all() and (share.sum(axis=0) < 1.1).all()
@@ -449,7 +449,7 @@ def test21_commands_of_the_quick_start(rgb, clone, tmp_path, capsys):
     (tmp_path / "out").mkdir()
     write_standins(store)
     recording = store / "build" / "shoppers.csv"
-    shoppers.write_shoppers(layout.build(0), recording, say=str, shoppers=6, stops=(4, 5), scene=twin.load_twin())
+    shoppers.write_shoppers(layout.build_store(0), recording, log=str, shoppers=6, stops=(4, 5), scene=twin.load_twin())
     for line in quick_start():
         words = shlex.split(line, comments=True)[1:]
         words += shlex.split(SMALLER.get(" ".join(line.split()[:2]), ""))

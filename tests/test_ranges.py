@@ -21,18 +21,18 @@ import nerg_mi.workflows
 from nerg_mi import errors, properties
 from nerg_mi.cli.building import build_command
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.ablation import frame_timer
-from nerg_mi.evaluation.metrics import Renderer
+from nerg_mi.evaluation.ablation import make_frame_timer
+from nerg_mi.evaluation.metrics import FieldRenderer
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
-from nerg_mi.ranges import FARTHEST, FLAG, RANGE, Checked, Range, check_number, ranged
-from nerg_mi.rays.readers.registry import shared_options
+from nerg_mi.ranges import MAX_COORDINATE, FLAG, RANGE, ValidatedDataclass, Range, check_number, range_field
+from nerg_mi.rays.readers.registry import collect_shared_options
 from nerg_mi.train import gaze_settings, radiance_settings
-from nerg_mi.train.geometry import place_of_scene, place_of_volume
+from nerg_mi.train.geometry import load_scene_geometry, load_volume_geometry
 from nerg_mi.workflows import rays
 from nerg_mi.workflows.base import Command
 from nerg_mi.workflows.scene_commands import KINDS as FIGURES
-from tools.command_pages import commands
+from tools.command_pages import iter_commands
 
 
 def _modules():
@@ -52,7 +52,7 @@ KINDS = list(
         )
         if isinstance(kind, type)
         and is_dataclass(kind)
-        and (issubclass(kind, Checked) or any(RANGE in f.metadata for f in fields(kind)))
+        and (issubclass(kind, ValidatedDataclass) or any(RANGE in f.metadata for f in fields(kind)))
     )
 )
 LEFT_OUT = {"settings", "output", "train_output", "test_output", "align_output", "salt"}
@@ -93,7 +93,7 @@ def test_all_kinds_of_options_are_found():
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: f"{k.__module__}.{k.__name__}")
 def test_every_number_is_refused_beyond_its_range_and_nowhere_else(kind):
-    assert not _numbers(kind) or issubclass(kind, Checked)
+    assert not _numbers(kind) or issubclass(kind, ValidatedDataclass)
     for field in _numbers(kind):
         within = field.metadata[RANGE]
         assert isinstance(within, Range), f"{field.name} has no range"
@@ -130,8 +130,8 @@ def test_the_command_line_refuses_the_same(kind):
 
 def test_every_number_of_the_command_line_shows_its_range():
     """Also where a command declares an option itself; those of readers of rays are checked by them."""
-    of_readers = {option.name for option in shared_options()}
-    options = [p for _, command, _ in commands() for p in command.params if isinstance(p, TyperOption)]
+    of_readers = {option.name for option in collect_shared_options()}
+    options = [p for _, command, _ in iter_commands() for p in command.params if isinstance(p, TyperOption)]
     numbers = [p for p in options if p.type_descriptor.annotation in (int, float) and p.name not in of_readers]
     limits = {(p.name, (i := p.type_descriptor.parameter_info).min, i.max) for p in numbers}
     assert len(limits) > 80 and [limit for limit in limits if None in limit] == []
@@ -141,8 +141,8 @@ def test_several_numbers_are_checked_one_by_one():
     from dataclasses import dataclass
 
     @dataclass(frozen=True)
-    class Some(Checked):
-        sizes: tuple[int, ...] = ranged((1, 2), Range(1, 9))
+    class Some(ValidatedDataclass):
+        sizes: tuple[int, ...] = range_field((1, 2), Range(1, 9))
 
     assert Some(sizes=(1, 9)).sizes == (1, 9)
     for wrong in ((1, 10), (1, 2.5), 3, "12"):
@@ -151,8 +151,8 @@ def test_several_numbers_are_checked_one_by_one():
 
 
 def test_numbers_of_numpy_are_numbers():
-    check_number(np.float32(2), Range(0, FARTHEST), "x")
-    check_number(np.int64(2), Range(0, FARTHEST), "x", whole=True)
+    check_number(np.float32(2), Range(0, MAX_COORDINATE), "x")
+    check_number(np.int64(2), Range(0, MAX_COORDINATE), "x", is_integer=True)
 
 
 # ---- Properties of plugins: what is taken, and that a wrong one is named with what it may be ----
@@ -164,15 +164,15 @@ ANY = Range(-1e9, 1e9)
 @pytest.mark.parametrize(
     "read, given, found",
     [
-        (lambda p: properties.number(p, "x", 1.5, ANY), {}, 1.5),
-        (lambda p: properties.number(p, "x", 1.5, Range(0, 9)), {"x": 2}, 2.0),
-        (lambda p: properties.integer(p, "x", 4, Range(1, 9)), {"x": 9.0}, 9),
-        (lambda p: properties.boolean(p, "x", True), {"x": False}, False),
-        (lambda p: properties.choice(p, "x", "a", ("a", "b")), {"x": "b"}, "b"),
-        (lambda p: properties.text(p, "x"), {"x": "name"}, "name"),
-        (lambda p: properties.text(p, "x", "other"), {}, "other"),
-        (lambda p: properties.color(p, "x", 0.25), {}, [0.25, 0.25, 0.25]),
-        (lambda p: properties.color(p, "x", 0.0), {"x": [0.1, 2.0, 0.0]}, [0.1, 2.0, 0.0]),
+        (lambda p: properties.read_number(p, "x", 1.5, ANY), {}, 1.5),
+        (lambda p: properties.read_number(p, "x", 1.5, Range(0, 9)), {"x": 2}, 2.0),
+        (lambda p: properties.read_integer(p, "x", 4, Range(1, 9)), {"x": 9.0}, 9),
+        (lambda p: properties.read_boolean(p, "x", True), {"x": False}, False),
+        (lambda p: properties.read_choice(p, "x", "a", ("a", "b")), {"x": "b"}, "b"),
+        (lambda p: properties.read_string(p, "x"), {"x": "name"}, "name"),
+        (lambda p: properties.read_string(p, "x", "other"), {}, "other"),
+        (lambda p: properties.read_color(p, "x", 0.25), {}, [0.25, 0.25, 0.25]),
+        (lambda p: properties.read_color(p, "x", 0.0), {"x": [0.1, 2.0, 0.0]}, [0.1, 2.0, 0.0]),
     ],
 )
 def test_values(read, given, found):
@@ -181,23 +181,23 @@ def test_values(read, given, found):
 
 def test_a_colour_of_a_texture(rgb):
     texture = rgb.load_dict({"type": "rgb", "value": [0.1, 0.2, 0.4]})
-    assert properties.color({"x": texture}, "x", 0.0) == pytest.approx([0.1, 0.2, 0.4])
+    assert properties.read_color({"x": texture}, "x", 0.0) == pytest.approx([0.1, 0.2, 0.4])
 
 
 @pytest.mark.parametrize(
     "read, value, words",
     [
-        (lambda p: properties.number(p, "x", 1, Range(0, 2)), 3, "0 .. 2, got 3"),
-        (lambda p: properties.number(p, "x", 1, ANY), math.nan, "nan"),
-        (lambda p: properties.number(p, "x", 1, ANY), True, "must be a number"),
-        (lambda p: properties.number(p, "x", 1, ANY), "1", "must be a number, got '1'"),
-        (lambda p: properties.integer(p, "x", 1, Range(0, 9)), 2.5, "whole number"),
-        (lambda p: properties.boolean(p, "x", True), 1, "true or false"),
-        (lambda p: properties.choice(p, "x", "a", ("a", "b")), "c", "one of a, b, got 'c'"),
-        (lambda p: properties.text(p, "x"), None, "a string, got nothing"),
-        (lambda p: properties.color(p, "x", 0), [1, 2], "one number or three"),
-        (lambda p: properties.color(p, "x", 0), [1, -2, 0], "not negative"),
-        (lambda p: properties.color(p, "x", 0), "red", "an rgb colour, got 'red'"),
+        (lambda p: properties.read_number(p, "x", 1, Range(0, 2)), 3, "0 .. 2, got 3"),
+        (lambda p: properties.read_number(p, "x", 1, ANY), math.nan, "nan"),
+        (lambda p: properties.read_number(p, "x", 1, ANY), True, "must be a number"),
+        (lambda p: properties.read_number(p, "x", 1, ANY), "1", "must be a number, got '1'"),
+        (lambda p: properties.read_integer(p, "x", 1, Range(0, 9)), 2.5, "whole number"),
+        (lambda p: properties.read_boolean(p, "x", True), 1, "true or false"),
+        (lambda p: properties.read_choice(p, "x", "a", ("a", "b")), "c", "one of a, b, got 'c'"),
+        (lambda p: properties.read_string(p, "x"), None, "a string, got nothing"),
+        (lambda p: properties.read_color(p, "x", 0), [1, 2], "one number or three"),
+        (lambda p: properties.read_color(p, "x", 0), [1, -2, 0], "not negative"),
+        (lambda p: properties.read_color(p, "x", 0), "red", "an rgb colour, got 'red'"),
     ],
 )
 def test_a_wrong_value_is_named(read, value, words):
@@ -217,15 +217,15 @@ def test_a_field_of_a_file_or_in_memory(rgb):
             return {"table": self.array}
 
     load = lambda path, ns: (path, {"about": ns})
-    field, metadata, filename = properties.trained({"filename": "here.safetensors"}, None, load, ns)
+    field, metadata, filename = properties.load_network({"filename": "here.safetensors"}, None, load, ns)
     assert field == filename and filename.endswith("here.safetensors") and metadata == {"about": ns}
     mine = Field(ns.TensorXf([1.0]))
-    assert properties.trained({}, mine, load, ns) == (mine, {}, "")
+    assert properties.load_network({}, mine, load, ns) == (mine, {}, "")
     with pytest.raises(NergError, match='"filename"'):
-        properties.trained({}, None, load, ns)
+        properties.load_network({}, None, load, ns)
     # Arrays that are not of the backend in use.
     with pytest.raises(NergError, match='"llvm_ad_rgb"'):
-        properties.trained({}, Field([1.0]), load, ns)
+        properties.load_network({}, Field([1.0]), load, ns)
 
 
 def test_a_file_is_looked_for_in_the_folders_of_a_scene(rgb, tmp_path):
@@ -234,18 +234,18 @@ def test_a_file_is_looked_for_in_the_folders_of_a_scene(rgb, tmp_path):
     rgb.set_file_resolver(type(known)(known))
     try:
         rgb.file_resolver().append(rgb.filesystem.path(str(tmp_path)))
-        assert properties.resolved("here.ply") == str(tmp_path / "here.ply")
-        assert properties.resolved("there.ply") == "there.ply"
+        assert properties.resolve_scene_file("here.ply") == str(tmp_path / "here.ply")
+        assert properties.resolve_scene_file("there.ply") == "there.ply"
     finally:
         rgb.set_file_resolver(known)
 
 
 def test_a_transform_is_a_matrix_or_the_identity(rgb):
     place = rgb.ScalarTransform4f().translate([1, 2, 3]).scale(2)
-    assert np.allclose(properties.transform({"to_world": place}, "to_world"), np.array(place.matrix))
-    assert np.array_equal(properties.transform({}, "to_world"), np.eye(4))
+    assert np.allclose(properties.read_transform({"to_world": place}, "to_world"), np.array(place.matrix))
+    assert np.array_equal(properties.read_transform({}, "to_world"), np.eye(4))
     with pytest.raises(NergError, match='"to_world".*3'):
-        properties.transform({"to_world": 3}, "to_world")
+        properties.read_transform({"to_world": 3}, "to_world")
 
 
 # ---- Errors in one sentence, and which of them a user can mend ----
@@ -283,24 +283,24 @@ def caught(code) -> BaseException:
     ],
 )
 def test_what_can_be_mended(error, mendable):
-    assert errors.expected(error) is mendable
+    assert errors.is_user_error(error) is mendable
 
 
 def test_values_that_were_chosen_are_the_users_to_mend():
     with pytest.raises(NergError, match=r"^a box needs a size; give other values by --aabb$"):
-        with errors.chosen("--aabb"):
+        with errors.blame_options("--aabb"):
             raise ValueError("a box needs a size.")
     with pytest.raises(NergError, match="^as it is$"):
-        with errors.chosen("--aabb"):
+        with errors.blame_options("--aabb"):
             raise NergError("as it is")
     with pytest.raises(TypeError):
-        with errors.chosen("--aabb"):
+        with errors.blame_options("--aabb"):
             raise TypeError
 
 
 def test_what_mitsuba_wraps_is_said_with_its_place():
     with pytest.raises(NergError) as said:
-        with errors.mitsuba_says():
+        with errors.translate_mitsuba_errors():
             raise RuntimeError(TRACE.format(error="nerg_mi.errors.NergError"))
     words = str(said.value)
     assert words.startswith('While loading "a.xml" (line 3)') and words.endswith('"step" must lie in 0 .. 1, got 2')
@@ -308,41 +308,41 @@ def test_what_mitsuba_wraps_is_said_with_its_place():
 
 
 def test_what_mitsuba_quotes_may_be_no_text():
-    with pytest.raises(NergError, match="is damaged"), errors.mitsuba_says():
+    with pytest.raises(NergError, match="is damaged"), errors.translate_mitsuba_errors():
         b"\xfe".decode()
 
 
 def test_a_mistake_in_a_plugin_is_none_of_the_scene():
     with pytest.raises(RuntimeError) as said:
-        with errors.mitsuba_says():
+        with errors.translate_mitsuba_errors():
             raise RuntimeError(TRACE.format(error="TypeError"))
     assert not isinstance(said.value, NergError)
 
 
 def _mesh(folder):
     (folder / "file.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    return lambda: place_of_scene(folder / "file.obj")
+    return lambda: load_scene_geometry(folder / "file.obj")
 
 
 def _volume(folder):
     write_volume(folder / "file.vol", np.ones((2, 2, 2), np.float32), (0, 0, 0), (1, 1, 1))
-    return lambda: place_of_volume(folder / "file.vol")
+    return lambda: load_volume_geometry(folder / "file.vol")
 
 
 def _timer(folder):
-    render = frame_timer(_volume(folder)(), np.zeros((1, 3)), folder)
+    render = make_frame_timer(_volume(folder)(), np.zeros((1, 3)), folder)
     return lambda: render(folder / "file.safetensors")
 
 
 def _camera_of_photo(folder):
-    renderer = Renderer.__new__(Renderer)
+    renderer = FieldRenderer.__new__(FieldRenderer)
     renderer.spp = 1
     return lambda: renderer(PosedCamera(Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.5), np.eye(4)))
 
 
 def _camera_of_scene(folder):
     scene = nerg.make_scene(shapes={"type": "cube"})
-    return lambda: scene.sensor(nerg.Camera((0, -3, 0), (0, 0, 0)))
+    return lambda: scene.resolve_sensor(nerg.Camera((0, -3, 0), (0, 0, 0)))
 
 
 @pytest.mark.parametrize(
@@ -351,7 +351,7 @@ def _camera_of_scene(folder):
         (_mesh, True),
         (_volume, True),
         (_timer, True),
-        (lambda folder: lambda: Renderer(folder / "file.safetensors"), True),
+        (lambda folder: lambda: FieldRenderer(folder / "file.safetensors"), True),
         (_camera_of_photo, False),
         (_camera_of_scene, False),
         (lambda folder: lambda: nerg.make_scene(shapes={"type": "cube"}), False),
@@ -369,7 +369,7 @@ def test_what_mitsuba_refuses_of_a_file_or_camera_is_the_users(rgb, tmp_path, mo
     assert (str(tmp_path / "file.") in str(said.value)) is names_file
 
 
-@pytest.mark.parametrize("load", [_timer, lambda folder: lambda: Renderer(folder / "file.safetensors")])
+@pytest.mark.parametrize("load", [_timer, lambda folder: lambda: FieldRenderer(folder / "file.safetensors")])
 @pytest.mark.parametrize("content", [None, b"", b"\x08\0\0\0\0\0\0\0{}      "], ids=["missing", "empty", "other"])
 def test_checkpoints_that_cannot_be_rendered_are_named(rgb, tmp_path, load, content):
     if content is not None:
@@ -390,9 +390,9 @@ def test_checkpoints_that_cannot_be_rendered_are_named(rgb, tmp_path, load, cont
     ],
 )
 def test_one_line(error, words):
-    assert errors.sentence(error) == words
+    assert errors.format_error(error) == words
 
 
 def test_text_of_a_file_is_cut_and_made_printable():
-    assert errors.plain("a\x1b[2Jb\n") == "a?[2Jb?"
-    assert errors.plain("x" * 400, 10) == "x" * 10 + "..." and errors.plain("x" * 10, 10) == "x" * 10
+    assert errors.sanitize("a\x1b[2Jb\n") == "a?[2Jb?"
+    assert errors.sanitize("x" * 400, 10) == "x" * 10 + "..." and errors.sanitize("x" * 10, 10) == "x" * 10

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.interruption import Interruption
-from nerg_mi.threads import set_thread_count, share
+from nerg_mi.threads import set_thread_count, limit_threads
 
 from .plugins import fields
 
@@ -74,7 +74,7 @@ def test_python_hears_ctrl_c_after_a_picture(rgb, scene):
     with Interruption() as stop:
         rgb.render(scene, spp=1)
         signal.raise_signal(signal.SIGINT)
-        assert stop.asked
+        assert stop.is_requested
 
 
 def test_ctrl_c_during_a_picture_is_raised(rgb, scene, monkeypatch):
@@ -125,4 +125,4 @@ def test_arrays_keep_their_values_however_often_it_changes(rgb):
 
 
 def test_a_worker_gives_a_job_what_it_asks_for_and_has():
-    assert (share(4, 2), share(2, 4), share(0, 3), share(3, 0)) == (2, 2, 3, 3) and share(0, 0) >= 1
+    assert (limit_threads(4, 2), limit_threads(2, 4), limit_threads(0, 3), limit_threads(3, 0)) == (2, 2, 3, 3) and limit_threads(0, 0) >= 1

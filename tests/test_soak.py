@@ -53,9 +53,9 @@ def slope(unit: Callable[[int], object], count: int) -> float:
 def store(**values: str):
     import mitsuba as mi
 
-    from nerg_mi.workflows.demo import store_scene
+    from nerg_mi.workflows.demo import find_store_scene
 
-    return mi.load_file(str(store_scene()), **({"width": "36", "height": "24"} | values))
+    return mi.load_file(str(find_store_scene()), **({"width": "36", "height": "24"} | values))
 
 
 def frames() -> Callable[[int], None]:
@@ -114,17 +114,17 @@ def gaze_steps() -> Callable[[int], None]:
 
     from nerg_mi.fields.encoding import HashGridConfig
     from nerg_mi.fields.gaze_product import GazeConfig
-    from nerg_mi.train.gaze_data import targets_of_rays
+    from nerg_mi.train.gaze_data import make_targets_from_rays
     from nerg_mi.train.gaze_product import ProductTrainer
     from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
-    from nerg_mi.train.geometry import place_of_nothing
+    from nerg_mi.train.geometry import no_geometry
 
-    rays = tiny.looks()
-    place = place_of_nothing(rays.origin)
+    rays = tiny.simulate_gaze()
+    place = no_geometry(rays.origin)
     probes = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, directions=64)
     config = GazeConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=4)
     settings = GazeSettings(steps=20_000, probes=4, directions=32, zones=0)
-    trainer = ProductTrainer(targets_of_rays(rays, place, probes), place.box, config, settings, ns)
+    trainer = ProductTrainer(make_targets_from_rays(rays, place, probes), place.box, config, settings, ns)
 
     def step(k: int) -> None:
         trainer.step()

@@ -55,7 +55,7 @@ def write_photos(folder: Path, count: int = 12) -> Path:
     return folder
 
 
-def looks(count: int = 400):
+def simulate_gaze(count: int = 400):
     """Rays (`rays.rays.Rays`) of two people who walk about and look at one point of the wall x = 1.5."""
     from nerg_mi.rays.rays import Rays
 
@@ -71,7 +71,7 @@ def looks(count: int = 400):
 
 def write_tracking(path: Path, count: int) -> Path:
     """A table of the rays of `looks` as a tracker would write it; see `MAP`."""
-    rays = looks(count)
+    rays = simulate_gaze(count)
     rows = np.column_stack([rays.t, rays.origin, rays.direction])
     with open(path, "w", encoding="utf-8") as out:
         out.write("t,person,x,y,z,dx,dy,dz\n")

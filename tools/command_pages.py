@@ -9,7 +9,7 @@ from typing import Any
 from tools.page import table
 
 
-def commands() -> Iterator[tuple[str, Any, Any]]:
+def iter_commands() -> Iterator[tuple[str, Any, Any]]:
     """Each command that does something: its words, as "nerg train gaze", its parser's command, and a context for it."""
     import typer
 
@@ -27,10 +27,10 @@ def _below(command: Any, name: str, parent: Any) -> Iterator[tuple[str, Any, Any
         yield context.command_path, command, context
 
 
-def reference() -> str:
+def format_reference() -> str:
     """A section for each command: what it does, how it is called, its arguments and its options."""
     sections = []
-    for path, command, context in commands():
+    for path, command, context in iter_commands():
         sections += [f"## {path}", _paragraphs(command.help or "")]
         usage = " ".join([path, *command.collect_usage_pieces(context)])
         sections += [f"Usage: `{usage}`", *_tables(command, context)]
@@ -45,7 +45,7 @@ def _tables(command: Any, context: Any) -> Iterator[str]:
         if record is None or parameter.name == "help":
             continue
         meaning, default = split_default(record[1])
-        cells = (f"`{record[0]}`", cell(meaning), f"`{default}`" if default else "")
+        cells = (f"`{record[0]}`", escape_cell(meaning), f"`{default}`" if default else "")
         rows[parameter.param_type_name].append(cells)
     for kind, found in rows.items():
         if found:
@@ -69,7 +69,7 @@ def split_default(text: str) -> tuple[str, str]:
     return meaning, default.strip() or ("required" if "required" in notes else "")
 
 
-def cell(text: str) -> str:
+def escape_cell(text: str) -> str:
     """Text of a help line within a table: what Markdown would take for markup is kept as it stands."""
     text = " ".join(text.split())
     return re.sub(r"([*<]|(?<!\w)_|_(?!\w))", r"\\\1", text)
@@ -77,4 +77,4 @@ def cell(text: str) -> str:
 
 def _paragraphs(text: str) -> str:
     """The help of a command, whose lines may be broken anywhere."""
-    return "\n\n".join(cell(part) for part in re.split(r"\n\s*\n", text.strip()))
+    return "\n\n".join(escape_cell(part) for part in re.split(r"\n\s*\n", text.strip()))

@@ -1,6 +1,6 @@
 """Kills: whatever happens to a command, files that were whole stay whole.
 
-    python -m tools.faults [--tries 100] [--only WORD] [--update docs/trust.md]
+    python -m tools.faults [--tries 100] [--only WORD] [--update docs/explanation/robustness.md]
 
 Commands run in a folder with an earlier result of each. Every second try is killed (SIGKILL) at a moment of its usual
 run, spread from its begin to its end; the others are killed as soon as a file is being written. After each, every file
@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
-from tools.page import table, update
+from tools.page import table, update_table
 
 
 @dataclass(frozen=True)
@@ -166,13 +166,13 @@ def kill_at(pid: int, seconds: float) -> int:
 
 def kill_while_writing(pid: int, folder: Path, turn: random.Random, skip: int) -> int:
     """Kill ``pid`` within the ``skip``-th write after this, or a few milliseconds later; its exit code."""
-    there, seen = set(filter(part, folder.rglob("*"))), 0
+    there, seen = set(filter(is_partial, folder.rglob("*"))), 0
     end = time.monotonic() + _LIMIT
     while time.monotonic() < end:
         done, status = os.waitpid(pid, os.WNOHANG)
         if done:
             return os.waitstatus_to_exitcode(status)
-        new = set(filter(part, folder.rglob("*"))) - there
+        new = set(filter(is_partial, folder.rglob("*"))) - there
         there |= new
         seen += len(new)
         if seen > skip:
@@ -188,11 +188,11 @@ def kill_while_writing(pid: int, folder: Path, turn: random.Random, skip: int) -
 
 def contents(*folders: Path) -> dict[Path, str]:
     """SHA-256 of every file in ``folders``, without the hidden ones that a killed writer leaves."""
-    found = (p for folder in folders for p in folder.rglob("*") if p.is_file() and not part(p))
+    found = (p for folder in folders for p in folder.rglob("*") if p.is_file() and not is_partial(p))
     return {p: hashlib.sha256(p.read_bytes()).hexdigest() for p in found}
 
 
-def part(path: Path) -> bool:
+def is_partial(path: Path) -> bool:
     """Whether ``path`` is a file that was being written."""
     return path.name.startswith(".") and ".part" in path.name
 
@@ -254,15 +254,15 @@ def prepare(folder: Path) -> None:
 
     import mitsuba as mi
 
-    from nerg_mi.workflows.demo import store_scene
+    from nerg_mi.workflows.demo import find_store_scene
     from tests import tiny
 
     mi.set_variant("scalar_rgb")
     tiny.write_photos(folder / "photos")
     tiny.write_tracking(folder / "track.csv", 40_000)
-    tiny.looks(2_000).save(folder / "rays.npz")
+    tiny.simulate_gaze(2_000).save(folder / "rays.npz")
     for name in ("scene.xml", "store.safetensors", "shoppers.safetensors"):
-        shutil.copy(store_scene().parent / name, folder / name)
+        shutil.copy(find_store_scene().parent / name, folder / name)
 
 
 def begin(command: Command, inputs: Path, out: Path) -> list[str]:
@@ -297,7 +297,7 @@ def try_kills(command: Command, inputs: Path, out: Path, tries: int, seed: int =
         tally.lost += len(lost)
         for line in lost:
             print(f"{command.name}: {line}", file=sys.stderr)
-    tally.left = sum(map(part, out.rglob("*")))
+    tally.left = sum(map(is_partial, out.rglob("*")))
     _require_success(command, wait(start(begin(command, inputs, out), log)), log)
     assert all((out / name).is_file() for name in command.made), f"{command.name} has not made {command.made}"
     return tally
@@ -348,7 +348,7 @@ def main(arguments: list[str] | None = None) -> int:
         work.chmod(0o755)
         _prepare_apart(inputs)
         rows = kills(work, inputs, options.tries, options.only)
-    update(options.update, "Faults", table(HEAD, rows))
+    update_table(options.update, "Faults", table(HEAD, rows))
     return int(any(row[3] for row in rows))
 
 

@@ -1,6 +1,7 @@
 """Damage what every reader reads, many times, and count what comes of it.
 
-    python -m tools.fuzz [--kind damage] [--cases 20000] [--start 1] [--only NAME] [--keep] [--update docs/trust.md]
+    python -m tools.fuzz [--kind damage] [--cases 20000] [--start 1] [--only NAME] [--keep]
+        [--update docs/explanation/robustness.md]
 
 Each reader gets as many cases, the same for the same ``--start``. ``--kind damage``: bytes and structure, drawn by
 hypothesis (tests/fuzz/mutations.py); ``semantic``: files that contradict themselves, and FIFOs, devices and links in
@@ -22,7 +23,7 @@ from pathlib import Path
 import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
 from tests.fuzz import cases, commands, readers, semantic
 from tests.fuzz.watch import BREACHES, CORPUS, kept, run_cases
-from tools.page import table, update
+from tools.page import table, update_table
 
 HEAD = (
     "reader",
@@ -84,7 +85,7 @@ def main() -> int:
             interrupted = True
     rows = [_row(r.name, outcomes[r.name], slowest[r.name], most[r.name]) for r in tried if outcomes[r.name]]
     rows.append(_row("all", sum(outcomes.values(), Counter()), max(slowest.values()), max(most.values())))
-    update(None if interrupted else given.update, "Readers", table(HEAD, rows))
+    update_table(None if interrupted else given.update, "Readers", table(HEAD, rows))
     if interrupted:
         return 130
     return 1 if broken else 0

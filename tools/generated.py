@@ -29,37 +29,37 @@ def plugins() -> str:
     _choose_variant()
     sections = []
     for name in PLUGINS:
-        page = manual.read(import_module(f"nerg_mi.plugins.{name}").__doc__ or "")
-        sections += [f"## {page.title}", page.parameter_table(), page.body]
+        page = manual.parse_manual(import_module(f"nerg_mi.plugins.{name}").__doc__ or "")
+        sections += [f"## {page.title}", page.format_parameter_table(), page.body]
     return "\n\n".join(sections)
 
 
 def presets() -> str:
     """The readers of tracking files that know their columns."""
-    from nerg_mi.rays.readers.registry import preset_table
+    from nerg_mi.rays.readers.registry import format_preset_table
 
-    return preset_table()
+    return format_preset_table()
 
 
 def checks() -> str:
     """What the sanity card of rays looks for."""
-    from nerg_mi.rays.quality import check_table
+    from nerg_mi.rays.quality import format_check_table
 
-    return check_table()
+    return format_check_table()
 
 
 def recipes() -> str:
     """What each gaze recipe sets: its field, length, losses and probes."""
     from nerg_mi.train import gaze_recipes
 
-    found = list(gaze_recipes.recipes().values())
+    found = list(gaze_recipes.load_recipes().values())
     rows = [("what it is", *(recipe.summary for recipe in found))]
     parts = (("", "settings", "gaze_settings"), ("probes: ", "probes", "probe_settings"))
     for prefix, given, made in parts:
         values = [getattr(recipe, made)() for recipe in found]
         names = dict.fromkeys(name for recipe in found for name in getattr(recipe, given))
         rows += [(f"{prefix}`{name}`", *(_shown(getattr(v, name)) for v in values)) for name in names]
-    configs = [_flat(recipe.architectures(gaze_recipes.FieldChoices())[0]) for recipe in found]
+    configs = [_flat(recipe.list_architectures(gaze_recipes.FieldOptions())[0]) for recipe in found]
     names = dict.fromkeys(name for config in configs for name in config)
     rows += [(f"field: `{name}`", *(_shown(c.get(name)) for c in configs)) for name in names]
     return table(("", *(f"`{recipe.name}`" for recipe in found)), rows)
@@ -91,8 +91,8 @@ def registered() -> str:
     _choose_variant()
     from nerg_mi.fields import encoding as encodings
     from nerg_mi.fields import gaze_base as gaze_fields
-    from nerg_mi.rays.readers.registry import reader_names
-    from nerg_mi.statistics.tables import BY_NAME
+    from nerg_mi.rays.readers.registry import list_reader_names
+    from nerg_mi.statistics.tables import MEASURES_BY_NAME
     from nerg_mi.train import gaze_recipes
     from nerg_mi.transport.aovs import AOVS
     from nerg_mi.transport.depth import DEPTHS
@@ -104,9 +104,9 @@ def registered() -> str:
         ("quadrature rule", "nerg_mi/transport/quadrature.py", RULES.names()),
         ("depth", "nerg_mi/transport/depth.py", DEPTHS.names()),
         ("AOV", "nerg_mi/transport/aovs.py", AOVS),
-        ("tracking reader", "nerg_mi/rays/readers/base.py", reader_names()),
-        ("statistic", "nerg_mi/statistics/tables.py", BY_NAME),
-        ("gaze recipe", "nerg_mi/train/gaze_recipes.py", gaze_recipes.recipes()),
+        ("tracking reader", "nerg_mi/rays/readers/base.py", list_reader_names()),
+        ("statistic", "nerg_mi/statistics/tables.py", MEASURES_BY_NAME),
+        ("gaze recipe", "nerg_mi/train/gaze_recipes.py", gaze_recipes.load_recipes()),
     )
     cells = [(what, f"`{file}`", ", ".join(f"`{name}`" for name in names)) for what, file, names in rows]
     return table(("what", "protocol, or table", "there are"), cells)
@@ -125,7 +125,7 @@ def measures() -> str:
     """The numbers of `nerg stats`: how each is defined, and over whom."""
     from nerg_mi.statistics.tables import MEASURES
 
-    rows = [(m.title.partition(" [")[0], m.definition, m.over, "yes" if m.compared else "") for m in MEASURES]
+    rows = [(m.title.partition(" [")[0], m.definition, m.population, "yes" if m.is_compared else "") for m in MEASURES]
     return table(("number", "definition", "over", "differences"), rows)
 
 
@@ -133,7 +133,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "plugins": plugins,
     "presets": presets,
     "checks": checks,
-    "commands": command_pages.reference,
+    "commands": command_pages.format_reference,
     "measures": measures,
     "recipes": recipes,
     "registered": registered,

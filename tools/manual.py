@@ -22,7 +22,7 @@ FLAGS = {
 
 
 @dataclass(frozen=True)
-class Parameter:
+class PluginParameter:
     """One parameter of a plugin; `flags`: what Mitsuba may do with it besides setting it."""
 
     name: str
@@ -32,20 +32,20 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Manual:
+class PluginManual:
     """A plugin's page: `title`, `parameters`, and `body`, the rest as Markdown."""
 
     title: str
-    parameters: list[Parameter]
+    parameters: list[PluginParameter]
     body: str
 
-    def parameter_table(self) -> str:
+    def format_parameter_table(self) -> str:
         flags = lambda p: f" *({', '.join(FLAGS[f] for f in p.flags)})*" if p.flags else ""
         rows = [(f"`{p.name}`", p.type, p.meaning + flags(p)) for p in self.parameters]
         return table(("parameter", "type", "meaning"), rows)
 
 
-def inline(text: str) -> str:
+def convert_inline(text: str) -> str:
     """reStructuredText within a line as Markdown."""
     text = re.sub(r":math:`([^`]+)`", r"$\1$", text)
     text = re.sub(r":ref:`([^`<]+?) <[^`>]+>`", r"`\1`", text)
@@ -57,17 +57,17 @@ def inline(text: str) -> str:
     return text
 
 
-def parameters(block: str) -> list[Parameter]:
+def parse_parameters(block: str) -> list[PluginParameter]:
     """The entries of a ``pluginparameters`` list."""
     found = []
     for entry in re.split(r"^ \* - ", block, flags=re.M)[1:]:
         name, kind, meaning, *flags = (" ".join(part.split()) for part in re.split(r"^   - ", entry, flags=re.M))
         marks = tuple(re.findall(r"\|(\w+)\|", " ".join(flags)))
-        found.append(Parameter(name, inline(kind).replace("`", ""), inline(meaning), marks))
+        found.append(PluginParameter(name, convert_inline(kind).replace("`", ""), convert_inline(meaning), marks))
     return found
 
 
-def examples(block: str) -> str:
+def convert_examples(block: str) -> str:
     """The examples of a ``tabs`` block as fenced code."""
     fences = []
     for language, code in re.findall(r"^ {4}\.\. code-tab:: (\w+)\n((?:(?: {8}.*)?\n)+)", block + "\n", flags=re.M):
@@ -76,7 +76,7 @@ def examples(block: str) -> str:
     return "\n\n".join(fences)
 
 
-def read(docstring: str) -> Manual:
+def parse_manual(docstring: str) -> PluginManual:
     """The manual page that a plugin's docstring is. Raises `ValueError` for what cannot be read."""
     blocks = re.split(r"\n\n(?=\S)", inspect.cleandoc(docstring))
     title, listed, body = "", [], []
@@ -84,15 +84,15 @@ def read(docstring: str) -> Manual:
         if block.startswith(".. _"):
             continue
         if re.fullmatch(r".+\n-{3,}", block):
-            title = inline(block.splitlines()[0])
+            title = convert_inline(block.splitlines()[0])
         elif block.startswith(".. pluginparameters::"):
-            listed = parameters(block)
+            listed = parse_parameters(block)
         elif block.startswith(".. tabs::"):
-            body.append(examples(block))
+            body.append(convert_examples(block))
         elif block.startswith(".. math::"):
             body.append(f"```math\n{textwrap.dedent(block.split('::', 1)[1].strip(chr(10))).rstrip()}\n```")
         elif block.startswith(".. "):
             raise ValueError(f'the manual page "{title}" has a {block.split()[1]}, which tools/manual.py does not know')
         else:
-            body.append(inline(block))
-    return Manual(title, listed, "\n\n".join(body))
+            body.append(convert_inline(block))
+    return PluginManual(title, listed, "\n\n".join(body))

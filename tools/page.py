@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.tables import markdown_table as table
+from nerg_mi.files.tables import format_markdown_table as table
 
 __all__ = ["replace_table", "table", "update"]
 
@@ -33,7 +33,7 @@ def replace_table(document: str, title: str, text: str) -> str:
     return "\n".join([*lines[:first], *text.split("\n"), *lines[end:]])
 
 
-def update(path: str | Path | None, title: str, text: str) -> None:
+def update_table(path: str | Path | None, title: str, text: str) -> None:
     """Print ``text``, and put it into the page ``path`` (None: only print)."""
     print(text)
     if path is not None:

@@ -40,13 +40,13 @@ def newest_package(names: list[str], minimum: int) -> str | None:
     return max((entry for entry in found if entry[0] >= minimum), default=(0, None))[1]
 
 
-def offered(minimum: int) -> str | None:
+def find_offered_package(minimum: int) -> str | None:
     """The newest libLLVM package from `minimum` up that apt offers; None if it offers none."""
     answer = subprocess.run(["apt-cache", "pkgnames", "libllvm"], capture_output=True, text=True, check=True)
     return newest_package(answer.stdout.split(), minimum)
 
 
-def administrator() -> list[str] | None:
+def get_root_command() -> list[str] | None:
     """What to put before a command to run it as root without a question; None if that is not allowed."""
     if os.geteuid() == 0:
         return []
@@ -60,28 +60,28 @@ def provide_llvm() -> None:
     sys.path.insert(0, str(ROOT))
     from nerg_mi import llvm
 
-    trouble = llvm.problem()
-    if trouble is None or (llvm.VARIABLE not in os.environ and llvm.has_cuda()):
+    trouble = llvm.find_problem()
+    if trouble is None or (llvm.PATH_VARIABLE not in os.environ and llvm.has_cuda()):
         return
-    if llvm.VARIABLE in os.environ or not shutil.which("apt-get"):
+    if llvm.PATH_VARIABLE in os.environ or not shutil.which("apt-get"):
         raise Stop(trouble)
 
-    root = administrator()
-    package = offered(llvm.MINIMUM)
+    root = get_root_command()
+    package = find_offered_package(llvm.MIN_VERSION)
     if package is None and root is not None:
         # A fresh machine may not have fetched the lists of packages.
         subprocess.run([*root, "apt-get", "update", "-qq"], check=True)
-        package = offered(llvm.MINIMUM)
+        package = find_offered_package(llvm.MIN_VERSION)
     if root is None:
         command = f"sudo apt-get install {package}" if package else "sudo apt-get update"
         raise Stop(
-            f"LLVM {llvm.MINIMUM} or newer is missing and installing it needs your password: type\n\n"
+            f"LLVM {llvm.MIN_VERSION} or newer is missing and installing it needs your password: type\n\n"
             f"    {command}\n\nand run this again."
         )
     if package is None:
         raise Stop(
-            f"apt offers no libLLVM from version {llvm.MINIMUM} up: use a newer release of the system, "
-            f"or set {llvm.VARIABLE} to such a libLLVM."
+            f"apt offers no libLLVM from version {llvm.MIN_VERSION} up: use a newer release of the system, "
+            f"or set {llvm.PATH_VARIABLE} to such a libLLVM."
         )
     print(f"Installing {package} ...", flush=True)
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
@@ -92,9 +92,9 @@ def provide_llvm() -> None:
         # Lists of packages that are there, but older than the packages.
         subprocess.run([*root, "apt-get", "update", "-qq"], check=True)
         subprocess.run(install, env=environment, check=True)
-    llvm.prepare()
-    if llvm.problem() is not None:
-        raise Stop(llvm.problem())
+    llvm.select_library()
+    if llvm.find_problem() is not None:
+        raise Stop(llvm.find_problem())
 
 
 # ------------------------------------------------------------------------

@@ -189,7 +189,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     )
 
 
-def arrays(path: Path) -> dict[str, np.ndarray]:
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """What a rays file or a picture holds by its names: headers, which name files and times, are left out."""
     if path.suffix == ".exr":
         with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -205,9 +205,9 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
 def digest(path: Path) -> str:
     """Digest of the arrays of a picture, a rays file or a checkpoint, of the rows of a study, or of a file's bytes."""
     if path.name == "study":
-        data = errors_of_study(path)
+        data = read_study_errors(path)
     elif path.suffix in (".exr", ".png", ".npz"):
-        parts = [f"{name} {a.dtype} {a.shape}".encode() + a.tobytes() for name, a in sorted(arrays(path).items())]
+        parts = [f"{name} {a.dtype} {a.shape}".encode() + a.tobytes() for name, a in sorted(read_arrays(path).items())]
         data = b"".join(parts)
     else:
         data = path.read_bytes()
@@ -219,7 +219,7 @@ def digest(path: Path) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def errors_of_study(folder: Path) -> bytes:
+def read_study_errors(folder: Path) -> bytes:
     """A study's rows without their times and memory, and without the fronts that follow from times."""
     rows = list(csv.DictReader((folder / "study.csv").open()))
     measured = ("ms", "second", "time", "memory", "bytes", "peak", "pareto")
@@ -227,7 +227,7 @@ def errors_of_study(folder: Path) -> bytes:
     return json.dumps(errors, sort_keys=True).encode()
 
 
-def wanted(folder: Path, only: list[str]) -> list[tuple[str, list[str]]]:
+def select_commands(folder: Path, only: list[str]) -> list[tuple[str, list[str]]]:
     """Of ``commands`` those whose outputs' names contain one of ``only`` (all where there is none), and those that make
     what these read."""
     kept = []
@@ -242,7 +242,7 @@ def wanted(folder: Path, only: list[str]) -> list[tuple[str, list[str]]]:
 def run(folder: Path, only: list[str]) -> dict[str, str]:
     """Run every command that is ``wanted``; output -> digest, or the error."""
     results = {}
-    for name, line in wanted(folder, only):
+    for name, line in select_commands(folder, only):
         out = folder / name
         process = subprocess.run([*NERG, *line, "-o", str(out)], capture_output=True, text=True)
         tables = sorted(out.glob("*.csv")) if out.is_dir() and name != "study" else []

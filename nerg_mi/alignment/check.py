@@ -9,25 +9,25 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rays.direction_checks import hit_shares, mirror_warning
+from nerg_mi.rays.direction_checks import compute_hit_fractions, describe_mirroring
 from nerg_mi.rays.rays import Rays
-from nerg_mi.transport.geometry import Place, trace_depth
+from nerg_mi.transport.geometry import SceneGeometry, trace_depth
 from nerg_mi.transport.medium import Medium
 
 from .constraints import AlignmentFit
-from .similarity import move, scale_of
+from .similarity import transform_points, similarity_scale
 
 # ---- Check ----
 #
 # Whether rays lie in a place as people's do: asked of every training and evaluation, before time is spent on it.
 
-RAYS, HEADS = 2048, 256  # So many rays, and heads, are asked about
-NOTHING = 0.98  # Where more of the gaze than this meets no surface, the alignment is certainly wrong
+NUM_RAYS, NUM_HEADS = 2048, 256  # So many rays, and heads, are asked about
+IMPOSSIBLE_ESCAPED = 0.98  # Where more of the gaze than this meets no surface, the alignment is certainly wrong
 DOUBTFUL = {"escaped": 0.3, "inside": 0.1, "below": 0.1}
 """Shares from which on it is doubtful: of gaze that meets nothing, of heads inside of something and below the floor."""
 
@@ -48,11 +48,11 @@ class AlignmentCheck:
     mirrored: str | None = None
 
     @property
-    def impossible(self) -> bool:
+    def is_impossible(self) -> bool:
         """Whether (nearly) all the gaze meets nothing."""
-        return self.escaped > NOTHING
+        return self.escaped > IMPOSSIBLE_ESCAPED
 
-    def doubts(self) -> list[str]:
+    def list_warnings(self) -> list[str]:
         """What is doubtful, in a few words each."""
         said = {
             "escaped": f"{100 * self.escaped:.0f} % of the gaze meets no surface",
@@ -63,18 +63,18 @@ class AlignmentCheck:
         return [*found, self.mirrored] if self.mirrored else found
 
 
-def check_alignment(subject: Medium | Place, rays: Rays, align: Similarity, seed: int = 0) -> AlignmentCheck:
+def check_alignment(geometry: Medium | SceneGeometry, rays: Rays, align: Similarity, seed: int = 0) -> AlignmentCheck:
     """Trace some of ``rays``, which ``align`` carries into the place ``subject``, and directions all
     around some heads."""
-    some = np.random.default_rng(seed).permutation(len(rays))[:RAYS]
+    some = np.random.default_rng(seed).permutation(len(rays))[:NUM_RAYS]
     if not len(some):
         return AlignmentCheck(0.0, 0.0, 0.0)
     turn = align.matrix[:3, :3] / align.scale
-    origin, direction = move(align.matrix, rays.origin[some]), rays.direction[some] @ turn.T
-    _, opacity = trace_depth(subject, origin, direction)
-    heads = origin[:HEADS]
+    origin, direction = transform_points(align.matrix, rays.origin[some]), rays.direction[some] @ turn.T
+    _, opacity = trace_depth(geometry, origin, direction)
+    heads = origin[:NUM_HEADS]
     around = np.concatenate([turn @ [[0, 0], [0, 0], [-1, 1]], fibonacci_directions(_DIRECTIONS).T], axis=1).T
-    depth, met = trace_depth(subject, np.repeat(heads, len(around), 0), np.tile(around, (len(heads), 1)))
+    depth, met = trace_depth(geometry, np.repeat(heads, len(around), 0), np.tile(around, (len(heads), 1)))
     depth, met = depth.reshape(len(heads), -1), met.reshape(len(heads), -1) >= _SURFACE_OPACITY
     tight = (met & (depth < _TIGHT * align.scale))[:, 2:].mean(axis=1)
     # Something is above, and nothing below: what is above is the floor.
@@ -85,10 +85,10 @@ def check_alignment(subject: Medium | Place, rays: Rays, align: Similarity, seed
     if escaped > DOUBTFUL["escaped"]:
 
         def trace(at: np.ndarray, along: np.ndarray) -> np.ndarray:
-            depth, met = trace_depth(subject, at, along)
+            depth, met = trace_depth(geometry, at, along)
             return np.where(met >= _SURFACE_OPACITY, depth, np.inf)
 
-        mirrored = mirror_warning(hit_shares(trace, origin, direction, turn.T), len(origin))
+        mirrored = describe_mirroring(compute_hit_fractions(trace, origin, direction, turn.T), len(origin))
     return AlignmentCheck(escaped, float((tight >= _MOSTLY).mean()), float(below.mean()), mirrored)
 
 
@@ -119,10 +119,10 @@ class Alignment:
     forced: bool = False
 
     @classmethod
-    def of_fit(cls, kind: str, fit: AlignmentFit, files: Mapping[str, Any], forced: bool) -> Alignment:
+    def from_fit(cls, kind: str, fit: AlignmentFit, files: Mapping[str, Any], forced: bool) -> Alignment:
         """What is recorded of a fit."""
-        residuals = {"count": len(fit.centimetres), **_spread(fit.centimetres, "cm"), **_spread(fit.degrees, "degrees")}
-        return cls(fit.matrix, {"kind": kind, **fit.about}, residuals, _uncertainty(fit), dict(files), forced)
+        residuals = {"count": len(fit.residuals_cm), **_spread(fit.residuals_cm, "cm"), **_spread(fit.residuals_deg, "degrees")}
+        return cls(fit.matrix, {"kind": kind, **fit.metadata}, residuals, _uncertainty(fit), dict(files), forced)
 
     def save(self, path: Path) -> None:
         """Write the file, whole or not at all."""
@@ -132,7 +132,7 @@ class Alignment:
             "from": "tracking",
             "to": "place",
             "matrix": self.matrix.tolist(),
-            "scale": scale_of(self.matrix),
+            "scale": similarity_scale(self.matrix),
             "evidence": self.evidence,
             "residuals": self.residuals,
             "uncertainty": self.uncertainty,
@@ -155,7 +155,7 @@ def read_similarity(path: Path, option: str, frames: str) -> Similarity:
         version = found.get("version")
         if not isinstance(version, int) or isinstance(version, bool) or not 1 <= version <= VERSION:
             raise NergError(
-                f'the alignment "{path}" has the version {plain(version, 40)}, and up to {VERSION} is read; '
+                f'the alignment "{path}" has the version {sanitize(version, 40)}, and up to {VERSION} is read; '
                 "update nerg_mi"
             )
         found = found["matrix"]
@@ -163,7 +163,7 @@ def read_similarity(path: Path, option: str, frames: str) -> Similarity:
         return Similarity(np.array([[float(x) for x in row] for row in found]))
     except (TypeError, ValueError, IndexError, OverflowError) as error:
         raise NergError(
-            f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}": {plain(error)}'
+            f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}": {sanitize(error)}'
         ) from error
 
 
@@ -179,7 +179,7 @@ def _uncertainty(fit: AlignmentFit) -> dict[str, float] | None:
         return None
     part = lambda a, b: float(np.sqrt(max(np.trace(covariance[a:b, a:b]), 0.0)))
     return {
-        "cm": 100 * part(3, 6) / scale_of(fit.matrix),
+        "cm": 100 * part(3, 6) / similarity_scale(fit.matrix),
         "degrees": float(np.degrees(part(0, 3))),
         "scale_percent": 100 * part(6, 7),
     }

@@ -16,13 +16,13 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.safe_read import read_npy
 from nerg_mi.formats.meshes import READERS, read_mesh_file
 from nerg_mi.maths.coordinates import check_coordinates, check_near_origin
-from nerg_mi.maths.sphere import uniform_directions
+from nerg_mi.maths.sphere import sample_uniform_directions
 from nerg_mi.photos.posed import read_semidense
-from nerg_mi.rays.readers.tables import iterate_table, table_columns
-from nerg_mi.transport.geometry import Place, trace_depth
+from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
+from nerg_mi.transport.geometry import SceneGeometry, trace_depth
 from nerg_mi.transport.medium import Medium
 
-from .similarity import Chart, move
+from .similarity import Chart, transform_points
 
 # ---- Grid ----
 #
@@ -42,7 +42,7 @@ class DistanceGrid:
         """The last point (3,) of the lattice."""
         return self.lower + self.step * (np.array(self.values.shape) - 1)
 
-    def at(self, points: np.ndarray) -> np.ndarray:
+    def interpolate(self, points: np.ndarray) -> np.ndarray:
         """Distances (N,) of ``points`` (N, 3)."""
         return self.with_slope(points)[0]
 
@@ -96,7 +96,7 @@ def read_surface(path: Path, count: int = POINTS, on_note: Callable[[str], None]
     elif path.suffix.lower() == ".npy":
         points = _array(path)
     else:
-        mesh = read_mesh_file(path, points=True)
+        mesh = read_mesh_file(path, allow_points=True)
         points = _sampled(mesh.vertices, mesh.faces, count)
         for note in mesh.notes:
             on_note(f"of {path}: {note}")
@@ -110,7 +110,7 @@ def read_surface(path: Path, count: int = POINTS, on_note: Callable[[str], None]
 
 
 def _table(path: Path) -> np.ndarray:
-    if "px_world" in table_columns(path):
+    if "px_world" in read_table_columns(path):
         return read_semidense(path).astype(np.float64)
     blocks = [b.numbers for b in iterate_table(path, ("x", "y", "z"))]
     return np.concatenate(blocks) if blocks else np.zeros((0, 3))
@@ -144,7 +144,7 @@ def _sampled(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
 # What rays end on is a surface, and what they pass on their way is free. Insides of hollow things are reached by rays
 # that begin there; they are pockets that no passage leads to, and count as solid.
 
-RAYS = 150_000  # Rays by which a place is traced
+NUM_RAYS = 150_000  # Rays by which a place is traced
 VOXELS = 1 << 20  # Voxels of its lattice, about
 _SURFACE_OPACITY = 0.5
 # Voxels around the place; a pocket has less than this share of the room of the largest.
@@ -152,16 +152,16 @@ _PAD, _POCKET = 3, 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class PlaceTraces:
+class SceneTraces:
     """What rays found of a place: they ``begin`` and ``end``, (N, 3), the latter on surfaces where ``met`` (N,)."""
 
-    begin: np.ndarray
+    start: np.ndarray
     end: np.ndarray
-    met: np.ndarray
+    is_hit: np.ndarray
 
-    def moved(self, matrix: np.ndarray) -> PlaceTraces:
+    def transform(self, matrix: np.ndarray) -> SceneTraces:
         """The same in another frame, to which ``matrix`` (4, 4) leads."""
-        return PlaceTraces(move(matrix, self.begin), move(matrix, self.end), self.met)
+        return SceneTraces(transform_points(matrix, self.start), transform_points(matrix, self.end), self.is_hit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,7 @@ class PlaceSurface:
         """Of the box around the points, but for the two percent at either end of each axis."""
         return float(np.linalg.norm(np.subtract(*np.percentile(self.points, [98, 2], axis=0))))
 
-    def floor(self) -> float:
+    def find_floor(self) -> float:
         """Height of the floor, z up: the lowest level that holds a good share of the points."""
         z = self.points[:, 2]
         low, high = np.percentile(z, [0.5, 99.5])
@@ -202,33 +202,33 @@ class PlaceSurface:
         return float(np.median(near)) if len(near) else float(edges[k])
 
 
-def trace_place(
-    subject: Medium | Place, lower: np.ndarray, upper: np.ndarray, rays: int = RAYS, seed: int = 0
-) -> PlaceTraces:
+def trace_scene(
+    subject: Medium | SceneGeometry, lower: np.ndarray, upper: np.ndarray, num_rays: int = NUM_RAYS, seed: int = 0
+) -> SceneTraces:
     """Trace ``rays`` from all over the box between two corners of a place. Raises `NergError` where none meets
     anything."""
     rng = np.random.default_rng(seed)
-    begin = rng.uniform(lower, upper, (rays, 3))
-    along = uniform_directions(rays, rng)
+    begin = rng.uniform(lower, upper, (num_rays, 3))
+    along = sample_uniform_directions(num_rays, rng)
     depth, opacity = trace_depth(subject, begin, along)
     met = opacity >= _SURFACE_OPACITY
     if met.mean() < 1e-3:
         raise NergError("the place has no surfaces that rays could meet, so that nothing can be aligned with it")
     far = np.linalg.norm(np.subtract(upper, lower))
-    return PlaceTraces(begin, begin + along * np.where(met, depth, far)[:, None], met)
+    return SceneTraces(begin, begin + along * np.where(met, depth, far)[:, None], met)
 
 
-def surface_of_traces(traces: PlaceTraces, voxels: int = VOXELS) -> PlaceSurface:
+def surface_of_traces(traces: SceneTraces, voxels: int = VOXELS) -> PlaceSurface:
     """The surface that rays have met."""
-    points = traces.end[traces.met]
+    points = traces.end[traces.is_hit]
     box = np.percentile(points, [0.2, 99.8], axis=0)
     lower, step, shape = _lattice(box[0], box[1], voxels)
-    length = np.linalg.norm(traces.end - traces.begin, axis=1)
+    length = np.linalg.norm(traces.end - traces.start, axis=1)
     # Rays that end where they begin began in something solid.
     real = length > 1.5 * step
-    solid, means = _voxels(traces.end[traces.met & real], lower, step, shape)
+    solid, means = _voxels(traces.end[traces.is_hit & real], lower, step, shape)
     passed = np.zeros(shape, bool)
-    begin, way, length = traces.begin[real], (traces.end - traces.begin)[real], length[real]
+    begin, way, length = traces.start[real], (traces.end - traces.start)[real], length[real]
     for t in np.arange(0, min(length.max(initial=0), float(np.linalg.norm(box[1] - box[0]))), 0.8 * step):
         on = length - 0.7 * step > t
         _mark(passed, begin[on] + way[on] * (t / length[on, None]), lower, step)
@@ -249,7 +249,7 @@ def surface_of_points(points: np.ndarray, voxels: int = VOXELS) -> PlaceSurface:
     return _finished(means, solid, ~solid, lower, step, False)
 
 
-def thinned(points: np.ndarray, step: float) -> np.ndarray:
+def downsample(points: np.ndarray, step: float) -> np.ndarray:
     """One point, the mean, of each voxel of edge ``step``: points that are evenly dense on their surfaces."""
     index = np.floor((points - points.min(axis=0)) / step).astype(np.int64)
     _, where, count = np.unique(index, axis=0, return_inverse=True, return_counts=True)
@@ -327,21 +327,21 @@ class AlignmentTarget:
     tracking, None: to be found.
     """
 
-    traces: PlaceTraces | None = None
+    traces: SceneTraces | None = None
     points: np.ndarray | None = None
-    turn: np.ndarray = field(default_factory=lambda: np.eye(4))
-    upright: bool = True
-    floor: float | None = 0.0
-    place_floor: float | None = None
+    to_z_up: np.ndarray = field(default_factory=lambda: np.eye(4))
+    is_upright: bool = True
+    tracking_floor: float | None = 0.0
+    scene_floor: float | None = None
     scale: float | None = None
 
     @cached_property
     def surface(self) -> PlaceSurface:
         """Its surface, z up. Raises `NergError` where no place was given."""
         if self.traces is not None:
-            return surface_of_traces(self.traces.moved(self.turn))
+            return surface_of_traces(self.traces.transform(self.to_z_up))
         if self.points is not None:
-            return surface_of_points(move(self.turn, self.points))
+            return surface_of_points(transform_points(self.to_z_up, self.points))
         raise NergError(
             "this evidence needs the place itself: give --field FILE, --scene FILE or --surface FILE (a mesh or points)"
         )
@@ -349,11 +349,11 @@ class AlignmentTarget:
     @property
     def place_level(self) -> float:
         """Height of the place's floor, z up."""
-        return self.surface.floor() if self.place_floor is None else self.place_floor
+        return self.surface.find_floor() if self.scene_floor is None else self.scene_floor
 
     def to_place(self, matrix: np.ndarray) -> np.ndarray:
         """A similarity that leads to the place turned z up, as one that leads to the place."""
-        return np.linalg.inv(self.turn) @ matrix
+        return np.linalg.inv(self.to_z_up) @ matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,15 +368,15 @@ class AlignmentFit:
     """
 
     matrix: np.ndarray
-    centimetres: np.ndarray
-    degrees: np.ndarray
+    residuals_cm: np.ndarray
+    residuals_deg: np.ndarray
     covariance: np.ndarray | None = None
     mirrored: str | None = None
     points: np.ndarray | None = None
     targets: np.ndarray | None = None
-    about: dict[str, Any] = field(default_factory=dict)
+    metadata: dict[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
-    doubts: Sequence[str] = ()
+    warnings: Sequence[str] = ()
 
 
 class Evidence(Protocol):
@@ -398,7 +398,7 @@ def mirror_sentence(what: str, mirrored: float, declared: float) -> str:
     return f"with the x axis negated {what} to {100 * mirrored:.3g} cm, as declared to {100 * declared:.3g} cm only"
 
 
-def angles(viewpoint: np.ndarray, at: np.ndarray, to: np.ndarray) -> np.ndarray:
+def angles_between(viewpoint: np.ndarray, at: np.ndarray, to: np.ndarray) -> np.ndarray:
     """Angles in degrees (N,) between points ``at`` and ``to``, both (N, 3), as seen from ``viewpoint``, (3,) or (N, 3);
     those nearer than a millionth of the farthest are left out."""
     a, b = at - viewpoint, to - viewpoint
@@ -412,9 +412,9 @@ def angles(viewpoint: np.ndarray, at: np.ndarray, to: np.ndarray) -> np.ndarray:
 def pair_covariance(source: np.ndarray, target: np.ndarray, matrix: np.ndarray, basis: np.ndarray) -> np.ndarray | None:
     """Covariance (7, 7) of a least-squares fit of points to points, from its normal equations, about the points' mean;
     None where there are no more points than numbers to be found."""
-    chart = Chart(matrix, move(matrix, source).mean(axis=0), basis)
+    chart = Chart(matrix, transform_points(matrix, source).mean(axis=0), basis)
     start = np.zeros(chart.size)
-    moved = chart.moved(start, source)
+    moved = chart.transform(start, source)
     by = np.concatenate([chart.pulled(start, moved, np.broadcast_to(e, moved.shape)) for e in np.eye(3)])
     free = by.shape[0] - chart.size
     if free < 1:

@@ -20,13 +20,13 @@ from .constraints import (
     DistanceGrid,
     PlaceSurface,
     Progress,
-    angles,
+    angles_between,
     mirror_sentence,
     pair_covariance,
     surface_of_points,
-    thinned,
+    downsample,
 )
-from .similarity import ALL, MIRROR, Chart, fit_similarity, move, scale_of, upright_basis
+from .similarity import ALL, MIRROR, Chart, fit_similarity, transform_points, similarity_scale, upright_basis
 
 # ---- Scores ----
 #
@@ -97,7 +97,7 @@ class GazeEnds:
     def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         along = np.geomspace(NEAR, FAR, STEPS)
         points = self.origins[:, None] + along[:, None] * self.directions[:, None]
-        distance = self.surface.distance.at(chart.moved(q, points.reshape(-1, 3))).reshape(len(points), STEPS)
+        distance = self.surface.distance.interpolate(chart.transform(q, points.reshape(-1, 3))).reshape(len(points), STEPS)
         # Between two places a ray may come nearer by half of the way from one to the other.
         reach = 0.5 * np.gradient(along) * chart.scale(q)
         nearest = np.argmin(distance - reach, axis=1)
@@ -119,7 +119,7 @@ class HeadHeight:
     name: str = "heads above the floor"
 
     def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        moved, s = chart.moved(q, self.points), chart.scale(q)
+        moved, s = chart.transform(q, self.points), chart.scale(q)
         height = (moved[:, 2] - self.floor) / s
         up = np.broadcast_to([0.0, 0.0, 1.0], moved.shape)
         slope = chart.pulled(q, moved, up) / s - height[:, None] * chart.basis[6]
@@ -130,7 +130,7 @@ class HeadHeight:
 
 def _of_grid(grid: DistanceGrid, points: np.ndarray, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances in units of the tracking of ``points`` (N, 3) of its frame, and their derivatives."""
-    moved, s = chart.moved(q, points), chart.scale(q)
+    moved, s = chart.transform(q, points), chart.scale(q)
     value, slope = grid.with_slope(moved)
     return value / s, (chart.pulled(q, moved, slope) - value[:, None] * chart.basis[6]) / s
 
@@ -152,7 +152,7 @@ class RefinedAlignment:
 
 
 def refine(
-    scores: Sequence[Score], base: np.ndarray, center: np.ndarray, basis: np.ndarray, wide: float = 1.0, most: int = 60
+    scores: Sequence[Score], base: np.ndarray, center: np.ndarray, basis: np.ndarray, scale_factor: float = 1.0, max_evaluations: int = 60
 ) -> RefinedAlignment:
     """Minimise the robust residuals of ``scores`` by Gauss-Newton steps in a trust region (SciPy's least_squares with a
     Cauchy loss), from the similarity ``base`` (4, 4) on.
@@ -161,7 +161,7 @@ def refine(
     of the scores' own scales, larger for a first, coarse fit; ``most``: evaluations.
     """
     chart = Chart(base, center, basis)
-    weight = [1 / (wide * s.scale * np.sqrt(max(len(s.group), 1))) for s in scores]
+    weight = [1 / (scale_factor * s.scale * np.sqrt(max(len(s.group), 1))) for s in scores]
 
     def stacked(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         parts = [s.residuals(chart, q) for s in scores]
@@ -193,7 +193,7 @@ def refine(
             return last[key]
 
         derivatives: Any = lambda q: at(q)[1]
-        q = least_squares(lambda q: at(q)[0], q, derivatives, x_scale="jac", max_nfev=most).x
+        q = least_squares(lambda q: at(q)[0], q, derivatives, x_scale="jac", max_nfev=max_evaluations).x
     r, by = stacked(q)
     z = r * r * counts
     group = np.concatenate([s.group for s in scores])
@@ -261,12 +261,12 @@ class Twin:
         found: dict[bool, list[_Placed]] = {}
         for flip in (False, True):
             progress(0.1 + 0.4 * flip, "placing the mirrored twin" if flip else "placing the twin")
-            found[flip] = _placed(move(MIRROR, twin) if flip else twin, place, target)
+            found[flip] = _placed(transform_points(MIRROR, twin) if flip else twin, place, target)
         best = found[False][0]
-        s = scale_of(best.matrix)
+        s = similarity_scale(best.matrix)
         x, y, forth = _closest(twin, place.points, KDTree(place.points), KDTree(twin), best.matrix, _OVERLAP)
-        basis = upright_basis(False) if target.upright else ALL
-        off = _nearest(KDTree(place.points), move(best.matrix, twin))[0] / s
+        basis = upright_basis(False) if target.is_upright else ALL
+        off = _nearest(KDTree(place.points), transform_points(best.matrix, twin))[0] / s
         kept = np.sort(off)[: int(_OVERLAP * len(off))]
         notes = [
             f"{len(twin):,} points of the twin; {_OVERLAP:.0%} of them lie within {100 * kept[-1]:.2g} cm",
@@ -274,14 +274,14 @@ class Twin:
         ]
         mirrored = None
         if found[True][0].cost < _CLEAR * best.cost:
-            flipped = found[True][0].cost / scale_of(found[True][0].matrix)
+            flipped = found[True][0].cost / similarity_scale(found[True][0].matrix)
             mirrored = mirror_sentence("the twin fits", flipped, best.cost / s)
         about = {"points": len(twin), "overlap": _OVERLAP, "mean_cm": 100 * best.cost / s}
         covariance = pair_covariance(x[forth], y[forth], best.matrix, basis)
         return AlignmentFit(
             target.to_place(best.matrix),
             100 * kept,
-            angles(move(best.matrix, x.mean(axis=0)), move(best.matrix, x[forth]), y[forth]),
+            angles_between(transform_points(best.matrix, x.mean(axis=0)), transform_points(best.matrix, x[forth]), y[forth]),
             covariance,
             mirrored,
             twin,
@@ -307,7 +307,7 @@ def _even(points: np.ndarray, source: str) -> np.ndarray:
     size = np.linalg.norm(np.ptp(points, axis=0))
     if not size > 0:
         raise NergError(f"all points of {source} are one; give a mesh or points on surfaces")
-    return thinned(points, float(size) / 250)
+    return downsample(points, float(size) / 250)
 
 
 def _placed(twin: np.ndarray, place: PlaceSurface, target: AlignmentTarget) -> list[_Placed]:
@@ -322,12 +322,12 @@ def _placed(twin: np.ndarray, place: PlaceSurface, target: AlignmentTarget) -> l
     scales = ratio * _SCALES if target.scale is None else np.array([target.scale])
     wide = 0.06 * place.diagonal
     starts = []
-    for turn in _turns(target.upright):
+    for turn in _turns(target.is_upright):
         # All scales at once.
         moved = scales[:, None, None] * ((x - x0) @ turn.T) + y0
         back = ((y - y0) @ turn) / scales[:, None, None] + x0
-        forth = place.distance.at(moved.reshape(-1, 3)).reshape(len(scales), -1)
-        away = own.at(back.reshape(-1, 3)).reshape(len(scales), -1) * scales[:, None]
+        forth = place.distance.interpolate(moved.reshape(-1, 3)).reshape(len(scales), -1)
+        away = own.interpolate(back.reshape(-1, 3)).reshape(len(scales), -1) * scales[:, None]
         near = np.exp(-0.5 * (forth / wide) ** 2).mean(axis=1) + np.exp(-0.5 * (away / wide) ** 2).mean(axis=1)
         starts += [(n, s, turn) for n, s in zip(near.tolist(), scales)]
     starts.sort(key=lambda g: -g[0])
@@ -338,10 +338,10 @@ def _placed(twin: np.ndarray, place: PlaceSurface, target: AlignmentTarget) -> l
         matrix[:3, :3] = s * turn
         matrix[:3, 3] = y0 - s * turn @ x0
         found.append(_icp(x, y, matrix, target, 15))
-    found.sort(key=lambda f: f.cost / scale_of(f.matrix))
+    found.sort(key=lambda f: f.cost / similarity_scale(f.matrix))
     x, y = few(twin, _FINE), few(place.points, 2 * _FINE)
     last = [_settled(x, y, f.matrix, place, own, target) for f in _different(found, place.diagonal)[:_LAST]]
-    return sorted(last, key=lambda f: f.cost / scale_of(f.matrix))
+    return sorted(last, key=lambda f: f.cost / similarity_scale(f.matrix))
 
 
 def _turns(upright: bool) -> list[np.ndarray]:
@@ -357,8 +357,8 @@ def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: AlignmentTarg
         # More is taken for common as the two come together.
         share = 0.6 + (_OVERLAP - 0.6) * min(1.0, 2 * k / most)
         a, b, _ = _closest(x, y, tree, own, matrix, share)
-        matrix = fit_similarity(a, b, upright=target.upright, scale=target.scale)
-        now = float(np.mean(np.linalg.norm(move(matrix, a) - b, axis=1)))
+        matrix = fit_similarity(a, b, upright=target.is_upright, scale=target.scale)
+        now = float(np.mean(np.linalg.norm(transform_points(matrix, a) - b, axis=1)))
         if 2 * k > most and abs(cost - now) < 1e-5 * max(now, 1e-300):
             break
         cost = now
@@ -374,16 +374,16 @@ def _settled(
     it has to be to tell that it is.
     """
     matrix = _icp(x, y, matrix, target, 8).matrix
-    near = _NEAR * place.diagonal / scale_of(matrix)
-    basis = upright_basis(False) if target.upright else ALL
+    near = _NEAR * place.diagonal / similarity_scale(matrix)
+    basis = upright_basis(False) if target.is_upright else ALL
     basis = basis if target.scale is None else basis[:, :-1]
-    center, own = move(matrix, x).mean(axis=0), np.arange(len(x))
+    center, own = transform_points(matrix, x).mean(axis=0), np.arange(len(x))
     on_surface = AtZero(place.distance, x, own, "points of the twin on surfaces", near)
     for wide in (3.0, 1.0):
         matrix = refine([on_surface], matrix, center, basis, wide, 30).matrix
-    s, most = scale_of(matrix), _FAR * place.diagonal
-    forth = np.minimum(place.distance.at(move(matrix, x)), most)
-    back = np.minimum(twin.at(move(np.linalg.inv(matrix), y)) * s, most)
+    s, most = similarity_scale(matrix), _FAR * place.diagonal
+    forth = np.minimum(place.distance.interpolate(transform_points(matrix, x)), most)
+    back = np.minimum(twin.interpolate(transform_points(np.linalg.inv(matrix), y)) * s, most)
     return _Placed(matrix, float(0.5 * (forth.mean() + back.mean())))
 
 
@@ -392,9 +392,9 @@ def _closest(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of ``x`` and of ``y`` that belong together, (M, 3) each, nearest from either side, without those that are
     farthest apart; and which were found from the side of ``x``, (M,) bool."""
-    forth, at = _nearest(tree, move(matrix, x))
-    back, of = _nearest(own, move(np.linalg.inv(matrix), y))
-    back = back * scale_of(matrix)
+    forth, at = _nearest(tree, transform_points(matrix, x))
+    back, of = _nearest(own, transform_points(np.linalg.inv(matrix), y))
+    back = back * similarity_scale(matrix)
     a = np.flatnonzero(forth <= np.quantile(forth, share))
     b = np.flatnonzero(back <= np.quantile(back, share))
     side = np.arange(len(a) + len(b)) < len(a)
@@ -415,14 +415,14 @@ def _different(found: list[_Placed], size: float) -> list[_Placed]:
 
 
 def _apart(a: _Placed, b: _Placed, size: float) -> bool:
-    turned = a.matrix[:3, :3] / scale_of(a.matrix) @ (b.matrix[:3, :3] / scale_of(b.matrix)).T
+    turned = a.matrix[:3, :3] / similarity_scale(a.matrix) @ (b.matrix[:3, :3] / similarity_scale(b.matrix)).T
     angle = np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
-    return bool(angle > 10 or abs(np.log(scale_of(a.matrix) / scale_of(b.matrix))) > 0.1)
+    return bool(angle > 10 or abs(np.log(similarity_scale(a.matrix) / similarity_scale(b.matrix))) > 0.1)
 
 
 def _rivals(found: list[_Placed], size: float) -> list[str]:
     best = found[0]
-    each = lambda f: f.cost / scale_of(f.matrix)
+    each = lambda f: f.cost / similarity_scale(f.matrix)
     for other in found[1:]:
         if _apart(best, other, size) and each(other) < _RIVAL * each(best):
             return [

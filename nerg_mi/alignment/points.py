@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import read_json, size_of
-from nerg_mi.photos.colmap import find_source
-from nerg_mi.photos.images import read_posed
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import read_json, check_regular_file
+from nerg_mi.photos.colmap import find_pose_source
+from nerg_mi.photos.images import read_posed_images
 from nerg_mi.photos.posed import PosedImages
-from nerg_mi.rays.readers.tables import iterate_table, table_columns
+from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
 
-from .constraints import AlignmentFit, AlignmentTarget, Progress, angles, mirror_sentence, pair_covariance
-from .similarity import ALL, MIRROR, check_points, errors, fit_similarity, in_plane, leave_one_out, move, upright_basis
+from .constraints import AlignmentFit, AlignmentTarget, Progress, angles_between, mirror_sentence, pair_covariance
+from .similarity import ALL, MIRROR, check_points, residual_distances, fit_similarity, in_plane, leave_one_out, transform_points, upright_basis
 
 # ---- Alignment from cameras whose poses are known in both frames: two models of the same pictures ----
 #
@@ -68,7 +68,7 @@ class Cameras:
             scale, shift = _scale_and_shift(x @ rotation.T, y, target.scale)
             matrix = np.eye(4)
             matrix[:3, :3], matrix[:3, 3] = scale * rotation, shift
-        off = errors(matrix, x, y)
+        off = residual_distances(matrix, x, y)
         inliers = (off <= 5 * np.median(off) + 1e-9 * size) & (angle <= 5 * np.median(angle) + 1e-6)
         notes = [
             *self.notes,
@@ -76,10 +76,10 @@ class Cameras:
             f"{np.median(angle):.2g} degrees (median)",
         ]
         mirrored = None
-        flipped = move(MIRROR, x)
+        flipped = transform_points(MIRROR, x)
         if len(x) > 3 and not in_plane(x):
-            off_flipped = errors(fit_similarity(flipped, y), flipped, y)
-            if np.median(off_flipped) < _CLEAR * np.median(errors(fit_similarity(x, y), x, y)):
+            off_flipped = residual_distances(fit_similarity(flipped, y), flipped, y)
+            if np.median(off_flipped) < _CLEAR * np.median(residual_distances(fit_similarity(x, y), x, y)):
                 mirrored = mirror_sentence("the centres meet", np.median(off_flipped), np.median(off))
         about = {"cameras": len(a), "agreeing": int(inliers.sum())}
         kept = inliers if inliers.sum() > 2 else np.ones(len(x), bool)
@@ -133,7 +133,7 @@ def _scale_and_shift(x: np.ndarray, y: np.ndarray, given: float | None) -> tuple
 def read_cameras(tracking: Path, place: Path) -> Cameras:
     """The poses of the pictures that two models (transforms.json, or COLMAP's) have in common, by the names of their
     files. Raises `NergError` where there are none."""
-    models = [read_posed(find_source(path)) for path in (tracking, place)]
+    models = [read_posed_images(find_pose_source(path)) for path in (tracking, place)]
     for key in (_whole, _last):
         tables = [_by_name(model, key) for model in models]
         common = sorted(set(tables[0]) & set(tables[1]))
@@ -183,20 +183,20 @@ class Pairs:
 
     def fit(self, target: AlignmentTarget, progress: Progress) -> AlignmentFit:
         """Umeyama's solution. Raises `NergError` for points that are too few or degenerate."""
-        x, y = self.tracking, move(target.turn, self.place)
-        check_points(x, y, self.source, upright=target.upright)
-        options: dict[str, Any] = {"upright": target.upright, "scale": target.scale}
+        x, y = self.tracking, transform_points(target.to_z_up, self.place)
+        check_points(x, y, self.source, upright=target.is_upright)
+        options: dict[str, Any] = {"upright": target.is_upright, "scale": target.scale}
         matrix = fit_similarity(x, y, **options)
-        off, left_out = errors(matrix, x, y), leave_one_out(x, y, **options)
-        flipped = move(MIRROR, x)
+        off, left_out = residual_distances(matrix, x, y), leave_one_out(x, y, **options)
+        flipped = transform_points(MIRROR, x)
         turned = fit_similarity(flipped, y, **options)
         notes = [self._describe(off, left_out)]
         mirrored = None
-        if not target.upright and in_plane(x):
+        if not target.is_upright and in_plane(x):
             notes.append("the points lie in a plane, so that they do not tell a mirrored frame; add one off the plane")
-        elif _rms(errors(turned, flipped, y)) < _CLEAR * _rms(off):
-            mirrored = mirror_sentence("the pairs meet", _rms(errors(turned, flipped, y)), _rms(off))
-        basis = upright_basis(False) if target.upright else ALL
+        elif _rms(residual_distances(turned, flipped, y)) < _CLEAR * _rms(off):
+            mirrored = mirror_sentence("the pairs meet", _rms(residual_distances(turned, flipped, y)), _rms(off))
+        basis = upright_basis(False) if target.is_upright else ALL
         if target.scale is not None:
             basis = basis[:, :-1]
         known = left_out[np.isfinite(left_out)]
@@ -204,7 +204,7 @@ class Pairs:
         return AlignmentFit(
             target.to_place(matrix),
             100 * off,
-            angles(y.mean(axis=0), move(matrix, x), y),
+            angles_between(y.mean(axis=0), transform_points(matrix, x), y),
             pair_covariance(x, y, matrix, basis),
             mirrored,
             x,
@@ -233,10 +233,10 @@ class Pairs:
         if len(off) < 5 or not known[worst] > 0.05:
             return []
         x, y = np.delete(self.tracking, worst, 0), np.delete(self.place, worst, 0)
-        without = errors(fit_similarity(x, y), x, y)
+        without = residual_distances(fit_similarity(x, y), x, y)
         if not np.median(without) < 0.25 * np.median(rest):
             return []
-        name = f' ("{plain(self.names[worst], 60)}")' if self.names else ""
+        name = f' ("{sanitize(self.names[worst], 60)}")' if self.names else ""
         return [
             f"pair {worst + 1}{name} is {100 * known[worst]:.0f} cm from where the others put it, and they agree to "
             f"{100 * np.median(without):.2g} cm without it: was it picked wrong?"
@@ -246,7 +246,7 @@ class Pairs:
 def read_pairs(path: Path) -> Pairs:
     """The pairs in a CSV or JSON file. Raises `NergError` for a file that holds none."""
     source = f'the file "{path}"'
-    size_of(path, "file of pairs", PAIRS_BYTES)
+    check_regular_file(path, "file of pairs", PAIRS_BYTES)
     tracking, place, names = _read_json(path) if path.suffix.lower() == ".json" else _read_csv(path)
     if not len(tracking):
         raise NergError(f"{source} holds no pairs of points; it is {_SHAPE}")
@@ -254,7 +254,7 @@ def read_pairs(path: Path) -> Pairs:
 
 
 def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    columns = table_columns(path)
+    columns = read_table_columns(path)
     missing = [name for name in _COLUMNS if name not in columns]
     if missing:
         raise NergError(f'the file of pairs "{path}" has no column {", ".join(missing)}; it is {_SHAPE}')
@@ -276,7 +276,7 @@ def _read_json(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
             raise ValueError("a point has three coordinates")
         names = tuple(str(row.get("name", "")) for row in rows)
     except (TypeError, ValueError, KeyError, IndexError, AttributeError, OverflowError) as error:
-        raise NergError(f'the file of pairs "{path}" cannot be used ({plain(error)}); it is {_SHAPE}') from error
+        raise NergError(f'the file of pairs "{path}" cannot be used ({sanitize(error)}); it is {_SHAPE}') from error
     return points[0].reshape(-1, 3), points[1].reshape(-1, 3), names if any(names) else ()
 
 

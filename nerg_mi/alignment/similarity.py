@@ -66,19 +66,19 @@ def _turn(covariance: np.ndarray) -> np.ndarray:
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
-def move(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """``points`` (..., 3) by a (4, 4) matrix."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def scale_of(matrix: np.ndarray) -> float:
+def similarity_scale(matrix: np.ndarray) -> float:
     """Length in the target of one unit of the source."""
     return float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
 
 
-def errors(matrix: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+def residual_distances(matrix: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """How far ``matrix`` carries points from where they belong, (N,), in units of the source."""
-    return np.linalg.norm(move(matrix, source) - target, axis=1) / scale_of(matrix)
+    return np.linalg.norm(transform_points(matrix, source) - target, axis=1) / similarity_scale(matrix)
 
 
 def leave_one_out(
@@ -91,22 +91,22 @@ def leave_one_out(
         rest = np.arange(len(source)) != k
         if not _refused(source[rest], upright) and not _refused(target[rest], upright):
             matrix = fit_similarity(source[rest], target[rest], upright=upright, scale=scale)
-            if scale_of(matrix) > 0:
-                out[k] = errors(matrix, source[k : k + 1], target[k : k + 1])[0]
+            if similarity_scale(matrix) > 0:
+                out[k] = residual_distances(matrix, source[k : k + 1], target[k : k + 1])[0]
     return out
 
 
-def check_points(source: np.ndarray, target: np.ndarray, what: str, *, upright: bool = False) -> None:
+def check_points(source: np.ndarray, target: np.ndarray, label: str, *, upright: bool = False) -> None:
     """Raise `NergError` for points that do not tell a similarity: too few, at one place, on a line, not finite.
 
     ``what``: whose points they are, for the message ('the file "pairs.csv"').
     """
     for points, frame in ((source, "tracking"), (target, "place")):
-        check_coordinates(points, f"{what}: points in the frame of the {frame}")
+        check_coordinates(points, f"{label}: points in the frame of the {frame}")
     for points, frame in ((source, "tracking"), (target, "place")):
         why = _refused(points, upright)
         if why:
-            raise NergError(f"{what}: {why} in the frame of the {frame}, which leaves the alignment open; pick others")
+            raise NergError(f"{label}: {why} in the frame of the {frame}, which leaves the alignment open; pick others")
 
 
 def _refused(points: np.ndarray, upright: bool) -> str:
@@ -168,11 +168,11 @@ class Chart:
 
     def scale(self, q: np.ndarray) -> float:
         """Its scale."""
-        return float(np.exp(self.basis[6] @ q)) * scale_of(self.base)
+        return float(np.exp(self.basis[6] @ q)) * similarity_scale(self.base)
 
-    def moved(self, q: np.ndarray, points: np.ndarray) -> np.ndarray:
+    def transform(self, q: np.ndarray, points: np.ndarray) -> np.ndarray:
         """``points`` (N, 3) in the place."""
-        return move(self.matrix(q), points)
+        return transform_points(self.matrix(q), points)
 
     def pulled(self, q: np.ndarray, moved: np.ndarray, slope: np.ndarray) -> np.ndarray:
         """Derivatives (N, k) with respect to ``q`` of a function whose gradients at the ``moved`` points (N, 3) are

@@ -11,12 +11,12 @@ from scipy import fft
 from scipy.stats import wilcoxon
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.direction_checks import DECLARED, EXCHANGES, head_frames
+from nerg_mi.rays.direction_checks import DECLARED, AXIS_SWAPS, compute_head_frames
 from nerg_mi.rays.rays import Rays
 
 from .constraints import AlignmentFit, AlignmentTarget, PlaceSurface, Progress
 from .icp import AtZero, GazeEnds, HeadHeight, RefinedAlignment, Score, groups_of, refine
-from .similarity import ALL, MIRROR, move, scale_of, upright_basis
+from .similarity import ALL, MIRROR, transform_points, similarity_scale, upright_basis
 
 # ---- Flips ----
 #
@@ -25,7 +25,7 @@ from .similarity import ALL, MIRROR, move, scale_of, upright_basis
 # Rooms are closed: nearly every ray ends on a surface, negated or not. But points, as cameras triangulate them, lie on
 # what there is to see, and gaze passes within a fraction of a degree of one.
 
-RAYS, POINTS = 400, 100_000  # So many rays are looked at, and so many points
+MAX_RAYS, POINTS = 400, 100_000  # So many rays are looked at, and so many points
 
 # A flip is told where it is so much better at the median, and better in more rays than chance would have it.
 _BETTER, _CHANCE = 0.75, 1e-4
@@ -67,17 +67,17 @@ def compare_flips(
     are left out, at random.
     """
     rng = np.random.default_rng(0)
-    some = rng.permutation(len(origin))[:RAYS]
+    some = rng.permutation(len(origin))[:MAX_RAYS]
     points = points[rng.permutation(len(points))[:POINTS]]
-    origin, direction = move(matrix, origin[some]), direction[some]
-    turn = matrix[:3, :3] / scale_of(matrix)
+    origin, direction = transform_points(matrix, origin[some]), direction[some]
+    turn = matrix[:3, :3] / similarity_scale(matrix)
     kinds = {DECLARED: direction}
     kinds |= {f"{'xyz'[k]} of the directions negated": direction * np.where(np.arange(3) == k, -1, 1) for k in range(3)}
     if head is not None:
         known = np.all(np.isfinite(head[some]), axis=1, keepdims=True)
-        frames = head_frames(head[some])
+        frames = compute_head_frames(head[some])
         own = np.einsum("nij,nj->ni", frames, direction)
-        for what, signs in EXCHANGES.items():
+        for what, signs in AXIS_SWAPS.items():
             mirrored = np.einsum("nij,ni->nj", frames, own * signs)
             kinds[f"{what} of the eyes exchanged"] = np.where(known, mirrored, direction)
     turned = np.stack([kind @ turn.T for kind in kinds.values()], axis=1)
@@ -120,14 +120,14 @@ def scale_range(surface: PlaceSurface, points: np.ndarray) -> np.ndarray:
     return most / 1.08 ** np.arange(15)
 
 
-def search(
+def search_placements(
     surface: PlaceSurface,
     hits: np.ndarray,
     free: np.ndarray,
     scales: Sequence[float] | np.ndarray,
-    floor: tuple[float, float],
+    floor_heights: tuple[float, float],
     turns: int = _TURNS,
-    kept: int = _KEPT,
+    max_guesses: int = _KEPT,
 ) -> list[Guess]:
     """The best guesses, best first.
 
@@ -142,9 +142,9 @@ def search(
     for scale in scales:
         maps = _Maps(surface, low, high, scale)
         for angle in 2 * np.pi * np.arange(turns) / turns:
-            found += maps.best(hits, free, angle, floor)
+            found += maps.best(hits, free, angle, floor_heights)
     found.sort(key=lambda g: -g.score)
-    return _apart(found, kept, 0.05 * surface.diagonal)
+    return _apart(found, max_guesses, 0.05 * surface.diagonal)
 
 
 class _Maps:
@@ -157,8 +157,8 @@ class _Maps:
         nodes = np.stack(np.meshgrid(*(np.arange(n) for n in self.shape), indexing="ij"), axis=-1)
         nodes = low + self.cell * (nodes.reshape(-1, 3) + 0.5)
         wide = max(NEAR * scale, 0.7 * self.cell)
-        on = np.exp(-0.5 * (surface.distance.at(nodes) / wide) ** 2)
-        open_ = np.exp(-0.5 * (surface.blocked.at(nodes) / wide) ** 2)
+        on = np.exp(-0.5 * (surface.distance.interpolate(nodes) / wide) ** 2)
+        open_ = np.exp(-0.5 * (surface.blocked.interpolate(nodes) / wide) ** 2)
         # Twice as wide, so that what leaves it on one side does not come in on the other.
         next_length: Any = fft.next_fast_len  # the stubs know no result
         self.size = [next_length(2 * int(n), real=True) for n in self.shape[:2]]
@@ -212,7 +212,7 @@ def _by_level(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(values, 2, 0), np.float32)
 
 
-def close(a: np.ndarray, b: np.ndarray, distance: float) -> bool:
+def is_close(a: np.ndarray, b: np.ndarray, distance: float) -> bool:
     """Whether two similarities (4, 4) are of the same placement: within a ``distance`` in the place, and a fifth of
     turn and scale."""
     turned = np.linalg.norm(a[:3, :3] - b[:3, :3]) < 0.2 * np.linalg.norm(b[:3, :3])
@@ -223,7 +223,7 @@ def _apart(found: list[Guess], count: int, distance: float) -> list[Guess]:
     """The first ``count`` that are not close to a better one."""
     out: list[Guess] = []
     for guess in found:
-        if not any(close(guess.matrix, o.matrix, distance) for o in out):
+        if not any(is_close(guess.matrix, o.matrix, distance) for o in out):
             out.append(guess)
         if len(out) == count:
             break
@@ -235,7 +235,7 @@ def _apart(found: list[Guess], count: int, distance: float) -> list[Guess]:
 # Alignment from the tracking alone: heads in free space above the floor, gaze that ends on surfaces, hit points on
 # them.
 
-MOST = 4000  # Rays that are looked at, evenly chosen over people
+MAX_SAMPLES = 4000  # Rays that are looked at, evenly chosen over people
 _FEW = 400
 # Gaze without hit points is looked along for one of so many rays: it tells little, and takes long.
 _SPARED = 5
@@ -253,23 +253,23 @@ class Tracking:
     looked for."""
 
     rays: Rays
-    start: np.ndarray | None = None
+    initial: np.ndarray | None = None
 
     kind = "tracking"
 
     def fit(self, target: AlignmentTarget, progress: Progress) -> AlignmentFit:
         """The best placement. Raises `NergError` where the rays leave it open."""
         some = _sample(self.rays)
-        if self.start is not None:
+        if self.initial is not None:
             progress(0.5, "refining")
-            coarse = _refined(some, target, target.turn @ self.start, 3.0, 30)
+            coarse = _refined(some, target, target.to_z_up @ self.initial, 3.0, 30)
             return self._fit_of(_refined(some, target, coarse.matrix, 1.0, 60), some, target, [], None)
-        if not target.upright:
+        if not target.is_upright:
             raise NergError(
                 "from the tracking alone only its turn about the vertical is looked for: say which way is up in the "
                 "place (--up), or give other evidence (--pairs, --twin, --cameras)"
             )
-        if target.floor is None:
+        if target.tracking_floor is None:
             raise NergError("from the tracking alone the height of its floor must be known; give it with --floor")
         if target.scale is None and not len(some.hits):
             raise NergError(
@@ -285,7 +285,7 @@ class Tracking:
         mirrored = _searched(some.mirrored(), target)
         doubts = []
         for other in proper[1:]:
-            alike = close(proper[0].matrix, other.matrix, 0.05 * target.surface.diagonal)
+            alike = is_close(proper[0].matrix, other.matrix, 0.05 * target.surface.diagonal)
             if not alike and other.cost < _RIVAL * proper[0].cost:
                 doubts.append(
                     f"another placement agrees almost as well (cost {other.cost:.3f}, the best {proper[0].cost:.3f}): "
@@ -303,15 +303,15 @@ class Tracking:
     def _fit_of(
         self, best: RefinedAlignment, some: _Sample, target: AlignmentTarget, doubts: list[str], mirrored: str | None
     ) -> AlignmentFit:
-        surface, s = target.surface, scale_of(best.matrix)
+        surface, s = target.surface, similarity_scale(best.matrix)
         points = some.hits if len(some.hits) else some.heads
         grid = surface.distance if len(some.hits) else surface.blocked
-        off = grid.at(move(best.matrix, points)) / s
+        off = grid.interpolate(transform_points(best.matrix, points)) / s
         degrees = np.zeros(0)
         if len(some.hits):
             way = np.linalg.norm(some.hits - some.hit_heads, axis=1)
             degrees = np.degrees(np.arctan2(off, np.maximum(way, 1e-6)))
-        inside = surface.blocked.at(move(best.matrix, some.heads)) / s
+        inside = surface.blocked.interpolate(transform_points(best.matrix, some.heads)) / s
         about = {
             "rays": len(self.rays),
             "looked_at": len(some.heads),
@@ -360,7 +360,7 @@ class _Sample:
 
     def mirrored(self) -> _Sample:
         """The same in a mirror."""
-        moved = {k: move(MIRROR, getattr(self, k)) for k in ("heads", "directions", "hits", "passed")}
+        moved = {k: transform_points(MIRROR, getattr(self, k)) for k in ("heads", "directions", "hits", "passed")}
         return replace(self, **moved)
 
     def few(self, count: int) -> _Sample:
@@ -382,7 +382,7 @@ class _Sample:
     def scores(self, target: AlignmentTarget) -> list[Score]:
         """What is known of them in the place; free space is not, where the place is bare points."""
         surface = target.surface
-        out: list[Score] = [HeadHeight(target.place_level, self.heads, self.group)] if target.upright else []
+        out: list[Score] = [HeadHeight(target.place_level, self.heads, self.group)] if target.is_upright else []
         if len(self.hits):
             out.append(AtZero(surface.distance, self.hits, self.group[self.at], "hit points on surfaces"))
         else:
@@ -399,7 +399,7 @@ def _sample(rays: Rays) -> _Sample:
         raise NergError("there are no rays to align; give a file that holds some")
     rng = np.random.default_rng(0)
     # Everybody counts as much as they were there, and strays of the tracker are chosen as seldom as they are.
-    kept = np.sort(rng.permutation(len(rays))[:MOST])
+    kept = np.sort(rng.permutation(len(rays))[:MAX_SAMPLES])
     heads, directions = rays.origin[kept], rays.direction[kept]
     group = groups_of(rays.person[kept], rays.t[kept])
     known = np.zeros(len(kept), bool) if rays.hit is None else np.isfinite(rays.hit[kept]).all(axis=1)
@@ -414,11 +414,11 @@ def _sample(rays: Rays) -> _Sample:
 
 def _searched(some: _Sample, target: AlignmentTarget) -> list[RefinedAlignment]:
     """The best placements, best first."""
-    assert target.floor is not None
-    surface, floor = target.surface, (target.floor, target.place_level)
+    assert target.tracking_floor is not None
+    surface, floor = target.surface, (target.tracking_floor, target.place_level)
     free = np.concatenate([some.heads, some.passed]) if surface.bounded else some.heads
     scales = np.array([target.scale]) if target.scale is not None else scale_range(surface, some.hits)
-    guesses: list[Guess] = search(surface, some.hits, free, scales, floor)
+    guesses: list[Guess] = search_placements(surface, some.hits, free, scales, floor)
     few = some.few(_FEW)
     found = [_refined(few, target, g.matrix, 4.0, 12) for g in guesses]
     found = [_refined(few, target, f.matrix, 1.5, 20) for f in sorted(found, key=lambda f: f.cost)[:6]]
@@ -427,10 +427,10 @@ def _searched(some: _Sample, target: AlignmentTarget) -> list[RefinedAlignment]:
 
 
 def _refined(some: _Sample, target: AlignmentTarget, base: np.ndarray, wide: float, most: int) -> RefinedAlignment:
-    center = move(base, np.median(some.heads, axis=0))
-    if target.upright and target.floor is not None:
+    center = transform_points(base, np.median(some.heads, axis=0))
+    if target.is_upright and target.tracking_floor is not None:
         center[2] = target.place_level
-    basis = upright_basis(target.floor is not None) if target.upright else ALL
+    basis = upright_basis(target.tracking_floor is not None) if target.is_upright else ALL
     if target.scale is not None:
         basis = basis[:, :-1]
     return refine(some.scores(target), base, center, basis, wide, most)

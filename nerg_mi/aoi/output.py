@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.figures.statistics import map_figure, moves_figure, things_figure
-from nerg_mi.figures.style import provenance, save
-from nerg_mi.files.atomic import replacing, write_text
-from nerg_mi.files.tables import markdown_table, write_csv
-from nerg_mi.rays.rays import pyarrow_modules
-from nerg_mi.statistics.tables import BY_NAME, FIELD, MEASURES, PersonRows, Row, shown
+from nerg_mi.figures.style import make_provenance, save
+from nerg_mi.files.atomic import replace_atomically, write_text
+from nerg_mi.files.tables import format_markdown_table, write_csv
+from nerg_mi.rays.rays import import_pyarrow
+from nerg_mi.statistics.tables import MEASURES_BY_NAME, PREDICTED, MEASURES, ParticipantRows, Row, format_measure
 from nerg_mi.statistics.visits import VisitSums
 from nerg_mi.workflows.base import Reporter
 
@@ -31,7 +31,7 @@ _PART = 1 << 16
 SUPPORT = "support [rays]"
 _MEASURES = {"share": "share of gaze", "visible": "visible share"}
 _WORDS = {"cell", "value", "first", "second", "thing", "source", "person", "from", "to", "measure", "found"}
-Cells = Callable[[Row], Sequence[Any]]
+FormatRow = Callable[[Row], Sequence[Any]]
 
 
 def has_parquet() -> bool:
@@ -39,15 +39,15 @@ def has_parquet() -> bool:
     return find_spec("pyarrow") is not None
 
 
-def write_rows(folder: Path, name: str, rows: Sequence[Row], head: Sequence[str], cells: Cells) -> list[Path]:
+def write_rows(folder: Path, name: str, rows: Sequence[Row], header: Sequence[str], format_row: FormatRow) -> list[Path]:
     """``rows`` as ``name``.csv, .md and, where that can be, .parquet in a ``folder``; ``head`` and ``cells``: the
     columns of the Markdown, which has `MOST_LINES` rows at most and says how many there are. Of no rows there is a
     table of names alone. Rows are read in parts, so that those of `PersonRows` are never there all at once."""
-    columns = _names(rows) or list(head)
+    columns = _names(rows) or list(header)
     written = [folder / f"{name}.csv", folder / f"{name}.md"]
     write_csv(written[0], rows, columns)
-    right = [title for title in head if title not in _WORDS]
-    text = markdown_table(head, [cells(row) for row in rows[:MOST_LINES]], right) + "\n"
+    right = [title for title in header if title not in _WORDS]
+    text = format_markdown_table(header, [format_row(row) for row in rows[:MOST_LINES]], right) + "\n"
     if len(rows) > MOST_LINES:
         text += f"\nThe first {MOST_LINES:,} of {len(rows):,} rows; all are in {name}.csv.\n"
     write_text(written[1], text)
@@ -59,13 +59,13 @@ def write_rows(folder: Path, name: str, rows: Sequence[Row], head: Sequence[str]
 
 def _names(rows: Sequence[Row]) -> list[str]:
     """All columns, in the order in which they appear."""
-    if isinstance(rows, PersonRows):
+    if isinstance(rows, ParticipantRows):
         return list(rows.columns)
     return list(dict.fromkeys(key for row in rows for key in row))
 
 
 def _write_parquet(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> None:
-    pa, pq = pyarrow_modules()
+    pa, pq = import_pyarrow()
 
     def table(start: int) -> Any:
         part = rows[start : start + _PART]
@@ -77,7 +77,7 @@ def _write_parquet(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> N
         # What is not known in the first part may be a number in others.
         kinds = [pa.float64() if pa.types.is_null(f.type) else f.type for f in schema]
         schema = pa.schema(list(zip(columns, kinds)))
-    with replacing(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
+    with replace_atomically(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
         writer.write_table(first.cast(schema))
         for start in range(_PART, len(rows), _PART):
             writer.write_table(table(start).cast(schema))
@@ -88,27 +88,27 @@ def cell_name(row: Row) -> str:
     return "all" if row["cell"] == "all" else f"{row['cell']} {row['value']}"
 
 
-def thing_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
+def thing_columns(rows: Sequence[Row]) -> tuple[list[str], FormatRow]:
     """Head and cells of the table of things, with the measures that any row has."""
     used = [m for m in MEASURES if any(row.get(m.name) is not None for row in rows)]
-    foretold = any(row["source"] == FIELD for row in rows)
+    foretold = any(row["source"] == PREDICTED for row in rows)
     head = ["cell", "thing", "source", "people", *(m.title for m in used), *([SUPPORT] if foretold else [])]
 
     def cells(row: Row) -> list[Any]:
         people = "" if row["people"] is None else row["people"]
-        found = [cell_name(row), row["thing"], row["source"], people, *(shown(row, m) for m in used)]
+        found = [cell_name(row), row["thing"], row["source"], people, *(format_measure(row, m) for m in used)]
         return [*found, support_words(row)] if foretold else found
 
     return head, cells
 
 
-def difference_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
+def difference_columns(rows: Sequence[Row]) -> tuple[list[str], FormatRow]:
     """Head and cells of the table of differences: shares in points of a percent, times in seconds."""
     head = ["cell", "first", "second", "thing", "measure", "second - first", "p", "p, adjusted", "found"]
 
     def cells(row: Row) -> list[Any]:
-        measure = BY_NAME[row["measure"]]
-        scale, unit = (100.0, " points") if measure.most == 1.0 else (1.0, " s" if "[s]" in measure.title else "")
+        measure = MEASURES_BY_NAME[row["measure"]]
+        scale, unit = (100.0, " points") if measure.upper_limit == 1.0 else (1.0, " s" if "[s]" in measure.title else "")
         told = ""
         if row["difference"] is not None:
             told = f"{scale * row['difference']:+.2f}{unit}"
@@ -123,13 +123,13 @@ def difference_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
 
 def support_words(row: Row) -> str:
     """How many rays a number of a field rests on, or that its checkpoint does not say."""
-    if row["source"] != FIELD or row["people"] is None:
+    if row["source"] != PREDICTED or row["people"] is None:
         return ""
     support = row.get("support")
     return "not in the checkpoint" if support is None else f"{support:,.0f}" if support >= 100 else f"{support:.3g}"
 
 
-def what_if_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
+def what_if_columns(rows: Sequence[Row]) -> tuple[list[str], FormatRow]:
     """Head and cells of the table of changes: shares in percent, their differences in points of it."""
     spread = any(row["difference_spread"] is not None for row in rows)
     head = ["thing", "measure", "people", "before [%]", "after [%]", "difference [points]"]
@@ -149,7 +149,7 @@ def what_if_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
     return head, cells
 
 
-def plain_columns(rows: Sequence[Row], names: Sequence[str] = ()) -> tuple[list[str], Cells]:
+def plain_columns(rows: Sequence[Row], names: Sequence[str] = ()) -> tuple[list[str], FormatRow]:
     """Head and cells of a table whose columns are told as they are."""
     head = _names(rows) or list(names)
 
@@ -173,15 +173,15 @@ class StatisticsResult:
     ``people``, ``what_if``, ``isovists``; ``sums``: what they were made of; ``blanked``: numbers on too few people;
     ``files`` that were written."""
 
-    things: list[Row] = field(default_factory=list)
+    aois: list[Row] = field(default_factory=list)
     differences: list[Row] = field(default_factory=list)
-    moves: list[Row] = field(default_factory=list)
+    transitions: list[Row] = field(default_factory=list)
     durations: list[Row] = field(default_factory=list)
-    people: Sequence[Row] = ()
+    participants: Sequence[Row] = ()
     what_if: list[Row] = field(default_factory=list)
     isovists: list[Row] = field(default_factory=list)
     sums: VisitSums | None = None
-    blanked: int = 0
+    num_suppressed: int = 0
     files: list[Path] = field(default_factory=list)
 
 
@@ -189,19 +189,19 @@ def write_results(
     folder: Path, result: StatisticsResult, inputs: Sequence[Path], options: StatisticsOptions, reporter: Reporter
 ) -> list[Path]:
     """Write what there is into the ``folder``: each table as CSV, Markdown and Parquet, and its picture."""
-    about = provenance("nerg stats", inputs, options.seed, options)
+    about = make_provenance("nerg stats", inputs, options.seed, options)
     files: list[Path] = []
     for name in ("things", "differences", "moves", "durations", "people", "what_if", "isovists"):
         rows: Sequence[Row] = getattr(result, name)
         if rows:
             columns = _COLUMNS.get(name, plain_columns)(rows)
             files += write_rows(folder, name, rows, *columns)
-    if result.things:
-        first = [r for r in result.things if r["cell"] == result.things[0]["cell"]]
+    if result.aois:
+        first = [r for r in result.aois if r["cell"] == result.aois[0]["cell"]]
         save(things_figure(first), folder / "things.png", about)
         files.append(folder / "things.png")
-    if result.sums is not None and result.moves:
-        told = {(r["from"], r["to"]): r["moves"] for r in result.moves if r["cell"] == "all" and r["moves"] is not None}
+    if result.sums is not None and result.transitions:
+        told = {(r["from"], r["to"]): r["moves"] for r in result.transitions if r["cell"] == "all" and r["moves"] is not None}
         names = [n for n in result.sums.areas if any(n in pair for pair in told)]
         if 1 < len(names) <= LARGEST_MATRIX:
             matrix = np.array([[told.get((a, b), 0) for b in names] for a in names], float)
@@ -210,7 +210,7 @@ def write_results(
     if result.isovists:
         points = np.array([[r["x"], r["y"]] for r in result.isovists])
         area = np.array([r["area"] for r in result.isovists])
-        figure = map_figure(points, area, options.step, "area that is seen [m²]", "Isovists at eye height")
+        figure = map_figure(points, area, options.grid_step, "area that is seen [m²]", "Isovists at eye height")
         save(figure, folder / "isovists.png", about)
         files.append(folder / "isovists.png")
     write_text(folder / "about.json", about.json() + "\n")
@@ -218,7 +218,7 @@ def write_results(
     if not has_parquet():
         reporter.message("Parquet is left out, since pyarrow is not installed: pip install 'nerg-mi[parquet]'")
     reporter.message(f"wrote {len(files)} files to {folder}: {', '.join(p.name for p in files if p.suffix == '.md')}")
-    if result.blanked:
-        write_text(folder / "blanked.txt", f"{result.blanked} numbers rest on too few people and are blank\n")
+    if result.num_suppressed:
+        write_text(folder / "blanked.txt", f"{result.num_suppressed} numbers rest on too few people and are blank\n")
         files.append(folder / "blanked.txt")
     return files

@@ -11,24 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.files.atomic import replacing
+from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.safe_read import read_npz
-from nerg_mi.formats.areas import AreaSet, files_of_areas, read_areas
+from nerg_mi.formats.areas import AreaSet, list_area_files, read_areas
 from nerg_mi.formats.checkpoint import read_metadata
-from nerg_mi.rays.dataset import HEAD, RayDataset, is_dataset, read_head, read_source, source_path
+from nerg_mi.rays.dataset import DATASET_MANIFEST, RayDataset, is_dataset, read_dataset_manifest, read_source_manifest, source_manifest_path
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.scene import files_of_scene
+from nerg_mi.rendering.scene import list_scene_files
 from nerg_mi.statistics.visits import Cell, VisitSums
 from nerg_mi.tasks.engines import prepare_once
-from nerg_mi.tasks.task import RENDERS, Files, Part, Plan
+from nerg_mi.tasks.task import RENDER_LIBRARIES, FileGroup, Part, Plan
 from nerg_mi.workflows.base import select_backend
-from nerg_mi.workflows.geometry import file_of_training, place_key
-from nerg_mi.workflows.options import as_base
-from nerg_mi.workflows.parts import Parts, PlannedScene
+from nerg_mi.workflows.geometry import find_training_file, geometry_key
+from nerg_mi.workflows.options import to_base
+from nerg_mi.workflows.parts import PartRunner, PlannedScene
 
-from .measured import AoiContext, Viewpoints, blocks_of, count_block
-from .options import CountOptions, PredictionOptions, SettingOptions, StatisticsOptions
-from .predicted import AoiScene, PredictedAttention, setting_of
+from .measured import AoiContext, Viewpoints, iter_blocks, count_block
+from .options import CountOptions, PredictionOptions, AoiOptions, StatisticsOptions
+from .predicted import AoiScene, PredictedAttention, load_aoi_scene
 from .scene import files_of_changes, read_changes
 
 # ---- What is run for a part ----
@@ -39,20 +39,20 @@ class PlannedSetting:
     """What people look at, as a part finds it on any machine: ``options``, and the files of the place, of ``areas`` and
     of ``changes`` to them, where there are some."""
 
-    options: SettingOptions
+    options: AoiOptions
     scene: PlannedScene | None
     field: Path | None
-    gaze: Files | None
-    areas: Files
-    changes: Files | None = None
+    gaze: FileGroup | None
+    areas: FileGroup
+    changes: FileGroup | None = None
 
     def opened(self) -> AoiScene:
         """The setting, in its Mitsuba variant, after its changes."""
         ns = select_backend(self.options.mode)
-        scene = None if self.scene is None else self.scene.checked()
+        scene = None if self.scene is None else self.scene.checked_path()
         gaze = None if self.gaze is None else self.gaze.path
-        setting = setting_of(scene, self.field, gaze, read_areas(self.areas.path), self.options, ns)
-        return setting if self.changes is None else setting.changed(read_changes(self.changes.path))
+        setting = load_aoi_scene(scene, self.field, gaze, read_areas(self.areas.path), self.options, ns)
+        return setting if self.changes is None else setting.apply_changes(read_changes(self.changes.path))
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,13 @@ class PlannedCount:
     """What all parts of a count have in common: rays end at their ``hits``, or not, and have these ``cohorts`` where no
     table does."""
 
-    setting: PlannedSetting
+    aoi_scene: PlannedSetting
     hits: bool
     cohorts: tuple[str, ...]
 
     def opened(self) -> AoiContext:
         """How rays are counted."""
-        return self.setting.opened().counting(self.hits, self.cohorts)
+        return self.aoi_scene.opened().make_context(self.hits, self.cohorts)
 
 
 @dataclass(frozen=True)
@@ -74,15 +74,15 @@ class DatasetPart:
     """Those parts of a ``source`` of a dataset that have these ``numbers``; ``files``: the dataset's, as far as these
     need them."""
 
-    files: Files
+    files: FileGroup
     source: str
     numbers: tuple[int, ...]
 
     def opened(self) -> RayDataset:
         """The dataset that has these parts and no others."""
         folder = self.files.path
-        head = read_head(folder)
-        source = read_source(source_path(folder, self.source), head)
+        head = read_dataset_manifest(folder)
+        source = read_source_manifest(source_manifest_path(folder, self.source), head)
         parts = tuple((source, part) for part in source.parts if part.number in self.numbers)
         return RayDataset(folder, head, (source,), parts)
 
@@ -91,7 +91,7 @@ def count_part(common: PlannedCount, rays: Path | DatasetPart, output: Path) -> 
     """The sums (.npz) of each block of some parts of a dataset, or of the rays of a file as one block, since they were
     cut already; with the number of blocks as a note."""
     counting = prepare_once(common, common.opened)
-    blocks = [Rays.load(rays)] if isinstance(rays, Path) else blocks_of(rays.opened(), counting.rules)
+    blocks = [Rays.load(rays)] if isinstance(rays, Path) else iter_blocks(rays.opened(), counting.rules)
     sums = [count_block(block, counting) for block in blocks]
     write_sums(output, sums)
     return {"blocks": len(sums)}
@@ -101,29 +101,29 @@ def count_part(common: PlannedCount, rays: Path | DatasetPart, output: Path) -> 
 class PlannedPrediction:
     """What all parts of asking a field have in common: people see ``view`` degrees."""
 
-    setting: PlannedSetting
-    view: float
+    aoi_scene: PlannedSetting
+    fov: float
 
 
 @dataclass(frozen=True)
-class Places:
+class ObserverPoses:
     """Where some people stand, ``positions`` (M, 3), and look ``ahead`` (M, 3)."""
 
     positions: np.ndarray
-    ahead: np.ndarray
+    facing: np.ndarray
 
 
 OF_EYES = ("share", "distance", "visible", "support")
 """What is foretold of each eye, a row each; by the members of an ensemble apart it has an axis before that."""
 
 
-def foretell_part(common: PlannedPrediction, places: Places, output: Path) -> None:
+def foretell_part(common: PlannedPrediction, places: ObserverPoses, output: Path) -> None:
     """What a field foretells (.npz) of people at some places."""
-    setting: AoiScene = prepare_once(common, common.setting.opened)
+    setting: AoiScene = prepare_once(common, common.aoi_scene.opened)
     count = len(places.positions)
-    eyes = Viewpoints(places.positions, places.ahead, ("",) * count, (frozenset(),) * count)
-    seen = setting.foretold(eyes, common.view)
-    with replacing(output) as temporary, temporary.open("wb") as out:
+    eyes = Viewpoints(places.positions, places.facing, ("",) * count, (frozenset(),) * count)
+    seen = setting.predict(eyes, common.fov)
+    with replace_atomically(output) as temporary, temporary.open("wb") as out:
         np.savez(out, **{name: getattr(seen, name) for name in (*OF_EYES, "members")})
 
 
@@ -136,7 +136,7 @@ def write_sums(path: Path, found: list[VisitSums]) -> None:
         rows = [(place[cell], person) for cell, person in sums.rows]
         arrays[f"{k}.names"] = np.array(json.dumps({"areas": sums.areas, "cells": cells, "rows": rows}))
         arrays |= {f"{k}.{name}": getattr(sums, name) for name in _ARRAYS}
-    with replacing(path) as temporary, temporary.open("wb") as out:
+    with replace_atomically(path) as temporary, temporary.open("wb") as out:
         np.savez(out, allow_pickle=False, **arrays)
 
 
@@ -162,19 +162,19 @@ _ARRAYS = tuple(f.name for f in fields(VisitSums) if f.name not in ("areas", "ce
 
 # ---- Parts ----
 
-EYES = 32  # places of a part from which a field is asked
+VIEWPOINTS_PER_PART = 32  # places of a part from which a field is asked
 _COUNTED = 0.6  # of all, where a field is asked too
 _DONE = 0.8
 _TOLD, _CHANGED = 0.9, 0.99  # when intervals are known, and after changes
 
 
 @dataclass(frozen=True)
-class CountingParts:
+class PartitionedStatistics:
     """How a count is shared out: its ``parts``, ``what`` the job is called, and the files of its setting: ``scene``,
     ``field``, ``gaze`` and those of the ``options``, of which ``areas`` were read. ``mode``: the Mitsuba variant."""
 
-    parts: Parts
-    what: str
+    parts: PartRunner
+    job_name: str
     scene: Path | None
     field: Path | None
     gaze: Path | None
@@ -183,70 +183,70 @@ class CountingParts:
     mode: str
 
     def count(
-        self, rays: Rays | Path, counting: AoiContext, seen: Callable[[Rays], None] | None
+        self, rays: Rays | Path, context: AoiContext, on_block: Callable[[Rays], None] | None
     ) -> Iterator[VisitSums]:
         """The sums of each block of ``rays``, in the order of `blocks_of`. ``seen`` is shown each block before that, in
         the same order, where it is not None."""
-        common = PlannedCount(self._setting(CountOptions), counting.hits, counting.cohort_names)
-        with self.parts.store.scratch() as folder:
+        common = PlannedCount(self._setting(CountOptions), context.hits, context.cohort_names)
+        with self.parts.store.make_scratch_folder() as folder:
             parts = []
             if not isinstance(rays, Rays) and is_dataset(rays):
-                data = RayDataset.open(rays).one_place()
+                data = RayDataset.open(rays).require_single_place()
                 for (source, part), own in _groups(data):
-                    files = [data.folder / HEAD, source_path(data.folder, source.id)]
+                    files = [data.folder / DATASET_MANIFEST, source_manifest_path(data.folder, source.id)]
                     files += [data.folder / p.path(source.id) for _, p in own]
-                    value = DatasetPart(Files(data.folder, tuple(files)), source.id, tuple(p.number for _, p in own))
+                    value = DatasetPart(FileGroup(data.folder, tuple(files)), source.id, tuple(p.number for _, p in own))
                     parts.append(Part(value, f"{source.file}, {part.day}, bucket {part.bucket}"))
-                if seen is not None:
-                    for block in blocks_of(data, counting.rules):
-                        seen(block)
+                if on_block is not None:
+                    for block in iter_blocks(data, context.rules):
+                        on_block(block)
             else:
                 first = 1
-                for block in blocks_of(rays, counting.rules):
-                    if seen is not None:
-                        seen(block)
+                for block in iter_blocks(rays, context.rules):
+                    if on_block is not None:
+                        on_block(block)
                     # Rays that the command has in memory, in files that its parts read.
                     path = folder / str(first) / "rays.npz"
                     _own(block).save(path)
                     parts.append(Part(path, f"rays {first:,} to {first + len(block) - 1:,}"))
                     first += len(block)
-            until = _DONE if seen is None else _COUNTED
-            for made in self.parts.run(self._plan(self.what, count_part, common, parts), 0.0, until):
+            until = _DONE if on_block is None else _COUNTED
+            for made in self.parts.run(self._plan(self.job_name, count_part, common, parts), 0.0, until):
                 yield from read_sums(made.path)
 
-    def foretell(self, eyes: Viewpoints, view: float, changes: Path | None = None) -> PredictedAttention:
+    def predict(self, viewpoints: Viewpoints, fov: float, changes: Path | None = None) -> PredictedAttention:
         """What the field says of ``eyes`` that see ``view`` degrees, after the ``changes`` of a file, if there are
         any."""
-        setting, what, since, until = self._setting(PredictionOptions), f"{self.what} (the field)", _COUNTED, _DONE
+        setting, what, since, until = self._setting(PredictionOptions), f"{self.job_name} (the field)", _COUNTED, _DONE
         if changes is not None:
-            files = Files(changes, tuple(files_of_changes(changes, read_changes(changes))))
-            setting, what = replace(setting, changes=files), f"{self.what} (after the changes)"
+            files = FileGroup(changes, tuple(files_of_changes(changes, read_changes(changes))))
+            setting, what = replace(setting, changes=files), f"{self.job_name} (after the changes)"
             since, until = _TOLD, _CHANGED
         places = []
-        for a in range(0, len(eyes.positions), EYES):
-            some = Places(eyes.positions[a : a + EYES], eyes.ahead[a : a + EYES])
+        for a in range(0, len(viewpoints.positions), VIEWPOINTS_PER_PART):
+            some = ObserverPoses(viewpoints.positions[a : a + VIEWPOINTS_PER_PART], viewpoints.ahead[a : a + VIEWPOINTS_PER_PART])
             places.append(Part(some, f"places {a + 1} to {a + len(some.positions)}"))
-        plan = self._plan(what, foretell_part, PlannedPrediction(setting, view), places)
+        plan = self._plan(what, foretell_part, PlannedPrediction(setting, fov), places)
         found = [read_foretold(made.path) for made in self.parts.run(plan, since, until)]
         each = {name: np.concatenate([getattr(f, name) for f in found]) for name in OF_EYES}
         return PredictedAttention(**each, members=np.concatenate([f.members for f in found], axis=1))
 
     def _plan(self, what: str, work: Callable, common: Any, parts: list[Part]) -> Plan:
-        return Plan(what, work, common, parts, ".npz", (*RENDERS, "scipy"))
+        return Plan(what, work, common, parts, ".npz", (*RENDER_LIBRARIES, "scipy"))
 
     def _setting(self, kind: type[CountOptions] | type[PredictionOptions]) -> PlannedSetting:
         """The setting, with those options of ``kind``."""
         o, gaze = self.options, None
-        assert o.areas is not None
+        assert o.aois is not None
         if self.gaze is not None:
             beside = [] if self.scene is not None else _place_beside(self.gaze, self.field)
-            gaze = Files(self.gaze, (self.gaze, *beside))
+            gaze = FileGroup(self.gaze, (self.gaze, *beside))
         return PlannedSetting(
-            replace(as_base(o, kind), mode=self.mode),
-            None if self.scene is None else PlannedScene.of(self.scene),
+            replace(to_base(o, kind), mode=self.mode),
+            None if self.scene is None else PlannedScene.plan(self.scene),
             self.field,
             gaze,
-            Files(o.areas, tuple(files_of_areas(o.areas, self.areas))),
+            FileGroup(o.aois, tuple(list_area_files(o.aois, self.areas))),
         )
 
 
@@ -273,7 +273,7 @@ def _place_beside(gaze: Path, field: Path | None) -> list[Path]:
     about = read_metadata(gaze).get("provenance", {})
     if about.get("geometry") == "none":
         return []
-    if field is not None and place_key(gaze, about) == "field_file":
+    if field is not None and geometry_key(gaze, about) == "field_file":
         return []
-    path = file_of_training(gaze, about, None, "put it there", "put that one there")
-    return files_of_scene(path) if path.suffix.lower() == ".xml" else [path]
+    path = find_training_file(gaze, about, None, "put it there", "put that one there")
+    return list_scene_files(path) if path.suffix.lower() == ".xml" else [path]

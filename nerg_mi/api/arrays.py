@@ -9,25 +9,25 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.maths.coordinates import check_coordinates
-from nerg_mi.ranges import FARTHEST, FIELDS_OF_VIEW, Range, check_number
+from nerg_mi.ranges import MAX_COORDINATE, FIELDS_OF_VIEW, Range, check_number
 
 # ---- What comes in from NumPy, checked, and what goes out to it, labelled ----
 
 Floats: TypeAlias = NDArray[np.float32]
 
 
-def points(values: ArrayLike, name: str) -> Floats:
+def as_points(values: ArrayLike, name: str) -> Floats:
     """``values`` as (N, 3) float32; one point (3,) is one row. Raises `NergError`, which calls it ``name``."""
     try:
         array = np.asarray(values, np.float64)
     except OverflowError as error:
         raise NergError(
-            f"{name} must have coordinates from {-FARTHEST:g} to {FARTHEST:g}, and one is beyond"
+            f"{name} must have coordinates from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}, and one is beyond"
         ) from error
     except (TypeError, ValueError) as error:
-        raise NergError(f"{name} must be numbers x, y, z, or rows of them, got {plain(repr(values), 60)}") from error
+        raise NergError(f"{name} must be numbers x, y, z, or rows of them, got {sanitize(repr(values), 60)}") from error
     array = array[None] if array.shape == (3,) else array
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
         raise NergError(f"{name} must have the shape (3,) or (N, 3), got {array.shape}")
@@ -35,9 +35,9 @@ def points(values: ArrayLike, name: str) -> Floats:
     return np.ascontiguousarray(array, np.float32)
 
 
-def unit(values: ArrayLike, count: int, name: str) -> Floats:
+def as_unit_vectors(values: ArrayLike, count: int, name: str) -> Floats:
     """``values`` as ``count`` unit vectors (N, 3); one direction serves all. Raises `NergError`."""
-    array = points(values, name).astype(np.float64)
+    array = as_points(values, name).astype(np.float64)
     if len(array) not in (1, count):
         raise NergError(f"{name} must be one or as many as the origins, {count}, got {len(array)}")
     length = np.linalg.norm(array, axis=1, keepdims=True)
@@ -47,7 +47,7 @@ def unit(values: ArrayLike, count: int, name: str) -> Floats:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Labelled:
+class LabelledArrays:
     """Arrays by name: ``result["gaze"]`` and ``result.gaze`` are the same array.
 
     ``values``: the arrays, of which the first axes are those that ``axes`` names and a last one, where there is one
@@ -68,7 +68,7 @@ class Labelled:
         try:
             return self.values[name]
         except KeyError:
-            raise KeyError(f'there is no "{name}" here, but {listed(self.names)}; ask for it by quantities=') from None
+            raise KeyError(f'there is no "{name}" here, but {join_names(self.names)}; ask for it by quantities=') from None
 
     def __getattr__(self, name: str) -> Floats:
         # Asked while an object is copied or unpickled, when there are no values yet.
@@ -99,19 +99,19 @@ class Labelled:
         return "\n".join([f"{type(self).__name__}({size})", *lines])
 
 
-def same_for_all(value: Floats, observers: int) -> Floats:
+def broadcast_to_observers(value: Floats, observers: int) -> Floats:
     """``value`` with an axis of ``observers`` in front, read-only, without a copy."""
     return np.broadcast_to(value, (observers, *value.shape))
 
 
-def listed(names: Sequence[str]) -> str:
+def join_names(names: Sequence[str]) -> str:
     """Names for a sentence."""
     return ", ".join(names)
 
 
 # ---- A camera in a few numbers ----
 
-PIXELS = 1 << 28
+MAX_PIXELS = 1 << 28
 """A picture may have so many pixels, as for the command `nerg render`."""
 
 
@@ -138,7 +138,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("origin", "target", "up"):
-            if len(points(value := getattr(self, name), f"{name} of a camera")) != 1 or np.ndim(value) != 1:
+            if len(as_points(value := getattr(self, name), f"{name} of a camera")) != 1 or np.ndim(value) != 1:
                 raise NergError(f"{name} of a camera must be x, y, z, got {value!r}")
             object.__setattr__(self, name, tuple(float(x) for x in value))
         ahead = np.subtract(self.target, self.origin)
@@ -148,9 +148,9 @@ class Camera:
             raise NergError(f"a camera cannot look along its own up {self.up}; give it another up")
         check_number(self.fov, FIELDS_OF_VIEW, "the fov of a camera")
         for name in ("width", "height"):
-            check_number(getattr(self, name), Range(1, PIXELS), f"the {name} of a picture", whole=True)
-        if self.width * self.height > PIXELS:
-            raise NergError(f"a picture has at most {PIXELS:,} pixels, got {self.width:,} x {self.height:,}")
+            check_number(getattr(self, name), Range(1, MAX_PIXELS), f"the {name} of a picture", is_integer=True)
+        if self.width * self.height > MAX_PIXELS:
+            raise NergError(f"a picture has at most {MAX_PIXELS:,} pixels, got {self.width:,} x {self.height:,}")
 
     def to_dict(self, spp: int = 16) -> dict:
         """The camera as Mitsuba takes it (`mi.load_dict`), with ``spp`` samples a pixel; a variant must be set."""

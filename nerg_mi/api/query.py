@@ -11,24 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.formats.areas import Region
 from nerg_mi.formats.meshes import READERS
-from nerg_mi.maths.arrays import vector_of
+from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
-from nerg_mi.ranges import FARTHEST, Range, check_number
-from nerg_mi.statistics.shares import Shares, SumRule, gaze_shares
+from nerg_mi.ranges import MAX_COORDINATE, Range, check_number
+from nerg_mi.statistics.shares import Shares, QuadratureRule, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, BoxAoi
 from nerg_mi.workflows.base import SILENT, Reporter
 
 from . import arrays
-from .arrays import Floats, Labelled, same_for_all
-from .scene import COLOR, FilePath, Scene, active_mitsuba, asked_quantities, context_for, mesh_child
+from .arrays import Floats, LabelledArrays, broadcast_to_observers
+from .scene import COLOR, FilePath, Scene, activate_mitsuba, resolve_quantities, make_aov_context, load_mesh_child
 
 # ---- One observer of a scene: what they see of points, and the density of their gaze ----
 
 
-class ObserverOf:
+class SceneObserver:
     """The observer of ``scene`` at ``position`` (3,), in scene units.
 
     The settings of the march, of depths and of visibility are those of the scene's integrator. What a normalised gaze
@@ -39,40 +39,40 @@ class ObserverOf:
         import drjit as dr
         import mitsuba as mi
 
-        self.scene, self.place, self.integrator = scene, scene.place, scene.integrator
+        self.scene, self.geometry, self.integrator = scene, scene.geometry, scene.integrator
         self.center: Any = mi.Point3f(position.tolist())
         # A position that is a constant of the kernel would be compiled anew for every observer.
         dr.make_opaque(self.center)
         self.gaze = None
         if scene.has_gaze:
             i = self.integrator
-            self.gaze = i.gaze.at([self.center], self.place, i.observer_settings, i.cache)
+            self.gaze = i.gaze.for_observers([self.center], self.geometry, i.observer_settings, i.cache)
 
-    def density(self, p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
+    def eval_gaze(self, p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
         """Gaze (Float, 1/sr) along the unit direction ``r_o``, in which the observer, who is at ``p_o`` in all lanes,
         sees the surface ``p_od``; as `nerg_mi.probes.surface_attention` wants it."""
         if self.gaze is None:
             raise ValueError("a scene without a gaze field has no gaze")
         return self.gaze.evaluate(p_od, p_o, r_o, active)[0]
 
-    def sees(self, p: Any, with_gaze: bool) -> dict[str, Any]:
+    def observe(self, p: Any, with_gaze: bool) -> dict[str, Any]:
         """Of points ``p`` (Point3f): ``distance``, ``depth`` and ``visibility``, and ``gaze`` where wanted (Floats)."""
         import drjit as dr
 
         mi = variant_types()
         from nerg_mi.transport.observer import distance_and_direction
-        from nerg_mi.transport.occlusion import trace_sight
+        from nerg_mi.transport.occlusion import trace_from_observer
 
         i = self.integrator
         distance, r_o = distance_and_direction(self.center, p)
         active = dr.full(mi.Bool, True, dr.width(p))
         ray = mi.Ray3f(self.center, r_o)
-        sight = trace_sight(self.place, ray, p, self.center, 0, active, i.falloff, i.observer_settings, cache=i.cache)
+        sight = trace_from_observer(self.geometry, ray, p, self.center, 0, active, i.falloff, i.observer_settings, cache=i.cache)
         values = {"distance": distance, "depth": sight.depth, "visibility": sight.visibility}
         if with_gaze:
             seen = active & (sight.visibility > 0)
             p_o = self.center + dr.zeros(mi.Point3f, dr.width(p))
-            gaze = self.density(sight.p_od, p_o, r_o, seen)
+            gaze = self.eval_gaze(sight.p_od, p_o, r_o, seen)
             values["gaze"] = dr.select(seen, gaze * sight.visibility, 0)
         return values
 
@@ -80,21 +80,21 @@ class ObserverOf:
 # ---- Questions to a scene that are no pictures: what rays meet, and what observers see of points ----
 
 
-BATCH = 1 << 18
+BATCH_SIZE = 1 << 18
 """So many rays or points are computed at once."""
 
-AT_POINTS = ("gaze", "visibility", "distance", "depth")
+POINT_QUANTITIES = ("gaze", "visibility", "distance", "depth")
 """What `observe` answers."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Traced(Labelled):
+class TraceResult(LabelledArrays):
     """Quantities of `trace`, each (rays,) or, with channels, (rays, channels); for given observers with an axis
     ``observer`` in front."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Observed(Labelled):
+class ObserveResult(LabelledArrays):
     """Quantities of `observe`, each (observers, points)."""
 
 
@@ -107,7 +107,7 @@ def trace(
     observers: ArrayLike | None = None,
     seed: int = 0,
     reporter: Reporter = SILENT,
-) -> Traced:
+) -> TraceResult:
     """What rays meet in a scene: the surface, its colour, and the gaze that it attracts.
 
     ``origins`` (N, 3) in scene units, or one (3,) for all; ``directions`` (N, 3), of any length but zero, or one.
@@ -129,16 +129,16 @@ def trace(
     >>> seen.depth.shape, seen.color.shape, bool(abs(seen.depth[0] - 1.6) < 0.1)
     ((2,), (2, 3), True)
     """
-    scene = Scene.of(scene)
-    active_mitsuba()
-    asked = asked_quantities(scene, quantities)
+    scene = Scene.coerce(scene)
+    activate_mitsuba()
+    asked = resolve_quantities(scene, quantities)
     o, d = _rays(origins, directions)
-    with mitsuba_says():
+    with translate_mitsuba_errors():
         tracer = _Tracer(scene, asked, seed, reporter)
         if observers is None:
-            return Traced(tracer.of_origins(o, d), ("ray",), None)
-        eyes = arrays.points(observers, "observers")
-        return Traced(tracer.of_observers(o, d, eyes), ("observer", "ray"), eyes)
+            return TraceResult(tracer.of_origins(o, d), ("ray",), None)
+        eyes = arrays.as_points(observers, "observers")
+        return TraceResult(tracer.of_observers(o, d, eyes), ("observer", "ray"), eyes)
 
 
 class _Tracer:
@@ -146,17 +146,17 @@ class _Tracer:
 
     def __init__(self, scene: Scene, asked: Sequence[str], seed: int, reporter: Reporter):
         self.scene, self.asked, self.seed, self.reporter = scene, asked, seed, reporter
-        self.context = context_for(scene, asked)
-        self.shared, self.own = self.context.shared, self.context.own
+        self.context = make_aov_context(scene, asked)
+        self.shared, self.own = self.context.shared_aovs, self.context.observer_aovs
 
     def of_observers(self, o: Floats, d: Floats, eyes: Floats) -> dict[str, Floats]:
         """Quantities (M, N, ...) of rays as observers at ``eyes`` (M, 3) have them."""
-        observers = [self.context.observer_at(eye, len(eyes) == 1) for eye in eyes] if self.own else []
-        parts = [self._part(o, d, a, lambda camera: map(camera.for_observer, observers)) for a in _starts(o)]
+        observers = [self.context.make_observer(eye, len(eyes) == 1) for eye in eyes] if self.own else []
+        parts = [self._part(o, d, a, lambda camera: map(camera.make_pixel, observers)) for a in _starts(o)]
         values = {}
         for name in self.asked:
             value = np.concatenate([part[name] for part in parts], axis=-1 if name in self.own else 0)
-            values[name] = value if name in self.own else same_for_all(value, len(eyes))
+            values[name] = value if name in self.own else broadcast_to_observers(value, len(eyes))
         return values
 
     def of_origins(self, o: Floats, d: Floats) -> dict[str, Floats]:
@@ -167,7 +167,7 @@ class _Tracer:
         gaze = self.context.gaze
         if self.context.views or (gaze is not None and gaze.field.config.normalized):
             return self._of_each_origin(o, d)
-        parts = [self._part(o, d, a, lambda camera: (camera.for_origins(),)) for a in _starts(o)]
+        parts = [self._part(o, d, a, lambda camera: (camera.make_pixel_per_origin(),)) for a in _starts(o)]
         first = lambda name, value: value[0] if name in self.own else value
         return {name: np.concatenate([first(name, part[name]) for part in parts]) for name in self.asked}
 
@@ -178,9 +178,9 @@ class _Tracer:
         groups = np.split(order, np.cumsum(np.bincount(of_ray.ravel()))[:-1])
         parts = []
         for number, (origin, rows) in enumerate(zip(origins, groups), 1):
-            who = self.context.observer_at(origin)
+            who = self.context.make_observer(origin)
             for a in _starts(rows):
-                part = self._part(o[rows], d[rows], a, lambda camera, who=who: (camera.for_observer(who, True),))
+                part = self._part(o[rows], d[rows], a, lambda camera, who=who: (camera.make_pixel(who, True),))
                 parts.append({name: v[0] if name in self.own else v for name, v in part.items()})
             self.reporter.progress(number / len(origins), f"origin {number:,} of {len(origins):,}")
         back = np.argsort(order)
@@ -191,18 +191,18 @@ class _Tracer:
         import drjit as dr
         import mitsuba as mi
 
-        o, d = o[first : first + BATCH], d[first : first + BATCH]
-        ray = mi.RayDifferential3f(vector_of(mi.Point3f, o), vector_of(mi.Vector3f, d))
+        o, d = o[first : first + BATCH_SIZE], d[first : first + BATCH_SIZE]
+        ray = mi.RayDifferential3f(to_vector(mi.Point3f, o), to_vector(mi.Vector3f, d))
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(self.seed + first, len(o))
         with dr.suspend_grad():
             camera = self.context.trace(self.scene.mitsuba, [], sampler, ray, mi.Bool(True))
-            shared = camera.channels(self.shared)
-            color = camera.radiance(self.scene.mitsuba, sampler, None)[0]
-            camera.settle(color, shared)
+            shared = camera.compute_channels(self.shared)
+            color = camera.compute_radiance(self.scene.mitsuba, sampler, None)[0]
+            camera.eval_shared(color, shared)
             each = []
             for mine in observed(camera) if self.own else ():
-                channels = mine.channels(self.own)
+                channels = mine.compute_channels(self.own)
                 dr.eval(channels)
                 each.append(self._named(self.own, channels, len(o)))
         values = self._named(self.shared, shared, len(o))
@@ -213,13 +213,13 @@ class _Tracer:
     def _named(self, names: Sequence[str], channels: Sequence[Any], count: int) -> dict[str, Floats]:
         """Channels as arrays (N,), or (N, C) where a quantity has several, by quantity."""
         columns: dict[str, list[Floats]] = {}
-        for name, value in zip(self.context.channels(names), channels):
+        for name, value in zip(self.context.channel_names(names), channels):
             columns.setdefault(name.rpartition(".")[0], []).append(_lanes(value, count))
         return {name: c[0] if len(c) == 1 else np.stack(c, axis=-1) for name, c in columns.items()}
 
 
 def _starts(rows: Any) -> range:
-    return range(0, len(rows), BATCH)
+    return range(0, len(rows), BATCH_SIZE)
 
 
 def observe(
@@ -227,7 +227,7 @@ def observe(
     points: ArrayLike,
     observers: ArrayLike | None = None,
     quantities: str | Sequence[str] | None = None,
-) -> Observed:
+) -> ObserveResult:
     """How observers see points of a scene: whether they do, and how much gaze they give what is there.
 
     ``points`` (N, 3) on surfaces, in scene units; ``observers`` (M, 3), or None for the scene's own. Arrays are (M, N).
@@ -244,35 +244,35 @@ def observe(
     >>> seen.visibility.round(2).tolist()
     [[1.0], [0.0]]
     """
-    scene = Scene.of(scene)
-    active_mitsuba()
-    known = AT_POINTS if scene.has_gaze else AT_POINTS[1:]
-    asked = known if quantities is None else asked_quantities(scene, quantities, known)
-    p = arrays.points(points, "points")
-    eyes = given_observers(scene, observers)
-    with mitsuba_says():
-        each = [_at_points(ObserverOf(scene, eye), p, "gaze" in asked) for eye in eyes]
-    return Observed({name: np.stack([one[name] for one in each]) for name in asked}, ("observer", "point"), eyes)
+    scene = Scene.coerce(scene)
+    activate_mitsuba()
+    known = POINT_QUANTITIES if scene.has_gaze else POINT_QUANTITIES[1:]
+    asked = known if quantities is None else resolve_quantities(scene, quantities, known)
+    p = arrays.as_points(points, "points")
+    eyes = resolve_observers(scene, observers)
+    with translate_mitsuba_errors():
+        each = [_at_points(SceneObserver(scene, eye), p, "gaze" in asked) for eye in eyes]
+    return ObserveResult({name: np.stack([one[name] for one in each]) for name in asked}, ("observer", "point"), eyes)
 
 
-def given_observers(scene: Scene, observers: ArrayLike | None) -> Floats:
+def resolve_observers(scene: Scene, observers: ArrayLike | None) -> Floats:
     """``observers`` as positions (M, 3); None: the scene's own. Raises `NergError` where there is none."""
     if observers is not None:
-        return arrays.points(observers, "observers")
+        return arrays.as_points(observers, "observers")
     if scene.observer is None:
         raise NergError("the scene has no observer of its own; say where they are with observers=[(x, y, z), ...]")
     return scene.observer[None]
 
 
-def _at_points(observer: ObserverOf, p: Floats, with_gaze: bool) -> dict[str, Floats]:
+def _at_points(observer: SceneObserver, p: Floats, with_gaze: bool) -> dict[str, Floats]:
     import drjit as dr
     import mitsuba as mi
 
     parts: dict[str, list[Floats]] = {}
-    for a in range(0, len(p), BATCH):
-        part = p[a : a + BATCH]
+    for a in range(0, len(p), BATCH_SIZE):
+        part = p[a : a + BATCH_SIZE]
         with dr.suspend_grad():
-            values = observer.sees(vector_of(mi.Point3f, part), with_gaze)
+            values = observer.observe(to_vector(mi.Point3f, part), with_gaze)
             dr.eval(values)
         for name, value in values.items():
             parts.setdefault(name, []).append(_lanes(value, len(part)))
@@ -280,12 +280,12 @@ def _at_points(observer: ObserverOf, p: Floats, with_gaze: bool) -> dict[str, Fl
 
 
 def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Floats, Floats]:
-    o = arrays.points(origins, "origins")
-    d = arrays.points(directions, "directions")
+    o = arrays.as_points(origins, "origins")
+    d = arrays.as_points(directions, "directions")
     count = max(len(o), len(d))
     if len(o) not in (1, count):
         raise NergError(f"there must be one origin or as many as directions, {count}, got {len(o)}")
-    return np.ascontiguousarray(np.broadcast_to(o, (count, 3))), arrays.unit(directions, count, "directions")
+    return np.ascontiguousarray(np.broadcast_to(o, (count, 3))), arrays.as_unit_vectors(directions, count, "directions")
 
 
 def _lanes(value: Any, count: int) -> Floats:
@@ -302,13 +302,13 @@ def _lanes(value: Any, count: int) -> Floats:
 # that ends on its own surface, in area form (`nerg_mi.probes.surface_attention`), which also tells where on it.
 
 
-FINE = SumRule()
+DEFAULT_SUM_RULE = QuadratureRule()
 """How finely the share of a box is summed, unless another tolerance is asked for."""
 
-PIECE = 4
+PATCH_SIZE_RATIO = 4
 """A piece of a surface is so many times shorter than its distance from the nearest observer."""
 
-MOST = 32
+MAX_AUTO_DIVISIONS = 32
 """A triangle is cut into so many parts a side at most, unless more are asked for."""
 
 
@@ -362,7 +362,7 @@ def attention(
     observers: ArrayLike | None = None,
     *,
     margin: float = MARGIN,
-    tolerance: float = FINE.tolerance,
+    tolerance: float = DEFAULT_SUM_RULE.rtol,
     divisions: int | None = None,
     two_sided: bool = False,
     reporter: Reporter = SILENT,
@@ -397,28 +397,28 @@ def attention(
     """
     import drjit as dr
 
-    from nerg_mi.probes.surface_attention import patches
+    from nerg_mi.probes.surface_attention import make_patches
 
-    scene = Scene.of(scene)
+    scene = Scene.coerce(scene)
     _check(scene)
-    check_number(margin, Range(0, FARTHEST), "margin")
+    check_number(margin, Range(0, MAX_COORDINATE), "margin")
     check_number(tolerance, Range(1e-9, 1), "tolerance")
     if (region := _box(surface)) is not None:
         if divisions is not None or two_sided:
             raise NergError("divisions and two_sided are of meshes, and this is a box; leave them out, or give a mesh")
-        eyes = given_observers(scene, observers)
-        rule = SumRule(tolerance=float(tolerance))
-        found = box_shares(scene, [region], eyes, margin=float(margin), rule=rule, reporter=reporter)
+        eyes = resolve_observers(scene, observers)
+        rule = QuadratureRule(rtol=float(tolerance))
+        found = compute_box_shares(scene, [region], eyes, margin=float(margin), rule=rule, reporter=reporter)
         single = lambda v: np.ascontiguousarray(v, np.float32)
         return Attention(single(found.share[:, 0]), eyes, single(found.error[:, 0]), single(found.escaped))
     whole = isinstance(divisions, (int, np.integer)) and not isinstance(divisions, bool)
     if not (divisions is None or (whole and 1 <= divisions <= 4096)):
         raise NergError(f"divisions must be a whole number from 1 to 4,096, got {divisions!r}")
-    eyes = given_observers(scene, observers)
+    eyes = resolve_observers(scene, observers)
     each = []
-    with mitsuba_says(), dr.suspend_grad():
+    with translate_mitsuba_errors(), dr.suspend_grad():
         mesh = _mesh(scene, surface)
-        pieces = patches(mesh, _enough_divisions(mesh, eyes) if divisions is None else int(divisions))
+        pieces = make_patches(mesh, _enough_divisions(mesh, eyes) if divisions is None else int(divisions))
         area = np.array(pieces.area, np.float32)
         for number, eye in enumerate(eyes):
             each.append(_density(scene, eye, pieces, two_sided))
@@ -431,25 +431,25 @@ def attention(
     return SurfaceAttention(share, eyes, density=density, points=where, normals=normals, area=area)
 
 
-def box_shares(
+def compute_box_shares(
     scene: Scene,
     regions: Sequence[Region],
     observers: Floats,
     *,
     margin: float = MARGIN,
-    rule: SumRule = FINE,
+    rule: QuadratureRule = DEFAULT_SUM_RULE,
     reporter: Reporter = SILENT,
 ) -> Shares:
     """The shares of ``observers`` (M, 3) on N boxes, which may be turned, all of them at once, (M, N), as finely as
     the ``rule`` says; arguments and errors as of `attention`."""
-    from nerg_mi.transport.observer_gaze import look_from
+    from nerg_mi.transport.observer_gaze import make_gaze_evaluator
 
     _check(scene)
-    i, place, count = scene.integrator, scene.place, len(observers)
+    i, place, count = scene.integrator, scene.geometry, len(observers)
     told = lambda done: reporter.progress(done / count, f"observer {done} of {count}")
-    with mitsuba_says():
+    with translate_mitsuba_errors():
         return gaze_shares(
-            lambda eye: look_from(i.gaze, place, i.observer_settings, eye),
+            lambda eye: make_gaze_evaluator(i.gaze, place, i.observer_settings, eye),
             observers,
             [BoxAoi(region) for region in regions],
             [(k,) for k in range(len(regions))],
@@ -459,7 +459,7 @@ def box_shares(
         )
 
 
-def mesh_shares(
+def compute_mesh_shares(
     scene: Scene, surfaces: Sequence[Any], observer: ArrayLike, *, divisions: int, two_sided: bool = False
 ) -> Floats:
     """The share (N,) of one observer's gaze that each of N meshes, ``surfaces``, receives, all of them at once.
@@ -469,14 +469,14 @@ def mesh_shares(
     import drjit as dr
 
     mi = variant_types()
-    from nerg_mi.probes.surface_attention import Patches, patches
+    from nerg_mi.probes.surface_attention import Patches, make_patches
 
     _check(scene)
     if not len(surfaces):
         return np.zeros(0, np.float32)
-    eye = given_observers(scene, observer)[0]
-    with mitsuba_says(), dr.suspend_grad():
-        each = [patches(_mesh(scene, surface), divisions) for surface in surfaces]
+    eye = resolve_observers(scene, observer)[0]
+    with translate_mitsuba_errors(), dr.suspend_grad():
+        each = [make_patches(_mesh(scene, surface), divisions) for surface in surfaces]
         area = [np.array(pieces.area, np.float64) for pieces in each]
         lanes = lambda name: np.concatenate([np.array(getattr(pieces, name), np.float32) for pieces in each], axis=1)
         pieces = Patches(mi.Point3f(lanes("p")), mi.Vector3f(lanes("n")), mi.Float(np.concatenate(area)))
@@ -486,20 +486,20 @@ def mesh_shares(
 
 
 def _check(scene: Scene) -> None:
-    active_mitsuba()
+    activate_mitsuba()
     if not scene.has_gaze:
         raise NergError("attention needs a gaze field; give make_scene gaze=")
 
 
 def _density(scene: Scene, eye: Floats, pieces: Any, two_sided: bool) -> Floats:
     """Share of the gaze (K,) per area that ``pieces`` receive from the observer at ``eye`` (3,)."""
-    from nerg_mi.probes.surface_attention import arriving
+    from nerg_mi.probes.surface_attention import attention_per_area
 
-    observer = ObserverOf(scene, eye)
+    observer = SceneObserver(scene, eye)
     settings = observer.integrator.observer_settings
-    found = arriving(observer.place, observer.density, observer.center, pieces.p, pieces.n, 0.0, settings, two_sided)
+    found = attention_per_area(observer.geometry, observer.eval_gaze, observer.center, pieces.p, pieces.n, 0.0, settings, two_sided)
     if not observer.integrator.gaze.field.config.normalized:
-        whole = box_shares(scene, [], eye[None]).whole[0]
+        whole = compute_box_shares(scene, [], eye[None]).integral[0]
         found /= whole if whole > 0 else 1
     return np.array(found, np.float32)
 
@@ -515,8 +515,8 @@ def _enough_divisions(mesh: Any, eyes: Floats) -> int:
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
     beside = np.maximum(np.maximum(corners.min((0, 1)) - eyes, eyes - corners.max((0, 1))), 0)
     nearest = np.linalg.norm(beside, axis=1).min()
-    wanted = PIECE * longest / nearest if nearest > 0 else np.inf
-    return int(2 ** np.ceil(np.log2(np.clip(wanted, 1, MOST))))
+    wanted = PATCH_SIZE_RATIO * longest / nearest if nearest > 0 else np.inf
+    return int(2 ** np.ceil(np.log2(np.clip(wanted, 1, MAX_AUTO_DIVISIONS))))
 
 
 def _box(surface: Any) -> Region | None:
@@ -527,10 +527,10 @@ def _box(surface: Any) -> Region | None:
         return surface
     if isinstance(surface, (str, os.PathLike, Mapping, mi.Object)):
         return None
-    corners = arrays.points(surface, "the corners of a box").astype(np.float64)
+    corners = arrays.as_points(surface, "the corners of a box").astype(np.float64)
     if len(corners) != 2 or not np.all(corners[0] < corners[1]):
         raise NergError(f"a box is a lower corner and an upper one, got {corners.tolist()}")
-    return Region.of("box", *corners)
+    return Region.create("box", *corners)
 
 
 def _mesh(scene: Scene, surface: Any) -> Any:
@@ -544,5 +544,5 @@ def _mesh(scene: Scene, surface: Any) -> Any:
             raise NergError(f'the scene has no shape "{surface}"; {known}')
         return by_id[surface]
     if isinstance(surface, (str, os.PathLike)):
-        surface = mesh_child(surface)
+        surface = load_mesh_child(surface)
     return mi.load_dict(dict(surface)) if isinstance(surface, Mapping) else surface

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.ranges import SEEDS, SPP, Range, check_number
 from nerg_mi.workflows.base import SILENT, Reporter
 
-from .arrays import Camera, Floats, Labelled, points, same_for_all
-from .scene import COLOR, FilePath, Scene, active_mitsuba, asked_quantities, context_for
+from .arrays import Camera, Floats, LabelledArrays, as_points, broadcast_to_observers
+from .scene import COLOR, FilePath, Scene, activate_mitsuba, resolve_quantities, make_aov_context
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -24,7 +24,7 @@ AXES = ("observer", "row", "column")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Pictures(Labelled):
+class Pictures(LabelledArrays):
     """Quantities of `render`, each (observers, height, width) or, with channels, (observers, height, width, channels):
     ``pictures["gaze"][0]`` or ``pictures.gaze[0]`` is the first observer's."""
 
@@ -62,14 +62,14 @@ def render(
       depth  (2, 32, 48), float32
       gaze   (2, 32, 48), float32
     """
-    scene = Scene.of(scene)
-    active_mitsuba()
-    asked = asked_quantities(scene, quantities)
-    sensor = scene.sensor(camera)
+    scene = Scene.coerce(scene)
+    activate_mitsuba()
+    asked = resolve_quantities(scene, quantities)
+    sensor = scene.resolve_sensor(camera)
     _check_counts(spp, seed)
-    with mitsuba_says():
-        context = context_for(scene, asked)
-        eyes = _observers(scene, sensor, observers, bool(context.own))
+    with translate_mitsuba_errors():
+        context = make_aov_context(scene, asked)
+        eyes = _observers(scene, sensor, observers, bool(context.observer_aovs))
         layers = _Layers(context, sensor, asked, eyes)
         values = _render(scene, sensor, layers, int(spp), int(seed), reporter)
     return Pictures({name: values[name] for name in asked}, AXES, eyes)
@@ -80,12 +80,12 @@ def _observers(scene: Scene, sensor: Any, given: ArrayLike | None, needed: bool)
     from nerg_mi.transport import observer
 
     if given is not None:
-        return points(given, "observers")
+        return as_points(given, "observers")
     if scene.observer is not None:
         return scene.observer[None]
     if needed:
-        observer.require_center(sensor, "the camera")
-    return np.array(observer.center(sensor), np.float32).reshape(1, 3)
+        observer.check_center(sensor, "the camera")
+    return np.array(observer.sensor_center(sensor), np.float32).reshape(1, 3)
 
 
 class _Layers:
@@ -95,34 +95,34 @@ class _Layers:
     def __init__(self, context: Any, sensor: Any, asked: Sequence[str], eyes: Floats):
         self.sensor, self.color, self.observers = sensor, COLOR in asked, len(eyes)
         self.context = context
-        self.shared, self.own = context.shared, context.own
-        self.lookers = [context.observer_at(eye, len(eyes) == 1) for eye in eyes] if self.own else []
-        shared, own = (context.channels(names) for names in (self.shared, self.own))
+        self.shared, self.own = context.shared_aovs, context.observer_aovs
+        self.lookers = [context.make_observer(eye, len(eyes) == 1) for eye in eyes] if self.own else []
+        shared, own = (context.channel_names(names) for names in (self.shared, self.own))
         self.names, self.count = [shared, *(own for _ in self.lookers)], len(shared) + len(own)
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterator[tuple]:
         camera = self.context.trace(scene, [self.sensor], sampler, ray, active)
-        shared = camera.channels(self.shared)
-        radiance, shown, _ = camera.radiance(scene, sampler, medium)
+        shared = camera.compute_channels(self.shared)
+        radiance, shown, _ = camera.compute_radiance(scene, sampler, medium)
         if self.lookers:
-            camera.settle(radiance, shown, shared)
+            camera.eval_shared(radiance, shown, shared)
         yield radiance, shown, shared
         for looker in self.lookers:
-            yield 0, shown, camera.for_observer(looker).channels(self.own)
+            yield 0, shown, camera.make_pixel(looker).compute_channels(self.own)
 
     def split(self, layer: int, pixels: Floats) -> dict[str, Floats]:
         """The channels (height, width, C) of a layer by quantity."""
         alpha = _has_alpha(self.sensor.film())
         first = ([COLOR] if self.color else []) + self.shared
-        return split(pixels, self.names[layer], self.own if layer else first, alpha)
+        return split_channels(pixels, self.names[layer], self.own if layer else first, alpha)
 
 
 def _render(scene: Scene, sensor: Any, layers: _Layers, spp: int, seed: int, reporter: Reporter) -> dict[str, Floats]:
     """All quantities, each with an axis of observers in front."""
     from nerg_mi.interruption import Interruption
-    from nerg_mi.rendering.bands import render_bands, why_whole
+    from nerg_mi.rendering.bands import render_bands, undividable_reason
 
-    reason = why_whole(scene.mitsuba, sensor)
+    reason = undividable_reason(scene.mitsuba, sensor)
     if reason is not None:
         raise NergError(f"this camera's rays cannot be shared between observers because of {reason}; give a Camera")
     with Interruption() as stop:
@@ -135,11 +135,11 @@ def _render(scene: Scene, sensor: Any, layers: _Layers, spp: int, seed: int, rep
         parts = [layers.split(band.layer, np.array(band.film.develop(), np.float32)) for band in bands]
         stop.check()
     common, *each = parts
-    values = {name: same_for_all(value, layers.observers) for name, value in common.items()}
+    values = {name: broadcast_to_observers(value, layers.observers) for name, value in common.items()}
     return values | {name: np.stack([one[name] for one in each]) for name in layers.own}
 
 
-def split(pixels: Floats, aov_names: Sequence[str], quantities: Sequence[str], alpha: bool) -> dict[str, Floats]:
+def split_channels(pixels: Floats, aov_names: Sequence[str], quantities: Sequence[str], alpha: bool) -> dict[str, Floats]:
     """The channels (height, width, C) of a film by quantity: colour in front, perhaps ``alpha``, the AOVs at the
     end."""
     first = pixels.shape[-1] - len(aov_names)
@@ -163,5 +163,5 @@ def _has_alpha(film: Any) -> bool:
 
 
 def _check_counts(spp: int, seed: int) -> None:
-    check_number(spp, Range(0, SPP.high), "spp", whole=True)
-    check_number(seed, SEEDS, "seed", whole=True)
+    check_number(spp, Range(0, SPP.high), "spp", is_integer=True)
+    check_number(seed, SEEDS, "seed", is_integer=True)

@@ -17,33 +17,33 @@ from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nerg_mi.errors import MissingFile, NergError, mitsuba_says
+from nerg_mi.errors import MissingFile, NergError, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.fields import load_gaze as read_gaze
 from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
 from nerg_mi.formats.meshes import read_mesh_file
-from nerg_mi.formats.splats import plugin_of_field
+from nerg_mi.formats.splats import choose_plugin
 from nerg_mi.rays.rays import Rays
-from nerg_mi.registration import plugin_class
+from nerg_mi.registration import get_plugin_class
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene_writer import clip_distances
 from nerg_mi.transport.geometry import check_shape
 
-from .arrays import Camera, Floats, listed, points
+from .arrays import Camera, Floats, join_names, as_points
 
 if TYPE_CHECKING:
     import mitsuba as mi
     from _typeshed import DataclassInstance
 
-    from nerg_mi.transport.geometry import Place
+    from nerg_mi.transport.geometry import SceneGeometry
 
 
 # ---- Shapes as a user has them (files, dicts, scenes, objects), as children of a Mitsuba scene ----
 
 
-def mesh_child(path: str | os.PathLike[str]) -> Any:
+def load_mesh_child(path: str | os.PathLike[str]) -> Any:
     """The mesh file ``path`` as a child of a Mitsuba scene, in its colours or in grey, and seen from both sides: a
     dict, or a mesh of what Mitsuba does not show as it is. What of the file is not used goes to Mitsuba's log. Raises
     `NergError` for a file that is missing or damaged."""
@@ -58,7 +58,7 @@ def mesh_child(path: str | os.PathLike[str]) -> Any:
     name, colors = ("face_color", mesh.face_colors) if mesh.colors is None else ("vertex_color", mesh.colors)
     tint = {} if colors is None else {"reflectance": {"type": "mesh_attribute", "name": name}}
     bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", **tint}}
-    if mesh.is_plain:
+    if mesh.is_readable_by_mitsuba:
         return {"type": Path(path).suffix.lower()[1:], "filename": str(path), "bsdf": bsdf}
     shown = mitsuba_mesh(mesh.vertices, mesh.faces, Path(path).stem, bsdf)
     if colors is not None:
@@ -66,7 +66,7 @@ def mesh_child(path: str | os.PathLike[str]) -> Any:
     return shown
 
 
-def scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
+def to_scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
     """``shapes`` by their names, as a scene's dict takes them; the variant must be active.
 
     ``shapes``: a mesh file, a scene file, what `mi.load_dict` takes for a shape or a scene, a Mitsuba shape or scene,
@@ -79,7 +79,7 @@ def scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
         return {}
     if isinstance(shapes, (str, os.PathLike)):
         if Path(shapes).suffix.lower() != ".xml":
-            return {name: mesh_child(shapes)}
+            return {name: load_mesh_child(shapes)}
         from nerg_mi.rendering.scene import load_scene
 
         return _of_scene(load_scene(Path(shapes)), name)
@@ -89,13 +89,13 @@ def scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
         return {name: shapes}
     if isinstance(shapes, Mapping):
         if shapes.get("type") == "scene":
-            with mitsuba_says():
+            with translate_mitsuba_errors():
                 return _of_scene(mi.load_dict(dict(shapes), optimize=False), name)
         if "type" in shapes:
             return {name: dict(shapes)}
-        named = [scene_children(child, str(key)) for key, child in shapes.items()]
+        named = [to_scene_children(child, str(key)) for key, child in shapes.items()]
     elif isinstance(shapes, (list, tuple)):
-        named = [scene_children(child, f"{name}_{i}") for i, child in enumerate(shapes)]
+        named = [to_scene_children(child, f"{name}_{i}") for i, child in enumerate(shapes)]
     else:
         raise NergError(
             f"shapes are mesh or scene files, dicts for mi.load_dict or Mitsuba objects, got {type(shapes).__name__}"
@@ -116,7 +116,7 @@ def _of_scene(scene, name: str) -> dict[str, Any]:
 # ---- The Mitsuba variant that the library works in: the one that is set, or the best where none is ----
 
 
-def active_mitsuba() -> ModuleType:
+def activate_mitsuba() -> ModuleType:
     """The module ``mitsuba`` with a variant that fields work in.
 
     A variant that is set stays set. Where none is, it is ``cuda_ad_rgb`` if that works here, and ``llvm_ad_rgb``
@@ -126,9 +126,9 @@ def active_mitsuba() -> ModuleType:
 
     variant = mi.variant()
     if variant is None:
-        from nerg_mi.rendering.scene import activate
+        from nerg_mi.rendering.scene import activate_variant
 
-        activate()
+        activate_variant()
     elif variant.startswith("scalar"):
         raise NergError(
             f'fields need a variant that compiles its kernels, and "{variant}" is active: '
@@ -137,11 +137,11 @@ def active_mitsuba() -> ModuleType:
     return mi
 
 
-def array_module() -> ModuleType:
+def get_array_module() -> ModuleType:
     """The Dr.Jit array types of the active variant (`nerg_mi.fields.mlp.namespace`)."""
     from nerg_mi.fields.mlp import namespace
 
-    return namespace(active_mitsuba().variant())
+    return namespace(activate_mitsuba().variant())
 
 
 # ---- Fields and rays in memory: read from files, handed to scenes, and saved again ----
@@ -176,7 +176,7 @@ class TrainedField(Generic[Network]):
         return np.array([self.network.box.lower, self.network.box.upper], np.float64)
 
     @property
-    def weights(self) -> int:
+    def num_weights(self) -> int:
         """How many numbers were trained."""
         return sum(int(np.prod(value.shape)) for value in self.network.parameters().values())
 
@@ -198,7 +198,7 @@ class TrainedField(Generic[Network]):
         lower, upper = (", ".join(f"{x:.3g}" for x in corner) for corner in self.bounds)
         members = 1 if isinstance(self.network, RadianceField) else len(self.network.members)
         what = f"{self.kind} field" if members == 1 else f"ensemble of {members} gaze fields"
-        return f"<{what} {self.name}: {self.weights:,} weights, box ({lower}) to ({upper})>"
+        return f"<{what} {self.name}: {self.num_weights:,} weights, box ({lower}) to ({upper})>"
 
 
 def load_field(path: FilePath) -> TrainedField[RadianceField]:
@@ -215,7 +215,7 @@ def load_field(path: FilePath) -> TrainedField[RadianceField]:
     >>> field.bounds.tolist()
     [[-0.1, -0.1, -0.1], [8.1, 6.1, 3.1]]
     """
-    network, metadata = load_radiance(_existing(path), array_module())
+    network, metadata = load_radiance(_existing(path), get_array_module())
     return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
 
 
@@ -232,7 +232,7 @@ def load_gaze(path: FilePath) -> TrainedField[AnyGazeField]:
     >>> gaze.kind
     'gaze'
     """
-    network, metadata = read_gaze(_existing(path), array_module())
+    network, metadata = read_gaze(_existing(path), get_array_module())
     return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
 
 
@@ -271,7 +271,7 @@ _WRITTEN = {"pictures", "json_file", "store"}
 """Options that name a file or a folder which is written."""
 
 
-def options_of(kind: type[Options], job: str, given: Options | None, changes: dict[str, Any]) -> Options:
+def build_options(kind: type[Options], job: str, given: Options | None, changes: dict[str, Any]) -> Options:
     """An object of the dataclass ``kind``: ``given`` (or the defaults) with ``changes``, for the variant in use. Files
     may be named by strings.
 
@@ -283,24 +283,24 @@ def options_of(kind: type[Options], job: str, given: Options | None, changes: di
         raise NergError(f"{job} works in the variant that is set; call mi.set_variant({changes['mode']!r}) before it")
     check_names(job, changes, [name for name in types if name != "mode"])
     if "mode" in types:
-        changes = {**changes, "mode": active_mitsuba().variant()}
+        changes = {**changes, "mode": activate_mitsuba().variant()}
     options = replace(kind() if given is None else given, **changes)
     files = {k: getattr(options, k) for k, of in types.items() if "Path" in of}
     return replace(
-        options, **{k: Path(v) if k in _WRITTEN else file_of(v, k) for k, v in files.items() if v is not None}
+        options, **{k: Path(v) if k in _WRITTEN else resolve_file(v, k) for k, v in files.items() if v is not None}
     )
 
 
-def check_names(job: str, given: Iterable[str], known: Collection[str], what: str = "option") -> None:
+def check_names(function: str, names: Iterable[str], allowed: Collection[str], noun: str = "option") -> None:
     """Raise `NergError` for a name ``given`` that is none of those ``known``."""
-    for name in given:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            meant = f'did you mean "{near[0]}"?' if near else f"it has {listed(list(known))}"
-            raise NergError(f'{job} has no {what} "{name}"; {meant}')
+    for name in names:
+        if name not in allowed:
+            near = difflib.get_close_matches(name, allowed, n=1)
+            meant = f'did you mean "{near[0]}"?' if near else f"it has {join_names(list(allowed))}"
+            raise NergError(f'{function} has no {noun} "{name}"; {meant}')
 
 
-def file_of(value: object, name: str) -> Path:
+def resolve_file(value: object, name: str) -> Path:
     """The file or folder that the argument ``name`` is: a string, a path, or a field or scene that has a file.
 
     Raises `NergError` for one that is missing, and for anything else.
@@ -314,7 +314,7 @@ def file_of(value: object, name: str) -> Path:
     return Path(path)
 
 
-def rays_of(value: object) -> Rays | Path:
+def resolve_rays(value: object) -> Rays | Path:
     """Rays in memory as they are, or their file. Raises `NergError` for anything else."""
     if isinstance(value, Rays):
         return value
@@ -323,17 +323,17 @@ def rays_of(value: object) -> Rays | Path:
             f"rays are what load_rays and import_rays give, or a file of theirs, got {type(value).__name__}; "
             "import_rays makes rays of a table (.csv, .parquet)"
         )
-    return file_of(value, "rays")
+    return resolve_file(value, "rays")
 
 
 @contextmanager
-def checkpoint_of(value: object, name: str) -> Iterator[Path]:
+def resolve_checkpoint(value: object, name: str) -> Iterator[Path]:
     """The checkpoint of a field that is the argument ``name``: its file, or one that is written for the block."""
     if isinstance(value, TrainedField) and value.path is None:
         with TemporaryDirectory() as folder:
             yield value.save(Path(folder) / f"{value.kind}.safetensors")
         return
-    yield file_of(value, name)
+    yield resolve_file(value, name)
 
 
 # ---- Scenes: a place, whose gaze it is, and from where it is seen ----
@@ -380,14 +380,14 @@ class Scene:
         """
         from nerg_mi.rendering.scene import load_scene
 
-        active_mitsuba()
+        activate_mitsuba()
         # Merged meshes lose their names.
         scene = cls(load_scene(Path(path), {key: str(value) for key, value in values.items()}, merge=False))
         scene.path = None if values else Path(path)
         return scene
 
     @classmethod
-    def of(cls, given: Scene | FilePath | mi.Scene) -> Scene:
+    def coerce(cls, given: Scene | FilePath | mi.Scene) -> Scene:
         """A scene as a call is given it: one of these, a file of one, or Mitsuba's. Raises `NergError` for anything
         else."""
         if isinstance(given, Scene):
@@ -396,7 +396,7 @@ class Scene:
             return cls.load(given)
         import mitsuba as mi
 
-        active_mitsuba()
+        activate_mitsuba()
         if isinstance(given, mi.Scene):
             return cls(given)
         raise NergError(f"a scene is what make_scene and Scene.load give, or a scene file, got {type(given).__name__}")
@@ -407,11 +407,11 @@ class Scene:
         return self.mitsuba.integrator()
 
     @property
-    def place(self) -> Place:
+    def geometry(self) -> SceneGeometry:
         """What rays of this scene meet: its field or volumes, and its shapes."""
-        from nerg_mi.transport.geometry import Place
+        from nerg_mi.transport.geometry import SceneGeometry
 
-        return Place(self.integrator.medium, self.mitsuba)
+        return SceneGeometry(self.integrator.medium, self.mitsuba)
 
     @property
     def has_gaze(self) -> bool:
@@ -421,19 +421,19 @@ class Scene:
     @property
     def observer(self) -> Floats | None:
         """Position (3,) of the scene's own observer; None where the camera is the observer."""
-        from nerg_mi.transport.observer import center
+        from nerg_mi.transport.observer import sensor_center
 
         sensor = self.integrator.observer
-        return None if sensor is None else np.ravel(np.array(center(sensor), np.float32))
+        return None if sensor is None else np.ravel(np.array(sensor_center(sensor), np.float32))
 
     def set_constant_weights(self, constant: bool = True) -> None:
         """Write the weights of its trained fields into the kernels, for many pictures or rays of one scene: the same
         results to the bit in less time, after some seconds of compilation (the page on performance, "Weights as
         constants"). ``constant`` false takes it back."""
         from nerg_mi.fields.mlp import set_constant_weights
-        from nerg_mi.rendering.bands import fields_of
+        from nerg_mi.rendering.bands import get_trained_fields
 
-        for trained in fields_of(self.integrator):
+        for trained in get_trained_fields(self.integrator):
             set_constant_weights(trained, constant)
 
     @property
@@ -441,13 +441,13 @@ class Scene:
         """What is computed when nothing is asked for by name."""
         return (COLOR, "depth", "opacity", *(("gaze", "visibility") if self.has_gaze else ()))
 
-    def sensor(self, camera: Camera | int | mi.Sensor | None = None) -> mi.Sensor:
+    def resolve_sensor(self, camera: Camera | int | mi.Sensor | None = None) -> mi.Sensor:
         """The sensor that ``camera`` names: a `Camera`, one of the scene's own by its number, or a Mitsuba sensor;
         without any the scene's first. Raises `NergError` where there is none."""
         import mitsuba as mi
 
         if isinstance(camera, Camera):
-            with mitsuba_says():
+            with translate_mitsuba_errors():
                 return self._fitted(mi.load_dict(camera.to_dict()), camera)
         if isinstance(camera, mi.Sensor):
             return camera
@@ -464,7 +464,7 @@ class Scene:
         import mitsuba as mi
 
         params: Any = mi.traverse(sensor)
-        near, far = clip_distances(self.place.extent(camera.origin))
+        near, far = clip_distances(self.geometry.extent(camera.origin))
         if near < params["near_clip"] or far > params["far_clip"]:
             params["near_clip"], params["far_clip"] = near, far
             params.update()
@@ -520,7 +520,7 @@ def make_scene(
     """
     import mitsuba as mi
 
-    active_mitsuba()
+    activate_mitsuba()
     # Objects may be nested by any name.
     check_names("make_scene", (k for k, v in settings.items() if isinstance(v, _PLAIN)), _parameters(), "setting")
     integrator: dict[str, Any] = {"type": "nerg", **settings}
@@ -530,17 +530,17 @@ def make_scene(
     if gaze is not None:
         integrator["gaze"] = _volume(gaze, "gaze", where)
     if observer is not None:
-        position = points(observer, "the observer")
+        position = as_points(observer, "the observer")
         if len(position) != 1:
             raise NergError("a scene has one observer; give render, observe or attention the others")
         integrator["observer"] = _observer_sensor(position[0])
     integrator.setdefault("aovs", ",".join(["depth", "opacity", *(["gaze", "visibility"] if gaze is not None else [])]))
-    children = scene_children(shapes)
+    children = to_scene_children(shapes)
     if not children and integrator.keys().isdisjoint({"field", "density"}):
         raise NergError("there is nothing to see in this scene; give make_scene a field or shapes")
     if camera is not None:
         children["camera"] = camera.to_dict() if isinstance(camera, Camera) else camera
-    with mitsuba_says():
+    with translate_mitsuba_errors():
         # Merged meshes lose their names.
         scene = Scene(mi.load_dict({"type": "scene", "integrator": integrator, **children}, optimize=False))
     if isinstance(camera, Camera):
@@ -553,7 +553,7 @@ _PLAIN = (str, bool, int, float, np.number)
 
 def _parameters() -> list[str]:
     """The parameters of the integrator ``nerg``, which its manual lists."""
-    manual = sys.modules[plugin_class("nerg").__module__].__doc__ or ""
+    manual = sys.modules[get_plugin_class("nerg").__module__].__doc__ or ""
     rows = re.findall(r"^ \* - ([a-z_]+(?:, [a-z_]+)*)$", manual, re.MULTILINE)
     return [name for row in rows for name in row.split(", ")]
 
@@ -566,28 +566,28 @@ def _observer_sensor(position: ArrayLike) -> dict:
     return {"type": "perspective", "to_world": place, "film": {"type": "hdrfilm", "width": 1, "height": 1}}
 
 
-def context_for(scene: Scene, quantities: Sequence[str]) -> Any:
+def make_aov_context(scene: Scene, quantities: Sequence[str]) -> Any:
     """What ``quantities`` of the scene are computed with; the ``own`` depend on the observer, the ``shared`` do not.
 
     Raises `NergError` for those that it cannot compute.
     """
-    return scene.integrator.for_aovs([name for name in quantities if name != COLOR], COLOR in quantities)
+    return scene.integrator.make_context([name for name in quantities if name != COLOR], COLOR in quantities)
 
 
-def asked_quantities(scene: Scene, names: object, known: tuple[str, ...] | None = None) -> tuple[str, ...]:
+def resolve_quantities(scene: Scene, names: object, allowed: tuple[str, ...] | None = None) -> tuple[str, ...]:
     """The quantities ``names`` (a name, several, or None for the scene's own choice), each once.
 
     ``known``: those that may be asked for; None leaves it to the integrator to say. Raises `NergError`.
     """
     if names is None:
         chosen = scene.default_quantities
-        return tuple(name for name in chosen if known is None or name in known)
+        return tuple(name for name in chosen if allowed is None or name in allowed)
     given = [names] if isinstance(names, str) else list(names) if isinstance(names, (list, tuple)) else None
     if not given or not all(isinstance(name, str) for name in given):
         raise NergError(f'quantities are names such as "depth", got {names!r}')
     for name in given:
-        if known is not None and name not in known:
-            raise NergError(f'there is no quantity "{name}" here; there are {listed(known)}')
+        if allowed is not None and name not in allowed:
+            raise NergError(f'there is no quantity "{name}" here; there are {join_names(allowed)}')
     return tuple(dict.fromkeys(given))
 
 
@@ -595,11 +595,11 @@ def _volume(given: object, role: str, to_world: Any) -> Any:
     """The volume of a field, which is a file or in memory, for the integrator's property ``role``."""
     plugin = {"field": "splats" if isinstance(given, Splats) else "nerf", "gaze": "gazefield"}[role]
     if isinstance(given, (str, os.PathLike)):
-        given = file_of(given, role)
-        plugin = plugin_of_field(given) if role == "field" else plugin
+        given = resolve_file(given, role)
+        plugin = choose_plugin(given) if role == "field" else plugin
         where = {} if to_world is None else {"to_world": to_world}
         return {"type": plugin, "filename": os.path.abspath(given), **where}
-    volume = plugin_class(plugin)
+    volume = get_plugin_class(plugin)
     if isinstance(given, TrainedField):
         return volume.of(given.network, to_world, given.name)
     return volume.of(given, to_world)

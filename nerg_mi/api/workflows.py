@@ -17,7 +17,7 @@ from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOp
 from nerg_mi.workflows.rays_commands import AlignOptions, RaysImportOptions
 from nerg_mi.workflows.scene_commands import BakeOptions, StudyOptions
 
-from .scene import FilePath, TrainedField, check_names, checkpoint_of, file_of, options_of, rays_of
+from .scene import FilePath, TrainedField, check_names, resolve_checkpoint, resolve_file, build_options, resolve_rays
 
 if TYPE_CHECKING:
     from nerg_mi.alignment.check import Alignment
@@ -61,8 +61,8 @@ def align(
     """
     from nerg_mi.workflows import align as alignment
 
-    job = options_of(AlignOptions, "align", options, changes)
-    return alignment.align(None if rays is None else rays_of(rays), output, job, reporter).alignment
+    job = build_options(AlignOptions, "align", options, changes)
+    return alignment.align(None if rays is None else resolve_rays(rays), output, job, reporter).alignment
 
 
 # ---- Gaze on surfaces, for notebooks ----
@@ -98,9 +98,9 @@ def bake(
     in_memory = rays if isinstance(rays, Rays) else None
     if rays is not None and in_memory is None:
         changes = {**changes, "rays": rays}
-    job = options_of(BakeOptions, "bake", options, changes)
+    job = build_options(BakeOptions, "bake", options, changes)
     files = [outputs] if isinstance(outputs, (str, Path)) or not isinstance(outputs, Sequence) else list(outputs)
-    return baking.bake_any(file_of(surface, "surface"), [Path(str(f)) for f in files], job, reporter, in_memory)
+    return baking.bake_any(resolve_file(surface, "surface"), [Path(str(f)) for f in files], job, reporter, in_memory)
 
 
 # ---- Scores of fields, and what settings cost ----
@@ -129,9 +129,9 @@ def evaluate_radiance(
     """
     from nerg_mi.workflows import train_radiance
 
-    job = options_of(RadianceScoreOptions, "evaluate_radiance", options, changes)
-    with checkpoint_of(field, "field") as path:
-        return train_radiance.evaluate_radiance(path, file_of(photos, "photos"), job, reporter)
+    job = build_options(RadianceScoreOptions, "evaluate_radiance", options, changes)
+    with resolve_checkpoint(field, "field") as path:
+        return train_radiance.evaluate_radiance(path, resolve_file(photos, "photos"), job, reporter)
 
 
 def evaluate_gaze(
@@ -160,9 +160,9 @@ def evaluate_gaze(
     """
     from nerg_mi.workflows import evaluate
 
-    job = options_of(GazeEvaluationOptions, "evaluate_gaze", options, changes)
-    data = rays_of(rays)
-    with checkpoint_of(gaze, "gaze") as path:
+    job = build_options(GazeEvaluationOptions, "evaluate_gaze", options, changes)
+    data = resolve_rays(rays)
+    with resolve_checkpoint(gaze, "gaze") as path:
         return evaluate.evaluate_gaze(path, data, output, job, reporter)
 
 
@@ -190,8 +190,8 @@ def ablate(
     """
     from nerg_mi.workflows import ablation
 
-    job = options_of(AblationOptions, "ablate", options, changes)
-    return ablation.ablate(rays_of(rays), output, job, reporter)
+    job = build_options(AblationOptions, "ablate", options, changes)
+    return ablation.ablate(resolve_rays(rays), output, job, reporter)
 
 
 def study(
@@ -216,8 +216,8 @@ def study(
     """
     from nerg_mi.workflows import study as studies
 
-    job = options_of(StudyOptions, "study", options, changes)
-    return studies.run_study(str(scene if isinstance(scene, str) else file_of(scene, "scene")), output, job, reporter)
+    job = build_options(StudyOptions, "study", options, changes)
+    return studies.run_study(str(scene if isinstance(scene, str) else resolve_file(scene, "scene")), output, job, reporter)
 
 
 # ---- Attention on things as numbers, from a notebook ----
@@ -234,7 +234,7 @@ def stats(
     """Numbers of attention on areas of interest: counted in rays, and as a gaze field foretells it.
 
     ``files``: rays (in memory, or their file, or a dataset), a scene, a gaze field, a radiance field, in any order.
-    ``areas``: a JSON file of boxes, meshes, shapes and groups (docs/statistics.md). ``output``: folder for the tables.
+    ``areas``: a JSON file of boxes, meshes, shapes and groups (docs/how-to/statistics.md). ``output``: folder for the tables.
     ``options``: those of `nerg stats` (`nerg_mi.aoi.options.StatisticsOptions`). Gives a
     `nerg_mi.aoi.output.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
 
@@ -251,8 +251,8 @@ def stats(
     given = [files] if isinstance(files, (str, os.PathLike, Rays)) else list(files)
     if areas is not None:
         options["areas"] = areas
-    job = options_of(StatisticsOptions, "stats", None, options)
-    paths = [f if isinstance(f, Rays) else file_of(f, "files") for f in given]
+    job = build_options(StatisticsOptions, "stats", None, options)
+    paths = [f if isinstance(f, Rays) else resolve_file(f, "files") for f in given]
     return statistics(paths, None if output is None else Path(output), job, reporter)
 
 
@@ -283,8 +283,8 @@ def import_rays(
     >>> len(rays), rays.persons
     (2, ('Ada',))
     """
-    from nerg_mi.rays.readers.base import options_of
-    from nerg_mi.rays.readers.registry import make_options, reader_named, reader_names
+    from nerg_mi.rays.readers.base import list_options
+    from nerg_mi.rays.readers.registry import make_options, get_reader, list_reader_names
     from nerg_mi.workflows import rays
 
     several = [files] if isinstance(files, (str, os.PathLike)) or not isinstance(files, Sequence) else files
@@ -293,11 +293,11 @@ def import_rays(
             f"import_rays reads files, named by strings or paths, got {type(files).__name__}; "
             'write a table to a file (df.to_csv("day.csv")), and name its columns (columns="origin=x,y,z ...")'
         )
-    of_readers = options_of(reader_named(reader).Options)
+    of_readers = list_options(get_reader(reader).Options)
     ours = {f.name for f in fields(RaysImportOptions)} - {"reader", "settings", "output"}
-    every = {option.name for name in reader_names() for option in options_of(reader_named(name).Options)}
+    every = {option.name for name in list_reader_names() for option in list_options(get_reader(name).Options)}
     check_names("import_rays", options, sorted(every | ours))
-    paths = [file_of(file, "files") for file in several]
+    paths = [resolve_file(file, "files") for file in several]
     of_job = {name: value for name, value in options.items() if name in ours}
     parse = {option.name: option.parse for option in of_readers}
     of_reader = {name: value for name, value in options.items() if name not in ours}
@@ -336,8 +336,8 @@ def train_radiance(
     """
     from nerg_mi.workflows import train_radiance as radiance
 
-    job = options_of(RadianceOptions, "train_radiance", options, changes)
-    result = radiance.train_radiance(file_of(photos, "photos"), output, job, reporter)
+    job = build_options(RadianceOptions, "train_radiance", options, changes)
+    result = radiance.train_radiance(resolve_file(photos, "photos"), output, job, reporter)
     return _trained(result.field, result.provenance, output)
 
 
@@ -365,8 +365,8 @@ def train_gaze(
     """
     from nerg_mi.workflows import train_gaze as gaze
 
-    job = options_of(GazeOptions, "train_gaze", options, changes)
-    result = gaze.train_gaze(None if rays is None else rays_of(rays), output, job, reporter)
+    job = build_options(GazeOptions, "train_gaze", options, changes)
+    result = gaze.train_gaze(None if rays is None else resolve_rays(rays), output, job, reporter)
     return _trained(result.field, result.provenance, output)
 
 
@@ -391,9 +391,9 @@ def train_prior(
     """
     from nerg_mi.workflows import train_gaze as gaze
 
-    job = options_of(PriorOptions, "train_prior", options, changes)
+    job = build_options(PriorOptions, "train_prior", options, changes)
     several = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
-    places = [place if isinstance(place, Rays) else file_of(place, "rays") for place in several]
+    places = [place if isinstance(place, Rays) else resolve_file(place, "rays") for place in several]
     result = gaze.learn_prior(places, output, job, reporter)
     return _trained(result.field, result.provenance, output)
 

@@ -9,7 +9,7 @@ import os
 import sys
 import traceback
 
-from .ending import INTERRUPTED, CtrlC, end_of, open_streams, quiet_ctrl_c, shorten_values
+from .ending import INTERRUPTED, CtrlC, exit_code, open_streams, quiet_ctrl_c, shorten_values
 
 with quiet_ctrl_c():
     from .building import DEBUG, build_app
@@ -37,7 +37,7 @@ def main(arguments: list[str] | None = None) -> None:
             finally:
                 sys.stdout.flush()
         except BaseException as error:
-            interrupt = ctrl_c.behind(error)
+            interrupt = ctrl_c.find_interrupt(error)
             if interrupt is not None:
                 print(str(interrupt) or "Interrupted.", file=sys.stderr)
                 sys.exit(INTERRUPTED)
@@ -45,6 +45,6 @@ def main(arguments: list[str] | None = None) -> None:
                 raise
             if debug:
                 traceback.print_exception(error)
-            code, text = end_of(error)
+            code, text = exit_code(error)
             print(f"nerg: {shorten_values(text, arguments)}", file=sys.stderr)
             sys.exit(code)

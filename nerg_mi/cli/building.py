@@ -174,11 +174,11 @@ def build_command(command: Command, line: str = "") -> Any:
     """The parser of ``command``, which the list of commands has a ``line`` about."""
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
     help = "\n\n".join(text for text in (command.help or line, command.more) if text)
-    app.command(command.name.split()[-1], help=help)(callback_of(command))
+    app.command(command.name.split()[-1], help=help)(make_callback(command))
     return typer.main.get_command(app)
 
 
-def callback_of(command: Command) -> Callable[..., None]:
+def make_callback(command: Command) -> Callable[..., None]:
     """The function that typer calls, whose parameters are those of ``command`` and an option for each field of its
     options.
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from nerg_mi.errors import expected, sentence
+from nerg_mi.errors import is_user_error, format_error
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -20,35 +20,35 @@ if TYPE_CHECKING:
 USER_ERROR = 1
 """Exit code of an error that the user can correct."""
 
-FAULT = 70
+INTERNAL_ERROR = 70
 """Exit code of a mistake in the program (EX_SOFTWARE of sysexits.h)."""
 
 INTERRUPTED = 130
 """Exit code of what was ended by Ctrl-C (128 and the signal's number, as a shell has it)."""
 
 
-ECHOED = 300
+MAX_ECHOED = 300
 """Characters of a value on the command line that a message repeats."""
 
 
 def shorten_values(text: str, arguments: Iterable[str]) -> str:
     """``text`` with the middle left out of what it repeats of ``arguments``, values and parts of lists, beyond
     `ECHOED` characters."""
-    parts = {part for argument in arguments if len(argument) > ECHOED for part in _SEPARATORS.split(argument)}
+    parts = {part for argument in arguments if len(argument) > MAX_ECHOED for part in _SEPARATORS.split(argument)}
     values = {argument.partition("=")[2] for argument in arguments} | set(arguments) | parts
     for value in sorted(values, key=len, reverse=True):
         for spelt in (value, repr(value)[1:-1]):
-            if len(spelt) > ECHOED:
-                text = text.replace(spelt, f"{spelt[: ECHOED // 2]}...{spelt[-ECHOED // 6 :]}")
+            if len(spelt) > MAX_ECHOED:
+                text = text.replace(spelt, f"{spelt[: MAX_ECHOED // 2]}...{spelt[-MAX_ECHOED // 6 :]}")
     return text
 
 
-def end_of(error: Exception) -> tuple[int, str]:
+def exit_code(error: Exception) -> tuple[int, str]:
     """Exit code of ``error``, and what is said about it."""
-    if expected(error):
-        return USER_ERROR, sentence(error)
+    if is_user_error(error):
+        return USER_ERROR, format_error(error)
     text = " ".join(str(error).split())
-    return FAULT, (
+    return INTERNAL_ERROR, (
         f"internal error ({type(error).__name__}{': ' + text if text else ''}): this is a fault of nerg_mi and not of "
         "your input; run again with --debug and report the traceback"
     )
@@ -131,7 +131,7 @@ class CtrlC:
         else:
             self._report_unraisable(unraisable)
 
-    def behind(self, end: BaseException) -> KeyboardInterrupt | None:
+    def find_interrupt(self, end: BaseException) -> KeyboardInterrupt | None:
         """The interrupt that led to ``end``; None where it is another error, or the command was done.
 
         Typer makes an exit with code 130 of it, which has it as its cause. Mitsuba makes an error of its own of it

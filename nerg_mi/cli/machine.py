@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import typer
 
-from nerg_mi.ranges import SECONDS, Checked, Range
+from nerg_mi.ranges import SECONDS, ValidatedDataclass, Range
 from nerg_mi.workflows.base import Reporter, argument, command
 from nerg_mi.workflows.options import option
 
@@ -19,15 +19,15 @@ from nerg_mi.workflows.options import option
 @command("doctor", more="Ends with exit code 0 if some compiled variant of Mitsuba works, else with 1.")
 def diagnose(reporter: Reporter) -> None:
     """Tell what works. Raises ``typer.Exit``."""
-    from nerg_mi.diagnosis import examine
+    from nerg_mi.diagnosis import run_diagnosis
 
-    diagnosis = examine()
+    diagnosis = run_diagnosis()
     reporter.message(str(diagnosis))
-    raise typer.Exit(0 if diagnosis.usable else 1)
+    raise typer.Exit(0 if diagnosis.is_usable else 1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkerOptions(Checked):
+class WorkerOptions(ValidatedDataclass):
     """What a worker has of its machine, and how long it waits."""
 
     threads: int = option(0, "Worker threads; 0: one a core.", "-t", "--threads", within=Range(0, 1024))
@@ -44,12 +44,12 @@ class WorkerOptions(Checked):
 )
 def work(address: str, options: WorkerOptions, reporter: Reporter) -> None:
     """Join a cluster."""
-    from nerg_mi.tasks.engines import serve_cluster, unprotected
-    from nerg_mi.threads import VARIABLE
+    from nerg_mi.tasks.engines import run_dask_worker, describe_exposure
+    from nerg_mi.threads import THREADS_VARIABLE
 
     if options.threads:
-        os.environ[VARIABLE] = str(options.threads)
-    danger = unprotected(address)
+        os.environ[THREADS_VARIABLE] = str(options.threads)
+    danger = describe_exposure(address)
     if danger is not None:
         reporter.warn(danger)
-    serve_cluster(address, options.wait, reporter.message, options.name)
+    run_dask_worker(address, options.wait, reporter.message, options.name)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-EVERY = 10.0
+LOG_INTERVAL = 10.0
 """Seconds between two lines of progress where no terminal shows a bar."""
 
-SOON = 2.0
+ESTIMATE_AFTER = 2.0
 """Seconds after which it is guessed how long the rest takes."""
 
 
@@ -60,7 +60,7 @@ class TerminalReporter:
             (task,) = self._bar.task_ids
             self._bar.update(task, completed=share, description=self.line())
         else:
-            self.tell_when_due()
+            self.log_when_due()
 
     def line(self) -> str:
         """What is being done, and how long the rest takes, or how long it has taken."""
@@ -69,25 +69,25 @@ class TerminalReporter:
         if text.endswith(" left") or " left, " in text:
             return text
         counted = time.monotonic() - self._counted
-        if share > 0.01 and counted >= SOON:
+        if share > 0.01 and counted >= ESTIMATE_AFTER:
             rest = f"{duration(counted * (1 - share) / share)} left"
-        elif elapsed >= EVERY and self._bar is None:
+        elif elapsed >= LOG_INTERVAL and self._bar is None:
             rest = f"{duration(elapsed)} so far"
         else:
             return text
         return f"{text}, {rest}" if text else rest
 
-    def tell_when_due(self) -> None:
+    def log_when_due(self) -> None:
         """A line of a log, if the last one is `EVERY` seconds ago."""
         with self._lock:
-            if time.monotonic() - self._told < EVERY:
+            if time.monotonic() - self._told < LOG_INTERVAL:
                 return
             self._told = time.monotonic()
             print(f"{self._now[0]:4.0%} {self.line()}".rstrip(), file=sys.stderr, flush=True)
 
     def _beat(self) -> None:
         while not self._ended.wait(1.0):
-            self.tell_when_due()
+            self.log_when_due()
 
     def _start(self) -> Progress | None:
         """The bar, with its one task; None where it would not be seen."""

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import mitsuba_says
+from nerg_mi.errors import translate_mitsuba_errors
 from nerg_mi.figures.style import Provenance, new_page, save
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.tables import markdown_table, write_csv, write_json
-from nerg_mi.formats.splats import plugin_of_field
+from nerg_mi.files.tables import format_markdown_table, write_csv, write_json
+from nerg_mi.formats.splats import choose_plugin
 from nerg_mi.rays.rays import Rays
-from nerg_mi.train.gaze_recipes import gaze_recipe
-from nerg_mi.train.geometry import GazePlace, volume_dict
-from nerg_mi.transport.geometry import Place
+from nerg_mi.train.gaze_recipes import get_recipe
+from nerg_mi.train.geometry import TrainingGeometry, make_volume_dict
+from nerg_mi.transport.geometry import SceneGeometry
 
-from .gaze import Baseline, GazeTest, make_test, map_scores
+from .gaze import Baseline, GazeTest, make_test, compute_map_scores
 from .study_scenes import make_sensor
 
 # ---- Ablation ----
@@ -45,10 +45,10 @@ class Variant:
 
     name: str  # What it is called in tables
     recipe: str  # Of `train.gaze_recipes`
-    gaze: str = "emit_capture"  # Factors: "emit", "capture" or "emit_capture"
+    field_variant: str = "emit_capture"  # Factors: "emit", "capture" or "emit_capture"
     semantic: str = ""  # Features of a radiance field that emit is given (`train.gaze_recipes.FieldChoices`)
     semantic_own: bool = False  # Whether emit has the field's own features besides
-    begin: bool = False  # Whether the trunk begins as the radiance field's,
+    init_from_field: bool = False  # Whether the trunk begins as the radiance field's,
     frozen: bool = False  # and stays so
     loss: str = ""  # What it is trained on (`train.gaze_settings.LOSSES`); "": the recipe's
 
@@ -57,24 +57,24 @@ class Variant:
         return f"{self.recipe}_{self.name.replace(', ', '_').replace(' ', '_')}_{seed}.safetensors"
 
 
-def all_variants(radiance: bool, recipes: Sequence[str] = ("default", "paper")) -> list[Variant]:
+def list_variants(has_radiance: bool, recipes: Sequence[str] = ("default", "paper")) -> list[Variant]:
     """Of each of ``recipes`` the three variants, the product on each other loss that the recipe may be trained on and,
     where there is a ``radiance`` field and the recipe takes them, the semantic ones and the two initialisations."""
     out = []
-    for recipe in map(gaze_recipe, recipes):
-        out += [Variant(name=name, recipe=recipe.name, gaze=name) for name in ("emit", "capture", "emit_capture")]
-        own = recipe.gaze_settings().loss
+    for recipe in map(get_recipe, recipes):
+        out += [Variant(name=name, recipe=recipe.name, field_variant=name) for name in ("emit", "capture", "emit_capture")]
+        own = recipe.make_gaze_settings().loss
         out += [Variant(name=f"loss {loss}", recipe=recipe.name, loss=loss) for loss in recipe.losses if loss != own]
-        if radiance and "semantic" in recipe.takes:
+        if has_radiance and "semantic" in recipe.supported_options:
             out += [
                 Variant(name=f"semantic {kind}{', own too' * own}", recipe=recipe.name, semantic=kind, semantic_own=own)
                 for kind in ("accumulated", "snapshot")
                 for own in (False, True)
             ]
-        if radiance and "begin" in recipe.takes:
+        if has_radiance and "begin" in recipe.supported_options:
             out += [
-                Variant(name="begins as the field, frozen", recipe=recipe.name, begin=True, frozen=True),
-                Variant(name="begins as the field", recipe=recipe.name, begin=True),
+                Variant(name="begins as the field, frozen", recipe=recipe.name, init_from_field=True, frozen=True),
+                Variant(name="begins as the field", recipe=recipe.name, init_from_field=True),
             ]
     return out
 
@@ -103,17 +103,17 @@ def make_tests(
     return tests
 
 
-def score(tests: dict[str, GazeTest], density: Baseline) -> dict[str, float]:
+def score_density(tests: dict[str, GazeTest], density: Baseline) -> dict[str, float]:
     """Scores of a ``density(positions, directions)`` in 1/sr on each of ``tests``, and the paper's loss."""
     row = {}
     for side, test in tests.items():
-        scores = map_scores(test.truth, density(test.centres, test.directions))
+        scores = compute_map_scores(test.truth, density(test.centres, test.directions))
         row |= {f"{side}_{k}": scores[k] for k in ("KLD", "CC", "MAE")}
         row[f"{side}_loss"] = scores["KLD"] + 1 - scores["CC"] + scores["MAE"]
     return row
 
 
-def relate(rows: list[dict]) -> None:
+def add_relative_losses(rows: list[dict]) -> None:
     """Give each of ``rows`` its losses relative to the mean of emit_capture of the same recipe, where that is there."""
     for recipe in {r["recipe"] for r in rows}:
         whole = [r for r in rows if (r["recipe"], r["variant"]) == (recipe, "emit_capture")]
@@ -140,7 +140,7 @@ def summarise(rows: list[dict]) -> list[dict]:
     return out
 
 
-def table(summary: list[dict]) -> str:
+def format_table(summary: list[dict]) -> str:
     """``summary`` as Markdown: losses relative to emit_capture of the same recipe and as they are, scores on held-out
     positions, seconds."""
     shown = [f"{side}_{kind}" for kind in ("relative", "loss") for side in ("train", "test")]
@@ -153,16 +153,16 @@ def table(summary: list[dict]) -> str:
             spread = f" ± {r[f'{k}.spread']:.{digits}f}" if f"{k}.spread" in r else ""
             cells.append(f"{r[k]:.{digits}f}{spread}" if k in r else "")
         lines.append([r["recipe"], r["variant"], r["seeds"], f"{r['steps']:.0f}", *cells])
-    return markdown_table(head, lines, head[2:]) + "\n"
+    return format_markdown_table(head, lines, head[2:]) + "\n"
 
 
-def write_ablation(folder: Path, rows: list[dict], notes: str, about: Provenance | None = None) -> list[Path]:
+def write_ablation(folder: Path, rows: list[dict], notes: str, provenance: Provenance | None = None) -> list[Path]:
     """Write ``ablation.md`` (below ``notes``), ``.csv``, ``.json`` and the plot ``.png`` into ``folder``; the paths."""
     summary, files = summarise(rows), [folder / f"ablation.{e}" for e in ("md", "csv", "json", "png")]
-    write_text(files[0], f"{notes}\n\n{table(summary)}")
+    write_text(files[0], f"{notes}\n\n{format_table(summary)}")
     write_csv(files[1], rows, COLUMNS)
     write_json(files[2], {"rows": rows, "summary": summary})
-    save(_figure(summary), files[3], about)
+    save(_figure(summary), files[3], provenance)
     return files
 
 
@@ -187,8 +187,8 @@ def _figure(summary: list[dict]) -> Any:
 # ---- How long the integrator takes for a frame of gaze, observer and camera in one place ----
 
 
-def frame_timer(
-    place: GazePlace,
+def make_frame_timer(
+    geometry: TrainingGeometry,
     centres: np.ndarray,
     folder: Path,
     cameras: int = 4,
@@ -204,16 +204,16 @@ def frame_timer(
     """
     import mitsuba as mi
 
-    if place.kind == "none" or (isinstance(place.medium, Place) and place.medium.medium is not None):
+    if geometry.kind == "none" or (isinstance(geometry.medium, SceneGeometry) and geometry.medium.medium is not None):
         return None
     rng = np.random.default_rng(seed)
     eyes, angles = centres[rng.integers(0, len(centres), cameras)], rng.uniform(0, 2 * np.pi, cameras)
 
     def render(checkpoint: Path) -> float:
-        integrator = {"type": "nerg", "aovs": "gaze", "radiance": False, **_medium(place, folder)}
+        integrator = {"type": "nerg", "aovs": "gaze", "radiance": False, **_medium(geometry, folder)}
         integrator["gaze"] = {"type": "gazefield", "filename": str(checkpoint)}
-        with mitsuba_says(checkpoint):
-            scene = mi.load_dict({"type": "scene", "integrator": integrator, **_shapes(place)})
+        with translate_mitsuba_errors(checkpoint):
+            scene = mi.load_dict({"type": "scene", "integrator": integrator, **_shapes(geometry)})
         times = []
         for eye, angle in [(eyes[0], angles[0]), *zip(eyes, angles)]:
             target = eye + (np.cos(angle), np.sin(angle), -0.1)
@@ -226,17 +226,17 @@ def frame_timer(
     return render
 
 
-def _medium(place: GazePlace, folder: Path) -> dict:
+def _medium(place: TrainingGeometry, folder: Path) -> dict:
     """What the integrator of ``place`` marches, as parameters of its plugin."""
     if place.kind == "field":
-        path = folder / place.about["field_file"]["file"]
-        return {"field": {"type": plugin_of_field(path), "filename": str(path)}}
+        path = folder / place.metadata["field_file"]["file"]
+        return {"field": {"type": choose_plugin(path), "filename": str(path)}}
     if place.kind == "hits":
-        return {"density": volume_dict(folder / place.about["geometry_file"]["file"])}
+        return {"density": make_volume_dict(folder / place.metadata["geometry_file"]["file"])}
     return {}
 
 
-def _shapes(place: GazePlace) -> dict:
+def _shapes(place: TrainingGeometry) -> dict:
     """The shapes of ``place``, as children of a scene."""
-    scene = place.medium.scene if isinstance(place.medium, Place) else None
+    scene = place.medium.scene if isinstance(place.medium, SceneGeometry) else None
     return {} if scene is None else {f"shape{i}": s for i, s in enumerate(scene.shapes())}

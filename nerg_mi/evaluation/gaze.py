@@ -11,7 +11,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField
-from nerg_mi.maths.arrays import vector_of
+from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.types import variant_types
@@ -20,9 +20,9 @@ from nerg_mi.probes.probes import Probes, place_probes
 from nerg_mi.rays.filters import purge, split_by_person
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
-from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.observer import ObserverSettings
-from nerg_mi.transport.observer_gaze import ObservedGaze, PlacedGaze
+from nerg_mi.transport.observer_gaze import ObservedGaze, GazeFieldInstance
 
 from . import metrics
 
@@ -36,7 +36,7 @@ from . import metrics
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Densities (P, D), 1/sr, of positions (P, 3) in directions (D, 3) or (P, D, 3)."""
 
-UNIFORM = 1.0 / (4.0 * np.pi)  # 1/sr
+UNIFORM_DENSITY = 1.0 / (4.0 * np.pi)  # 1/sr
 # Points in a leaf of a KD-tree, which decides the order of those that are equally far, and so the last bits of sums.
 _LEAF = 16
 
@@ -59,16 +59,16 @@ class CachedBaseline:
         return answer
 
 
-def uniform() -> Baseline:
+def make_uniform_baseline() -> Baseline:
     """The density that knows nothing: 1/(4π) everywhere."""
 
     def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        return np.full((len(np.atleast_2d(positions)), np.shape(directions)[-2]), UNIFORM)
+        return np.full((len(np.atleast_2d(positions)), np.shape(directions)[-2]), UNIFORM_DENSITY)
 
     return evaluate
 
 
-def position_blind(rays: Rays, *, kappa: float = 50.0, backend: Backend = None) -> Baseline:
+def make_position_blind_baseline(rays: Rays, *, kappa: float = 50.0, backend: Backend = None) -> Baseline:
     """One density for all positions: the KDE of all training rays, with ``kappa``
     (what people look at wherever they stand)."""
     # Runs of rays are separate mixtures averaged in float64: one sum of 10^5
@@ -87,7 +87,7 @@ def position_blind(rays: Rays, *, kappa: float = 50.0, backend: Backend = None) 
     return evaluate
 
 
-def nearest_probes(probes: Probes, k: int = 16, *, backend: Backend = None) -> Baseline:
+def make_nearest_probes_baseline(probes: Probes, k: int = 16, *, backend: Backend = None) -> Baseline:
     """Mean density of the ``k`` training probes nearest to a position; k = 1 is
     the nearest probe. Fewer where there are fewer probes."""
     from scipy.spatial import KDTree
@@ -112,7 +112,7 @@ def nearest_probes(probes: Probes, k: int = 16, *, backend: Backend = None) -> B
     return evaluate
 
 
-def nearest_rays(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: Backend = None) -> Baseline:
+def make_nearest_rays_baseline(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: Backend = None) -> Baseline:
     """KDE of the ``k`` training rays whose origins are nearest to a position: a
     probe without a radius, hard to beat where rays are many."""
     from scipy.spatial import KDTree
@@ -132,7 +132,7 @@ def nearest_rays(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: Bac
     return evaluate
 
 
-def standard_baselines(
+def make_standard_baselines(
     rays: Rays, radius: float, kappa: float = 20.0, blind_kappa: float = 50.0, seed: int = 0, count: int = 2048
 ) -> tuple[Baseline, dict[str, Baseline]]:
     """``(blind, baselines)``: the density that information is counted from, and by name all that a gaze field is shown
@@ -140,14 +140,14 @@ def standard_baselines(
     probes = place_probes(
         rays, radius, count=count, min_rays=min(64, len(rays)), kappa_rule="fixed", kappa=kappa, seed=seed
     )
-    blind = position_blind(rays, kappa=blind_kappa)
+    blind = make_position_blind_baseline(rays, kappa=blind_kappa)
     return blind, {
-        "uniform": uniform(),
-        "position-blind": position_blind(rays, kappa=kappa),
+        "uniform": make_uniform_baseline(),
+        "position-blind": make_position_blind_baseline(rays, kappa=kappa),
         f"position-blind, kappa {blind_kappa:g}": blind,
-        "nearest probe": nearest_probes(probes, 1),
-        "16 nearest probes": nearest_probes(probes, 16),
-        "4,096 nearest rays": nearest_rays(rays, 4096, kappa=kappa),
+        "nearest probe": make_nearest_probes_baseline(probes, 1),
+        "16 nearest probes": make_nearest_probes_baseline(probes, 16),
+        "4,096 nearest rays": make_nearest_rays_baseline(rays, 4096, kappa=kappa),
     }
 
 
@@ -196,7 +196,7 @@ class FieldDensity:
         field: AnyGazeField,
         medium,
         align: Similarity | None = None,
-        kind: str = "median",
+        depth_kind: str = "median",
         on_position: Callable[[int], None] | None = None,
     ):
         if medium is None and field.config.needs_surfaces:
@@ -204,9 +204,9 @@ class FieldDensity:
                 "this gaze field was trained among surfaces, and there is no place that has any: give it the field, "
                 "the scene or the geometry"
             )
-        self._gaze, self._place = PlacedGaze(field), medium if isinstance(medium, Place) else Place(medium)
-        march = default_settings(self._place)
-        self._settings = ObserverSettings(march=march, depth=kind, surface_opacity=SURFACE_OPACITY)
+        self._gaze, self._place = GazeFieldInstance(field), medium if isinstance(medium, SceneGeometry) else SceneGeometry(medium)
+        march = default_march_settings(self._place)
+        self._settings = ObserverSettings(march=march, depth=depth_kind, surface_opacity=SURFACE_OPACITY)
         self._align, self._on_position = align or Similarity(), on_position
         self._observed: dict[bytes, ObservedGaze] = {}
 
@@ -228,15 +228,15 @@ class FieldDensity:
         p_o, key = mi.Point3f(*position.tolist()), position.tobytes()
         new = key not in self._observed
         if new:
-            self._observed[key] = self._gaze.at([p_o], self._place, self._settings)
-        r_o = vector_of(mi.Vector3f, directions)
-        density = np.stack([np.array(m) for m in self._observed[key].members_along(p_o, r_o)])
+            self._observed[key] = self._gaze.for_observers([p_o], self._place, self._settings)
+        r_o = to_vector(mi.Vector3f, directions)
+        density = np.stack([np.array(m) for m in self._observed[key].evaluate_members_along(p_o, r_o)])
         if new and self._on_position is not None:
             self._on_position(len(self._observed))
         return density
 
 
-def score_table(rows: list[dict], title: str) -> str:
+def format_score_table(rows: list[dict], title: str) -> str:
     """``rows`` as a table for the terminal."""
     from rich.console import Console
     from rich.table import Table
@@ -260,8 +260,8 @@ def score_table(rows: list[dict], title: str) -> str:
 # are drawn whole, with all of their rays (Efron & Tibshirani 1993).
 
 SPLITS = ("both", "pos", "people")  # What may be new to a field: positions and people, positions, or people
-MAPS, RAYS = ("KLD", "CC", "SIM", "MAE"), ("NSS", "AUC", "sAUC", "bits", "loglik")
-SCORES = MAPS + RAYS
+MAP_SCORES, RAY_SCORES = ("KLD", "CC", "SIM", "MAE"), ("NSS", "AUC", "sAUC", "bits", "loglik")
+SCORES = MAP_SCORES + RAY_SCORES
 """KLD in nats and CC, SIM of densities normalised over the sphere; MAE in 1/sr of densities as they are; NSS; AUC-Judd;
 sAUC against rays of other test positions; bits a ray beyond the blind density; mean log density (nats of 1/sr)."""
 # Share of an evaluation's time that goes to the densities of methods that are quick; the rest goes to resamples.
@@ -276,20 +276,20 @@ class GazeTest:
     centres: np.ndarray  # Positions (P, 3), metres, in the rays' frame
     directions: np.ndarray  # Directions (D, 3) of equal area, in which maps are compared
     truth: np.ndarray  # True densities (P, D), 1/sr
-    parts: np.ndarray  # Those of each person alone (P, N, D)
+    participant_densities: np.ndarray  # Those of each person alone (P, N, D)
     counts: np.ndarray  # Rays of each person at each position (P, N)
-    persons: tuple[str, ...]  # Names of the persons
-    at: np.ndarray  # Rays drawn at each position (P, K, 3)
-    who: np.ndarray  # Whose they are (P, K), indices of the persons
-    others: np.ndarray  # Rays drawn at other positions (P, K, 3)
+    participants: tuple[str, ...]  # Names of the persons
+    sample_directions: np.ndarray  # Rays drawn at each position (P, K, 3)
+    sample_participants: np.ndarray  # Whose they are (P, K), indices of the persons
+    other_directions: np.ndarray  # Rays drawn at other positions (P, K, 3)
 
     @cached_property
-    def drawn(self) -> np.ndarray:
+    def query_directions(self) -> np.ndarray:
         """Rays that densities are asked for, (P, 2 K, 3): those drawn at each position, then those at others."""
-        return np.concatenate([self.at, self.others], axis=1)
+        return np.concatenate([self.sample_directions, self.other_directions], axis=1)
 
 
-def held_out_rays(rays: Rays, account: dict, split: str = "both", seed: int = 0) -> tuple[Rays, Rays, np.ndarray]:
+def select_held_out_rays(rays: Rays, holdout: dict, split: str = "both", seed: int = 0) -> tuple[Rays, Rays, np.ndarray]:
     """``(training rays, test rays, test centres)`` of a checkpoint's ``account`` of what it held out (``hold_out``).
 
     ``split``: ``both``: positions and people that are new; ``pos``: people who were trained on, at new positions;
@@ -297,14 +297,14 @@ def held_out_rays(rays: Rays, account: dict, split: str = "both", seed: int = 0)
     """
     if split not in SPLITS:
         raise NergError(f'the split must be one of {", ".join(SPLITS)}, got "{split}"')
-    centres, unseen = np.array(account["centres"]), np.zeros(len(rays), bool)
-    if account.get("people"):
-        unseen = split_by_person(rays, test_persons=account["people"])[1]
+    centres, unseen = np.array(holdout["centres"]), np.zeros(len(rays), bool)
+    if holdout.get("people"):
+        unseen = split_by_person(rays, test_persons=holdout["people"])[1]
     elif split != "pos":
         raise NergError(
             f'no people were held out of this training, so that there is no split "{split}"; train with --test-people'
         )
-    away = purge(rays, centres, account["purged_within"])
+    away = purge(rays, centres, holdout["purged_within"])
     train = rays.select(~unseen & away)
     if split == "people":
         scored = rays.select(unseen & away)
@@ -323,7 +323,7 @@ def make_test(
     kappa: float = 20.0,
     directions: int = 2048,
     min_rays: int = 64,
-    cap: int = 1024,
+    max_rays: int = 1024,
     seed: int = 0,
 ) -> GazeTest:
     """Truth around those of ``centres`` that have ``min_rays`` rays within ``radius`` metres, by kernels of ``kappa``.
@@ -335,7 +335,7 @@ def make_test(
     if not enough.any():
         raise NergError(f"none of {len(centres)} test positions has {min_rays} rays within {radius} m; lower min_rays")
     probes = place_probes(
-        rays, radius, queries=centres[enough], cap=cap, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query"
+        rays, radius, queries=centres[enough], max_rays=max_rays, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query"
     )
     d, rng = fibonacci_directions(directions), np.random.default_rng(seed)
     person = rays.person[probes.indices]
@@ -386,7 +386,7 @@ def evaluate_gaze(
     blind: Baseline,
     resamples: int = 200,
     seed: int = 0,
-    on_part: Callable[[float], None] | None = None,
+    on_progress: Callable[[float], None] | None = None,
 ) -> list[dict]:
     """One row a method: the scores of ``SCORES``, each with ``.low`` and ``.high`` of a 95 % interval, and the
     integral.
@@ -398,11 +398,11 @@ def evaluate_gaze(
     much the first method is above it, likewise. With fewer than three persons there are no intervals. ``on_part`` is
     told the share that is done.
     """
-    rng, N = np.random.default_rng(seed), len(test.persons)
-    told = on_part or (lambda share: None)
+    rng, N = np.random.default_rng(seed), len(test.participants)
+    told = on_progress or (lambda share: None)
     answers = _answers(test, methods, blind, lambda share: told(_ANSWERS * share))
     rows = [
-        {"method": name, **map_scores(test.truth, maps), **{k: float(v.mean()) for k, v in values.items()}}
+        {"method": name, **compute_map_scores(test.truth, maps), **{k: float(v.mean()) for k, v in values.items()}}
         for name, maps, values in answers
     ]
     boot = [[] for _ in answers]
@@ -412,11 +412,11 @@ def evaluate_gaze(
         share = test.counts * times
         held = share.sum(axis=1) > 0
         share = share[held] / share[held].sum(axis=1, keepdims=True)
-        truth, weight = np.einsum("pn,pnd->pd", share, test.parts[held]), times[test.who].astype(float)
+        truth, weight = np.einsum("pn,pnd->pd", share, test.participant_densities[held]), times[test.sample_participants].astype(float)
         for kept, (_, maps, values) in zip(boot, answers):
             kept.append(
                 {
-                    **map_scores(truth, maps[held]),
+                    **compute_map_scores(truth, maps[held]),
                     **{k: float((v * weight).sum() / weight.sum()) for k, v in values.items()},
                 }
             )
@@ -446,34 +446,34 @@ def _answers(
     test: GazeTest, methods: dict[str, Baseline], blind: Baseline, on_part: Callable[[float], None] | None = None
 ) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
     """``(name, maps (P, D), ray scores (P, K) by name)`` of each method. ``on_part`` is told the share that is done."""
-    K = test.at.shape[1]
-    ask = lambda method: [np.asarray(method(test.centres, v), np.float64) for v in (test.directions, test.drawn)]
+    K = test.sample_directions.shape[1]
+    ask = lambda method: [np.asarray(method(test.centres, v), np.float64) for v in (test.directions, test.query_directions)]
     maps, at = ask(blind)
-    log_blind, out = _log(at[:, :K], maps), []
+    log_prior, out = _log(at[:, :K], maps), []
     for name, method in methods.items():
         maps, at = ask(method)
-        out.append((name, maps, ray_scores(maps, at[:, :K], at[:, K:], log_blind)))
+        out.append((name, maps, compute_ray_scores(maps, at[:, :K], at[:, K:], log_prior)))
         if on_part is not None:
             on_part(len(out) / len(methods))
     return out
 
 
-def person_rows(test: GazeTest, methods: dict[str, Baseline], blind: Baseline, min_rays: int = 64) -> list[dict]:
+def score_participants(test: GazeTest, methods: dict[str, Baseline], blind: Baseline, min_rays: int = 64) -> list[dict]:
     """One row a method and person: the person's rays, scored; map scores at positions of ``min_rays`` such rays."""
     rows = []
     for name, maps, values in _answers(test, methods, blind):
-        for i, person in enumerate(test.persons):
-            own, enough = test.who == i, test.counts[:, i] >= min_rays
-            scores = dict.fromkeys(MAPS, float("nan"))
+        for i, person in enumerate(test.participants):
+            own, enough = test.sample_participants == i, test.counts[:, i] >= min_rays
+            scores = dict.fromkeys(MAP_SCORES, float("nan"))
             if enough.any():
-                scores = map_scores(test.parts[enough, i], maps[enough])
+                scores = compute_map_scores(test.participant_densities[enough, i], maps[enough])
             rays = {k: float(v[own].mean()) if own.any() else float("nan") for k, v in values.items()}
             rows.append({"method": name, "person": person, "rays": int(test.counts[:, i].sum()), **scores, **rays})
     return rows
 
 
-def split_half(
-    test_side: Rays,
+def score_split_half(
+    test_rays: Rays,
     centres: np.ndarray,
     radius: float,
     kappa: float,
@@ -483,9 +483,9 @@ def split_half(
 ) -> dict | None:
     """Scores of one half of the people of ``test_side`` as predicted by the other, where both have ``min_rays`` rays: a
     reference and no bound. None where there is no such position, or only one person."""
-    if len(np.unique(test_side.person)) < 2:
+    if len(np.unique(test_rays.person)) < 2:
         return None
-    halves = [test_side.select(mask) for mask in split_by_person(test_side, seed=seed)]
+    halves = [test_rays.select(mask) for mask in split_by_person(test_rays, seed=seed)]
     both = np.logical_and(*(_enough(half, centres, radius, min_rays) for half in halves))
     if not both.any():
         return None
@@ -498,7 +498,7 @@ def split_half(
     return {k: v for k, v in row.items() if "." not in k}
 
 
-def map_scores(truth: np.ndarray, maps: np.ndarray) -> dict[str, float]:
+def compute_map_scores(truth: np.ndarray, maps: np.ndarray) -> dict[str, float]:
     """Means over positions of the scores of ``MAPS``."""
     return {
         "KLD": float(metrics.kld(truth, maps, eps=EPS).mean()),
@@ -508,17 +508,17 @@ def map_scores(truth: np.ndarray, maps: np.ndarray) -> dict[str, float]:
     }
 
 
-def ray_scores(maps: np.ndarray, at: np.ndarray, others: np.ndarray, log_blind: np.ndarray) -> dict[str, np.ndarray]:
+def compute_ray_scores(maps: np.ndarray, sample_densities: np.ndarray, other_densities: np.ndarray, log_prior: np.ndarray) -> dict[str, np.ndarray]:
     """The scores of ``RAYS`` of each ray, (P, K), from the densities ``maps`` (P, D), at the rays ``at`` (P, K), and at
     rays that were seen from elsewhere, ``others`` (P, M). AUC of a ray: the share of the sphere whose density is lower,
     ties half; their mean is AUC-Judd with as many thresholds as there are values."""
-    log = _log(at, maps)
-    below = lambda among: np.stack([_share_below(a, g) for a, g in zip(among, at)])
+    log = _log(sample_densities, maps)
+    below = lambda among: np.stack([_share_below(a, g) for a, g in zip(among, sample_densities)])
     return {
-        "NSS": metrics.nss(maps, at),
+        "NSS": metrics.nss(maps, sample_densities),
         "AUC": below(maps),
-        "sAUC": below(others),
-        "bits": (log - log_blind) / np.log(2),
+        "sAUC": below(other_densities),
+        "bits": (log - log_prior) / np.log(2),
         "loglik": log,
     }
 

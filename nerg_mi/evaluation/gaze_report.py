@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.figures.style import Provenance, find_colors, new_page, save
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.figures.style import Provenance, find_colormap, new_page, save
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.safe_read import is_count, read_json
-from nerg_mi.files.tables import markdown_table, write_csv, write_json
+from nerg_mi.files.tables import format_markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid
-from nerg_mi.probes.probes import LEVELS, level_name
+from nerg_mi.probes.probes import REGION_LEVELS, format_level
 
 from .gaze import SCORES, Baseline, GazeTest
-from .uncertainty import KEPT
+from .uncertainty import RETAINED_FRACTIONS
 
 # ---- What an evaluation of gaze writes: tables as Markdown, CSV and JSON, and pictures of truth and prediction ----
 
@@ -27,11 +27,11 @@ _DIGITS = {"MAE": 4}  # Digits of the scores that have others than three
 _WORDS = ("method", "person", "signal", "error")  # Columns that hold words
 
 
-def markdown(rows: list[dict], columns: tuple[str, ...] = ("method", *SCORES, "integral")) -> str:
+def format_table(rows: list[dict], columns: tuple[str, ...] = ("method", *SCORES, "integral")) -> str:
     """A table of ``rows``, with intervals in brackets where they are known."""
     shown = [c for c in columns if any(c in r for r in rows)]
     numbers = [c for c in shown if c not in _WORDS]
-    return markdown_table(shown, ([_cell(row, c) for c in shown] for row in rows), numbers) + "\n"
+    return format_markdown_table(shown, ([_cell(row, c) for c in shown] for row in rows), numbers) + "\n"
 
 
 def _cell(row: dict, column: str) -> str:
@@ -50,8 +50,8 @@ def _cell(row: dict, column: str) -> str:
 def write_report(
     folder: Path,
     rows: list[dict],
-    persons: list[dict],
-    about: dict,
+    participants: list[dict],
+    metadata: dict,
     notes: str,
     positions: list[dict] | None = None,
     ranks: list[dict] | None = None,
@@ -67,43 +67,43 @@ def write_report(
     ours, bar = rows[0], next(r["method"] for r in reversed(rows) if r["method"] != "split half")
     difference = {k.replace(".less", ""): v for k, v in ours.items() if ".less" in k}
     differences = [{"method": f"{ours['method']} less {bar}", **difference}]
-    each = markdown(persons, ("method", "person", "rays", "KLD", "CC", "NSS", "AUC", "bits", "loglik"))
-    text = f"{notes}\n\n{markdown(rows)}\n{markdown(differences)}\n{uncertainty_text(ranks, regions)}"
+    each = format_table(participants, ("method", "person", "rays", "KLD", "CC", "NSS", "AUC", "bits", "loglik"))
+    text = f"{notes}\n\n{format_table(rows)}\n{format_table(differences)}\n{format_uncertainty(ranks, regions)}"
     write_text(files[0], f"{text}## Each person\n\n{each}")
-    for path, table in zip((*files[1:3], files[4]), (rows, persons, positions)):
+    for path, table in zip((*files[1:3], files[4]), (rows, participants, positions)):
         write_csv(path, table)
-    of_all = {"methods": rows, "persons": persons, "uncertainty": ranks, "calibration": regions}
-    write_json(files[3], {**about, **of_all})
+    of_all = {"methods": rows, "persons": participants, "uncertainty": ranks, "calibration": regions}
+    write_json(files[3], {**metadata, **of_all})
     return files
 
 
-def uncertainty_text(ranks: list[dict], regions: list[dict]) -> str:
+def format_uncertainty(ranks: list[dict], regions: list[dict]) -> str:
     """What a page says of rows of `uncertainty.rank_rows` and `uncertainty.calibration_rows`, as Markdown."""
     text = ""
     if ranks:
-        shares = tuple(f"{share:.0%}" for share in KEPT)
+        shares = tuple(f"{share:.0%}" for share in RETAINED_FRACTIONS)
         text += (
             "## Uncertainty\n\nrho: Spearman's rank correlation of what makes unsure (little support; a wide spread of "
             "an ensemble's members) with the error at a position: KLD, or its excess over that of half of the people "
             "under the other half. Then the mean error of the surest positions. A signal that is the same everywhere "
-            f"has no rho.\n\n{markdown(ranks, ('signal', 'error', 'positions', 'rho', *shares))}\n"
+            f"has no rho.\n\n{format_table(ranks, ('signal', 'error', 'positions', 'rho', *shares))}\n"
         )
     if regions:
         text += (
             "## Calibration\n\nShare of the rays in the smallest regions that are said to hold so much of the gaze; "
             '"calibrated": that should hold so much, by what the training held out.'
-            f"\n\n{markdown(regions, ('method', *(level_name(level) for level in LEVELS)))}\n"
+            f"\n\n{format_table(regions, ('method', *(format_level(level) for level in REGION_LEVELS)))}\n"
         )
     return text
 
 
-def side_by_side(
+def draw_comparison(
     test: GazeTest,
     methods: dict[str, Baseline],
     path: Path,
     count: int = 4,
     height: int = 48,
-    about: Provenance | None = None,
+    provenance: Provenance | None = None,
 ) -> None:
     """Truth and each of ``methods`` at ``count`` test positions, as panoramas (z up) on one scale a row, in 1/sr, with
     how many rays of how many people the truth is made of."""
@@ -120,7 +120,7 @@ def side_by_side(
         top, images = np.quantile(pictures[0][1][i], 0.995), []
         for (name, maps), axis in zip(pictures, row):
             shown = maps[i].reshape(height, 2 * height)
-            images.append(axis.imshow(shown, vmin=0, vmax=top, cmap=find_colors("inferno")))
+            images.append(axis.imshow(shown, vmin=0, vmax=top, cmap=find_colormap("inferno")))
             axis.set(xticks=[], yticks=[])
             if i == 0:
                 axis.set_title(name, fontsize=10)
@@ -128,12 +128,12 @@ def side_by_side(
         words = f"{rays.sum():,.0f} rays of {np.count_nonzero(rays)} people"
         row[0].set_ylabel(", ".join(f"{x:.1f}" for x in test.centres[which[i]]) + f" m\n{words}", fontsize=8)
         figure.colorbar(images[-1], ax=row.tolist(), shrink=0.9).set_label("1/sr", fontsize=8)
-    save(figure, path, about)
+    save(figure, path, provenance)
 
 
 # ---- What `nerg eval gaze` has written, read again: the file ``gaze.json`` of its folder ----
 
-MOST = 4 << 20  # So many bytes of such a file are read at most
+MAX_FILE_BYTES = 4 << 20  # So many bytes of such a file are read at most
 
 _ROWS = 20_000
 _WORD = 200
@@ -148,16 +148,16 @@ class GazeResults:
     gaze: str
     sha256: str
     split: str
-    positions: int
-    people: int
+    num_positions: int
+    num_participants: int
     kappa: float
     rows: tuple[dict[str, Any], ...]
-    persons: tuple[dict[str, Any], ...]
+    participant_rows: tuple[dict[str, Any], ...]
 
 
 def read_results(path: str | Path) -> GazeResults:
     """The results in ``path``. Raises `NergError` for a file that holds none."""
-    found = read_json(path, "evaluation", MOST)
+    found = read_json(path, "evaluation", MAX_FILE_BYTES)
     if not isinstance(found, dict):
         raise _damaged(path, "it is no JSON object")
     missing = [k for k in ("gaze", "split", "positions", "methods") if k not in found]
@@ -184,7 +184,7 @@ def _rows(given: object, path: str | Path, name: str) -> tuple[dict[str, Any], .
         for key, value in row.items():
             text = key in ("method", "person")
             if not (isinstance(value, str) and len(value) <= _WORD if text else value is None or _is_number(value)):
-                raise _damaged(path, f'"{plain(key, 40)}" of a row of its "{name}" is {plain(value, 40)}')
+                raise _damaged(path, f'"{sanitize(key, 40)}" of a row of its "{name}" is {sanitize(value, 40)}')
     return tuple(given)
 
 
@@ -220,14 +220,14 @@ def _damaged(path: str | Path, why: str) -> NergError:
 # place of 1.96 (Hesterberg, What Teachers Should Know About the Bootstrap, 2015). Where only the two methods' own
 # intervals are known, the reach of the lead is the sum of theirs, which is never too small.
 
-LEAST_PEOPLE, LEAST_POSITIONS = 5, 10  # Below these there is no verdict
+MIN_PARTICIPANTS, MIN_POSITIONS = 5, 10  # Below these there is no verdict
 
-DECIDING = {"bits": 1, "CC": 1, "KLD": -1}  # The scores that decide, and whether more (1) or less (-1) is better
+VERDICT_SCORES = {"bits": 1, "CC": 1, "KLD": -1}  # The scores that decide, and whether more (1) or less (-1) is better
 
-UNIFORM, BLIND, NEAREST, HALF = "uniform", "position-blind", "4,096 nearest rays", "split half"
+UNIFORM, POSITION_BLIND, NEAREST_RAYS, SPLIT_HALF = "uniform", "position-blind", "4,096 nearest rays", "split half"
 """Names of the methods that a field is compared with."""
 
-WORDS = {
+SPLIT_LABELS = {
     "both": "new people at new places",
     "pos": "known people at new places",
     "people": "new people at places where others were",
@@ -238,7 +238,7 @@ BETTER, WORSE, UNDECIDED = "better", "worse", "undecided"
 
 
 @dataclass(frozen=True)
-class Lead:
+class ScoreDifference:
     """By how much the field is ahead of a reference in one score, positive where it is better, and its 95 % interval;
     NaN where it is not known."""
 
@@ -258,12 +258,12 @@ class Comparison:
     """The field beside one ``reference``."""
 
     reference: str
-    leads: tuple[Lead, ...]
+    differences: tuple[ScoreDifference, ...]
 
     @property
     def outcome(self) -> str:
         """`BETTER`, `WORSE` or `UNDECIDED`, by at least two scores and none against them."""
-        found = [lead.outcome for lead in self.leads]
+        found = [lead.outcome for lead in self.differences]
         for one, other in ((BETTER, WORSE), (WORSE, BETTER)):
             if found.count(one) >= 2 and other not in found:
                 return one
@@ -279,70 +279,70 @@ class Verdict:
     grade: str
     sentence: str
     comparisons: tuple[Comparison, ...] = ()
-    half: float | None = None
+    split_half_fraction: float | None = None
 
 
-def judge(rows: Sequence[Mapping[str, Any]], split: str, people: int, positions: int) -> Verdict:
+def compute_verdict(rows: Sequence[Mapping[str, Any]], split: str, num_participants: int, num_positions: int) -> Verdict:
     """The verdict on the first of ``rows``, the field's, beside the others, which are told apart by ``method``.
 
     ``split``: a word of `WORDS`; ``people``, ``positions``: in the test.
     """
-    whom = WORDS.get(split, split)
-    if people < LEAST_PEOPLE or positions < LEAST_POSITIONS:
+    whom = SPLIT_LABELS.get(split, split)
+    if num_participants < MIN_PARTICIPANTS or num_positions < MIN_POSITIONS:
         return Verdict(
             "none",
-            f"No verdict for {whom}: {_count(people, 'person', 'people')} at {_count(positions, 'place', 'places')} "
-            f"are too few; it takes {LEAST_PEOPLE} people and {LEAST_POSITIONS} places.",
+            f"No verdict for {whom}: {_count(num_participants, 'person', 'people')} at {_count(num_positions, 'place', 'places')} "
+            f"are too few; it takes {MIN_PARTICIPANTS} people and {MIN_POSITIONS} places.",
         )
     field, blind, strongest = rows[0], _blind(rows), _strongest(rows)
-    found = {name: _row(rows, name) for name in (UNIFORM, NEAREST)}
-    compare = lambda name, row: Comparison(name, tuple(lead_of(field, row, score, people) for score in DECIDING))
-    pairs = [(UNIFORM, found[UNIFORM]), (BLIND, blind), (NEAREST, found[NEAREST])]
+    found = {name: _row(rows, name) for name in (UNIFORM, NEAREST_RAYS)}
+    compare = lambda name, row: Comparison(name, tuple(compare_scores(field, row, score, num_participants) for score in VERDICT_SCORES))
+    pairs = [(UNIFORM, found[UNIFORM]), (POSITION_BLIND, blind), (NEAREST_RAYS, found[NEAREST_RAYS])]
     if strongest not in ("", *(name for name, _ in pairs)):
         pairs.append((strongest, _row(rows, strongest)))
     comparisons = tuple(compare(name, row) for name, row in pairs if row is not None)
-    half = _way_to_half(field, blind, _row(rows, HALF))
-    grade, sentence = _words(comparisons, strongest, whom, people)
+    half = _way_to_half(field, blind, _row(rows, SPLIT_HALF))
+    grade, sentence = _words(comparisons, strongest, whom, num_participants)
     return Verdict(grade, sentence, comparisons, half)
 
 
-def lead_of(field: Mapping[str, Any], other: Mapping[str, Any], score: str, people: int) -> Lead:
+def compare_scores(field: Mapping[str, Any], other: Mapping[str, Any], score: str, num_participants: int) -> ScoreDifference:
     """The lead of the row ``field`` before the row ``other`` in ``score``, with an interval for so many ``people``."""
-    sign, nan = DECIDING[score], math.nan
+    sign, nan = VERDICT_SCORES[score], math.nan
     value = sign * (_number(field, score) - _number(other, score))
     reach = _reach(other, f"{score}.gap")
     if math.isnan(reach):
         reach = _reach(field, score) + _reach(other, score)
-    if math.isnan(value) or math.isnan(reach) or people < 2:
-        return Lead(score, value, nan, nan)
-    reach *= widening(people)
-    return Lead(score, value, value - reach, value + reach)
+    if math.isnan(value) or math.isnan(reach) or num_participants < 2:
+        return ScoreDifference(score, value, nan, nan)
+    reach *= small_sample_factor(num_participants)
+    return ScoreDifference(score, value, value - reach, value + reach)
 
 
-def widening(people: int) -> float:
+def small_sample_factor(num_participants: int) -> float:
     """How much wider the interval of a mean over so many ``people`` is than 1.96 standard errors of their bootstrap."""
     from scipy.special import stdtrit
 
-    return float(math.sqrt(people / (people - 1)) * stdtrit(people - 1, 0.975) / 1.96)
+    return float(math.sqrt(num_participants / (num_participants - 1)) * stdtrit(num_participants - 1, 0.975) / 1.96)
 
 
 def _words(comparisons: Sequence[Comparison], strongest: str, whom: str, people: int) -> tuple[str, str]:
     outcome = {c.reference: c.outcome for c in comparisons}
-    if BLIND not in outcome:
+    if POSITION_BLIND not in outcome:
         return "none", f"No verdict for {whom}: the evaluation has no position-blind density to compare with."
-    for name, words in ((UNIFORM, "worse than knowing nothing"), (BLIND, "worse than position-blind")):
+    for name, words in ((UNIFORM, "worse than knowing nothing"), (POSITION_BLIND, "worse than position-blind")):
         if outcome.get(name) == WORSE:
             return "reject", f"{words.capitalize()} for {whom}: do not use."
-    if outcome[BLIND] == UNDECIDED:
+    if outcome[POSITION_BLIND] == UNDECIDED:
         return (
             "unclear",
             f"Not shown to be better than position-blind for {whom}: do not rely on where people stand without more of "
             "them.",
         )
-    if NEAREST not in outcome:
+    if NEAREST_RAYS not in outcome:
         return "limited", f"Better than position-blind for {whom}; it was not compared with nearest rays."
-    others = {name: result for name, result in outcome.items() if name not in (UNIFORM, BLIND)}
-    shown = {NEAREST: "nearest rays"}
+    others = {name: result for name, result in outcome.items() if name not in (UNIFORM, POSITION_BLIND)}
+    shown = {NEAREST_RAYS: "nearest rays"}
     for name, result in others.items():
         if result == WORSE:
             worse = shown.get(name, name)
@@ -356,22 +356,22 @@ def _words(comparisons: Sequence[Comparison], strongest: str, whom: str, people:
             )
     if not strongest:
         return "use", f"Better than nearest rays for {whom}."
-    rest = "" if strongest == NEAREST else "and than nearest rays "
+    rest = "" if strongest == NEAREST_RAYS else "and than nearest rays "
     return "use", f"Better than {shown.get(strongest, strongest)}, the strongest baseline, {rest}for {whom}."
 
 
 def _strongest(rows: Sequence[Mapping[str, Any]]) -> str:
     """The baseline whose log score is the highest, by its name; "" where none has one. The other half of the people is
     no baseline, and kernels of the position-blind density have one name."""
-    scored = [r for r in rows[1:] if r.get("method") != HALF and not math.isnan(_number(r, "bits"))]
+    scored = [r for r in rows[1:] if r.get("method") != SPLIT_HALF and not math.isnan(_number(r, "bits"))]
     best = max(scored, key=lambda r: _number(r, "bits"), default={})
     name = str(best.get("method", ""))
-    return BLIND if name.startswith(BLIND) else name
+    return POSITION_BLIND if name.startswith(POSITION_BLIND) else name
 
 
 def _blind(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
     """The position-blind density whose log score is the highest."""
-    found = [r for r in rows[1:] if str(r.get("method", "")).startswith(BLIND)]
+    found = [r for r in rows[1:] if str(r.get("method", "")).startswith(POSITION_BLIND)]
     known = [r for r in found if not math.isnan(_number(r, "bits"))]
     return max(known or found, key=lambda r: _number(r, "bits"), default=None)
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.figures.overlay import srgb, write_png
-from nerg_mi.figures.style import provenance
+from nerg_mi.figures.style import make_provenance
 from nerg_mi.files.atomic import make_folder
-from nerg_mi.maths.color import mean_score, psnr, psnr_of_fitted_half
-from nerg_mi.photos.cameras import PosedCamera, pixel_directions, sensor_dict
-from nerg_mi.photos.images import PhotoView, pinhole, through_lens
+from nerg_mi.maths.color import mean_ignoring_nan, psnr, color_corrected_psnr
+from nerg_mi.photos.cameras import PosedCamera, pixel_directions, make_sensor_dict
+from nerg_mi.photos.images import PhotoView, make_pinhole_camera, apply_lens
 
 # ---- Images ----
 #
@@ -59,12 +59,12 @@ class DepthScore:
 
     median: float
     mean: float
-    off: float
+    outlier_fraction: float
     opacity: float
-    translucent: float
+    translucent_fraction: float
 
 
-def depth_score(depth: np.ndarray, opacity: np.ndarray, truth: np.ndarray) -> DepthScore | None:
+def compute_depth_score(depth: np.ndarray, opacity: np.ndarray, truth: np.ndarray) -> DepthScore | None:
     """Score of ``depth`` (h, w), 0 where there is none, against ``truth`` (h, w), 0 where unknown; None if nowhere
     known."""
     known = truth > 0
@@ -83,7 +83,7 @@ def depth_score(depth: np.ndarray, opacity: np.ndarray, truth: np.ndarray) -> De
 
 
 @dataclass(frozen=True)
-class Rendered:
+class RenderedView:
     """``color`` (h, w, 3): sRGB before black, composited as a picture with alpha is; ``depth`` (h, w): the
     integrator's default, the median, from the camera's centre, scene units; ``opacity`` (h, w); ``mask``: pixels that
     could be rendered."""
@@ -97,7 +97,7 @@ class Rendered:
 _LAUNCH = 1 << 23  # Samples that are rendered at once: the memory for those of a whole picture may not be there
 
 
-class Renderer:
+class FieldRenderer:
     """Renders the field in a checkpoint as the cameras of a data set see it. Needs a Mitsuba variant."""
 
     def __init__(self, field: str | Path, spp: int = 16):
@@ -105,20 +105,20 @@ class Renderer:
 
         self.spp = spp
         integrator = {"type": "nerg", "field": {"type": "nerf", "filename": str(field)}, "aovs": "depth,opacity"}
-        with mitsuba_says(field):
+        with translate_mitsuba_errors(field):
             self.scene = mi.load_dict({"type": "scene", "integrator": integrator})
 
-    def __call__(self, camera: PosedCamera, seed: int = 0) -> Rendered:
+    def __call__(self, camera: PosedCamera, seed: int = 0) -> RenderedView:
         """``camera``'s picture, ``spp`` rays a pixel."""
         import drjit as dr
         import mitsuba as mi
 
         i = camera.intrinsics
         plain = not i.is_distorted and abs(i.fx / i.fy - 1) < 1e-9
-        source = camera if plain else pinhole(camera)
-        about = sensor_dict(source)
+        source = camera if plain else make_pinhole_camera(camera)
+        about = make_sensor_dict(source)
         about["sampler"] = {"type": "multijitter", "sample_count": self.spp}
-        with mitsuba_says():
+        with translate_mitsuba_errors():
             sensor = mi.load_dict(about)
         params = mi.traverse(sensor)
         to_world: Any = params["to_world"]
@@ -131,7 +131,7 @@ class Renderer:
         out = np.zeros(())
         for first in range(0, self.spp, each):
             count = min(each, self.spp - first)
-            with mitsuba_says():
+            with translate_mitsuba_errors():
                 part = mi.render(self.scene, sensor=sensor, spp=count, seed=mi.UInt32(seed + first))
                 out = out + np.array(part, np.float64) * (count / self.spp)
             # Mitsuba takes Ctrl-C while it renders.
@@ -144,9 +144,9 @@ class Renderer:
         along = -pixel_directions(source.intrinsics)[..., 2]
         depth = np.where(opacity > 0, out[..., 3] + about["near_clip"] / along, 0)
         if plain:
-            return Rendered(color, depth, opacity, np.ones(opacity.shape, bool))
-        stacked, mask = through_lens(np.dstack([color, depth, opacity]).astype(np.float32), source, camera)
-        return Rendered(np.clip(stacked[..., :3], 0, 1), stacked[..., 3], np.clip(stacked[..., 4], 0, 1), mask)
+            return RenderedView(color, depth, opacity, np.ones(opacity.shape, bool))
+        stacked, mask = apply_lens(np.dstack([color, depth, opacity]).astype(np.float32), source, camera)
+        return RenderedView(np.clip(stacked[..., :3], 0, 1), stacked[..., 3], np.clip(stacked[..., 4], 0, 1), mask)
 
 
 @dataclass(frozen=True)
@@ -166,17 +166,17 @@ class ViewScores:
     @property
     def psnr_mean(self) -> float:
         """The mean over the views, in dB."""
-        return mean_score(self.psnr)
+        return mean_ignoring_nan(self.psnr)
 
     @property
     def psnr_fitted_mean(self) -> float:
         """The mean over the views whose colours could be fitted, in dB."""
-        return mean_score(self.psnr_fitted)
+        return mean_ignoring_nan(self.psnr_fitted)
 
     @property
     def ssim_mean(self) -> float:
         """The mean over the views that have one."""
-        return mean_score(self.ssim)
+        return mean_ignoring_nan(self.ssim)
 
     def to_dict(self) -> dict:
         """For JSON: the fields and the means; without ``depth`` where it is None."""
@@ -190,29 +190,29 @@ def score_views(
     field: str | Path,
     views: list[PhotoView],
     spp: int = 16,
-    pictures: Path | None = None,
+    picture_folder: Path | None = None,
     on_view: Callable[[str, float, float], None] = lambda name, psnr, ssim: None,
 ) -> ViewScores:
     """Scores of the field in a checkpoint on ``views``; writes each picture beside its truth into the folder
     ``pictures``. ``on_view`` is told each view's name, PSNR in dB and SSIM. Raises `NergError` without any view."""
     if not views:
         raise NergError("there are no views to score; the data set holds none out, so give --holdout 8 or --train")
-    render, rows, depths = Renderer(field, spp), [], []
+    render, rows, depths = FieldRenderer(field, spp), [], []
     text: dict[str, str] = {}
-    if pictures is not None:
-        make_folder(pictures)
-        text = provenance("nerg eval radiance", [field], None, {"spp": spp}).text()
+    if picture_folder is not None:
+        make_folder(picture_folder)
+        text = make_provenance("nerg eval radiance", [field], None, {"spp": spp}).text()
     for k, view in enumerate(views):
-        seen, truth = render(view.camera, k), view.over(0)
+        seen, truth = render(view.camera, k), view.composite_over(0)
         mask = seen.mask if view.mask is None else seen.mask & view.mask
         alpha = view.color[..., 3] if view.has_alpha else None
-        fitted = psnr_of_fitted_half(seen.color, truth, alpha, mask)
+        fitted = color_corrected_psnr(seen.color, truth, alpha, mask)
         rows.append((psnr(seen.color, truth, mask), ssim(seen.color, truth, mask), fitted))
         if view.depth is not None:
-            depths.append(depth_score(seen.depth, seen.opacity, np.where(mask, view.depth, 0)))
-        if pictures is not None:
+            depths.append(compute_depth_score(seen.depth, seen.opacity, np.where(mask, view.depth, 0)))
+        if picture_folder is not None:
             both = np.concatenate([seen.color, truth], axis=1)
-            write_png(pictures / f"{Path(view.name).stem}.png", both, text)
+            write_png(picture_folder / f"{Path(view.name).stem}.png", both, text)
         on_view(view.name, *rows[-1][:2])
     known = [d for d in depths if d is not None]
     return ViewScores(

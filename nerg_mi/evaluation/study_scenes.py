@@ -13,9 +13,9 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Box
-from nerg_mi.transport.observer_gaze import PlacedGaze
+from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
-NUMPY = SimpleNamespace(select=np.where, exp=np.exp)  # The functions that densities use, as Dr.Jit names them
+NUMPY_FUNCTIONS = SimpleNamespace(select=np.where, exp=np.exp)  # The functions that densities use, as Dr.Jit names them
 
 # Linear radiance at the box's lower corner, and what it gains along x, y, z.
 COLOR_BASE = np.array([0.1, 0.2, 0.15])
@@ -40,10 +40,10 @@ class AnalyticScene:
     target: tuple = (0.5, 0.5, 0.45)
     observer: tuple = (-0.7, -0.9, 0.7)
     fov: float = 42.0
-    opaque: bool = False
+    is_opaque: bool = False
 
 
-def color(p: np.ndarray) -> np.ndarray:
+def evaluate_color(p: np.ndarray) -> np.ndarray:
     """Linear radiance (..., 3) at points (..., 3)."""
     return COLOR_BASE + p @ COLOR_SLOPE.T
 
@@ -108,7 +108,7 @@ def _fog(x, y, z, ns):
 
 
 def _fog_optical_depth(o, d, a, b):
-    first = _fog(None, None, o[:, 2] + d[:, 2] * a, NUMPY)
+    first = _fog(None, None, o[:, 2] + d[:, 2] * a, NUMPY_FUNCTIONS)
     x = d[:, 2] * (b - a) / FOG_HEIGHT
     small = np.abs(x) < 1e-6
     return first * (b - a) * np.where(small, 1 - x / 2, -np.expm1(-x) / np.where(small, 1, x))
@@ -126,9 +126,9 @@ SCENES = {
     s.name: s
     for s in (
         AnalyticScene("slab", _slab, _no_breaks),
-        AnalyticScene("sphere", _sphere, _sphere_breaks, opaque=True, observer=(-0.9, -0.3, 0.7)),
+        AnalyticScene("sphere", _sphere, _sphere_breaks, is_opaque=True, observer=(-0.9, -0.3, 0.7)),
         AnalyticScene(
-            "sheets", _sheets, _sheets_breaks, opaque=True, camera=(0.75, -1.5, 0.95), observer=(0.2, -1.2, 0.3)
+            "sheets", _sheets, _sheets_breaks, is_opaque=True, camera=(0.75, -1.5, 0.95), observer=(0.2, -1.2, 0.3)
         ),
         AnalyticScene("fog", _fog, _no_breaks, _fog_optical_depth),
         AnalyticScene("ramp", _ramp, _no_breaks, _ramp_optical_depth),
@@ -187,7 +187,7 @@ def _volumes(variant: str):
             rows = dr.width(field.parameters()["grid.table"])
             table = 2 * np.random.default_rng(1).normal(size=rows).astype(np.float32)
             field.set_parameters({"grid.table": ns.Float(table)})
-            self._gaze = PlacedGaze(field)
+            self._gaze = GazeFieldInstance(field)
 
         def placed_gaze(self):
             return self._gaze
@@ -195,7 +195,7 @@ def _volumes(variant: str):
     return SimpleNamespace(density=Density, color=lambda: Affine(mi.Properties()), gaze=lambda: Gaze(mi.Properties()))
 
 
-def volumes(scene: AnalyticScene, resolution: int = 0) -> dict:
+def make_volumes(scene: AnalyticScene, resolution: int = 0) -> dict:
     """``density``, ``color`` and ``gaze`` of the integrator; with a ``resolution`` the density is a ``gridvolume`` of
     so many voxels along an edge, holding the exact density at their centres."""
     import mitsuba as mi
@@ -205,7 +205,7 @@ def volumes(scene: AnalyticScene, resolution: int = 0) -> dict:
     if resolution:
         x = (np.arange(resolution) + 0.5) / resolution
         z, y, x = np.meshgrid(x, x, x, indexing="ij")
-        values = np.broadcast_to(scene.density(x, y, z, NUMPY), x.shape)
+        values = np.broadcast_to(scene.density(x, y, z, NUMPY_FUNCTIONS), x.shape)
         grid = mi.VolumeGrid(np.ascontiguousarray(values[..., None], np.float32))
         density = mi.load_dict({"type": "gridvolume", "grid": grid, "filter_type": "trilinear", "wrap_mode": "clamp"})
     return {"density": density, "color": made.color(), "gaze": made.gaze()}

@@ -10,34 +10,34 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.safe_read import real_path
+from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.depth import DEPTHS
-from nerg_mi.transport.geometry import Place
-from nerg_mi.transport.observer import center
-from nerg_mi.transport.occlusion import EXACT
+from nerg_mi.transport.geometry import SceneGeometry
+from nerg_mi.transport.observer import sensor_center
+from nerg_mi.transport.occlusion import RELATIVE_TOLERANCE
 
-from .study_scenes import SCENES, AnalyticScene, make_sensor, volumes
+from .study_scenes import SCENES, AnalyticScene, make_sensor, make_volumes
 from .study_truth import (
     COLOR_SPP,
-    LIMITS,
-    SOURCE,
-    Truth,
+    REFERENCE_EXTENTS,
+    SPLAT_SOURCE,
+    StudyTruth,
     compute_truth,
     compute_truth_of_shapes,
-    cut_off,
-    errors,
-    first_hit,
-    first_solid,
-    towards,
-    triangles,
+    apply_splat_extent,
+    compute_errors,
+    find_first_hit,
+    find_first_solid,
+    distance_and_direction,
+    extract_triangles,
 )
 
 # ---- The settings of an integrator, read back so that another one can be made of them ----
 
 
-def parameters(integrator) -> dict:
+def read_parameters(integrator) -> dict:
     """The parameters of an integrator of type ``nerg``, read back by the names of its manual page."""
     names = ("occlusion", "radiance", "jitter")
     march = ("step", "dt_gamma", "stop", "color_cutoff", "quadrature", "coarse", "refined")
@@ -51,7 +51,7 @@ def parameters(integrator) -> dict:
     }
 
 
-def extent(integrator) -> float | None:
+def read_splat_extent(integrator) -> float | None:
     """Where the Gaussians of its field are cut off, in standard deviations; None where its field is none of these."""
     medium = integrator.medium
     return None if medium is None or medium.hits is None else medium.arrays.extent
@@ -67,7 +67,7 @@ def extent(integrator) -> float | None:
 KINDS = ("auto", "analytic", "file")
 AOVS = "depth,opacity,visibility,gaze"
 FALLOFF = 0.1
-FINER = 32  # The reference of a scene file has steps this many times shorter than the scene's own
+REFERENCE_REFINEMENT = 32  # The reference of a scene file has steps this many times shorter than the scene's own
 # Nothing is skipped, merged or cut short in a reference.
 _CONVERGED = {"coarse": 1.0, "dt_gamma": 0.0, "jitter": False, "color_cutoff": 0.0, "stop": 1e-9} | {
     "quadrature": "constant",
@@ -82,10 +82,10 @@ class ExactSurfaces:
     distances (N,) along unit rays, inf on a miss; ``visible(eye, points)``: whether (N,) nothing lies between."""
 
     cast: Callable[[np.ndarray, np.ndarray], np.ndarray]
-    visible: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    is_visible: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def no_surfaces(scene: Path) -> ExactSurfaces | None:
+def no_exact_surfaces(scene: Path) -> ExactSurfaces | None:
     """Of scene files of whose surfaces nothing is known."""
     return None
 
@@ -96,8 +96,8 @@ def open_subject(
     width: int,
     height: int,
     defaults: Mapping[str, str] | None = None,
-    surfaces: Callable[[Path], ExactSurfaces | None] = no_surfaces,
-) -> Subject:
+    surfaces: Callable[[Path], ExactSurfaces | None] = no_exact_surfaces,
+) -> StudySubject:
     """The scene called, or in the file, ``scene``, with a picture of ``width`` x ``height`` pixels.
 
     ``kind``: one of `KINDS`; ``defaults``: of a scene file; ``surfaces``: what is known of the surfaces that the field
@@ -115,44 +115,44 @@ def open_subject(
     return load_subject(Path(scene), width, height, defaults or {}, surfaces)
 
 
-class Subject:
+class StudySubject:
     """Common to all kinds. ``scene``: `mi.Scene`; ``sensor``; ``size``: (width, height) in pixels; ``base``: the
     integrator's parameters and children; ``extent``: diagonal of the medium in scene units; ``tolerance``: fixed, so
     that all settings answer the same question of visibility (the integrator's own default follows the step)."""
 
     name: str
-    opaque: bool
+    is_opaque: bool
     has_gaze = True
-    normalized = False
+    is_normalized = False
     """Whether that gaze is divided by an integral."""
-    marched = True
+    is_marched = True
     """Whether there is a medium, whose marching can be set."""
-    hits = False
+    has_splats = False
     """Whether that is Gaussian splats, which are met one by one."""
-    resampled = False
+    can_resample = False
     """Whether its density can be had as a grid of other resolutions."""
 
     def _set_up(self, scene, sensor, base: dict) -> None:
-        self.scene, self.sensor, self.base = scene, sensor, base
+        self.scene, self.sensor, self.base_params = scene, sensor, base
         self._truths: dict = {}
-        first = self.integrator()
+        first = self.make_integrator()
         self.step = first.settings.step
-        if self.marched:
+        if self.is_marched:
             self.extent, self.tolerance = first.medium.length_scale, 2 * self.step
         else:
-            self.extent = Place(None, scene).diagonal
-            self.tolerance = EXACT * self.extent
-        self.base = {**base, "tolerance": self.tolerance}
+            self.extent = SceneGeometry(None, scene).shape_diagonal
+            self.tolerance = RELATIVE_TOLERANCE * self.extent
+        self.base_params = {**base, "tolerance": self.tolerance}
 
-    def integrator(self, params: Mapping = {}, resolution: int = 0):
+    def make_integrator(self, params: Mapping = {}, resolution: int = 0):
         """A ``nerg`` integrator with ``params`` over the scene's own; ``resolution``: density as a grid."""
         import mitsuba as mi
 
         if resolution:
             raise NergError(f'"{self.name}" has no grids of other resolutions; only analytic scenes do')
-        return mi.load_dict({"type": "nerg", **cut_off({**self.base, **params})})
+        return mi.load_dict({"type": "nerg", **apply_splat_extent({**self.base_params, **params})})
 
-    def aovs(self) -> str:
+    def aov_names(self) -> str:
         return AOVS if self.has_gaze else AOVS.replace(",gaze", "")
 
     def resize(self, width: int, height: int) -> None:
@@ -166,7 +166,7 @@ class Subject:
         self.size = (width, height)
         self._truths.clear()
 
-    def rays(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    def record_rays(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Origins and directions (N, 3) float64 of the rays that a render with one sample a pixel traces."""
         import mitsuba as mi
 
@@ -186,7 +186,7 @@ class Subject:
 
         return np.array(mi.render(self.scene, integrator=integrator, sensor=self.sensor, spp=spp, seed=seed))
 
-    def channels(self, integrator, spp: int, seed: int) -> dict[str, np.ndarray]:
+    def render_channels(self, integrator, spp: int, seed: int) -> dict[str, np.ndarray]:
         """A render as columns: ``color`` (N, 3), and each AOV (N,)."""
         picture = self.render(integrator, spp, seed)
         picture = picture.reshape(-1, picture.shape[-1]).astype(float)
@@ -195,57 +195,57 @@ class Subject:
         out = {n: picture[:, first + k] for k, n in enumerate(names)}
         return out | {"color": np.broadcast_to(picture[:, :first][:, :3], (len(picture), 3))}
 
-    def truth(self, seed: int, depth: str, visibility: str) -> Truth:
+    def get_truth(self, seed: int, depth: str, visibility: str) -> StudyTruth:
         """The reference for the rays of ``seed``, for kinds of depth (where something is marched) and visibility as the
         integrator names them."""
         # Refined depths and maps are ways to find the same answers.
-        depth = DEPTHS.find(depth).finds if self.marched else ""
+        depth = DEPTHS.find(depth).surface_kind if self.is_marched else ""
         visibility = "transmittance" if visibility == "transmittance" else "depth"
         key = seed, depth, visibility
         if key not in self._truths:
             self._truths[key] = self._find_truth(*key)
         return self._truths[key]
 
-    def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
+    def _find_truth(self, seed: int, depth: str, visibility: str) -> StudyTruth:
         """What `truth` keeps."""
         raise NotImplementedError
 
-    def exact(self, seed: int) -> tuple[np.ndarray, np.ndarray] | None:
+    def find_exact_hits(self, seed: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Where surfaces are exactly, and whether the observer sees them exactly: (N,) distances, inf on a miss, and
         (N,) bool. None where that is not known."""
         raise NotImplementedError
 
 
-class AnalyticSubject(Subject):
+class AnalyticSubject(StudySubject):
     """An analytic scene."""
 
-    resampled = True
+    can_resample = True
 
     def __init__(self, scene: AnalyticScene, width: int, height: int):
         import mitsuba as mi
 
-        self.analytic, self.name, self.opaque = scene, scene.name, scene.opaque
-        self._volumes = volumes(scene)
+        self.analytic, self.name, self.is_opaque = scene, scene.name, scene.is_opaque
+        self._volumes = make_volumes(scene)
         observer = make_sensor(scene.observer, (0.5, 0.5, 0.5), 40, 1, 1)
         sensor = mi.load_dict(make_sensor(scene.camera, scene.target, scene.fov, width, height))
         self.size = (width, height)
         base = {**self._volumes, "observer": observer, "falloff": FALLOFF, "aovs": AOVS}
         self._set_up(mi.load_dict({"type": "scene", "sensor": sensor}), sensor, base)
 
-    def integrator(self, params: Mapping = {}, resolution: int = 0):
+    def make_integrator(self, params: Mapping = {}, resolution: int = 0):
         import mitsuba as mi
 
-        grid = {"density": volumes(self.analytic, resolution)["density"]} if resolution else {}
-        return mi.load_dict({"type": "nerg", **self.base, **grid, **params})
+        grid = {"density": make_volumes(self.analytic, resolution)["density"]} if resolution else {}
+        return mi.load_dict({"type": "nerg", **self.base_params, **grid, **params})
 
-    def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
+    def _find_truth(self, seed: int, depth: str, visibility: str) -> StudyTruth:
         import mitsuba as mi
 
-        o, d = self.rays(seed)
-        made, p_o = self.integrator(), mi.Point3f(*self.analytic.observer)
+        o, d = self.record_rays(seed)
+        made, p_o = self.make_integrator(), mi.Point3f(*self.analytic.observer)
         return compute_truth(
             self.analytic,
-            made.gaze.at([p_o], Place(made.medium), made.observer_settings),
+            made.gaze.for_observers([p_o], SceneGeometry(made.medium), made.observer_settings),
             o,
             d,
             depth=depth,
@@ -255,20 +255,20 @@ class AnalyticSubject(Subject):
             surface_opacity=0.5,
         )
 
-    def exact(self, seed: int):
-        if not self.opaque:
+    def find_exact_hits(self, seed: int):
+        if not self.is_opaque:
             return None
-        o, d = self.rays(seed)
-        t = first_solid(self.analytic, o, d)
+        o, d = self.record_rays(seed)
+        t = find_first_solid(self.analytic, o, d)
         hit = np.isfinite(t)
         eye = np.asarray(self.analytic.observer, float)
         offset = o + d * np.where(hit, t, 0)[:, None] - eye
         distance = np.linalg.norm(offset, axis=-1)
-        met = first_solid(self.analytic, np.broadcast_to(eye, o.shape), offset / distance[:, None])
+        met = find_first_solid(self.analytic, np.broadcast_to(eye, o.shape), offset / distance[:, None])
         return t, hit & (met > distance - 1e-6)  # Both distances lead to the same point, but for rounding
 
 
-class FileSubject(Subject):
+class FileSubject(StudySubject):
     """A scene file whose integrator is ``nerg`` and whose first sensor takes the picture.
 
     ``surfaces``: where its surfaces exactly are; None where that is not known.
@@ -276,80 +276,80 @@ class FileSubject(Subject):
 
     def __init__(self, path: Path, loaded, width: int, height: int, surfaces: ExactSurfaces | None = None):
         integrator, sensor = loaded.integrator(), loaded.sensors()[0]
-        self.name = path.stem if path.stem != "scene" else real_path(path).parent.name
-        self.surfaces, self.opaque = surfaces, surfaces is not None
+        self.name = path.stem if path.stem != "scene" else resolve_path(path).parent.name
+        self.surfaces, self.is_opaque = surfaces, surfaces is not None
         children = integrator.children
         self.has_gaze, medium = "gaze" in children, integrator.medium
-        self.normalized = self.has_gaze and integrator.gaze.field.config.normalized
-        self.hits = medium is not None and medium.hits is not None
-        self._set_up(loaded, sensor, {**children, **parameters(integrator), "aovs": self.aovs()})
+        self.is_normalized = self.has_gaze and integrator.gaze.field.config.normalized
+        self.has_splats = medium is not None and medium.hits is not None
+        self._set_up(loaded, sensor, {**children, **read_parameters(integrator), "aovs": self.aov_names()})
         self.resize(width, height)
 
-    def eye(self) -> np.ndarray:
+    def observer_position(self) -> np.ndarray:
         """Where the observer stands (3,)."""
-        observer = self.base.get("observer")
-        return np.array(center(observer if observer is not None else self.sensor), float).reshape(3)
+        observer = self.base_params.get("observer")
+        return np.array(sensor_center(observer if observer is not None else self.sensor), float).reshape(3)
 
-    def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
+    def _find_truth(self, seed: int, depth: str, visibility: str) -> StudyTruth:
         """A render with steps `FINER` times shorter, or with Gaussians cut off far out, and how far one with steps
         twice as long, or Gaussians cut off nearer, is from it."""
-        limits = LIMITS if self.hits else [{"step": self.step / n} for n in (FINER, FINER // 2)]
+        limits = REFERENCE_EXTENTS if self.has_splats else [{"step": self.step / n} for n in (REFERENCE_REFINEMENT, REFERENCE_REFINEMENT // 2)]
         kinds = {**_CONVERGED, "depth": depth, "visibility": visibility, "radiance": True}
-        fine, half = (self.channels(self.integrator({**kinds, **limit}), 1, seed) for limit in limits)
-        known = Truth(
+        fine, half = (self.render_channels(self.make_integrator({**kinds, **limit}), 1, seed) for limit in limits)
+        known = StudyTruth(
             **{n: fine[n] for n in ("color", "opacity", "depth", "visibility")},
             gaze=fine.get("gaze", np.zeros(len(fine["depth"]))),
-            source=SOURCE if self.hits else f"render with steps of {self.step / FINER:.3g} units",
+            source=SPLAT_SOURCE if self.has_splats else f"render with steps of {self.step / REFERENCE_REFINEMENT:.3g} units",
             convergence={},
         )
-        return replace(known, convergence=errors(half, known))
+        return replace(known, convergence=compute_errors(half, known))
 
-    def exact(self, seed: int):
+    def find_exact_hits(self, seed: int):
         if self.surfaces is None:
             return None
-        o, d = self.rays(seed)
+        o, d = self.record_rays(seed)
         t = self.surfaces.cast(o, d)
         hit = np.isfinite(t)
         seen = np.zeros(len(t), bool)
         # A millimetre before the surface: the point itself must not hide itself.
-        seen[hit] = self.surfaces.visible(self.eye(), o[hit] + d[hit] * (t[hit, None] - 1e-3))
+        seen[hit] = self.surfaces.is_visible(self.observer_position(), o[hit] + d[hit] * (t[hit, None] - 1e-3))
         return t, seen
 
 
 class ShapesSubject(FileSubject):
     """A scene file of meshes and no field."""
 
-    marched = False
+    is_marched = False
 
     def __init__(self, path: Path, loaded, width: int, height: int):
-        self.corners = triangles(loaded)
+        self.triangles = extract_triangles(loaded)
         self._hits: dict = {}
         self._color = None
         super().__init__(path, loaded, width, height)
-        self.opaque = True
+        self.is_opaque = True
 
     def resize(self, width: int, height: int) -> None:
         super().resize(width, height)
         self._hits.clear()
         self._color = None
 
-    def first_hits(self, seed: int) -> np.ndarray:
+    def find_first_hits(self, seed: int) -> np.ndarray:
         """Distances (N,) to the shapes along the rays of ``seed``; inf on a miss."""
         if seed not in self._hits:
-            self._hits[seed] = first_hit(self.corners, *self.rays(seed))
+            self._hits[seed] = find_first_hit(self.triangles, *self.record_rays(seed))
         return self._hits[seed]
 
-    def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
+    def _find_truth(self, seed: int, depth: str, visibility: str) -> StudyTruth:
         if self._color is None:
-            self._color = self.channels(self.integrator({"aovs": ""}), COLOR_SPP, seed + 1)["color"]
+            self._color = self.render_channels(self.make_integrator({"aovs": ""}), COLOR_SPP, seed + 1)["color"]
         return compute_truth_of_shapes(self, seed, visibility, self._color)
 
-    def exact(self, seed: int):
-        o, d = self.rays(seed)
-        t = self.first_hits(seed)
+    def find_exact_hits(self, seed: int):
+        o, d = self.record_rays(seed)
+        t = self.find_first_hits(seed)
         hit = np.isfinite(t)
-        distance, r_o = towards(self.eye(), o + d * np.where(hit, t, 0)[:, None])
-        met = first_hit(self.corners, np.broadcast_to(self.eye(), o.shape), r_o)
+        distance, r_o = distance_and_direction(self.observer_position(), o + d * np.where(hit, t, 0)[:, None])
+        met = find_first_hit(self.triangles, np.broadcast_to(self.observer_position(), o.shape), r_o)
         return t, hit & (met > distance - 1e-6)  # Both distances lead to the same point, but for rounding
 
 
@@ -358,7 +358,7 @@ def load_subject(
     width: int,
     height: int,
     defaults: Mapping[str, str],
-    surfaces: Callable[[Path], ExactSurfaces | None] = no_surfaces,
+    surfaces: Callable[[Path], ExactSurfaces | None] = no_exact_surfaces,
 ) -> FileSubject:
     """The scene in the file ``path``, of a field or of shapes; as `open_subject` has it."""
     loaded = load_scene(path, defaults)

@@ -9,7 +9,7 @@ import numpy as np
 
 from nerg_mi.figures.style import Provenance, new_page, save
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.tables import markdown_table, write_csv, write_json
+from nerg_mi.files.tables import format_markdown_table, write_csv, write_json
 
 from .study import COLUMNS, PAPER
 
@@ -17,14 +17,14 @@ from .study import COLUMNS, PAPER
 #
 # What follows from a study's rows: the Pareto front, the comparison with the paper's marching, and the files.
 
-FRONTS = ("color_rmse", "depth_mae", "visibility_mae", "gaze_mae")
+PARETO_ERRORS = ("color_rmse", "depth_mae", "visibility_mae", "gaze_mae")
 """The errors that are set against time; a row's ``pareto`` names those for which it is on the front."""
 
-BESIDE = ("default_seconds", "default_cpu_seconds", "timed_by")
+TIMING_COLUMNS = ("default_seconds", "default_cpu_seconds", "timed_by")
 """Columns of rows that were timed in parts: the default's times by the process that timed the row, and which it was."""
 
 
-def pareto(points: list[tuple[float, float]]) -> list[bool]:
+def find_pareto_front(points: list[tuple[float, float]]) -> list[bool]:
     """Which of the points (time, error) no other one beats: no other is at most as large in both and smaller in one."""
     order = sorted(range(len(points)), key=lambda i: points[i])
     on, best = [False] * len(points), math.inf
@@ -36,30 +36,30 @@ def pareto(points: list[tuple[float, float]]) -> list[bool]:
     return on
 
 
-def comparable(row: dict) -> bool:
+def is_comparable(row: dict) -> bool:
     """Whether a row renders all that the default does, for one ray a pixel of the scene itself."""
     return row["spp"] == 1 and not row["resolution"] and row["group"] not in ("leave out", "spp")
 
 
-def mark_fronts(rows: list[dict]) -> None:
+def mark_pareto_fronts(rows: list[dict]) -> None:
     """Set ``pareto`` of each row: the errors of `FRONTS` for which it is on the front, space-separated."""
     for row in rows:
         row["pareto"] = ""
-    for error in FRONTS:
-        able = [r for r in rows if comparable(r) and error in r]
-        for row, on in zip(able, pareto([(r["seconds"], r[error]) for r in able])):
+    for error in PARETO_ERRORS:
+        able = [r for r in rows if is_comparable(r) and error in r]
+        for row, on in zip(able, find_pareto_front([(r["seconds"], r[error]) for r in able])):
             if on:
                 row["pareto"] = f"{row['pareto']} {error.rsplit('_', 1)[0]}".strip()
 
 
-def against_paper(rows: list[dict], clock: str = "seconds") -> list[dict]:
+def compare_with_paper(rows: list[dict], clock: str = "seconds") -> list[dict]:
     """For each row of the paper's marching: the default beside it, the least depth error of ours that takes no longer,
     and the shortest time of ours whose depth error is no larger, with the ratios; None where ours has no such row.
 
     ``clock``: ``seconds``, or ``cpu_seconds`` where other work shares the machine.
     """
     # A map is made once for many frames: its rows' times are not those of one picture.
-    ours = [r for r in rows if r["group"] != PAPER and comparable(r) and r["visibility"] != "map"]
+    ours = [r for r in rows if r["group"] != PAPER and is_comparable(r) and r["visibility"] != "map"]
     default = next(r for r in rows if r["group"] == "default")
     out = []
     for paper in (r for r in rows if r["group"] == PAPER):
@@ -88,19 +88,19 @@ def write_tables(out: Path, report: dict) -> list[Path]:
     """Write ``study.csv`` (the rows), ``study.md`` (the same by factor, to read), ``scaling.csv`` and ``study.json``
     (all of ``report``); returns their paths."""
     paths = [out / "study.csv", out / "study.md", out / "scaling.csv", out / "study.json"]
-    of_rows = [*COLUMNS, *(BESIDE if report.get("timed_by") else ())]
+    of_rows = [*COLUMNS, *(TIMING_COLUMNS if report.get("timed_by") else ())]
     for path, rows, columns in ((paths[0], report["rows"], of_rows), (paths[2], report["scaling"], None)):
         write_csv(
             path,
             ({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows),
             columns or list(rows[0]),
         )
-    write_text(paths[1], markdown(report))
+    write_text(paths[1], format_report(report))
     write_json(paths[3], report)
     return paths
 
 
-def summary(report: dict) -> list[str]:
+def summarise(report: dict) -> list[str]:
     """The default beside the paper's marching, in words: a line each."""
     lines = []
     for pair in report["against_paper"]:
@@ -145,7 +145,7 @@ _SHOWN = (
 )
 
 
-def markdown(report: dict) -> str:
+def format_report(report: dict) -> str:
     """A table for each factor, the default first in all of them, and the comparison with the paper's marching."""
     rows = report["rows"]
     shown = [c for c in _SHOWN if any(c[0] in r for r in rows)]
@@ -163,11 +163,11 @@ def markdown(report: dict) -> str:
     for group in dict.fromkeys(r["group"] for r in rows[1:]):
         mine = [default, *(r for r in rows if r["group"] == group)]
         cells = [[r["setting"], *(f"{r[k] * by:.3g}" if k in r else "" for k, _, by in shown)] for r in mine]
-        text.append(f"### {group}\n\n{markdown_table(head, cells)}")
+        text.append(f"### {group}\n\n{format_markdown_table(head, cells)}")
     for clock, unit in (("seconds", "ms"), ("cpu_seconds", "CPU ms")):
         head = ["paper", unit, "depth MAE", "no slower", "times less error", "no worse", "times faster"]
         cells = []
-        for pair in against_paper(rows, clock):
+        for pair in compare_with_paper(rows, clock):
             paper, time, error = pair["paper"], pair["equal_time"], pair["equal_error"]
             cells.append([paper["setting"], f"{1e3 * paper[clock]:.3g}", f"{paper['depth_mae']:.3g}"])
             cells[-1] += [time["setting"], f"{time['error_ratio']:.3g}"] if time else ["none", ""]
@@ -175,18 +175,18 @@ def markdown(report: dict) -> str:
         if not cells:
             continue
         title = f"against the paper's marching, by {clock.replace('_', ' ')}"
-        text.append(f"### {title}\n\n{markdown_table(head, cells)}")
+        text.append(f"### {title}\n\n{format_markdown_table(head, cells)}")
     return "\n\n".join(text) + "\n"
 
 
 def _timed_by(who: list[dict]) -> str:
     """Who took the times, in a sentence."""
-    of_each = (
+    get_or_compute_each = (
         f"process {found['process']} ({found['processor']}, {found['threads']} threads), {found['rows']} settings, "
         "the default in {:.3g} to {:.3g} ms".format(*(1e3 * s for s in found["seconds"]))
         for found in who
     )
-    return f"Times are those of whoever measured a setting: {'; '.join(of_each)}."
+    return f"Times are those of whoever measured a setting: {'; '.join(get_or_compute_each)}."
 
 
 # ---- Pictures of a study: error against time with the Pareto front, and cost against size on log axes ----
@@ -197,16 +197,16 @@ PANELS = (
     ("visibility_mae", "visibility MAE"),
     ("gaze_mae", "gaze MAE [1/sr]"),
 )
-FLOOR = 1e-9  # Errors below it are shown on the axis' lower end: single precision has nothing to say there
+MIN_PLOTTED_ERROR = 1e-9  # Errors below it are shown on the axis' lower end: single precision has nothing to say there
 
 
-def plot_errors(path: Path, rows: list[dict], title: str, about: Provenance | None = None) -> None:
+def plot_errors(path: Path, rows: list[dict], title: str, provenance: Provenance | None = None) -> None:
     """Four panels of error against seconds, a colour a factor, the front as a line, the paper's marching as crosses."""
     import matplotlib
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator
 
     figure = new_page(960, 720)
-    able = [r for r in rows if comparable(r)]
+    able = [r for r in rows if is_comparable(r)]
     groups = list(dict.fromkeys(r["group"] for r in able))
     colors = matplotlib.colormaps["tab20"](np.linspace(0, 1, 20))[: len(groups)]
     handles = {}
@@ -215,14 +215,14 @@ def plot_errors(path: Path, rows: list[dict], title: str, about: Provenance | No
             mine = [r for r in able if r["group"] == group and error in r]
             if not mine:
                 continue
-            xy = np.array([(r["seconds"], max(r[error], FLOOR)) for r in mine])
+            xy = np.array([(r["seconds"], max(r[error], MIN_PLOTTED_ERROR)) for r in mine])
             marker, size = {"default": ("*", 150), PAPER: ("x", 34)}.get(group, ("o", 16))
             tint = {"default": "black", PAPER: "crimson"}.get(group, color)
             handles[group] = axes.scatter(
                 *xy.T, s=size, marker=marker, color=tint, zorder=4 if group in ("default", PAPER) else 3
             )
         front = sorted(
-            (r["seconds"], max(r[error], FLOOR)) for r in able if error.rsplit("_", 1)[0] in r["pareto"].split()
+            (r["seconds"], max(r[error], MIN_PLOTTED_ERROR)) for r in able if error.rsplit("_", 1)[0] in r["pareto"].split()
         )
         if front:
             (handles["Pareto front"],) = axes.plot(
@@ -241,10 +241,10 @@ def plot_errors(path: Path, rows: list[dict], title: str, about: Provenance | No
     figure.suptitle(title, fontsize=10)
     figure.legend(handles.values(), handles, loc="lower center", ncol=6, fontsize=7, frameon=False)
     figure.tight_layout(rect=(0, 0.06, 1, 1))
-    save(figure, path, about)
+    save(figure, path, provenance)
 
 
-def plot_scaling(path: Path, rows: list[dict], title: str, about: Provenance | None = None) -> None:
+def plot_scaling(path: Path, rows: list[dict], title: str, provenance: Provenance | None = None) -> None:
     """Seconds against pixels, samples a pixel and extent, log-log, with the exponent of the upper half of each."""
     figure = new_page(960, 320)
     names = {"pixels": "pixels", "samples": "samples a pixel", "extent": "extent of the scene at equal step"}
@@ -253,16 +253,16 @@ def plot_scaling(path: Path, rows: list[dict], title: str, about: Provenance | N
         x, y = np.array([(r["value"], r["seconds"]) for r in rows if r["axis"] == axis]).T
         axes.loglog(x, y, "o-", color="C0", markersize=4, linewidth=1)
         half = len(x) // 2
-        axes.set_title(f"exponent {exponent(x[half - 1 :], y[half - 1 :]):.2f} in the upper half", fontsize=8)
+        axes.set_title(f"exponent {fit_exponent(x[half - 1 :], y[half - 1 :]):.2f} in the upper half", fontsize=8)
         axes.set_xlabel(names[axis], fontsize=8)
         axes.set_ylabel("seconds a picture", fontsize=8)
         axes.tick_params(labelsize=7, which="both")
         axes.grid(True, which="major", color="0.9", linewidth=0.6)
     figure.suptitle(title, fontsize=10)
     figure.tight_layout()
-    save(figure, path, about)
+    save(figure, path, provenance)
 
 
-def exponent(x, y) -> float:
+def fit_exponent(x, y) -> float:
     """Slope of log y against log x, by least squares."""
     return float(np.polyfit(np.log(np.asarray(x, float)), np.log(np.asarray(y, float)), 1)[0])

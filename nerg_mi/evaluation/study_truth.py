@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.arrays import vector_of
-from nerg_mi.maths.color import decibels
-from nerg_mi.maths.geometry import box_interval
+from nerg_mi.maths.arrays import to_vector
+from nerg_mi.maths.color import psnr_from_mse
+from nerg_mi.maths.geometry import intersect_box_numpy
 from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.depth import DEPTHS
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer_gaze import ObservedGaze
 
 from . import metrics
-from .study_scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene
+from .study_scenes import COLOR_BASE, COLOR_SLOPE, NUMPY_FUNCTIONS, AnalyticScene
 
 # ---- Reference ----
 #
@@ -29,9 +29,9 @@ from .study_scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene
 # and a moment by composite Gauss-Legendre quadrature (32 panels of 16 nodes: the integrands are analytic, so it is
 # exact to rounding).
 
-PANELS, NODES = 32, 16
-SOLID = 1.0  # Density (1/unit) that counts as a solid in a scene of hard surfaces; the vacuum between has 1e-4
-FUZZ = 1 / 64  # Most that a surface is moved towards the camera for being soft, as a share of its depth
+QUADRATURE_PANELS, QUADRATURE_NODES = 32, 16
+SOLID_DENSITY = 1.0  # Density (1/unit) that counts as a solid in a scene of hard surfaces; the vacuum between has 1e-4
+MAX_SURFACE_SHIFT = 1 / 64  # Most that a surface is moved towards the camera for being soft, as a share of its depth
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class RayTruth:
 
     def depth(self, kind: str) -> np.ndarray:
         """Of a kind that the integrator knows."""
-        return DEPTHS.find(kind).exact(self)
+        return DEPTHS.find(kind).find_exact(self)
 
     def color(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """Linear radiance (N, 3) of the scenes' affine colour, black behind."""
@@ -68,27 +68,27 @@ class RayTruth:
         return COLOR_BASE * self.opacity[:, None] + place @ COLOR_SLOPE.T
 
 
-def box_distances(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def intersect_unit_cube(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where float64 rays (N, 3) enter and leave the unit cube, from the origin on; equal on a miss."""
-    near, far = box_interval(o, d, np.zeros(3), np.ones(3))
+    near, far = intersect_box_numpy(o, d, np.zeros(3), np.ones(3))
     near = np.maximum(near, 0)
     miss = ~(near < far)
     return np.where(miss, 0, near), np.where(miss, 0, far)
 
 
-def trace(scene: AnalyticScene, o: np.ndarray, d: np.ndarray, end: np.ndarray | None = None) -> RayTruth:
+def trace_rays(scene: AnalyticScene, o: np.ndarray, d: np.ndarray, end: np.ndarray | None = None) -> RayTruth:
     """What float64 rays ``o + t d`` (N, 3) see of ``scene``, up to the distances ``end`` (N,)."""
-    near, far = box_distances(o, d)
+    near, far = intersect_unit_cube(o, d)
     if end is not None:
         far = np.clip(far, near, np.maximum(end, near))
     return (_pieces if scene.optical_depth is None else _profile)(scene, o, d, near, far)
 
 
-def first_solid(scene: AnalyticScene, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+def find_first_solid(scene: AnalyticScene, o: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Distance (N,) at which float64 rays meet the solid of a scene that is constant between breaks: matter denser than
     `SOLID`; inf on a miss."""
-    start, length, sigma = _intervals(scene, o, d, *box_distances(o, d))
-    solid = (sigma > SOLID) & (length > 0)
+    start, length, sigma = _intervals(scene, o, d, *intersect_unit_cube(o, d))
+    solid = (sigma > SOLID_DENSITY) & (length > 0)
     return np.where(solid.any(-1), start[np.arange(len(o)), np.argmax(solid, -1)], np.inf)
 
 
@@ -98,14 +98,14 @@ def _intervals(scene, o, d, near, far):
     t = np.sort(np.clip(t, near[:, None], far[:, None]), -1)
     start, length = t[:, :-1], np.diff(t, axis=-1)
     p = o[:, None] + d[:, None] * (start + length / 2)[..., None]
-    return start, length, scene.density(p[..., 0], p[..., 1], p[..., 2], NUMPY)
+    return start, length, scene.density(p[..., 0], p[..., 1], p[..., 2], NUMPY_FUNCTIONS)
 
 
 def _pieces(scene, o, d, near, far) -> RayTruth:
     start, length, sigma = _intervals(scene, o, d, near, far)
     tau = sigma * length
     before = np.cumsum(tau, -1) - tau
-    share = mean_share(tau)
+    share = mean_depth_fraction(tau)
     moment = (np.exp(-before) * -np.expm1(-tau) * (start + length * share)).sum(-1)
     total = tau.sum(-1)
 
@@ -121,7 +121,7 @@ def _pieces(scene, o, d, near, far) -> RayTruth:
     return RayTruth(total, moment, lambda goal: crossing(goal)[0], np.where(total >= np.log(2), free_path, 0))
 
 
-def mean_share(x: np.ndarray) -> np.ndarray:
+def mean_depth_fraction(x: np.ndarray) -> np.ndarray:
     """1/x - 1/expm1(x), with its series where that cancels."""
     small = x < 1e-2
     y = np.clip(np.where(small, 1, x), None, 700)
@@ -130,16 +130,16 @@ def mean_share(x: np.ndarray) -> np.ndarray:
 
 
 def _profile(scene, o, d, near, far) -> RayTruth:
-    x, w = np.polynomial.legendre.leggauss(NODES)
-    edges = (np.arange(PANELS)[:, None] + 0.5 + 0.5 * x) / PANELS
+    x, w = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
+    edges = (np.arange(QUADRATURE_PANELS)[:, None] + 0.5 + 0.5 * x) / QUADRATURE_PANELS
     length = far - near
     moment = np.zeros(len(o))
-    for share, weight in zip(edges.ravel(), np.tile(w, PANELS)):
+    for share, weight in zip(edges.ravel(), np.tile(w, QUADRATURE_PANELS)):
         t = near + length * share
         p = o + d * t[:, None]
-        sigma = scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY)
+        sigma = scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY_FUNCTIONS)
         moment += weight * t * sigma * np.exp(-scene.optical_depth(o, d, near, t))
-    moment *= length / (2 * PANELS)
+    moment *= length / (2 * QUADRATURE_PANELS)
     total = np.where(length > 0, scene.optical_depth(o, d, near, far), 0)
 
     def crossing(goal):
@@ -152,12 +152,12 @@ def _profile(scene, o, d, near, far) -> RayTruth:
 
     p = o + d * crossing(np.log(2))[:, None]
     reached = total >= np.log(2)
-    sigma = np.where(reached, scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY), 1)
+    sigma = np.where(reached, scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY_FUNCTIONS), 1)
     return RayTruth(total, moment, crossing, np.where(reached, 1 / sigma, 0))
 
 
 @dataclass(frozen=True)
-class Truth:
+class StudyTruth:
     """A reference picture, a row a ray or pixel: ``color`` (N, 3) linear, the others (N,); ``gaze`` is 0 throughout
     without a gaze field.
 
@@ -185,30 +185,30 @@ def compute_truth(
     falloff: float,
     tolerance: float,
     surface_opacity: float,
-) -> Truth:
+) -> StudyTruth:
     """The reference of ``nerg``'s channels for rays (N, 3), as its manual page defines them.
 
     ``gaze``: for the scene's observer (a single-precision network, evaluated at float64 positions), or None.
     """
-    seen = trace(scene, o, d)
+    seen = trace_rays(scene, o, d)
     t = seen.depth(depth)
     surface = seen.opacity >= surface_opacity
     p_d = o + d * t[:, None]
     p_o = np.asarray(scene.observer, float)
     # The point looked for lies in front of the surface, by the tolerance and by how far light goes into it.
-    in_front = tolerance + np.minimum(DEPTHS.find(depth).mean_free_paths * seen.free_path, t * FUZZ)
-    distance, r_o = towards(p_o, p_d - d * in_front[:, None])
+    in_front = tolerance + np.minimum(DEPTHS.find(depth).mean_free_paths * seen.free_path, t * MAX_SURFACE_SHIFT)
+    distance, r_o = distance_and_direction(p_o, p_d - d * in_front[:, None])
     start = np.broadcast_to(p_o, o.shape)
     p_od = p_d
     if visibility == "transmittance":
-        share = np.exp(-trace(scene, start, r_o, distance).tau)
+        share = np.exp(-trace_rays(scene, start, r_o, distance).tau)
     else:
-        met = trace(scene, start, r_o)
+        met = trace_rays(scene, start, r_o)
         d_o = np.where(met.opacity >= surface_opacity, met.depth(depth), np.inf)
         share, p_od = _hidden(distance, d_o, tolerance, falloff, p_d, p_o, r_o)
     share = np.where(surface, share, 0)
-    density = np.zeros(len(o)) if gaze is None else evaluate_gaze(gaze, p_od, p_o, towards(p_o, p_d)[1]) * share
-    return Truth(seen.color(o, d), seen.opacity, t, share, density, "float64 closed form", {})
+    density = np.zeros(len(o)) if gaze is None else evaluate_gaze(gaze, p_od, p_o, distance_and_direction(p_o, p_d)[1]) * share
+    return StudyTruth(seen.color(o, d), seen.opacity, t, share, density, "float64 closed form", {})
 
 
 def _hidden(distance, d_o, tolerance: float, falloff: float, p_d, p_o, r_o) -> tuple[np.ndarray, np.ndarray]:
@@ -220,7 +220,7 @@ def _hidden(distance, d_o, tolerance: float, falloff: float, p_d, p_o, r_o) -> t
     return share, np.where(blocked[:, None], p_o + r_o * np.where(blocked, d_o, 0)[:, None], p_d)
 
 
-def towards(p_o, p):
+def distance_and_direction(p_o, p):
     """Distance (N,) and unit direction (N, 3) from ``p_o`` to ``p``."""
     v = p - p_o
     distance = np.linalg.norm(v, axis=-1)
@@ -232,7 +232,7 @@ def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
     ``gaze``."""
     mi = variant_types()
     met, eye, along = (
-        vector_of(kind, np.broadcast_to(v, p_od.shape))
+        to_vector(kind, np.broadcast_to(v, p_od.shape))
         for kind, v in ((mi.Point3f, p_od), (mi.Point3f, p_o), (mi.Vector3f, r_o))
     )
     return np.array(gaze.evaluate(met, eye, along, mi.Bool(True))[0], float)
@@ -240,11 +240,11 @@ def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
 
 # ---- How far a picture is from the truth: the errors that a study reports ----
 
-SURFACE = 0.5  # Opacity from which on a ray meets a surface
-TRACE = 1e-3  # Opacity from which on a depth is compared
+MIN_SURFACE_OPACITY = 0.5  # Opacity from which on a ray meets a surface
+MIN_DEPTH_OPACITY = 1e-3  # Opacity from which on a depth is compared
 KLD_EPS = 1e-6  # Of the mean: what a gaze of zero costs where the truth is not zero is bounded by it (13.8 nats)
 
-NAMES = tuple(
+ERROR_NAMES = tuple(
     """
     color_rmse color_psnr opacity_mae depth_mae depth_p99 visibility_mae visibility_wrong gaze_mae gaze_kld
     surface_mae surface_p99
@@ -252,8 +252,8 @@ NAMES = tuple(
 )
 
 
-def errors(
-    seen: dict[str, np.ndarray], known: Truth, exact: tuple[np.ndarray, np.ndarray] | None = None
+def compute_errors(
+    channels: dict[str, np.ndarray], truth: StudyTruth, exact: tuple[np.ndarray, np.ndarray] | None = None
 ) -> dict[str, float]:
     """Errors of the channels ``seen`` (N,), colour (N, 3), by name; what was not rendered is left out.
 
@@ -265,29 +265,29 @@ def errors(
     these pixels that are shown (above 1/2) and hidden, or the reverse.
     """
     out = {}
-    if "color" in seen and np.any(seen["color"]):
-        out["color_rmse"] = float(np.sqrt(np.mean((seen["color"] - known.color) ** 2)))
-        out["color_psnr"] = decibels(out["color_rmse"] ** 2, 1e-24)
-    if "opacity" in seen:
-        out["opacity_mae"] = float(np.mean(np.abs(seen["opacity"] - known.opacity)))
-    traced = known.opacity >= TRACE
-    if "depth" in seen and traced.any():
-        off = np.abs(seen["depth"] - known.depth)[traced]
+    if "color" in channels and np.any(channels["color"]):
+        out["color_rmse"] = float(np.sqrt(np.mean((channels["color"] - truth.color) ** 2)))
+        out["color_psnr"] = psnr_from_mse(out["color_rmse"] ** 2, 1e-24)
+    if "opacity" in channels:
+        out["opacity_mae"] = float(np.mean(np.abs(channels["opacity"] - truth.opacity)))
+    traced = truth.opacity >= MIN_DEPTH_OPACITY
+    if "depth" in channels and traced.any():
+        off = np.abs(channels["depth"] - truth.depth)[traced]
         out["depth_mae"], out["depth_p99"] = float(off.mean()), float(np.percentile(off, 99))
-    surface = known.opacity >= SURFACE
-    if "visibility" in seen and surface.any():
-        out["visibility_mae"] = float(np.mean(np.abs(seen["visibility"] - known.visibility)[surface]))
-    if "gaze" in seen and np.any(known.gaze[surface] > 0):
-        out["gaze_mae"] = float(np.mean(np.abs(seen["gaze"] - known.gaze)[surface]))
-        out["gaze_kld"] = float(metrics.kld(known.gaze[surface], seen["gaze"][surface], eps=KLD_EPS))
+    surface = truth.opacity >= MIN_SURFACE_OPACITY
+    if "visibility" in channels and surface.any():
+        out["visibility_mae"] = float(np.mean(np.abs(channels["visibility"] - truth.visibility)[surface]))
+    if "gaze" in channels and np.any(truth.gaze[surface] > 0):
+        out["gaze_mae"] = float(np.mean(np.abs(channels["gaze"] - truth.gaze)[surface]))
+        out["gaze_kld"] = float(metrics.kld(truth.gaze[surface], channels["gaze"][surface], eps=KLD_EPS))
     if exact is not None:
         distance, visible = exact
         hit = np.isfinite(distance)
-        if "depth" in seen:
-            off = np.abs(seen["depth"] - np.where(hit, distance, 0))[hit]
+        if "depth" in channels:
+            off = np.abs(channels["depth"] - np.where(hit, distance, 0))[hit]
             out["surface_mae"], out["surface_p99"] = float(off.mean()), float(np.percentile(off, 99))
-        if "visibility" in seen:
-            out["visibility_wrong"] = float(np.mean(((seen["visibility"] > 0.5) != visible)[hit]))
+        if "visibility" in channels:
+            out["visibility_wrong"] = float(np.mean(((channels["visibility"] > 0.5) != visible)[hit]))
     return out
 
 
@@ -297,7 +297,7 @@ CHUNK = 64  # Rays tested against all triangles at once
 COLOR_SPP = 256  # The mean of so many samples a pixel is the colour that pictures are compared with
 
 
-def triangles(scene) -> np.ndarray:
+def extract_triangles(scene) -> np.ndarray:
     """Corners (N, 3, 3), float64, of all shapes of a Mitsuba scene. Raises NergError for a shape that is no mesh."""
     import mitsuba as mi
 
@@ -313,12 +313,12 @@ def triangles(scene) -> np.ndarray:
     return np.concatenate(found)
 
 
-def first_hit(corners: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+def find_first_hit(triangles: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
     """Distance (N,) at which rays ``o + t d`` (N, 3), t > 0, first meet one of the triangles (M, 3, 3); inf on a miss.
 
     Möller and Trumbore 1997, in float64. Edges count as inside to rounding, so that no ray slips between neighbours.
     """
-    a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     out = np.empty(len(o))
     for begin in range(0, len(o), CHUNK):
         origin, way = o[begin : begin + CHUNK, None], d[begin : begin + CHUNK, None]
@@ -335,41 +335,41 @@ def first_hit(corners: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
     return out
 
 
-def observed_gaze(subject, p_o: np.ndarray) -> ObservedGaze:
+def make_observed_gaze(subject, p_o: np.ndarray) -> ObservedGaze:
     """The gaze field of ``subject`` for the observer at ``p_o`` (3,)."""
     import mitsuba as mi
 
     # The integral is the integrator's own, of all directions: over ray casts, which are exact to single precision, and
     # tested against ``first_hit``.
-    integrator = subject.integrator({"integral_tolerance": 0.0})
-    place = Place(None, subject.scene)
-    return integrator.gaze.at([mi.Point3f(*p_o.tolist())], place, integrator.observer_settings)
+    integrator = subject.make_integrator({"integral_tolerance": 0.0})
+    place = SceneGeometry(None, subject.scene)
+    return integrator.gaze.for_observers([mi.Point3f(*p_o.tolist())], place, integrator.observer_settings)
 
 
-def compute_truth_of_shapes(subject, seed: int, visibility: str, color: np.ndarray) -> Truth:
+def compute_truth_of_shapes(subject, seed: int, visibility: str, color: np.ndarray) -> StudyTruth:
     """The reference of ``nerg``'s channels for shapes alone, as its manual page defines them.
 
     ``color``: (N, 3), what the colours of the picture tend to.
     """
-    o, d = subject.rays(seed)
-    t = subject.first_hits(seed)
+    o, d = subject.record_rays(seed)
+    t = subject.find_first_hits(seed)
     hit = np.isfinite(t)
     depth = np.where(hit, t, 0)
-    p_d, p_o = o + d * depth[:, None], subject.eye()
-    distance, r_o = towards(p_o, p_d - d * subject.tolerance)
-    met = first_hit(subject.corners, np.broadcast_to(p_o, o.shape), r_o)
+    p_d, p_o = o + d * depth[:, None], subject.observer_position()
+    distance, r_o = distance_and_direction(p_o, p_d - d * subject.tolerance)
+    met = find_first_hit(subject.triangles, np.broadcast_to(p_o, o.shape), r_o)
     p_od = p_d
     if visibility == "transmittance":
         share = (met >= distance).astype(float)
     else:
-        falloff = float(subject.base["falloff"])
+        falloff = float(subject.base_params["falloff"])
         share, p_od = _hidden(distance, met, subject.tolerance, falloff, p_d, p_o, r_o)
     share = np.where(hit, share, 0)
     gaze = np.zeros(len(o))
     if subject.has_gaze:
-        gaze = evaluate_gaze(observed_gaze(subject, p_o), p_od, p_o, towards(p_o, p_d)[1]) * share
+        gaze = evaluate_gaze(make_observed_gaze(subject, p_o), p_od, p_o, distance_and_direction(p_o, p_d)[1]) * share
     source = f"float64 ray casts; colour the mean of {COLOR_SPP} samples a pixel"
-    return Truth(color, hit.astype(float), depth, share, gaze, source, {})
+    return StudyTruth(color, hit.astype(float), depth, share, gaze, source, {})
 
 
 # ---- Splats ----
@@ -377,14 +377,14 @@ def compute_truth_of_shapes(subject, seed: int, visibility: str, color: np.ndarr
 # What can be set of Gaussian splats: they are not marched, but cut off, each at so many standard deviations, and rays
 # end where little light is left.
 
-EXTENTS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
-STOPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
-LIMITS = ({"extent": 8.0}, {"extent": 6.0})
+SPLAT_EXTENTS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
+SPLAT_STOPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+REFERENCE_EXTENTS = ({"extent": 8.0}, {"extent": 6.0})
 """Where Gaussians are cut off in a reference, and in one that tells how good it is."""
-SOURCE = f"render of Gaussians cut off at {LIMITS[0]['extent']:g} standard deviations"
+SPLAT_SOURCE = f"render of Gaussians cut off at {REFERENCE_EXTENTS[0]['extent']:g} standard deviations"
 
 
-def cut_off(params: Mapping) -> dict:
+def apply_splat_extent(params: Mapping) -> dict:
     """``params`` of an integrator without ``extent``, where Gaussians of its field are cut off: if it is there, the
     field is another one that is cut off there."""
     import mitsuba as mi

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.probes.probes import LEVELS, asked_level, level_name, region_levels
+from nerg_mi.probes.probes import REGION_LEVELS, get_calibrated_level, format_level, compute_region_levels
 
 from . import metrics
 from .gaze import EPS, SCORES, GazeTest
@@ -17,14 +17,14 @@ SIGNALS = {"support": True, "spread": False}
 """What tells how sure a field is, by its name in a row of `position_rows`, and whether more of it is surer."""
 ERRORS = ("KLD", "excess")
 """Errors of a position: KLD (nats), and by how much it is above that of one half of the people under the other."""
-KEPT = (1.0, 0.75, 0.5, 0.25)  # Shares of the positions, the surest, whose mean error is told
+RETAINED_FRACTIONS = (1.0, 0.75, 0.5, 0.25)  # Shares of the positions, the surest, whose mean error is told
 # Halves of the people that are drawn, rays that each half has at a position at least, and the blind density's share of
 # what one half tells of the other, so that where it never looked is not impossible.
 _HALVES, _RAYS, _BLIND = 8, 32, 0.2
 _GROUPS = 5  # Groups of positions from which on there is an interval
 
 
-def position_rows(
+def score_positions(
     test: GazeTest,
     maps: np.ndarray,
     blind: np.ndarray,
@@ -39,7 +39,7 @@ def position_rows(
     ``support`` (P,), rays, and ``spread`` (P,), the standard deviation over an ensemble's members, integrated over the
     sphere. ``groups``: of neighbouring positions; None: each is its own."""
     error, less = (metrics.kld(test.truth, m, eps=EPS) for m in (maps, blind))
-    half = half_errors(test, blind, seed)
+    half = compute_split_half_errors(test, blind, seed)
     rows = []
     for i, (x, y, z) in enumerate(test.centres.tolist()):
         row = {"x": x, "y": y, "z": z, "group": str(i if groups is None else groups[i])}
@@ -52,18 +52,18 @@ def position_rows(
     return rows
 
 
-def half_errors(test: GazeTest, blind: np.ndarray, seed: int = 0) -> np.ndarray:
+def compute_split_half_errors(test: GazeTest, blind: np.ndarray, seed: int = 0) -> np.ndarray:
     """KLD (P,) of half of the people under the other half, mixed with a fifth of ``blind`` (P, D): means over both
     directions and several draws of the halves. NaN where no draw leaves both halves 32 rays."""
     rng, found = np.random.default_rng(seed), []
-    people = len(test.persons)
+    people = len(test.participants)
     for _ in range(_HALVES if people > 1 else 0):
         side = rng.permutation(people) < people // 2
         counts = [test.counts * side, test.counts * ~side]
         both = np.logical_and(*(c.sum(axis=1) >= _RAYS for c in counts))
         error = np.full(len(test.truth), np.nan)
         shares = [c[both] / c[both].sum(axis=1, keepdims=True) for c in counts]
-        a, b = (np.einsum("pn,pnd->pd", share, test.parts[both]) for share in shares)
+        a, b = (np.einsum("pn,pnd->pd", share, test.participant_densities[both]) for share in shares)
         told = lambda maps, both=both: (1 - _BLIND) * maps + _BLIND * blind[both]
         error[both] = (metrics.kld(a, told(b), eps=EPS) + metrics.kld(b, told(a), eps=EPS)) / 2
         found.append(error)
@@ -72,7 +72,7 @@ def half_errors(test: GazeTest, blind: np.ndarray, seed: int = 0) -> np.ndarray:
     return np.where(known.any(axis=0), np.where(known, each, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1), np.nan)
 
 
-def rank_rows(rows: Sequence[Mapping[str, Any]], resamples: int = 200, seed: int = 0) -> list[dict[str, Any]]:
+def correlate_uncertainty(rows: Sequence[Mapping[str, Any]], resamples: int = 200, seed: int = 0) -> list[dict[str, Any]]:
     """A row a signal of `SIGNALS` that ``rows`` of `position_rows` have, and error: Spearman's rank correlation of what
     makes unsure with the error, ``rho``, with ``.low`` and ``.high`` of its 95 % interval where there are five groups
     of positions, and the mean error of the surest `KEPT` of the positions. NaN where a signal is the same everywhere,
@@ -87,11 +87,11 @@ def rank_rows(rows: Sequence[Mapping[str, Any]], resamples: int = 200, seed: int
             value = np.array([r[error] for r in used], float)
             row = {"signal": signal, "error": error, "positions": len(used), "rho": _spearman(doubt, value)}
             row |= _interval(doubt, value, [r["group"] for r in used], resamples, seed)
-            out.append(row | {f"{share:.0%}": _risk(doubt, value, share) for share in KEPT})
+            out.append(row | {f"{share:.0%}": _risk(doubt, value, share) for share in RETAINED_FRACTIONS})
     return out
 
 
-def calibration_rows(
+def measure_calibration(
     test: GazeTest,
     methods: Mapping[str, tuple[np.ndarray, np.ndarray]],
     resamples: int = 200,
@@ -102,21 +102,21 @@ def calibration_rows(
     `LEVELS` of the gaze, with ``.low`` and ``.high`` where there are three persons. ``methods``: densities in the
     test's directions (P, D), and at its rays (P, K). ``calibrated``: by methods that have them, what its training found
     are to be asked for (`probes.probes.calibrated_levels`), which make a row "METHOD, calibrated"."""
-    rng, people = np.random.default_rng(seed), len(test.persons)
+    rng, people = np.random.default_rng(seed), len(test.participants)
     draws = rng.multinomial(people, np.full(people, 1 / people), resamples if people >= 3 else 0)
     out = []
     for name, (maps, at) in methods.items():
-        level = region_levels(maps, at)
+        level = compute_region_levels(maps, at)
         rows: dict[str, Mapping[str, float] | None] = {name: None}
         if calibrated and name in calibrated:
             rows[f"{name}, calibrated"] = calibrated[name]
         for title, asked in rows.items():
             row: dict[str, Any] = {"method": title}
-            for share in LEVELS:
-                inside, key = level <= asked_level(share, asked), level_name(share)
+            for share in REGION_LEVELS:
+                inside, key = level <= get_calibrated_level(share, asked), format_level(share)
                 row[key] = float(inside.mean())
                 if len(draws):
-                    weights = [times[test.who] for times in draws]
+                    weights = [times[test.sample_participants] for times in draws]
                     reach = 1.96 * np.std([(inside * w).sum() / w.sum() for w in weights])
                     row[f"{key}.low"], row[f"{key}.high"] = row[key] - reach, row[key] + reach
             out.append(row)
@@ -170,10 +170,10 @@ SPLIT_HALF = "split half"  # A reference and no method: what half of the people 
 _SCORES = (*SCORES, "integral")
 
 
-def mean_rows(folds: Sequence[Sequence[Mapping[str, Any]]], confidence: float = 0.95) -> list[dict[str, Any]]:
+def summarise_folds(folds: Sequence[Sequence[Mapping[str, Any]]], confidence: float = 0.95) -> list[dict[str, Any]]:
     """`means` of the scores and of the integral of ``folds``, which have the rows of `workflows.evaluate_gaze`, the
     field's first. The last row is the field less the last method, fold by fold."""
-    found = means(folds, _SCORES, confidence)
+    found = average_folds(folds, _SCORES, confidence)
     names = [row["method"] for row in found]
     by_name = [{row["method"]: row for row in rows} for rows in folds]
     bar = next((name for name in reversed(names) if name != SPLIT_HALF), None)
@@ -184,7 +184,7 @@ def mean_rows(folds: Sequence[Sequence[Mapping[str, Any]]], confidence: float = 
     return [*found, _row(f"{names[0]} less {bar}", less, _SCORES, confidence)]
 
 
-def means(
+def average_folds(
     folds: Sequence[Sequence[Mapping[str, Any]]], scores: Sequence[str], confidence: float = 0.95
 ) -> list[dict[str, Any]]:
     """A row a method, in the order of the first fold: means of ``scores`` over the ``folds`` whose rows have them, with

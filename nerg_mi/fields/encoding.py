@@ -45,7 +45,7 @@ class EncodingConfig(Protocol):
 
     kind: ClassVar[str]  # What a checkpoint calls this kind of encoding
     # By name of a size that is a whole number: the largest that is read from a file.
-    limits: ClassVar[Mapping[str, int]]
+    max_sizes: ClassVar[Mapping[str, int]]
 
     @property
     def dimensions(self) -> int:
@@ -62,7 +62,7 @@ class EncodingConfig(Protocol):
         """Cells along an edge of the unit cube that the encoding resolves at most."""
         ...
 
-    def shapes(self) -> dict[str, tuple[int, ...]]:
+    def parameter_shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the parameters, by name: flat arrays (Float) have one axis, tensors (TensorXf) more."""
         ...
 
@@ -100,7 +100,7 @@ class Encoding(Protocol):
         """
         ...
 
-    def evaluated(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
+    def evaluate_eagerly(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
         """The same numbers in memory, for many points at once; an encoding may have a faster way to them."""
         out = self(p, active)
         dr.eval(out)
@@ -108,7 +108,7 @@ class Encoding(Protocol):
 
     def named(self) -> dict[str, Any]:
         """The parameters by name."""
-        return {name: getattr(self, name) for name in self.config.shapes()}
+        return {name: getattr(self, name) for name in self.config.parameter_shapes()}
 
     def replace(self, name: str, value: Any) -> None:
         """Put ``value`` in the place of the parameter ``name``, of the same shape; `pack` makes it count."""
@@ -174,11 +174,11 @@ def random_encoding(config: EncodingConfig, ns: ModuleType, rng: np.random.Gener
     return _ENCODINGS[type(config)].random(config, ns, rng)
 
 
-def encoding_of(
+def encoding_from_parameters(
     config: EncodingConfig, parameters: Mapping[str, Any], name: str = "grid", mode: dr.ReduceMode = dr.ReduceMode.Auto
 ) -> Encoding:
     """The encoding of ``config`` whose parameters stand in ``parameters`` as ``NAME.PARAMETER``; see `Encoding`."""
-    arrays = {key: parameters[f"{name}.{key}"] for key in config.shapes()}
+    arrays = {key: parameters[f"{name}.{key}"] for key in config.parameter_shapes()}
     return _ENCODINGS[type(config)](config, **arrays, mode=mode)  # pyright: ignore[reportCallIssue] as `Encoding` says
 
 
@@ -199,7 +199,7 @@ class HashGridConfig(EncodingConfig):
     """Sizes of a hash grid. Resolutions grow geometrically from the coarsest level to the finest."""
 
     kind: ClassVar[str] = DEFAULT_KIND
-    limits: ClassVar[Mapping[str, int]] = {
+    max_sizes: ClassVar[Mapping[str, int]] = {
         "levels": 64,
         "features": 4,
         "log2_rows": 26,
@@ -232,7 +232,7 @@ class HashGridConfig(EncodingConfig):
         """Number of features that the grid returns a point."""
         return self.levels * self.features
 
-    def shapes(self) -> dict[str, tuple[int, ...]]:
+    def parameter_shapes(self) -> dict[str, tuple[int, ...]]:
         return {"table": (self.offsets()[-1] * self.features,)}
 
     def describe(self) -> str:
@@ -273,7 +273,7 @@ class HashGrid(Encoding):
 
     def __init__(self, config: HashGridConfig, table: Any, mode: dr.ReduceMode = dr.ReduceMode.Auto):
         self.config, self.table, self.mode = config, table, mode
-        (expected,) = config.shapes()["table"]
+        (expected,) = config.parameter_shapes()["table"]
         if len(table) != expected:
             raise ValueError(f'"grid.table" has {len(table)} entries where its configuration {config} needs {expected}')
         self._scales = config.level_scales()
@@ -283,7 +283,7 @@ class HashGrid(Encoding):
     @classmethod
     def random(cls, config: HashGridConfig, ns: ModuleType, rng: np.random.Generator, scale: float = 1e-4) -> HashGrid:
         """A grid with entries uniform in ``[-scale, scale]``."""
-        (size,) = config.shapes()["table"]
+        (size,) = config.parameter_shapes()["table"]
         return cls(config, ns.Float(rng.uniform(-scale, scale, size).astype(np.float32)))
 
     def is_hashed(self, level: int) -> bool:
@@ -299,7 +299,7 @@ class HashGrid(Encoding):
             out += self._level(level, p, inside)
         return out
 
-    def evaluated(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
+    def evaluate_eagerly(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
         """The same features, evaluated one level after another: the rows of one level stay in the caches.
 
         Worth it for many scattered points whose features are to be kept in memory anyhow.

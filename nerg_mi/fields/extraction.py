@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.arrays import vector_of
+from nerg_mi.maths.arrays import to_vector
 
 from .radiance import RadianceField
 
@@ -34,7 +34,7 @@ class Lattice:
     shape: tuple[int, int, int]
 
     @staticmethod
-    def over(field: RadianceField, resolution: int) -> Lattice:
+    def for_field(field: RadianceField, resolution: int) -> Lattice:
         """``resolution`` cells along the longest edge of the field's box, or of the core of a contracted one."""
         if resolution < 2:
             raise ValueError(f"a lattice needs at least 2 cells along its longest edge, got {resolution}")
@@ -56,7 +56,7 @@ class Lattice:
         return np.asarray(self.lower) + (np.asarray(index) + 0.5) * self.step
 
 
-class Sampler:
+class FieldSampler:
     """Asks a field about many points, in batches; densities are 0 in the empty cells of its occupancy grid."""
 
     def __init__(self, field: RadianceField):
@@ -65,15 +65,15 @@ class Sampler:
     def _density(self, p, masked: bool = True):
         active = self.ns.Bool(True)
         if masked and self.field.occupancy is not None:
-            active = self.field.occupancy.coarse.empty_cells(self.field.box.to_cube(p)) == 0
+            active = self.field.occupancy.coarse.distance_to_occupied(self.field.box.to_cube(p)) == 0
         return dr.select(active, self.field.density(p, active), 0)
 
     def density(self, p: np.ndarray, masked: bool = True) -> np.ndarray:
         """Density (1/unit) at points (N, 3); with ``masked`` False also what the networks say of empty cells."""
         with dr.suspend_grad():
-            return _joined(lambda q: self._density(vector_of(self.ns.Array3f, q), masked).numpy(), p)
+            return _joined(lambda q: self._density(to_vector(self.ns.Array3f, q), masked).numpy(), p)
 
-    def on(self, lattice: Lattice) -> np.ndarray:
+    def density_on(self, lattice: Lattice) -> np.ndarray:
         """Density (z, y, x) at the lattice's points."""
         return self._over(lattice, 1, lambda sigma: sigma)
 
@@ -102,15 +102,15 @@ class Sampler:
         """Colour (N, 3) in the field's colour space of points (N, 3), as seen along unit ``directions`` (N, 3)."""
 
         def ask(q):
-            features = self.field.density_features(vector_of(self.ns.Array3f, q[:, :3]))[1]
-            c = self.field.color(features, vector_of(self.ns.Array3f, q[:, 3:]))
+            features = self.field.density_features(to_vector(self.ns.Array3f, q[:, :3]))[1]
+            c = self.field.color(features, to_vector(self.ns.Array3f, q[:, 3:]))
             dr.eval(c)
             return np.array(c).T if np.array(c).shape[0] == 3 else np.array(c)
 
         with dr.suspend_grad():
             return _joined(ask, np.concatenate([p, directions], 1), 3)
 
-    def diffuse(self, p: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    def diffuse_color(self, p: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Colour (N, 3) of surface points seen head on and at 45 degrees, averaged: a field's colour depends on it."""
         first = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
         u = np.cross(normals, first)
@@ -136,12 +136,12 @@ def surface_density(lattice: Lattice) -> float:
     return math.log(2) / lattice.step
 
 
-def opacity(density: np.ndarray, lattice: Lattice) -> np.ndarray:
+def cell_opacity(density: np.ndarray, lattice: Lattice) -> np.ndarray:
     """Opacity of a cell of that density."""
     return -np.expm1(-density * lattice.step)
 
 
-def crossings(sampler: Sampler, lattice: Lattice, index: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+def find_crossings(sampler: FieldSampler, lattice: Lattice, index: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
     """``index`` (N, 3), fractional on one axis, moved along that edge to where density crosses ``threshold``; and where
     no surface is, but only the end of what the field's occupancy grid has looked at (mask (N,)).
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import plain
-from nerg_mi.maths.arrays import vector_of
+from nerg_mi.errors import sanitize
+from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
-from nerg_mi.ranges import FARTHEST
+from nerg_mi.ranges import MAX_COORDINATE
 
 from .encoding import Encoding, EncodingConfig, encoding_config
 from .mlp import MLP, namespace
@@ -30,7 +30,7 @@ _MOST = 1 << 60
 
 
 @dataclass(frozen=True)
-class Basis:
+class DataSummary:
     """``rays`` of ``people`` (None: not known), and ``images`` of salience, that a gaze field learnt from, or of which
     a density is made."""
 
@@ -46,10 +46,10 @@ class Basis:
         return " and ".join(filter(None, [rays, _count(self.images, "salience image", "salience images")]))
 
 
-def basis_of(provenance: Mapping[str, Any]) -> Basis | None:
+def summarize_provenance(provenance: Mapping[str, Any]) -> DataSummary | None:
     """That of a checkpoint's ``provenance``; None where it does not tell, as other programs' checkpoints do not."""
     rays, people, images = (_number(provenance.get(name)) for name in ("rays", "people", "salience_views"))
-    return Basis(rays or 0, people or None, images or 0) if rays or images else None
+    return DataSummary(rays or 0, people or None, images or 0) if rays or images else None
 
 
 def _number(value: object) -> int | None:
@@ -67,7 +67,7 @@ def _count(number: int, one: str, several: str) -> str:
 # Support at p is the sum over rays of Epanechnikov's kernel, Σ_i max(0, 1 - |o_i - p|² / (5R)²), R the radius of a
 # probe: a ray that started at p counts as one, a ray 5R away not at all. A field knows more than its probes: kernels of
 # R are zero wherever a field is asked for what it was not shown, where its error grows with the distance still. How
-# well those of 5 R rank the errors: docs/gaze-evaluation.md.
+# well those of 5 R rank the errors: docs/explanation/accuracy.md.
 #
 # Rays are kept as cells of R/2 with their number, mean origin and variance. The sum over a cell within reach follows
 # from these exactly. In one that the reach cuts, the squared distances are taken to be spread uniformly.
@@ -84,12 +84,12 @@ class RaySupport:
 
     def __init__(self, cells: np.ndarray, radius: float):
         self.cells, self.radius = np.ascontiguousarray(cells, np.float32).reshape(-1, 5), float(radius)
-        self.reach = REACH * self.radius
-        if not np.all(np.isfinite(self.cells)) or not 0 < self.radius <= FARTHEST:
+        self.cutoff = REACH * self.radius
+        if not np.all(np.isfinite(self.cells)) or not 0 < self.radius <= MAX_COORDINATE:
             raise ValueError(f"the support of a gaze field needs finite cells and a positive radius, got {self.radius}")
 
     @staticmethod
-    def of(origins: np.ndarray, radius: float) -> RaySupport:
+    def from_origins(origins: np.ndarray, radius: float) -> RaySupport:
         """That of rays from ``origins`` (N, 3), for probes of ``radius``."""
         origins = np.asarray(origins, np.float64).reshape(-1, 3)
         lower = origins.min(axis=0)
@@ -101,13 +101,13 @@ class RaySupport:
         apart = np.bincount(cell, weights=((origins - mean[cell]) ** 2).sum(axis=1)) / count
         return RaySupport(np.concatenate([mean, count[:, None], apart[:, None]], axis=1), radius)
 
-    def at(self, p):
+    def evaluate(self, p):
         """Support at ``p`` (Array3f or Point3f of one lane), a Float of one lane, without derivatives."""
         Float: Any = dr.float32_array_t(type(p.x))
         p = dr.detach(p)
         x, y, z, count, apart = (Float(np.ascontiguousarray(column)) for column in self.cells.T)
         square = dr.square(x - p.x) + dr.square(y - p.y) + dr.square(z - p.z)
-        scale = 1 / self.reach**2
+        scale = 1 / self.cutoff**2
         inside = 1 - (square + apart) * scale
         # Half the width of a uniform law with the variance of |o - p|² in a cell whose rays spread alike in all
         # directions.
@@ -115,7 +115,7 @@ class RaySupport:
         cut = dr.square(dr.maximum(inside + reach, 0)) / (4 * reach)
         return dr.sum(count * dr.select(inside > reach, inside, cut))
 
-    def densest(self) -> np.ndarray:
+    def find_densest_position(self) -> np.ndarray:
         """Where most rays started (3,) float64, by kernels of R: of the mean origins of the cells with most rays; of
         equal ones the first."""
         cells = self.cells.astype(np.float64)
@@ -136,7 +136,7 @@ SIZE_LIMITS = {"width": 4096, "geometry": 4096, "hidden": 64, "layers": 64, "sh_
 # Positions and directions are Dr.Jit 3-arrays of the field's backend, in the field's own frame and units; directions
 # are unit vectors, and ``r_o`` points from the observer to the surface. Densities do not change with scale.
 
-LARGEST = 1e6  # No stored weight is larger; products of a network's layers then stay in single precision
+MAX_WEIGHT = 1e6  # No stored weight is larger; products of a network's layers then stay in single precision
 
 
 class Arrays(Protocol):
@@ -145,7 +145,7 @@ class Arrays(Protocol):
 
     ns: ModuleType
 
-    def array(self, name: str, *shape: int | None, largest: float = LARGEST) -> np.ndarray:
+    def array(self, name: str, *shape: int | None, max_value: float = MAX_WEIGHT) -> np.ndarray:
         """The float32 array ``name`` of that ``shape`` (None: of any length), with no value beyond ``largest``."""
         ...
 
@@ -157,7 +157,7 @@ class Arrays(Protocol):
         """The network whose layers have these ``sizes``; ``normalized``: with the gains and shifts of LayerNorm."""
         ...
 
-    def member(self, index: int, about: dict) -> tuple[dict, Arrays]:
+    def member(self, index: int, architecture: dict) -> tuple[dict, Arrays]:
         """The checked architecture and the arrays of the member ``index`` of an ensemble."""
         ...
 
@@ -172,13 +172,13 @@ class AnyGazeField:
 
     kind: ClassVar[str]  # The name under which a checkpoint knows the class
     # The largest whole numbers that a checkpoint may claim for its sizes, by name.
-    limits: ClassVar[Mapping[str, int]] = SIZE_LIMITS
+    max_sizes: ClassVar[Mapping[str, int]] = SIZE_LIMITS
     fixed: ClassVar[tuple[str, ...]] = ()  # Parameters that no training changes
 
     config: Any
     box: AnyBox
     support: RaySupport | None = None  # How many rays it learnt from around a position, where that is known
-    basis: Basis | None = None  # How many rays and people it learnt from in all, where that is known
+    basis: DataSummary | None = None  # How many rays and people it learnt from in all, where that is known
 
     @property
     def ns(self) -> ModuleType:
@@ -363,14 +363,14 @@ class GazeHead(AnyGazeField):
             emit = emit / integral
         gaze = emit * capture
         if self.config.mix:
-            gaze = (1 - self.config.mix) * gaze + self.config.mix * dr.exp(self.log_blind(r_o))
+            gaze = (1 - self.config.mix) * gaze + self.config.mix * dr.exp(self.log_prior(r_o))
         return gaze, emit, capture
 
-    def log_blind(self, r_o: Vector3f) -> Float:
+    def log_prior(self, r_o: Vector3f) -> Float:
         """Log of the blind density (1/sr) in direction ``r_o``, interpolated in its table, the array ``prior``."""
-        return look_up(self.prior.array, self.config.prior, r_o)
+        return interpolate_table(self.prior.array, self.config.prior, r_o)
 
-    def set_mix(self, mix: float) -> None:
+    def set_prior_weight(self, mix: float) -> None:
         """Let the share of the blind density be ``mix``."""
         self.config = replace(self.config, mix=mix)
 
@@ -393,21 +393,21 @@ def kinds() -> tuple[str, ...]:
     return tuple(_KINDS)
 
 
-def build(about: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
+def build_gaze_field(about: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
     """The gaze field that a checkpoint describes by ``about``, of its ``arrays``. Raises ``ValueError`` for a kind that
     is not registered."""
     # Checkpoints of the first version name no kind: there was one.
     kind = about.get("kind", "product")
     if kind not in _KINDS:
-        raise ValueError(f'it is a gaze field of the kind "{plain(kind, 40)}", which this version does not know')
+        raise ValueError(f'it is a gaze field of the kind "{sanitize(kind, 40)}", which this version does not know')
     return _KINDS[kind].from_arrays(about, box, arrays)
 
 
-def limits_of(about: object) -> Mapping[str, int]:
+def max_sizes_of(about: object) -> Mapping[str, int]:
     """The largest sizes that a checkpoint may claim for the gaze field that it describes by ``about``; none for a kind
     that is not registered, of which nothing is built."""
     kind = about.get("kind", "product") if isinstance(about, dict) else None
-    return _KINDS[kind].limits if isinstance(kind, str) and kind in _KINDS else {}
+    return _KINDS[kind].max_sizes if isinstance(kind, str) and kind in _KINDS else {}
 
 
 # ---- What people look at wherever they stand, the blind density, as a latitude-longitude table of its logarithm ----
@@ -415,7 +415,7 @@ def limits_of(about: object) -> Mapping[str, int]:
 _FLOOR = 1e-3  # Of the blind density that is uniform, so that its logarithm is finite
 
 
-def look_up(table, rows: int, d):
+def interpolate_table(table, rows: int, d):
     """Bilinear value of a flat latitude-longitude ``table`` (rows x 2 rows, texel centres, +z first) along ``d``."""
     Float = type(d.x)
     UInt32 = dr.uint32_array_t(Float)
@@ -439,7 +439,7 @@ def table_directions(rows: int) -> np.ndarray:
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
 
 
-def blind_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.ndarray) -> np.ndarray:
+def make_prior_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.ndarray) -> np.ndarray:
     """Log table (rows, 2 rows) of a blind density given at ``table_directions(rows)``, 1/sr.
 
     A thousandth of it is uniform. Scaled so that what ``look_up`` makes of it integrates to one over ``directions`` (N,
@@ -447,8 +447,8 @@ def blind_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.n
     """
     density = np.asarray(density, np.float64)
     log = np.log((1 - _FLOOR) * density + _FLOOR / (4 * np.pi))
-    d = vector_of(ns.Array3f, directions)
-    found = np.asarray(dr.exp(look_up(ns.Float(log.astype(np.float32)), rows, d)), np.float64)
+    d = to_vector(ns.Array3f, directions)
+    found = np.asarray(dr.exp(interpolate_table(ns.Float(log.astype(np.float32)), rows, d)), np.float64)
     return (log - np.log(4 * np.pi * found.mean())).reshape(rows, 2 * rows).astype(np.float32)
 
 
@@ -486,11 +486,11 @@ class GazeEnsemble(AnyGazeField):
 
     @classmethod
     def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> GazeEnsemble:
-        members = [arrays.member(i, member) for i, member in enumerate(about["members"])]
+        members = [arrays.get_member(i, member) for i, member in enumerate(about["members"])]
         # Before any is built: a file may hold them one inside of another, without end.
         if any("members" in member for member, _ in members):
             raise ValueError("a member of its ensemble is an ensemble itself, which this version does not read")
-        return cls([density for member, own in members for density in build(member, box, own).members])
+        return cls([density for member, own in members for density in build_gaze_field(member, box, own).members])
 
     def architecture(self) -> dict:
         return {"kind": self.kind, "members": [m.architecture() for m in self.members]}

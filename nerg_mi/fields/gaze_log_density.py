@@ -22,7 +22,7 @@ import numpy as np
 from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool
-from nerg_mi.ranges import FARTHEST, LENGTHS
+from nerg_mi.ranges import MAX_COORDINATE, LENGTHS
 
 from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, random_encoding
 from .gaze_base import SIZE_LIMITS, Arrays, GazeHead, GazeHeadConfig, register, require_words
@@ -66,7 +66,7 @@ class LogGazeConfig(GazeHeadConfig):
             raise ValueError(f"every size of a gaze field must be positive, got {self}")
         if not 0 <= self.mix <= 1:
             raise ValueError(f"the share of the blind density must lie in [0, 1], got {self.mix}")
-        if np.shape(self.heads) != (2, 3) or not np.all(np.abs(self.heads) <= FARTHEST):
+        if np.shape(self.heads) != (2, 3) or not np.all(np.abs(self.heads) <= MAX_COORDINATE):
             raise ValueError(f"the box of heads needs two finite corners, got {self.heads}")
 
     @property
@@ -96,7 +96,7 @@ class LogGazeField(GazeHead):
 
     kind: ClassVar[str] = LogGazeConfig.kind
     # Its "geometry" is a word.
-    limits: ClassVar[Mapping[str, int]] = {k: v for k, v in SIZE_LIMITS.items() if k != "geometry"}
+    max_sizes: ClassVar[Mapping[str, int]] = {k: v for k, v in SIZE_LIMITS.items() if k != "geometry"}
     NETS: ClassVar[tuple[str, ...]] = ("emit_net", "capture_net")
     ARRAYS: ClassVar[tuple[str, ...]] = ("escaped", "prior")
     fixed: ClassVar[tuple[str, ...]] = ("prior",)
@@ -120,7 +120,7 @@ class LogGazeField(GazeHead):
     def random(
         config: LogGazeConfig, box: AnyBox, ns: ModuleType, seed: int = 0, prior: np.ndarray | None = None
     ) -> LogGazeField:
-        """An untrained field of backend ``ns``; equal seeds give equal weights. ``prior``: a ``blind_table``;
+        """An untrained field of backend ``ns``; equal seeds give equal weights. ``prior``: a ``make_prior_table``;
         uniform."""
         rng = np.random.default_rng(seed)
         if prior is None:
@@ -141,11 +141,11 @@ class LogGazeField(GazeHead):
         return cls(
             config,
             box,
-            arrays.grid(config.grid),
+            arrays.build_grid(config.build_grid),
             arrays.net("emit_net", config.emit_sizes),
             arrays.net("capture_net", config.capture_sizes),
             arrays.ns.Float(arrays.array("escaped", 1)),
-            arrays.ns.TensorXf(arrays.array("prior", config.prior, 2 * config.prior, largest=_LARGEST_LOG)),
+            arrays.ns.TensorXf(arrays.array("prior", config.prior, 2 * config.prior, max_value=_LARGEST_LOG)),
         )
 
     def emit_inputs(self, p_od, p_o, r_o, active: Bool | bool = True) -> list:
@@ -182,7 +182,7 @@ class LogGazeField(GazeHead):
         """``(emit * blind, capture)``: the product of both is what ``Z`` is the integral of. ``escaped``: mask of
         directions in which no surface is met. There are no ``semantic`` features."""
         c, one = self.config, type(p_od.x)(1)
-        logit = self.log_blind(r_o)
+        logit = self.log_prior(r_o)
         if c.variant != "capture":
             emit = self.emit_net(self.emit_inputs(p_od, p_o, r_o, active))[0]
             logit += emit if c.fills_escaped else dr.select(escaped, self.escaped, emit)

@@ -164,10 +164,10 @@ class GazeField(GazeHead):
     def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> GazeField:
         config = GazeConfig.from_dict(about)
         nets = {
-            name: arrays.net(name, sizes, cls._is_normalized(config, name))
+            name: arrays.build_network(name, sizes, cls._is_normalized(config, name))
             for name, sizes in cls._sizes(config).items()
         }
-        return cls(config, box, arrays.grid(config.grid), **nets)
+        return cls(config, box, arrays.build_grid(config.build_grid), **nets)
 
     def _trunk(self, p, d, active, semantic=None):
         if semantic is not None and not self.config.semantic_own:

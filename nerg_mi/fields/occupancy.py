@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import drjit as dr
 import numpy as np
 
-from nerg_mi.maths.arrays import aligned
+from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.types import Array3f, Bool, Float, UInt32
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class _Bits:
         """Itself: it refines no other grid (``occupancy.RefinedGrid.coarse``)."""
         return self
 
-    def packed(self) -> np.ndarray:
+    def pack_bits(self) -> np.ndarray:
         """The bits as bytes, level by level where there are some, x fastest, lowest bit first; see ``from_packed``."""
         return np.packbits(self.bits.ravel(), bitorder="little")
 
@@ -66,11 +66,11 @@ class OccupancyGrid(_Bits):
         return self.cells[0]
 
     @property
-    def fraction(self) -> float:
+    def occupied_fraction(self) -> float:
         """Share of the cells that are occupied."""
         return float(self.bits.mean())
 
-    def empty_cells(self, u: Array3f, active: Bool | bool = True) -> UInt32:
+    def distance_to_occupied(self, u: Array3f, active: Bool | bool = True) -> UInt32:
         """Distance in cells (UInt32) from the cell of ``u`` (unit cube) to an occupied one; 0: occupied.
 
         Points outside of the cube are clamped to its nearest cell.
@@ -84,10 +84,10 @@ class OccupancyGrid(_Bits):
     def from_packed(data: np.ndarray, resolution: int, ns: ModuleType, threshold: float) -> OccupancyGrid:
         """The cubic grid of ``resolution`` cells an edge whose ``packed`` bits are ``data`` (uint8); ``ValueError`` if
         they are too few."""
-        return OccupancyGrid(unpacked(data, resolution), ns, threshold)
+        return OccupancyGrid(unpack_bits(data, resolution), ns, threshold)
 
 
-def unpacked(data: np.ndarray, resolution: int) -> np.ndarray:
+def unpack_bits(data: np.ndarray, resolution: int) -> np.ndarray:
     """The bits (R, R, R) of a cubic grid of ``resolution`` R whose ``packed`` form is ``data`` (uint8); ``ValueError``
     if they are too few."""
     if data.size * 8 < resolution**3:
@@ -156,7 +156,7 @@ def _grown_words(words: np.ndarray) -> np.ndarray:
     return out
 
 
-def grown(cells: np.ndarray) -> np.ndarray:
+def dilate(cells: np.ndarray) -> np.ndarray:
     """``cells`` (bool, three axes) and all that touch one of them, by a face, an edge or a corner."""
     # An axis at a time: a tenth of the work of a dilation by the whole cube.
     for axis in range(3):
@@ -184,9 +184,9 @@ class CascadeGrid(_Bits):
 
     def __init__(self, bits: np.ndarray, bound: float, ns: ModuleType, threshold: float):
         bits = np.asarray(bits, bool)
-        if bits.ndim != 4 or len(set(bits.shape[1:])) != 1 or bits.shape[1] % 2 or len(bits) != levels_of(bound):
+        if bits.ndim != 4 or len(set(bits.shape[1:])) != 1 or bits.shape[1] % 2 or len(bits) != count_cascade_levels(bound):
             raise ValueError(
-                f"cascades of a bound of {bound} are {levels_of(bound)} cubes with an even number of cells along each "
+                f"cascades of a bound of {bound} are {count_cascade_levels(bound)} cubes with an even number of cells along each "
                 f"edge, got shape {bits.shape}"
             )
         self.bits, self.bound, self.threshold = bits, float(bound), float(threshold)
@@ -213,7 +213,7 @@ class CascadeGrid(_Bits):
         return self.bits.shape[1]
 
     @property
-    def fraction(self) -> float:
+    def occupied_fraction(self) -> float:
         """Share of the volume that is occupied."""
         volume, inner = 0.0, 0.0
         for level, half in enumerate(self._halves):
@@ -256,7 +256,7 @@ class CascadeGrid(_Bits):
                     out[az[z], ay[y], ax[x]] = True
         return out
 
-    def empty_cells(self, u: Array3f, active: Bool | bool = True) -> UInt32:
+    def distance_to_occupied(self, u: Array3f, active: Bool | bool = True) -> UInt32:
         """Distance in cells of the common grid (UInt32) from that of ``u`` (unit cube) to an occupied one; 0: occupied.
 
         Points outside of the cube are clamped to its nearest cell.
@@ -284,7 +284,7 @@ class CascadeGrid(_Bits):
     def from_packed(data: np.ndarray, resolution: int, bound: float, ns: ModuleType, threshold: float) -> CascadeGrid:
         """The cascades of ``resolution`` cells an edge whose ``packed`` bits are ``data`` (uint8); ``ValueError`` if
         they are too few."""
-        count = levels_of(bound) * resolution**3
+        count = count_cascade_levels(bound) * resolution**3
         if data.size * 8 < count:
             raise ValueError(
                 f"cascades of resolution {resolution} to a bound of {bound} need {count // 8} bytes, got {data.size}"
@@ -293,21 +293,21 @@ class CascadeGrid(_Bits):
         return CascadeGrid(bits.astype(bool), bound, ns, threshold)
 
 
-def levels_of(bound: float) -> int:
+def count_cascade_levels(bound: float) -> int:
     """Number of cubes that torch-ngp keeps for a scene of [-bound, bound]³; ``ValueError`` for a bound below 1."""
     if not (np.isfinite(bound) and bound >= 1):
         raise ValueError(f"the bound of cascades must be at least 1, got {bound}")
     return 1 + int(np.ceil(np.log2(bound)))
 
 
-def contracted_cascades(bits: np.ndarray, reach: float, ns: ModuleType, threshold: float) -> CascadeGrid:
+def cascades_from_contracted(bits: np.ndarray, reach: float, ns: ModuleType, threshold: float) -> CascadeGrid:
     """Cascades that hold all that the cells ``bits`` of a contracted box's unit cube hold.
 
     ``bits``: bool array (R, R, R), indexed [z, y, x], of the cube that `maths.geometry.ContractedBox` encodes
     positions in, R even; ``reach``: of the box. The cascades have R cells along each edge, the inner cube's R / 2 cells
     becoming R; each cell is on that meets one of ``bits``.
     """
-    r, levels = len(bits), levels_of(reach)
+    r, levels = len(bits), count_cascade_levels(reach)
     out = np.zeros((levels, r, r, r), bool)
     if bits.any():
         lower, upper = _preimages(bits, reach)
@@ -360,7 +360,7 @@ def _mark(cells: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
 # Of their parts those stay that were found to hold something (``refine``). Distances are kept a cell, parts are
 # looked up in occupied cells only: two tables of a byte a cell, where a grid of parts would take eight.
 
-PARTS = 2  # Parts of a cell along each axis
+PARTS_PER_AXIS = 2  # Parts of a cell along each axis
 
 
 class RefinedGrid:
@@ -390,8 +390,8 @@ class RefinedGrid:
             )
         self._ns, self.coarse_bits, self.masks = ns, bits, masks
         self._coarse: OccupancyGrid | None = None
-        self.threshold, self.coarse_threshold, self.missed = float(threshold), float(coarse_threshold), float(missed)
-        self.cells = tuple(PARTS * n for n in bits.shape[::-1])
+        self.threshold, self.coarse_threshold, self.missed_optical_depth = float(threshold), float(coarse_threshold), float(missed)
+        self.cells = tuple(PARTS_PER_AXIS * n for n in bits.shape[::-1])
         whole = np.zeros(bits.shape, np.uint8)
         whole[bits] = masks
         # Cells of which nothing is left are empty as any other.
@@ -410,8 +410,8 @@ class RefinedGrid:
         """A bit a part: bool array, indexed [z, y, x]."""
         out = np.zeros(self.cells[::-1], bool)
         z, y, x = np.nonzero(self.coarse_bits)
-        for part, (k, j, i) in enumerate(np.ndindex(PARTS, PARTS, PARTS)):
-            out[PARTS * z + k, PARTS * y + j, PARTS * x + i] = self.masks >> part & 1
+        for part, (k, j, i) in enumerate(np.ndindex(PARTS_PER_AXIS, PARTS_PER_AXIS, PARTS_PER_AXIS)):
+            out[PARTS_PER_AXIS * z + k, PARTS_PER_AXIS * y + j, PARTS_PER_AXIS * x + i] = self.masks >> part & 1
         return out
 
     @property
@@ -420,11 +420,11 @@ class RefinedGrid:
         return self.cells[0]
 
     @property
-    def fraction(self) -> float:
+    def occupied_fraction(self) -> float:
         """Share of the parts that are occupied."""
         return float(np.unpackbits(self.masks).sum() / np.prod(self.cells))
 
-    def empty_cells(self, u: Array3f, active: Bool | bool = True) -> UInt32:
+    def distance_to_occupied(self, u: Array3f, active: Bool | bool = True) -> UInt32:
         """Distance in parts (UInt32) from that of ``u`` (unit cube) to an occupied one, or less; 0: occupied.
 
         Points outside of the cube are clamped to its nearest part.
@@ -432,12 +432,12 @@ class RefinedGrid:
         uint, n = dr.uint32_array_t(type(u.x)), self.cells[0]
         p = [uint(dr.clip(x * n, 0, n - 1)) for x in (u.x, u.y, u.z)]
         x, y, z = (c >> 1 for c in p)
-        cell = x + (n // PARTS) * (y + (n // PARTS) * z)
+        cell = x + (n // PARTS_PER_AXIS) * (y + (n // PARTS_PER_AXIS) * z)
         away = uint(dr.gather(type(self.distance), self.distance, cell, active))
         parts = uint(dr.gather(type(self.parts), self.parts, cell, active & (away == 0)))
         part = (p[0] & 1) | ((p[1] & 1) << 1) | ((p[2] & 1) << 2)
         # An occupied cell that is k away is at least 2 k - 1 parts away.
-        return dr.select(away > 0, PARTS * away - 1, 1 - ((parts >> part) & 1))
+        return dr.select(away > 0, PARTS_PER_AXIS * away - 1, 1 - ((parts >> part) & 1))
 
 
 # ---- A finer bound of a trained field: which parts of its occupied cells hold anything, and what is missed ----
@@ -455,7 +455,7 @@ _GROWTH = 1.2207440846057596  # The root of x⁴ = x + 1, whose powers are the s
 _SAMPLES = 1 << 17
 
 
-def refine(field: RadianceField, points: int = POINTS) -> RefinedGrid | None:
+def refine_occupancy(field: RadianceField, points: int = POINTS) -> RefinedGrid | None:
     """The refined form of ``field``'s occupancy for its present weights; None where there is no plain grid.
 
     A density counts from ``STEP_DEPTH`` in a step on, of the field's own length or a 1024th of its box's diagonal.
@@ -463,22 +463,22 @@ def refine(field: RadianceField, points: int = POINTS) -> RefinedGrid | None:
     grid = field.occupancy
     if isinstance(grid, RefinedGrid):
         grid = grid.coarse
-    if not isinstance(grid, OccupancyGrid) or field.box.contracted:
+    if not isinstance(grid, OccupancyGrid) or field.box.is_contracted:
         return None
     step = field.march_step or field.box.diagonal / 1024
     threshold = min(STEP_DEPTH / step, grid.threshold or np.inf)
     ns = field.ns
     with dr.suspend_grad():
-        cells = ns.UInt32(aligned(np.flatnonzero(grid.bits), np.uint32))
+        cells = ns.UInt32(copy_aligned(np.flatnonzero(grid.bits), np.uint32))
         masks = _masks(field, grid.bits, cells, threshold, points)
-        missed = _missed(field, cells, ns.UInt32(aligned(masks, np.uint32)), grid.resolution, step)
+        missed = _missed(field, cells, ns.UInt32(copy_aligned(masks, np.uint32)), grid.resolution, step)
     return RefinedGrid(grid.bits, masks, ns, threshold, grid.threshold, missed)
 
 
 def _masks(field: RadianceField, bits: np.ndarray, cells: UInt32, threshold: float, points: int) -> np.ndarray:
     """Masks of the parts of ``bits`` (R, R, R), whose occupied cells are ``cells`` (N), that hold a density above the
     ``threshold`` at one of the ``points``: uint8 (N,)."""
-    ns, count, resolution = field.ns, PARTS**3, len(bits)
+    ns, count, resolution = field.ns, PARTS_PER_AXIS**3, len(bits)
     if dr.width(cells) == 0:
         return np.zeros(0, np.uint8)
     found, near = (dr.zeros(ns.UInt8, count * dr.width(cells)) for _ in range(2))
@@ -493,7 +493,7 @@ def _masks(field: RadianceField, bits: np.ndarray, cells: UInt32, threshold: flo
         dr.make_opaque(offset)
         shift = ns.Array3f(rest & 1, rest >> 1 & 1, rest >> 2 & 1)
         cell = cell_corner(dr.gather(ns.UInt32, cells, rest // count), resolution, ns)
-        sigma = field.density(field.box.from_unit((cell + (shift + offset) / PARTS) / resolution), True)
+        sigma = field.density(field.box.from_unit((cell + (shift + offset) / PARTS_PER_AXIS) / resolution), True)
         dr.scatter(found, ns.UInt8(1), rest, sigma > threshold)
         dr.scatter(near, ns.UInt8(1), rest, sigma > _PLAIN * threshold)
         dr.eval(found, near)
@@ -502,17 +502,17 @@ def _masks(field: RadianceField, bits: np.ndarray, cells: UInt32, threshold: flo
 
 def _packed(found: Any) -> np.ndarray:
     """Masks of cells of the parts that were ``found`` (UInt8 a part)."""
-    return np.packbits(found.numpy().reshape(-1, PARTS**3) > 0, axis=1, bitorder="little").ravel()
+    return np.packbits(found.numpy().reshape(-1, PARTS_PER_AXIS**3) > 0, axis=1, bitorder="little").ravel()
 
 
 def _touching(bits: np.ndarray, masks: np.ndarray) -> np.ndarray:
     """Of each part of the occupied cells of ``bits``, whether it is one of ``masks`` or touches one: uint8, ravelled.
     A surface that passes one part may cut a corner off the next."""
-    at = np.argwhere(bits)[:, None] * PARTS + np.array(list(np.ndindex(PARTS, PARTS, PARTS)))
+    at = np.argwhere(bits)[:, None] * PARTS_PER_AXIS + np.array(list(np.ndindex(PARTS_PER_AXIS, PARTS_PER_AXIS, PARTS_PER_AXIS)))
     z, y, x = at.reshape(-1, 3).T
-    whole = np.zeros([PARTS * n for n in bits.shape], bool)
+    whole = np.zeros([PARTS_PER_AXIS * n for n in bits.shape], bool)
     whole[z, y, x] = np.unpackbits(masks, bitorder="little")
-    return grown(whole)[z, y, x].astype(np.uint8)
+    return dilate(whole)[z, y, x].astype(np.uint8)
 
 
 def _missed(field: RadianceField, cells: UInt32, masks: UInt32, resolution: int, step: float) -> float:
@@ -524,8 +524,8 @@ def _missed(field: RadianceField, cells: UInt32, masks: UInt32, resolution: int,
     if dr.width(cells) == 0:
         return 0.0
     ns, rng = field.ns, np.random.default_rng(0)
-    index = ns.UInt32(aligned(rng.integers(0, dr.width(cells), _SAMPLES, np.uint32), np.uint32))
-    inside = ns.Array3f(*(ns.Float(aligned(rng.random(_SAMPLES, np.float32))) for _ in range(3)))
+    index = ns.UInt32(copy_aligned(rng.integers(0, dr.width(cells), _SAMPLES, np.uint32), np.uint32))
+    inside = ns.Array3f(*(ns.Float(copy_aligned(rng.random(_SAMPLES, np.float32))) for _ in range(3)))
     part = [ns.UInt32(c >= 0.5) for c in (inside.x, inside.y, inside.z)]
     bit = (dr.gather(ns.UInt32, masks, index) >> (part[0] | part[1] << 1 | part[2] << 2)) & 1
     u = (cell_corner(dr.gather(ns.UInt32, cells, index), resolution, ns) + inside) / resolution

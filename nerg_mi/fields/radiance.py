@@ -12,7 +12,7 @@ import numpy as np
 from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float
-from nerg_mi.ranges import FARTHEST, VALUES
+from nerg_mi.ranges import MAX_COORDINATE, POSITIVE_VALUES
 
 from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, encoding_config, random_encoding
 from .mlp import MLP, namespace
@@ -55,7 +55,7 @@ class BackgroundConfig(GridConfig):
     sh_degree: int = 4  # Degree of the encoding of directions
 
     def __post_init__(self):
-        if not 0 < self.radius <= FARTHEST:
+        if not 0 < self.radius <= MAX_COORDINATE:
             raise ValueError(f"the radius of a background must be positive and finite, got {self.radius}")
         if self.grid.dimensions != 2 or min(self.width, self.hidden) < 1:
             raise ValueError(f"a background needs a grid of 2 dimensions and sizes of at least 1, got {self}")
@@ -130,7 +130,7 @@ def mean_features(sums: list[Float], opacity: Float) -> list[Float]:
     return [s * per for s in sums]
 
 
-def network_inputs(features: list[Float], deferred: bool) -> list[Float]:
+def color_network_inputs(features: list[Float], deferred: bool) -> list[Float]:
     """What the colour net is given, behind the direction, for ``features``."""
     if not deferred:
         return features
@@ -139,8 +139,8 @@ def network_inputs(features: list[Float], deferred: bool) -> list[Float]:
     return [*(dr.log(x / (1 - x)) for x in inside), *features[3:]]
 
 
-def network_color(outputs: list[Float], inputs: list[Float], deferred: bool) -> list[Float]:
-    """Colour (3 Floats in 0..1) of the colour net's ``outputs`` for its ``inputs`` (`network_inputs`)."""
+def decode_color(outputs: list[Float], inputs: list[Float], deferred: bool) -> list[Float]:
+    """Colour (3 Floats in 0..1) of the colour net's ``outputs`` for its ``inputs`` (`color_network_inputs`)."""
     return [sigmoid(c + x) for c, x in zip(outputs, inputs)] if deferred else [sigmoid(c) for c in outputs]
 
 
@@ -174,7 +174,7 @@ class RadianceConfig(GridConfig):
     def __post_init__(self):
         if min(self.width, self.density_hidden, self.color_hidden, self.geometry, self.sh_degree) < 1:
             raise ValueError(f"every size of a radiance field must be at least 1, got {self}")
-        if self.density_scale not in VALUES:
+        if self.density_scale not in POSITIVE_VALUES:
             raise ValueError(f"density_scale must be positive and finite, got {self.density_scale}")
         if not isinstance(self.deferred, bool):
             raise ValueError(f"deferred must be true or false, got {self.deferred!r}")
@@ -341,7 +341,7 @@ class RadianceField:
 
     def _density(self, h, p):
         """Density (1/unit) at ``p`` where the density net's first output is ``h``."""
-        return self.box.density_along(density_from_log(h, self.config.density_scale), p)
+        return self.box.density_from_encoded(density_from_log(h, self.config.density_scale), p)
 
     def density_features(self, p, active: Bool | bool = True):
         """Density (1/unit) at ``p`` and the ``geometry`` features (list of Floats) that ``color`` needs."""
@@ -352,6 +352,6 @@ class RadianceField:
     def color(self, features: list, d):
         """Colour (Array3f in ``color_space``, 0..1) of a point with ``features``, seen along unit ``d``; of a deferred
         field also that of an opaque ray along ``d`` with these features on average (``radiance.mean_features``)."""
-        given = network_inputs(features, self.config.deferred)
+        given = color_network_inputs(features, self.config.deferred)
         rgb = self.color_net(encode_direction(d, self.config.sh_degree) + given)
-        return type(d)(*network_color(rgb, given, self.config.deferred))
+        return type(d)(*decode_color(rgb, given, self.config.deferred))

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.maths.sphere import C0, DEGREES, rotated_harmonics
-from nerg_mi.ranges import FARTHEST
+from nerg_mi.maths.sphere import SH_C0, HARMONIC_DEGREES, rotated_harmonics
+from nerg_mi.ranges import MAX_COORDINATE
 
 _LEAST_SCALE = 1e-9
 _LEAST_OPACITY = 1e-7
@@ -39,7 +39,7 @@ class Splats:
     extra: Mapping[str, np.ndarray] = field(default_factory=dict)  # Further columns of the file, (N,) each, by name
     color_space: str = "srgb"  # Of the colours: "srgb" or "linear"
     # What a reader had to guess, and what the file holds that is not used: a sentence each.
-    guesses: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -51,7 +51,7 @@ class Splats:
                 raise ValueError(f"the {name} of {n:,} Gaussians have the shape {value.shape}")
             object.__setattr__(self, name, value)
         colors = np.asarray(self.harmonics, np.float32)
-        if colors.ndim != 3 or len(colors) != n or colors.shape[1] not in DEGREES or colors.shape[2] != 3:
+        if colors.ndim != 3 or len(colors) != n or colors.shape[1] not in HARMONIC_DEGREES or colors.shape[2] != 3:
             raise ValueError(
                 f"the harmonics of {n:,} Gaussians have the shape {colors.shape}, which is no degree from 0 to 3"
             )
@@ -62,8 +62,8 @@ class Splats:
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"some of the {name} of its Gaussians are not finite (a splat editor removes these)")
         for name in ("centers", "scales"):
-            if not (np.abs(getattr(self, name)) <= FARTHEST).all():
-                raise ValueError(f"some of the {name} of its Gaussians are beyond {FARTHEST:g} units")
+            if not (np.abs(getattr(self, name)) <= MAX_COORDINATE).all():
+                raise ValueError(f"some of the {name} of its Gaussians are beyond {MAX_COORDINATE:g} units")
         object.__setattr__(self, "rotations", _normalized(self.rotations))
         object.__setattr__(self, "opacities", np.clip(self.opacities, 0, 1))
         if self.scales.min() < _LEAST_SCALE:
@@ -75,22 +75,22 @@ class Splats:
     @property
     def degree(self) -> int:
         """Of the harmonics: 0 to 3."""
-        return DEGREES[self.harmonics.shape[1]]
+        return HARMONIC_DEGREES[self.harmonics.shape[1]]
 
-    def placed(self, to_world: Similarity) -> Splats:
+    def transform(self, to_world: Similarity) -> Splats:
         """These Gaussians in another frame, harmonics and all."""
-        if to_world.identity:
+        if to_world.is_identity:
             return self
         turn = to_world.matrix[:3, :3] / to_world.scale
         centers = self.centers @ to_world.matrix[:3, :3].T + to_world.matrix[:3, 3]
-        rotations = multiply_quaternions(quaternions_of(turn), self.rotations.astype(np.float64))
+        rotations = multiply_quaternions(matrices_to_quaternions(turn), self.rotations.astype(np.float64))
         colors = rotated_harmonics(self.harmonics, turn)
         scales = self.scales * np.float32(to_world.scale)
         return replace(self, centers=centers, scales=scales, rotations=rotations, harmonics=colors)
 
     def axes(self) -> np.ndarray:
         """Rotation matrices (N, 3, 3), float64: columns are the Gaussians' own axes."""
-        return matrices_of(self.rotations)
+        return quaternions_to_matrices(self.rotations)
 
 
 def _normalized(rotations: np.ndarray) -> np.ndarray:
@@ -106,7 +106,7 @@ def _normalized(rotations: np.ndarray) -> np.ndarray:
     return unit
 
 
-def joined(parts: Sequence[Splats]) -> Splats:
+def concatenate_splats(parts: Sequence[Splats]) -> Splats:
     """All Gaussians of ``parts``, without further columns. Raises `ValueError` for several degrees of harmonics, and
     for several colour spaces."""
     if len({(splats.degree, splats.color_space) for splats in parts}) > 1:
@@ -117,37 +117,37 @@ def joined(parts: Sequence[Splats]) -> Splats:
     return replace(parts[0], **arrays, extra={}, notes=notes)
 
 
-def from_trained(
+def splats_from_raw_parameters(
     centers: np.ndarray, log_scales: np.ndarray, rotations: np.ndarray, logits: np.ndarray, harmonics: np.ndarray
 ) -> Splats:
     """Splats of what a training stores: logarithms of the scales, logits of the opacities; quaternions w first."""
-    return Splats(centers, scales_of(log_scales), rotations, opacities_of(logits), harmonics)
+    return Splats(centers, scales_from_logs(log_scales), rotations, opacities_from_logits(logits), harmonics)
 
 
-def scales_of(logarithms: np.ndarray) -> np.ndarray:
+def scales_from_logs(logarithms: np.ndarray) -> np.ndarray:
     """Scales, float64, of their ``logarithms``."""
     with np.errstate(over="ignore"):
         return np.exp(np.asarray(logarithms, np.float64))
 
 
-def opacities_of(logits: np.ndarray) -> np.ndarray:
+def opacities_from_logits(logits: np.ndarray) -> np.ndarray:
     """Opacities, float64, of their ``logits``."""
     with np.errstate(over="ignore"):
         return 1 / (1 + np.exp(-np.asarray(logits, np.float64)))
 
 
-def logits_of(opacities: np.ndarray) -> np.ndarray:
+def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
     """Logits of ``opacities``, float64, of which those that are 0 or 1 are kept finite."""
     p = np.clip(np.asarray(opacities, np.float64), _LEAST_OPACITY, 1 - _LEAST_OPACITY)
     return np.log(p) - np.log1p(-p)
 
 
-def harmonics_of(colors: np.ndarray) -> np.ndarray:
+def harmonics_from_colors(colors: np.ndarray) -> np.ndarray:
     """Harmonics of degree 0, (N, 1, 3), of ``colors`` (N, 3) that are the same from everywhere."""
-    return ((np.asarray(colors, np.float64) - 0.5) / C0)[:, None]
+    return ((np.asarray(colors, np.float64) - 0.5) / SH_C0)[:, None]
 
 
-def matrices_of(quaternions: np.ndarray) -> np.ndarray:
+def quaternions_to_matrices(quaternions: np.ndarray) -> np.ndarray:
     """Rotation matrices (N, 3, 3), float64, of unit ``quaternions`` (N, 4), w first."""
     w, x, y, z = np.asarray(quaternions, np.float64).T
     rows = [
@@ -158,7 +158,7 @@ def matrices_of(quaternions: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def quaternions_of(rotations: np.ndarray) -> np.ndarray:
+def matrices_to_quaternions(rotations: np.ndarray) -> np.ndarray:
     """The quaternions (N, 4), or (4,), w first, of rotation matrices (N, 3, 3), or (3, 3)."""
     from scipy.spatial.transform import Rotation
 

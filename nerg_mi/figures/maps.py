@@ -152,16 +152,16 @@ class Walls:
     low: np.ndarray
     high: np.ndarray
     height: np.ndarray
-    cut: np.ndarray
-    level: float
+    is_cut: np.ndarray
+    cut_height: float
 
 
 @dataclass(frozen=True, eq=False)
-class PersonWalk:
+class ParticipantPath:
     """Where a person was: ``places`` (N, 2) in the order of time, ``breaks`` (N,) bool where a new walk begins."""
 
     name: str
-    places: np.ndarray
+    positions: np.ndarray
     breaks: np.ndarray
 
 
@@ -172,14 +172,14 @@ class SightLines:
 
     origins: np.ndarray
     ends: np.ndarray
-    person: np.ndarray
+    participant: np.ndarray
 
 
 def floor_figure(
     low: np.ndarray,
     high: np.ndarray,
     walls: Walls | None = None,
-    walks: list[PersonWalk] | None = None,
+    paths: list[ParticipantPath] | None = None,
     rays: SightLines | None = None,
     fields: SightLines | None = None,
     fov: float = 60.0,
@@ -192,7 +192,7 @@ def floor_figure(
     """
     size = np.asarray(high, float) - low
     pixels = np.maximum(size / size.max() * _FLOOR_FIGURES_SIDE, 200)
-    names = _legend_entries(walls, walks or [], rays, fields, fov)
+    names = _legend_entries(walls, paths or [], rays, fields, fov)
     columns = max(int(pixels[0] // 190), 1)
     head = 30 + 17 * -(-len(names) // columns)
     width, height = _LEFT + pixels[0] + _RIGHT, _FOOT + pixels[1] + head
@@ -205,11 +205,11 @@ def floor_figure(
         _draw_fields(axes, fields, fov)
     if rays is not None:
         _draw_rays(axes, rays)
-    for k, walk in enumerate(walks or []):
-        starts = walk.places[walk.breaks]
-        axes.plot(*_with_gaps(walk).T, color=color_of(k), linewidth=1.4, zorder=4, solid_joinstyle="round")
+    for k, walk in enumerate(paths or []):
+        starts = walk.positions[walk.breaks]
+        axes.plot(*_with_gaps(walk).T, color=participant_color(k), linewidth=1.4, zorder=4, solid_joinstyle="round")
         axes.plot(
-            *starts.T, "o", color=color_of(k), markersize=3.5, markeredgecolor=PAPER, markeredgewidth=0.6, zorder=5
+            *starts.T, "o", color=participant_color(k), markersize=3.5, markeredgecolor=PAPER, markeredgewidth=0.6, zorder=5
         )
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -225,29 +225,29 @@ def floor_figure(
     return page
 
 
-def color_of(person: int) -> str:
+def participant_color(index: int) -> str:
     """The colour of the person with this number; those beyond the last colour begin anew."""
-    return PEOPLE[person % len(PEOPLE)]
+    return PEOPLE[index % len(PEOPLE)]
 
 
-def _with_gaps(walk: PersonWalk) -> np.ndarray:
+def _with_gaps(walk: ParticipantPath) -> np.ndarray:
     """The places of a walk with a NaN before each at which a new one begins."""
-    return np.insert(walk.places.astype(float), np.flatnonzero(walk.breaks), np.nan, axis=0)
+    return np.insert(walk.positions.astype(float), np.flatnonzero(walk.breaks), np.nan, axis=0)
 
 
 def _plan(walls: Walls) -> np.ndarray:
     """Greys (ny, nx, 3): the higher the darker, white where nothing is met, and darkest where the cut goes through."""
-    share = np.clip(np.nan_to_num(walls.height) / walls.level, 0.0, 1.0)
+    share = np.clip(np.nan_to_num(walls.height) / walls.cut_height, 0.0, 1.0)
     grey = _GREYS[0] + share * (_GREYS[1] - _GREYS[0])
     grey = np.where(np.isnan(walls.height), 1.0, grey)
-    return np.repeat(np.where(walls.cut, _CUT, grey)[..., None], 3, axis=-1)
+    return np.repeat(np.where(walls.is_cut, _CUT, grey)[..., None], 3, axis=-1)
 
 
 def _draw_rays(axes: Any, rays: SightLines) -> None:
     from matplotlib.collections import LineCollection
 
     lines = np.stack([rays.origins, rays.ends], axis=1)
-    colors = [color_of(k) for k in rays.person]
+    colors = [participant_color(k) for k in rays.participant]
     axes.add_collection(LineCollection(list(lines), colors=colors, linewidths=0.6, alpha=0.45, zorder=3))
     axes.scatter(*rays.ends.T, s=5, c=colors, linewidths=0, zorder=3.5)
 
@@ -259,26 +259,26 @@ def _draw_fields(axes: Any, fields: SightLines, fov: float) -> None:
     along = fields.ends - fields.origins
     angle, reach = np.degrees(np.arctan2(along[:, 1], along[:, 0])), np.linalg.norm(along, axis=1)
     wedges = [Wedge(tuple(o), r, a - fov / 2, a + fov / 2) for o, r, a in zip(fields.origins, reach, angle)]
-    colors = [color_of(k) for k in fields.person]
+    colors = [participant_color(k) for k in fields.participant]
     axes.add_collection(
         PatchCollection(wedges, facecolor=colors, edgecolor=colors, alpha=0.22, linewidth=0.7, zorder=2)
     )
 
 
 def _legend_entries(
-    walls: Walls | None, walks: list[PersonWalk], rays: SightLines | None, fields: SightLines | None, fov: float
+    walls: Walls | None, walks: list[ParticipantPath], rays: SightLines | None, fields: SightLines | None, fov: float
 ) -> list[tuple[str, dict[str, Any]]]:
     square = dict(linestyle="none", marker="s", markersize=6)
     found: list[tuple[str, dict[str, Any]]] = []
     if walls is not None:
-        found.append((f"cut at {walls.level:g} m", {**square, "color": str(_CUT)}))
+        found.append((f"cut at {walls.cut_height:g} m", {**square, "color": str(_CUT)}))
         found.append(("lower things", {**square, "color": str(_GREYS[1])}))
-        if np.isnan(walls.height[~walls.cut]).any():
+        if np.isnan(walls.height[~walls.is_cut]).any():
             edge = dict(color=PAPER, markeredgecolor="0.6", markeredgewidth=0.6)
             found.append(("nothing below", {**square, **edge}))
     for k, walk in enumerate(walks[:_NAMED]):
         found.append(
-            (walk.name if len(walk.name) <= 22 else walk.name[:21] + "…", dict(color=color_of(k), linewidth=1.4))
+            (walk.name if len(walk.name) <= 22 else walk.name[:21] + "…", dict(color=participant_color(k), linewidth=1.4))
         )
     if len(walks) > _NAMED:
         found.append((f"and {len(walks) - _NAMED} more people", dict(color="none")))

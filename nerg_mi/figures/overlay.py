@@ -11,10 +11,10 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files import images
 from nerg_mi.maths.color import encode_srgb
-from nerg_mi.ranges import DECADES
+from nerg_mi.ranges import LOG_DECADES
 from nerg_mi.transport.aovs import AOVS, Aov, Display, Quantity
 
-from .style import SMALL, Sheet, color_values, find_colors, hatch
+from .style import SMALL, Sheet, apply_colormap, find_colormap, hatch
 
 # ---- From linear radiance to the bytes of a picture ----
 #
@@ -51,7 +51,7 @@ def write_png(path, display, text: dict[str, str] | None = None) -> None:
 # opaque with the value, over a picture that is dimmed and greyed, so that goods stay recognisable and their colours are
 # not mistaken for heat. Where there is no surface nothing is coloured, and what is not known can be hatched.
 
-MOST_DECADES = float(DECADES.high)
+MOST_DECADES = float(LOG_DECADES.high)
 
 
 @dataclass(frozen=True)
@@ -65,40 +65,40 @@ class Heat:
     cannot be shown.
     """
 
-    top: float
-    colors: str = "inferno"
+    vmax: float
+    colormap: str = "inferno"
     opacity: float = 0.9
     ramp: float = 0.35
-    dim: float = 0.8
+    background_brightness: float = 0.8
     grey: float = 0.6
     decades: float = 0.0
 
     def __post_init__(self):
-        if not (np.isfinite(self.top) and self.top > 0):
-            raise NergError(f"the top of a heat map's scale must be positive, got {self.top}: give it a range")
+        if not (np.isfinite(self.vmax) and self.vmax > 0):
+            raise NergError(f"the top of a heat map's scale must be positive, got {self.vmax}: give it a range")
         if not 0 <= self.decades <= MOST_DECADES:
             raise NergError(f"a scale has 0 (linear) to {MOST_DECADES:.0f} decades, and {self.decades} were asked for")
-        find_colors(self.colors)
+        find_colormap(self.colormap)
 
     @property
-    def low(self) -> float:
+    def vmin(self) -> float:
         """The value at the lower end of the scale."""
-        return self.top * 10.0**-self.decades if self.decades else 0.0
+        return self.vmax * 10.0**-self.decades if self.decades else 0.0
 
-    def shares(self, values) -> np.ndarray:
+    def normalize(self, values) -> np.ndarray:
         """Place on the scale, 0..1."""
-        x = np.nan_to_num(np.asarray(values, np.float64)) / self.top
+        x = np.nan_to_num(np.asarray(values, np.float64)) / self.vmax
         if self.decades:
             x = 1.0 + np.log10(np.maximum(x, 10.0 ** -(MOST_DECADES + 1))) / self.decades
         return np.clip(x, 0.0, 1.0)
 
     def alpha(self, values) -> np.ndarray:
         """Opacity of the heat, 0..``opacity``: a smooth rise over ``ramp``."""
-        x = np.clip(self.shares(values) / self.ramp, 0.0, 1.0)
+        x = np.clip(self.normalize(values) / self.ramp, 0.0, 1.0)
         return self.opacity * x * x * (3.0 - 2.0 * x)
 
 
-def top_of(values, mask, percentile: float = 99.5) -> float:
+def robust_max(values, mask, percentile: float = 99.5) -> float:
     """The value that ``percentile`` percent of the pixels in ``mask`` (bool, like ``values``) stay below.
 
     A robust end for a scale: a few grazing pixels do not darken all others. Raises NergError where nothing is positive.
@@ -116,7 +116,7 @@ def underlay(color, heat: Heat) -> np.ndarray:
     """Display values (h, w, 3) of the linear picture ``color`` (h, w, 3), dimmed and greyed as ``heat`` says."""
     shown = srgb(color)
     luminance = srgb(np.clip(color, 0, 1) @ LUMINANCE)[..., None]
-    return heat.dim * (shown + heat.grey * (luminance - shown))
+    return heat.background_brightness * (shown + heat.grey * (luminance - shown))
 
 
 def overlay(color, values, heat: Heat, mask=None, unknown=None) -> np.ndarray:
@@ -130,7 +130,7 @@ def overlay(color, values, heat: Heat, mask=None, unknown=None) -> np.ndarray:
         alpha = np.where(mask, alpha, 0.0)
     if unknown is not None:
         alpha = np.where(unknown, 0.0, alpha)
-    hot = color_values(heat.colors, heat.shares(values))
+    hot = apply_colormap(heat.colormap, heat.normalize(values))
     base = underlay(color, heat)
     shown = base + alpha[..., None] * (hot - base)
     return shown if unknown is None else hatch(shown, unknown)
@@ -140,7 +140,7 @@ def scale_strip(heat: Heat, steps: int = 256) -> np.ndarray:
     """The colours of the scale (``steps``, 3) from its lower end to ``heat.top``, as they look over a surface of middle
     grey; steps are even on the scale, be it linear or logarithmic."""
     share = np.linspace(0.0, 1.0, steps)
-    values = heat.top * (10.0 ** (heat.decades * (share - 1.0)) if heat.decades else share)
+    values = heat.vmax * (10.0 ** (heat.decades * (share - 1.0)) if heat.decades else share)
     return overlay(np.full((1, steps, 3), 0.2), values[None], heat)[0]
 
 
@@ -151,10 +151,10 @@ def scale_strip(heat: Heat, steps: int = 256) -> np.ndarray:
 # Each function takes arrays as the integrator gives them (rows from the top) and returns a matplotlib ``Figure``, see
 # `sheet`; `style.save` writes it.
 
-HIDDEN = np.array([0.16, 0.20, 0.42])
+HIDDEN_TINT = np.array([0.16, 0.20, 0.42])
 """Tint (display sRGB) of what the observer cannot see."""
 
-GAZE = AOVS["gaze"].scale_label
+GAZE_LABEL = AOVS["gaze"].scale_label
 _STEPS = 256
 
 
@@ -178,11 +178,11 @@ def depth_figure(
     title: str = "Depth",
     unit: str = "m",
     limits: tuple[float, float] | None = None,
-    colors: str = "viridis_r",
+    colormap: str = "viridis_r",
 ):
     """``depth`` (h, w) in scene units, with a colour bar; hatched where ``mask`` (h, w) says that nothing is met.
     ``limits``: ends of the scale, by default those of `percentile_limits`."""
-    return map_figure(depth, mask, title, f"{AOVS['depth'].label} [{unit}]", limits, colors)
+    return map_figure(depth, mask, title, f"{AOVS['depth'].label} [{unit}]", limits, colormap)
 
 
 def map_figure(
@@ -200,20 +200,20 @@ def map_figure(
     values = np.asarray(values, np.float64)
     some = np.asarray(mask, bool) & np.isfinite(values)
     ends = limits or percentile_limits(values, mask)
-    shown = color_of(np.where(some, values, ends[0]), ends, colors, kind)
+    shown = map_colors(np.where(some, values, ends[0]), ends, colors, kind)
     sheet = Sheet([_hatched(shown, ~some)], [title], scale=True, note=note)
     add_map_scale(sheet, ends, colors, kind, label, values[some], unknown=not some.all())
     return sheet.page
 
 
-def color_of(values, limits: tuple[float, float], colors: str, kind: str) -> np.ndarray:
+def map_colors(values, limits: tuple[float, float], colormap: str, kind: str) -> np.ndarray:
     """Display colours (..., 3) of ``values`` (...) between ``limits``; classes have each their own, as far as there
     are so many."""
     values = np.asarray(values, np.float64)
     if kind == "categorical":
-        count = find_colors(colors, kind).N
-        return color_values(colors, (np.round(values) % count + 0.5) / count, kind)
-    return color_values(colors, (values - limits[0]) / (limits[1] - limits[0]), kind)
+        count = find_colormap(colormap, kind).N
+        return apply_colormap(colormap, (np.round(values) % count + 0.5) / count, kind)
+    return apply_colormap(colormap, (values - limits[0]) / (limits[1] - limits[0]), kind)
 
 
 def add_map_scale(
@@ -223,15 +223,15 @@ def add_map_scale(
     low, high = limits
     if kind == "categorical":
         classes = np.repeat(np.arange(round(low), round(high) + 1), _STEPS // 8)
-        sheet.bar(color_of(classes, limits, colors, kind), low - 0.5, high + 0.5, label, unknown=unknown)
+        sheet.bar(map_colors(classes, limits, colors, kind), low - 0.5, high + 0.5, label, unknown=unknown)
         return
-    strip = color_values(colors, np.linspace(0, 1, _STEPS), kind)
+    strip = apply_colormap(colors, np.linspace(0, 1, _STEPS), kind)
     over = dict(above=bool(np.any(values > high)), below=bool(np.any(values < low)))
     sheet.bar(strip, low, high, label, unknown=unknown, **over)
 
 
 def gaze_figure(
-    color, gaze, mask, heat: Heat, title: str = "Gaze", label: str = GAZE, marker=None, unknown=None, note: str = ""
+    color, gaze, mask, heat: Heat, title: str = "Gaze", label: str = GAZE_LABEL, marker=None, unknown=None, note: str = ""
 ) -> Any:
     """``gaze`` (h, w) in 1/sr over the linear picture ``color`` (h, w, 3), with its scale, which ``label`` explains.
     ``marker``: pixel (x, y) at which the observer stands; ``unknown`` (h, w) bool: where it is hatched, since nothing
@@ -254,7 +254,7 @@ def shaded(color, values) -> np.ndarray:
     blue one where they are 0."""
     v = np.clip(np.asarray(values, np.float64), 0, 1)[..., None]
     luminance = srgb(np.clip(color, 0, 1) @ LUMINANCE)[..., None]
-    hidden = HIDDEN * (0.35 + 0.9 * luminance)
+    hidden = HIDDEN_TINT * (0.35 + 0.9 * luminance)
     return hidden + v * (srgb(color) - hidden)
 
 
@@ -265,7 +265,7 @@ def difference_figure(
     title: str = "Difference",
     label: str = "difference",
     limit=None,
-    colors: str = "RdBu_r",
+    colormap: str = "RdBu_r",
     note: str = "",
 ):
     """``first`` less ``second``, (h, w) each, in the colours of a diverging map whose middle is 0; hatched where
@@ -274,10 +274,10 @@ def difference_figure(
     less = np.asarray(first, np.float64) - np.asarray(second, np.float64)
     some = np.isfinite(less) if mask is None else np.isfinite(less) & np.asarray(mask, bool)
     limit = float(limit or symmetric_limit(less[some]))
-    return map_figure(less, some, title, label, (-limit, limit), colors, "diverging", note)
+    return map_figure(less, some, title, label, (-limit, limit), colormap, "diverging", note)
 
 
-def occlusion_figure(own, moved_without, moved_with, heat: Heat, marker=None, hatched: bool = False, note: str = ""):
+def occlusion_figure(observer_view, moved_without, moved_with, heat: Heat, marker=None, hatched: bool = False, note: str = ""):
     """The paper's occlusion figure: three pictures with one scale.
 
     ``own``, ``moved_without``, ``moved_with``: tuples (color (h, w, 3) linear, gaze (h, w) in 1/sr, mask (h, w)): what
@@ -285,7 +285,7 @@ def occlusion_figure(own, moved_without, moved_with, heat: Heat, marker=None, ha
     observer stands in the two pictures of the other camera. ``hatched``: hatch where there is no surface;
     ``note``: what it rests on.
     """
-    parts = (own, moved_without, moved_with)
+    parts = (observer_view, moved_without, moved_with)
     void = [~np.asarray(m, bool) if hatched else None for _, _, m in parts]
     pictures = [overlay(c, g, heat, m, u) for (c, g, m), u in zip(parts, void)]
     titles = ["The observer's own view", "Another camera, without occlusion", "The same with occlusion"]
@@ -293,14 +293,14 @@ def occlusion_figure(own, moved_without, moved_with, heat: Heat, marker=None, ha
     if marker is not None:
         for panel in (1, 2):
             mark_observer(sheet, panel, marker)
-    add_scale(sheet, heat, GAZE, [(g, m) for _, g, m in parts], any(u is not None and u.any() for u in void))
+    add_scale(sheet, heat, GAZE_LABEL, [(g, m) for _, g, m in parts], any(u is not None and u.any() for u in void))
     return sheet.page
 
 
 def add_scale(sheet: Sheet, heat: Heat, label: str, values, unknown: bool = False) -> None:
     """The scale of ``heat`` on a ``sheet``; ``values``: pairs (values, mask) of all pictures that it explains."""
-    above = any(float(np.max(v, where=np.asarray(m, bool), initial=0.0)) > heat.top for v, m in values)
-    sheet.bar(scale_strip(heat), heat.low, heat.top, label, above=above, log=heat.decades > 0, unknown=unknown)
+    above = any(float(np.max(v, where=np.asarray(m, bool), initial=0.0)) > heat.vmax for v, m in values)
+    sheet.bar(scale_strip(heat), heat.vmin, heat.vmax, label, above=above, log=heat.decades > 0, unknown=unknown)
 
 
 def mark_observer(sheet: Sheet, panel: int, at: tuple[float, float]) -> None:
@@ -348,8 +348,8 @@ class OverlayLayers:
     values: np.ndarray
     mask: np.ndarray
     marker: tuple[float, float] | None = None
-    supported: bool = True
-    basis: str = ""
+    has_support: bool = True
+    support_note: str = ""
 
 
 @dataclass(frozen=True)
@@ -358,9 +358,9 @@ class Style:
     is logarithmic (0: linear), whether what is not known is hatched (``hatched``), and the ``title`` (None: the usual
     one)."""
 
-    colors: str | None = None
+    colormap: str | None = None
     decades: float = 0.0
-    hatched: bool = True
+    hatch_unknown: bool = True
     title: str | None = None
 
 
@@ -389,17 +389,17 @@ class Overlay:
         return self.quantity.display
 
     @property
-    def colors(self) -> str:
+    def default_colormap(self) -> str:
         """The colour map where nobody chose another."""
         return self.display.cmap or _USUAL_COLORS[self.display.kind]
 
     @property
-    def color_kind(self) -> str:
+    def colormap_kind(self) -> str:
         """The kind of its colour maps, see `style.find_colors`."""
         return self.display.kind if self.display.kind in ("diverging", "categorical") else "sequential"
 
     @property
-    def scaled(self) -> bool:
+    def needs_limits(self) -> bool:
         """Whether the ends of its scale depend on what is seen."""
         return self.display.limits is None and self.display.kind != "categorical"
 
@@ -408,46 +408,46 @@ class Overlay:
         """Whether its scale follows from the upper end alone."""
         return self.display.kind in ("heat", "diverging")
 
-    def limits(self, of: OverlayLayers) -> Limits:
+    def limits(self, layers: OverlayLayers) -> Limits:
         """The ends of the scale of one picture; None where it shows nothing of the quantity, or needs no scale."""
-        return self.limits_of(of.values, of.mask)
+        return self.limits_of(layers.values, layers.mask)
 
     def limits_of(self, values, mask) -> Limits:
         """The same of ``values`` (h, w) where ``mask`` (h, w) is true."""
-        if not self.scaled:
+        if not self.needs_limits:
             return None
         values, mask = np.nan_to_num(values), np.asarray(mask, bool)
         if self.display.kind == "heat":
-            return (0.0, top_of(values, mask)) if np.any(values[mask] > 0) else None
+            return (0.0, robust_max(values, mask)) if np.any(values[mask] > 0) else None
         if self.display.kind == "diverging":
             limit = symmetric_limit(values[mask])
             return -limit, limit
         return percentile_limits(values, mask)
 
-    def paint(self, of: OverlayLayers, limits: Limits, style: Style = USUAL, unknown=None) -> np.ndarray:
+    def paint(self, layers: OverlayLayers, limits: Limits, style: Style = USUAL, unknown=None) -> np.ndarray:
         """Display values (h, w, 3) of ``of``, hatched where ``unknown`` (h, w) bool is true."""
-        kind, colors = self.display.kind, style.colors or self.colors
+        kind, colors = self.display.kind, style.colormap or self.default_colormap
         if kind == "heat":
-            return overlay(of.color, of.values, self.heat(limits, style), of.mask, unknown)
+            return overlay(layers.color, layers.values, self.heat(limits, style), layers.mask, unknown)
         if kind == "shade":
-            shown = shaded(of.color, np.nan_to_num(of.values))
+            shown = shaded(layers.color, np.nan_to_num(layers.values))
         else:
-            shown = color_of(np.nan_to_num(of.values), self._ends(of.values, of.mask, limits), colors, self.color_kind)
+            shown = map_colors(np.nan_to_num(layers.values), self._ends(layers.values, layers.mask, limits), colors, self.colormap_kind)
         return shown if unknown is None else _hatched(shown, unknown)
 
-    def draw(self, of: OverlayLayers, limits: Limits, style: Style = USUAL) -> Any:
+    def draw(self, layers: OverlayLayers, limits: Limits, style: Style = USUAL) -> Any:
         """A figure of ``of`` on a scale with these ``limits``."""
         needs_support, label = self.quantity.needs_support, self.quantity.scale_label
         title = style.title or self.quantity.heading
         if self.display.kind == "heat":
-            if style.title is None and needs_support and not of.supported:
+            if style.title is None and needs_support and not layers.has_support:
                 title = f"{title}: nobody recorded around here"
-            unknown = unknown_of(of, needs_support) if style.hatched else None
+            unknown = unknown_mask(layers, needs_support) if style.hatch_unknown else None
             heat = self.heat(limits, style)
-            return gaze_figure(of.color, of.values, of.mask, heat, title, label, of.marker, unknown, of.basis)
-        unknown = ~(np.asarray(of.mask, bool) & np.isfinite(of.values))
-        sheet = Sheet([self.paint(of, limits, style, unknown)], [title], scale=True, note=of.basis)
-        self.add_scale(sheet, [of], limits, style, bool(unknown.any()))
+            return gaze_figure(layers.color, layers.values, layers.mask, heat, title, label, layers.marker, unknown, layers.support_note)
+        unknown = ~(np.asarray(layers.mask, bool) & np.isfinite(layers.values))
+        sheet = Sheet([self.paint(layers, limits, style, unknown)], [title], scale=True, note=layers.support_note)
+        self.add_scale(sheet, [layers], limits, style, bool(unknown.any()))
         return sheet.page
 
     def add_scale(
@@ -459,22 +459,22 @@ class Overlay:
             add_scale(sheet, self.heat(limits, style), label, [(of.values, of.mask) for of in each], unknown)
         elif self.display.kind == "shade":
             grey = np.linspace(0, 1, _STEPS)[:, None]
-            sheet.bar(HIDDEN * 0.8 + grey * (0.85 - HIDDEN * 0.8), 0.0, 1.0, label, unknown=unknown)
+            sheet.bar(HIDDEN_TINT * 0.8 + grey * (0.85 - HIDDEN_TINT * 0.8), 0.0, 1.0, label, unknown=unknown)
         else:
             seen = np.concatenate([of.values[of.mask & np.isfinite(of.values)] for of in each])
             ends = self._ends(seen, np.ones(seen.shape, bool), limits)
-            add_map_scale(sheet, ends, style.colors or self.colors, self.color_kind, label, seen, unknown)
+            add_map_scale(sheet, ends, style.colormap or self.default_colormap, self.colormap_kind, label, seen, unknown)
 
     def check_limits(self, limits: Limits) -> None:
         """Raise `NergError` where there is nothing to take a scale from."""
-        if limits is None and self.scaled:
+        if limits is None and self.needs_limits:
             raise NergError(
                 f'"{self.name}" is 0 wherever a surface is seen; move the camera or the observer, or give --top'
             )
 
     def heat(self, limits: Limits, style: Style = USUAL) -> Heat:
         """How its values become heat on a scale with these ``limits``."""
-        return Heat(1.0 if limits is None else limits[1], style.colors or self.colors, decades=style.decades)
+        return Heat(1.0 if limits is None else limits[1], style.colormap or self.default_colormap, decades=style.decades)
 
     def _ends(self, values, mask, limits: Limits) -> tuple[float, float]:
         """The ends of a scale of colours alone."""
@@ -486,16 +486,16 @@ class Overlay:
         return limits or self.display.limits or percentile_limits(values, mask)
 
 
-def unknown_of(layers: OverlayLayers, of_gaze: bool) -> np.ndarray:
+def unknown_mask(layers: OverlayLayers, of_gaze: bool) -> np.ndarray:
     """Where nothing is known (h, w), bool: where there is no surface, and everywhere for gaze without support."""
     void = ~np.asarray(layers.mask, bool)
-    return void if layers.supported or not of_gaze else np.ones_like(void)
+    return void if layers.has_support or not of_gaze else np.ones_like(void)
 
 
-def overlays_of(aov: Aov, channels: Sequence[str] | None = None) -> list[Overlay]:
+def list_overlays(aov: Aov, channels: Sequence[str] | None = None) -> list[Overlay]:
     """What can be laid over a picture of an AOV: itself, or each of its ``channels``; None: those that every medium
     has."""
-    if not aov.several:
+    if not aov.has_multiple_channels:
         return [Overlay(aov, aov.name)]
     return [_overlay_of_channel(aov, channel) for channel in channels or aov.channels or "0"]
 
@@ -511,17 +511,17 @@ def find_overlay(name: str) -> Overlay:
     first, _, channel = name.partition(".")
     if first in AOVS:
         aov = AOVS[first]
-        names = [of.name for of in overlays_of(aov)]
-        if not aov.several and channel in ("", aov.channels):
+        names = [of.name for of in list_overlays(aov)]
+        if not aov.has_multiple_channels and channel in ("", aov.channels):
             return Overlay(aov, first)
         if name in names or (aov.channels is None and channel.isdecimal()):
             return _overlay_of_channel(aov, channel)
         raise NergError(f'"{name}" is no single channel: lay {" or ".join(names)} over the picture')
-    known = [of.name for aov in AOVS.values() for of in overlays_of(aov)]
+    known = [of.name for aov in AOVS.values() for of in list_overlays(aov)]
     raise NergError(f'there is no overlay "{name}"; there are {", ".join(known)}')
 
 
-def find_stored(name: str) -> Overlay:
+def find_channel_overlay(name: str) -> Overlay:
     """The overlay of the channel ``name`` of a file: one of a nested integrator's, which no table knows, lies over the
     picture as a heat."""
     first = name.partition(".")[0]
@@ -530,10 +530,10 @@ def find_stored(name: str) -> Overlay:
     return Overlay(Quantity(name=first, label=name, display=Display(kind="heat")), name)
 
 
-def shared_limits(each: Sequence[Limits], top: float | None) -> Limits:
+def shared_limits(all_limits: Sequence[Limits], vmax: float | None) -> Limits:
     """Ends of one scale for all pictures, of the ends of ``each``, with the upper end ``top`` where one is given."""
-    known = [limits for limits in each if limits is not None]
-    if top is not None:
+    known = [limits for limits in all_limits if limits is not None]
+    if vmax is not None:
         low = min((limits[0] for limits in known), default=0.0)
-        return min(low, 0.0) if low >= top else low, top
+        return min(low, 0.0) if low >= vmax else low, vmax
     return (min(limits[0] for limits in known), max(limits[1] for limits in known)) if known else None

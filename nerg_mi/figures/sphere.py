@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
-from .overlay import GAZE, Heat, add_scale, overlay
+from .overlay import GAZE_LABEL, Heat, add_scale, overlay
 from .style import INK, SMALL, Sheet, hatch
 
 # ---- Projections ----
@@ -83,7 +83,7 @@ def find_projection(name: str) -> Projection:
     return PROJECTIONS[name]
 
 
-def resample(panorama: Any, projection: Projection, width: int) -> tuple[np.ndarray, np.ndarray]:
+def resample_panorama(panorama: Any, projection: Projection, width: int) -> tuple[np.ndarray, np.ndarray]:
     """A full-sphere picture (h, w, ...), of the sensor `panorama`, on the paper of ``projection``, ``width`` pixels
     wide and half as high: the nearest pixel's value at each, and where the map is (width // 2, width), bool.
 
@@ -116,7 +116,7 @@ def sphere_figure(
     title: str = "All that the observer could turn to",
     projection: str = "equirectangular",
     unknown=None,
-    label: str = GAZE,
+    label: str = GAZE_LABEL,
     note: str = "",
 ) -> Any:
     """Pictures (h, w, ...) of a `panorama` sensor as a map of the observer's sphere, as wide as they are.
@@ -128,10 +128,10 @@ def sphere_figure(
     """
     chosen = find_projection(projection)
     width = int(np.shape(gaze)[1]) // 2 * 2
-    shown, inside = resample(overlay(color, gaze, heat, mask), chosen, width)
+    shown, inside = resample_panorama(overlay(color, gaze, heat, mask), chosen, width)
     hatched = unknown is not None and bool(np.any(unknown))
     if hatched:
-        shown = hatch(shown, resample(unknown, chosen, width)[0])
+        shown = hatch(shown, resample_panorama(unknown, chosen, width)[0])
     sheet = Sheet([np.where(inside[..., None], shown, 1.0)], [title], scale=True, axes=True, note=note)
     axes = sheet.panels[0]
     sheet.images[0].set_extent((-1, 1, -1, 1))

@@ -11,7 +11,7 @@ from nerg_mi.statistics.tables import is_too_low
 
 from .style import INK, label_axes, label_bar, new_page
 
-MOST = 40
+MAX_BARS = 40
 """So many things are drawn, those of the greatest share."""
 
 _COLORS = {"tracked": "#2b6cb0", "field": "#d9730d"}
@@ -26,7 +26,7 @@ def things_figure(rows: Sequence[Row], title: str = "Attention on things") -> An
     best: dict[str, float] = {}
     for row in rows:
         best[row["thing"]] = max(best.get(row["thing"], 0.0), row.get("share") or 0.0)
-    names = sorted(best, key=lambda n: -best[n])[:MOST][::-1]
+    names = sorted(best, key=lambda n: -best[n])[:MAX_BARS][::-1]
     place = {name: k for k, name in enumerate(names)}
     page = new_page(1100, 130 + 24 * max(len(names), 3))
     height = page.get_figheight() * 100

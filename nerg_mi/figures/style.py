@@ -45,7 +45,7 @@ _COLORS = {
 }
 
 
-def find_colors(name: str, kind: str = "sequential") -> Any:
+def find_colormap(name: str, kind: str = "sequential") -> Any:
     """The colour map ``name`` of matplotlib: a function from 0..1 to RGBA. A name may end in ``_r``, for the other
     direction. Raises `NergError` for one that is not of the ``kind``: "sequential", "diverging" or "categorical"."""
     import matplotlib
@@ -56,9 +56,9 @@ def find_colors(name: str, kind: str = "sequential") -> Any:
     return matplotlib.colormaps[name]
 
 
-def color_values(name: str, shares: Any, kind: str = "sequential") -> np.ndarray:
+def apply_colormap(name: str, shares: Any, kind: str = "sequential") -> np.ndarray:
     """Display colours (..., 3) of places ``shares`` (...) on a scale, 0..1."""
-    return np.asarray(find_colors(name, kind)(np.asarray(shares, np.float64)))[..., :3]
+    return np.asarray(find_colormap(name, kind)(np.asarray(shares, np.float64)))[..., :3]
 
 
 # ---- Hatching ----
@@ -74,7 +74,7 @@ PALE, LINE = 0.82, 0.42
 _MIXED = 0.65
 
 
-def lines(height: int, width: int, unit: int = 1) -> np.ndarray:
+def hatch_lines(height: int, width: int, unit: int = 1) -> np.ndarray:
     """Whether a pixel (``height``, ``width``) lies on a line of the hatching; ``unit``: by what lines are coarser."""
     y, x = np.ogrid[:height, :width]
     return (x + y) % (PERIOD * unit) < WIDTH * unit
@@ -86,11 +86,11 @@ def hatch(display: Any, unknown: Any, unit: int = 1) -> np.ndarray:
     where = np.asarray(unknown, bool)[..., None]
     pale = shown + _MIXED * (PALE - shown)
     height, width = shown.shape[:2]
-    drawn = np.where(lines(height, width, unit)[..., None], LINE, pale)
+    drawn = np.where(hatch_lines(height, width, unit)[..., None], LINE, pale)
     return np.where(where, drawn, shown)
 
 
-def swatch(height: int, width: int, unit: int = 1) -> np.ndarray:
+def hatch_swatch(height: int, width: int, unit: int = 1) -> np.ndarray:
     """What stands in a legend (``height``, ``width``, 3): the hatching over a middle grey."""
     return hatch(np.full((height, width, 3), 0.5), np.full((height, width), True), unit)
 
@@ -128,12 +128,12 @@ class Provenance:
         return {"Software": programs, "Comment": self.json()}
 
 
-def provenance(
+def make_provenance(
     what: str,
     inputs: Iterable[str | Path] = (),
     seed: int | None = None,
     settings: Any = None,
-    known: dict[Path, str] | None = None,
+    checksums: dict[Path, str] | None = None,
 ) -> Provenance:
     """That of what is made of the files, or datasets of rays, ``inputs`` by ``settings``.
 
@@ -141,15 +141,15 @@ def provenance(
     ``known``: checksums by path that need not be computed again; those that are computed are added. Raises `NergError`
     for a file that cannot be read.
     """
-    known = {} if known is None else known
+    checksums = {} if checksums is None else checksums
     sums: dict[str, str] = {}
     for path in dict.fromkeys(map(Path, inputs)):
         name, number = path.name, 2
         while name in sums:
             name, number = f"{path.name} ({number})", number + 1
-        if path not in known:
-            known[path] = _digest(path)
-        sums[name] = known[path]
+        if path not in checksums:
+            checksums[path] = _digest(path)
+        sums[name] = checksums[path]
     given = {name: value for name, value in _given(settings).items() if name not in _OF_THE_RUN}
     return Provenance(what, sums, seed, {k: _plain(v) for k, v in given.items()}, versions())
 
@@ -157,12 +157,12 @@ def provenance(
 def _digest(path: Path) -> str:
     if not path.is_dir():
         return file_sha256(path)
-    from nerg_mi.rays.dataset import rays_digest
+    from nerg_mi.rays.dataset import hash_rays
 
-    return rays_digest(path)
+    return hash_rays(path)
 
 
-def files_among(*values: Any) -> list[Path]:
+def existing_files(*values: Any) -> list[Path]:
     """Those of ``values`` that name files or folders which are there; others, such as rays in memory, have no name."""
     return [Path(v) for v in values if isinstance(v, (str, os.PathLike)) and Path(v).exists()]
 
@@ -214,14 +214,14 @@ _OF_SVG = {"Software": "Creator", "Comment": "Description", "Title": "Title"}
 _SALT = "nerg_mi"
 
 
-def save(figure: Any, path: str | os.PathLike, about: Provenance | Mapping[str, str] | None = None) -> None:
+def save(figure: Any, path: str | os.PathLike, metadata: Provenance | Mapping[str, str] | None = None) -> None:
     """Write a matplotlib figure as .png, or as .svg with its pictures embedded and all else as lines and text.
 
     ``about``: what its header says, names of PNG's texts (such as ``Comment``) in a mapping; no time is in it, so that
     equal figures are equal files. Raises `NergError` for other suffixes and for what cannot be written.
     """
     check_writable(path, *FORMATS)
-    text = dict(about.text() if isinstance(about, Provenance) else about or {})
+    text = dict(metadata.text() if isinstance(metadata, Provenance) else metadata or {})
     write_bytes(path, encode(figure, Path(path).suffix.lower(), text))
 
 
@@ -379,10 +379,10 @@ class Sheet:
         left, below = (54 * unit, 42 * unit) if axes else (_EDGE * unit, 0.0)
         foot, gap = _EDGE * unit, _GAP * unit
         self._side = _SIDE * unit if scale else 0.0
-        self.width = even(left + columns * slot_w + (columns - 1) * (left if axes else gap) + self._side + foot)
+        self.width = round_up_to_even(left + columns * slot_w + (columns - 1) * (left if axes else gap) + self._side + foot)
         note = wrap(note, self.width - 2 * left, SMALL * unit) if note else ""
         foot += SMALL * unit * _PER_POINT * 1.25 * (note.count("\n") + 1) if note else 0.0
-        self.height = even(rows * (head + slot_h + below) + foot)
+        self.height = round_up_to_even(rows * (head + slot_h + below) + foot)
         self.page = new_page(self.width, self.height)
         self.panels: list[Any] = []
         self.images: list[Any] = []
@@ -463,7 +463,7 @@ class Sheet:
     def _no_data(self, x: float, top: float, text: str = "no data") -> None:
         side = round(16 * self.unit)
         axes = self._add(x, top, side, side)
-        axes.imshow(np.clip(swatch(side, side, max(round(self.unit), 1)), 0, 1), interpolation="nearest")
+        axes.imshow(np.clip(hatch_swatch(side, side, max(round(self.unit), 1)), 0, 1), interpolation="nearest")
         axes.set_xticks([])
         axes.set_yticks([])
         for spine in axes.spines.values():
@@ -479,7 +479,7 @@ def _scaled(label: str, factor: str) -> str:
     return label.replace("[", f"[{factor} ", 1) if "[" in label else f"{label} [{factor}]"
 
 
-def even(pixels: float) -> int:
+def round_up_to_even(pixels: float) -> int:
     """Rounded up to an even number, as the sides of a video's frames have to be."""
     return 2 * math.ceil(round(pixels) / 2)
 

@@ -42,14 +42,14 @@ _REMEDIES = {
 
 
 @contextmanager
-def replacing(path: str | os.PathLike) -> Iterator[Path]:
+def replace_atomically(path: str | os.PathLike) -> Iterator[Path]:
     """The name of a new, empty file to be written, which takes the place of ``path`` when the block ends.
 
     The name keeps the suffix of ``path``, by which many writers choose a format. Parent folders are made. A link is
     followed, and the permissions of a file that is replaced are kept. If the block raises, the new file is removed and
     the old one is as it was; an `OSError` of the block comes out as a `NergError` that names ``path`` and the remedy.
     """
-    with writing(path):
+    with translate_write_errors(path):
         target = Path(os.path.realpath(path))
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -81,7 +81,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 
 @contextmanager
-def replacing_folder(path: str | os.PathLike) -> Iterator[Path]:
+def create_folder_atomically(path: str | os.PathLike) -> Iterator[Path]:
     """The name of a new, empty folder to be filled, which becomes the folder ``path`` when the block ends.
 
     ``path`` must be absent or an empty folder, see `check_new_folder`. Parent folders are made. If the block raises,
@@ -89,7 +89,7 @@ def replacing_folder(path: str | os.PathLike) -> Iterator[Path]:
     ``path`` and the remedy.
     """
     check_new_folder(path)
-    with writing(path):
+    with translate_write_errors(path):
         target = Path(os.path.realpath(path))
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = target.with_name(f".{target.name[:32]}.{os.getpid()}-{secrets.token_hex(4)}.part")
@@ -109,14 +109,14 @@ def check_new_folder(path: str | os.PathLike) -> None:
     """Raise `NergError` where no folder ``path`` can be made, or where it is there and holds something: to be asked
     before long work."""
     check_folder(path)
-    with writing(path):
+    with translate_write_errors(path):
         if os.path.isdir(path) and any(os.scandir(path)):
             raise NergError(f'the folder "{path}" is there and not empty: choose another name, or remove it first')
 
 
 def write_bytes(path: str | os.PathLike, *parts: bytes | memoryview) -> None:
     """Write ``parts``, one after the other, to ``path``, whole or not at all; see `replacing`."""
-    with replacing(path) as temporary, temporary.open("wb") as out:
+    with replace_atomically(path) as temporary, temporary.open("wb") as out:
         for part in parts:
             out.write(part)
 
@@ -134,7 +134,7 @@ def check_writable(path: str | os.PathLike, *suffixes: str) -> None:
     """
     if suffixes and Path(path).suffix.lower() not in suffixes:
         raise NergError(f'"{path}" has no format that is written here: let its name end in {" or ".join(suffixes)}')
-    with writing(path):
+    with translate_write_errors(path):
         target = Path(os.path.realpath(path))
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -145,41 +145,41 @@ def check_writable(path: str | os.PathLike, *suffixes: str) -> None:
 def check_folder(path: str | os.PathLike) -> None:
     """Raise `NergError` where it is plain that no files can be written into the folder ``path``, which need not be
     there yet."""
-    with writing(path):
+    with translate_write_errors(path):
         _check_parents(Path(os.path.realpath(path)) / "file")
 
 
 def make_folder(path: str | os.PathLike) -> Path:
     """Make the folder ``path`` with its parents, if it is not there; raises `NergError` where that cannot be done."""
-    with writing(path):
+    with translate_write_errors(path):
         Path(path).mkdir(parents=True, exist_ok=True)
     return Path(path)
 
 
 @contextmanager
-def locked(path: str | os.PathLike, busy: str) -> Iterator[None]:
+def lock_file(path: str | os.PathLike, busy_message: str) -> Iterator[None]:
     """A block in which nobody else has the lock on the file ``path``, which is made if it is not there.
 
     Raises `NergError`, which says ``busy``, where somebody has it. The system takes it from a process that is killed.
     """
-    with writing(path):
+    with translate_write_errors(path):
         handle = os.open(path, os.O_RDONLY | os.O_CREAT, 0o666)
     try:
-        with writing(path):
+        with translate_write_errors(path):
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 # Its last owner may have removed it since it was opened.
                 if not os.path.exists(path) or not os.path.samestat(os.fstat(handle), os.stat(path)):
                     raise BlockingIOError
             except BlockingIOError as error:
-                raise NergError(busy) from error
+                raise NergError(busy_message) from error
         yield
     finally:
         os.close(handle)
 
 
 @contextmanager
-def reserving(path: str | os.PathLike | None) -> Iterator[None]:
+def reserve_output(path: str | os.PathLike | None) -> Iterator[None]:
     """A block, of long work, in which no other process writes the output ``path``; None: no output.
 
     Raises `NergError` where one does. A hidden file beside ``path`` is locked meanwhile; a process that is killed
@@ -190,10 +190,10 @@ def reserving(path: str | os.PathLike | None) -> Iterator[None]:
         return
     target = Path(os.path.realpath(path))
     lock = target.with_name(f".{target.name}.lock")
-    with removing_empty_parents(lock):
+    with remove_empty_new_parents(lock):
         make_folder(lock.parent)
         busy = f'"{path}" is being made by another process: wait for its end, or choose another name'
-        with locked(lock, busy):
+        with lock_file(lock, busy):
             try:
                 yield
             finally:
@@ -201,7 +201,7 @@ def reserving(path: str | os.PathLike | None) -> Iterator[None]:
 
 
 @contextmanager
-def removing_empty_parents(path: str | os.PathLike) -> Iterator[None]:
+def remove_empty_new_parents(path: str | os.PathLike) -> Iterator[None]:
     """A block after which those parents of ``path`` are removed that were not there before, and are empty."""
     missing = [parent for parent in Path(os.path.realpath(path)).parents if not parent.exists()]
     try:
@@ -215,7 +215,7 @@ def removing_empty_parents(path: str | os.PathLike) -> Iterator[None]:
 
 
 @contextmanager
-def writing(path: str | os.PathLike) -> Iterator[None]:
+def translate_write_errors(path: str | os.PathLike) -> Iterator[None]:
     """An `OSError` of the block as a `NergError` that names ``path`` and says what to do."""
     try:
         yield

@@ -15,27 +15,27 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.threads import set_thread_count
 
-from .atomic import replacing, write_bytes
-from .safe_read import open_file, reading
+from .atomic import replace_atomically, write_bytes
+from .safe_read import open_file, translate_read_errors
 
 # ---- What a picture's header says of its size, so that no decoder makes room for more than is read here ----
 
-PIXELS = 1 << 27  # a picture may have so many pixels: 16,384 x 8,192
-DECODED_BYTES = 3 << 27  # its values may take so many bytes: three 8-bit channels of as many pixels
+MAX_PIXELS = 1 << 27  # a picture may have so many pixels: 16,384 x 8,192
+MAX_DECODED_BYTES = 3 << 27  # its values may take so many bytes: three 8-bit channels of as many pixels
 
-WARRANTED = 16
+MAX_EXPANSION = 16
 """So many times its file's bytes a picture may take in any case, in pixels as in bytes: photos of 200 million pixels
 and large environment maps are no attack, where a small file that claims as much is one."""
 
-BYTES = 4 << 30  # maximum bytes of a file
+MAX_BYTES = 4 << 30  # maximum bytes of a file
 
-JPEG_BYTES = 1 << 29
+MAX_JPEG_BYTES = 1 << 29
 """And so many as JPEG, which is read whole: a photo of 200 million pixels has a fifth of them."""
 
-SCANS = 100  # a progressive JPEG may run over its pixels so many times; encoders make ten
+MAX_JPEG_SCANS = 100  # a progressive JPEG may run over its pixels so many times; encoders make ten
 _EXR_HEADER_BYTES = 1 << 20
 _EXR_KINDS = {0: 4, 1: 2, 2: 4}
 
@@ -45,26 +45,26 @@ class ImageHeader:
     """``kind``: "png", "jpeg", "exr" and so on; ``size``: width and height in pixels; ``bytes``: that all of its values
     take once they are decoded."""
 
-    kind: str
+    format: str
     size: tuple[int, int]
-    bytes: int
+    decoded_bytes: int
 
 
 def check_image(
-    path: str | os.PathLike, what: str = "image", most: int = PIXELS, most_bytes: int = BYTES
+    path: str | os.PathLike, file_kind: str = "image", max_pixels: int = MAX_PIXELS, max_bytes: int = MAX_BYTES
 ) -> ImageHeader:
     """The header of the picture ``path``; `NergError` where it is damaged, beyond ``most`` pixels of three bytes and
     beyond `WARRANTED` times its file, or where the file has more than ``most_bytes``."""
-    with open_file(path, what, most=most_bytes) as file:
+    with open_file(path, file_kind, max_bytes=max_bytes) as file:
         length = os.fstat(file.fileno()).st_size
         header = _header(file, length)
     width, height = header.size
     if not (width > 0 and height > 0):
-        raise NergError(f'the {what} "{path}" has {width} x {height} pixels; give one that shows something')
-    pixels, decoded = (max(limit, WARRANTED * length) for limit in (most, most * DECODED_BYTES // PIXELS))
-    if width * height > pixels or header.bytes > decoded:
+        raise NergError(f'the {file_kind} "{path}" has {width} x {height} pixels; give one that shows something')
+    pixels, decoded = (max(limit, MAX_EXPANSION * length) for limit in (max_pixels, max_pixels * MAX_DECODED_BYTES // MAX_PIXELS))
+    if width * height > pixels or header.decoded_bytes > decoded:
         raise NergError(
-            f'the {what} "{path}" has {width:,} x {height:,} pixels, {header.bytes:,} bytes, and at most '
+            f'the {file_kind} "{path}" has {width:,} x {height:,} pixels, {header.decoded_bytes:,} bytes, and at most '
             f"{pixels:,} pixels and {decoded:,} bytes are read of a file of {length:,}; make it smaller"
         )
     return header
@@ -103,8 +103,8 @@ def _png(start: bytes) -> ImageHeader:
 
 
 def _jpeg(file, length: int) -> ImageHeader:
-    if length > JPEG_BYTES:
-        raise ValueError(f"it has {length:,} bytes, more than the {JPEG_BYTES:,} of JPEG that are read")
+    if length > MAX_JPEG_BYTES:
+        raise ValueError(f"it has {length:,} bytes, more than the {MAX_JPEG_BYTES:,} of JPEG that are read")
     file.seek(0)
     data = file.read()
     at = 2
@@ -117,8 +117,8 @@ def _jpeg(file, length: int) -> ImageHeader:
             continue
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
-            if _scans(data, at) > SCANS:
-                raise ValueError(f"it runs over its pixels more than {SCANS} times")
+            if _scans(data, at) > MAX_JPEG_SCANS:
+                raise ValueError(f"it runs over its pixels more than {MAX_JPEG_SCANS} times")
             return ImageHeader("jpeg", (width, height), width * height * max(channels, 1) * (1 if bits == 8 else 2))
         if marker in (0xD9, 0xDA):
             break
@@ -183,7 +183,7 @@ def _exr_attributes(file, length: int) -> dict[bytes, bytes]:
         _exr_name(file)
         size = struct.unpack("<i", file.read(4))[0]
         if not 0 <= size <= length - file.tell() or file.tell() + size > _EXR_HEADER_BYTES:
-            raise ValueError(f'the attribute "{plain(name.decode("latin1"))}" of its header claims {size:,} bytes')
+            raise ValueError(f'the attribute "{sanitize(name.decode("latin1"))}" of its header claims {size:,} bytes')
         out[name] = file.read(size)
     return out
 
@@ -241,7 +241,7 @@ def write_exr(
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
     data = {name: np.ascontiguousarray(value) for name, value in channels.items()}
     rows = len(next(iter(data.values())))
-    with replacing(path) as temporary:
+    with replace_atomically(path) as temporary:
         with _writing(path, temporary), OpenEXR.File(header, data) as file:
             file.write(str(temporary))
         _check_whole(path, temporary, rows)
@@ -291,7 +291,7 @@ def _raise_if_full(path: Path) -> None:
         os.fsync(file.fileno())
 
 
-def read_exr(path: str | os.PathLike, what: str = "image") -> dict[str, np.ndarray]:
+def read_exr(path: str | os.PathLike, file_kind: str = "image") -> dict[str, np.ndarray]:
     """The channels of the first part of an EXR file, arrays (h, w) by name: colours before all others of their layer
     (R, G, B, X, Y, Z, A), the rest by name.
 
@@ -300,26 +300,26 @@ def read_exr(path: str | os.PathLike, what: str = "image") -> dict[str, np.ndarr
     """
     import OpenEXR
 
-    check_image(path, what)
+    check_image(path, file_kind)
     # The library says so of whatever it finds wrong.
-    with reading(path, what, also=(RuntimeError, TypeError)), OpenEXR.File(str(path), separate_channels=True) as file:
+    with translate_read_errors(path, file_kind, extra_errors=(RuntimeError, TypeError)), OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: np.ascontiguousarray(channel.pixels) for name, channel in file.channels().items()}
     if {"RY", "BY"} <= set(channels):
         raise NergError(
-            f'the {what} "{path}" stores luminance and colour differences (RY, BY); save it with R, G and B'
+            f'the {file_kind} "{path}" stores luminance and colour differences (RY, BY); save it with R, G and B'
         )
     if len({c.shape for c in channels.values()}) != 1 or any(c.ndim != 2 for c in channels.values()):
-        raise NergError(f'the {what} "{path}" has channels of different sizes; save it with one value a pixel in each')
+        raise NergError(f'the {file_kind} "{path}" has channels of different sizes; save it with one value a pixel in each')
     return {name: channels[name] for name in sorted(channels, key=_channel_order)}
 
 
-def read_exr_text(path: str | os.PathLike, what: str = "image") -> dict[str, str]:
+def read_exr_attributes(path: str | os.PathLike, file_kind: str = "image") -> dict[str, str]:
     """The texts in the header of an EXR file by their names: the ``attributes`` of `exr_rows` and of other programs.
     Raises `NergError` for what is damaged."""
     import OpenEXR
 
-    check_image(path, what)
-    with reading(path, what, also=(RuntimeError, TypeError)), OpenEXR.File(str(path), header_only=True) as file:
+    check_image(path, file_kind)
+    with translate_read_errors(path, file_kind, extra_errors=(RuntimeError, TypeError)), OpenEXR.File(str(path), header_only=True) as file:
         return {name: value for name, value in file.header().items() if isinstance(value, str)}
 
 
@@ -331,7 +331,7 @@ def _channel_order(name: str) -> str:
 
 
 @contextmanager
-def exr_rows(
+def open_exr_writer(
     path: str | os.PathLike, width: int, height: int, attributes: Mapping[str, str] | None = None
 ) -> Iterator[Callable[[Mapping[str, np.ndarray]], None]]:
     """A single-part scanline file that is written from the top in pieces, so that it need not lie in memory as a whole.
@@ -344,7 +344,7 @@ def exr_rows(
     import OpenEXR
 
     file, rows = None, 0
-    with replacing(path) as temporary:
+    with replace_atomically(path) as temporary:
 
         def write(channels: Mapping[str, np.ndarray]) -> None:
             nonlocal file, rows
@@ -372,7 +372,7 @@ def exr_rows(
 
 
 @contextmanager
-def threads_for_mitsuba() -> Iterator[None]:
+def ensure_two_threads() -> Iterator[None]:
     """Two threads at least, for as long as Mitsuba reads files: with one its EXR reader, too, waits for ever, and a
     scene may hold textures and emitters in that format."""
     import drjit as dr
@@ -388,7 +388,7 @@ def threads_for_mitsuba() -> Iterator[None]:
         set_thread_count(threads)
 
 
-def bitmap_channels(bitmap) -> dict[str, np.ndarray]:
+def split_bitmap_channels(bitmap) -> dict[str, np.ndarray]:
     """The channels of a Mitsuba bitmap as float32 arrays (h, w), by the names that it gives them."""
     import mitsuba as mi
 
@@ -402,7 +402,7 @@ def bitmap_channels(bitmap) -> dict[str, np.ndarray]:
 def write_bitmap_exr(path: str | Path, bitmap) -> None:
     """Write a Mitsuba bitmap with all of its channels, as float32, and the text of its metadata."""
     attributes = {k: str(v) for k, v in bitmap.metadata().items() if isinstance(v, (str, int, float))}
-    write_exr(path, bitmap_channels(bitmap), attributes)
+    write_exr(path, split_bitmap_channels(bitmap), attributes)
 
 
 # ---- PNG files, whole or absent, with text in their headers ----
@@ -410,7 +410,7 @@ def write_bitmap_exr(path: str | Path, bitmap) -> None:
 _HEADER = 33  # bytes of the signature and of the first chunk, IHDR, behind which others may stand
 
 
-def encode_png(bitmap, text: Mapping[str, str] | None = None) -> bytes:
+def encode_png(bitmap, metadata: Mapping[str, str] | None = None) -> bytes:
     """A Mitsuba bitmap of 8 or 16 bits a channel as the bytes of a PNG file; ``text``: what its header says, by
     keywords of Latin letters.
 
@@ -422,7 +422,7 @@ def encode_png(bitmap, text: Mapping[str, str] | None = None) -> bytes:
     bitmap.write(stream, mi.Bitmap.FileFormat.PNG)
     data = stream.raw_buffer()
     # Mitsuba would write texts of the bitmap's metadata with quotation marks around them.
-    return data[:_HEADER] + b"".join(_chunk(*item) for item in (text or {}).items()) + data[_HEADER:]
+    return data[:_HEADER] + b"".join(_chunk(*item) for item in (metadata or {}).items()) + data[_HEADER:]
 
 
 def _chunk(keyword: str, text: str) -> bytes:
@@ -436,6 +436,6 @@ def _chunk(keyword: str, text: str) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def write_png(path: str | os.PathLike, bitmap, text: Mapping[str, str] | None = None) -> None:
+def write_png(path: str | os.PathLike, bitmap, metadata: Mapping[str, str] | None = None) -> None:
     """Write a Mitsuba bitmap of 8 or 16 bits a channel, with ``text``; see `encode_png` and `atomic.replacing`."""
-    write_bytes(path, encode_png(bitmap, text))
+    write_bytes(path, encode_png(bitmap, metadata))

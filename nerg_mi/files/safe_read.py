@@ -24,7 +24,7 @@ from typing import IO, Any, BinaryIO
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, plain, sentence
+from nerg_mi.errors import MissingFile, NergError, sanitize, format_error
 
 # ---- Bounded ----
 #
@@ -33,9 +33,9 @@ from nerg_mi.errors import MissingFile, NergError, plain, sentence
 # A reader asks first how large things are, by the bytes that are there and by the limits stated here, and only then
 # makes room for them. Compressed files and NumPy's follow below; headers of pictures: `nerg_mi.files.images`.
 
-JSON_BYTES = 64 << 20  # a JSON file may have so many bytes: the poses of some 80,000 frames
-JSON_VALUES = 8_000_000  # so many values may stand in it: each takes up to 100 bytes of memory
-JSON_DEPTH = 64  # so deep may arrays and objects be nested; what this package reads is six deep at most
+MAX_JSON_BYTES = 64 << 20  # a JSON file may have so many bytes: the poses of some 80,000 frames
+MAX_JSON_VALUES = 8_000_000  # so many values may stand in it: each takes up to 100 bytes of memory
+MAX_JSON_DEPTH = 64  # so deep may arrays and objects be nested; what this package reads is six deep at most
 
 _DAMAGED = (
     OSError,
@@ -62,8 +62,8 @@ _REMEDY = "copy it again, or make it anew"
 
 
 @contextmanager
-def reading(
-    path: str | os.PathLike, what: str = "file", remedy: str = _REMEDY, also: tuple[type[Exception], ...] = ()
+def translate_read_errors(
+    path: str | os.PathLike, file_kind: str = "file", remedy: str = _REMEDY, extra_errors: tuple[type[Exception], ...] = ()
 ) -> Iterator[None]:
     """Whatever a damaged file makes the block raise, as one `NergError` that names ``path`` and the ``remedy``.
 
@@ -76,14 +76,14 @@ def reading(
     except NergError:
         raise
     except FileNotFoundError as error:
-        raise MissingFile(f'there is no {what} "{path}"; correct its name') from error
-    except (*_DAMAGED, *also) as error:
-        raise NergError(f'the {what} "{path}" cannot be read: {_said(error)}; {_remedy(error, remedy)}') from error
+        raise MissingFile(f'there is no {file_kind} "{path}"; correct its name') from error
+    except (*_DAMAGED, *extra_errors) as error:
+        raise NergError(f'the {file_kind} "{path}" cannot be read: {_said(error)}; {_remedy(error, remedy)}') from error
     except Exception as error:
         # The library is imported by those who read its files: without it the exception cannot be one of its own.
         if type(error).__name__ != "SafetensorError":
             raise
-        raise NergError(f'the {what} "{path}" cannot be read: {_said(error)}; {remedy}') from error
+        raise NergError(f'the {file_kind} "{path}" cannot be read: {_said(error)}; {remedy}') from error
 
 
 def _said(error: BaseException) -> str:
@@ -94,10 +94,10 @@ def _said(error: BaseException) -> str:
     if isinstance(error, EOFError):
         return "it ends too early"
     if isinstance(error, KeyError):
-        return f"it lacks {plain(error)}"
+        return f"it lacks {sanitize(error)}"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror[:1].lower() + error.strerror[1:]
-    return plain(sentence(error)).rstrip(".")
+    return sanitize(format_error(error)).rstrip(".")
 
 
 def _remedy(error: BaseException, remedy: str) -> str:
@@ -122,36 +122,36 @@ def is_count(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 62
 
 
-def size_of(path: str | os.PathLike, what: str = "file", most: int | None = None) -> int:
+def check_regular_file(path: str | os.PathLike, file_kind: str = "file", max_bytes: int | None = None) -> int:
     """Bytes of the ordinary file ``path``; `NergError` for a folder, a device or a pipe, and beyond ``most`` bytes.
 
     A pipe may keep its reader waiting for ever, and a device may have no end. So every path is checked by this before
     it is opened, here or by a library. A link counts as what it leads to: ``/dev/stdin`` is read where it is a file.
     """
-    with reading(path, what):
+    with translate_read_errors(path, file_kind):
         # A name may hold what no file's can, such as a zero byte.
         found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
         kind, remedy = _KINDS.get(stat.S_IFMT(found.st_mode), ("no ordinary file", "give the name of a file"))
-        raise NergError(f'the {what} "{path}" is {kind}; {remedy}')
-    if most is not None and found.st_size > most:
+        raise NergError(f'the {file_kind} "{path}" is {kind}; {remedy}')
+    if max_bytes is not None and found.st_size > max_bytes:
         raise NergError(
-            f'the {what} "{path}" has {found.st_size:,} bytes, more than the {most:,} that are read; give a smaller one'
+            f'the {file_kind} "{path}" has {found.st_size:,} bytes, more than the {max_bytes:,} that are read; give a smaller one'
         )
     return found.st_size
 
 
-def is_ordinary(path: Path, what: str = "file") -> bool:
+def is_regular_file(path: Path, file_kind: str = "file") -> bool:
     """Whether there is an ordinary file ``path``; a folder is none. `NergError` for a device, a pipe or a socket, which
     is no missing file."""
     if path.is_file():
         return True
     if path.exists() and not path.is_dir():
-        size_of(path, what)
+        check_regular_file(path, file_kind)
     return False
 
 
-def real_path(path: str | os.PathLike) -> Path:
+def resolve_path(path: str | os.PathLike) -> Path:
     """``path``, absolute and without links. Links that lead in a circle stay: what opens them says so, where
     `Path.resolve` of Python before 3.13 raises a ``RuntimeError``."""
     return Path(os.path.realpath(path))
@@ -159,56 +159,56 @@ def real_path(path: str | os.PathLike) -> Path:
 
 @contextmanager
 def open_file(
-    path: str | os.PathLike, what: str = "file", remedy: str = _REMEDY, most: int | None = None
+    path: str | os.PathLike, file_kind: str = "file", remedy: str = _REMEDY, max_bytes: int | None = None
 ) -> Iterator[BinaryIO]:
     """The ordinary file ``path``, open to be read in the block; see `size_of`, and `reading` for errors of the
     block."""
-    size_of(path, what, most)
-    with reading(path, what, remedy), open(path, "rb") as file:
+    check_regular_file(path, file_kind, max_bytes)
+    with translate_read_errors(path, file_kind, remedy), open(path, "rb") as file:
         yield file
 
 
-def read_bytes(path: str | os.PathLike, what: str, most: int) -> bytes:
+def read_bytes(path: str | os.PathLike, file_kind: str, max_bytes: int) -> bytes:
     """The bytes of the ordinary file ``path``, at most ``most``; see `size_of`. All of them are held: read what may be
     larger than its reader can hold by `open_file`."""
-    with open_file(path, what, most=most) as file:
+    with open_file(path, file_kind, max_bytes=max_bytes) as file:
         return file.read()
 
 
-def map_bytes(path: str | os.PathLike, what: str, most: int, start: bytes, remedy: str = _REMEDY) -> memoryview:
+def map_bytes(path: str | os.PathLike, file_kind: str, max_bytes: int, magic: bytes, remedy: str = _REMEDY) -> memoryview:
     """The bytes of the ordinary file ``path``, at most ``most``, each read when it is used: what is not used takes no
     memory. `NergError` for a file that does not begin with ``start``; see `open_file`."""
-    with open_file(path, what, remedy, most) as file:
-        if file.read(len(start)) != start:
-            raise ValueError(f'it does not begin with "{plain(start.decode("latin-1"))}", as such a file does')
+    with open_file(path, file_kind, remedy, max_bytes) as file:
+        if file.read(len(magic)) != magic:
+            raise ValueError(f'it does not begin with "{sanitize(magic.decode("latin-1"))}", as such a file does')
         return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
 
-def read_json(path: str | os.PathLike, what: str = "file", most: int = JSON_BYTES) -> object:
+def read_json(path: str | os.PathLike, file_kind: str = "file", max_bytes: int = MAX_JSON_BYTES) -> object:
     """The JSON document ``path``. `NergError` for what is none, is larger than ``most`` bytes or is nested too deep."""
-    return parse_json(read_bytes(path, what, most), path, what, most)
+    return parse_json(read_bytes(path, file_kind, max_bytes), path, file_kind, max_bytes)
 
 
 def parse_json(
-    raw: bytes | memoryview | str, path: str | os.PathLike, what: str = "file", most: int = JSON_BYTES
+    raw: bytes | memoryview | str, path: str | os.PathLike, file_kind: str = "file", max_bytes: int = MAX_JSON_BYTES
 ) -> object:
     """The JSON document ``raw``, which stood in ``path``. `NergError` for what is none, is nested deeper than
     `JSON_DEPTH` or holds more than `JSON_VALUES` values. Integers of hundreds of digits are floats."""
-    if len(raw) > most:
+    if len(raw) > max_bytes:
         raise NergError(
-            f'the {what} "{path}" holds a JSON document of {len(raw):,} bytes, more than the {most:,} that are read; '
+            f'the {file_kind} "{path}" holds a JSON document of {len(raw):,} bytes, more than the {max_bytes:,} that are read; '
             "give a smaller one"
         )
-    with reading(path, what, "correct it, or make it anew"):
+    with translate_read_errors(path, file_kind, "correct it, or make it anew"):
         if not isinstance(raw, str):
             raw = bytes(raw)
             raw = raw.decode(json.detect_encoding(raw))
-        _check_json(raw, path, what)
+        _check_json(raw, path, file_kind)
         try:
             return json.loads(raw, parse_int=_integer)
         except json.JSONDecodeError as error:
             raise NergError(
-                f'the {what} "{path}" is not valid JSON: {plain(error)}; correct it, or make it anew'
+                f'the {file_kind} "{path}" is not valid JSON: {sanitize(error)}; correct it, or make it anew'
             ) from error
 
 
@@ -223,20 +223,20 @@ _STRING = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"?', re.DOTALL)
 
 def _check_json(text: str, path, what: str) -> None:
     opened = text.count("[") + text.count("{")
-    if opened <= JSON_DEPTH and text.count(",") <= JSON_VALUES // 2:
+    if opened <= MAX_JSON_DEPTH and text.count(",") <= MAX_JSON_VALUES // 2:
         return
     bare = np.frombuffer(_STRING.sub("", text).encode("ascii", "ignore"), np.uint8)
     up, down = (bare == 0x5B) | (bare == 0x7B), (bare == 0x5D) | (bare == 0x7D)
     values = int(up.sum()) + int((bare == 0x2C).sum())
-    if values > JSON_VALUES:
+    if values > MAX_JSON_VALUES:
         raise NergError(
-            f'the {what} "{path}" holds more than the {JSON_VALUES:,} values that are read; give a smaller one'
+            f'the {what} "{path}" holds more than the {MAX_JSON_VALUES:,} values that are read; give a smaller one'
         )
     brackets = np.where(up, 1, -1)[up | down]
     depth = int(np.cumsum(brackets, dtype=np.int64).max(initial=0))
-    if depth > JSON_DEPTH:
+    if depth > MAX_JSON_DEPTH:
         raise NergError(
-            f'the {what} "{path}" is nested {depth:,} deep, and at most {JSON_DEPTH} deep is read; make it anew'
+            f'the {what} "{path}" is nested {depth:,} deep, and at most {MAX_JSON_DEPTH} deep is read; make it anew'
         )
 
 
@@ -245,9 +245,9 @@ def _check_json(text: str, path, what: str) -> None:
 # Deflate makes up to 1,032 bytes of one. What is inflated may be 100 times the compressed file, and `FREE` bytes in any
 # case, for an array of zeros is no attack.
 
-RATIO = 100  # so many times its own size may a compressed file inflate to
-FREE = 256 << 20  # so many bytes it may inflate to whatever its size
-DIRECTORY_BYTES = 8 << 20  # a zip archive's list of members may have so many bytes: some 100,000 members
+MAX_INFLATION_RATIO = 100  # so many times its own size may a compressed file inflate to
+MIN_INFLATION_LIMIT = 256 << 20  # so many bytes it may inflate to whatever its size
+MAX_DIRECTORY_BYTES = 8 << 20  # a zip archive's list of members may have so many bytes: some 100,000 members
 _CHUNK = 1 << 20
 _GZIP = 16 + zlib.MAX_WBITS
 # Bytes of a gzip file without any that come out: its header with names, and zeros that fill up a tape's block.
@@ -256,9 +256,9 @@ _IDLE = 1 << 24
 _DEFLATE = 1100
 
 
-def inflated_limit(compressed: int) -> int:
+def compute_inflation_limit(compressed: int) -> int:
     """How many bytes may come out of ``compressed`` bytes."""
-    return max(FREE, RATIO * compressed)
+    return max(MIN_INFLATION_LIMIT, MAX_INFLATION_RATIO * compressed)
 
 
 class _Bounded(io.RawIOBase):
@@ -272,7 +272,7 @@ class _Bounded(io.RawIOBase):
         return True
 
     def readinto(self, buffer) -> int:
-        with reading(self._path, self._what):
+        with translate_read_errors(self._path, self._what):
             data = self._stream.read(min(len(buffer), _CHUNK))
         self._taken += len(data)
         if self._taken > self._most:
@@ -327,61 +327,61 @@ def _too_large(path, what: str, most: int) -> NergError:
 
 
 @contextmanager
-def open_gzip(path: str | os.PathLike, what: str = "file", most: int | None = None) -> Iterator[io.BufferedReader]:
+def open_gzip(path: str | os.PathLike, file_kind: str = "file", max_bytes: int | None = None) -> Iterator[io.BufferedReader]:
     """The inflated bytes of the gzip file ``path``, as a stream. `NergError`, also from reading it: where it is damaged
     or more than ``most`` bytes (default: `inflated_limit`) come out."""
-    most = inflated_limit(size_of(path, what)) if most is None else most
-    with reading(path, what):
+    max_bytes = compute_inflation_limit(check_regular_file(path, file_kind)) if max_bytes is None else max_bytes
+    with translate_read_errors(path, file_kind):
         file = open(path, "rb")
     with file:
-        yield io.BufferedReader(_Bounded(_Members(file), most, path, what), _CHUNK)
+        yield io.BufferedReader(_Bounded(_Members(file), max_bytes, path, file_kind), _CHUNK)
 
 
 @contextmanager
-def open_zip(path: str | os.PathLike, what: str = "file", most: int | None = None) -> Iterator[zipfile.ZipFile]:
+def open_zip(path: str | os.PathLike, file_kind: str = "file", max_bytes: int | None = None) -> Iterator[zipfile.ZipFile]:
     """The zip archive ``path``, whose members claim no more than ``most`` bytes together (default: `inflated_limit`).
 
     `NergError` for one that is damaged, encrypted, or too large. Read its members by `read_member` or `member_into`,
     which do not trust what a member claims.
     """
-    size = size_of(path, what)
-    most = inflated_limit(size) if most is None else most
-    with reading(path, what):
+    size = check_regular_file(path, file_kind)
+    max_bytes = compute_inflation_limit(size) if max_bytes is None else max_bytes
+    with translate_read_errors(path, file_kind):
         listed = _directory_bytes(path, size)
-    if listed > DIRECTORY_BYTES:
+    if listed > MAX_DIRECTORY_BYTES:
         raise NergError(
-            f'the {what} "{path}" lists members over {listed:,} bytes, more than the {DIRECTORY_BYTES:,} that are '
+            f'the {file_kind} "{path}" lists members over {listed:,} bytes, more than the {MAX_DIRECTORY_BYTES:,} that are '
             "read; give one with fewer members"
         )
-    with reading(path, what):
+    with translate_read_errors(path, file_kind):
         archive = zipfile.ZipFile(path)
     with archive:
         members = archive.infolist()
         if len({m.filename for m in members}) != len(members):
-            raise NergError(f'the {what} "{path}" holds two members of one name; make it anew')
+            raise NergError(f'the {file_kind} "{path}" holds two members of one name; make it anew')
         if any(m.flag_bits & 1 for m in members):
-            raise NergError(f'the {what} "{path}" is encrypted; give it without a password')
-        if sum(m.file_size for m in members) > most:
-            raise _too_large(path, what, most)
+            raise NergError(f'the {file_kind} "{path}" is encrypted; give it without a password')
+        if sum(m.file_size for m in members) > max_bytes:
+            raise _too_large(path, file_kind, max_bytes)
         yield archive
 
 
-def read_member(archive: zipfile.ZipFile, name: str, path: str | os.PathLike, what: str = "file") -> bytearray:
+def read_member(archive: zipfile.ZipFile, name: str, path: str | os.PathLike, file_kind: str = "file") -> bytearray:
     """The bytes of the member ``name`` of an archive of `open_zip`."""
-    stream, size = open_member(archive, name, path, what)
+    stream, size = open_member(archive, name, path, file_kind)
     out = bytearray(size)
     with stream:
-        member_into(stream, memoryview(out), path, what)
+        read_into(stream, memoryview(out), path, file_kind)
     return out
 
 
 def open_member(
-    archive: zipfile.ZipFile, name: str, path: str | os.PathLike, what: str = "file"
+    archive: zipfile.ZipFile, name: str, path: str | os.PathLike, file_kind: str = "file"
 ) -> tuple[IO[bytes], int]:
     """``(stream, size)`` of the member ``name``: the size is what it claims, where its compressed bytes can come to so
     much.
     """
-    with reading(path, what):
+    with translate_read_errors(path, file_kind):
         info = archive.getinfo(name)
         stream = archive.open(info)
         file: Any = archive.fp
@@ -389,16 +389,16 @@ def open_member(
     if info.file_size > _DEFLATE * info.compress_size + _DEFLATE or info.header_offset + info.compress_size > whole:
         stream.close()
         raise NergError(
-            f'the member "{plain(info.filename)}" of the {what} "{path}" claims {info.file_size:,} bytes, to which the '
+            f'the member "{sanitize(info.filename)}" of the {file_kind} "{path}" claims {info.file_size:,} bytes, to which the '
             f"{min(info.compress_size, whole):,} that are there do not inflate; copy the file again"
         )
     return stream, info.file_size
 
 
-def member_into(stream, out: memoryview, path: str | os.PathLike, what: str = "file") -> None:
+def read_into(stream, out: memoryview, path: str | os.PathLike, file_kind: str = "file") -> None:
     """Fill ``out`` (bytes) from ``stream``, in pieces: asked for all at once, zlib makes room for all that it finds."""
     at = 0
-    with reading(path, what):
+    with translate_read_errors(path, file_kind):
         while at < len(out):
             data = stream.read(min(_CHUNK, len(out) - at))
             if not data:
@@ -438,15 +438,15 @@ def _directory_bytes(path, size: int) -> int:
 #
 # Lines of large text files, plain or gzip, in blocks: memory stays bounded whatever the file holds.
 
-LINE_CHARACTERS = 1 << 20  # a line of a tracking file may be so long: HoloLens 2 writes 17,000 characters
+MAX_LINE_LENGTH = 1 << 20  # a line of a tracking file may be so long: HoloLens 2 writes 17,000 characters
 _BLOCK_CHARACTERS = 1 << 24
 _LINE_BLOCKS_CHUNK = 1 << 22
 
-OnBadLine = Callable[[int, str], None]
+BadLineCallback = Callable[[int, str], None]
 """Told of a line that cannot be read: its number, from 1, and why. Readers that are given none raise `NergError`."""
 
 
-def line_blocks(path: str | os.PathLike, what: str, most: int) -> Generator[list[str], None, None]:
+def read_line_blocks(path: str | os.PathLike, file_kind: str, max_lines: int) -> Generator[list[str], None, None]:
     """Lines of the UTF-8 file ``path`` (inflated where its name ends in ``.gz``) with their ends, in blocks of at most
     ``most`` lines and some 16 million characters.
 
@@ -454,30 +454,30 @@ def line_blocks(path: str | os.PathLike, what: str, most: int) -> Generator[list
     line of more than `LINE_CHARACTERS`.
     """
     decoder, rest, found, count, characters = codecs.getincrementaldecoder("utf-8")(), "", [], 0, 0
-    with _opened(path, what) as source:
+    with _opened(path, file_kind) as source:
         ended = False
         while not ended:
-            with reading(path, what):
+            with translate_read_errors(path, file_kind):
                 data = source.read(_LINE_BLOCKS_CHUNK)
             ended = not data
             try:
                 text = rest + decoder.decode(data, final=ended)
             except UnicodeDecodeError as error:
-                raise NergError(f'the {what} "{path}" is no UTF-8 text ({error.reason}); save it as UTF-8') from error
+                raise NergError(f'the {file_kind} "{path}" is no UTF-8 text ({error.reason}); save it as UTF-8') from error
             # As files are split: at \n, \r or both, and not at the many other characters that end lines elsewhere.
             lines = io.StringIO(text, newline="").readlines()
             # The last line may go on, or end in the \r of a \r\n.
             rest = "" if ended or not lines else lines.pop()
-            if max(map(len, [*lines, rest])) > LINE_CHARACTERS:
-                at = next(k for k, line in enumerate([*lines, rest]) if len(line) > LINE_CHARACTERS)
+            if max(map(len, [*lines, rest])) > MAX_LINE_LENGTH:
+                at = next(k for k, line in enumerate([*lines, rest]) if len(line) > MAX_LINE_LENGTH)
                 raise NergError(
-                    f'line {count + len(found) + at + 1} of the {what} "{path}" has more than the {LINE_CHARACTERS:,} '
+                    f'line {count + len(found) + at + 1} of the {file_kind} "{path}" has more than the {MAX_LINE_LENGTH:,} '
                     "characters that are read; is it a text file?"
                 )
             found += lines
             characters += len(text) - len(rest)
-            while len(found) >= most or (found and (ended or characters >= _BLOCK_CHARACTERS)):
-                block, found = found[:most], found[most:]
+            while len(found) >= max_lines or (found and (ended or characters >= _BLOCK_CHARACTERS)):
+                block, found = found[:max_lines], found[max_lines:]
                 count += len(block)
                 characters = sum(map(len, found))
                 yield block
@@ -489,8 +489,8 @@ def _opened(path: str | os.PathLike, what: str) -> Iterator[IO[bytes]]:
         with open_gzip(path, what) as source:
             yield source
         return
-    size_of(path, what)
-    with reading(path, what):
+    check_regular_file(path, what)
+    with translate_read_errors(path, what):
         source = open(path, "rb")
     with source:
         yield source
@@ -501,10 +501,10 @@ def _opened(path: str | os.PathLike, what: str) -> Iterator[IO[bytes]]:
 # NumPy's files, .npy and .npz: what a header claims is compared with the bytes that are there before an array is
 # made.
 
-HEADER_BYTES = 10_000  # the header of an array may have so many bytes
+MAX_NPY_HEADER_BYTES = 10_000  # the header of an array may have so many bytes
 
 
-class Npz:
+class NpzReader:
     """The arrays of an open .npz archive, each read when it is asked for.
 
     ``names``: of the arrays. ``archive[name]`` raises `KeyError` for a name that is not among them, and `NergError` for
@@ -524,14 +524,14 @@ class Npz:
 
     def __getitem__(self, name: str) -> np.ndarray:
         """The array ``name``."""
-        member, what = self._members[name], f'array "{plain(name)}" of the {self._what}'
+        member, what = self._members[name], f'array "{sanitize(name)}" of the {self._what}'
         stream, size = open_member(self._archive, member, self._path, self._what)
         with stream:
             return _array(stream, size, self._path, what)
 
-    def about(self, name: str) -> tuple[tuple[int, ...], np.dtype]:
+    def read_header(self, name: str) -> tuple[tuple[int, ...], np.dtype]:
         """Shape and type of the array ``name``, from its header."""
-        member, what = self._members[name], f'array "{plain(name)}" of the {self._what}'
+        member, what = self._members[name], f'array "{sanitize(name)}" of the {self._what}'
         stream, size = open_member(self._archive, member, self._path, self._what)
         with stream:
             shape, _, dtype = _header(stream, size, self._path, what)
@@ -539,41 +539,41 @@ class Npz:
 
 
 @contextmanager
-def open_npz(path: str | os.PathLike, what: str = "file", most: int | None = None) -> Iterator[Npz]:
+def open_npz(path: str | os.PathLike, file_kind: str = "file", max_bytes: int | None = None) -> Iterator[NpzReader]:
     """The arrays of the .npz archive ``path``; `NergError` for one that is damaged, or inflates to more than ``most``
     bytes (default: `safe_read.inflated_limit`)."""
-    with open_zip(path, what, most) as archive:
-        yield Npz(archive, path, what)
+    with open_zip(path, file_kind, max_bytes) as archive:
+        yield NpzReader(archive, path, file_kind)
 
 
-def read_npz(path: str | os.PathLike, what: str = "file", most: int | None = None) -> dict[str, np.ndarray]:
+def read_npz(path: str | os.PathLike, file_kind: str = "file", max_bytes: int | None = None) -> dict[str, np.ndarray]:
     """All arrays of the .npz archive ``path`` by name; see `open_npz`."""
-    with open_npz(path, what, most) as archive:
+    with open_npz(path, file_kind, max_bytes) as archive:
         return {name: archive[name] for name in archive.names}
 
 
-def read_npy(path: str | os.PathLike, what: str = "file") -> np.ndarray:
+def read_npy(path: str | os.PathLike, file_kind: str = "file") -> np.ndarray:
     """The array in the .npy file ``path``. `NergError` for one that is damaged, claims more than the file holds, or
     holds Python objects, which only running code could make."""
-    size = size_of(path, what)
-    with reading(path, what):
+    size = check_regular_file(path, file_kind)
+    with translate_read_errors(path, file_kind):
         stream = open(path, "rb")
     with stream:
-        return _array(stream, size, path, what)
+        return _array(stream, size, path, file_kind)
 
 
 def _array(stream, size: int, path, what: str) -> np.ndarray:
     shape, columns_first, dtype = _header(stream, size, path, what)
-    with reading(path, what):
+    with translate_read_errors(path, what):
         out = np.empty(math.prod(shape), dtype)
         if out.size:
-            member_into(stream, out.view(np.uint8).data, path, what)
+            read_into(stream, out.view(np.uint8).data, path, what)
         return out.reshape(shape[::-1]).T if columns_first else out.reshape(shape)
 
 
 def _header(stream, size: int, path, what: str) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, whether the first index runs fastest, and type; the stream then stands at the first number."""
-    with reading(path, what, also=(TypeError,)):
+    with translate_read_errors(path, what, extra_errors=(TypeError,)):
         version = np.lib.format.read_magic(stream)
         read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
         if read is None:
@@ -581,7 +581,7 @@ def _header(stream, size: int, path, what: str) -> tuple[tuple[int, ...], bool, 
                 f'the {what} "{path}" is of version {version[0]}.{version[1]} of the format, and 1.0 and 2.0 are read; '
                 "write it again with numpy.save"
             )
-        shape, columns_first, dtype = read(stream, max_header_size=HEADER_BYTES)
+        shape, columns_first, dtype = read(stream, max_header_size=MAX_NPY_HEADER_BYTES)
         taken = stream.tell()
     if dtype.hasobject:
         raise NergError(
@@ -589,12 +589,12 @@ def _header(stream, size: int, path, what: str) -> tuple[tuple[int, ...], bool, 
         )
     if any(n < 0 for n in shape) or len(shape) > 32 or (dtype.itemsize == 0 and math.prod(shape)):
         raise NergError(
-            f'the {what} "{path}" claims the shape {plain(shape)} of {plain(dtype)}, which is none; make it anew'
+            f'the {what} "{path}" claims the shape {sanitize(shape)} of {sanitize(dtype)}, which is none; make it anew'
         )
     need, there = math.prod(shape) * dtype.itemsize, size - taken
     if need > there:
         raise NergError(
-            f'the {what} "{path}" claims the shape {plain(shape)} of {plain(dtype)}, {need:,} bytes, '
+            f'the {what} "{path}" claims the shape {sanitize(shape)} of {sanitize(dtype)}, {need:,} bytes, '
             f"and has {there:,}; copy it again, or make it anew"
         )
     return shape, columns_first, dtype

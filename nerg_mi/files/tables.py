@@ -10,7 +10,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from .atomic import replacing, write_text
+from .atomic import replace_atomically, write_text
 
 
 def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
@@ -23,25 +23,25 @@ def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], column
     if not columns:
         rows = list(rows)
         columns = list(dict.fromkeys(k for row in rows for k in row))
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+    with replace_atomically(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, restval="")
-        csv.writer(file).writerow(map(without_formula, columns))
+        csv.writer(file).writerow(map(escape_formula, columns))
         # NaN alone is no equal of itself.
-        writer.writerows({k: without_formula(v) for k, v in row.items() if v == v} for row in rows)
+        writer.writerows({k: escape_formula(v) for k, v in row.items() if v == v} for row in rows)
 
 
 # Also the wide forms that spreadsheets take for the same in some languages.
 _FORMULA = re.compile(r"'*[=+\-@\t\r\uff1d\uff0b\uff0d\uff20].", re.DOTALL)
 
 
-def without_formula(value: Any) -> Any:
+def escape_formula(value: Any) -> Any:
     """``value`` as a cell of CSV: text that begins with ``=``, ``+``, ``-``, ``@``, a tab or a carriage return has an
     apostrophe before it, by which spreadsheets know text. Numbers, and several of them ("-1, 2, 3"), stay as they are.
     `with_formula` gives the text back."""
     return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) and not _is_numbers(value) else value
 
 
-def with_formula(cell: str) -> str:
+def unescape_formula(cell: str) -> str:
     """The text that `without_formula` made the ``cell`` of."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
@@ -53,14 +53,14 @@ def _is_numbers(text: str) -> bool:
         return False
 
 
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]], right: Collection[str] = ()) -> str:
+def format_markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]], right_aligned: Collection[str] = ()) -> str:
     """A Markdown table of cells as ``str`` shows them, without a line end; bars, line breaks, HTML and images in
     cells are escaped, but for code spans.
 
     ``right``: those columns of ``head`` that are aligned to the right.
     """
-    cells = [[_markdown_cell(str(cell)) for cell in row] for row in (head, *rows)]
-    rule = ["---:" if name in right else "---" for name in head]
+    cells = [[_markdown_cell(str(cell)) for cell in row] for row in (header, *rows)]
+    rule = ["---:" if name in right_aligned else "---" for name in header]
     return "\n".join("| " + " | ".join(line) + " |" for line in (cells[0], rule, *cells[1:]))
 
 

@@ -12,10 +12,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from nerg_mi.errors import NergError, import_extra, plain
+from nerg_mi.errors import NergError, import_extra, sanitize
 
-from .atomic import replacing
-from .safe_read import reading, size_of
+from .atomic import replace_atomically
+from .safe_read import translate_read_errors, check_regular_file
 
 # ---- Movie tables ----
 #
@@ -44,9 +44,9 @@ class _Claims:
     boxes: int = 0
 
 
-def check_movie(path: str | os.PathLike, what: str = "video") -> None:
+def check_video_tables(path: str | os.PathLike, file_kind: str = "video") -> None:
     """Raise ``ValueError`` where the boxes of ``path`` claim more than its bytes warrant; other kinds of files pass."""
-    length = size_of(path, what)
+    length = check_regular_file(path, file_kind)
     claims = _Claims()
     with open(path, "rb") as file:
         for kind, start, end in _boxes(file, 0, length, claims):
@@ -57,16 +57,16 @@ def check_movie(path: str | os.PathLike, what: str = "video") -> None:
         raise ValueError(f"it claims {claims.samples:,} samples{edits} in {length:,} bytes")
 
 
-def frame_times(path: str | os.PathLike, what: str = "video") -> np.ndarray:
+def read_frame_times(path: str | os.PathLike, file_kind: str = "video") -> np.ndarray:
     """Seconds (F,) at which the frames of the first track of pictures are shown, in the order in which they are.
 
     Durations of frames may vary. Edits shift frames, and leave out those that a player does not show, as FFmpeg numbers
     them. Raises `NergError` for what is no MP4 or QuickTime file, is damaged, or whose frames are in fragments.
     """
-    with reading(path, what, "copy it again, or rewrite it with ffmpeg -i VIDEO -c copy NEW.mp4"):
-        check_movie(path, what)
+    with translate_read_errors(path, file_kind, "copy it again, or rewrite it with ffmpeg -i VIDEO -c copy NEW.mp4"):
+        check_video_tables(path, file_kind)
         with open(path, "rb") as file:
-            scale, tracks = _tracks(file, size_of(path, what))
+            scale, tracks = _tracks(file, check_regular_file(path, file_kind))
         track = next((t for t in tracks if t.get(b"hdlr", b"")[8:12] == b"vide"), None)
         if track is None or b"stts" not in track:
             raise ValueError("it has no track of pictures, or is no MP4 or QuickTime file")
@@ -215,7 +215,7 @@ _LEAST, _MOST = 16, 8192
 _NAMES = {"Software": "artist", "Comment": "comment", "Title": "title"}
 
 
-def check_video(fps: float) -> None:
+def check_video_output(fps: float) -> None:
     """Raise `NergError` for an ``fps`` that is no rate, and `ImportError` where PyAV is missing: before long work."""
     _pyav()
     if not (np.isfinite(fps) and 0 < fps <= _MOST_FPS):
@@ -223,8 +223,8 @@ def check_video(fps: float) -> None:
 
 
 @contextmanager
-def video_frames(
-    path: str | os.PathLike, fps: float = 25.0, text: Mapping[str, str] | None = None
+def open_video_writer(
+    path: str | os.PathLike, fps: float = 25.0, metadata: Mapping[str, str] | None = None
 ) -> Iterator[Callable[[np.ndarray], None]]:
     """A video of ``fps`` pictures a second, which are not kept in memory.
 
@@ -233,11 +233,11 @@ def video_frames(
     the header says, by PNG's names (``Comment``, ``Software``). Equal frames give equal files with the same FFmpeg.
     Raises `NergError` for sizes that cannot be shown and for no frames at all, `ImportError` where PyAV is missing.
     """
-    check_video(fps)
+    check_video_output(fps)
     av = _pyav()
     container: Any = None
     stream: Any = None
-    with replacing(path) as temporary:
+    with replace_atomically(path) as temporary:
         # Without the name and version of the writing library, and its estimate of the bit rate, files stay equal.
         flags = {"movflags": "+faststart", "fflags": "+bitexact", "write_btrt": "0"}
         container = av.open(str(temporary), "w", format="mp4", options=flags)
@@ -260,7 +260,7 @@ def video_frames(
                 container.mux(stream.encode(picture))
 
         try:
-            for key, value in (text or {}).items():
+            for key, value in (metadata or {}).items():
                 container.metadata[_NAMES.get(key, key)] = value
             yield write
             if stream is None:
@@ -304,7 +304,7 @@ def _encoding(path: str | os.PathLike, av: Any) -> Iterator[None]:
     except av.error.FFmpegError as error:
         if isinstance(error, OSError):
             raise
-        raise NergError(f'"{path}" could not be encoded ({plain(error)}); choose another size or rate') from error
+        raise NergError(f'"{path}" could not be encoded ({sanitize(error)}); choose another size or rate') from error
 
 
 def _pyav() -> Any:

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.fields.splats import matrices_of
-from nerg_mi.files.safe_read import is_count, is_ordinary, read_bytes, read_json, reading
-from nerg_mi.ranges import FARTHEST
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.fields.splats import quaternions_to_matrices
+from nerg_mi.files.safe_read import is_count, is_regular_file, read_bytes, read_json, translate_read_errors
+from nerg_mi.ranges import MAX_COORDINATE
 
 # ---- Regions ----
 #
@@ -27,10 +27,10 @@ from nerg_mi.ranges import FARTHEST
 # What else may stand in such a file (parts of meshes, shapes of a scene, groups, the objects of a recording) is read by
 # `nerg_mi.formats.areas`.
 
-BYTES = 4 << 20  # a file of areas may have so many bytes
-MOST = 1000  # and so many areas
+MAX_BYTES = 4 << 20  # a file of areas may have so many bytes
+MAX_AREAS = 1000  # and so many areas
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
-BEYOND_BOXES = ("mesh", "shape", "parts", "adt")  # keys of which an area has one that is no box
+NON_BOX_KEYS = ("mesh", "shape", "parts", "adt")  # keys of which an area has one that is no box
 _LETTERS = 80
 _EXAMPLE = '{"shelf": [[0, 0, 0], [1, 2, 3]]}'
 
@@ -42,36 +42,36 @@ class Region:
     name: str
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
-    turn: Quaternion | None = None
+    rotation: Quaternion | None = None
 
     def __post_init__(self) -> None:
         corners = np.array([self.lower, self.upper], float)
-        if corners.shape == (2, 3) and not (np.abs(corners) <= FARTHEST).all():
+        if corners.shape == (2, 3) and not (np.abs(corners) <= MAX_COORDINATE).all():
             raise NergError(
-                f'the area "{plain(self.name, 40)}" reaches to {np.abs(corners).max():g}; its corners must be finite, '
-                f"and at most {FARTHEST:g}"
+                f'the area "{sanitize(self.name, 40)}" reaches to {np.abs(corners).max():g}; its corners must be finite, '
+                f"and at most {MAX_COORDINATE:g}"
             )
         if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
             raise NergError(
-                f'the area "{plain(self.name, 40)}" needs a lower and an upper corner of three numbers, each '
+                f'the area "{sanitize(self.name, 40)}" needs a lower and an upper corner of three numbers, each '
                 "less in the lower one"
             )
-        check_name(self.name)
-        if self.turn is not None:
-            size = math.hypot(*self.turn) if len(self.turn) == 4 else math.nan
+        check_area_name(self.name)
+        if self.rotation is not None:
+            size = math.hypot(*self.rotation) if len(self.rotation) == 4 else math.nan
             if not abs(size - 1) < 1e-3:
-                raise NergError(f'the turn of the area "{plain(self.name, 40)}" is no rotation; give a unit quaternion')
+                raise NergError(f'the turn of the area "{sanitize(self.name, 40)}" is no rotation; give a unit quaternion')
 
     @classmethod
-    def of(
-        cls, name: str, lower: Iterable[float], upper: Iterable[float], turn: Iterable[float] | float | None = None
+    def create(
+        cls, name: str, lower: Iterable[float], upper: Iterable[float], rotation: Iterable[float] | float | None = None
     ) -> Region:
         """The same of any numbers. ``turn``: a quaternion (x, y, z, w) of any length but zero, or degrees about z,
         counter-clockwise seen from above. Raises `NergError` where they are not three each, or no rotation."""
         low, high = [float(v) for v in lower], [float(v) for v in upper]
         if len(low) != 3 or len(high) != 3:
-            raise NergError(f'the area "{plain(name, 40)}" needs a lower and an upper corner of three numbers')
-        return cls(name, (low[0], low[1], low[2]), (high[0], high[1], high[2]), _turn(turn, name))
+            raise NergError(f'the area "{sanitize(name, 40)}" needs a lower and an upper corner of three numbers')
+        return cls(name, (low[0], low[1], low[2]), (high[0], high[1], high[2]), _turn(rotation, name))
 
     @property
     def corners(self) -> np.ndarray:
@@ -79,49 +79,49 @@ class Region:
         return np.array([self.lower, self.upper], float)
 
     @property
-    def middle(self) -> np.ndarray:
+    def center(self) -> np.ndarray:
         """(3,)."""
         return self.corners.mean(axis=0)
 
     @property
-    def matrix(self) -> np.ndarray:
+    def rotation_matrix(self) -> np.ndarray:
         """Rotation (3, 3) whose columns are the box's own axes."""
-        if self.turn is None:
+        if self.rotation is None:
             return np.eye(3)
-        x, y, z, w = np.array(self.turn, float) / math.hypot(*self.turn)
-        return matrices_of(np.array([[w, x, y, z]]))[0]
+        x, y, z, w = np.array(self.rotation, float) / math.hypot(*self.rotation)
+        return quaternions_to_matrices(np.array([[w, x, y, z]]))[0]
 
-    def to_own(self, points: np.ndarray) -> np.ndarray:
+    def to_local(self, points: np.ndarray) -> np.ndarray:
         """``points`` (..., 3) turned back about the middle, where this is the box between `corners`."""
-        return points if self.turn is None else (points - self.middle) @ self.matrix + self.middle
+        return points if self.rotation is None else (points - self.center) @ self.rotation_matrix + self.center
 
-    def place(self, points: np.ndarray) -> np.ndarray:
+    def to_world(self, points: np.ndarray) -> np.ndarray:
         """The inverse of `to_own`."""
-        return points if self.turn is None else (points - self.middle) @ self.matrix.T + self.middle
+        return points if self.rotation is None else (points - self.center) @ self.rotation_matrix.T + self.center
 
     @property
     def vertices(self) -> np.ndarray:
         """The box's own eight corners (8, 3); bit k of a row's number chooses the upper one along axis k."""
         upper = (np.arange(8)[:, None] >> np.arange(3) & 1).astype(bool)
-        return self.place(np.where(upper, self.corners[1], self.corners[0]))
+        return self.to_world(np.where(upper, self.corners[1], self.corners[0]))
 
     @property
     def bounds(self) -> np.ndarray:
         """Corners (2, 3) of the smallest upright box around it."""
-        return self.corners if self.turn is None else np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        return self.corners if self.rotation is None else np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
-    def holds(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    def contains(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Whether ``points`` (..., 3) lie in it, or no farther than ``margin`` from it along each of its axes."""
         lower, upper = self.corners
         with np.errstate(invalid="ignore"):
-            points = self.to_own(np.asarray(points, float))
+            points = self.to_local(np.asarray(points, float))
         return np.all((points >= lower - margin) & (points <= upper + margin), axis=-1)
 
 
-def check_name(name: str) -> None:
+def check_area_name(name: str) -> None:
     """Raise `NergError` for a name that no area may have."""
     if not name.strip() or len(name) > _LETTERS or not name.isprintable():
-        raise NergError(f'an area needs a name of 1 to {_LETTERS} printable characters, got "{plain(name, 40)}"')
+        raise NergError(f'an area needs a name of 1 to {_LETTERS} printable characters, got "{sanitize(name, 40)}"')
 
 
 def _turn(turn: Iterable[float] | float | None, name: str) -> Quaternion | None:
@@ -134,7 +134,7 @@ def _turn(turn: Iterable[float] | float | None, name: str) -> Quaternion | None:
         numbers = [float(v) for v in turn]
     size = math.hypot(*numbers)
     if len(numbers) != 4 or not 1e-6 < size < 1e6:
-        raise NergError(f'the turn of the area "{plain(name, 40)}" is degrees about z, or four numbers x, y, z, w')
+        raise NergError(f'the turn of the area "{sanitize(name, 40)}" is degrees about z, or four numbers x, y, z, w')
     x, y, z, w = numbers if isinstance(turn, (int, float)) else (v / size for v in numbers)
     return (x, y, z, w)
 
@@ -147,7 +147,7 @@ def read_regions(path: str | Path) -> list[Region]:
     "max": [...]}}``. A box may have a ``turn`` about its middle: degrees about z, or a quaternion x, y, z, w. Raises
     `NergError` for what is neither, and where none is a box.
     """
-    entries = read_entries(path)
+    entries = read_area_entries(path)
     boxes = [parse_box(e) for e in entries if e.is_box]
     if not boxes:
         raise NergError(f'"{path}" has no area that is a box; draw one in the viewer, or write {_EXAMPLE}')
@@ -159,27 +159,27 @@ class AreaEntry:
     """What a file says of an area: its ``name`` and what it is ``given`` as; ``where``: for errors."""
 
     name: object
-    given: Any
-    where: str
+    definition: Any
+    location: str
 
     @property
     def is_box(self) -> bool:
         """Whether it is a box, or nothing that is known."""
-        return not (isinstance(self.given, dict) and any(key in self.given for key in BEYOND_BOXES))
+        return not (isinstance(self.definition, dict) and any(key in self.definition for key in NON_BOX_KEYS))
 
 
-def read_entries(path: str | Path) -> list[AreaEntry]:
+def read_area_entries(path: str | Path) -> list[AreaEntry]:
     """What a file of areas has, not looked at yet. Raises `NergError` for what is no such file, and for names that come
     twice."""
-    found = read_json(path, "file of areas", BYTES)
+    found = read_json(path, "file of areas", MAX_BYTES)
     if isinstance(found, dict) and isinstance(found.get("regions"), list):
         listed = [(one.get("name"), one) if isinstance(one, dict) else (None, one) for one in found["regions"]]
     elif isinstance(found, dict):
         listed = list(found.items())
     else:
         raise NergError(f'"{path}" names no areas; write {_EXAMPLE} in the coordinates of the place')
-    if not 0 < len(listed) <= MOST:
-        raise NergError(f'"{path}" has {len(listed)} areas, and 1 to {MOST} are read; write {_EXAMPLE}')
+    if not 0 < len(listed) <= MAX_AREAS:
+        raise NergError(f'"{path}" has {len(listed)} areas, and 1 to {MAX_AREAS} are read; write {_EXAMPLE}')
     names = [name for name, _ in listed if isinstance(name, str)]
     if len(set(names)) < len(names):
         raise NergError(f'"{path}" has two areas of one name; rename one of them')
@@ -188,7 +188,7 @@ def read_entries(path: str | Path) -> list[AreaEntry]:
 
 def parse_box(entry: AreaEntry) -> Region:
     """The box of an entry. Raises `NergError` for what is none."""
-    name, given, where = entry.name, entry.given, entry.where
+    name, given, where = entry.name, entry.definition, entry.location
     corners: Any = (given.get("min"), given.get("max")) if isinstance(given, dict) else given
     turn: Any = given.get("turn") if isinstance(given, dict) else None
     try:
@@ -199,7 +199,7 @@ def parse_box(entry: AreaEntry) -> Region:
     except (TypeError, ValueError) as error:
         raise NergError(f"{where} needs a name, and two corners of three numbers each, as in {_EXAMPLE}") from error
     try:
-        return Region.of(name, lower, upper, turn)
+        return Region.create(name, lower, upper, turn)
     except (NergError, OverflowError) as error:
         raise NergError(f"{where}: {error}") from error
 
@@ -209,20 +209,20 @@ def is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def to_json(regions: Sequence[Region], others: Sequence[dict[str, Any]] = ()) -> str:
+def format_areas(regions: Sequence[Region], other_areas: Sequence[dict[str, Any]] = ()) -> str:
     """``regions`` as the text of a JSON file, with ``others`` as they stood in one after them."""
-    return json.dumps({"regions": [*map(box_json, regions), *others]}, indent=1) + "\n"
+    return json.dumps({"regions": [*map(box_to_json, regions), *other_areas]}, indent=1) + "\n"
 
 
-def box_json(region: Region) -> dict[str, Any]:
+def box_to_json(region: Region) -> dict[str, Any]:
     """A box as it stands in a file."""
-    turn = {} if region.turn is None else {"turn": list(region.turn)}
+    turn = {} if region.rotation is None else {"turn": list(region.rotation)}
     return {"name": region.name, "min": list(region.lower), "max": list(region.upper), **turn}
 
 
 # ---- What an area of interest can be, besides a box (`nerg_mi.formats.areas.Region`) ----
 
-DEEPEST = 100  # so deep may groups be nested that stand before their parts
+MAX_GROUP_DEPTH = 100  # so deep may groups be nested that stand before their parts
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ class MeshPart:
     file: Path
     faces: tuple[tuple[int, int], ...] | None = None
 
-    def chosen(self, count: int) -> np.ndarray:
+    def select_faces(self, count: int) -> np.ndarray:
         """Which of ``count`` faces are of it, (count,) bool. Raises `NergError` for ranges beyond them."""
         if self.faces is None:
             return np.ones(count, bool)
@@ -275,7 +275,7 @@ class AreaSet:
     """
 
     areas: tuple[Area, ...]
-    others: tuple[dict[str, Any], ...] = ()
+    non_boxes: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
         names = [a.name for a in self.areas]
@@ -288,7 +288,7 @@ class AreaSet:
             unknown = next((p for p in area.parts if p not in names), None)
             if unknown is not None:
                 raise NergError(f'the group "{area.name}" has a part "{unknown}", and there is no such area')
-        self.members()
+        self.element_indices()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -301,7 +301,7 @@ class AreaSet:
         return [a for a in self.areas if isinstance(a, Region)]
 
     @property
-    def things(self) -> tuple[Region | MeshPart | SceneShape, ...]:
+    def elements(self) -> tuple[Region | MeshPart | SceneShape, ...]:
         """Those that are no groups."""
         return tuple(a for a in self.areas if not isinstance(a, AreaGroup))
 
@@ -311,16 +311,16 @@ class AreaSet:
         return [a.file for a in self.areas if isinstance(a, MeshPart)]
 
     @property
-    def solids(self) -> dict[str, tuple[int, ...]]:
+    def box_indices(self) -> dict[str, tuple[int, ...]]:
         """Those that are boxes, or groups of boxes alone, by name: the numbers of the `boxes` that each consists of."""
-        number = {k: n for n, k in enumerate(k for k, thing in enumerate(self.things) if isinstance(thing, Region))}
-        every = self.members().items()
+        number = {k: n for n, k in enumerate(k for k, thing in enumerate(self.elements) if isinstance(thing, Region))}
+        every = self.element_indices().items()
         return {name: tuple(number[k] for k in of) for name, of in every if all(k in number for k in of)}
 
-    def members(self) -> dict[str, tuple[int, ...]]:
+    def element_indices(self) -> dict[str, tuple[int, ...]]:
         """Of each area, which of the `things` it consists of, by their numbers."""
         by_name = {a.name: a for a in self.areas}
-        known = {a.name: frozenset([k]) for k, a in enumerate(self.things)}
+        known = {a.name: frozenset([k]) for k, a in enumerate(self.elements)}
         for area in self.areas:
             _resolve(area, by_name, known, ())
         return {a.name: tuple(sorted(known[a.name])) for a in self.areas}
@@ -329,8 +329,8 @@ class AreaSet:
 def _resolve(area: Area, by_name: dict[str, Area], known: dict[str, frozenset[int]], above: tuple[str, ...]) -> None:
     """Add to what is ``known`` of which things areas consist those of ``area`` and of its parts, each looked at once.
     Raises `NergError` for a group that holds itself."""
-    if area.name in above or len(above) > DEEPEST:
-        raise NergError(f'the group "{area.name}" holds itself, or groups are nested deeper than {DEEPEST}')
+    if area.name in above or len(above) > MAX_GROUP_DEPTH:
+        raise NergError(f'the group "{area.name}" holds itself, or groups are nested deeper than {MAX_GROUP_DEPTH}')
     if area.name in known or not isinstance(area, AreaGroup):
         return
     for part in area.parts:
@@ -347,8 +347,8 @@ def _resolve(area: Area, by_name: dict[str, Area], known: dict[str, frozenset[in
 # twin's world has y up; that of rays z: (x, y, z) becomes (x, -z, y), as `nerg rays import --preset aria` does for its
 # recordings. Poses with a time are those of objects that were carried about: these have no one place, and are left out.
 
-BOXES, POSES, NAMES = "3d_bounding_box.csv", "scene_objects.csv", "instances.json"
-TABLE_BYTES = 256 << 20  # a table may have so many bytes
+ADT_BOXES_FILE, ADT_POSES_FILE, ADT_NAMES_FILE = "3d_bounding_box.csv", "scene_objects.csv", "instances.json"
+MAX_TABLE_BYTES = 256 << 20  # a table may have so many bytes
 _THIN = 1e-3  # metres: a box that is thinner is made so thick
 _UID, _TIME = "object_uid", "timestamp[ns]"
 _SIDES = [f"p_local_obj_{axis}{end}[m]" for end in ("min", "max") for axis in "xyz"]
@@ -358,9 +358,9 @@ _TURN = [f"q_wo_{axis}" for axis in "xyzw"]
 _UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def files_of_twin(folder: Path) -> list[Path]:
+def list_twin_files(folder: Path) -> list[Path]:
     """Those files that `read_twin_objects` reads of a recording's ``folder`` and that are there."""
-    return [folder / name for name in (BOXES, POSES, NAMES) if (folder / name).is_file()]
+    return [folder / name for name in (ADT_BOXES_FILE, ADT_POSES_FILE, ADT_NAMES_FILE) if (folder / name).is_file()]
 
 
 def read_twin_objects(folder: Path, categories: Collection[str] | None = None) -> list[Region]:
@@ -368,14 +368,14 @@ def read_twin_objects(folder: Path, categories: Collection[str] | None = None) -
 
     Raises `NergError` for a folder without these files, damaged ones, and where no object is left.
     """
-    sides, places = _rows(folder / BOXES, _SIDES), _rows(folder / POSES, [*_PLACE, *_TURN])
-    about = _names(folder / NAMES)
+    sides, places = _rows(folder / ADT_BOXES_FILE, _SIDES), _rows(folder / ADT_POSES_FILE, [*_PLACE, *_TURN])
+    about = _names(folder / ADT_NAMES_FILE)
     if categories is not None:
         known = sorted({category for _, category in about.values()})
         unknown = next((c for c in categories if c not in known), None)
         if unknown is not None:
-            listed = ", ".join(plain(k, 40) for k in known[:30])
-            raise NergError(f'"{folder}" has no objects of the category "{plain(unknown, 40)}"; there are {listed}')
+            listed = ", ".join(sanitize(k, 40) for k in known[:30])
+            raise NergError(f'"{folder}" has no objects of the category "{sanitize(unknown, 40)}"; there are {listed}')
     found = []
     for uid in sides:
         name, category = about.get(uid, (uid, ""))
@@ -383,9 +383,9 @@ def read_twin_objects(folder: Path, categories: Collection[str] | None = None) -
             found.append((name, uid))
     if not found:
         raise NergError(f'"{folder}" has no object that stands still with a box and a place; name other areas')
-    if len(found) > MOST:
+    if len(found) > MAX_AREAS:
         raise NergError(
-            f'"{folder}" has {len(found):,} objects, and {MOST} areas are read; choose some by "categories"'
+            f'"{folder}" has {len(found):,} objects, and {MAX_AREAS} areas are read; choose some by "categories"'
         )
     found.sort()
     count = {name: sum(n == name for n, _ in found) for name, _ in found}
@@ -405,15 +405,15 @@ def _box(name: str, sides: np.ndarray, place: np.ndarray) -> Region:
     turn = Rotation.from_matrix(_UP) * Rotation.from_quat(place[3:])
     middle = _UP @ place[:3] + turn.apply((lower + upper) / 2)
     half = (upper - lower) / 2
-    return Region.of(name, middle - half, middle + half, turn.as_quat())
+    return Region.create(name, middle - half, middle + half, turn.as_quat())
 
 
 def _rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
     """Numbers of the rows without a time, by object."""
-    raw = read_bytes(path, "table of objects", TABLE_BYTES)
+    raw = read_bytes(path, "table of objects", MAX_TABLE_BYTES)
     found: dict[str, np.ndarray] = {}
     moving: set[str] = set()
-    with reading(path, "table of objects", "download it again", also=(csv.Error,)):
+    with translate_read_errors(path, "table of objects", "download it again", extra_errors=(csv.Error,)):
         table = csv.reader(io.StringIO(raw.decode()))
         head = next(table, [])
         missing = [c for c in (_UID, _TIME, *columns) if c not in head]
@@ -430,18 +430,18 @@ def _rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
                 continue
             values = np.array([float(row[k]) for k in where])
             if not (np.abs(values) < 1e6).all():
-                raise ValueError(f"the object {plain(row[uid], 40)} has numbers that are none")
+                raise ValueError(f"the object {sanitize(row[uid], 40)} has numbers that are none")
             if columns == _SIDES and not (values[:3] <= values[3:]).all():
-                raise ValueError(f"the box of the object {plain(row[uid], 40)} ends before it begins")
+                raise ValueError(f"the box of the object {sanitize(row[uid], 40)} ends before it begins")
             if columns != _SIDES and not 0.5 < np.linalg.norm(values[3:]) < 2:
-                raise ValueError(f"the turn of the object {plain(row[uid], 40)} is no rotation")
+                raise ValueError(f"the turn of the object {sanitize(row[uid], 40)} is no rotation")
             found[row[uid]] = values
     return {key: values for key, values in found.items() if key not in moving}
 
 
 def _names(path: Path) -> dict[str, tuple[str, str]]:
     """Name and category of objects; none where there is no such file."""
-    if not is_ordinary(path, "file of instances"):
+    if not is_regular_file(path, "file of instances"):
         return {}
     found = read_json(path, "file of instances")
     if not isinstance(found, dict):
@@ -451,7 +451,7 @@ def _names(path: Path) -> dict[str, tuple[str, str]]:
         told = about if isinstance(about, dict) else {}
         name, category = told.get("instance_name", uid), told.get("category", "")
         if not isinstance(name, str) or not isinstance(category, str):
-            raise NergError(f'"{path}" has a name of the object {plain(uid, 40)} that is no text; download it again')
+            raise NergError(f'"{path}" has a name of the object {sanitize(uid, 40)} that is no text; download it again')
         clean = "".join(c if c.isprintable() else "?" for c in name).strip() or uid
         names[uid] = clean[:70], category
     return names
@@ -459,8 +459,8 @@ def _names(path: Path) -> dict[str, tuple[str, str]]:
 
 # ---- Reading areas of interest from a JSON file, or from the folder of a recording of Aria Digital Twin ----
 
-MESHES = (".ply", ".obj")  # suffixes of meshes that an area can be a part of
-PARTS = 1000  # so many ranges of faces, parts of a group, or categories may an area name
+MESH_SUFFIXES = (".ply", ".obj")  # suffixes of meshes that an area can be a part of
+MAX_PARTS = 1000  # so many ranges of faces, parts of a group, or categories may an area name
 
 _READING_EXAMPLE = (
     '{"name": "a", "min": [0, 0, 0], "max": [1, 2, 3]}, {"name": "b", "mesh": "sign.ply", "faces": [0, [4, 9]]}, '
@@ -481,44 +481,44 @@ def read_areas(path: str | Path) -> AreaSet:
         return AreaSet(tuple(read_twin_objects(path)))
     found: list[Area] = []
     others: list[dict[str, Any]] = []
-    for entry in read_entries(path):
+    for entry in read_area_entries(path):
         if entry.is_box:
             found.append(parse_box(entry))
             continue
         named = {"name": entry.name} if isinstance(entry.name, str) else {}
-        others.append({**named, **entry.given})
+        others.append({**named, **entry.definition})
         try:
             found += _other(entry, path)
         except NergError as error:
-            raise NergError(f"{entry.where}: {error}") from error
-        if len(found) > MOST:
-            raise NergError(f'"{path}" has more than {MOST} areas; choose some of the objects by "categories"')
+            raise NergError(f"{entry.location}: {error}") from error
+        if len(found) > MAX_AREAS:
+            raise NergError(f'"{path}" has more than {MAX_AREAS} areas; choose some of the objects by "categories"')
     try:
         return AreaSet(tuple(found), tuple(others))
     except NergError as error:
         raise NergError(f'"{path}": {error}') from error
 
 
-def files_of_areas(path: str | Path, areas: AreaSet) -> list[Path]:
+def list_area_files(path: str | Path, areas: AreaSet) -> list[Path]:
     """The files that `read_areas` and whoever loads the meshes of its ``areas`` read of ``path``."""
     path = Path(path)
     if path.is_dir():
-        return files_of_twin(path)
-    twins = [file for given in areas.others if "adt" in given for file in files_of_twin(path.parent / given["adt"])]
+        return list_twin_files(path)
+    twins = [file for given in areas.non_boxes if "adt" in given for file in list_twin_files(path.parent / given["adt"])]
     return list(dict.fromkeys([path, *areas.meshes, *twins]))
 
 
 def _other(entry: AreaEntry, path: Path) -> list[Area]:
     """The areas of an entry that is no box."""
-    given = entry.given
+    given = entry.definition
     if "adt" in given:
         return _objects(entry, path)
     name = entry.name
     if not isinstance(name, str):
         raise NergError(f"an area needs a name, as in {_READING_EXAMPLE}")
-    check_name(name)
+    check_area_name(name)
     if "mesh" in given:
-        file = mesh_beside(given["mesh"], path)
+        file = resolve_mesh_path(given["mesh"], path)
         return [MeshPart(name, file, None if given.get("faces") is None else _ranges(given["faces"]))]
     if "shape" in given:
         if not isinstance(given["shape"], str) or not given["shape"]:
@@ -528,24 +528,24 @@ def _other(entry: AreaEntry, path: Path) -> list[Area]:
 
 
 def _objects(entry: AreaEntry, path: Path) -> list[Area]:
-    categories = entry.given.get("categories")
+    categories = entry.definition.get("categories")
     chosen = None if categories is None else _words(categories, "categories")
-    objects: list[Area] = list(read_twin_objects(_inside(entry.given["adt"], path), chosen))
+    objects: list[Area] = list(read_twin_objects(_inside(entry.definition["adt"], path), chosen))
     if entry.name is None or entry.name == "":
         return objects
     if not isinstance(entry.name, str):
         raise NergError("a name must be a text")
-    check_name(entry.name)
+    check_area_name(entry.name)
     return [*objects, AreaGroup(entry.name, tuple(a.name for a in objects))]
 
 
-def mesh_beside(name: object, path: Path, what: str = "areas") -> Path:
+def resolve_mesh_path(name: object, path: Path, file_kind: str = "areas") -> Path:
     """The mesh ``name`` (.ply, .obj) beside the file ``path`` of ``what``, or below. Raises `NergError` for other
     names."""
-    file = _inside(name, path, what)
-    if file.suffix.lower() not in MESHES:
+    file = _inside(name, path, file_kind)
+    if file.suffix.lower() not in MESH_SUFFIXES:
         raise NergError(
-            f'the mesh "{plain(file.name, 60)}" is no .ply or .obj; convert it to one of {", ".join(MESHES)}'
+            f'the mesh "{sanitize(file.name, 60)}" is no .ply or .obj; convert it to one of {", ".join(MESH_SUFFIXES)}'
         )
     return file
 
@@ -557,7 +557,7 @@ def _inside(name: object, path: Path, what: str = "areas") -> Path:
     folder = os.path.realpath(path.parent)
     found = os.path.realpath(os.path.join(folder, name))
     if os.path.isabs(name) or os.path.commonpath([folder, found]) != folder:
-        raise NergError(f'"{plain(name, 80)}" lies outside of the folder of the {what}; put it, or a copy, there')
+        raise NergError(f'"{sanitize(name, 80)}" lies outside of the folder of the {what}; put it, or a copy, there')
     return path.parent / name
 
 
@@ -565,7 +565,7 @@ def _ranges(given: object) -> tuple[tuple[int, int], ...]:
     """Numbers of faces, or pairs of a first and a last one."""
     listed = given if isinstance(given, list) else [None]
     found = []
-    for one in listed if 0 < len(listed) <= PARTS else [None]:
+    for one in listed if 0 < len(listed) <= MAX_PARTS else [None]:
         ends: list[Any] = one if isinstance(one, list) else [one, one]
         if len(ends) != 2 or not all(is_count(v) for v in ends) or ends[0] > ends[1]:
             raise NergError('"faces" are numbers from 0 on, or pairs of a first and a last one, as in [0, [4, 9]]')
@@ -574,6 +574,6 @@ def _ranges(given: object) -> tuple[tuple[int, int], ...]:
 
 
 def _words(given: object, what: str) -> tuple[str, ...]:
-    if not isinstance(given, list) or not 0 < len(given) <= PARTS or not all(isinstance(w, str) for w in given):
-        raise NergError(f'"{what}" must be 1 to {PARTS} names')
+    if not isinstance(given, list) or not 0 < len(given) <= MAX_PARTS or not all(isinstance(w, str) for w in given):
+        raise NergError(f'"{what}" must be 1 to {MAX_PARTS} names')
     return tuple(dict.fromkeys(given))

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, plain
+from nerg_mi.errors import MissingFile, NergError, sanitize
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.safe_read import open_file, parse_json, reading
+from nerg_mi.files.safe_read import open_file, parse_json, translate_read_errors
 
 FORMAT = 1  # the version of the files, raised when an earlier version of this package could misread them
-CHECKPOINT_BYTES = 16 << 30  # a checkpoint may have so many bytes
-HEADER_BYTES = 16 << 20  # the header, which names every array and holds the metadata, may have so many bytes
+MAX_CHECKPOINT_BYTES = 16 << 30  # a checkpoint may have so many bytes
+MAX_HEADER_BYTES = 16 << 20  # the header, which names every array and holds the metadata, may have so many bytes
 
 
 def write_checkpoint(path: str | Path, kind: str, tensors: dict[str, np.ndarray], metadata: dict) -> None:
@@ -60,18 +60,18 @@ def _opened(path: Path) -> Iterator[Any]:
         raise MissingFile(f'the checkpoint "{path}" does not exist: correct its name, or make one with "nerg train"')
     _check_header(path)
     # The library asks NumPy for types that it has not (bfloat16), which is the file's doing.
-    with reading(path, "checkpoint", also=(TypeError, AttributeError)):
+    with translate_read_errors(path, "checkpoint", extra_errors=(TypeError, AttributeError)):
         try:
             with safe_open(path, framework="numpy") as file:
                 yield file
         except SafetensorError as error:
             raise NergError(
-                f'"{path}" is not a readable safetensors file: {plain(error)}; copy it again, or make it anew'
+                f'"{path}" is not a readable safetensors file: {sanitize(error)}; copy it again, or make it anew'
             ) from error
 
 
 def _check_header(path: Path) -> None:
-    with open_file(path, "checkpoint", most=CHECKPOINT_BYTES) as file:
+    with open_file(path, "checkpoint", max_bytes=MAX_CHECKPOINT_BYTES) as file:
         size, header = os.fstat(file.fileno()).st_size, int.from_bytes(file.read(8), "little")
         start = file.read(1)
     if size < 8 or header > size - 8:
@@ -81,8 +81,8 @@ def _check_header(path: Path) -> None:
             f'"{path}" is not a readable safetensors file: its header claims {header:,} bytes and the file has '
             f"{size:,}; copy it again, or make it anew"
         )
-    if header > HEADER_BYTES:
-        raise NergError(f'the header of "{path}" has {header:,} bytes, more than the {HEADER_BYTES:,} that are read')
+    if header > MAX_HEADER_BYTES:
+        raise NergError(f'the header of "{path}" has {header:,} bytes, more than the {MAX_HEADER_BYTES:,} that are read')
     if start != b"{":
         raise NergError(f'"{path}" is not a readable safetensors file: its header is no JSON object; copy it again')
 
@@ -99,12 +99,12 @@ def _metadata(file: Any, path: Path, kind: str | None = None) -> dict:
         raise NergError(f'the metadata of "{path}" are damaged: a JSON object is needed; copy it again')
     if kind is not None and metadata.get("kind") != kind:
         raise NergError(
-            f'"{path}" holds a {plain(metadata.get("kind"), 40)} field where a {kind} field is needed; '
+            f'"{path}" holds a {sanitize(metadata.get("kind"), 40)} field where a {kind} field is needed; '
             "name one of those"
         )
     if metadata.get("format") != FORMAT:
         raise NergError(
-            f'"{path}" has checkpoint format {plain(metadata.get("format"), 40)}, and this version reads '
+            f'"{path}" has checkpoint format {sanitize(metadata.get("format"), 40)}, and this version reads '
             f"format {FORMAT}: use a newer nerg_mi, or train the field anew"
         )
     if not isinstance(metadata.get("provenance", {}), dict):

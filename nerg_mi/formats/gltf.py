@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import plain
-from nerg_mi.fields.splats import matrices_of
-from nerg_mi.files.safe_read import is_count, parse_json, reading
+from nerg_mi.errors import sanitize
+from nerg_mi.fields.splats import quaternions_to_matrices
+from nerg_mi.files.safe_read import is_count, parse_json, translate_read_errors
 
 GLTF_MAGIC = b"glTF"  # beginning of a file
-GLTF_BYTES = 1 << 30  # maximum bytes of a file
-DEPTH = 64  # nodes may be nested so deep
-INSTANCES = 100_000  # so many meshes may stand in a scene
-TRIANGLES = 20_000_000  # so many triangles may be in all of them
+MAX_GLTF_BYTES = 1 << 30  # maximum bytes of a file
+MAX_NODE_DEPTH = 64  # nodes may be nested so deep
+MAX_INSTANCES = 100_000  # so many meshes may stand in a scene
+MAX_TRIANGLES = 20_000_000  # so many triangles may be in all of them
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _INDICES = {5121: "u1", 5123: "<u2", 5125: "<u4"}
 _FLOATS = {5126: "<f4"}
@@ -43,7 +43,7 @@ _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _WIDTHS = {name: width for width, name in _SHAPES.items()}
 
 
-def shown_unlit(
+def encode_unlit_glb(
     attributes: Sequence[Attribute],
     faces: np.ndarray | None,
     up: str = "z",
@@ -126,11 +126,11 @@ def parse_glb(raw: bytes | memoryview, path: str | os.PathLike) -> GltfTriangles
     for extensions that it requires and that are not read, and where there is no triangle.
     """
     # Whatever stands where another kind of value belongs is the file's mistake.
-    with reading(path, "mesh", "export it again", also=(TypeError, AttributeError)):
-        document, data = read_parts(raw, path)
+    with translate_read_errors(path, "mesh", "export it again", extra_errors=(TypeError, AttributeError)):
+        document, data = read_glb_chunks(raw, path)
         _check_extensions(document)
         quantized = _QUANTIZATION in document.get("extensionsUsed", [])
-        found = list(instances(document, *_CORNERS_OF))
+        found = list(iter_instances(document, *_CORNERS_OF))
         vertices: list[np.ndarray] = []
         colors: list[np.ndarray | None] = []
         faces: list[np.ndarray] = []
@@ -144,8 +144,8 @@ def parse_glb(raw: bytes | memoryview, path: str | os.PathLike) -> GltfTriangles
                 known[key] = _triangles(document, data, *key, _QUANTIZED if quantized else _FLOATS)
             corners, index = known[key]
             triangles += len(index)
-            if triangles > TRIANGLES:
-                raise ValueError(f"it has more than the {TRIANGLES:,} triangles that are read")
+            if triangles > MAX_TRIANGLES:
+                raise ValueError(f"it has more than the {MAX_TRIANGLES:,} triangles that are read")
             vertices.append(corners @ matrix[:3, :3].T + matrix[:3, 3])
             colors.append(_vertex_colors(document, data, primitive["attributes"], len(corners)))
             # A mirrored instance is seen from its other side.
@@ -164,7 +164,7 @@ def _check_extensions(document: dict[str, Any]) -> None:
     """Raise `ValueError` for extensions without which the triangles are others."""
     for name in document.get("extensionsRequired", []):
         if name != _QUANTIZATION and not str(name).startswith(_LOOKS):
-            raise ValueError(f'it requires the extension "{plain(name, 60)}", which is not read; export it without it')
+            raise ValueError(f'it requires the extension "{sanitize(name, 60)}", which is not read; export it without it')
     if any(_INSTANCING in node.get("extensions", {}) for node in document.get("nodes", [])):
         raise ValueError(f"it has copies of meshes by {_INSTANCING}, which is not read; export it without it")
 
@@ -177,7 +177,7 @@ def _unused(document: dict[str, Any], primitives: list[dict[str, Any]]) -> tuple
     parts += ["morph targets"] if any("targets" in p for p in primitives) else []
     parts += sorted({name for p in primitives for name in p["attributes"]} - {"POSITION", "NORMAL", "COLOR_0"})
     parts += [str(name) for name in document.get("extensionsUsed", []) if name != _QUANTIZATION]
-    return (f"parts that are not used: {plain(', '.join(parts))}",) if parts else ()
+    return (f"parts that are not used: {sanitize(', '.join(parts))}",) if parts else ()
 
 
 def _vertex_colors(
@@ -187,15 +187,15 @@ def _vertex_colors(
         return None
     shape = document["accessors"][_index(attributes["COLOR_0"])]["type"]
     if shape not in ("VEC3", "VEC4"):
-        raise ValueError(f'its colours are of the type "{plain(shape, 40)}"')
-    colors = accessor_values(document, data, attributes["COLOR_0"], shape)[:, :3].astype(np.float64)
+        raise ValueError(f'its colours are of the type "{sanitize(shape, 40)}"')
+    colors = read_accessor(document, data, attributes["COLOR_0"], shape)[:, :3].astype(np.float64)
     if len(colors) != count or not np.isfinite(colors).all():
         raise ValueError("its colours are not as many as its vertices, or not finite")
     return np.clip(colors, 0, 1)
 
 
-def read_parts(
-    raw: bytes | memoryview, path: str | os.PathLike, what: str = "mesh"
+def read_glb_chunks(
+    raw: bytes | memoryview, path: str | os.PathLike, file_kind: str = "mesh"
 ) -> tuple[dict[str, Any], bytes | memoryview]:
     """The document and the binary chunk of the bytes ``raw`` of the file ``path``, a kind of file called ``what``."""
     magic, version, _ = struct.unpack_from("<4sII", raw)
@@ -208,7 +208,7 @@ def read_parts(
         if len(part) < length:
             raise ValueError("it ends within one of its chunks")
         if kind == _JSON and document is None:
-            document = parse_json(part, path, what)
+            document = parse_json(part, path, file_kind)
         elif kind == _BINARY and not data:
             data = part
         at += 8 + length
@@ -217,7 +217,7 @@ def read_parts(
     return document, data
 
 
-def instances(document: dict[str, Any], *modes: int) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+def iter_instances(document: dict[str, Any], *modes: int) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """Primitives of ``modes``, and where each stands: the matrix (4, 4) of its node in the scene."""
     nodes = document.get("nodes", [])
     scenes = document.get("scenes")
@@ -227,7 +227,7 @@ def instances(document: dict[str, Any], *modes: int) -> Iterator[tuple[dict[str,
     while waiting:
         number, above, depth = waiting.pop()
         seen += 1
-        if depth > DEPTH or seen > INSTANCES:
+        if depth > MAX_NODE_DEPTH or seen > MAX_INSTANCES:
             raise ValueError("its nodes are nested too deep, or in a circle")
         node = nodes[number]
         here = above @ _matrix(node)
@@ -244,7 +244,7 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
     else:
         x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
         out = np.eye(4)
-        rotation = matrices_of(np.array([[w, x, y, z]]))[0]
+        rotation = quaternions_to_matrices(np.array([[w, x, y, z]]))[0]
         out[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
         out[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
     if not np.isfinite(out).all():
@@ -260,11 +260,11 @@ def _triangles(
     mode: int,
     kinds: Mapping[int, str],
 ) -> tuple[np.ndarray, np.ndarray]:
-    corners = accessor_values(document, data, position, "VEC3", kinds).astype(np.float64)
+    corners = read_accessor(document, data, position, "VEC3", kinds).astype(np.float64)
     if indices is None:
         index = np.arange(len(corners))
     else:
-        index = accessor_values(document, data, indices, "SCALAR", _INDICES).reshape(-1).astype(np.int64)
+        index = read_accessor(document, data, indices, "SCALAR", _INDICES).reshape(-1).astype(np.int64)
     if len(index) and index.max() >= len(corners):
         raise ValueError("its triangles have corners that are none of its vertices")
     return corners, index[_CORNERS_OF[mode](len(index))]
@@ -291,7 +291,7 @@ _CORNERS_OF = {_TRIANGLES: _separate, 5: _strip, 6: _fan}
 """How the corners of a primitive, by its mode, make triangles."""
 
 
-def accessor_values(
+def read_accessor(
     document: dict[str, Any], data: bytes | memoryview, number: object, shape: str, kinds: Mapping[int, str] = _FLOATS
 ) -> np.ndarray:
     """An accessor's values (N, components), as far as the bytes that are there hold them. ``kinds``: NumPy's type of

@@ -14,17 +14,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import map_bytes, reading, size_of
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import map_bytes, translate_read_errors, check_regular_file
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.coordinates import check_near_origin
 
-from .gltf import GLTF_BYTES, GLTF_MAGIC, parse_glb
+from .gltf import MAX_GLTF_BYTES, GLTF_MAGIC, parse_glb
 from .ply import PLY_MAGIC, PlyTable, parse_numbers, parse_ply
 
-BYTES = 64 << 30  # maximum bytes of a file
-TEXT_BYTES = 1 << 30  # and so many where it is text
-GREY = 0.5  # what has no colour
+MAX_BYTES = 64 << 30  # maximum bytes of a file
+MAX_TEXT_BYTES = 1 << 30  # and so many where it is text
+DEFAULT_GREY = 0.5  # what has no colour
 _BLOCK = 1 << 24  # bytes of text that are read at once, and of its longest line
 _FLAT = 1e-6  # of a polygon's area: a triangle of its fan that is turned over by more makes it concave
 _CORNERS_TRIED, _AT_ONCE = 64, 1 << 20
@@ -55,17 +55,17 @@ class MeshFile:
     colors: np.ndarray | None = None
     face_colors: np.ndarray | None = None
     notes: tuple[str, ...] = ()
-    unreadable: str = ""
+    unreadable_reason: str = ""
     hides_colors: bool = False
     encodes_colors: bool = False
 
     @property
-    def is_plain(self) -> bool:
+    def is_readable_by_mitsuba(self) -> bool:
         """Whether Mitsuba shows the file as it is."""
-        return not (self.unreadable or self.hides_colors or self.encodes_colors)
+        return not (self.unreadable_reason or self.hides_colors or self.encodes_colors)
 
 
-def read_mesh_file(path: str | os.PathLike, points: bool = False, suffix: str | None = None) -> MeshFile:
+def read_mesh_file(path: str | os.PathLike, allow_points: bool = False, suffix: str | None = None) -> MeshFile:
     """The mesh in ``path``; ``points``: whether it may have no faces; ``suffix``: of its format, whatever its name.
 
     Raises `NergError` for a file that is missing, damaged or no mesh, for vertices that are not finite, for faces with
@@ -75,14 +75,14 @@ def read_mesh_file(path: str | os.PathLike, points: bool = False, suffix: str | 
     if suffix not in READERS:
         raise NergError(f'"{path}" is no mesh that is read; give one that ends in {", ".join(READERS)}')
     # Whatever stands where another kind of value belongs is the file's mistake.
-    with reading(path, "mesh", "export it again", also=(TypeError, AttributeError)), np.errstate(all="ignore"):
+    with translate_read_errors(path, "mesh", "export it again", extra_errors=(TypeError, AttributeError)), np.errstate(all="ignore"):
         mesh = READERS[suffix](path)
         if not len(mesh.vertices):
             raise ValueError("it has no vertices")
-        if not (len(mesh.faces) or points):
+        if not (len(mesh.faces) or allow_points):
             raise ValueError("it has no faces")
         bad = np.flatnonzero(~np.isfinite(mesh.vertices).all(axis=1))
-        if len(bad) and not points:
+        if len(bad) and not allow_points:
             raise ValueError(f"vertex {bad[0] + 1:,} is not finite, one of {len(bad):,}")
         if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
             raise ValueError(f"it has a face with a corner that is none of its {len(mesh.vertices):,} vertices")
@@ -163,7 +163,7 @@ def _linear_colors(columns: Sequence[np.ndarray], kind: np.dtype) -> tuple[np.nd
 
 
 def _read_ply(path: str | os.PathLike) -> MeshFile:
-    ply = parse_ply(np.frombuffer(map_bytes(path, "mesh", BYTES, PLY_MAGIC, "export it again"), np.uint8))
+    ply = parse_ply(np.frombuffer(map_bytes(path, "mesh", MAX_BYTES, PLY_MAGIC, "export it again"), np.uint8))
     vertex, face = (ply.tables.get(name, PlyTable(0)) for name in ("vertex", "face"))
     names = next((names for names in _CORNERS if names in face.lists), None)
     if face.count and names is None:
@@ -181,7 +181,7 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
     for name, table in (("vertex", vertex), ("face", face)):
         tints = next((c for c in _COLORS if all(n in table.columns for n in c[:3])), None)
         if tints:
-            tints_of[name], encoded = _linear_colors(take(table, tints[:3]), table.kinds[tints[0]])
+            tints_of[name], encoded = _linear_colors(take(table, tints[:3]), table.dtypes[tints[0]])
             encodes |= encoded
             used[name] |= set(tints[:3])
     normals = None
@@ -194,8 +194,8 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
     for name, table in ply.tables.items():
         unused = [n for n in (*table.columns, *table.lists) if n not in used.get(name, ())]
         if unused and table.count:
-            notes.append(f"columns of {plain(name, 40)} that are not used: {plain(', '.join(unused))}")
-    notes += [f"not used: {plain(c, 80)}" for c in ply.comments if c.startswith("TextureFile")]
+            notes.append(f"columns of {sanitize(name, 40)} that are not used: {sanitize(', '.join(unused))}")
+    notes += [f"not used: {sanitize(c, 80)}" for c in ply.comments if c.startswith("TextureFile")]
     uneven = int((counts != 3).sum())
     if uneven:
         notes.append(f"{uneven:,} faces of more than three corners are split into triangles")
@@ -204,7 +204,7 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
     unreadable = ""
     if uneven:
         unreadable = "it has faces of more than three corners"
-    elif ply.trailing:
+    elif ply.has_trailing_data:
         unreadable = "more follows its rows"
     elif "nx" in vertex.columns and normals is None:
         # Whatever has such a normal is black.
@@ -317,13 +317,13 @@ def _parts(tokens: list[bytes]) -> list[np.ndarray]:
     for row, token in zip(table, tokens):
         parts = token.split(b"/")
         if len(parts) > 3:
-            raise ValueError(f'a corner of a face is "{plain(token.decode("latin-1"), 40)}"')
+            raise ValueError(f'a corner of a face is "{sanitize(token.decode("latin-1"), 40)}"')
         row[: len(parts)] = [int(part or 0) for part in parts]
     return list(table.T)
 
 
 def _read_obj(path: str | os.PathLike) -> MeshFile:
-    size_of(path, "mesh", TEXT_BYTES)
+    check_regular_file(path, "mesh", MAX_TEXT_BYTES)
     obj, rest, end, ended = _Obj(), bytearray(), b"", False
     with open(path, "rb") as file:
         while not ended:
@@ -364,7 +364,7 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
         notes.append(f"of four numbers after the coordinates of its vertices {what}")
     if tints:
         values = parse_numbers(b" ".join(word for words in tints.values() for word in words)).reshape(-1, 3)
-        colors = np.full((obj.count, 3), GREY)
+        colors = np.full((obj.count, 3), DEFAULT_GREY)
         if not np.isfinite(values).all():
             raise ValueError("some of its colours are not finite")
         # sRGB values of 0 to 1, or to 255.
@@ -375,7 +375,7 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
         notes.append("weights of its vertices are not used")
     if obj.other:
         names = ", ".join(name.decode("latin-1") for name in obj.other)
-        notes.append(f"statements that are not used: {plain(names)}")
+        notes.append(f"statements that are not used: {sanitize(names)}")
     if beyond:
         notes.append(_BEYOND.format(beyond))
     return MeshFile(
@@ -384,12 +384,12 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
 
 
 def _read_glb(path: str | os.PathLike) -> MeshFile:
-    triangles = parse_glb(map_bytes(path, "mesh", GLTF_BYTES, GLTF_MAGIC, "export it again"), path)
+    triangles = parse_glb(map_bytes(path, "mesh", MAX_GLTF_BYTES, GLTF_MAGIC, "export it again"), path)
     # Its y is up.
     vertices = np.stack([triangles.vertices[:, 0], -triangles.vertices[:, 2], triangles.vertices[:, 1]], axis=1)
     faces = triangles.faces
     return MeshFile(
-        vertices, faces, np.arange(len(faces)), None, triangles.colors, notes=triangles.notes, unreadable="it is glTF"
+        vertices, faces, np.arange(len(faces)), None, triangles.colors, notes=triangles.notes, unreadable_reason="it is glTF"
     )
 
 

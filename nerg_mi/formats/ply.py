@@ -21,8 +21,8 @@ import numpy as np
 from nerg_mi.files.atomic import write_bytes
 
 PLY_MAGIC = b"ply"  # beginning of a file
-HEADER_BYTES = 1 << 20  # the header of a file may be so long
-TEXT_BYTES = 256 << 20  # and the rows, where their numbers are text
+MAX_HEADER_BYTES = 1 << 20  # the header of a file may be so long
+MAX_TEXT_BYTES = 256 << 20  # and the rows, where their numbers are text
 _TYPES = {"<f4": "float", "|u1": "uchar"}
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -45,7 +45,7 @@ class PlyTable:
     count: int
     columns: dict[str, Callable[[], np.ndarray]] = field(default_factory=dict)
     lists: dict[str, Callable[[], tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
-    kinds: dict[str, np.dtype] = field(default_factory=dict)
+    dtypes: dict[str, np.dtype] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Ply:
 
     tables: dict[str, PlyTable]
     comments: tuple[str, ...]
-    trailing: bool
+    has_trailing_data: bool
 
 
 def parse_ply(raw: np.ndarray) -> Ply:
@@ -64,7 +64,7 @@ def parse_ply(raw: np.ndarray) -> Ply:
     Raises `ValueError` for what is no such file or ends before its rows; nothing is allocated by counts that the bytes
     do not hold. Values of text are float64.
     """
-    head = bytes(raw[:HEADER_BYTES])
+    head = bytes(raw[:MAX_HEADER_BYTES])
     end = re.search(rb"(?:^|\n)end_header[ \t]*\r?\n", head)
     if not head.startswith(PLY_MAGIC) or end is None:
         raise ValueError("it has no header of a PLY file")
@@ -236,8 +236,8 @@ class _Bytes(_RowSource):
 
 class _Words(_RowSource):
     def __init__(self, raw: np.ndarray):
-        if len(raw) > TEXT_BYTES:
-            raise ValueError(f"it is text of more than {TEXT_BYTES:,} bytes, and larger files are read as binary")
+        if len(raw) > MAX_TEXT_BYTES:
+            raise ValueError(f"it is text of more than {MAX_TEXT_BYTES:,} bytes, and larger files are read as binary")
         self._words = parse_numbers(raw.tobytes())
         self.length = len(self._words)
 
@@ -261,7 +261,7 @@ def write_columns(
     path: str | os.PathLike,
     vertices: Mapping[str, np.ndarray],
     faces: np.ndarray | None = None,
-    of_faces: Mapping[str, np.ndarray] | None = None,
+    face_columns: Mapping[str, np.ndarray] | None = None,
     comments: Sequence[str] = (),
 ) -> None:
     """Write ``vertices``, columns (V,) by the names of their properties, and ``faces`` (F, 3), with columns (F,)
@@ -275,7 +275,7 @@ def write_columns(
     head += [f"element vertex {len(table)}", *_properties(table)]
     data = table.tobytes()
     if faces is not None:
-        more = _table(of_faces or {}, len(faces))
+        more = _table(face_columns or {}, len(faces))
         rows = np.zeros(len(faces), [("n", "u1"), ("v", "<i4", 3), *more.dtype.descr])
         rows["n"], rows["v"] = 3, faces
         for name in more.dtype.names or ():

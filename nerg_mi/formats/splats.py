@@ -11,34 +11,34 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import (
     Splats,
-    from_trained,
-    harmonics_of,
-    joined,
-    logits_of,
-    opacities_of,
-    quaternions_of,
-    scales_of,
+    splats_from_raw_parameters,
+    harmonics_from_colors,
+    concatenate_splats,
+    logits_from_opacities,
+    opacities_from_logits,
+    matrices_to_quaternions,
+    scales_from_logs,
 )
-from nerg_mi.files.safe_read import JSON_BYTES, map_bytes, open_file, open_gzip, reading
+from nerg_mi.files.safe_read import MAX_JSON_BYTES, map_bytes, open_file, open_gzip, translate_read_errors
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.maths.sphere import DEGREES
+from nerg_mi.maths.sphere import HARMONIC_DEGREES
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import trace_depth
 
-from .gltf import GLTF_BYTES, GLTF_MAGIC, accessor_values, instances, read_parts
+from .gltf import MAX_GLTF_BYTES, GLTF_MAGIC, read_accessor, iter_instances, read_glb_chunks
 from .ply import PLY_MAGIC, parse_ply, write_columns
-from .surfaces import points
+from .surfaces import extract_points
 
 # ---- Antimatter ----
 #
 # Gaussian splats as ``.splat`` (antimatter15): 32 bytes each, colours that are the same from everywhere.
 
-SPLAT_BYTES = 4 << 30  # maximum bytes of a file
+MAX_SPLAT_BYTES = 4 << 30  # maximum bytes of a file
 _ROW = np.dtype([("center", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
 _SPLAT_BLOCK = 1 << 14  # Gaussians that are converted at once
 
@@ -46,7 +46,7 @@ _SPLAT_BLOCK = 1 << 14  # Gaussians that are converted at once
 def read_splat(path: str | os.PathLike) -> Splats:
     """The Gaussian splats in ``path``, in some 2.4 times the memory of the file; `NergError` for what cannot be such a
     file."""
-    with open_file(path, "splat file", "export it again", SPLAT_BYTES) as file:
+    with open_file(path, "splat file", "export it again", MAX_SPLAT_BYTES) as file:
         size = os.fstat(file.fileno()).st_size
         count, rest = divmod(size, _ROW.itemsize)
         if rest:
@@ -59,7 +59,7 @@ def read_splat(path: str | os.PathLike) -> Splats:
             centers[block], scales[block] = rows["center"], rows["scale"]
             rotations[block] = (rows["rotation"].astype(np.float64) - 128) / 128
             colors = rows["color"] / 255.0
-            opacities[block], harmonics[block] = colors[:, 3], harmonics_of(colors[:, :3])
+            opacities[block], harmonics[block] = colors[:, 3], harmonics_from_colors(colors[:, :3])
         return Splats(centers, scales, rotations, opacities, harmonics)
 
 
@@ -78,7 +78,7 @@ def has_gltf_splats(path: str | os.PathLike) -> bool:
     with open_file(path, "splat file") as file:
         head = file.read(20)
         length = int.from_bytes(head[12:16], "little")
-        return EXTENSION.encode() in file.read(min(length, JSON_BYTES))
+        return EXTENSION.encode() in file.read(min(length, MAX_JSON_BYTES))
 
 
 def read_gltf_splats(path: str | os.PathLike) -> Splats:
@@ -87,11 +87,11 @@ def read_gltf_splats(path: str | os.PathLike) -> Splats:
     Raises `NergError` for a damaged file, for one without splats or with compressed ones, for nodes that scale
     unevenly, for splats that are not all of one degree of harmonics, and for values beyond what the extension says.
     """
-    raw = map_bytes(path, "splat file", GLTF_BYTES, GLTF_MAGIC, "export it again")
-    with reading(path, "splat file", "export it again", also=(TypeError, AttributeError)):
-        document, data = read_parts(raw, path, "splat file")
+    raw = map_bytes(path, "splat file", MAX_GLTF_BYTES, GLTF_MAGIC, "export it again")
+    with translate_read_errors(path, "splat file", "export it again", extra_errors=(TypeError, AttributeError)):
+        document, data = read_glb_chunks(raw, path, "splat file")
         found = []
-        for primitive, matrix in instances(document, _POINTS):
+        for primitive, matrix in iter_instances(document, _POINTS):
             about = primitive.get("extensions", {}).get(EXTENSION)
             if about is None:
                 continue
@@ -101,16 +101,16 @@ def read_gltf_splats(path: str | os.PathLike) -> Splats:
                 where = Similarity(matrix)
             except NergError as error:
                 raise ValueError("its nodes do more than to turn, to move and a uniform scale") from error
-            found.append(_splats(document, data, primitive["attributes"], about).placed(where))
+            found.append(_splats(document, data, primitive["attributes"], about).transform(where))
         if not found:
             raise ValueError(f"its scene has no splats of {EXTENSION}")
-        return joined(found)
+        return concatenate_splats(found)
 
 
 def _splats(
     document: dict[str, Any], data: bytes | memoryview, attributes: dict[str, Any], extension: dict[str, Any]
 ) -> Splats:
-    take = lambda name, shape: accessor_values(document, data, attributes[name], shape)
+    take = lambda name, shape: read_accessor(document, data, attributes[name], shape)
     own = lambda name, shape: take(f"{EXTENSION}:{name}", shape)
     harmonics = []
     for degree in range(4):
@@ -123,15 +123,15 @@ def _splats(
     xyzw, scales, opacities = own("ROTATION", "VEC4"), own("SCALE", "VEC3"), own("OPACITY", "SCALAR")[:, 0]
     kernel, color_space = extension.get("kernel", "ellipse"), extension.get("colorSpace", "srgb_rec709_display")
     if kernel != "ellipse":
-        raise ValueError(f'its kernel is "{plain(kernel, 40)}", and "ellipse" is read')
+        raise ValueError(f'its kernel is "{sanitize(kernel, 40)}", and "ellipse" is read')
     if color_space not in _COLOR_SPACES:
-        raise ValueError(f'its colour space is "{plain(color_space, 40)}", and {" and ".join(_COLOR_SPACES)} are read')
+        raise ValueError(f'its colour space is "{sanitize(color_space, 40)}", and {" and ".join(_COLOR_SPACES)} are read')
     _check_range("opacities", opacities, 0, 1, "logits")
     _check_range("scales", scales, 0, np.inf, "logarithms")
     _check_range("rotations' lengths", np.linalg.norm(xyzw, axis=1), 0.9, 1.1, "quaternions that are not normalised")
     used = {"POSITION", *(f"{EXTENSION}:{n}" for n in ("ROTATION", "SCALE", "OPACITY"))}
     unused = [n for n in attributes if n not in used and not re.fullmatch(rf"{EXTENSION}:SH_DEGREE_[0-3]_COEF_\d", n)]
-    notes = (f"attributes that are not used: {plain(', '.join(unused))}",) if unused else ()
+    notes = (f"attributes that are not used: {sanitize(', '.join(unused))}",) if unused else ()
     shapes = take("POSITION", "VEC3"), scales, xyzw[:, [3, 0, 1, 2]], opacities
     return Splats(*shapes, np.stack(harmonics, axis=1), color_space=_COLOR_SPACES[color_space], notes=notes)
 
@@ -152,8 +152,8 @@ def _check_range(name: str, values: np.ndarray, low: float, high: float, otherwi
 # their Gaussians become a thousandth as thick as they are wide. Of Mip-Splatting (Yu et al. 2024) the 3D filter is
 # applied. Opacities and lengths where logits and logarithms belong are recognised by values that these cannot have.
 
-PLY_BYTES = 8 << 30  # maximum bytes of a file
-HEADER_BYTES = 64 << 10  # so many of them tell splats from meshes
+MAX_PLY_BYTES = 8 << 30  # maximum bytes of a file
+DETECTION_BYTES = 64 << 10  # so many of them tell splats from meshes
 _CENTER, _SCALE, _ROTATION = ("x", "y", "z"), ("scale_0", "scale_1", "scale_2"), tuple(f"rot_{i}" for i in range(4))
 _BASE, _NORMAL = tuple(f"f_dc_{i}" for i in range(3)), ("nx", "ny", "nz")
 _FILTER = "filter_3D"
@@ -166,18 +166,18 @@ _NEIGHBOR, _SAMPLE = 4, 2000
 _OPAQUE = 32
 
 
-def has_splats(path: str | os.PathLike) -> bool:
+def has_ply_splats(path: str | os.PathLike) -> bool:
     """Whether the header of the PLY file ``path`` names what Gaussian splats have: their colours, or their shape."""
     with open_file(path, "PLY file") as file:
-        names = re.findall(rb"^property [a-z0-9]+ (\w+)\s*$", file.read(HEADER_BYTES), re.MULTILINE)
+        names = re.findall(rb"^property [a-z0-9]+ (\w+)\s*$", file.read(DETECTION_BYTES), re.MULTILINE)
         return b"f_dc_0" in names or {b"opacity", b"scale_0", b"rot_0"} <= set(names)
 
 
 def read_ply_splats(path: str | os.PathLike) -> Splats:
     """The Gaussian splats in the PLY file ``path``; `NergError` for another kind of file, and for a damaged one."""
     remedy = "export it again as a 3DGS .ply"
-    raw = map_bytes(path, "splat file", PLY_BYTES, PLY_MAGIC, remedy)
-    with reading(path, "splat file", remedy):
+    raw = map_bytes(path, "splat file", MAX_PLY_BYTES, PLY_MAGIC, remedy)
+    with translate_read_errors(path, "splat file", remedy):
         tables = parse_ply(np.frombuffer(raw, np.uint8)).tables
         first = next(iter(tables), "")
         if first != "vertex":
@@ -192,7 +192,7 @@ def read_ply_splats(path: str | os.PathLike) -> Splats:
             raise ValueError(f'it lacks the column "{missing[0]}", which Gaussian splats have')
         rest = sorted((int(m[1]), name) for name in columns if (m := re.fullmatch(r"f_rest_(\d{1,3})", name)))
         count = 1 + len(rest) // 3
-        if len(rest) % 3 or count not in DEGREES or [i for i, _ in rest] != list(range(len(rest))):
+        if len(rest) % 3 or count not in HARMONIC_DEGREES or [i for i, _ in rest] != list(range(len(rest))):
             raise ValueError(f"its {len(rest)} columns f_rest_* are those of no degree from 0 to 3")
         take = lambda names: np.stack([columns.pop(name) for name in names if name in columns], axis=-1)
         base = take(_BASE)[:, None]
@@ -206,9 +206,9 @@ def read_ply_splats(path: str | os.PathLike) -> Splats:
             scales, opacities = _filtered(scales, opacities, columns.pop(_FILTER))
         extra = {name: column for name, column in columns.items() if name not in _NORMAL}
         unused = [*extra, *(f"those of {name}" for name in list(tables)[1:])]
-        notes = (f"columns that are not used: {plain(', '.join(unused))}",) if unused else ()
+        notes = (f"columns that are not used: {sanitize(', '.join(unused))}",) if unused else ()
         harmonics = np.concatenate([base, more], axis=1)
-        return Splats(centers, scales, rotations, opacities, harmonics, extra, guesses=guesses, notes=notes)
+        return Splats(centers, scales, rotations, opacities, harmonics, extra, assumptions=guesses, notes=notes)
 
 
 def _activated(
@@ -219,7 +219,7 @@ def _activated(
     if _are_lengths(centers, scales):
         guesses.append("its scales are taken as lengths: as logarithms they would far exceed the Gaussians' distances")
     else:
-        scales = scales_of(scales)
+        scales = scales_from_logs(scales)
     # As logits, all opacities of a training would lie between 0.5 and 0.73.
     if len(opacities) >= _SOME and 0 <= opacities.min() < opacities.max() <= 1:
         guesses.append("its opacities are taken as they are, since all lie in 0..1: logits reach further")
@@ -227,7 +227,7 @@ def _activated(
         guesses.append("its opacities are taken for 255ths: as logits they would all be opaque or half so")
         opacities = opacities / np.float32(255)
     else:
-        opacities = opacities_of(opacities)
+        opacities = opacities_from_logits(opacities)
     return scales, opacities, tuple(guesses)
 
 
@@ -242,7 +242,7 @@ def _are_lengths(centers: np.ndarray, scales: np.ndarray) -> bool:
     usual = np.median(scales.max(axis=1))
     # Logarithms that all lie in 0..1 are suspicious by themselves: no training leaves all sizes within a factor of 2.7.
     overlap = 2 if scales.max() <= 1 else 16
-    return bool(distance > 0 and usual < 4 * distance and overlap * distance < scales_of(usual))
+    return bool(distance > 0 and usual < 4 * distance and overlap * distance < scales_from_logs(usual))
 
 
 def _filtered(scales: np.ndarray, opacities: np.ndarray, deviation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -261,7 +261,7 @@ def write_ply_splats(path: str | os.PathLike, splats: Splats, comments: tuple[st
     columns |= {name: splats.harmonics[:, 0, i] for i, name in enumerate(_BASE)}
     rest = splats.harmonics[:, 1:].swapaxes(1, 2).reshape(len(splats), -1)
     columns |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
-    columns["opacity"] = logits_of(splats.opacities)
+    columns["opacity"] = logits_from_opacities(splats.opacities)
     logs = np.log(splats.scales.astype(np.float64))
     columns |= {name: logs[:, i] for i, name in enumerate(_SCALE)}
     columns |= {name: splats.rotations[:, i] for i, name in enumerate(_ROTATION)}
@@ -274,7 +274,7 @@ def write_ply_splats(path: str | os.PathLike, splats: Splats, comments: tuple[st
 #
 # Axes are the file's: x right, y up, z back, unless its writer was told otherwise.
 
-COUNT = 50_000_000  # a file may hold so many Gaussians
+MAX_SPZ_GAUSSIANS = 50_000_000  # a file may hold so many Gaussians
 _MAGIC = 0x5053474E
 _COLOR_SCALE = 0.15
 
@@ -284,7 +284,7 @@ def read_spz(path: str | os.PathLike) -> Splats:
     with open_file(path, "splat file") as file:
         start = file.read(4)
     convert = f'convert it by: npx @playcanvas/splat-transform "{Path(path).name}" out.ply'
-    with reading(path, "splat file", convert):
+    with translate_read_errors(path, "splat file", convert):
         if start == struct.pack("<I", _MAGIC):
             raise ValueError("it is SPZ of version 4 or later, and versions 1 to 3 are read")
         with open_gzip(path, "splat file") as stream:
@@ -292,8 +292,8 @@ def read_spz(path: str | os.PathLike) -> Splats:
             magic, version, count, degree, fraction = struct.unpack_from("<IIIBB", head)
             if magic != _MAGIC or not 1 <= version <= 3 or degree > 3 or fraction > 23 or len(head) < 16:
                 raise ValueError("it is no SPZ of version 1 to 3")
-            if count > COUNT:
-                raise ValueError(f"it announces {count:,} Gaussians, more than the {COUNT:,} that are read")
+            if count > MAX_SPZ_GAUSSIANS:
+                raise ValueError(f"it announces {count:,} Gaussians, more than the {MAX_SPZ_GAUSSIANS:,} that are read")
             more = (degree + 1) ** 2 - 1
             widths = (6 if version == 1 else 9, 1, 3, 3, 4 if version == 3 else 3, 3 * more)
             data = stream.read(count * sum(widths))
@@ -309,7 +309,7 @@ def read_spz(path: str | os.PathLike) -> Splats:
         shaped = (rest.reshape(count, more, 3) - 128.0) / 128
         harmonics = np.concatenate([base[:, None], shaped], axis=1)
         rotations = _smallest_three(rotation) if version == 3 else _vector_part(rotation)
-        return from_trained(centers, scale / 16.0 - 10, rotations, logits_of(alpha[:, 0] / 255.0), harmonics)
+        return splats_from_raw_parameters(centers, scale / 16.0 - 10, rotations, logits_from_opacities(alpha[:, 0] / 255.0), harmonics)
 
 
 def _fixed(data: np.ndarray) -> np.ndarray:
@@ -354,20 +354,20 @@ _OTHERS = (".sog", ".ksplat", ".lcc")
 _AMONG_OTHERS = (*_OTHERS, ".gltf", ".json")
 
 
-def is_splats(path: str | os.PathLike) -> bool:
+def is_splat_file(path: str | os.PathLike) -> bool:
     """Whether ``path`` is a file of Gaussian splats, by its name; a ``.ply`` or ``.glb``, which may be a mesh, by its
     header."""
     suffix = Path(path).suffix.lower()
-    tell = {".ply": has_splats, ".glb": has_gltf_splats}.get(suffix)
+    tell = {".ply": has_ply_splats, ".glb": has_gltf_splats}.get(suffix)
     return suffix in READERS if tell is None else tell(path)
 
 
-def plugin_of_field(path: str | os.PathLike) -> str:
+def choose_plugin(path: str | os.PathLike) -> str:
     """The volume plugin that shows the file of a place: that of splats, or that of radiance fields."""
-    return "splats" if is_splats(path) else "nerf"
+    return "splats" if is_splat_file(path) else "nerf"
 
 
-def refuse_others(path: str | os.PathLike) -> None:
+def refuse_unsupported_splats(path: str | os.PathLike) -> None:
     """Raise `NergError`, which names the converter, for splats in a format that is not read."""
     if Path(path).suffix.lower() in _OTHERS:
         read_splats(path)
@@ -399,7 +399,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
 # No training: where a lattice crosses the field's surface a Gaussian is laid along it, as wide as its neighbours are
 # far, in the colour that the field has there from in front. Depths are then those of the field to a fraction of a cell.
 
-WIDTH = 0.7
+SURFEL_WIDTH = 0.7
 """Standard deviation along the surface, in distances to the nearest neighbours: one more widely smears colours, one
 less leaves gaps."""
 
@@ -407,7 +407,7 @@ _SURFELS_THIN, _OPACITY = 0.1, 0.9
 _NEIGHBORS, _NEAREST = 12, 4
 
 
-def splats_of_field(
+def make_splats(
     field: RadianceField, resolution: int = 256, threshold: float | None = None
 ) -> tuple[Splats, dict[str, float]]:
     """Gaussians in the field's own frame, and what was done: ``cell`` of the lattice and ``moved``, the median distance
@@ -416,7 +416,7 @@ def splats_of_field(
     ``resolution``: cells along the longest edge; ``threshold``: density at which the surface lies (default: that of
     ``points``). Raises `NergError` where there is none.
     """
-    surface = points(field, resolution, threshold)
+    surface = extract_points(field, resolution, threshold)
     cell = surface.report["cell"]
     p, normals = surface.vertices, surface.normals
     lost = np.linalg.norm(normals, axis=1) < 0.5
@@ -427,10 +427,10 @@ def splats_of_field(
     met = (opacity >= 0.5) & (depth < 2 * cell)
     shift = np.where(met, cell - depth, 0)
     p = p + shift[:, None] * normals
-    wide = WIDTH * np.clip(spacing, 0.25 * cell, 2 * cell)
-    scales = np.stack([wide, wide, _SURFELS_THIN * wide / WIDTH], axis=1)
+    wide = SURFEL_WIDTH * np.clip(spacing, 0.25 * cell, 2 * cell)
+    scales = np.stack([wide, wide, _SURFELS_THIN * wide / SURFEL_WIDTH], axis=1)
     opacities = np.full(len(p), _OPACITY)
-    splats = Splats(p, scales, quaternions_of(_frames(normals)), opacities, harmonics_of(surface.colors))
+    splats = Splats(p, scales, matrices_to_quaternions(_frames(normals)), opacities, harmonics_from_colors(surface.colors))
     return splats, {"cell": float(cell), "moved": float(np.median(np.abs(shift)))}
 
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, import_extra
-from nerg_mi.fields.extraction import Lattice, Sampler, crossings, opacity, surface_density
+from nerg_mi.fields.extraction import Lattice, FieldSampler, find_crossings, cell_opacity, surface_density
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.maths.color import decode_srgb, encode_srgb
 
-from .gltf import Attribute, shown_unlit
+from .gltf import Attribute, encode_unlit_glb
 from .ply import write_columns
 
 # ---- Surfaces ----
@@ -42,13 +42,13 @@ class Surface:
         return 0 if self.faces is None else len(self.faces)
 
 
-def mesh(
+def extract_mesh(
     field: RadianceField,
     resolution: int = 256,
     threshold: float | None = None,
-    fill: int = 1,
-    keep: float = 0.001,
-    unseen: bool = False,
+    fill_cells: int = 1,
+    min_piece_fraction: float = 0.001,
+    keep_unseen: bool = False,
 ) -> Surface:
     """The surface where density crosses ``threshold`` (default: ``surface_density``), by marching cubes.
 
@@ -59,20 +59,20 @@ def mesh(
     measure = import_extra("skimage.measure", "a mesh needs scikit-image", "mesh")
     import trimesh
 
-    sampler, lattice = Sampler(field), Lattice.over(field, resolution)
+    sampler, lattice = FieldSampler(field), Lattice.for_field(field, resolution)
     threshold = surface_density(lattice) if threshold is None else threshold
-    density = sampler.on(lattice)
-    level = float(opacity(np.array(threshold), lattice))
-    volume, filled = _closed(opacity(density, lattice), level, fill)
+    density = sampler.density_on(lattice)
+    level = float(cell_opacity(np.array(threshold), lattice))
+    volume, filled = _closed(cell_opacity(density, lattice), level, fill_cells)
     if not volume.min() < level < volume.max():
         raise NergError(
             f"density crosses {threshold:g} per unit nowhere (it lies in {density.min():g} .. {density.max():g} on "
             f"{lattice.shape} points): choose another --density"
         )
     index, faces, _, _ = measure.marching_cubes(volume.transpose(2, 1, 0), level, allow_degenerate=False)
-    index, hidden = crossings(sampler, lattice, index.astype(np.float64), threshold)
+    index, hidden = find_crossings(sampler, lattice, index.astype(np.float64), threshold)
     vertices, total = lattice.points(index), len(faces)
-    if not unseen:
+    if not keep_unseen:
         faces = faces[hidden[faces].sum(1) < 2]
         if len(faces) == 0:
             raise NergError(
@@ -81,7 +81,7 @@ def mesh(
             )
     left = len(faces)
     body = trimesh.Trimesh(vertices, faces[:, ::-1] if _inside_out(vertices, faces, sampler) else faces, process=False)
-    body, pieces, kept = _without_floaters(body, keep)
+    body, pieces, kept = _without_floaters(body, min_piece_fraction)
     normals = np.array(body.vertex_normals)
     edges, open_edges = _open_edges(body, lattice)
     report = {
@@ -113,7 +113,7 @@ def _closed(volume: np.ndarray, level: float, cells: int) -> tuple[np.ndarray, i
     return np.where(holes, closed, volume), int(np.count_nonzero(holes))
 
 
-def _inside_out(vertices, faces, sampler: Sampler) -> bool:
+def _inside_out(vertices, faces, sampler: FieldSampler) -> bool:
     """Whether normals point towards higher density, by the majority of some faces."""
     some = faces[:: max(len(faces) // 2000, 1)]
     a, b, c = (vertices[some[:, k]] for k in range(3))
@@ -153,14 +153,14 @@ def _open_edges(body, lattice: Lattice) -> tuple[int, int]:
     return int(near.sum()), int((~near).sum())
 
 
-def points(
+def extract_points(
     field: RadianceField, resolution: int = 256, threshold: float | None = None, count: int | None = None, seed: int = 0
 ) -> Surface:
     """Points where the edges of a lattice cross the surface, with normals down the density's gradient; at most
     ``count``."""
-    sampler, lattice = Sampler(field), Lattice.over(field, resolution)
+    sampler, lattice = FieldSampler(field), Lattice.for_field(field, resolution)
     threshold = surface_density(lattice) if threshold is None else threshold
-    dense = sampler.on(lattice).transpose(2, 1, 0) >= threshold
+    dense = sampler.density_on(lattice).transpose(2, 1, 0) >= threshold
     index = []
     for axis in range(3):
         low, high = (np.moveaxis(dense, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
@@ -174,12 +174,12 @@ def points(
         )
     if count is not None and count < len(index):
         index = index[np.sort(np.random.default_rng(seed).choice(len(index), count, replace=False))]
-    index, hidden = crossings(sampler, lattice, index, threshold)
+    index, hidden = find_crossings(sampler, lattice, index, threshold)
     p = lattice.points(index[~hidden])
     h = 0.5 * lattice.step
     slope = np.stack(
         [
-            opacity(sampler.density(p - h * e), lattice) - opacity(sampler.density(p + h * e), lattice)
+            cell_opacity(sampler.density(p - h * e), lattice) - cell_opacity(sampler.density(p + h * e), lattice)
             for e in np.eye(3)
         ],
         1,
@@ -189,8 +189,8 @@ def points(
     return Surface(p, None, normals, _srgb(field, sampler, p, normals), report)
 
 
-def _srgb(field: RadianceField, sampler: Sampler, p, normals) -> np.ndarray:
-    c = np.clip(sampler.diffuse(np.asarray(p), np.asarray(normals)), 0, 1)
+def _srgb(field: RadianceField, sampler: FieldSampler, p, normals) -> np.ndarray:
+    c = np.clip(sampler.diffuse_color(np.asarray(p), np.asarray(normals)), 0, 1)
     return encode_srgb(c) if field.color_space == "linear" else c
 
 
@@ -219,7 +219,7 @@ def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
         ("NORMAL", surface.normals.astype("<f4"), False),
         ("COLOR_0", rgba, True),
     ]
-    write_bytes(path, *shown_unlit(attributes, surface.faces, up))
+    write_bytes(path, *encode_unlit_glb(attributes, surface.faces, up))
 
 
 # ---- Volumes ----
@@ -245,7 +245,7 @@ def write_volume(path: str | Path, data: np.ndarray, lower, upper) -> None:
     write_bytes(path, head, np.ascontiguousarray(data).data)
 
 
-def density_and_color(field: RadianceField, resolution: int = 256, color: bool = True, samples: int = 2):
+def sample_density_and_color(field: RadianceField, resolution: int = 256, color: bool = True, samples: int = 2):
     """``(density (z, y, x), colour (z, y, x, 3) or None, lower, upper)`` of voxels, ``resolution`` along the longest
     edge.
 
@@ -255,7 +255,7 @@ def density_and_color(field: RadianceField, resolution: int = 256, color: bool =
     """
     from scipy.ndimage import distance_transform_edt
 
-    sampler, lattice = Sampler(field), Lattice.over(field, resolution)
+    sampler, lattice = FieldSampler(field), Lattice.for_field(field, resolution)
     alpha = sampler.opacity_on(lattice, samples)
     density = -np.log(np.maximum(1 - alpha, math.exp(-_DEEPEST))) / lattice.step
     lower = np.array(lattice.lower)
@@ -273,7 +273,7 @@ def density_and_color(field: RadianceField, resolution: int = 256, color: bool =
         p = _to_the_surface(sampler, lattice, lattice.points(at[:, ::-1]), normals)
         # Where density is even there is no normal, and any direction will do.
         normals[np.linalg.norm(normals, axis=1) < 0.5] = [0, 0, 1]
-        c = sampler.diffuse(p, normals)
+        c = sampler.diffuse_color(p, normals)
         out[tuple(at.T)] = decode_srgb(c) if field.color_space == "srgb" else c
     del filled
     nearest: Any = distance_transform_edt(alpha <= _FAINT, return_distances=False, return_indices=True)
@@ -298,7 +298,7 @@ def _slope(values: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.stack(slopes, 1)
 
 
-def _to_the_surface(sampler: Sampler, lattice: Lattice, p: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _to_the_surface(sampler: FieldSampler, lattice: Lattice, p: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Points moved out of (or into) the matter along ``normals`` to where it begins, if that is within two voxels."""
     threshold, reach = surface_density(lattice), 2 * lattice.step
     dense = sampler.density(p) >= threshold

@@ -12,23 +12,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, import_extra, plain
+from nerg_mi.errors import MissingFile, NergError, import_extra, sanitize
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.safe_read import open_zip, read_member, reading, size_of
+from nerg_mi.files.safe_read import open_zip, read_member, translate_read_errors, check_regular_file
 
 if TYPE_CHECKING:
     import torch
 
 
-PICKLE_BYTES = 8 << 20
+MAX_PICKLE_BYTES = 8 << 20
 """The pickle may have so many bytes: it holds names and shapes, the numbers are in records of their own."""
 
-OPERATIONS = 1_000_000  # so many operations may it have
+MAX_OPERATIONS = 1_000_000  # so many operations may it have
 
-WORK = 8 * PICKLE_BYTES
+MAX_WORK = 8 * MAX_PICKLE_BYTES
 """So many values and characters may its operations take in all, what is repeated counted each time."""
 
-EXPANDED = 1 << 20  # so many numbers may a tensor have that repeats those of its storage
+MAX_EXPANDED_NUMBERS = 1 << 20  # so many numbers may a tensor have that repeats those of its storage
 _TEXT = 64
 # What torch.load would also make of a file, and no checkpoint of weights has: sparse and quantised tensors, devices,
 # sets, byte arrays of any size, ...
@@ -49,7 +49,7 @@ _NAMES = frozenset(
 _FILLED = ("APPEND", "APPENDS", "SETITEM", "SETITEMS", "BUILD")
 
 
-class NamedValue:
+class EnumStandIn:
     """Stands for a member of an Enum of the file's own program: only its ``value`` is kept."""
 
     __slots__ = ("value",)
@@ -63,7 +63,7 @@ class _NumberType:
 
     def __init__(self, name, *_):
         if not (isinstance(name, str) and re.fullmatch(r"[biuf][1248]", name)):
-            raise ValueError(f'the number type "{plain(name, 40)}" is not read here')
+            raise ValueError(f'the number type "{sanitize(name, 40)}" is not read here')
         self.name = f"<{name}"
 
     def __setstate__(self, state):
@@ -78,7 +78,7 @@ _STANDINS = [
     (_NumberType, "numpy.dtype"),
     (_number, "numpy.core.multiarray.scalar"),
     (_number, "numpy._core.multiarray.scalar"),
-    (NamedValue, "nerg.gaze_prediction.NeRGVariant"),
+    (EnumStandIn, "nerg.gaze_prediction.NeRGVariant"),
 ]
 
 
@@ -101,8 +101,8 @@ def read_torch(path: str | Path):
     path = Path(path)
     if not path.exists():
         raise MissingFile(f'there is no file "{path}"; correct its name')
-    size_of(path, "checkpoint")
-    with reading(path, "checkpoint"), open(path, "rb") as file:
+    check_regular_file(path, "checkpoint")
+    with translate_read_errors(path, "checkpoint"), open(path, "rb") as file:
         zipped = file.read(4) == b"PK\3\4" and zipfile.is_zipfile(path)
     if not zipped:
         raise NergError(
@@ -118,7 +118,7 @@ def read_torch(path: str | Path):
             return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:
         # Whatever torch meets in a pickle that is none, of any class; its advice is to programmers.
-        said = plain(str(error).partition("WeightsUnpickler error: ")[2] or error).split("\n")[0]
+        said = sanitize(str(error).partition("WeightsUnpickler error: ")[2] or error).split("\n")[0]
         raise NergError(f'"{path}" is not read, for its pickle is damaged or no checkpoint\'s: {said}') from error
 
 
@@ -132,20 +132,20 @@ def _check_archive(path: Path) -> bytes:
             raise NergError(
                 f'"{path}" is a zip archive, but not one that torch.save wrote (no data.pkl); name one of those'
             )
-        if pickles[0].file_size > PICKLE_BYTES:
+        if pickles[0].file_size > MAX_PICKLE_BYTES:
             raise NergError(
-                f'the pickle of "{path}" has {pickles[0].file_size:,} bytes, more than the {PICKLE_BYTES:,} that are '
+                f'the pickle of "{path}" has {pickles[0].file_size:,} bytes, more than the {MAX_PICKLE_BYTES:,} that are '
                 "read; save its weights alone"
             )
         for member in members:
             if member.compress_type != zipfile.ZIP_STORED:
                 raise NergError(
-                    f'the member "{plain(member.filename)}" of "{path}" is compressed, as none is that torch.save '
+                    f'the member "{sanitize(member.filename)}" of "{path}" is compressed, as none is that torch.save '
                     "writes; pack it again without compression"
                 )
-        with reading(path, "checkpoint"):
+        with translate_read_errors(path, "checkpoint"):
             if damaged := archive.testzip():
-                raise ValueError(f'its member "{plain(damaged)}" is not what was written')
+                raise ValueError(f'its member "{sanitize(damaged)}" is not what was written')
         return bytes(read_member(archive, pickles[0].filename, path, "checkpoint"))
 
 
@@ -162,10 +162,10 @@ def check_pickle(pickled: bytes) -> None:
     work = 0
     for count, (operation, argument, _) in enumerate(pickletools.genops(pickled)):
         name, takes = operation.name, operation.stack_before
-        if count >= OPERATIONS or work > WORK:
-            raise ValueError(f"it has more than {OPERATIONS:,} operations, or repeats what they make too often")
+        if count >= MAX_OPERATIONS or work > MAX_WORK:
+            raise ValueError(f"it has more than {MAX_OPERATIONS:,} operations, or repeats what they make too often")
         if name == "GLOBAL" and argument not in _NAMES:
-            raise ValueError(f'it asks for "{plain(argument, 80).replace(" ", ".")}", which no weights need')
+            raise ValueError(f'it asks for "{sanitize(argument, 80).replace(" ", ".")}", which no weights need')
         if "PUT" in name:
             memo[argument] = stack[-1]
         elif "GET" in name:
@@ -203,12 +203,12 @@ def is_tensor(value: object) -> bool:
 def to_numpy(tensor: torch.Tensor, path: Path) -> np.ndarray:
     """The values of a tensor of the file ``path``; bfloat16 becomes float32."""
     stored = tensor.untyped_storage().nbytes() // tensor.element_size()
-    if tensor.numel() > max(stored, EXPANDED):
+    if tensor.numel() > max(stored, MAX_EXPANDED_NUMBERS):
         raise NergError(
             f'a tensor of "{path}" of shape {tuple(tensor.shape)} repeats the {stored:,} numbers that are stored; copy '
             "the file again"
         )
-    with reading(path, "checkpoint", also=(RuntimeError, TypeError)):
+    with translate_read_errors(path, "checkpoint", extra_errors=(RuntimeError, TypeError)):
         tensor = tensor.detach()
         return np.array((tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy())
 

@@ -9,16 +9,16 @@ from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.fields.encoding import Encoding, HashGrid, HashGridConfig
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import MLP
-from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, levels_of
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, count_cascade_levels
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box
 
-from .fields import building, check_sizes
-from .torch_files import NamedValue, is_tensor, read_torch, to_numpy, write_torch
+from .fields import translate_build_errors, check_sizes
+from .torch_files import EnumStandIn, is_tensor, read_torch, to_numpy, write_torch
 
 # ---- The state dictionary of a torch checkpoint, and the parts of fields in it ----
 #
@@ -58,7 +58,7 @@ class StateDict:
             )
         return tuple(self._tensors[name].shape)
 
-    def weights(self, name: str) -> np.ndarray:
+    def get_weights(self, name: str) -> np.ndarray:
         """``self[name]`` in fp32. Raises `NergError` when it is not finite."""
         with np.errstate(over="ignore"):  # what fp32 cannot hold is not finite
             value = self[name].astype(np.float32)
@@ -66,7 +66,7 @@ class StateDict:
             raise NergError(f'"{self.prefix}{name}" in "{self.path}" is not finite: its training has diverged')
         return value
 
-    def below(self, prefix: str) -> StateDict:
+    def select(self, prefix: str) -> StateDict:
         return StateDict(self.path, self._tensors, prefix)
 
 
@@ -81,17 +81,17 @@ def open_checkpoint(path: str | Path) -> tuple[dict, dict]:
     return whole, model
 
 
-def averaged_weights(path: str | Path, whole: dict, model: dict, wanted: bool | None) -> dict:
+def find_averages(path: str | Path, checkpoint: dict, model: dict, use_averages: bool | None) -> dict:
     """Moving averages by name, those of ``ema["shadow_params"]``; {} for the raw weights.
 
     ``wanted``: True, False, or None for averages where the file has them. torch-ngp's best checkpoint (``ngp.pth``)
     keeps its averages as the weights themselves.
     """
-    ema = whole.get("ema")
+    ema = checkpoint.get("ema")
     shadow = ema.get("shadow_params") if isinstance(ema, dict) else None
     shadow = shadow if isinstance(shadow, list) else []
-    if (not wanted and wanted is not None) or not shadow:
-        if wanted and not shadow:
+    if (not use_averages and use_averages is not None) or not shadow:
+        if use_averages and not shadow:
             raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
         return {}
     # Buffers are not averaged; parameters come in the order of the state dictionary.
@@ -104,8 +104,8 @@ def averaged_weights(path: str | Path, whole: dict, model: dict, wanted: bool | 
     return dict(zip(names, shadow))
 
 
-def origin(path: str | Path, whole: dict, program: str, averaged: bool) -> dict:
-    counts = {k: whole[k] for k in ("epoch", "global_step") if isinstance(whole.get(k), int)}
+def describe_origin(path: str | Path, checkpoint: dict, program: str, averaged: bool) -> dict:
+    counts = {k: checkpoint[k] for k in ("epoch", "global_step") if isinstance(checkpoint.get(k), int)}
     return {
         "imported_from": Path(path).name,
         "format": program,
@@ -114,16 +114,16 @@ def origin(path: str | Path, whole: dict, program: str, averaged: bool) -> dict:
     }
 
 
-def decimals(values: np.ndarray) -> np.ndarray:
+def shorten_floats(values: np.ndarray) -> np.ndarray:
     """The numbers that were typed: a bound of 2.7 stands in the file as the float32 next to it."""
     return np.array([float(str(v)) for v in values.astype(np.float32).ravel()])
 
 
-def whole(value: float) -> int | float:
+def to_integer_if_whole(value: float) -> int | float:
     return int(value) if value == int(value) else value
 
 
-def sh_degree(state: StateDict, inputs: int) -> int:
+def infer_sh_degree(state: StateDict, inputs: int) -> int:
     degree = math.isqrt(max(inputs, 0))
     if degree < 1 or degree**2 != inputs:
         raise NergError(
@@ -132,7 +132,7 @@ def sh_degree(state: StateDict, inputs: int) -> int:
     return degree
 
 
-def grid_config(state: StateDict, name: str, finest: float, dimensions: int = 3) -> HashGridConfig:
+def infer_grid_config(state: StateDict, name: str, finest: float, dimensions: int = 3) -> HashGridConfig:
     """Configuration of the hash grid ``name``, whose level sizes are compared with those stored."""
     offsets, table = (
         state[f"{name}.offsets"].astype(int).ravel()[: _LEVELS + 2].tolist(),
@@ -145,7 +145,7 @@ def grid_config(state: StateDict, name: str, finest: float, dimensions: int = 3)
             "copy it again"
         )
     config = HashGridConfig(
-        levels, table[1], max(int(largest) - 1, 1).bit_length(), finest=whole(finest), dimensions=dimensions
+        levels, table[1], max(int(largest) - 1, 1).bit_length(), finest=to_integer_if_whole(finest), dimensions=dimensions
     )
     if config.offsets() != offsets:
         raise NergError(
@@ -155,11 +155,11 @@ def grid_config(state: StateDict, name: str, finest: float, dimensions: int = 3)
     return config
 
 
-def grid(state: StateDict, name: str, config: HashGridConfig, ns: ModuleType) -> HashGrid:
-    return HashGrid(config, ns.Float(state.weights(f"{name}.embeddings").ravel()))
+def build_grid(state: StateDict, name: str, config: HashGridConfig, ns: ModuleType) -> HashGrid:
+    return HashGrid(config, ns.Float(state.get_weights(f"{name}.embeddings").ravel()))
 
 
-def layers(state: StateDict, name: str, ns: ModuleType) -> MLP:
+def build_network(state: StateDict, name: str, ns: ModuleType) -> MLP:
     """A network of layers ``name.0.weight``, ``name.1.weight``, ... without biases."""
     found = [k for k in state.names() if k.startswith(f"{name}.")]
     names = [f"{name}.{i}.weight" for i in range(max(len(found), 1))]
@@ -167,7 +167,7 @@ def layers(state: StateDict, name: str, ns: ModuleType) -> MLP:
         raise NergError(f'"{name}" in "{state.path}" has {", ".join(found)}, where layers without biases are expected')
     if len(names) > _LAYERS:
         raise NergError(f'"{name}" in "{state.path}" has {len(names)} layers, and at most {_LAYERS} are read')
-    return MLP([ns.TensorXf(state.weights(k)) for k in names])
+    return MLP([ns.TensorXf(state.get_weights(k)) for k in names])
 
 
 # ---- Occupancy ----
@@ -179,7 +179,7 @@ _CELLS = 128
 
 def read_occupancy(state: StateDict, bound: float, ns: ModuleType, mean_density) -> OccupancyGrid | CascadeGrid | None:
     """From the bitfield, or else from the density grid; None for a field that was trained without either."""
-    levels = levels_of(bound)
+    levels = count_cascade_levels(bound)
     density = state["density_grid"].reshape(levels, -1) if "density_grid" in state else None
     if "density_bitfield" in state:
         bits = np.unpackbits(state["density_bitfield"], bitorder="little").astype(bool)
@@ -213,9 +213,9 @@ def morton_order(cells: int = _CELLS) -> np.ndarray:
     return (spread[:, None, None] << 2 | spread[:, None] << 1 | spread).ravel()
 
 
-def bitfield(occupancy, bound: float) -> np.ndarray:
+def pack_bitfield(occupancy, bound: float) -> np.ndarray:
     """Bits of all cascades in Morton order, packed; every bit is set where nothing is known."""
-    levels = levels_of(bound)
+    levels = count_cascade_levels(bound)
     if occupancy is None:
         bits = np.ones((levels, _CELLS, _CELLS, _CELLS), bool)
     elif isinstance(occupancy, CascadeGrid) and (occupancy.bound, occupancy.resolution) == (bound, _CELLS):
@@ -252,7 +252,7 @@ MARCH_STEP = 2 * math.sqrt(3) / 1024  # torch-ngp's shortest step, at its defaul
 
 
 @dataclass(frozen=True)
-class Given:
+class ImportOptions:
     """What the user says of a checkpoint because the file does not."""
 
     # The space that colours were trained in.
@@ -263,21 +263,21 @@ class Given:
     background_radius: float | None = None
 
 
-AS_TRAINED_BY_DEFAULT = Given()  # what holds for a checkpoint that torch-ngp's own defaults have trained
+DEFAULT_IMPORT_OPTIONS = ImportOptions()  # what holds for a checkpoint that torch-ngp's own defaults have trained
 
 
 def read_torch_ngp(
-    path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = AS_TRAINED_BY_DEFAULT
+    path: str | Path, ns: ModuleType, ema: bool | None = None, options: ImportOptions = DEFAULT_IMPORT_OPTIONS
 ) -> tuple[RadianceField, dict]:
     """The radiance field in a torch-ngp checkpoint on backend ``ns``, and what to say about its origin (JSON)."""
     whole, model = open_checkpoint(path)
-    with building(path):
-        averaged = averaged_weights(path, whole, model, ema)
-        field = radiance_field(StateDict(Path(path), model, averaged=averaged), ns, given, whole.get("mean_density"))
-    return field, origin(path, whole, "torch-ngp", bool(averaged))
+    with translate_build_errors(path):
+        averaged = find_averages(path, whole, model, ema)
+        field = build_radiance_field(StateDict(Path(path), model, averaged=averaged), ns, options, whole.get("mean_density"))
+    return field, describe_origin(path, whole, "torch-ngp", bool(averaged))
 
 
-def radiance_field(state: StateDict, ns: ModuleType, given: Given, mean_density: float | None = None) -> RadianceField:
+def build_radiance_field(state: StateDict, ns: ModuleType, options: ImportOptions, mean_density: float | None = None) -> RadianceField:
     """The field that a torch-ngp state dictionary describes."""
     for name in state.names():
         if name in ("encoder.params", "sigma_net.params", "color_net.params"):
@@ -285,42 +285,42 @@ def radiance_field(state: StateDict, ns: ModuleType, given: Given, mean_density:
                 f'"{state.path}" was trained with --tcnn or --ff, whose layout is not read: retrain without'
             )
     box, bound = _box(state)
-    density, color = layers(state, "sigma_net", ns), layers(state, "color_net", ns)
+    density, color = build_network(state, "sigma_net", ns), build_network(state, "color_net", ns)
     width, geometry = density.weights[0].shape[0], density.outputs - 1
-    sizes = grid_config(state, "encoder", given.finest or 2048 * bound)
+    sizes = infer_grid_config(state, "encoder", options.finest or 2048 * bound)
     config = RadianceConfig(
         sizes,
         width,
         len(density.weights) - 1,
         len(color.weights) - 1,
         geometry,
-        sh_degree(state, color.inputs - geometry),
+        infer_sh_degree(state, color.inputs - geometry),
     )
     check_sizes(config.to_dict(), "networks")
     return RadianceField(
         config,
         box,
-        grid(state, "encoder", sizes, ns),
+        build_grid(state, "encoder", sizes, ns),
         density,
         color,
         read_occupancy(state, bound, ns, mean_density),
-        given.color_space,
+        options.color_space,
         MARCH_STEP,
-        _background(state, ns, given, config.sh_degree),
+        _background(state, ns, options, config.sh_degree),
     )
 
 
 def _box(state: StateDict) -> tuple[Box, float]:
-    train = decimals(state["aabb_train"])
-    aabb = decimals(state["aabb_infer"]) if "aabb_infer" in state else train
+    train = shorten_floats(state["aabb_train"])
+    aabb = shorten_floats(state["aabb_infer"]) if "aabb_infer" in state else train
     bound = float(np.abs(train).max())
     if train.shape != (6,) or aabb.shape != (6,) or not bound >= 1:
-        boxes = " and ".join(plain(repr(box.tolist()), 80) for box in (train, aabb))
+        boxes = " and ".join(sanitize(repr(box.tolist()), 80) for box in (train, aabb))
         raise NergError(f'the boxes of "{state.path}", {boxes}, are not those of a bound of at least 1')
     return Box(tuple(aabb[:3].tolist()), tuple(aabb[3:].tolist()), bound), bound
 
 
-def _background(state: StateDict, ns: ModuleType, given: Given, degree: int) -> Background | None:
+def _background(state: StateDict, ns: ModuleType, given: ImportOptions, degree: int) -> Background | None:
     if "bg_net.0.weight" not in state:
         return None
     if given.background_radius is None:
@@ -330,14 +330,14 @@ def _background(state: StateDict, ns: ModuleType, given: Given, degree: int) -> 
         )
     if given.background_radius == 0:
         return None
-    net, sizes = layers(state, "bg_net", ns), grid_config(state, "encoder_bg", 2048, 2)
+    net, sizes = build_network(state, "bg_net", ns), infer_grid_config(state, "encoder_bg", 2048, 2)
     config = BackgroundConfig(
         float(given.background_radius), sizes, net.weights[0].shape[0], len(net.weights) - 1, degree
     )
-    return Background(config, grid(state, "encoder_bg", sizes, ns), net)
+    return Background(config, build_grid(state, "encoder_bg", sizes, ns), net)
 
 
-def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
+def make_state_dict(field: RadianceField) -> dict[str, np.ndarray]:
     """State dictionary with which torch-ngp's ``NeRFNetwork(bound)`` renders ``field``.
 
     Raises `NergError` naming what does not fit: torch-ngp fixes the sizes of its networks and grid by the bound.
@@ -347,12 +347,12 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
         raise NergError(f'this field has no torch-ngp form: its positions go through "{c.grid.kind}", not a hash grid')
     bound = box.side / 2
     expected = HashGridConfig(
-        levels=c.grid.levels, features=c.grid.features, log2_rows=c.grid.log2_rows, finest=max(whole(2048 * bound), 16)
+        levels=c.grid.levels, features=c.grid.features, log2_rows=c.grid.log2_rows, finest=max(to_integer_if_whole(2048 * bound), 16)
     )
     wrong = [
         words
         for fits, words in (
-            (not box.contracted, "torch-ngp knows no contraction of what is around a box"),
+            (not box.is_contracted, "torch-ngp knows no contraction of what is around a box"),
             (
                 box.center == (0, 0, 0) and bound >= 1,
                 f"its unit cube must be [-b, b]^3 with b >= 1, not {box.lower} to {box.upper}",
@@ -380,7 +380,7 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     state = {
         "aabb_train": cube,
         "aabb_infer": np.array([*box.lower, *box.upper], np.float32),
-        "density_bitfield": bitfield(field.occupancy and field.occupancy.coarse, bound),
+        "density_bitfield": pack_bitfield(field.occupancy and field.occupancy.coarse, bound),
         "step_counter": np.zeros((16, 2), np.int32),
     }
     _put_grid(state, "encoder", field.grid)
@@ -413,7 +413,7 @@ def write_torch_ngp(field: RadianceField, path: str | Path) -> None:
             "stats": stats,
             "mean_count": 0,
             "mean_density": threshold,
-            "model": torch_ngp_state(field),
+            "model": make_state_dict(field),
         },
     )
 
@@ -430,13 +430,13 @@ _HEADS = {
 }
 
 
-def is_nerg(model: dict) -> bool:
+def is_nerg_checkpoint(model: dict) -> bool:
     """Whether a state dictionary is one of a gaze field."""
     return "net1.lin0.weight" in model or "net1.0.weight" in model
 
 
 def read_nerg(
-    path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = AS_TRAINED_BY_DEFAULT
+    path: str | Path, ns: ModuleType, ema: bool | None = None, options: ImportOptions = DEFAULT_IMPORT_OPTIONS
 ) -> tuple[RadianceField | None, GazeField, dict]:
     """Radiance field (None where the file holds none), gaze field and origin (JSON) of a NeRG checkpoint.
 
@@ -452,20 +452,20 @@ def read_nerg(
     if ema and not averaged:
         raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
     state = StateDict(Path(path), model)
-    with building(path):
-        gaze = gaze_field(state, _variant(state, whole.get("variant")), ns)
-        nerf = state.below("model_nerf.")
-        field = radiance_field(nerf, ns, given) if nerf.names() else None
-    return field, gaze, origin(path, whole, "NeRG", averaged)
+    with translate_build_errors(path):
+        gaze = build_gaze_field(state, _variant(state, whole.get("variant")), ns)
+        nerf = state.select("model_nerf.")
+        field = build_radiance_field(nerf, ns, options) if nerf.names() else None
+    return field, gaze, describe_origin(path, whole, "NeRG", averaged)
 
 
 def _variant(state: StateDict, stored) -> str:
     emit, capture = (any(n in state for n in names) for names in _HEADS.values())
-    name = stored.value if isinstance(stored, NamedValue) else stored
+    name = stored.value if isinstance(stored, EnumStandIn) else stored
     if name is None:
         name = {(True, True): "EmitCapture", (True, False): "Emit", (False, True): "Capture"}.get((emit, capture))
     if not isinstance(name, str) or name not in _VARIANTS or any(n.startswith("attend_head.") for n in state.names()):
-        said = plain(name, 40) if isinstance(name, str) else "unknown"
+        said = sanitize(name, 40) if isinstance(name, str) else "unknown"
         raise NergError(
             f'"{state.path}" is of the variant {said}; {", ".join(_VARIANTS)} are read, '
             "the others need the NeRF's features along the ray or an attention block"
@@ -482,39 +482,39 @@ def _variant(state: StateDict, stored) -> str:
     return _VARIANTS[name]
 
 
-def gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
+def build_gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
     """The gaze field that the authors' state dictionary describes."""
-    bound = float(np.abs(decimals(state["aabb_train"])).max())
+    bound = float(np.abs(shorten_floats(state["aabb_train"])).max())
     normalized = "net1.lin0.weight" in state
     read = _normalized if normalized else _plain
     position, direction = read(state, "net1", ns), read(state, "net2", ns)
     width, geometry = direction.outputs, position.outputs
     if position.weights[0].shape[0] != width or direction.weights[0].shape[0] != width:
         raise NergError(f'the networks of "{state.path}" are not all {width} wide; networks of one width are read')
-    sizes = grid_config(state, "encoder", 256 * bound)
+    sizes = infer_grid_config(state, "encoder", 256 * bound)
     config = GazeConfig(
         sizes,
         variant,
         "linear",
         width,
         geometry,
-        sh_degree(state, direction.inputs - geometry),
+        infer_sh_degree(state, direction.inputs - geometry),
         trunk="layernorm" if normalized else "linear",
     )
     check_sizes(config.to_dict(), "networks")
     heads = [_head(state, names, width, ns) for names in _HEADS.values()]
-    box, table = Box((-bound,) * 3, (bound,) * 3, bound), grid(state, "encoder", sizes, ns)
+    box, table = Box((-bound,) * 3, (bound,) * 3, bound), build_grid(state, "encoder", sizes, ns)
     return GazeField(config, box, table, position, direction, *heads)
 
 
 def _head(state: StateDict, names: tuple, width: int, ns: ModuleType) -> MLP:
     found = [n for n in names if n in state]
     # A head that the variant lacks is never evaluated.
-    return MLP([ns.TensorXf(state.weights(found[0]) if found else np.zeros((1, width), np.float32))])
+    return MLP([ns.TensorXf(state.get_weights(found[0]) if found else np.zeros((1, width), np.float32))])
 
 
 def _normalized(state: StateDict, name: str, ns: ModuleType) -> MLP:
-    array = lambda key: ns.TensorXf(state.weights(f"{name}.{key}"))
+    array = lambda key: ns.TensorXf(state.get_weights(f"{name}.{key}"))
     norms = [
         {"gain": array(f"layernorm{i}.weight"), "shift": array(f"layernorm{i}.bias"), "bias": array(f"lin{i}.bias")}
         for i in range(2)
@@ -524,4 +524,4 @@ def _normalized(state: StateDict, name: str, ns: ModuleType) -> MLP:
 
 def _plain(state: StateDict, name: str, ns: ModuleType) -> MLP:
     # ReLU and Dropout lie between the two layers of these Sequentials.
-    return MLP([ns.TensorXf(state.weights(f"{name}.{i}.weight")) for i in (0, 3)])
+    return MLP([ns.TensorXf(state.get_weights(f"{name}.{i}.weight")) for i in (0, 3)])

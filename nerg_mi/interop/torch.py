@@ -146,7 +146,7 @@ class GazeModule(_FieldModule):
 
     A normalised field's integral is found once an observer, over directions of equal area::
 
-        around = Outlook(field, Similarity(), place, eye, settings).trace()  # directions, their depths, what escapes
+        around = ObserverTracer(field, Similarity(), place, eye, settings).trace()  # directions, their depths, what escapes
 
         Z = module.integral(p_od, p_o, r_o, escaped)  # everywhere around the observer
         gaze = module(p_od, p_o, r_o, Z)  # anywhere
@@ -167,7 +167,7 @@ class GazeModule(_FieldModule):
         p_o: torch.Tensor,
         r_o: torch.Tensor,
         integral: torch.Tensor | float | None = None,
-        escaped: torch.Tensor | None = None,
+        misses: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Gaze (N,) in 1/sr of observers ``p_o`` (N, 3) who see ``p_od`` (N, 3) along unit ``r_o`` (N, 3).
 
@@ -180,12 +180,12 @@ class GazeModule(_FieldModule):
                 'this gaze field is normalised over the observer\'s sphere: give its "integral" there, which the '
                 "method integral finds"
             )
-        extra = self._extra(len(p_od), 1.0 if integral is None else integral, escaped)
+        extra = self._extra(len(p_od), 1.0 if integral is None else integral, misses)
         evaluate = lambda field, p, o, r, e: [field.evaluate(p, o, r, integral=e.x, escaped=e.y > 0.5)[0]]
         return self._evaluate(evaluate, *self._rows(p_od=p_od, p_o=p_o, r_o=r_o), extra)[0]
 
-    def unnormalized(
-        self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None
+    def evaluate_unnormalized(
+        self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, misses: torch.Tensor | None = None
     ) -> torch.Tensor:
         """Emit times capture (N,) before any division: what the integral is one of. Arguments as for ``forward``."""
 
@@ -193,17 +193,17 @@ class GazeModule(_FieldModule):
             emit, capture = field.unnormalized(p, o, r, escaped=e.y > 0.5)
             return [emit * capture + dr.zeros(type(e.x), dr.width(e))]
 
-        return self._evaluate(product, *self._rows(p_od=p_od, p_o=p_o, r_o=r_o), self._extra(len(p_od), 1.0, escaped))[
+        return self._evaluate(product, *self._rows(p_od=p_od, p_o=p_o, r_o=r_o), self._extra(len(p_od), 1.0, misses))[
             0
         ]
 
     def integral(
-        self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None
+        self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, misses: torch.Tensor | None = None
     ) -> torch.Tensor:
         """The integral over the sphere (one number) of one observer, who is ``p_o`` in every row, from N directions
         ``r_o`` of equal area that lead to ``p_od``. Of the integrator's many directions it is the integrator's
         (``transport.observer_gaze``)."""
-        return 4 * torch.pi * self.unnormalized(p_od, p_o, r_o, escaped).mean()
+        return 4 * torch.pi * self.evaluate_unnormalized(p_od, p_o, r_o, misses).mean()
 
     def _extra(self, count: int, integral, escaped) -> torch.Tensor:
         """Integrals and what escapes as rows (N, 3)."""
@@ -246,20 +246,20 @@ class GazeEnsembleModule(torch.nn.Module):
     def _densities(self) -> list[GazeModule]:
         return cast("list[GazeModule]", list(self.members))
 
-    def each(
+    def forward_members(
         self,
         p_od: torch.Tensor,
         p_o: torch.Tensor,
         r_o: torch.Tensor,
         integral: torch.Tensor | None = None,
-        escaped: torch.Tensor | None = None,
+        misses: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Gaze (members, N) of every member. ``integral``: of a normalised ensemble, (members,) or (members, N); the
         other arguments, and what is raised, as for `GazeModule`."""
         if integral is not None and len(integral) != len(self.members):
             raise ValueError(f"give the integral of each of the {len(self.members)} members, got {len(integral)}")
         integrals = [None] * len(self.members) if integral is None else integral
-        return torch.stack([member(p_od, p_o, r_o, z, escaped) for member, z in zip(self._densities(), integrals)])
+        return torch.stack([member(p_od, p_o, r_o, z, misses) for member, z in zip(self._densities(), integrals)])
 
     def forward(
         self,
@@ -267,16 +267,16 @@ class GazeEnsembleModule(torch.nn.Module):
         p_o: torch.Tensor,
         r_o: torch.Tensor,
         integral: torch.Tensor | None = None,
-        escaped: torch.Tensor | None = None,
+        misses: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Gaze (N,) in 1/sr, the mean of ``each``."""
-        return self.each(p_od, p_o, r_o, integral, escaped).mean(0)
+        return self.forward_members(p_od, p_o, r_o, integral, misses).mean(0)
 
     def integral(
-        self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None
+        self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, misses: torch.Tensor | None = None
     ) -> torch.Tensor:
         """The integrals of the members (members,) over the sphere of one observer; see ``GazeModule.integral``."""
-        return torch.stack([member.integral(p_od, p_o, r_o, escaped) for member in self._densities()])
+        return torch.stack([member.integral(p_od, p_o, r_o, misses) for member in self._densities()])
 
 
 def _columns(ns, p):

@@ -20,13 +20,13 @@ from .types import Float
 ALIGNMENT = 64  # Bytes: the widest packet's
 
 
-def aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> np.ndarray:
+def copy_aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> np.ndarray:
     """A copy of ``values``, of any shape, that begins at a whole packet."""
     array = np.asarray(values)
     return _columns(array.reshape(-1, 1), np.dtype(dtype))[0].reshape(array.shape)
 
 
-def vector_of(kind: Any, rows: ArrayLike, dtype: DTypeLike = np.float32) -> Any:
+def to_vector(kind: Any, rows: ArrayLike, dtype: DTypeLike = np.float32) -> Any:
     """The Dr.Jit vector type ``kind`` (``mi.Point3f``, say) whose lanes are ``rows`` (N, components)."""
     import drjit as dr
 

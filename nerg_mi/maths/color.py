@@ -63,7 +63,7 @@ def composite_to_linear(total, alpha, color_space: str):
 # ---- The peak signal-to-noise ratio of pictures ----
 
 
-def decibels(mean_square: float, least: float = 1e-12) -> float:
+def psnr_from_mse(mean_square: float, least: float = 1e-12) -> float:
     """PSNR in dB, of values in 0..1, for a ``mean_square`` error, which counts as ``least`` at least."""
     return float(-10 * np.log10(max(mean_square, least)))
 
@@ -76,10 +76,10 @@ def psnr(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None)
     error = (np.clip(picture, 0, 1).astype(np.float64) - truth) ** 2
     if mask is not None:
         error = error[mask]
-    return decibels(float(np.mean(error))) if error.size else float("nan")
+    return psnr_from_mse(float(np.mean(error))) if error.size else float("nan")
 
 
-def mean_score(scores: Sequence[float]) -> float:
+def mean_ignoring_nan(scores: Sequence[float]) -> float:
     """The mean of those that are not NaN; NaN if there is none."""
     known = [score for score in scores if not math.isnan(score)]
     return float(np.mean(known)) if known else math.nan
@@ -109,7 +109,7 @@ def fit_colors(
     return np.linalg.solve(x.T @ x + weight * np.eye(4), x.T @ y + weight * np.eye(4, 3)).T
 
 
-def psnr_of_fitted_half(
+def color_corrected_psnr(
     picture: np.ndarray, truth: np.ndarray, coverage: np.ndarray | None = None, mask: np.ndarray | None = None
 ) -> float:
     """PSNR in dB of the right half of ``picture`` once its colours were fitted to ``truth`` on the left half, so that

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.ranges import FARTHEST
+from nerg_mi.ranges import MAX_COORDINATE
 
 FAR = 20_000.0
 """Distance of the origin, in units, from which on places that are small beside it are refused: 2 mm are lost there."""
@@ -17,11 +17,11 @@ _SAMPLE, _STRAY = 100_000, 0.01
 def check_coordinates(points: np.ndarray, name: str) -> None:
     """Raise `NergError`, which calls ``points`` (N, 3) by their ``name``, for a coordinate that is no number or beyond
     `FARTHEST`."""
-    within = np.abs(points) <= FARTHEST
+    within = np.abs(points) <= MAX_COORDINATE
     if not within.all():
         row = int(np.flatnonzero(~within.all(axis=1))[0])
         raise NergError(
-            f"{name} must have coordinates from {-FARTHEST:g} to {FARTHEST:g}, and row {row} is "
+            f"{name} must have coordinates from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}, and row {row} is "
             f"{points[row].tolist()}; correct it, or move the origin nearer"
         )
 

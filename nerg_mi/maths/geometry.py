@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
-from nerg_mi.ranges import FARTHEST
+from nerg_mi.ranges import MAX_COORDINATE
 
 from .coordinates import check_coordinates
 from .types import Array3f, Bool, Float, Point3f, Vector3f
@@ -34,14 +34,14 @@ class Box:
     bound: float | None = None  # Half the edge of the unit cube, where that is not the box's longest
 
     # Whether positions are contracted before they are encoded, and how far then (`geometry.ContractedBox`).
-    contracted: ClassVar[bool] = False
-    reach: ClassVar[float | None] = None
+    is_contracted: ClassVar[bool] = False
+    outer_scale: ClassVar[float | None] = None
 
     def __post_init__(self):
         lower, upper = np.asarray(self.lower, float), np.asarray(self.upper, float)
-        if lower.shape != (3,) or upper.shape != (3,) or not (np.abs([lower, upper]) <= FARTHEST).all():
+        if lower.shape != (3,) or upper.shape != (3,) or not (np.abs([lower, upper]) <= MAX_COORDINATE).all():
             raise ValueError(
-                f"a box needs two finite corners of 3 numbers within {FARTHEST:g}, got {self.lower} and {self.upper}"
+                f"a box needs two finite corners of 3 numbers within {MAX_COORDINATE:g}, got {self.lower} and {self.upper}"
             )
         if not np.all(upper > lower):
             raise ValueError(f"the upper corner {self.upper} of a box must exceed its lower corner {self.lower}")
@@ -95,7 +95,7 @@ class Box:
         """How much larger cells of the unit cube are at ``p`` than in the core: they are all alike."""
         return 1.0
 
-    def density_along(self, sigma: Float, p: Array3f) -> Float:
+    def density_from_encoded(self, sigma: Float, p: Array3f) -> Float:
         """Density per unit of the field at ``p`` where it is ``sigma`` per unit as positions are encoded: the same."""
         return sigma
 
@@ -146,14 +146,14 @@ class ContractedBox:
     """
 
     core: Box
-    reach: float = REACH
+    outer_scale: float = REACH
 
-    contracted: ClassVar[bool] = True
+    is_contracted: ClassVar[bool] = True
     bound: ClassVar[float | None] = None  # The unit cube is not the box's own (`Box.bound`)
 
     def __post_init__(self):
-        if not (2 <= self.reach <= 2**12 and np.frexp(self.reach)[0] == 0.5):
-            raise ValueError(f"the reach of a contracted box must be a power of two from 2 to 4096, got {self.reach}")
+        if not (2 <= self.outer_scale <= 2**12 and np.frexp(self.outer_scale)[0] == 0.5):
+            raise ValueError(f"the reach of a contracted box must be a power of two from 2 to 4096, got {self.outer_scale}")
         if self.core.bound is not None:
             raise ValueError("a contracted box has a core that is bounded by its own corners")
 
@@ -165,7 +165,7 @@ class ContractedBox:
     @property
     def cube_side(self) -> float:
         """Edge of the outer cube, in the field's units."""
-        return self.core.side * self.reach
+        return self.core.side * self.outer_scale
 
     @property
     def center(self) -> tuple[float, ...]:
@@ -199,14 +199,14 @@ class ContractedBox:
         """The points (Array3f) that are encoded at ``u``; those beyond the outer cube come to lie on its face."""
         y = (u - 0.5) * 4
         n = dr.maximum(dr.maximum(dr.maximum(dr.abs(y.x), dr.abs(y.y)), dr.abs(y.z)), 1)
-        scale = dr.rcp(n * dr.maximum(2 - n, 1 / self.reach))
+        scale = dr.rcp(n * dr.maximum(2 - n, 1 / self.outer_scale))
         return y * (scale * (0.5 * self.side)) + type(y)(*self.center)
 
     def distance_scale(self, p: Array3f) -> Float | float:
         """How many times farther than the inner cube's face ``p`` (Array3f) is from the centre; 1 within the cube."""
         return self._halves(p)[1]
 
-    def density_along(self, sigma: Float, p: Array3f) -> Float:
+    def density_from_encoded(self, sigma: Float, p: Array3f) -> Float:
         """Density per unit of the field at ``p`` (Array3f) where it is ``sigma`` per unit as positions are encoded, out
         along the line from the centre: σ / m². A field without structure then absorbs no more outside than within."""
         return sigma * dr.rcp(dr.square(self._halves(p)[1]))
@@ -218,13 +218,13 @@ class ContractedBox:
     contains = Box.contains
 
     def to_dict(self) -> dict:
-        return {**self.core.to_dict(), "reach": self.reach}
+        return {**self.core.to_dict(), "reach": self.outer_scale}
 
 
 AnyBox = Box | ContractedBox  # Where a field lives: both kinds answer the same
 
 
-def box_of(about: dict) -> AnyBox:
+def box_from_dict(about: dict) -> AnyBox:
     """The box whose ``to_dict`` made ``about``. Raises ``ValueError`` or ``TypeError`` for what is none."""
     known = dict(about)
     reach = known.pop("reach", None)
@@ -255,7 +255,7 @@ def intersect_box(o: Array3f, d: Array3f, lower: Sequence[Any], upper: Sequence[
     return near, far
 
 
-def box_interval(o: ArrayLike, d: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def intersect_box_numpy(o: ArrayLike, d: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """The same for NumPy rays: ``o``, ``d`` broadcast to (N, 3); ``t_near`` and ``t_far`` (N,), infinite where no
     component of ``d`` leaves its slab."""
     near, far = -np.inf, np.inf
@@ -299,19 +299,19 @@ class Similarity:
         check_coordinates(m[None, :3, 3], 'the translation of "to_world"')
         self.matrix, self.scale = m, float(scale)
         self.inverse = np.linalg.inv(m)
-        self.identity = bool(np.array_equal(m, np.eye(4)))
+        self.is_identity = bool(np.array_equal(m, np.eye(4)))
 
     def point_to_local(self, p: Point3f) -> Point3f:
         """A scene point in field coordinates."""
-        return p if self.identity else self._apply(self.inverse, p, 1)
+        return p if self.is_identity else self._apply(self.inverse, p, 1)
 
     def vector_to_local(self, v: Vector3f) -> Vector3f:
         """A scene vector in field coordinates; a unit vector becomes 1 / scale long."""
-        return v if self.identity else self._apply(self.inverse, v, 0)
+        return v if self.is_identity else self._apply(self.inverse, v, 0)
 
     def direction_to_local(self, v: Vector3f) -> Vector3f:
         """A unit scene direction as a unit field direction."""
-        return v if self.identity else self._apply(self.inverse * self.scale, v, 0)
+        return v if self.is_identity else self._apply(self.inverse * self.scale, v, 0)
 
     def bounds(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner, (3,) each, of the scene's axis-aligned box around the field's box with the corners

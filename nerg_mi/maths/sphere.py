@@ -32,7 +32,7 @@ def fibonacci_directions(count: int, which: np.ndarray | None = None) -> np.ndar
     return _from_height(z, i * _GOLDEN_ANGLE)
 
 
-def numbers_in_cone(count: int, axis: np.ndarray, angle: float) -> np.ndarray:
+def indices_in_cone(count: int, axis: np.ndarray, angle: float) -> np.ndarray:
     """Numbers (N,), rising, of those of ``count`` `fibonacci_directions` that lie within ``angle`` (radian) of the unit
     ``axis`` (3,). Only the turns of the spiral at the cone's heights are made."""
     if angle >= np.pi:
@@ -86,7 +86,7 @@ def _morton(d: np.ndarray) -> np.ndarray:
     return code
 
 
-def uniform_directions(count: int, rng: np.random.Generator) -> np.ndarray:
+def sample_uniform_directions(count: int, rng: np.random.Generator) -> np.ndarray:
     """``count`` independent uniform directions, (count, 3) (Archimedes)."""
     return _from_height(1.0 - 2.0 * rng.random(count), 2.0 * np.pi * rng.random(count))
 
@@ -139,17 +139,17 @@ def _from_height(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
 # Order and signs are those of Gaussian splats, of instant-ngp and of Dr.Jit's ``sh_eval``: l = 0..3, m = -l..l, with
 # the Condon-Shortley phase.
 
-C0 = 0.28209479177387814  # The harmonic of degree 0, a constant: 1 / (2 sqrt(pi))
+SH_C0 = 0.28209479177387814  # The harmonic of degree 0, a constant: 1 / (2 sqrt(pi))
 
-DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}  # Degree by the number of coefficients
+HARMONIC_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}  # Degree by the number of coefficients
 
 
-def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
+def eval_harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
     """The ``(degree + 1)**2`` harmonics (N, K) of unit ``directions`` (N, 3); ``degree``: 0 to 3."""
     x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
     xx, yy, zz = x * x, y * y, z * z
     of_degrees = [
-        [np.full_like(x, C0)],
+        [np.full_like(x, SH_C0)],
         [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x],
         [
             1.0925484305920792 * x * y,
@@ -178,9 +178,9 @@ def rotated_harmonics(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndar
     than it has harmonics, which fixes it to rounding.
     """
     coefficients = np.asarray(coefficients, np.float64)
-    degree = DEGREES[coefficients.shape[1]]
+    degree = HARMONIC_DEGREES[coefficients.shape[1]]
     directions = fibonacci_directions(48)
-    here, there = harmonics(directions, degree), harmonics(directions @ np.asarray(rotation, np.float64), degree)
+    here, there = eval_harmonics(directions, degree), eval_harmonics(directions @ np.asarray(rotation, np.float64), degree)
     out = np.empty_like(coefficients)
     for order in range(degree + 1):
         part = slice(order * order, (order + 1) ** 2)

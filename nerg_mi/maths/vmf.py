@@ -70,7 +70,7 @@ def kappa_from_resultant(resultant: np.ndarray | float) -> np.ndarray:
     return np.clip(solved, KAPPA_MIN, KAPPA_MAX)
 
 
-def convolved_kappa(kappa: np.ndarray | float, by: np.ndarray | float) -> np.ndarray:
+def convolve_kappa(kappa: np.ndarray | float, by: np.ndarray | float) -> np.ndarray:
     """κ of a von Mises-Fisher law seen through another one: A(κ) = A(κ_1) A(κ_2).
 
     The convolution of two such laws is none, but hardly differs from the one with its mean direction and mean resultant
@@ -114,12 +114,12 @@ def sample(mu: np.ndarray, kappa: np.ndarray | float, rng: np.random.Generator) 
     u, phi = rng.random(mu.shape[:-1]), 2.0 * np.pi * rng.random(mu.shape[:-1])
     v = np.minimum(-np.log1p(u * np.expm1(-2.0 * kappa)) / kappa, 2.0)
     r = np.sqrt(v * (2.0 - v))  # sin of the angle, from 1 - cos without cancellation
-    a, b = tangents(mu)
+    a, b = tangent_frame(mu)
     x = (1.0 - v)[..., None] * mu + (r * np.cos(phi))[..., None] * a + (r * np.sin(phi))[..., None] * b
     return x / np.linalg.norm(x, axis=-1, keepdims=True)
 
 
-def tangents(n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tangent_frame(n: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors orthogonal to n and to each other (Duff et al. 2017)."""
     x, y, z = np.moveaxis(n, -1, 0)
     sign = np.copysign(1.0, z)

@@ -91,7 +91,7 @@ def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
 
     Raises `NergError` where the model folds over inside the image, so that no inverse exists.
     """
-    u, good = undistort_where(xy, lens)
+    u, good = undistort_with_mask(xy, lens)
     if not good.all():
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
         listed = ", ".join(f"{k}={v:g}" for k, v in zip(names, lens.distortion) if v)
@@ -102,7 +102,7 @@ def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
     return u
 
 
-def undistort_where(xy: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+def undistort_with_mask(xy: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """As `undistort`, (..., 2), and a mask (...) of the coordinates that have an inverse; elsewhere it is none."""
     goal = np.asarray(xy, np.float64)
     if not any(lens.distortion):
@@ -141,7 +141,7 @@ def _ratio(r2, lens: Intrinsics):
     return over / under, (slope - over / under * under_slope) / under
 
 
-def pinhole_limit(lens: Intrinsics) -> float:
+def find_pinhole_limit(lens: Intrinsics) -> float:
     """Squared tangent of the angle at which a pinhole lens folds over: what lies beyond is not in the photo, though the
     model gives it a pixel. The radial part alone; infinite where it never does."""
     # With t = r², the image radius is r N(t)/D(t); its slope has the sign of N D + 2 t (N' D - N D').
@@ -173,7 +173,7 @@ def _fisheye_radius(theta, lens: Intrinsics):
     )
 
 
-def fisheye_limit(lens: Intrinsics) -> tuple[float, float]:
+def find_fisheye_limit(lens: Intrinsics) -> tuple[float, float]:
     """The largest angle that a fisheye lens shows, at most π, and its image radius: no pixel beyond has a direction."""
     radius, slope = _fisheye_radius(_ANGLES, lens)
     falls = np.flatnonzero(slope <= 0)
@@ -181,7 +181,7 @@ def fisheye_limit(lens: Intrinsics) -> tuple[float, float]:
     return float(_ANGLES[last]), float(radius[last])
 
 
-def rays(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
+def image_to_directions(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
     """Unit directions (..., 3) that image coordinates ``xy`` (..., 2) show; a fisheye's last one beyond its limit.
 
     Raises `NergError` as `undistort` does.
@@ -190,7 +190,7 @@ def rays(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
         u = undistort(xy, lens)
         d = np.concatenate([u, np.ones_like(u[..., :1])], axis=-1)
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
-    most, end = fisheye_limit(lens)
+    most, end = find_fisheye_limit(lens)
     r = np.linalg.norm(xy, axis=-1)
     goal = np.minimum(r, end)
     # The polynomial rises from 0 to the limit: a table finds the place, Newton's iteration the digits.
@@ -206,20 +206,20 @@ def rays(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
     return np.concatenate([xy * across[..., None], np.cos(theta)[..., None]], axis=-1)
 
 
-def image(d: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+def directions_to_image(d: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     """Image coordinates (..., 2) of directions ``d`` (..., 3) of any length, and a mask of those that the lens can
     show."""
     d = np.asarray(d, np.float64)
     if not lens.fisheye:
         front = d[..., 2] > 1e-9
         xy = d[..., :2] / np.where(front, d[..., 2], 1.0)[..., None]
-        front &= np.sum(xy * xy, axis=-1) < pinhole_limit(lens)
+        front &= np.sum(xy * xy, axis=-1) < find_pinhole_limit(lens)
         return distort(np.where(front[..., None], xy, 0.0), lens), front
     r = np.linalg.norm(d[..., :2], axis=-1)
     theta = np.arctan2(r, d[..., 2])
     radius, _ = _fisheye_radius(theta, lens)
     scale = np.where(r > 0, radius / np.where(r > 0, r, 1), 0.0)
-    return d[..., :2] * scale[..., None], theta <= fisheye_limit(lens)[0]
+    return d[..., :2] * scale[..., None], theta <= find_fisheye_limit(lens)[0]
 
 
 # ---- Rays of posed cameras ----
@@ -261,10 +261,10 @@ def pixel_grid(intrinsics: Intrinsics) -> np.ndarray:
 
 def pixel_directions(intrinsics: Intrinsics) -> np.ndarray:
     """Unit directions (height, width, 3), float64, of the pixels' centres in the OpenGL camera frame."""
-    return rays(pixel_grid(intrinsics), intrinsics) * _OPENGL_FROM_OPENCV
+    return image_to_directions(pixel_grid(intrinsics), intrinsics) * _OPENGL_FROM_OPENCV
 
 
-def view_tangents(intrinsics: Intrinsics) -> tuple[float, float, float, float]:
+def find_view_tangents(intrinsics: Intrinsics) -> tuple[float, float, float, float]:
     """How far a picture reaches left, right, up and down: tangents of the angles from its axis, lens included.
 
     At most tan 85°: what a fisheye sees beyond that no frustum holds.
@@ -274,7 +274,7 @@ def view_tangents(intrinsics: Intrinsics) -> tuple[float, float, float, float]:
     y = np.linspace(0, i.height, 33)
     border = [(u, v) for u in x for v in (0, i.height)] + [(u, v) for v in y for u in (0, i.width)]
     xy = (np.array(border) - [i.cx, i.cy]) / [i.fx, i.fy]
-    d = rays(xy, i)
+    d = image_to_directions(xy, i)
     ahead = np.maximum(d[:, 2], 1e-9)
     tangent = np.clip(d[:, :2] / ahead[:, None], -_WIDEST, _WIDEST)
     left, up = -tangent.min(axis=0)
@@ -286,11 +286,11 @@ def project(points: np.ndarray, camera: PosedCamera) -> tuple[np.ndarray, np.nda
     """Pixel coordinates (N, 2) of world ``points`` (N, 3), and a mask (N,) of those that the lens can show."""
     i = camera.intrinsics
     local = (np.asarray(points) - camera.center) @ camera.to_world[:3, :3]
-    xy, shown = image(local * _OPENGL_FROM_OPENCV, i)
+    xy, shown = directions_to_image(local * _OPENGL_FROM_OPENCV, i)
     return xy * [i.fx, i.fy] + [i.cx, i.cy], shown
 
 
-def sensor_dict(camera: PosedCamera) -> dict:
+def make_sensor_dict(camera: PosedCamera) -> dict:
     """A Mitsuba ``perspective`` sensor (dict for ``mi.load_dict``) that takes this camera's picture.
 
     Box filter, float32 RGB, one ray through each pixel's footprint. Raises `NergError` for what
@@ -334,14 +334,14 @@ def sensor_dict(camera: PosedCamera) -> dict:
 # ---- Pictures, masks and depth at another size ----
 
 
-def area_average(image: np.ndarray, width: int, height: int) -> np.ndarray:
+def resize_by_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """Area average of ``image`` (h, w, c), float32 in 0..1; of four channels the first three count by the fourth."""
     h, w, c = image.shape
     if c == 4:
         image = np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], axis=2)
-    out = (overlap(h, height) @ image.reshape(h, w * c)).reshape(height, w, c)
+    out = (make_area_weights(h, height) @ image.reshape(h, w * c)).reshape(height, w, c)
     out = out.transpose(1, 0, 2).reshape(w, height * c)
-    out = (overlap(w, width) @ out).reshape(width, height, c).transpose(1, 0, 2)
+    out = (make_area_weights(w, width) @ out).reshape(width, height, c).transpose(1, 0, 2)
     if c == 4:
         alpha = out[..., 3:]
         color = np.where(alpha > 0, out[..., :3] / np.where(alpha > 0, alpha, 1), 0)
@@ -349,7 +349,7 @@ def area_average(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return np.ascontiguousarray(np.clip(out, 0, 1), np.float32)
 
 
-def overlap(old: int, new: int):
+def make_area_weights(old: int, new: int):
     """Sparse matrix (new, old): the share that each old pixel has in each new one."""
     from scipy.sparse import csr_array
 
@@ -362,7 +362,7 @@ def overlap(old: int, new: int):
     return csr_array((share.ravel().astype(np.float32), (rows, np.minimum(pixel, old - 1).ravel())), shape=(new, old))
 
 
-def nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
+def resize_nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
     """The value of ``values`` (h, w) at each new pixel's centre."""
     h, w = values.shape
     y = ((np.arange(height) + 0.5) * h / height).astype(int)
@@ -370,8 +370,8 @@ def nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
     return values[np.ix_(y, x)]
 
 
-def all_used(mask: np.ndarray, width: int, height: int) -> np.ndarray:
+def resize_mask(mask: np.ndarray, width: int, height: int) -> np.ndarray:
     """Where all that a new pixel covers is on in ``mask`` (h, w, bool)."""
     if mask.shape == (height, width):
         return mask
-    return area_average(mask[..., None].astype(np.float32), width, height)[..., 0] > 0.9999
+    return resize_by_area(mask[..., None].astype(np.float32), width, height)[..., 0] > 0.9999

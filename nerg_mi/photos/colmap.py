@@ -15,11 +15,11 @@ from typing import BinaryIO
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, plain, sentence
+from nerg_mi.errors import MissingFile, NergError, sanitize, format_error
 from nerg_mi.files.atomic import file_sha256
-from nerg_mi.files.safe_read import is_ordinary, open_file, real_path, size_of
+from nerg_mi.files.safe_read import is_regular_file, open_file, resolve_path, check_regular_file
 
-from .posed import FARTHEST, FileFinder, MaskFile, PosedFrame, PosedImages, Unused, name_some, settled
+from .posed import MAX_POSITION, FileFinder, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names, sort_frames
 from .transforms import read_frame_poses
 
 # ---- Colmap ----
@@ -29,11 +29,11 @@ from .transforms import read_frame_poses
 # The layout of both is COLMAP's (src/colmap/scene/reconstruction_io): little-endian; world-to-camera poses as a
 # quaternion (w, x, y, z) and a translation; cameras look along +z with y down; the first pixel's centre is (0.5, 0.5).
 
-BYTES = 8 << 30
+MAX_BYTES = 8 << 30
 """A file of a model may have so many bytes: ``images.bin`` of some 30,000 photos, most of it observations."""
 
-IMAGES = 1 << 18  # a model may have so many images, and as many cameras
-POINTS = 12_000_000  # and so many points
+MAX_IMAGES = 1 << 18  # a model may have so many images, and as many cameras
+MAX_POINTS = 12_000_000  # and so many points
 
 # COLMAP's numbers of its camera models, and how many parameters each has.
 _MODELS = {
@@ -106,13 +106,13 @@ class _Camera:
         return {"w": float(self.width), "h": float(self.height), **lens}
 
 
-def model_files(folder: str | Path) -> dict[str, Path] | None:
+def find_model_files(folder: str | Path) -> dict[str, Path] | None:
     """The files "cameras", "images" and, where it exists, "points3D" of a model in ``folder``; None if there is
     none."""
     folder = Path(folder)
     for suffix in (".bin", ".txt"):
         files = {name: folder / (name + suffix) for name in ("cameras", "images", "points3D")}
-        files = {name: path for name, path in files.items() if is_ordinary(path, "COLMAP file")}
+        files = {name: path for name, path in files.items() if is_regular_file(path, "COLMAP file")}
         if {"cameras", "images"} <= files.keys():
             return files
     return None
@@ -144,8 +144,8 @@ def read_colmap(
             frames.append(_frame(name, cameras.get(camera), camera, q, t, image, mask_finder))
         except (ValueError, OverflowError, OSError) as e:
             # A name may be longer than the system allows, or hold what no name can.
-            unused.append(Unused(name, sentence(e)))
-    frames, unused = settled(files["images"], frames, unused)
+            unused.append(UnusedFrame(name, format_error(e)))
+    frames, unused = sort_frames(files["images"], frames, unused)
     counts, points = {"cameras": len(cameras), "images": len(poses)}, None
     if "points3D" in files:
         counts["points3D"], points = _trusted((_points_bin if binary else _points_txt)(files["points3D"]))
@@ -179,13 +179,13 @@ def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.
         try:
             found.append((name, _to_world(q, t)))
         except NergError as error:
-            raise NergError(f'image "{plain(name)}" of "{path}": {error}; copy the model again') from error
+            raise NergError(f'image "{sanitize(name)}" of "{path}": {error}; copy the model again') from error
     notes = _count_notes(path, len(found)) if path.suffix == ".txt" else []
     return path, _digest(files), found, notes
 
 
 def _require_model(folder: Path) -> dict[str, Path]:
-    files = model_files(folder)
+    files = find_model_files(folder)
     if files is None:
         raise MissingFile(f'"{folder}" holds no COLMAP model: neither cameras.bin and images.bin nor their .txt')
     return files
@@ -194,7 +194,7 @@ def _require_model(folder: Path) -> dict[str, Path]:
 @contextmanager
 def _open(path: Path) -> Iterator[BinaryIO]:
     """A file of a model; what it holds is read in pieces, since observations may be gigabytes."""
-    with open_file(path, "COLMAP file", most=BYTES) as file:
+    with open_file(path, "COLMAP file", max_bytes=MAX_BYTES) as file:
         yield file
 
 
@@ -208,14 +208,14 @@ def _frame(name: str, camera: _Camera | None, number: int, q, t, image: Path, ma
     if camera is None:
         raise NergError(f"the model has no camera {number}")
     if not image.is_file():
-        raise NergError(f'its image "{plain(image)}" does not exist')
+        raise NergError(f'its image "{sanitize(image)}" does not exist')
     lens, mask = camera.lens(), None
     if masks is not None:
         # COLMAP appends the suffix; others replace it.
         paths = [masks.find(n, "mask") for n in (f"{name}.png", str(Path(name).with_suffix(".png")))]
         existing = [p for p in paths if p.is_file()]
         if not existing:
-            raise NergError(f'its mask "{plain(paths[0])}" does not exist')
+            raise NergError(f'its mask "{sanitize(paths[0])}" does not exist')
         mask = MaskFile(existing[0])
     return PosedFrame(name, image, _to_world(q, t), lens, mask=mask, ignores_exif=True)
 
@@ -224,7 +224,7 @@ def _to_world(q, t) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     norm = float(np.linalg.norm(q))
-    if not (1e-6 < norm <= FARTHEST and np.abs(t).max() <= FARTHEST):
+    if not (1e-6 < norm <= MAX_POSITION and np.abs(t).max() <= MAX_POSITION):
         raise NergError("its pose is not finite, or its quaternion is zero")
     back = Rotation.from_quat(np.roll(np.asarray(q, np.float64), -1)).as_matrix().T
     out = np.eye(4)
@@ -240,7 +240,7 @@ class _Reader:
     """Little-endian records of an open file; an end that comes too early is told with its place."""
 
     def __init__(self, path: Path, file: BinaryIO):
-        self.path, self.file, self.at, self.size = path, file, 0, size_of(path, "COLMAP file")
+        self.path, self.file, self.at, self.size = path, file, 0, check_regular_file(path, "COLMAP file")
 
     def count(self, most: int, what: str) -> int:
         """The number of records, which begins the file."""
@@ -293,7 +293,7 @@ def _cameras_bin(path: Path) -> dict[int, _Camera]:
     out = {}
     with _open(path) as file:
         r = _Reader(path, file)
-        for k in range(r.count(IMAGES, "cameras")):
+        for k in range(r.count(MAX_IMAGES, "cameras")):
             number, model, width, height = r.take("iiQQ", f"camera record {k + 1}")
             if model not in _MODELS:
                 raise NergError(
@@ -310,7 +310,7 @@ def _images_bin(path: Path) -> list[tuple]:
     out = []
     with _open(path) as file:
         r = _Reader(path, file)
-        for k in range(r.count(IMAGES, "images")):
+        for k in range(r.count(MAX_IMAGES, "images")):
             what = f"image record {k + 1}"
             values = r.take("i7di", what)
             name = r.name(what)
@@ -324,7 +324,7 @@ def _images_bin(path: Path) -> list[tuple]:
 def _points_bin(path: Path) -> Iterator[_Point]:
     with _open(path) as file:
         r = _Reader(path, file)
-        count = r.count(POINTS, "points")
+        count = r.count(MAX_POINTS, "points")
         for k in range(count):
             what = f"point record {k + 1}"
             values = r.take("Q3d3BdQ", what)
@@ -370,7 +370,7 @@ def _count_notes(path: Path, count: int) -> list[str]:
 
 def _cameras_txt(path: Path) -> dict[int, _Camera]:
     out = {}
-    for number, words in _rows(path, IMAGES, "cameras"):
+    for number, words in _rows(path, MAX_IMAGES, "cameras"):
         try:
             out[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
         except (ValueError, IndexError) as e:
@@ -393,7 +393,7 @@ def _images_txt(path: Path) -> list[tuple]:
                 raise ValueError
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"') from e
-        _check_count(path, len(out), IMAGES, "images")
+        _check_count(path, len(out), MAX_IMAGES, "images")
         after_image = True
     return out
 
@@ -407,7 +407,7 @@ def _are_observations(words: list[str]) -> bool:
 
 
 def _points_txt(path: Path) -> Iterator[_Point]:
-    for number, words in _rows(path, POINTS, "points"):
+    for number, words in _rows(path, MAX_POINTS, "points"):
         try:
             yield float(words[1]), float(words[2]), float(words[3]), float(words[7]), (len(words) - 8) // 2
         except (ValueError, IndexError) as e:
@@ -419,7 +419,7 @@ def _trusted(points: Iterator[_Point]) -> tuple[int, np.ndarray]:
     count, trusted = 0, [np.empty((0, 3))]
     while block := list(itertools.islice(points, _BLOCK)):
         table = np.array(block, np.float64)
-        good = np.all(np.abs(table) <= FARTHEST, axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
+        good = np.all(np.abs(table) <= MAX_POSITION, axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
         trusted.append(table[good, :3])
         count += len(block)
     return count, np.concatenate(trusted)
@@ -443,16 +443,16 @@ class NamedPoses:
     notes: list[str]  # sentences on what of a COLMAP model contradicts itself, and on models that are not used
 
 
-def find_source(dataset: str | Path) -> Path:
+def find_pose_source(dataset: str | Path) -> Path:
     """The transforms file of ``dataset``, or the folder of its COLMAP model, of several the one with the most images.
     ``dataset``: a folder, or that file itself."""
     dataset = Path(dataset)
     if dataset.exists() and not dataset.is_dir():
-        size_of(dataset, "posed image set")
+        check_regular_file(dataset, "posed image set")
         # A file of a COLMAP model stands for the model.
         return dataset.parent if dataset.suffix in (".bin", ".txt") else dataset
     for name in ("transforms.json", "transforms_train.json"):
-        if is_ordinary(dataset / name, "transforms file"):
+        if is_regular_file(dataset / name, "transforms file"):
             return dataset / name
     for name in _MODEL_FOLDERS:
         models = _list_models(dataset / name)
@@ -467,18 +467,18 @@ def find_source(dataset: str | Path) -> Path:
 def _list_models(folder: Path) -> list[Path]:
     """COLMAP's models of one reconstruction: in the numbered folders of ``folder``, and ``folder`` itself."""
     numbered = sorted((p for p in folder.glob("*") if p.name.isdecimal()), key=lambda p: int(p.name))
-    return [p for p in (*numbered, folder) if model_files(p) is not None]
+    return [p for p in (*numbered, folder) if find_model_files(p) is not None]
 
 
 def describe_other_models(model: Path) -> list[str]:
     """A sentence on the models of the same reconstruction that are not used where the COLMAP ``model`` is."""
     models = _list_models(model.parent if model.name.isdecimal() else model)
-    others = [p for p in models if real_path(p) != real_path(model)]
+    others = [p for p in models if resolve_path(p) != resolve_path(model)]
     if not others:
         return []
     describe = lambda p: f'"{p.name}" ({count_images(p):,} images)'
     return [
-        f"of {len(models)} COLMAP models {describe(model)} is used, and not {name_some(describe(p) for p in others)}"
+        f"of {len(models)} COLMAP models {describe(model)} is used, and not {format_names(describe(p) for p in others)}"
     ]
 
 
@@ -488,7 +488,7 @@ def read_named_poses(source: str | Path) -> NamedPoses:
     Raises `NergError` for what cannot be parsed, and for a file that lists nothing.
     """
     source = Path(source)
-    if source.is_dir() and model_files(source) is not None:
+    if source.is_dir() and find_model_files(source) is not None:
         path, sha256, listed, notes = read_image_poses(source)
         notes += describe_other_models(source)
     else:
@@ -519,42 +519,42 @@ _SURE = 10.0
 
 
 @dataclass(frozen=True)
-class Up:
+class UpEstimate:
     """``direction``: (3,) unit vector. ``roll``: median angle in degrees by which the horizontal axes of the pictures
     are off the horizon; ``plane``: share of the points on a plane that is level, None where there is none;
     ``between``: degrees between the plane's normal and what the cameras say."""
 
     direction: np.ndarray
-    roll: float
-    plane: float | None = None
-    between: float | None = None
+    median_roll: float
+    plane_fraction: float | None = None
+    plane_angle: float | None = None
 
     @property
-    def sure(self) -> bool:
+    def is_reliable(self) -> bool:
         """Whether the cameras agree."""
-        return self.roll <= _SURE
+        return self.median_roll <= _SURE
 
     def __str__(self) -> str:
-        cameras = f"the cameras are held level to {self.roll:.1f} degrees (median)"
-        if self.plane is None:
+        cameras = f"the cameras are held level to {self.median_roll:.1f} degrees (median)"
+        if self.plane_fraction is None:
             return f"{cameras}; no plane of the points is level"
-        return f"{cameras}, and a plane of {self.plane:.0%} of the points is {self.between:.1f} degrees from their up"
+        return f"{cameras}, and a plane of {self.plane_fraction:.0%} of the points is {self.plane_angle:.1f} degrees from their up"
 
 
-def find_up(to_world: np.ndarray, points: np.ndarray) -> Up:
+def estimate_up(to_world: np.ndarray, points: np.ndarray) -> UpEstimate:
     """Up in the coordinates of OpenGL camera-to-world poses (N, 4, 4) and of ``points`` (M, 3) on surfaces."""
     rights, tops, centers = to_world[:, :3, 0], to_world[:, :3, 1], to_world[:, :3, 3]
     by_cameras = _level(rights, tops)
     roll = float(np.degrees(np.median(np.arcsin(np.clip(np.abs(rights @ by_cameras), 0, 1)))))
     found = _plane(points, centers, by_cameras) if len(points) >= 100 else None
     if found is None:
-        return Up(by_cameras, roll)
+        return UpEstimate(by_cameras, roll)
     normal, share = found
     between = float(np.degrees(np.arccos(np.clip(normal @ by_cameras, -1, 1))))
-    return Up(normal, roll, share, between)
+    return UpEstimate(normal, roll, share, between)
 
 
-def turn_to_z(up: np.ndarray) -> np.ndarray:
+def rotation_to_z(up: np.ndarray) -> np.ndarray:
     """The smallest rotation (3, 3) that takes the unit vector ``up`` to +z."""
     from scipy.spatial.transform import Rotation
 

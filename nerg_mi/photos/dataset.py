@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.safe_read import real_path
-from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, box_interval
+from nerg_mi.files.safe_read import resolve_path
+from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, intersect_box_numpy
 
 from . import cameras
 from .cameras import PosedCamera, pixel_directions, project
-from .colmap import Up
-from .images import PhotoView, load_usable, read_split, up_of
-from .posed import PosedImages, Unused
+from .colmap import UpEstimate
+from .images import PhotoView, load_usable_views, read_split, estimate_photo_up
+from .posed import PosedImages, UnusedFrame
 
 # ---- Bounds ----
 #
@@ -51,19 +51,19 @@ _AGREEING, _MORE = 0.05, 0.2
 
 
 @dataclass(frozen=True)
-class Extent:
+class SceneExtent:
     """Where a place may hold density: ``box``, contracted where the place does not end there; ``how`` the box was
     found, the end of a sentence; ``kind`` of the place, "object", "room" or "unbounded", and ``why``, a clause."""
 
     box: AnyBox
-    how: str
+    source: str
     kind: str
-    why: str
+    reason: str
 
 
-def place_extent(
-    cameras: list[PosedCamera], object_only: bool = False, points: np.ndarray | None = None, complete: bool = False
-) -> Extent:
+def estimate_extent(
+    cameras: list[PosedCamera], object_only: bool = False, points: np.ndarray | None = None, are_points_complete: bool = False
+) -> SceneExtent:
     """The box around what ``cameras`` looked at, as `scene_box` finds it, and whether the place ends there.
 
     An object before nothing, ``object_only``, ends at its box, and so does a place without ``points`` (N, 3), on
@@ -75,11 +75,11 @@ def place_extent(
     A place that ends at its box holds its cameras too, or is contracted around its points where that would more than
     double the box. Not so where the points are ``complete``, of all that the cameras see: nothing stands before them.
     """
-    box, how = scene_box(cameras, object_only, points)
+    box, how = estimate_box(cameras, object_only, points)
     if object_only:
-        return Extent(box, how, "object", "the photos show nothing behind it")
+        return SceneExtent(box, how, "object", "the photos show nothing behind it")
     if points is None or len(points) < _MIN_POINTS:
-        return Extent(box, how, "room", "no points on surfaces tell whether there is more than its box")
+        return SceneExtent(box, how, "room", "no points on surfaces tell whether there is more than its box")
     beyond = float(np.mean(np.any((points < box.lower) | (points > box.upper), axis=1)))
     why = f"{100 * beyond:.1f} % of the points on surfaces lie beyond its box"
     if beyond > _BEYOND:
@@ -87,17 +87,17 @@ def place_extent(
         away = float(np.quantile(np.abs(points - box.center).max(axis=1), _CORE))
         half = float(np.clip(away, 0.5 * box.side, 0.5 * _MOST_LARGER * box.side))
         core = Box(tuple(np.subtract(box.center, half)), tuple(np.add(box.center, half)))
-        return Extent(ContractedBox(core), f"{how}, nine tenths of them", "unbounded", why)
+        return SceneExtent(ContractedBox(core), f"{how}, nine tenths of them", "unbounded", why)
     lower, upper = np.quantile(points, [0.5 - 0.5 * _CORE, 0.5 + 0.5 * _CORE], axis=0)
     if box.side > _LEAST_SMALLER * float(np.max(upper - lower)):
         margin = _MARGIN * float(np.max(upper - lower))
         why = f"a box two fifths as large as one around all {len(points)} points holds nine tenths of them"
         core = Box(tuple(lower - margin), tuple(upper + margin))
-        return Extent(ContractedBox(core), f"around nine tenths of {len(points)} points on surfaces", "unbounded", why)
-    return Extent(box, how, "room", why) if complete else _with_cameras(box, cameras, how, why)
+        return SceneExtent(ContractedBox(core), f"around nine tenths of {len(points)} points on surfaces", "unbounded", why)
+    return SceneExtent(box, how, "room", why) if are_points_complete else _with_cameras(box, cameras, how, why)
 
 
-def _with_cameras(box: Box, cameras: list[PosedCamera], how: str, why: str) -> Extent:
+def _with_cameras(box: Box, cameras: list[PosedCamera], how: str, why: str) -> SceneExtent:
     """A place whose points lie within ``box``, and its ``cameras``: what stands between them and the points may have
     none, and is seen."""
     centers = np.array([c.center for c in cameras])
@@ -105,12 +105,12 @@ def _with_cameras(box: Box, cameras: list[PosedCamera], how: str, why: str) -> E
     whole = Box(tuple(lower), tuple(upper))
     if whole.side > _FAR_OUTSIDE * box.side:
         why = f"{why}, but the cameras stand far outside of it"
-        return Extent(ContractedBox(box), how, "unbounded", why)
+        return SceneExtent(ContractedBox(box), how, "unbounded", why)
     grown = np.any(lower < box.lower) or np.any(upper > box.upper)
-    return Extent(whole, f"{how} and the cameras" if grown else how, "room", why)
+    return SceneExtent(whole, f"{how} and the cameras" if grown else how, "room", why)
 
 
-def scene_box(
+def estimate_box(
     cameras: list[PosedCamera], object_only: bool = False, points: np.ndarray | None = None
 ) -> tuple[Box, str]:
     """A box in the cameras' coordinates, and a sentence saying how it was found.
@@ -174,7 +174,7 @@ def _half_angle_tangent(camera: PosedCamera) -> float:
     return min(i.width / (2 * i.fx), i.height / (2 * i.fy))
 
 
-def unmatched(cameras: list[PosedCamera], box: AnyBox, grid: int = 4, depths: int = 12) -> list[int]:
+def find_unmatched(cameras: list[PosedCamera], box: AnyBox, grid: int = 4, depths: int = 12) -> list[int]:
     """Cameras that share nothing within ``box`` with any other: no sample point of their pictures is in another's.
 
     ``grid`` by ``grid`` pixels of each are followed through the box and looked for at ``depths`` places.
@@ -195,9 +195,9 @@ def _samples(camera: PosedCamera, box: AnyBox, grid: int, depths: int) -> np.nda
     """Points (N, 3) within the box on rays of the picture."""
     i = camera.intrinsics
     u, v = np.meshgrid((np.arange(grid) + 0.5) / grid * i.width, (np.arange(grid) + 0.5) / grid * i.height)
-    d = cameras.rays(np.stack([(u.ravel() - i.cx) / i.fx, (v.ravel() - i.cy) / i.fy], axis=-1), i) * [1, -1, -1]
+    d = cameras.image_to_directions(np.stack([(u.ravel() - i.cx) / i.fx, (v.ravel() - i.cy) / i.fy], axis=-1), i) * [1, -1, -1]
     d = d @ camera.to_world[:3, :3].T
-    near, far = box_interval(camera.center, d, box.lower, box.upper)
+    near, far = intersect_box_numpy(camera.center, d, box.lower, box.upper)
     near = np.maximum(near, 0)
     hit = far > near
     t = near[hit, None] + (far - near)[hit, None] * (np.arange(depths) + 0.5) / depths
@@ -212,14 +212,14 @@ def _sees(camera: PosedCamera, points: np.ndarray) -> bool:
     return bool(np.any(shown & np.all((at >= 0) & (at <= [i.width, i.height]), axis=1)))
 
 
-def explain_wrong_depth(seen: list[tuple[PosedCamera, np.ndarray]]) -> str | None:
+def explain_wrong_depth(views: list[tuple[PosedCamera, np.ndarray]]) -> str | None:
     """Why depth is in other units than its camera; None where it may be in the same. ``seen``: cameras, each with its
     depth (h, w), distances along its rays.
 
     In the right unit views agree on where a point is. In much too large a unit all of them are at one place, compared
     with their depth, so that what merely looks alike agrees in every larger unit as well: that is no evidence.
     """
-    picked = [seen[k] for k in np.unique(np.linspace(0, len(seen) - 1, _COMPARED).astype(int))]
+    picked = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, _COMPARED).astype(int))]
     views = [(c, d, depth_points(c, d, _COMPARED_POINTS) - c.center) for c, d in picked]
     now = _agreement(views, 1.0)
     if now <= 1 - _MORE:
@@ -229,8 +229,8 @@ def explain_wrong_depth(seen: list[tuple[PosedCamera, np.ndarray]]) -> str | Non
                 f"{best:.0%} of its points agree with the depth of other views if it is multiplied by {factor:g}, and "
                 f"{now:.0%} as it is"
             )
-    extent = float(np.linalg.norm(np.ptp([c.center for c, _ in seen], axis=0)))
-    median = float(np.median([np.median(d[d > 0]) for _, d in seen if (d > 0).any()] or [0.0]))
+    extent = float(np.linalg.norm(np.ptp([c.center for c, _ in views], axis=0)))
+    median = float(np.median([np.median(d[d > 0]) for _, d in views if (d > 0).any()] or [0.0]))
     if extent > 0 and median > _FARTHEST_DEPTH * extent:
         return f"its median is {median:.3g} units, and the cameras spread over {extent:.3g}"
     return None
@@ -253,9 +253,9 @@ def _agreement(views: list[tuple[PosedCamera, np.ndarray, np.ndarray]], factor: 
     return agreeing / count if count else 0.0
 
 
-def depth_points(camera: PosedCamera, depth: np.ndarray, most: int) -> np.ndarray:
+def depth_points(camera: PosedCamera, depth: np.ndarray, max_points: int) -> np.ndarray:
     """World points (N, 3) that ``camera`` sees by its ``depth`` (h, w), some ``most`` evenly over its pixels."""
-    step = max(1, int(np.sqrt(depth.size / most)))
+    step = max(1, int(np.sqrt(depth.size / max_points)))
     t = depth[::step, ::step]
     d = pixel_directions(camera.intrinsics)[::step, ::step][t > 0] @ camera.to_world[:3, :3].T
     return camera.center + d * t[t > 0][:, None]
@@ -291,19 +291,19 @@ class Dataset:
     # Where density may be, contracted where the place does not end at the box that was found.
     box: AnyBox
     # How the box was found, the end of a sentence.
-    box_from: str
+    box_source: str
     # Frames that were left out, each with its reason.
-    unused: list[Unused]
+    unused: list[UnusedFrame]
     # For provenance (JSON).
     source: dict
     # Sentences about frames that are used with something missing.
     notes: list[str] | tuple = ()
     # A sentence on the length of a unit.
-    unit: str = ""
+    unit_note: str = ""
     # What kind of place it was taken for, and why, a sentence.
-    kind: str = ""
+    kind_note: str = ""
     # Which way is up, a sentence.
-    up: str = ""
+    up_note: str = ""
 
 
 def open_dataset(
@@ -330,17 +330,17 @@ def open_dataset(
     Frames that cannot be used are left out and listed; `NergError`, naming file and frame, when none can.
     """
     split = read_split(path, holdout, coordinates, scale, allow_outside)
-    train, bad = load_usable(split.posed.frames, width, downscale, depth)
+    train, bad = load_usable_views(split.posed.frames, width, downscale, depth)
     if not train:
         raise NergError(
             f'none of the {len(bad)} training frames of "{split.posed.path}" can be used; the first, '
             f'"{bad[0].name}": {bad[0].reason}'
         )
     _check_depth(split.posed, train)
-    held_out, bad_held = load_usable(split.held_out, width, downscale, depth)
+    held_out, bad_held = load_usable_views(split.held_out, width, downscale, depth)
     masks = _describe_masks([*train, *held_out])
     extent = _extent(split.posed, train, aabb, unbounded)
-    alone = unmatched([v.camera for v in train], extent.box) if len(train) > 1 else []
+    alone = find_unmatched([v.camera for v in train], extent.box) if len(train) > 1 else []
     if len(alone) == len(train):
         raise NergError(
             f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") look '
@@ -348,12 +348,12 @@ def open_dataset(
             "they show with --aabb"
         )
     if alone:
-        bad += [Unused(train[k].name, "no other frame looks at what it shows") for k in alone]
+        bad += [UnusedFrame(train[k].name, "no other frame looks at what it shows") for k in alone]
         train = [v for k, v in enumerate(train) if k not in set(alone)]
         extent = _extent(split.posed, train, aabb, unbounded)
     unused = [*split.posed.unused, *bad, *bad_held]
     source = {
-        "dataset": real_path(split.posed.path).parent.name,
+        "dataset": resolve_path(split.posed.path).parent.name,
         "transforms": split.posed.path.name,
         "sha256": split.posed.sha256,
         "training_frames": len(train),
@@ -363,13 +363,13 @@ def open_dataset(
         "height": train[0].shape[0],
         "to_file": split.posed.to_file.tolist(),
     }
-    up = up_of(split.posed)
-    if up.sure:
+    up = estimate_photo_up(split.posed)
+    if up.is_reliable:
         source["up"] = [round(float(x), 6) for x in up.direction]
-    kind = f"{_KINDS[extent.kind]}: {extent.why}"
+    kind = f"{_KINDS[extent.kind]}: {extent.reason}"
     unit = _unit(split.posed, train, extent.box.core, scale)
     return Dataset(
-        train, held_out, extent.box, extent.how, unused, source, [*split.posed.notes, *masks], unit, kind, _up(up)
+        train, held_out, extent.box, extent.source, unused, source, [*split.posed.notes, *masks], unit, kind, _up(up)
     )
 
 
@@ -386,7 +386,7 @@ def _check_depth(posed: PosedImages, views: list[PhotoView]) -> None:
 
 def _describe_masks(views: list[PhotoView]) -> list[str]:
     """A sentence on what the masks of ``views`` leave out, where there are any."""
-    fractions = [v.left_out for v in views if v.left_out is not None]
+    fractions = [v.masked_fraction for v in views if v.masked_fraction is not None]
     if not fractions:
         return []
     if not any(fractions):
@@ -394,18 +394,18 @@ def _describe_masks(views: list[PhotoView]) -> list[str]:
     return [f"masks leave out {np.mean(fractions):.1%} of the pixels of {len(fractions)} frames"]
 
 
-def _extent(posed: PosedImages, views: list[PhotoView], aabb, unbounded: bool | None) -> Extent:
+def _extent(posed: PosedImages, views: list[PhotoView], aabb, unbounded: bool | None) -> SceneExtent:
     """Where density may be: the box that is given, or the one that is found; contracted as asked for, or as found."""
     extent = _found(posed, views, aabb)
-    if unbounded is None or unbounded == extent.box.contracted:
+    if unbounded is None or unbounded == extent.box.is_contracted:
         return extent
     core = extent.box.core
     if unbounded:
-        return Extent(ContractedBox(core), extent.how, "unbounded", "as asked for")
-    return Extent(core, extent.how, "room", "it is to end at its box, as asked for")
+        return SceneExtent(ContractedBox(core), extent.source, "unbounded", "as asked for")
+    return SceneExtent(core, extent.source, "room", "it is to end at its box, as asked for")
 
 
-def _found(posed: PosedImages, views: list[PhotoView], aabb) -> Extent:
+def _found(posed: PosedImages, views: list[PhotoView], aabb) -> SceneExtent:
     if aabb is not None:
         if len(aabb) != 6:
             raise NergError(f"aabb needs the six numbers x0,y0,z0,x1,y1,z1, got {len(aabb)}")
@@ -415,11 +415,11 @@ def _found(posed: PosedImages, views: list[PhotoView], aabb) -> Extent:
     else:
         seen = None if posed.points is not None else _depth_points(views)
         points, cutout = posed.points if seen is None else seen, all(v.has_alpha for v in views)
-        return place_extent([v.camera for v in views], cutout, points, complete=seen is not None)
+        return estimate_extent([v.camera for v in views], cutout, points, are_points_complete=seen is not None)
     tight = Box(tuple(given[0]), tuple(given[1]))
     pad = _PAD * tight.side
     box, how = Box(tuple(given[0] - pad), tuple(given[1] + pad)), f"{source}, grown by {pad:.3g} on every side"
-    return Extent(box, how, "room", "it ends at its box")
+    return SceneExtent(box, how, "room", "it ends at its box")
 
 
 def _depth_points(views: list[PhotoView]) -> np.ndarray | None:
@@ -434,10 +434,10 @@ def _corners(box: AnyBox) -> str:
     return " to ".join("(" + ", ".join(f"{x:.3g}" for x in c) + ")" for c in (box.lower, box.upper))
 
 
-def _up(up: Up) -> str:
+def _up(up: UpEstimate) -> str:
     """What is known of up, and what to do where it is not +z."""
-    if not up.sure:
-        return f"the cameras do not agree on what is up (rolled by {up.roll:.0f} degrees, median)"
+    if not up.is_reliable:
+        return f"the cameras do not agree on what is up (rolled by {up.median_roll:.0f} degrees, median)"
     off = float(np.degrees(np.arccos(np.clip(up.direction[2], -1, 1))))
     if off <= _LEVEL:
         return f"up is +z to {off:.1f} degrees ({up})"

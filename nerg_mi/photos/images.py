@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, plain
+from nerg_mi.errors import MissingFile, NergError, sanitize
 from nerg_mi.files.images import check_image, read_exr
-from nerg_mi.files.safe_read import is_ordinary, read_npy, reading, real_path
+from nerg_mi.files.safe_read import is_regular_file, read_npy, translate_read_errors, resolve_path
 from nerg_mi.maths.color import encode_srgb
 from nerg_mi.ranges import LENGTHS, check_number
 
@@ -21,16 +21,16 @@ from . import cameras
 from .cameras import (
     Intrinsics,
     PosedCamera,
-    all_used,
-    area_average,
-    nearest,
+    resize_mask,
+    resize_by_area,
+    resize_nearest,
     pixel_directions,
     pixel_grid,
-    sensor_dict,
-    view_tangents,
+    make_sensor_dict,
+    find_view_tangents,
 )
-from .colmap import Up, describe_other_models, find_source, find_up, read_colmap, turn_to_z
-from .posed import DepthFile, MaskFile, PosedFrame, PosedImages, Unused, name_some
+from .colmap import UpEstimate, describe_other_models, find_pose_source, estimate_up, read_colmap, rotation_to_z
+from .posed import DepthFile, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names
 from .transforms import read_dataparser, read_transforms
 
 # ---- Pictures, depth and masks from files, and photos as their cameras describe them ----
@@ -76,7 +76,7 @@ def read_image(path: str | Path) -> np.ndarray:
         else mi.Bitmap.AlphaTransform.Empty
     )
     wanted = formats.RGBA if alpha else formats.RGB
-    with reading(path, "image", also=(RuntimeError,)):
+    with translate_read_errors(path, "image", extra_errors=(RuntimeError,)):
         linear = bitmap.convert(wanted, kinds.Float32, srgb_gamma=False, alpha_transform=straight)
     out = np.array(linear, np.float32)
     if alpha:
@@ -99,7 +99,7 @@ def read_photo(frame: PosedFrame) -> np.ndarray:
     if orientation == 1:
         return pixels
     upright = _TURNS[orientation](pixels)
-    fits_stored, fits_upright = (frame.has_shape(p.shape[1], p.shape[0]) for p in (pixels, upright))
+    fits_stored, fits_upright = (frame.matches_shape(p.shape[1], p.shape[0]) for p in (pixels, upright))
     if fits_stored and fits_upright and not frame.ignores_exif:
         raise NergError(
             f'the photo "{frame.image}" is to be turned by its EXIF orientation ({orientation}), and nothing tells '
@@ -128,7 +128,7 @@ def _read_orientation(path: Path) -> int:
     return value if value in _TURNS else 1
 
 
-def open_bitmap(path: str | Path, what: str):
+def open_bitmap(path: str | Path, file_kind: str):
     """The picture ``path`` as a Mitsuba bitmap, as Mitsuba itself opens it; `NergError` for one that is damaged or too
     large.
 
@@ -136,10 +136,10 @@ def open_bitmap(path: str | Path, what: str):
     """
     import mitsuba as mi
 
-    if check_image(path, what).kind == "exr":
-        return _exr_bitmap(read_exr(path, what))
+    if check_image(path, file_kind).format == "exr":
+        return _exr_bitmap(read_exr(path, file_kind))
     # Mitsuba says so of whatever it finds wrong.
-    with reading(path, what, also=(RuntimeError,)):
+    with translate_read_errors(path, file_kind, extra_errors=(RuntimeError,)):
         return mi.Bitmap(str(path))
 
 
@@ -163,13 +163,13 @@ def _exr_bitmap(channels: dict[str, np.ndarray]):
 def _layer(bitmap, path):
     """The colour layer of a multichannel EXR."""
     # Layers whose channels do not fit together make Mitsuba say so.
-    with reading(path, "image", also=(RuntimeError,)):
+    with translate_read_errors(path, "image", extra_errors=(RuntimeError,)):
         layers = dict(bitmap.split())
     for name in ("<root>", "rgba", "color"):
         if name in layers:
             return layers[name]
     raise NergError(
-        f'the image "{path}" has no channels R, G and B, only the layers {plain(", ".join(sorted(layers)))}; '
+        f'the image "{path}" has no channels R, G and B, only the layers {sanitize(", ".join(sorted(layers)))}; '
         "save it with these"
     )
 
@@ -214,7 +214,7 @@ def read_mask(source: MaskFile, shape: tuple[int, int]) -> np.ndarray:
         # A black stencil says by its alpha alone what is used.
         is_stencil = not white.any() and not opaque.all()
         white = opaque if is_stencil else white & opaque
-    return np.asarray(~white if source.hides else white)
+    return np.asarray(~white if source.is_inverted else white)
 
 
 def _is_white(values: np.ndarray) -> np.ndarray:
@@ -235,7 +235,7 @@ def _depth_channel(channels: dict[str, np.ndarray], path: Path) -> np.ndarray:
     if {"R", "G", "B"} <= set(names) and all(np.array_equal(channels["R"], channels[n], True) for n in "GB"):
         return channels["R"]
     raise NergError(
-        f'the depth file "{path}" has the channels {name_some(names)}; save it with one channel, or call one of them Z'
+        f'the depth file "{path}" has the channels {format_names(names)}; save it with one channel, or call one of them Z'
     )
 
 
@@ -257,7 +257,7 @@ class PhotoView:
     pixels: np.ndarray
     depth: np.ndarray | None = None
     mask: np.ndarray | None = None
-    left_out: float | None = None
+    masked_fraction: float | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -273,7 +273,7 @@ class PhotoView:
     def has_alpha(self) -> bool:
         return self.pixels.shape[2] == 4
 
-    def over(self, background: float) -> np.ndarray:
+    def composite_over(self, background: float) -> np.ndarray:
         """The picture (h, w, 3), float32, before a grey ``background``."""
         color = self.color
         if not self.has_alpha:
@@ -296,9 +296,9 @@ def split_holdout(frames: list[PosedFrame], every: int) -> tuple[list[PosedFrame
     return train, held
 
 
-def load_usable(
+def load_usable_views(
     frames: list[PosedFrame], width: int | None = None, downscale: float | None = None, depth: bool = False
-) -> tuple[list[PhotoView], list[Unused]]:
+) -> tuple[list[PhotoView], list[UnusedFrame]]:
     """`load_view` of all ``frames``, and those for which it failed."""
     check_size(width, downscale)
     views, unused = [], []
@@ -306,7 +306,7 @@ def load_usable(
         try:
             views.append(load_view(frame, width, downscale, depth))
         except ValueError as e:
-            unused.append(Unused(frame.name, str(e)))
+            unused.append(UnusedFrame(frame.name, str(e)))
     return views, unused
 
 
@@ -339,17 +339,17 @@ def load_view(
     size = max(1, round(w / factor)), max(1, round(h / factor))
     intrinsics = stated.resized(*size)
     # Every pixel must have a ray; lenses fold over at the borders first.
-    view_tangents(intrinsics)
-    mask = None if frame.mask is None else all_used(read_mask(frame.mask, (h, w)), *size)
+    find_view_tangents(intrinsics)
+    mask = None if frame.mask is None else resize_mask(read_mask(frame.mask, (h, w)), *size)
     left_out = None if mask is None else 1 - float(mask.mean())
     if intrinsics.fisheye:
-        shown = np.linalg.norm(pixel_grid(intrinsics), axis=-1) < cameras.fisheye_limit(intrinsics)[1]
+        shown = np.linalg.norm(pixel_grid(intrinsics), axis=-1) < cameras.find_fisheye_limit(intrinsics)[1]
         mask = mask if shown.all() else shown if mask is None else mask & shown
     if mask is not None and not mask.any():
         raise NergError("its mask leaves out every pixel")
     distance = _distances(frame.depth, (h, w), intrinsics) if depth and frame.depth is not None else None
     if size != (w, h):
-        pixels = area_average(_as_floats(pixels), *size)
+        pixels = resize_by_area(_as_floats(pixels), *size)
     if pixels.dtype == np.float32:
         # 16 bits tell more than the photo and take half the room.
         pixels = np.round(pixels * 65535).astype(np.uint16)
@@ -371,7 +371,7 @@ def _distances(file: DepthFile, shape: tuple[int, int], intrinsics) -> np.ndarra
             f'the depth file "{file.path}" has {out.shape[1]} x {out.shape[0]} pixels, which is not the '
             f"shape of its image, {w} x {h}"
         )
-    out = nearest(out, intrinsics.width, intrinsics.height)
+    out = resize_nearest(out, intrinsics.width, intrinsics.height)
     if file.along_axis:
         ahead = -pixel_directions(intrinsics)[..., 2]
         out = np.where(ahead > 1e-3, out / np.maximum(ahead, 1e-3), 0).astype(np.float32)
@@ -388,7 +388,7 @@ _WRITTEN = (".safetensors", ".run", ".preview.png")
 
 
 @dataclass(frozen=True)
-class Split:
+class HoldoutSplit:
     """``posed``: the training file, its frames those to train on; ``held_out``: frames, chosen by the ``rule``, a few
     words for provenance."""
 
@@ -397,12 +397,12 @@ class Split:
     rule: str
 
 
-def read_posed(source: Path, allow_outside: bool = False) -> PosedImages:
+def read_posed_images(source: Path, allow_outside: bool = False) -> PosedImages:
     """Read what `find_source` found. ``allow_outside``: use files outside of its folder too (of a COLMAP model: of the
     one that holds its images), to which names and links in it may lead."""
     if source.is_file():
         return read_transforms(source, allow_outside)
-    folders = [source, *list(real_path(source).parents)[:3]]
+    folders = [source, *list(resolve_path(source).parents)[:3]]
     images = next((f / "images" for f in folders if (f / "images").is_dir()), None)
     if images is None:
         raise MissingFile(
@@ -419,7 +419,7 @@ def read_split(
     coordinates: str = "file",
     scale: float = 1.0,
     allow_outside: bool = False,
-) -> Split:
+) -> HoldoutSplit:
     """Read ``dataset`` and set its held-out frames apart.
 
     ``holdout``: every so many frames, 0 none. None: the frames of a ``transforms_test.json`` or else
@@ -430,13 +430,13 @@ def read_split(
     ``scale``: of all lengths, after that.
     ``allow_outside``: as `read_posed` has it.
     """
-    source = find_source(dataset)
-    posed = read_posed(source, allow_outside)
+    source = find_pose_source(dataset)
+    posed = read_posed_images(source, allow_outside)
     whole = posed
     similarity = _similarity(posed, coordinates, scale)
-    posed = posed.moved(similarity)
-    if posed.spare:
-        spare = set(posed.spare)
+    posed = posed.transform(similarity)
+    if posed.unassigned:
+        spare = set(posed.unassigned)
         posed = replace(
             posed,
             frames=[f for f in posed.frames if f.name not in spare],
@@ -446,46 +446,46 @@ def read_split(
     test = None if other is None else read_transforms(other, allow_outside)
     posed = replace(posed, notes=[*posed.notes, *_describe_leftovers([whole, *([] if test is None else [test])])])
     if test is not None and other is not None:
-        test = test.moved(similarity)
-        hidden = {real_path(f.image) for f in test.frames}
-        both = [f for f in posed.frames if real_path(f.image) in hidden]
-        train = [f for f in posed.frames if real_path(f.image) not in hidden]
+        test = test.transform(similarity)
+        hidden = {resolve_path(f.image) for f in test.frames}
+        both = [f for f in posed.frames if resolve_path(f.image) in hidden]
+        train = [f for f in posed.frames if resolve_path(f.image) not in hidden]
         if not train:
             raise NergError(
                 f'all frames of "{posed.path}" are also in "{other.name}", which holds them out; use holdout 0'
             )
-        unused = [*posed.unused, *(Unused(f.name, f"it is held out by {other.name}") for f in both), *test.unused]
+        unused = [*posed.unused, *(UnusedFrame(f.name, f"it is held out by {other.name}") for f in both), *test.unused]
         posed = replace(posed, frames=train, unused=unused, notes=[*posed.notes, *test.notes])
-        return Split(posed, test.frames, other.name)
+        return HoldoutSplit(posed, test.frames, other.name)
     if holdout is None and posed.held_out:
         names = set(posed.held_out)
         train = [f for f in posed.frames if f.name not in names]
         if not train:
             raise NergError(f'"{posed.path}" holds out all of its frames; use holdout 0')
-        return Split(
+        return HoldoutSplit(
             replace(posed, frames=train), [f for f in posed.frames if f.name in names], f"listed in {posed.path.name}"
         )
     every = 8 if holdout is None else holdout
     train, held = split_holdout(posed.frames, every)
-    return Split(replace(posed, frames=train), held, f"every {every}th frame" if every else "none")
+    return HoldoutSplit(replace(posed, frames=train), held, f"every {every}th frame" if every else "none")
 
 
-def up_of(posed: PosedImages) -> Up:
+def estimate_photo_up(posed: PosedImages) -> UpEstimate:
     """Up, as the cameras of ``posed`` are held and as its points lie."""
     points = np.zeros((0, 3)) if posed.points is None else posed.points
-    return find_up(np.stack([f.to_world for f in posed.frames]), points)
+    return estimate_up(np.stack([f.to_world for f in posed.frames]), points)
 
 
 def _describe_leftovers(sets: list[PosedImages]) -> list[str]:
     """What lies in the folder of a data set, described by the files of ``sets``, and is not used: photos beside those
     that the files list, and what else the folder holds."""
-    resolve = cache(real_path)
+    resolve = cache(resolve_path)
     locate = lambda path: resolve(path.parent) / path.name
-    listed = {locate(p) for posed in sets for p in posed.images}
+    listed = {locate(p) for posed in sets for p in posed.image_files}
     others = {locate(x.path) for posed in sets for f in posed.frames for x in (f.depth, f.mask) if x is not None}
     photos = {
         p
-        for folder in {resolve(folder) for posed in sets for folder in posed.folders if folder.is_dir()}
+        for folder in {resolve(folder) for posed in sets for folder in posed.image_folders if folder.is_dir()}
         for p in folder.iterdir()
         if p.suffix.lower() in _PHOTOS and not p.name.startswith((".", "dynamic_mask_"))
     } - others
@@ -493,14 +493,14 @@ def _describe_leftovers(sets: list[PosedImages]) -> list[str]:
     if stray:
         notes.append(
             f"{len(stray)} of {len(photos)} photos have no pose in {sets[0].path.name} and are not used: "
-            f"{name_some(p.name for p in stray)}"
+            f"{format_names(p.name for p in stray)}"
         )
-    root = real_path(sets[0].root)
+    root = resolve_path(sets[0].root)
     used = {*listed, *others, *stray, *(locate(posed.path) for posed in sets)}
     used = {name for p in used if p.is_relative_to(root) for name in p.relative_to(root).parts[:1]}
     rest = {p.name for p in root.iterdir() if not (p.name.startswith(".") or p.name.endswith(_WRITTEN))} - used
     if rest:
-        notes.append(f'not used of "{plain(root.name)}": {name_some(sorted(rest))}')
+        notes.append(f'not used of "{sanitize(root.name)}": {format_names(sorted(rest))}')
     return notes
 
 
@@ -509,7 +509,7 @@ def _test_file(source: Path) -> Path | None:
         return None
     for name in ("transforms_test.json", "transforms_val.json"):
         path = source.with_name(name)
-        if path != source and is_ordinary(path, "transforms file"):
+        if path != source and is_regular_file(path, "transforms file"):
             return path
     return None
 
@@ -517,19 +517,19 @@ def _test_file(source: Path) -> Path | None:
 def _similarity(posed: PosedImages, coordinates: str, scale: float) -> np.ndarray:
     """From the file's coordinates to those asked for."""
     check_number(scale, LENGTHS, "scale")
-    original = np.eye(4) if posed.original is None else posed.original
+    original = np.eye(4) if posed.to_original is None else posed.to_original
     if coordinates == "file":
         to = np.eye(4)
     elif coordinates == "upright":
-        up, to = up_of(posed), np.eye(4)
-        if not up.sure:
+        up, to = estimate_photo_up(posed), np.eye(4)
+        if not up.is_reliable:
             raise NergError(
-                f'the cameras of "{posed.path}" do not agree on what is up (rolled by {up.roll:.0f} degrees), so that '
+                f'the cameras of "{posed.path}" do not agree on what is up (rolled by {up.median_roll:.0f} degrees), so that '
                 'nothing can be turned upright; use the coordinates "file"'
             )
-        to[:3, :3] = turn_to_z(up.direction)
+        to[:3, :3] = rotation_to_z(up.direction)
     elif coordinates == "original":
-        if posed.original is None:
+        if posed.to_original is None:
             raise NergError(
                 f'"{posed.path}" has no "applied_transform", so that its original coordinates are not known; '
                 'use the coordinates "file"'
@@ -555,7 +555,7 @@ def _similarity(posed: PosedImages, coordinates: str, scale: float) -> np.ndarra
 _WIDEST = np.radians(75)
 
 
-class Undistorted(NamedTuple):
+class UndistortedPhoto(NamedTuple):
     """``image``: (h, w, 3 or 4) float32, sRGB, alpha straight; ``mask``: (h, w), where the photo says what is to be
     seen; ``sensor``: dict for ``mi.load_dict`` that renders the same picture."""
 
@@ -564,7 +564,7 @@ class Undistorted(NamedTuple):
     sensor: dict
 
 
-def undistorted(view: PhotoView) -> Undistorted:
+def undistort_photo(view: PhotoView) -> UndistortedPhoto:
     """``view`` as a pinhole camera of the same place, size and principal point would have taken it.
 
     The focal length stays (the mean of the two where pixels are not square), so that details keep their size at
@@ -575,10 +575,10 @@ def undistorted(view: PhotoView) -> Undistorted:
     color = view.color
     own = _own_mask(view)
     if not i.is_distorted and abs(i.fx / i.fy - 1) < 1e-9:
-        return Undistorted(color, own, sensor_dict(view.camera))
+        return UndistortedPhoto(color, own, make_sensor_dict(view.camera))
     focal = float(np.sqrt(i.fx * i.fy))
     plain = Intrinsics(i.width, i.height, focal, focal, i.cx, i.cy)
-    xy, shown = cameras.image(_forward(plain), i)
+    xy, shown = cameras.directions_to_image(_forward(plain), i)
     at = xy * [i.fx, i.fy] + [i.cx, i.cy]
     inside = shown & np.all((at >= 0.5) & (at <= [i.width - 0.5, i.height - 0.5]), axis=-1)
     # A lens that folds over shows some places twice; the photo holds the near one only.
@@ -586,14 +586,14 @@ def undistorted(view: PhotoView) -> Undistorted:
     at = np.where(inside[..., None], at, 0.5)
     if not own.all():
         inside &= _sample(own[..., None].astype(np.float32), at, 1)[..., 0] > 0.999
-    return Undistorted(
+    return UndistortedPhoto(
         np.where(inside[..., None], _resample(color, at), 0).astype(np.float32),
         inside,
-        sensor_dict(PosedCamera(plain, view.camera.to_world)),
+        make_sensor_dict(PosedCamera(plain, view.camera.to_world)),
     )
 
 
-def pinhole(camera: PosedCamera, oversample: float = 1.0) -> PosedCamera:
+def make_pinhole_camera(camera: PosedCamera, oversample: float = 1.0) -> PosedCamera:
     """The smallest pinhole camera at the same place that sees all that ``camera`` does, up to 75 degrees off its axis.
 
     ``oversample``: its pixels to one of ``camera``'s at the centre.
@@ -608,7 +608,7 @@ def pinhole(camera: PosedCamera, oversample: float = 1.0) -> PosedCamera:
     return PosedCamera(Intrinsics(right - left, bottom - top, focal, focal, float(-left), float(-top)), camera.to_world)
 
 
-def through_lens(picture: np.ndarray, source: PosedCamera, camera: PosedCamera) -> tuple[np.ndarray, np.ndarray]:
+def apply_lens(picture: np.ndarray, source: PosedCamera, camera: PosedCamera) -> tuple[np.ndarray, np.ndarray]:
     """A rendered ``picture`` (h, w, c) of the pinhole ``source`` as ``camera``, at the same place, would have taken it.
 
     Returns it (camera's height, width, c), float32, resampled by cubic splines, and a mask of the pixels that
@@ -621,7 +621,7 @@ def through_lens(picture: np.ndarray, source: PosedCamera, camera: PosedCamera) 
         raise ValueError(
             f"the picture has {picture.shape[1]} x {picture.shape[0]} pixels, but its camera {i.width} x {i.height}"
         )
-    xy, shown = cameras.image(_forward(camera.intrinsics), i)
+    xy, shown = cameras.directions_to_image(_forward(camera.intrinsics), i)
     at = xy * [i.fx, i.fy] + [i.cx, i.cy]
     inside = shown & np.all((at >= 0.5) & (at <= [i.width - 0.5, i.height - 0.5]), axis=-1)
     at = np.where(inside[..., None], at, 0.5)
@@ -630,7 +630,7 @@ def through_lens(picture: np.ndarray, source: PosedCamera, camera: PosedCamera) 
 
 def _forward(intrinsics: Intrinsics) -> np.ndarray:
     """Directions (h, w, 3) of the pixels in OpenCV's camera frame."""
-    return cameras.rays(pixel_grid(intrinsics), intrinsics)
+    return cameras.image_to_directions(pixel_grid(intrinsics), intrinsics)
 
 
 def _own_mask(view: PhotoView) -> np.ndarray:
@@ -641,7 +641,7 @@ def _unfolded(at: np.ndarray, plain: Intrinsics, i: Intrinsics, inside: np.ndarr
     """Where the direction that the photo's lens gives for the pixel ``at`` is the one that led there."""
     out = np.zeros(inside.shape, bool)
     if inside.any():
-        back = cameras.rays((at[inside] - [i.cx, i.cy]) / [i.fx, i.fy], i)
+        back = cameras.image_to_directions((at[inside] - [i.cx, i.cy]) / [i.fx, i.fy], i)
         out[inside] = np.linalg.norm(back - _forward(plain)[inside], axis=-1) < 1e-6
     return out
 

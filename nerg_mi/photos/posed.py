@@ -13,8 +13,8 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import is_ordinary, line_blocks, real_path
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import is_regular_file, read_line_blocks, resolve_path
 from nerg_mi.maths.coordinates import check_near_origin
 
 from .cameras import Intrinsics
@@ -28,7 +28,7 @@ LENS_KEYS = tuple("w h fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6 camera_angle_x ca
 """Keys of `PosedFrame.lens`, all floats: pixels, radians, and coefficients as `Intrinsics` has them; "fisheye" is 1 for
 fisheye lenses."""
 
-FARTHEST = 1e12
+MAX_POSITION = 1e12
 """Nothing may lie farther from the origin, in units: beyond, differences of positions are lost."""
 
 # Focal lengths as shares of the picture's width: from a view of almost 180 degrees to one of a thousandth of a degree.
@@ -36,20 +36,20 @@ _FOCAL = 1e-3, 1e5
 _BENT, _UNBENT = 1e9, 1e-30
 
 
-def inside(root: Path | None, path: Path, what: str) -> Path:
+def check_inside(root: Path | None, path: Path, file_kind: str) -> Path:
     """``path``, where it lies below the folder ``root`` once all links are followed (None: anywhere).
 
     Raises `NergError` otherwise: a data set of somebody else's must not make files be read that it does not hold.
     """
     if root is not None and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
         raise NergError(
-            f'its {what} "{plain(path)}" lies outside of the data set\'s folder "{root}"; move it there, or allow this '
+            f'its {file_kind} "{sanitize(path)}" lies outside of the data set\'s folder "{root}"; move it there, or allow this '
             "with --allow-outside"
         )
     return path
 
 
-def fold_name(name: str) -> str:
+def normalize_name(name: str) -> str:
     """``name`` of a file, equal for all spellings of it by different systems: separators, composition and case."""
     return unicodedata.normalize("NFC", str(PurePosixPath(name.replace("\\", "/")))).casefold()
 
@@ -62,48 +62,48 @@ class FileFinder:
         self.folder, self.root = folder, root
         self._listed: dict[Path, dict[str, list[str]]] = {}
 
-    def find(self, name: str, what: str) -> Path:
+    def find(self, name: str, file_kind: str) -> Path:
         """The file ``name``; as it is spelled, where there is none.
 
         Raises `NergError` for one outside of the root, for a device or a pipe, and where several files differ from
         ``name`` by case alone.
         """
-        path = inside(self.root, self.folder / name, what)
-        if is_ordinary(path, what):
+        path = check_inside(self.root, self.folder / name, file_kind)
+        if is_regular_file(path, file_kind):
             return path
         slashes = name.replace("\\", "/")
-        inside(self.root, self.folder / slashes, what)
-        match = self._match(PurePosixPath(slashes), what)
-        return path if match is None else inside(self.root, match, what)
+        check_inside(self.root, self.folder / slashes, file_kind)
+        match = self._match(PurePosixPath(slashes), file_kind)
+        return path if match is None else check_inside(self.root, match, file_kind)
 
     def _match(self, name: PurePosixPath, what: str) -> Path | None:
         path = self.folder
         for part in () if name.is_absolute() or ".." in name.parts else name.parts:
             if not (path / part).exists():
-                names = self._names(path).get(fold_name(part), [])
+                names = self._names(path).get(normalize_name(part), [])
                 if len(names) > 1:
                     raise NergError(
-                        f'its {what} "{plain(part)}" may be each of {name_some(names)}; spell it as the file is'
+                        f'its {what} "{sanitize(part)}" may be each of {format_names(names)}; spell it as the file is'
                     )
                 if not names:
                     return None
                 part = names[0]
             path = path / part
-        return path if is_ordinary(path, what) else None
+        return path if is_regular_file(path, what) else None
 
     def _names(self, folder: Path) -> dict[str, list[str]]:
         if folder not in self._listed:
             names = self._listed[folder] = {}
             for entry in sorted(os.listdir(folder)) if folder.is_dir() else ():
-                names.setdefault(fold_name(entry), []).append(entry)
+                names.setdefault(normalize_name(entry), []).append(entry)
         return self._listed[folder]
 
 
-def name_some(names: Iterable[object], most: int = 5) -> str:
+def format_names(names: Iterable[object], max_names: int = 5) -> str:
     """The first ``most`` of ``names`` for a message, and how many more there are."""
-    names = [plain(name, 80) for name in names]
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+    names = [sanitize(name, 80) for name in names]
+    more = f" and {len(names) - max_names} more" if len(names) > max_names else ""
+    return ", ".join(names[:max_names]) + more
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class MaskFile:
     """``hides``: white marks what is left out (instant-ngp's dynamic masks), not what is used (nerfstudio, COLMAP)."""
 
     path: Path
-    hides: bool = False
+    is_inverted: bool = False
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class PosedFrame:
     mask: MaskFile | None = None
     ignores_exif: bool = False
 
-    def has_shape(self, width: int, height: int) -> bool:
+    def matches_shape(self, width: int, height: int) -> bool:
         """Whether the camera is of an image of ``width`` x ``height`` pixels, or of its shape, to a hundredth."""
         w, h = self.lens.get("w", width), self.lens.get("h", height)
         return w > 0 and h > 0 and abs(w * height - h * width) <= 0.01 * h * width
@@ -151,9 +151,9 @@ class PosedFrame:
         """
         lens = self.lens
         w, h = lens.get("w", width), lens.get("h", height)
-        if not self.has_shape(width, height):
+        if not self.matches_shape(width, height):
             remedy = 'correct width and height ("w" and "h"), or the image'
-            if self.has_shape(height, width):
+            if self.matches_shape(height, width):
                 remedy = "turn the pixels as the camera was held; other numbers would turn its rays"
             raise NergError(
                 f'the image "{self.image}" has {width} x {height} pixels but its camera says {w:g} x {h:g}; {remedy}'
@@ -167,17 +167,17 @@ class PosedFrame:
         fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
         if fx is None or fy is None or not all(_FOCAL[0] * w <= f <= _FOCAL[1] * w for f in (fx, fy)):
             raise NergError(
-                f'frame "{plain(self.name)}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in '
+                f'frame "{sanitize(self.name)}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in '
                 "radians"
             )
         if not (abs(lens.get("cx", 0)) <= 100 * w and abs(lens.get("cy", 0)) <= 100 * h):
             raise NergError(
-                f'the principal point ("cx", "cy") of frame "{plain(self.name)}" is not near its picture; correct it'
+                f'the principal point ("cx", "cy") of frame "{sanitize(self.name)}" is not near its picture; correct it'
             )
         bent = {k: lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")}
         if not all(abs(x) <= _BENT for x in bent.values()):
             raise NergError(
-                f'the distortion of frame "{plain(self.name)}" has coefficients beyond {_BENT:g}; correct them'
+                f'the distortion of frame "{sanitize(self.name)}" has coefficients beyond {_BENT:g}; correct them'
             )
         # One that bends nothing would still be divided by where a lens is asked for its fold.
         bent = {k: x if abs(x) >= _UNBENT else 0.0 for k, x in bent.items()}
@@ -187,14 +187,14 @@ class PosedFrame:
 
 
 @dataclass(frozen=True)
-class Unused:
+class UnusedFrame:
     """A frame that is left out, and why."""
 
     name: str
     reason: str
 
     def __str__(self) -> str:
-        return f'left out "{plain(self.name)}": {plain(self.reason, 1000)}'
+        return f'left out "{sanitize(self.name)}": {sanitize(self.reason, 1000)}'
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class PosedImages:
     path: Path
     frames: list[PosedFrame]
     # Frames that cannot be used.
-    unused: list[Unused]
+    unused: list[UnusedFrame]
     # (2, 3) corners of the scene box, from the file, or None.
     aabb: np.ndarray | None
     # Of the file, for provenance.
@@ -216,19 +216,19 @@ class PosedImages:
     points: np.ndarray | None = None
     # The data set's folder, and those of its photos.
     root: Path = Path()
-    folders: frozenset[Path] = frozenset()
+    image_folders: frozenset[Path] = frozenset()
     # Image files that the file lists, whether or not their frames can be used.
-    images: frozenset[Path] = frozenset()
+    image_files: frozenset[Path] = frozenset()
     # Names of the frames that the file itself holds out, or None.
     held_out: list[str] | None = None
     # Names of the frames that it sets apart from both.
-    spare: list[str] = field(default_factory=list)
+    unassigned: list[str] = field(default_factory=list)
     # (4, 4) similarity from these coordinates to those before the writer turned them (applied_transform), or None.
-    original: np.ndarray | None = None
+    to_original: np.ndarray | None = None
     # (4, 4) similarity from these coordinates to those of the file.
     to_file: np.ndarray = field(default_factory=lambda: np.eye(4))
 
-    def moved(self, similarity: np.ndarray) -> PosedImages:
+    def transform(self, similarity: np.ndarray) -> PosedImages:
         """The same in other coordinates: ``similarity`` (4, 4), a uniform scale, a rotation and a translation."""
         scale, rotation = _parts(similarity)
         back = np.linalg.inv(similarity)
@@ -244,7 +244,7 @@ class PosedImages:
             frames=frames,
             aabb=_moved_box(self.aabb, similarity),
             points=None if self.points is None else self.points @ similarity[:3, :3].T + similarity[:3, 3],
-            original=None if self.original is None else self.original @ back,
+            to_original=None if self.to_original is None else self.to_original @ back,
             to_file=self.to_file @ back,
         )
 
@@ -282,8 +282,8 @@ def rigid_pose(matrix: object) -> np.ndarray:
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise NergError("the last row of its pose is not 0, 0, 0, 1 (is the matrix transposed?)")
     rotation = pose[:3, :3]
-    if not np.abs(pose).max() <= FARTHEST:
-        raise NergError(f"its pose has numbers beyond {FARTHEST:g}")
+    if not np.abs(pose).max() <= MAX_POSITION:
+        raise NergError(f"its pose has numbers beyond {MAX_POSITION:g}")
     scale = np.cbrt(np.linalg.det(rotation))
     if not scale > 0 or not np.abs(rotation @ rotation.T / scale**2 - np.eye(3)).max() <= 1e-2:
         raise NergError("its pose is not a rotation and a translation (mirrored, sheared or singular)")
@@ -294,10 +294,10 @@ def rigid_pose(matrix: object) -> np.ndarray:
     return pose
 
 
-def settled(path: Path, frames: list[PosedFrame], unused: list[Unused]) -> tuple[list[PosedFrame], list[Unused]]:
+def sort_frames(path: Path, frames: list[PosedFrame], unused: list[UnusedFrame]) -> tuple[list[PosedFrame], list[UnusedFrame]]:
     """Both in order of their names, each image file counting once. Raises `NergError` where no frame is left, and for
     cameras too far from the origin for single precision."""
-    frames, repeated = drop_repeated(sorted(frames, key=lambda f: f.name))
+    frames, repeated = drop_duplicates(sorted(frames, key=lambda f: f.name))
     unused = sorted(unused + repeated, key=lambda u: u.name)
     if not frames:
         raise _none_usable(path, unused)
@@ -305,29 +305,29 @@ def settled(path: Path, frames: list[PosedFrame], unused: list[Unused]) -> tuple
     return frames, unused
 
 
-def drop_repeated(frames: list[PosedFrame]) -> tuple[list[PosedFrame], list[Unused]]:
+def drop_duplicates(frames: list[PosedFrame]) -> tuple[list[PosedFrame], list[UnusedFrame]]:
     """``frames`` with each image file once, and what was said about it again."""
     first: dict[Path, PosedFrame] = {}
     kept, unused = [], []
     for frame in frames:
-        key = real_path(frame.image)
+        key = resolve_path(frame.image)
         if key not in first:
             first[key] = frame
             kept.append(frame)
             continue
         same = np.allclose(first[key].to_world, frame.to_world, atol=1e-6)
         more = "" if same else ", with another pose; the first counts"
-        unused.append(Unused(frame.name, f"its image is listed twice{more}"))
+        unused.append(UnusedFrame(frame.name, f"its image is listed twice{more}"))
     return kept, unused
 
 
-def _none_usable(path: Path, unused: list[Unused]) -> NergError:
+def _none_usable(path: Path, unused: list[UnusedFrame]) -> NergError:
     """The error of a set without a single usable frame."""
     if not unused:
         return NergError(f'"{path}" lists no frames; name the file of a posed image set')
     return NergError(
-        f'none of the {len(unused)} frames of "{path}" can be used; the first, "{plain(unused[0].name)}": '
-        f"{plain(unused[0].reason, 1000)}"
+        f'none of the {len(unused)} frames of "{path}" can be used; the first, "{sanitize(unused[0].name)}": '
+        f"{sanitize(unused[0].reason, 1000)}"
     )
 
 
@@ -335,7 +335,7 @@ def _none_usable(path: Path, unused: list[Unused]) -> NergError:
 #
 # Semi-dense points of Project Aria: what the glasses saw of a place, in the world of the recording's trajectory.
 
-INV_DIST_STD, DIST_STD = 0.005, 0.01
+MAX_INV_DIST_STD, MAX_DIST_STD = 0.005, 0.01
 """Points whose inverse distance (1/m) and distance (m) are known less well are left out, as in Aria's own tools."""
 
 _NUMBERS = ("px_world", "py_world", "pz_world", "inv_dist_std", "dist_std")
@@ -345,7 +345,7 @@ _WORLDS = 1000  # a file of more is none of points
 
 
 def read_semidense(
-    path: str | os.PathLike, world: str | None = None, *, inv_dist_std: float = INV_DIST_STD, dist_std: float = DIST_STD
+    path: str | os.PathLike, world: str | None = None, *, max_inv_dist_std: float = MAX_INV_DIST_STD, max_dist_std: float = MAX_DIST_STD
 ) -> np.ndarray:
     """The points (N, 3) float32, metres, of ``semidense_points.csv.gz`` (older name ``global_points.csv.gz``) that are
     known to ``inv_dist_std`` (1/m) and ``dist_std`` (m).
@@ -355,7 +355,7 @@ def read_semidense(
     other columns, or no point that is known so well.
     """
     found: dict[str, list[np.ndarray]] = defaultdict(list)
-    with closing(line_blocks(path, "file of semi-dense points", _BLOCK)) as blocks:
+    with closing(read_line_blocks(path, "file of semi-dense points", _BLOCK)) as blocks:
         columns, count = None, 0
         for lines in blocks:
             if columns is None:
@@ -365,7 +365,7 @@ def read_semidense(
             if not kept:
                 continue
             values = _convert(path, kept, columns)
-            well = np.flatnonzero((values[:, 3] <= inv_dist_std) & (values[:, 4] <= dist_std))
+            well = np.flatnonzero((values[:, 3] <= max_inv_dist_std) & (values[:, 4] <= max_dist_std))
             well = well[np.isfinite(values[well, :3]).all(axis=1)]
             names = np.array([kept[i][1].split(",")[columns[1]].strip() for i in well.tolist()], dtype=object)
             for name in set(names.tolist()):
@@ -374,13 +374,13 @@ def read_semidense(
                 raise NergError(f'"{path}" has more than {_WORLDS:,} worlds (graph_uid); have it made again by MPS')
     if not found:
         raise NergError(
-            f'"{path}" holds no point that is known to {inv_dist_std:g} 1/m and {dist_std:g} m; allow larger deviations'
+            f'"{path}" holds no point that is known to {max_inv_dist_std:g} 1/m and {max_dist_std:g} m; allow larger deviations'
         )
     if world is None:
         world = max(found, key=lambda name: (sum(map(len, found[name])), name))
     if world not in found:
-        named = ", ".join(plain(name, 40) for name in sorted(found)[:4])
-        raise NergError(f'"{path}" has no point of the world "{plain(world, 40)}"; there are {named}')
+        named = ", ".join(sanitize(name, 40) for name in sorted(found)[:4])
+        raise NergError(f'"{path}" has no point of the world "{sanitize(world, 40)}"; there are {named}')
     return np.concatenate(found[world])
 
 
@@ -389,7 +389,7 @@ def _columns(path: str | os.PathLike, header: str) -> tuple[int, ...]:
     names = [name.strip() for name in header.lstrip("\ufeff").split(",")]
     missing = [name for name in (_WORLD, *_NUMBERS) if name not in names]
     if missing:
-        there = ", ".join(plain(name, 40) for name in names[:8])
+        there = ", ".join(sanitize(name, 40) for name in names[:8])
         raise NergError(
             f'"{path}" has no column {", ".join(missing)}; its columns are {there}; give semidense_points.csv.gz of an '
             "Aria recording"
@@ -409,5 +409,5 @@ def _convert(path: str | os.PathLike, lines: Sequence[tuple[int, str]], columns:
         try:
             rows.append([float(cells[i]) for i in columns[2:]])
         except ValueError:
-            raise NergError(f'"{path}", line {number}: {plain(line, 60)!r} is no point; copy the file again') from None
+            raise NergError(f'"{path}", line {number}: {sanitize(line, 60)!r} is no point; copy the file again') from None
     return np.array(rows)

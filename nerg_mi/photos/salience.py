@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.files.safe_read import read_npy, real_path
+from nerg_mi.files.safe_read import read_npy, resolve_path
 
 from . import cameras
-from .cameras import Intrinsics, PosedCamera, all_used, area_average, nearest, overlap
-from .colmap import find_source
-from .images import open_bitmap, read_mask, read_photo, read_posed
-from .posed import MaskFile, PosedFrame, inside
+from .cameras import Intrinsics, PosedCamera, resize_mask, resize_by_area, resize_nearest, make_area_weights
+from .colmap import find_pose_source
+from .images import open_bitmap, read_mask, read_photo, read_posed_images
+from .posed import MaskFile, PosedFrame, check_inside
 
 # ---- Solid angles of a picture's pixels, whatever the lens ----
 #
@@ -43,18 +43,18 @@ def pixel_solid_angles(intrinsics: Intrinsics) -> np.ndarray:
         rows = np.arange(a, min(a + _ROWS, i.height) + 1)
         x, y = np.meshgrid((np.arange(i.width + 1) - i.cx) / i.fx, (rows - i.cy) / i.fy)
         xy = np.stack([x, y], axis=-1)
-        d = cameras.rays(xy, i)
+        d = cameras.image_to_directions(xy, i)
         corner = d[:-1, :-1], d[:-1, 1:], d[1:, 1:], d[1:, :-1]
-        part = triangle(*corner[:3]) + triangle(corner[0], *corner[2:])
+        part = spherical_triangle_area(*corner[:3]) + spherical_triangle_area(corner[0], *corner[2:])
         if i.fisheye:
-            beyond = np.linalg.norm(xy, axis=-1) >= cameras.fisheye_limit(i)[1]
+            beyond = np.linalg.norm(xy, axis=-1) >= cameras.find_fisheye_limit(i)[1]
             part[beyond[:-1, :-1] & beyond[:-1, 1:] & beyond[1:, 1:] & beyond[1:, :-1]] = 0
         out[a : a + len(part)] = np.maximum(part, 0)
     out.flags.writeable = False
     return out
 
 
-def triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+def spherical_triangle_area(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     """Signed areas (...) of spherical triangles with unit corners (..., 3); positive where a, b, c are right-handed."""
     dot = lambda u, v: np.einsum("...i,...i->...", u, v)
     return 2 * np.arctan2(dot(a, np.cross(b, c)), 1 + dot(a, b) + dot(b, c) + dot(c, a))
@@ -71,11 +71,11 @@ def triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 # The authors' scale of attention, and their blur in pixels at that width.
-WIDTH = 64
+RESIDUAL_WIDTH = 64
 _SIGMA = 2.5
 
 
-def spectral_residual(photo: np.ndarray, width: int = WIDTH) -> np.ndarray:
+def spectral_residual(photo: np.ndarray, width: int = RESIDUAL_WIDTH) -> np.ndarray:
     """Salience (h, w), float64, at most 1, of ``photo`` (H, W, 3) in 0..1, sRGB; computed and returned ``width`` pixels
     wide.
 
@@ -88,7 +88,7 @@ def spectral_residual(photo: np.ndarray, width: int = WIDTH) -> np.ndarray:
     H, W = photo.shape[:2]
     w = min(width, W)
     grey = np.asarray(photo, np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
-    grey = area_average(grey[..., None], w, max(1, round(H * w / W)))[..., 0].astype(np.float64)
+    grey = resize_by_area(grey[..., None], w, max(1, round(H * w / W)))[..., 0].astype(np.float64)
     if not np.ptp(grey) > 1e-6:
         raise NergError("it has one colour everywhere, and no spectrum to find salience in")
     spectrum = np.asarray(fft2(grey))
@@ -106,9 +106,9 @@ def spectral_residual(photo: np.ndarray, width: int = WIDTH) -> np.ndarray:
 # what lies outside the picture: with the share s_i of pixel i and its solid angle dω_i, the density there is s_i / dω_i
 # / Σ s, in 1/sr, given that the picture is looked at.
 
-SUFFIXES = (".png", ".exr", ".npy")
-PER = ("pixel", "steradian")
-MODELS = {"spectral-residual": spectral_residual}
+SALIENCE_SUFFIXES = (".png", ".exr", ".npy")
+VALUE_UNITS = ("pixel", "steradian")
+SALIENCE_MODELS = {"spectral-residual": spectral_residual}
 # Pixels that are kept of an image: gaze fields are coarse.
 _KEPT = 1 << 14
 # Share by which a map may be off the shape of its photo.
@@ -124,11 +124,11 @@ class SalienceView:
 
     name: str
     camera: PosedCamera
-    share: np.ndarray
+    gaze_fraction: np.ndarray
     solid_angle: np.ndarray
 
     @property
-    def extent(self) -> float:
+    def total_solid_angle(self) -> float:
         """Solid angle of what is known, sr."""
         return float(self.solid_angle.sum(dtype=np.float64))
 
@@ -136,23 +136,23 @@ class SalienceView:
     def density(self) -> np.ndarray:
         """(h, w), 1/sr, given that the picture is looked at; 0 where nothing is known."""
         known = self.solid_angle > 0
-        return np.where(known, self.share / np.where(known, self.solid_angle, 1), 0)
+        return np.where(known, self.gaze_fraction / np.where(known, self.solid_angle, 1), 0)
 
-    def reduced(self, pixels: int) -> SalienceView:
+    def reduce(self, pixels: int) -> SalienceView:
         """The same on at most ``pixels`` pixels, each of which has the gaze and the solid angle of those that it
         covers."""
-        h, w = self.share.shape
+        h, w = self.gaze_fraction.shape
         if h * w <= pixels:
             return self
         factor = np.sqrt(pixels / (h * w))
         width, height = max(1, int(w * factor)), max(1, int(h * factor))
         camera = PosedCamera(self.camera.intrinsics.resized(width, height), self.camera.to_world)
-        rows, columns = overlap(h, height) * np.float32(h / height), overlap(w, width) * np.float32(w / width)
+        rows, columns = make_area_weights(h, height) * np.float32(h / height), make_area_weights(w, width) * np.float32(w / width)
         total = lambda v: np.asarray((columns @ (rows @ v).T).T, np.float64)
-        share = total(self.share)
+        share = total(self.gaze_fraction)
         return SalienceView(self.name, camera, share / share.sum(), total(self.solid_angle))
 
-    def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """``count`` directions that each stand for as much of the view's extent: (count, 3) unit, in the world, at
         random within the pixels (count,), flat indices, that are drawn by their solid angle (systematically: each as
         often as is its due, rounded up or down)."""
@@ -161,12 +161,12 @@ class SalienceView:
         which = np.minimum(which, np.flatnonzero(self.solid_angle.ravel())[-1])
         i, at = self.camera.intrinsics, rng.random((2, count))
         xy = np.stack([(which % i.width + at[0] - i.cx) / i.fx, (which // i.width + at[1] - i.cy) / i.fy], axis=-1)
-        return cameras.rays(xy, i) * _OPENGL_FROM_OPENCV @ self.camera.to_world[:3, :3].T, which
+        return cameras.image_to_directions(xy, i) * _OPENGL_FROM_OPENCV @ self.camera.to_world[:3, :3].T, which
 
-    def look_up(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def evaluate(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``(density, known)`` (N,) of world ``directions`` (N, 3): 1/sr, and whether the view shows them."""
         i = self.camera.intrinsics
-        xy, shown = cameras.image(np.asarray(directions) @ self.camera.to_world[:3, :3] * _OPENGL_FROM_OPENCV, i)
+        xy, shown = cameras.directions_to_image(np.asarray(directions) @ self.camera.to_world[:3, :3] * _OPENGL_FROM_OPENCV, i)
         x, y = np.floor(xy[:, 0] * i.fx + i.cx), np.floor(xy[:, 1] * i.fy + i.cy)
         known = shown & (x >= 0) & (x < i.width) & (y >= 0) & (y < i.height)
         at = np.where(known, y, 0).astype(int), np.where(known, x, 0).astype(int)
@@ -180,10 +180,10 @@ class SalienceSet:
     ``unused``: sentences on what of the posed set is not used; ``about``: for provenance (JSON)."""
 
     views: list[SalienceView]
-    missing: list[str]
-    stray: list[str]
-    unused: list[str]
-    about: dict = field(default_factory=dict)
+    frames_without_map: list[str]
+    unmatched_files: list[str]
+    notes: list[str]
+    provenance: dict = field(default_factory=dict)
 
 
 def open_salience(
@@ -191,7 +191,7 @@ def open_salience(
     source: str | Path,
     per: str = "pixel",
     align: np.ndarray | None = None,
-    trained: dict | None = None,
+    field_provenance: dict | None = None,
     allow_outside: bool = False,
 ) -> SalienceSet:
     """The salience images of a posed image set ``dataset`` (as `colmap.find_source` knows them).
@@ -207,14 +207,14 @@ def open_salience(
 
     Raises `NergError`, naming the file, for an image that is none, and when no frame has one.
     """
-    if per not in PER:
-        raise NergError(f'salience is given per {" or per ".join(PER)}, not per "{per}"')
-    posed = read_posed(find_source(dataset), allow_outside)
-    if align is None and trained and trained.get("sha256") == posed.sha256 and "to_file" in trained:
-        align = np.linalg.inv(trained["to_file"])
+    if per not in VALUE_UNITS:
+        raise NergError(f'salience is given per {" or per ".join(VALUE_UNITS)}, not per "{per}"')
+    posed = read_posed_images(find_pose_source(dataset), allow_outside)
+    if align is None and field_provenance and field_provenance.get("sha256") == posed.sha256 and "to_file" in field_provenance:
+        align = np.linalg.inv(field_provenance["to_file"])
     if align is not None:
-        posed = posed.moved(np.asarray(align, np.float64))
-    model = MODELS.get(str(source))
+        posed = posed.transform(np.asarray(align, np.float64))
+    model = SALIENCE_MODELS.get(str(source))
     if model is not None:
         files, stray = {f.name: None for f in posed.frames}, []
     else:
@@ -224,12 +224,12 @@ def open_salience(
     if not views:
         raise NergError(
             f'no image in "{source}" is called as one of the {len(posed.frames)} frames of "{posed.path}" is; '
-            f'the first of these would be "{Path(posed.frames[0].name).stem}" with {", ".join(SUFFIXES)}'
+            f'the first of these would be "{Path(posed.frames[0].name).stem}" with {", ".join(SALIENCE_SUFFIXES)}'
         )
     about = {
         "views": posed.path.name,
         "sha256": posed.sha256,
-        "salience": str(source) if model else real_path(source).name,
+        "salience": str(source) if model else resolve_path(source).name,
         "per": per,
         "used": len(views),
         "missing": len(missing),
@@ -289,10 +289,10 @@ def _files(folder: Path, frames: list[PosedFrame], allow_outside: bool) -> tuple
     """The file of each frame that has one, and names of the others."""
     if not folder.is_dir():
         raise MissingFile(
-            f'there is no folder "{folder}" of salience images; give one, or a model: {", ".join(MODELS)}'
+            f'there is no folder "{folder}" of salience images; give one, or a model: {", ".join(SALIENCE_MODELS)}'
         )
     found: dict[str, Path] = {}
-    for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES):
+    for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in SALIENCE_SUFFIXES):
         if path.stem in found:
             raise NergError(
                 f'"{found[path.stem].name}" and "{path.name}" in "{folder}" are of the same frame; keep one'
@@ -309,7 +309,7 @@ def _files(folder: Path, frames: list[PosedFrame], allow_outside: bool) -> tuple
                 "give the photos different names"
             )
         path = found[stem]
-        out[frame.name], owner[stem] = path if allow_outside else inside(folder, path, "salience image"), frame.name
+        out[frame.name], owner[stem] = path if allow_outside else check_inside(folder, path, "salience image"), frame.name
     return out, [p.name for stem, p in found.items() if stem not in owner]
 
 
@@ -341,8 +341,8 @@ def _view(frame: PosedFrame, path: Path | None, model, per: str) -> SalienceView
             f"{what} is zero wherever the lens and the mask of its frame show anything; "
             "leave it out, or correct the mask"
         )
-    view = SalienceView(frame.name, PosedCamera(intrinsics, frame.to_world), share / share.sum(), solid).reduced(_KEPT)
-    return SalienceView(view.name, view.camera, view.share.astype(np.float32), view.solid_angle.astype(np.float32))
+    view = SalienceView(frame.name, PosedCamera(intrinsics, frame.to_world), share / share.sum(), solid).reduce(_KEPT)
+    return SalienceView(view.name, view.camera, view.gaze_fraction.astype(np.float32), view.solid_angle.astype(np.float32))
 
 
 def _opaque(photo: np.ndarray) -> np.ndarray:
@@ -362,6 +362,6 @@ def _unmasked(frame: PosedFrame, file: MaskFile, intrinsics: Intrinsics) -> np.n
     """Which pixels of a map are known altogether, by the mask ``file`` of its ``frame``."""
     mask = read_mask(file, read_photo(frame).shape[:2])
     width, height = min(intrinsics.width, mask.shape[1]), min(intrinsics.height, mask.shape[0])
-    used = all_used(mask, width, height)
+    used = resize_mask(mask, width, height)
     # A map that is finer than its mask takes the nearest.
-    return nearest(used, intrinsics.width, intrinsics.height)
+    return resize_nearest(used, intrinsics.width, intrinsics.height)

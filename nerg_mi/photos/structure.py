@@ -22,19 +22,19 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import write_bytes, write_text
 from nerg_mi.files.images import check_image
-from nerg_mi.files.safe_read import read_bytes, reading
+from nerg_mi.files.safe_read import read_bytes, translate_read_errors
 
-from .colmap import Up
-from .posed import Unused, inside
+from .colmap import UpEstimate
+from .posed import UnusedFrame, check_inside
 
 # ---- Which pictures are compared with which ----
 
 MATCHING = ("auto", "exhaustive", "sequential")
 
-EXHAUSTIVE = 100
+MAX_EXHAUSTIVE = 100
 """Of so many pictures, by default, each is compared with each: the work grows with their square."""
 
 # Neighbours, and after them steps of 16, 32, ...; and pictures, evenly over all, of which each is compared with each:
@@ -42,11 +42,11 @@ EXHAUSTIVE = 100
 _NEIGHBOURS, _LANDMARKS = 10, 60
 
 
-def chosen_pairs(count: int, matching: str = "auto") -> list[tuple[int, int]]:
+def select_pairs(count: int, matching: str = "auto") -> list[tuple[int, int]]:
     """Pairs (i, j), i < j, of ``count`` pictures in the order in which they were taken; sorted."""
     if matching not in MATCHING:
         raise NergError(f'matching must be {", ".join(MATCHING)}, got "{matching}"')
-    if matching == "exhaustive" or (matching == "auto" and count <= EXHAUSTIVE):
+    if matching == "exhaustive" or (matching == "auto" and count <= MAX_EXHAUSTIVE):
         return list(combinations(range(count), 2))
     steps = [*range(1, _NEIGHBOURS + 1), *(1 << k for k in range(4, 32) if 1 << k < count)]
     near = {(i, i + step) for step in steps for i in range(count - step)}
@@ -58,7 +58,7 @@ def chosen_pairs(count: int, matching: str = "auto") -> list[tuple[int, int]]:
 #
 # Pictures as structure from motion takes them: upright copies for the capture, small ones to find features in.
 
-SIDE = 65_500  # longest side of a picture in pixels: that of a JPEG file
+MAX_SIDE = 65_500  # longest side of a picture in pixels: that of a JPEG file
 
 # As good as telephones write them; colours are not stored more coarsely than brightness.
 _JPEG = dict(format="JPEG", quality=95, subsampling=0)
@@ -73,32 +73,32 @@ class PhotoCopy:
 
     name: str
     size: tuple[int, int]
-    small: tuple[int, int]
-    made_by: tuple = ()
+    small_size: tuple[int, int]
+    camera_key: tuple = ()
     focal: float | None = None
     seconds: float | None = None
 
 
 @dataclass(frozen=True)
-class Folders:
+class PhotoFolders:
     """Where copies go: ``images`` of the capture, and ``small``, whose files are called by `small_name`."""
 
     images: Path
-    small: Path
+    small_images: Path
 
 
-def small_name(index: int) -> str:
+def small_file_name(index: int) -> str:
     """File of the small copy of the so-many-th picture: no letter of its own name can be in the way of COLMAP."""
     return f"{index:06d}.png"
 
 
-def small_size(size: tuple[int, int], longest: int) -> tuple[int, int]:
+def fit_size(size: tuple[int, int], max_side: int) -> tuple[int, int]:
     """``size`` with a longer side of at most ``longest`` pixels."""
-    factor = min(1.0, longest / max(size))
+    factor = min(1.0, max_side / max(size))
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
 
-def encoded(image: Any, suffix: str) -> bytes:
+def encode_image(image: Any, suffix: str) -> bytes:
     """A Pillow image as the bytes of a PNG or JPEG file, by its ``suffix``."""
     out = io.BytesIO()
     _rgb(image).save(out, **(dict(format="PNG") if suffix.lower() == ".png" else _JPEG))
@@ -110,7 +110,7 @@ def _rgb(image: Any) -> Any:
     return image if image.mode == "RGB" else image.convert("RGB")
 
 
-def shrunk(image: Any, size: tuple[int, int]) -> bytes:
+def encode_small_image(image: Any, size: tuple[int, int]) -> bytes:
     """A Pillow image at ``size``, by averaging, as the bytes of a PNG file."""
     from PIL import Image
 
@@ -122,14 +122,14 @@ def shrunk(image: Any, size: tuple[int, int]) -> bytes:
     return out.getvalue()
 
 
-def cameras_of(pictures: Iterable[PhotoCopy], share: bool = True) -> list[int]:
+def assign_cameras(pictures: Iterable[PhotoCopy], share_cameras: bool = True) -> list[int]:
     """Number, from 0, of the camera of each picture: those of equal size, maker, model and focal length ``share`` one.
 
     A telephone held upright and held across has two: each with its principal point at the centre of its pictures.
     """
     found: dict[object, int] = {}
     return [
-        found.setdefault((p.size, p.made_by) if share else k, len(found) if share else k)
+        found.setdefault((p.size, p.camera_key) if share_cameras else k, len(found) if share_cameras else k)
         for k, p in enumerate(pictures)
     ]
 
@@ -138,7 +138,7 @@ def cameras_of(pictures: Iterable[PhotoCopy], share: bool = True) -> list[int]:
 #
 # A folder of photos: which can be used, copied as they are to be looked at.
 
-SUFFIXES = (".jpg", ".jpeg", ".png")  # of the files that are taken for photos, in small letters
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")  # of the files that are taken for photos, in small letters
 
 # Pictures that a camera writes and that are not read here: to be named, not passed over.
 _OTHERS = (".heic", ".heif", ".tif", ".tiff", ".webp", ".dng", ".raw", ".cr2", ".nef", ".arw", ".avif", ".exr", ".bmp")
@@ -154,19 +154,19 @@ _TURNS = "FLIP_LEFT_RIGHT ROTATE_180 FLIP_TOP_BOTTOM TRANSPOSE ROTATE_270 TRANSV
 _KEPT = ("L", "RGB", "RGBA", "I;16")
 
 
-def list_photos(folder: str | Path) -> tuple[list[Path], list[Unused]]:
+def list_photos(folder: str | Path) -> tuple[list[Path], list[UnusedFrame]]:
     """Photos directly in ``folder``, by name, and pictures of other kinds. `NergError` where there is no photo."""
     folder = Path(folder)
-    with reading(folder, "folder of photos"):
+    with translate_read_errors(folder, "folder of photos"):
         files = sorted(p for p in folder.iterdir() if not (p.is_dir() or p.name.startswith(".")))
-    photos = [p for p in files if p.suffix.lower() in SUFFIXES]
+    photos = [p for p in files if p.suffix.lower() in PHOTO_SUFFIXES]
     others = [
-        Unused(p.name, "only JPEG and PNG photos are read; convert it") for p in files if p.suffix.lower() in _OTHERS
+        UnusedFrame(p.name, "only JPEG and PNG photos are read; convert it") for p in files if p.suffix.lower() in _OTHERS
     ]
     if not photos:
         if others:
             raise NergError(
-                f'"{folder}" holds {len(others)} pictures such as "{plain(others[0].name)}" but no JPEG or PNG; '
+                f'"{folder}" holds {len(others)} pictures such as "{sanitize(others[0].name)}" but no JPEG or PNG; '
                 "convert them"
             )
         below = folder / "images"
@@ -177,11 +177,11 @@ def list_photos(folder: str | Path) -> tuple[list[Path], list[Unused]]:
 
 def copy_photos(
     photos: list[Path],
-    folders: Folders,
-    longest: int,
-    progress: Callable[[int, int], None],
+    folders: PhotoFolders,
+    max_side: int,
+    on_progress: Callable[[int, int], None],
     allow_outside: bool = False,
-) -> tuple[list[PhotoCopy], list[Unused]]:
+) -> tuple[list[PhotoCopy], list[UnusedFrame]]:
     """Copy each of the ``photos`` to ``folders``, turned as its EXIF orientation says, and those that cannot be used.
 
     A photo that stands upright as it is stored is copied byte for byte; another is stored anew, a JPEG at quality 95, a
@@ -189,34 +189,34 @@ def copy_photos(
     ``allow_outside``: follow links that lead out of the photos' folder.
     """
     pictures: list[PhotoCopy] = []
-    unused: list[Unused] = []
+    unused: list[UnusedFrame] = []
     seen: dict[str, str] = {}
     for k, path in enumerate(photos):
         try:
             if not path.name.isprintable():
                 raise NergError("its name holds what is no character, which COLMAP cannot store; rename it")
-            pictures.append(_copied(path, folders, len(pictures), longest, seen, allow_outside))
+            pictures.append(_copied(path, folders, len(pictures), max_side, seen, allow_outside))
         except NergError as error:
-            unused.append(Unused(path.name, str(error)))
-        progress(k + 1, len(photos))
+            unused.append(UnusedFrame(path.name, str(error)))
+        on_progress(k + 1, len(photos))
     return pictures, unused
 
 
 def _copied(
-    path: Path, folders: Folders, index: int, longest: int, seen: dict[str, str], allow_outside: bool
+    path: Path, folders: PhotoFolders, index: int, longest: int, seen: dict[str, str], allow_outside: bool
 ) -> PhotoCopy:
     """``seen``: names of the photos before by their content, to which this one is added."""
-    photo = read_photo(path if allow_outside else inside(path.parent, path, "photo"))
+    photo = read_photo(path if allow_outside else check_inside(path.parent, path, "photo"))
     image, name = photo.image, path.name
     before = seen.setdefault(hashlib.sha256(photo.raw).hexdigest(), name)
     if before != name:
         raise NergError(f'it is the same file as "{before}"')
-    write_bytes(folders.images / name, photo.raw if photo.stays else encoded(image, path.suffix))
+    write_bytes(folders.images / name, photo.raw if photo.is_upright else encode_image(image, path.suffix))
     size = (image.width, image.height)
-    small = small_size(size, longest)
-    write_bytes(folders.small / small_name(index), shrunk(image, small))
-    focal = photo.as_35 / _DIAGONAL_35 * float((size[0] ** 2 + size[1] ** 2) ** 0.5) if photo.as_35 else None
-    return PhotoCopy(name, size, small, photo.made_by, focal)
+    small = fit_size(size, longest)
+    write_bytes(folders.small_images / small_file_name(index), encode_small_image(image, small))
+    focal = photo.focal_35mm / _DIAGONAL_35 * float((size[0] ** 2 + size[1] ** 2) ** 0.5) if photo.focal_35mm else None
+    return PhotoCopy(name, size, small, photo.camera_key, focal)
 
 
 @dataclass(frozen=True)
@@ -227,9 +227,9 @@ class Photo:
 
     raw: bytes
     image: Any
-    stays: bool
-    made_by: tuple = ()
-    as_35: float | None = None
+    is_upright: bool
+    camera_key: tuple = ()
+    focal_35mm: float | None = None
 
 
 def read_photo(path: Path) -> Photo:
@@ -240,13 +240,13 @@ def read_photo(path: Path) -> Photo:
 
     # Pillow takes four bytes a pixel, and as many again to turn it.
     header = check_image(path, "photo", _PIXELS, _BYTES)
-    kind = header.kind
-    if max(header.size) > SIDE:
-        raise NergError(f'the photo "{path}" has a side of {max(header.size):,} pixels, more than {SIDE:,}; cut it')
+    kind = header.format
+    if max(header.size) > MAX_SIDE:
+        raise NergError(f'the photo "{path}" has a side of {max(header.size):,} pixels, more than {MAX_SIDE:,}; cut it')
     if kind not in ("jpeg", "png"):
         raise NergError(f'the photo "{path}" is of the kind "{kind}", whatever its name; convert it to JPEG or PNG')
     raw = read_bytes(path, "photo", _BYTES)
-    with warnings.catch_warnings(), reading(path, "photo"):
+    with warnings.catch_warnings(), translate_read_errors(path, "photo"):
         # What is odd about its notes does not matter.
         warnings.simplefilter("ignore")
         # Not by Image.open, which has a limit of its own, below what telephones take by now.
@@ -280,13 +280,13 @@ LENSES = {"auto": None, "radial": "SIMPLE_RADIAL", "opencv": "OPENCV"}
 
 
 @dataclass(frozen=True)
-class Settings:
+class StructureSettings:
     """``lens``: one of `LENSES`; ``matching``: as `chosen_pairs` has it; ``share``: pictures share cameras; ``orient``:
     turn the model so that up is +z; ``threads``: None for all."""
 
     lens: str = "auto"
     matching: str = "auto"
-    share: bool = True
+    share_cameras: bool = True
     orient: bool = True
     seed: int = 0
     threads: int | None = None
@@ -300,14 +300,14 @@ class Reconstruction:
     the order of the first part; ``surface``, ``colors``: points (M, 3) that three pictures see, and their colours
     (M, 3), uint8."""
 
-    parts: list[list[str]]
+    models: list[list[str]]
     error: float
-    points: int
-    up: Up | None
+    num_points: int
+    up: UpEstimate | None
     lenses: list[dict]
     to_world: np.ndarray
-    surface: np.ndarray
-    colors: np.ndarray
+    point_positions: np.ndarray
+    point_colors: np.ndarray
 
 
 def check_installed() -> None:
@@ -317,7 +317,7 @@ def check_installed() -> None:
 
 
 def reconstruct(
-    pictures: list[PhotoCopy], work: Path, settings: Settings, progress: Callable[[str, int, int], None]
+    pictures: list[PhotoCopy], work: Path, settings: StructureSettings, on_progress: Callable[[str, int, int], None]
 ) -> Reconstruction | None:
     """Find the poses of ``pictures``, whose small copies lie in ``work``/small; None where no three fit together.
 
@@ -327,9 +327,9 @@ def reconstruct(
     check_installed()
     if settings.lens not in LENSES:
         raise NergError(f'lens must be {", ".join(LENSES)}, got "{settings.lens}"')
-    chosen_pairs(0, settings.matching)
+    select_pairs(0, settings.matching)
     write_text(work / "job.json", json.dumps(_job(pictures, settings)))
-    _run(work, settings.threads, progress)
+    _run(work, settings.threads, on_progress)
     with np.load(work / "result.npz", allow_pickle=False) as found:
         result, arrays = json.loads(str(found["result"])), {k: found[k] for k in found.files if k != "result"}
     if not result["parts"]:
@@ -339,7 +339,7 @@ def reconstruct(
         [[pictures[k].name for k in sorted(part)] for part in result["parts"]],
         result["error"],
         result["points"],
-        None if up is None else Up(np.array(up["direction"]), up["roll"], up["plane"], up["between"]),
+        None if up is None else UpEstimate(np.array(up["direction"]), up["roll"], up["plane"], up["between"]),
         result["lenses"],
         arrays["to_world"],
         arrays["points"],
@@ -347,16 +347,16 @@ def reconstruct(
     )
 
 
-def _job(pictures: list[PhotoCopy], settings: Settings) -> dict[str, Any]:
-    numbers = cameras_of(pictures, settings.share)
+def _job(pictures: list[PhotoCopy], settings: StructureSettings) -> dict[str, Any]:
+    numbers = assign_cameras(pictures, settings.share_cameras)
     cameras = []
     for number in range(max(numbers) + 1):
         own = [p for p, n in zip(pictures, numbers) if n == number]
-        focal = [p.focal * p.small[0] / p.size[0] for p in own if p.focal is not None]
+        focal = [p.focal * p.small_size[0] / p.size[0] for p in own if p.focal is not None]
         cameras.append(
             {
                 "size": own[0].size,
-                "small": own[0].small,
+                "small": own[0].small_size,
                 "focal": float(np.median(focal)) if focal else None,
                 "pictures": len(own),
             }
@@ -409,5 +409,5 @@ def _ended(code: int, words: str, work: Path) -> str:
     # A trace follows the sentence where a library aborts, and precedes it where Python raises.
     said = next((line for line in lines if "Check failed" in line or "] " in line[:80]), lines[-1] if lines else "")
     return (
-        f"COLMAP ended early, with code {code} ({plain(said, 200)}); try again with --threads 1, or with other photos"
+        f"COLMAP ended early, with code {code} ({sanitize(said, 200)}); try again with --threads 1, or with other photos"
     )

@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from .colmap import find_up, turn_to_z
-from .structure import chosen_pairs, small_name
+from .colmap import estimate_up, rotation_to_z
+from .structure import select_pairs, small_file_name
 
-SMALLEST = 3  # so many pictures a model needs: two of them tell a place from one that is bent
+MIN_MODEL_SIZE = 3  # so many pictures a model needs: two of them tell a place from one that is bent
 
 # Cameras with so many pictures have all parameters of OpenCV's lens refined, others a focal length and one radial term.
 _MANY = 10
@@ -31,7 +31,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 _QUIET = 2  # of glog: errors
 
 
-def main(folder: Path, tell: Callable[..., None]) -> None:
+def main(folder: Path, on_progress: Callable[..., None]) -> None:
     """Do what ``job.json`` in ``folder`` says, and ``tell`` of it."""
     import pycolmap
 
@@ -40,9 +40,9 @@ def main(folder: Path, tell: Callable[..., None]) -> None:
     pycolmap.set_random_seed(job["seed"])
     database = folder / "database.db"
     _write_database(pycolmap, database, job)
-    _find_features(pycolmap, database, folder, job, tell)
-    _match(pycolmap, database, folder, job, tell)
-    models = _map(pycolmap, database, folder, job, tell)
+    _find_features(pycolmap, database, folder, job, on_progress)
+    _match(pycolmap, database, folder, job, on_progress)
+    models = _map(pycolmap, database, folder, job, on_progress)
     models = sorted(models, key=lambda m: -m.num_reg_images())
     result: dict[str, Any] = {"parts": [[_index(m.image(i)) for i in m.reg_image_ids()] for m in models]}
     if models:
@@ -69,7 +69,7 @@ def _write_database(pycolmap: Any, path: Path, job: dict) -> None:
         rig.add_ref_sensor(made.sensor_id)
         database.write_rig(rig, use_rig_id=True)
     for number, picture in enumerate(job["pictures"], 1):
-        image = pycolmap.Image(name=small_name(number - 1), camera_id=picture["camera"] + 1, image_id=number)
+        image = pycolmap.Image(name=small_file_name(number - 1), camera_id=picture["camera"] + 1, image_id=number)
         database.write_image(image, use_image_id=True)
         frame = pycolmap.Frame()
         frame.frame_id, frame.rig_id = number, picture["camera"] + 1
@@ -81,7 +81,7 @@ def _write_database(pycolmap: Any, path: Path, job: dict) -> None:
 def _find_features(pycolmap: Any, database: Path, folder: Path, job: dict, tell: Callable[..., None]) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads = job["threads"]
-    names = [small_name(k) for k in range(len(job["pictures"]))]
+    names = [small_file_name(k) for k in range(len(job["pictures"]))]
     # Several at a time, so that there is something to tell in between.
     several = 2 * (os.cpu_count() or 1) if job["threads"] < 1 else 2 * job["threads"]
     for begin in range(0, len(names), several):
@@ -95,11 +95,11 @@ def _match(pycolmap: Any, database: Path, folder: Path, job: dict, tell: Callabl
     matching.num_threads, checking.ransac.random_seed = job["threads"], job["seed"]
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = folder / "pairs.txt"
-    pairs = chosen_pairs(len(job["pictures"]), job["matching"])
+    pairs = select_pairs(len(job["pictures"]), job["matching"])
     several = max(50, len(pairs) // 50)
     for begin in range(0, len(pairs), several):
         tell("matching", begin, len(pairs))
-        lines = [f"{small_name(i)} {small_name(j)}\n" for i, j in pairs[begin : begin + several]]
+        lines = [f"{small_file_name(i)} {small_file_name(j)}\n" for i, j in pairs[begin : begin + several]]
         (folder / "pairs.txt").write_text("".join(lines), encoding="utf-8")
         pycolmap.match_image_pairs(
             database, matching_options=matching, pairing_options=pairing, verification_options=checking
@@ -111,7 +111,7 @@ def _map(pycolmap: Any, database: Path, folder: Path, job: dict, tell: Callable[
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = job["threads"]
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = job["seed"]
-    options.min_model_size, options.max_num_models = SMALLEST, 10
+    options.min_model_size, options.max_num_models = MIN_MODEL_SIZE, 10
     count, registered = len(job["pictures"]), 0
 
     def begun() -> None:
@@ -134,7 +134,7 @@ def _map(pycolmap: Any, database: Path, folder: Path, job: dict, tell: Callable[
         initial_image_pair_callback=begun,
         next_image_callback=one_more,
     )
-    return [found[k] for k in sorted(found) if found[k].num_reg_images() >= SMALLEST]
+    return [found[k] for k in sorted(found) if found[k].num_reg_images() >= MIN_MODEL_SIZE]
 
 
 def _index(image: Any) -> int:
@@ -149,9 +149,9 @@ def _finish(pycolmap: Any, model: Any, folder: Path, job: dict) -> dict:
         "observations": model.compute_mean_observations_per_reg_image(),
     }
     if job["orient"]:
-        up = find_up(_poses(model), np.array([p.xyz for p in model.points3D.values() if p.track.length() > 2]))
-        out["up"] = {"roll": up.roll, "plane": up.plane, "between": up.between, "direction": up.direction.tolist()}
-        turn = pycolmap.Rotation3d(turn_to_z(up.direction))
+        up = estimate_up(_poses(model), np.array([p.xyz for p in model.points3D.values() if p.track.length() > 2]))
+        out["up"] = {"roll": up.median_roll, "plane": up.plane_fraction, "between": up.plane_angle, "direction": up.direction.tolist()}
+        turn = pycolmap.Rotation3d(rotation_to_z(up.direction))
         model.transform(pycolmap.Sim3d(1.0, turn, np.zeros(3)))
     for camera in model.cameras.values():
         _resize(pycolmap, camera, job["cameras"][camera.camera_id - 1]["size"])

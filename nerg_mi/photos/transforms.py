@@ -20,24 +20,24 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain, sentence
-from nerg_mi.files.safe_read import JSON_BYTES, is_ordinary, parse_json, read_bytes
+from nerg_mi.errors import NergError, sanitize, format_error
+from nerg_mi.files.safe_read import MAX_JSON_BYTES, is_regular_file, parse_json, read_bytes
 
 from .cameras import OPENGL_FROM_MITSUBA
 from .posed import (
-    FARTHEST,
+    MAX_POSITION,
     LENS_KEYS,
     DepthFile,
     FileFinder,
     MaskFile,
     PosedFrame,
     PosedImages,
-    Unused,
-    fold_name,
-    inside,
-    name_some,
+    UnusedFrame,
+    normalize_name,
+    check_inside,
+    format_names,
     rigid_pose,
-    settled,
+    sort_frames,
 )
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
@@ -98,7 +98,7 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
     Raises `NergError`, naming file and frame, for malformed JSON and when not a single frame can be used.
     """
     path = Path(path)
-    raw = read_bytes(path, "transforms file", JSON_BYTES)
+    raw = read_bytes(path, "transforms file", MAX_JSON_BYTES)
     data = _json(path, raw)
     entries = _frames(data, path)
     original = _original(data, path)
@@ -112,7 +112,7 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
     for index, entry in enumerate(entries):
         name = entry.get("file_path") if isinstance(entry, dict) else None
         if not isinstance(name, str):
-            unused.append(Unused(f"frame {index}", 'it has no "file_path"'))
+            unused.append(UnusedFrame(f"frame {index}", 'it has no "file_path"'))
             continue
         try:
             image = _image_file(finder, name)
@@ -121,11 +121,11 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
             frames.append(_frame({**shared, **entry}, entry, finder, name, image, metre, notes))
         except (ValueError, OverflowError, OSError) as e:
             # A name may be longer than the system allows, or hold what no name can.
-            unused.append(Unused(name, sentence(e)))
-    frames, unused = settled(path, frames, unused)
+            unused.append(UnusedFrame(name, format_error(e)))
+    frames, unused = sort_frames(path, frames, unused)
     held_out, spare = _splits(data, frames)
     if unread:
-        notes.append(f"keys of {path.name} that are not used: {name_some(sorted(unread), 12)}")
+        notes.append(f"keys of {path.name} that are not used: {format_names(sorted(unread), 12)}")
     return PosedImages(
         path,
         frames,
@@ -134,11 +134,11 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
         hashlib.sha256(raw).hexdigest(),
         notes,
         root=path.parent,
-        folders=frozenset(p.parent for p in listed),
-        images=frozenset(listed),
+        image_folders=frozenset(p.parent for p in listed),
+        image_files=frozenset(listed),
         held_out=held_out,
-        spare=spare,
-        original=original,
+        unassigned=spare,
+        to_original=original,
     )
 
 
@@ -149,7 +149,7 @@ def read_frame_poses(path: str | Path) -> tuple[str, list[tuple[str, np.ndarray]
     `NergError` names file and frame for what is no such file, or no pose.
     """
     path = Path(path)
-    raw = read_bytes(path, "transforms file", JSON_BYTES)
+    raw = read_bytes(path, "transforms file", MAX_JSON_BYTES)
     found = []
     data = _json(path, raw)
     _unread_keys_of_file(data, path, False)
@@ -163,14 +163,14 @@ def read_frame_poses(path: str | Path) -> tuple[str, list[tuple[str, np.ndarray]
             _unread_keys(entry, False)
             found.append((name, _pose({**{k: data.get(k) for k in _SHARED}, **entry})))
         except NergError as error:
-            raise NergError(f'frame "{plain(name)}" of "{path}": {error}; correct or remove it') from error
+            raise NergError(f'frame "{sanitize(name)}" of "{path}": {error}; correct or remove it') from error
     return hashlib.sha256(raw).hexdigest(), found
 
 
 def read_dataparser(path: str | Path) -> np.ndarray:
     """The similarity (4, 4) of nerfstudio's ``dataparser_transforms.json``: original coordinates to trained ones."""
     path = Path(path)
-    data = _json(path, read_bytes(path, "file of nerfstudio's coordinates", JSON_BYTES))
+    data = _json(path, read_bytes(path, "file of nerfstudio's coordinates", MAX_JSON_BYTES))
     try:
         m, scale = np.asarray(data["transform"], np.float64), float(data["scale"])
     except (KeyError, TypeError, ValueError, OverflowError) as e:
@@ -212,7 +212,7 @@ def _unread_keys(entry: dict, with_depth: bool) -> set[str]:
                 same = str(value).casefold() in _SAME_MEANING or value == entry.get("transform_matrix", [])
                 if not (same or _is_off(value)):
                     raise NergError(
-                        f'the key "{plain(key, 60)}" with the value {plain(value, 60)} is not read: {remedy}'
+                        f'the key "{sanitize(key, 60)}" with the value {sanitize(value, 60)} is not read: {remedy}'
                     )
     return {k for k in unread if not k.startswith("ftheta")}
 
@@ -242,7 +242,7 @@ def _frame(
     pose, lens, mask = _pose(data), _lens(data), _mask(entry, finder, image)
     depth = _depth(data, entry, finder, metre)
     if depth is not None and not depth.path.is_file():
-        notes.append(f'"{plain(name)}" is used without depth: its depth file "{plain(depth.path)}" does not exist')
+        notes.append(f'"{sanitize(name)}" is used without depth: its depth file "{sanitize(depth.path)}" does not exist')
         depth = None
     return PosedFrame(name, image, pose, lens, depth, mask)
 
@@ -258,11 +258,11 @@ def _mask(entry: dict, finder: FileFinder, image: Path) -> MaskFile | None:
         mask = finder.find(_path(entry, "mask_path"), "mask")
         if not mask.is_file():
             raise NergError(
-                f'its mask "{plain(entry["mask_path"])}" does not exist; restore it, or remove its "mask_path"'
+                f'its mask "{sanitize(entry["mask_path"])}" does not exist; restore it, or remove its "mask_path"'
             )
         return MaskFile(mask)
     dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")
-    return MaskFile(inside(finder.root, dynamic, "mask"), hides=True) if is_ordinary(dynamic, "mask") else None
+    return MaskFile(check_inside(finder.root, dynamic, "mask"), is_inverted=True) if is_regular_file(dynamic, "mask") else None
 
 
 def _depth(data: dict, entry: dict, finder: FileFinder, metre: float) -> DepthFile | None:
@@ -277,7 +277,7 @@ def _depth(data: dict, entry: dict, finder: FileFinder, metre: float) -> DepthFi
         unit = _number(data, "integer_depth_scale")
     else:
         unit = (1.0 if path.suffix.lower() == ".exr" else _MILLIMETRE) * metre
-    if not 0 < unit <= FARTHEST:
+    if not 0 < unit <= MAX_POSITION:
         raise NergError("the unit of its depth file is not a positive number")
     return DepthFile(path, unit, not _is_true(data, "is_euclidean_depth"))
 
@@ -287,7 +287,7 @@ def _is_true(data: dict, key: str, default: bool = False) -> bool:
     if value is None:
         return default
     if value not in (True, False):
-        raise NergError(f'its "{key}" must be true or false, not {plain(value, 60)}')
+        raise NergError(f'its "{key}" must be true or false, not {sanitize(value, 60)}')
     return bool(value)
 
 
@@ -313,7 +313,7 @@ def _lens(data: dict) -> dict:
         or any(str(k).startswith("ftheta") for k in data)
     ):
         raise NergError(
-            f'its lens model "{plain(model, 60)}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, '
+            f'its lens model "{sanitize(model, 60)}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, '
             'p2, to "OPENCV_FISHEYE" with k1 to k4, or to "PINHOLE"'
         )
     lens = {k: _number(data, k) for k in LENS_KEYS if k != "fisheye" and data.get(k) is not None}
@@ -362,7 +362,7 @@ def _original(data: dict, path: Path) -> np.ndarray | None:
 
 def _rigid(m: np.ndarray) -> bool:
     """Whether ``m`` is a rotation and a translation, in 3 x 4 or 4 x 4 numbers."""
-    if m.shape not in ((3, 4), (4, 4)) or not np.abs(m).max() <= FARTHEST:
+    if m.shape not in ((3, 4), (4, 4)) or not np.abs(m).max() <= MAX_POSITION:
         return False
     return bool(np.abs(m[:3, :3] @ m[:3, :3].T - np.eye(3)).max() < 1e-3 and np.linalg.det(m[:3, :3]) > 0)
 
@@ -370,7 +370,7 @@ def _rigid(m: np.ndarray) -> bool:
 def _splits(data: dict, frames: list[PosedFrame]) -> tuple[list[str] | None, list[str]]:
     """Held-out and spare frames by nerfstudio's lists of file names."""
     listed = {
-        k: {fold_name(x) for x in data[f"{k}_filenames"] if isinstance(x, str)}
+        k: {normalize_name(x) for x in data[f"{k}_filenames"] if isinstance(x, str)}
         for k in ("train", "val", "test")
         if isinstance(data.get(f"{k}_filenames"), list)
     }
@@ -378,8 +378,8 @@ def _splits(data: dict, frames: list[PosedFrame]) -> tuple[list[str] | None, lis
         return None, []
     test = listed.get("test") or listed.get("val", set())
     train = listed.get("train")
-    held = [f.name for f in frames if fold_name(f.name) in test]
-    spare = [f.name for f in frames if f.name not in held and train is not None and fold_name(f.name) not in train]
+    held = [f.name for f in frames if normalize_name(f.name) in test]
+    spare = [f.name for f in frames if f.name not in held and train is not None and normalize_name(f.name) not in train]
     return held, spare
 
 
@@ -391,6 +391,6 @@ def _aabb(data: dict, path: Path) -> np.ndarray | None:
     except (TypeError, ValueError, OverflowError):
         box = np.zeros(0)
     box = box.reshape(2, 3) if box.size == 6 else box
-    if box.shape != (2, 3) or not np.abs(box).max() <= FARTHEST or not np.all(box[1] > box[0]):
+    if box.shape != (2, 3) or not np.abs(box).max() <= MAX_POSITION or not np.all(box[1] > box[0]):
         raise NergError(f'"aabb" in "{path}" must be two corners of 3 numbers, the second above the first')
     return box

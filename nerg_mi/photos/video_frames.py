@@ -13,10 +13,10 @@ import numpy as np
 
 from nerg_mi.errors import NergError, import_extra
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.safe_read import reading, size_of
-from nerg_mi.files.video import check_movie
+from nerg_mi.files.safe_read import translate_read_errors, check_regular_file
+from nerg_mi.files.video import check_video_tables
 
-from .structure import SIDE, SUFFIXES, Folders, PhotoCopy, encoded, shrunk, small_name, small_size
+from .structure import MAX_SIDE, PHOTO_SUFFIXES, PhotoFolders, PhotoCopy, encode_image, encode_small_image, small_file_name, fit_size
 
 FORMATS = ("mov", "matroska", "avi", "mpegts", "mpeg", "asf")
 """Kinds of files, as FFmpeg calls them, that are taken for videos: of .mp4 and .mov; .mkv and .webm; .avi; .mts; .mpg;
@@ -28,10 +28,10 @@ CODECS = (
 ).split()
 """Decoders, as FFmpeg calls them, that may run: those of cameras, phones and converters, of its three hundred."""
 
-BYTES = 16 << 30
+MAX_BYTES = 16 << 30
 """A file may have so many bytes: FFmpeg looks through all of those that it does not understand."""
 
-PIXELS = 8192 * 4320
+MAX_PIXELS = 8192 * 4320
 """A frame may have so many: no camera films more, and a decoder holds many frames at a time."""
 
 # Sharpness is compared at this width: finer, it would be the noise of dark places. And at so many times it in height.
@@ -50,7 +50,7 @@ class SharpFrame(NamedTuple):
     pixels: np.ndarray
 
 
-def sharpness(gray: np.ndarray) -> float:
+def compute_sharpness(gray: np.ndarray) -> float:
     """Variance of the Laplacian of a picture (h, w): blur takes away what varies from pixel to pixel."""
     g = np.asarray(gray, np.float32)
     inner = g[1:-1, 1:-1]
@@ -60,10 +60,10 @@ def sharpness(gray: np.ndarray) -> float:
 def copy_frames(
     video: str | Path,
     count: int,
-    folders: Folders,
-    longest: int,
+    folders: PhotoFolders,
+    max_side: int,
     threads: int | None,
-    progress: Callable[[int, int], None],
+    on_progress: Callable[[int, int], None],
 ) -> list[PhotoCopy]:
     """Copy ``count`` frames of a video, at most, to ``folders``: as JPEG at quality 95, turned as it is to be shown.
 
@@ -74,20 +74,20 @@ def copy_frames(
     from PIL import Image
 
     pictures: list[PhotoCopy] = []
-    for frame in sharpest_frames(video, count, threads):
+    for frame in select_sharpest_frames(video, count, threads):
         image = Image.fromarray(frame.pixels)
         name = f"frame_{frame.number:06d}.jpg"
-        write_bytes(folders.images / name, encoded(image, ".jpg"))
-        small = small_size(image.size, longest)
-        write_bytes(folders.small / small_name(len(pictures)), shrunk(image, small))
+        write_bytes(folders.images / name, encode_image(image, ".jpg"))
+        small = fit_size(image.size, max_side)
+        write_bytes(folders.small_images / small_file_name(len(pictures)), encode_small_image(image, small))
         pictures.append(PhotoCopy(name, image.size, small, seconds=frame.seconds))
-        progress(len(pictures), count)
+        on_progress(len(pictures), count)
     return pictures
 
 
-def sharpest_frames(video: str | Path, count: int, threads: int | None = None) -> Iterator[SharpFrame]:
+def select_sharpest_frames(video: str | Path, count: int, threads: int | None = None) -> Iterator[SharpFrame]:
     """The sharpest frame in each of ``count`` equally long stretches; a stretch without a frame has none."""
-    if Path(video).suffix.lower() in SUFFIXES:
+    if Path(video).suffix.lower() in PHOTO_SUFFIXES:
         raise NergError(f'"{video}" is a single photo; name the folder that holds it and others of the same place')
     ticks, tick = _frame_ticks(video)
     begin, span = int(ticks[0]), int(ticks[-1] - ticks[0])
@@ -107,12 +107,12 @@ def sharpest_frames(video: str | Path, count: int, threads: int | None = None) -
                 best = None
             stretch = max(stretch, at)
             with _reading(video):
-                score = sharpness(_gray(frame))
+                score = compute_sharpness(_gray(frame))
             if best is None or score > best[0]:
                 best = score, frame
         if best is None:
             raise NergError(
-                f'the video "{video}" has no frame that can be decoded, of {PIXELS:,} pixels at most; convert it to '
+                f'the video "{video}" has no frame that can be decoded, of {MAX_PIXELS:,} pixels at most; convert it to '
                 "H.264, or copy it again"
             )
         yield as_shown(best[1])
@@ -126,7 +126,7 @@ def _pyav() -> Any:
 def _reading(video: str | Path) -> Iterator[None]:
     """A block in which FFmpeg reads ``video``: what it says, as one sentence, without its number of the error."""
     av = _pyav()
-    with reading(video, "video", _REMEDY):
+    with translate_read_errors(video, "video", _REMEDY):
         try:
             yield
         except av.FFmpegError as error:
@@ -163,13 +163,13 @@ def _opened(video: str | Path) -> Iterator[tuple[Any, Any]]:
 
     FFmpeg is given the open file, since it takes names such as "12:30.mp4" for addresses; it may open nothing else.
     """
-    size_of(video, "video", BYTES)
+    check_regular_file(video, "video", MAX_BYTES)
     av = _pyav()
     with _reading(video):
-        check_movie(video)
+        check_video_tables(video)
         file = open(video, "rb")
     with file:
-        limits = {"max_pixels": str(PIXELS), "codec_whitelist": ",".join(CODECS)}
+        limits = {"max_pixels": str(MAX_PIXELS), "codec_whitelist": ",".join(CODECS)}
         with _reading(video):
             container = av.open(
                 _Source(file),
@@ -192,10 +192,10 @@ def _opened(video: str | Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _check_size(video: str | Path, width: int, height: int) -> None:
-    if width * height > PIXELS or max(width, height) > SIDE:
+    if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
         raise NergError(
-            f'the video "{video}" has {width:,} x {height:,} pixels, and at most {PIXELS:,} are read, a side of at '
-            f"most {SIDE:,}; make it smaller"
+            f'the video "{video}" has {width:,} x {height:,} pixels, and at most {MAX_PIXELS:,} are read, a side of at '
+            f"most {MAX_SIDE:,}; make it smaller"
         )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths import vmf
-from nerg_mi.maths.arrays import vector_of
+from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.maths.vmf import log_normaliser
 
@@ -26,20 +26,20 @@ from nerg_mi.maths.vmf import log_normaliser
 # ray is best predicted by the others. Each for every probe, or one for all of them.
 
 KAPPA_MIN = 1.0
-PROBES = 256  # probes that speak for all where one κ is sought
+SHARED_KAPPA_PROBES = 256  # probes that speak for all where one κ is sought
 
 
-def kappa_grid(kappa_max: float, kappa_min: float = KAPPA_MIN) -> np.ndarray:
+def make_kappa_grid(kappa_max: float, kappa_min: float = KAPPA_MIN) -> np.ndarray:
     """Concentrations that ``loo`` chooses from: geometric, 25 % steps."""
     return np.geomspace(kappa_min, kappa_max, max(2, 1 + round(np.log(kappa_max / kappa_min) / np.log(1.25))))
 
 
-def leave_one_out_scores(
+def compute_loo_scores(
     directions: np.ndarray,
     groups: np.ndarray | None,
     grid: np.ndarray,
     *,
-    most: int = 256,
+    max_rays: int = 256,
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
     """Mean log-likelihood a ray at each κ of ``grid`` (K,), natural, of 1/sr: Σ_i log mean_j f(x_i; x_j, κ) / n.
@@ -49,8 +49,8 @@ def leave_one_out_scores(
     ``directions`` (n, 3) unit, at least two; of more than ``most`` a random choice is used.
     """
     rng = rng or np.random.default_rng(0)
-    if len(directions) > most:
-        chosen = rng.choice(len(directions), most, replace=False)
+    if len(directions) > max_rays:
+        chosen = rng.choice(len(directions), max_rays, replace=False)
         directions, groups = directions[chosen], None if groups is None else np.asarray(groups)[chosen]
     if groups is None or len(np.unique(groups)) < 2:
         groups = np.arange(len(directions))
@@ -65,22 +65,22 @@ def leave_one_out_scores(
     return (np.log(sums) - np.multiply.outer(grid, nearest[:, 0]) - log_count).mean(axis=1) + vmf.log_normaliser(grid)
 
 
-def leave_one_out_kappa(
+def select_loo_kappa(
     directions: np.ndarray,
     groups: np.ndarray | None = None,
     *,
     kappa_max: float = 1000.0,
-    most: int = 256,
+    max_rays: int = 256,
     rng: np.random.Generator | None = None,
 ) -> float:
     """κ between 1 and ``kappa_max`` under which rays are best predicted by the others; 1 for a ray alone."""
     if len(directions) < 2:
         return KAPPA_MIN
-    grid = kappa_grid(kappa_max)
-    return float(grid[int(np.argmax(leave_one_out_scores(directions, groups, grid, most=most, rng=rng)))])
+    grid = make_kappa_grid(kappa_max)
+    return float(grid[int(np.argmax(compute_loo_scores(directions, groups, grid, max_rays=max_rays, rng=rng)))])
 
 
-def loo_kappas(
+def select_loo_kappas(
     directions: np.ndarray,
     persons: np.ndarray,
     offsets: np.ndarray,
@@ -92,16 +92,16 @@ def loo_kappas(
     which the rays of 256 probes (at random) are best predicted together."""
     runs = [slice(a, b) for a, b in zip(offsets[:-1], offsets[1:])]
     if not shared:
-        return np.array([leave_one_out_kappa(directions[r], persons[r], kappa_max=kappa_max, rng=rng) for r in runs])
-    grid, total = kappa_grid(kappa_max), 0.0
-    for p in rng.permutation(len(runs))[:PROBES]:
+        return np.array([select_loo_kappa(directions[r], persons[r], kappa_max=kappa_max, rng=rng) for r in runs])
+    grid, total = make_kappa_grid(kappa_max), 0.0
+    for p in rng.permutation(len(runs))[:SHARED_KAPPA_PROBES]:
         if runs[p].stop - runs[p].start > 1:
-            total = total + leave_one_out_scores(directions[runs[p]], persons[runs[p]], grid, rng=rng)
+            total = total + compute_loo_scores(directions[runs[p]], persons[runs[p]], grid, rng=rng)
     best = grid[int(np.argmax(total))] if np.ndim(total) else KAPPA_MIN
     return np.full(len(runs), float(best))
 
 
-def silverman_kappas(
+def compute_silverman_kappas(
     directions: np.ndarray, weights: np.ndarray | None, offsets: np.ndarray, kappa_max: float, shared: bool
 ) -> np.ndarray:
     """κ (P,) by the published code's rule, at most ``kappa_max``; with ``weights`` (n,) from the weighted mean
@@ -123,10 +123,10 @@ Backend = str | ModuleType | dr.ArrayBase | None
 """Where a density is evaluated: a name such as ``"llvm"``, a namespace of Dr.Jit's arrays, an array, or None for that
 of Mitsuba's variant (:func:`default_backend`)."""
 
-GROUP = 16  # Directions that a lane of `SphericalKde.evaluate` takes at once
+DIRECTIONS_PER_LANE = 16  # Directions that a lane of `SphericalKde.evaluate` takes at once
 
 
-def default_backend() -> str:
+def get_default_backend() -> str:
     """``"cuda"`` where Mitsuba was switched to a CUDA variant, else ``"llvm"``."""
     mitsuba = sys.modules.get("mitsuba")
     variant = (mitsuba.variant() if mitsuba is not None else None) or ""
@@ -178,7 +178,7 @@ class SphericalKde:
             share = weights / np.repeat(total, counts)
 
         self.count = len(counts)
-        self.ns: ModuleType = backend if isinstance(backend, ModuleType) else namespace(backend or default_backend())
+        self.ns: ModuleType = backend if isinstance(backend, ModuleType) else namespace(backend or get_default_backend())
         # One packet of four floats a ray: direction and weight come in one gather.
         packed = np.concatenate([rays, share[:, None]], axis=1).astype(np.float32)
         self._rays = self.ns.Float(packed.ravel())
@@ -191,7 +191,7 @@ class SphericalKde:
         """Concentrations of the kernels, (P,) float32."""
         return np.array(self._kappa)
 
-    def part(self, first: int, last: int) -> SphericalKde:
+    def select_range(self, first: int, last: int) -> SphericalKde:
         """The densities of probes ``first`` to ``last`` - 1 as an object of their own."""
         if (first, last) == (0, self.count):
             return self
@@ -237,7 +237,7 @@ class SphericalKde:
         # A lane takes several directions of one probe, so that a ray is fetched once for all of them: four times as
         # fast.
         D = directions.shape[-2]
-        G = min(GROUP, D)
+        G = min(DIRECTIONS_PER_LANE, D)
         groups = -(-D // G)
         ns = self.ns
         lane = dr.arange(ns.UInt32, self.count * groups)
@@ -274,7 +274,7 @@ class SphericalKde:
 # spacing is a fraction of that, and in between by cubic interpolation: a lookup costs sixteen values, however many rays
 # the probe holds.
 
-SPACING = 0.15
+TEXEL_SPACING = 0.15
 """Texels' distance in units of 1/sqrt(κ). The error of the cubic interpolation goes with its fourth power; at 0.15 it
 is below 1e-4 of the highest density that the kernel of one ray reaches (measured in the tests)."""
 _PAD = 2  # texels that a face has beyond its edge, so that the interpolation never crosses from one face to another
@@ -290,43 +290,43 @@ class SphericalKdeTable:
     """
 
     def __init__(
-        self, kde: SphericalKde, probe: int = 0, used: np.ndarray | None = None, spacing: float = SPACING
+        self, kde: SphericalKde, probe: int = 0, directions: np.ndarray | None = None, spacing: float = TEXEL_SPACING
     ) -> None:
         self.ns = ns = kde.ns
         kappa = float(kde.kappa[probe])
-        self.n = n = _texels(kappa, spacing)
+        self.resolution = n = _texels(kappa, spacing)
         if n > _MOST:
             raise ValueError(
                 f"κ = {kappa:.3g} needs {6 * n * n:,} texels; evaluate the density directly (SphericalKde.evaluate)"
             )
-        self.width = n + 2 * _PAD
-        wanted = np.ones((6, self.width, self.width), bool) if used is None else self._touched(used)
+        self.padded_resolution = n + 2 * _PAD
+        wanted = np.ones((6, self.padded_resolution, self.padded_resolution), bool) if directions is None else self._touched(directions)
         at = np.flatnonzero(wanted.ravel())
-        face, row = np.divmod(at, self.width * self.width)
-        j, i = np.divmod(row, self.width)
+        face, row = np.divmod(at, self.padded_resolution * self.padded_resolution)
+        j, i = np.divmod(row, self.padded_resolution)
         angle = lambda k: np.tan(0.25 * math.pi * ((k - _PAD + 0.5) * 2.0 / n - 1.0))
         values = np.zeros(wanted.size, np.float32)
-        values[at] = kde.part(probe, probe + 1).evaluate(_from_face(face, angle(i), angle(j)))[0]
-        self.evaluated = len(at)
+        values[at] = kde.select_range(probe, probe + 1).evaluate(_from_face(face, angle(i), angle(j)))[0]
+        self.num_evaluated = len(at)
         self._values = ns.Float(values)
 
     @staticmethod
-    def fits(kde: SphericalKde, count: int) -> bool:
+    def is_worthwhile(kde: SphericalKde, count: int) -> bool:
         """Whether a table of the first probe has texels no denser than ``count`` directions over the sphere."""
-        n = _texels(float(kde.kappa[0]), SPACING)
+        n = _texels(float(kde.kappa[0]), TEXEL_SPACING)
         return n <= _MOST and 6 * n * n <= 16 * count
 
     def _touched(self, directions: np.ndarray) -> np.ndarray:
         """Texels (6, width, width) that lookups in ``directions`` read."""
         ns = self.ns
-        hit = dr.zeros(ns.UInt32, 6 * self.width * self.width)
-        first = self._cell(vector_of(ns.Array3f, directions.reshape(-1, 3)))[0]
+        hit = dr.zeros(ns.UInt32, 6 * self.padded_resolution * self.padded_resolution)
+        first = self._cell(to_vector(ns.Array3f, directions.reshape(-1, 3)))[0]
         dr.scatter(hit, ns.UInt32(1), first)
-        corner = np.array(hit).reshape(6, self.width, self.width) > 0
+        corner = np.array(hit).reshape(6, self.padded_resolution, self.padded_resolution) > 0
         out = corner.copy()
         for dj in range(4):
             for di in range(4):
-                out[:, dj:, di:] |= corner[:, : self.width - dj, : self.width - di]
+                out[:, dj:, di:] |= corner[:, : self.padded_resolution - dj, : self.padded_resolution - di]
         return out
 
     def _cell(self, d: Array3f) -> tuple[UInt32, list[Float]]:
@@ -339,10 +339,10 @@ class SphericalKdeTable:
         face += dr.select(major < 0, ns.UInt32(1), ns.UInt32(0))
         u = dr.select(on_x, d.y, d.x) / dr.abs(major)
         v = dr.select(on_x | on_y, d.z, d.y) / dr.abs(major)
-        place = [dr.fma(dr.atan(w), 2.0 / math.pi, 0.5) * self.n + (_PAD - 0.5) for w in (u, v)]
-        whole = [dr.clip(dr.floor(p), 1, self.width - 3) for p in place]
+        place = [dr.fma(dr.atan(w), 2.0 / math.pi, 0.5) * self.resolution + (_PAD - 0.5) for w in (u, v)]
+        whole = [dr.clip(dr.floor(p), 1, self.padded_resolution - 3) for p in place]
         i, j = (ns.UInt32(w) - 1 for w in whole)
-        return (face * self.width + j) * self.width + i, [p - w for p, w in zip(place, whole)]
+        return (face * self.padded_resolution + j) * self.padded_resolution + i, [p - w for p, w in zip(place, whole)]
 
     def density(self, direction: Array3f) -> Float:
         """Density in ``direction`` (unit), in 1/sr: traced, not evaluated, differentiable."""
@@ -352,13 +352,13 @@ class SphericalKdeTable:
         for j in range(4):
             row = 0
             for i in range(4):
-                row = dr.fma(dr.gather(self.ns.Float, self._values, first + (j * self.width + i)), ws[i], row)
+                row = dr.fma(dr.gather(self.ns.Float, self._values, first + (j * self.padded_resolution + i)), ws[i], row)
             total = dr.fma(row, wt[j], total)
         return dr.maximum(total, 0)  # Interpolation may fall below zero by the size of its error
 
     def evaluate(self, directions: np.ndarray) -> np.ndarray:
         """Densities (N,) float32 in ``directions`` (N, 3), 1/sr."""
-        d = vector_of(self.ns.Array3f, directions)
+        d = to_vector(self.ns.Array3f, directions)
         return np.array(self.density(d))
 
 

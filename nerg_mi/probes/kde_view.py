@@ -8,7 +8,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import Basis
+from nerg_mi.fields.gaze_base import DataSummary
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Float, Point3f, Vector3f
 from nerg_mi.rays.rays import RayIndex, Rays
@@ -23,10 +23,10 @@ from .probes import Probes, place_probes
 # What the paper shows beside its field (Section 5.3), there in five seconds a frame and more.
 
 METHODS = ("auto", "exact", "table")
-WORTH = 4096  # directions from which on a table is quicker
+MIN_TABLE_DIRECTIONS = 4096  # directions from which on a table is quicker
 
 
-def probe_at(
+def make_probe_at(
     rays: Rays, observer: np.ndarray, radius: float = 0.25, *, index: RayIndex | None = None, **options: Any
 ) -> Probes:
     """The one probe of an observer at ``observer`` (3,), in metres in the rays' frame; ``options`` as for
@@ -35,7 +35,7 @@ def probe_at(
     return place_probes(rays, radius, queries=np.asarray(observer).reshape(1, 3), index=index, **options)
 
 
-def directions_to(observer: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compute_directions(observer: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit directions r_o (N, 3) float32 from ``observer`` (3,) to ``points`` (..., 3), such as the AOV ``position``,
     and the mask (...) of points that have one: finite and not the observer's own place. Others get +z."""
     points = np.asarray(points)
@@ -46,7 +46,7 @@ def directions_to(observer: np.ndarray, points: np.ndarray) -> tuple[np.ndarray,
     return offset / length[:, None], there.reshape(points.shape[:-1])
 
 
-def kde_frame(
+def evaluate_kde_frame(
     probe: Probes | SphericalKde,
     directions: np.ndarray | None = None,
     *,
@@ -63,7 +63,7 @@ def kde_frame(
 
     ``method``: ``exact`` sums all rays at all pixels in one kernel; ``table`` does so on the part of the sphere that is
     seen, at a spacing that resolves the kernels, and interpolates (:mod:`nerg_mi.probes.kde`: within 1e-4 of the
-    highest density of one ray's kernel); ``auto`` tabulates from 4,096 pixels on. Run times: docs/rays.md. Raises
+    highest density of one ray's kernel); ``auto`` tabulates from 4,096 pixels on. Run times: docs/explanation/performance.md. Raises
     `NergError` for another word, ``ValueError`` where it is not given where the pixels look, or more than one density.
     """
     if method not in METHODS:
@@ -71,7 +71,7 @@ def kde_frame(
     there = None
     if directions is None and points is not None and observer is not None:
         shape = np.shape(points)[:-1]
-        directions, there = directions_to(observer, points)
+        directions, there = compute_directions(observer, points)
     elif directions is None or points is not None:
         raise ValueError("say where the pixels look: either directions, or an observer and points")
     else:
@@ -82,9 +82,9 @@ def kde_frame(
     if kde.count != 1:
         raise ValueError(f"a picture has one observer and needs one probe, got {kde.count}")
     table = method == "table" or (
-        method == "auto" and len(directions) >= WORTH and SphericalKdeTable.fits(kde, len(directions))
+        method == "auto" and len(directions) >= MIN_TABLE_DIRECTIONS and SphericalKdeTable.is_worthwhile(kde, len(directions))
     )
-    density = SphericalKdeTable(kde, used=directions).evaluate(directions) if table else kde.evaluate(directions)[0]
+    density = SphericalKdeTable(kde, directions=directions).evaluate(directions) if table else kde.evaluate(directions)[0]
     density = density.reshape(shape)
     for shown in (there, mask):
         if shown is not None:
@@ -109,7 +109,7 @@ class KdeView:
     there are no rays.
     """
 
-    occluded = True
+    is_occluded = True
 
     def __init__(
         self,
@@ -123,20 +123,20 @@ class KdeView:
             raise NergError("there are no rays to show the density of; give a file that has some")
         self.to_world, self.backend = to_world or Similarity(), backend
         self.count, self.kappa = min(count, len(rays)), kappa
-        self.basis = Basis(len(rays), len(np.unique(rays.person)))
+        self.basis = DataSummary(len(rays), len(np.unique(rays.person)))
         self._origin, self._direction = rays.origin, rays.direction
 
-    def nearest(self, p: np.ndarray) -> np.ndarray:
+    def find_nearest(self, p: np.ndarray) -> np.ndarray:
         """Directions (count, 3) of the rays that started nearest to ``p`` (3,), in metres in the rays' frame."""
         square = ((self._origin - p) ** 2).sum(axis=1)
         if self.count == len(square):
             return self._direction
         return self._direction[np.argpartition(square, self.count - 1)[: self.count]]
 
-    def at(self, p_o: Point3f) -> ObservedKde:
+    def for_position(self, p_o: Point3f) -> ObservedKde:
         """The density of the observer at ``p_o`` (in the scene, one lane)."""
         p = np.array(self.to_world.point_to_local(p_o), np.float64).ravel()
-        rays = self.nearest(p)
+        rays = self.find_nearest(p)
         kde = SphericalKde(rays, np.array([0, len(rays)]), self.kappa, backend=self.backend)
         return ObservedKde(kde, self.to_world)
 
@@ -151,14 +151,14 @@ class ObservedKde:
         self.kde, self.to_world = kde, to_world
         self.table: SphericalKdeTable | None = None  # Made when it first pays
 
-    def value(self, r_o: Vector3f) -> Float:
+    def evaluate(self, r_o: Vector3f) -> Float:
         """Density (1/sr) in unit scene directions ``r_o``, without derivatives."""
         d = self.to_world.direction_to_local(dr.detach(r_o))
         ns, lanes = self.kde.ns, dr.width(d)
         d = ns.Array3f(d.x, d.y, d.z)
         with dr.suspend_grad():
             # All of a table is made, whatever is seen of it; a texel costs a fifth of a lane.
-            if lanes < WORTH or not SphericalKdeTable.fits(self.kde, lanes // 4):
+            if lanes < MIN_TABLE_DIRECTIONS or not SphericalKdeTable.is_worthwhile(self.kde, lanes // 4):
                 return self.kde.density(dr.zeros(ns.UInt32, lanes), d)
             if self.table is None:
                 self.table = SphericalKdeTable(self.kde)

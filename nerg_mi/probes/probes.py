@@ -12,7 +12,7 @@ from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Neighbours, RayIndex, Rays
 
-from .kde import Backend, SphericalKde, loo_kappas, silverman_kappas
+from .kde import Backend, SphericalKde, select_loo_kappas, compute_silverman_kappas
 
 # ---- Where probes stand: on a lattice, at random, where people were, or there and evenly (blue noise) ----
 
@@ -117,11 +117,11 @@ class Probes:
         unit. Each integrates to one over the sphere."""
         return self.kde(backend).evaluate(directions)
 
-    def widened(self, kappa: float) -> Probes:
+    def widen(self, kappa: float) -> Probes:
         """The probes seen through a von Mises-Fisher law of ``kappa`` about each ray: where eyes look, of rays that say
         where heads point (κ about 37 was measured on people in a shop). See
-        :func:`nerg_mi.maths.vmf.convolved_kappa`."""
-        return replace(self, kappa=vmf.convolved_kappa(self.kappa, kappa))
+        :func:`nerg_mi.maths.vmf.convolve_kappa`."""
+        return replace(self, kappa=vmf.convolve_kappa(self.kappa, kappa))
 
 
 def place_probes(
@@ -132,13 +132,13 @@ def place_probes(
     count: int = 4096,
     queries: np.ndarray | None = None,
     spacing: float | None = None,
-    cap: int = 1024,
+    max_rays: int = 1024,
     min_rays: int = 64,
     kappa_rule: str = "silverman",
     kappa: float = 20.0,
     kappa_max: float = 1000.0,
     kappa_shared: bool = False,
-    widen: float | None = None,
+    eye_kappa: float | None = None,
     weights: str = "equal",
     ray_weights: np.ndarray | None = None,
     centre: str = "mean",
@@ -172,8 +172,8 @@ def place_probes(
     _check_one_of("kappa_rule", kappa_rule, KAPPA_RULES)
     _check_one_of("centre", centre, CENTRES)
     _check_one_of("weights", weights, WEIGHTS)
-    if not radius > 0 or min_rays < 1 or cap < min_rays:
-        raise NergError(f"radius {radius}, min_rays {min_rays}, cap {cap}: need radius > 0 and 1 <= min_rays <= cap")
+    if not radius > 0 or min_rays < 1 or max_rays < min_rays:
+        raise NergError(f"radius {radius}, min_rays {min_rays}, cap {max_rays}: need radius > 0 and 1 <= min_rays <= cap")
     rng = np.random.default_rng(seed)
     counted = None
     if ray_weights is not None:
@@ -186,7 +186,7 @@ def place_probes(
         queries = place_queries(rays.origin, placement, count, spacing, radius, rng)
     queries = np.asarray(queries, dtype=np.float64).reshape(-1, 3)
 
-    near = (index or RayIndex(rays)).nearest(queries, cap, radius)
+    near = (index or RayIndex(rays)).query(queries, max_rays, radius)
     enough = np.diff(near.offsets) >= min_rays
     if not enough.any():
         raise NergError(
@@ -200,17 +200,17 @@ def place_probes(
     if kappa_rule == "fixed":
         kappas = np.full(len(queries), float(kappa))
     elif kappa_rule == "silverman":
-        kappas = silverman_kappas(directions, w, offsets, kappa_max, kappa_shared)
+        kappas = compute_silverman_kappas(directions, w, offsets, kappa_max, kappa_shared)
     else:
-        kappas = loo_kappas(directions, persons, offsets, kappa_max, kappa_shared, rng)
+        kappas = select_loo_kappas(directions, persons, offsets, kappa_max, kappa_shared, rng)
     positions = _weighted_means(rays.origin[indices], w, offsets) if centre == "mean" else queries
     if counted is not None:
         indices = counted[indices]
     probes = Probes(positions, queries, float(radius), indices, offsets, directions, kappas, w)
-    return probes if widen is None else probes.widened(widen)
+    return probes if eye_kappa is None else probes.widen(eye_kappa)
 
 
-def person_weights(rays: Rays) -> np.ndarray:
+def compute_participant_weights(rays: Rays) -> np.ndarray:
     """Weights (N,) under which every person counts as much, whatever the number of their rays; their mean is one."""
     counts = np.bincount(rays.person)
     return len(rays) / np.count_nonzero(counts) / counts[rays.person]
@@ -266,12 +266,12 @@ def _weighted_means(values: np.ndarray, weights: np.ndarray | None, offsets: np.
 _LEAST, _MOST = 2048, 1 << 17
 
 
-def resolving_count(kappa: float) -> int:
+def count_resolving_directions(kappa: float) -> int:
     """Directions of equal area that resolve kernels of ``kappa``: four in a width 1/sqrt(κ), 2,048 to 131,072."""
     return int(np.clip(np.ceil(4.0 * np.pi * 16.0 * kappa), _LEAST, _MOST))
 
 
-def integral(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
+def compute_integral(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
     """∫ p over the sphere by quadrature with ``count`` directions, (P,): one, as far as they resolve the kernels.
 
     ``count``: None for as many as `resolving_count` of the sharpest kernel.
@@ -279,12 +279,12 @@ def integral(probes: Probes, count: int | None = None, backend: Backend = None) 
     return _average(probes, count, backend, lambda p: p)
 
 
-def entropy(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
+def compute_entropy(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
     """Differential entropy -∫ p log p, (P,), natural, by quadrature; at most log 4π = 2.53, of the uniform one."""
     return -_average(probes, count, backend, lambda p: p * np.log(np.where(p > 0, p, 1.0)))
 
 
-def effective_persons(probes: Probes, rays: Rays) -> np.ndarray:
+def count_effective_participants(probes: Probes, rays: Rays) -> np.ndarray:
     """People who count, (P,): the same of the people's summed weights.
 
     Successive rays of one person say the same over and over, so this, and not the rays, is what a probe's certainty
@@ -299,7 +299,7 @@ def effective_persons(probes: Probes, rays: Rays) -> np.ndarray:
     return out
 
 
-def sample(probes: Probes, count: int, rng: np.random.Generator) -> np.ndarray:
+def sample_directions(probes: Probes, count: int, rng: np.random.Generator) -> np.ndarray:
     """``count`` independent directions from each probe's density, (P, count, 3): a ray by weight, then its kernel."""
     w = np.ones(len(probes.indices)) if probes.weights is None else probes.weights
     up_to = np.concatenate([[0.0], np.cumsum(w)])
@@ -312,11 +312,11 @@ def sample(probes: Probes, count: int, rng: np.random.Generator) -> np.ndarray:
 
 def _average(probes: Probes, count: int | None, backend: Backend, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """4π times the mean of a function of the density over directions of equal area, in blocks of probes."""
-    x = fibonacci_directions(count or resolving_count(float(probes.kappa.max())))
+    x = fibonacci_directions(count or count_resolving_directions(float(probes.kappa.max())))
     kde = probes.kde(backend)
     out, step = np.empty(len(probes)), max(1, (1 << 24) // len(x))
     for start in range(0, len(probes), step):
-        density = kde.part(start, min(start + step, len(probes))).evaluate(x)
+        density = kde.select_range(start, min(start + step, len(probes))).evaluate(x)
         out[start : start + step] = 4.0 * np.pi * of(density.astype(np.float64)).mean(axis=1)
     return out
 
@@ -330,19 +330,19 @@ def _average(probes: Probes, count: int | None, backend: Backend, of: Callable[[
 # the quantile of the shares in which they lie (split conformal prediction, Vovk et al. 2005, with highest-density
 # regions, Izbicki et al. 2022).
 
-LEVELS = (0.5, 0.8, 0.95)  # Shares of the gaze whose smallest regions are looked at
+REGION_LEVELS = (0.5, 0.8, 0.95)  # Shares of the gaze whose smallest regions are looked at
 
 
-def level_name(level: float) -> str:
+def format_level(level: float) -> str:
     """What a share of the gaze is called in tables and files."""
     return f"{level:.0%}"
 
 
-def region_levels(maps: np.ndarray, at: np.ndarray) -> np.ndarray:
+def compute_region_levels(maps: np.ndarray, sample_densities: np.ndarray) -> np.ndarray:
     """Share of the gaze (P, K) in the smallest region that a ray lies in, of densities ``maps`` (P, D) in directions of
     equal area that are ``at`` (P, K) at the rays: what is denser, and half of what is equal (Hyndman 1996)."""
     out = []
-    for row, values in zip(np.maximum(maps, 0).astype(np.float64), at):
+    for row, values in zip(np.maximum(maps, 0).astype(np.float64), sample_densities):
         ordered = np.sort(row)
         mass = np.concatenate([[0.0], np.cumsum(ordered)])
         lower, upper = (mass[np.searchsorted(ordered, values, side)] for side in ("left", "right"))
@@ -350,15 +350,15 @@ def region_levels(maps: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def calibrated_levels(levels: np.ndarray, weights: np.ndarray) -> dict[str, float]:
+def calibrate_levels(levels: np.ndarray, weights: np.ndarray) -> dict[str, float]:
     """By `level_name`, the share to ask for so that the region holds each of `LEVELS` of the looks that were held out:
     weighted quantiles of the shares ``levels`` (n,) of `region_levels` in which they lie, ``weights`` (n,)."""
     order = np.argsort(levels)
     held = np.cumsum(weights[order]) / weights.sum()
     at = lambda level: order[min(np.searchsorted(held, level), len(order) - 1)]
-    return {level_name(level): float(levels[at(level)]) for level in LEVELS}
+    return {format_level(level): float(levels[at(level)]) for level in REGION_LEVELS}
 
 
-def asked_level(level: float, calibrated: Mapping[str, float] | None) -> float:
+def get_calibrated_level(level: float, calibrated: Mapping[str, float] | None) -> float:
     """The share to ask for so that a region holds ``level``, one of `LEVELS`: itself where nothing was calibrated."""
-    return level if calibrated is None else calibrated[level_name(level)]
+    return level if calibrated is None else calibrated[format_level(level)]

@@ -22,9 +22,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f, variant_types
-from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.observer import ObserverSettings, distance_and_direction
-from nerg_mi.transport.occlusion import trace_sight
+from nerg_mi.transport.occlusion import trace_from_observer
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -43,12 +43,12 @@ class Patches:
     n: Vector3f  # unit normals
     area: Float  # square scene units
 
-    def moved(self, offset: Vector3f) -> Patches:
+    def translate(self, offset: Vector3f) -> Patches:
         """The same pieces, shifted by ``offset``."""
         return Patches(self.p + offset, self.n, self.area)
 
 
-def patches(mesh: mi.Mesh, divisions: int = 4) -> Patches:
+def make_patches(mesh: mi.Mesh, divisions: int = 4) -> Patches:
     """A Mitsuba mesh, each triangle cut into ``divisions``² congruent ones: the centroid rule, of second order.
 
     Normals are the faces' own, to the side that sees the vertices counter-clockwise. Attached to the
@@ -83,8 +83,8 @@ def _centroids(n: int) -> np.ndarray:
     return np.array(upright + turned, np.float32) / n
 
 
-def attended(
-    place: Place | None,
+def attention_per_sr(
+    scene: SceneGeometry | None,
     density: Density,
     p_o: Point3f,
     p: Point3f,
@@ -104,11 +104,11 @@ def attended(
     n = dr.select(two_sided & (cosine < 0), -n, n)
     active = ((cosine != 0) if two_sided else (cosine > 0)) & (distance > 0)
     p_od, seen = p, mi.Float(1)
-    if place is not None:
-        settings = settings or ObserverSettings(march=default_settings(place))
+    if scene is not None:
+        settings = settings or ObserverSettings(march=default_march_settings(scene))
         # Looked for a tolerance above the surface, as if a camera stood there.
         ray = mi.Ray3f(p + n, -n)
-        found = trace_sight(place, ray, p, p_o, penetration, active, mi.Float(falloff), settings, whole=False)
+        found = trace_from_observer(scene, ray, p, p_o, penetration, active, mi.Float(falloff), settings, needs_depth=False)
         p_od, seen = found.p_od, found.visibility
         active &= seen > 0
     return dr.select(active, density(p_od, p_o, r_o, active) * seen, 0)
@@ -120,8 +120,8 @@ def _faced(p_o: Point3f, p: Point3f, n: Vector3f) -> tuple[Float, Vector3f, Floa
     return distance, r_o, -dr.dot(n, r_o)
 
 
-def arriving(
-    place: Place | None,
+def attention_per_area(
+    scene: SceneGeometry | None,
     density: Density,
     p_o: Point3f,
     p: Point3f,
@@ -137,7 +137,7 @@ def arriving(
     ``two_sided`` counts both sides of an open one. Lanes are pairs; differentiable in all of them, in the density's
     parameters and in ``falloff``, but not over the edges of ``place``.
     """
-    g = attended(place, density, p_o, p, n, falloff, settings, two_sided)
+    g = attention_per_sr(scene, density, p_o, p, n, falloff, settings, two_sided)
     distance, _, cosine = _faced(p_o, p, n)
     cosine = dr.abs(cosine) if two_sided else cosine
     facing = (cosine > 0) & (distance > 0)
@@ -145,8 +145,8 @@ def arriving(
     return dr.select(facing, g * cosine / square, 0)
 
 
-def contributions(
-    place: Place | None,
+def attention_per_patch(
+    scene: SceneGeometry | None,
     density: Density,
     observers: Point3f,
     surface: Patches,
@@ -166,11 +166,11 @@ def contributions(
     p = dr.gather(mi.Point3f, mi.Point3f(surface.p), where)
     n = dr.gather(mi.Vector3f, mi.Vector3f(surface.n), where)
     area = dr.gather(mi.Float, mi.Float(surface.area), where)
-    return area * arriving(place, density, p_o, p, n, falloff, settings, two_sided)
+    return area * attention_per_area(scene, density, p_o, p, n, falloff, settings, two_sided)
 
 
-def received(
-    place: Place | None,
+def attention_on(
+    scene: SceneGeometry | None,
     density: Density,
     observers: Point3f,
     surface: Patches,
@@ -183,5 +183,5 @@ def received(
     Arguments as of ``arriving``. Makes observers x patches lanes at once. Exact as patches shrink against their
     distance from the observer: at a distance of k patch diameters the error is of the order 1 / k².
     """
-    each = contributions(place, density, observers, surface, falloff, settings, two_sided)
+    each = attention_per_patch(scene, density, observers, surface, falloff, settings, two_sided)
     return dr.block_sum(each, dr.width(each) // dr.width(observers))

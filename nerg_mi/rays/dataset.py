@@ -18,7 +18,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import file_sha256, write_text
-from nerg_mi.files.safe_read import inflated_limit, is_count, read_json, reading, size_of
+from nerg_mi.files.safe_read import compute_inflation_limit, is_count, read_json, translate_read_errors, check_regular_file
 
 from .filters import select_mask
 from .rays import VERSION as RAYS_VERSION
@@ -28,7 +28,7 @@ from .rays import (
     merge_counts,
     merge_metadata,
     merge_rays,
-    pyarrow_modules,
+    import_pyarrow,
     read_metadata,
     sample_rows,
 )
@@ -45,7 +45,7 @@ from .rays import (
 # some times and end after 292 years. Origins, directions, hit points and heads are float32, NaN where they are unknown.
 
 SUFFIX = ".rays"  # How the name of a dataset ends where one is made
-HEAD = "_dataset.json"
+DATASET_MANIFEST = "_dataset.json"
 SOURCES = "_sources"
 UNKNOWN = "unknown"  # The day of a clock that does not tell it, and the place that nobody has named
 PART_ROWS = 1 << 20  # A part has so many rays at most: it is read as a whole
@@ -93,7 +93,7 @@ def split_path(path: str | os.PathLike) -> tuple[Path, dict[str, str]]:
 
 def is_dataset(path: str | os.PathLike) -> bool:
     """Whether ``path`` is a dataset, or a folder of parts in one."""
-    return (split_path(path)[0] / HEAD).is_file()
+    return (split_path(path)[0] / DATASET_MANIFEST).is_file()
 
 
 # ---- The account of a dataset, in JSON: what it is, and what became of each source that was imported ----
@@ -107,7 +107,7 @@ _MOST_BUCKETS = 4096
 
 
 @dataclass(frozen=True)
-class Head:
+class DatasetManifest:
     """What holds for a whole dataset."""
 
     buckets: int
@@ -164,35 +164,35 @@ class Source:
         return sum(part.rays for part in self.parts)
 
 
-def write_head(folder: Path, head: Head) -> None:
+def write_dataset_manifest(folder: Path, head: DatasetManifest) -> None:
     """Write what makes ``folder`` a dataset."""
-    write_text(folder / HEAD, json.dumps({"version": VERSION, **asdict(head)}) + "\n")
+    write_text(folder / DATASET_MANIFEST, json.dumps({"version": VERSION, **asdict(head)}) + "\n")
 
 
-def read_head(folder: Path) -> Head:
+def read_dataset_manifest(folder: Path) -> DatasetManifest:
     """What holds for the dataset ``folder``. Raises `NergError` for a folder that is none."""
-    path = folder / HEAD
+    path = folder / DATASET_MANIFEST
     content = _document(path)
     head: dict[str, Any] = {key: content.get(key) for key in ("buckets", "salt", "closed")}
     _check(path, "buckets", is_count(head["buckets"]) and 0 < head["buckets"] <= _MOST_BUCKETS, "number of buckets")
     _check(path, "salt", head["salt"] is None or isinstance(head["salt"], str), "text")
     _check(path, "closed", isinstance(head["closed"], bool), "yes or no")
-    return Head(**head)
+    return DatasetManifest(**head)
 
 
-def source_path(folder: Path, source: str) -> Path:
+def source_manifest_path(folder: Path, source: str) -> Path:
     """The account of the source with this id."""
     return folder / SOURCES / f"{source}.json"
 
 
 def write_source(folder: Path, source: Source) -> None:
     """Write the account of a source whose parts are there."""
-    write_text(source_path(folder, source.id), json.dumps({"version": VERSION, **asdict(source)}) + "\n")
+    write_text(source_manifest_path(folder, source.id), json.dumps({"version": VERSION, **asdict(source)}) + "\n")
 
 
-def read_sources(folder: Path, head: Head) -> list[Source]:
+def read_sources(folder: Path, head: DatasetManifest) -> list[Source]:
     """The accounts of all sources of a dataset in the order of their ids; of those of one path the latest."""
-    found = [read_source(path, head) for path in sorted((folder / SOURCES).glob("[!.]*.json"))]
+    found = [read_source_manifest(path, head) for path in sorted((folder / SOURCES).glob("[!.]*.json"))]
     latest: dict[str, Source] = {}
     for source in found:
         if source.where not in latest or source.generation > latest[source.where].generation:
@@ -200,7 +200,7 @@ def read_sources(folder: Path, head: Head) -> list[Source]:
     return [source for source in found if latest[source.where] is source]
 
 
-def read_source(path: Path, head: Head) -> Source:
+def read_source_manifest(path: Path, head: DatasetManifest) -> Source:
     """The account ``path`` of a source, checked. Raises `NergError` for one that is damaged."""
     content = _document(path)
     content.pop("version")
@@ -220,7 +220,7 @@ def read_source(path: Path, head: Head) -> Source:
     return Source(**{**content, "parts": parts})
 
 
-def _part(path: Path, content: dict[str, Any], head: Head, persons: dict[str, int]) -> PartFile:
+def _part(path: Path, content: dict[str, Any], head: DatasetManifest, persons: dict[str, int]) -> PartFile:
     if set(content) != {f.name for f in fields(PartFile)}:
         raise _damaged(path, "the keys of a part are not those of one")
     for key, (holds, what) in _PART_KINDS.items():
@@ -252,7 +252,7 @@ def _check(path: Path, key: str, holds: bool, what: str) -> None:
 
 
 def _damaged(path: Path, why: str) -> NergError:
-    remedy = "copy it again" if path.name == HEAD else "copy it again, or remove it and import its source again"
+    remedy = "copy it again" if path.name == DATASET_MANIFEST else "copy it again, or remove it and import its source again"
     return NergError(f'the account "{path}" of a dataset is damaged ({why}); {remedy}')
 
 
@@ -391,17 +391,17 @@ def read_groups(
     the file tells. ``hits``: whether hit points are read. Persons and cohorts of each are those that occur in it.
     Raises `NergError` for a part that is missing, damaged, or not the one of the account.
     """
-    pa, pq = pyarrow_modules()
+    pa, pq = import_pyarrow()
     path = _inside(folder, folder / part.path(source.id))
-    size = size_of(path, _WHAT)
+    size = check_regular_file(path, _WHAT)
     if size != part.bytes:
         raise _foreign(path, f"it has {size:,} bytes, and {part.bytes:,} by the account")
-    with reading(path, _WHAT, "import its source again", also=(pa.ArrowException,)), pq.ParquetFile(path) as file:
+    with translate_read_errors(path, _WHAT, "import its source again", extra_errors=(pa.ArrowException,)), pq.ParquetFile(path) as file:
         about = file.metadata
         if about.num_rows != part.rays:
             raise _foreign(path, f"it has {about.num_rows:,} rays, and {part.rays:,} by the account")
         groups = [about.row_group(k) for k in range(about.num_row_groups)]
-        if sum(group.total_byte_size for group in groups) > inflated_limit(size):
+        if sum(group.total_byte_size for group in groups) > compute_inflation_limit(size):
             raise _foreign(path, f"it claims more than its {size:,} bytes warrant")
         if sum(group.num_rows for group in groups) != part.rays or any(g.num_rows > GROUP_ROWS for g in groups):
             raise _foreign(path, "its row groups are not those that are written here")
@@ -500,8 +500,8 @@ def _codes(pa: Any, column: Any, path: Path) -> tuple[np.ndarray, tuple[str, ...
 
 # ---- A dataset of rays that was written: scanned block by block, loaded as far as it fits, or sampled ----
 
-MOST = 50_000_000  # So many rays are loaded at once, unless another bound is given
-RAY_BYTES = 110  # Memory of a ray that is loaded, roughly
+MAX_LOADED_RAYS = 50_000_000  # So many rays are loaded at once, unless another bound is given
+BYTES_PER_RAY = 110  # Memory of a ray that is loaded, roughly
 
 
 @dataclass(frozen=True, eq=False)
@@ -512,7 +512,7 @@ class RayDataset:
     """
 
     folder: Path
-    head: Head
+    manifest: DatasetManifest
     sources: tuple[Source, ...]  # those that have rays in it, or that gave none at all
     parts: tuple[tuple[Source, PartFile], ...]  # in the order of reading: place, day, bucket, source, number
 
@@ -523,9 +523,9 @@ class RayDataset:
         Raises `NergError` for a folder that is no dataset, whose account is damaged, or which holds no such rays.
         """
         folder, chosen = split_path(path)
-        if not (folder / HEAD).is_file():
+        if not (folder / DATASET_MANIFEST).is_file():
             raise NergError(f"\"{path}\" is no dataset of rays; make one with 'nerg rays import ... -o NAME.rays'")
-        head = read_head(folder)
+        head = read_dataset_manifest(folder)
         sources = read_sources(folder, head)
         parts = [
             (source, part)
@@ -579,13 +579,13 @@ class RayDataset:
         named = "\n".join(f"{source.id} {part.path(source.id)} {part.rays} {part.bytes}" for source, part in self.parts)
         return hashlib.sha256(named.encode()).hexdigest()
 
-    def of_place(self, place: str) -> RayDataset:
+    def select_place(self, place: str) -> RayDataset:
         """Its rays of one place, and the sources that have some there or gave none at all."""
         parts = tuple(found for found in self.parts if found[1].place == place)
         there = {source.id for source, _ in parts}
         return replace(self, parts=parts, sources=tuple(s for s in self.sources if s.id in there or not s.parts))
 
-    def one_place(self) -> RayDataset:
+    def require_single_place(self) -> RayDataset:
         """Itself. Raises `NergError` where it holds several places, each of which has a frame of its own."""
         if len(self.places) > 1:
             raise NergError(
@@ -594,7 +594,7 @@ class RayDataset:
             )
         return self
 
-    def scan(self, conditions: Conditions = EVERYTHING, *, hits: bool = True, whole: bool = False) -> Iterator[Rays]:
+    def scan(self, conditions: Conditions = EVERYTHING, *, hits: bool = True, whole_parts: bool = False) -> Iterator[Rays]:
         """The rays that meet ``conditions``, in blocks of at most `GROUP_ROWS`, or with ``whole`` of a part each: all
         rays of its people of one day and source, in the order of persons and times, unless that has more than a
         million.
@@ -605,7 +605,7 @@ class RayDataset:
         """
         self._check(conditions)
         for source, part in self.parts:
-            if not conditions.may_hold(part, self.head.buckets):
+            if not conditions.may_hold(part, self.manifest.buckets):
                 continue
             wanted = lambda first, n, bounds: conditions.may_hold_group(bounds)
             blocks = (
@@ -613,7 +613,7 @@ class RayDataset:
                 for _, block in read_groups(self.folder, source, part, wanted, hits)
                 if len(kept := conditions.select(block))
             )
-            if whole:
+            if whole_parts:
                 found = list(blocks)
                 blocks = [merge_rays(found)] if found else []
             yield from blocks
@@ -631,10 +631,10 @@ class RayDataset:
                 listed = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
                 raise NergError(f"no {what} is called {', '.join(map(repr, unknown))}; there are {listed}")
 
-    def load(self, conditions: Conditions = EVERYTHING, *, most: int = MOST, hits: bool = True) -> Rays:
+    def load(self, conditions: Conditions = EVERYTHING, *, most: int = MAX_LOADED_RAYS, hits: bool = True) -> Rays:
         """The rays that meet ``conditions``, in memory. Raises `NergError` where they are more than ``most``, as soon
         as that is known, or of several places."""
-        self.one_place()
+        self.require_single_place()
         if not conditions.any and len(self) > most:
             raise self._too_many(f"{len(self):,}", most)
         found, count = [], 0
@@ -647,7 +647,7 @@ class RayDataset:
 
     def _too_many(self, count: str, most: int) -> NergError:
         return NergError(
-            f'"{self.folder}" holds {count} such rays, and {most:,} ({most * RAY_BYTES / 1e9:.2g} GB) are loaded at '
+            f'"{self.folder}" holds {count} such rays, and {most:,} ({most * BYTES_PER_RAY / 1e9:.2g} GB) are loaded at '
             "most: choose some by 'nerg rays filter' (--box, --person, --from, or --sample for some of all), or name a "
             "day of it"
         )
@@ -660,7 +660,7 @@ class RayDataset:
         (see `dataset.sample_rows`). The metadata have a step ``sample``. Equal seeds give equal samples of equal
         datasets. Raises `NergError` as `load` does, but for how many rays there are.
         """
-        self.one_place()
+        self.require_single_place()
         rows = sample_rows(len(self), n, seed, runs)
         blocks, start = [], 0
         for source, part in self.parts:
@@ -687,7 +687,7 @@ def _within(rows: np.ndarray, first: int, count: int) -> np.ndarray:
     return rows[np.searchsorted(rows, first) : np.searchsorted(rows, first + count)]
 
 
-def load_rays(path: str | os.PathLike, most: int | None = None, seed: int = 0) -> Rays:
+def load_rays(path: str | os.PathLike, max_rays: int | None = None, seed: int = 0) -> Rays:
     """The rays of a file, or of a dataset or a part of it (``shop.rays/place=north``).
 
     ``most``: of a dataset, take so many at most: of more, a sample by ``seed`` in which each is as likely as any other.
@@ -696,11 +696,11 @@ def load_rays(path: str | os.PathLike, most: int | None = None, seed: int = 0) -
     if not Path(path).is_dir():
         return Rays.load(path)
     dataset = RayDataset.open(path)
-    if most is not None and len(dataset) > most:
-        return dataset.sample(most, seed)
-    return dataset.load(most=MOST if most is None else most)
+    if max_rays is not None and len(dataset) > max_rays:
+        return dataset.sample(max_rays, seed)
+    return dataset.load(most=MAX_LOADED_RAYS if max_rays is None else max_rays)
 
 
-def rays_digest(path: str | os.PathLike) -> str:
+def hash_rays(path: str | os.PathLike) -> str:
     """SHA-256 of a file of rays, or that of which rays a dataset holds."""
     return RayDataset.open(path).digest if is_dataset(path) else file_sha256(Path(path))

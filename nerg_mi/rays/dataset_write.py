@@ -19,32 +19,32 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import check_folder, file_sha256, locked, removing_empty_parents, replacing, writing
-from nerg_mi.files.safe_read import reading
+from nerg_mi.files.atomic import check_folder, file_sha256, lock_file, remove_empty_new_parents, replace_atomically, translate_write_errors
+from nerg_mi.files.safe_read import translate_read_errors
 from nerg_mi.tasks.engines import process_pool
 
 from .dataset import (
     GROUP_ROWS,
-    HEAD,
+    DATASET_MANIFEST,
     PART_ROWS,
     SOURCES,
     UNKNOWN,
-    Head,
+    DatasetManifest,
     PartFile,
     Source,
     bucket_of,
     check_day,
     check_place,
-    read_head,
-    read_source,
+    read_dataset_manifest,
+    read_source_manifest,
     read_sources,
-    source_path,
-    write_head,
+    source_manifest_path,
+    write_dataset_manifest,
     write_source,
 )
 from .pseudonyms import pseudonymise
 from .quality import GAP
-from .rays import VECTORS, Rays, column_parts, pyarrow_modules
+from .rays import VECTORS, Rays, column_parts, import_pyarrow
 from .readers.base import Reader
 from .readers.registry import read_rays
 
@@ -103,7 +103,7 @@ class Marks:
 
 def _files(source: Path) -> list[tuple[Path, os.stat_result]]:
     """The files that a source consists of, by their names within it (nothing for a file), and what is known of them."""
-    with reading(source, "tracking file"):
+    with translate_read_errors(source, "tracking file"):
         if not source.is_dir():
             return [(Path(), os.stat(source))]
         found = []
@@ -169,7 +169,7 @@ class SourceWriter:
                 self._write(rays, order[start : min(start + PART_ROWS, b)], place, name, int(bucket[order[a]]))
 
     def _write(self, rays: Rays, rows: np.ndarray, place: str, day: str, bucket: int) -> None:
-        _, pq = pyarrow_modules()
+        _, pq = import_pyarrow()
         persons, cohorts = _counts(rays.person[rows], rays.persons), Counter()
         if rays.cohort is not None:
             cohorts = _counts(rays.cohort[rows], rays.cohorts)
@@ -198,7 +198,7 @@ class SourceWriter:
         path = self._folder / PartFile(**about).path(self.source)
         table = table_of(rays, rows)
         floats = {name: "BYTE_STREAM_SPLIT" for name in table.schema.names if name not in _WORDS}
-        with replacing(path) as temporary:
+        with replace_atomically(path) as temporary:
             pq.write_table(
                 table,
                 temporary,
@@ -242,7 +242,7 @@ def days_of(t: np.ndarray) -> np.ndarray | None:
 
 def schema() -> Any:
     """The columns of a part, as pyarrow has them."""
-    pa, _ = pyarrow_modules()
+    pa, _ = import_pyarrow()
     names = pa.dictionary(pa.int32(), pa.string())
     kinds = dict(t=pa.float64(), person=names, origin=pa.float32(), direction=pa.float32(), confidence=pa.float64())
     kinds |= dict(hit=pa.float32(), cohort=names, head=pa.float32())
@@ -251,7 +251,7 @@ def schema() -> Any:
 
 def table_of(rays: Rays, rows: np.ndarray) -> Any:
     """The rays ``rows`` (n,), in this order, as a table of `schema`."""
-    pa, _ = pyarrow_modules()
+    pa, _ = import_pyarrow()
     columns: dict[str, Any] = {"t": rays.t[rows], "confidence": rays.confidence[rows]}
     for name in VECTORS:
         value = getattr(rays, name)
@@ -310,7 +310,7 @@ class ImportRecipe:
     place: str
     day: str | None = None  # None: by the clock
     key: bytes | None = None  # the salt of pseudonyms; None: names as they are
-    kept_salt: bool = True  # whether that is a file's; else it is random and kept by nobody
+    is_salt_stored: bool = True  # whether that is a file's; else it is random and kept by nobody
 
     @property
     def mark(self) -> str:
@@ -325,7 +325,7 @@ class ImportTask:
     """One source to be imported into the dataset ``folder``."""
 
     folder: Path
-    head: Head
+    head: DatasetManifest
     path: Path
     recipe: ImportRecipe
     mark: str  # of the recipe
@@ -426,17 +426,17 @@ def _without_names(rest: Rays, names: tuple[str, ...], recipe: ImportRecipe, nam
         replace(nobody, metadata={"frame": rest.metadata["frame"], "sources": sources[-1:]}), recipe.key
     )
     files = [entry for entry in hidden["sources"] if "hmac_sha256" in entry]
-    kept = "salt of a file" if recipe.kept_salt else "random salt, not kept"
+    kept = "salt of a file" if recipe.is_salt_stored else "random salt, not kept"
     about = {**hidden, "sources": files, "pseudonyms": f"HMAC-SHA256, {kept}"}
     return about, alias.metadata["sources"][0]["file"]
 
 
-def _whole_source(folder: Path, id: str, head: Head) -> Source | None:
+def _whole_source(folder: Path, id: str, head: DatasetManifest) -> Source | None:
     """The account of a source that was imported, if all of its parts are there."""
-    path = source_path(folder, id)
+    path = source_manifest_path(folder, id)
     if not path.is_file():
         return None
-    found = read_source(path, head)
+    found = read_source_manifest(path, head)
     return found if has_parts(folder, found) else None
 
 
@@ -493,14 +493,14 @@ _RANDOM = ""  # The mark of a salt that nobody has kept
 
 
 @dataclass
-class Update:
+class DatasetUpdate:
     """What became of the sources that were named."""
 
-    imported: int = 0  # with the rays of `rays`
-    rays: int = 0
-    replaced: int = 0  # of those imported: sources that have changed, or are read in another way
-    unchanged: int = 0
-    alike: int = 0  # of the same name and content as others: kept once
+    num_imported: int = 0  # with the rays of `rays`
+    num_rays: int = 0
+    num_replaced: int = 0  # of those imported: sources that have changed, or are read in another way
+    num_unchanged: int = 0
+    num_duplicates: int = 0  # of the same name and content as others: kept once
     errors: list[str] = field(default_factory=list)  # of those that could not be imported, a sentence each
 
 
@@ -510,7 +510,7 @@ def update_dataset(
     recipe: ImportRecipe,
     workers: int = 1,
     on_done: Callable[[str], None] | None = None,
-) -> Update:
+) -> DatasetUpdate:
     """Import ``files``, each a source, into the dataset ``folder``, which is made if it is not there.
 
     ``workers``: processes that do it beside each other. ``on_done``: called with the name of each source as it is done.
@@ -521,7 +521,7 @@ def update_dataset(
     check_place(recipe.place)
     if recipe.day is not None:
         check_day(recipe.day)
-    pyarrow_modules()
+    import_pyarrow()
     if not files:
         raise NergError("there are no tracking files to import; name one or more")
     _check_head(folder, recipe)
@@ -529,13 +529,13 @@ def update_dataset(
     mark, marks = recipe.mark, Marks(recipe.key)
     named = {marks.where(path): path for path in files}
     stamps = {where: marks.stamp(path) for where, path in named.items()}
-    done, is_new = Update(), not (folder / HEAD).is_file()
+    done, is_new = DatasetUpdate(), not (folder / DATASET_MANIFEST).is_file()
     with ExitStack() as ends:
-        ends.enter_context(removing_empty_parents(folder / HEAD))
+        ends.enter_context(remove_empty_new_parents(folder / DATASET_MANIFEST))
         if is_new:
-            write_head(folder, Head(BUCKETS, _salt(recipe)))
-        head = read_head(folder)
-        ends.enter_context(locked(folder / HEAD, f'another import into "{folder}" is at work; wait for its end'))
+            write_dataset_manifest(folder, DatasetManifest(BUCKETS, _salt(recipe)))
+        head = read_dataset_manifest(folder)
+        ends.enter_context(lock_file(folder / DATASET_MANIFEST, f'another import into "{folder}" is at work; wait for its end'))
         if is_new:
             ends.callback(_remove_if_empty, folder, head)
         known = {source.where: source for source in read_sources(folder, head)}
@@ -546,7 +546,7 @@ def update_dataset(
             stamp = stamps[where]
             same = found is not None and found.recipe == mark and stamp is not None and found.stamp == stamp
             if found is not None and same and has_parts(folder, found):
-                done.unchanged += 1
+                done.num_unchanged += 1
                 continue
             before = None if found is None else (found.id, found.generation)
             tasks.append(
@@ -557,36 +557,36 @@ def update_dataset(
             _count(done, outcome, seen)
             if on_done is not None:
                 on_done(outcome.path.name)
-        done.replaced = _clean(folder, read_sources(folder, head))
+        done.num_replaced = _clean(folder, read_sources(folder, head))
     return done
 
 
-def _count(done: Update, outcome: Outcome, seen: set[str]) -> None:
+def _count(done: DatasetUpdate, outcome: Outcome, seen: set[str]) -> None:
     if outcome.error is not None:
         done.errors.append(outcome.error)
     elif outcome.source in seen:
-        done.alike += 1
+        done.num_duplicates += 1
     elif outcome.unchanged:
-        done.unchanged += 1
+        done.num_unchanged += 1
     else:
-        done.imported += 1
-        done.rays += outcome.rays
+        done.num_imported += 1
+        done.num_rays += outcome.rays
     seen.add(outcome.source)
 
 
 def check_target(folder: Path) -> None:
     """Raise `NergError` where no dataset can be made or added to."""
     check_folder(folder)
-    with writing(folder):
-        if folder.is_dir() and not (folder / HEAD).is_file() and any(os.scandir(folder)):
+    with translate_write_errors(folder):
+        if folder.is_dir() and not (folder / DATASET_MANIFEST).is_file() and any(os.scandir(folder)):
             raise NergError(f'the folder "{folder}" is there and no dataset of rays: choose another name, or remove it')
 
 
 def _check_head(folder: Path, recipe: ImportRecipe) -> None:
     """Raise `NergError` where nothing can be added to the dataset, or people would have other names than there."""
-    if not (folder / HEAD).is_file():
+    if not (folder / DATASET_MANIFEST).is_file():
         return
-    head, wanted = read_head(folder), _salt(recipe)
+    head, wanted = read_dataset_manifest(folder), _salt(recipe)
     if head.closed:
         raise NergError(f'"{folder}" was filtered from another dataset: import into that one, and filter it again')
     if head.salt == _RANDOM:
@@ -602,16 +602,16 @@ def _check_head(folder: Path, recipe: ImportRecipe) -> None:
 def _salt(recipe: ImportRecipe) -> str | None:
     if recipe.key is None:
         return None
-    return Marks(recipe.key).of("salt") if recipe.kept_salt else _RANDOM
+    return Marks(recipe.key).of("salt") if recipe.is_salt_stored else _RANDOM
 
 
-def _remove_if_empty(folder: Path, head: Head) -> None:
+def _remove_if_empty(folder: Path, head: DatasetManifest) -> None:
     """Remove the account of a new dataset into which nothing was imported, with what imports have left."""
     if read_sources(folder, head):
         return
     _clean(folder, [])
-    with writing(folder):
-        (folder / HEAD).unlink()
+    with translate_write_errors(folder):
+        (folder / DATASET_MANIFEST).unlink()
     for path in sorted(folder.rglob("*"), reverse=True):
         # What is not of an import stays.
         with suppress(OSError):
@@ -621,13 +621,13 @@ def _remove_if_empty(folder: Path, head: Head) -> None:
 def _clean(folder: Path, sources: Sequence[Source]) -> int:
     """Remove what imports have left that does not belong to ``sources``: accounts of replaced ones, whose number is
     given, parts of them or of sources without an account, and files that were being written."""
-    accounts = {source_path(folder, source.id).name for source in sources}
+    accounts = {source_manifest_path(folder, source.id).name for source in sources}
     parts = {folder / part.path(source.id) for source in sources for part in source.parts}
     old = [path for path in (folder / SOURCES).glob("*.json") if path.name not in accounts]
     written = [path for path in old if not path.name.startswith(".")]
     stray = [path for path in folder.glob("place=*/day=*/bucket=*/part-*.parquet") if path not in parts]
     unfinished = [*folder.glob(".*.part.json"), *folder.glob("place=*/day=*/bucket=*/.*.part.parquet")]
-    with writing(folder):
+    with translate_write_errors(folder):
         for path in {*old, *stray, *unfinished}:
             path.unlink(missing_ok=True)
     return len(written)

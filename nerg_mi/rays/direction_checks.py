@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .checks import ENOUGH, MOST, Check, Figures, check, group_medians, name_persons, name_some, to_source
-from .filters import time_order
+from .filters import argsort_by_person_time
 from .rays import Rays
 
 # ---- People, or recordings, in frames of their own ----
@@ -272,7 +272,7 @@ def _guess(figures: Figures, heads: np.ndarray, rows: np.ndarray) -> str:
     """The remedy, by what the directions (rows) that are far from the head have in common."""
     rays, rows = figures.rays, rows[:: max(1, len(rows) // MOST)]
     head, d = heads[rows].astype(np.float64), rays.direction[rows]
-    own = np.einsum("nij,nj->ni", head_frames(head), d)
+    own = np.einsum("nij,nj->ni", compute_head_frames(head), d)
     in_world, in_head = (np.linalg.norm(v.mean(axis=0)) for v in (d, own))
     if in_world > _ONE_WAY and in_head < _MANY_WAYS:
         return (
@@ -291,7 +291,7 @@ def _guess(figures: Figures, heads: np.ndarray, rows: np.ndarray) -> str:
     )
 
 
-EXCHANGES = {
+AXIS_SWAPS = {
     "left and right": (1.0, -1.0, 1.0),
     "up and down": (1.0, 1.0, -1.0),
     "left and right, and up and down,": (1.0, -1.0, -1.0),
@@ -299,7 +299,7 @@ EXCHANGES = {
 """Signs of a direction ahead, to the right and up in the head (`head_frames`), by what they exchange of the eyes."""
 
 
-def head_frames(head: np.ndarray) -> np.ndarray:
+def compute_head_frames(head: np.ndarray) -> np.ndarray:
     """Rotations (n, 3, 3) from the world to ahead, right and up of heads (n, 3) that are not tilted sideways."""
     right = np.cross(head, (0.0, 0.0, 1.0))
     right /= np.maximum(np.linalg.norm(right, axis=1, keepdims=True), 1e-9)
@@ -346,7 +346,7 @@ def _best_exchange(turned: np.ndarray) -> str:
     """The exchange with which gaze turns least (medians of (4, n)), if it is clearly less than without."""
     now, *others = np.median(turned, axis=1)
     best = int(np.argmin(others))
-    return list(EXCHANGES)[best] if others[best] < _BETTER * now else ""
+    return list(AXIS_SWAPS)[best] if others[best] < _BETTER * now else ""
 
 
 def _turned(figures: Figures, heads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -368,10 +368,10 @@ def _turned(figures: Figures, heads: np.ndarray) -> tuple[np.ndarray, np.ndarray
     use = (person[lag:] == person[:-lag]) & (dt > 0) & (dt < 2 * _LAG) & (speed > _TURNS[0]) & (speed < _TURNS[1])
     use &= ~figures.frozen[rows[lag:]]
     (first,) = np.nonzero(use)
-    frames = [head_frames(head[first + k]) for k in (0, lag)]
+    frames = [compute_head_frames(head[first + k]) for k in (0, lag)]
     own = [np.einsum("nij,nj->ni", f, rays.direction[rows[first + k]]) for f, k in zip(frames, (0, lag))]
     turned = []
-    for signs in ((1.0, 1.0, 1.0), *EXCHANGES.values()):
+    for signs in ((1.0, 1.0, 1.0), *AXIS_SWAPS.values()):
         before, after = (np.einsum("nij,ni->nj", f, v * signs) for f, v in zip(frames, own))
         turned.append(np.linalg.norm(after - before, axis=1))
     return np.array(turned), person[first]
@@ -393,7 +393,7 @@ def check_locked(figures: Figures) -> list[str]:
     rows = rows[:: max(1, len(rows) // MOST)]
     person, count = rays.person[rows], len(rays.persons)
     n, heads = np.bincount(person, minlength=count), rays.head[rows].astype(np.float64)
-    own = np.einsum("nij,nj->ni", head_frames(heads), rays.direction[rows])
+    own = np.einsum("nij,nj->ni", compute_head_frames(heads), rays.direction[rows])
     mean = lambda v: (
         np.stack([np.bincount(person, weights=c, minlength=count) for c in v.T], axis=1) / np.maximum(n[:, None], 1)
     )
@@ -422,7 +422,7 @@ DECLARED = "as declared"  # Name of the directions without an axis negated
 _MIRROR_BETTER = 0.02  # share by which a mirror must be better, besides three standard errors
 
 
-def hit_shares(
+def compute_hit_fractions(
     trace: Trace, origins: np.ndarray, directions: np.ndarray, to_source: np.ndarray | None = None
 ) -> dict[str, float]:
     """Share of the rays that end on a surface, for the directions as they are and with each of the axes negated.
@@ -439,7 +439,7 @@ def hit_shares(
     return shares
 
 
-def mirror_warning(shares: dict[str, float], count: int) -> str | None:
+def describe_mirroring(shares: dict[str, float], count: int) -> str | None:
     """A sentence where `hit_shares` of ``count`` rays are better with one axis negated than as they are declared, by
     more than chance; None otherwise.
 
@@ -538,7 +538,7 @@ def walking_agreement(rays: Rays, order: np.ndarray | None = None) -> np.ndarray
     ``order``: `filters.time_order` of the rays, if it is known. Of millions of rays, runs of some thousands are looked
     at.
     """
-    steps = _find_steps(rays, time_order(rays) if order is None else order)
+    steps = _find_steps(rays, argsort_by_person_time(rays) if order is None else order)
     return None if len(steps.way) < _STEPS else _correlate(steps)
 
 

@@ -67,7 +67,7 @@ def _codes(names: Sequence[str], known: tuple[str, ...], what: str) -> list[int]
     return [known.index(n) for n in names]
 
 
-def time_order(rays: Rays) -> np.ndarray | None:
+def argsort_by_person_time(rays: Rays) -> np.ndarray | None:
     """The rays' order by person and time (N,); None where they are in that order already."""
     earlier = (rays.person[1:] < rays.person[:-1]) | (
         (rays.person[1:] == rays.person[:-1]) & (rays.t[1:] < rays.t[:-1])
@@ -75,7 +75,7 @@ def time_order(rays: Rays) -> np.ndarray | None:
     return np.lexsort((rays.t, rays.person)) if earlier.any() else None
 
 
-def person_order(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
+def group_by_person(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     """The rays' order by person and time (N,), and where in it each person's run starts, with N at the end."""
     order = np.lexsort((rays.t, rays.person))
     starts = np.flatnonzero(np.r_[True, np.diff(rays.person[order]) != 0])
@@ -85,7 +85,7 @@ def person_order(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
 def label_stays(rays: Rays, distance: float = 0.1, gap: float = 1.0) -> np.ndarray:
     """Which stay each ray belongs to, (N,) int64: the rays of a person from a first one on, as long as the origins lie
     within ``distance`` metres of its origin and no pause is longer than ``gap`` seconds. Numbered from 0."""
-    order, starts = person_order(rays)
+    order, starts = group_by_person(rays)
     origin, t = rays.origin[order], rays.t[order]
     # A pause or another person ends a stay in any case.
     new = np.r_[True, np.diff(t) > gap]
@@ -147,15 +147,15 @@ def thin_mask(rays: Rays, seconds: float = 2.0, distance: float = 0.1, gap: floa
 _GAP = 0.1
 
 
-def ivt(rays: Rays, velocity: float = 100.0, least: float = 0.06, gap: float = _GAP) -> np.ndarray:
+def detect_fixations_ivt(rays: Rays, velocity: float = 100.0, min_duration: float = 0.06, gap: float = _GAP) -> np.ndarray:
     """By velocity (I-VT): runs of rays that turn no faster than ``velocity`` degrees a second, of ``least`` seconds or
     more.
 
     The velocity of a ray is that from the one before it (of the first of a run, to the one after). 100 degrees a second
     is for gaze in the world of people who walk and turn, 30 is usual where the head rests. Returns (N,) int64.
     """
-    _positive(velocity=velocity, least=least, gap=gap)
-    order, starts = person_order(rays)
+    _positive(velocity=velocity, least=min_duration, gap=gap)
+    order, starts = group_by_person(rays)
     t, d = rays.t[order], rays.direction[order]
     step = np.diff(t)
     joined = (step > 0) & (step <= gap)
@@ -164,18 +164,18 @@ def ivt(rays: Rays, velocity: float = 100.0, least: float = 0.06, gap: float = _
         slow = joined & (_angles(d[1:], d[:-1]) <= velocity * step)
     # Rays joined by slow steps are one run; a ray after a fast step begins one.
     run = np.cumsum(np.r_[True, ~slow]) - 1
-    return _numbered(run, t, order, least)
+    return _numbered(run, t, order, min_duration)
 
 
-def idt(rays: Rays, dispersion: float = 3.0, least: float = 0.1, gap: float = _GAP) -> np.ndarray:
+def detect_fixations_idt(rays: Rays, dispersion: float = 3.0, min_duration: float = 0.1, gap: float = _GAP) -> np.ndarray:
     """By dispersion (I-DT): a window of ``least`` seconds whose directions lie within ``dispersion`` degrees grows as
     long as they do; otherwise it starts one ray later.
 
     Dispersion is the spread of the angle sideways plus the spread upwards, max - min each, in the plane that touches
     the sphere at the window's first direction (azimuthal equidistant, its axes level and upright). Returns (N,) int64.
     """
-    _positive(dispersion=dispersion, least=least, gap=gap)
-    order, starts = person_order(rays)
+    _positive(dispersion=dispersion, least=min_duration, gap=gap)
+    order, starts = group_by_person(rays)
     t, d = rays.t[order], rays.direction[order]
     bounds = np.flatnonzero(np.r_[True, np.diff(t) > gap])
     bounds = np.union1d(bounds, starts)
@@ -183,7 +183,7 @@ def idt(rays: Rays, dispersion: float = 3.0, least: float = 0.1, gap: float = _G
     number = 0
     for a, b in zip(bounds[:-1], bounds[1:]):
         # The last ray of the shortest window that starts at each; b where the time does not suffice.
-        full = np.searchsorted(t[a:b], t[a:b] + least - 1e-9) + a
+        full = np.searchsorted(t[a:b], t[a:b] + min_duration - 1e-9) + a
         start, possible = a, _may_start(d[a:b], full - a, b - a, dispersion)
         for s in np.flatnonzero(possible) + a:
             if s < start:
@@ -196,7 +196,7 @@ def idt(rays: Rays, dispersion: float = 3.0, least: float = 0.1, gap: float = _G
     return out
 
 
-def fixation_rays(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
+def average_fixations(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
     """One ray a fixation, and how long each lasted (F,), seconds.
 
     Time of the middle, mean origin, mean direction, mean confidence, mean hit point and mean head (of those known) of
@@ -326,7 +326,7 @@ class Sessions:
         """Which rays a part of the order is."""
         return part if self.order is None else self.order[part]
 
-    def label(self) -> np.ndarray:
+    def label_rays(self) -> np.ndarray:
         """Number of the recording of each place of the order, (N,)."""
         return np.repeat(np.arange(len(self.person)), np.diff(self.starts))
 
@@ -343,7 +343,7 @@ def find_sessions(rays: Rays) -> Sessions:
     sorted_ = lambda values: values if order is None else values[order]
     other, step = np.diff(sorted_(person)) != 0, np.diff(sorted_(rays.t))
     if np.count_nonzero(~other & (step < -_BACK)) > max(_MIXED[0], _MIXED[1] * len(rays)):
-        order = time_order(rays)
+        order = argsort_by_person_time(rays)
         other, step = np.diff(sorted_(person)) != 0, np.diff(sorted_(rays.t))
     back = ~other & (step < -_BACK)
     new = np.flatnonzero(other | back | (step > PAUSE)) + 1
@@ -417,7 +417,7 @@ class PositionSplit:
     zone: np.ndarray  # (T,) the zone of each test centre
 
     @property
-    def sides(self) -> tuple[np.ndarray, np.ndarray]:
+    def masks(self) -> tuple[np.ndarray, np.ndarray]:
         """Masks (N,) of training and test rays."""
         return self.train, self.test
 
@@ -495,7 +495,7 @@ def purge(rays: Rays, centres: np.ndarray, distance: float) -> np.ndarray:
 
 
 def split_by_person(
-    rays: Rays, *, test_share: float = 0.5, test_persons: Sequence[str] | None = None, seed: int = 0
+    rays: Rays, *, test_fraction: float = 0.5, test_persons: Sequence[str] | None = None, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Hold out people: masks (N,) of training and test rays.
 
@@ -511,7 +511,7 @@ def split_by_person(
             )
         held = np.array([rays.persons.index(p) for p in test_persons])
     else:
-        count = int(np.clip(round(test_share * len(present)), 1, max(1, len(present) - 1)))
+        count = int(np.clip(round(test_fraction * len(present)), 1, max(1, len(present) - 1)))
         held = np.random.default_rng(seed).permutation(present)[:count]
     test = np.isin(rays.person, held)
     if test.all() or not test.any():
@@ -520,7 +520,7 @@ def split_by_person(
 
 
 def split_by_time(
-    rays: Rays, *, test_share: float = 0.2, gap: float = 5.0, of: str = "all"
+    rays: Rays, *, test_fraction: float = 0.2, gap: float = 5.0, clock: str = "all"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Hold out the end: masks (N,) of training and test rays.
 
@@ -529,16 +529,16 @@ def split_by_time(
     for all (a day of a shop), or ``person``, each person's own time (recordings with clocks of their own). Raises
     `NergError` when a side is empty.
     """
-    if of not in ("all", "person") or not 0 < test_share < 1 or not gap >= 0:
+    if clock not in ("all", "person") or not 0 < test_fraction < 1 or not gap >= 0:
         raise NergError(
             'a split by time needs the clock "all" or "person", a share between 0 and 1 and a gap of 0 s or more, '
-            f'got "{of}", {test_share} and {gap}'
+            f'got "{clock}", {test_fraction} and {gap}'
         )
-    group = np.zeros(len(rays), np.int64) if of == "all" else rays.person
+    group = np.zeros(len(rays), np.int64) if clock == "all" else rays.person
     first, last = np.full(group.max(initial=0) + 1, np.inf), np.full(group.max(initial=0) + 1, -np.inf)
     np.minimum.at(first, group, rays.t)
     np.maximum.at(last, group, rays.t)
-    cut = (last - test_share * (last - first))[group]
+    cut = (last - test_fraction * (last - first))[group]
     train, test = rays.t < cut - gap, rays.t >= cut
     if not train.any() or not test.any():
         raise NergError(
@@ -547,7 +547,7 @@ def split_by_time(
     return train, test
 
 
-def combine(*sides: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def combine_splits(*sides: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Masks (N,) of training and test rays of several splits at once.
 
     Training rays are those of every training side, test rays those of every test side (unseen people at unseen places,
@@ -566,7 +566,7 @@ def combine(*sides: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarr
     return train, test
 
 
-def position_of_split(rays: Rays) -> dict[str, Any]:
+def read_position_split(rays: Rays) -> dict[str, Any]:
     """How ``rays``, one side of a split by position, were parted: ``test_centres`` (lists of 3), ``radius`` and so on,
     as their metadata tell; empty where they do not."""
     for step in rays.metadata.get("steps", []):
@@ -577,7 +577,7 @@ def position_of_split(rays: Rays) -> dict[str, Any]:
 
 def _enough(index: RayIndex, places: np.ndarray, radius: float, least: int) -> np.ndarray:
     """Which places have at least ``least`` rays within ``radius``: no need to count the others."""
-    return np.diff(index.nearest(places, least, radius).offsets) >= least
+    return np.diff(index.query(places, least, radius).offsets) >= least
 
 
 def _distance_to(centres: np.ndarray, points: np.ndarray) -> np.ndarray:

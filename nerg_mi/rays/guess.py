@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import line_blocks, real_path
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import read_line_blocks, resolve_path
 
 from .readers import poses
 from .readers.base import BAD_LINES, UNITS, Reader
@@ -168,7 +168,7 @@ def preset_of_files(path: Path) -> tuple[Reader[Any], str] | None:
 
 def preset_of_text(path: Path) -> tuple[Reader[Any], str] | None:
     """The reader of a file by its first line, where that is no header, and why."""
-    for block in line_blocks(path, "tracking file", 1):
+    for block in read_line_blocks(path, "tracking file", 1):
         return next(((reader, why) for reader in readers() if (why := reader.signature.line(block[0]))), None)
     return None
 
@@ -238,7 +238,7 @@ def _numeric(path: Path, columns: list[str]) -> dict[str, bool]:
     """Names of the columns that hold numbers or times alone, or nothing, and whether they hold times as text."""
     if path.suffix.lower() == ".parquet":
         return {name: kind for name in dict.fromkeys(columns) if (kind := _parquet_kind(path, name)) is not None}
-    head, *rows = next(iter(line_blocks(path, "table", _PEEKED + 1)), [""])
+    head, *rows = next(iter(read_line_blocks(path, "table", _PEEKED + 1)), [""])
     separator = max(",;\t", key=head.count)
     kinds: list[set[bool | None]] = [set() for _ in columns]
     for line in rows:
@@ -293,9 +293,9 @@ class Proposal:
     preset: str | None = None
     columns: ColumnMap | None = None
     options: dict[str, str] = field(default_factory=dict)
-    sure: list[str] = field(default_factory=list)
-    guessed: list[str] = field(default_factory=list)
-    open: list[str] = field(default_factory=list)
+    certain: list[str] = field(default_factory=list)
+    guesses: list[str] = field(default_factory=list)
+    questions: list[str] = field(default_factory=list)
 
     @property
     def command(self) -> str | None:
@@ -303,7 +303,7 @@ class Proposal:
         if self.preset is None and self.columns is None:
             return None
         what = ["--preset", self.preset] if self.preset else ["--map", str(self.columns)]
-        stem = real_path(self.paths[0]).name.split(".")[0] or "rays"
+        stem = resolve_path(self.paths[0]).name.split(".")[0] or "rays"
         words = ["nerg", "rays", "import", *map(str, self.paths), "-o", f"{stem}.npz", *what]
         for flag, value in self.options.items():
             words += [flag, value] if value else [flag]
@@ -376,17 +376,17 @@ def _is_name(column: str) -> bool:
 
 def _use_preset(out: Proposal, reader: Reader[Any], why: str) -> None:
     out.preset = reader.name
-    out.sure.append(f"the preset {reader.name}: {why}")
+    out.certain.append(f"the preset {reader.name}: {why}")
     out.options |= reader.signature.options
     if reader.signature.question:
-        out.open.append(reader.signature.question)
+        out.questions.append(reader.signature.question)
 
 
 def _use_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
     """Fill ``out`` with a column map, as far as there is one."""
     numbers = sample.numbers
     if sample.repeated:
-        out.open.append(f"several columns are called {', '.join(map(repr, sample.repeated[:8]))}: rename all but one")
+        out.questions.append(f"several columns are called {', '.join(map(repr, sample.repeated[:8]))}: rename all but one")
     vectors = {s: v for s, v in roles.vectors.items() if all(c in numbers for c in v)}
     quaternions = {
         s: q for s, q in roles.quaternions.items() if all(c in numbers for c in q) and is_unit(sample.vector(q))
@@ -425,7 +425,7 @@ def _use_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
         turns, _ = poses.rotations_from_matrices(sample.vector(matrix))
         mirrored = poses.is_mirrored(sample.vector(matrix))
         if mirrored.any():
-            out.open.append(f"{mirrored.sum():,} of {len(mirrored):,} rows: {poses.MIRRORED}; the import drops them")
+            out.questions.append(f"{mirrored.sum():,} of {len(mirrored):,} rows: {poses.MIRRORED}; the import drops them")
     elif turn is not None:
         turns = poses.rotations_from_quaternions(sample.vector(quaternions[turn]))
     gaze = sample.vector(vectors[direction]) if direction else None
@@ -468,23 +468,23 @@ def _find_time(out: Proposal, sample: TableSample, roles: Roles) -> tuple[str | 
     if name is None:
         why = "no column is called so"
         if unread := next((c for c in roles.times if c in sample.columns), None):
-            cell = plain(next(iter(sample.texts(unread)), ""), 40)
+            cell = sanitize(next(iter(sample.texts(unread)), ""), 40)
             why = f"{unread!r} holds {cell!r}, which is read neither as a number nor as 2024-05-01T12:00:00.25"
-        out.open.append(f"the time: {why}; without t= rows are numbered, and --tick is the time of one")
+        out.questions.append(f"the time: {why}; without t= rows are numbered, and --tick is the time of one")
         return None, None
     if name in sample.clocks:
-        out.sure.append(f"{name!r} holds times of day, or dates with them (in UTC where no offset is written)")
+        out.certain.append(f"{name!r} holds times of day, or dates with them (in UTC where no offset is written)")
         return name, sample.numbers[name]
     stated, fits = time_unit(name), find_tick(sample.numbers[name])
     tick = stated or fits
     if stated:
-        out.sure.append(f"{name!r} is the time, in units of {stated:g} s by its name")
+        out.certain.append(f"{name!r} is the time, in units of {stated:g} s by its name")
     elif fits:
-        out.guessed.append(f"{name!r} is the time, in units of {fits:g} s by the steps between its rows")
+        out.assumptions.append(f"{name!r} is the time, in units of {fits:g} s by the steps between its rows")
     else:
-        out.open.append(f"the unit of the time {name!r}: its steps fit no device (--tick, seconds in one unit)")
+        out.questions.append(f"the unit of the time {name!r}: its steps fit no device (--tick, seconds in one unit)")
     if stated and fits and not np.isclose(stated, fits):
-        out.guessed.append(f"the steps of {name!r} would be a device's in units of {fits:g} s: is its name right?")
+        out.assumptions.append(f"the steps of {name!r} would be a device's in units of {fits:g} s: is its name right?")
     if tick and tick != 1.0:
         out.options["--tick"] = f"{tick:g}"
     return name, sample.numbers[name] * (tick or 1.0)
@@ -504,23 +504,23 @@ def _gravity_up(sample: TableSample, roles: Roles) -> str | None:
 def _frame(out: Proposal, standing: Standing | None, against: str | None) -> dict[str, str]:
     """Up and units, as far as the rows tell: by where heads are, or by the axis ``against`` which gravity pulls."""
     if against is not None:
-        out.sure.append(f"{against} is up: the columns of gravity say so")
+        out.certain.append(f"{against} is up: the columns of gravity say so")
     if standing is None or (against is not None and standing.up != against):
         if against is None:
-            out.open.append(
+            out.questions.append(
                 "which axis is up (--up), the hand (--hand) and the unit (--units): along no one axis do the rows stay "
                 "at the height of eyes"
             )
             out.options |= {"--up": "UP", "--hand": "HAND", "--units": "UNIT"}
             return {}
         out.options["--up"] = against
-        out.guessed.append("the unit is the metre; the rows are at no height that would tell, as where 0 is no floor")
+        out.assumptions.append("the unit is the metre; the rows are at no height that would tell, as where 0 is no floor")
         return {"up": against, "metre": "m"}
     out.options["--up"] = standing.up
     if standing.units != "m":
         out.options["--units"] = standing.units
     which = f"the unit is {standing.units}" if against else f"{standing.up} is up and the unit {standing.units}"
-    out.guessed.append(f"{which}: the rows stay at {standing.height:.2f} m along {standing.up}")
+    out.assumptions.append(f"{which}: the rows stay at {standing.height:.2f} m along {standing.up}")
     return {"up": standing.up, "metre": standing.units}
 
 
@@ -538,7 +538,7 @@ def _pose_evidence(
     if turns is not None and up and where is not None and seconds is not None:
         forward = find_forward(turns, where, seconds, up, UNITS[settings["metre"]])
         if forward:
-            out.guessed.append(f"heads look along their {forward}: that is where they walk to")
+            out.assumptions.append(f"heads look along their {forward}: that is where they walk to")
     unity = up == "y" and forward != "-z"
     unreal = up is not None and up.endswith("z") and settings["metre"] == "cm"
     hand = "left" if unity or unreal else "right"
@@ -547,7 +547,7 @@ def _pose_evidence(
         which = "as cameras' frames are" if up == "-y" else "as most worlds with that axis up are"
         if hand == "left":
             which = "as Unity's worlds with y up are" if unity else "as Unreal's worlds (z up, in centimetres) are"
-        out.guessed.append(
+        out.assumptions.append(
             f"the world is {hand}-handed, {which}; no row tells: a mirrored place is the sign of the other"
         )
     if turns is None:
@@ -557,15 +557,15 @@ def _pose_evidence(
         out.options["--forward"] = forward
     if forward is None:
         usual_one = f"{default} is usual in such a world" if default else "it depends on the world"
-        out.open.append(f"the axis along which heads look (--forward): {usual_one}, and nobody walks in the rows")
+        out.questions.append(f"the axis along which heads look (--forward): {usual_one}, and nobody walks in the rows")
     if gaze is None:
         return None
     local = find_local(gaze, turns, forward or default or "z")
     if local is None:
-        out.open.append("whether the gaze is in the head's frame: its rows tell neither; it is taken for the head's")
+        out.questions.append("whether the gaze is in the head's frame: its rows tell neither; it is taken for the head's")
         return True
     where_to = "the head's frame" if local else "the world, so that the head's pose is left out"
-    out.guessed.append(f"the gaze is in {where_to}: so it is nearer to where the head points")
+    out.assumptions.append(f"the gaze is in {where_to}: so it is nearer to where the head points")
     return local
 
 
@@ -582,7 +582,7 @@ def _person(out: Proposal, sample: TableSample, roles: Roles) -> str | None:
     """The column of participants, unless it counts rows."""
     if roles.person not in sample.columns or not is_counter(sample.texts(roles.person)):
         return roles.person if roles.person in sample.columns else None
-    out.open.append(f"{roles.person!r} has another value in nearly every row: it counts rows, not participants")
+    out.questions.append(f"{roles.person!r} has another value in nearly every row: it counts rows, not participants")
     return None
 
 
@@ -593,12 +593,12 @@ def _use_validity(out: Proposal, sample: TableSample) -> None:
         values = sorted(set(sample.texts(name).tolist()))
         valid = valid_values(name, values)
         if valid is None or any(c in name + "".join(valid) for c in ",="):
-            out.open.append(
+            out.questions.append(
                 f"which values of {name!r} mark valid rows (--valid): {', '.join(map(repr, values[:8]))}"
                 f"{', ...' if len(values) > 8 else ''}"
             )
         elif valid:
-            out.guessed.append(f"rows are valid where {name!r} is {' or '.join(valid)}")
+            out.assumptions.append(f"rows are valid where {name!r} is {' or '.join(valid)}")
             words.append(shlex.quote(name) + "=" + ",".join(map(shlex.quote, valid)))
     if words:
         out.options["--valid"] = " ".join(words)
@@ -610,14 +610,14 @@ def _use_angles(out: Proposal, sample: TableSample, roles: Roles, chosen: dict) 
     names: tuple[str, ...] | None = None
     if chosen["direction"] is None and roles.azel and all(c in sample.numbers for c in roles.azel):
         names = chosen["azel"] = roles.azel
-        out.guessed.append("azimuths turn to the right and elevations up; put - before a name where they do not")
+        out.assumptions.append("azimuths turn to the right and elevations up; put - before a name where they do not")
     elif chosen["direction"] is None and roles.yaw_pitch_roll:
         if all(c in sample.numbers for c in roles.yaw_pitch_roll):
             names = roles.yaw_pitch_roll
             gaze = any(set(n.lower().replace("_", " ").split()) & _GAZE for n in names)
             chosen["yawpitch" if posed or (gaze and len(names) == 2) else "ypr"] = names[: 2 if posed else 3]
-            out.guessed.append(
-                "yaw and pitch turn as docs/rays.md tells of this frame; put - before a name of yawpitch where not"
+            out.assumptions.append(
+                "yaw and pitch turn as docs/reference/formats.md tells of this frame; put - before a name of yawpitch where not"
             )
     if names is None:
         return
@@ -627,7 +627,7 @@ def _use_angles(out: Proposal, sample: TableSample, roles: Roles, chosen: dict) 
     if not degrees:
         out.options["--radians"] = ""
     how = "by their names" if stated is not None else f"the largest is {most:.3g}"
-    which = out.sure if stated is not None else out.guessed
+    which = out.certain if stated is not None else out.assumptions
     which.append(f"the angles are {'degrees' if degrees else 'radians'}: {how}")
 
 
@@ -637,21 +637,21 @@ def _finish(out: Proposal, sample: TableSample, roles: Roles, chosen: dict) -> N
         out.columns = ColumnMap(**named)
     except NergError as error:
         out.options = {}
-        out.open.append(
+        out.questions.append(
             f"no map can be proposed ({error}); its columns that hold numbers are "
             f"{', '.join(list(sample.numbers)[:24]) or 'none'}"
         )
         return
     for key in ("origin", "direction", "hit", "eye", "xyzw", "matrix"):
         if key in named:
-            out.guessed.append(
+            out.assumptions.append(
                 f"{key}: {', '.join(named[key][:4])}{', ...' if len(named[key]) > 4 else ''} by its names"
             )
     if "person" in named:
-        out.guessed.append(f"person: {named['person']!r} by its name")
+        out.assumptions.append(f"person: {named['person']!r} by its name")
     else:
-        out.open.append("the person: no column names participants, and the file is one")
+        out.questions.append("the person: no column names participants, and the file is one")
     used = {name for value in named.values() if not isinstance(value, str) for name in value}
     left = [v[0] for v in (*roles.vectors.values(), *roles.quaternions.values()) if not used & set(v)]
     if left:
-        out.open.append(f"what is left out: {', '.join(left[:8])}{', ...' if len(left) > 8 else ''}")
+        out.questions.append(f"what is left out: {', '.join(left[:8])}{', ...' if len(left) > 8 else ''}")

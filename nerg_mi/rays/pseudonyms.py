@@ -41,7 +41,7 @@ def read_salt(path: str | os.PathLike) -> bytes:
     return salt
 
 
-def pseudonyms(names: Iterable[str], salt: bytes | None = None) -> dict[str, str]:
+def make_pseudonyms(names: Iterable[str], salt: bytes | None = None) -> dict[str, str]:
     """A pseudonym for each of ``names`` of people: what `pseudonymise` gives them for the same salt."""
     key = _key(salt)
     return {name: "p" + _digest(key, "person", name)[:_DIGITS] for name in names}

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.safe_read import plain
+from nerg_mi.files.safe_read import sanitize
 
 from .checks import RECORDING_CHECKS, Figures
 from .dataset import RayDataset
 from .direction_checks import DIRECTION_CHECKS
-from .filters import time_order
+from .filters import argsort_by_person_time
 from .rays import Rays
 
 # ---- Which checks there are, and what all of them find ----
@@ -28,7 +28,7 @@ def find_warnings(figures: Figures) -> list[str]:
     return [warning for check in CHECKS for warning in check.find(figures)]
 
 
-def check_table() -> str:
+def format_check_table() -> str:
     """The checks as a table in Markdown, for the manual."""
     rows = ["| check | looks for |", "|---|---|"]
     return "\n".join([*rows, *(f"| {check.name} | {check.looks_for} |" for check in CHECKS)]) + "\n"
@@ -68,7 +68,7 @@ def summarise(rays: Rays) -> RaysSummary:
     """
     if len(rays) == 0:
         raise NergError("there are no rays to summarise; select fewer away")
-    order = time_order(rays)
+    order = argsort_by_person_time(rays)
     step, speed = _steps(rays, order)
     duplicates, some = int(np.count_nonzero(step == 0)), bool(step.size)
     positive = step[step > 0]
@@ -144,12 +144,12 @@ def _hits(rays: Rays) -> tuple[int, float]:
 
 # ---- The sanity card of a set of rays in words: what `nerg_mi.rays.quality` found, line by line ----
 
-WARNING = "implausible"  # Name of the lines that say what is likely wrong
+WARNING_LABEL = "implausible"  # Name of the lines that say what is likely wrong
 _PERSONS = 8  # named
 _RUNS = 3  # of dropped lines, named
 
 
-def card_lines(rays: Rays, summary: RaysSummary) -> list[tuple[str, str]]:
+def make_quality_report(rays: Rays, summary: RaysSummary) -> list[tuple[str, str]]:
     """Names and texts of the card's lines. Texts hold names that come from files."""
     s = summary
     triple = lambda v: " ".join(f"{x:.2f}" for x in v)
@@ -191,20 +191,20 @@ def card_lines(rays: Rays, summary: RaysSummary) -> list[tuple[str, str]]:
         lines.append(("hit points", f"{share:.1f} % of the rays, median distance {s.hit_distance:.2f} m"))
     if s.duplicates:
         lines.append(("duplicates", f"{s.duplicates:,} rays share person and time with another"))
-    return lines + [(WARNING, warning) for warning in s.warnings]
+    return lines + [(WARNING_LABEL, warning) for warning in s.warnings]
 
 
-def card_table(rays: Rays, summary: RaysSummary, title: str, lines: Sequence[tuple[str, str]] = ()) -> str:
+def format_quality_report(rays: Rays, summary: RaysSummary, title: str, lines: Sequence[tuple[str, str]] = ()) -> str:
     """The card as a table for the terminal, below a ``title``; ``lines``: further ones, before what is implausible."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     # Names come from files: they are neither markup nor control characters of a terminal.
-    safe = lambda text: escape(plain(text, 10_000))
+    safe = lambda text: escape(sanitize(text, 10_000))
     card = Table(show_header=False, box=None, title=safe(title), title_justify="left")
-    for name, text in sorted([*card_lines(rays, summary), *lines], key=lambda line: line[0] == WARNING):
-        card.add_row(f"[bold]{name}[/bold]" if name == WARNING else name, safe(text))
+    for name, text in sorted([*make_quality_report(rays, summary), *lines], key=lambda line: line[0] == WARNING_LABEL):
+        card.add_row(f"[bold]{name}[/bold]" if name == WARNING_LABEL else name, safe(text))
     console = Console()
     with console.capture() as shown:
         console.print(card)

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import replacing
-from nerg_mi.files.safe_read import JSON_BYTES, inflated_limit, is_count, open_npz, parse_json, reading, size_of
-from nerg_mi.ranges import FARTHEST
+from nerg_mi.files.atomic import replace_atomically
+from nerg_mi.files.safe_read import MAX_JSON_BYTES, compute_inflation_limit, is_count, open_npz, parse_json, translate_read_errors, check_regular_file
+from nerg_mi.ranges import MAX_COORDINATE
 
 # ---- The JSON document of a rays file: what of it the rest of the package relies on is checked here, once ----
 
@@ -176,20 +176,20 @@ def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], met
     if _suffix(path) == ".npz":
         # What savez_compressed writes, with a faster level of zlib, and stored what hardly shrinks: millions of rays in
         # seconds.
-        with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", compresslevel=1) as archive:
+        with replace_atomically(path) as temporary, zipfile.ZipFile(temporary, "w", compresslevel=1) as archive:
             for name, value in {"metadata": np.array(document), **columns}.items():
                 archive.compression = zipfile.ZIP_DEFLATED if _shrinks(value) else zipfile.ZIP_STORED
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
                     np.lib.format.write_array(out, value, allow_pickle=False)
         return
-    pa, pq = pyarrow_modules()
+    pa, pq = import_pyarrow()
     table = {}
     for name, value in columns.items():
         if name in VECTORS:
             table.update({f"{name}_{axis}": value[:, i] for i, axis in enumerate("xyz")})
         else:
             table[name] = value
-    with replacing(path) as temporary:
+    with replace_atomically(path) as temporary:
         pq.write_table(pa.table(table).replace_schema_metadata({"nerg_mi": document}), temporary, compression="zstd")
 
 
@@ -216,21 +216,21 @@ def read_rays_file(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict
 
 def _read_npz(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], str]:
     with open_npz(path, "rays file") as archive:
-        there = {name: archive.about(name) for name in archive.names if name in COLUMNS}
+        there = {name: archive.read_header(name) for name in archive.names if name in COLUMNS}
         _check_columns(path, {name: (shape, dtype.kind) for name, (shape, dtype) in there.items()})
         if "metadata" not in archive:
             raise not_rays(path, "it lacks the metadata")
-        shape, dtype = archive.about("metadata")
-        if shape != () or dtype.kind != "U" or dtype.itemsize > 4 * JSON_BYTES:
+        shape, dtype = archive.read_header("metadata")
+        if shape != () or dtype.kind != "U" or dtype.itemsize > 4 * MAX_JSON_BYTES:
             raise not_rays(path, "its metadata are no text")
-        with reading(path, "rays file"):
+        with translate_read_errors(path, "rays file"):
             document = str(archive["metadata"])
         return {name: archive[name] for name in there}, document
 
 
 def _read_parquet(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bytes]:
-    pa, _ = pyarrow_modules()
-    with reading(path, "rays file", also=(pa.ArrowException,)), open_parquet(path, "rays file") as table:
+    pa, _ = import_pyarrow()
+    with translate_read_errors(path, "rays file", extra_errors=(pa.ArrowException,)), open_parquet(path, "rays file") as table:
         about, schema = table.metadata, table.schema_arrow
         there = {}
         for name in COLUMNS:
@@ -285,21 +285,21 @@ def _check_columns(path: str | os.PathLike, there: dict[str, tuple[tuple[int, ..
         if kind not in (("i", "u") if name in _CODES else ("f", "i", "u")):
             raise not_rays(path, f"{name} is not {'whole numbers' if name in _CODES else 'numbers'}")
     # Narrow numbers become wide ones, and equal values may be stored once: what counts is the memory that rays take.
-    size = size_of(path, "rays file")
-    if _BYTES * n > inflated_limit(size):
+    size = check_regular_file(path, "rays file")
+    if _BYTES * n > compute_inflation_limit(size):
         raise _not_warranted(path, "rays file", n, size)
 
 
 def open_parquet(path: str | os.PathLike, what: str, row_bytes: int = 0) -> Any:
     """The open Parquet file ``path``; `NergError` for one that is damaged, or claims more than its bytes warrant: equal
     values are stored once, so that what counts is also what its rows, of ``row_bytes`` or more, become."""
-    pa, pq = pyarrow_modules()
-    size = size_of(path, what)
-    with reading(path, what, also=(pa.ArrowException,)):
+    pa, pq = import_pyarrow()
+    size = check_regular_file(path, what)
+    with translate_read_errors(path, what, extra_errors=(pa.ArrowException,)):
         table = pq.ParquetFile(path)
         about = table.metadata
         claimed = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
-    if max(claimed, row_bytes * about.num_rows) > inflated_limit(size):
+    if max(claimed, row_bytes * about.num_rows) > compute_inflation_limit(size):
         raise _not_warranted(path, what, about.num_rows, size)
     return table
 
@@ -318,7 +318,7 @@ def _suffix(path: str | os.PathLike) -> str:
     return suffix
 
 
-def pyarrow_modules() -> tuple[Any, Any]:
+def import_pyarrow() -> tuple[Any, Any]:
     try:
         import pyarrow
         import pyarrow.parquet
@@ -399,11 +399,11 @@ class Rays:
         _refuse(~np.isfinite(length), "a direction that is not finite", "drop it before building Rays")
         _refuse(length == 0, "a zero direction", "drop it before building Rays")
         _refuse(np.abs(length - 1) > 1e-4, "a direction that is not of unit length", "divide it by its length")
-        nowhere = np.asarray(~(np.abs(self.origin) <= FARTHEST).all(axis=1))
-        _refuse(nowhere, f"an origin that is not finite or beyond {FARTHEST:g} m", "drop it before building Rays")
+        nowhere = np.asarray(~(np.abs(self.origin) <= MAX_COORDINATE).all(axis=1))
+        _refuse(nowhere, f"an origin that is not finite or beyond {MAX_COORDINATE:g} m", "drop it before building Rays")
         if self.hit is not None:
-            far = np.asarray((np.abs(self.hit) > FARTHEST).any(axis=1))
-            _refuse(far, f"a hit point beyond {FARTHEST:g} m", "drop it, or make it NaN, which is unknown")
+            far = np.asarray((np.abs(self.hit) > MAX_COORDINATE).any(axis=1))
+            _refuse(far, f"a hit point beyond {MAX_COORDINATE:g} m", "drop it, or make it NaN, which is unknown")
         _refuse(~np.isfinite(self.t), "a time that is not finite", "drop it before building Rays")
         # Before they become 32 bits wide, in which numbers that are too large would be those of somebody else.
         _refuse(~((self.person >= 0) & (self.person < len(self.persons))), "an unknown person", "extend persons")
@@ -428,7 +428,7 @@ class Rays:
         provenance stay comparable."""
         return replace(self, **{name: column[which] for name, column in self.columns().items()})
 
-    def keep_in_place(self, mask: np.ndarray) -> Rays:
+    def filter_in_place(self, mask: np.ndarray) -> Rays:
         """The rays of a boolean mask (N,), moved together in the memory of these, which must not be used afterwards: of
         millions of rays there are then never two copies."""
         kept = np.flatnonzero(mask)
@@ -516,7 +516,7 @@ class RayIndex:
         # on the size of the leaves, and with it the bits of what is made of them.
         self._tree = KDTree(origin, leafsize=16, balanced_tree=False)
 
-    def nearest(self, places: np.ndarray, most: int, radius: float = np.inf) -> Neighbours:
+    def query(self, places: np.ndarray, most: int, radius: float = np.inf) -> Neighbours:
         """The ``most`` nearest rays of each of ``places`` (Q, 3), within ``radius`` metres (those at exactly R
         count)."""
         places = np.asarray(places, dtype=np.float64).reshape(-1, 3)

@@ -45,7 +45,7 @@ class LayerSource(Protocol):
         ...
 
 
-class OwnLayer:
+class IntegratorLayer:
     """The picture of an integrator, as the one layer."""
 
     def __init__(self, integrator):
@@ -120,7 +120,7 @@ class SamplePace:
 # can be had alone, and are those that they have in the whole picture.
 
 
-def base_seed(sampler) -> int | None:
+def get_base_seed(sampler) -> int | None:
     """The ``seed`` of an ``independent`` sampler of Mitsuba; None for another kind, or for one that draws in another
     way."""
     import drjit as dr
@@ -130,13 +130,13 @@ def base_seed(sampler) -> int | None:
         return None
     base, theirs, count = int(found[1]), sampler.clone(), 64
     theirs.seed(7, count)
-    ours = for_samples(1, base, 7, 0, count)
+    ours = make_strip_sampler(1, base, 7, 0, count)
     # Another release of Mitsuba may seed differently: its pictures are then rendered in one piece, and stay what they
     # are.
     return base if dr.all(theirs.next_2d() == ours.next_2d(), axis=None) else None
 
 
-def for_samples(spp: int, base: int, seed: int, first: int, count: int):
+def make_strip_sampler(spp: int, base: int, seed: int, first: int, count: int):
     """A sampler for the samples ``first``, ..., ``first + count - 1`` of a picture with ``spp`` samples a pixel, which
     are counted pixel by pixel. ``base`` is the sampler's own seed and ``seed`` that of the render.
 
@@ -197,10 +197,10 @@ others in the copies on the way to the file."""
 
 
 @runtime_checkable
-class Observing(Protocol):
+class ObserverIntegrator(Protocol):
     """An integrator in Python that renders as `mi.SamplingIntegrator` does within a context of its own."""
 
-    def seen_by(self, sensor, scene) -> AbstractContextManager:
+    def rendering_from(self, sensor, scene) -> AbstractContextManager:
         """The context in which samples of ``sensor``'s picture of ``scene`` are traced."""
         ...
 
@@ -217,7 +217,7 @@ class Band:
     layer: int = 0
 
 
-def why_whole(scene, sensor) -> str | None:
+def undividable_reason(scene, sensor) -> str | None:
     """Why a picture of ``sensor`` can only be rendered in one piece; None where it can be divided."""
     import mitsuba as mi
 
@@ -228,13 +228,13 @@ def why_whole(scene, sensor) -> str | None:
         return f"the variant {mi.variant()}"
     if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
         return f"the integrator {integrator.class_name()}"
-    if not isinstance(integrator, Observing) and _renders_itself(type(integrator), mi.SamplingIntegrator):
+    if not isinstance(integrator, ObserverIntegrator) and _renders_itself(type(integrator), mi.SamplingIntegrator):
         return f"the integrator {integrator.class_name()}, which renders in a way of its own"
     if film.class_name() != "HDRFilm":
         return f"the film {film.class_name()}"
     if is_batch(sensor):
         return "a batch of sensors"
-    if base_seed(sensor.sampler()) is None:
+    if get_base_seed(sensor.sampler()) is None:
         return f"the sampler {sensor.sampler().class_name()}"
     return None
 
@@ -245,7 +245,7 @@ def _renders_itself(kind: type, base: type) -> bool:
     return any("render" in vars(c) for c in above[: above.index(base)])
 
 
-def rows_for(scene, sensor, memory: float) -> int:
+def fit_rows_to_memory(scene, sensor, memory: float) -> int:
     """Rows of a band that needs at most ``memory`` bytes; at least 1, and of a filter that is wider than a pixel so
     many that the rows around a band, which are rendered again for it, are a quarter of it at most."""
     width, height = sensor.film().crop_size()
@@ -278,14 +278,14 @@ def render_bands(
     integrator, of a picture that can be divided; the bands of all of them follow each other. Raises
     ``KeyboardInterrupt`` after a picture in one piece that was to be stopped: there Mitsuba itself takes the signal.
     """
-    if why_whole(scene, sensor):
+    if undividable_reason(scene, sensor):
         yield _whole(scene, sensor, spp, seed, on_strip)
         return
     grid = _Grid(sensor.film(), spp or sensor.sampler().sample_count(), rows)
     integrator = scene.integrator()
-    layers = OwnLayer(integrator) if layers is None else layers
-    observing = lambda: integrator.seen_by(sensor, scene) if isinstance(integrator, Observing) else nullcontext()
-    base = base_seed(sensor.sampler())
+    layers = IntegratorLayer(integrator) if layers is None else layers
+    observing = lambda: integrator.rendering_from(sensor, scene) if isinstance(integrator, ObserverIntegrator) else nullcontext()
+    base = get_base_seed(sensor.sampler())
     pace = pace or SamplePace(strip)
     pace.begin()
     done = 0
@@ -343,7 +343,7 @@ def _trace(scene, sensor, layers: LayerSource, grid: _Grid, base, seed, top, fir
 
     mi = variant_types()
     film, spp = sensor.film(), grid.spp
-    sampler = for_samples(spp, base, seed, first, count)
+    sampler = make_strip_sampler(spp, base, seed, first, count)
     # Numbers that differ from strip to strip are kept out of the kernel, which is then the same for all.
     number = dr.arange(mi.UInt32, count)
     active = number >= dr.opaque(mi.UInt32, max(start - first, 0))
@@ -464,7 +464,7 @@ def _crop(film, size, offset) -> None:
 #
 # A picture taken apart: its colour and its AOVs as arrays.
 
-SURFACE = 0.5
+SURFACE_OPACITY = 0.5
 """Opacity from which on a pixel shows a surface, as the integrator has it by default."""
 
 
@@ -480,7 +480,7 @@ class Channels:
     @property
     def mask(self) -> np.ndarray:
         """Where there is a surface (h, w), bool; needs the AOV ``opacity``."""
-        return self.aovs["opacity"] >= SURFACE
+        return self.aovs["opacity"] >= SURFACE_OPACITY
 
 
 def render_channels(
@@ -492,10 +492,10 @@ def render_channels(
     all, several times a second, and may raise.
     """
     (band,) = render_bands(scene, sensor, spp=spp, seed=seed, on_strip=on_strip)
-    return channels_of(band.film, scene.integrator().aov_names())
+    return read_channels(band.film, scene.integrator().aov_names())
 
 
-def channels_of(film, aov_names: Sequence[str]) -> Channels:
+def read_channels(film, aov_names: Sequence[str]) -> Channels:
     """What a developed ``film`` holds, whose last channels are those of AOVs, with these names."""
     names = [name.split(".") for name in aov_names]
     pixels = np.array(film.develop())
@@ -511,21 +511,21 @@ def channels_of(film, aov_names: Sequence[str]) -> Channels:
 # ---- The integrator `nerg` of a scene asked for AOVs that its own list may lack, for the scene's own observer ----
 
 
-class AskedLayer:
+class AovLayer:
     """What is rendered in place of a scene's own picture (`LayerSource`): colour, and the AOVs ``names_asked``.
 
     Raises `NergError` for those that ``integrator``, a `nerg`, cannot compute.
     """
 
     def __init__(self, integrator: Any, sensor: Any, names_asked: Sequence[str]):
-        self._sensor, self._context = sensor, integrator.for_aovs(names_asked, True)
-        self.names = [self._context.channels(self._context.aovs)]
+        self._sensor, self._context = sensor, integrator.make_context(names_asked, True)
+        self.names = [self._context.channel_names(self._context.aovs)]
         self.count = len(self.names[0])
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterable[tuple]:
         camera = self._context.trace(scene, [self._sensor], sampler, ray, active)
-        channels = camera.for_observer().channels(self._context.aovs)
-        radiance, shown, _ = camera.radiance(scene, sampler, medium)
+        channels = camera.make_pixel().compute_channels(self._context.aovs)
+        radiance, shown, _ = camera.compute_radiance(scene, sampler, medium)
         return [(radiance, shown, channels)]
 
 
@@ -534,7 +534,7 @@ def is_nerg(integrator: Any) -> bool:
     return type(integrator).__name__ == "NergIntegrator"
 
 
-def nerg_of(path: Path, scene: Any) -> Any:
+def require_nerg(path: Path, scene: Any) -> Any:
     """The integrator of ``scene``, which was read from ``path``. Raises `NergError` where it is not `nerg`."""
     integrator = scene.integrator()
     if not is_nerg(integrator):
@@ -546,7 +546,7 @@ def nerg_of(path: Path, scene: Any) -> Any:
     return integrator
 
 
-def render_asked(
+def render_aovs(
     path: Path,
     scene: Any,
     sensor: Any,
@@ -560,36 +560,36 @@ def render_asked(
     Raises `NergError` for a scene whose integrator is not `nerg`, for AOVs that this cannot compute, and for pictures
     that are made in one piece only (`why_whole`).
     """
-    integrator = nerg_of(path, scene)
-    reason = why_whole(scene, sensor)
+    integrator = require_nerg(path, scene)
+    reason = undividable_reason(scene, sensor)
     if reason is not None:
         raise NergError(f'"{path}" cannot be rendered with an overlay because of {reason}; choose another sensor')
-    layer = AskedLayer(integrator, sensor, names)
+    layer = AovLayer(integrator, sensor, names)
     (band,) = render_bands(scene, sensor, spp=spp, seed=seed, on_strip=on_strip, layers=layer)
-    return channels_of(band.film, layer.names[0])
+    return read_channels(band.film, layer.names[0])
 
 
 # ---- Long renders ----
 #
 # What pays only where many samples are rendered of one scene: kernels that know the weights of its fields.
 
-SAMPLES = 1 << 27
+LONG_RENDER_SAMPLES = 1 << 27
 """From so many on a render is long: 146 pictures of 1280 x 720 pay for some seconds of compilation many times."""
 
 
-def prepare_for(samples: int, scene: Any) -> bool:
+def prepare_long_render(samples: int, scene: Any) -> bool:
     """Make ready ``scene`` for so many ``samples``, without a change of what it shows; whether there was anything to
     do."""
     integrator = scene.integrator()
-    if samples < SAMPLES or not is_nerg(integrator):
+    if samples < LONG_RENDER_SAMPLES or not is_nerg(integrator):
         return False
-    found = fields_of(integrator)
+    found = get_trained_fields(integrator)
     for field in found:
         set_constant_weights(field)
     return bool(found)
 
 
-def fields_of(integrator: Any) -> list[RadianceField | AnyGazeField]:
+def get_trained_fields(integrator: Any) -> list[RadianceField | AnyGazeField]:
     """The trained fields of an integrator `nerg`, those that it has: of its radiance, of its gaze."""
     medium, gaze = integrator.medium, integrator.gaze
     found: list[RadianceField | AnyGazeField] = [medium.field] if isinstance(medium, FieldMedium) else []

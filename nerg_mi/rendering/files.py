@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.atomic import check_writable, replacing
-from nerg_mi.files.images import bitmap_channels, encode_png, exr_rows
-from nerg_mi.files.safe_read import map_bytes, open_file, read_bytes, reading
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.atomic import check_writable, replace_atomically
+from nerg_mi.files.images import split_bitmap_channels, encode_png, open_exr_writer
+from nerg_mi.files.safe_read import map_bytes, open_file, read_bytes, translate_read_errors
 from nerg_mi.files.tables import write_csv
-from nerg_mi.formats.meshes import BYTES, MeshFile, read_mesh_file
+from nerg_mi.formats.meshes import MAX_BYTES, MeshFile, read_mesh_file
 from nerg_mi.formats.ply import PLY_MAGIC, parse_ply, write_columns
 
 # ---- Frames file ----
@@ -41,7 +41,7 @@ def read_frames(path: str | Path) -> list[dict[str, str]]:
     """Values by the name of their `<default>`, of each picture. Raises `NergError` for what is no such file, naming the
     line."""
     raw = read_bytes(path, "file of frames", FRAMES_BYTES)
-    with reading(path, "file of frames", "correct it"):
+    with translate_read_errors(path, "file of frames", "correct it"):
         text = raw.decode("utf-8-sig")
     names: list[str] | None = None
     frames: list[dict[str, str]] = []
@@ -62,7 +62,7 @@ def read_frames(path: str | Path) -> list[dict[str, str]]:
                 raise NergError(f'"{path}" has more than {FRAMES:,} frames; divide it')
             frames.append(dict(zip(names, cells)))
     except csv.Error as error:
-        raise NergError(f'"{path}" (line {lines.line_num}) is no CSV: {plain(error)}; correct it') from error
+        raise NergError(f'"{path}" (line {lines.line_num}) is no CSV: {sanitize(error)}; correct it') from error
     if not frames:
         raise NergError(f'"{path}" holds no frames: a line of names of <default>s, and a line for each picture')
     return frames
@@ -71,7 +71,7 @@ def read_frames(path: str | Path) -> list[dict[str, str]]:
 def _names(path: str | Path, names: list[str]) -> list[str]:
     bad = next((name for name in names if not _NAME.fullmatch(name)), None)
     if bad is not None or len(names) > _COLUMNS:
-        what = f"{len(names)} names" if bad is None else f'"{plain(bad, 40)}"'
+        what = f"{len(names)} names" if bad is None else f'"{sanitize(bad, 40)}"'
         raise NergError(f'"{path}" begins with {what}, where names of <default>s of the scene are needed, such as eye')
     if len(set(names)) < len(names):
         raise NergError(f'"{path}" names a <default> twice; leave one of the columns')
@@ -83,7 +83,7 @@ def write_frames(path: str | Path, frames: Sequence[Mapping[str, str]]) -> None:
     write_csv(path, frames)
 
 
-def numbered(output: Path, number: int, count: int) -> Path:
+def frame_path(output: Path, number: int, count: int) -> Path:
     """The file of the picture ``number``, from 1 on, of ``count``: walk.png, walk_0001.png."""
     return output.with_name(f"{output.stem}_{number:0{max(4, len(str(count)))}d}{output.suffix}")
 
@@ -98,7 +98,7 @@ def check_mesh(path: str | os.PathLike, kind: str, colored: bool = False) -> Non
     """Raise `NergError` for a file that Mitsuba's plugin ``kind`` ("ply", "obj") does not read as a mesh, or not as the
     one that it is; ``colored``: whether a texture is to show its colours."""
     mesh = read_mesh_file(path, suffix=f".{kind}")
-    reason = mesh.unreadable or (
+    reason = mesh.unreadable_reason or (
         "an alpha, or their format, hides its colours" if colored and mesh.hides_colors else ""
     )
     if reason:
@@ -110,8 +110,8 @@ def check_mesh(path: str | os.PathLike, kind: str, colored: bool = False) -> Non
 
 def check_points(path: str | os.PathLike) -> None:
     """Raise `NergError` for a PLY file that holds less than its header says, or no vertices."""
-    raw = map_bytes(path, "PLY file", BYTES, PLY_MAGIC, "export it again")
-    with reading(path, "PLY file", "export it again"):
+    raw = map_bytes(path, "PLY file", MAX_BYTES, PLY_MAGIC, "export it again")
+    with translate_read_errors(path, "PLY file", "export it again"):
         tables = parse_ply(np.frombuffer(raw, np.uint8)).tables
         if "vertex" not in tables or not tables["vertex"].count:
             raise ValueError("it has no vertices")
@@ -149,13 +149,13 @@ def check_vol(path: str | os.PathLike) -> None:
 #
 # Picture files that are written from the top in pieces: .exr with all channels of a film, .png with its colour.
 
-FORMATS = (".exr", ".png")
+IMAGE_FORMATS = (".exr", ".png")
 _DITHER = 256
 """Rows after which the pattern repeats that Mitsuba adds where it rounds to 8 bits."""
 
 
 @contextmanager
-def picture_rows(
+def open_image_rows(
     path: str | Path, width: int, height: int, text: Mapping[str, str] | None = None
 ) -> Iterator[Callable[[object, int], None]]:
     """A picture file of ``width`` x ``height`` pixels, whole or absent.
@@ -163,13 +163,13 @@ def picture_rows(
     Gives a function that writes the next rows: the first ``rows`` of a Mitsuba bitmap. Float32 in .exr, tonemapped to
     sRGB in .png. ``text``: what the header says, by PNG's names.
     """
-    check_writable(path, *FORMATS)
+    check_writable(path, *IMAGE_FORMATS)
     if Path(path).suffix.lower() == ".exr":
-        with exr_rows(path, width, height, text) as write:
-            yield lambda bitmap, rows: write({name: values[:rows] for name, values in bitmap_channels(bitmap).items()})
+        with open_exr_writer(path, width, height, text) as write:
+            yield lambda bitmap, rows: write({name: values[:rows] for name, values in split_bitmap_channels(bitmap).items()})
         return
     # Opened first, so that a folder that cannot be written to is found before anything is rendered.
-    with replacing(path) as temporary:
+    with replace_atomically(path) as temporary:
         display = DisplayRows(width, height)
         yield display.add
         temporary.write_bytes(encode_png(display.bitmap(), text))

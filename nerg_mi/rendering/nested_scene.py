@@ -8,16 +8,16 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import reading, real_path, size_of
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import translate_read_errors, resolve_path, check_regular_file
 
 from .scene import check_scene_file
-from .scene_writer import Blank, Comment, Node, SceneContent, Verbatim, document, element, relative_name, value_of
+from .scene_writer import BlankLine, Comment, Node, SceneContent, Verbatim, format_document, element, relative_path, check_attribute
 
 # ---- Somebody's scene file as the place of a scene with gaze ----
 #
 # Mitsuba takes one integrator a scene, which has to be `nerg`; the one of the file then lights its shapes from within
-# (docs/shapes-and-fields.md). An `<include>` cannot do that, so that the file is copied: what it includes becomes a
+# (docs/how-to/environments.md). An `<include>` cannot do that, so that the file is copied: what it includes becomes a
 # part of the copy, its sensors come after ours, and a `<path>` leads to the files that it names.
 
 BYTES = 16 << 20
@@ -27,7 +27,7 @@ SPP = 64
 """Samples a pixel: paths of light have more noise than fields."""
 
 
-def nested_place(path: Path, folder: Path) -> SceneContent:
+def nest_scene(path: Path, folder: Path) -> SceneContent:
     """The scene file ``path`` as the place of one that is written into ``folder``.
 
     Raises `NergError` for what is no scene file, and for one whose integrator is `nerg` already or one of several.
@@ -43,12 +43,12 @@ def nested_place(path: Path, folder: Path) -> SceneContent:
     if integrators:
         light = (Comment(f"What lights the shapes: the integrator of {path.name}."), *map(verbatim, integrators))
     return SceneContent(
-        inside=light,
-        beside=(Comment(f"What follows is {path.name}; its sensors are counted after ours."), *map(verbatim, others)),
-        first=(*_paths(path, children, folder), *map(verbatim, defaults), Blank()),
+        integrator_children=light,
+        scene_children=(Comment(f"What follows is {path.name}; its sensors are counted after ours."), *map(verbatim, others)),
+        preamble=(*_paths(path, children, folder), *map(verbatim, defaults), BlankLine()),
         spp=SPP,
         version=version,
-        taken=frozenset(values) | frozenset(ids),
+        reserved_names=frozenset(values) | frozenset(ids),
     )
 
 
@@ -80,7 +80,7 @@ def name_files(elements: list[ElementTree.Element], path: Path, children: list[E
             continue
         there = next((f / value for f in folders if (f / value).is_file()), None)
         if there is not None:
-            one.set("value", value_of(str(real_path(there))))
+            one.set("value", check_attribute(str(resolve_path(there))))
 
 
 def verbatim(found: ElementTree.Element) -> Verbatim:
@@ -92,12 +92,12 @@ def verbatim(found: ElementTree.Element) -> Verbatim:
 
 
 def _root(path: Path) -> ElementTree.Element:
-    size_of(path, "scene file", BYTES)
+    check_regular_file(path, "scene file", BYTES)
     builder = ElementTree.TreeBuilder(insert_comments=True)
-    with reading(path, "scene file", "correct it", also=(ElementTree.ParseError,)):
+    with translate_read_errors(path, "scene file", "correct it", extra_errors=(ElementTree.ParseError,)):
         root = ElementTree.parse(path, ElementTree.XMLParser(target=builder)).getroot()
     if root.tag != "scene":
-        raise NergError(f'"{path}" is no scene file: it begins with <{plain(root.tag, 40)}> where <scene> is needed')
+        raise NergError(f'"{path}" is no scene file: it begins with <{sanitize(root.tag, 40)}> where <scene> is needed')
     return root
 
 
@@ -112,7 +112,7 @@ def _inlined(root: ElementTree.Element, path: Path, folders: list[Path]) -> Iter
         name = child.get("filename", "")
         found = next((f / name for f in folders if name and (f / name).is_file()), None)
         if found is None:
-            raise NergError(f'the scene file "{path}" includes "{plain(name)}", which is not there; correct the name')
+            raise NergError(f'the scene file "{path}" includes "{sanitize(name)}", which is not there; correct the name')
         yield from _inlined(_root(found), found, folders)
 
 
@@ -123,7 +123,7 @@ def _check_integrators(path: Path, integrators: list[ElementTree.Element], value
     if "nerg" in kinds:
         raise NergError(
             f'the integrator of "{path}" is "nerg" already; put the gaze field into it by hand, as a <volume '
-            'name="gaze" type="gazefield"> (docs/plugins.md), and "nerg render" shows it'
+            'name="gaze" type="gazefield"> (docs/reference/plugins.md), and "nerg render" shows it'
         )
 
 
@@ -138,8 +138,8 @@ def fill(text: str, values: dict[str, str]) -> str:
 def _paths(path: Path, children: list[ElementTree.Element], folder: Path) -> list[Node]:
     """Where the files are that the scene names."""
     given = [path.parent, *(path.parent / child.get("value", "") for child in children if child.tag == "path")]
-    names = [relative_name(place, folder) for place in given]
-    return [element("path", value=value_of(name)) for name in dict.fromkeys(names) if name != "."]
+    names = [relative_path(place, folder) for place in given]
+    return [element("path", value=check_attribute(name)) for name in dict.fromkeys(names) if name != "."]
 
 
 # ---- A scene file with another gaze field in its place ----
@@ -148,7 +148,7 @@ ROLE = "gaze"
 """The integrator's property that is its gaze field."""
 
 
-def gaze_of_scene(path: Path) -> Path | None:
+def find_gaze_file(path: Path) -> Path | None:
     """The file of the gaze field in the integrator of the scene file ``path``; None where it has none.
 
     Raises `NergError` for a scene without an integrator of its own in the file.
@@ -161,7 +161,7 @@ def gaze_of_scene(path: Path) -> Path | None:
     return path.parent / fill(name, filled_values(own)) if name else None
 
 
-def with_gaze(path: Path, gaze: Path) -> str:
+def replace_gaze(path: Path, gaze: Path) -> str:
     """The scene file ``path`` as text, with the gaze field of the file ``gaze`` in place of its own, or beside what it
     has; names of files are absolute, so that it may be written anywhere.
 
@@ -173,8 +173,8 @@ def with_gaze(path: Path, gaze: Path) -> str:
     if volume is not None:
         integrator.remove(volume)
     volume = SubElement(integrator, "volume", name=ROLE, type="gazefield")
-    SubElement(volume, "string", name="filename", value=value_of(str(real_path(gaze))))
-    return document(list(map(verbatim, own)), f"{path.name} with the gaze field {gaze.name}.", version)
+    SubElement(volume, "string", name="filename", value=check_attribute(str(resolve_path(gaze))))
+    return format_document(list(map(verbatim, own)), f"{path.name} with the gaze field {gaze.name}.", version)
 
 
 def _elements(path: Path) -> tuple[str, list[Element]]:

@@ -12,12 +12,12 @@ from xml.parsers import expat
 import numpy as np
 
 from nerg_mi import llvm
-from nerg_mi.errors import NergError, UnusableLLVM, mitsuba_says, sentence
-from nerg_mi.files.images import check_image, threads_for_mitsuba
-from nerg_mi.files.safe_read import open_file, real_path, size_of
+from nerg_mi.errors import NergError, UnusableLLVM, translate_mitsuba_errors, format_error
+from nerg_mi.files.images import check_image, ensure_two_threads
+from nerg_mi.files.safe_read import open_file, resolve_path, check_regular_file
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.maths.coordinates import check_coordinates
-from nerg_mi.properties import resolved
+from nerg_mi.properties import resolve_scene_file
 from nerg_mi.ranges import SPP, check_number
 from nerg_mi.transport.geometry import check_shape
 
@@ -60,7 +60,7 @@ def check_scene_file(path: str | Path, defaults: Mapping[str, str] | None = None
     _Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()}).read_whole(path)
 
 
-def files_of_scene(path: str | Path, defaults: Mapping[str, str] | None = None) -> list[Path]:
+def list_scene_files(path: str | Path, defaults: Mapping[str, str] | None = None) -> list[Path]:
     """The scene file ``path`` and the files that it names, as far as they are there: what it includes, meshes, fields,
     textures; a mesh is its own only file. ``defaults`` and errors as of `check_scene_file`."""
     path = Path(path)
@@ -74,7 +74,7 @@ def files_of_scene(path: str | Path, defaults: Mapping[str, str] | None = None) 
 def check_scene(path: str | Path, scene) -> None:
     """Look at what Mitsuba has made of the file: shapes, sensors, films and samplers. Raises `NergError`."""
     for shape in scene.shapes():
-        check_shape(shape, f' of "{path}"', merged=True)
+        check_shape(shape, f' of "{path}"', check_merged=True)
     for index, sensor in enumerate(scene.sensors()):
         check_coordinates(
             np.array(sensor.world_transform().matrix, float).reshape(4, 4)[:3, 3:].T,
@@ -91,7 +91,7 @@ def check_scene(path: str | Path, scene) -> None:
 
 def check_samples(count: int, what: str) -> None:
     """Raise `NergError` for no samples a pixel and for too many."""
-    check_number(count, SPP, f"the number of samples a pixel of {what}", whole=True)
+    check_number(count, SPP, f"the number of samples a pixel of {what}", is_integer=True)
 
 
 class _Scene:
@@ -110,7 +110,7 @@ class _Scene:
             check_mesh(mesh, kind, self._colored)
 
     def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
-        whole = real_path(path)
+        whole = resolve_path(path)
         if whole in within:
             raise NergError(f'the scene file "{path}" includes itself; take that <include> out')
         if len(within) > INCLUDES:
@@ -200,10 +200,10 @@ class _Scene:
     def _find(self, name: str, what: str) -> Path | None:
         """The file that Mitsuba opens as ``name``, None where there is none. Raises `NergError` for a pipe, a device or
         a folder."""
-        places = [folder / name for folder in self._folders] + [Path(resolved(name))]
+        places = [folder / name for folder in self._folders] + [Path(resolve_scene_file(name))]
         found = next((place for place in places if name and os.path.exists(place)), None)
         if found is not None:
-            size_of(found, what)
+            check_regular_file(found, what)
         return found
 
 
@@ -216,7 +216,7 @@ _PREFERRED = ("cuda_ad_rgb", "llvm_ad_rgb")
 _OWN = ("path", "parallel", "optimize")
 
 
-def activate(variant: str | None = None) -> str:
+def activate_variant(variant: str | None = None) -> str:
     """Make a Mitsuba variant the active one, with the plugins of this package, and give its name.
 
     `variant` None: `cuda_ad_rgb` where there is an NVIDIA driver, otherwise `llvm_ad_rgb`. Raises NergError for a name
@@ -235,7 +235,7 @@ def activate(variant: str | None = None) -> str:
         except UnusableLLVM:
             raise
         except ImportError as error:  # Mitsuba says so where the backend of a variant cannot start
-            reason = sentence(error)
+            reason = format_error(error)
     raise NergError(f'the variant "{wanted[-1]}" does not work here ({reason}); "nerg doctor" says how to mend it')
 
 
@@ -255,7 +255,7 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None, merg
         if name in given:
             raise NergError(f'"{name}" is a name that Mitsuba keeps for itself: give the value in "{path}" another')
     check_scene_file(path, defaults)
-    with mitsuba_says(), threads_for_mitsuba():
+    with translate_mitsuba_errors(), ensure_two_threads():
         try:
             loaded = mi.load_file(str(path), optimize=merge, **given)
         except RuntimeError as error:

@@ -12,7 +12,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.maths.types import Point3f, variant_types
 
 # ---- Where a point of a scene lies in a camera's picture, and how near and far the camera sees ----
@@ -28,7 +28,7 @@ def clip_distances(extent: float, unit: float = 1.0) -> tuple[float, float]:
     return min(0.01 * unit, 3e-3 * extent), max(1e4 * unit, 100 * extent)
 
 
-def pixel_of(camera: Any, point: Point3f) -> tuple[float, float] | None:
+def project_to_pixel(camera: Any, point: Point3f) -> tuple[float, float] | None:
     """Where ``point`` (one lane, scene units) lies in the picture of the perspective ``camera``: (x, y) in pixels,
     counted from the first one's centre; None outside of it, and behind the camera."""
     mi = variant_types()
@@ -72,7 +72,7 @@ class Verbatim:
 
 
 @dataclass(frozen=True)
-class Blank:
+class BlankLine:
     """An empty line between groups."""
 
 
@@ -85,7 +85,7 @@ class Element:
     children: tuple[Node, ...] = ()
 
 
-Node = Element | Comment | Verbatim | Blank
+Node = Element | Comment | Verbatim | BlankLine
 
 
 def element(tag: str, *children: Node, **attributes: object) -> Element:
@@ -98,7 +98,7 @@ def prop(kind: str, name: str, value: object) -> Element:
     return element(kind, name=name, value=value)
 
 
-def numbers(values: Iterable[float]) -> str:
+def format_numbers(values: Iterable[float]) -> str:
     """Numbers with commas between them, with nine digits or, of single precision, as many as tell them apart; no
     "-0"."""
     return ", ".join(f"{_shortest(float(v)) + 0.0:.9g}" for v in values)
@@ -119,7 +119,7 @@ def matrix(values: np.ndarray) -> Element:
     return element("matrix", value=" ".join(f"{float(v) + 0.0:.15g}" for v in np.asarray(values).ravel()))
 
 
-def document(nodes: Sequence[Node], head: str, version: str = "3.0.0") -> str:
+def format_document(nodes: Sequence[Node], head: str, version: str = "3.0.0") -> str:
     """A scene file of ``nodes`` whose first comment is ``head``, its paragraphs apart.
 
     Raises `NergError` for characters that no XML holds.
@@ -131,12 +131,12 @@ def document(nodes: Sequence[Node], head: str, version: str = "3.0.0") -> str:
     return "\n".join([*lines, "</scene>", ""])
 
 
-def value_of(name: str) -> str:
+def check_attribute(name: str) -> str:
     """A file's ``name`` as the value of an attribute. Raises `NergError` for one that Mitsuba would not take as it is:
     it fills in what follows a dollar sign."""
     if "$" in name or _UNFIT.search(name):
         raise NergError(
-            f'the name "{plain(name)}" cannot stand in a scene file, because of "$" or of characters that are no text; '
+            f'the name "{sanitize(name)}" cannot stand in a scene file, because of "$" or of characters that are no text; '
             "rename the file or its folder"
         )
     return name
@@ -144,7 +144,7 @@ def value_of(name: str) -> str:
 
 def _lines(node: Node, indent: str) -> list[str]:
     match node:
-        case Blank():
+        case BlankLine():
             return [""]
         case Comment(text):
             return _comment(text, indent)
@@ -160,7 +160,7 @@ def _lines(node: Node, indent: str) -> list[str]:
 
 def _quoted(value: str) -> str:
     if _UNFIT.search(value):
-        raise NergError(f'"{plain(value)}" cannot stand in a scene file: it holds characters that are no text')
+        raise NergError(f'"{sanitize(value)}" cannot stand in a scene file: it holds characters that are no text')
     return '"' + escape(value, {'"': "&quot;", "\n": "&#10;", "\r": "&#13;", "\t": "&#9;"}) + '"'
 
 
@@ -192,7 +192,7 @@ def _comment(text: str, indent: str) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Eye:
+class LookAt:
     """Where somebody, or a camera, is and what they look at: (3,) each in scene units; ``up``: (3,), where it is not
     that of the scene."""
 
@@ -217,15 +217,15 @@ class SceneContent:
     ``beside``: of the scene (shapes, lights); ``first``: before all else (paths and defaults of another file).
     ``files``: names of files by the `<default>` that holds them."""
 
-    inside: tuple[Node, ...] = ()
-    beside: tuple[Node, ...] = ()
-    first: tuple[Node, ...] = ()
+    integrator_children: tuple[Node, ...] = ()
+    scene_children: tuple[Node, ...] = ()
+    preamble: tuple[Node, ...] = ()
     files: Mapping[str, str] = field(default_factory=dict)
     # Samples a pixel that make a picture without much noise.
     spp: int = 16
     version: str = "3.0.0"
     # Names of <default>s, and ids, that another file has taken.
-    taken: frozenset[str] = frozenset()
+    reserved_names: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -249,19 +249,19 @@ class SceneText:
     diagonal of a box around the place and its cameras, in scene units; ``observer``: None where the camera is the
     observer."""
 
-    place: SceneContent
-    attention: GazeFiles
-    camera: Eye
-    observer: Eye | None
+    content: SceneContent
+    gaze_files: GazeFiles
+    camera: LookAt
+    observer: LookAt | None
     up: np.ndarray
     lens: Lens = Lens()
     width: int = 480
     unit: float = 1.0
     extent: float = 10.0
     # Sentences for whoever opens the file: of the file, of the camera, of the observer.
-    about: str = ""
-    about_camera: str = ""
-    about_observer: str = ""
+    comment: str = ""
+    camera_comment: str = ""
+    observer_comment: str = ""
 
     @property
     def falloff(self) -> float:
@@ -269,9 +269,9 @@ class SceneText:
         and single precision resolves."""
         return float(np.clip(0.05 * self.unit, 1e-4 * self.extent, 0.02 * self.extent))
 
-    def xml(self) -> str:
+    def to_xml(self) -> str:
         """The text of the file."""
-        return document(_nodes(self), self.about, self.place.version)
+        return format_document(_nodes(self), self.comment, self.content.version)
 
 
 class _SceneNames:
@@ -281,7 +281,7 @@ class _SceneNames:
         self._taken = taken
 
     def __call__(self, name: str) -> str:
-        return default_name(name, self._taken)
+        return free_default_name(name, self._taken)
 
     def default(self, name: str, value: object) -> Element:
         return element("default", name=self(name), value=value)
@@ -291,56 +291,56 @@ class _SceneNames:
 
 
 def _nodes(scene: SceneText) -> Sequence[Node]:
-    names, place = _SceneNames(scene.place.taken), scene.place
+    names, place = _SceneNames(scene.content.reserved_names), scene.content
     return [
-        *place.first,
+        *place.preamble,
         *_defaults(scene, names),
-        Blank(),
+        BlankLine(),
         _integrator(scene, names),
-        Blank(),
+        BlankLine(),
         _camera(scene, names),
-        Blank(),
+        BlankLine(),
         *_own_sensors(scene, names),
-        *([Blank(), *place.beside] if place.beside else []),
+        *([BlankLine(), *place.scene_children] if place.scene_children else []),
     ]
 
 
 def _defaults(scene: SceneText, names: _SceneNames) -> list[Node]:
     height = max(1, round(scene.width / scene.lens.aspect))
-    attention, sphere = scene.attention, 2 * round(0.4 * scene.width)
-    files = {**scene.place.files, "gaze": attention.gaze, "rays": attention.rays}
+    attention, sphere = scene.gaze_files, 2 * round(0.4 * scene.width)
+    files = {**scene.content.files, "gaze": attention.gaze, "rays": attention.rays}
     out: list[Node] = [names.default(name, file) for name, file in files.items() if file is not None]
     out += [
         names.default(name, value)
         for name, value in {
-            "spp": scene.place.spp,
+            "spp": scene.content.spp,
             "width": scene.width,
             "height": height,
             "sphere_width": sphere,
             "sphere_height": sphere // 2,
         }.items()
     ]
-    out += [Blank(), Comment(scene.about_camera)]
+    out += [BlankLine(), Comment(scene.camera_comment)]
     out += [
-        names.default("camera", numbers(scene.camera.origin)),
-        names.default("target", numbers(scene.camera.target)),
+        names.default("camera", format_numbers(scene.camera.origin)),
+        names.default("target", format_numbers(scene.camera.target)),
     ]
-    out += [names.default("fov", numbers([scene.lens.fov])), names.default("up", numbers(scene.up))]
+    out += [names.default("fov", format_numbers([scene.lens.fov])), names.default("up", format_numbers(scene.up))]
     if scene.observer is not None:
-        out += [Blank(), Comment(scene.about_observer)]
-        out += [names.default("eye", numbers(scene.observer.origin))]
-        out += [names.default("ahead", numbers(scene.observer.target))]
+        out += [BlankLine(), Comment(scene.observer_comment)]
+        out += [names.default("eye", format_numbers(scene.observer.origin))]
+        out += [names.default("ahead", format_numbers(scene.observer.target))]
     aovs = ["depth", "opacity", *([attention.quantity] if attention.quantity else []), "visibility"]
     falloff = Comment(
         "How far behind what the observer sees gaze fades to zero, in units of the scene; 0: a hard edge."
     )
     return [
         *out,
-        Blank(),
+        BlankLine(),
         names.default("aovs", ",".join(aovs)),
         names.default("depth", "median"),
         falloff,
-        names.default("falloff", numbers([scene.falloff])),
+        names.default("falloff", format_numbers([scene.falloff])),
         names.default("visibility", "depth"),
         names.default("tolerance", "0"),
         names.default("occlusion", "true"),
@@ -349,8 +349,8 @@ def _defaults(scene: SceneText, names: _SceneNames) -> list[Node]:
 
 
 def _integrator(scene: SceneText, names: _SceneNames) -> Element:
-    attention = scene.attention
-    children: list[Node] = list(scene.place.inside)
+    attention = scene.gaze_files
+    children: list[Node] = list(scene.content.integrator_children)
     if attention.gaze is not None:
         children.append(element("volume", prop("string", "filename", names.use("gaze")), name="gaze", type="gazefield"))
     if attention.rays is not None:
@@ -375,9 +375,9 @@ def _own_sensors(scene: SceneText, names: _SceneNames) -> list[Node]:
     observer = scene.observer
     eye, ahead = ("camera", "target") if observer is None else ("eye", "ahead")
     pose = _look(names.use(eye), names.use(ahead), _up(observer or scene.camera, names))
-    front = ahead_level((observer or scene.camera), scene.up)
+    front = level_direction((observer or scene.camera), scene.up)
     around = transform(
-        element("lookat", origin="0, 0, 0", target=numbers(front), up=numbers(scene.up)),
+        element("lookat", origin="0, 0, 0", target=format_numbers(front), up=format_numbers(scene.up)),
         element("translate", value=names.use(eye)),
     )
     film = _film(names.use("sphere_width"), names.use("sphere_height"))
@@ -385,13 +385,13 @@ def _own_sensors(scene: SceneText, names: _SceneNames) -> list[Node]:
     towards = "the direction in which the observer looks" if observer is not None else "where the camera looks"
     return [
         _perspective("own_view", pose, scene, names),
-        Blank(),
+        BlankLine(),
         Comment(f"The middle of this picture is the horizon towards {towards}."),
         sphere,
     ]
 
 
-def ahead_level(eye: Eye, up: np.ndarray) -> np.ndarray:
+def level_direction(eye: LookAt, up: np.ndarray) -> np.ndarray:
     """Unit direction (3,) in which ``eye`` looks, made level; any level one for an eye that looks straight up or
     down."""
     up = np.asarray(up, float) / np.linalg.norm(up)
@@ -406,8 +406,8 @@ def _perspective(
     name: str, pose: Node, scene: SceneText, names: _SceneNames, offset: Sequence[float] = (0, 0)
 ) -> Element:
     lens: list[Node] = [prop("float", "fov", names.use("fov")), prop("string", "fov_axis", "x")]
-    lens += [prop("float", f"principal_point_offset_{a}", numbers([v])) for a, v in zip("xy", offset) if v]
-    near, far = (numbers([distance]) for distance in clip_distances(scene.extent, scene.unit))
+    lens += [prop("float", f"principal_point_offset_{a}", format_numbers([v])) for a, v in zip("xy", offset) if v]
+    near, far = (format_numbers([distance]) for distance in clip_distances(scene.extent, scene.unit))
     film = _film(names.use("width"), names.use("height"))
     clip = [prop("float", "near_clip", near), prop("float", "far_clip", far)]
     return element("sensor", *lens, *clip, pose, _sampler(names), film, type="perspective", id=names(name))
@@ -433,16 +433,16 @@ def _look(origin: str, target: str, up: str) -> Element:
     return transform(element("lookat", origin=origin, target=target, up=up))
 
 
-def _up(eye: Eye, names: _SceneNames) -> str:
-    return names.use("up") if eye.up is None else numbers(eye.up)
+def _up(eye: LookAt, names: _SceneNames) -> str:
+    return names.use("up") if eye.up is None else format_numbers(eye.up)
 
 
-def default_name(name: str, taken: frozenset[str]) -> str:
+def free_default_name(name: str, taken: frozenset[str]) -> str:
     """The `<default>` of a written scene that is called ``name`` where no other file has ``taken`` that name."""
     return f"nerg_{name}" if name in taken else name
 
 
-def relative_name(path: Path, folder: Path) -> str:
+def relative_path(path: Path, folder: Path) -> str:
     """``path`` as a scene file in ``folder`` names it: relative where both lie below a common folder, else absolute."""
     path, folder = Path(os.path.realpath(path)), Path(os.path.realpath(folder))
     common = os.path.commonpath([path, folder])

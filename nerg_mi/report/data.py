@@ -14,22 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.evaluation.gaze_report import GazeResults, Verdict, judge, widening
+from nerg_mi.evaluation.gaze_report import GazeResults, Verdict, compute_verdict, small_sample_factor
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.overlay import srgb, to_bytes
 from nerg_mi.formats.areas import Region
-from nerg_mi.maths.arrays import vector_of
+from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
 from nerg_mi.rays.quality import RaysSummary
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
-from nerg_mi.statistics.shares import Look, Shares
-from nerg_mi.statistics.visits import Aoi, HitAssignment, land, regroup
+from nerg_mi.statistics.shares import DirectionQuery, Shares
+from nerg_mi.statistics.visits import Aoi, HitAssignment, assign_hits, regroup
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
-from nerg_mi.train.geometry import GazePlace
-from nerg_mi.transport.geometry import Place, default_settings, trace_depth
+from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, trace_depth
 from nerg_mi.transport.observer import ObserverSettings
-from nerg_mi.transport.observer_gaze import PlacedGaze, look_from
+from nerg_mi.transport.observer_gaze import GazeFieldInstance, make_gaze_evaluator
 
 # ---- Glances ----
 #
@@ -46,26 +46,26 @@ class EyePositions:
     """Where people stood: ``positions`` (P, 3), and whose they are, ``person`` (P,)."""
 
     positions: np.ndarray
-    person: np.ndarray
+    participant: np.ndarray
 
 
-class Onlooker:
+class GazeSampler:
     """A gaze field in its place, asked about observers in the place's coordinates.
 
     ``kind``: of the depth at which a ray meets its surface.
     """
 
-    def __init__(self, field: AnyGazeField, place: GazePlace, kind: str = "median"):
+    def __init__(self, field: AnyGazeField, geometry: TrainingGeometry, kind: str = "median"):
         self.field, self._kind = field, kind
-        self._place = place.medium if isinstance(place.medium, Place) else Place(place.medium)
-        self._known = place.medium is not None
-        march = default_settings(self._place)
+        self._place = geometry.medium if isinstance(geometry.medium, SceneGeometry) else SceneGeometry(geometry.medium)
+        self._known = geometry.medium is not None
+        march = default_march_settings(self._place)
         self._settings = ObserverSettings(
             march=march, depth=kind, surface_opacity=SURFACE_OPACITY, directions=_INTEGRAL
         )
-        self._gaze = PlacedGaze(field)
+        self._gaze = GazeFieldInstance(field)
 
-    def meet(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Depth (N,) along rays (N, 3), and whether they meet a surface; nothing is met where no place is known."""
         if not self._known:
             return np.zeros(len(origins), np.float32), np.zeros(len(origins), bool)
@@ -76,25 +76,25 @@ class Onlooker:
         """Gaze (N,) in 1/sr of the ``observer`` (3,) in unit ``directions`` (N, 3)."""
         mi = variant_types()
         center = mi.Point3f(*np.asarray(observer, float).tolist())
-        observed = self._gaze.at([center], self._place, self._settings)
-        return np.array(observed.along(center, vector_of(mi.Vector3f, directions)))
+        observed = self._gaze.for_observers([center], self._place, self._settings)
+        return np.array(observed.along(center, to_vector(mi.Vector3f, directions)))
 
-    def on_points(self, observer: np.ndarray, points: np.ndarray, spacing: float) -> np.ndarray:
+    def density_at_points(self, observer: np.ndarray, points: np.ndarray, spacing: float) -> np.ndarray:
         """Gaze (N,) in 1/sr that the ``observer`` (3,) gives ``points`` (N, 3) of surfaces, none to those that are
         hidden by more than twice the ``spacing``."""
         away = points - observer
         distance = np.linalg.norm(away, axis=1)
         directions = away / np.maximum(distance, 1e-9)[:, None]
-        depth, met = self.meet(np.broadcast_to(observer, points.shape), directions)
+        depth, met = self.trace(np.broadcast_to(observer, points.shape), directions)
         seen = ~met | (depth >= distance - 2 * spacing)
         return np.where(seen, self.density(observer, directions), 0)
 
-    def look_from(self, eye: np.ndarray) -> Look:
+    def query_from(self, observer: np.ndarray) -> DirectionQuery:
         """What the observer at ``eye`` (3,) meets and gives their gaze, as `gaze_shares` wants it."""
-        return look_from(self._gaze, self._place, self._settings, eye)
+        return make_gaze_evaluator(self._gaze, self._place, self._settings, observer)
 
 
-def eyes_of(rays: Rays, place: GazePlace, most: int) -> EyePositions:
+def sample_eye_positions(rays: Rays, geometry: TrainingGeometry, most: int) -> EyePositions:
     """About ``most`` of the positions of ``rays``, in the place's coordinates, as many of each person: evenly chosen
     among theirs in the order of time, and begun at another part of it for each person, so that all together are spread
     over whole visits even where each person has only one. Of more people than that so many, evenly chosen."""
@@ -111,13 +111,13 @@ def eyes_of(rays: Rays, place: GazePlace, most: int) -> EyePositions:
         # At the same share of as many equal stretches.
         chosen.append(own[((np.arange(count) + start) * len(own) / count).astype(int)])
     rows = np.concatenate(chosen)
-    return EyePositions(place.points_from_rays(rays.origin[rows]), rays.person[rows])
+    return EyePositions(geometry.points_to_field(rays.origin[rows]), rays.person[rows])
 
 
-def land_rays(
+def assign_ray_hits(
     rays: Rays,
-    place: GazePlace,
-    onlooker: Onlooker,
+    geometry: TrainingGeometry,
+    sampler: GazeSampler,
     most: int,
     things: Sequence[Aoi],
     members: Sequence[tuple[int, ...]],
@@ -127,16 +127,16 @@ def land_rays(
     numbers, ``members``, and whose each is (N,). Rays end at their own hit points, or else at what they meet in the
     place. ``margin``: as of `visits.land`."""
     some = rays if len(rays) <= most else rays.select(np.linspace(0, len(rays) - 1, most).round().astype(int))
-    origins, directions = place.points_from_rays(some.origin), place.directions_from_rays(some.direction)
-    met, hit = onlooker.meet(origins, directions)
+    origins, directions = geometry.points_to_field(some.origin), geometry.directions_to_field(some.direction)
+    met, hit = sampler.trace(origins, directions)
     depth = np.where(hit, met, np.inf)
     if some.hit is not None:
-        away = place.points_from_rays(some.hit) - origins
+        away = geometry.points_to_field(some.hit) - origins
         far = np.linalg.norm(away, axis=1)
         ends = np.isfinite(far) & (far > 0)
         directions = np.where(ends[:, None], away / np.where(ends, far, 1)[:, None], directions)
         depth = np.where(ends, far, depth)
-    return regroup(land(things, origins, directions, depth, margin), members), some.person
+    return regroup(assign_hits(things, origins, directions, depth, margin), members), some.person
 
 
 # ---- Names ----
@@ -150,7 +150,7 @@ _KEPT = ("frame", "source_frame", "transform", "rows_read", "preset")
 _WORD = 3
 
 
-class Labels:
+class ParticipantLabels:
     """Numbered people, as in "person 1", in place of names: by the number of rays, the most first, and then those who
     are only named by evaluations."""
 
@@ -160,11 +160,11 @@ class Labels:
             count = np.bincount(rays.person, minlength=len(rays.persons))
             names = [rays.persons[i] for i in np.argsort(-count, kind="stable")]
         for found in results:
-            names += [str(row["person"]) for row in found.persons if "person" in row]
+            names += [str(row["person"]) for row in found.participant_rows if "person" in row]
         self._number = {name: k + 1 for k, name in enumerate(dict.fromkeys(names))}
         self._label = {name: f"person {number}" for name, number in self._number.items()}
 
-    def of(self, name: str) -> str:
+    def label(self, name: str) -> str:
         """What stands for ``name``."""
         return self._label.get(name, "a person")
 
@@ -172,7 +172,7 @@ class Labels:
         """The number that stands for ``name``, 0 for nobody's."""
         return self._number.get(name, 0)
 
-    def hide(self, text: str) -> str:
+    def anonymize(self, text: str) -> str:
         """``text``, such as a file's name, with what stands for people in place of their names: also within words, but
         for names of one or two characters."""
         parts = sorted((n for n in self._label if n), key=len, reverse=True)
@@ -182,7 +182,7 @@ class Labels:
         return re.sub(pattern, swap, text, flags=re.IGNORECASE) if pattern else text
 
 
-def rays_without_names(rays: Rays, labels: Labels) -> Rays:
+def anonymize_rays(rays: Rays, labels: ParticipantLabels) -> Rays:
     """``rays`` whose people are called by ``labels``, and of whose metadata only that is left which names nobody."""
     about = {key: rays.metadata[key] for key in _KEPT if key in rays.metadata}
     files = [d.get("file") for d in rays.metadata.get("dropped", [])]
@@ -195,14 +195,14 @@ def rays_without_names(rays: Rays, labels: Labels) -> Rays:
     code = np.empty(len(order), np.int32)
     code[order] = np.arange(len(order))
     return replace(
-        rays, person=code[rays.person], persons=tuple(labels.of(rays.persons[i]) for i in order), metadata=about
+        rays, person=code[rays.person], persons=tuple(labels.label(rays.persons[i]) for i in order), metadata=about
     )
 
 
-def results_without_names(found: GazeResults, labels: Labels) -> GazeResults:
+def anonymize_results(results: GazeResults, labels: ParticipantLabels) -> GazeResults:
     """``found`` whose people are called by ``labels``."""
-    persons = tuple({**row, "person": labels.of(str(row.get("person", "")))} for row in found.persons)
-    return replace(found, persons=persons)
+    persons = tuple({**row, "person": labels.label(str(row.get("person", "")))} for row in results.participant_rows)
+    return replace(results, participant_rows=persons)
 
 
 # ---- Objects ----
@@ -217,7 +217,7 @@ LEAST_PEOPLE = 3
 
 
 @dataclass(frozen=True)
-class Share:
+class MeanShare:
     """A mean share of attention over people, and the 95 % interval of that mean; NaN where people are too few for
     it."""
 
@@ -233,14 +233,14 @@ class ObjectAttention:
     where it can be seen, and ``looked``: who have a ray on it, of ``people``; None where nobody was recorded."""
 
     name: str
-    field: Share
-    recorded: Share | None
-    saw: int | None
-    looked: int | None
-    people: int | None
+    predicted: MeanShare
+    recorded: MeanShare | None
+    num_could_see: int | None
+    num_looked: int | None
+    num_participants: int | None
 
 
-def attention_on(
+def summarize_objects(
     names: Sequence[str], shares: Shares, who: np.ndarray, recorded: tuple[HitAssignment, np.ndarray] | None = None
 ) -> tuple[ObjectAttention, ...]:
     """Attention on each of the objects called ``names``, by the ``shares`` of eyes, which are those of ``who`` (P,).
@@ -252,27 +252,27 @@ def attention_on(
     for k, name in enumerate(names):
         share = shares.share[:, k]
         if recorded is None:
-            out.append(ObjectAttention(name, Share(float(share.mean()), math.nan, math.nan), None, None, None, None))
+            out.append(ObjectAttention(name, MeanShare(float(share.mean()), math.nan, math.nan), None, None, None, None))
             continue
         landed, person = recorded
         on = np.zeros(len(person))
         on[landed.rows[k]] = 1.0
         rays = _each(on, person)
-        saw = _each(shares.seen[:, k].astype(float), who)
+        saw = _each(shares.is_hit[:, k].astype(float), who)
         field, people = mean_over_people(_each(share, who)), len(np.unique(person))
         seen, looked = int(np.sum(saw > 0)), int(np.sum(rays > 0))
         out.append(ObjectAttention(name, field, mean_over_people(rays), max(seen, looked), looked, people))
     return tuple(out)
 
 
-def mean_over_people(values: np.ndarray) -> Share:
+def mean_over_people(values: np.ndarray) -> MeanShare:
     """The mean of ``values`` (N,), one a person, between 0 and 1, and its interval."""
     mean, n = float(values.mean()), len(values)
     if n < LEAST_PEOPLE:
-        return Share(mean, math.nan, math.nan)
+        return MeanShare(mean, math.nan, math.nan)
     # The bootstrap's standard error of a mean is that of the population: divided by n, not by n - 1.
-    reach = 1.96 * float(values.std()) / math.sqrt(n) * widening(n)
-    return Share(mean, max(mean - reach, 0.0), min(mean + reach, 1.0))
+    reach = 1.96 * float(values.std()) / math.sqrt(n) * small_sample_factor(n)
+    return MeanShare(mean, max(mean - reach, 0.0), min(mean + reach, 1.0))
 
 
 def _each(values: np.ndarray, person: np.ndarray) -> np.ndarray:
@@ -308,15 +308,15 @@ class ReportProxy:
     spacing: float
 
 
-def place_proxy(
+def make_proxy(
     scene: Any,
-    eyes: np.ndarray,
+    viewpoints: np.ndarray,
     up: np.ndarray,
     observers: np.ndarray,
     gaze: GazeAt,
     most: int = 80_000,
     size: tuple[int, int] = (320, 160),
-    on_eye: Callable[[int, int], None] | None = None,
+    on_panorama: Callable[[int, int], None] | None = None,
 ) -> ReportProxy | None:
     """What panoramas of ``size`` from ``eyes`` (K, 3) show of ``scene`` (`mi.Scene`), as ``most`` points at most.
 
@@ -325,24 +325,24 @@ def place_proxy(
     there is no surface.
     """
     parts = []
-    for number, eye in enumerate(eyes):
+    for number, eye in enumerate(viewpoints):
         parts.append(_panorama(scene, np.asarray(eye, float), np.asarray(up, float), size))
-        if on_eye is not None:
-            on_eye(number + 1, len(eyes))
+        if on_panorama is not None:
+            on_panorama(number + 1, len(viewpoints))
     points, normals, facing, colors, distance = (np.concatenate(columns) for columns in zip(*parts))
     if not len(points):
         return None
     near = distance <= _FAR * np.median(distance)
     values = np.concatenate([colors, facing], axis=1)
-    points, values, spacing = thin(points[near], normals[near], values[near], most)
+    points, values, spacing = downsample_points(points[near], normals[near], values[near], most)
     colors, normals = values[:, :3], smooth_normals(points, values[:, 3:])
     baked = [gaze(np.asarray(observer, float), points, spacing) for observer in observers]
     heat = np.stack(baked).astype(np.float32) if baked else np.zeros((0, len(points)), np.float32)
     return ReportProxy(points.astype(np.float32), normals.astype(np.float32), to_bytes(srgb(colors)), heat, spacing)
 
 
-def thin(
-    points: np.ndarray, normals: np.ndarray, values: np.ndarray, most: int
+def downsample_points(
+    points: np.ndarray, normals: np.ndarray, values: np.ndarray, max_points: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """The means of ``points`` (N, 3) and of their ``values`` (N, C) in each of at most ``most`` cubes, and the cubes'
     edge. Surfaces whose ``normals`` face opposite ways are kept apart, as the two sides of a thin wall are."""
@@ -353,7 +353,7 @@ def thin(
         cell = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
         key = np.ravel_multi_index((*cell.T, facing), (*(cell.max(axis=0) + 1), 6))
         _, which, count = np.unique(key, return_inverse=True, return_counts=True)
-        if len(count) <= most:
+        if len(count) <= max_points:
             break
         edge *= 1.1
     mean = lambda v: np.stack([np.bincount(which, weights=c) for c in v.T], axis=1) / count[:, None]
@@ -423,7 +423,7 @@ def _nearer_step(points: np.ndarray, axis: int) -> np.ndarray:
     return np.where(far(forward) <= far(backward), forward, backward)
 
 
-def spread_out(points: np.ndarray, count: int, first: np.ndarray | None = None) -> np.ndarray:
+def farthest_point_sampling(points: np.ndarray, count: int, first: np.ndarray | None = None) -> np.ndarray:
     """Indices of up to ``count`` of ``points`` (N, 3), each the farthest from those before; the first one is the
     farthest from ``first`` (K, 3), or number 0."""
     if not len(points):
@@ -467,22 +467,22 @@ class Run:
 
     title: str
     gaze: Mapping[str, Any]
-    place: str
-    kind: str
+    geometry_description: str
+    geometry_kind: str
     radiance: Mapping[str, Any] = field(default_factory=dict)
     observer: str = ""
     rays: Rays | None = None
     summary: RaysSummary | None = None
     results: tuple[GazeResults, ...] = ()
     # Remarks on them: of another name, of an earlier version.
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     objects: tuple[ObjectAttention, ...] = ()
     # From how many places of people objects were looked for.
-    eyes: int = 0
+    num_viewpoints: int = 0
     # Shares of objects that fewer people could see are not shown.
-    least: int = 1
+    min_participants: int = 1
     # For each looked-from place of people, how many people were within its radius.
-    company: tuple[int, ...] = ()
+    nearby_participants: tuple[int, ...] = ()
     pictures: Mapping[str, ReportPicture] = field(default_factory=dict)
     stage: str | None = None
     # How many observers, paths and points the 3D scene has.
@@ -495,9 +495,9 @@ class Run:
     # What the report was made with, by the option's name.
     settings: Mapping[str, str] = field(default_factory=dict)
     # Rays and people that the gaze rests on, in words, "" where that is not known.
-    basis: str = ""
+    support_note: str = ""
     # Where all of this comes from (`figures.style`), as JSON.
-    made: str = ""
+    provenance_json: str = ""
     # ``objects`` of the observer alone, where one was named; of people otherwise.
     observed_objects: tuple[ObjectAttention, ...] = ()
 
@@ -509,7 +509,7 @@ class Run:
     @property
     def verdicts(self) -> list[tuple[GazeResults, Verdict]]:
         """The verdict on each evaluation."""
-        return [(r, judge(r.rows, r.split, r.people, r.positions)) for r in self.results]
+        return [(r, compute_verdict(r.rows, r.split, r.num_participants, r.num_positions)) for r in self.results]
 
 
 # ---- Stage ----
@@ -519,7 +519,7 @@ class Run:
 # Positions are 16 bits an axis of the points' box, normals and colours 8 bits a component, gaze the square root of its
 # share of the observer's own scale in 8 bits.
 
-PATH_POINTS = 16_000
+MAX_PATH_POINTS = 16_000
 """Positions of all people's paths together, at most."""
 
 # Angle above the level from which the scene is shown at first, in radians.
@@ -548,7 +548,7 @@ class Stage:
     camera: ReportCamera
 
 
-def pack(stage: Stage) -> str:
+def pack_stage(stage: Stage) -> str:
     """The scene as JSON that is safe within a page, its arrays in base64."""
     proxy, M = stage.proxy, len(stage.observers)
     lower, size = _frame(stage)

@@ -57,15 +57,15 @@ def paragraph(*content: Content, kind: str | None = None) -> Html:
     return element("p", *content, class_=kind)
 
 
-def table(head: Sequence[Content], rows: Iterable[Sequence[Content]], numbers: Sequence[int] = ()) -> Html:
+def table(header: Sequence[Content], rows: Iterable[Sequence[Content]], numeric_columns: Sequence[int] = ()) -> Html:
     """A table with a line of names; the columns ``numbers``, counted from 0, are aligned to the right."""
-    side = lambda column: "number" if column in numbers else None
+    side = lambda column: "number" if column in numeric_columns else None
     line = lambda tag, cells: element("tr", [element(tag, c, class_=side(i)) for i, c in enumerate(cells)])
     body = [line("td", row) for row in rows]
-    return element("div", element("table", element("thead", line("th", head)), element("tbody", body)), class_="scroll")
+    return element("div", element("table", element("thead", line("th", header)), element("tbody", body)), class_="scroll")
 
 
-def pairs(rows: Iterable[tuple[Content, Content]]) -> Html:
+def key_value_table(rows: Iterable[tuple[Content, Content]]) -> Html:
     """A table of names and what belongs to them."""
     lines = [element("tr", element("th", name, scope="row"), element("td", value)) for name, value in rows]
     return element("div", element("table", element("tbody", lines), class_="pairs"), class_="scroll")
@@ -98,7 +98,7 @@ class Point:
     value: float
     low: float = math.nan
     high: float = math.nan
-    own: bool = False
+    is_highlighted: bool = False
 
 
 def interval_chart(panels: Sequence[tuple[str, Sequence[Point]]]) -> Html:
@@ -106,7 +106,7 @@ def interval_chart(panels: Sequence[tuple[str, Sequence[Point]]]) -> Html:
     rows = len(panels[0][1])
     width, height = _LABELS + len(panels) * _WIDTH, TOP + rows * ROW + FOOT
     shown = [
-        _text(_LABELS - 12, _middle(i), p.label, anchor="end", weight=600 if p.own else None)
+        _text(_LABELS - 12, _middle(i), p.label, anchor="end", weight=600 if p.is_highlighted else None)
         for i, p in enumerate(panels[0][1])
     ]
     for k, (title, points) in enumerate(panels):
@@ -127,11 +127,11 @@ def _panel(left: float, title: str, points: Sequence[Point]) -> Html:
         parts.append(_line(x(tick), TOP, x(tick), bottom, _GRID if tick else _INK, 1))
         parts.append(_text(x(tick), bottom + 15, f"{tick:g}", anchor="middle", kind="faint"))
     for i, p in enumerate(points):
-        color, y = _OWN if p.own else _INK, _middle(i)
+        color, y = _OWN if p.is_highlighted else _INK, _middle(i)
         if math.isfinite(p.low) and math.isfinite(p.high):
             parts.append(_line(x(p.low), y, x(p.high), y, color, 2))
         if math.isfinite(p.value):
-            parts.append(element("circle", cx=_short(x(p.value)), cy=_short(y), r=4.5 if p.own else 3.5, fill=color))
+            parts.append(element("circle", cx=_short(x(p.value)), cy=_short(y), r=4.5 if p.is_highlighted else 3.5, fill=color))
     return Html("".join(parts))
 
 

@@ -11,11 +11,11 @@ from importlib.resources import files
 from typing import Any
 
 from nerg_mi import __version__
-from nerg_mi.evaluation.gaze_report import BLIND, HALF, WORDS, Comparison, GazeResults, Verdict
-from nerg_mi.rays.quality import WARNING, card_lines
+from nerg_mi.evaluation.gaze_report import POSITION_BLIND, SPLIT_HALF, SPLIT_LABELS, Comparison, GazeResults, Verdict
+from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report
 
-from .data import ObjectAttention, Run, Share
-from .html import Html, Point, element, figure, image, interval_chart, markup, pairs, paragraph, table
+from .data import ObjectAttention, Run, MeanShare
+from .html import Html, Point, element, figure, image, interval_chart, markup, key_value_table, paragraph, table
 
 # ---- What a section of a report is ----
 
@@ -27,7 +27,7 @@ class Section:
 
     name: str
     title: str
-    body: Callable[[Run], Html]
+    render: Callable[[Run], Html]
     absent: Callable[[Run], str | None] = lambda run: None
 
 
@@ -37,14 +37,14 @@ class Section:
 def _show_data(run: Run) -> Html:
     """The sanity card of the rays."""
     assert run.rays is not None and run.summary is not None
-    lines = card_lines(run.rays, run.summary)
-    warned = any(name == WARNING for name, _ in lines)
+    lines = make_quality_report(run.rays, run.summary)
+    warned = any(name == WARNING_LABEL for name, _ in lines)
     words = (
         "What is marked as implausible is the likely mistake; mend it before anything else is believed."
         if warned
         else "Nothing in them is implausible."
     )
-    return markup([paragraph(words), pairs(lines)])
+    return markup([paragraph(words), key_value_table(lines)])
 
 
 def _explain_absent_data(run: Run) -> str | None:
@@ -68,7 +68,7 @@ def _show_gaze(run: Run) -> Html:
     shown = lambda names: [
         figure(image(p.png, p.alt), p.caption) for p in (run.pictures.get(n) for n in names) if p is not None
     ]
-    basis = f" The field is {run.basis}." if run.basis else ""
+    basis = f" The field is {run.support_note}." if run.support_note else ""
     words = (
         f"{run.observer}{basis} Densities are in 1/sr: what a colour stands for, times the solid angle that "
         "it covers for the observer, is the probability that they look there."
@@ -115,32 +115,32 @@ _DRAWN = 24
 
 def _show_objects(run: Run) -> Html:
     """A table and a chart, the most attended first."""
-    order = sorted(run.objects, key=lambda o: (-o.field.mean, o.name))
-    shown = [o for o in order if not _hidden(o, run.least)]
+    order = sorted(run.objects, key=lambda o: (-o.predicted.mean, o.name))
+    shown = [o for o in order if not _hidden(o, run.min_participants)]
     recorded = any(o.recorded is not None for o in order)
     shown_parts: list = [paragraph(_words(run, recorded))]
     if shown:
         shown_parts.append(figure(_chart(shown[:_DRAWN], recorded), _caption(len(shown), recorded)))
     head = ["object", "gaze by the field, %", *(["rays recorded, %", "could see it", "looked"] if recorded else [])]
-    rows = [_row(o, run.least, recorded) for o in [*shown, *(o for o in order if _hidden(o, run.least))]]
+    rows = [_row(o, run.min_participants, recorded) for o in [*shown, *(o for o in order if _hidden(o, run.min_participants))]]
     shown_parts.append(table(head, rows, range(1, len(head))))
     return markup(shown_parts)
 
 
 def _hidden(o: ObjectAttention, least: int) -> bool:
-    return o.saw is not None and o.saw < least
+    return o.num_could_see is not None and o.num_could_see < least
 
 
 def _row(o: ObjectAttention, least: int, recorded: bool) -> list[str]:
     if _hidden(o, least):
         return [o.name, "hidden", *(["hidden", f"fewer than {least}", "hidden"] if recorded else [])]
-    cells = [o.name, _percent(o.field)]
+    cells = [o.name, _percent(o.predicted)]
     if recorded and o.recorded is not None:
-        cells += [_percent(o.recorded), f"{o.saw} of {o.people}", f"{o.looked}"]
+        cells += [_percent(o.recorded), f"{o.num_could_see} of {o.num_participants}", f"{o.num_looked}"]
     return cells
 
 
-def _percent(share: Share) -> str:
+def _percent(share: MeanShare) -> str:
     text = f"{100 * share.mean:.2f}"
     return text if math.isnan(share.low) else f"{text} [{100 * share.low:.2f}, {100 * share.high:.2f}]"
 
@@ -149,7 +149,7 @@ def _chart(objects: list[ObjectAttention], recorded: bool) -> Html:
     point = lambda o, s: Point(
         o.name if len(o.name) < 28 else o.name[:26] + "…", 100 * s.mean, 100 * s.low, 100 * s.high
     )
-    panels = [("gaze by the field, %", [point(o, o.field) for o in objects])]
+    panels = [("gaze by the field, %", [point(o, o.predicted) for o in objects])]
     if recorded:
         panels.append(("rays recorded, %", [point(o, o.recorded) for o in objects if o.recorded is not None]))
     return interval_chart(panels)
@@ -163,13 +163,13 @@ def _caption(count: int, recorded: bool) -> str:
 def _words(run: Run, recorded: bool) -> str:
     if not recorded:
         return (
-            f"The share of gaze that the field says an observer gives each object, at {run.eyes} "
-            f"{'place' if run.eyes == 1 else 'places'}. Without rays nothing is known of people, and there are no "
+            f"The share of gaze that the field says an observer gives each object, at {run.num_viewpoints} "
+            f"{'place' if run.num_viewpoints == 1 else 'places'}. Without rays nothing is known of people, and there are no "
             "intervals."
         )
-    least = f" What fewer than {run.least} people could see is hidden." if run.least > 1 else ""
+    least = f" What fewer than {run.min_participants} people could see is hidden." if run.min_participants > 1 else ""
     return (
-        f"The share of gaze that the field says people give each object, at {run.eyes} places where they stood, and "
+        f"The share of gaze that the field says people give each object, at {run.num_viewpoints} places where they stood, and "
         "the share of their rays that end at it. Each person counts alike; brackets are 95 % intervals over "
         "people. Who could see it stood at one of these places in view of it, or looked at it. A field is smooth: "
         "small things that many look at may have a smaller share of it than of the rays."
@@ -180,7 +180,7 @@ def _words(run: Run, recorded: bool) -> str:
 def _explain_absent_objects(run: Run) -> str | None:
     if run.objects:
         return None
-    if run.kind == "none":
+    if run.geometry_kind == "none":
         return "No objects are named, for nothing is known of the place."
     return "No objects are named: --objects FILE.json gives their boxes."
 
@@ -199,12 +199,12 @@ def _show_people(run: Run) -> Html:
 
 
 def _company(run: Run) -> list[str]:
-    if not run.company:
+    if not run.nearby_participants:
         return []
     radius = (run.provenance.get("probes") or {}).get("radius")
     within = f"{radius:g} m" if isinstance(radius, (int, float)) else "half a metre"
-    alone, middle = sum(n <= 1 for n in run.company), sorted(run.company)[len(run.company) // 2]
-    words = f"At the {len(run.company)} places that were looked from, the median number of people within {within} is"
+    alone, middle = sum(n <= 1 for n in run.nearby_participants), sorted(run.nearby_participants)[len(run.nearby_participants) // 2]
+    words = f"At the {len(run.nearby_participants)} places that were looked from, the median number of people within {within} is"
     if not alone:
         return [f"{words} {middle}, and nowhere fewer than two."]
     return [
@@ -225,7 +225,7 @@ PEOPLE = Section("people", "Where people were", _show_people, _explain_absent_pe
 
 def _show_place(run: Run) -> Html:
     """What it is and what it looks like."""
-    shown = [paragraph(run.place), pairs(_facts(run))]
+    shown = [paragraph(run.geometry_description), key_value_table(_facts(run))]
     picture = run.pictures.get("color")
     if picture is not None:
         shown.append(figure(image(picture.png, picture.alt), picture.caption))
@@ -260,7 +260,7 @@ def _show_provenance(run: Run) -> Html:
     shown = [
         table(["", "file", "SHA-256"], [[role, name, element("code", digest)] for role, name, digest in run.inputs])
     ]
-    shown.append(pairs(list(run.versions.items())))
+    shown.append(key_value_table(list(run.versions.items())))
     shown.append(
         paragraph(
             "Equal files, settings and versions make an equal report, to the byte. It holds everything that it shows "
@@ -299,8 +299,8 @@ def _show_scores(run: Run) -> Html:
 
 
 def _title(found: GazeResults) -> str:
-    words = WORDS.get(found.split, found.split)
-    return f"{words[:1].upper()}{words[1:]} ({found.people} people, {found.positions} places)"
+    words = SPLIT_LABELS.get(found.split, found.split)
+    return f"{words[:1].upper()}{words[1:]} ({found.num_participants} people, {found.num_positions} places)"
 
 
 def _split(found: GazeResults, verdict: Verdict) -> list[Html]:
@@ -320,7 +320,7 @@ def _split(found: GazeResults, verdict: Verdict) -> list[Html]:
         )
         note = "Leads are positive where the field is better; their intervals are made wider for few people."
         shown += [leads, paragraph(note, kind="note")]
-    if found.persons:
+    if found.participant_rows:
         shown.append(_persons(found))
     return shown
 
@@ -328,7 +328,7 @@ def _split(found: GazeResults, verdict: Verdict) -> list[Html]:
 def _persons(found: GazeResults) -> Html:
     rows = [
         [str(r["method"]), str(r.get("person", "")), f"{r.get('rays') or 0:,}", *(_number(r.get(s)) for s in _PANELS)]
-        for r in found.persons
+        for r in found.participant_rows
     ]
     head = ["", "person", "rays", *(COLUMNS[s] for s in _PANELS)]
     if len(rows) > 60:
@@ -344,14 +344,14 @@ def _point(row: Mapping[str, Any], score: str, own: bool) -> Point:
 def _lead(found: Comparison) -> list[str]:
     cells = [
         f"{lead.value:+.3f}" + ("" if math.isnan(lead.low) else f" [{lead.low:+.3f}, {lead.high:+.3f}]")
-        for lead in found.leads
+        for lead in found.differences
     ]
     return [found.reference, *cells, found.outcome]
 
 
 def _cell(row: Mapping[str, Any], column: str) -> str:
     text = _number(row.get(column))
-    if text and _known(row.get(f"{column}.low")) and _known(row.get(f"{column}.high")) and row["method"] != HALF:
+    if text and _known(row.get(f"{column}.low")) and _known(row.get(f"{column}.high")) and row["method"] != SPLIT_HALF:
         text += f" [{row[f'{column}.low']:.3f}, {row[f'{column}.high']:.3f}]"
     return text
 
@@ -395,16 +395,16 @@ def _show_settings(run: Run) -> Html:
     test = about.get("test")
     if isinstance(test, dict):
         facts.append(("held out", _held_out(test)))
-    shown = [element("h3", "Training"), pairs(facts)]
+    shown = [element("h3", "Training"), key_value_table(facts)]
     for key, title in (("settings", "Its settings"), ("probes", "Its probes")):
         rows = _flat(about.get(key, {}))
         if rows:
-            shown.append(element("details", element("summary", title), pairs(rows)))
+            shown.append(element("details", element("summary", title), key_value_table(rows)))
     architecture = _flat(run.gaze.get("architecture", {}))
     if architecture:
-        shown.append(element("details", element("summary", "Its field"), pairs(architecture)))
+        shown.append(element("details", element("summary", "Its field"), key_value_table(architecture)))
     if run.settings:
-        shown += [element("h3", "This report"), pairs(list(run.settings.items()))]
+        shown += [element("h3", "This report"), key_value_table(list(run.settings.items()))]
     return markup(shown)
 
 
@@ -476,7 +476,7 @@ def _show_stage(run: Run) -> Html:
         f"{run.stage_points:,} points of surfaces as they were seen from where people can stand. Drag to turn, "
         "shift and drag to move, the wheel comes closer; backs of surfaces are left out, so that one looks into "
         "rooms from outside. Blue marks are observers. Where scripts or WebGL are off, a picture stands for it."
-        f"{f' The gaze is {run.basis}.' if run.basis else ''}"
+        f"{f' The gaze is {run.support_note}.' if run.support_note else ''}"
     )
     return markup([paragraph(words), element("div", controls, canvas, picture, data)])
 
@@ -534,12 +534,12 @@ def _show_verdict(run: Run) -> Html:
     shown = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}") for _, verdict in run.verdicts]
     results = run.results[0]
     basis = (
-        f"By {results.people} people at {results.positions} places that were kept from the training. What decides is "
+        f"By {results.num_participants} people at {results.num_positions} places that were kept from the training. What decides is "
         "whether the 95 % interval over people of the lead in log score, CC and KLD leaves out zero; two of three must "
-        f"agree and none may object. {BLIND.capitalize()} is where people look wherever they stand. The strongest "
+        f"agree and none may object. {POSITION_BLIND.capitalize()} is where people look wherever they stand. The strongest "
         "baseline is the one with the highest log score."
     )
-    half = next((v.half for _, v in run.verdicts if v.half is not None), None)
+    half = next((v.split_half_fraction for _, v in run.verdicts if v.split_half_fraction is not None), None)
     way = (
         ""
         if half is None
@@ -548,7 +548,7 @@ def _show_verdict(run: Run) -> Html:
             f"{100 * half:.0f} %{'' if half <= 1 else ': further, for half of so few people tell little'}."
         )
     )
-    return markup([*shown, paragraph(basis, way, kind="note"), *(paragraph(d, kind="note") for d in run.doubts)])
+    return markup([*shown, paragraph(basis, way, kind="note"), *(paragraph(d, kind="note") for d in run.warnings)])
 
 
 def _explain_absent_verdict(run: Run) -> str | None:
@@ -592,7 +592,7 @@ SECTIONS: tuple[Section, ...] = (
 # The page: its sections in order, what they need to be shown, and a policy by which it loads nothing.
 
 
-def page(run: Run) -> str:
+def render_page(run: Run) -> str:
     """The whole document. Equal runs give equal text."""
     style, script = (_part(name) for name in ("style.css", "viewer.js"))
     scripts = [script] if run.stage is not None else []
@@ -612,7 +612,7 @@ def page(run: Run) -> str:
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         element("meta", name="referrer", content="no-referrer"),
         element("meta", name="generator", content=f"nerg_mi {__version__}"),
-        *([element("meta", name="provenance", content=run.made)] if run.made else []),
+        *([element("meta", name="provenance", content=run.provenance_json)] if run.provenance_json else []),
         element("title", run.title),
         element("style", Html(style)),
     ]
@@ -629,7 +629,7 @@ def page(run: Run) -> str:
 
 def _section(section, run: Run) -> Html:
     absent = section.absent(run)
-    body = paragraph(absent, kind="absent") if absent else section.body(run)
+    body = paragraph(absent, kind="absent") if absent else section.render(run)
     return element("section", element("h2", section.title), body, id=section.name)
 
 

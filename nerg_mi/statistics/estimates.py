@@ -9,7 +9,7 @@ import numpy as np
 
 # ---- Numbers with their 95 % intervals, their differences, and which of many differences are found ----
 
-LEAST_PEOPLE = 3  # fewer people than these, or than these who add anything to a number, give no interval
+MIN_PARTICIPANTS = 3  # fewer people than these, or than these who add anything to a number, give no interval
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Estimates:
     value: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    people: np.ndarray
+    participants: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Differences:
     p: np.ndarray
 
 
-def adjusted(p: np.ndarray) -> np.ndarray:
+def adjust_p_values(p: np.ndarray) -> np.ndarray:
     """p-values (K,) adjusted by the procedure of Benjamini and Hochberg (1995): the least false discovery rate at which
     each is rejected; NaN stays NaN and counts for nothing."""
     from scipy.stats import false_discovery_control
@@ -70,8 +70,8 @@ _BLOCK = 1 << 22
 Pair = tuple[np.ndarray, np.ndarray]
 
 
-def ratios(
-    x: np.ndarray, y: np.ndarray, *, resamples: int = RESAMPLES, seed: int = 0, most: float = np.inf
+def estimate_ratios(
+    x: np.ndarray, y: np.ndarray, *, resamples: int = RESAMPLES, seed: int = 0, upper_limit: float = np.inf
 ) -> Estimates:
     """Σ x / Σ y over P people of K numbers, (P, K) each, y >= 0; ``most``: no interval goes beyond it, or below 0."""
     value, residual, people = _linear(x, y)
@@ -85,12 +85,12 @@ def ratios(
         for part, w in _blocks(len(x), resamples, seed, np.zeros(len(x), int)):
             m, square = _moments(w, x, y)
             t[part] = _studentised(m - value, square * more, linear)
-    c = np.where((x != 0).sum(axis=0) >= LEAST_PEOPLE, np.maximum(_quantile(t, error), least), np.nan)
+    c = np.where((x != 0).sum(axis=0) >= MIN_PARTICIPANTS, np.maximum(_quantile(t, error), least), np.nan)
     low, high = value - c * error, value + c * error
-    return Estimates(value, np.clip(low, 0.0, most), np.clip(high, 0.0, most), people)
+    return Estimates(value, np.clip(low, 0.0, upper_limit), np.clip(high, 0.0, upper_limit), people)
 
 
-def ratio_differences(first: Pair, second: Pair, *, resamples: int = RESAMPLES, seed: int = 0) -> Differences:
+def estimate_ratio_differences(first: Pair, second: Pair, *, resamples: int = RESAMPLES, seed: int = 0) -> Differences:
     """Σ x / Σ y of the ``second`` less that of the ``first``, each of arrays (P, K) over the same list of P people,
     with y = 0 for those who are not of it: people who are of both are drawn together."""
     (x, y), (u, v) = first, second
@@ -112,7 +112,7 @@ def ratio_differences(first: Pair, second: Pair, *, resamples: int = RESAMPLES, 
     adds, others = (x != 0).sum(axis=0), (u != 0).sum(axis=0)
     # A number to which nobody adds is 0 of each: of people who are of both, the difference is the other number.
     same = (((x != 0) | (u != 0)) & (y > 0) & (v > 0)).sum(axis=0)
-    enough = np.minimum(np.where(adds, adds, same), np.where(others, others, same)) >= LEAST_PEOPLE
+    enough = np.minimum(np.where(adds, adds, same), np.where(others, others, same)) >= MIN_PARTICIPANTS
     reach = np.where(enough, _quantile(t, error) * error, np.nan)
     low, high = value - reach, value + reach
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -145,7 +145,7 @@ def _more(people: np.ndarray) -> np.ndarray:
 
 def _spread(parts: np.ndarray, people: np.ndarray) -> np.ndarray:
     """Standard error (K,) of the sum of independent ``parts`` (P, K), NaN for few ``people`` (K,)."""
-    return np.where(people >= LEAST_PEOPLE, np.sqrt((parts**2).sum(axis=0)), np.nan)
+    return np.where(people >= MIN_PARTICIPANTS, np.sqrt((parts**2).sum(axis=0)), np.nan)
 
 
 def _studentised(far: np.ndarray, square: np.ndarray, linear: np.ndarray) -> np.ndarray:
@@ -215,17 +215,17 @@ _ALPHA = 0.05
 _Z = 1.959963984540054
 
 
-def proportions(x: np.ndarray, y: np.ndarray) -> Estimates:
+def estimate_proportions(x: np.ndarray, y: np.ndarray) -> Estimates:
     """Σ x / Σ y of ``x`` and ``y`` (P, K) that are 0 or 1, x <= y, with their intervals."""
     people = y.sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = x.sum(axis=0) / people
-    low, high = mid_p(x.sum(axis=0), people)
-    few = people < LEAST_PEOPLE
+    low, high = mid_p_interval(x.sum(axis=0), people)
+    few = people < MIN_PARTICIPANTS
     return Estimates(value, np.where(few, np.nan, low), np.where(few, np.nan, high), people.astype(int))
 
 
-def mid_p(successes: np.ndarray, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mid_p_interval(successes: np.ndarray, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Ends (K,) of the mid-p interval of a probability, of ``successes`` (K,) of as many ``trials``."""
     x, n = np.asarray(successes, float), np.asarray(trials, float)
     return _lower(x, n), 1.0 - _lower(n - x, n)
@@ -247,7 +247,7 @@ def _lower(x: np.ndarray, n: np.ndarray) -> np.ndarray:
     return np.where(x > 0, low, 0.0)
 
 
-def proportion_differences(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> Differences:
+def estimate_proportion_differences(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> Differences:
     """The share of the ``second`` less that of the ``first``, each of arrays (P, K) over the same list of P people,
     with y = 0 for those who are not of it."""
     from scipy.special import ndtr
@@ -263,5 +263,5 @@ def proportion_differences(first: tuple[np.ndarray, np.ndarray], second: tuple[n
         error = np.sqrt(np.maximum(square, 0.0))
         p = 2 * ndtr(-np.abs(b - a) / error)
     low, high = np.maximum(b - a - _Z * error, -1.0), np.minimum(b - a + _Z * error, 1.0)
-    few = (m < LEAST_PEOPLE) | (n < LEAST_PEOPLE)
+    few = (m < MIN_PARTICIPANTS) | (n < MIN_PARTICIPANTS)
     return Differences(value, *(np.where(few, np.nan, w) for w in (low, high, p)))

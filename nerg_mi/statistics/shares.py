@@ -21,21 +21,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.sphere import fibonacci_directions, numbers_in_cone
+from nerg_mi.maths.sphere import fibonacci_directions, indices_in_cone
 from nerg_mi.ranges import LENGTHS, check_number
-from nerg_mi.transport.observer_gaze import PARTS, POWER
+from nerg_mi.transport.observer_gaze import ERROR_PARTS, ERROR_EXPONENT
 
-from .visits import Aoi, land, regroup
+from .visits import Aoi, assign_hits, regroup
 
-FIRST = 1 << 13  # directions over the sphere that are looked along first
-MOST = 1 << 20  # a spiral has so many directions over the sphere at most, a fifth of a degree apart
+INITIAL_DIRECTIONS = 1 << 13  # directions over the sphere that are looked along first
+MAX_DIRECTIONS = 1 << 20  # a spiral has so many directions over the sphere at most, a fifth of a degree apart
 WHOLE = 1 << 17  # and if all of them are looked along
 LEAST = 64  # so many directions cross a thing at least, where a spiral has them
-ENOUGH = 1 << 14  # a thing that so many directions cross is summed over no more
+MAX_AOI_DIRECTIONS = 1 << 14  # a thing that so many directions cross is summed over no more
 _RAYS = 1 << 17
 _SPHERE = 4 * math.pi
 
-Look = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray | None]]
+DirectionQuery = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray | None]]
 """Of unit directions (N, 3): the gaze (M, N) of an observer in 1/sr, or in proportion to it, by each member of an
 ensemble or by one field; and the distance (N,) of the surface that is met, infinite where there is none, or None where
 no surfaces are known."""
@@ -51,47 +51,47 @@ class Shares:
 
     share: np.ndarray
     error: np.ndarray
-    seen: np.ndarray
+    is_hit: np.ndarray
     distance: np.ndarray
     escaped: np.ndarray
-    whole: np.ndarray
+    integral: np.ndarray
     members: np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
-class SumRule:
+class QuadratureRule:
     """How finely is summed: to an error of ``tolerance``, a share of what is summed, or of ``least``, a share of the
     gaze, over ``first`` directions around an eye or more."""
 
-    tolerance: float = 1e-2
-    least: float = 1e-5
-    first: int = FIRST
+    rtol: float = 1e-2
+    atol: float = 1e-5
+    initial_directions: int = INITIAL_DIRECTIONS
 
 
-ROUGH = SumRule(tolerance=0.02, least=5e-5)  # for many areas at once, or many eyes over which is averaged
+COARSE = QuadratureRule(rtol=0.02, atol=5e-5)  # for many areas at once, or many eyes over which is averaged
 
 
 def gaze_shares(
-    look_from: Callable[[np.ndarray], Look],
-    eyes: np.ndarray,
-    things: Sequence[Aoi],
+    make_gaze_evaluator: Callable[[np.ndarray], DirectionQuery],
+    observers: np.ndarray,
+    aois: Sequence[Aoi],
     members: Sequence[tuple[int, ...]],
     margin: float,
-    rule: SumRule | None = None,
+    rule: QuadratureRule | None = None,
     on_eyes: Callable[[int], None] | None = None,
 ) -> Shares:
     """The shares of gaze that ``eyes`` (E, 3) give to areas, which consist of ``things`` by their numbers, ``members``.
 
-    ``look_from`` makes the look of an eye (3,); ``margin``: as of `visits.land`. ``on_eyes`` is told how many eyes are
+    ``make_gaze_evaluator`` makes the look of an eye (3,); ``margin``: as of `visits.land`. ``on_eyes`` is told how many eyes are
     done, after some of them each time. Raises `NergError` where the gaze is not finite.
     """
-    rule = rule or SumRule()
-    eyes = np.asarray(eyes, float)
+    rule = rule or QuadratureRule()
+    observers = np.asarray(observers, float)
     found: list[Shares] = []
-    each = max(1, _RAYS // rule.first)
-    for a in range(0, len(eyes), each):
-        some = eyes[a : a + each]
-        found.append(_Sums(look_from, some, things, members, margin, rule).shares())
+    each = max(1, _RAYS // rule.initial_directions)
+    for a in range(0, len(observers), each):
+        some = observers[a : a + each]
+        found.append(_Sums(make_gaze_evaluator, some, aois, members, margin, rule).shares())
         if on_eyes is not None:
             on_eyes(a + len(some))
     if not found:
@@ -107,22 +107,22 @@ class _Sums:
 
     def __init__(
         self,
-        look_from: Callable[[np.ndarray], Look],
+        make_gaze_evaluator: Callable[[np.ndarray], DirectionQuery],
         eyes: np.ndarray,
         things: Sequence[Aoi],
         members: Sequence[tuple[int, ...]],
         margin: float,
-        rule: SumRule,
+        rule: QuadratureRule,
     ):
-        self.look_from, self.eyes, self.things, self.members = look_from, eyes, things, members
-        self.looks: dict[int, Look] = {}
+        self.make_gaze_evaluator, self.eyes, self.things, self.members = make_gaze_evaluator, eyes, things, members
+        self.looks: dict[int, DirectionQuery] = {}
         self.margin, self.rule = margin, rule
         E, A = len(eyes), len(members)
         # Integrals over the parts of a spiral: of the mean density, and of members apart.
-        self.parts: np.ndarray = np.zeros((1, E, A + 1, PARTS))
+        self.parts: np.ndarray = np.zeros((1, E, A + 1, ERROR_PARTS))
         self.distance, self.escaped = np.zeros((E, A)), np.zeros(E)
         self.seen = np.zeros((E, A), bool)
-        self.count = np.full((E, A + 1), rule.first)
+        self.count = np.full((E, A + 1), rule.initial_directions)
         # Of an area the directions of the spiral that was last asked for.
         self._crossing: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
         for e in range(E):
@@ -151,14 +151,14 @@ class _Sums:
     def _integrals(self) -> tuple[np.ndarray, np.ndarray]:
         """``(value (M, E, A + 1), error (E, A + 1))``, the error of the mean density."""
         scatter = self.parts[0].std(axis=-1, ddof=1)
-        return self.parts.mean(axis=-1), scatter * PARTS**-POWER
+        return self.parts.mean(axis=-1), scatter * ERROR_PARTS**-ERROR_EXPONENT
 
     def _refine(self, open_: np.ndarray) -> np.ndarray:
         """Give more directions to those sums of ``open_`` (E, A + 1) that err by more than the tolerance, and say
         which these are."""
         value, error = self._integrals()
-        enough = self.rule.tolerance * np.abs(value[0]) + self.rule.least * value[0, :, -1:]
-        most = np.full(self.count.shape, MOST)
+        enough = self.rule.rtol * np.abs(value[0]) + self.rule.atol * value[0, :, -1:]
+        most = np.full(self.count.shape, MAX_DIRECTIONS)
         most[:, -1] = WHOLE
         more = open_ & (error > enough) & (self.count < most)
         for e, a in np.argwhere(more).tolist():
@@ -166,7 +166,7 @@ class _Sums:
             times = 1 << max(1, math.ceil(math.log2(error[e, a] / enough[e, a])))
             if a < len(self.members):
                 crossing = max(1, len(self._numbers(int(self.count[e, a]), e, a)))
-                times = min(times, ENOUGH // crossing)
+                times = min(times, MAX_AOI_DIRECTIONS // crossing)
             count = min(int(self.count[e, a]) * times, int(most[e, a]))
             more[e, a] = count > self.count[e, a]
             self.count[e, a] = count
@@ -174,9 +174,9 @@ class _Sums:
 
     def _first_count(self, e: int, a: int) -> int:
         """Directions around an eye of which enough cross an area, or as many as may be."""
-        count = self.rule.first
-        while count < MOST and (crossing := len(self._numbers(count, e, a))) < LEAST:
-            count = min(MOST, count << max(1, math.ceil(math.log2(LEAST / max(crossing, 0.5)))))
+        count = self.rule.initial_directions
+        while count < MAX_DIRECTIONS and (crossing := len(self._numbers(count, e, a))) < LEAST:
+            count = min(MAX_DIRECTIONS, count << max(1, math.ceil(math.log2(LEAST / max(crossing, 0.5)))))
         return count
 
     def _numbers(self, count: int, e: int, a: int) -> np.ndarray:
@@ -189,7 +189,7 @@ class _Sums:
             away = center - self.eyes[e]
             apart = float(np.linalg.norm(away))
             axis = away / apart if apart > 0 else np.array([0.0, 0.0, 1.0])
-            numbers = numbers_in_cone(count, axis, math.asin(min(radius / apart, 1.0)) if apart > radius else math.pi)
+            numbers = indices_in_cone(count, axis, math.asin(min(radius / apart, 1.0)) if apart > radius else math.pi)
             d = fibonacci_directions(count, numbers)
             found.append(numbers[self.things[k].may_meet(np.broadcast_to(self.eyes[e], d.shape), d)])
         numbers = found[0] if len(found) == 1 else np.unique(np.concatenate(found))
@@ -210,7 +210,7 @@ class _Sums:
             if not len(d):
                 continue
             if e not in self.looks:
-                self.looks[e] = self.look_from(self.eyes[e])
+                self.looks[e] = self.make_gaze_evaluator(self.eyes[e])
             gaze, depth = self.looks[e](d)
             gaze = np.maximum(gaze, 0)
             gaze = np.concatenate([gaze.mean(axis=0)[None], gaze]) if len(gaze) > 1 else gaze
@@ -229,11 +229,11 @@ class _Sums:
             self.parts = np.repeat(self.parts, len(gaze), axis=0)
         starts = np.cumsum([0, *(len(b.numbers) for b in batch)])
         eye = np.repeat([b.eye for b in batch], np.diff(starts))
-        place = eye * PARTS + np.concatenate([b.numbers for b in batch]) % PARTS
+        place = eye * ERROR_PARTS + np.concatenate([b.numbers for b in batch]) % ERROR_PARTS
         # Directions in each part of the spiral.
-        size = (count - np.arange(PARTS) + PARTS - 1) // PARTS
+        size = (count - np.arange(ERROR_PARTS) + ERROR_PARTS - 1) // ERROR_PARTS
         part = lambda rows, w: (
-            np.bincount(place[rows], w, E * PARTS).reshape(E, PARTS) * (_SPHERE / np.maximum(size, 1))
+            np.bincount(place[rows], w, E * ERROR_PARTS).reshape(E, ERROR_PARTS) * (_SPHERE / np.maximum(size, 1))
         )
         d = np.concatenate([b.directions for b in batch])
         known = batch[0].depth is not None
@@ -244,7 +244,7 @@ class _Sums:
                 for k in self.members[a]:
                     among[k].append(rows + start)
         which = [np.unique(np.concatenate(r)) if r else np.zeros(0, np.int64) for r in among]
-        landed = regroup(land(self.things, self.eyes[eye], d, depth, self.margin, which), self.members)
+        landed = regroup(assign_hits(self.things, self.eyes[eye], d, depth, self.margin, which), self.members)
         wanted = wanted & np.isin(np.arange(E), [b.eye for b in batch])[:, None]
         for a in np.flatnonzero(wanted[:, :A].any(axis=0)).tolist():
             mine, rows = wanted[:, a], landed.rows[a]
@@ -280,10 +280,10 @@ class _Looked:
 # surface stands before it. An isovist is the region that is seen from a point (Benedikt 1979); here its horizontal
 # slice at eye height, whose area is ½ Σ r² Δθ over directions.
 
-Depth = Callable[[np.ndarray, np.ndarray], np.ndarray]
+DepthQuery = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Of origins and unit directions (N, 3): distance to the first surface (N,), infinite where there is none."""
 
-SAMPLES = 48  # points of a thing that are looked for
+POINTS_PER_AOI = 48  # points of a thing that are looked for
 _SIGHTS = 1 << 20
 
 
@@ -293,25 +293,25 @@ class SamplePoints:
 
     points: np.ndarray
     normals: np.ndarray
-    thing: np.ndarray
-    count: int
+    aoi_index: np.ndarray
+    num_aois: int
 
     @classmethod
-    def of(cls, things: Sequence[Aoi], samples: int = SAMPLES) -> SamplePoints:
-        found = [thing.samples(samples) for thing in things]
-        who = np.repeat(np.arange(len(things)), [len(points) for points, _ in found])
+    def sample(cls, aois: Sequence[Aoi], num_points: int = POINTS_PER_AOI) -> SamplePoints:
+        found = [thing.sample_points(num_points) for thing in aois]
+        who = np.repeat(np.arange(len(aois)), [len(points) for points, _ in found])
         nothing = np.zeros((0, 3))
         points, normals = (np.concatenate([nothing, *(f[k] for f in found)]) for k in range(2))
-        return cls(points, normals, who, len(things))
+        return cls(points, normals, who, len(aois))
 
 
-def unhidden(targets: SamplePoints, eyes: np.ndarray, depth: Depth, margin: float) -> np.ndarray:
+def unhidden(targets: SamplePoints, observers: np.ndarray, depth: DepthQuery, margin: float) -> np.ndarray:
     """Which of the S points are seen from each of E ``eyes`` (E, 3), turned to wherever they like: (E, S). A surface
     may stand up to ``margin`` before a point and yet be its own."""
-    out = np.zeros((len(eyes), len(targets.points)), bool)
+    out = np.zeros((len(observers), len(targets.points)), bool)
     each = max(1, _SIGHTS // max(len(targets.points), 1))
-    for a in range(0, len(eyes), each):
-        eye = eyes[a : a + each]
+    for a in range(0, len(observers), each):
+        eye = observers[a : a + each]
         away = targets.points[None] - eye[:, None]
         distance = np.linalg.norm(away, axis=2)
         inside = np.einsum("esk,sk->es", away, targets.normals)
@@ -323,26 +323,26 @@ def unhidden(targets: SamplePoints, eyes: np.ndarray, depth: Depth, margin: floa
     return out
 
 
-def in_view(targets: SamplePoints, eyes: np.ndarray, ahead: np.ndarray, seen: np.ndarray, view: float) -> np.ndarray:
+def visible_in_fov(targets: SamplePoints, observers: np.ndarray, ahead: np.ndarray, is_visible: np.ndarray, fov: float) -> np.ndarray:
     """Whether any of the points of each of K things that are ``seen`` (N, S) lies within a ``view`` of so many degrees
     about the unit directions ``ahead`` (N, 3) of ``eyes`` (N, 3): (N, K)."""
-    out = np.zeros((len(eyes), targets.count), bool)
-    least = np.cos(np.radians(min(view, 360.0) / 2))
-    starts = np.flatnonzero(np.r_[True, np.diff(targets.thing) != 0]) if len(targets.thing) else np.zeros(0, int)
+    out = np.zeros((len(observers), targets.num_aois), bool)
+    least = np.cos(np.radians(min(fov, 360.0) / 2))
+    starts = np.flatnonzero(np.r_[True, np.diff(targets.aoi_index) != 0]) if len(targets.aoi_index) else np.zeros(0, int)
     each = max(1, _SIGHTS // max(len(targets.points), 1))
-    for a in range(0, len(eyes), each):
+    for a in range(0, len(observers), each):
         part = slice(a, a + each)
-        eye, f = eyes[part], ahead[part]
+        eye, f = observers[part], ahead[part]
         # |s - p|² and (s - p) · f by products of matrices.
         along = f @ targets.points.T - np.einsum("nk,nk->n", f, eye)[:, None]
         square = (targets.points**2).sum(axis=1) - 2 * eye @ targets.points.T + (eye**2).sum(axis=1)[:, None]
-        within = seen[part] & (along >= least * np.sqrt(np.maximum(square, 0)))
+        within = is_visible[part] & (along >= least * np.sqrt(np.maximum(square, 0)))
         if len(starts):
-            out[part, targets.thing[starts]] = np.logical_or.reduceat(within, starts, axis=1)
+            out[part, targets.aoi_index[starts]] = np.logical_or.reduceat(within, starts, axis=1)
     return out
 
 
-class CellsInView:
+class VisibilityCache:
     """What can be seen from where people stood, at the middles of cells of edge ``cell``, each traced once.
 
     Of very many cells those that are not asked for again are forgotten: what is said stays the same.
@@ -351,19 +351,19 @@ class CellsInView:
     MOST = 1 << 28
     """Bytes of what is known of cells."""
 
-    def __init__(self, targets: SamplePoints, depth: Depth, cell: float, margin: float):
+    def __init__(self, targets: SamplePoints, depth: DepthQuery, cell: float, margin: float):
         check_number(cell, LENGTHS, "--cell")
         self._targets, self._depth, self._cell, self._margin = targets, depth, cell, margin
         self._known: dict[tuple[int, int, int], np.ndarray] = {}
         self.traced = 0
 
-    def in_view(self, seen: np.ndarray, eyes: np.ndarray, ahead: np.ndarray, view: float) -> np.ndarray:
+    def in_view(self, is_visible: np.ndarray, observers: np.ndarray, ahead: np.ndarray, fov: float) -> np.ndarray:
         """`in_view` of its things."""
-        return in_view(self._targets, eyes, ahead, seen, view)
+        return visible_in_fov(self._targets, observers, ahead, is_visible, fov)
 
-    def seen(self, eyes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def get_visibility(self, observers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``(points (C, S), cell (N,))``: which points are seen from the cells of N ``eyes``, and which is whose."""
-        index = np.floor(eyes / self._cell).astype(np.int64)
+        index = np.floor(observers / self._cell).astype(np.int64)
         cells, of = np.unique(index, axis=0, return_inverse=True)
         keys = [tuple(key) for key in cells.tolist()]
         new = [k for k, key in enumerate(keys) if key not in self._known]
@@ -390,11 +390,11 @@ class Isovists:
     nearest: np.ndarray
     farthest: np.ndarray
     radius: np.ndarray
-    seen: np.ndarray
+    visible_share: np.ndarray
 
 
-def standing(
-    lower: np.ndarray, upper: np.ndarray, step: float, height: float, depth: Depth, floor: float
+def find_standing_positions(
+    lower: np.ndarray, upper: np.ndarray, step: float, height: float, depth: DepthQuery, floor: float
 ) -> np.ndarray:
     """Places (G, 3) on a grid at eye ``height`` above the ``floor`` where somebody can stand: what is below is the
     floor, and one is inside of nothing, which would end above at the height at which it begins from above."""
@@ -416,8 +416,8 @@ def standing(
     return eyes[free & ~within]
 
 
-def isovists(
-    points: np.ndarray, depth: Depth, targets: SamplePoints, margin: float, reach: float, directions: int = 360
+def compute_isovists(
+    points: np.ndarray, depth: DepthQuery, targets: SamplePoints, margin: float, max_distance: float, directions: int = 360
 ) -> Isovists:
     """Those of ``points`` (G, 3) by so many ``directions`` around; nothing is farther than ``reach``."""
     angle = 2 * np.pi * (np.arange(directions) + 0.5) / directions
@@ -427,14 +427,14 @@ def isovists(
     for a in range(0, len(points), each):
         part = points[a : a + each]
         met = depth(np.repeat(part, directions, axis=0), np.tile(around, (len(part), 1)))
-        r[a : a + each] = np.minimum(met, reach).reshape(-1, directions)
+        r[a : a + each] = np.minimum(met, max_distance).reshape(-1, directions)
     ends = r[:, :, None] * around[None, :, :2]
     perimeter = np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).sum(axis=1)
     seen = unhidden(targets, points, depth, margin)
-    count = np.bincount(targets.thing, minlength=targets.count)
+    count = np.bincount(targets.aoi_index, minlength=targets.num_aois)
     share = (
-        np.stack([seen[:, targets.thing == k].sum(axis=1) / max(count[k], 1) for k in range(targets.count)], axis=1)
-        if targets.count
+        np.stack([seen[:, targets.aoi_index == k].sum(axis=1) / max(count[k], 1) for k in range(targets.num_aois)], axis=1)
+        if targets.num_aois
         else np.zeros((len(points), 0))
     )
     area = 0.5 * (r**2).sum(axis=1) * (2 * np.pi / directions)

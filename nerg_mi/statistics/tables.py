@@ -9,7 +9,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from .estimates import Estimates, adjusted, proportion_differences, proportions, ratio_differences, ratios
+from .estimates import Estimates, adjust_p_values, estimate_proportion_differences, estimate_proportions, estimate_ratio_differences, estimate_ratios
 from .visits import ALL, BINS, Cell, VisitSums
 
 # ---- The numbers that are told of things, each a ratio of sums over people (`intervals`) ----
@@ -26,25 +26,25 @@ class Participants:
 
     names: tuple[str, ...]
     time: np.ndarray
-    on_time: np.ndarray
+    dwell_time: np.ndarray
     distance: np.ndarray
-    visible: np.ndarray | None
-    reached: np.ndarray
+    visible_time: np.ndarray | None
+    hit_probability: np.ndarray
     looks: np.ndarray | None = None
     first_sum: np.ndarray | None = None
     first_count: np.ndarray | None = None
     present: np.ndarray | None = None
 
     @classmethod
-    def of(cls, sums: VisitSums, cell: Cell, seen: bool) -> Participants:
+    def from_sums(cls, sums: VisitSums, cell: Cell, has_visibility: bool) -> Participants:
         """Those of a cell; ``seen``: whether it is known what they could see."""
-        rows, names = sums.persons_of(cell)
+        rows, names = sums.find_participants(cell)
         return cls(
             tuple(names),
             sums.time[rows],
-            sums.on_time[rows],
+            sums.dwell_time[rows],
             sums.distance[rows],
-            sums.visible[rows] if seen else None,
+            sums.visible_time[rows] if has_visibility else None,
             (sums.looks[rows] > 0).astype(float),
             sums.looks[rows],
             sums.first_sum[rows],
@@ -61,24 +61,24 @@ class Participants:
             out[to] = v
             return out
 
-        given = {f.name: getattr(self, f.name) for f in fields(self)} | {"present": self.there.astype(float)}
+        given = {f.name: getattr(self, f.name) for f in fields(self)} | {"present": self.is_in_cell.astype(float)}
         made = {name: spread(v) for name, v in given.items() if isinstance(v, np.ndarray)}
         return replace(self, **(made | {"names": tuple(names)}))
 
     @property
-    def there(self) -> np.ndarray:
+    def is_in_cell(self) -> np.ndarray:
         """Who is of the cell at all (P,) bool."""
         return np.ones(len(self.names), bool) if self.present is None else self.present > 0
 
     @property
     def timed(self) -> np.ndarray:
         """Of whom there is any time (P, 1)."""
-        return (self.time > 0)[:, None] & self.there[:, None]
+        return (self.time > 0)[:, None] & self.is_in_cell[:, None]
 
     @property
     def everybody(self) -> np.ndarray:
         """(P, A) ones for those who are there."""
-        return np.repeat(self.there[:, None], self.on_time.shape[1], axis=1).astype(float)
+        return np.repeat(self.is_in_cell[:, None], self.dwell_time.shape[1], axis=1).astype(float)
 
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -94,20 +94,20 @@ class Measure:
     name: str
     title: str
     definition: str
-    over: str
-    pair: Callable[[Participants], Pair | None]
-    most: float = np.inf
-    counts: bool = False
-    compared: bool = False
+    population: str
+    numerator_denominator: Callable[[Participants], Pair | None]
+    upper_limit: float = np.inf
+    is_proportion: bool = False
+    is_compared: bool = False
 
     def estimate(self, people: Participants, resamples: int, seed: int) -> Estimates | None:
         """The number of each area, with its interval."""
-        pair = self.pair(people)
+        pair = self.numerator_denominator(people)
         if pair is None:
             return None
         x, y = pair
-        binary = self.counts and bool(np.isin(x, (0.0, 1.0)).all())
-        return proportions(x, y) if binary else ratios(x, y, resamples=resamples, seed=seed, most=self.most)
+        binary = self.is_proportion and bool(np.isin(x, (0.0, 1.0)).all())
+        return estimate_proportions(x, y) if binary else estimate_ratios(x, y, resamples=resamples, seed=seed, upper_limit=self.upper_limit)
 
 
 def _share(p: Participants, seconds: np.ndarray | None) -> Pair | None:
@@ -132,10 +132,10 @@ def _returns(p: Participants) -> Pair | None:
 
 
 def _unseen(p: Participants) -> Pair | None:
-    if p.visible is None:
+    if p.visible_time is None:
         return None
-    could = (p.visible > 0).astype(float)
-    return could * (1 - p.reached), could
+    could = (p.visible_time > 0).astype(float)
+    return could * (1 - p.hit_probability), could
 
 
 MEASURES = (
@@ -143,94 +143,94 @@ MEASURES = (
         name="share",
         title="share of time",
         definition="mean of D_pk / T_p",
-        over="people with time",
-        pair=lambda p: _share(p, p.on_time),
-        most=1.0,
-        compared=True,
+        population="people with time",
+        numerator_denominator=lambda p: _share(p, p.dwell_time),
+        upper_limit=1.0,
+        is_compared=True,
     ),
     Measure(
         name="dwell",
         title="dwell [s]",
         definition="mean of D_pk",
-        over="all people",
-        pair=lambda p: (p.on_time, p.everybody),
-        compared=True,
+        population="all people",
+        numerator_denominator=lambda p: (p.dwell_time, p.everybody),
+        is_compared=True,
     ),
     Measure(
         name="reach",
         title="reach",
         definition="mean of [L_pk > 0]",
-        over="all people",
-        pair=lambda p: (p.reached * p.everybody, p.everybody),
-        most=1.0,
-        counts=True,
-        compared=True,
+        population="all people",
+        numerator_denominator=lambda p: (p.hit_probability * p.everybody, p.everybody),
+        upper_limit=1.0,
+        is_proportion=True,
+        is_compared=True,
     ),
     Measure(
         name="first_look",
         title="first look [s]",
         definition="mean over people, and over each one's sittings with a look, of seconds from its first ray to the "
         "look",
-        over="who looked",
-        pair=_first,
+        population="who looked",
+        numerator_denominator=_first,
     ),
     Measure(
         name="looks",
         title="looks",
         definition="mean of L_pk",
-        over="all people",
-        pair=lambda p: None if p.looks is None else (p.looks, p.everybody),
-        compared=True,
+        population="all people",
+        numerator_denominator=lambda p: None if p.looks is None else (p.looks, p.everybody),
+        is_compared=True,
     ),
-    Measure(name="returns", title="returns", definition="mean of L_pk - 1", over="who looked", pair=_returns),
+    Measure(name="returns", title="returns", definition="mean of L_pk - 1", population="who looked", numerator_denominator=_returns),
     Measure(
         name="distance",
         title="distance [m]",
         definition="Σ w_i d_i / Σ w_i, from the eye to where the ray enters the thing",
-        over="rays on it",
-        pair=lambda p: (p.distance, p.on_time),
+        population="rays on it",
+        numerator_denominator=lambda p: (p.distance, p.dwell_time),
     ),
     Measure(
         name="visible",
         title="visible share",
         definition="mean of V_pk / T_p",
-        over="people with time",
-        pair=lambda p: _share(p, p.visible),
-        most=1.0,
+        population="people with time",
+        numerator_denominator=lambda p: _share(p, p.visible_time),
+        upper_limit=1.0,
     ),
     Measure(
         name="given_visible",
         title="looked at, given visible",
         definition="Σ_p D_pk / Σ_p V_pk",
-        over="who could see it",
-        pair=lambda p: None if p.visible is None else (p.on_time, p.visible),
-        most=1.0,
-        compared=True,
+        population="who could see it",
+        numerator_denominator=lambda p: None if p.visible_time is None else (p.dwell_time, p.visible_time),
+        upper_limit=1.0,
+        is_compared=True,
     ),
     Measure(
         name="unseen",
         title="visible but unseen",
         definition="mean of [L_pk = 0]",
-        over="who could see it",
-        pair=_unseen,
-        most=1.0,
-        counts=True,
+        population="who could see it",
+        numerator_denominator=_unseen,
+        upper_limit=1.0,
+        is_proportion=True,
     ),
 )
 """All, in the order of tables."""
 
-BY_NAME = {measure.name: measure for measure in MEASURES}
-COMPARED = tuple(measure.name for measure in MEASURES if measure.compared)
+MEASURES_BY_NAME = {measure.name: measure for measure in MEASURES}
+COMPARED_MEASURES = tuple(measure.name for measure in MEASURES if measure.is_compared)
 
 
 # ---- Tables ----
 #
 # Tables of numbers: things by cell and source, differences, moves, durations; with a floor on people.
 
-TRACKED, FIELD = "tracked", "field"
+MEASURED, PREDICTED = "tracked", "field"
 """Sources of numbers: rays that were recorded, and what the gaze field foretells."""
 
-PLACES = 16
+MIN_VIEWPOINTS = 16
 """From so many places a person a field should be asked for their reach: from fewer it comes out too low."""
 
 MOST_VALUES = 12  # so many values of a dimension are compared with each other
@@ -241,21 +241,21 @@ Row = dict[str, Any]
 class MinParticipantsFilter:
     """Blanks numbers that rest on fewer than ``least`` people, and counts those that were."""
 
-    least: int = 1
-    blanked: int = field(default=0)
+    minimum: int = 1
+    num_suppressed: int = field(default=0)
 
-    def passes(self, people: int) -> bool:
+    def passes(self, num_participants: int) -> bool:
         """Whether a number of so many people may be told; one of nobody is nobody's secret."""
-        if 0 < people < self.least:
-            self.blanked += 1
+        if 0 < num_participants < self.minimum:
+            self.num_suppressed += 1
             return False
         return True
 
 
-def thing_rows(
+def aoi_rows(
     areas: Sequence[str],
     cells: Mapping[Cell, Mapping[str, Participants]],
-    floor: MinParticipantsFilter,
+    min_participants: MinParticipantsFilter,
     *,
     resamples: int,
     seed: int,
@@ -267,16 +267,16 @@ def thing_rows(
         found: dict[str, list[Row]] = {}
         for source, people in sources.items():
             estimates = {m.name: m.estimate(people, resamples, seed) for m in MEASURES}
-            count = int(people.there.sum())
+            count = int(people.is_in_cell.sum())
             found[source] = []
             for a, area in enumerate(areas):
                 row: Row = {"cell": cell.dimension, "value": cell.value, "thing": area, "source": source}
-                row["people"] = count if floor.passes(count) else None
+                row["people"] = count if min_participants.passes(count) else None
                 for name, e in estimates.items():
-                    told = e is not None and floor.passes(int(e.people[a]))
+                    told = e is not None and min_participants.passes(int(e.participants[a]))
                     for key in ("", "_low", "_high"):
                         row[name + key] = _number(getattr(e, key[1:] or "value")[a]) if told else None
-                    row[name + "_people"] = int(e.people[a]) if e is not None and told else None
+                    row[name + "_people"] = int(e.participants[a]) if e is not None and told else None
                 found[source].append(row)
         rows += [found[source][a] for a in range(len(areas)) for source in sources]
     return rows
@@ -289,12 +289,12 @@ def _number(value: float) -> float | None:
 def difference_rows(
     areas: Sequence[str],
     cells: Mapping[Cell, Mapping[str, Participants]],
-    floor: MinParticipantsFilter,
+    min_participants: MinParticipantsFilter,
     *,
-    source: str = TRACKED,
+    source: str = MEASURED,
     resamples: int,
     seed: int,
-    compared: Sequence[str] = COMPARED,
+    compared: Sequence[str] = COMPARED_MEASURES,
 ) -> list[Row]:
     """Differences between every two values of a dimension, of each area and measure, with p-values that are adjusted
     over all rows (``p_adjusted``), and ``found``: whether that is at most 0.05."""
@@ -310,9 +310,9 @@ def difference_rows(
             pair = a.aligned(names), b.aligned(names)
             for measure in (m for m in MEASURES if m.name in compared):
                 rows += _differences(
-                    areas, dimension, (first.value, second.value), measure, pair, floor, resamples, seed
+                    areas, dimension, (first.value, second.value), measure, pair, min_participants, resamples, seed
                 )
-    corrected = adjusted(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
+    corrected = adjust_p_values(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
     for row, p in zip(rows, corrected):
         row["p_adjusted"] = _number(p)
         row["found"] = bool(p <= 0.05)
@@ -329,13 +329,13 @@ def _differences(
     resamples: int,
     seed: int,
 ) -> list[Row]:
-    first, second = (measure.pair(p) for p in people)
+    first, second = (measure.numerator_denominator(p) for p in people)
     if first is None or second is None:
         return []
-    if measure.counts:
-        found = proportion_differences(first, second)
+    if measure.is_proportion:
+        found = estimate_proportion_differences(first, second)
     else:
-        found = ratio_differences(first, second, resamples=resamples, seed=seed)
+        found = estimate_ratio_differences(first, second, resamples=resamples, seed=seed)
     least = np.minimum((first[1] > 0).sum(axis=0), (second[1] > 0).sum(axis=0))
     rows = []
     for a, area in enumerate(areas):
@@ -347,29 +347,29 @@ def _differences(
     return rows
 
 
-def move_rows(sums: VisitSums, floor: MinParticipantsFilter) -> list[Row]:
+def transition_rows(sums: VisitSums, min_participants: MinParticipantsFilter) -> list[Row]:
     """Moves between things of each cell: ``from``, ``to``, how many ``moves``, and their ``share`` of those from
     there."""
     rows = []
     for c, cell in enumerate(sums.cells):
-        people = len(sums.persons_of(cell)[0])
-        total = sums.moves[c].sum(axis=1)
-        for i, j in np.argwhere(sums.moves[c] > 0):
-            told = floor.passes(people)
-            n = float(sums.moves[c, i, j])
+        people = len(sums.find_participants(cell)[0])
+        total = sums.transitions[c].sum(axis=1)
+        for i, j in np.argwhere(sums.transitions[c] > 0):
+            told = min_participants.passes(people)
+            n = float(sums.transitions[c, i, j])
             row: Row = {"cell": cell.dimension, "value": cell.value, "from": sums.areas[i], "to": sums.areas[j]}
             rows.append(row | {"moves": int(n) if told else None, "share": n / float(total[i]) if told else None})
     return rows
 
 
-def duration_rows(sums: VisitSums, floor: MinParticipantsFilter) -> list[Row]:
+def duration_rows(sums: VisitSums, min_participants: MinParticipantsFilter) -> list[Row]:
     """How many looks at each area last how long, of each cell; `BINS` in seconds."""
     rows = []
     names = [f"{a:g} to {b:g} s" if np.isfinite(b) else f"{a:g} s or more" for a, b in zip(BINS[:-1], BINS[1:])]
     for c, cell in enumerate(sums.cells):
-        people = len(sums.persons_of(cell)[0])
+        people = len(sums.find_participants(cell)[0])
         for a, area in enumerate(sums.areas):
-            told = floor.passes(people)
+            told = min_participants.passes(people)
             counts = {n: int(v) if told else None for n, v in zip(names, sums.lasted[c, a])}
             rows.append({"cell": cell.dimension, "value": cell.value, "thing": area, **counts})
     return rows
@@ -378,16 +378,16 @@ def duration_rows(sums: VisitSums, floor: MinParticipantsFilter) -> list[Row]:
 def is_too_low(row: Row, measure: str) -> bool:
     """Whether a number comes out too low: the reach by a field that was asked from few ``places`` a person."""
     places = row.get("places")
-    return measure == "reach" and row.get(measure) is not None and places is not None and places < PLACES
+    return measure == "reach" and row.get(measure) is not None and places is not None and places < MIN_VIEWPOINTS
 
 
-def shown(row: Row, measure: Measure) -> str:
+def format_measure(row: Row, measure: Measure) -> str:
     """A value with its interval as Markdown has it, and, after ±, its spread over the members of an ensemble: shares in
     percent, small ones with two digits behind the point. What comes out too low says so."""
     value = row.get(measure.name)
     if value is None:
         return ""
-    scale, digits = (100.0, 2 if 0 < value < 0.01 else 1) if measure.most == 1.0 else (1.0, 2)
+    scale, digits = (100.0, 2 if 0 < value < 0.01 else 1) if measure.upper_limit == 1.0 else (1.0, 2)
     text = f"{scale * value:.{digits}f}" + (" %" if scale > 1 else "")
     low, high = row.get(measure.name + "_low"), row.get(measure.name + "_high")
     if low is not None and high is not None:
@@ -402,7 +402,7 @@ def shown(row: Row, measure: Measure) -> str:
 # The table of single people: each one's own sums of each area, made row by row as it is read.
 
 
-class PersonRows(Sequence[Row]):
+class ParticipantRows(Sequence[Row]):
     """A row for each person and area, over all that was recorded, in the order of the people's names.
 
     Rows are made when they are asked for, so that the table of a quarter of a million people takes no memory beside
@@ -413,10 +413,10 @@ class PersonRows(Sequence[Row]):
 
     columns = ("person", "thing", "time", "rays", "dwell", "looks", "first_look", "visible")
 
-    def __init__(self, sums: VisitSums, names: Mapping[str, str], seen: bool):
-        rows, persons = sums.persons_of(ALL)
+    def __init__(self, sums: VisitSums, names: Mapping[str, str], has_visibility: bool):
+        rows, persons = sums.find_participants(ALL)
         self._of = sorted((names[person], r) for person, r in zip(persons, rows.tolist()))
-        self._sums, self._seen = sums, seen
+        self._sums, self._seen = sums, has_visibility
 
     def __len__(self) -> int:
         return len(self._of) * len(self._sums.areas)
@@ -446,8 +446,8 @@ class PersonRows(Sequence[Row]):
             "thing": s.areas[a],
             "time": float(s.time[r]),
             "rays": int(s.rays[r]),
-            "dwell": float(s.on_time[r, a]),
+            "dwell": float(s.dwell_time[r, a]),
             "looks": int(s.looks[r, a]),
             "first_look": first,
-            "visible": float(s.visible[r, a]) if self._seen else None,
+            "visible": float(s.visible_time[r, a]) if self._seen else None,
         }

@@ -10,10 +10,10 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
-from nerg_mi.maths.geometry import box_interval
-from nerg_mi.maths.vmf import tangents
+from nerg_mi.maths.geometry import intersect_box_numpy
+from nerg_mi.maths.vmf import tangent_frame
 from nerg_mi.ranges import SECONDS, check_number
-from nerg_mi.rays.filters import person_order
+from nerg_mi.rays.filters import group_by_person
 from nerg_mi.rays.rays import Rays
 
 # ---- Landing ----
@@ -39,7 +39,7 @@ class Aoi(Protocol):
         ...
 
     @property
-    def open(self) -> bool:
+    def is_surface(self) -> bool:
         """Whether it is a surface, of which nobody is inside."""
         ...
 
@@ -57,7 +57,7 @@ class Aoi(Protocol):
         """Whether rays (N, 3) may be on it (N,): they cross a box around it."""
         ...
 
-    def samples(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def sample_points(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """About ``count`` points (S, 3) spread over its surface evenly by area, and their outward normals (S, 3), zero
         where both sides are seen; always the same ones."""
         ...
@@ -68,7 +68,7 @@ class BoxAoi:
     """A box, upright or turned."""
 
     region: Region
-    open = False
+    is_surface = False
 
     @property
     def name(self) -> str:
@@ -76,19 +76,19 @@ class BoxAoi:
 
     def interval(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         region = self.region
-        turned = d if region.turn is None else d @ region.matrix
-        return box_interval(region.to_own(np.asarray(o, float)), turned, *region.corners)
+        turned = d if region.rotation is None else d @ region.rotation_matrix
+        return intersect_box_numpy(region.to_local(np.asarray(o, float)), turned, *region.corners)
 
     @property
     def ball(self) -> tuple[np.ndarray, float]:
         lower, upper = self.region.corners
-        return self.region.middle, float(np.linalg.norm(upper - lower)) / 2
+        return self.region.center, float(np.linalg.norm(upper - lower)) / 2
 
     def may_meet(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         near, far = self.interval(o, d)
         return (near < far) & (far > 0)
 
-    def samples(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def sample_points(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = self.region.corners
         size = upper - lower
         # An edge of the squares whose number is about the count.
@@ -108,7 +108,7 @@ class BoxAoi:
                 points.append(face)
                 normals.append(out)
         found = np.concatenate(points), np.concatenate(normals)
-        return self.region.place(found[0]), found[1] @ self.region.matrix.T
+        return self.region.to_world(found[0]), found[1] @ self.region.rotation_matrix.T
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class HitAssignment:
     rows: tuple[np.ndarray, ...]
     distance: tuple[np.ndarray, ...]
 
-    def matrix(self) -> np.ndarray:
+    def to_matrix(self) -> np.ndarray:
         """Whether each ray is on each thing (N, K)."""
         found = np.zeros((self.count, len(self.rows)), bool)
         for k, rows in enumerate(self.rows):
@@ -128,8 +128,8 @@ class HitAssignment:
         return found
 
 
-def land(
-    things: Sequence[Aoi],
+def assign_hits(
+    aois: Sequence[Aoi],
     o: np.ndarray,
     d: np.ndarray,
     depth: np.ndarray | None,
@@ -143,13 +143,13 @@ def land(
     ``among``: of each thing the rows, rising, of the rays that may be on it; None: all.
     """
     if depth is None:
-        return _land_on_solids(things, o, d, margin)
+        return _land_on_solids(aois, o, d, margin)
     rows, distance = [], []
-    for k, thing in enumerate(things):
+    for k, thing in enumerate(aois):
         some = slice(None) if among is None else among[k]
         near, far = thing.interval(o[some], d[some])
         reach = depth[some]
-        if thing.open:
+        if thing.is_surface:
             on, at = np.isfinite(near) & (near >= 0) & (near <= reach + margin), near
         else:
             ends = (near - margin <= reach) & (reach < far + margin)
@@ -164,7 +164,7 @@ def _land_on_solids(things: Sequence[Aoi], o: np.ndarray, d: np.ndarray, margin:
     """What rays land on where nothing is known but the things."""
     spans = [thing.interval(o, d) for thing in things]
     entered = [
-        (near >= 0) & (np.isfinite(near) if thing.open else near < far) for thing, (near, far) in zip(things, spans)
+        (near >= 0) & (np.isfinite(near) if thing.is_surface else near < far) for thing, (near, far) in zip(things, spans)
     ]
     reach = np.full(len(o), np.inf)
     for (_, far), met in zip(spans, entered):
@@ -205,7 +205,7 @@ def unite(parts: Sequence[HitAssignment]) -> HitAssignment:
     return HitAssignment(count, tuple(rows), tuple(distance))
 
 
-def concatenate(parts: Sequence[HitAssignment]) -> HitAssignment:
+def concatenate_hits(parts: Sequence[HitAssignment]) -> HitAssignment:
     """What rays land on that follow each other."""
     starts = np.cumsum([0, *(part.count for part in parts)])
     things = len(parts[0].rows)
@@ -214,11 +214,11 @@ def concatenate(parts: Sequence[HitAssignment]) -> HitAssignment:
     return HitAssignment(int(starts[-1]), tuple(rows), tuple(distance))
 
 
-def cone(d: np.ndarray, degrees: float, rings: Sequence[tuple[float, int]] = ((0.5, 6), (1.0, 12))) -> list[np.ndarray]:
+def sample_cone(d: np.ndarray, degrees: float, rings: Sequence[tuple[float, int]] = ((0.5, 6), (1.0, 12))) -> list[np.ndarray]:
     """Unit directions (N, 3) about each of ``d`` (N, 3), itself first, then so many evenly on each of the ``rings``
     (share of the angle ``degrees``, number): 19 directions that leave no hole wider than half of the angle."""
     d = np.asarray(d, float)
-    u, v = tangents(d)
+    u, v = tangent_frame(d)
     found = [d]
     for share, number in rings:
         angle = np.radians(degrees * share)
@@ -232,7 +232,7 @@ def cone(d: np.ndarray, degrees: float, rings: Sequence[tuple[float, int]] = ((0
 # Looks: how long each ray stands for, and which rays on a thing are one look at it.
 #
 # A *sitting* is a run of a person's rays without a pause of more than `VisitRules.pause`. A ray stands for the time to
-# the next of its sitting, unless that is more than `VisitRules.gap` away: then, and at the end of a sitting, for the
+# the next of its sitting, unless that is more than `VisitRules.max_gap` away: then, and at the end of a sitting, for the
 # sitting's usual step (the median of those that are no longer than the gap), or for none where there is no such step. A
 # *look* at a thing is a run of rays on it, in which nothing else lasts longer than `VisitRules.merge`; one that lasts
 # less than `VisitRules.least` from its first ray's start to its last one's end is none.
@@ -242,17 +242,17 @@ def cone(d: np.ndarray, degrees: float, rings: Sequence[tuple[float, int]] = ((0
 class VisitRules:
     """Times in seconds. Raises `NergError` for those that are no numbers, or negative."""
 
-    gap: float = 1.0
-    pause: float = 60.0
-    merge: float = 0.15
-    least: float = 0.1
+    max_gap: float = 1.0
+    session_pause: float = 60.0
+    merge_gap: float = 0.15
+    min_visit: float = 0.1
 
     def __post_init__(self) -> None:
         for name in ("gap", "pause", "merge", "least"):
             value = getattr(self, name)
             check_number(value, SECONDS, f"--{name}")
-        if not self.pause >= self.gap > 0:
-            raise NergError(f"--pause ({self.pause:g} s) is at least --gap ({self.gap:g} s), which is more than 0")
+        if not self.session_pause >= self.max_gap > 0:
+            raise NergError(f"--pause ({self.session_pause:g} s) is at least --gap ({self.max_gap:g} s), which is more than 0")
 
 
 @dataclass(frozen=True)
@@ -275,9 +275,9 @@ def timeline(person: np.ndarray, t: np.ndarray, rules: VisitRules) -> Timeline:
     if np.any(np.diff(person) < 0) or np.any(step[same] < 0):
         raise ValueError("rays must be in the order of persons and times")
     # In single precision two times may be a hair apart or beyond.
-    joined = same & (step <= rules.pause * (1 + 1e-9))
+    joined = same & (step <= rules.session_pause * (1 + 1e-9))
     sitting = np.cumsum(np.r_[np.zeros(min(len(t), 1), int), ~joined])
-    near = joined & (step <= rules.gap * (1 + 1e-9))
+    near = joined & (step <= rules.max_gap * (1 + 1e-9))
     usual = _medians(sitting[:-1][near & (step > 0)], step[near & (step > 0)], int(sitting[-1]) + 1 if len(t) else 0)
     weight = usual[sitting] if len(t) else np.zeros(0)
     weight[:-1][near] = step[near]
@@ -319,12 +319,12 @@ def looks_at(rows: np.ndarray, line: Timeline, rules: VisitRules) -> Visits:
         return Visits(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
     start, end = line.t[rows], line.t[rows] + line.weight[rows]
     # The latest end so far: a ray that stands for long may outlast the next.
-    apart = start[1:] - end[:-1] > rules.merge + 1e-9
+    apart = start[1:] - end[:-1] > rules.merge_gap + 1e-9
     new = np.r_[True, apart | (np.diff(line.sitting[rows]) != 0)]
     first = np.flatnonzero(new)
     last = np.r_[first[1:], len(rows)] - 1
     lasted = end[last] - start[first]
-    kept = lasted >= rules.least - 1e-9
+    kept = lasted >= rules.min_visit - 1e-9
     return Visits(rows[first][kept], start[first][kept], end[last][kept])
 
 
@@ -371,17 +371,17 @@ class VisitSums:
     time2: np.ndarray
     rays: np.ndarray
     sittings: np.ndarray
-    on_time: np.ndarray
+    dwell_time: np.ndarray
     on_rays: np.ndarray
     distance: np.ndarray
     looks: np.ndarray
-    visible: np.ndarray
+    visible_time: np.ndarray
     first_sum: np.ndarray
     first_count: np.ndarray
-    first: np.ndarray
-    last: np.ndarray
+    first_start: np.ndarray
+    last_end: np.ndarray
     lasted: np.ndarray
-    moves: np.ndarray
+    transitions: np.ndarray
 
     @classmethod
     def empty(cls, areas: Sequence[str], cells: Sequence[Cell], rows: Sequence[tuple[Cell, str]] = ()) -> VisitSums:
@@ -391,9 +391,9 @@ class VisitSums:
         found["first"] += np.inf
         found["last"] -= np.inf
         lasted, moves = np.zeros((C, A, len(BINS) - 1)), np.zeros((C, A, A))
-        return cls(tuple(areas), tuple(cells), tuple(rows), **found, lasted=lasted, moves=moves)
+        return cls(tuple(areas), tuple(cells), tuple(rows), **found, lasted=lasted, transitions=moves)
 
-    def persons_of(self, cell: Cell) -> tuple[np.ndarray, list[str]]:
+    def find_participants(self, cell: Cell) -> tuple[np.ndarray, list[str]]:
         """The rows of a cell, and whose they are, sorted by name."""
         found = sorted((person, r) for r, (of, person) in enumerate(self.rows) if of == cell)
         return np.array([r for _, r in found], np.int64), [person for person, _ in found]
@@ -428,24 +428,24 @@ class Total:
             add = np.minimum if name in _LEAST else np.maximum if name in _GREATEST else np.add
             out[to] = add(out[to], getattr(part, name))
         self._room.lasted += part.lasted
-        self._room.moves += part.moves
+        self._room.transitions += part.transitions
 
     def _grow(self, held: int) -> None:
         room, known = VisitSums.empty(self._areas, self._cells, [(ALL, "")] * held), self._room
         for name in (*_OF_ROWS, *_OF_AREAS):
             getattr(room, name)[: self._held] = getattr(known, name)
-        room.lasted, room.moves = known.lasted, known.moves
+        room.lasted, room.transitions = known.lasted, known.transitions
         self._room, self._held = room, held
 
     def sums(self) -> VisitSums:
         """What has been added so far; not a copy."""
         n = len(self._place)
         arrays = {name: getattr(self._room, name)[:n] for name in (*_OF_ROWS, *_OF_AREAS)}
-        made = dict(lasted=self._room.lasted, moves=self._room.moves)
+        made = dict(lasted=self._room.lasted, moves=self._room.transitions)
         return VisitSums(self._areas, self._cells, tuple(self._place), **arrays, **made)
 
 
-def merge(sums: Iterable[VisitSums]) -> VisitSums:
+def merge_sums(sums: Iterable[VisitSums]) -> VisitSums:
     """The sum of one or more, in the order in which they are given. Raises ``ValueError`` where areas or cells
     differ."""
     total: Total | None = None
@@ -472,7 +472,7 @@ def partial_sums(
     are of each, or None for all; ``visible`` (N, A): whether an area could be seen, None where nobody knows; what is
     looked at is. ``movable``: areas between which looks move, by number; default: all.
     """
-    order, _ = person_order(rays)
+    order, _ = group_by_person(rays)
     line = timeline(rays.person[order], rays.t[order], rules)
     back = np.empty(len(order), np.int64)
     back[order] = np.arange(len(order))
@@ -546,12 +546,12 @@ def _add_area(
     mine = slice(None) if mask is None else mask[at]
     at, far = at[mine], far[mine]
     row, weight = table[line.person[at]], line.weight[at]
-    _sum_into(out.on_time[:, a], row, weight)
+    _sum_into(out.dwell_time[:, a], row, weight)
     _sum_into(out.on_rays[:, a], row)
     _sum_into(out.distance[:, a], row, weight * far)
     if seen is not None:
         some = np.flatnonzero(seen if mask is None else seen & mask)
-        _sum_into(out.visible[:, a], table[line.person[some]], line.weight[some])
+        _sum_into(out.visible_time[:, a], table[line.person[some]], line.weight[some])
 
 
 def _add_looks(
@@ -566,8 +566,8 @@ def _add_looks(
 ) -> None:
     row = table[line.person[first]]
     _sum_into(out.looks[:, a], row)
-    np.minimum.at(out.first[:, a], row, start)
-    np.maximum.at(out.last[:, a], row, end)
+    np.minimum.at(out.first_start[:, a], row, start)
+    np.maximum.at(out.last_end[:, a], row, end)
     sitting, which = np.unique(line.sitting[first], return_index=True)
     _sum_into(out.first_sum[:, a], row[which], start[which] - begin[sitting])
     _sum_into(out.first_count[:, a], row[which])
@@ -588,4 +588,4 @@ def _add_moves(out: VisitSums, line: Timeline, masks: list, found: list, movable
     for c, mask in enumerate(masks):
         # A move is of the cell in which it ends.
         mine = moved if mask is None else moved & mask[first[1:]]
-        np.add.at(out.moves[c], (thing[:-1][mine], thing[1:][mine]), 1)
+        np.add.at(out.transitions[c], (thing[:-1][mine], thing[1:][mine]), 1)

@@ -138,7 +138,7 @@ def _is_triangle(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 MOLLIFY = 1e-5  # share of the mean length of edges by which two edges of a triangle exceed the third at least
 
 
-def laplacian(mesh: Mesh) -> sparse.csr_array:
+def make_laplacian(mesh: Mesh) -> sparse.csr_array:
     """L (V, V), positive semidefinite, without unit: its integral form, to be divided by areas of vertices."""
     faces, lengths = delaunay(mesh.faces, _mollified(mesh))
     i, j = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
@@ -193,7 +193,7 @@ class Smoother:
         # In units in which neither areas nor times of tiny or huge places vanish.
         unit = float(area.mean())
         self._area = area / unit
-        matrix = sparse.diags_array(self._area) + (0.5 * length**2 / steps / unit) * laplacian(mesh)
+        matrix = sparse.diags_array(self._area) + (0.5 * length**2 / steps / unit) * make_laplacian(mesh)
         # Without pivots: a matrix with such signs needs none, and its factors then keep them, so that no density
         # becomes negative. Other components are other blocks, which nothing of this one reaches.
         self._solve = splu(
@@ -222,8 +222,8 @@ class SurfaceSums:
     what there was; ``weight``: of the observers or rays, ``count`` of them.
     """
 
-    face: np.ndarray
-    vertex: np.ndarray
+    face_sums: np.ndarray
+    vertex_sums: np.ndarray
     elsewhere: float = 0.0
     escaped: float = 0.0
     total: float = 0.0
@@ -231,18 +231,18 @@ class SurfaceSums:
     count: int = 0
 
     @classmethod
-    def none(cls, faces: int, vertices: int) -> SurfaceSums:
+    def zeros(cls, faces: int, vertices: int) -> SurfaceSums:
         """Nothing yet."""
         return cls(np.zeros(faces), np.zeros(vertices))
 
-    def plus(self, other: SurfaceSums) -> SurfaceSums:
+    def add(self, other: SurfaceSums) -> SurfaceSums:
         """Both; the order in which sums are added decides their last digits."""
         return SurfaceSums(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
     @property
     def on_surface(self) -> float:
         """What ended on the surface."""
-        return float(self.face.sum())
+        return float(self.face_sums.sum())
 
     @property
     def unaccounted(self) -> float:
@@ -250,12 +250,12 @@ class SurfaceSums:
         return self.total - self.on_surface - self.elsewhere - self.escaped
 
 
-def merge(parts: Iterable[SurfaceSums]) -> SurfaceSums:
+def merge_sums(parts: Iterable[SurfaceSums]) -> SurfaceSums:
     """The sum of ``parts``, of which there is one at least, in their order."""
     parts = iter(parts)
     found = next(parts)
     for part in parts:
-        found = found.plus(part)
+        found = found.add(part)
     return found
 
 

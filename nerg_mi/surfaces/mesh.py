@@ -12,10 +12,10 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError, import_extra
-from nerg_mi.maths.arrays import aligned, vector_of
+from nerg_mi.maths.arrays import copy_aligned, to_vector
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.types import variant_types
-from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.medium import Medium
 from nerg_mi.transport.observer import ObserverSettings
 
@@ -65,17 +65,17 @@ class Repairs:
     area, and ``repeated`` ones with the corners of another."""
 
     merged: int
-    flat: int
+    num_degenerate_faces: int
     repeated: int
 
     @property
-    def sentence(self) -> str | None:
+    def summary(self) -> str | None:
         """What was done, None where nothing was."""
         said = [
             f"{number:,} {what}"
             for number, what in (
                 (self.merged, "vertices that lie on others merged"),
-                (self.flat, "faces without area left out"),
+                (self.num_degenerate_faces, "faces without area left out"),
                 (self.repeated, "faces that repeat others left out"),
             )
             if number
@@ -93,7 +93,7 @@ def _across(corners: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
-def weld(vertices: np.ndarray, faces: np.ndarray, what: str = "the mesh") -> tuple[Mesh, np.ndarray, Repairs]:
+def weld_mesh(vertices: np.ndarray, faces: np.ndarray, what: str = "the mesh") -> tuple[Mesh, np.ndarray, Repairs]:
     """The mesh of ``vertices`` (V, 3) and ``faces`` (F, 3) with one vertex for each place, ``(mesh, index, repairs)``.
 
     Files repeat vertices along edges where normals or colours jump; surfaces that touch there are one surface, and
@@ -165,7 +165,7 @@ class RefinedMesh:
 
     mesh: Mesh
     parent: np.ndarray
-    place: np.ndarray
+    barycentric: np.ndarray
 
 
 def refine(mesh: Mesh, longest: float) -> RefinedMesh:
@@ -245,12 +245,12 @@ NEAR = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
-class Ends:
+class RayEnds:
     """Where N rays end: ``face`` (N,) of the surface, or -1; ``place`` (N, 3), barycentric coordinates on it;
     ``elsewhere`` (N,) bool: at something else."""
 
     face: np.ndarray
-    place: np.ndarray
+    barycentric: np.ndarray
     elsewhere: np.ndarray
 
 
@@ -265,7 +265,7 @@ class SurfaceTarget:
     def __init__(
         self,
         mesh: Mesh,
-        others: list[tuple[np.ndarray, np.ndarray]] | None = None,
+        occluders: list[tuple[np.ndarray, np.ndarray]] | None = None,
         medium: Medium | None = None,
         settings: ObserverSettings | None = None,
         falloff: float = 0.0,
@@ -274,58 +274,58 @@ class SurfaceTarget:
 
         self.mesh, self.falloff = mesh, falloff
         self._shape = mitsuba_mesh(mesh.vertices, mesh.faces, "surface")
-        hiding = {f"other_{k}": mitsuba_mesh(v, f, f"other_{k}") for k, (v, f) in enumerate(others or ())}
+        hiding = {f"other_{k}": mitsuba_mesh(v, f, f"other_{k}") for k, (v, f) in enumerate(occluders or ())}
         scene: Any = mi.load_dict({"type": "scene", "surface": self._shape, **hiding}, optimize=False)
         # What a scene is made of is given to it, and may come out as another object.
         self._shape = next(shape for shape in scene.shapes() if shape.id() == "surface")
-        self.place = Place(medium, scene)
+        self.geometry = SceneGeometry(medium, scene)
         self.settings = settings or ObserverSettings(
-            march=default_settings(self.place), surface_opacity=SURFACE_OPACITY
+            march=default_march_settings(self.geometry), surface_opacity=SURFACE_OPACITY
         )
 
     @property
-    def sharp(self) -> bool:
+    def has_binary_visibility(self) -> bool:
         """Whether what is met hides all that is behind it: shapes alone, without a medium, and without a fall-off."""
-        return self.place.medium is None and self.falloff == 0
+        return self.geometry.medium is None and self.falloff == 0
 
-    def sees(self, eye: np.ndarray, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    def is_visible(self, observer: np.ndarray, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """Whether ``eye`` (3,) sees ``points`` (N, 3) of the surface, which lie in its ``faces`` (N,); of `sharp`
         targets. A point is seen where the ray at it ends at its own face, however obliquely, or not before it."""
         mi = variant_types()
-        to = points - eye
+        to = points - observer
         distance = np.linalg.norm(to, axis=1)
-        d = vector_of(mi.Vector3f, to / np.where(distance > 0, distance, 1)[:, None])
-        o = mi.Point3f(np.asarray(eye, np.float64).tolist())
+        d = to_vector(mi.Vector3f, to / np.where(distance > 0, distance, 1)[:, None])
+        o = mi.Point3f(np.asarray(observer, np.float64).tolist())
         # A position that is a constant of the kernel would be compiled anew for every observer.
         dr.make_opaque(o)
         count = len(points)
         with dr.suspend_grad():
-            view = self.place.trace(mi.Ray3f(o, d), dr.full(mi.Bool, True, count), self.settings.march)
-            assert view.cast is not None, "a target has shapes"
-            own = (view.cast.shape == mi.ShapePtr(self._shape)) & (
-                view.cast.prim_index == mi.UInt32(aligned(faces, np.uint32).ravel())
+            view = self.geometry.trace(mi.Ray3f(o, d), dr.full(mi.Bool, True, count), self.settings.march)
+            assert view.shape_intersection is not None, "a target has shapes"
+            own = (view.shape_intersection.shape == mi.ShapePtr(self._shape)) & (
+                view.shape_intersection.prim_index == mi.UInt32(copy_aligned(faces, np.uint32).ravel())
             )
-            seen = ~view.hit | own | (view.distance >= mi.Float(aligned(distance * (1 - NEAR)).ravel()))
+            seen = ~view.hits_shape | own | (view.shape_distance >= mi.Float(copy_aligned(distance * (1 - NEAR)).ravel()))
         return np.broadcast_to(np.array(seen).astype(bool), (count,)) & (distance > 0)
 
-    def ends(self, origins: np.ndarray, directions: np.ndarray) -> Ends:
+    def trace(self, origins: np.ndarray, directions: np.ndarray) -> RayEnds:
         """Where rays with ``origins`` (N, 3) and unit ``directions`` (N, 3) end."""
         mi = variant_types()
-        o, d = (vector_of(mi.Point3f, v) for v in (origins, directions))
+        o, d = (to_vector(mi.Point3f, v) for v in (origins, directions))
         count = len(origins)
         with dr.suspend_grad():
-            view = self.place.trace(mi.Ray3f(o, mi.Vector3f(d)), dr.full(mi.Bool, True, count), self.settings.march)
-            assert view.cast is not None, "a target has shapes"
-            before = view.front >= self.settings.surface_opacity
-            on = view.hit & ~before & (view.cast.shape == mi.ShapePtr(self._shape))
-            uv, prim = view.cast.prim_uv, view.cast.prim_index
-            dr.eval(on, uv, prim, view.hit, before)
+            view = self.geometry.trace(mi.Ray3f(o, mi.Vector3f(d)), dr.full(mi.Bool, True, count), self.settings.march)
+            assert view.shape_intersection is not None, "a target has shapes"
+            before = view.medium_opacity >= self.settings.surface_opacity
+            on = view.hits_shape & ~before & (view.shape_intersection.shape == mi.ShapePtr(self._shape))
+            uv, prim = view.shape_intersection.prim_uv, view.shape_intersection.prim_index
+            dr.eval(on, uv, prim, view.hits_shape, before)
         on_it = np.array(on).astype(bool)
-        met = np.broadcast_to(np.array(view.hit | before).astype(bool), (count,))
+        met = np.broadcast_to(np.array(view.hits_shape | before).astype(bool), (count,))
         u, v = (np.array(c, np.float64) for c in (uv.x, uv.y))
         place = np.stack([1 - u - v, u, v], axis=1)
         face = np.where(on_it, np.array(prim).astype(np.int64), -1)
-        return Ends(face, np.where(on_it[:, None], place, 0.0), met & ~on_it)
+        return RayEnds(face, np.where(on_it[:, None], place, 0.0), met & ~on_it)
 
 
 def mitsuba_mesh(vertices: np.ndarray, faces: np.ndarray, name: str, bsdf: Mapping[str, Any] | None = None) -> Any:
@@ -363,15 +363,15 @@ class Charts:
     faces: np.ndarray
 
 
-def unroller() -> Any:
+def import_xatlas() -> Any:
     """The package xatlas; `ImportError` with the remedy where it is not installed."""
     return import_extra("xatlas", "a texture needs xatlas", "bake")
 
 
-def unroll(mesh: Mesh, pixels: int) -> Charts:
+def unwrap_uv(mesh: Mesh, pixels: int) -> Charts:
     """``mesh`` cut into charts that fill a square of ``pixels`` a side without overlaps. Needs xatlas; raises
     `NergError` for meshes that are too large."""
-    xatlas = unroller()
+    xatlas = import_xatlas()
     if len(mesh.faces) > MOST_CHART_FACES:
         raise NergError(
             f"a mesh of {len(mesh.faces):,} triangles is not unrolled into a texture, but up to "
@@ -399,7 +399,7 @@ def unroll(mesh: Mesh, pixels: int) -> Charts:
     return Charts(vertex.astype(np.int64), uv.astype(np.float64) * size / pixels, faces.astype(np.int64))
 
 
-def texture_rows(
+def iter_texture_rows(
     charts: Charts, refined: RefinedMesh, values: np.ndarray, pixels: int
 ) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
     """``values`` (V,) on the vertices of ``refined``, of whose whole mesh ``charts`` are, as a square texture.
@@ -411,7 +411,7 @@ def texture_rows(
     import mitsuba as mi
     from scipy.ndimage import distance_transform_edt
 
-    corners = np.einsum("fij,fjk->fik", refined.place, charts.uv[charts.faces[refined.parent]])
+    corners = np.einsum("fij,fjk->fik", refined.barycentric, charts.uv[charts.faces[refined.parent]])
     flat = np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=2).reshape(-1, 3)
     # A texel shows what lies under its centre, which is found as all else is: by a ray.
     sheet = mitsuba_mesh(flat, np.arange(len(flat)).reshape(-1, 3), "charts")

@@ -13,17 +13,17 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.arrays import vector_of
+from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import Float, Point3f, Vector3f, variant_types
-from nerg_mi.maths.vmf import tangents
-from nerg_mi.probes.surface_attention import Density, attended
+from nerg_mi.maths.vmf import tangent_frame
+from nerg_mi.probes.surface_attention import Density, attention_per_sr
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings
-from nerg_mi.transport.observer_gaze import PlacedGaze
+from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
-from .laplacian import SurfaceSums, deposit, merge
+from .laplacian import SurfaceSums, deposit, merge_sums
 from .mesh import Mesh, SurfaceTarget
 
 # ---- Cones ----
@@ -41,7 +41,7 @@ RING = 6  # directions around the middle one
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 
 
-def blurred(density: Callable[[Vector3f], Any], directions: Vector3f, sigma: float) -> Any:
+def blur_density(density: Callable[[Vector3f], Any], directions: Vector3f, sigma: float) -> Any:
     """``density`` along ``directions`` (unit, a lane each), seen through a cone of ``sigma`` radian."""
     import drjit as dr
 
@@ -55,7 +55,7 @@ def blurred(density: Callable[[Vector3f], Any], directions: Vector3f, sigma: flo
     return found
 
 
-def bundle(directions: np.ndarray, sigma: float, count: int, rng: np.random.Generator) -> np.ndarray:
+def sample_cone(directions: np.ndarray, sigma: float, count: int, rng: np.random.Generator) -> np.ndarray:
     """``count`` unit directions (N, count, 3) of equal weight in a cone of ``sigma`` radian around each of
     ``directions`` (N, 3).
 
@@ -69,7 +69,7 @@ def bundle(directions: np.ndarray, sigma: float, count: int, rng: np.random.Gene
     # The angle of a Gaussian of two dimensions is Rayleigh's.
     angle = np.minimum(sigma * np.sqrt(-2 * np.log1p(-shell)), np.pi)
     turn = 2 * np.pi * rng.random((n, 1)) + _GOLDEN * np.arange(count)
-    side, up = tangents(directions)
+    side, up = tangent_frame(directions)
     around = np.cos(turn)[..., None] * side[:, None] + np.sin(turn)[..., None] * up[:, None]
     out = np.cos(angle)[..., None] * directions[:, None] + np.sin(angle)[..., None] * around
     return out / np.linalg.norm(out, axis=-1, keepdims=True)
@@ -82,7 +82,7 @@ def bundle(directions: np.ndarray, sigma: float, count: int, rng: np.random.Gene
 # has room for so many of them only. The solid angle of a triangle is that of A. van Oosterom and J. Strackee, "The
 # Solid Angle of a Plane Triangle" (1983); no Jacobian has to be evaluated where it is steep.
 
-LEVELS = 40  # a face is cut in four so many times at most: to 10^-12 of its size
+MAX_LEVELS = 40  # a face is cut in four so many times at most: to 10^-12 of its size
 MOST_PIECES = 1 << 25  # pieces of a mesh at most, as one observer sees it: five gigabytes
 
 
@@ -91,36 +91,36 @@ class Pieces:
     """Parts of faces as ``eye`` (3,) sees them: ``face`` (P,) that each lies in; ``cut`` (P, 3, 3), of each of its
     corners the barycentric coordinates there; ``relative`` (P, 3, 3), its corners from the eye in scene units."""
 
-    eye: np.ndarray
+    observer: np.ndarray
     face: np.ndarray
-    cut: np.ndarray
+    barycentric: np.ndarray
     relative: np.ndarray
 
     def __len__(self) -> int:
         return len(self.face)
 
     @property
-    def place(self) -> np.ndarray:
+    def centroid_barycentric(self) -> np.ndarray:
         """Barycentric coordinates (P, 3) of the centroids."""
-        return self.cut.mean(axis=1)
+        return self.barycentric.mean(axis=1)
 
     @property
-    def center(self) -> np.ndarray:
+    def centroids(self) -> np.ndarray:
         """Centroids (P, 3) in the scene."""
-        return self.relative.mean(axis=1) + self.eye
+        return self.relative.mean(axis=1) + self.observer
 
     @cached_property
     def solid_angle(self) -> np.ndarray:
         """Solid angles (P,) under which the eye sees them, in steradian."""
         return solid_angles(self.relative)
 
-    def part(self, rows: np.ndarray | slice) -> Pieces:
+    def select(self, rows: np.ndarray | slice) -> Pieces:
         """Those numbered, or marked, by ``rows``."""
-        return Pieces(self.eye, self.face[rows], self.cut[rows], self.relative[rows])
+        return Pieces(self.observer, self.face[rows], self.barycentric[rows], self.relative[rows])
 
     def quartered(self) -> Pieces:
         """Each cut into four congruent ones, one after the other."""
-        return Pieces(self.eye, np.repeat(self.face, 4), _quarters(self.cut), _quarters(self.relative))
+        return Pieces(self.observer, np.repeat(self.face, 4), _quarters(self.barycentric), _quarters(self.relative))
 
 
 def pieces_of(mesh: Mesh, eye: np.ndarray, angle: float, faces: slice = slice(None)) -> Pieces:
@@ -134,16 +134,16 @@ def pieces_of(mesh: Mesh, eye: np.ndarray, angle: float, faces: slice = slice(No
     number = np.arange(len(mesh.faces))[faces]
     left = Pieces(eye, number, np.broadcast_to(np.eye(3), (len(number), 3, 3)), relative)
     found: list[Pieces] = []
-    for level in range(LEVELS + 1):
+    for level in range(MAX_LEVELS + 1):
         here = left.relative
         middle = here.mean(axis=1)
         radius = np.sqrt(_square(here - middle[:, None]).max(axis=1))
         edge = np.sqrt(_square(here - here[:, [2, 0, 1]]).max(axis=1))
         # Not "<=": what is not finite is cut no further.
         small = ~(edge > angle * np.maximum(np.sqrt(_square(middle)) - radius, 0))
-        if level == LEVELS:
+        if level == MAX_LEVELS:
             small[:] = True
-        found.append(left.part(small))
+        found.append(left.select(small))
         if small.all():
             break
         if sum(map(len, found)) + 4 * np.count_nonzero(~small) > MOST_PIECES:
@@ -152,7 +152,7 @@ def pieces_of(mesh: Mesh, eye: np.ndarray, angle: float, faces: slice = slice(No
                 f"{MOST_PIECES:,} pieces of "
                 f"{np.degrees(angle):g} degrees; give a larger --angle"
             )
-        left = left.part(~small).quartered()
+        left = left.select(~small).quartered()
     joined = (np.concatenate([getattr(part, name) for part in found]) for name in ("face", "cut", "relative"))
     return Pieces(eye, *joined)
 
@@ -223,11 +223,11 @@ def visible_pieces(
     ``batch``: pieces that are looked at together. The target is `sharp`.
     """
     for a in range(0, len(pieces), batch):
-        left = pieces.part(slice(a, a + batch))
+        left = pieces.select(slice(a, a + batch))
         for level in range(CUTS + 1):
             seen = _seen(target, left)
             rows = np.flatnonzero(seen.any(axis=1))
-            left, seen = left.part(rows), seen[rows]
+            left, seen = left.select(rows), seen[rows]
             if not len(left):
                 break
             whole = left.solid_angle * density(left)
@@ -241,18 +241,18 @@ def visible_pieces(
 
 def _seen(target: SurfaceTarget, pieces: Pieces) -> np.ndarray:
     """Whether each of the points (P, 7) is seen at which pieces are looked at."""
-    points = np.matmul(_LOOKED_AT, pieces.relative) + pieces.eye
+    points = np.matmul(_LOOKED_AT, pieces.relative) + pieces.observer
     count = len(_LOOKED_AT)
-    return target.sees(pieces.eye, points.reshape(-1, 3), np.repeat(pieces.face, count)).reshape(-1, count)
+    return target.is_visible(pieces.observer, points.reshape(-1, 3), np.repeat(pieces.face, count)).reshape(-1, count)
 
 
 # ---- Population ----
 #
 # Where people were, by how long: the time of each tracked ray, and a few observers that stand for all of them.
 
-GAP = 0.5  # seconds that a ray stands for at most: nobody knows where people were while they were not tracked
+MAX_GAP = 0.5  # seconds that a ray stands for at most: nobody knows where people were while they were not tracked
 
-WEIGHTS = ("time", "person", "equal")
+WEIGHTINGS = ("time", "person", "equal")
 """Whom rays count by: each by its time; so that all people count alike; each alike."""
 
 _CELLS = 4096
@@ -266,11 +266,11 @@ class WeightedObservers:
 
     positions: np.ndarray
     weights: np.ndarray
-    mean: float = 0.0
-    farthest: float = 0.0
+    rms_distance: float = 0.0
+    p95_distance: float = 0.0
 
 
-def ray_seconds(rays: Rays, gap: float = GAP) -> np.ndarray:
+def ray_durations(rays: Rays, gap: float = MAX_GAP) -> np.ndarray:
     """Seconds (N,) that each ray stands for: until the next one of the same person and recording, and ``gap`` at most;
     of the last of a recording the median of the others in it."""
     sessions = find_sessions(rays)
@@ -284,9 +284,9 @@ def ray_seconds(rays: Rays, gap: float = GAP) -> np.ndarray:
     return out if out.sum() > 0 else np.full(len(rays), gap)
 
 
-def ray_weights(rays: Rays, by: str, gap: float = GAP) -> np.ndarray:
+def ray_weights(rays: Rays, by: str, gap: float = MAX_GAP) -> np.ndarray:
     """Weights (N,) of ``rays`` that add up to one, by one of `WEIGHTS`."""
-    seconds = np.ones(len(rays)) if by == "equal" else ray_seconds(rays, gap)
+    seconds = np.ones(len(rays)) if by == "equal" else ray_durations(rays, gap)
     if by == "person":
         each = np.bincount(rays.person, seconds)
         seconds = seconds / np.where(each > 0, each, 1)[rays.person]
@@ -370,14 +370,14 @@ CASTS = 1 << 20  # rays that are cast in one launch
 class RaySettings:
     """``cone``: its standard deviation in radian, 0 for a line; ``bundle``: rays of each; ``seed`` of their turns."""
 
-    cone: float = 0.0
-    bundle: int = 16
+    cone_sigma: float = 0.0
+    rays_per_cone: int = 16
     seed: int = 0
 
     @property
     def casts(self) -> int:
         """Rays cast for each tracked one."""
-        return self.bundle if self.cone > 0 else 1
+        return self.rays_per_cone if self.cone_sigma > 0 else 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,34 +388,34 @@ class TrackedRays:
     origins: np.ndarray
     directions: np.ndarray
     weights: np.ndarray
-    first: int = 0
+    first_index: int = 0
 
     def __len__(self) -> int:
         return len(self.weights)
 
-    def part(self, start: int, stop: int) -> TrackedRays:
+    def select(self, start: int, stop: int) -> TrackedRays:
         """The rays from ``start`` up to ``stop``."""
         rows = slice(start, stop)
-        return TrackedRays(self.origins[rows], self.directions[rows], self.weights[rows], self.first + start)
+        return TrackedRays(self.origins[rows], self.directions[rows], self.weights[rows], self.first_index + start)
 
 
-def ray_sums(target: SurfaceTarget, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
+def sum_rays(target: SurfaceTarget, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
     """What ``rays`` leave on ``target``: partial sums, which `visits.merge` adds up to those of more rays.
 
     The draws depend on the seed and on ``rays.first`` alone, so that parts that are cut alike give the same everywhere.
     """
     mesh = target.mesh
     on_faces, on_vertices = np.zeros(len(mesh.faces)), np.zeros(len(mesh.vertices))
-    rng = np.random.default_rng([settings.seed, rays.first])
+    rng = np.random.default_rng([settings.seed, rays.first_index])
     each, elsewhere, escaped = settings.casts, 0.0, 0.0
     step = max(1, CASTS // each)
     for a in range(0, len(rays), step):
-        some = rays.part(a, min(a + step, len(rays)))
-        directions = bundle(some.directions, settings.cone, each, rng).reshape(-1, 3)
-        ends = target.ends(np.repeat(some.origins, each, axis=0), directions)
+        some = rays.select(a, min(a + step, len(rays)))
+        directions = sample_cone(some.directions, settings.cone_sigma, each, rng).reshape(-1, 3)
+        ends = target.trace(np.repeat(some.origins, each, axis=0), directions)
         weights = np.repeat(some.weights / each, each)
         on = ends.face >= 0
-        found = deposit(mesh.faces, len(mesh.vertices), ends.face[on], ends.place[on], weights[on])
+        found = deposit(mesh.faces, len(mesh.vertices), ends.face[on], ends.barycentric[on], weights[on])
         on_faces, on_vertices = on_faces + found[0], on_vertices + found[1]
         elsewhere += float(weights[ends.elsewhere].sum())
         escaped += float(weights[~on & ~ends.elsewhere].sum())
@@ -494,7 +494,7 @@ def _directions(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
 # points, and what they lack of each other is the error that is told.
 
 BATCH = 1 << 18  # pieces in one launch
-FACES = 1 << 16  # faces that are cut into pieces together
+FACES_PER_BATCH = 1 << 16  # faces that are cut into pieces together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -502,8 +502,8 @@ class GazeSumSettings:
     """``angle``: radian under which an observer sees a piece at most; ``cone``: standard deviation in radian of the
     cone that gaze is seen through, 0 for none; ``directions`` over the sphere, about."""
 
-    angle: float = 0.035
-    cone: float = 0.0
+    max_angle: float = 0.035
+    cone_sigma: float = 0.0
     directions: int = 1 << 16
 
 
@@ -520,13 +520,13 @@ class SurfaceObserver:
 MakeObserver = Callable[[np.ndarray], SurfaceObserver]  # of an observer's position (3,)
 
 
-def observers_from_field(gaze: PlacedGaze, place: Place, settings: ObserverSettings) -> MakeObserver:
+def observers_from_field(gaze: GazeFieldInstance, geometry: SceneGeometry, settings: ObserverSettings) -> MakeObserver:
     """Observers whose gaze is the field ``gaze`` in ``place``, traced with ``settings``."""
 
     def make(eye: np.ndarray) -> SurfaceObserver:
         center = _center(eye)
         # Nobody is asked for twice, and what is known of all of them would fill the memory.
-        observed = gaze.at([center], place, settings, ObserverCache())
+        observed = gaze.for_observers([center], geometry, settings, ObserverCache())
         return SurfaceObserver(
             center,
             lambda p_od, p_o, r_o, active: observed.evaluate(p_od, p_o, r_o, active)[0],
@@ -536,34 +536,34 @@ def observers_from_field(gaze: PlacedGaze, place: Place, settings: ObserverSetti
     return make
 
 
-def gaze_sums(
+def sum_gaze(
     target: SurfaceTarget,
-    make: MakeObserver,
+    make_observer: MakeObserver,
     eyes: np.ndarray,
     weights: Sequence[float] | np.ndarray,
     settings: GazeSumSettings,
 ) -> SurfaceSums:
     """What observers at ``eyes`` (M, 3), who count by ``weights`` (M,), leave on ``target``: partial sums, which
     `merge` adds up to those of more observers."""
-    none = SurfaceSums.none(len(target.mesh.faces), len(target.mesh.vertices))
+    none = SurfaceSums.zeros(len(target.mesh.faces), len(target.mesh.vertices))
     with dr.suspend_grad():
-        return merge([none, *(_of_one(target, make(eye), float(w), eye, settings) for eye, w in zip(eyes, weights))])
+        return merge_sums([none, *(_of_one(target, make_observer(eye), float(w), eye, settings) for eye, w in zip(eyes, weights))])
 
 
 def _of_one(
     target: SurfaceTarget, looker: SurfaceObserver, weight: float, eye: np.ndarray, settings: GazeSumSettings
 ) -> SurfaceSums:
     mesh, eye = target.mesh, np.asarray(eye, np.float64)
-    everywhere = along_through(looker, settings.cone)
+    everywhere = along_through(looker, settings.cone_sigma)
     directions, angles = sphere_rule(everywhere, settings.directions)
     share = weight * angles * everywhere(directions)
-    ends = target.ends(np.broadcast_to(eye, directions.shape), directions)
+    ends = target.trace(np.broadcast_to(eye, directions.shape), directions)
     total, escaped = float(share.sum()), float(share[(ends.face < 0) & ~ends.elsewhere].sum())
     on_faces, on_vertices = np.zeros(len(mesh.faces)), np.zeros(len(mesh.vertices))
-    for a in range(0, len(mesh.faces), FACES):
-        pieces = pieces_of(mesh, eye, settings.angle, slice(a, a + FACES))
-        for some, received in _received(target, looker, pieces, total / weight if weight else 0.0, settings.cone):
-            found = deposit(mesh.faces, len(mesh.vertices), some.face, some.place, weight * received)
+    for a in range(0, len(mesh.faces), FACES_PER_BATCH):
+        pieces = pieces_of(mesh, eye, settings.max_angle, slice(a, a + FACES_PER_BATCH))
+        for some, received in _received(target, looker, pieces, total / weight if weight else 0.0, settings.cone_sigma):
+            found = deposit(mesh.faces, len(mesh.vertices), some.face, some.centroid_barycentric, weight * received)
             on_faces, on_vertices = on_faces + found[0], on_vertices + found[1]
     return SurfaceSums(on_faces, on_vertices, float(share[ends.elsewhere].sum()), escaped, total, weight, 1)
 
@@ -573,27 +573,27 @@ def _received(
 ) -> Iterator[tuple[Pieces, np.ndarray]]:
     """Pieces, some of which may be cut again, and the gaze (P,) that each receives."""
     density = density_through(looker, cone)
-    if target.sharp:
+    if target.has_binary_visibility:
         yield from visible_pieces(target, pieces, lambda some: _of_pieces(looker, density, some), total, BATCH)
         return
     for a in range(0, len(pieces), BATCH):
         # Most of a place is hidden from wherever one stands, and gaze costs more than rays.
-        some = pieces.part(slice(a, a + BATCH))
-        some = some.part(_of_seen(target, looker, uniform, some) > 0)
+        some = pieces.select(slice(a, a + BATCH))
+        some = some.select(_of_seen(target, looker, unit_density, some) > 0)
         if len(some):
             yield some, some.solid_angle * _of_seen(target, looker, density, some)
 
 
 def _of_seen(target: SurfaceTarget, looker: SurfaceObserver, density: Density, pieces: Pieces) -> np.ndarray:
     normals = target.mesh.normals[pieces.face]
-    return after_occlusion(target.place, looker, density, pieces.center, normals, target.falloff, target.settings)
+    return after_occlusion(target.geometry, looker, density, pieces.centroids, normals, target.falloff, target.settings)
 
 
 def unhidden(looker: SurfaceObserver, density: Density, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """``density`` (N,) of ``looker`` at ``points`` (N, 3), along unit ``directions`` (N, 3), in 1/sr, whatever may
     stand between."""
     mi = variant_types()
-    r_o, p_od = vector_of(mi.Vector3f, directions), vector_of(mi.Point3f, points)
+    r_o, p_od = to_vector(mi.Vector3f, directions), to_vector(mi.Point3f, points)
     p_o = looker.center + dr.zeros(mi.Point3f, len(points))
     return _rows(density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(points))), len(points))
 
@@ -602,16 +602,16 @@ def density_through(looker: SurfaceObserver, cone: float) -> Density:
     """The density of ``looker`` seen through a cone of standard deviation ``cone`` in radian; 0: itself."""
     if cone == 0:
         return looker.density
-    return lambda p_od, p_o, r_o, active: blurred(looker.along, r_o, cone)
+    return lambda p_od, p_o, r_o, active: blur_density(looker.along, r_o, cone)
 
 
 def _of_pieces(looker: SurfaceObserver, density: Density, pieces: Pieces) -> np.ndarray:
     middle = pieces.relative.mean(axis=1)
-    return unhidden(looker, density, pieces.center, middle / np.linalg.norm(middle, axis=1, keepdims=True))
+    return unhidden(looker, density, pieces.centroids, middle / np.linalg.norm(middle, axis=1, keepdims=True))
 
 
 def after_occlusion(
-    place: Place,
+    place: SceneGeometry,
     looker: SurfaceObserver,
     density: Density,
     points: np.ndarray,
@@ -623,12 +623,12 @@ def after_occlusion(
     """``density`` (N,) of ``looker`` after occlusion by what may be a medium, at ``points`` on surfaces with
     ``normals`` (N, 3), in 1/sr; ``penetration`` as of `nerg_mi.probes.surface_attention.attended`."""
     mi = variant_types()
-    p_o, p = looker.center + dr.zeros(mi.Point3f, len(points)), vector_of(mi.Point3f, points)
-    n = vector_of(mi.Vector3f, normals)
-    return _rows(attended(place, density, p_o, p, n, falloff, settings, True, penetration=penetration), len(points))
+    p_o, p = looker.center + dr.zeros(mi.Point3f, len(points)), to_vector(mi.Point3f, points)
+    n = to_vector(mi.Vector3f, normals)
+    return _rows(attention_per_sr(place, density, p_o, p, n, falloff, settings, True, penetration=penetration), len(points))
 
 
-def uniform(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
+def unit_density(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
     """A density of 1, of which occlusion leaves the visibility."""
     return type(r_o.x)(1)
 
@@ -641,8 +641,8 @@ def _rows(values: Any, count: int) -> np.ndarray:
 def along_through(looker: SurfaceObserver, cone: float) -> Callable[[np.ndarray], np.ndarray]:
     """The density (N,) of ``looker`` in unit directions (N, 3), seen through a cone as `density_through` has it."""
     mi = variant_types()
-    along = looker.along if cone == 0 else lambda directions: blurred(looker.along, directions, cone)
-    return lambda d: _rows(along(vector_of(mi.Vector3f, d)), len(d))
+    along = looker.along if cone == 0 else lambda directions: blur_density(looker.along, directions, cone)
+    return lambda d: _rows(along(to_vector(mi.Vector3f, d)), len(d))
 
 
 def _center(eye: np.ndarray) -> Point3f:

@@ -9,14 +9,14 @@ import drjit as dr
 import numpy as np
 from scipy import sparse
 
-from nerg_mi.fields.splats import Splats, matrices_of
-from nerg_mi.maths.arrays import aligned, vector_of
+from nerg_mi.fields.splats import Splats, quaternions_to_matrices
+from nerg_mi.maths.arrays import copy_aligned, to_vector
 from nerg_mi.maths.types import variant_types
-from nerg_mi.transport.geometry import Place
-from nerg_mi.transport.march_primal import HITS_STOP
+from nerg_mi.transport.geometry import SceneGeometry
+from nerg_mi.transport.march_primal import DEFAULT_HITS_STOP
 from nerg_mi.transport.medium import LastHit, LocalRay
 from nerg_mi.transport.observer import ObserverSettings
-from nerg_mi.transport.splat_medium import MOST_ABSORBED, SplatArrays, SplatHits
+from nerg_mi.transport.splat_medium import MAX_ALPHA, SplatArrays, SplatHits
 
 from .laplacian import SurfaceSums
 from .sources import (
@@ -26,11 +26,11 @@ from .sources import (
     TrackedRays,
     after_occlusion,
     along_through,
-    bundle,
+    sample_cone,
     density_through,
     sphere_rule,
     unhidden,
-    uniform,
+    unit_density,
 )
 
 # ---- Splat hits ----
@@ -52,8 +52,8 @@ class HitGroup:
     rows: np.ndarray
     index: np.ndarray
     arriving: np.ndarray
-    absorbed: np.ndarray
-    left: np.ndarray
+    alpha: np.ndarray
+    remaining: np.ndarray
     through: np.ndarray
 
 
@@ -62,7 +62,7 @@ def groups_of_hits(
     origins: np.ndarray,
     directions: np.ndarray,
     before: np.ndarray | None = None,
-    stop: float = HITS_STOP,
+    stop: float = DEFAULT_HITS_STOP,
 ) -> Generator[HitGroup, np.ndarray | None, None]:
     """What rays with ``origins`` (N, 3) and unit ``directions`` (N, 3), in the frame of ``arrays``, meet of them.
 
@@ -92,13 +92,13 @@ def groups_of_hits(
 def _next(hits, origins, directions, after, before, light, stop) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance, share and place in the tree (M, K) of the next hits; distances are infinite where there are none."""
     mi = variant_types()
-    o, d = vector_of(mi.Point3f, origins), vector_of(mi.Vector3f, directions)
+    o, d = to_vector(mi.Point3f, origins), to_vector(mi.Vector3f, directions)
     count = len(origins)
-    given = lambda values: mi.Float(aligned(values).ravel())
+    given = lambda values: mi.Float(copy_aligned(values).ravel())
     ray = LocalRay(o, d, d, mi.Float(0), mi.Float(dr.inf))
-    last = LastHit(given(after[0]), mi.UInt32(aligned(after[1], np.uint32).ravel()))
+    last = LastHit(given(after[0]), mi.UInt32(copy_aligned(after[1], np.uint32).ravel()))
     with dr.suspend_grad():
-        found = hits.nearest(
+        found = hits.find_next(
             ray, last, given(before), given(light), dr.opaque(mi.Float, stop), dr.full(mi.Bool, True, count)
         )
         dr.eval(found.t, found.absorbed, found.index)
@@ -118,8 +118,8 @@ def _next(hits, origins, directions, after, before, light, stop) -> tuple[np.nda
 # plane would then be that of their numbers. They start as far before it as a point may lie
 # behind a surface and still be seen: a place that stands before it hides it, and takes nothing of its area.
 
-RAYS = 8  # to a side of a Gaussian
-HIDDEN = 0.05  # of its whole area: a side of which less is seen counts as hidden
+RAYS_PER_SIDE = 8  # to a side of a Gaussian
+MIN_VISIBLE_FRACTION = 0.05  # of its whole area: a side of which less is seen counts as hidden
 TILT = np.radians(25)  # of the rays
 _BATCH = 1 << 17
 # Multiples of both together fill a square evenly (the plastic number).
@@ -138,14 +138,14 @@ def sides_of(directions: np.ndarray, axes: np.ndarray) -> np.ndarray:
     return (np.einsum("ij,ij->i", directions, axes) <= 0).astype(np.int64)
 
 
-def whole_areas(splats: Splats, extent: float) -> np.ndarray:
+def unoccluded_areas(splats: Splats, extent: float) -> np.ndarray:
     """Areas (N,) of Gaussians that nothing hides, in square scene units."""
     scales = np.sort(splats.scales.astype(np.float64), axis=1)
-    opacity = np.minimum(splats.opacities.astype(np.float64), MOST_ABSORBED)
+    opacity = np.minimum(splats.opacities.astype(np.float64), MAX_ALPHA)
     return 2 * np.pi * scales[:, 1] * scales[:, 2] * opacity * -np.expm1(-(extent**2) / 2)
 
 
-def splat_areas(splats: Splats, arrays: SplatArrays, tolerance: float) -> np.ndarray:
+def compute_splat_areas(splats: Splats, arrays: SplatArrays, tolerance: float) -> np.ndarray:
     """Areas (2, N) in square scene units of the sides (`sides_of`) of ``splats``, which ``arrays`` hold. ``tolerance``:
     how far a point may lie behind a surface that is not hidden by it."""
     lights = np.zeros((2, len(splats)))
@@ -156,15 +156,15 @@ def splat_areas(splats: Splats, arrays: SplatArrays, tolerance: float) -> np.nda
         np.take_along_axis(sigma, order[:, k, None], axis=1),
     )
     (normal, thin), (first, a), (second, b) = (take(k) for k in range(3))
-    radius = np.sqrt(-2 * np.log1p(-(np.arange(RAYS) + 0.5) / RAYS))
-    turn = _GOLDEN * np.arange(RAYS)
+    radius = np.sqrt(-2 * np.log1p(-(np.arange(RAYS_PER_SIDE) + 0.5) / RAYS_PER_SIDE))
+    turn = _GOLDEN * np.arange(RAYS_PER_SIDE)
     away = np.minimum(radius, arrays.extent) * np.array([np.cos(turn), np.sin(turn)])
-    step = _BATCH // RAYS
+    step = _BATCH // RAYS_PER_SIDE
     for start in range(0, len(splats), step):
         part = slice(start, start + step)
         on = (a * first)[part, None] * away[0][:, None] + (b * second)[part, None] * away[1][:, None]
         # Which way each leans has nothing to do with where its point lies, or all of a plane would come too early.
-        lean = 2 * np.pi * np.modf(np.arange(len(splats))[part, None] * _SPREAD[0] + np.arange(RAYS) * _SPREAD[1])[0]
+        lean = 2 * np.pi * np.modf(np.arange(len(splats))[part, None] * _SPREAD[0] + np.arange(RAYS_PER_SIDE) * _SPREAD[1])[0]
         tilt = np.sin(TILT) * np.stack([np.cos(lean), np.sin(lean)])[..., None]
         aside = first[part, None] * tilt[0] + second[part, None] * tilt[1]
         # Where the peaks of rays lie that lean so: in the plane that the Gaussian's own measure calls upright to them.
@@ -174,15 +174,15 @@ def splat_areas(splats: Splats, arrays: SplatArrays, tolerance: float) -> np.nda
             d = sign * np.cos(TILT) * normal[part, None] + aside
             peak = splats.centers[part, None] + on - sign * (over / np.cos(TILT))[..., None] * normal[part, None]
             o = peak - before * d
-            found = _light(arrays, o.reshape(-1, 3), d.reshape(-1, 3), np.repeat(before, RAYS), start)
-            lights[side, part] = found.reshape(-1, RAYS).mean(axis=1)
-    return whole_areas(splats, arrays.extent) * lights
+            found = _light(arrays, o.reshape(-1, 3), d.reshape(-1, 3), np.repeat(before, RAYS_PER_SIDE), start)
+            lights[side, part] = found.reshape(-1, RAYS_PER_SIDE).mean(axis=1)
+    return unoccluded_areas(splats, arrays.extent) * lights
 
 
 def _light(arrays: SplatArrays, o: np.ndarray, d: np.ndarray, distance: np.ndarray, start: int) -> np.ndarray:
     """Light (R,) that reaches, along each ray, the Gaussian that it is aimed at: `RAYS` to each, from number ``start``
     on, whose peaks lie at ``distance`` (R,)."""
-    own, found = start + np.arange(len(o)) // RAYS, np.zeros(len(o))
+    own, found = start + np.arange(len(o)) // RAYS_PER_SIDE, np.zeros(len(o))
     # A little behind the peak, which is found once more.
     groups = groups_of_hits(arrays, o, d, distance * 1.01 + 1e-5 * (np.abs(o).max(axis=1) + distance))
     try:
@@ -205,11 +205,11 @@ def _light(arrays: SplatArrays, o: np.ndarray, d: np.ndarray, distance: np.ndarr
 # Gaze per area is that share by the area that a Gaussian takes of what is seen (`splat_areas`): of rays that fall on a
 # surface with the density D, a Gaussian receives D ∫ T_i α_i dA, whatever else is around.
 
-DIRECTIONS = 1 << 14  # in which an observer's gaze is looked at, about
+NUM_DIRECTIONS = 1 << 14  # in which an observer's gaze is looked at, about
 CASTS = 1 << 17  # rays that are cast in one launch: each brings a dozen hits
 
 
-def splat_ray_sums(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
+def sum_rays_on_splats(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
     """What ``rays``, in the frame of ``arrays``, leave on the Gaussians: partial sums, whose ``face`` (2 N,) are the
     shares on their sides 0, then on their sides 1, and whose ``vertex`` is empty.
 
@@ -217,36 +217,36 @@ def splat_ray_sums(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, set
     ends is unaccounted for: 1e-4 of a ray at most. The draws depend on the seed and on ``rays.first`` alone.
     """
     count = len(axes)
-    rng = np.random.default_rng([settings.seed, rays.first])
+    rng = np.random.default_rng([settings.seed, rays.first_index])
     each, shares, escaped = settings.casts, np.zeros(2 * count), 0.0
     step = max(1, CASTS // each)
     for a in range(0, len(rays), step):
-        some = rays.part(a, min(a + step, len(rays)))
-        directions = bundle(some.directions, settings.cone, each, rng).reshape(-1, 3)
+        some = rays.select(a, min(a + step, len(rays)))
+        directions = sample_cone(some.directions, settings.cone_sigma, each, rng).reshape(-1, 3)
         weights = np.repeat(some.weights / each, each)
         for group in groups_of_hits(arrays, np.repeat(some.origins, each, axis=0), directions):
             ray, hit = np.nonzero(group.index >= 0)
             thing, rows = group.index[ray, hit], group.rows[ray]
             side = sides_of(directions[rows], axes[thing])
-            share = weights[rows] * group.arriving[ray, hit] * group.absorbed[ray, hit]
+            share = weights[rows] * group.arriving[ray, hit] * group.alpha[ray, hit]
             shares += np.bincount(side * count + thing, share, 2 * count)
-            escaped += float((weights[group.rows] * group.left)[group.through].sum())
+            escaped += float((weights[group.rows] * group.remaining)[group.through].sum())
     weight = float(rays.weights.sum())
     return SurfaceSums(shares, np.zeros(0), 0.0, escaped, weight, weight, len(rays))
 
 
-def gaze_and_escaped(
-    arrays: SplatArrays, looker: SurfaceObserver, eye: np.ndarray, cone: float = 0.0
+def integrate_gaze(
+    arrays: SplatArrays, observer: SurfaceObserver, position: np.ndarray, cone: float = 0.0
 ) -> tuple[float, float]:
     """What the gaze of ``looker``, an observer at ``eye`` (3,) in the frame of ``arrays``, adds up to over the sphere,
     and how much of it meets no Gaussian: what comes through, as of rays. ``cone``: as of `sources.GazeSumSettings`.
     """
-    density = along_through(looker, cone)
+    density = along_through(observer, cone)
     with dr.suspend_grad():
-        directions, angles = sphere_rule(density, DIRECTIONS)
+        directions, angles = sphere_rule(density, NUM_DIRECTIONS)
         share, escaped = angles * density(directions), 0.0
-        for group in groups_of_hits(arrays, np.broadcast_to(eye, directions.shape), directions):
-            escaped += float((share[group.rows] * group.left)[group.through].sum())
+        for group in groups_of_hits(arrays, np.broadcast_to(position, directions.shape), directions):
+            escaped += float((share[group.rows] * group.remaining)[group.through].sum())
     return float(share.sum()), escaped
 
 
@@ -273,8 +273,8 @@ def gaze_and_escaped(
 
 FACING = np.cos(np.radians(30))  # cosine between the normals of neighbours at least
 RISE = np.sin(np.radians(15))  # sine of the angle at which a neighbour may lie out of the plane
-STEPS = 100  # steps at most, where all of a kernel's reach is covered
-MOST = 400  # steps at most, where many Gaussians lie at borders
+MAX_STEPS = 100  # steps at most, where all of a kernel's reach is covered
+MAX_BORDER_STEPS = 400  # steps at most, where many Gaussians lie at borders
 CLOSE = 0.7  # standard deviation of a step at least, as a share of the edge of a square of a Gaussian's area
 REACH = 3.0  # standard deviations of a step after which it is cut off
 
@@ -302,7 +302,7 @@ class SplatSmoother:
         which, sign = self._sides % count, np.where(self._sides < count, -1.0, 1.0)
         area = areas.ravel()[self._sides]
         apart = _weighted_median(np.sqrt(area), area) if len(area) else length
-        step = min(max(CLOSE * apart, length / np.sqrt(STEPS)), length)
+        step = min(max(CLOSE * apart, length / np.sqrt(MAX_STEPS)), length)
         step = length / np.sqrt(max(1, np.floor((length / step) ** 2)))
         # Normals of surfaces, which point to where they are seen from.
         normals, places = sign[:, None] * axes[which], np.asarray(centers, np.float64)[which]
@@ -324,7 +324,7 @@ class SplatSmoother:
         flow = np.where(i == j, stays[i], weight) / self._area[j]
         self._flow = sparse.csr_array((flow, (i, j)), (cells, cells))
         if variance > 0:
-            self.steps = min(max(1, round(length**2 / variance)), MOST)
+            self.steps = min(max(1, round(length**2 / variance)), MAX_BORDER_STEPS)
 
     def __call__(self, amounts: np.ndarray) -> np.ndarray:
         """The amounts (2, N) on the sides after smoothing; their sum stays."""
@@ -391,13 +391,13 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 # `nerg_mi.probes.surface_attention.attended`, of a point that lies before the centre by the thickness of the Gaussian
 # too. Such densities are colours: rendered in place of them, they mix by the light that reaches the eye.
 
-BATCH = 1 << 18  # Gaussians in one launch
+BATCH_SIZE = 1 << 18  # Gaussians in one launch
 
 
 def splat_densities(
     splats: Splats,
-    place: Place,
-    make: MakeObserver,
+    geometry: SceneGeometry,
+    make_observer: MakeObserver,
     eyes: np.ndarray,
     weights: np.ndarray,
     settings: ObserverSettings,
@@ -414,14 +414,14 @@ def splat_densities(
     out, every, axes = np.zeros((2, len(splats))), np.arange(len(splats)), shortest_axes(splats)
     with dr.suspend_grad():
         for eye, weight in zip(np.asarray(eyes, np.float64), weights):
-            found = float(weight) * _of_one(splats, place, make(eye), eye, settings, cone, falloff)
+            found = float(weight) * _of_one(splats, geometry, make_observer(eye), eye, settings, cone, falloff)
             out[sides_of(splats.centers - eye, axes), every] += found
     return out
 
 
 def _of_one(
     splats: Splats,
-    place: Place,
+    place: SceneGeometry,
     looker: SurfaceObserver,
     eye: np.ndarray,
     settings: ObserverSettings,
@@ -429,12 +429,12 @@ def _of_one(
     falloff: float,
 ) -> np.ndarray:
     out = np.zeros(len(splats))
-    for a in range(0, len(splats), BATCH):
-        part = slice(a, a + BATCH)
+    for a in range(0, len(splats), BATCH_SIZE):
+        part = slice(a, a + BATCH_SIZE)
         centers, scales = splats.centers[part].astype(np.float64), splats.scales[part].astype(np.float64)
-        facing, normals, depth = _facing(centers - eye, matrices_of(splats.rotations[part]), scales)
-        before = variant_types().Float(aligned(depth))
-        seen = after_occlusion(place, looker, uniform, centers, normals, falloff, settings, before)
+        facing, normals, depth = _facing(centers - eye, quaternions_to_matrices(splats.rotations[part]), scales)
+        before = variant_types().Float(copy_aligned(depth))
+        seen = after_occlusion(place, looker, unit_density, centers, normals, falloff, settings, before)
         rows = np.flatnonzero(seen > 0)
         # Most of a place is hidden from wherever one stands, and gaze costs more than rays.
         if len(rows):

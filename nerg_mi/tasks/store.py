@@ -21,17 +21,17 @@ from nerg_mi.files.atomic import (
     check_folder,
     file_sha256,
     make_folder,
-    replacing,
-    replacing_folder,
+    replace_atomically,
+    create_folder_atomically,
     write_bytes,
     write_text,
-    writing,
+    translate_write_errors,
 )
 from nerg_mi.files.safe_read import is_count, read_json
 
-from .task import FOLDER, FORMAT, Checksums, Plan, Task, processor
+from .task import FOLDER_SUFFIX, FORMAT, Checksums, Plan, Task, read_processor_name
 
-AGE = 3600.0
+LEFTOVER_AGE = 3600.0
 """Seconds after which unfinished files count as left by a process that died."""
 
 _RECEIPT = ".receipt.json"
@@ -41,7 +41,7 @@ _SUFFIX = re.compile(r"|/|(\.[A-Za-z0-9]+){1,2}")
 
 
 @dataclass(frozen=True)
-class Receipt:
+class ResultManifest:
     """That of the output of the task ``key``: its ``size`` in bytes and ``sha256`` (of a folder `digest_of`), the
     ``seconds`` that it took, the ``processor`` that made it, the ``notes`` of the work, and the SHA-256 of the
     ``inputs`` of that part alone, by their names."""
@@ -57,16 +57,16 @@ class Receipt:
     inputs: Mapping[str, str]
 
 
-def receipt_of(task: Task, output: Path, seconds: float, notes: Mapping[str, Any]) -> Receipt:
+def make_manifest(task: Task, output: Path, seconds: float, notes: Mapping[str, Any]) -> ResultManifest:
     """The receipt of ``output``, which ``task`` made here in so many ``seconds``."""
     inputs = {file.name: file.sha256 for file in task.files}
-    return Receipt(task.key, *digest_of(output), seconds, processor(), notes, task.label, task.suffix, inputs)
+    return ResultManifest(task.key, *compute_digest(output), seconds, read_processor_name(), notes, task.label, task.suffix, inputs)
 
 
-def read_receipt(path: str | os.PathLike) -> Receipt:
+def read_manifest(path: str | os.PathLike) -> ResultManifest:
     """The receipt in the file ``path``. Raises `NergError` for one that is damaged or of another version."""
     content = read_json(path, "receipt", 8 << 20)
-    names = {f.name for f in fields(Receipt)}
+    names = {f.name for f in fields(ResultManifest)}
     if not isinstance(content, dict) or content.pop("format", None) != FORMAT or set(content) != names:
         raise NergError(f'the receipt "{path}" is not of this version; remove it, and its output is made again')
     kinds = {name: dict if name in ("notes", "inputs") else str for name in names - {"size", "seconds"}}
@@ -74,31 +74,31 @@ def read_receipt(path: str | os.PathLike) -> Receipt:
     numbers = is_count(content["size"]) and isinstance(content["seconds"], (int, float)) and content["seconds"] >= 0
     if not (whole and numbers and _KEY.fullmatch(content["key"]) and _SUFFIX.fullmatch(content["suffix"])):
         raise NergError(f'the receipt "{path}" is damaged; remove it, and its output is made again')
-    return Receipt(**content)
+    return ResultManifest(**content)
 
 
-def digest_of(output: Path) -> tuple[int, str]:
+def compute_digest(output: Path) -> tuple[int, str]:
     """Bytes of an output and their SHA-256 (hex); of a folder the sum, and that of its files' names and digests. Raises
     `NergError` where it cannot be read."""
     if not output.is_dir():
         return os.stat(output).st_size if output.exists() else 0, file_sha256(output)
     digest, size = hashlib.sha256(), 0
-    for file in files_in(output):
+    for file in list_files(output):
         digest.update(f"{file.relative_to(output).as_posix()}\0{file_sha256(file)}\n".encode())
         size += file.stat().st_size
     return size, digest.hexdigest()
 
 
-def files_in(folder: Path) -> list[Path]:
+def list_files(folder: Path) -> list[Path]:
     """All files below ``folder``, in an order that does not depend on the machine."""
     return sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.relative_to(folder).as_posix())
 
 
-def content_of(output: Path) -> list[tuple[str, bytes]]:
+def read_contents(output: Path) -> list[tuple[str, bytes]]:
     """Names and bytes of the files of an output; the name is empty where the output is a file."""
     if not output.is_dir():
         return [("", output.read_bytes())]
-    return [(file.relative_to(output).as_posix(), file.read_bytes()) for file in files_in(output)]
+    return [(file.relative_to(output).as_posix(), file.read_bytes()) for file in list_files(output)]
 
 
 class Store:
@@ -112,115 +112,115 @@ class Store:
         check_folder(folder)
         self.folder = Path(os.path.abspath(folder))
 
-    def output(self, key: str, suffix: str) -> Path:
+    def output_path(self, key: str, suffix: str) -> Path:
         """Where the output of the task ``key`` is, or will be."""
-        return self.folder / key[:2] / f"{key}{'' if suffix == FOLDER else suffix}"
+        return self.folder / key[:2] / f"{key}{'' if suffix == FOLDER_SUFFIX else suffix}"
 
-    def receipt_file(self, key: str) -> Path:
+    def manifest_path(self, key: str) -> Path:
         """Where its receipt is, or will be."""
         return self.folder / key[:2] / f"{key}{_RECEIPT}"
 
-    def receipt(self, key: str) -> Receipt | None:
+    def read_manifest(self, key: str) -> ResultManifest | None:
         """The receipt of the task ``key``; None where there is none, or it is damaged or of another version: what
         cannot be verified is made again."""
-        file = self.receipt_file(key)
+        file = self.manifest_path(key)
         if not file.exists():
             return None
         try:
-            receipt = read_receipt(file)
+            receipt = read_manifest(file)
         except NergError:
             return None
         return receipt if receipt.key == key else None
 
-    def find(self, key: str, suffix: str) -> Receipt | None:
+    def find_valid(self, key: str, suffix: str) -> ResultManifest | None:
         """The receipt of an output that is there and has the bytes that it had when it was made; None otherwise."""
-        receipt, output = self.receipt(key), self.output(key, suffix)
+        receipt, output = self.read_manifest(key), self.output_path(key, suffix)
         if receipt is None or not output.exists():
             return None
         try:
-            whole = digest_of(output) == (receipt.size, receipt.sha256)
+            whole = compute_digest(output) == (receipt.size, receipt.sha256)
         except NergError:
             return None
         return receipt if whole else None
 
     @contextmanager
-    def writing(self, task: Task) -> Iterator[Path]:
+    def write_output(self, task: Task) -> Iterator[Path]:
         """The name of a new file, or folder, that becomes the output of ``task`` when the block ends."""
-        output = self.output(task.key, task.suffix)
-        if task.suffix != FOLDER:
-            with replacing(output) as temporary:
+        output = self.output_path(task.key, task.suffix)
+        if task.suffix != FOLDER_SUFFIX:
+            with replace_atomically(output) as temporary:
                 yield temporary
             return
         # `find` has seen no whole one there.
         shutil.rmtree(output, ignore_errors=True)
-        with replacing_folder(output) as temporary:
+        with create_folder_atomically(output) as temporary:
             yield temporary
 
-    def add(self, receipt: Receipt) -> None:
+    def add_manifest(self, manifest: ResultManifest) -> None:
         """Write the ``receipt`` of an output that is in its place: from now on it counts as made."""
-        text = json.dumps({"format": FORMAT, **asdict(receipt)}, sort_keys=True, indent=1)
-        write_text(self.receipt_file(receipt.key), text + "\n")
+        text = json.dumps({"format": FORMAT, **asdict(manifest)}, sort_keys=True, indent=1)
+        write_text(self.manifest_path(manifest.key), text + "\n")
 
-    def put(self, task: Task, receipt: Receipt, content: Sequence[tuple[str, bytes]]) -> None:
+    def import_output(self, task: Task, manifest: ResultManifest, content: Sequence[tuple[str, bytes]]) -> None:
         """Write an output that was made elsewhere, as `content_of` gave it there. Raises `NergError` where the bytes
         are not those of the ``receipt``."""
-        with self.writing(task) as temporary:
+        with self.write_output(task) as temporary:
             for name, data in content:
                 write_bytes(temporary / name if name else temporary, data)
-            if digest_of(temporary) != (receipt.size, receipt.sha256):
+            if compute_digest(temporary) != (manifest.size, manifest.sha256):
                 raise NergError(f"{task.label} arrived with other bytes than it was sent with; start the job again")
-        self.add(receipt)
+        self.add_manifest(manifest)
 
     def remove(self, key: str, suffix: str) -> None:
         """Remove an output with its receipt, the receipt first."""
-        with writing(self.folder):
-            self.receipt_file(key).unlink(missing_ok=True)
-            output = self.output(key, suffix)
+        with translate_write_errors(self.folder):
+            self.manifest_path(key).unlink(missing_ok=True)
+            output = self.output_path(key, suffix)
             shutil.rmtree(output) if output.is_dir() else output.unlink(missing_ok=True)
 
-    def receipts(self) -> Iterator[Receipt]:
+    def iter_manifests(self) -> Iterator[ResultManifest]:
         """All receipts that can be read, by their keys."""
         for file in sorted(self.folder.glob(f"[0-9a-f][0-9a-f]/*{_RECEIPT}")):
-            receipt = self.receipt(file.name.removesuffix(_RECEIPT))
+            receipt = self.read_manifest(file.name.removesuffix(_RECEIPT))
             if receipt is not None:
                 yield receipt
 
-    def leftovers(self, older: float) -> list[Path]:
+    def find_leftovers(self, min_age: float) -> list[Path]:
         """What processes that died have left unfinished: hidden files and folders that nobody has written to for
         ``older`` seconds, outputs without a receipt, and scratch folders."""
-        keys = {receipt.key for receipt in self.receipts()}
+        keys = {receipt.key for receipt in self.iter_manifests()}
         paths = [
             path
             for path in sorted(self.folder.glob("[0-9a-f][0-9a-f]/*"))
             if path.name.removesuffix(_RECEIPT).partition(".")[0] not in keys
         ]
         paths += sorted(self.folder.glob(f"{_SCRATCH}*"))
-        return [path for path in paths if time.time() - path.lstat().st_mtime > older]
+        return [path for path in paths if time.time() - path.lstat().st_mtime > min_age]
 
     @contextmanager
-    def scratch(self) -> Iterator[Path]:
+    def make_scratch_folder(self) -> Iterator[Path]:
         """A folder in the store for files that a job makes for its parts to read, removed when the block ends."""
         with TemporaryDirectory(prefix=_SCRATCH, dir=make_folder(self.folder)) as folder:
             yield Path(folder)
 
     # ---- Plans ----
 
-    def remember(self, plan: Plan) -> Path:
+    def save_plan(self, plan: Plan) -> Path:
         """Write down what ``plan`` needs, so that its outputs count as wanted."""
         every = [*plan.shared.files, *(file for task in plan.tasks for file in task.files)]
         # What lies in the store was made by other parts, or for these, and is made again where it has to be.
         inputs = {file.path: file.sha256 for file in every if self.folder not in Path(file.path).parents}
         common = sorted({inputs[file.path] for file in plan.shared.files if file.path in inputs})
-        path = self.folder / "plans" / f"{hashlib.sha256(plan.what.encode()).hexdigest()[:16]}.json"
+        path = self.folder / "plans" / f"{hashlib.sha256(plan.name.encode()).hexdigest()[:16]}.json"
         keys = {task.key: task.suffix for task in plan.tasks}
-        content = {"format": FORMAT, "what": plan.what, "inputs": inputs, "common": common, "keys": keys}
+        content = {"format": FORMAT, "what": plan.name, "inputs": inputs, "common": common, "keys": keys}
         write_text(path, json.dumps(content) + "\n")
         return path
 
-    def plans(self) -> list[StoredPlan]:
+    def read_plans(self) -> list[StoredPlan]:
         """All plans, by their names. Raises `NergError` for one that is damaged."""
         plans = [read_plan(path) for path in sorted(self.folder.glob("plans/*.json"))]
-        return sorted(plans, key=lambda plan: plan.what)
+        return sorted(plans, key=lambda plan: plan.name)
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ class StoredPlan:
     """A plan as a store has it: the ``keys`` of its tasks with their suffixes, the SHA-256 of the ``inputs`` by path,
     where they were, and those of them that all tasks read, ``common``."""
 
-    what: str
+    name: str
     keys: dict[str, str]
     inputs: dict[str, str]
     common: frozenset[str]
@@ -256,34 +256,34 @@ def read_plan(path: str | os.PathLike) -> StoredPlan:
 
 
 @dataclass(frozen=True)
-class JobAccount:
+class JobStatus:
     """How far one job is: ``done`` of ``total`` parts, with ``bytes`` of output that took ``seconds`` to make;
     ``changed``: its inputs that have other bytes by now, ``gone``: those that are not there any more; ``outdated``:
     parts that are done and were made of what was changed."""
 
-    what: str
+    name: str
     total: int
     done: int
     bytes: int
     seconds: float
     changed: tuple[str, ...]
-    gone: tuple[str, ...]
+    missing: tuple[str, ...]
     outdated: int
 
     @property
-    def left(self) -> int:
+    def remaining(self) -> int:
         """Parts that are not there yet."""
         return self.total - self.done
 
 
 @dataclass(frozen=True)
-class Account:
+class StoreStatus:
     """``jobs`` of a store; ``stale``: outputs that no job asks for any more, as it was started last, and those that
     were made of files that were changed since; ``leftovers``: what processes that died have left; ``bytes`` of all
     outputs."""
 
-    jobs: tuple[JobAccount, ...]
-    stale: tuple[Receipt, ...]
+    jobs: tuple[JobStatus, ...]
+    stale: tuple[ResultManifest, ...]
     leftovers: tuple[Path, ...]
     bytes: int
     leftover_bytes: int
@@ -294,34 +294,34 @@ class Account:
         return sum(receipt.size for receipt in self.stale)
 
 
-def read_account(store: Store, age: float = AGE) -> Account:
+def read_status(store: Store, age: float = LEFTOVER_AGE) -> StoreStatus:
     """What ``store`` holds; unfinished files count as leftovers after ``age`` seconds. Outputs are not read: whether
     they are whole is verified before they are used. Raises `NergError` where there is no store, or its plans cannot be
     read."""
-    plans = store.plans()
+    plans = store.read_plans()
     if not plans and not any(store.folder.glob("[0-9a-f][0-9a-f]")):
         raise NergError(f'"{store.folder}" holds no parts of jobs; name the folder that was given as --store')
-    receipts = {receipt.key: receipt for receipt in store.receipts()}
+    receipts = {receipt.key: receipt for receipt in store.iter_manifests()}
     checksums = Checksums()
     jobs, wanted = [], set[str]()
     for plan in plans:
         job, current = _job(plan, receipts, checksums)
         jobs.append(job)
         wanted |= current
-    leftovers = tuple(store.leftovers(age))
+    leftovers = tuple(store.find_leftovers(age))
     stale = tuple(receipt for key, receipt in receipts.items() if key not in wanted)
     size = sum(receipt.size for receipt in receipts.values())
-    return Account(tuple(jobs), stale, leftovers, size, sum(map(_size, leftovers)))
+    return StoreStatus(tuple(jobs), stale, leftovers, size, sum(map(_size, leftovers)))
 
 
-def _job(plan: StoredPlan, receipts: dict[str, Receipt], checksums: Checksums) -> tuple[JobAccount, set[str]]:
+def _job(plan: StoredPlan, receipts: dict[str, ResultManifest], checksums: Checksums) -> tuple[JobStatus, set[str]]:
     """How far a plan is, and the keys of what it asks for that is not out of date."""
     gone, changed, digests, others = [], [], set[str](), set[str]()
     for path, digest in plan.inputs.items():
         if not Path(path).is_file():
             # Nobody can say whether it was changed.
             gone.append(path)
-        elif checksums.of(path) != digest:
+        elif checksums.compute(path) != digest:
             changed.append(path)
             digests.add(digest)
             continue
@@ -331,20 +331,20 @@ def _job(plan: StoredPlan, receipts: dict[str, Receipt], checksums: Checksums) -
     done = [receipts[key] for key in plan.keys if key in receipts]
     outdated = {r.key for r in done if digests & plan.common or digests & set(r.inputs.values())}
     size, seconds = sum(receipt.size for receipt in done), sum(receipt.seconds for receipt in done)
-    account = JobAccount(
-        plan.what, len(plan.keys), len(done), size, seconds, tuple(changed), tuple(gone), len(outdated)
+    account = JobStatus(
+        plan.name, len(plan.keys), len(done), size, seconds, tuple(changed), tuple(gone), len(outdated)
     )
     return account, set(plan.keys) - outdated
 
 
-def remove_stale(store: Store, account: Account) -> int:
+def remove_stale(store: Store, status: StoreStatus) -> int:
     """Remove from ``store`` what ``account`` says is stale or left over; gives the bytes that became free."""
-    for receipt in account.stale:
+    for receipt in status.stale:
         store.remove(receipt.key, receipt.suffix)
-    for path in account.leftovers:
-        with writing(path):
+    for path in status.leftovers:
+        with translate_write_errors(path):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
-    return account.stale_bytes + account.leftover_bytes
+    return status.stale_bytes + status.leftover_bytes
 
 
 def _size(path: Path) -> int:

@@ -31,16 +31,16 @@ from nerg_mi.ranges import CHANGES_RESULT
 FORMAT = 2
 """Version of what a key is made of, and of the files in a store."""
 
-FOLDER = "/"
+FOLDER_SUFFIX = "/"
 """The suffix of outputs that are folders."""
 
-RENDERS = ("mitsuba", "drjit", "numpy")
+RENDER_LIBRARIES = ("mitsuba", "drjit", "numpy")
 """Distributions on whose versions pictures and trainings depend."""
 
-MOST = 500_000
+MAX_PARTS = 500_000
 """So many parts a job may have; each should last a second or more, so that this is a week of work."""
 
-Work = Callable[[Any, Any, Path], Mapping[str, Any] | None]
+TaskFunction = Callable[[Any, Any, Path], Mapping[str, Any] | None]
 """What runs a part: ``work(common, value, output)`` writes the file ``output``, or fills that folder, which is there
 and empty. It may return notes, a few values as JSON has them. A function of a module, since processes find it by its
 name. Output and notes are the same for the same arguments, in any process and in any order; an error that the user can
@@ -51,12 +51,12 @@ correct is a `NergError`."""
 
 
 @dataclass(frozen=True)
-class Files:
+class FileGroup:
     """A file, or folder, ``path``, with ``all`` files that are read because of it: they are named by where they lie to
     each other, and laid out alike where a worker has to be sent them."""
 
     path: Path
-    all: tuple[Path, ...]
+    members: tuple[Path, ...]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Checksums:
     def __init__(self) -> None:
         self._before: dict[str, tuple[tuple[int, ...], str]] = {}
 
-    def of(self, path: str | os.PathLike) -> str:
+    def compute(self, path: str | os.PathLike) -> str:
         """Hex digest of the file ``path``. Raises `NergError` for what cannot be read."""
         name = os.path.abspath(path)
         signature = _signature(name)
@@ -95,10 +95,10 @@ class Checksums:
             self._before[name] = (signature, digest)
         return digest
 
-    def is_at(self, file: InputFile) -> bool:
+    def is_unchanged(self, file: InputFile) -> bool:
         """Whether the file lies where it was planned, with the same bytes."""
         try:
-            return os.path.getsize(file.path) == file.size and self.of(file.path) == file.sha256
+            return os.path.getsize(file.path) == file.size and self.compute(file.path) == file.sha256
         except (OSError, NergError):
             return False
 
@@ -114,7 +114,7 @@ def _signature(path: str) -> tuple[int, ...] | None:
 # ---- Values ----
 
 
-def rebuilt(value: Any, change: Callable[[Any], Any] = lambda leaf: leaf) -> Any:
+def rebuild_value(value: Any, change: Callable[[Any], Any] = lambda leaf: leaf) -> Any:
     """``value`` with each of its paths and texts through ``change``, and with options that do not change a result at
     their defaults; itself where nothing of it differs."""
     if isinstance(value, (str, Path)):
@@ -123,30 +123,30 @@ def rebuilt(value: Any, change: Callable[[Any], Any] = lambda leaf: leaf) -> Any
         new = {}
         for f in fields(value):
             old = getattr(value, f.name)
-            one = rebuilt(old, change) if f.metadata.get(CHANGES_RESULT, True) else f.default
+            one = rebuild_value(old, change) if f.metadata.get(CHANGES_RESULT, True) else f.default
             if one is not old:
                 new[f.name] = one
         return replace(value, **new) if new else value
     if isinstance(value, Mapping):
-        table = {k: rebuilt(v, change) for k, v in value.items()}
+        table = {k: rebuild_value(v, change) for k, v in value.items()}
         return table if any(table[k] is not v for k, v in value.items()) else value
     if isinstance(value, (tuple, list)):
-        items = [rebuilt(v, change) for v in value]
+        items = [rebuild_value(v, change) for v in value]
         return type(value)(items) if any(a is not b for a, b in zip(items, value)) else value
     return value
 
 
-def relocated(value: Any, files: Iterable[InputFile], folder: Path) -> Any:
+def relocate_paths(value: Any, files: Iterable[InputFile], folder: Path) -> Any:
     """``value`` with the paths of ``files`` where they are laid out by their names, in ``folder``."""
     inputs = {file.path: file for file in files}
 
     def change(leaf: Any) -> Any:
         if isinstance(leaf, str) and leaf not in inputs:
             return leaf
-        name = find_name(leaf, inputs)
+        name = find_input_name(leaf, inputs)
         return leaf if name is None else type(leaf)(folder / name)
 
-    return rebuilt(value, change)
+    return rebuild_value(value, change)
 
 
 def _members(value: Any) -> Iterator[tuple[str, Any]]:
@@ -159,14 +159,14 @@ def _members(value: Any) -> Iterator[tuple[str, Any]]:
         yield from ((str(k), v) for k, v in enumerate(value))
 
 
-def inputs_of(value: Any, checksums: Checksums, below: str = "value") -> dict[str, InputFile]:
+def find_inputs(value: Any, checksums: Checksums, prefix: str = "value") -> dict[str, InputFile]:
     """The files of all paths in ``value``, by their whole paths. One that a `Files` lists has its name there; each
     other one is a file of its inside. Raises `NergError` for a file that cannot be read."""
-    groups: list[tuple[str, Files]] = []
+    groups: list[tuple[str, FileGroup]] = []
     alone: list[tuple[str, Path]] = []
 
     def visit(part: Any, trail: str) -> None:
-        if isinstance(part, Files):
+        if isinstance(part, FileGroup):
             groups.append((trail, part))
         elif isinstance(part, Path):
             alone.append((trail, part))
@@ -174,26 +174,26 @@ def inputs_of(value: Any, checksums: Checksums, below: str = "value") -> dict[st
             for name, one in _members(part):
                 visit(one, f"{trail}/{re.sub('[^A-Za-z0-9_]', '_', name)}")
 
-    visit(value, below)
+    visit(value, prefix)
     inputs: dict[str, InputFile] = {}
 
     def add(name: str, path: str) -> None:
         if path not in inputs:
-            inputs[path] = InputFile(name, checksums.of(path), os.path.getsize(path), path)
+            inputs[path] = InputFile(name, checksums.compute(path), os.path.getsize(path), path)
 
     for trail, group in groups:
-        every, whole = [os.path.abspath(path) for path in group.all], os.path.abspath(group.path)
+        every, whole = [os.path.abspath(path) for path in group.members], os.path.abspath(group.path)
         # A layout begins at the folder that all have in common.
         above = os.path.commonpath([*map(os.path.dirname, every), *([] if whole in every else [whole])])
         for path in every:
             add(f"{trail}/{Path(path).relative_to(above).as_posix()}", path)
     for trail, path in alone:
-        if find_name(path, inputs) is None:
+        if find_input_name(path, inputs) is None:
             add(f"{trail}/{path.name}", os.path.abspath(path))
     return inputs
 
 
-def find_name(path: str | os.PathLike, inputs: Mapping[str, InputFile]) -> str | None:
+def find_input_name(path: str | os.PathLike, inputs: Mapping[str, InputFile]) -> str | None:
     """What the file, or folder, ``path`` is called among ``inputs``, by whole paths; None where it is not there."""
     whole = os.path.abspath(path)
     if whole in inputs:
@@ -205,7 +205,7 @@ def find_name(path: str | os.PathLike, inputs: Mapping[str, InputFile]) -> str |
     return None
 
 
-def digest_of_value(value: Any, inputs: Mapping[str, InputFile] = MappingProxyType({})) -> str:
+def compute_value_digest(value: Any, inputs: Mapping[str, InputFile] = MappingProxyType({})) -> str:
     """SHA-256 (hex) of ``value``, of which paths are the names and bytes of ``inputs``. Raises ``TypeError`` for what
     has no digest."""
     return hashlib.sha256(json.dumps(_plain(value, inputs), sort_keys=True).encode()).hexdigest()
@@ -217,7 +217,7 @@ def _plain(value: Any, inputs: Mapping[str, InputFile]) -> Any:
         return value
     if isinstance(value, Path) or (isinstance(value, str) and value in inputs):
         file = inputs.get(os.path.abspath(value))
-        return {"file": find_name(value, inputs) if file is None else [file.name, file.sha256]}
+        return {"file": find_input_name(value, inputs) if file is None else [file.name, file.sha256]}
     if isinstance(value, str):
         return value
     if isinstance(value, np.generic):
@@ -242,17 +242,17 @@ _LEAVE_OUT = ("cli", "viewer", "tasks")
 
 
 @cache
-def code_digest() -> str:
+def compute_code_digest() -> str:
     """Hex digest (16 digits) of the sources that outputs are made by: a version number alone stays what it is while a
     checkout changes."""
     folders = []
     for room in _ROOMS:
         spec = importlib.util.find_spec(room)
         folders += [(room, Path(place)) for place in (spec and spec.submodule_search_locations) or ()]
-    return digest_of_sources(folders)
+    return compute_sources_digest(folders)
 
 
-def digest_of_sources(folders: Iterable[tuple[str, Path]]) -> str:
+def compute_sources_digest(folders: Iterable[tuple[str, Path]]) -> str:
     """Hex digest (16 digits) of all Python files in packages, each a name and its folder, except `_LEAVE_OUT`."""
     digest = hashlib.sha256()
     for room, folder in folders:
@@ -264,7 +264,7 @@ def digest_of_sources(folders: Iterable[tuple[str, Path]]) -> str:
 
 
 @cache
-def processor() -> str:
+def read_processor_name() -> str:
     """What this machine calls its processor, or its kind where it does not say."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
@@ -297,14 +297,14 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Shared:
+class SharedContext:
     """What all tasks of a job have in common, sent once to each process: ``files`` are those in ``common``; ``code``:
     the `code_digest` of who planned."""
 
-    work: Work
+    work: TaskFunction
     common: Any
     files: tuple[InputFile, ...]
-    code: str
+    code_digest: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,17 +314,17 @@ class Plan:
     plan of that name replaces this one in a store. ``suffix``: of the outputs (".png"), `FOLDER` for folders;
     ``libraries``: distributions on whose versions the output depends."""
 
-    what: str
-    work: Work
+    name: str
+    work: TaskFunction
     common: Any
     parts: Sequence[Part]
     suffix: str = ""
-    libraries: tuple[str, ...] = RENDERS
+    libraries: tuple[str, ...] = RENDER_LIBRARIES
     checksums: Checksums = field(default_factory=Checksums)
 
     def __post_init__(self) -> None:
-        if len(self.parts) > MOST:
-            raise NergError(f"{self.what} has {len(self.parts):,} parts, and at most {MOST:,} are planned; divide it")
+        if len(self.parts) > MAX_PARTS:
+            raise NergError(f"{self.name} has {len(self.parts):,} parts, and at most {MAX_PARTS:,} are planned; divide it")
         if "<" in self.work.__qualname__:
             raise ValueError(f'"{self.work.__qualname__}" is not a function of a module')
         if not re.fullmatch(r"|/|(\.[A-Za-z0-9]+){1,2}", self.suffix):
@@ -332,14 +332,14 @@ class Plan:
 
     @cached_property
     def _common(self) -> tuple[Any, dict[str, InputFile]]:
-        common = rebuilt(self.common)
-        return common, inputs_of(common, self.checksums, "common")
+        common = rebuild_value(self.common)
+        return common, find_inputs(common, self.checksums, "common")
 
     @cached_property
-    def shared(self) -> Shared:
+    def shared(self) -> SharedContext:
         """What is sent once to each process."""
         common, inputs = self._common
-        return Shared(self.work, common, tuple(inputs.values()), code_digest())
+        return SharedContext(self.work, common, tuple(inputs.values()), compute_code_digest())
 
     @cached_property
     def tasks(self) -> list[Task]:
@@ -348,15 +348,15 @@ class Plan:
         basis = {
             "format": FORMAT,
             "work": f"{self.work.__module__}:{self.work.__qualname__}",
-            "common": digest_of_value(common, inputs),
+            "common": compute_value_digest(common, inputs),
             "suffix": self.suffix,
-            "code": code_digest(),
+            "code": compute_code_digest(),
             "versions": {name: version(name) for name in self.libraries},
         }
         tasks = []
         for part in self.parts:
-            value = rebuilt(part.value)
-            inside = inputs_of(value, self.checksums, "part")
-            key = digest_of_value({**basis, "part": digest_of_value(value, inside)})
+            value = rebuild_value(part.value)
+            inside = find_inputs(value, self.checksums, "part")
+            key = compute_value_digest({**basis, "part": compute_value_digest(value, inside)})
             tasks.append(Task(key, value, tuple(inside.values()), self.suffix, part.label))
         return tasks

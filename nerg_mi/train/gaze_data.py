@@ -13,22 +13,22 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, blind_table, table_directions
-from nerg_mi.maths.arrays import vector_of
-from nerg_mi.maths.geometry import AnyBox, box_interval
+from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, make_prior_table, table_directions
+from nerg_mi.maths.arrays import to_vector
+from nerg_mi.maths.geometry import AnyBox, intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.types import variant_types
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.probes.kde import SphericalKde
-from nerg_mi.probes.probes import Probes, person_weights, place_probes
+from nerg_mi.probes.probes import Probes, compute_participant_weights, place_probes
 from nerg_mi.rays.filters import purge, split_by_person, split_by_position
 from nerg_mi.rays.rays import Rays
-from nerg_mi.transport.field_medium import FieldMedium, accumulated, snapshot
-from nerg_mi.transport.geometry import Place, default_settings, trace_depth
-from nerg_mi.transport.observer_gaze import nearest_depth
+from nerg_mi.transport.field_medium import FieldMedium, accumulate_features, evaluate_features
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, trace_depth
+from nerg_mi.transport.observer_gaze import interpolate_nearest_depth
 
-from .gaze_settings import VANISHED, GazeSettings, ProbeSettings
-from .geometry import NOWHERE, GazePlace
+from .gaze_settings import MIN_MEAN_DENSITY, GazeSettings, ProbeSettings
+from .geometry import DEFAULT_DEPTH, TrainingGeometry
 
 # ---- The blind density that a log-density gaze field begins with: what people look at wherever they stand ----
 
@@ -39,7 +39,7 @@ _ROUNDS = 100  # Rounds of the iteration that puts it together from them
 _SCALED_OVER = 1 << 16  # Directions over which the table is scaled to integrate to one
 
 
-def check_kernels(rows: int, kappa: float) -> None:
+def check_prior_kappa(rows: int, kappa: float) -> None:
     """Raise `NergError` where kernels of this concentration are narrower than half a texel of a table of ``rows``."""
     if kappa > (most := (2 * rows / np.pi) ** 2):
         raise NergError(
@@ -48,23 +48,23 @@ def check_kernels(rows: int, kappa: float) -> None:
         )
 
 
-def blind_of_rays(
-    rays: Rays, rows: int, place: GazePlace | None = None, seed: int = 0, weights: str = "equal", kappa: float = 10.0
+def make_prior_from_rays(
+    rays: Rays, rows: int, geometry: TrainingGeometry | None = None, seed: int = 0, weights: str = "equal", kappa: float = 10.0
 ) -> np.ndarray:
-    """``fields.gaze_base.blind_table`` (rows, 2 rows) of where ``rays`` go, in the frame of ``place`` (None:
+    """``fields.gaze_base.make_prior_table`` (rows, 2 rows) of where ``rays`` go, in the frame of ``place`` (None:
     that of the rays). ``weights``: with ``person`` all people count alike, however many rays are theirs; ``kappa``:
     concentration of the kernel of each ray; see `check_kernels`."""
-    check_kernels(rows, kappa)
+    check_prior_kappa(rows, kappa)
     which = np.random.default_rng(seed).permutation(len(rays))[:_MOST_RAYS]
-    each = person_weights(rays)[which] if weights == "person" else None
+    each = compute_participant_weights(rays)[which] if weights == "person" else None
     kde = SphericalKde(rays.direction[which], np.array([0, len(which)]), kappa, each)
     directions = table_directions(rows)
-    density = kde.evaluate(directions if place is None else place.directions_to_rays(directions))[0]
-    return blind_table(density, rows, kde.ns, fibonacci_directions(_SCALED_OVER))
+    density = kde.evaluate(directions if geometry is None else geometry.directions_to_rays(directions))[0]
+    return make_prior_table(density, rows, kde.ns, fibonacci_directions(_SCALED_OVER))
 
 
-def blind_of_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
-    """``fields.gaze_base.blind_table`` (rows, 2 rows) of what is looked at wherever the camera stands, of which
+def make_prior_from_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
+    """``fields.gaze_base.make_prior_table`` (rows, 2 rows) of what is looked at wherever the camera stands, of which
     each of ``views`` shows a part.
 
     The density b of greatest likelihood when view v sees b given its part, found by Hunter's (2004) iteration for
@@ -80,7 +80,7 @@ def blind_of_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
     density, known = np.empty((len(views), len(area)), np.float32), np.empty((len(views), len(area)), bool)
     for k, view in enumerate(views):
         # Texels are coarse: a view's pixels should not be finer than they are.
-        density[k], known[k] = view.reduced(max(1, round(view.extent / area.max()))).look_up(directions)
+        density[k], known[k] = view.reduce(max(1, round(view.total_solid_angle / area.max()))).evaluate(directions)
     # What lies between the texels' centres is not seen.
     found = density @ area
     known &= found[:, None] > 0
@@ -94,10 +94,10 @@ def blind_of_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
     if shown.any():
         blind = blind[np.flatnonzero(shown)[KDTree(directions[shown], leafsize=_LEAF).query(directions)[1]]]
     kde = SphericalKde(directions, np.array([0, len(area)]), _VIEWS_KAPPA, blind * area)
-    return blind_table(kde.evaluate(directions)[0], rows, kde.ns, fibonacci_directions(_SCALED_OVER))
+    return make_prior_table(kde.evaluate(directions)[0], rows, kde.ns, fibonacci_directions(_SCALED_OVER))
 
 
-def heads_box(positions: np.ndarray, box: AnyBox) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def compute_observer_bounds(positions: np.ndarray, box: AnyBox) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Corners of the box of observers at ``positions`` (N, 3), of some extent along each axis of ``box``."""
     low, high = positions.min(axis=0), positions.max(axis=0)
     return tuple(low.tolist()), tuple(np.maximum(high, low + 1e-3 * box.side).tolist())
@@ -108,11 +108,11 @@ def heads_box(positions: np.ndarray, box: AnyBox) -> tuple[tuple[float, ...], tu
 # What a gaze field takes over from a radiance field: its features along the observers' rays, the paper's semantic
 # variants.
 
-BATCH = 1 << 18  # Rays whose features are computed in one launch
+FEATURE_BATCH = 1 << 18  # Rays whose features are computed in one launch
 
 
-def semantic_features(
-    place: GazePlace, origins: np.ndarray, directions: np.ndarray, distance: np.ndarray, kind: str
+def compute_semantic_features(
+    geometry: TrainingGeometry, origins: np.ndarray, directions: np.ndarray, distance: np.ndarray, kind: str
 ) -> np.ndarray:
     """Features (N, F), float16, of what rays see: ``accumulated`` along them, or the ``snapshot`` at ``distance`` (N,).
 
@@ -120,19 +120,19 @@ def semantic_features(
     field.
     """
     mi = variant_types()
-    medium = place.medium
+    medium = geometry.medium
     if not isinstance(medium, FieldMedium):
         raise NergError("semantic features are those of a radiance field; give one with --field")
     out = np.empty((len(origins), medium.feature_count), np.float16)
     with dr.suspend_grad():
-        for a in range(0, len(out), BATCH):
-            part = slice(a, a + BATCH)
-            o, d = vector_of(mi.Point3f, origins[part]), vector_of(mi.Vector3f, directions[part])
+        for a in range(0, len(out), FEATURE_BATCH):
+            part = slice(a, a + FEATURE_BATCH)
+            o, d = to_vector(mi.Point3f, origins[part]), to_vector(mi.Vector3f, directions[part])
             if kind == "snapshot":
                 t = mi.Float(np.ascontiguousarray(distance[part], np.float32))
-                found = snapshot(medium, o + d * t, mi.Bool(True))
+                found = evaluate_features(medium, o + d * t, mi.Bool(True))
             else:
-                found = accumulated(Place(medium), mi.Ray3f(o, d), mi.Bool(True), default_settings(medium))
+                found = accumulate_features(SceneGeometry(medium), mi.Ray3f(o, d), mi.Bool(True), default_march_settings(medium))
             # At once: each by itself would march, or evaluate the network, again.
             dr.eval(found)
             out[part] = np.stack([np.array(f) for f in found], axis=-1)
@@ -154,26 +154,26 @@ class Supervision:
         if self.rays is None and not self.views:
             raise ValueError("a gaze field learns from rays, from views or from both, and there is neither")
 
-    def digest(self) -> dict[str, str | None]:
+    def compute_digest(self) -> dict[str, str | None]:
         """SHA-256 of what a training takes from ``rays`` and from ``views`` (JSON); None for what there is none of."""
-        views = [a for v in self.views for a in (v.camera.to_world, v.share, v.solid_angle)]
+        views = [a for v in self.views for a in (v.camera.to_world, v.gaze_fraction, v.solid_angle)]
         return {
             "rays": None if self.rays is None else digest_rays(self.rays),
             "views": _sha256(views) if views else None,
         }
 
-    def counts(self) -> dict[str, int]:
+    def count_data(self) -> dict[str, int]:
         """How many ``rays`` of how many ``people``, and how many salience images there are (JSON)."""
         rays = self.rays
         people = 0 if rays is None else len(np.unique(rays.person))
         return {"rays": 0 if rays is None else len(rays), "people": people, "salience_views": len(self.views)}
 
-    def support(self, radius: float, place: GazePlace) -> RaySupport | None:
+    def make_support(self, radius: float, geometry: TrainingGeometry) -> RaySupport | None:
         """Rays that start around a position in the frame of ``place``, for probes of ``radius`` metres; None
         without rays."""
         if self.rays is None:
             return None
-        return RaySupport.of(place.points_from_rays(self.rays.origin), radius * place.align.scale)
+        return RaySupport.from_origins(geometry.points_to_field(self.rays.origin), radius * geometry.align.scale)
 
 
 def digest_rays(rays: Rays) -> str:
@@ -196,15 +196,15 @@ _WATCHED = 0.12  # Share of the views that a validation watches
 class ValidationSplit:
     """What the first of a training's fits learns from, and what it is scored on."""
 
-    learn: Supervision  # What is learnt from
-    watched: Supervision | None = None  # What is scored; None: nothing is watched
+    training: Supervision  # What is learnt from
+    validation: Supervision | None = None  # What is scored; None: nothing is watched
     centres: np.ndarray | None = None  # Where its rays are scored (T, 3), in their frame; None: at its views
     rays_held_out: int = 0  # Rays and views that are not learnt from
     views_held_out: int = 0
 
 
 def split_validation(
-    supervision: Supervision, place: GazePlace, settings: GazeSettings, probes: ProbeSettings
+    supervision: Supervision, geometry: TrainingGeometry, settings: GazeSettings, probes: ProbeSettings
 ) -> ValidationSplit:
     """Zones of positions that are watched, where ``settings`` ask for any, purged by 2R: of rays, or of views where
     there are no rays. No view within 2R of a position that is watched is learnt from.
@@ -223,11 +223,11 @@ def split_validation(
         rays,
         probes.radius,
         zones=settings.zones,
-        test_probes=settings.watched,
-        min_rays=settings.watched_rays or probes.min_rays,
+        test_probes=settings.validation_probes,
+        min_rays=settings.validation_min_rays or probes.min_rays,
         seed=settings.seed + 1,
     )
-    kept = far_views(views, place.points_from_rays(split.test_centres), 2 * probes.radius * place.align.scale)
+    kept = select_far_views(views, geometry.points_to_field(split.test_centres), 2 * probes.radius * geometry.align.scale)
     return ValidationSplit(
         Supervision(rays.select(split.train), tuple(kept)),
         # All rays around the centres: what is scored is what people there really looked at.
@@ -239,7 +239,7 @@ def split_validation(
 
 
 def hold_out(
-    rays: Rays, radius: float, zones: int, positions: int, seed: int = 0, min_rays: int = 64, people: float = 0.0
+    rays: Rays, radius: float, zones: int, positions: int, seed: int = 0, min_rays: int = 64, participant_fraction: float = 0.0
 ) -> tuple[Rays, dict]:
     """Rays to train on, when ``positions`` test positions in ``zones`` zones are held out; and an account of it (JSON).
 
@@ -249,8 +249,8 @@ def hold_out(
     """
     known, names = np.ones(len(rays), bool), []
     looked_at = rays
-    if people:
-        known, unseen = split_by_person(rays, test_share=people, seed=seed)
+    if participant_fraction:
+        known, unseen = split_by_person(rays, test_fraction=participant_fraction, seed=seed)
         names = [rays.persons[i] for i in np.unique(rays.person[unseen])]
         looked_at = rays.select(unseen)
     split = split_by_position(looked_at, radius, zones=zones, test_probes=positions, min_rays=min_rays, seed=seed)
@@ -287,7 +287,7 @@ def split_views(
     each = max(1, round(_WATCHED * len(views) / len(chosen)))
     near = np.linalg.norm(centres[:, None] - centres[chosen], axis=2)
     watched = np.unique(np.argsort(near, axis=0, kind="stable")[:each])
-    learn = far_views(views, centres[watched], distance)
+    learn = select_far_views(views, centres[watched], distance)
     if len(learn) < max(2, len(views) // 4):
         raise NergError(
             f"{len(learn)} of {len(views)} views are left to train on, the others are watched or within "
@@ -296,7 +296,7 @@ def split_views(
     return learn, [views[k] for k in watched]
 
 
-def far_views(views: Sequence[SalienceView], points: np.ndarray, distance: float) -> list[SalienceView]:
+def select_far_views(views: Sequence[SalienceView], points: np.ndarray, distance: float) -> list[SalienceView]:
     """Those of ``views`` whose camera is farther than ``distance`` from each of ``points`` (T, 3), all in one frame."""
     return [v for v in views if np.linalg.norm(points - v.camera.center, axis=1).min(initial=np.inf) > distance]
 
@@ -306,8 +306,8 @@ def far_views(views: Sequence[SalienceView], points: np.ndarray, distance: float
 SURFACE_OPACITY = 0.5  # Opacity from which on a ray has met a surface; the integrator's default
 
 
-def surface_distances(
-    place: GazePlace, positions: np.ndarray, directions: np.ndarray, depth: str = "median", fill: bool = False
+def compute_surface_distances(
+    geometry: TrainingGeometry, positions: np.ndarray, directions: np.ndarray, depth: str = "median", fill_misses: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Distances (P, D) from ``positions`` (P, 3) along unit ``directions`` (P, D, 3) to the surface that each meets,
     float32, and which meet none, (P, D) bool; all in the frame and units of the place.
@@ -318,24 +318,24 @@ def surface_distances(
     ends at the depth of the directions of its position nearest to it that do meet one: where the geometry has holes.
     """
     P, D = directions.shape[:2]
-    if place.medium is None:
-        return np.full((P, D), NOWHERE, np.float32), np.zeros((P, D), bool)
+    if geometry.medium is None:
+        return np.full((P, D), DEFAULT_DEPTH, np.float32), np.zeros((P, D), bool)
     origins = np.repeat(np.asarray(positions, np.float64), D, axis=0)
     flat = np.asarray(directions, np.float64).reshape(-1, 3)
-    distance, opacity = trace_depth(place.medium, origins, flat, kind=depth)
+    distance, opacity = trace_depth(geometry.medium, origins, flat, kind=depth)
     escaped = opacity < SURFACE_OPACITY
-    distance[escaped] = box_exit(place.box, origins[escaped], flat[escaped])
+    distance[escaped] = compute_box_exit(geometry.box, origins[escaped], flat[escaped])
     distance, escaped = distance.reshape(P, D), escaped.reshape(P, D)
-    if fill:
+    if fill_misses:
         for p in np.flatnonzero(escaped.any(axis=1) & ~escaped.all(axis=1)):
             met = ~escaped[p]
-            distance[p, escaped[p]] = nearest_depth(directions[p, met], distance[p, met], directions[p, escaped[p]])
+            distance[p, escaped[p]] = interpolate_nearest_depth(directions[p, met], distance[p, met], directions[p, escaped[p]])
     return distance, escaped
 
 
-def box_exit(box: AnyBox, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def compute_box_exit(box: AnyBox, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Distance (N,) at which rays leave ``box``; its diagonal for rays that never enter it."""
-    near, far = box_interval(origins, directions, box.lower, box.upper)
+    near, far = intersect_box_numpy(origins, directions, box.lower, box.upper)
     return np.where((far > 0) & (near <= far) & np.isfinite(far), far, box.diagonal)
 
 
@@ -348,17 +348,17 @@ def box_exit(box: AnyBox, origins: np.ndarray, directions: np.ndarray) -> np.nda
 
 
 @dataclass(frozen=True)
-class TargetNeeds:
+class TargetRequirements:
     """What a kind of gaze field is shown besides directions, densities and distances."""
 
     semantic: str = ""  # Features of a radiance field (`fields.gaze_product.SEMANTICS`); "": none
-    fill: bool = False  # Whether directions that meet no surface end at the depth of those around them, not on the box
-    blind_rows: int = 0  # Rows of the table of the blind density that the field begins with; 0: it needs none
+    fill_misses: bool = False  # Whether directions that meet no surface end at the depth of those around them, not on the box
+    prior_rows: int = 0  # Rows of the table of the blind density that the field begins with; 0: it needs none
 
     @staticmethod
-    def of(config: GazeHeadConfig) -> TargetNeeds:
+    def from_config(config: GazeHeadConfig) -> TargetRequirements:
         """What a field of the configuration ``config`` needs."""
-        return TargetNeeds(config.semantic, config.fills_escaped, config.prior)
+        return TargetRequirements(config.semantic, config.fills_escaped, config.prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,64 +369,64 @@ class GazeTargets:
     directions: np.ndarray  # Unit directions (P, D, 3), r_o
     truth: np.ndarray  # True densities (P, D), 1/sr
     distance: np.ndarray  # Distances (P, D) from p_o to p_od
-    escaped: np.ndarray  # Where no surface was met (P, D), bool
+    misses: np.ndarray  # Where no surface was met (P, D), bool
     # Features (P, D, F) of a radiance field, float16, for a gaze field that wants them.
     semantic: np.ndarray | None = None
-    # Table of the log of the density of all rays whatever their position (`fields.gaze_base.blind_table`).
-    blind: np.ndarray | None = None
+    # Table of the log of the density of all rays whatever their position (`fields.gaze_base.make_prior_table`).
+    prior_table: np.ndarray | None = None
     # The same observers in other directions, for the epoch that is given, where each epoch has its own.
-    renew: Callable[[int], GazeTargets] | None = None
+    resample: Callable[[int], GazeTargets] | None = None
     # Corners of the box of observers that capture's encoding spans; None: that of the positions.
-    heads: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    observer_bounds: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     # Solid angle (P,), sr, of which the D directions are parts and over which the truth integrates to one; None: 4π.
-    extent: np.ndarray | None = None
+    solid_angle: np.ndarray | None = None
 
     @property
-    def escape_share(self) -> float:
+    def miss_fraction(self) -> float:
         """Share of the directions that meet no surface."""
-        return float(self.escaped.mean())
+        return float(self.misses.mean())
 
     @property
-    def escaped_gaze(self) -> float:
+    def miss_gaze_fraction(self) -> float:
         """Share of the true gaze that goes where no surface is."""
-        gaze = self.truth if self.extent is None else self.truth * self.extent[:, None]
-        return float((gaze * self.escaped).sum() / gaze.sum())
+        gaze = self.truth if self.solid_angle is None else self.truth * self.solid_angle[:, None]
+        return float((gaze * self.misses).sum() / gaze.sum())
 
 
-def observe(
+def make_observer_targets(
     positions: np.ndarray,
     directions: np.ndarray,
     truth: np.ndarray,
-    place: GazePlace,
+    geometry: TrainingGeometry,
     depth: str = "median",
-    needs: TargetNeeds | None = None,
+    requirements: TargetRequirements | None = None,
 ) -> GazeTargets:
     """Targets of observers (P, 3) whose density in ``directions`` (P, D, 3) is ``truth`` (P, D), all in the frame of
     ``place``, with the surfaces that they see there; ``depth``: kind of depth that is the surface.
 
     Raises `NergError` where ``needs`` asks for features of a place that is no radiance field.
     """
-    needs = needs or TargetNeeds()
-    distance, escaped = surface_distances(place, positions, directions, depth, needs.fill)
+    requirements = requirements or TargetRequirements()
+    distance, escaped = compute_surface_distances(geometry, positions, directions, depth, requirements.fill_misses)
     features = None
-    if needs.semantic:
+    if requirements.semantic:
         origins = np.repeat(positions, directions.shape[1], axis=0)
-        features = semantic_features(place, origins, directions.reshape(-1, 3), distance.ravel(), needs.semantic)
+        features = compute_semantic_features(geometry, origins, directions.reshape(-1, 3), distance.ravel(), requirements.semantic)
         features = features.reshape(*directions.shape[:2], -1)
     narrow = lambda v: v.astype(np.float32, copy=False)
     return GazeTargets(narrow(positions), narrow(directions), narrow(truth), distance, escaped, features)
 
 
-def concatenate(a: GazeTargets, b: GazeTargets) -> GazeTargets:
+def concatenate_targets(a: GazeTargets, b: GazeTargets) -> GazeTargets:
     """The observers of both, with as many directions each; the blind density is that of ``a``."""
     rows = lambda name: np.concatenate([getattr(a, name), getattr(b, name)])
-    out: dict[str, Any] = {k: rows(k) for k in ("positions", "directions", "truth", "distance", "escaped")}
-    extent = [np.full(len(t.truth), 4 * np.pi, np.float32) if t.extent is None else t.extent for t in (a, b)]
+    out: dict[str, Any] = {k: rows(k) for k in ("positions", "directions", "truth", "distance", "misses")}
+    extent = [np.full(len(t.truth), 4 * np.pi, np.float32) if t.solid_angle is None else t.solid_angle for t in (a, b)]
     semantic = None if a.semantic is None else rows("semantic")
-    renew, of_a, of_b = None, a.renew, b.renew
+    renew, of_a, of_b = None, a.resample, b.resample
     if of_a is not None and of_b is not None:
-        renew = lambda epoch: concatenate(of_a(epoch), of_b(epoch))
-    return GazeTargets(**out, semantic=semantic, blind=a.blind, renew=renew, extent=np.concatenate(extent))
+        renew = lambda epoch: concatenate_targets(of_a(epoch), of_b(epoch))
+    return GazeTargets(**out, semantic=semantic, prior_table=a.prior_table, resample=renew, solid_angle=np.concatenate(extent))
 
 
 # ---- Targets as arrays of a backend, and the batches that are gathered from them ----
@@ -435,34 +435,34 @@ _WHOLE = 1 - 1e-6  # Below 4π by more than this share, directions are those of 
 
 
 @dataclass(frozen=True)
-class Batch:
+class GazeBatch:
     """B observers with D directions each, flat: value b * D + d is observer b in direction d."""
 
     p_o: Any  # Observers (Array3f, B lanes)
     r_o: Any  # Directions (Array3f, B * D lanes), unit
     p_od: Any  # What they end at (Array3f, B * D lanes)
     truth: Any  # True densities (Float, B * D lanes), 1/sr
-    escaped: Any  # Where no surface is met (Bool, B * D lanes)
-    extent: Any  # Solid angle in sr (Float, B lanes) that the directions of an observer are equal parts of
+    misses: Any  # Where no surface is met (Bool, B * D lanes)
+    solid_angle: Any  # Solid angle in sr (Float, B lanes) that the directions of an observer are equal parts of
     semantic: list | None = None  # Features of a radiance field (F Floats, B * D lanes); None without any
-    views: bool = False  # Whether some of the observers are views, who are known in part
+    has_views: bool = False  # Whether some of the observers are views, who are known in part
 
-    def integral(self, density: Any) -> Any:
+    def integrate(self, density: Any) -> Any:
         """Integral (Float, B lanes) of the ``density`` (Float, B * D lanes, 1/sr) of each observer over its extent."""
-        directions = dr.width(density) // dr.width(self.extent)
-        return dr.block_sum(density, directions) * (self.extent / directions)
+        directions = dr.width(density) // dr.width(self.solid_angle)
+        return dr.block_sum(density, directions) * (self.solid_angle / directions)
 
-    def given_view(self, density: Any, truth: Any = None) -> Any:
+    def condition_on_view(self, density: Any, truth: Any = None) -> Any:
         """Densities of observers that are views, given the view: what else is looked at is not known there. Others
         stay. The result has the integral that ``truth`` has in the same directions, else one."""
-        if not self.views:
+        if not self.has_views:
             return density
-        inside = self.integral(dr.maximum(density, 0))
+        inside = self.integrate(dr.maximum(density, 0))
         # A density of zeros has no scale to be taken out.
-        scaled = (self.extent < 4 * np.pi * _WHOLE) & (inside > VANISHED)
-        whole = 1 if truth is None else self.integral(truth)
+        scaled = (self.solid_angle < 4 * np.pi * _WHOLE) & (inside > MIN_MEAN_DENSITY)
+        whole = 1 if truth is None else self.integrate(truth)
         factor = dr.select(scaled, whole / dr.select(scaled, inside, 1), 1)
-        return density * dr.repeat(factor, dr.width(density) // dr.width(self.extent))
+        return density * dr.repeat(factor, dr.width(density) // dr.width(self.solid_angle))
 
 
 class TargetArrays:
@@ -470,32 +470,32 @@ class TargetArrays:
     without any observer."""
 
     def __init__(self, targets: GazeTargets, ns: ModuleType):
-        self.ns, self.count, self.directions = ns, *targets.truth.shape
-        if self.count == 0:
+        self.ns, self.num_observers, self.num_directions = ns, *targets.truth.shape
+        if self.num_observers == 0:
             raise NergError("there are no probes to train on")
         flat = lambda v: ns.Float(np.ascontiguousarray(v, np.float32).ravel())
-        self._extent = None if targets.extent is None else np.asarray(targets.extent, np.float32)
+        self._extent = None if targets.solid_angle is None else np.asarray(targets.solid_angle, np.float32)
         self._positions, self._r_o = flat(targets.positions), flat(targets.directions)
         self._truth, self._distance = flat(targets.truth), flat(targets.distance)
-        self._escaped = ns.Bool(np.ascontiguousarray(targets.escaped).ravel())
+        self._escaped = ns.Bool(np.ascontiguousarray(targets.misses).ravel())
         self._features = 0 if targets.semantic is None else targets.semantic.shape[-1]
         if self._features:
             self._semantic = ns.Float16(np.ascontiguousarray(targets.semantic).ravel())
 
-    def batch(self, observers: np.ndarray, directions: np.ndarray) -> Batch:
+    def gather_batch(self, observers: np.ndarray, directions: np.ndarray) -> GazeBatch:
         """The ``observers`` (B,) in ``directions`` (B, D), indices of each observer's own."""
         ns = self.ns
         at = ns.UInt32(observers.astype(np.uint32))
-        index = ns.UInt32((observers[:, None] * self.directions + directions).astype(np.uint32).ravel())
+        index = ns.UInt32((observers[:, None] * self.num_directions + directions).astype(np.uint32).ravel())
         p_o, r_o = dr.gather(ns.Array3f, self._positions, at), dr.gather(ns.Array3f, self._r_o, index)
-        p_od = dr.gather(ns.Array3f, self._positions, index // self.directions) + r_o * dr.gather(
+        p_od = dr.gather(ns.Array3f, self._positions, index // self.num_directions) + r_o * dr.gather(
             ns.Float, self._distance, index
         )
         semantic = None
         if self._features:
             F = self._features
             semantic = [ns.Float(dr.gather(ns.Float16, self._semantic, index * F + k)) for k in range(F)]
-        return Batch(
+        return GazeBatch(
             p_o,
             r_o,
             p_od,
@@ -517,7 +517,7 @@ class TargetArrays:
 # together the probes see what one set leaves out.
 
 
-def probes_of_rays(rays: Rays, settings: ProbeSettings, queries: np.ndarray | None = None, seed: int = 0) -> Probes:
+def make_probes(rays: Rays, settings: ProbeSettings, queries: np.ndarray | None = None, seed: int = 0) -> Probes:
     """Probes on ``rays``, at ``queries`` (P, 3) metres where given, else as ``settings`` places them.
 
     Raises `NergError` when none holds enough rays.
@@ -529,7 +529,7 @@ def probes_of_rays(rays: Rays, settings: ProbeSettings, queries: np.ndarray | No
         count=settings.count,
         spacing=settings.spacing,
         queries=queries,
-        cap=settings.cap,
+        max_rays=settings.cap,
         min_rays=min(settings.min_rays, settings.cap),
         kappa_rule=settings.kappa_rule,
         kappa=settings.kappa,
@@ -538,51 +538,51 @@ def probes_of_rays(rays: Rays, settings: ProbeSettings, queries: np.ndarray | No
     )
 
 
-def targets_of_probes(
+def make_targets_from_probes(
     probes: Probes,
-    place: GazePlace,
+    geometry: TrainingGeometry,
     directions: int,
     depth: str = "median",
-    needs: TargetNeeds | None = None,
+    requirements: TargetRequirements | None = None,
     seed: int | tuple[int, ...] = 0,
 ) -> GazeTargets:
     """Targets of ``probes`` in as many ``directions`` each; ``depth``: kind of depth that is the surface; ``seed``: of
     the rotations. Raises `NergError` where all kernels are so narrow that they vanish between the directions."""
-    turned = rotated_sets(directions, len(probes), np.random.default_rng(seed))
+    turned = make_rotated_directions(directions, len(probes), np.random.default_rng(seed))
     truth = probes.density(turned)
     if not truth.any():
         raise NergError(
             f"the kernels of all rays vanish between {directions:,} directions; give a smaller --kappa, or more "
             "--directions"
         )
-    return observe(
-        place.points_from_rays(probes.positions), place.directions_from_rays(turned), truth, place, depth, needs
+    return make_observer_targets(
+        geometry.points_to_field(probes.positions), geometry.directions_to_field(turned), truth, geometry, depth, requirements
     )
 
 
-def targets_of_rays(
+def make_targets_from_rays(
     rays: Rays,
-    place: GazePlace,
+    geometry: TrainingGeometry,
     settings: ProbeSettings,
-    needs: TargetNeeds | None = None,
+    requirements: TargetRequirements | None = None,
     queries: np.ndarray | None = None,
     seed: int = 0,
 ) -> GazeTargets:
     """Targets of the probes on ``rays``, at ``queries`` (P, 3) metres where given. With ``settings.fresh`` they can
     ``renew`` their directions. Raises `NergError` when no probe holds enough rays."""
-    needs = needs or TargetNeeds()
-    probes = probes_of_rays(rays, settings, queries, seed)
-    turned = lambda seed: targets_of_probes(probes, place, settings.directions, settings.depth, needs, seed)
+    requirements = requirements or TargetRequirements()
+    probes = make_probes(rays, settings, queries, seed)
+    turned = lambda seed: make_targets_from_probes(probes, geometry, settings.directions, settings.depth, requirements, seed)
     targets = turned(seed)
     if settings.fresh:
-        targets = replace(targets, renew=lambda epoch: turned((seed, epoch)))
-    if needs.blind_rows:
-        blind = blind_of_rays(rays, needs.blind_rows, place, seed, settings.weights, settings.mix_kappa)
-        targets = replace(targets, blind=blind)
+        targets = replace(targets, resample=lambda epoch: turned((seed, epoch)))
+    if requirements.prior_rows:
+        blind = make_prior_from_rays(rays, requirements.prior_rows, geometry, seed, settings.weights, settings.mix_kappa)
+        targets = replace(targets, prior_table=blind)
     return targets
 
 
-def rotated_sets(count: int, sets: int, rng: np.random.Generator) -> np.ndarray:
+def make_rotated_directions(count: int, sets: int, rng: np.random.Generator) -> np.ndarray:
     """``sets`` Fibonacci sets of ``count`` directions, each turned by a uniform random rotation, (sets, count, 3)."""
     # Unit quaternions from normal numbers are uniform rotations (Shoemake 1992); the first is the real part.
     rotation = Rotation.from_quat(np.roll(rng.normal(size=(sets, 4)), -1, axis=1)).as_matrix()
@@ -601,11 +601,11 @@ def rotated_sets(count: int, sets: int, rng: np.random.Generator) -> np.ndarray:
 _PER_PIXEL = 4  # Directions a pixel of a view, so that hardly any is left out
 
 
-def targets_of_views(
+def make_targets_from_views(
     views: Sequence[SalienceView],
-    place: GazePlace,
+    geometry: TrainingGeometry,
     settings: ProbeSettings,
-    needs: TargetNeeds | None = None,
+    requirements: TargetRequirements | None = None,
     seed: int = 0,
 ) -> GazeTargets:
     """Targets of ``views`` in the frame of ``place``.
@@ -613,22 +613,22 @@ def targets_of_views(
     ``settings.directions`` directions a view, each with the density of the pixel that it lies in; pixels are joined
     until each has some four. With ``settings.fresh`` the targets can ``renew`` their directions.
     """
-    needs, count = needs or TargetNeeds(), settings.directions
-    small = [v.reduced(max(1, count // _PER_PIXEL)) for v in views]
+    requirements, count = requirements or TargetRequirements(), settings.directions
+    small = [v.reduce(max(1, count // _PER_PIXEL)) for v in views]
 
     def drawn(seed: int | tuple[int, int]) -> GazeTargets:
         rng = np.random.default_rng(seed)
         directions, truth = np.empty((len(views), count, 3)), np.empty((len(views), count))
         for k, view in enumerate(small):
-            directions[k], pixels = view.draw(count, rng)
+            directions[k], pixels = view.sample(count, rng)
             truth[k] = view.density.ravel()[pixels]
-        extent = np.array([v.extent for v in views])
+        extent = np.array([v.total_solid_angle for v in views])
         truth /= truth.mean(axis=1, keepdims=True) * extent[:, None]
         positions = np.array([v.camera.center for v in views])
-        targets = observe(positions, directions, truth, place, settings.depth, needs)
-        return replace(targets, extent=extent.astype(np.float32))
+        targets = make_observer_targets(positions, directions, truth, geometry, settings.depth, requirements)
+        return replace(targets, solid_angle=extent.astype(np.float32))
 
     targets = drawn(seed)
     if settings.fresh:
-        targets = replace(targets, renew=lambda epoch: drawn((seed, epoch)))
-    return replace(targets, blind=blind_of_views(views, needs.blind_rows)) if needs.blind_rows else targets
+        targets = replace(targets, resample=lambda epoch: drawn((seed, epoch)))
+    return replace(targets, prior_table=make_prior_from_views(views, requirements.prior_rows)) if requirements.prior_rows else targets

@@ -12,17 +12,17 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.encoding import HashGridConfig, encode_direction, encoding_of
+from nerg_mi.fields.encoding import HashGridConfig, encode_direction, encoding_from_parameters
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField, activate
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
 
-from .gaze_data import Batch
-from .gaze_recipes import DEFAULT, FieldChoices, Recipe, register_recipe
+from .gaze_data import GazeBatch
+from .gaze_recipes import DEFAULT_RECIPE, FieldOptions, Recipe, register_recipe
 from .gaze_settings import LOSSES
-from .gaze_trainer import GazeTrainer, gaze_loss
+from .gaze_trainer import GazeTrainer, compute_gaze_loss
 from .radiance_losses import stack, unstack
 
 # ---- Product model ----
@@ -32,7 +32,7 @@ from .radiance_losses import stack, unstack
 # An observer looks in many directions from one position: what capture needs of the position is computed once a probe.
 
 
-def gaze_density(
+def evaluate_gaze_density(
     config: GazeConfig,
     box: AnyBox,
     parameters: dict,
@@ -53,7 +53,7 @@ def gaze_density(
         count = sum(k.startswith(name + ".") for k in parameters)
         return MLP([parameters[f"{name}.{i}"] for i in range(count)])
 
-    grid = encoding_of(config.grid, parameters, mode=dr.ReduceMode.Expand)
+    grid = encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand)
     position, direction = net("position_net"), net("direction_net")
     repeats = dr.width(r_o) // dr.width(p_o)
 
@@ -78,7 +78,7 @@ def gaze_density(
     return gaze
 
 
-def used_parameters(config: GazeConfig, parameters: dict) -> dict:
+def select_trainable_parameters(config: GazeConfig, parameters: dict) -> dict:
     """Those of ``parameters`` that the variant evaluates; the rest would only decay."""
     idle = {"emit": "capture_head", "capture": "emit_head"}.get(config.variant)
     return {k: v for k, v in parameters.items() if idle is None or not k.startswith(idle)}
@@ -91,43 +91,43 @@ class ProductTrainer(GazeTrainer):
     """A run of a ``GazeField``; see ``GazeTrainer``."""
 
     @classmethod
-    def begin_as(cls, radiance: RadianceField, config: GazeConfig) -> tuple[GazeConfig, dict]:
-        config = trunk_config(config, radiance.config)
-        return config, initial_weights(radiance, config)
+    def init_from_radiance(cls, radiance: RadianceField, config: GazeConfig) -> tuple[GazeConfig, dict]:
+        config = match_trunk_config(config, radiance.config)
+        return config, extract_initial_weights(radiance, config)
 
     @classmethod
-    def with_features(cls, radiance: RadianceField, config: GazeConfig) -> GazeConfig:
+    def configure_features(cls, radiance: RadianceField, config: GazeConfig) -> GazeConfig:
         return replace(config, geometry=radiance.config.geometry)
 
-    def untrained(self) -> GazeField:
+    def init_field(self) -> GazeField:
         return GazeField.random(self.config, self.box, self.ns, self.settings.seed)
 
-    def trainable(self, parameters: dict) -> dict:
-        return used_parameters(self.config, parameters)
+    def select_trainable(self, parameters: dict) -> dict:
+        return select_trainable_parameters(self.config, parameters)
 
     def backward(self) -> None:
         s, data = self.settings, self.data
-        count, D = min(s.probes, data.count), min(s.directions, data.directions)
-        observers = self.rng.choice(data.count, count, replace=False)
-        if D < data.directions:
-            directions = np.argpartition(self.rng.random((count, data.directions)), D, axis=1)[:, :D]
+        count, D = min(s.probes, data.num_observers), min(s.directions, data.num_directions)
+        observers = self.rng.choice(data.num_observers, count, replace=False)
+        if D < data.num_directions:
+            directions = np.argpartition(self.rng.random((count, data.num_directions)), D, axis=1)[:, :D]
         else:
             directions = np.broadcast_to(np.arange(D), (count, D))
-        batch = data.batch(observers, directions)
-        density = self.density(batch, self.current())
-        self.loss = gaze_loss(density, batch.truth, D, **LOSSES[s.loss])
+        batch = data.gather_batch(observers, directions)
+        density = self.evaluate_density(batch, self.current_parameters())
+        self.loss = compute_gaze_loss(density, batch.truth, D, **LOSSES[s.loss])
         total = self.loss.total
         if s.integral:
             # Against the truth in the same directions, so that drawing few of them is no bias.
-            total += s.integral * dr.mean(dr.square(batch.integral(density - batch.truth)))
+            total += s.integral * dr.mean(dr.square(batch.integrate(density - batch.truth)))
         dr.backward(total)
 
-    def density(self, batch: Batch, parameters: dict) -> Any:
+    def evaluate_density(self, batch: GazeBatch, parameters: dict) -> Any:
         semantic = batch.semantic if self.config.semantic else None
-        density = gaze_density(self.config, self.box, parameters, batch.p_od, batch.p_o, batch.r_o, self.ns, semantic)
-        return batch.given_view(density, batch.truth)
+        density = evaluate_gaze_density(self.config, self.box, parameters, batch.p_od, batch.p_o, batch.r_o, self.ns, semantic)
+        return batch.condition_on_view(density, batch.truth)
 
-    def judge(self, kld: float, cc: float, mae: float, off: float) -> float:
+    def validation_objective(self, kld: float, cc: float, mae: float, off: float) -> float:
         w = LOSSES[self.settings.loss]
         return w["kld"] * kld + w["cc"] * (1 - cc) + w["mae"] * mae + self.settings.integral * off
 
@@ -135,20 +135,20 @@ class ProductTrainer(GazeTrainer):
 # ---- The paper's two initialisations: a trunk that starts as the radiance field's, frozen or fine-tuned ----
 
 
-def trunk_config(config: GazeConfig, radiance: RadianceConfig) -> GazeConfig:
+def match_trunk_config(config: GazeConfig, radiance: RadianceConfig) -> GazeConfig:
     """``config`` with the sizes that let its trunk begin as that of a field of the configuration ``radiance``."""
     return replace(
         config, grid=radiance.grid, width=radiance.width, geometry=radiance.geometry, sh_degree=radiance.sh_degree
     )
 
 
-def initial_weights(field: RadianceField, config: GazeConfig) -> dict:
+def extract_initial_weights(field: RadianceField, config: GazeConfig) -> dict:
     """Grid and position network of ``field`` by the names of a gaze field: what its features come from, not its
     density.
 
     Raises `NergError` where ``config`` has other sizes.
     """
-    like = trunk_config(config, field.config)
+    like = match_trunk_config(config, field.config)
     if (config.grid, config.position_sizes) != (like.grid, like.position_sizes):
         raise NergError("a gaze field that begins with a radiance field's weights must have its sizes")
     weights = [dr.detach(w) for w in field.density_net.weights]
@@ -169,7 +169,7 @@ def initial_weights(field: RadianceField, config: GazeConfig) -> dict:
 _SIZES = {"small": (8, 14, 4, 128, 64, 15), "paper": (16, 19, 16, 512, 64, 15)}
 
 
-def sized_gaze_config(size: str = "small", variant: str = "emit_capture", activation: str = "softplus") -> GazeConfig:
+def make_gaze_config(size: str = "small", variant: str = "emit_capture", activation: str = "softplus") -> GazeConfig:
     """Architecture of a ``size``: ``small`` or ``paper``. Raises `NergError` for another word."""
     if size not in _SIZES:
         raise NergError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
@@ -181,11 +181,11 @@ def sized_gaze_config(size: str = "small", variant: str = "emit_capture", activa
         activation=activation,
         width=width,
         geometry=geometry,
-        emit_scale=uniform_scale(variant, activation),
+        emit_scale=compute_uniform_scale(variant, activation),
     )
 
 
-def uniform_scale(variant: str, activation: str) -> float:
+def compute_uniform_scale(variant: str, activation: str) -> float:
     """The ``emit_scale`` with which weights of zero are the uniform density, 1/(4π).
 
     Networks without biases fall to zero under weight decay. Were that a density of another integral, they would have to
@@ -200,13 +200,13 @@ def uniform_scale(variant: str, activation: str) -> float:
 # ---- Recipes ----
 
 
-def _product(size: str, activation: str) -> Callable[[FieldChoices], GazeConfig]:
-    def config(choices: FieldChoices) -> GazeConfig:
-        plain = sized_gaze_config(choices.size or size, choices.variant, choices.activation or activation)
-        if choices.place == "none":
+def _product(size: str, activation: str) -> Callable[[FieldOptions], GazeConfig]:
+    def config(choices: FieldOptions) -> GazeConfig:
+        plain = make_gaze_config(choices.size or size, choices.variant, choices.activation or activation)
+        if choices.geometry_kind == "none":
             raise NergError(
                 "a gaze field of this recipe needs surfaces; without any geometry only a log density trains, "
-                f"such as that of the recipe {DEFAULT}"
+                f"such as that of the recipe {DEFAULT_RECIPE}"
             )
         return replace(
             plain, normalized=choices.normalized, semantic=choices.semantic, semantic_own=choices.semantic_own
@@ -221,19 +221,19 @@ register_recipe(
     Recipe(
         name="small",
         summary="emit times capture on a small grid, on the paper's losses and the integral over the sphere",
-        config=_product("small", "softplus"),
+        make_config=_product("small", "softplus"),
         trainer=ProductTrainer,
         losses=("paper", "code"),
         settings={"steps": 600},
         probes={},
-        takes=_OF_PRODUCTS,
+        supported_options=_OF_PRODUCTS,
     )
 )
 register_recipe(
     Recipe(
         name="paper",
         summary="the paper's networks, losses and probes, as many steps as 50 epochs have",
-        config=_product("paper", "linear"),
+        make_config=_product("paper", "linear"),
         trainer=ProductTrainer,
         losses=("paper", "code"),
         settings={
@@ -243,8 +243,8 @@ register_recipe(
             "probes": 16,
             "directions": 1024,
             "learning_rate": 1e-3,
-            "final_rate": 0.1,
-            "hold": 0.0,
+            "lr_final_ratio": 0.1,
+            "lr_hold_fraction": 0.0,
             "weight_decay": 0.0,
         },
         # Bandwidth and least number of rays are those of the authors' code.
@@ -256,6 +256,6 @@ register_recipe(
             "directions": 1024,
             "min_rays": 8,
         },
-        takes=_OF_PRODUCTS,
+        supported_options=_OF_PRODUCTS,
     )
 )

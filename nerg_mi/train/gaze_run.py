@@ -14,39 +14,39 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, basis_of
+from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, summarize_provenance
 from nerg_mi.interruption import Interruption
-from nerg_mi.probes.probes import Probes, calibrated_levels, region_levels
+from nerg_mi.probes.probes import Probes, calibrate_levels, compute_region_levels
 from nerg_mi.rays.filters import purge, split_by_position
 from nerg_mi.rays.rays import Rays
 
 from .gaze_data import (
     GazeTargets,
     Supervision,
-    TargetNeeds,
-    concatenate,
-    heads_box,
-    probes_of_rays,
+    TargetRequirements,
+    concatenate_targets,
+    compute_observer_bounds,
+    make_probes,
     split_validation,
-    targets_of_probes,
-    targets_of_rays,
-    targets_of_views,
+    make_targets_from_probes,
+    make_targets_from_rays,
+    make_targets_from_views,
 )
 from .gaze_trainer import (
     GazeFit,
     GazePlan,
     GazeProgress,
     GazeRunFile,
-    Listener,
+    ProgressCallback,
     StateSettings,
-    alignment,
-    fit_again,
-    fit_watched,
-    kept_identity,
-    rounded,
+    alignment_to_json,
+    refit,
+    fit_with_validation,
+    read_run_identity,
+    round_scores,
 )
-from .geometry import GazePlace
-from .trainer import kept_unless
+from .geometry import TrainingGeometry
+from .trainer import saving_on_failure
 
 # ---- Mixing ----
 #
@@ -61,9 +61,9 @@ from .trainer import kept_unless
 # needs none of it in the first folds, the others are left out. The same looks that were held out tell which regions of
 # the mixture hold 80 % of the gaze of others.
 
-SHARES = np.linspace(0.05, 1.0, 20)
+PRIOR_WEIGHTS = np.linspace(0.05, 1.0, 20)
 """Shares of the blind density that are tried: never none, so that no density is zero."""
-MINUTES = 0.5  # Share of the minutes of a training that the folds take
+FOLD_TIME_FRACTION = 0.5  # Share of the minutes of a training that the folds take
 # Zones, positions in all of them and rays at each, of what a fold holds out; and directions that it is judged in.
 _ZONES, _POSITIONS, _RAYS, _DIRECTIONS = 3, 48, 16, 1024
 # Folds after which a field that needs no more than the least share in any is believed; probes of a fold at most, and
@@ -74,7 +74,7 @@ _LEAST = 1e-9  # Of a density (1/sr), so that its logarithm is finite
 
 
 @dataclass(frozen=True)
-class MixChoice:
+class PriorWeightSelection:
     """The share of the blind density that was chosen, and why; of no folds the given share alone."""
 
     mix: float  # The share
@@ -96,15 +96,15 @@ class MixChoice:
         return {k: _rounded(v) for k, v in asdict(self).items()}
 
     @staticmethod
-    def of(found: dict) -> MixChoice:
+    def from_dict(found: dict) -> PriorWeightSelection:
         """The one of which `to_dict` was kept. Raises ``TypeError`` and ``ValueError`` for what is none."""
-        choice = MixChoice(**found)
+        choice = PriorWeightSelection(**found)
         if not 0 <= choice.mix <= 1:
             raise ValueError(f'the share "mix" must be from 0 to 1, got {choice.mix}')
         return choice
 
 
-def mixes(plan: GazePlan) -> bool:
+def selects_prior_weight(plan: GazePlan) -> bool:
     """Whether ``plan`` asks for a share that folds choose."""
     return plan.settings.mix_folds > 0 and plan.config.prior > 0
 
@@ -120,24 +120,24 @@ class _Judgement(NamedTuple):
 
 
 @dataclass(frozen=True)
-class JudgedFolds:
+class FoldResults:
     """What folds tell of one architecture."""
 
-    mix: float  # The share that it has of itself
-    curves: np.ndarray  # KLD (F, S) in each fold with each of ``SHARES``
-    judgements: list[_Judgement]  # Of each fold
+    default_weight: float  # The share that it has of itself
+    kld_curves: np.ndarray  # KLD (F, S) in each fold with each of ``SHARES``
+    densities: list[_Judgement]  # Of each fold
 
-    def choose(self) -> MixChoice:
+    def select_weight(self) -> PriorWeightSelection:
         """The share that it is given: its own where there is no fold."""
-        if not len(self.curves):
-            return MixChoice(self.mix, 0)
-        choice = _choose(self.curves)
-        return replace(choice, regions=_regions(self.judgements, choice.mix))
+        if not len(self.kld_curves):
+            return PriorWeightSelection(self.default_weight, 0)
+        choice = _choose(self.kld_curves)
+        return replace(choice, regions=_regions(self.densities, choice.mix))
 
 
-def judge_folds(
-    supervision: Supervision, place: GazePlace, plan: GazePlan, ns: ModuleType, tell: Listener = lambda progress: None
-) -> JudgedFolds:
+def evaluate_folds(
+    supervision: Supervision, geometry: TrainingGeometry, plan: GazePlan, ns: ModuleType, on_progress: ProgressCallback = lambda progress: None
+) -> FoldResults:
     """How well fields that ``plan`` trains on ``supervision``, which has rays, in ``place`` foretell people and
     positions that are held out, with each share of the blind density.
 
@@ -148,38 +148,38 @@ def judge_folds(
     if rays is None or not config.prior:
         raise ValueError("folds are of rays, and of fields that have a density that does not depend on the position")
     if plan.settings.minutes is not None:
-        plan = plan.with_settings(minutes=MINUTES * plan.settings.minutes / plan.settings.mix_folds)
-    settings, needs = plan.settings, TargetNeeds.of(plan.config)
+        plan = plan.with_settings(minutes=FOLD_TIME_FRACTION * plan.settings.minutes / plan.settings.mix_folds)
+    settings, needs = plan.settings, TargetRequirements.from_config(plan.config)
     probes = replace(plan.probes, count=min(plan.probes.count, _PROBES), fresh=False)
     if settings.steps is not None:
         settings = replace(settings, steps=math.ceil(_STEPS * settings.steps))
-    box = heads_box(place.points_from_rays(rays.origin), place.box)
-    for k, (learn, held, centres) in enumerate(inner_folds(rays, plan)):
+    box = compute_observer_bounds(geometry.points_to_field(rays.origin), geometry.box)
+    for k, (learn, held, centres) in enumerate(iter_folds(rays, plan)):
         try:
-            targets = targets_of_rays(learn, place, probes, needs, seed=settings.seed)
+            targets = make_targets_from_rays(learn, geometry, probes, needs, seed=settings.seed)
         except NergError:
             # Those who are left make no probe: this fold says nothing.
             continue
         judged = replace(probes, directions=_DIRECTIONS, min_rays=1)
-        probes_held = probes_of_rays(held, judged, centres, settings.seed + 3)
-        truth = targets_of_probes(probes_held, place, _DIRECTIONS, judged.depth, needs, settings.seed + 3)
-        trainer = plan.trainer(replace(targets, heads=box), place.box, config, settings, ns)
+        probes_held = make_probes(held, judged, centres, settings.seed + 3)
+        truth = make_targets_from_probes(probes_held, geometry, _DIRECTIONS, judged.depth, needs, settings.seed + 3)
+        trainer = plan.trainer(replace(targets, observer_bounds=box), geometry.box, config, settings, ns)
         with Interruption() as stop:
             while trainer.progress < 1:
                 trainer.step()
                 done = (k + trainer.progress) / settings.mix_folds
-                tell(GazeProgress(f"fold {k + 1}", done, trainer.steps, trainer.seconds, None))
+                on_progress(GazeProgress(f"fold {k + 1}", done, trainer.steps, trainer.seconds, None))
                 stop.check()
-        field, blind = trainer.densities(truth)
-        curves.append([_kld(truth.truth, (1 - m) * field + m * blind) for m in SHARES])
-        judgements.append(_Judgement(field, blind, _bins(probes_held, place, truth.directions), probes_held.offsets))
+        field, blind = trainer.evaluate_densities(truth)
+        curves.append([_kld(truth.truth, (1 - m) * field + m * blind) for m in PRIOR_WEIGHTS])
+        judgements.append(_Judgement(field, blind, _bins(probes_held, geometry, truth.directions), probes_held.offsets))
         if len(curves) == _ENOUGH and all(int(np.argmin(curve)) == 0 for curve in curves):
             break
-    tell(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
-    return JudgedFolds(config.mix, np.array(curves), judgements)
+    on_progress(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
+    return FoldResults(config.mix, np.array(curves), judgements)
 
 
-def inner_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.ndarray]]:
+def iter_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.ndarray]]:
     """``(learn, held, centres)`` of each fold: the rays of some people away from ``centres`` (T, 3), and those of the
     others, who are judged there. One person alone is held out at places only. A fold without such places is left out.
     """
@@ -227,9 +227,9 @@ def _kld(truth: np.ndarray, density: np.ndarray) -> float:
     return float((p * np.log(np.maximum(p, _LEAST / p.shape[1]) / q)).sum(axis=1).mean())
 
 
-def _bins(probes: Probes, place: GazePlace, directions: np.ndarray) -> np.ndarray:
+def _bins(probes: Probes, place: TrainingGeometry, directions: np.ndarray) -> np.ndarray:
     """Which of the ``directions`` (P, D, 3), those of its probe, each ray of ``probes`` is nearest to, (n,)."""
-    along, o = place.directions_from_rays(probes.directions), probes.offsets
+    along, o = place.directions_to_field(probes.directions), probes.offsets
     return np.concatenate([np.argmax(along[a:b] @ d.T, axis=1) for a, b, d in zip(o[:-1], o[1:], directions)])
 
 
@@ -240,12 +240,12 @@ def _regions(judgements: Sequence[_Judgement], mix: float) -> dict[str, float]:
     for of in judgements:
         density = (1 - mix) * of.field + mix * of.blind
         for p, (a, b) in enumerate(zip(of.offsets[:-1], of.offsets[1:])):
-            levels.append(region_levels(density[p : p + 1], density[p : p + 1, of.bins[a:b]])[0])
+            levels.append(compute_region_levels(density[p : p + 1], density[p : p + 1, of.bins[a:b]])[0])
             weights.append(np.full(b - a, 1 / (b - a)))
-    return calibrated_levels(np.concatenate(levels), np.concatenate(weights))
+    return calibrate_levels(np.concatenate(levels), np.concatenate(weights))
 
 
-def nearly_best(curves: np.ndarray) -> np.ndarray:
+def within_half_se(curves: np.ndarray) -> np.ndarray:
     """Indices of the columns of ``curves`` (F, S), a row a fold, that are worse than the one of the least mean by no
     more than half a standard error over folds."""
     more = curves - curves[:, [int(curves.mean(axis=0).argmin())]]
@@ -253,10 +253,10 @@ def nearly_best(curves: np.ndarray) -> np.ndarray:
     return np.flatnonzero(more.mean(axis=0) <= _DOUBT * error)
 
 
-def _choose(curves: np.ndarray) -> MixChoice:
+def _choose(curves: np.ndarray) -> PriorWeightSelection:
     """The largest of `SHARES` that is nearly the best over folds (F, S)."""
-    mean, chosen = curves.mean(axis=0), int(nearly_best(curves)[-1])
-    return MixChoice(float(SHARES[chosen]), len(curves), float(mean[chosen]), float(mean[0]), float(mean[-1]))
+    mean, chosen = curves.mean(axis=0), int(within_half_se(curves)[-1])
+    return PriorWeightSelection(float(PRIOR_WEIGHTS[chosen]), len(curves), float(mean[chosen]), float(mean[0]), float(mean[-1]))
 
 
 # ---- Variants ----
@@ -266,17 +266,17 @@ def _choose(curves: np.ndarray) -> MixChoice:
 # Where no surfaces are known, emit is told of points at one distance whatever is there. In some places it tells where
 # others look from elsewhere all the same, in others it follows whom it has seen: those who are held out tell which.
 
-CHOICE = "choice"  # Entry of what a run must agree on (``GazePlan.identity``): what was chosen before it began
+SELECTION_KEY = "choice"  # Entry of what a run must agree on (``GazePlan.identity``): what was chosen before it began
 
 
-def choose_variant(
+def select_variant(
     supervision: Supervision,
-    place: GazePlace,
+    geometry: TrainingGeometry,
     plan: GazePlan,
     ns: ModuleType,
-    tell: Listener = lambda progress: None,
-    kept: dict | None = None,
-) -> tuple[GazePlan, MixChoice | None]:
+    on_progress: ProgressCallback = lambda progress: None,
+    resumed_identity: dict | None = None,
+) -> tuple[GazePlan, PriorWeightSelection | None]:
     """``plan`` with one architecture, and the share of the blind density where folds have chosen both.
 
     That of `GazePlan.config` stays, unless one of the ``alternatives`` foretells those who are held out better by half
@@ -285,56 +285,56 @@ def choose_variant(
     Raises ``KeyboardInterrupt`` after Ctrl-C, or where ``tell`` does.
     """
     configs, plan = (plan.config, *plan.alternatives), replace(plan, alternatives=())
-    if len(configs) == 1 or not mixes(plan) or supervision.rays is None:
+    if len(configs) == 1 or not selects_prior_weight(plan) or supervision.rays is None:
         return plan, None
-    if kept is not None:
-        return _kept(plan, configs, kept)
+    if resumed_identity is not None:
+        return _kept(plan, configs, resumed_identity)
     each, judging = [], plan
     if plan.settings.minutes is not None:
         judging = plan.with_settings(minutes=plan.settings.minutes / len(configs))
     try:
         for k, config in enumerate(configs):
-            told = part_of(tell, k, len(configs), f"{{}} of {config.variant}")
-            each.append(judge_folds(supervision, place, replace(judging, config=config), ns, told))
+            told = scale_progress(on_progress, k, len(configs), f"{{}} of {config.variant}")
+            each.append(evaluate_folds(supervision, geometry, replace(judging, config=config), ns, told))
     except KeyboardInterrupt as error:
         names = " and ".join(config.variant for config in configs)
         raise KeyboardInterrupt(f"interrupted while folds chose between {names}; nothing was kept") from error
     return _best(plan, configs, each)
 
 
-def _kept(plan: GazePlan, configs: tuple[GazeHeadConfig, ...], kept: dict) -> tuple[GazePlan, MixChoice | None]:
+def _kept(plan: GazePlan, configs: tuple[GazeHeadConfig, ...], kept: dict) -> tuple[GazePlan, PriorWeightSelection | None]:
     """What was chosen among ``configs``; that of another run is found out when the two are compared."""
     started = [c for c in configs if json.loads(json.dumps(c.to_dict())) == kept.get("architecture")]
     plan = replace(plan, config=started[0]) if started else plan
-    if CHOICE not in kept:
+    if SELECTION_KEY not in kept:
         return plan, None
     try:
-        return plan, MixChoice.of(kept[CHOICE])
+        return plan, PriorWeightSelection.from_dict(kept[SELECTION_KEY])
     except (TypeError, ValueError) as error:
         raise NergError(f"what the run had chosen is damaged ({error}); start anew without --resume") from error
 
 
 def _best(
-    plan: GazePlan, configs: tuple[GazeHeadConfig, ...], each: list[JudgedFolds]
-) -> tuple[GazePlan, MixChoice | None]:
+    plan: GazePlan, configs: tuple[GazeHeadConfig, ...], each: list[FoldResults]
+) -> tuple[GazePlan, PriorWeightSelection | None]:
     """The plan with the best of ``configs``, which were judged as ``each`` says, and its share."""
-    choices = [judged.choose() for judged in each]
+    choices = [judged.select_weight() for judged in each]
     # Folds end early for a field that needs none of the blind density.
-    folds = min(len(judged.curves) for judged in each)
+    folds = min(len(judged.kld_curves) for judged in each)
     if not folds:
         return plan, choices[0]
-    shares = [int(np.abs(SHARES - choice.mix).argmin()) for choice in choices]
-    curves = np.stack([judged.curves[:folds, s] for judged, s in zip(each, shares)], axis=1)
-    k = int(nearly_best(curves)[0])
+    shares = [int(np.abs(PRIOR_WEIGHTS - choice.mix).argmin()) for choice in choices]
+    curves = np.stack([judged.kld_curves[:folds, s] for judged, s in zip(each, shares)], axis=1)
+    k = int(within_half_se(curves)[0])
     variants = {config.variant: float(kld) for config, kld in zip(configs, curves.mean(axis=0))}
     return replace(plan, config=configs[k]), replace(choices[k], variant=configs[k].variant, variants=variants)
 
 
-def part_of(tell: Listener, k: int, count: int, stage: str) -> Listener:
+def scale_progress(on_progress: ProgressCallback, k: int, count: int, stage: str) -> ProgressCallback:
     """Tells how the whole of ``count`` parts goes by how number ``k`` does; its stages are named as ``stage`` says."""
 
     def told(progress: GazeProgress) -> None:
-        tell(replace(progress, stage=stage.format(progress.stage), done=(k + progress.done) / count))
+        on_progress(replace(progress, stage=stage.format(progress.stage), fraction=(k + progress.fraction) / count))
 
     return told
 
@@ -356,12 +356,12 @@ class TrainedGaze(NamedTuple):
 
 def train_gaze(
     supervision: Supervision,
-    place: GazePlace,
+    geometry: TrainingGeometry,
     plan: GazePlan,
     ns: ModuleType,
     *,
     state: StateSettings | None = None,
-    tell: Listener | None = None,
+    on_progress: ProgressCallback | None = None,
     write: Callable[[GazeHead, dict], None] | None = None,
 ) -> TrainedGaze:
     """Train a gaze field on ``supervision`` in ``place``, with arrays of the backend ``ns``.
@@ -377,49 +377,49 @@ def train_gaze(
     ``write``: is given the result, which it puts into a file. Once it has done so, the state of a run that is done is
     removed; if it raises, the state is that of the end. Without it the state stays.
     """
-    tell, state, started = tell or (lambda progress: None), state or StateSettings(), time.perf_counter()
-    plan, choice = choose_variant(supervision, place, plan, ns, tell, kept_identity(state))
+    on_progress, state, started = on_progress or (lambda progress: None), state or StateSettings(), time.perf_counter()
+    plan, choice = select_variant(supervision, geometry, plan, ns, on_progress, read_run_identity(state))
     if choice is not None:
-        state = replace(state, about={**state.about, CHOICE: choice.to_dict()})
-    settings, needs = plan.settings, TargetNeeds.of(plan.config)
-    file = GazeRunFile(state.path, plan.identity(supervision, place, state), state.every, state.resume)
+        state = replace(state, identity={**state.identity, SELECTION_KEY: choice.to_dict()})
+    settings, needs = plan.settings, TargetRequirements.from_config(plan.config)
+    file = GazeRunFile(state.path, plan.make_identity(supervision, geometry, state), state.interval, state.resume)
     file.seconds += time.perf_counter() - started
     started = time.perf_counter()
-    tell(GazeProgress("probes", 0.0, 0, 0.0, None))
-    split, watched = split_validation(supervision, place, settings, plan.probes), None
-    if split.watched is not None:
-        watched = make_targets(split.watched, place, plan, needs, settings.seed + 2, split.centres)
-    refits, mixed = settings.refit and watched is not None, mixes(plan) and supervision.rays is not None
-    share = (0.5 if refits else 1.0) * (1 - MINUTES if mixed else 1.0)
+    on_progress(GazeProgress("probes", 0.0, 0, 0.0, None))
+    split, watched = split_validation(supervision, geometry, settings, plan.probes), None
+    if split.validation is not None:
+        watched = make_targets(split.validation, geometry, plan, needs, settings.seed + 2, split.centres)
+    refits, mixed = settings.refit and watched is not None, selects_prior_weight(plan) and supervision.rays is not None
+    share = (0.5 if refits else 1.0) * (1 - FOLD_TIME_FRACTION if mixed else 1.0)
     prepared, again = 0.0, file.stage == "refit"
-    used = supervision if again else split.learn
-    targets = make_targets(used, place, plan, needs, settings.seed)
+    used = supervision if again else split.training
+    targets = make_targets(used, geometry, plan, needs, settings.seed)
     if again:
-        first = GazeFit.of(file.found)
+        first = GazeFit.from_dict(file.validation_state)
     else:
         prepared = time.perf_counter() - started
-        first = fit_watched(targets, watched, place.box, plan, ns, share, file, tell)
+        first = fit_with_validation(targets, watched, geometry.box, plan, ns, share, file, on_progress)
         again = refits and not first.interrupted
         if again:
             # Making the targets of everything may take long: what was found is kept before.
-            file.keep("refit", None, first.found(), {}, now=True)
-            used, targets = supervision, make_targets(supervision, place, plan, needs, settings.seed)
-    last = fit_again(targets, first, place.box, plan, ns, file, tell) if again else first
+            file.save("refit", None, first.to_dict(), {}, force=True)
+            used, targets = supervision, make_targets(supervision, geometry, plan, needs, settings.seed)
+    last = refit(targets, first, geometry.box, plan, ns, file, on_progress) if again else first
     trainer = last.trainer
     interrupted = first.interrupted or last.interrupted
     if mixed and choice is None and not interrupted:
         try:
-            choice = judge_folds(supervision, place, plan, ns, tell).choose()
+            choice = evaluate_folds(supervision, geometry, plan, ns, on_progress).select_weight()
         except KeyboardInterrupt:
             interrupted = True
-    field = trainer.field(last.weights)
+    field = trainer.make_field(last.weights)
     if choice is not None:
-        field.set_mix(choice.mix)
-    field.support = used.support(plan.probes.radius, place)
-    field.basis = basis_of(supervision.counts())
-    provenance = _provenance(supervision, place, plan, targets) | {
+        field.set_prior_weight(choice.mix)
+    field.support = used.make_support(plan.probes.radius, geometry)
+    field.basis = summarize_provenance(supervision.count_data())
+    provenance = _provenance(supervision, geometry, plan, targets) | {
         "steps": trainer.steps,
-        "seconds": round(file.spent, 1),
+        "seconds": round(file.elapsed, 1),
         "seconds_preparing": round(prepared, 1),
         "refitted": again,
         "interrupted": interrupted,
@@ -433,22 +433,22 @@ def train_gaze(
             "rays_held_out": split.rays_held_out,
             "views_held_out": split.views_held_out,
             "best_step": first.best_step,
-            **rounded(first.scores),
+            **round_scores(first.scores),
             "history": first.history,
         }
     if write is not None:
         stage, weights = ("refit", {}) if again else ("fit", last.weights)
-        keep = lambda: file.keep(stage, trainer, first.found(), weights, now=True)
-        with kept_unless(state.path, keep, done=not provenance["interrupted"]):
+        keep = lambda: file.save(stage, trainer, first.to_dict(), weights, force=True)
+        with saving_on_failure(state.path, keep, is_done=not provenance["interrupted"]):
             write(field, provenance)
     return TrainedGaze(field, provenance)
 
 
 def make_targets(
     supervision: Supervision,
-    place: GazePlace,
+    geometry: TrainingGeometry,
     plan: GazePlan,
-    needs: TargetNeeds,
+    requirements: TargetRequirements,
     seed: int,
     centres: np.ndarray | None = None,
 ) -> GazeTargets:
@@ -456,24 +456,24 @@ def make_targets(
     frame; None: where the plan places them."""
     rays, views, probes = supervision.rays, supervision.views, plan.probes
     if rays is None:
-        return targets_of_views(views, place, probes, needs, seed)
-    targets = targets_of_rays(rays, place, probes, needs, centres, seed)
+        return make_targets_from_views(views, geometry, probes, requirements, seed)
+    targets = make_targets_from_rays(rays, geometry, probes, requirements, centres, seed)
     if not views:
         return targets
     # The blind density is that of the rays.
-    needs = TargetNeeds(needs.semantic, needs.fill)
-    return concatenate(targets, targets_of_views(views, place, probes, needs, seed))
+    requirements = TargetRequirements(requirements.semantic, requirements.fill_misses)
+    return concatenate_targets(targets, make_targets_from_views(views, geometry, probes, requirements, seed))
 
 
-def _provenance(supervision: Supervision, place: GazePlace, plan: GazePlan, targets: GazeTargets) -> dict:
+def _provenance(supervision: Supervision, place: TrainingGeometry, plan: GazePlan, targets: GazeTargets) -> dict:
     """What the field was trained with and on (JSON)."""
     return {
         "settings": plan.settings.to_dict(),
         "probes": plan.probes.to_dict(),
-        "align": alignment(place),
-        **supervision.counts(),
+        "align": alignment_to_json(place),
+        **supervision.count_data(),
         "probes_made": len(targets.truth),
-        "escaped_directions": round(targets.escape_share, 6),
-        "escaped_gaze": round(targets.escaped_gaze, 6),
+        "escaped_directions": round(targets.miss_fraction, 6),
+        "escaped_gaze": round(targets.miss_gaze_fraction, 6),
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }

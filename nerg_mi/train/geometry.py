@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, mitsuba_says
+from nerg_mi.errors import MissingFile, NergError, translate_mitsuba_errors
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.formats.meshes import read_mesh_file
-from nerg_mi.formats.splats import READERS, is_splats, read_splats, refuse_others
+from nerg_mi.formats.splats import READERS, is_splat_file, read_splats, refuse_unsupported_splats
 from nerg_mi.formats.surfaces import write_volume
-from nerg_mi.maths.geometry import AnyBox, Box, Similarity, box_interval
+from nerg_mi.maths.geometry import AnyBox, Box, Similarity, intersect_box_numpy
 from nerg_mi.ranges import LENGTHS, check_number
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import check_vol
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.transport.field_medium import FieldMedium
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 from nerg_mi.transport.volume_medium import VolumeMedium
 
@@ -36,11 +36,11 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 # spend nearly every voxel on air. So the box gives up hit points where that saves most voxels for each of them; those
 # beyond it are drawn where their rays leave it (its shell), in their true directions at too short a distance.
 
-VOXEL = 0.08  # Edge of a voxel in metres where none is asked for and the place is not too large for it
+DEFAULT_VOXEL = 0.08  # Edge of a voxel in metres where none is asked for and the place is not too large for it
 
-MOST = 1 << 24  # Voxels of a place: a file of 64 MiB, 8,600 cubic metres in voxels of the default edge
+MAX_VOXELS = 1 << 24  # Voxels of a place: a file of 64 MiB, 8,600 cubic metres in voxels of the default edge
 
-PAD = 6  # Voxels around the points that a box holds
+PADDING_VOXELS = 6  # Voxels around the points that a box holds
 
 # Share of the hit points at either end of an axis that the box need not hold: a glance through a gap ends tens of
 # metres behind the place. The same of the origins, where a box must be cut: a tracker that loses somebody puts them
@@ -61,8 +61,8 @@ class HitExtent:
     lower: np.ndarray  # Lower corner (3,) of the box in metres
     shape: tuple[int, int, int]  # Voxels along x, y and z
     voxel: float  # Their edge in metres
-    cut: bool = False  # Whether hit points beyond the box stand on its shell
-    beyond: float = 0.0  # Their share of the hit points
+    is_cut: bool = False  # Whether hit points beyond the box stand on its shell
+    outside_fraction: float = 0.0  # Their share of the hit points
 
     @property
     def upper(self) -> np.ndarray:
@@ -72,18 +72,18 @@ class HitExtent:
     @property
     def shell(self) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the box on which hit points beyond stand: inside of the padding."""
-        return self.lower + PAD * self.voxel, self.upper - PAD * self.voxel
+        return self.lower + PADDING_VOXELS * self.voxel, self.upper - PADDING_VOXELS * self.voxel
 
-    def beyond_shell(self, hits: np.ndarray) -> np.ndarray:
+    def is_outside_shell(self, hits: np.ndarray) -> np.ndarray:
         """Which of ``hits`` (N, 3) stand on the shell, (N,) bool; none of a place that was not cut."""
-        if not self.cut:
+        if not self.is_cut:
             return np.zeros(len(hits), bool)
         # A wall along which the box was cut is no more than half a voxel beyond it.
         low, high = self.shell[0] - 0.5 * self.voxel, self.shell[1] + 0.5 * self.voxel
         return np.logical_not(((hits >= low) & (hits <= high)).all(axis=1))
 
 
-def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitExtent:
+def compute_hit_extent(rays: Rays, voxel: float | None = None, max_voxels: int = MAX_VOXELS) -> HitExtent:
     """The box of a place of at most ``most`` voxels made from the hit points of ``rays``.
 
     It holds all origins and the hits but for half a percent at each end of each axis. Where these are too many voxels
@@ -100,8 +100,8 @@ def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitE
     hits = rays.hit[known]
     first, last = np.quantile(hits, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
     low, high = np.minimum(first, rays.origin.min(axis=0)), np.maximum(last, rays.origin.max(axis=0))
-    edge = VOXEL if voxel is None else voxel
-    if np.prod(_count(low, high, edge)) <= most:
+    edge = DEFAULT_VOXEL if voxel is None else voxel
+    if np.prod(_count(low, high, edge)) <= max_voxels:
         return _padded(low, high, edge)
     core = np.quantile(rays.origin, [_OUTLIERS, 1 - _OUTLIERS], axis=0) + [[-_MARGIN], [_MARGIN]]
     core = np.clip(core, low, high)
@@ -109,15 +109,15 @@ def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitE
     pick = lambda points: points[rng.permutation(len(points))[:_SAMPLE]]
     points, sample = np.concatenate([pick(hits), pick(rays.origin)]), pick(hits)
     while True:
-        box = _cut(low, high, core, points, edge, most)
+        box = _cut(low, high, core, points, edge, max_voxels)
         kept = 0.0 if box is None else ((sample >= box[0]) & (sample <= box[1])).all(axis=1).mean()
         if box is not None and (voxel is not None or kept >= _KEPT):
-            extent = replace(_padded(*box, edge), cut=True)
-            return replace(extent, beyond=float(extent.beyond_shell(hits).mean()))
+            extent = replace(_padded(*box, edge), is_cut=True)
+            return replace(extent, outside_fraction=float(extent.is_outside_shell(hits).mean()))
         if voxel is not None:
             size = " x ".join(f"{s:.3g}" for s in core[1] - core[0])
             raise NergError(
-                f"people were in {size} m, which is more than {most:,} voxels of {voxel:g} m; "
+                f"people were in {size} m, which is more than {max_voxels:,} voxels of {voxel:g} m; "
                 "enlarge the voxel (--voxel) or leave it out"
             )
         edge *= 2 ** (1 / 3)  # Half as many voxels
@@ -125,12 +125,12 @@ def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitE
 
 def _count(low: np.ndarray, high: np.ndarray, voxel: float) -> np.ndarray:
     """Voxels along each axis of the box around ``low`` and ``high``, as floats: they may be too many for integers."""
-    return np.ceil((high - (low - PAD * voxel)) / voxel) + PAD
+    return np.ceil((high - (low - PADDING_VOXELS * voxel)) / voxel) + PADDING_VOXELS
 
 
 def _padded(low: np.ndarray, high: np.ndarray, voxel: float) -> HitExtent:
     """The extent of the box around ``low`` and ``high``."""
-    return HitExtent(low - PAD * voxel, tuple(_count(low, high, voxel).astype(int).tolist()), voxel)
+    return HitExtent(low - PADDING_VOXELS * voxel, tuple(_count(low, high, voxel).astype(int).tolist()), voxel)
 
 
 def _cut(
@@ -185,13 +185,13 @@ def voxelise_hits(rays: Rays, voxel: float | None = None, extent: HitExtent | No
     """
     from scipy.ndimage import binary_closing, binary_dilation
 
-    extent = extent or hit_extent(rays, voxel)
+    extent = extent or compute_hit_extent(rays, voxel)
     if rays.hit is None:
         raise NergError("these rays have no hit points to make a place from; give a radiance field instead (--field)")
     known = np.isfinite(rays.hit).all(axis=1)
     hits, origins = rays.hit[known], rays.origin[known]
-    if extent.cut:
-        far = extent.beyond_shell(hits)
+    if extent.is_cut:
+        far = extent.is_outside_shell(hits)
         hits[far] = _on_shell(origins[far], hits[far], extent)
         there = np.isfinite(hits).all(axis=1)
         hits, origins = hits[there], origins[there]
@@ -214,7 +214,7 @@ def _marked(extent: HitExtent, points: np.ndarray, out: np.ndarray | None = None
 def _on_shell(origins: np.ndarray, hits: np.ndarray, extent: HitExtent) -> np.ndarray:
     """Where rays to hits beyond the shell leave it, (N, 3); NaN for those that never are within it."""
     way = hits - origins
-    enter, leave = box_interval(origins, way, *extent.shell)
+    enter, leave = intersect_box_numpy(origins, way, *extent.shell)
     passes = (leave > np.maximum(enter, 0)) & (leave <= 1)
     return np.where(passes[:, None], origins + way * np.where(passes, leave, 0)[:, None], np.nan)
 
@@ -235,7 +235,7 @@ def _passed(origins: np.ndarray, hits: np.ndarray, extent: HitExtent) -> np.ndar
     return out
 
 
-def volume_dict(path: str | Path) -> dict:
+def make_volume_dict(path: str | Path) -> dict:
     """The Mitsuba plugin, as a dict, that shows what ``formats.surfaces.write_volume`` wrote of hit points.
 
     Without interpolation, which would bring every surface nearer by most of a voxel.
@@ -285,31 +285,31 @@ def shade_hits(density: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tup
 
 # ---- Where people looked around: what a gaze field's depths are traced in, and the frame that it lives in ----
 
-NOWHERE = 2.0  # How far away everything is taken to be where no geometry is known, in the field's units
+DEFAULT_DEPTH = 2.0  # How far away everything is taken to be where no geometry is known, in the field's units
 
 _STRAY, _AROUND = 0.002, 0.02
 """Share of Gaussians that may lie beyond each side of the box of splats, and what is added around the others."""
 
 
 @dataclass(frozen=True, eq=False)
-class GazePlace:
+class TrainingGeometry:
     """Where people looked around, and how their frame lies in it."""
 
     # What depths are traced in, in the field's frame (`transport.geometry.trace_depth`); None where nothing is known.
-    medium: FieldMedium | VolumeMedium | SplatMedium | Place | None
+    medium: FieldMedium | VolumeMedium | SplatMedium | SceneGeometry | None
     box: AnyBox  # Where a gaze field lives, in that frame
     kind: str  # What it was made of: "field", "scene", "hits" or "none"
-    about: dict = field(default_factory=dict)  # For the provenance (JSON): the file, and what it is
+    metadata: dict = field(default_factory=dict)  # For the provenance (JSON): the file, and what it is
     align: Similarity = field(default_factory=Similarity)  # From the rays' frame, in metres, to the field's
     radiance: RadianceField | None = None  # The radiance field that the medium shows, where it is one
     # What its file holds that is not used, and what had to be guessed of it: a sentence each.
     notes: tuple[str, ...] = ()
 
-    def points_from_rays(self, points: np.ndarray) -> np.ndarray:
+    def points_to_field(self, points: np.ndarray) -> np.ndarray:
         """Points (..., 3) of the rays' frame in the field's."""
         return points @ self.align.matrix[:3, :3].T + self.align.matrix[:3, 3]
 
-    def directions_from_rays(self, directions: np.ndarray) -> np.ndarray:
+    def directions_to_field(self, directions: np.ndarray) -> np.ndarray:
         """Unit directions (..., 3) of the rays' frame in the field's."""
         return directions @ (self.align.matrix[:3, :3] / self.align.scale).T
 
@@ -319,34 +319,34 @@ class GazePlace:
         return directions @ (self.align.matrix[:3, :3] / self.align.scale)
 
 
-def place_of_field(path: Path, ns: ModuleType) -> GazePlace:
+def load_field_geometry(path: Path, ns: ModuleType) -> TrainingGeometry:
     """A trained radiance field, or Gaussian splats, read from ``path`` with arrays of the backend ``ns``."""
     if path.suffix.lower() in READERS:
         return _place_of_splats(path, ns)
-    refuse_others(path)
+    refuse_unsupported_splats(path)
     radiance, _ = load_radiance(path, ns)
-    about = {"field_file": file_identity(path)}
-    return GazePlace(FieldMedium(radiance), radiance.box, "field", about, radiance=radiance)
+    about = {"field_file": identify_file(path)}
+    return TrainingGeometry(FieldMedium(radiance), radiance.box, "field", about, radiance=radiance)
 
 
-def _place_of_splats(path: Path, ns: ModuleType) -> GazePlace:
+def _place_of_splats(path: Path, ns: ModuleType) -> TrainingGeometry:
     splats = read_splats(path)
     # Of splats that photos have trained a few lie far outside of the place.
     lower, upper = np.quantile(splats.centers.astype(np.float64), (_STRAY, 1 - _STRAY), axis=0)
     pad = _AROUND * max(upper - lower) + float(splats.scales.max(axis=1).mean())
     box = Box(tuple(lower - pad), tuple(upper + pad))
-    medium, about = SplatMedium(SplatArrays(splats, ns)), {"field_file": file_identity(path)}
-    return GazePlace(medium, box, "field", about, notes=(*splats.guesses, *splats.notes))
+    medium, about = SplatMedium(SplatArrays(splats, ns)), {"field_file": identify_file(path)}
+    return TrainingGeometry(medium, box, "field", about, notes=(*splats.assumptions, *splats.notes))
 
 
-def place_of_scene(path: Path) -> GazePlace:
+def load_scene_geometry(path: Path) -> TrainingGeometry:
     """The shapes of a Mitsuba scene, and the field or volume of its integrator where that is a ``nerg``; or a mesh
     (.ply, .obj, .glb).
 
     Raises `NergError` for a scene with neither.
     """
     scene, notes = _scene_of_mesh(path) if path.suffix.lower() in MESHES else (load_scene(path), ())
-    place = Place(getattr(scene.integrator(), "medium", None), scene)
+    place = SceneGeometry(getattr(scene.integrator(), "medium", None), scene)
     bounds = place.bounds()
     if bounds is None:
         raise NergError(
@@ -356,37 +356,37 @@ def place_of_scene(path: Path) -> GazePlace:
     lower, upper = bounds
     # A plane has no thickness, and a field needs some.
     pad = 0.01 * max(upper - lower)
-    box, about = Box(tuple(lower - pad), tuple(upper + pad)), {"scene_file": file_identity(path)}
-    return GazePlace(place, box, "scene", about, notes=notes)
+    box, about = Box(tuple(lower - pad), tuple(upper + pad)), {"scene_file": identify_file(path)}
+    return TrainingGeometry(place, box, "scene", about, notes=notes)
 
 
 def _scene_of_mesh(path: Path) -> tuple[Any, tuple[str, ...]]:
     """A scene of the mesh in ``path``, and sentences on what of the file is not used."""
     import mitsuba as mi
 
-    if path.suffix.lower() in READERS and is_splats(path):
+    if path.suffix.lower() in READERS and is_splat_file(path):
         raise NergError(f'"{path}" holds Gaussian splats, which are a field: give it by --field')
     mesh = read_mesh_file(path)
-    with mitsuba_says(path):
+    with translate_mitsuba_errors(path):
         return mi.load_dict({"type": "scene", "mesh": mitsuba_mesh(mesh.vertices, mesh.faces, "mesh")}), mesh.notes
 
 
-def place_of_hits(rays: Rays, path: Path, voxel: float | None = None) -> GazePlace:
+def make_hit_geometry(rays: Rays, path: Path, voxel: float | None = None) -> TrainingGeometry:
     """A volume made of the rays' hit points, written to ``path`` (.vol); ``voxel``: edge of its voxels in metres, by
     default what `hit_extent` chooses."""
-    extent = hit_extent(rays, voxel)
+    extent = compute_hit_extent(rays, voxel)
     density, box = voxelise_hits(rays, extent=extent)
     write_volume(path, density, box.lower, box.upper)
     size = {
         "shape": list(extent.shape),
         "solid": round(float((density > 0).mean()), 4),
         "voxel": extent.voxel,
-        "beyond": round(extent.beyond, 4),
+        "beyond": round(extent.outside_fraction, 4),
     }
-    return place_of_volume(path, size)
+    return load_volume_geometry(path, size)
 
 
-def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
+def load_volume_geometry(path: Path, metadata: dict | None = None) -> TrainingGeometry:
     """A volume that ``place_of_hits`` has written. Raises `NergError` for one that is missing or damaged."""
     import mitsuba as mi
 
@@ -397,23 +397,23 @@ def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
     # Mitsuba makes some box of any six numbers.
     if not (np.isfinite(box).all() and (box[:3] < box[3:]).all()):
         raise NergError(f'the place of hit points "{path}" has no box with a lower and an upper corner; make it anew')
-    with mitsuba_says(path):
-        medium = VolumeMedium(mi.load_dict(volume_dict(path)))
+    with translate_mitsuba_errors(path):
+        medium = VolumeMedium(mi.load_dict(make_volume_dict(path)))
     lower, upper = medium.bounds()
-    return GazePlace(
+    return TrainingGeometry(
         medium,
         Box(tuple(lower.tolist()), tuple(upper.tolist())),
         "hits",
-        {"geometry_file": {**file_identity(path), **(about or {})}},
+        {"geometry_file": {**identify_file(path), **(metadata or {})}},
     )
 
 
-def place_of_nothing(origins: np.ndarray) -> GazePlace:
+def no_geometry(origins: np.ndarray) -> TrainingGeometry:
     """No geometry: everything is ``NOWHERE`` away from whoever looks from one of ``origins`` (N, 3)."""
-    lower, upper = origins.min(axis=0) - NOWHERE, origins.max(axis=0) + NOWHERE
-    return GazePlace(None, Box(tuple(lower.tolist()), tuple(upper.tolist())), "none", {"geometry": "none"})
+    lower, upper = origins.min(axis=0) - DEFAULT_DEPTH, origins.max(axis=0) + DEFAULT_DEPTH
+    return TrainingGeometry(None, Box(tuple(lower.tolist()), tuple(upper.tolist())), "none", {"geometry": "none"})
 
 
-def file_identity(path: Path) -> dict[str, str]:
+def identify_file(path: Path) -> dict[str, str]:
     """Name and SHA-256 of a file, for the provenance (JSON)."""
     return {"file": path.name, "sha256": file_sha256(path)}

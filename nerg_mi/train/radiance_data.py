@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Array3f, Float, UInt32
-from nerg_mi.photos.cameras import Intrinsics, fisheye_limit
+from nerg_mi.photos.cameras import Intrinsics, find_fisheye_limit
 from nerg_mi.photos.images import PhotoView
 
 # ---- Directions that lenses show, on the device: the float32 counterpart of `photos.cameras.rays` ----
@@ -37,7 +37,7 @@ class LensTable:
         rows = [[0.5 - i.cx, 0.5 - i.cy, 1 / i.fx, 1 / i.fy, *i.distortion, *_end(i)] for i in lenses]
         self._columns = [ns.Float(c) for c in np.array(rows, np.float32).T]
 
-    def directions(self, frame, column, row):
+    def compute_directions(self, frame, column, row):
         """Directions (3 Floats, OpenGL camera frame, of any length) of pixels ``column``, ``row`` of ``frame``,
         UInt32."""
         ns = self.ns
@@ -99,7 +99,7 @@ def _end(lens: Intrinsics) -> tuple[float, float]:
     """Image radius and angle where a fisheye ends."""
     if not lens.fisheye:
         return 0.0, 0.0
-    angle, radius = fisheye_limit(lens)
+    angle, radius = find_fisheye_limit(lens)
     return radius, angle
 
 
@@ -173,7 +173,7 @@ class PixelBank:
         self._colors = self._color_type(table.ravel())
 
     def _store_depth(self, views: list[PhotoView], used: list[int]) -> None:
-        self._depth, self.depth_everywhere = None, False
+        self._depth, self.has_full_depth = None, False
         self.has_depth = any(v.depth is not None for v in views)
         if not self.has_depth:
             return
@@ -185,14 +185,14 @@ class PixelBank:
                 # What is known must not round to unknown.
                 table[at : at + n] = np.where(depth > 0, np.clip(np.round(depth / unit[k]), 1, _DEPTH_STEPS), 0)
             at += n
-        self.depth_everywhere = np.count_nonzero(table) >= 0.999 * self.size
+        self.has_full_depth = np.count_nonzero(table) >= 0.999 * self.size
         self._depth, self._depth_unit = self.ns.UInt8(table.view(np.uint8)), self.ns.Float(unit)
 
-    def batch(self, index) -> PixelBatch:
+    def gather_batch(self, index) -> PixelBatch:
         """Rays and colours of the pixels at ``index`` (UInt32)."""
         ns = self.ns
         frame, column, row = self._locate(index)
-        x, y, z = self._lenses.directions(frame, column, row)
+        x, y, z = self._lenses.compute_directions(frame, column, row)
         m = [dr.gather(ns.Float, self._pose, frame * 12 + k) for k in range(12)]
         d = dr.normalize(ns.Array3f(*[m[4 * r] * x + m[4 * r + 1] * y + m[4 * r + 2] * z for r in range(3)]))
         o = ns.Array3f(m[3], m[7], m[11])
@@ -221,11 +221,11 @@ class PixelBank:
         row = offset // width
         return frame, offset - row * width, row
 
-    def surface_points(self, chunk: int = 2**20):
+    def iter_surface_points(self, chunk: int = 2**20):
         """The points (Array3f, world) that the pixels with depth see, ``chunk`` pixels at a time."""
         for first in range(0, self.size, chunk):
             index = dr.arange(self.ns.UInt32, min(chunk, self.size - first)) + dr.opaque(self.ns.UInt32, first)
-            pixels = self.batch(index)
+            pixels = self.gather_batch(index)
             if pixels.depth is not None:
                 known: Any = dr.compress(pixels.depth > 0)
                 yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, known)

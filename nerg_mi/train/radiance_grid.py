@@ -8,11 +8,11 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cell_corner, contracted_cascades, grown
-from nerg_mi.maths.arrays import aligned
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cell_corner, cascades_from_contracted, dilate
+from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f
-from nerg_mi.photos.cameras import PosedCamera, view_tangents
+from nerg_mi.photos.cameras import PosedCamera, find_view_tangents
 
 # ---- Where density may be while a field trains, and the bound that is stored when it is done ----
 #
@@ -47,7 +47,7 @@ class DensityGrid:
         growth: float = 0.0,
     ):
         self.ns, self.box, self.resolution, self.step, self.threshold = ns, box, resolution, step, threshold
-        self.growth = growth if box.contracted else 0.0
+        self.growth = growth if box.is_contracted else 0.0
         cells = resolution**3
         self.index = dr.arange(ns.UInt32, cells)
         self._allow(self._seen(cameras, min_views, near))
@@ -65,21 +65,21 @@ class DensityGrid:
 
     def _point(self, index, rng: np.random.Generator, stratum=0, parts: int = 1):
         """A random world point in each cell, in part ``stratum`` of ``parts`` an axis."""
-        jitter = self.ns.Array3f(*[self.ns.Float(aligned(rng.random(dr.width(index), np.float32))) for _ in range(3)])
+        jitter = self.ns.Array3f(*[self.ns.Float(copy_aligned(rng.random(dr.width(index), np.float32))) for _ in range(3)])
         return self._to_world(self._corner(index) + (stratum + jitter) / (parts * self.resolution))
 
     def _to_world(self, u):
         return self.box.from_unit(u)
 
-    def step_at(self, p):
+    def step_length_at(self, p):
         """Length of a training step at ``p`` (Array3f, world), about: rays start anywhere near the centre."""
         if not self.growth:
             return self.step
         return dr.maximum(self.growth * dr.norm(p - self.ns.Array3f(*self.box.center)), self.step)
 
-    def cell_at(self, p):
+    def cell_size_at(self, p):
         """Edge of the cell that holds ``p`` (Array3f, world), in the field's units; across the line to the centre."""
-        inner = 2 if self.box.contracted else 1
+        inner = 2 if self.box.is_contracted else 1
         return self.box.distance_scale(p) * (inner * self.box.side / self.resolution)
 
     def _seen(self, cameras: list[PosedCamera], min_views: int, near: float):
@@ -89,7 +89,7 @@ class DensityGrid:
         """
         Float, UInt32 = self.ns.Float, self.ns.UInt32
         p = self._to_world(self._corner(self.index) + 0.5 / self.resolution)
-        cell = 0 if self.box.contracted else self.box.side / self.resolution
+        cell = 0 if self.box.is_contracted else self.box.side / self.resolution
         half = ((np.subtract(self.box.upper, self.box.lower) + cell) / 2).tolist()
         inside = dr.all(dr.abs(p - self.ns.Array3f(*self.box.center)) < self.ns.Array3f(*half))
         count = dr.zeros(UInt32, self.resolution**3)
@@ -97,7 +97,7 @@ class DensityGrid:
         for camera in cameras:
             rows = [Float(v) for v in camera.to_world[:3, :3].T.ravel()]
             origin = [Float(v) for v in camera.center]
-            edge = [Float(v) for v in view_tangents(camera.intrinsics)]
+            edge = [Float(v) for v in find_view_tangents(camera.intrinsics)]
             # As literals the pose would compile one kernel a camera.
             dr.make_opaque(rows, origin, edge)
             d = [p[k] - origin[k] for k in range(3)]
@@ -117,21 +117,21 @@ class DensityGrid:
         """
         found = self._holding(points)
         self.always = self.seen & self.ns.Bool(found.ravel())
-        self._allow(self.seen & self.ns.Bool(grown(found).ravel()))
+        self._allow(self.seen & self.ns.Bool(dilate(found).ravel()))
 
     def _holding(self, points) -> np.ndarray:
         """Cells (R, R, R) that hold one of the points (Array3f, world) of an iterable."""
         r = self.resolution
         found = dr.zeros(self.ns.UInt8, r**3)
         for p in points:
-            self.mark(found, p)
+            self.mark_cells(found, p)
         return found.numpy().reshape(r, r, r) > 0
 
-    def mark(self, found, p) -> None:
+    def mark_cells(self, cells, p) -> None:
         """Set ``found`` (UInt8 a cell) where it holds one of the points ``p`` (Array3f, world)."""
         if dr.width(p) > 0:
-            dr.scatter(found, self.ns.UInt8(1), self._cell(p))
-            dr.eval(found)
+            dr.scatter(cells, self.ns.UInt8(1), self._cell(p))
+            dr.eval(cells)
 
     def _allow(self, cells) -> None:
         """Restrict samples to ``cells`` (mask), all of which count as occupied until they are looked at."""
@@ -142,11 +142,11 @@ class DensityGrid:
         self.bits = dr.select(cells, self.ns.UInt8(1), 0)
         dr.eval(self.seen, self.value, self.bits)
 
-    def occupied(self, p, active):
+    def is_occupied(self, p, active):
         """Mask of the points ``p`` (Array3f, world) in cells that may hold density."""
-        return self.within(self.bits, p, active)
+        return self.is_within(self.bits, p, active)
 
-    def within(self, bits, p, active):
+    def is_within(self, bits, p, active):
         """Mask of the points ``p`` (Array3f, world) in cells of ``bits`` (UInt8 a cell)."""
         return active & (dr.gather(self.ns.UInt8, bits, self._cell(p), active) > 0)
 
@@ -162,12 +162,12 @@ class DensityGrid:
 
         ``density``: σ at world points (Array3f, mask), without gradient.
         """
-        index = self.part(self.turn, 1 if everywhere else _PARTS)
+        index = self.select_cells(self.turn, 1 if everywhere else _PARTS)
         self.turn += not everywhere
         if dr.width(index) > 0:
             # Beyond some optical depth more says nothing, and would drown the mean.
             p = self._point(index, rng)
-            value = dr.minimum(density(p, True) * self.step_at(p), 10)
+            value = dr.minimum(density(p, True) * self.step_length_at(p), 10)
             if not everywhere:
                 value = dr.maximum(dr.gather(self.ns.Float, self.value, index) * _DECAY, value)
             dr.scatter(self.value, value, index, mode=dr.ReduceMode.Permute)
@@ -176,28 +176,28 @@ class DensityGrid:
         bound = dr.minimum(self.threshold, 0.5 * mean)
         self.bits = dr.select((self.seen & (self.value > bound)) | self.always, self.ns.UInt8(1), 0)
         dr.eval(self.bits)
-        self.off = dr.compress(self.seen & (self.bits == 0))
+        self.unsampled = dr.compress(self.seen & (self.bits == 0))
 
     def restore(self, value, bits, seen, always, turn: int) -> None:
         """Go on from a stored state (arrays of the attributes of these names)."""
         ns = self.ns
         self.value, self.bits, self.seen, self.always = ns.Float(value), ns.UInt8(bits), ns.Bool(seen), ns.Bool(always)
         self.seen_count, self.turn = int(seen.sum()), turn
-        self.off = dr.compress(self.seen & (self.bits == 0))
+        self.unsampled = dr.compress(self.seen & (self.bits == 0))
 
     def empty_points(self, count: int, rng: np.random.Generator):
         """Random points (Array3f, world) in cells that cameras see and that are not sampled; None without any."""
-        if dr.width(self.off) == 0:
+        if dr.width(self.unsampled) == 0:
             return None
-        pick = self.ns.UInt32(aligned(rng.integers(0, dr.width(self.off), count, np.uint32), np.uint32))
-        return self._point(dr.gather(self.ns.UInt32, self.off, pick), rng)
+        pick = self.ns.UInt32(copy_aligned(rng.integers(0, dr.width(self.unsampled), count, np.uint32), np.uint32))
+        return self._point(dr.gather(self.ns.UInt32, self.unsampled, pick), rng)
 
     @property
-    def fraction(self) -> float:
+    def occupied_fraction(self) -> float:
         """Share of all cells that samples are taken in."""
         return float(dr.sum(self.ns.Float(self.bits))[0]) / self.resolution**3
 
-    def bound(self, density, rng: np.random.Generator, lit, probes: int = 3) -> OccupancyGrid | CascadeGrid:
+    def extract_occupancy(self, density, rng: np.random.Generator, contributing_points, probes: int = 3) -> OccupancyGrid | CascadeGrid:
         """A grid for rendering, of cells that may hold density and that matter to the training rays.
 
         ``probes``**3 jittered points a cell are looked at; a cell with one above the threshold stays on, and so do all
@@ -211,43 +211,43 @@ class DensityGrid:
             index = dr.compress(self.seen & (found == 0))
             if dr.width(index) == 0:
                 break
-            self.probe(found, index, density, rng, (k % probes, k // probes % probes, k // probes**2), probes)
-        dense = self.grown(found)
+            self.mark_dense_cells(found, index, density, rng, (k % probes, k // probes % probes, k // probes**2), probes)
+        dense = self.dilate_cells(found)
         bits = self.ns.UInt8(dense.ravel())
-        shown = self._holding(lit(density, lambda p, active: self.within(bits, p, active)))
-        bits = dense & grown(shown)
-        if self.box.reach is not None:
-            return contracted_cascades(bits, self.box.reach, self.ns, self.limit)
-        return OccupancyGrid(bits, self.ns, self.limit)
+        shown = self._holding(contributing_points(density, lambda p, active: self.is_within(bits, p, active)))
+        bits = dense & dilate(shown)
+        if self.box.outer_scale is not None:
+            return cascades_from_contracted(bits, self.box.outer_scale, self.ns, self.density_threshold)
+        return OccupancyGrid(bits, self.ns, self.density_threshold)
 
     @property
-    def limit(self) -> float:
+    def density_threshold(self) -> float:
         """Density, in 1/unit, that absorbs ``threshold`` in one training step; of a contracted box, near its centre."""
         return self.threshold / self.step
 
-    def probe(self, found, index, density, rng: np.random.Generator, stratum: tuple, parts: int) -> None:
+    def mark_dense_cells(self, cells, index, density, rng: np.random.Generator, stratum: tuple, parts: int) -> None:
         """Set ``found`` (UInt8 a cell) for those of the cells ``index`` that are denser than ``limit`` at a random
         point of their ``stratum`` (three numbers) of ``parts`` an axis."""
         corner = self.ns.Array3f(*stratum)
         dr.make_opaque(corner)
         p = self._point(index, rng, corner, parts)
-        limit = self.threshold / self.step_at(p) if self.growth else self.limit
+        limit = self.threshold / self.step_length_at(p) if self.growth else self.density_threshold
         hit: Any = dr.compress(density(p, True) > limit)
         if dr.width(hit) > 0:
-            dr.scatter(found, self.ns.UInt8(1), dr.gather(self.ns.UInt32, index, hit))
-            dr.eval(found)
+            dr.scatter(cells, self.ns.UInt8(1), dr.gather(self.ns.UInt32, index, hit))
+            dr.eval(cells)
 
-    def grown(self, found) -> np.ndarray:
+    def dilate_cells(self, cells) -> np.ndarray:
         """Cells (R, R, R) of ``found`` (UInt8 a cell) and all that touch one of them, as far as they may be sampled."""
         shape = (self.resolution,) * 3
-        return grown(found.numpy().reshape(shape) > 0) & self.seen.numpy().reshape(shape)
+        return dilate(cells.numpy().reshape(shape) > 0) & self.seen.numpy().reshape(shape)
 
-    def keep(self, cells: np.ndarray) -> None:
+    def keep_sampled(self, cells: np.ndarray) -> None:
         """From now on sample ``cells`` (R, R, R) whatever is found in them."""
         self.always = self.always | self.ns.Bool(cells.ravel())
         dr.eval(self.always)
 
-    def part(self, turn: int, parts: int = _PARTS):
+    def select_cells(self, turn: int, parts: int = _PARTS):
         """Every ``parts``-th cell (UInt32) that may be sampled, from cell ``turn`` modulo ``parts`` on."""
         index = dr.arange(self.ns.UInt32, self.resolution**3 // parts) * parts + dr.opaque(self.ns.UInt32, turn % parts)
         seen: Any = dr.compress(dr.gather(self.ns.Bool, self.seen, index))
@@ -268,51 +268,51 @@ _STRATA = ((0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1))
 _LOOKS = 32  # Groups of training rays that decide which cells matter
 
 
-class Settling:
+class OccupancyExtraction:
     """Which cells the `DensityGrid.bound` of this moment would hold, nearly: by fewer points a cell and fewer rays.
 
     ``at``: pieces done; ``found``: cells (UInt8 each) with density; ``shown``: cells that absorb some light.
     """
 
-    PROBES = len(_STRATA) * _PARTS
-    PIECES = PROBES + _LOOKS
+    PROBE_PIECES = len(_STRATA) * _PARTS
+    NUM_PIECES = PROBE_PIECES + _LOOKS
 
     def __init__(self, grid: DensityGrid):
-        self.grid, self.at = grid, 0
-        self.found, self.shown = (dr.zeros(grid.ns.UInt8, grid.resolution**3) for _ in range(2))
-        self.dense = None
-        dr.eval(self.found, self.shown)
+        self.grid, self.pieces_done = grid, 0
+        self.dense_cells, self.contributing_cells = (dr.zeros(grid.ns.UInt8, grid.resolution**3) for _ in range(2))
+        self.dilated_dense = None
+        dr.eval(self.dense_cells, self.contributing_cells)
 
     @property
-    def done(self) -> bool:
-        return self.at >= self.PIECES
+    def is_done(self) -> bool:
+        return self.pieces_done >= self.NUM_PIECES
 
-    def restore(self, at: int, found: np.ndarray, shown: np.ndarray) -> None:
+    def restore(self, pieces_done: int, dense_cells: np.ndarray, contributing_cells: np.ndarray) -> None:
         """Go on from a stored state."""
         UInt8 = self.grid.ns.UInt8
-        self.at, self.found, self.shown, self.dense = at, UInt8(found), UInt8(shown), None
+        self.pieces_done, self.dense_cells, self.contributing_cells, self.dilated_dense = pieces_done, UInt8(dense_cells), UInt8(contributing_cells), None
 
-    def advance(self, density, lit, seed: int) -> None:
+    def advance(self, density, contributing_points, seed: int) -> None:
         """The next piece; with the last one the grid is told.
 
         ``density``: of the field, as `DensityGrid.bound` has it; ``lit(density, occupied, rng)``: points (Array3f,
         world) of samples that some training rays see, or None; ``seed``: of the points and rays.
         """
-        if self.done:
+        if self.is_done:
             return
-        grid, rng = self.grid, np.random.default_rng((seed, self.at))
-        if self.at < self.PROBES:
-            part = grid.part(self.at)
-            open_: Any = dr.compress(dr.gather(grid.ns.UInt8, self.found, part) == 0)
+        grid, rng = self.grid, np.random.default_rng((seed, self.pieces_done))
+        if self.pieces_done < self.PROBE_PIECES:
+            part = grid.select_cells(self.pieces_done)
+            open_: Any = dr.compress(dr.gather(grid.ns.UInt8, self.dense_cells, part) == 0)
             if dr.width(open_) > 0:
                 index = dr.gather(grid.ns.UInt32, part, open_)
-                grid.probe(self.found, index, density, rng, _STRATA[self.at // _PARTS], 2)
+                grid.mark_dense_cells(self.dense_cells, index, density, rng, _STRATA[self.pieces_done // _PARTS], 2)
         else:
-            if self.dense is None:
-                self.dense = grid.ns.UInt8(grid.grown(self.found).ravel())
-            p = lit(density, lambda p, active: grid.within(self.dense, p, active), rng)
+            if self.dilated_dense is None:
+                self.dilated_dense = grid.ns.UInt8(grid.dilate_cells(self.dense_cells).ravel())
+            p = contributing_points(density, lambda p, active: grid.is_within(self.dilated_dense, p, active), rng)
             if p is not None:
-                grid.mark(self.shown, p)
-        self.at += 1
-        if self.done:
-            grid.keep(grid.grown(self.shown) & grid.grown(self.found))
+                grid.mark_cells(self.contributing_cells, p)
+        self.pieces_done += 1
+        if self.is_done:
+            grid.keep_sampled(grid.dilate_cells(self.contributing_cells) & grid.dilate_cells(self.dense_cells))

@@ -7,27 +7,27 @@ from typing import Any, cast
 import drjit as dr
 import numpy as np
 
-from nerg_mi.fields.encoding import encode_direction, encoding_of
+from nerg_mi.fields.encoding import encode_direction, encoding_from_parameters
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.radiance import (
     RadianceConfig,
     density_from_log,
     mean_features,
-    network_color,
-    network_inputs,
+    decode_color,
+    color_network_inputs,
     point_features,
 )
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Float, UInt32
-from nerg_mi.transport.quadrature import mean_depth_share
+from nerg_mi.transport.quadrature import mean_depth_fraction
 
 from .radiance_data import PixelBatch
-from .radiance_sampling import RaySamples, ray_sum, weights
+from .radiance_sampling import RaySamples, sum_along_rays, compute_weights
 
 # ---- What a radiance field is fitted to: the colours of rays and, where it is known, their depth ----
 
 
-def huber(error, delta: float):
+def huber_loss(error, delta: float):
     """Huber's loss, quadratic below ``delta`` and linear above, with unit curvature at 0."""
     size = dr.abs(error)
     return dr.select(size < delta, 0.5 * size * size, delta * (size - 0.5 * delta))
@@ -44,7 +44,7 @@ def color_loss(color, opacity, pixels: PixelBatch, background, delta: float):
         target = pixels.rgb[k]
         if pixels.alpha is not None:
             target = dr.lerp(background[k], target, pixels.alpha)
-        loss += huber(color[k] + (1 - opacity) * background[k] - target, delta)
+        loss += huber_loss(color[k] + (1 - opacity) * background[k] - target, delta)
     return loss / 3
 
 
@@ -61,15 +61,15 @@ def depth_loss(weight: Float, tau: Float, samples: RaySamples, depth: Float, mar
     if not isinstance(margin, float):
         margin = dr.gather(type(weight), margin, s.ray, s.active)
     near = (samples.t < truth + margin) & (samples.t + samples.length > truth - margin)
-    caught = ray_sum(dr.select(near, weight, 0), s)
+    caught = sum_along_rays(dr.select(near, weight, 0), s)
     # Only absorption near the surface is moved: a floater is to vanish, not to drag the surface along.
-    offset = samples.t + samples.length * mean_depth_share(tau) - truth
-    shift = ray_sum(dr.select(near, weight * offset, 0), s)
+    offset = samples.t + samples.length * mean_depth_fraction(tau) - truth
+    shift = sum_along_rays(dr.select(near, weight * offset, 0), s)
     loss = (1 - caught) + dr.minimum(dr.abs(shift) / scale, 10)
     return dr.select(depth > 0, loss, 0)
 
 
-def feature_decay(features):
+def feature_decay_loss(features):
     """Mean square (Float) of a grid's ``features``.
 
     What many rays see outweighs it, as each feature has one share in millions. Features that few rays have shaped, or
@@ -84,7 +84,7 @@ def distortion_loss(weight, samples: RaySamples, scale: float):
     are in order). The samples' places have no derivative. Samples that stand for others count as one: the second term
     is then too large by 1/p of each."""
     length = samples.length / scale
-    return ray_sum(
+    return sum_along_rays(
         dr.custom(_Distortion, weight, samples.t / scale + 0.5 * length, length, samples.segments), samples.segments
     )
 
@@ -128,8 +128,8 @@ def composite(sigma: Float, parts: list, samples: RaySamples) -> tuple[Float, Fl
     """
     s, thinned = samples.segments, samples.thinned
     tau = dr.select(s.active, sigma * samples.length, 0)
-    weight = weights(tau, s, thinned)
-    sums, opacity = [ray_sum(weight * x, s) for x in parts], ray_sum(weight, s)
+    weight = compute_weights(tau, s, thinned)
+    sums, opacity = [sum_along_rays(weight * x, s) for x in parts], sum_along_rays(weight, s)
     if thinned is not None:
         scale = dr.detach(thinned.opacity / dr.maximum(opacity, 1e-6))
         sums = [cast("Float", dr.replace_grad(x * scale, x)) for x in sums]
@@ -160,7 +160,7 @@ def unstack(x, ns) -> list:
     ]
 
 
-def density_summand(config: RadianceConfig, box: AnyBox, parameters: dict, p, d, ns, features: list | None = None):
+def evaluate_samples(config: RadianceConfig, box: AnyBox, parameters: dict, p, d, ns, features: list | None = None):
     """Density (1/unit) at world points ``p`` seen along ``d``, and what a ray composites of them (list of Floats):
     colour (3 in 0..1), or of a deferred field the features that `ray_color` makes colour of.
 
@@ -169,12 +169,12 @@ def density_summand(config: RadianceConfig, box: AnyBox, parameters: dict, p, d,
     ``p``, where that has been looked up already.
     """
     h = unstack(_net(parameters, "density_net").tensor(_features(config, box, parameters, p, ns, features)), ns)
-    sigma = box.density_along(density_from_log(h[0], config.density_scale), p)
+    sigma = box.density_from_encoded(density_from_log(h[0], config.density_scale), p)
     features = point_features(h[1:], config.deferred)
     return sigma, features if config.deferred else _color(config, parameters, features, d, ns)
 
 
-def ray_color(config: RadianceConfig, parameters: dict, sums: list, opacity, d, ns) -> list:
+def evaluate_ray_color(config: RadianceConfig, parameters: dict, sums: list, opacity, d, ns) -> list:
     """Colour (3 Floats, times opacity) of rays along ``d`` that composited ``sums`` of what `density_summand` returns,
     with this ``opacity``."""
     if not config.deferred:
@@ -183,22 +183,22 @@ def ray_color(config: RadianceConfig, parameters: dict, sums: list, opacity, d, 
 
 
 def _color(config: RadianceConfig, parameters: dict, features: list, d, ns) -> list:
-    given = network_inputs(features, config.deferred)
+    given = color_network_inputs(features, config.deferred)
     c = _net(parameters, "color_net").tensor(stack(encode_direction(d, config.sh_degree) + given, ns))
-    return network_color(unstack(c, ns), given, config.deferred)
+    return decode_color(unstack(c, ns), given, config.deferred)
 
 
-def density(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns):
+def evaluate_density(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns):
     """Density (1/unit) alone, at world points ``p`` in ``box``; see `density_summand`."""
     head = _head(parameters)
     log_density = head.tensor(_features(config, box, parameters, p, ns)).array
-    return box.density_along(density_from_log(log_density, config.density_scale), p)
+    return box.density_from_encoded(density_from_log(log_density, config.density_scale), p)
 
 
-def density_of(config: RadianceConfig, box: AnyBox, parameters: dict, p, features: list):
+def evaluate_density_from_features(config: RadianceConfig, box: AnyBox, parameters: dict, p, features: list):
     """Density (1/unit) at ``p`` where the grid returns ``features`` (list of Floats); no weight gradients, one
     kernel."""
-    return box.density_along(density_from_log(_head(parameters)(features)[0], config.density_scale), p)
+    return box.density_from_encoded(density_from_log(_head(parameters)(features)[0], config.density_scale), p)
 
 
 def _head(parameters: dict) -> MLP:
@@ -207,7 +207,7 @@ def _head(parameters: dict) -> MLP:
 
 
 def _features(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns, known: list | None = None):
-    rows = encoding_of(config.grid, parameters, mode=dr.ReduceMode.Expand)(box.to_unit(p))
+    rows = encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand)(box.to_unit(p))
     return stack(rows if known is None else [dr.replace_grad(a, b) for a, b in zip(known, rows)], ns)
 
 
@@ -224,7 +224,7 @@ def _net(parameters: dict, name: str) -> MLP:
 # (Rematas et al. 2022, Urban Radiance Fields, sec. 4.1, there decoded from a latent code). Over the photos their mean
 # is no change at all, so that the scene has the colours of the average photo.
 
-PHOTOS = "photos"  # Name of the optimiser's parameter
+PHOTO_PARAMETER = "photos"  # Name of the optimiser's parameter
 # The optimiser moves a number by up to its learning rate a step, which is much for a colour.
 _UNIT = 0.01
 _GREY = 0.5
@@ -236,11 +236,11 @@ class PhotoColors:
     def __init__(self, ns, frames: int):
         self.ns, self.frames = ns, frames
 
-    def start(self) -> Float:
+    def init_parameter(self) -> Float:
         """The parameter where no photo changes anything."""
         return dr.zeros(self.ns.Float, 12 * self.frames)
 
-    def changes(self, parameter: Float) -> Float:
+    def compute_changes(self, parameter: Float) -> Float:
         """The entries of [A - 1 | b], photo by photo and row by row."""
         ns, each = self.ns, dr.arange(self.ns.UInt32, 12 * self.frames) % 12
         mean = dr.zeros(ns.Float, 12)
@@ -252,19 +252,19 @@ class PhotoColors:
         rows = [dr.gather(self.ns.Array4f, changes, 3 * frame + k) for k in range(3)]
         return [c + r[0] * color[0] + r[1] * color[1] + r[2] * color[2] + r[3] * opacity for c, r in zip(color, rows)]
 
-    def decay(self, changes: Float) -> Float:
+    def decay_loss(self, changes: Float) -> Float:
         """Mean over the photos of the squares of their ``changes``, summed."""
         return dr.sum(dr.square(changes)) / self.frames
 
-    def stops(self, parameter: Float) -> float:
+    def compute_exposure_spread(self, parameter: Float) -> float:
         """How far the photos' exposures are apart: the standard deviation of what becomes of a middle grey, in f-stops.
 
         A stop, twice the light, multiplies sRGB values of middle greys by about 2^(1/2.2).
         """
-        m = self.matrices(parameter)
+        m = self.compute_matrices(parameter)
         grey = (m[..., :3].sum(axis=-1) * _GREY + m[..., 3]).mean(axis=-1) / _GREY
         return float(2.2 * np.std(np.log2(np.maximum(grey, 1e-3))))
 
-    def matrices(self, parameter: Float) -> np.ndarray:
+    def compute_matrices(self, parameter: Float) -> np.ndarray:
         """[A | b] of every photo, (frames, 3, 4)."""
-        return np.eye(3, 4) + self.changes(parameter).numpy().reshape(-1, 3, 4)
+        return np.eye(3, 4) + self.compute_changes(parameter).numpy().reshape(-1, 3, 4)

@@ -16,25 +16,25 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
-from nerg_mi.figures.style import provenance
+from nerg_mi.figures.style import make_provenance
 from nerg_mi.files.images import write_png
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
-from nerg_mi.maths.color import mean_score, psnr, psnr_of_fitted_half
+from nerg_mi.maths.color import mean_ignoring_nan, psnr, color_corrected_psnr
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.dataset import Dataset
 from nerg_mi.photos.images import PhotoView
 
-from .radiance_losses import PHOTOS
+from .radiance_losses import PHOTO_PARAMETER
 from .radiance_settings import RadianceSettings
 from .radiance_trainer import Preview, RadianceTrainer
-from .trainer import StepClock, kept_unless, require_same, restoring
+from .trainer import StepClock, saving_on_failure, check_same_run, reading_run_state
 
 # ---- How much of what photos show lies beyond the part of a place that its field resolves best ----
 
 
-def share_beyond(views: list[PhotoView], render: Callable[[PhotoView], Preview], core: Box, every: int = 1) -> float:
+def compute_outside_fraction(views: list[PhotoView], render: Callable[[PhotoView], Preview], core: Box, every: int = 1) -> float:
     """Share of the pixels of ``views`` (every ``every``-th, from ``every // 2`` on) that show what lies outside of
     ``core``, or nothing, by the depths that ``render`` finds for them."""
     outside = []
@@ -53,35 +53,35 @@ def share_beyond(views: list[PhotoView], render: Callable[[PhotoView], Preview],
 @dataclass(frozen=True)
 class HeldOutError:
     """In dB, one of each view: ``psnr`` before black; ``fitted`` of right halves, their colours fitted on left
-    halves (`psnr_of_fitted_half`). NaN where no pixel counts, of all views in their means."""
+    halves (`color_corrected_psnr`). NaN where no pixel counts, of all views in their means."""
 
     psnr: list[float]
-    fitted: list[float]
+    psnr_fitted: list[float]
 
     @property
     def mean(self) -> float:
-        return mean_score(self.psnr)
+        return mean_ignoring_nan(self.psnr)
 
     @property
     def mean_fitted(self) -> float:
-        return mean_score(self.fitted)
+        return mean_ignoring_nan(self.psnr_fitted)
 
 
-def measure(
+def evaluate_views(
     trainer: RadianceTrainer, views: list[PhotoView], every: int = 1, field: RadianceField | None = None
 ) -> HeldOutError:
     """The error on ``views``, on every ``every``-th pixel of those that their masks leave in.
 
     Of ``field``, by its own occupancy; without one, of the trainer's averaged weights so far.
     """
-    field, part = field or trainer.field(bound=False), (slice(every // 2, None, every),) * 2
+    field, part = field or trainer.make_field(with_occupancy=False), (slice(every // 2, None, every),) * 2
     errors = HeldOutError([], [])
     for view in views:
-        color, truth = trainer.render(view, every, field).color, view.over(0)[part]
+        color, truth = trainer.render(view, every, field).color, view.composite_over(0)[part]
         mask = None if view.mask is None else view.mask[part]
         alpha = view.color[part][..., 3] if view.has_alpha else None
         errors.psnr.append(psnr(color, truth, mask))
-        errors.fitted.append(psnr_of_fitted_half(color, truth, alpha, mask))
+        errors.psnr_fitted.append(color_corrected_psnr(color, truth, alpha, mask))
     return errors
 
 
@@ -91,7 +91,7 @@ _FALL = 1.0  # Looks at a few views differ by some tenths of a dB from one anoth
 _FEW_STEPS = 500  # Fields of photos still gain whole dB with every doubling of their steps below this
 
 
-def complaints(history: list[dict], steps: int, stride: int, minutes: float | None, seconds: float = 0.0) -> list[str]:
+def find_problems(history: list[dict], steps: int, stride: int, minutes: float | None, seconds: float = 0.0) -> list[str]:
     """One sentence for each thing that makes the result worse than it might be; none for a sound run.
 
     ``history``: looks at the watched views in order, each with ``steps`` and ``psnr`` in dB, the last being that of the
@@ -131,7 +131,7 @@ def warm_up(trainer) -> None:
     starts.
     """
     with _forgotten(trainer):
-        every, grid = trainer.settings.grid_every, trainer.grid
+        every, grid = trainer.settings.grid_interval, trainer.grid
         # The kernels of the average differ the first two times; a step whose number is divisible looks over the grid.
         for before in (3, 7, every):
             trainer.steps = before
@@ -141,27 +141,27 @@ def warm_up(trainer) -> None:
         for before in (every, every + 1):
             grid.value = dr.select((grid.index & 1) == 0, grid.value, 0)
             dr.eval(grid.value)
-            grid.off = dr.opaque(type(grid.off), 0, 64)
+            grid.unsampled = dr.opaque(type(grid.unsampled), 0, 64)
             trainer.steps = before
             trainer.step()
-        settling = trainer.settling
-        for at in (0, 1, settling.PROBES, settling.PIECES - 1):
+        settling = trainer.extraction
+        for at in (0, 1, settling.PROBE_PIECES, settling.NUM_PIECES - 1):
             # As if density had been found everywhere: where there is none yet no ray would meet any.
-            settling.dense = dr.select(grid.seen, type(grid.bits)(1), 0)
-            settling.at = at
-            trainer.update_live()
-            trainer.settle()
+            settling.dilated_dense = dr.select(grid.seen, type(grid.bits)(1), 0)
+            settling.pieces_done = at
+            trainer.update_current_field()
+            trainer.extract_occupancy_piece()
         dr.sync_thread()
     trainer.start()
 
 
 @contextmanager
 def _forgotten(trainer):
-    parts = (trainer, trainer.grid, trainer.settling, trainer.optimiser)
+    parts = (trainer, trainer.grid, trainer.extraction, trainer.optimiser)
     # Arrays are scattered to in place: a second name would change with the first.
     before = [{k: type(v)(v) if dr.is_array_v(v) else v for k, v in vars(part).items()} for part in parts]
     state, averaged, rng = dict(trainer.optimiser.state), dict(trainer.averaged), copy.deepcopy(trainer.rng)
-    live = {k: type(v)(v) for k, v in trainer.live.parameters().items()}
+    live = {k: type(v)(v) for k, v in trainer.current_field.parameters().items()}
     try:
         yield
     finally:
@@ -174,7 +174,7 @@ def _forgotten(trainer):
             dr.enable_grad(value)
             state[name] = (value, *rest)
         trainer.optimiser.state = state
-        trainer.live.set_parameters(live)
+        trainer.current_field.set_parameters(live)
 
 
 # ---- A whole radiance training: from a data set to a checkpoint, with its held-out error on the way ----
@@ -183,7 +183,7 @@ KIND = "radiance run"
 # Shares of the run at which the held-out error is looked at.
 _LOOKS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
 _LOOK_VIEWS = 4
-LOOK_GAP = 50  # Steps at least between two looks, one of which takes as long as several
+MIN_EVALUATION_INTERVAL = 50  # Steps at least between two looks, one of which takes as long as several
 # Samples at most of a look and of a preview, and of the error at the end: fog has hundreds on each ray.
 _LOOK_SAMPLES, _FINAL_SAMPLES = 2**20, 2**24
 
@@ -193,7 +193,7 @@ class RadianceProgress:
     """State of a run. ``done``: share 0..1; ``seconds``: so far; ``psnr``: the last held-out error in dB, or None;
     ``rays``, ``samples``: of the last step."""
 
-    done: float
+    fraction: float
     steps: int
     seconds: float
     rays: int
@@ -250,7 +250,7 @@ def train_field(
     with Interruption() as stop:
         while trainer.progress < 1 and not interrupted:
             trainer.step()
-            if looks and trainer.progress >= looks[0] and trainer.steps >= looked + LOOK_GAP:
+            if looks and trainer.progress >= looks[0] and trainer.steps >= looked + MIN_EVALUATION_INTERVAL:
                 looks, looked = [x for x in looks if x > trainer.progress], trainer.steps
                 _look(trainer, watched, history)
                 last = history[-1]["psnr"] if history else None
@@ -271,27 +271,27 @@ def train_field(
                 # Only here, between two steps: elsewhere there would be weights and random numbers of different steps.
                 interrupted = True
         if preview is not None and watched:
-            with kept_unless(state, keep, done=False):
+            with saving_on_failure(state, keep, is_done=False):
                 write_preview(trainer, watched[0], preview)
-        interrupted = interrupted or stop.asked  # One that came while the last preview was made
+        interrupted = interrupted or stop.is_requested  # One that came while the last preview was made
     seconds = trainer.seconds
     if interrupted:
         keep()
-    with kept_unless(state, keep, done=write is not None and not interrupted):
+    with saving_on_failure(state, keep, is_done=write is not None and not interrupted):
         field, provenance = _result(trainer, dataset, watched, history, seconds, interrupted)
         if write is not None:
             write(field, provenance)
     return field, provenance
 
 
-def save_run(trainer: RadianceTrainer, path: Path, about: dict, history: list) -> None:
+def save_run(trainer: RadianceTrainer, path: Path, identity: dict, history: list) -> None:
     """Write the state of ``trainer`` atomically. ``about``: what the run must agree on to be resumed (JSON);
     ``history``: of its held-out error so far."""
-    tensors, metadata = trainer.state()
-    write_checkpoint(path, KIND, tensors, {"about": about, "history": history, **metadata})
+    tensors, metadata = trainer.get_state()
+    write_checkpoint(path, KIND, tensors, {"about": identity, "history": history, **metadata})
 
 
-def load_run(trainer: RadianceTrainer, path: Path | None, about: dict) -> list:
+def load_run(trainer: RadianceTrainer, path: Path | None, identity: dict) -> list:
     """Set ``trainer`` to the state in ``path``; returns the history.
 
     Raises `NergError` unless the state is one of a run with the same ``about``.
@@ -299,8 +299,8 @@ def load_run(trainer: RadianceTrainer, path: Path | None, about: dict) -> list:
     if path is None:
         raise NergError("there is nothing to resume: name the file that holds the state of the run")
     tensors, meta = read_checkpoint(path, KIND)
-    with restoring(path):
-        require_same(path, meta["about"], about)
+    with reading_run_state(path):
+        check_same_run(path, meta["about"], identity)
         trainer.restore(tensors, meta)
         return list(meta["history"])
 
@@ -314,7 +314,7 @@ def _result(
     interrupted: bool,
 ) -> tuple[RadianceField, dict]:
     """The field that the run has come to, and its provenance with the error on all held-out views."""
-    field = trainer.field()
+    field = trainer.make_field()
     provenance = {
         **dataset.source,
         "settings": trainer.settings.to_dict(),
@@ -326,10 +326,10 @@ def _result(
         **trainer.clock.summary(),
     }
     if trainer.photos is not None:
-        provenance["photo_stops"] = round(trainer.photos.stops(trainer.averaged[PHOTOS]), 3)
+        provenance["photo_stops"] = round(trainer.photos.compute_exposure_spread(trainer.averaged[PHOTO_PARAMETER]), 3)
     if dataset.held_out:
-        every = trainer.pixels_within(dataset.held_out, _FINAL_SAMPLES)
-        error = measure(trainer, dataset.held_out, every, field)
+        every = trainer.choose_pixel_stride(dataset.held_out, _FINAL_SAMPLES)
+        error = evaluate_views(trainer, dataset.held_out, every, field)
         provenance["psnr_held_out"] = {
             "mean": _rounded(error.mean),
             "mean_fitted": _rounded(error.mean_fitted),
@@ -337,13 +337,13 @@ def _result(
             "views": {v.name: _rounded(p) for v, p in zip(dataset.held_out, error.psnr)},
         }
         _look(trainer, watched, history, field)
-        if field.box.contracted:
-            every = trainer.pixels_within(watched, _LOOK_SAMPLES)
-            beyond = share_beyond(watched, lambda view: trainer.render(view, every, field), field.box.core, every)
+        if field.box.is_contracted:
+            every = trainer.choose_pixel_stride(watched, _LOOK_SAMPLES)
+            beyond = compute_outside_fraction(watched, lambda view: trainer.render(view, every, field), field.box.core, every)
             provenance["beyond_box"] = round(beyond, 4)
     provenance["psnr_watched"] = {"views": [v.name for v in watched], "history": history}
     minutes = trainer.settings.minutes
-    provenance["complaints"] = complaints(history, trainer.steps, trainer.stride, minutes, seconds)
+    provenance["complaints"] = find_problems(history, trainer.steps, trainer.stride, minutes, seconds)
     return field, provenance
 
 
@@ -357,8 +357,8 @@ def _look(
 ) -> None:
     """Add the error on the ``watched`` views, if any of their pixels counts, to ``history``: every so many pixels, as
     many as take little time."""
-    every, seconds = trainer.pixels_within(watched, _LOOK_SAMPLES), trainer.seconds
-    psnr = measure(trainer, watched, every, field).mean
+    every, seconds = trainer.choose_pixel_stride(watched, _LOOK_SAMPLES), trainer.seconds
+    psnr = evaluate_views(trainer, watched, every, field).mean
     if not math.isnan(psnr):
         row = {"steps": trainer.steps, "seconds": round(seconds, 1), "psnr": round(psnr, 2), "every_pixel": every}
         history.append(row)
@@ -368,7 +368,7 @@ def write_preview(trainer: RadianceTrainer, view: PhotoView, path: Path) -> None
     """PNG of ``view`` as the field shows it now, beside what is true, on as many pixels as take little time."""
     import mitsuba as mi
 
-    every = trainer.pixels_within([view], _LOOK_SAMPLES)
+    every = trainer.choose_pixel_stride([view], _LOOK_SAMPLES)
     seen = trainer.render(view, every)
-    both = np.concatenate([np.clip(seen.color, 0, 1), view.over(0)[every // 2 :: every, every // 2 :: every]], axis=1)
-    write_png(path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)), provenance("nerg train radiance").text())
+    both = np.concatenate([np.clip(seen.color, 0, 1), view.composite_over(0)[every // 2 :: every, every // 2 :: every]], axis=1)
+    write_png(path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)), make_provenance("nerg train radiance").text())

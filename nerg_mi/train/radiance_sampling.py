@@ -10,10 +10,10 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
-from nerg_mi.maths.arrays import aligned
+from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f, Float, UInt32
-from nerg_mi.transport.quadrature import absorbed_share
+from nerg_mi.transport.quadrature import absorbed_fraction
 
 # ---- Volume rendering of samples that lie packed, ray after ray, in flat arrays; differentiable ----
 #
@@ -80,14 +80,14 @@ class Segments:
 
 
 @dataclass
-class Thinned:
+class ThinnedSamples:
     """What is known of samples that stand for others: one was kept with probability p, on the sum of all.
 
     ``copies``: 1 / p of each sample; ``before``: optical depth in front of it, of all samples; ``opacity``: of each
     ray, of all samples.
     """
 
-    copies: Float
+    multiplicity: Float
     before: Float
     opacity: Float
 
@@ -98,11 +98,11 @@ class _Weights(dr.CustomOp):
     def eval(self, tau, segments, thinned):
         self.segments = segments
         Float = type(tau)
-        self.copies = 1 if thinned is None else thinned.copies
+        self.multiplicity = 1 if thinned is None else thinned.multiplicity
         capped = dr.minimum(tau, _MAX_TAU)
         before = Float(segments.before(capped)) if thinned is None else thinned.before
         transmitted = dr.select(segments.active, self.copies * dr.exp(-before), 0)
-        self.weight = transmitted * absorbed_share(capped)
+        self.weight = transmitted * absorbed_fraction(capped)
         self.passed = transmitted * dr.exp(-capped)
         return Float(self.weight)
 
@@ -138,7 +138,7 @@ class _RaySum(dr.CustomOp):
         return "sum along rays"
 
 
-def weights(tau: Float, segments: Segments, thinned: Thinned | None = None) -> Float:
+def compute_weights(tau: Float, segments: Segments, thinned: ThinnedSamples | None = None) -> Float:
     """Weights of samples of optical depth ``tau`` >= 0 (Float); 0 for padding.
 
     Of ``thinned`` samples each weight is that of all the samples it stands for: sums of them along a ray, and their
@@ -147,18 +147,18 @@ def weights(tau: Float, segments: Segments, thinned: Thinned | None = None) -> F
     return dr.custom(_Weights, tau, segments, thinned)
 
 
-def ray_sum(x: Float, segments: Segments) -> Float:
+def sum_along_rays(x: Float, segments: Segments) -> Float:
     """Sum of ``x`` (a Float, one entry a sample) along each ray: a Float, one entry a ray."""
     return dr.custom(_RaySum, x, segments)
 
 
-def damp_near(values: list, t, reach) -> list:
+def damp_near(values: list, t, distance) -> list:
     """``values`` of samples at distance ``t``, with derivatives scaled by (t / reach)² within ``reach``.
 
     What is near a camera is sampled by many of its rays, and would turn to fog before far surfaces are found (Philip
     and Deschaintre 2023, "Floaters No More").
     """
-    share = dr.minimum(dr.square(t / reach), 1)
+    share = dr.minimum(dr.square(t / distance), 1)
     return [dr.replace_grad(x, x * share) for x in values]
 
 
@@ -185,7 +185,7 @@ class StepTable:
         # One more, because jitter shifts every edge by up to one step.
         edges.append(edges[-1] + max(step, growth * edges[-1]))
         self.steps = len(edges) - 1
-        self.edges = ns.Float(aligned(np.array(edges)))
+        self.edges = ns.Float(copy_aligned(np.array(edges)))
         # As literals they would compile the kernels anew for every table.
         self._steps = dr.opaque(ns.UInt32, self.steps)
         self._share = dr.opaque(ns.Float64, 1 / self.steps)
@@ -219,7 +219,7 @@ class CameraRays:
     count: int
 
 
-def rays_in_box(o, d, box: AnyBox, near: float) -> CameraRays:
+def clip_rays(o, d, box: AnyBox, near: float) -> CameraRays:
     """Rays clipped to ``box``, from ``near`` on."""
     # Not maths.ray_box: of rays along a face a training may lose some, and is spared the selects that keep them.
     Float = type(d.x)
@@ -247,22 +247,22 @@ class RaySamples:
     segments: Segments
     count: int
     features: list | None = None
-    thinned: Thinned | None = None
-    looked: float = 0.0
+    thinned: ThinnedSamples | None = None
+    prepass_samples_per_ray: float = 0.0
 
 
 @dataclass(frozen=True)
-class Thinning:
+class RussianRoulette:
     """Which samples to keep: those of a weight of ``sure`` or more all, others with a probability in proportion to
     their weight, but ``least`` at least. ``seed``: of the choices. They are independent of one another, because
     derivatives hold products of two samples, whose average is right only if so."""
 
-    sure: float
-    least: float
+    weight: float
+    min_probability: float
     seed: int
 
 
-def occupied_steps(rays: CameraRays, table: StepTable, offset, occupied, most: int | None = None) -> tuple | None:
+def find_occupied_steps(rays: CameraRays, table: StepTable, offset, is_occupied, max_steps: int | None = None) -> tuple | None:
     """Steps whose midpoints lie in the box and in an occupied cell: (ray, t, length, p), evaluated; rays covered.
 
     ``offset``: each ray's jitter, [0, 1); ``occupied``: function of points (Array3f) and a mask, giving a mask.
@@ -274,15 +274,15 @@ def occupied_steps(rays: CameraRays, table: StepTable, offset, occupied, most: i
         raise ValueError(f"{rays.count} rays of {table.steps} steps are too many for one batch")
     ray, k = table.split(dr.arange(UInt32, total))
     _, _, p, inside = _step(rays, table, offset, ray, k)
-    kept = dr.compress(occupied(p, inside))
+    kept = dr.compress(is_occupied(p, inside))
     count, covered = dr.width(kept), rays.count
     if count == 0:
         return None
-    if most is not None and count > most:
+    if max_steps is not None and count > max_steps:
         # Rays lie one after another: the first step that does not fit tells which ray is incomplete.
-        covered = int(dr.gather(UInt32, kept, UInt32(most)).numpy()[0]) // table.steps
+        covered = int(dr.gather(UInt32, kept, UInt32(max_steps)).numpy()[0]) // table.steps
         if covered == 0:
-            raise NergError(f"a single ray has more than {most} steps; enlarge the batch, look_most or the step")
+            raise NergError(f"a single ray has more than {max_steps} steps; enlarge the batch, look_most or the step")
         count = dr.width(dr.compress(kept < dr.opaque(UInt32, covered * table.steps)))
         kept = dr.gather(UInt32, kept, dr.arange(UInt32, count))
     ray, k = table.split(kept)
@@ -300,16 +300,16 @@ def _step(rays: CameraRays, table: StepTable, offset, ray, k):
     return t, length, o + d * middle, inside
 
 
-def visible_samples(
+def select_visible_samples(
     rays: CameraRays,
     table: StepTable,
     offset,
-    occupied,
+    is_occupied,
     density,
-    stop: float,
+    min_transmittance: float,
     pad: int | None = None,
-    thinning: Thinning | None = None,
-    most: int | None = None,
+    roulette: RussianRoulette | None = None,
+    max_prepass_samples: int | None = None,
     with_features: bool = False,
 ) -> tuple[RaySamples | None, int]:
     """Samples that may matter, and the number of leading rays that they cover completely.
@@ -320,7 +320,7 @@ def visible_samples(
     that hardly absorb. ``most``: samples at most at which ``density`` is evaluated, by the same means.
     Returns (None, rays) when no ray meets anything.
     """
-    steps = occupied_steps(rays, table, offset, occupied, most)
+    steps = find_occupied_steps(rays, table, offset, is_occupied, max_prepass_samples)
     if steps is None:
         return None, rays.count
     ray, t, length, p, covered = steps
@@ -333,15 +333,15 @@ def visible_samples(
     dr.eval(tau, features)
     before = Float(segments.before(tau))
     light = dr.exp(-before)
-    chosen, thinned = light > stop, None
-    if thinning is not None:
-        weight = light * absorbed_share(tau)
-        share = dr.clip(weight / thinning.sure, thinning.least, 1)
+    chosen, thinned = light > min_transmittance, None
+    if roulette is not None:
+        weight = light * absorbed_fraction(tau)
+        share = dr.clip(weight / roulette.weight, roulette.min_probability, 1)
         ns = namespace(t)
-        random = ns.PCG32(dr.width(t), dr.opaque(ns.UInt64, thinning.seed)).next_float32()
+        random = ns.PCG32(dr.width(t), dr.opaque(ns.UInt64, roulette.seed)).next_float32()
         chosen &= random < share
-        thinned = Thinned(dr.rcp(share), before, absorbed_share(Float(segments.total(tau))))
-        dr.eval(chosen, thinned.copies, before, thinned.opacity)
+        thinned = ThinnedSamples(dr.rcp(share), before, absorbed_fraction(Float(segments.total(tau))))
+        dr.eval(chosen, thinned.multiplicity, before, thinned.opacity)
     kept = dr.compress(chosen)
     count, looked = dr.width(kept), dr.width(t) / covered
     if count == 0:
@@ -359,8 +359,8 @@ def visible_samples(
     if features is not None:
         features = [dr.gather(type(f), f, source) for f in features]
     if thinned is not None:
-        thinned.copies, thinned.before = (dr.gather(Float, v, source) for v in (thinned.copies, thinned.before))
-        dr.eval(thinned.copies, thinned.before)
+        thinned.multiplicity, thinned.before = (dr.gather(Float, v, source) for v in (thinned.multiplicity, thinned.before))
+        dr.eval(thinned.multiplicity, thinned.before)
     dr.eval(ray, active, t, length, p, features)
     segments = Segments(ray, active, rays.count)
     return RaySamples(ray, t, length, p, segments, min(count, pad or count), features, thinned, looked), covered

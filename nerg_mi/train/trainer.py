@@ -15,8 +15,8 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.safe_read import reading
-from nerg_mi.formats.fields import number
+from nerg_mi.files.safe_read import translate_read_errors
+from nerg_mi.formats.fields import read_number
 
 # ---- Trainer ----
 
@@ -27,7 +27,7 @@ class Trainer:
     ``schedule``: steps that the learning rate's schedule spans, where that is not ``settings``' own length.
     """
 
-    AVERAGE_EVERY: ClassVar[int] = 1  # The average is taken of every so many steps
+    AVERAGE_INTERVAL: ClassVar[int] = 1  # The average is taken of every so many steps
 
     def __init__(self, settings: Any, ns: ModuleType, schedule: int | None = None):
         self.settings, self.ns, self._schedule = settings, ns, schedule
@@ -56,20 +56,20 @@ class Trainer:
 
     def move_weights(self) -> None:
         """Move the weights along the gradients that are in them."""
-        self.optimiser.set_learning_rate(self.settings.rate(self.progress))
+        self.optimiser.set_learning_rate(self.settings.learning_rate_at(self.progress))
         self.optimiser.step()
 
     def average_weights(self) -> None:
         """Move the averages towards the weights of this step."""
         # A short memory at first: the start of a run is not worth remembering.
-        decay = min(self.settings.average, (1 + self.steps) / (10 + self.steps)) ** self.AVERAGE_EVERY
+        decay = min(self.settings.ema_decay, (1 + self.steps) / (10 + self.steps)) ** self.AVERAGE_INTERVAL
         # As a literal it would compile a kernel each time.
         part = dr.opaque(self.ns.Float, 1 - decay)
         for k, old in self.averaged.items():
             self.averaged[k] = type(old)(old + (dr.detach(self.optimiser[k]) - old) * part)
         dr.eval(self.averaged)
 
-    def state(self) -> tuple[dict, dict]:
+    def get_state(self) -> tuple[dict, dict]:
         """``(tensors, metadata)`` for `restore`: weights, moments and averages by name, and all that a run counts."""
         tensors, taken = {}, {}
         for name, (value, _, _, (count, first, second, _)) in self.optimiser.state.items():
@@ -85,15 +85,15 @@ class Trainer:
         for name, (value, promoted, rate, (count, first, second, largest)) in optimiser.state.items():
             old = {"weights": value, "first": first, "second": second, "averaged": self.averaged[name]}
             for part, x in old.items():
-                require_shape(tensors, f"{part}.{name}", x)
+                check_shape(tensors, f"{part}.{name}", x)
             new = {part: type(x)(tensors[f"{part}.{name}"]) for part, x in old.items()}
             dr.enable_grad(new["weights"])
-            count = dr.opaque(type(count), int(count_of(taken, name)))
+            count = dr.opaque(type(count), int(read_count(taken, name)))
             optimiser.state[name] = new["weights"], promoted, rate, (count, new["first"], new["second"], largest)
             self.averaged[name] = new["averaged"]
         dr.eval(optimiser.state, self.averaged)
-        self.steps = int(count_of(meta, "steps"))
-        self._started = time.perf_counter() - count_of(meta, "seconds")
+        self.steps = int(read_count(meta, "steps"))
+        self._started = time.perf_counter() - read_count(meta, "seconds")
         self.rng.bit_generator.state = meta["random"]
 
 
@@ -108,28 +108,28 @@ _COUNTS = {"rays": (0, 2**60), "samples": (0, 2**60), "looked": (0, 2**60), "str
 
 
 @contextmanager
-def restoring(path: str | Path) -> Iterator[None]:
+def reading_run_state(path: str | Path) -> Iterator[None]:
     """What a damaged state makes the block raise, as a `NergError` that names ``path``."""
-    with reading(path, "state of a run", "start anew without --resume", also=(TypeError, AttributeError)):
+    with translate_read_errors(path, "state of a run", "start anew without --resume", extra_errors=(TypeError, AttributeError)):
         yield
 
 
-def count_of(meta: dict, name: str) -> float:
+def read_count(meta: dict, name: str) -> float:
     """The number ``name`` of a state's metadata. Raises ``ValueError`` where it is none that a run can have come to."""
-    value, (least, most) = number(meta, name, "state"), _COUNTS.get(name, (0, 2**32 - 1))
+    value, (least, most) = read_number(meta, name, "state"), _COUNTS.get(name, (0, 2**32 - 1))
     if not least <= value <= most:
         raise ValueError(f'"{name}" of its state is {value:g}, which no run comes to')
     return value
 
 
-def require_shape(tensors: dict, name: str, like) -> None:
+def check_shape(tensors: dict, name: str, like) -> None:
     """Raise ``ValueError`` unless the stored array ``name`` has the shape of the Dr.Jit array ``like``."""
     if tuple(tensors[name].shape) != tuple(dr.shape(like)):
         raise ValueError(f'its array "{name}" has the shape {tensors[name].shape} and not {tuple(dr.shape(like))}')
 
 
 @contextmanager
-def kept_unless(path: Path | None, keep: Callable[[], None], done: bool) -> Iterator[None]:
+def saving_on_failure(path: Path | None, save: Callable[[], None], is_done: bool) -> Iterator[None]:
     """A block that measures and writes what a training has come to; the state in ``path`` is removed when it has ended.
 
     ``path``: None where no state is kept; ``keep``: brings it up to date, called if the block raises, so that no step
@@ -141,7 +141,7 @@ def kept_unless(path: Path | None, keep: Callable[[], None], done: bool) -> Iter
         if path is None:
             raise
         try:
-            keep()
+            save()
         except NergError:
             # The same full disk: an older state stays, and what could not be written first is what is told.
             raise error from None
@@ -151,11 +151,11 @@ def kept_unless(path: Path | None, keep: Callable[[], None], done: bool) -> Iter
         if isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {path})") from error
         raise
-    if path is not None and done:
+    if path is not None and is_done:
         path.unlink(missing_ok=True)
 
 
-def require_same(path: str | Path, then: dict, now: dict) -> None:
+def check_same_run(path: str | Path, then: dict, now: dict) -> None:
     """Raise `NergError` unless a run that was started as ``then`` says is the one that ``now`` says, entry by entry."""
     if not isinstance(then, dict):
         raise NergError(f'the run in "{path}" cannot go on: its state is damaged; start anew without --resume')
@@ -170,7 +170,7 @@ def require_same(path: str | Path, then: dict, now: dict) -> None:
 
 # ---- How long the steps of a training take, and how fast the machine evaluates the field in them ----
 
-KEPT = 1 << 12  # Durations that are kept at most: the state of a run of days must stay small enough to be read again
+MAX_DURATIONS = 1 << 12  # Durations that are kept at most: the state of a run of days must stay small enough to be read again
 
 
 class StepClock:
@@ -181,7 +181,7 @@ class StepClock:
     """
 
     def __init__(self):
-        self.evaluations, self.steps, self.seconds, self.each = 0, 0, 0.0, 1
+        self.evaluations, self.steps, self.seconds, self.keep_every = 0, 0, 0.0, 1
         self.extremes, self.durations, self._running = [float("inf"), 0.0], [], False
 
     def __enter__(self) -> StepClock:
@@ -190,18 +190,18 @@ class StepClock:
 
     def __exit__(self, *error) -> None:
         self._running = False
-        self.add(time.perf_counter() - self._begin)
+        self.add_step(time.perf_counter() - self._begin)
 
-    def add(self, seconds: float) -> None:
+    def add_step(self, seconds: float) -> None:
         """One more step, of so many ``seconds``."""
-        if self.steps % self.each == 0:
+        if self.steps % self.keep_every == 0:
             self.durations.append(seconds)
         self.steps, self.seconds = self.steps + 1, self.seconds + seconds
         self.extremes = [min(self.extremes[0], seconds), max(self.extremes[1], seconds)]
-        if len(self.durations) > KEPT:
-            self.durations, self.each = self.durations[::2], 2 * self.each
+        if len(self.durations) > MAX_DURATIONS:
+            self.durations, self.keep_every = self.durations[::2], 2 * self.keep_every
 
-    def count(self, evaluations: int) -> None:
+    def add_evaluations(self, evaluations: int) -> None:
         """Add to the evaluations, if there is a step on: others, for looks and bounds, are not timed."""
         if self._running:
             self.evaluations += evaluations
@@ -222,14 +222,14 @@ class StepClock:
             "evaluations": self.evaluations,
             "steps": self.steps,
             "seconds": self.seconds,
-            "each": self.each,
+            "each": self.keep_every,
             "extremes": self.extremes if self.steps else [],
             "durations": [round(x, 5) for x in self.durations],
         }
 
     def restore(self, state: dict) -> None:
-        self.evaluations, self.steps, self.each = (int(state[name]) for name in ("evaluations", "steps", "each"))
+        self.evaluations, self.steps, self.keep_every = (int(state[name]) for name in ("evaluations", "steps", "each"))
         self.seconds, self.durations = float(state["seconds"]), [float(x) for x in state["durations"]]
         self.extremes = [float(x) for x in state["extremes"]] or [float("inf"), 0.0]
-        if self.steps < 0 or self.each < 1 or len(self.extremes) != 2 or bool(self.durations) != bool(self.steps):
+        if self.steps < 0 or self.keep_every < 1 or len(self.extremes) != 2 or bool(self.durations) != bool(self.steps):
             raise ValueError('its "clock" is not one of a run')

@@ -12,7 +12,7 @@ import drjit as dr
 
 from nerg_mi.errors import NergError
 
-from .field_medium import snapshot
+from .field_medium import evaluate_features
 from .observer import ObserverView, SupportView
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class Display:
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
     """What pictures of a quantity need to know. ``title``: of a picture that shows it, and of the viewer's layer, by
-    default its ``name``; ``label``: what its scale measures, by default the name, in which ``unit``; ``rests_on``: the
+    default its ``name``; ``label``: what its scale measures, by default the name, in which ``unit``; ``data_source``: the
     part of the integrator, "gaze" or "kde", that was made of rays, whose number pictures state; ``needs_support``:
     whether it is hatched where no rays were recorded around the observer."""
 
@@ -66,7 +66,7 @@ class Quantity:
     label: str = ""
     unit: str = ""
     display: Display = Display()
-    rests_on: str = ""
+    data_source: str = ""
     needs_support: bool = False
 
     @property
@@ -89,25 +89,25 @@ class Aov(Quantity):
     channels: str | None = "Y"
     # What it is, for the manual.
     summary: str
-    # A Float for each channel, of a ``plugins.nerg_pixel.CameraView``, or of a ``Pixel`` where it is ``of_observer``.
+    # A Float for each channel, of a ``plugins.nerg_pixel.CameraView``, or of a ``Pixel`` where it is ``is_per_observer``.
     compute: Callable[[Any], list]
     # What is known of an observer once their position is, of the integrator, for ``Pixel.view_of_observer``.
     view: Callable[[Any], ObserverView] | None = None
     # Whether it depends on where the observer is: what does not is computed once for several of them.
-    of_observer: bool = False
+    is_per_observer: bool = False
     # Whether an integrator that can compute it gives the same value everywhere.
     is_constant: Callable[[Any], bool] = lambda nerg: False
     # In the order in which they are checked.
-    needs: tuple[Need, ...] = ()
+    dependencies: tuple[Need, ...] = ()
     # What has to be prepared for it, see ``Pixel``.
     demands: frozenset[str] = frozenset()
 
     @property
-    def several(self) -> bool:
+    def has_multiple_channels(self) -> bool:
         """Whether it has more than one channel."""
         return self.channels is None or len(self.channels) > 1
 
-    def channels_of(self, medium) -> list[str]:
+    def channel_suffixes(self, medium) -> list[str]:
         """The suffixes of its channels for that medium."""
         return [str(i) for i in range(medium.feature_count)] if self.channels is None else list(self.channels)
 
@@ -118,7 +118,7 @@ _EVALUATIONS = "evaluations per pixel"
 
 
 def _features_at(p: Any) -> list:
-    return snapshot(cast("Medium", p.context.medium), p.p_d, p.surface & (p.depth < p.view.distance))
+    return evaluate_features(cast("Medium", p.context.medium), p.p_d, p.surface & (p.depth < p.view.distance))
 
 
 def _color_evaluations(p: Any) -> list:
@@ -164,11 +164,11 @@ AOVS: dict[str, Aov] = {
             label="gaze density",
             unit="1/sr",
             display=_HEAT,
-            rests_on="gaze",
+            data_source="gaze",
             needs_support=True,
             compute=lambda p: [p.attention.gaze],
-            of_observer=True,
-            needs=(GAZE,),
+            is_per_observer=True,
+            dependencies=(GAZE,),
             demands=_GAZE,
         ),
         Aov(
@@ -177,11 +177,11 @@ AOVS: dict[str, Aov] = {
             title="What surfaces attract",
             label="emitted attention",
             display=_HEAT,
-            rests_on="gaze",
+            data_source="gaze",
             is_constant=lambda nerg: nerg.gaze.field.config.variant == "capture",
             compute=lambda p: [p.attention.emit],
-            of_observer=True,
-            needs=(GAZE,),
+            is_per_observer=True,
+            dependencies=(GAZE,),
             demands=_FACTORS,
         ),
         Aov(
@@ -190,11 +190,11 @@ AOVS: dict[str, Aov] = {
             title="What the observer gives",
             label="captured attention",
             display=_HEAT,
-            rests_on="gaze",
+            data_source="gaze",
             is_constant=lambda nerg: nerg.gaze.field.config.variant == "emit",
             compute=lambda p: [p.attention.capture],
-            of_observer=True,
-            needs=(GAZE,),
+            is_per_observer=True,
+            dependencies=(GAZE,),
             demands=_FACTORS,
         ),
         Aov(
@@ -204,11 +204,11 @@ AOVS: dict[str, Aov] = {
             label="standard deviation of gaze",
             unit="1/sr",
             display=_HEAT,
-            rests_on="gaze",
+            data_source="gaze",
             needs_support=True,
             compute=lambda p: [p.attention.spread],
-            of_observer=True,
-            needs=(GAZE, MEMBERS),
+            is_per_observer=True,
+            dependencies=(GAZE, MEMBERS),
             demands=frozenset({"gaze", "spread"}),
         ),
         Aov(
@@ -218,11 +218,11 @@ AOVS: dict[str, Aov] = {
             title="Support",
             label="training rays around the observer",
             display=_HEAT,
-            rests_on="gaze",
+            data_source="gaze",
             compute=lambda p: [p.view_of_observer("support")],
             view=lambda nerg: SupportView(nerg.gaze.field.support, nerg.gaze.to_world),
-            of_observer=True,
-            needs=(GAZE, SUPPORT),
+            is_per_observer=True,
+            dependencies=(GAZE, SUPPORT),
         ),
         Aov(
             name="kde",
@@ -232,11 +232,11 @@ AOVS: dict[str, Aov] = {
             label="tracked gaze",
             unit="1/sr",
             display=_HEAT,
-            rests_on="kde",
+            data_source="kde",
             compute=lambda p: [p.view_of_observer("kde")],
             view=lambda nerg: nerg.children["kde"].kde_view(),
-            of_observer=True,
-            needs=(KDE,),
+            is_per_observer=True,
+            dependencies=(KDE,),
         ),
         Aov(
             name="visibility",
@@ -245,7 +245,7 @@ AOVS: dict[str, Aov] = {
             label="0 hidden, 1 visible",
             display=Display(kind="shade", limits=(0.0, 1.0)),
             compute=lambda p: [dr.select(p.camera.surface, p.sight.visibility, 0)],
-            of_observer=True,
+            is_per_observer=True,
         ),
         Aov(
             name="observer_depth",
@@ -255,7 +255,7 @@ AOVS: dict[str, Aov] = {
             unit="scene units",
             display=Display(cmap="viridis_r"),
             compute=lambda p: [dr.select(p.camera.surface, p.sight.depth, 0)],
-            of_observer=True,
+            is_per_observer=True,
             demands=frozenset({"observer_depth"}),
         ),
         Aov(
@@ -264,7 +264,7 @@ AOVS: dict[str, Aov] = {
             summary="the field's geometry features, accumulated like colour (not divided by opacity)",
             display=_SIGNED,
             compute=lambda p: p.accumulated_features,
-            needs=(FIELD,),
+            dependencies=(FIELD,),
             demands=frozenset({"features"}),
         ),
         Aov(
@@ -273,7 +273,7 @@ AOVS: dict[str, Aov] = {
             summary="the same features at the surface :math:`p_d`; 0 on shapes",
             display=_SIGNED,
             compute=_features_at,
-            needs=(FIELD,),
+            dependencies=(FIELD,),
         ),
         Aov(
             name="density_evals",
@@ -281,7 +281,7 @@ AOVS: dict[str, Aov] = {
             title="Evaluations of density",
             label=_EVALUATIONS,
             compute=lambda p: [p.density_evaluations()],
-            of_observer=True,
+            is_per_observer=True,
             demands=_COUNTS,
         ),
         Aov(
@@ -298,8 +298,8 @@ AOVS: dict[str, Aov] = {
             title="Evaluations of gaze",
             label=_EVALUATIONS,
             compute=lambda p: [p.attention.evaluations],
-            of_observer=True,
-            needs=(GAZE,),
+            is_per_observer=True,
+            dependencies=(GAZE,),
             demands=_GAZE,
         ),
     )
@@ -313,7 +313,7 @@ def read_aovs(value: str, nerg) -> list[str]:
     for name in names:
         if name not in AOVS:
             raise NergError(f'"aovs" does not know "{name}"; it knows {", ".join(AOVS)}')
-        for need in AOVS[name].needs:
+        for need in AOVS[name].dependencies:
             if not need.is_met(nerg):
                 raise NergError(f'"aovs" asks for "{name}", {need.complaint}')
     if len(set(names)) < len(names):
@@ -333,14 +333,14 @@ def views_of(names: Iterable[str], nerg) -> dict[str, ObserverView]:
 
 def channel_names(names: Iterable[str], medium) -> list[str]:
     """The names of all channels of these AOVs, in their order."""
-    return [f"{name}.{channel}" for name in names for channel in AOVS[name].channels_of(medium)]
+    return [f"{name}.{channel}" for name in names for channel in AOVS[name].channel_suffixes(medium)]
 
 
 def compute(names: Sequence[str], pixel: Any) -> list:
     """All channels of these AOVs, in their order."""
     # Evaluations are counted when all else has made its own.
     order = sorted((AOVS[name] for name in names), key=lambda aov: "counts" in aov.demands)
-    found = {aov.name: aov.compute(pixel if aov.of_observer else pixel.camera) for aov in order}
+    found = {aov.name: aov.compute(pixel if aov.is_per_observer else pixel.camera) for aov in order}
     return [channel for name in names for channel in found[name]]
 
 

@@ -77,12 +77,12 @@ class Depth(Protocol):
         ...
 
     @property
-    def finds(self) -> str:
+    def surface_kind(self) -> str:
         """Name of the kind whose surface it finds: its own, unless it finds that of another kind better. `nerg study`
         compares with that kind."""
         ...
 
-    def exact(self, profile: Profile) -> np.ndarray:
+    def find_exact(self, profile: Profile) -> np.ndarray:
         """Distance (N,) of the surface where the density is in closed form, for `nerg study`."""
         ...
 
@@ -114,9 +114,9 @@ class Expected:
     summary = "mean distance of absorption"
     mean_free_paths = 1.0
     at_half = False
-    finds = "expected"
+    surface_kind = "expected"
 
-    def exact(self, profile: Profile) -> np.ndarray:
+    def find_exact(self, profile: Profile) -> np.ndarray:
         return profile.expected
 
     def inside(self, marched: Marched) -> Float:
@@ -134,9 +134,9 @@ class Median:
     summary = "where half of the ray's own opacity is reached"
     mean_free_paths = LOG2
     at_half = True
-    finds = "median"
+    surface_kind = "median"
 
-    def exact(self, profile: Profile) -> np.ndarray:
+    def find_exact(self, profile: Profile) -> np.ndarray:
         return profile.quantile(0.5)
 
     def inside(self, marched: Marched) -> Float:
@@ -168,8 +168,8 @@ class RefinedMedian(Median):
         met = dr.isfinite(dr.select(half.rest, again.half, result.half))
         found = marched.active & (half.rest | half.opaque) & met
         # Steps of cells are as long as their voxels: they are searched until the crossing is found.
-        in_cells = RULES.find(settings.quadrature).in_cells
-        end = t1 if in_cells else dr.minimum(enter + step_length(enter, settings), t1)
+        ends_at_cells = RULES.find(settings.quadrature).ends_at_cells
+        end = t1 if ends_at_cells else dr.minimum(enter + step_length(enter, settings), t1)
         part = settings.step / _PARTS
         fine = march(
             marched.medium,

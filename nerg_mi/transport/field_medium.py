@@ -13,7 +13,7 @@ from nerg_mi.fields.radiance import RadianceField, mean_features
 from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Ray3f, Vector3f, variant_types
 
-from .geometry import Place
+from .geometry import SceneGeometry
 from .march_primal import MarchSettings
 from .medium import ColorPainter, LocalRay, Medium, Occupancy, Painter, bounded
 
@@ -34,17 +34,17 @@ class FeaturePainter:
 
     def __init__(self, medium: Medium, color_type: type | None = None):
         self.color_type, self.count = color_type, medium.feature_count
-        self._own = color_type is not None and not medium.deferred
+        self._own = color_type is not None and not medium.is_deferred
         self._ns = namespace(medium.parameters()[0])
 
     def zero(self) -> Any:
         return self._ns.ArrayXf([self._ns.Float(0)] * (3 * self._own + self.count))
 
-    def paint(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Any:
+    def shade(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Any:
         color = list(medium.color(features, p, w, active)) if self._own else []
         return self._ns.ArrayXf([*color, *features])
 
-    def color(self, medium: Medium, sums: Any, opacity: Float, ray: LocalRay, active: Bool) -> Color | None:
+    def resolve_color(self, medium: Medium, sums: Any, opacity: Float, ray: LocalRay, active: Bool) -> Color | None:
         array_type = self.color_type
         if array_type is None or self._own:
             return None if array_type is None else array_type(list(sums)[:3])
@@ -61,18 +61,18 @@ class FeaturePainter:
         return list(sums)[3 * self._own :]
 
 
-def color_painter(medium: Medium, color_type: type, features: bool = False) -> Painter:
+def make_color_shader(medium: Medium, color_type: type, features: bool = False) -> Painter:
     """What gathers the colour of a medium that has one, as ``color_type``; with ``features``, a `FeaturePainter`."""
-    return FeaturePainter(medium, color_type) if features or medium.deferred else ColorPainter(color_type)
+    return FeaturePainter(medium, color_type) if features or medium.is_deferred else ColorPainter(color_type)
 
 
-def snapshot(medium: Medium, p: Point3f, active: Bool) -> list[Float]:
+def evaluate_features(medium: Medium, p: Point3f, active: Bool) -> list[Float]:
     """Features at scene points ``p``; 0 where not ``active``."""
     features = medium.density_features(medium.to_local(p), active)[1]
     return [dr.select(active, f, 0) for f in features]
 
 
-def accumulated(place: Place, ray: Ray3f, active: Bool, settings: MarchSettings) -> list[Float]:
+def accumulate_features(place: SceneGeometry, ray: Ray3f, active: Bool, settings: MarchSettings) -> list[Float]:
     """Features accumulated along ``ray`` through ``place``, whose medium has some; 0 where not ``active``.
 
     What gathers them is always the default's, in training as in every picture: ``color_cutoff`` chooses how exact
@@ -83,18 +83,18 @@ def accumulated(place: Place, ray: Ray3f, active: Bool, settings: MarchSettings)
 
 
 def observed_features(
-    kind: str, place: Place, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool, settings: MarchSettings
+    kind: str, place: SceneGeometry, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool, settings: MarchSettings
 ) -> list[Float] | None:
     """Features of what an observer sees at ``p_od`` along unit ``r_o`` from ``p_o``, for a gaze field that wants such
     of ``kind`` (``fields.gaze_product.SEMANTICS``); None for one that wants none. ``settings``: of the march."""
     if kind == "snapshot":
-        return snapshot(_featured(place), p_od, active)
+        return evaluate_features(_featured(place), p_od, active)
     if kind == "accumulated":
-        return accumulated(place, variant_types().Ray3f(p_o, r_o), active, settings)
+        return accumulate_features(place, variant_types().Ray3f(p_o, r_o), active, settings)
     return None
 
 
-def _featured(place: Place) -> Medium:
+def _featured(place: SceneGeometry) -> Medium:
     if place.medium is None:
         raise ValueError("a place without a medium has no features")
     return place.medium
@@ -120,7 +120,7 @@ class FieldMedium:
         self.color_space = field.color_space
 
     @property
-    def deferred(self) -> bool:
+    def is_deferred(self) -> bool:
         return self.field.config.deferred
 
     @property
@@ -137,12 +137,12 @@ class FieldMedium:
         return self.field.box.diagonal * self.to_world.scale
 
     @property
-    def step(self) -> float | None:
+    def default_step(self) -> float | None:
         """The step that the field was trained with, in scene units."""
         return None if self.field.march_step is None else self.field.march_step * self.to_world.scale
 
     @property
-    def growth(self) -> float:
+    def default_dt_gamma(self) -> float:
         return self.field.march_growth
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +154,7 @@ class FieldMedium:
     def refresh(self, anyway: bool = False) -> None:
         """Nothing to do: weights are read whenever the field is marched."""
 
-    def local(self, o: Point3f, d: Vector3f) -> LocalRay:
+    def ray_to_local(self, o: Point3f, d: Vector3f) -> LocalRay:
         o_l, d_l = self.to_world.point_to_local(o), self.to_world.vector_to_local(d)
         near, far = intersect_box(o_l, d_l, self.field.box.lower, self.field.box.upper)
         return LocalRay(o_l, d_l, self.to_world.direction_to_local(d), near, far)
@@ -174,7 +174,7 @@ class FieldMedium:
     def occupied_density(self, p: Point3f, active: Bool) -> Float:
         """``density`` where no march has looked up the occupancy grid before: 0 in its empty cells."""
         if self.occupancy is not None:
-            active = active & (self.occupancy.empty_cells(self.to_unit(p), active) == 0)
+            active = active & (self.occupancy.distance_to_occupied(self.to_unit(p), active) == 0)
         return dr.select(active, self.density(p, active), 0)
 
     def density_features(self, p: Point3f, active: Bool) -> tuple[Float, list[Float]]:

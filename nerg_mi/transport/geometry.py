@@ -132,14 +132,14 @@ class RayView:
     # The medium's part; None without a medium.
     march: MarchResult | None
     # Whether a shape ends the ray, and its distance in scene units, infinite without one.
-    hit: Bool
-    distance: Float
+    hits_shape: Bool
+    shape_distance: Float
     # Opacity of everything: 1 where a shape is hit.
     opacity: Float
     # Opacity of the medium in front of the shape.
-    front: Float
+    medium_opacity: Float
     # Mitsuba's preliminary intersection; None without shapes.
-    cast: Any
+    shape_intersection: Any
     # What `depth` does.
     find_depth: Callable[[str, Bool], Float]
 
@@ -148,7 +148,7 @@ class RayView:
         met."""
         return self.find_depth(kind, active)
 
-    def meets(self, surface_opacity: float) -> Bool:
+    def has_surface(self, surface_opacity: float) -> Bool:
         """Whether there is a surface: matter at all, and as much of it as ``surface_opacity``, which may be 0."""
         return (self.opacity > 0) & (self.opacity >= surface_opacity)
 
@@ -158,7 +158,7 @@ class RayView:
         return 0 if self.march is None else escape_distance(kind, self.march, depth)
 
 
-class Place:
+class SceneGeometry:
     """A medium, the shapes of a Mitsuba scene, or both: all that rays are traced through.
 
     Positions and distances are the scene's. ``medium``: or None; ``scene``: the scene whose shapes are met, or None,
@@ -174,20 +174,20 @@ class Place:
             check_shape(shape)
 
     @property
-    def diagonal(self) -> float:
+    def shape_diagonal(self) -> float:
         """Diagonal of the bounding box of all shapes, in scene units."""
-        return float(np.linalg.norm(np.subtract(*self.corners())))
+        return float(np.linalg.norm(np.subtract(*self.shape_bounds())))
 
-    def corners(self) -> tuple[np.ndarray, np.ndarray]:
+    def shape_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the bounding box of all shapes, (3,) each. There must be shapes."""
-        corners = [corners_of(shape) for shape in ([] if self.scene is None else self.scene.shapes())]
+        corners = [shape_corners(shape) for shape in ([] if self.scene is None else self.scene.shapes())]
         return np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Lower and upper corner (3,) of the medium and the shapes; of a medium without an end those of its inner cube.
         None where there is neither."""
         corners = [] if self.medium is None else [self.medium.bounds()]
-        corners += [] if self.scene is None else [self.corners()]
+        corners += [] if self.scene is None else [self.shape_bounds()]
         return (np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)) if corners else None
 
     def extent(self, *points: ArrayLike) -> float:
@@ -213,7 +213,7 @@ class Place:
             return RayView(None, hit, distance, opacity, Float(0), preliminary, at_shape)
 
         medium = self.medium
-        local = medium.local(ray.o, ray.d)
+        local = medium.ray_to_local(ray.o, ray.d)
         t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(dr.minimum(local.t_far, end), distance)
         result = scouted_march(medium, local, t0, t1, active, settings, **options)
         front = result.opacity
@@ -230,12 +230,12 @@ class Place:
         return RayView(result, hit, distance, dr.select(hit, 1, front), front, preliminary, in_both)
 
 
-def as_place(subject: Medium | Place) -> Place:
+def as_place(subject: Medium | SceneGeometry) -> SceneGeometry:
     """``subject`` itself, or the place that consists of this medium alone."""
-    return subject if isinstance(subject, Place) else Place(subject)
+    return subject if isinstance(subject, SceneGeometry) else SceneGeometry(subject)
 
 
-def check_shape(shape: Any, of: str = "", merged: bool = False) -> None:
+def check_shape(shape: Any, of: str = "", check_merged: bool = False) -> None:
     """Raise `NergError` for a mesh without faces and for a shape that is not finite, or reaches beyond `FARTHEST`.
 
     ``of``: what a message says of the scene that it is in. ``merged``: whether meshes that Mitsuba has merged, whose
@@ -244,12 +244,12 @@ def check_shape(shape: Any, of: str = "", merged: bool = False) -> None:
     if shape.is_mesh() and shape.face_count() == 0:
         # Mitsuba 3.9.1 builds a scene of it, but cannot shade what it does not meet.
         raise NergError(f'the mesh "{shape.id()}"{of} has no faces; take it out of the scene')
-    if merged or shape.bbox().valid() or not shape.is_mesh():
+    if check_merged or shape.bbox().valid() or not shape.is_mesh():
         name = f'shape "{shape.id()}"' if shape.id() else shape.class_name()
-        check_coordinates(np.array(corners_of(shape), float), f"the corners of the {name}{of}")
+        check_coordinates(np.array(shape_corners(shape), float), f"the corners of the {name}{of}")
 
 
-def corners_of(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
+def shape_corners(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner of the bounding box of ``shape``, (3,) each, in scene units."""
     box = shape.bbox()
     # Boxes of NaN are not valid, either.
@@ -319,27 +319,27 @@ class Shading:
         Derivatives are those of the nested integrator, or of the albedo; ``path`` has none.
         """
         mi = variant_types()
-        seen = active & (view.front < 1)
+        seen = active & (view.medium_opacity < 1)
         environment: Any = None if hide_emitters else scene.environment()
         nested: Any = self.nested
         if nested is not None:
             color, valid, aovs = nested.sample(scene, sampler, ray, medium, seen)
             if environment is None:
                 # Directly seen emitters are shapes; where there is nothing at all, there is the background.
-                color = dr.select(view.hit | valid, color, background)
+                color = dr.select(view.hits_shape | valid, color, background)
             return color, aovs, seen & valid
         behind = background if environment is None else environment.eval(_beyond(ray), seen)
-        shown = active & (view.hit | (environment is not None))
-        if view.cast is None:
+        shown = active & (view.hits_shape | (environment is not None))
+        if view.shape_intersection is None:
             return behind, [], shown
-        hit = seen & view.hit
+        hit = seen & view.hits_shape
         if len(scene.emitters()) > 0:
             # Paths are not differentiated: Dr.Jit has no reverse mode through their loop.
             with dr.suspend_grad():
                 self._path = self._path or mi.load_dict({"type": "path", "hide_emitters": bool(hide_emitters)})
                 shape = self._path.sample(scene, sampler, ray, None, hit)[0]
         else:
-            si = view.cast.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, hit)
+            si = view.shape_intersection.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, hit)
             shape = si.bsdf().eval_diffuse_reflectance(si, hit)
         return dr.select(hit, shape, behind), [], shown
 
@@ -363,14 +363,14 @@ BATCH = 1 << 19
 """Rays that are marched in one launch."""
 
 
-def default_settings(subject: Medium | Place) -> MarchSettings:
+def default_march_settings(subject: Medium | SceneGeometry) -> MarchSettings:
     """The march of the integrator ``nerg`` with nothing set."""
     medium = as_place(subject).medium
     return MarchSettings(step=default_step(medium), dt_gamma=default_growth(medium), stop=default_stop(medium))
 
 
 def trace_depth(
-    subject: Medium | Place,
+    subject: Medium | SceneGeometry,
     origins: np.ndarray | Point3f,
     directions: np.ndarray | Vector3f,
     settings: MarchSettings | None = None,
@@ -381,7 +381,7 @@ def trace_depth(
 
     ``subject``: a medium, or a ``Place`` (of shapes, which are met exactly, or of both). ``origins``, ``directions``:
     N rays in the scene's frame, directions unit, either as NumPy arrays (N, 3) or as Dr.Jit 3-arrays of N lanes.
-    ``settings``: see ``default_settings``. ``kind``: a name in ``depth.DEPTHS``. Returns ``(depth, opacity)`` of
+    ``settings``: see ``default_march_settings``. ``kind``: a name in ``depth.DEPTHS``. Returns ``(depth, opacity)`` of
     the kind that the rays came in (float32 (N,), or Dr.Jit Floats, evaluated): depth is the distance from the origin in
     scene units, 0 where nothing absorbs; which opacity makes a surface is the caller's to say. At most ``batch`` rays
     are marched in one launch. Carries no derivatives. Raises ``NergError`` for an unknown kind and ``ValueError`` for
@@ -391,7 +391,7 @@ def trace_depth(
     if batch < 1:
         raise ValueError(f"a batch must hold at least 1 ray, got {batch}")
     place = as_place(subject)
-    settings = settings or default_settings(place)
+    settings = settings or default_march_settings(place)
     if dr.is_array_v(origins):
         return _traced_jit(place, cast("Point3f", origins), cast("Vector3f", directions), settings, kind, batch)
     o, d = (np.asarray(v, np.float32) for v in (origins, directions))
@@ -408,7 +408,7 @@ def trace_depth(
 
 
 def _traced_jit(
-    place: Place, origins: Point3f, directions: Vector3f, settings: MarchSettings, kind: str, batch: int
+    place: SceneGeometry, origins: Point3f, directions: Vector3f, settings: MarchSettings, kind: str, batch: int
 ) -> tuple[Float, Float]:
     count = max(dr.width(origins), dr.width(directions))
     array, Float = type(origins), type(origins.x)
@@ -426,7 +426,7 @@ def _traced_jit(
     return depth, opacity
 
 
-def _types(place: Place) -> tuple[ModuleType, type]:
+def _types(place: SceneGeometry) -> tuple[ModuleType, type]:
     """Namespace and 3-array of the backend that a place's arrays belong to."""
     if place.scene is None and place.medium is not None:
         for value in place.medium.parameters():
@@ -437,7 +437,7 @@ def _types(place: Place) -> tuple[ModuleType, type]:
     return namespace(mi.Float), mi.Point3f
 
 
-def _trace(place: Place, o: Point3f, d: Vector3f, settings: MarchSettings, kind: str) -> tuple[Float, Float]:
+def _trace(place: SceneGeometry, o: Point3f, d: Vector3f, settings: MarchSettings, kind: str) -> tuple[Float, Float]:
     Float, count = type(o.x), max(dr.width(o), dr.width(d))
     with dr.suspend_grad():
         ray = SceneRay(o, d, Float(dr.inf))

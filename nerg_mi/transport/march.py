@@ -25,7 +25,7 @@ from .march_primal import (
     nothing_absorbed,
 )
 from .medium import Hits, LastHit, LocalRay, Medium, Painter
-from .quadrature import RULES, absorbed_share, boundaries
+from .quadrature import RULES, absorbed_fraction, boundaries
 
 # ---- Derivatives of a march, by marching again ----
 #
@@ -137,7 +137,7 @@ class March(dr.CustomOp):
                 if color is not None:
                     arriving += dr.dot(adjoint.color, step.color)
                     behind += dr.dot(adjoint.color, primal.color - state.color)
-                f = step.dtau * (adjoint.tau - behind) + step.transmittance * absorbed_share(step.dtau) * arriving
+                f = step.dtau * (adjoint.tau - behind) + step.transmittance * absorbed_fraction(step.dtau) * arriving
                 h = dr.select(step.before, -primal.half_slope * step.dtau, dr.select(step.crosses, step.crossing, 0))
                 dr.backward_from(dr.select(step.active, f + d_half * h, 0))
                 grads = [g + dr.grad(x) for g, x in zip(grads, leaves)]
@@ -160,7 +160,7 @@ class March(dr.CustomOp):
                     dr.set_grad(leaf, tangent)
                 step, state = self._replay(leaves, state)
                 # The step's own weight, and what it adds to the sums while T_i is held fixed.
-                weight = step.transmittance * absorbed_share(step.dtau)
+                weight = step.transmittance * absorbed_fraction(step.dtau)
                 outputs = [step.dtau, weight * step.mean, dr.select(step.crosses, step.crossing, 0)]
                 outputs += [] if color is None else [weight * step.color]
                 # Keep all derivatives: an output is an interior node of others, and the weights serve again.
@@ -204,7 +204,7 @@ class March(dr.CustomOp):
             state,
             active,
             step.dtau,
-            absorbed_share(dr.detach(step.dtau)),
+            absorbed_fraction(dr.detach(step.dtau)),
             dr.fma(length, step.share, t - primal_t0),
             step.paint,
             lambda missing: begin + step.crossing(missing),
@@ -264,7 +264,7 @@ class HitMarch(March):
             return replace(state, active=state.active & (t[0] < dr.inf)), t, index, extra
 
         def group(active, last, state, extra):
-            near = hits.nearest(ray, last, t1, dr.exp(-state.tau), dr.exp(-end), active)
+            near = hits.find_next(ray, last, t1, dr.exp(-state.tau), dr.exp(-end), active)
             farthest = LastHit(near.t[-1], near.index[-1])
             state = replace(state, active=active & (near.t[0] < dr.inf))
             state, _, _, extra = dr.while_loop(
@@ -282,14 +282,14 @@ class HitMarch(March):
     def _replay(self, leaves: list[Any], state: Any) -> tuple[Replayed, Any]:
         medium, active, index = self.request.medium, state.active, state.index
         o, d, w, t0, t1 = leaves
-        t, absorbed = cast("Hits", medium.hits).again(LocalRay(o, d, w, t0, t1), index, active)
+        t, absorbed = cast("Hits", medium.hits).reevaluate(LocalRay(o, d, w, t0, t1), index, active)
         return self._absorb(
             state,
             active,
             dr.select(active, -log1p(-absorbed), 0),
             dr.select(active, dr.detach(absorbed), 0),
             t - t0,
-            lambda painter, lit: painter.paint(medium, [index], o + d * t, w, lit),
+            lambda painter, lit: painter.shade(medium, [index], o + d * t, w, lit),
             lambda missing: t,
         )
 

@@ -12,7 +12,7 @@ from nerg_mi.maths.arrays import log1p, quotient
 from nerg_mi.maths.types import Bool, Color, Float, UInt32
 
 from .medium import Hits, LastHit, LocalRay, Medium, Occupancy, Painter, VoxelCells
-from .quadrature import RULES, absorbed_share, boundaries
+from .quadrature import RULES, absorbed_fraction, boundaries
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -56,7 +56,7 @@ def _optical_depth(opacity: float) -> float:
 
 # ---- What controls a march, and what it returns ----
 
-HITS_STOP = 1e-4
+DEFAULT_HITS_STOP = 1e-4
 """Transmittance at which the rasteriser of Gaussian splats stops (Kerbl et al. 2023)."""
 
 
@@ -93,17 +93,17 @@ def default_step(medium: Medium | None) -> float:
     medium, where nothing is marched."""
     if medium is None:
         return 1.0
-    return medium.step or medium.length_scale / 1024
+    return medium.default_step or medium.length_scale / 1024
 
 
 def default_growth(medium: Medium | None) -> float:
     """Growth of steps with distance (`MarchSettings.dt_gamma`) where none is asked for: what suits the medium."""
-    return MarchSettings.dt_gamma if medium is None else medium.growth
+    return MarchSettings.dt_gamma if medium is None else medium.default_dt_gamma
 
 
 def default_stop(medium: Medium | None) -> float:
     """`MarchSettings.stop` where none is asked for: of a medium of hits what its renderers and trainings stop at."""
-    return MarchSettings.stop if medium is None or medium.hits is None else HITS_STOP
+    return MarchSettings.stop if medium is None or medium.hits is None else DEFAULT_HITS_STOP
 
 
 def add(total: Float, lost: Float, term: Float) -> tuple[Float, Float]:
@@ -193,7 +193,7 @@ class MarchResult(MarchSums):
     @property
     def opacity(self) -> Float:
         """1 - transmittance."""
-        return absorbed_share(self.tau)
+        return absorbed_fraction(self.tau)
 
     @property
     def expected_depth(self) -> Float:
@@ -279,7 +279,7 @@ def leap(
         step = full * share
         middle = t + 0.5 * dr.minimum(step, t1 - t)
         u = o + d * middle
-        k = grid.empty_cells(u, seeking)
+        k = grid.distance_to_occupied(u, seeking)
         # The cells at chessboard distance < k around this one are empty: a box of 2k - 1 cells.
         reach = type(t)(k) - 1
         gap = type(t)(dr.inf)
@@ -379,7 +379,7 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
             active = found.settle(occlusion.clear(t, tau), active)
         step = quadrature.step(medium, ray, t, delta, t_next, state.carry, active, color is not None)
         distance = dr.fma(delta, step.share, t - t0)
-        found, weight, crosses = found.absorb(active, step.dtau, absorbed_share(step.dtau), distance, goal)
+        found, weight, crosses = found.absorb(active, step.dtau, absorbed_fraction(step.dtau), distance, goal)
         slope = delta / dr.select(crosses, step.dtau, 1)
         found.cross(crosses, t + step.crossing(goal - tau), slope, t, tau)
         if color is not None:
@@ -413,7 +413,7 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
     found = state.found
     if color is not None:
         # What never gathered enough weight for a colour of its own takes that of the rest.
-        painted = absorbed_share(found.tau) - state.pending
+        painted = absorbed_fraction(found.tau) - state.pending
         found.color *= dr.select(painted > 0, 1 + state.pending / dr.select(painted > 0, painted, 1), 0)
     return found
 
@@ -474,7 +474,7 @@ def march_hits(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> Ma
             found.color = found.color + weight * dr.if_stmt(
                 (lit, index),
                 lit,
-                lambda lit, index: painter.paint(medium, [cast("Float", index)], ray.o + ray.d * t, ray.w, lit),
+                lambda lit, index: painter.shade(medium, [cast("Float", index)], ray.o + ray.d * t, ray.w, lit),
                 lambda lit, index: painter.zero(),
                 label="colour",
             )
@@ -487,7 +487,7 @@ def march_hits(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> Ma
 
     def group(active: Bool, last: LastHit, found: MarchResult) -> tuple[Bool, LastHit, MarchResult]:
         """The next hits, as many as are found at once."""
-        near, found = hits.nearest(ray, last, t1, dr.exp(-found.tau), stop, active), replace(found)
+        near, found = hits.find_next(ray, last, t1, dr.exp(-found.tau), stop, active), replace(found)
         if found.density_evals is not None:
             found.density_evals = found.density_evals + near.evals
         farthest = LastHit(near.t[-1], near.index[-1])

@@ -180,11 +180,11 @@ class Hits(Protocol):
     """What rays meet of a medium, in groups of ``at_once``."""
 
     @property
-    def at_once(self) -> int:
+    def group_size(self) -> int:
         """How many are returned at once."""
         ...
 
-    def nearest(
+    def find_next(
         self, ray: LocalRay, after: LastHit, before: Float, transmittance: Float, stop: Float, active: Bool
     ) -> NextHits:
         """The next hits behind ``after`` and nearer than the distance ``before``; ``at_once`` of them, or all, or as
@@ -192,7 +192,7 @@ class Hits(Protocol):
         derivatives."""
         ...
 
-    def again(self, ray: LocalRay, index: UInt32, active: Bool) -> tuple[Float, Float]:
+    def reevaluate(self, ray: LocalRay, index: UInt32, active: Bool) -> tuple[Float, Float]:
         """``(t, absorbed)`` of the thing ``index``, attached to the ray and to the medium's parameters."""
         ...
 
@@ -222,7 +222,7 @@ class Occupancy(Protocol):
         """The grid that this one refines, which holds all that it holds; itself where it refines none."""
         ...
 
-    def empty_cells(self, u: Array3f, active: Bool | bool = True) -> UInt32:
+    def distance_to_occupied(self, u: Array3f, active: Bool | bool = True) -> UInt32:
         """How far the cell of ``u`` is from an occupied one, in cells by the chessboard's measure, or less; 0 in an
         occupied one. Points outside of the cube belong to its nearest cell."""
         ...
@@ -242,7 +242,7 @@ class Medium(Protocol):
         ...
 
     @property
-    def deferred(self) -> bool:
+    def is_deferred(self) -> bool:
         """Whether a ray's colour is that of its samples' mean features, rather than the mean of their colours."""
         ...
 
@@ -262,12 +262,12 @@ class Medium(Protocol):
         ...
 
     @property
-    def step(self) -> float | None:
+    def default_step(self) -> float | None:
         """Length of a step that suits the medium, in scene units; None where it knows none."""
         ...
 
     @property
-    def growth(self) -> float:
+    def default_dt_gamma(self) -> float:
         """Share of its distance that a step is at least, which suits a medium that gets coarser with distance; 0 where
         steps are best of one length."""
         ...
@@ -301,7 +301,7 @@ class Medium(Protocol):
         called after they may have changed."""
         ...
 
-    def local(self, o: Point3f, d: Vector3f) -> LocalRay:
+    def ray_to_local(self, o: Point3f, d: Vector3f) -> LocalRay:
         """The ray of the scene from ``o`` along unit ``d``."""
         ...
 
@@ -354,7 +354,7 @@ class Painter(Protocol):
         """A sum of nothing, of one lane."""
         ...
 
-    def paint(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
+    def shade(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         """The contribution of a sample that absorbs all light, attached to whatever carries derivatives.
 
         ``features``: of the same point, as ``medium.density_features`` returned them, or the index of a hit (`hits`);
@@ -363,14 +363,14 @@ class Painter(Protocol):
         """
         ...
 
-    def color(self, medium: Medium, sums: Color, opacity: Float, ray: LocalRay, active: Bool) -> Color | None:
+    def resolve_color(self, medium: Medium, sums: Color, opacity: Float, ray: LocalRay, active: Bool) -> Color | None:
         """Colour, times ``opacity``, of rays that gathered ``sums``; None where no colour is gathered."""
         ...
 
 
 class ColorPainter:
     """The medium's own colour, as an ``array_type`` such as ``Color3f``; in the medium's ``color_space``. Not for a
-    medium that is ``deferred``: see ``field_medium.color_painter``."""
+    medium that is ``deferred``: see ``field_medium.make_color_shader``."""
 
     def __init__(self, array_type: type):
         self.array_type = array_type
@@ -378,8 +378,8 @@ class ColorPainter:
     def zero(self) -> Color:
         return self.array_type(0)
 
-    def paint(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
+    def shade(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         return self.array_type(medium.color(features, p, w, active))
 
-    def color(self, medium: Medium, sums: Color, opacity: Float, ray: LocalRay, active: Bool) -> Color:
+    def resolve_color(self, medium: Medium, sums: Color, opacity: Float, ray: LocalRay, active: Bool) -> Color:
         return sums

@@ -13,7 +13,7 @@ from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Float, Point3f, Ray3f, Vector3f, variant_types
 
-from .geometry import Place
+from .geometry import SceneGeometry
 from .jit import Fingerprint, of_shapes, recording
 from .march_primal import MarchSettings
 
@@ -64,7 +64,7 @@ class ObserverCache:
         self._kept: dict[Hashable, _Kept] = {}
         self._numbers = numbers or self
 
-    def of_each(
+    def get_or_compute_each(
         self, thing: Hashable, observers: list[Point3f], made_of: Any, make: Callable[[Point3f], Any]
     ) -> list[Known]:
         """For each of ``observers`` (one lane each) what ``make(center)`` makes, or made before.
@@ -77,7 +77,7 @@ class ObserverCache:
         return self.of_known(thing, known, made_of, lambda k: make(k.center))
 
     def of_known(self, thing: Hashable, known: list[Known], made_of: Any, make: Callable[[Known], Any]) -> list[Known]:
-        """For each of ``known`` what ``make`` makes of it, or made before; otherwise as ``of_each``."""
+        """For each of ``known`` what ``make`` makes of it, or made before; otherwise as ``get_or_compute_each``."""
         return self._of_known(thing, known, made_of, make, 0)
 
     def of_numbers(
@@ -111,12 +111,12 @@ class ObserverCache:
         kept = self._kept.get(thing)
         return [] if kept is None else list(kept.known.values())
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Drop everything: something has changed that no array shows."""
         self._kept.clear()
 
 
-def fingerprint_of(place: Place) -> tuple[Fingerprint, Fingerprint]:
+def fingerprint_of(place: SceneGeometry) -> tuple[Fingerprint, Fingerprint]:
     """Of all that rays meet in ``place``: its shapes and its medium's arrays."""
     values = [] if place.medium is None else [v for v in place.medium.parameters() if dr.is_array_v(v)]
     return of_shapes(place), Fingerprint(values)
@@ -171,7 +171,7 @@ class ObserverSettings:
 _CENTERED = {"PerspectiveCamera", "ThinLensCamera", "Panorama", "RadianceMeter"}
 
 
-def center(sensor: mi.Sensor) -> Point3f:
+def sensor_center(sensor: mi.Sensor) -> Point3f:
     """Centre of ``sensor`` in the scene (one lane); attached to its ``to_world``."""
     return cast("Any", sensor).world_transform() @ variant_types().Point3f(0)
 
@@ -204,7 +204,7 @@ def _kind(sensor: mi.Sensor) -> str:
     return sensor.class_name() if name in ("Sensor", "ProjectiveCamera") else name
 
 
-def require_center(sensor: mi.Sensor, role: str) -> None:
+def check_center(sensor: mi.Sensor, role: str) -> None:
     """Raise ``ValueError`` when ``sensor`` (called ``role`` in the message) has no single centre."""
     if _kind(sensor) not in _CENTERED:
         raise NergError(
@@ -220,14 +220,14 @@ def same_center(sensors: Sequence[mi.Sensor], p_o: Point3f) -> bool:
     """
     if recording():
         return False
-    centers = [center(m) for s in sensors for m in _members(s) if _kind(m) in _CENTERED]
+    centers = [sensor_center(m) for s in sensors for m in _members(s) if _kind(m) in _CENTERED]
     count = sum(len(_members(s)) for s in sensors)
     return len(centers) == count > 0 and all(bool(dr.all(dr.detach(c) == dr.detach(p_o))) for c in centers)
 
 
 def centers(sensors: Sequence[mi.Sensor]) -> list[Point3f]:
     """Centre of each of ``sensors`` and of the members of batches."""
-    return [center(m) for s in sensors for m in _members(s)]
+    return [sensor_center(m) for s in sensors for m in _members(s)]
 
 
 def center_of_ray(sensors: Sequence[mi.Sensor], ray: Ray3f) -> Point3f:
@@ -238,16 +238,16 @@ def center_of_ray(sensors: Sequence[mi.Sensor], ray: Ray3f) -> Point3f:
     """
     members = [m for s in sensors for m in _members(s)]
     for member in members:
-        require_center(member, "the rendering sensor")
+        check_center(member, "the rendering sensor")
     if not members:
         raise NergError('there is no sensor to take the observer from: give the integrator an "observer"')
-    best = center(members[0])
+    best = sensor_center(members[0])
     if len(members) == 1:
         return best
     mi = variant_types()
     miss = mi.Float(dr.inf)
     for member in members:
-        c = center(member)
+        c = sensor_center(member)
         v = ray.o - c
         along = dr.dot(v, ray.d)
         off_line = dr.norm(v - ray.d * along)
@@ -292,7 +292,7 @@ def select_nearest(known: list[Known], p_o: Point3f, of: Callable[[Any], Float])
 class ObservedView(Protocol):
     """A view of one observer."""
 
-    def value(self, r_o: Vector3f) -> Float:
+    def evaluate(self, r_o: Vector3f) -> Float:
         """What it is along unit scene directions ``r_o``, without derivatives."""
         ...
 
@@ -301,16 +301,16 @@ class ObserverView(Protocol):
     """Something that is known of every observer, once their position is; it never changes itself."""
 
     @property
-    def occluded(self) -> bool:
+    def is_occluded(self) -> bool:
         """Whether what the observer cannot see has a value of 0."""
         ...
 
-    def at(self, p_o: Point3f) -> ObservedView:
+    def for_position(self, p_o: Point3f) -> ObservedView:
         """The view of the observer at ``p_o`` (in the scene, one lane)."""
         ...
 
 
-def view_along(
+def evaluate_view(
     view: ObserverView, observers: list[Point3f], p_o: Point3f, r_o: Vector3f, cache: ObserverCache
 ) -> Float:
     """``view`` along ``r_o`` of that one of ``observers`` (one lane each) who is nearest to ``p_o``, lane by
@@ -320,22 +320,22 @@ def view_along(
             "one of the AOVs depends on where the observer is, which a frozen function does not know while it is "
             'recorded: leave it out of "aovs"'
         )
-    known = cache.of_each(view, observers, (), view.at)
-    return select_nearest(known, p_o, lambda value: value.value(r_o))
+    known = cache.get_or_compute_each(view, observers, (), view.for_position)
+    return select_nearest(known, p_o, lambda value: value.evaluate(r_o))
 
 
 class SupportView:
     """How many training rays started around an observer (``fields.gaze_base``): one number each."""
 
-    occluded = False
+    is_occluded = False
 
     def __init__(self, support: RaySupport, to_world: Similarity | None = None):
         self.support, self.to_world = support, to_world or Similarity()
 
-    def at(self, p_o: Point3f) -> ObservedSupport:
+    def for_position(self, p_o: Point3f) -> ObservedSupport:
         """The support of the observer at ``p_o``."""
         with dr.suspend_grad():
-            total = self.support.at(self.to_world.point_to_local(p_o))
+            total = self.support.evaluate(self.to_world.point_to_local(p_o))
             dr.eval(total)
         return ObservedSupport(total)
 
@@ -346,7 +346,7 @@ class ObservedSupport:
     def __init__(self, total: Float):
         self.total = total
 
-    def value(self, r_o: Vector3f) -> Float:
+    def evaluate(self, r_o: Vector3f) -> Float:
         """The number; ``r_o`` makes no difference."""
         return self.total
 

@@ -11,13 +11,13 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.fields.gaze_base import AnyGazeField, GazeHead, mean, spread
-from nerg_mi.maths.arrays import vector_of
+from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.sphere import fibonacci_vectors, neighbourly_order
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f, variant_types
 
 from .field_medium import observed_features
-from .geometry import Place
+from .geometry import SceneGeometry
 from .jit import Fingerprint, recording
 from .observer import Known, ObserverCache, ObserverSettings, fingerprint_of, select_nearest
 
@@ -33,12 +33,12 @@ FIRST = 1 << 13
 at least."""
 
 USUAL, FEWEST = 5e-3, 1 << 11
-PARTS = 8
+ERROR_PARTS = 8
 """Parts of a sum whose scatter tells its error. Every eighth point of a golden spiral lies on one too, of eight times
 the angle, and no rounder; parts err in opposite ways more often than not, so that the error is told too large, by two
 or three times in the mean."""
 
-POWER = 0.75
+ERROR_EXPONENT = 0.75
 """Of the number of points, with which the error of a sum over them falls."""
 
 
@@ -55,7 +55,7 @@ def integrate(values: Callable[[int], np.ndarray], most: int, tolerance: float) 
     """The integral of what ``values(count)`` (count,) are in that many directions of equal area, as
     `maths.sphere.fibonacci_directions` numbers them: over as few as err by ``tolerance``, a share of it, or over
     ``most``."""
-    first = FIRST >> max(0, math.floor(math.log2(tolerance / USUAL) / POWER)) if tolerance > 0 else most
+    first = FIRST >> max(0, math.floor(math.log2(tolerance / USUAL) / ERROR_EXPONENT)) if tolerance > 0 else most
     count = min(max(first, FEWEST), most)
     while True:
         found = _sum(values(count))
@@ -69,9 +69,9 @@ def integrate(values: Callable[[int], np.ndarray], most: int, tolerance: float) 
 def _sum(values: np.ndarray) -> Integral:
     values = np.asarray(values, np.float64)
     mean = float(values.mean())
-    parts = [values[k::PARTS].mean() for k in range(min(PARTS, len(values)))]
+    parts = [values[k::ERROR_PARTS].mean() for k in range(min(ERROR_PARTS, len(values)))]
     scatter = float(np.std(parts, ddof=1)) if len(parts) > 1 else math.inf
-    error = scatter * PARTS**-POWER / abs(mean) if mean else math.inf if scatter else 0.0
+    error = scatter * ERROR_PARTS**-ERROR_EXPONENT / abs(mean) if mean else math.inf if scatter else 0.0
     return Integral(4 * math.pi * mean, len(values), error)
 
 
@@ -108,7 +108,7 @@ class AllAround:
         self.filling: Filling | None = None
         """What fills directions that escape, once that has been asked for."""
 
-    def of(self, count: int, outlook: Outlook) -> ObserverSurroundings:
+    def of(self, count: int, outlook: ObserverTracer) -> ObserverSurroundings:
         """Those in ``count`` directions; ``outlook``: always the observer's."""
         if count not in self._traced:
             if outlook.field.config.fills_escaped and self.filling is None:
@@ -127,13 +127,13 @@ class Filling:
 
 
 @dataclass(frozen=True, eq=False)
-class Outlook:
+class ObserverTracer:
     """What the observer at ``center`` (one lane) meets in ``place``, traced with ``settings``, where ``field``, which
     ``to_world`` places in the scene, is to be evaluated."""
 
     field: AnyGazeField
     to_world: Similarity
-    place: Place
+    place: SceneGeometry
     center: Point3f
     settings: ObserverSettings
 
@@ -164,7 +164,7 @@ class Outlook:
                 known = filling or self.trace_filling()
                 if len(known.distance):
                     depth = np.array(depth)
-                    depth[escaped] = nearest_depth(known.directions, known.distance, np.array(directions).T[escaped])
+                    depth[escaped] = interpolate_nearest_depth(known.directions, known.distance, np.array(directions).T[escaped])
                     depth = mi.Float(depth)
         return depth, ~met
 
@@ -182,7 +182,7 @@ class Outlook:
         mi, settings = variant_types(), self.settings
         everywhere = dr.full(mi.Bool, True, dr.width(directions))
         view = self.place.trace(mi.Ray3f(self.center, directions), everywhere, settings.march)
-        met = everywhere & view.meets(settings.surface_opacity)
+        met = everywhere & view.has_surface(settings.surface_opacity)
         return met, cast("Float", dr.select(met, view.depth(settings.depth, met), beyond))
 
     def _beyond(self, directions: Vector3f) -> Float:
@@ -193,7 +193,7 @@ class Outlook:
         return dr.select((near < far) & (far > 0) & dr.isfinite(far), far, box.diagonal * local.scale)
 
 
-def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def interpolate_nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Depth in directions ``wanted`` (M, 3) from that of the up to eight nearest of ``known`` (N, 3): the mean of its
     logarithm, weighted by the inverse square of the distance."""
     from scipy.spatial import KDTree
@@ -209,7 +209,7 @@ def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> n
 #
 # A field alone cannot be evaluated for an observer: a normalised one must be divided by its integral over the
 # observer's sphere, which depends on where they stand, and one with semantic features needs those of the place. So a
-# ``PlacedGaze`` has no densities; ``at`` gives an ``ObservedGaze``, which has.
+# ``GazeFieldInstance`` has no densities; ``at`` gives an ``ObservedGaze``, which has.
 
 STEP = 1 / 256
 """How far an observer is moved for the derivatives of an integral, of the side of the field's box: edges that pass
@@ -219,7 +219,7 @@ MOVING = 1 << 15
 """Directions of these integrals at most."""
 
 
-class PlacedGaze:
+class GazeFieldInstance:
     """``field`` placed in the scene by ``to_world`` (field to scene); neither is replaced afterwards."""
 
     def __init__(self, field: AnyGazeField, to_world: Similarity | None = None):
@@ -229,12 +229,12 @@ class PlacedGaze:
         """Arrays that gaze depends on, for derivatives."""
         return list(self.field.parameters().values())
 
-    def outlook(self, place: Place, center: Point3f, settings: ObserverSettings) -> Outlook:
+    def make_tracer(self, place: SceneGeometry, center: Point3f, settings: ObserverSettings) -> ObserverTracer:
         """What the observer at ``center`` (one lane) meets where the field is to be evaluated for them."""
-        return Outlook(self.field, self.to_world, place, center, settings)
+        return ObserverTracer(self.field, self.to_world, place, center, settings)
 
-    def at(
-        self, observers: list[Point3f], place: Place, settings: ObserverSettings, cache: ObserverCache | None = None
+    def for_observers(
+        self, observers: list[Point3f], place: SceneGeometry, settings: ObserverSettings, cache: ObserverCache | None = None
     ) -> ObservedGaze:
         """The field for ``observers`` (scene points, one lane each) in ``place``, traced with ``settings``.
 
@@ -248,7 +248,7 @@ class PlacedGaze:
             raise ValueError("a gaze field that is normalised over the observer's sphere needs to know the observers")
         cache = cache or ObserverCache()
         made_of = (fingerprint_of(place), settings.surfaces)
-        around = cache.of_each((self, "surroundings"), observers, made_of, lambda center: AllAround())
+        around = cache.get_or_compute_each((self, "surroundings"), observers, made_of, lambda center: AllAround())
         made_of = (*made_of, settings.directions, settings.integral_tolerance)
         integrals = []
         for member in self.field.members:
@@ -287,9 +287,9 @@ class _SphereIntegral:
     """The integral of one ``member`` of the ``placed`` field over the sphere around observers (``observer.Known``, with
     their ``AllAround``) in ``place``."""
 
-    placed: PlacedGaze
+    placed: GazeFieldInstance
     member: GazeHead
-    place: Place
+    place: SceneGeometry
     settings: ObserverSettings
 
     def detached(self, known: Known) -> Float:
@@ -338,7 +338,7 @@ class _SphereIntegral:
         return integrate(numbered, self.settings.directions, self.settings.integral_tolerance)
 
     def _around(self, known: Known, count: int) -> ObserverSurroundings:
-        return known.value.of(count, self.placed.outlook(self.place, known.center, self.settings))
+        return known.value.of(count, self.placed.make_tracer(self.place, known.center, self.settings))
 
     def _integrand(self, known: Known, around: ObserverSurroundings) -> Float:
         o = known.center + dr.zeros(type(known.center), dr.width(around.directions))
@@ -349,10 +349,10 @@ class _SphereIntegral:
 
 
 class ObservedGaze:
-    """A gaze field for the observers that ``PlacedGaze.at`` was given, for as long as its weights and the place are
+    """A gaze field for the observers that ``GazeFieldInstance.at`` was given, for as long as its weights and the place are
     those of then. It holds no directions, only numbers: many of them may be kept."""
 
-    def __init__(self, placed: PlacedGaze, place: Place, settings: ObserverSettings, integrals: list[list[Known]]):
+    def __init__(self, placed: GazeFieldInstance, place: SceneGeometry, settings: ObserverSettings, integrals: list[list[Known]]):
         self._placed, self._place, self._settings, self._integrals = placed, place, settings, integrals
 
     @property
@@ -364,7 +364,7 @@ class ObservedGaze:
         return self._placed.parameters()
 
     @property
-    def made_of(self) -> tuple:
+    def dependencies(self) -> tuple:
         """What densities depend on besides the place and the observers, comparable with ``==``."""
         return self._placed, self._settings, Fingerprint(self.parameters())
 
@@ -389,41 +389,41 @@ class ObservedGaze:
         """
         return mean(self._each(p_od, p_o, r_o, active, semantic, escaped))
 
-    def spread(self, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool) -> tuple[Float, Float, Float, Float]:
+    def evaluate_with_std(self, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool) -> tuple[Float, Float, Float, Float]:
         """``evaluate`` of an ensemble, and the standard deviation of its members' gaze (1/sr)."""
         found = self._each(p_od, p_o, r_o, active)
         gaze, emit, capture = mean(found)
         return gaze, emit, capture, spread(found)
 
-    def along(self, p_o: Point3f, r_o: Vector3f) -> Float:
+    def evaluate_along(self, p_o: Point3f, r_o: Vector3f) -> Float:
         """Density (1/sr) of the observer at ``p_o`` (one lane) in unit directions ``r_o``, carrying no derivatives.
 
         On surfaces it is what the integrator shows there, and elsewhere what the field was trained to be."""
-        return mean([(gaze,) for gaze in self.members_along(p_o, r_o)])[0]
+        return mean([(gaze,) for gaze in self.evaluate_members_along(p_o, r_o)])[0]
 
-    def members_along(self, p_o: Point3f, r_o: Vector3f) -> list[Float]:
+    def evaluate_members_along(self, p_o: Point3f, r_o: Vector3f) -> list[Float]:
         """``along`` of each member of an ensemble by itself; of one field that alone."""
         return self._look(p_o, r_o)[0]
 
-    def look(self, p_o: Point3f, r_o: Vector3f, filling: Filling | None = None) -> tuple[list[Float], Float]:
-        """``members_along``, and the distance of the surface that is met along each, infinite where there is none.
+    def evaluate_with_distance(self, p_o: Point3f, r_o: Vector3f, filling: Filling | None = None) -> tuple[list[Float], Float]:
+        """``evaluate_members_along``, and the distance of the surface that is met along each, infinite where there is none.
         ``filling``: that of the observer, if it has been traced."""
         found, distance, escaped = self._look(p_o, r_o, filling)
         if not self._placed.field.config.needs_surfaces:
             with dr.suspend_grad():
                 center = variant_types().Point3f(dr.detach(p_o))
-                met, distance = self._placed.outlook(self._place, center, self._settings).met_along(r_o)
+                met, distance = self._placed.make_tracer(self._place, center, self._settings).met_along(r_o)
                 escaped = ~met
         return found, dr.select(escaped, dr.inf, distance)
 
     def _look(self, p_o: Point3f, r_o: Vector3f, filling: Filling | None = None) -> tuple[list[Float], Float, Bool]:
-        """``(gaze of each member, distance, escaped)``, the last two as of ``Outlook.distance_along``."""
+        """``(gaze of each member, distance, escaped)``, the last two as of ``ObserverTracer.distance_along``."""
         mi = variant_types()
         with dr.suspend_grad():
             center = mi.Point3f(dr.detach(p_o))
             dr.make_opaque(center)
             width = dr.width(r_o)
-            distance, escaped = self._placed.outlook(self._place, center, self._settings).distance_along(r_o, filling)
+            distance, escaped = self._placed.make_tracer(self._place, center, self._settings).distance_along(r_o, filling)
             o = center + dr.zeros(mi.Point3f, width)
             everywhere = dr.full(mi.Bool, True, width)
             found = self._each(o + r_o * distance, o, r_o, everywhere, None, escaped)
@@ -469,8 +469,8 @@ class ObservedGaze:
 _INTEGRAL = 2048
 
 
-def look_from(
-    gaze: PlacedGaze, place: Place, settings: ObserverSettings, eye: np.ndarray
+def make_gaze_evaluator(
+    gaze: GazeFieldInstance, place: SceneGeometry, settings: ObserverSettings, eye: np.ndarray
 ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """A function of unit directions (N, 3): the gaze (M, N) of the observer at ``eye`` (3,), in proportion to 1/sr, by
     each of M members of an ensemble or by one field, and the distance (N,) of the first surface, infinite where there
@@ -481,12 +481,12 @@ def look_from(
     # A position that is a constant of the kernel would be compiled anew for every observer.
     dr.make_opaque(center)
     cache = ObserverCache()
-    observed = gaze.at([center], place, settings, cache)
+    observed = gaze.for_observers([center], place, settings, cache)
     around = cache.peek((gaze, "surroundings"))
     filling = around[0].value.filling if around else None
 
     def look(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found, distance = observed.look(center, vector_of(mi.Vector3f, directions), filling)
+        found, distance = observed.evaluate_with_distance(center, to_vector(mi.Vector3f, directions), filling)
         dr.eval(found, distance)
         lanes = lambda v: np.broadcast_to(np.array(v, np.float64), (len(directions),))
         return np.array([lanes(g) for g in found]), lanes(distance)

@@ -9,7 +9,7 @@ import drjit as dr
 from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f, variant_types
 
 from .depth import DEPTHS
-from .geometry import Place, RayView
+from .geometry import SceneGeometry, RayView
 from .march_primal import Occlusion
 from .observer import ObserverCache, ObserverSettings, distance_and_direction, fingerprint_of, visibility
 from .observer_gaze import ObservedGaze
@@ -29,14 +29,14 @@ class ObserverMap:
     centres.
     """
 
-    def __init__(self, place: Place, center: Point3f, settings: ObserverSettings):
+    def __init__(self, place: SceneGeometry, center: Point3f, settings: ObserverSettings):
         mi = variant_types()
         self.height, self.width, self.center = settings.map_height, 2 * settings.map_height, center
         self._float, self._uint, self._vector = mi.Float, mi.UInt32, mi.Vector3f
         with dr.suspend_grad():
             everywhere = dr.full(mi.Bool, True, self.width * self.height)
             view = place.trace(mi.Ray3f(self.center, self._directions()), everywhere, settings.march)
-            met = view.meets(settings.surface_opacity)
+            met = view.has_surface(settings.surface_opacity)
             self.depth = dr.select(met, view.depth(settings.depth, met), dr.inf)
             dr.eval(self.depth)
 
@@ -120,7 +120,7 @@ class ObserverMap:
 _PAST = 4
 # Ray casts agree on a shape to this share of the scene's diagonal, or of twice the coordinates there: what is far
 # away takes no part in how exactly a near one is met, but for the size of its triangles.
-EXACT, _FAR = 1e-4, 3e-7
+RELATIVE_TOLERANCE, _FAR = 1e-4, 3e-7
 LARGEST = 1e18
 """Tolerance at most, in scene units: the square of a distance so long is still finite in single precision."""
 
@@ -141,8 +141,8 @@ class Sight:
     gaze: Float | None = None
 
 
-def trace_sight(
-    place: Place,
+def trace_from_observer(
+    place: SceneGeometry,
     ray: Ray3f,
     p_d: Point3f,
     p_o: Point3f,
@@ -154,7 +154,7 @@ def trace_sight(
     count: bool = False,
     gaze: ObservedGaze | None = None,
     cache: ObserverCache | None = None,
-    whole: bool = True,
+    needs_depth: bool = True,
 ) -> Sight:
     """What the observer at ``p_o`` meets towards the surface ``p_d`` that the camera sees on ``ray``.
 
@@ -192,10 +192,10 @@ def trace_sight(
             to_point.maxt = distance
             between = place.trace(to_point, active, settings.march, count=count)
             reached = type(distance)(1) if between.march is None else dr.exp(-between.march.tau)
-            seen = dr.select(between.hit, 0, reached)
+            seen = dr.select(between.hits_shape, 0, reached)
             return Sight(p_d, distance, seen, _evaluations(between))
         occlusion = None
-        if not whole and DEPTHS.find(settings.depth).at_half:
+        if not needs_depth and DEPTHS.find(settings.depth).at_half:
             before = distance - tolerance
             occlusion = Occlusion(before, before - falloff, settings.surface_opacity)
         view = place.trace(to_point, active, settings.march, count=count, occlusion=occlusion)
@@ -212,34 +212,34 @@ def _met(view: RayView, settings: ObserverSettings, active: Bool) -> Float:
     point."""
     march = view.march
     if march is None or march.known is None:
-        return dr.select(active & view.meets(settings.surface_opacity), view.depth(settings.depth, active), dr.inf)
+        return dr.select(active & view.has_surface(settings.surface_opacity), view.depth(settings.depth, active), dr.inf)
     rest = active & ~march.known
-    met = dr.select(rest & view.meets(settings.surface_opacity), view.depth(settings.depth, rest), dr.inf)
+    met = dr.select(rest & view.has_surface(settings.surface_opacity), view.depth(settings.depth, rest), dr.inf)
     # Infinite where the way is clear: transmittance 1/2 has not been reached there.
     return dr.select(active & march.known, march.half, met)
 
 
-def _tolerance(place: Place, ray: Ray3f, p_d: Point3f, p_o: Point3f, settings: ObserverSettings) -> Float | float:
+def _tolerance(place: SceneGeometry, ray: Ray3f, p_d: Point3f, p_o: Point3f, settings: ObserverSettings) -> Float | float:
     if settings.tolerance:
         return min(settings.tolerance, LARGEST)
     if place.medium is None:
         near = 2 * dr.maximum(dr.norm(dr.detach(p_d)), dr.norm(dr.detach(p_o)))
-        return EXACT * dr.minimum(place.diagonal, near) + _FAR * place.diagonal
+        return RELATIVE_TOLERANCE * dr.minimum(place.shape_diagonal, near) + _FAR * place.shape_diagonal
     march = settings.march
     return dr.minimum(2 * dr.maximum(march.step, march.dt_gamma * dr.norm(p_d - ray.o)), LARGEST)
 
 
 def _map_of(
-    place: Place, p_o: Point3f, settings: ObserverSettings, gaze: ObservedGaze | None, cache: ObserverCache
+    place: SceneGeometry, p_o: Point3f, settings: ObserverSettings, gaze: ObservedGaze | None, cache: ObserverCache
 ) -> tuple[ObserverMap, Float | None]:
     """The observer's map, and the table of ``gaze`` on it (None without one, or where it has derivatives)."""
     made_of = (fingerprint_of(place), settings.surfaces, settings.map_height)
     make = lambda center: ObserverMap(place, center, settings)
-    known = cache.of_each("map", [p_o], made_of, make)
+    known = cache.get_or_compute_each("map", [p_o], made_of, make)
     around = known[0].value
     if gaze is None or dr.grad_enabled(p_o, *gaze.parameters()):
         return around, None
-    of_map = (around, gaze.made_of)
+    of_map = (around, gaze.dependencies)
     table = cache.of_known("gaze of map", known, of_map, lambda k: k.value.gaze_table(gaze))[0].value
     return around, table
 

@@ -33,12 +33,12 @@ _SERIES_BELOW = 0.5
 _EXP_LIMIT = 80.0
 
 
-def absorbed_share(tau: Float) -> Float:
+def absorbed_fraction(tau: Float) -> Float:
     """Share 1 - exp(-τ) of the light that a step of optical depth ``tau`` absorbs."""
     return one_minus_exp(tau)
 
 
-def mean_depth_share(tau: Float) -> Float:
+def mean_depth_fraction(tau: Float) -> Float:
     """Mean distance into a step at which light is absorbed, as a share of its length.
 
     h(τ) = 1/τ - 1/expm1(τ): 1/2 for thin steps, 1/τ for opaque ones. ``tau``: optical depth
@@ -110,7 +110,7 @@ def linear_share(first: Float, last: Float) -> Float:
     """Mean absorption distance, as a share of the step, of a density that is linear over it.
 
     ``first``, ``last``: density at the ends times the step's length, >= 0. Good to 1e-6 (relative); equals
-    ``mean_depth_share`` where both are equal. Finite, with a finite derivative, everywhere.
+    ``mean_depth_fraction`` where both are equal. Finite, with a finite derivative, everywhere.
     """
     first, last = dr.minimum(first, _DENSEST), dr.minimum(last, _DENSEST)
     # Steps that are thinner than 1e-18 weigh nothing: the derivative's squares must not underflow.
@@ -214,7 +214,7 @@ class Registry(Generic[Kind]):
     def __iter__(self) -> Iterator[Kind]:
         return iter(self._known.values())
 
-    def manual(self) -> str:
+    def format_manual(self) -> str:
         """One sentence about each, as the manual has it."""
         return " ".join(f"``{item.name}``: {item.summary}." for item in self)
 
@@ -264,7 +264,7 @@ class Rule(Protocol):
         ...
 
     @property
-    def in_cells(self) -> bool:
+    def ends_at_cells(self) -> bool:
         """Whether steps end where the ray leaves a voxel, which asks for a medium with ``cells``. Otherwise they are
         as long as the settings say."""
         ...
@@ -316,10 +316,10 @@ def register_quadrature(rule: Rule) -> Rule:
 def boundaries(rule: Rule, medium: Medium) -> VoxelCells | None:
     """Where steps of ``rule`` end in ``medium``; None where they are as long as the settings say. Raises ``NergError``
     for a medium that has no voxels where the rule needs them."""
-    if not rule.in_cells:
+    if not rule.ends_at_cells:
         return None
     if medium.cells is None:
-        others = " or ".join(f'"{other.name}"' for other in RULES if not other.in_cells)
+        others = " or ".join(f'"{other.name}"' for other in RULES if not other.ends_at_cells)
         raise NergError(f'the quadrature "{rule.name}" needs an axis-aligned "gridvolume" as density; use {others}')
     return medium.cells
 
@@ -353,7 +353,7 @@ def _step_along_line(
 
     def paint(painter, lit):
         p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
-        return painter.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
+        return painter.shade(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
 
     return MarchStep(
         dtau, share, lambda missing: linear_crossing(first, last, delta, missing), paint, carry, evaluations
@@ -365,7 +365,7 @@ class Constant:
 
     name = "constant"
     summary = "density is constant over a step, sampled at its middle"
-    in_cells = False
+    ends_at_cells = False
 
     def start(self, Float):
         return None
@@ -376,11 +376,11 @@ class Constant:
         dtau = dr.select(active, sigma * delta, 0)
 
         def paint(painter, lit):
-            return painter.paint(medium, features, p, ray.w, lit)
+            return painter.shade(medium, features, p, ray.w, lit)
 
         return MarchStep(
             dtau,
-            mean_depth_share(dtau),
+            mean_depth_fraction(dtau),
             lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),
             paint,
             None,
@@ -394,7 +394,7 @@ class Linear:
 
     name = "linear"
     summary = "linear between samples at the steps' ends"
-    in_cells = False
+    ends_at_cells = False
 
     def start(self, Float):
         # Density at the end of the step before, and where that was (distances are not negative).
@@ -431,7 +431,7 @@ class Cells:
         "integrate its interpolant exactly (opacity to rounding, depth to a hundredth of a voxel); a ``step`` that is "
         "given bounds them, ``dt_gamma``, ``coarse`` and ``jitter`` do not apply"
     )
-    in_cells = True
+    ends_at_cells = True
 
     def start(self, Float):
         return None

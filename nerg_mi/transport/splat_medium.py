@@ -9,8 +9,8 @@ from typing import Any, ClassVar, cast
 import drjit as dr
 import numpy as np
 
-from nerg_mi.fields.splats import Splats, matrices_of
-from nerg_mi.maths.arrays import aligned
+from nerg_mi.fields.splats import Splats, quaternions_to_matrices
+from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, UInt32, Vector3f
 
@@ -97,7 +97,7 @@ SHAPE = 16
 """Numbers a Gaussian in ``shapes``: the matrix (row by row) that leads to its own axes and standard deviations, its
 centre, its opacity, and three unused."""
 
-MOST_ABSORBED = 0.9999
+MAX_ALPHA = 0.9999
 """Share of light that one Gaussian absorbs at most, as in Mitsuba's ``volprim_rf_basic``."""
 
 _NAMES = ("centers", "scales", "rotations", "opacities", "harmonics")
@@ -129,7 +129,7 @@ class SplatArrays:
         # Packets of four are gathered at once.
         self._stride = -(-3 * self.terms // 4) * 4
         for name in _NAMES:
-            setattr(self, name, ns.Float(aligned(getattr(splats, name)).ravel()))
+            setattr(self, name, ns.Float(copy_aligned(getattr(splats, name)).ravel()))
         self.pack()
 
     def parameters(self) -> dict[str, Any]:
@@ -144,7 +144,7 @@ class SplatArrays:
         )
         rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
         # An ellipsoid's half extents are the lengths of its matrix' rows.
-        half = self.extent * np.sqrt(((matrices_of(rotations) * scales[:, None]) ** 2).sum(axis=2))
+        half = self.extent * np.sqrt(((quaternions_to_matrices(rotations) * scales[:, None]) ** 2).sum(axis=2))
         tree = build_tree(centers - half, centers + half)
         self.lower, self.upper = (centers - half).min(axis=0), (centers + half).max(axis=0)
         # Read by kernels, which would be compiled anew if they held the numbers, as often as Gaussians are moved.
@@ -153,10 +153,10 @@ class SplatArrays:
         self.leaves = tree.leaves
         # Aligned alike each time: frozen functions tell arrays by it, and would be recorded anew.
         self.nodes, self.places = (
-            ns.Float(aligned(tree.nodes).ravel()),
-            ns.UInt32(aligned(tree.places, np.uint32).ravel()),
+            ns.Float(copy_aligned(tree.nodes).ravel()),
+            ns.UInt32(copy_aligned(tree.places, np.uint32).ravel()),
         )
-        order = ns.UInt32(aligned(tree.order, np.uint32).ravel())
+        order = ns.UInt32(copy_aligned(tree.order, np.uint32).ravel())
         take = lambda values, width: [dr.gather(ns.Float, values, order * width + i) for i in range(width)]
         c, s, q = take(self.centers, 3), take(self.scales, 3), take(self.rotations, 4)
         inverse = dr.rcp(dr.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
@@ -176,7 +176,7 @@ class SplatArrays:
         self.order = order
         dr.eval(self.shapes, self.colors, self.nodes, self.places)
 
-    def peak(self, place: UInt32, o: Any, d: Any, active: Bool) -> tuple[Float, Float, Float]:
+    def find_peak(self, place: UInt32, o: Any, d: Any, active: Bool) -> tuple[Float, Float, Float]:
         """``(t, absorbed, distance)`` of the Gaussian at ``place`` of the tree's order on the ray ``o + t d``.
 
         Where the ray is nearest to its centre by the Gaussian's own measure, the share of light absorbed, all of it
@@ -189,7 +189,7 @@ class SplatArrays:
         t = -_dot(from_center, along) / dr.select(square > 0, square, 1)
         off = [dr.fma(t, v, p) for v, p in zip(along, from_center)]
         distance = _dot(off, off)
-        return t, dr.minimum(g[12] * dr.exp(-0.5 * distance), MOST_ABSORBED), distance
+        return t, dr.minimum(g[12] * dr.exp(-0.5 * distance), MAX_ALPHA), distance
 
     def color(self, place: UInt32, w: Vector3f, active: Bool) -> Color:
         """Colour of the Gaussian at ``place`` in the unit direction ``w`` of the ray: a list of three."""
@@ -234,12 +234,12 @@ class _Walk:
 class SplatHits:
     """What rays meet of ``arrays``: a `medium.Hits`."""
 
-    at_once = AT_ONCE
+    group_size = AT_ONCE
 
     def __init__(self, arrays: SplatArrays):
         self.arrays = arrays
 
-    def nearest(
+    def find_next(
         self, ray: LocalRay, after: LastHit, before: Float, transmittance: Float, stop: Float, active: Bool
     ) -> NextHits:
         """See `medium.Hits`."""
@@ -252,7 +252,7 @@ class SplatHits:
 
         def test(walk: _Walk) -> _Walk:
             place = dr.gather(UInt32, a.places, walk.node - a.leaves, walk.active)
-            t, absorbed, distance = a.peak(place, o, d, walk.active)
+            t, absorbed, distance = a.find_peak(place, o, d, walk.active)
             behind = (t > after.t) | ((t == after.t) & (place > after.index))
             good = walk.active & behind & (distance < a.extent**2) & (t < walk.far) & (t < before)
             t = dr.select(good, t, dr.inf)
@@ -304,9 +304,9 @@ class SplatHits:
         (walk,) = dr.while_loop((start,), lambda walk: walk.active, lambda walk: (step(walk),), label="nearest")
         return NextHits(walk.t, walk.absorbed, walk.index, walk.evals)
 
-    def again(self, ray: LocalRay, index: UInt32, active: Bool) -> tuple[Float, Float]:
+    def reevaluate(self, ray: LocalRay, index: UInt32, active: Bool) -> tuple[Float, Float]:
         """See `medium.Hits`."""
-        t, absorbed, _ = self.arrays.peak(index, ray.o, ray.d, active)
+        t, absorbed, _ = self.arrays.find_peak(index, ray.o, ray.d, active)
         return t, absorbed
 
 
@@ -332,9 +332,9 @@ class SplatMedium:
     """
 
     has_color = True
-    deferred = False
+    is_deferred = False
     feature_count = 0
-    growth = 0.0
+    default_dt_gamma = 0.0
     occupancy = None
     cells = None
 
@@ -347,7 +347,7 @@ class SplatMedium:
         return float(np.linalg.norm(self.arrays.upper - self.arrays.lower)) * self.to_world.scale
 
     @property
-    def step(self) -> float | None:
+    def default_step(self) -> float | None:
         """The median thickness of a Gaussian: how far apart two ideas of a surface usually are."""
         return self.arrays.thickness * self.to_world.scale
 
@@ -360,7 +360,7 @@ class SplatMedium:
     def refresh(self, anyway: bool = False) -> None:
         """Nothing: whoever sets parameters of the splats packs them."""
 
-    def local(self, o: Point3f, d: Vector3f) -> LocalRay:
+    def ray_to_local(self, o: Point3f, d: Vector3f) -> LocalRay:
         along = self.to_world.vector_to_local(d)
         w = self.to_world.direction_to_local(d)
         p = self.to_world.point_to_local(o)

@@ -41,7 +41,7 @@ class VolumeMedium:
         self._interaction, self._ns = mi.Interaction3f, namespace(mi.Float)
         self._density: Any = density
         self._color: Any = color
-        self.has_color, self.deferred = color is not None, False
+        self.has_color, self.is_deferred = color is not None, False
         box = density.bbox()
         self._lower, self._upper = np.array(box.min, float), np.array(box.max, float)
         if not np.all(np.isfinite(self._lower) & np.isfinite(self._upper)) or np.any(self._upper <= self._lower):
@@ -50,7 +50,7 @@ class VolumeMedium:
                 "give it a to_world that places it in the scene"
             )
         self.cells: VoxelCells | None = None
-        self.step: float | None = None
+        self.default_step: float | None = None
         self.bound: OccupancyGrid | None = None
         self._read: Fingerprint | None = None
         self.refresh()
@@ -67,11 +67,11 @@ class VolumeMedium:
         if arrays == self._read and not anyway:
             return
         described = describe(self._density)
-        self.cells, self.bound, self.step = None, None, None
+        self.cells, self.bound, self.default_step = None, None, None
         if described is not None:
             self.cells, data = described
             # A step that is longer than a voxel can pass over a sheet.
-            self.step = min(self.length_scale / 1024, 0.5 * self.cells.edge)
+            self.default_step = min(self.length_scale / 1024, 0.5 * self.cells.edge)
             self.bound = bound(data, self._ns)
         # At the end: what was refused is looked at again.
         self._read = arrays
@@ -84,7 +84,7 @@ class VolumeMedium:
         return self.bound
 
     @property
-    def growth(self) -> float:
+    def default_dt_gamma(self) -> float:
         return 0.0
 
     @property
@@ -103,7 +103,7 @@ class VolumeMedium:
                 values += [v for v in dict(mi.traverse(volume)).values() if dr.is_array_v(v) and dr.is_float_v(v)]
         return values
 
-    def local(self, o: Point3f, d: Vector3f) -> LocalRay:
+    def ray_to_local(self, o: Point3f, d: Vector3f) -> LocalRay:
         near, far = intersect_box(o, d, self._lower.tolist(), self._upper.tolist())
         return LocalRay(o, d, d, near, far)
 

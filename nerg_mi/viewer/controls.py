@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sentence
-from nerg_mi.figures.style import Provenance, provenance
+from nerg_mi.errors import NergError, format_error
+from nerg_mi.figures.style import Provenance, make_provenance
 from nerg_mi.files.images import encode_png
-from nerg_mi.formats.areas import MOST, Region, to_json
-from nerg_mi.rendering.scene import files_of_scene
+from nerg_mi.formats.areas import MAX_AREAS, Region, format_areas
+from nerg_mi.rendering.scene import list_scene_files
 
 from . import layers
 from .layers import Scale
@@ -49,7 +49,7 @@ def telling(event_or_client: Any, title: str) -> Iterator[None]:
     try:
         yield
     except NergError as error:
-        tell(event_or_client, title, sentence(error))
+        tell(event_or_client, title, format_error(error))
 
 
 class Inset:
@@ -108,7 +108,7 @@ class Controls:
         variant = gui.add_dropdown("Gaze field", names, initial_value=session.gaze_name) if len(names) > 1 else None
         titles = [layer.title for layer in session.layers]
         layer = gui.add_dropdown("Layer", titles, initial_value=session.shade.layer.title)
-        self._legend = gui.add_html(layers.legend(session.shade.layer, session.scale(), self.page.stale))
+        self._legend = gui.add_html(layers.format_legend(session.shade.layer, session.scale(), self.page.stale))
         basis = gui.add_html(basis_note(session))
         colors = gui.add_dropdown("Colours", _maps_of(session.shade.layer), initial_value=_USUAL)
         automatic = gui.add_checkbox("Automatic range", True)
@@ -147,7 +147,7 @@ class Controls:
             try:
                 session.set_gaze(event.target.value)
             except NergError as error:
-                tell(event, "Gaze field", sentence(error))
+                tell(event, "Gaze field", format_error(error))
                 event.target.value = session.gaze_name
                 return
             layer.options = tuple(la.title for la in session.layers)
@@ -186,7 +186,7 @@ class Controls:
                 try:
                     self.page.place_observer(np.array(self._at.value))
                 except NergError as error:
-                    tell(event, "Observer", sentence(error))
+                    tell(event, "Observer", format_error(error))
                     self._at.value = rounded(session.observer)
 
         @to_camera.on_click
@@ -224,7 +224,7 @@ class Controls:
         # Several threads come here, and the last to write should be the last to have looked.
         with self._scaling:
             session = self.session
-            self._legend.content = layers.legend(session.shade.layer, session.scale(), self.page.stale)
+            self._legend.content = layers.format_legend(session.shade.layer, session.scale(), self.page.stale)
             if session.scene.has_gaze:
                 self._table.content = table(session.shares, session.stale_shares)
 
@@ -379,7 +379,7 @@ def about_picture(session: Any, window: BrowserWindow) -> Provenance:
         "samples": window.last[0].samples,
         "ceiling": session.ceiling,
     }
-    return provenance("nerg view", files_of_scene(session.scene_file), 0, settings, session.checksums)
+    return make_provenance("nerg view", list_scene_files(session.scene_file), 0, settings, session.checksums)
 
 
 def png_bytes(session: Any, colors: np.ndarray, text: dict[str, str] | None = None) -> bytes:
@@ -429,7 +429,7 @@ class AreasPanel:
 
         @save.on_click
         def _(event: Any) -> None:
-            text = to_json(self.session.regions, self.session.other_areas).encode()
+            text = format_areas(self.session.regions, self.session.other_areas).encode()
             event.client.send_file_download("areas.json", text, save_immediately=True)
 
         self._show_all()
@@ -438,8 +438,8 @@ class AreasPanel:
         """One more area. Raises `NergError` for a name that there is already, and for too many."""
         if region.name in (r.name for r in self.session.regions):
             raise NergError(f'there is an area "{region.name}" already; give it another name')
-        if len(self.session.regions) >= MOST:
-            raise NergError(f"there are {MOST} areas already; remove one of them")
+        if len(self.session.regions) >= MAX_AREAS:
+            raise NergError(f"there are {MAX_AREAS} areas already; remove one of them")
         self.session.regions = [*self.session.regions, region]
         self._changed(region.name)
 
@@ -457,7 +457,7 @@ class AreasPanel:
                 if proxy is None:
                     raise NergError("there are no points to lay a box around yet; wait a moment")
                 lower, upper = box_around(proxy.points, proxy.size, view, drawn.screen_min, drawn.screen_max)
-                self.add(Region.of(name, lower, upper))
+                self.add(Region.create(name, lower, upper))
                 self._name.value = f"area {len(self.session.regions) + 1}"
 
         # Messages arrive in order: whoever reads this can draw, and does not turn the camera instead.
@@ -507,9 +507,9 @@ class AreasPanel:
     def _replace(self, middle: np.ndarray, size: np.ndarray) -> None:
         name = self._chosen.value
         lower, upper = middle - size / 2, middle + size / 2
-        turn = next((r.turn for r in self.session.regions if r.name == name), None)
+        turn = next((r.rotation for r in self.session.regions if r.name == name), None)
         try:
-            new = Region.of(name, lower, upper, turn)
+            new = Region.create(name, lower, upper, turn)
         except NergError:
             # Nothing that a hand can drag: the gizmo goes back to where the area is.
             self._choose()
@@ -534,7 +534,7 @@ class AreasPanel:
             )
             handles = [box]
             if chosen or len(self.session.regions) <= _FEW:
-                top = (*region.middle[:2], region.bounds[1, 2])
+                top = (*region.center[:2], region.bounds[1, 2])
                 handles.append(scene.add_label(f"/areas/{k}_name", region.name, position=top, anchor="bottom-center"))
             self._boxes[region.name] = handles
 

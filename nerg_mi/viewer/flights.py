@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from nerg_mi.errors import NergError, expected, sentence
+from nerg_mi.errors import NergError, is_user_error, format_error
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.video import check_video
-from nerg_mi.rendering.scene_writer import numbers
+from nerg_mi.files.video import check_video_output
+from nerg_mi.rendering.scene_writer import format_numbers
 from nerg_mi.workflows.render import render_file
 from nerg_mi.workflows.scene_commands import PictureOptions
 
@@ -51,8 +51,8 @@ def film_options(layer: Layer, scale: Scale, frames: Path, fps: float, mode: str
     options = PictureOptions(frames=frames, fps=fps, mode=mode)
     if overlay is None:
         return options
-    top, cmap = scale.high if overlay.scaled else None, None if layer.kind == "shade" else scale.colors
-    return replace(options, overlay=overlay.name, top=top, cmap=cmap)
+    top, cmap = scale.high if overlay.needs_limits else None, None if layer.kind == "shade" else scale.colors
+    return replace(options, overlay=overlay.name, vmax=top, cmap=cmap)
 
 
 class Film:
@@ -161,7 +161,7 @@ def frames_csv(views: Sequence[PinholeView]) -> str:
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow([CAMERA, TARGET])
-    writer.writerows([numbers(v.origin), numbers(v.target)] for v in views)
+    writer.writerows([format_numbers(v.origin), format_numbers(v.target)] for v in views)
     return text.getvalue()
 
 
@@ -219,7 +219,7 @@ class Flying:
             return
         folder = tempfile.TemporaryDirectory()
         try:
-            check_video(self._fps.value)
+            check_video_output(self._fps.value)
             check_copied(session)
             asked = tuple(name for name in layers.quantities(shade.layer) if name != "color")
             views, shown = shown_of_flight(
@@ -236,7 +236,7 @@ class Flying:
             write_text(frames, frames_csv(views))
         except (NergError, ImportError) as error:
             folder.cleanup()
-            tell(client, TITLE, sentence(error))
+            tell(client, TITLE, format_error(error))
             return
 
         def end(error: BaseException | None) -> None:
@@ -245,8 +245,8 @@ class Flying:
                     client.send_file_download("flight.mp4", video.read_bytes(), save_immediately=True)
                 elif isinstance(error, KeyboardInterrupt):
                     tell(client, TITLE, "The video was cancelled.")
-                elif expected(error):
-                    tell(client, TITLE, sentence(error))
+                elif is_user_error(error):
+                    tell(client, TITLE, format_error(error))
                 else:
                     self.page.on_error(error)
             finally:

@@ -10,8 +10,8 @@ import numpy as np
 
 from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import Overlay, OverlayLayers, Style, color_of, find_overlay, overlays_of, srgb, to_bytes
-from nerg_mi.figures.style import CATEGORICAL, DIVERGING, SEQUENTIAL, find_colors, hatch
+from nerg_mi.figures.overlay import Overlay, OverlayLayers, Style, map_colors, find_overlay, list_overlays, srgb, to_bytes
+from nerg_mi.figures.style import CATEGORICAL, DIVERGING, SEQUENTIAL, find_colormap, hatch
 from nerg_mi.transport.aovs import AOVS
 
 MAPS = {"sequential": SEQUENTIAL, "diverging": DIVERGING, "categorical": CATEGORICAL}
@@ -41,9 +41,9 @@ class Layer:
         return "color" if self.overlay is None else self.overlay.display.kind
 
     @property
-    def of_observer(self) -> bool:
+    def is_per_observer(self) -> bool:
         """Whether it depends on the observer."""
-        return self.overlay is not None and AOVS[self.quantity].of_observer
+        return self.overlay is not None and AOVS[self.quantity].is_per_observer
 
     def values(self, by_quantity: Mapping[str, np.ndarray]) -> np.ndarray | None:
         """Its values (...) among those of each quantity, (...) or, of several channels, (..., channels)."""
@@ -70,17 +70,17 @@ def layer_of(name: str) -> Layer:
     return Layer(None if name == COLOR else find_overlay(name))
 
 
-def available(scene: Scene) -> list[Layer]:
+def list_layers(scene: Scene) -> list[Layer]:
     """The layers that ``scene`` can show: colour, and every AOV that varies in it."""
     found = [Layer()]
     for aov in AOVS.values():
         try:
-            scene.integrator.for_aovs([aov.name], False)
+            scene.integrator.make_context([aov.name], False)
         except NergError:
             # That is how the integrator says what it lacks.
             continue
         if not aov.is_constant(scene.integrator):
-            found += [Layer(overlay) for overlay in overlays_of(aov, aov.channels_of(scene.integrator.medium))]
+            found += [Layer(overlay) for overlay in list_overlays(aov, aov.channel_suffixes(scene.integrator.medium))]
     return found
 
 
@@ -91,18 +91,18 @@ def quantities(layer: Layer) -> list[str]:
 
 def color_kind(layer: Layer) -> str:
     """The kind of the colour maps that ``layer`` may have."""
-    return "sequential" if layer.overlay is None else layer.overlay.color_kind
+    return "sequential" if layer.overlay is None else layer.overlay.colormap_kind
 
 
-def usual_scale(layer: Layer, limits: tuple[float, float] | None, colors: str | None) -> Scale:
+def choose_scale(layer: Layer, limits: tuple[float, float] | None, colors: str | None) -> Scale:
     """The scale of ``layer``, where nobody chose ``limits`` or ``colors`` its usual one."""
     overlay = layer.overlay
     if overlay is None:
         return Scale()
     low, high = limits or overlay.display.limits or (0.0, 1.0)
     # What was chosen for a layer before may be a map of another kind.
-    chosen = colors if colors is not None and colors in MAPS[overlay.color_kind] else overlay.colors
-    return Scale(low, high, chosen, overlay.color_kind)
+    chosen = colors if colors is not None and colors in MAPS[overlay.colormap_kind] else overlay.default_colormap
+    return Scale(low, high, chosen, overlay.colormap_kind)
 
 
 @dataclass(frozen=True)
@@ -115,19 +115,19 @@ class Scale:
     kind: str = "sequential"
 
     def __post_init__(self) -> None:
-        find_colors(self.colors, self.kind)
+        find_colormap(self.colors, self.kind)
         if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
             raise NergError(f"a range goes from a number to a larger one, got {self.low:g} to {self.high:g}")
 
 
-def automatic(layer: Layer, values: np.ndarray, mask: np.ndarray) -> tuple[float, float] | None:
+def choose_range(layer: Layer, values: np.ndarray, mask: np.ndarray) -> tuple[float, float] | None:
     """A range for ``values`` where ``mask`` has a surface; None where there is nothing to take one from."""
     if layer.overlay is None or not np.any(mask):
         return None
     return layer.overlay.limits_of(np.asarray(values), np.asarray(mask, bool))
 
 
-def colored(
+def colorize(
     layer: Layer, color: np.ndarray, values: np.ndarray | None, mask: np.ndarray, scale: Scale, hatched: bool = True
 ) -> np.ndarray:
     """uint8 (..., 3) of what ``layer`` shows: linear ``color`` (..., 3), ``values`` (...) and ``mask`` (...), where
@@ -161,10 +161,10 @@ def note(text: str) -> str:
     return f"<div style='font-size:0.85em;padding:0 1em'>{escape(text)}</div>"
 
 
-def legend(layer: Layer, scale: Scale, stale: str = "") -> str:
+def format_legend(layer: Layer, scale: Scale, stale: str = "") -> str:
     """The scale as HTML; empty where there is none. ``stale``: why it is not that of what is shown; "": it is."""
     if stale:
-        return f"<div style='{STALE}'>{legend(layer, scale)}</div>{note(stale)}"
+        return f"<div style='{STALE}'>{format_legend(layer, scale)}</div>{note(stale)}"
     from matplotlib.colors import to_hex
 
     overlay = layer.overlay
@@ -173,7 +173,7 @@ def legend(layer: Layer, scale: Scale, stale: str = "") -> str:
     if overlay.display.kind in ("shade", "categorical"):
         return note(overlay.quantity.label)
     places = np.linspace(scale.low, scale.high, 9)
-    stops = ",".join(to_hex(c) for c in color_of(places, (scale.low, scale.high), scale.colors, scale.kind))
+    stops = ",".join(to_hex(c) for c in map_colors(places, (scale.low, scale.high), scale.colors, scale.kind))
     unit = overlay.quantity.unit or overlay.quantity.label
     ends = f"<span>{scale.low:.3g}</span><span>{escape(unit)}</span><span>{scale.high:.3g}</span>"
     return (

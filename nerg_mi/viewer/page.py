@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.errors import NergError, expected, sentence
+from nerg_mi.errors import NergError, is_user_error, format_error
 
 from . import layers
 from .points import LEVELS, PinholeView, StagePicture
@@ -190,7 +190,7 @@ class Page:
         self.problem = ""
         with self._lock:
             self._follow, self._count = True, True
-            if self.session.shade.layer.of_observer:
+            if self.session.shade.layer.is_per_observer:
                 self.renew(REST if not at_rest else 0.0)
         for told in self.on_moved:
             told()
@@ -355,8 +355,8 @@ class Page:
 
     def on_error(self, error: BaseException) -> None:
         """Show what went wrong; a mistake of the program by its name as well."""
-        text = sentence(error)
-        self.problem = text if expected(error) else f"{type(error).__name__}: {text} (a mistake in the program)"
+        text = format_error(error)
+        self.problem = text if is_user_error(error) else f"{type(error).__name__}: {text} (a mistake in the program)"
 
     # Browsers
 

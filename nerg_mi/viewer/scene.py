@@ -16,7 +16,7 @@ import numpy as np
 from nerg_mi.api.query import trace
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.nested_scene import name_files, scene_elements, verbatim
-from nerg_mi.rendering.scene_writer import Comment, document, element, numbers, prop
+from nerg_mi.rendering.scene_writer import Comment, format_document, element, format_numbers, prop
 
 from . import layers
 from .page import Page
@@ -57,7 +57,7 @@ def copied(path: Path, shown: Shown) -> str:
     Raises `NergError` for a scene whose integrator is not written in the file.
     """
     version, children = scene_elements(path)
-    eye = [] if shown.observer is None else [element("default", name=OBSERVER, value=numbers(shown.observer))]
+    eye = [] if shown.observer is None else [element("default", name=OBSERVER, value=format_numbers(shown.observer))]
     # What a copy that is viewed itself has of its own is said anew.
     ours = {("sensor", SENSOR), ("default", CAMERA), ("default", TARGET)} | {("default", OBSERVER) for _ in eye}
     named = lambda child: (child.tag, child.get("id" if child.tag == "sensor" else "name"))
@@ -68,14 +68,14 @@ def copied(path: Path, shown: Shown) -> str:
     name_files(own, path, children)
     _observe(integrators[0], shown)
     nodes = [
-        element("default", name=CAMERA, value=numbers(shown.view.origin)),
-        element("default", name=TARGET, value=numbers(shown.view.target)),
+        element("default", name=CAMERA, value=format_numbers(shown.view.origin)),
+        element("default", name=TARGET, value=format_numbers(shown.view.target)),
         *eye,
         _sensor(shown),
         Comment("What follows is from the scene that was viewed; its sensors are counted after ours."),
         *map(verbatim, own),
     ]
-    return document(nodes, f"A view of {path.name}, copied from the viewer.", version)
+    return format_document(nodes, f"A view of {path.name}, copied from the viewer.", version)
 
 
 def _observe(integrator: Element, shown: Shown) -> None:
@@ -90,13 +90,13 @@ def _observe(integrator: Element, shown: Shown) -> None:
     if shown.ceiling is not None:
         height, up = shown.ceiling
         SubElement(integrator, "float", name="ceiling", value=f"{height:.9g}")
-        SubElement(integrator, "vector", name="up", value=numbers(up))
+        SubElement(integrator, "vector", name="up", value=format_numbers(up))
     SubElement(integrator, "string", name="aovs", value=",".join(shown.aovs))
 
 
 def _sensor(shown: Shown):
     view = shown.view
-    up = numbers(view.up)
+    up = format_numbers(view.up)
     film = element(
         "film",
         prop("integer", "width", shown.width),

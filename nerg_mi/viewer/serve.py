@@ -12,7 +12,7 @@ from pathlib import Path
 
 from nerg_mi.workflows.base import SILENT, Reporter
 from nerg_mi.workflows.scene_commands import ViewOptions
-from nerg_mi.workflows.view import place_to_view
+from nerg_mi.workflows.view import make_viewer_scene
 
 from .controls import AreasPanel, Controls
 from .flights import Flying
@@ -42,12 +42,12 @@ def viewer(
     options = options or ViewOptions()
     require_viser()
     token = None if is_loopback(options.host) else new_token()
-    guard = Guard(options.host, token, options.names)
+    guard = Guard(options.host, token, options.hostnames)
     with tempfile.TemporaryDirectory() as folder:
         server = start_server(guard, options.port, "nerg view")
         page = Page(server)
         try:
-            session = Session(lambda: place_to_view(files, Path(folder), options, reporter), options, page)
+            session = Session(lambda: make_viewer_scene(files, Path(folder), options, reporter), options, page)
             page.session = session
             session.start()
             page.open(session)

@@ -12,21 +12,21 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from nerg_mi.api.query import box_shares, mesh_shares, trace
-from nerg_mi.api.scene import COLOR, Scene, active_mitsuba
-from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.api.query import compute_box_shares, compute_mesh_shares, trace
+from nerg_mi.api.scene import COLOR, Scene, activate_mitsuba
+from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.probes.probes import place_probes
-from nerg_mi.ranges import FARTHEST
+from nerg_mi.ranges import MAX_COORDINATE
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.statistics.shares import ROUGH
+from nerg_mi.statistics.shares import COARSE
 from nerg_mi.transport.geometry import Ceiling
-from nerg_mi.workflows.render import basis_words
-from nerg_mi.workflows.scene_cameras import given_point
+from nerg_mi.workflows.render import describe_basis
+from nerg_mi.workflows.scene_cameras import check_point
 from nerg_mi.workflows.scene_commands import ViewOptions
-from nerg_mi.workflows.view import PlaceToView
+from nerg_mi.workflows.view import ViewerScene
 
 from . import layers
 from .layers import Layer, Scale, Shade
@@ -80,17 +80,17 @@ FACES = 1 << 17
 """Faces of shapes whose shares are counted in one step, but for a shape that has more."""
 
 
-def shares_in_steps(
+def iter_attention_shares(
     scene: Scene, at: np.ndarray, regions: Sequence[Region], shapes: Sequence[str]
 ) -> Iterator[dict[str, float]]:
     """The share of the observer at ``at`` (3,) of each of ``regions``, together, then of the meshes whose ids are
     ``shapes``, so many at a time as a step can count."""
     if regions:
-        boxes = box_shares(scene, regions, np.asarray(at, np.float32)[None], rule=ROUGH).share[0]
+        boxes = compute_box_shares(scene, regions, np.asarray(at, np.float32)[None], rule=COARSE).share[0]
         yield dict(zip([region.name for region in regions], boxes.tolist()))
     for names in shape_groups(scene, shapes):
         with rough_integrals(scene):
-            meshes = mesh_shares(scene, names, at, divisions=1, two_sided=True)
+            meshes = compute_mesh_shares(scene, names, at, divisions=1, two_sided=True)
         yield dict(zip(names, meshes.tolist()))
 
 
@@ -340,7 +340,7 @@ _SHAPES = 60
 class Session:
     """A place that is viewed. ``start`` loads it; until then there is nothing to see."""
 
-    def __init__(self, place: Callable[[], PlaceToView], options: ViewOptions, listener: Listener):
+    def __init__(self, place: Callable[[], ViewerScene], options: ViewOptions, listener: Listener):
         self.options, self.listener = options, listener
         self._place = place
         self.worker = Worker(listener.on_error)
@@ -374,7 +374,7 @@ class Session:
 
     def _load(self) -> None:
         self.place = self._place()
-        self.mode = active_mitsuba().variant()
+        self.mode = activate_mitsuba().variant()
         self.gaze_name = next(iter(self.place.variants), "")
         self._use(self.place.scene)
         self.shade = Shade(self._first_layer())
@@ -383,7 +383,7 @@ class Session:
             raise NergError(f'"{self.place.scene}" has no sensor to begin with; give it one')
         self.home = PinholeView.of_sensor(sensors[0])
         self.spp = min(self.options.spp or int(sensors[0].sampler().sample_count()), _MOST_SPP)
-        given = given_point(self.options.observer, "--observer")
+        given = check_point(self.options.observer, "--observer")
         own = self.scene.observer
         if given is None:
             given = self._ahead_of_home() if own is None else np.asarray(own, float)
@@ -393,17 +393,17 @@ class Session:
         cut = self.scene.integrator.ceiling
         self.cut_up, self.ceiling = (self.place.up, None) if cut is None else (cut.up, cut.height)
         self.tracks = None if self.place.rays is None else Tracks(self.place.rays, self.place.align)
-        areas = read_areas(self.options.regions) if self.options.regions is not None else AreaSet(())
+        areas = read_areas(self.options.aois) if self.options.aois is not None else AreaSet(())
         # What is no box is not shown, and is saved again with what is.
-        self.regions, self.other_areas = areas.boxes, list(areas.others)
+        self.regions, self.other_areas = areas.boxes, list(areas.non_boxes)
         shapes = [shape.id() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()]
         self.shapes = [name for name in shapes if name and not name.startswith("__")][:_SHAPES]
 
     def _use(self, scene_file: Path) -> None:
         """Show the scene of that file from now on."""
         self.scene_file, self.scene = scene_file, Scene(load_scene(scene_file))
-        self.layers = layers.available(self.scene)
-        self.basis = basis_words(self.scene.mitsuba)
+        self.layers = layers.list_layers(self.scene)
+        self.basis = describe_basis(self.scene.mitsuba)
 
     def _first_layer(self) -> Layer:
         return next((la for la in self.layers if la.quantity in ("gaze", "kde")), self.layers[0])
@@ -422,7 +422,7 @@ class Session:
         Raises `NergError` for what is no position.
         """
         position = np.asarray(at, float)
-        within = position.shape == (3,) and (np.abs(position) <= FARTHEST).all()
+        within = position.shape == (3,) and (np.abs(position) <= MAX_COORDINATE).all()
         if not within or not (heading is None or np.isfinite(heading).all()):
             text = ", ".join(f"{v:g}" for v in position.ravel()[:3])
             raise NergError(f"an observer cannot stand at ({text}); give three numbers in scene units")
@@ -446,7 +446,7 @@ class Session:
     def _set_falloff(self) -> None:
         import mitsuba as mi
 
-        with mitsuba_says():
+        with translate_mitsuba_errors():
             params: Any = mi.traverse(self.scene.integrator)
             params["falloff"] = self.falloff
             params.update()
@@ -505,7 +505,7 @@ class Session:
         """Whether the scale of the layer is known: until then it goes from 0 to 1."""
         shade = self.shade
         overlay = shade.layer.overlay
-        unscaled = overlay is None or not overlay.scaled
+        unscaled = overlay is None or not overlay.needs_limits
         return unscaled or shade.fixed is not None or shade.layer.title in self._ranges
 
     @property
@@ -577,7 +577,7 @@ class Session:
     def scale(self) -> Scale:
         """The scale of the layer that is shown."""
         shade = self.shade
-        return layers.usual_scale(shade.layer, shade.fixed or self._ranges.get(shade.layer.title), shade.colors)
+        return layers.choose_scale(shade.layer, shade.fixed or self._ranges.get(shade.layer.title), shade.colors)
 
     def points(self, level: int = 0) -> Points | None:
         """The points below the ceiling, coloured as the layer shows them, so many as the proxy has at ``level``; None
@@ -593,7 +593,7 @@ class Session:
             layer, values = shade.layer, values[:count]
         else:
             layer, values = layers.layer_of(COLOR), None
-        colors = layers.colored(
+        colors = layers.colorize(
             layer, color, values, np.ones(count, bool), self.scale() if values is not None else Scale()
         )
         if self.stale_points:
@@ -642,7 +642,7 @@ class Session:
         try:
             at, regions, version = asked
             found: dict[str, float] = {}
-            for more in shares_in_steps(self.scene, at, regions, self.shapes):
+            for more in iter_attention_shares(self.scene, at, regions, self.shapes):
                 found |= more
                 yield None
                 if version != self.version:
@@ -686,7 +686,7 @@ class Session:
                 if leads and values is not None and layer.quantity not in self.baked:
                     with self.lock:
                         self._learn(layer.quantity, found.values, mask)
-                deliver(found, layers.colored(layer, found.values["color"], values, mask, self.scale()))
+                deliver(found, layers.colorize(layer, found.values["color"], values, mask, self.scale()))
             yield None
 
     def _sphere(self, deliver: Callable[[np.ndarray], None], width: int) -> Iterator[None]:
@@ -704,14 +704,14 @@ class Session:
         values = {k: np.asarray(seen[k][0])[:count].reshape(height, width, *seen[k].shape[2:]) for k in asked}
         yield None
         mask = values["opacity"] > 0.5
-        deliver(layers.colored(layer, values["color"], layer.values(values), mask, self.scale()))
+        deliver(layers.colorize(layer, values["color"], layer.values(values), mask, self.scale()))
 
     def _learn(self, quantity: str, by_quantity: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
         """Take the automatic range of the layers of ``quantity`` from its values."""
         for layer in self.layers:
             values = layer.values(by_quantity)
             if layer.quantity == quantity and values is not None:
-                found = layers.automatic(layer, values, mask)
+                found = layers.choose_range(layer, values, mask)
                 if found is None:
                     self._ranges.setdefault(layer.title, (0.0, 1.0))
                 elif found != self._ranges.get(layer.title):

@@ -18,35 +18,35 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
-from nerg_mi.evaluation.ablation import Variant, frame_timer
-from nerg_mi.evaluation.gaze import Baseline, FieldDensity, GazeTest, held_out_rays
-from nerg_mi.figures.style import files_among, provenance
-from nerg_mi.files.atomic import check_folder, replacing
+from nerg_mi.evaluation.ablation import Variant, make_frame_timer
+from nerg_mi.evaluation.gaze import Baseline, FieldDensity, GazeTest, select_held_out_rays
+from nerg_mi.figures.style import existing_files, make_provenance
+from nerg_mi.files.atomic import check_folder, replace_atomically
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.formats.splats import is_splats
+from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.engines import prepare_once
-from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan
+from nerg_mi.tasks.task import FOLDER_SUFFIX, RENDER_LIBRARIES, Part, Plan
 from nerg_mi.train.gaze_data import Supervision, digest_rays, hold_out
-from nerg_mi.train.gaze_recipes import gaze_recipe
+from nerg_mi.train.gaze_recipes import get_recipe
 from nerg_mi.train.gaze_trainer import GazePlan
-from nerg_mi.train.geometry import GazePlace
+from nerg_mi.train.geometry import TrainingGeometry
 
 from .base import SILENT, Reporter, select_backend
 from .gaze_commands import AblationOptions, GazeOptions
-from .geometry import check_place, make_place, place_kind
+from .geometry import check_geometry, make_geometry, geometry_kind
 from .options import exposed_options
-from .parts import Parts, PlannedScene
+from .parts import PartRunner, PlannedScene
 from .train_gaze import plan_gaze, train_planned
 
 # ---- What the variants of an ablation have in common, and the training of one of them ----
 
 
 @dataclass(frozen=True)
-class Bench:
+class AblationBenchmark:
     """What all variants have in common: the rays of training, tests at ``centres`` (T, 3) and so many ``people`` who
     are held out, the place, and the ``folder`` of checkpoints."""
 
@@ -54,44 +54,44 @@ class Bench:
     tests: dict[str, GazeTest]
     centres: np.ndarray
     people: int
-    place: GazePlace
+    place: TrainingGeometry
     folder: Path
     ns: ModuleType
     options: AblationOptions
 
 
-def bench_of(data: Rays, options: AblationOptions, folder: Path, ns: ModuleType, reporter: Reporter) -> Bench:
+def prepare_benchmark(data: Rays, options: AblationOptions, folder: Path, ns: ModuleType, reporter: Reporter) -> AblationBenchmark:
     """What all variants have in common that are trained on some of the rays ``data`` and scored on the others; a place
     of hit points is written into ``folder``."""
-    truth = law_of(options.law) if options.law else None
+    truth = load_ground_truth(options.law) if options.law else None
     _, account = hold_out(
         data, options.radius, options.zones, options.positions, options.first, options.min_rays, options.people
     )
-    train, scored, centres = held_out_rays(data, account, "both" if options.people else "pos")
-    place = make_place(options, train, (), folder / "place.vol", ns, reporter=reporter)
+    train, scored, centres = select_held_out_rays(data, account, "both" if options.people else "pos")
+    place = make_geometry(options, train, (), folder / "place.vol", ns, reporter=reporter)
     # Bad places are part of what may be compared: it is told, and no more.
-    check_place(place, train, f"--{place.kind} FILE", True, reporter)
+    check_geometry(place, train, f"--{place.kind} FILE", True, reporter)
     tests = ablation.make_tests(scored, train, centres, options.radius, options.kappa, options.min_rays, truth)
-    return Bench(train, tests, np.asarray(centres), len(account["people"]), place, folder, ns, options)
+    return AblationBenchmark(train, tests, np.asarray(centres), len(account["people"]), place, folder, ns, options)
 
 
-def train_variant(variant: Variant, seed: int, path: Path, bench: Bench) -> dict:
+def train_variant(variant: Variant, seed: int, path: Path, bench: AblationBenchmark) -> dict:
     """Scores and times of one training, whose checkpoint is written to ``path``."""
     made = {"recipe": variant.recipe, "variant": variant.name, "seed": seed}
-    return _train(made, plan_of(variant, seed, bench), path, bench)
+    return _train(made, make_plan(variant, seed, bench), path, bench)
 
 
-def plan_of(variant: Variant, seed: int, bench: Bench) -> GazePlan:
+def make_plan(variant: Variant, seed: int, bench: AblationBenchmark) -> GazePlan:
     """How a variant is trained with a seed."""
-    options, quick = bench.options, gaze_recipe(variant.recipe).quick
+    options, quick = bench.options, get_recipe(variant.recipe).is_quick
     plan = plan_gaze(
         GazeOptions(
             **exposed_options(options),
             recipe=variant.recipe,
-            variant=variant.gaze,
+            variant=variant.field_variant,
             semantic=variant.semantic,
-            semantic_own=variant.semantic_own,
-            begin="field" if variant.begin else "random",
+            semantic_concat=variant.semantic_own,
+            init="field" if variant.init_from_field else "random",
             freeze=variant.frozen,
             loss=variant.loss or None,
             steps=(options.default_steps if quick else options.steps) or None,
@@ -103,24 +103,24 @@ def plan_of(variant: Variant, seed: int, bench: Bench) -> GazePlan:
         bench.place,
     )
     # Positions that validate are to be had wherever there are some that test.
-    watched = plan.settings.watched_rays or plan.probes.min_rays
-    return plan.with_settings(watched_rays=min(watched, options.min_rays))
+    watched = plan.settings.validation_min_rays or plan.probes.min_rays
+    return plan.with_settings(validation_min_rays=min(watched, options.min_rays))
 
 
-def _train(made: dict, plan: GazePlan, path: Path, bench: Bench) -> dict:
+def _train(made: dict, plan: GazePlan, path: Path, bench: AblationBenchmark) -> dict:
     """Train, write the checkpoint (``made``: what it is), and score. Raises ``KeyboardInterrupt`` after Ctrl-C."""
     started = time.perf_counter()
     result = train_planned(Supervision(bench.train), bench.place, plan, bench.ns)
     if result.interrupted:
         raise KeyboardInterrupt
     seconds = time.perf_counter() - started
-    save_gaze(result.field, path, {**bench.place.about, **result.provenance, **made})
+    save_gaze(result.field, path, {**bench.place.metadata, **result.provenance, **made})
     density = FieldDensity(result.field, bench.place.medium, bench.place.align, plan.probes.depth)
     times = {"steps": result.provenance["steps"], "train_seconds": seconds}
-    return {**made, **times, **ablation.score(bench.tests, density)}
+    return {**made, **times, **ablation.score_density(bench.tests, density)}
 
 
-def law_of(name: str) -> Baseline:
+def load_ground_truth(name: str) -> Baseline:
     """The density of an instance of the class that ``MODULE:CLASS`` names."""
     module, _, kind = name.partition(":")
     try:
@@ -161,24 +161,24 @@ def ablate(
     the user can mend.
     """
     options, output = options or AblationOptions(), Path(output)
-    place_kind(options)
+    geometry_kind(options)
     width, height = _size(options.size)
     recipes = options.recipes.split(",")
-    radiance = options.field is not None and not is_splats(options.field)
-    known = ablation.all_variants(radiance, recipes)
+    radiance = options.field is not None and not is_splat_file(options.field)
+    known = ablation.list_variants(radiance, recipes)
     variants = _chosen(known, options.variant)
     if options.law:
-        law_of(options.law)
+        load_ground_truth(options.law)
     check_folder(output)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.0, "preparing")
     data = rays if isinstance(rays, Rays) else load_rays(rays)
-    bench = bench_of(data, options, output, ns, reporter)
+    bench = prepare_benchmark(data, options, output, ns, reporter)
     timer = None
     if options.cameras:
         folder = output if options.field is None else Path(options.field).parent
-        timer = frame_timer(bench.place, bench.centres, folder, options.cameras, width, height)
-    seeds = lambda v: range(options.first, options.first + (options.seeds if gaze_recipe(v.recipe).quick else 1))
+        timer = make_frame_timer(bench.place, bench.centres, folder, options.cameras, width, height)
+    seeds = lambda v: range(options.first, options.first + (options.seeds if get_recipe(v.recipe).is_quick else 1))
     due = [(v, seed) for v in variants for seed in seeds(v)]
     rows = []
     for (variant, seed), row in zip(due, _rows(due, bench, data, reporter)):
@@ -189,16 +189,16 @@ def ablate(
             f"{variant.recipe:8s} {variant.name:28s} seed {seed}: test KLD {row['test_KLD']:.3f}, "
             f"CC {row['test_CC']:.3f}; {row['train_seconds']:.0f} s"
         )
-    ablation.relate(rows)
+    ablation.add_relative_losses(rows)
     notes = _notes(len(bench.centres), bench.people, (len(bench.train), len(data)), options, timer is not None)
-    made = provenance("nerg ablate", files_among(rays, options.field, options.scene), None, options)
+    made = make_provenance("nerg ablate", existing_files(rays, options.field, options.scene), None, options)
     files = ablation.write_ablation(output, rows, notes, made)
     for path in files:
         reporter.message(f"wrote {path}")
     return AblationResult(rows, files)
 
 
-def _rows(due: list[tuple[Variant, int]], bench: Bench, data: Rays, reporter: Reporter) -> Iterator[dict]:
+def _rows(due: list[tuple[Variant, int]], bench: AblationBenchmark, data: Rays, reporter: Reporter) -> Iterator[dict]:
     """The row of each training that is ``due``."""
     if bench.options.in_parts:
         yield from _rows_in_parts(due, bench, data, reporter)
@@ -208,17 +208,17 @@ def _rows(due: list[tuple[Variant, int]], bench: Bench, data: Rays, reporter: Re
         yield _row(variant, seed, bench)
 
 
-def _rows_in_parts(due: list[tuple[Variant, int]], bench: Bench, rays: Rays, reporter: Reporter) -> Iterator[dict]:
+def _rows_in_parts(due: list[tuple[Variant, int]], bench: AblationBenchmark, rays: Rays, reporter: Reporter) -> Iterator[dict]:
     """The same from parts, of which some may have been kept; ``rays``: all of them. Checkpoints are copied into the
     folder of ``bench``."""
     options, folder = bench.options, bench.folder
-    scene = None if options.scene is None else PlannedScene.of(options.scene)
+    scene = None if options.scene is None else PlannedScene.plan(options.scene)
     common = Ablation(training_options(options), rays, scene)
     tasks = [Part((v.recipe, v.name, seed), f"{v.recipe} {v.name}, seed {seed}") for v, seed in due]
-    plan = Plan(f"nerg ablate {os.path.abspath(folder)}", train_part, common, tasks, FOLDER, (*RENDERS, "scipy"))
-    made = Parts(options, folder, reporter, options.threads).run(plan)
+    plan = Plan(f"nerg ablate {os.path.abspath(folder)}", train_part, common, tasks, FOLDER_SUFFIX, (*RENDER_LIBRARIES, "scipy"))
+    made = PartRunner(options, folder, reporter, options.threads).run(plan)
     for (variant, seed), part in zip(due, made):
-        with replacing(folder / variant.file_name(seed)) as temporary:
+        with replace_atomically(folder / variant.file_name(seed)) as temporary:
             shutil.copyfile(part.path / _FIELD, temporary)
         row = read_json(part.path / _ROW, "row of an ablation")
         assert isinstance(row, dict)
@@ -248,19 +248,19 @@ def train_part(common: Ablation, value: tuple[str, str, int], output: Path) -> N
     options, (recipe, name, seed) = common.options, value
     ns = select_backend(options.mode)
     if common.scene is not None:
-        common.scene.checked()
+        common.scene.checked_path()
 
-    def prepare() -> tuple[Bench, TemporaryDirectory]:
+    def prepare() -> tuple[AblationBenchmark, TemporaryDirectory]:
         folder = TemporaryDirectory(prefix="nerg-ablation-")
-        return bench_of(common.rays, options, Path(folder.name), ns, SILENT), folder
+        return prepare_benchmark(common.rays, options, Path(folder.name), ns, SILENT), folder
 
     bench = prepare_once(common, prepare)[0]
-    variants = ablation.all_variants(options.field is not None, [recipe])
+    variants = ablation.list_variants(options.field is not None, [recipe])
     variant = next(v for v in variants if v.name == name)
     write_json(output / _ROW, train_variant(variant, seed, output / _FIELD, bench), allow_nan=True)
 
 
-def _row(variant: Variant, seed: int, bench: Bench) -> dict:
+def _row(variant: Variant, seed: int, bench: AblationBenchmark) -> dict:
     """Scores and times of one training, which an earlier run may have left."""
     path = bench.folder / variant.file_name(seed)
     kept = path.with_suffix(".json")
@@ -273,23 +273,23 @@ def _row(variant: Variant, seed: int, bench: Bench) -> dict:
     return row
 
 
-def _keep(row: dict, variant: Variant, seed: int, bench: Bench) -> None:
+def _keep(row: dict, variant: Variant, seed: int, bench: AblationBenchmark) -> None:
     """Write ``row`` beside its checkpoint."""
     path = (bench.folder / variant.file_name(seed)).with_suffix(".json")
     write_json(path, {"row": row, "same": _identity(variant, seed, bench)}, allow_nan=True)
 
 
-def _identity(variant: Variant, seed: int, bench: Bench) -> dict:
+def _identity(variant: Variant, seed: int, bench: AblationBenchmark) -> dict:
     """All that a row depends on, as JSON has it."""
-    plan = plan_of(variant, seed, bench)
+    plan = make_plan(variant, seed, bench)
     return {
         "architecture": plan.config.to_dict(),
         "settings": plan.settings.to_dict(),
         "probes": plan.probes.to_dict(),
         "rays": digest_rays(bench.train),
         "tests": {k: hashlib.sha256(t.truth.tobytes()).hexdigest() for k, t in bench.tests.items()},
-        "begin": variant.begin,
-        **bench.place.about,
+        "begin": variant.init_from_field,
+        **bench.place.metadata,
     }
 
 

@@ -9,21 +9,21 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.alignment.check import Alignment, check_alignment, read_similarity
-from nerg_mi.alignment.constraints import AlignmentFit, AlignmentTarget, Evidence, read_surface, trace_place
+from nerg_mi.alignment.constraints import AlignmentFit, AlignmentTarget, Evidence, read_surface, trace_scene
 from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.points import read_cameras, read_pairs
-from nerg_mi.alignment.similarity import move
+from nerg_mi.alignment.similarity import transform_points
 from nerg_mi.alignment.tracking import Tracking, compare_flips
 from nerg_mi.errors import NergError
 from nerg_mi.figures.maps import alignment_figure
-from nerg_mi.figures.style import provenance, save
+from nerg_mi.figures.style import make_provenance, save
 from nerg_mi.files.atomic import check_writable, file_sha256
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.photos.colmap import turn_to_z
+from nerg_mi.photos.colmap import rotation_to_z
 from nerg_mi.rays.direction_checks import DECLARED
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train import geometry
-from nerg_mi.train.geometry import GazePlace
+from nerg_mi.train.geometry import TrainingGeometry
 
 from .base import SILENT, Reporter, select_backend
 from .options import parse_point
@@ -74,7 +74,7 @@ def align(
     if refused and not options.force:
         raise NergError(f"{refused}; or write it all the same with --force")
     files = {name: _identity(path) for name, path in _sources(rays, options).items()}
-    found = Alignment.of_fit(evidence.kind, fit, files, bool(refused))
+    found = Alignment.from_fit(evidence.kind, fit, files, bool(refused))
     _report_found(found, reporter)
     if place is not None and place.medium is not None and data is not None:
         _report_check(place, data, found.matrix, reporter)
@@ -84,7 +84,7 @@ def align(
     if output is not None:
         picture = output.with_suffix(".png")
         heads = None if data is None else data.origin
-        about = provenance("nerg align", _sources(rays, options).values(), None, options)
+        about = make_provenance("nerg align", _sources(rays, options).values(), None, options)
         save(_figure(fit, target, heads, found), picture, about)
         found.save(output)
         written = [output, picture]
@@ -95,17 +95,17 @@ def align(
 def _evidence(options: AlignOptions, rays: Rays | None, reporter: Reporter) -> Evidence:
     """What is given as evidence. Raises `NergError` for more than one kind, or none."""
     given = [name for name in ("pairs", "twin", "cameras") if getattr(options, name) is not None]
-    if len(given) > 1 or (given and options.start is not None):
-        named = ", ".join(f"--{name}" for name in [*given, *(["start"] if options.start else [])])
+    if len(given) > 1 or (given and options.init is not None):
+        named = ", ".join(f"--{name}" for name in [*given, *(["start"] if options.init else [])])
         raise NergError(f"{named} are different evidence: give one of them, and --refine to go on from it")
-    if (options.cameras is None) != (options.place_cameras is None):
+    if (options.tracking_cameras is None) != (options.scene_cameras is None):
         raise NergError("cameras are known in both frames by --cameras and --place-cameras: give both")
     if options.refine and rays is None:
         raise NergError("--refine needs the tracking: give a rays file")
     makers: dict[str, Callable[[Path], Evidence]] = {
         "pairs": read_pairs,
         "twin": lambda path: Twin(read_surface(path, on_note=reporter.message), f'the twin "{path}"'),
-        "cameras": lambda path: read_cameras(path, _path(options.place_cameras)),
+        "cameras": lambda path: read_cameras(path, _path(options.scene_cameras)),
     }
     if given:
         return makers[given[0]](_path(getattr(options, given[0])))
@@ -114,7 +114,7 @@ def _evidence(options: AlignOptions, rays: Rays | None, reporter: Reporter) -> E
             "say what to align by: a rays file (the tracking alone), or --pairs FILE, --twin FILE, or --cameras with "
             "--place-cameras"
         )
-    start = None if options.start is None else read_similarity(options.start, "--start", "rays to place").matrix
+    start = None if options.init is None else read_similarity(options.init, "--start", "rays to place").matrix
     return Tracking(rays, start)
 
 
@@ -123,18 +123,18 @@ def _path(path: Path | None) -> Path:
     return path
 
 
-def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazePlace | None, AlignmentTarget]:
+def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[TrainingGeometry | None, AlignmentTarget]:
     given = [n for n in ("field", "scene", "surface") if getattr(options, n) is not None]
     if len(given) > 1:
         raise NergError(f"the place is one: give --{' or --'.join(given)}")
-    up = "z" if options.up is None and kind == Tracking.kind and options.start is None else options.up
+    up = "z" if options.up is None and kind == Tracking.kind and options.init is None else options.up
     if up is not None and options.up is None:
         reporter.message("z is taken for up in the place; say --up where it is another axis")
     common = {
         "turn": _turn(up),
         "upright": up is not None,
-        "floor": options.floor,
-        "place_floor": options.place_floor,
+        "floor": options.floor_height,
+        "place_floor": options.scene_floor_height,
         "scale": options.scale,
     }
     if not given:
@@ -148,15 +148,15 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazeP
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.02, "tracing the place")
     place = (
-        geometry.place_of_field(options.field, ns)
+        geometry.load_field_geometry(options.field, ns)
         if options.field is not None
-        else geometry.place_of_scene(_path(options.scene))
+        else geometry.load_scene_geometry(_path(options.scene))
     )
     for note in place.notes:
         reporter.message(f"of {options.field or options.scene}: {note}")
     assert place.medium is not None
     core = place.box.core
-    traces = trace_place(place.medium, np.array(core.lower), np.array(core.upper), seed=options.seed)
+    traces = trace_scene(place.medium, np.array(core.lower), np.array(core.upper), seed=options.seed)
     return place, AlignmentTarget(traces=traces, **common)
 
 
@@ -169,7 +169,7 @@ def _turn(up: str | None) -> np.ndarray:
     length = np.linalg.norm(axis)
     if length == 0:
         raise NergError(f"--up is an axis (x, y, z, -x, -y, -z) or three numbers x,y,z that are not all 0, got {up!r}")
-    turn[:3, :3] = turn_to_z(axis / length)
+    turn[:3, :3] = rotation_to_z(axis / length)
     return turn
 
 
@@ -193,7 +193,7 @@ def _refusal(fit: AlignmentFit, options: AlignOptions) -> str:
             f"the tracking is mirrored: {fit.mirrored}; import it again with the other --hand, or correct the axis "
             "that is negated in the evidence"
         )
-    median = float(np.median(fit.centimetres)) if len(fit.centimetres) else 0.0
+    median = float(np.median(fit.residuals_cm)) if len(fit.residuals_cm) else 0.0
     if not median <= options.max_residual:
         return (
             f"the residual is {median:.3g} cm (median), beyond --max-residual {options.max_residual:g}: give other "
@@ -205,7 +205,7 @@ def _refusal(fit: AlignmentFit, options: AlignOptions) -> str:
 def _report_notes(fit: AlignmentFit, reporter: Reporter) -> None:
     for line in fit.notes:
         reporter.message(line)
-    for line in fit.doubts:
+    for line in fit.warnings:
         reporter.warn(line)
 
 
@@ -225,7 +225,7 @@ def _report_found(found: Alignment, reporter: Reporter) -> None:
         )
 
 
-def _report_check(place: GazePlace, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
+def _report_check(place: TrainingGeometry, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
     assert place.medium is not None
     check = check_alignment(place.medium, rays, Similarity(matrix))
     reporter.message(
@@ -256,8 +256,8 @@ def _figure(fit: AlignmentFit, target: AlignmentTarget, heads: np.ndarray | None
         None if surface is None else surface.points,
         points,
         None if same else heads,
-        target.turn @ found.matrix,
-        None if fit.targets is None else move(target.turn, fit.targets),
+        target.to_z_up @ found.matrix,
+        None if fit.targets is None else transform_points(target.to_z_up, fit.targets),
         f"Aligned by {found.evidence['kind']}{said}",
         None if surface is None else _below_ceiling(surface.points),
     )

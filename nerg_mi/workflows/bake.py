@@ -19,28 +19,28 @@ from nerg_mi.figures.style import Provenance
 from nerg_mi.files.atomic import check_writable, write_bytes
 from nerg_mi.files.images import encode_png
 from nerg_mi.files.tables import write_csv, write_json
-from nerg_mi.formats.gltf import Attribute, shown_unlit
+from nerg_mi.formats.gltf import Attribute, encode_unlit_glb
 from nerg_mi.formats.ply import write_columns
-from nerg_mi.formats.splats import is_splats
+from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, merge
-from nerg_mi.surfaces.mesh import Mesh, RefinedMesh, texture_rows, unroll, unroller
+from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, merge_sums
+from nerg_mi.surfaces.mesh import Mesh, RefinedMesh, iter_texture_rows, unwrap_uv, import_xatlas
 from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
 
 from .bake_chunks import (
     UNITS,
     BakeScene,
-    Receivers,
-    alignment_of,
+    BakeTarget,
+    load_alignment,
     check_values,
-    cone_of,
-    cut,
-    origin_of,
-    read_receivers,
-    source_of,
-    sums_of,
-    who_looks,
+    cone_radians,
+    refine_target,
+    describe_origin,
+    read_target,
+    select_source,
+    compute_sums,
+    make_gaze_groups,
 )
 from .base import SILENT, Reporter, select_backend
 from .scene_commands import BakeOptions
@@ -58,11 +58,11 @@ _BARE = 0.3  # linear grey of a surface that nobody looks at
 
 
 @dataclass(frozen=True, eq=False)
-class Baked:
+class BakeOutput:
     """What is written: ``refined`` surface with ``density`` (V,) of its vertices in ``unit``, and ``share`` (F,) of its
     faces; ``receivers`` as they were given; ``scale``: scene units a metre."""
 
-    receivers: Receivers
+    receivers: BakeTarget
     refined: RefinedMesh
     density: np.ndarray
     share: np.ndarray
@@ -72,17 +72,17 @@ class Baked:
     about: Provenance
     summary: Mapping[str, Any]
 
-    def of_given_faces(self) -> np.ndarray:
+    def input_face_shares(self) -> np.ndarray:
         """Share (F',) of the faces that were given."""
         return np.bincount(self.refined.parent, self.share, len(self.receivers.mesh.faces))
 
 
-def write_output(baked: Baked, path: Path, pixels: int | None) -> None:
+def write_output(baked: BakeOutput, path: Path, pixels: int | None) -> None:
     """Write ``baked`` to ``path``, by its suffix; ``pixels`` a side of a texture, None for none."""
     WRITERS[path.suffix.lower()](baked, path, pixels)
 
 
-def _ply(baked: Baked, path: Path, pixels: int | None) -> None:
+def _ply(baked: BakeOutput, path: Path, pixels: int | None) -> None:
     mesh, normals = baked.refined.mesh, vertex_normals(baked.refined.mesh)
     colors = np.rint(255 * _colors(baked, baked.density, normals)).astype(np.uint8)
     names = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
@@ -92,8 +92,8 @@ def _ply(baked: Baked, path: Path, pixels: int | None) -> None:
     write_columns(path, columns, mesh.faces, comments=comments)
 
 
-def _glb(baked: Baked, path: Path, pixels: int | None) -> None:
-    extras = {"unit": baked.unit, "top": baked.heat.top, "provenance": json.loads(baked.about.json())}
+def _glb(baked: BakeOutput, path: Path, pixels: int | None) -> None:
+    extras = {"unit": baked.unit, "top": baked.heat.vmax, "provenance": json.loads(baked.about.json())}
     mesh = baked.refined.mesh
     normals = vertex_normals(mesh)
     if pixels is None:
@@ -105,14 +105,14 @@ def _glb(baked: Baked, path: Path, pixels: int | None) -> None:
             ("COLOR_0", rgba, True),
             ("_VALUE", baked.density.astype("<f4"), False),
         ]
-        write_bytes(path, *shown_unlit(attributes, mesh.faces, extras=extras))
+        write_bytes(path, *encode_unlit_glb(attributes, mesh.faces, extras=extras))
         return
     import mitsuba as mi
 
     whole = baked.receivers.mesh
-    charts = unroll(whole, pixels)
+    charts = unwrap_uv(whole, pixels)
     picture = np.zeros((pixels, pixels, 3), np.uint8)
-    for rows, values, known in texture_rows(charts, baked.refined, baked.density, pixels):
+    for rows, values, known in iter_texture_rows(charts, baked.refined, baked.density, pixels):
         picture[rows][known] = np.rint(255 * _shown(baked.heat, values[known]))
     image = encode_png(mi.Bitmap(picture), {"Comment": baked.about.json()})
     attributes = [
@@ -120,12 +120,12 @@ def _glb(baked: Baked, path: Path, pixels: int | None) -> None:
         ("NORMAL", vertex_normals(whole)[charts.vertex].astype("<f4"), False),
         ("TEXCOORD_0", charts.uv.astype("<f4"), False),
     ]
-    write_bytes(path, *shown_unlit(attributes, charts.faces, extras=extras, image=image))
+    write_bytes(path, *encode_unlit_glb(attributes, charts.faces, extras=extras, image=image))
 
 
-def _csv(baked: Baked, path: Path, pixels: int | None) -> None:
+def _csv(baked: BakeOutput, path: Path, pixels: int | None) -> None:
     given, square = baked.receivers, baked.scale**2
-    shares, area, center = baked.of_given_faces(), given.mesh.area, given.mesh.corners.mean(axis=1)
+    shares, area, center = baked.input_face_shares(), given.mesh.area, given.mesh.corners.mean(axis=1)
     factor = float(baked.summary["factor"])
     columns = ("shape", "face", "x", "y", "z", "area_m2", "value", "share")
 
@@ -137,7 +137,7 @@ def _csv(baked: Baked, path: Path, pixels: int | None) -> None:
     write_csv(path, (dict(zip(columns, row(k))) for k in range(len(center))), columns)
 
 
-def _json(baked: Baked, path: Path, pixels: int | None) -> None:
+def _json(baked: BakeOutput, path: Path, pixels: int | None) -> None:
     write_json(path, dict(baked.summary), allow_nan=False)
 
 
@@ -152,7 +152,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
     return np.where(length > 0, sums / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
 
 
-def _colors(baked: Baked, values: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _colors(baked: BakeOutput, values: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """sRGB (V, 3) of vertices: heat over grey that shades by the normal, so that an unlit mesh shows its shape."""
     shade = 0.75 + 0.25 * normals @ np.array([0.48, 0.36, 0.8])
     return _shown(baked.heat, values, shade)
@@ -171,7 +171,7 @@ def check_texture(paths: list[Path], pixels: int | None) -> None:
         return
     if not any(path.suffix.lower() == ".glb" for path in paths):
         raise NergError("--texture belongs to glTF; let the name of an output end in .glb")
-    unroller()
+    import_xatlas()
 
 
 # ---- Bake ----
@@ -225,29 +225,29 @@ def bake(
     source = _check(surface, paths, options, rays)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.0, "reading")
-    align = alignment_of(options)
-    receivers = read_receivers(surface, options.shapes, options.resolution, ns, reporter)
+    align = load_alignment(options)
+    receivers = read_target(surface, options.shapes, options.resolution, ns, reporter)
     across = receivers.mesh.diagonal / align.scale
     if across > _LARGEST:
         reporter.warn(
             f"the surface measures {across:,.0f} m across; if its unit is not the metre, give --align with the scale "
             "from metres to it"
         )
-    refined = cut(receivers, options.detail, align.scale)
+    refined = refine_target(receivers, options.max_edge, align.scale)
     mesh = refined.mesh
     reporter.message(f"{len(receivers.mesh.faces):,} triangles, cut into {len(mesh.faces):,} to hold gaze")
-    cone = cone_of(options, source)
+    cone = cone_radians(options, source)
     scene = BakeScene(
         mesh,
         receivers.others,
         options.gaze if source == "field" else None,
         surface.absolute() if surface.suffix.lower() == ".xml" else None,
-        GazeSumSettings(angle=math.radians(options.angle), cone=cone),
-        RaySettings(cone=cone, bundle=options.bundle, seed=options.seed),
+        GazeSumSettings(max_angle=math.radians(options.max_angle), cone_sigma=cone),
+        RaySettings(cone_sigma=cone, rays_per_cone=options.cone_samples, seed=options.seed),
     )
-    groups, factor = who_looks(options, source, rays, align, reporter)
-    found = sums_of(scene, groups, options, paths[0] if paths else surface, reporter)
-    sums = merge(found)
+    groups, factor = make_gaze_groups(options, source, rays, align, reporter)
+    found = compute_sums(scene, groups, options, paths[0] if paths else surface, reporter)
+    sums = merge_sums(found)
     reporter.progress(0.9, "smoothing")
     smoother = Smoother(mesh, options.smooth * align.scale) if options.smooth > 0 else None
     shares, amounts = _smoothed(mesh, sums, smoother)
@@ -257,13 +257,13 @@ def bake(
     summary = _summary(receivers, refined.parent, sums, share, factor, options, source)
     if len(found) == 2:
         summary["halves_cc"] = _agreement(mesh, found, smoother)
-    heat = Heat(options.top or _top(mesh, density), options.cmap, decades=options.decades)
-    about, summary["provenance"] = origin_of(surface, options)
-    baked = Baked(receivers, refined, density, share, UNITS[options.unit], align.scale, heat, about, summary)
+    heat = Heat(options.vmax or _top(mesh, density), options.cmap, decades=options.log_decades)
+    about, summary["provenance"] = describe_origin(surface, options)
+    baked = BakeOutput(receivers, refined, density, share, UNITS[options.unit], align.scale, heat, about, summary)
     _tell(summary, reporter)
     for path in paths:
         reporter.progress(0.95, f"writing {path.name}")
-        write_output(baked, path, options.texture)
+        write_output(baked, path, options.texture_size)
         reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB, {time.perf_counter() - start:.1f} s)")
     on, elsewhere, escaped, total = (summary[k] for k in ("on_surface", "elsewhere", "escaped", "total"))
     return Bake(mesh, density, share, on, elsewhere, escaped, total, summary, tuple(paths))
@@ -275,23 +275,23 @@ def bake_any(
     """`bake` on a mesh, and `bake_splats.bake_splats` on Gaussian splats."""
     from .bake_splats import bake_splats
 
-    return (bake_splats if is_splats(surface) else bake)(surface, output, options, reporter, rays)
+    return (bake_splats if is_splat_file(surface) else bake)(surface, output, options, reporter, rays)
 
 
 def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
     """Whose gaze it is, of `bake_chunks.SOURCES`. Raises `NergError` for options that contradict each other."""
     for path in paths:
         check_writable(path, *SUFFIXES)
-    check_texture(paths, options.texture)
+    check_texture(paths, options.texture_size)
     check_values(options)
-    return source_of(options, rays, surface.suffix.lower() == ".xml")
+    return select_source(options, rays, surface.suffix.lower() == ".xml")
 
 
 def _smoothed(mesh: Mesh, sums: SurfaceSums, smoother: Smoother | None) -> tuple[np.ndarray, np.ndarray]:
     """Integrals over faces (F,) and over hat functions (V,), after smoothing."""
     if smoother is None:
-        return sums.face, sums.vertex
-    amount = smoother(sums.vertex)
+        return sums.face_sums, sums.vertex_sums
+    amount = smoother(sums.vertex_sums)
     return (amount / mesh.vertex_area)[mesh.faces].mean(axis=1) * mesh.area, amount
 
 
@@ -312,7 +312,7 @@ def _top(mesh: Mesh, density: np.ndarray) -> float:
 
 
 def _summary(
-    receivers: Receivers,
+    receivers: BakeTarget,
     parent: np.ndarray,
     sums: SurfaceSums,
     share: np.ndarray,

@@ -12,30 +12,30 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.metrics import cc
-from nerg_mi.fields.splats import Splats, harmonics_of
-from nerg_mi.figures.overlay import Heat, overlay, top_of
+from nerg_mi.fields.splats import Splats, harmonics_from_colors
+from nerg_mi.figures.overlay import Heat, overlay, robust_max
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.maths.color import decode_srgb
-from nerg_mi.maths.sphere import C0
+from nerg_mi.maths.sphere import SH_C0
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.laplacian import SurfaceSums, merge
+from nerg_mi.surfaces.laplacian import SurfaceSums, merge_sums
 from nerg_mi.surfaces.sources import RaySettings
-from nerg_mi.surfaces.splats import HIDDEN, SplatSmoother, splat_areas, whole_areas
+from nerg_mi.surfaces.splats import MIN_VISIBLE_FRACTION, SplatSmoother, compute_splat_areas, unoccluded_areas
 
 from .bake_chunks import (
     UNITS,
-    SplatPlace,
+    SplatGeometry,
     SplatScene,
-    alignment_of,
+    load_alignment,
     check_values,
-    cone_of,
-    origin_of,
-    source_of,
-    splat_place,
-    sums_of,
-    who_looks,
+    cone_radians,
+    describe_origin,
+    select_source,
+    make_splat_geometry,
+    compute_sums,
+    make_gaze_groups,
 )
 from .base import SILENT, Reporter, select_backend
 from .scene_commands import BakeOptions
@@ -84,19 +84,19 @@ def bake_splats(
     select_backend(options.mode, options.threads)
     reporter.progress(0.0, "reading")
     given = read_splats(path)
-    for note in (*given.guesses, *given.notes):
+    for note in (*given.assumptions, *given.notes):
         reporter.message(f"of {path}: {note}")
-    align, cone = alignment_of(options), cone_of(options, source)
-    of_rays = RaySettings(cone=cone, bundle=options.bundle, seed=options.seed)
-    groups, factor = who_looks(options, source, rays, align, reporter)
+    align, cone = load_alignment(options), cone_radians(options, source)
+    of_rays = RaySettings(cone_sigma=cone, rays_per_cone=options.cone_samples, seed=options.seed)
+    groups, factor = make_gaze_groups(options, source, rays, align, reporter)
     if source == "rays":
-        scene = SplatScene(path, len(given), of_rays=of_rays)
+        scene = SplatScene(path, len(given), ray_settings=of_rays)
     else:
         scene = SplatScene(path, len(given), options.gaze, cone, of_rays)
-    found = sums_of(scene, groups, options, paths[0] if paths else path, reporter)
-    sums = merge(found)
+    found = compute_sums(scene, groups, options, paths[0] if paths else path, reporter)
+    sums = merge_sums(found)
     reporter.progress(0.9, "areas of Gaussians")
-    spread = _SplatSpread(splat_place(given), source, options.smooth * align.scale)
+    spread = _SplatSpread(make_splat_geometry(given), source, options.smooth * align.scale)
     density = spread.density(sums)
     if not (density > 0).any():
         raise NergError(
@@ -107,11 +107,11 @@ def bake_splats(
     summary = _summary(sums, source, unit, factor, attention)
     if len(found) == 2:
         summary["halves_cc"] = float(cc(spread.density(found[0]), spread.density(found[1]), spread.area))
-    heat = Heat(options.top or top_of(attention, attention > 0), options.cmap, decades=options.decades)
-    about, summary["provenance"] = origin_of(path, options)
-    baked = recolored(given, attention, heat)
-    _tell(summary, heat.top, reporter)
-    comments = (f"{COLUMN}: {unit}", f"colours end at {heat.top:.6g}", f"nerg_mi {about.json()}")
+    heat = Heat(options.vmax or robust_max(attention, attention > 0), options.cmap, decades=options.log_decades)
+    about, summary["provenance"] = describe_origin(path, options)
+    baked = recolor_splats(given, attention, heat)
+    _tell(summary, heat.vmax, reporter)
+    comments = (f"{COLUMN}: {unit}", f"colours end at {heat.vmax:.6g}", f"nerg_mi {about.json()}")
     for output in paths:
         if output.suffix.lower() == ".json":
             write_json(output, summary)
@@ -122,26 +122,26 @@ def bake_splats(
     return SplatBake(baked, attention, sums.count, summary, tuple(paths))
 
 
-def recolored(splats: Splats, values: np.ndarray, heat: Heat) -> Splats:
+def recolor_splats(splats: Splats, values: np.ndarray, heat: Heat) -> Splats:
     """``splats`` in colours that are the same from everywhere: ``values`` (N,) as ``heat`` over their own, dimmed; the
     values are their column `COLUMN`."""
-    own = np.clip(0.5 + C0 * splats.harmonics[:, 0].astype(np.float64), 0, 1)
+    own = np.clip(0.5 + SH_C0 * splats.harmonics[:, 0].astype(np.float64), 0, 1)
     own = decode_srgb(own) if splats.color_space == "srgb" else own
     shown = overlay(own[None], np.asarray(values)[None], heat)[0]
     extra = {**splats.extra, COLUMN: np.asarray(values, np.float32)}
-    return replace(splats, harmonics=harmonics_of(shown), extra=extra, color_space="srgb")
+    return replace(splats, harmonics=harmonics_from_colors(shown), extra=extra, color_space="srgb")
 
 
 class _SplatSpread:
     """From sums of a ``source`` to densities of the Gaussians of ``there``, smoothed by ``length`` scene units, or not
     if that is 0. ``area`` (N,): of both sides of each."""
 
-    def __init__(self, there: SplatPlace, source: str, length: float):
+    def __init__(self, there: SplatGeometry, source: str, length: float):
         self._source, self._smoother = source, None
         if source == "field" and length == 0:
             return
-        self._areas = splat_areas(there.splats, there.arrays, there.tolerance)
-        self.area, least = self._areas.sum(axis=0), HIDDEN * whole_areas(there.splats, there.arrays.extent)
+        self._areas = compute_splat_areas(there.splats, there.arrays, there.tolerance)
+        self.area, least = self._areas.sum(axis=0), MIN_VISIBLE_FRACTION * unoccluded_areas(there.splats, there.arrays.extent)
         # A side that hardly anything is seen of has a share, which by its area would be any density.
         self._divisor = np.maximum(self._areas, least)
         if length > 0:
@@ -151,7 +151,7 @@ class _SplatSpread:
 
     def density(self, sums: SurfaceSums) -> np.ndarray:
         """Gaze (N,) per square scene unit, as a share of all."""
-        found = sums.face.reshape(2, -1) / sums.weight
+        found = sums.face_sums.reshape(2, -1) / sums.weight
         if self._source == "field":
             if self._smoother is None:
                 return found.sum(axis=0)
@@ -200,7 +200,7 @@ def _check(paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
         if entry.name in _OF_TRIANGLES and getattr(options, entry.name) != entry.default:
             name = {"shapes": "shape"}.get(entry.name, entry.name)
             raise NergError(f"--{name} is of surfaces with triangles; leave it out for Gaussian splats")
-    source = source_of(options, rays)
+    source = select_source(options, rays)
     if source == "field" and options.gaze is None:
         raise NergError(
             "splats have no gaze of their own; name a field by --gaze, which "

@@ -24,9 +24,9 @@ def select_backend(mode: str | None, threads: int | None = None) -> ModuleType:
     variant that does not exist or does not work.
     """
     from nerg_mi.fields.mlp import namespace
-    from nerg_mi.rendering.scene import activate
+    from nerg_mi.rendering.scene import activate_variant
 
-    active = activate(mode)
+    active = activate_variant(mode)
     if threads:
         set_thread_count(threads)
     return namespace(active)
@@ -136,12 +136,12 @@ def declare(name: str, function: str, help: str = "", /, **settings: Any) -> Non
     """Declare the command ``name`` as `command` does; ``function``: what it runs, as "MODULE:NAME", imported then."""
 
     def run(**values: Any) -> Any:
-        return imported(function)(**values)
+        return import_function(function)(**values)
 
     command(name, help, **settings)(run)
 
 
-def imported(function: str) -> Callable[..., Any]:
+def import_function(function: str) -> Callable[..., Any]:
     """The function "MODULE:NAME"."""
     module, _, name = function.partition(":")
     return getattr(importlib.import_module(module), name)
@@ -164,7 +164,7 @@ class Reporter(Protocol):
         """How much of the work is done, from 0 to 1, and what is being done."""
 
 
-class Silent:
+class SilentReporter:
     """Listens to nothing."""
 
     def message(self, text: str) -> None:
@@ -177,7 +177,7 @@ class Silent:
         pass
 
 
-SILENT = Silent()
+SILENT = SilentReporter()
 """The reporter of jobs that were given none."""
 
 
@@ -197,7 +197,7 @@ def versions(mode: str) -> dict[str, str]:
         "numpy": numpy.__version__,
         "python": platform.python_version(),
     }
-    library = llvm.current()
+    library = llvm.find_current()
     if mode.startswith("llvm") and library is not None:
         out["libLLVM"] = ".".join(map(str, library.version))
     if mode.startswith("cuda"):

@@ -17,25 +17,25 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.evaluation.gaze_report import read_results
 from nerg_mi.figures import overlay as figures
-from nerg_mi.figures.overlay import Heat, srgb, top_of, write_png
+from nerg_mi.figures.overlay import Heat, srgb, robust_max, write_png
 from nerg_mi.figures.sphere import sphere_figure
-from nerg_mi.figures.style import Provenance, provenance, save
+from nerg_mi.figures.style import Provenance, make_provenance, save
 from nerg_mi.files.atomic import check_folder, file_sha256, write_bytes
 from nerg_mi.files.images import write_bitmap_exr
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.bands import Channels, render_channels
-from nerg_mi.rendering.scene import activate, load_scene
-from nerg_mi.rendering.scene_writer import pixel_of
+from nerg_mi.rendering.scene import activate_variant, load_scene
+from nerg_mi.rendering.scene_writer import project_to_pixel
 from nerg_mi.transport.geometry import pixel_solid_angles
-from nerg_mi.transport.observer import center
+from nerg_mi.transport.observer import sensor_center
 
 from .bake import bake
 from .base import SILENT, Reporter, versions
-from .render import basis_texts, basis_words
+from .render import describe_bases, describe_basis
 from .report import RESULTS, make_report
 from .scene_commands import BakeOptions, DemoOptions, ReportOptions
 
@@ -50,7 +50,7 @@ REPORT_POINTS = 60_000
 TRACKED = "shoppers.npz"
 """A tenth of each visit of the tracked gaze that the store's field was trained on."""
 
-REPORT_EYES = 24
+REPORT_VIEWPOINTS = 24
 """Places of people that the report looks from: few, since a demo must be quick."""
 
 STAGES = (
@@ -82,10 +82,10 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         raise NergError(f"the demo needs pictures of at least 12 pixels and 1 sample a pixel, got {width} and {spp}")
     out = Path(out)
     check_folder(out)
-    scene = store_scene() if options.scene is None else Path(options.scene)
+    scene = find_store_scene() if options.scene is None else Path(options.scene)
     defaults = dict(options.defaults or {})
     inputs = _inputs(scene, defaults)
-    mode = activate(options.mode)
+    mode = activate_variant(options.mode)
     clock = _Clock(reporter)
     sizes = {"width": width, "height": 2 * width // 3, "sphere_width": width // 2 * 2, "sphere_height": width // 2}
     values = {k: str(v) for k, v in sizes.items()} | defaults
@@ -101,7 +101,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
             )
 
         def render(of: Any, index: int) -> Channels:
-            with mitsuba_says():
+            with translate_mitsuba_errors():
                 return render_channels(of, of.sensors()[index], spp, seed, lambda done, total: stop.check())
 
         clock.start("camera")
@@ -115,49 +115,49 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         stop.check()
 
     clock.start("pictures")
-    about = provenance("nerg demo", inputs, seed, {"spp": spp, "mode": mode, **sizes, "defaults": defaults})
+    about = make_provenance("nerg demo", inputs, seed, {"spp": spp, "mode": mode, **sizes, "defaults": defaults})
     # One scale for all pictures of gaze, so that a colour means the same in each of them.
-    tops = [top_of(r.aovs["gaze"], r.mask) for r in (own, camera, sphere, without) if np.any(r.aovs["gaze"] > 0)]
+    tops = [robust_max(r.aovs["gaze"], r.mask) for r in (own, camera, sphere, without) if np.any(r.aovs["gaze"] > 0)]
     if not tops:
         raise NergError(
             f'the gaze is 0 in every picture: move the eye of "{scene}", or train its gaze field for longer'
         )
     heat = Heat(max(tops))
     pictures = {"own": own, "without": without, "camera": camera, "sphere": sphere}
-    files = _write_pictures(out, pictures, heat, observer_pixel(seen), basis_words(seen), about)
-    for key, value in (about.text() | basis_texts(seen)).items():
+    files = _write_pictures(out, pictures, heat, observer_pixel(seen), describe_basis(seen), about)
+    for key, value in (about.text() | describe_bases(seen)).items():
         camera.bitmap.metadata()[key] = value
     write_bitmap_exr(out / "scene.exr", camera.bitmap)
     files.append(out / "scene.exr")
     clock.start("surfaces")
-    eye = tuple(float(v) for v in np.ravel(np.array(center(seen.sensors()[OWN]))))
+    eye = tuple(float(v) for v in np.ravel(np.array(sensor_center(seen.sensors()[OWN]))))
     if (scene.parent / TWIN).is_file():
         files.append(_bake(scene.parent / TWIN, inputs[2], eye, out / "heatmap.glb", mode, seed))
     clock.start("tracked gaze")
     tracked = []
-    if scene == store_scene() and inputs[2] == scene.parent / CHECKPOINTS["gaze"]:
-        tracked = [write_tracked(out / TRACKED)]
+    if scene == find_store_scene() and inputs[2] == scene.parent / CHECKPOINTS["gaze"]:
+        tracked = [write_recording(out / TRACKED)]
         files += tracked
     clock.start("report")
     # Named by the scene, or that beside it of which the demo is made.
     objects = scene.parent / OBJECTS
     shown = ReportOptions(
-        objects=objects if objects.is_file() else None,
+        aois=objects if objects.is_file() else None,
         observer=eye,
         **_camera_of(seen.sensors()[CAMERA]),
-        eyes=REPORT_EYES,
+        viewpoints=REPORT_VIEWPOINTS,
         width=min(max(width, 24), 1200),
-        points=REPORT_POINTS,
+        max_points=REPORT_POINTS,
         seed=seed,
         mode=mode,
         title="The demo store and its shoppers" if options.scene is None else None,
     )
     rendered = {"camera": camera, "own": own, "sphere": sphere}
-    evaluation = evaluation_beside(scene, inputs[2])
+    evaluation = find_evaluation(scene, inputs[2])
     made = make_report([*inputs[1:], *tracked, *evaluation], out / "report.html", shown, rendered=rendered)
     files.append(made.path)
     if made.run.observed_objects:
-        rows = [{"object": o.name, "observer_share": round(o.field.mean, 6)} for o in made.run.observed_objects]
+        rows = [{"object": o.name, "observer_share": round(o.predicted.mean, 6)} for o in made.run.observed_objects]
         write_csv(out / "aoi.csv", rows)
         files.append(out / "aoi.csv")
     clock.stop()
@@ -170,7 +170,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         "spp": spp,
         **sizes,
         "defaults": defaults,
-        "gaze_scale_top_per_sr": heat.top,
+        "gaze_scale_top_per_sr": heat.vmax,
         "gaze_sphere_integral": sphere_integral(sphere),
         "seconds": {k: round(v, 2) for k, v in clock.seconds.items()},
         "inputs": {p.name: file_sha256(p) for p in [*inputs, *evaluation]},
@@ -201,7 +201,7 @@ def _viewer(out: Path) -> str:
     return f"python3 -m http.server --bind 127.0.0.1 --directory {out} 8000, then http://127.0.0.1:8000/{first.name}"
 
 
-def store_scene() -> Path:
+def find_store_scene() -> Path:
     """The demo store's scene.xml, as installed."""
     import nerg_mi.scenes as scenes  # pyright: ignore[reportMissingImports] which lies at the root of a checkout
 
@@ -225,21 +225,21 @@ def _inputs(scene: Path, defaults: Mapping[str, str]) -> list[Path]:
     return paths
 
 
-def evaluation_beside(scene: Path, gaze: Path) -> list[Path]:
+def find_evaluation(scene: Path, gaze: Path) -> list[Path]:
     """The evaluation that stands beside ``scene``, if it is of this ``gaze`` field."""
     path = scene.parent / RESULTS
     return [path] if path.is_file() and read_results(path).sha256 == file_sha256(gaze) else []
 
 
-def write_tracked(path: Path) -> Path:
+def write_recording(path: Path) -> Path:
     """Write the store's sample of the tracked gaze that its field was trained on as the file ``path`` of rays."""
-    write_bytes(path, (store_scene().parent / TRACKED).read_bytes())
+    write_bytes(path, (find_store_scene().parent / TRACKED).read_bytes())
     return path
 
 
 def _bake(twin: Path, gaze: Path, eye: tuple[float, ...], output: Path, mode: str, seed: int) -> Path:
     """Write the gaze of the observer at ``eye`` on the mesh ``twin`` as ``output``, as fine as a glance at it needs."""
-    options = BakeOptions(gaze=gaze, observer=eye, angle=5.0, detail=0.2, mode=mode, seed=seed)
+    options = BakeOptions(gaze=gaze, observer=eye, max_angle=5.0, max_edge=0.2, mode=mode, seed=seed)
     bake(twin, [output], options)
     return output
 
@@ -257,7 +257,7 @@ def _camera_of(sensor) -> dict:
 def observer_pixel(scene) -> tuple[float, float] | None:
     """Where the observer of ``scene`` stands in the camera's picture: (x, y) in pixels, counted from the first one's
     centre; None outside of it."""
-    return pixel_of(scene.sensors()[CAMERA], center(scene.sensors()[OWN]))
+    return project_to_pixel(scene.sensors()[CAMERA], sensor_center(scene.sensors()[OWN]))
 
 
 def sphere_integral(sphere: Channels) -> float:

@@ -18,27 +18,27 @@ from nerg_mi.figures.overlay import (
     Overlay,
     OverlayLayers,
     difference_figure,
-    find_stored,
+    find_channel_overlay,
     gaze_figure,
     shared_limits,
-    top_of,
+    robust_max,
 )
-from nerg_mi.figures.style import FORMATS, contact_sheet, find_colors, provenance, save, shrink
+from nerg_mi.figures.style import FORMATS, contact_sheet, find_colormap, make_provenance, save, shrink
 from nerg_mi.files.atomic import check_writable
-from nerg_mi.files.images import read_exr, read_exr_text
-from nerg_mi.files.safe_read import reading
+from nerg_mi.files.images import read_exr, read_exr_attributes
+from nerg_mi.files.safe_read import translate_read_errors
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.ply import parse_ply
-from nerg_mi.formats.splats import is_splats
-from nerg_mi.maths.arrays import vector_of
-from nerg_mi.rendering.bands import SURFACE
-from nerg_mi.rendering.scene import activate
+from nerg_mi.formats.splats import is_splat_file
+from nerg_mi.maths.arrays import to_vector
+from nerg_mi.rendering.bands import SURFACE_OPACITY
+from nerg_mi.rendering.scene import activate_variant
 from nerg_mi.surfaces.mesh import Mesh, mitsuba_mesh
 
-from .base import SILENT, Reporter, imported
+from .base import SILENT, Reporter, import_function
 from .draw_scenes import Drawing
-from .scene_cameras import given_point
-from .scene_commands import KINDS, BakedFigureOptions, DifferenceOptions, Kind, SheetOptions
+from .scene_cameras import check_point
+from .scene_commands import KINDS, BakedFigureOptions, DifferenceOptions, FigureKind, SheetOptions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,11 +68,11 @@ def read_stored(path: Path, overlay: Overlay) -> OverlayLayers:
         raise NergError(f'"{path}" has no "{overlay.name}"; it has {", ".join(found)}')
     color = [found[name] for name in "RGB"] if {"R", "G", "B"} <= set(found) else [np.zeros_like(values)] * 3
     opacity = found.get("opacity.Y")
-    mask = np.ones(values.shape, bool) if opacity is None else opacity >= SURFACE
+    mask = np.ones(values.shape, bool) if opacity is None else opacity >= SURFACE_OPACITY
     as_floats = lambda array: np.nan_to_num(np.asarray(array, np.float32))
-    part = overlay.quantity.rests_on
-    basis = read_exr_text(path, "picture").get(f"{part}.basis", "") if part else ""
-    return OverlayLayers(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask, basis=basis)
+    part = overlay.quantity.data_source
+    basis = read_exr_attributes(path, "picture").get(f"{part}.basis", "") if part else ""
+    return OverlayLayers(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask, support_note=basis)
 
 
 # ---- How two pictures differ in a quantity: the first less the second ----
@@ -80,12 +80,12 @@ def read_stored(path: Path, overlay: Overlay) -> OverlayLayers:
 
 def difference(files: Sequence[Path], options: DifferenceOptions, reporter: Reporter) -> Drawing:
     """The first of two files less the second."""
-    find_colors(options.cmap, "diverging")
-    if options.top is not None and not (np.isfinite(options.top) and options.top > 0):
-        raise NergError(f"--top must be positive, got {options.top}")
+    find_colormap(options.cmap, "diverging")
+    if options.vmax is not None and not (np.isfinite(options.vmax) and options.vmax > 0):
+        raise NergError(f"--top must be positive, got {options.vmax}")
     if len(files) != 2:
         raise NergError(f"a difference is of two pictures, and {len(files)} were given; name two .exr files")
-    overlay = find_stored(options.channel)
+    overlay = find_channel_overlay(options.channel)
     if overlay.display.kind == "categorical":
         raise NergError(f'"{overlay.name}" names classes, which have no difference; choose another --channel')
     first, second = (read_stored(path, overlay) for path in files)
@@ -95,8 +95,8 @@ def difference(files: Sequence[Path], options: DifferenceOptions, reporter: Repo
     mask, unit = first.mask & second.mask, overlay.quantity.unit
     title = f"{files[0].stem} less {files[1].stem}"
     label = f"difference of {overlay.name}" + (f" [{unit}]" if unit else "")
-    note = shared_note([path.stem for path in files], [first.basis, second.basis])
-    figure = difference_figure(first.values, second.values, mask, title, label, options.top, options.cmap, note)
+    note = shared_note([path.stem for path in files], [first.support_note, second.support_note])
+    figure = difference_figure(first.values, second.values, mask, title, label, options.vmax, options.cmap, note)
     return Drawing(figure, list(files))
 
 
@@ -110,25 +110,25 @@ def sheet(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> D
     if options.overlay is None:
         for k, path in enumerate(files):
             reporter.progress(k / len(files), path.name)
-            pictures.append(shrink(_display(path), options.width))
+            pictures.append(shrink(_display(path), options.max_width))
         return Drawing(contact_sheet(pictures, names, options.columns), list(files))
-    overlay = find_stored(options.overlay)
-    style = options.style(kind=overlay.color_kind)
+    overlay = find_channel_overlay(options.overlay)
+    style = options.style(kind=overlay.colormap_kind)
     limits, notes = [], []
     for path in files:
         stored = read_stored(path, overlay)
-        notes.append(stored.basis)
+        notes.append(stored.support_note)
         limits.append(overlay.limits(stored))
-    ends = shared_limits(limits, options.top)
+    ends = shared_limits(limits, options.vmax)
     overlay.check_limits(ends)
     explained, hatched = [], False
     for k, path in enumerate(files):
         reporter.progress(k / len(files), path.name)
         stored = read_stored(path, overlay)
         seen = stored.mask & np.isfinite(stored.values)
-        unknown = ~seen if style.hatched else None
+        unknown = ~seen if style.hatch_unknown else None
         hatched = hatched or (unknown is not None and bool(unknown.any()))
-        pictures.append(shrink(overlay.paint(stored, ends, style, unknown), options.width))
+        pictures.append(shrink(overlay.paint(stored, ends, style, unknown), options.max_width))
         # Of all values the outermost are enough for a scale.
         outermost = [stored.values[seen].min(), stored.values[seen].max()] if seen.any() else []
         explained.append(OverlayLayers(stored.color, np.array(outermost), np.ones(len(outermost), bool)))
@@ -141,7 +141,7 @@ def _display(path: Path) -> np.ndarray:
     """The picture as it is shown (h, w, 3), in 0..1."""
     from nerg_mi.figures.overlay import srgb
     from nerg_mi.photos.images import read_image
-    from nerg_mi.rendering.scene import activate
+    from nerg_mi.rendering.scene import activate_variant
 
     if path.suffix.lower() == EXR:
         from nerg_mi.files.images import read_exr
@@ -149,7 +149,7 @@ def _display(path: Path) -> np.ndarray:
         found = read_exr(path, "picture")
         if {"R", "G", "B"} <= set(found):
             return srgb(np.stack([found[name] for name in "RGB"], axis=-1))
-    activate(None)
+    activate_variant(None)
     image = read_image(path)
     shown = image / np.iinfo(image.dtype).max if image.dtype.kind == "u" else np.asarray(image, np.float64)
     if shown.shape[2] == 4:
@@ -173,29 +173,29 @@ class BakedSurface:
     mesh: Mesh
     values: np.ndarray
     label: str
-    made_of: tuple[str, ...]
+    gaze_files: tuple[str, ...]
 
 
 def surface(files: Sequence[Path], options: BakedFigureOptions, reporter: Reporter) -> Drawing:
     """The picture of the surface that `nerg bake` has written."""
     style = options.style()
     (path,) = files
-    activate(options.mode)
+    activate_variant(options.mode)
     baked = read_baked(path)
-    up = _unit(given_point(options.up, "--up"), np.array([0.0, 0, 1]), "--up")
+    up = _unit(check_point(options.up, "--up"), np.array([0.0, 0, 1]), "--up")
     mesh, values = baked.mesh, baked.values
-    if options.below is not None:
-        kept = (mesh.vertices[mesh.faces] @ up).min(axis=1) < options.below
+    if options.clip_above is not None:
+        kept = (mesh.vertices[mesh.faces] @ up).min(axis=1) < options.clip_above
         if not kept.any():
-            raise NergError(f'nothing of "{path}" is below {options.below:g}; give a larger --below')
+            raise NergError(f'nothing of "{path}" is below {options.clip_above:g}; give a larger --below')
         mesh = Mesh(mesh.vertices, mesh.faces[kept])
     value, shade, met = _seen(mesh, values, up, options)
     if not met.any():
         raise NergError(f'nothing of "{path}" is in the picture; give another --camera or --target')
     grey = np.where(met, _BARE + _LIT * shade, _PAPER)
-    heat = Heat(options.top or top_of(value, met), style.colors or "inferno", decades=style.decades)
+    heat = Heat(options.vmax or robust_max(value, met), style.colormap or "inferno", decades=style.decades)
     title = options.title or baked.label.partition("[")[0].strip().capitalize()
-    note = f"made of {', '.join(baked.made_of)}" if baked.made_of else ""
+    note = f"made of {', '.join(baked.gaze_files)}" if baked.gaze_files else ""
     color = np.repeat(grey[..., None], 3, axis=2)
     # Beside the surface there is nothing that could be known: it is paper, and not hatched.
     return Drawing(gaze_figure(color, value, met, heat, title, baked.label, note=note), [path])
@@ -207,12 +207,12 @@ def read_baked(path: Path) -> BakedSurface:
         raise NergError(f'"{path}" is no baked surface that is drawn; give the .ply that "nerg bake" writes')
     if not path.exists():
         raise MissingFile(f'there is no file "{path}"; correct its name')
-    if is_splats(path):
+    if is_splat_file(path):
         raise NergError(
             f'"{path}" holds Gaussian splats, which show their gaze as they are: nerg scene {path} -o a.xml'
         )
     body = read_mesh_file(path)
-    with reading(path, "baked surface"):
+    with translate_read_errors(path, "baked surface"):
         with path.open("rb") as file:
             head = file.read(_HEADER).partition(b"end_header")[0].decode("utf-8", "replace").splitlines()
         columns = parse_ply(np.fromfile(path, np.uint8)).tables["vertex"].columns
@@ -241,7 +241,7 @@ def _seen(mesh: Mesh, values: np.ndarray, up: np.ndarray, options: BakedFigureOp
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     ours = mitsuba_mesh(mesh.vertices, mesh.faces, "surface")
     scene: mi.Scene = mi.load_dict({"type": "scene", "surface": ours})
-    ray = mi.Ray3f(mi.Point3f(*eye.tolist()), vector_of(mi.Vector3f, d))
+    ray = mi.Ray3f(mi.Point3f(*eye.tolist()), to_vector(mi.Vector3f, d))
     found = scene.ray_intersect_preliminary(ray)
     met = np.array(found.is_valid(), bool)
     face = mesh.faces[np.where(met, np.array(found.prim_index, np.int64), 0)]
@@ -261,9 +261,9 @@ def _camera(mesh: Mesh, up: np.ndarray, options: BakedFigureOptions) -> tuple[np
     """Where the camera is, and its axes: to the right, up and ahead. Raises `NergError` for one that sees nothing."""
     corners = mesh.vertices[np.unique(mesh.faces)]
     lower, upper = corners.min(axis=0), corners.max(axis=0)
-    target = given_point(options.target, "--target")
+    target = check_point(options.target, "--target")
     target = (lower + upper) / 2 if target is None else target
-    eye = given_point(options.camera, "--camera")
+    eye = check_point(options.camera, "--camera")
     if eye is None:
         side = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
         back = np.cross(side, up)
@@ -297,7 +297,7 @@ def _unit(vector: np.ndarray | None, otherwise: np.ndarray | None, name: str) ->
 FileName = str | os.PathLike
 
 
-def find_kind(name: str) -> Kind:
+def find_kind(name: str) -> FigureKind:
     """The kind ``name``. Raises `NergError` for one that is not known."""
     if name not in KINDS:
         raise NergError(f'there is no figure "{name}"; there are {", ".join(KINDS)}')
@@ -349,19 +349,19 @@ def draw_files(files: Path | list[Path], output: Path, options: Any, reporter: R
     draw_kind(kind, files if isinstance(files, list) else [files], output, options, reporter)
 
 
-def draw_kind(kind: Kind, files: Sequence[Path], output: Path | None, options: Any, reporter: Reporter = SILENT) -> Any:
+def draw_kind(kind: FigureKind, files: Sequence[Path], output: Path | None, options: Any, reporter: Reporter = SILENT) -> Any:
     """The figure of ``kind`` of ``files``, with an object of its ``options``; written to ``output``, with its
     provenance, where that is given."""
     if output is not None:
         check_writable(output, *FORMATS)
-    if not 1 <= len(files) <= kind.most:
-        raise NergError(f'a figure "{kind.name}" is drawn of 1 to {kind.most} files, and {len(files)} were given')
+    if not 1 <= len(files) <= kind.max_files:
+        raise NergError(f'a figure "{kind.name}" is drawn of 1 to {kind.max_files} files, and {len(files)} were given')
     for path in files:
         if not path.exists():
             raise MissingFile(f'there is no file "{path}"')
-    made = imported(kind.function)(files, options, reporter)
+    made = import_function(kind.function)(files, options, reporter)
     if output is not None:
-        about = provenance(f"nerg draw {kind.name}", _inputs(made.inputs, options), made.seed, options)
+        about = make_provenance(f"nerg draw {kind.name}", _inputs(made.inputs, options), made.seed, options)
         save(made.figure, output, about)
         reporter.message(f"Wrote {output} ({' x '.join(f'{v:.0f}' for v in made.figure.bbox.size)}).")
     return made.figure
@@ -369,12 +369,12 @@ def draw_kind(kind: Kind, files: Sequence[Path], output: Path | None, options: A
 
 def _inputs(paths: Sequence[Path], options: Any) -> list[Path]:
     """The files that were read: of a scene those that it names, too."""
-    from nerg_mi.rendering.scene import files_of_scene
+    from nerg_mi.rendering.scene import list_scene_files
 
     found: list[Path] = []
     for path in paths:
         if path.suffix.lower() == ".xml":
-            found += files_of_scene(path, getattr(options, "defaults", None))
+            found += list_scene_files(path, getattr(options, "defaults", None))
         else:
             found.append(path)
     return found

@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.maps import PersonWalk, SightLines, Walls, floor_figure
-from nerg_mi.figures.overlay import Overlay, OverlayLayers, find_overlay, occlusion_figure, shared_limits, unknown_of
+from nerg_mi.figures.maps import ParticipantPath, SightLines, Walls, floor_figure
+from nerg_mi.figures.overlay import Overlay, OverlayLayers, find_overlay, occlusion_figure, shared_limits, unknown_mask
 from nerg_mi.figures.sphere import find_projection, sphere_figure
 from nerg_mi.interruption import Interruption
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.bands import nerg_of
-from nerg_mi.rendering.scene import activate, load_scene
-from nerg_mi.rendering.scene_writer import pixel_of
-from nerg_mi.transport.geometry import Place, pixel_solid_angles, trace_depth
+from nerg_mi.rendering.bands import require_nerg
+from nerg_mi.rendering.scene import activate_variant, load_scene
+from nerg_mi.rendering.scene_writer import project_to_pixel
+from nerg_mi.transport.geometry import SceneGeometry, pixel_solid_angles, trace_depth
 
 from .base import Reporter
-from .render import layers_of
+from .render import render_layers
 from .scene_commands import FloorOptions, SceneFigureOptions, SphereOptions, TriptychOptions
 
 # ---- A kind of figure: what it is called, which files and options it takes, and how it is drawn ----
@@ -55,23 +55,23 @@ _REACH = 1.2  # metres that a field of view, or a ray whose hit is not known, is
 def floor(files: Sequence[Path], options: FloorOptions, reporter: Reporter) -> Drawing:
     """The plan of the rays of a file, over the place of ``options.scene`` where there is one."""
     (path,) = files
-    rays = _of_people(load_rays(path), options.people)
+    rays = _of_people(load_rays(path), options.participants)
     if not len(rays):
         raise NergError(f'"{path}" holds no rays; give a file of rays that has some')
-    if not options.cut > 0:
-        raise NergError(f"--cut is a height above the floor, got {options.cut}")
+    if not options.cut_height > 0:
+        raise NergError(f"--cut is a height above the floor, got {options.cut_height}")
     low, high = _corners(rays)
     inputs, walls = [path], None
     if options.scene is not None:
-        from nerg_mi.rendering.bands import nerg_of
-        from nerg_mi.rendering.scene import activate, load_scene
+        from nerg_mi.rendering.bands import require_nerg
+        from nerg_mi.rendering.scene import activate_variant, load_scene
 
-        activate(options.mode)
+        activate_variant(options.mode)
         reporter.progress(0.0, "loading the scene")
         scene = load_scene(options.scene, options.defaults)
         reporter.progress(0.2, "cutting the place")
-        nerg = nerg_of(options.scene, scene)
-        walls = cut_place(nerg, scene, low, high, options.floor + options.cut, options.floor)
+        nerg = require_nerg(options.scene, scene)
+        walls = cut_scene(nerg, scene, low, high, options.floor_height + options.cut_height, options.floor_height)
         inputs.append(options.scene)
     number = {person: k for k, person in enumerate(np.unique(rays.person))}
     walks = _walks(rays, number) if options.paths else []
@@ -81,8 +81,8 @@ def floor(files: Sequence[Path], options: FloorOptions, reporter: Reporter) -> D
         high,
         walls,
         walks,
-        _sights(rays, number, options.rays),
-        _fields(rays, number, options.views),
+        _sights(rays, number, options.num_rays),
+        _fields(rays, number, options.num_views),
         options.fov,
         f"{len(rays):,} rays of {people}",
     )
@@ -112,11 +112,11 @@ def _corners(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     return low - edge, high + edge
 
 
-def _walks(rays: Rays, people: Mapping[int, int]) -> list[PersonWalk]:
+def _walks(rays: Rays, people: Mapping[int, int]) -> list[ParticipantPath]:
     """The path of each person: not finer than can be seen, and with breaks where they were not recorded."""
     sessions = find_sessions(rays)
     order = np.arange(len(rays)) if sessions.order is None else sessions.order
-    label, found = sessions.label(), []
+    label, found = sessions.label_rays(), []
     for person in people:
         mine = rays.person[order] == person
         rows, recording = order[mine], label[mine]
@@ -124,7 +124,7 @@ def _walks(rays: Rays, people: Mapping[int, int]) -> list[PersonWalk]:
         step = np.linalg.norm(np.diff(places, axis=0), axis=1)
         breaks = np.r_[True, (np.abs(np.diff(t)) > _GAP) | (step > _JUMP) | (np.diff(recording) != 0)]
         kept = breaks | np.r_[True, np.diff(np.floor(np.cumsum(np.r_[0.0, step]) / _FINEST)) > 0]
-        found.append(PersonWalk(rays.persons[person], places[kept], breaks[kept]))
+        found.append(ParticipantPath(rays.persons[person], places[kept], breaks[kept]))
     return found
 
 
@@ -160,7 +160,7 @@ def _ahead(rays: Rays, some: np.ndarray) -> np.ndarray:
 
 # ---- A scene file opened for a figure, and what its cameras see ----
 
-MOST_PIXELS = 1 << 23
+MAX_PIXELS = 1 << 23
 """A figure is drawn in one piece, in double precision, some 200 bytes a pixel; a film of 3,840 x 2,160 is allowed."""
 
 
@@ -172,7 +172,7 @@ class OpenScene:
 
     def __init__(self, path: Path, scene: Any, options: SceneFigureOptions, tell: Callable[[float], None], parts: int):
         self.path, self.scene, self._options = path, scene, options
-        self.nerg = nerg_of(path, scene)
+        self.nerg = require_nerg(path, scene)
         if not scene.sensors():
             raise NergError(f'"{path}" has no sensor; give it one')
         self._tell, self._parts, self._done = tell, parts, 0
@@ -186,11 +186,11 @@ class OpenScene:
             )
         return self.scene.sensors()[index]
 
-    def see(self, sensor: Any, overlay: Overlay) -> OverlayLayers:
+    def render(self, sensor: Any, overlay: Overlay) -> OverlayLayers:
         """What ``sensor`` sees with the ``overlay``'s quantity."""
         options, first = self._options, self._done
         on_strip = lambda part, total: self._tell((first + part / total) / self._parts)
-        found = layers_of(self.path, self.scene, sensor, overlay, options.spp, options.seed, on_strip)
+        found = render_layers(self.path, self.scene, sensor, overlay, options.spp, options.seed, on_strip)
         self._done += 1
         return found
 
@@ -199,7 +199,7 @@ class OpenScene:
 def open_scene(path: Path, options: SceneFigureOptions, reporter: Reporter, parts: int = 1) -> Iterator[OpenScene]:
     """The scene file ``path``, of which ``parts`` pictures will be rendered within the block, which Ctrl-C ends. Raises
     `NergError` for what is none, or has another integrator than `nerg`."""
-    activate(options.mode)
+    activate_variant(options.mode)
     with Interruption() as stop:
 
         def tell(share: float) -> None:
@@ -230,9 +230,9 @@ def upright_pose(sensor: Any) -> Any:
     return look_at(origin=eye.tolist(), target=(eye + heading).tolist(), up=level.tolist())
 
 
-def film(width: int, height: int) -> dict[str, Any]:
+def make_film(width: int, height: int) -> dict[str, Any]:
     """A film of so many pixels on which no value is blended with its neighbours'. Raises `NergError` for too many."""
-    if width * height > MOST_PIXELS:
+    if width * height > MAX_PIXELS:
         raise NergError(
             f"a figure of {width:,} x {height:,} pixels is too large to be drawn in one piece; ask for less"
         )
@@ -246,7 +246,7 @@ def film(width: int, height: int) -> dict[str, Any]:
     }
 
 
-def sampler_like(sensor: Any) -> dict[str, Any]:
+def copy_sampler(sensor: Any) -> dict[str, Any]:
     """As many samples a pixel as ``sensor`` has, drawn independently."""
     return {"type": "independent", "sample_count": int(sensor.sampler().sample_count())}
 
@@ -268,18 +268,18 @@ def sphere(files: Sequence[Path], options: SphereOptions, reporter: Reporter) ->
         panorama = {
             "type": "panorama",
             "to_world": upright_pose(opened.nerg.observer or camera),
-            "film": film(width, width // 2),
-            "sampler": sampler_like(camera),
+            "film": make_film(width, width // 2),
+            "sampler": copy_sampler(camera),
         }
-        seen = opened.see(mi.load_dict(panorama), overlay)
-    limits = shared_limits([overlay.limits(seen)], options.top)
+        seen = opened.render(mi.load_dict(panorama), overlay)
+    limits = shared_limits([overlay.limits(seen)], options.vmax)
     overlay.check_limits(limits)
     heat = overlay.heat(limits, style)
     integral = float((seen.values.astype(np.float64) * pixel_solid_angles(width, width // 2)).sum())
     title = f"All that the observer can turn to: integral {integral:.3g}"
-    unknown = unknown_of(seen, True) if style.hatched else None
+    unknown = unknown_mask(seen, True) if style.hatch_unknown else None
     figure = sphere_figure(
-        seen.color, seen.values, seen.mask, heat, title, options.projection, unknown, note=seen.basis
+        seen.color, seen.values, seen.mask, heat, title, options.projection, unknown, note=seen.support_note
     )
     return Drawing(figure, [path], options.seed)
 
@@ -291,7 +291,7 @@ def sphere(files: Sequence[Path], options: SphereOptions, reporter: Reporter) ->
 
 def triptych(files: Sequence[Path], options: TriptychOptions, reporter: Reporter) -> Drawing:
     """Three pictures with one scale; the scene file needs an observer who is not the camera."""
-    from nerg_mi.transport.observer import center
+    from nerg_mi.transport.observer import sensor_center
 
     style = options.style()
     (path,) = files
@@ -305,19 +305,19 @@ def triptych(files: Sequence[Path], options: TriptychOptions, reporter: Reporter
             )
         if camera.class_name() != "PerspectiveCamera":
             raise NergError(f'sensor {options.sensor} of "{path}" is no perspective camera; choose another with -s')
-        own = opened.see(_own_camera(nerg.observer, camera), overlay)
+        own = opened.render(_own_camera(nerg.observer, camera), overlay)
         with_occlusion, nerg.occlusion = nerg.occlusion, False
         try:
-            without = opened.see(camera, overlay)
+            without = opened.render(camera, overlay)
         finally:
             nerg.occlusion = with_occlusion
-        seen = opened.see(camera, overlay)
-        marker = pixel_of(camera, center(nerg.observer))
-    limits = shared_limits([overlay.limits(of) for of in (own, without, seen)], options.top)
+        seen = opened.render(camera, overlay)
+        marker = project_to_pixel(camera, sensor_center(nerg.observer))
+    limits = shared_limits([overlay.limits(of) for of in (own, without, seen)], options.vmax)
     overlay.check_limits(limits)
     heat = overlay.heat(limits, style)
     first, second, third = ((of.color, of.values, of.mask) for of in (own, without, seen))
-    figure = occlusion_figure(first, second, third, heat, marker, style.hatched, seen.basis)
+    figure = occlusion_figure(first, second, third, heat, marker, style.hatch_unknown, seen.support_note)
     return Drawing(figure, [path], options.seed)
 
 
@@ -334,8 +334,8 @@ def _own_camera(observer: Any, camera: Any) -> Any:
         "near_clip": camera.near_clip(),
         "far_clip": camera.far_clip(),
         "to_world": mi.ScalarTransform4f(matrix.tolist()),
-        "film": film(width, height),
-        "sampler": sampler_like(camera),
+        "film": make_film(width, height),
+        "sampler": copy_sampler(camera),
     }
     return mi.load_dict(own)
 
@@ -349,7 +349,7 @@ CELLS = 360
 _SURFACE = 0.5
 
 
-def cut_place(nerg: Any, scene: Any, low: np.ndarray, high: np.ndarray, level: float, floor: float) -> Walls:
+def cut_scene(nerg: Any, scene: Any, low: np.ndarray, high: np.ndarray, level: float, floor: float) -> Walls:
     """The place of the integrator ``nerg`` in ``scene`` between the corners ``low`` and ``high`` (2,), cut at the
     height ``level``; all in scene units, +z up.
 
@@ -357,7 +357,7 @@ def cut_place(nerg: Any, scene: Any, low: np.ndarray, high: np.ndarray, level: f
     what lies between. A cell in the midst of thick matter meets it at once. ``floor``: the height from which others are
     counted.
     """
-    place = Place(nerg.medium, scene)
+    place = SceneGeometry(nerg.medium, scene)
     side = float(max(high - low)) / CELLS
     nx, ny = (max(int(np.ceil(v / side)), 1) for v in high - low)
     x, y = low[0] + (np.arange(nx) + 0.5) * side, low[1] + (np.arange(ny) + 0.5) * side

@@ -19,29 +19,29 @@ from nerg_mi.evaluation.gaze import (
     Baseline,
     CachedBaseline,
     FieldDensity,
-    score_table,
-    standard_baselines,
+    format_score_table,
+    make_standard_baselines,
 )
-from nerg_mi.evaluation.gaze_report import markdown, side_by_side, uncertainty_text, write_report
-from nerg_mi.evaluation.uncertainty import calibration_rows, mean_rows, means, position_rows, rank_rows
+from nerg_mi.evaluation.gaze_report import format_table, draw_comparison, format_uncertainty, write_report
+from nerg_mi.evaluation.uncertainty import measure_calibration, summarise_folds, average_folds, score_positions, correlate_uncertainty
 from nerg_mi.fields.gaze_base import AnyGazeField
-from nerg_mi.figures.style import files_among, provenance
+from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_folder, file_sha256, write_text
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.probes.probes import LEVELS, level_name
-from nerg_mi.rays.dataset import is_dataset, load_rays, rays_digest
+from nerg_mi.probes.probes import REGION_LEVELS, format_level
+from nerg_mi.rays.dataset import is_dataset, load_rays, hash_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.tasks.task import FOLDER, RENDERS, Part, Plan
+from nerg_mi.tasks.task import FOLDER_SUFFIX, RENDER_LIBRARIES, Part, Plan
 from nerg_mi.threads import set_thread_count
-from nerg_mi.train.geometry import GazePlace
+from nerg_mi.train.geometry import TrainingGeometry
 
 from .base import SILENT, Reporter, select_backend
 from .gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions
-from .geometry import check_place, place_kind, place_of_training
+from .geometry import check_geometry, geometry_kind, load_training_geometry
 from .options import exposed_options, shared_options
-from .parts import Parts, PlannedScene
+from .parts import PartRunner, PlannedScene
 from .train_gaze import PRIOR, train_gaze
 
 # ---- Evaluation ----
@@ -105,15 +105,15 @@ def evaluate_gaze(
     account, seed = about["test"], options.seed
     split = options.split or ("both" if account.get("people") else "pos")
     reporter.progress(0.0, "test")
-    train, scored, centres = evaluation.held_out_rays(data, account, split, seed)
+    train, scored, centres = evaluation.select_held_out_rays(data, account, split, seed)
     test = evaluation.make_test(
         scored, centres, account["radius"], options.kappa, options.directions, options.min_rays, seed=seed
     )
-    place = place_of_training(gaze, about, loaded.box, options, ns)
+    place = load_training_geometry(gaze, about, loaded.box, options, ns)
     option = f"--{place.kind} {options.field or options.scene or 'FILE'}"
     # What was trained by force is scored, and told.
-    check_place(place, scored, option, True, reporter)
-    blind, others = standard_baselines(train, account["radius"], options.kappa, options.blind_kappa, seed)
+    check_geometry(place, scored, option, True, reporter)
+    blind, others = make_standard_baselines(train, account["radius"], options.kappa, options.prior_kappa, seed)
     depth, count = about.get("probes", {}).get("depth", "median"), len(test.centres)
     # Most of the time goes to the densities of the field.
     known = lambda number: reporter.progress(0.05 + 0.6 * min(number / count, 1), f"position {number} of {count}")
@@ -125,17 +125,17 @@ def evaluate_gaze(
     reporter.progress(0.05, "scores")
     told = lambda share: reporter.progress(0.65 + 0.2 * share, "scores") if share > 0 else None
     rows = evaluation.evaluate_gaze(test, methods, kept, options.resamples, seed, told)
-    half = evaluation.split_half(scored, test.centres, account["radius"], options.kappa, blind, options.min_rays, seed)
+    half = evaluation.score_split_half(scored, test.centres, account["radius"], options.kappa, blind, options.min_rays, seed)
     rows += [half] if half else []
     reporter.progress(0.86, "each person")
-    persons = evaluation.person_rows(test, {k: methods[k] for k in _BY_PERSON}, kept, options.min_rays)
+    persons = evaluation.score_participants(test, {k: methods[k] for k in _BY_PERSON}, kept, options.min_rays)
     reporter.progress(0.9, "uncertainty")
     places = _positions(test, loaded, place, members, methods[_BLIND], _groups(account, split, test.centres), seed)
-    ranks = rank_rows(places, options.resamples, seed)
-    at = lambda method: method(test.centres, test.drawn)[:, : test.at.shape[1]]
+    ranks = correlate_uncertainty(places, options.resamples, seed)
+    at = lambda method: method(test.centres, test.query_directions)[:, : test.sample_directions.shape[1]]
     asked = {k: (methods[k](test.centres, test.directions), at(methods[k])) for k in _CALIBRATED}
     found = about.get("mix", {}).get("regions")
-    regions = calibration_rows(test, asked, options.resamples, seed, {"gaze field": found} if found else None)
+    regions = measure_calibration(test, asked, options.resamples, seed, {"gaze field": found} if found else None)
     files = []
     if output is not None:
         summary = {
@@ -144,7 +144,7 @@ def evaluate_gaze(
             "split": split,
             "kappa": options.kappa,
             "positions": len(test.centres),
-            "people": len(test.persons),
+            "people": len(test.participants),
             "resamples": options.resamples,
         }
         notes = _notes(gaze.name, split, test, (len(train), len(data)), account["radius"], options)
@@ -152,10 +152,10 @@ def evaluate_gaze(
         if options.pictures:
             reporter.progress(0.95, "pictures")
             files.append(output / "positions.png")
-            sources = files_among(gaze, rays, options.field, options.scene)
-            made = provenance("nerg eval gaze", sources, seed, options)
-            side_by_side(test, {k: methods[k] for k in _DRAWN}, files[-1], options.pictures, about=made)
-    return GazeEvaluation(rows, persons, split, len(test.centres), len(test.persons), files, places, ranks, regions)
+            sources = existing_files(gaze, rays, options.field, options.scene)
+            made = make_provenance("nerg eval gaze", sources, seed, options)
+            draw_comparison(test, {k: methods[k] for k in _DRAWN}, files[-1], options.pictures, provenance=made)
+    return GazeEvaluation(rows, persons, split, len(test.centres), len(test.participants), files, places, ranks, regions)
 
 
 def print_evaluation(
@@ -165,7 +165,7 @@ def print_evaluation(
     result = evaluate_gaze(gaze, rays, output or gaze.with_suffix(".eval"), options, reporter)
     rows = [{k: row[k] for k in ("method", *evaluation.SCORES, "integral")} for row in result.rows]
     title = f"{gaze.name}, {result.split}: {result.positions} positions, {result.people} persons"
-    reporter.message(evaluation.score_table(rows, title))
+    reporter.message(evaluation.format_score_table(rows, title))
     for path in result.files:
         reporter.message(f"wrote {path}")
 
@@ -173,7 +173,7 @@ def print_evaluation(
 def _positions(
     test: evaluation.GazeTest,
     loaded: AnyGazeField,
-    place: GazePlace,
+    place: TrainingGeometry,
     members_of: Baseline,
     blind: Baseline,
     groups: list[str] | None,
@@ -184,13 +184,13 @@ def _positions(
     members = members_of(test.centres, test.directions)
     support = spread = None
     if loaded.support is not None:
-        points = place.points_from_rays(test.centres)
-        support = np.array([np.ravel(loaded.support.at(loaded.ns.Array3f(*map(float, p))))[0] for p in points])
+        points = place.points_to_field(test.centres)
+        support = np.array([np.ravel(loaded.support.evaluate(loaded.ns.Array3f(*map(float, p))))[0] for p in points])
     if len(members) > 1:
         spread = 4 * np.pi * members.std(axis=0, ddof=1).mean(axis=1)
     of_blind = np.asarray(blind(test.centres, test.directions))
     maps = members.mean(axis=0)
-    return position_rows(test, maps, of_blind, support=support, spread=spread, groups=groups, seed=seed)
+    return score_positions(test, maps, of_blind, support=support, spread=spread, groups=groups, seed=seed)
 
 
 def _groups(account: dict, split: str, centres: np.ndarray) -> list[str] | None:
@@ -213,7 +213,7 @@ def _rays_of_training(gaze: Path, about: dict, rays: Rays | str | Path) -> Rays:
     if isinstance(rays, Rays):
         return rays
     trained = about.get("rays_file", {})
-    if trained.get("sha256") not in (None, rays_digest(rays)):
+    if trained.get("sha256") not in (None, hash_rays(rays)):
         raise NergError(
             f'"{gaze}" was trained on other rays than "{rays}"; give the file {trained["file"]}, as it was then'
         )
@@ -232,11 +232,11 @@ def _notes(
     """What the tables say, for whoever reads them later; ``count``: of the rays that were trained on, and of all."""
     trained, whole = count
     return (
-        f"# {name}: {split}\n\n{len(test.centres)} positions, {len(test.persons)} persons; {trained:,} of {whole:,} "
+        f"# {name}: {split}\n\n{len(test.centres)} positions, {len(test.participants)} persons; {trained:,} of {whole:,} "
         f"rays trained on. Truth: rays within {radius:g} m, kappa {options.kappa:g}, {options.directions} directions "
         f"of equal area; KLD in nats with {EPS:g} of the uniform density added; MAE in 1/sr; AUC against all "
         "directions, sAUC against rays of other positions; bits a ray beyond the position-blind density of kappa "
-        f"{options.blind_kappa:g}; loglik in nats of 1/sr. Brackets: 1.96 standard errors either way, from "
+        f"{options.prior_kappa:g}; loglik in nats of 1/sr. Brackets: 1.96 standard errors either way, from "
         f"{options.resamples} resamples of the persons. Split half: half of the people predict the other half, where "
         "both have enough rays; a reference, no bound."
     )
@@ -248,7 +248,7 @@ def _notes(
 FIELD, SCORED = "gaze.safetensors", "scores.json"
 """What the output of a fold holds: its field, and the rows of each split."""
 
-_LEVELS = tuple(level_name(level) for level in LEVELS)
+_LEVELS = tuple(format_level(level) for level in REGION_LEVELS)
 
 
 @dataclass(frozen=True)
@@ -280,17 +280,17 @@ def evaluate_folds(
     """
     options, output = options or FoldOptions(), Path(output)
     splits = tuple(_splits(options.splits))
-    place_kind(options)
+    geometry_kind(options)
     check_folder(output)
-    parts = Parts(options, output, reporter, options.threads)
+    parts = PartRunner(options, output, reporter, options.threads)
     if options.threads:
         set_thread_count(options.threads)
     reporter.progress(0.0, "reading")
-    common = Folds(fold_options(options), splits, *_sources(rays, options))
+    common = FoldInputs(fold_options(options), splits, *_sources(rays, options))
     seeds = range(options.first, options.first + options.folds)
     what = f"nerg eval folds {os.path.abspath(output)}"
     tasks = [Part(seed, f"fold {seed}") for seed in seeds]
-    plan = Plan(what, train_and_score, common, tasks, FOLDER, (*RENDERS, "scipy"))
+    plan = Plan(what, train_and_score, common, tasks, FOLDER_SUFFIX, (*RENDER_LIBRARIES, "scipy"))
     each, fields, by_split = [], [], {split: [] for split in splits}
     positions, regions = [], {split: [] for split in splits}
     for seed, made in zip(seeds, parts.run(plan)):
@@ -305,12 +305,12 @@ def evaluate_folds(
             regions[split].append(found[split]["calibration"])
         score = by_split[splits[0]][-1][0]
         reporter.message(f"fold {seed}, {splits[0]}: KLD {score['KLD']:.3f}, CC {score['CC']:.3f}")
-    rows = [{"split": split, **row} for split, found in by_split.items() for row in mean_rows(found)]
+    rows = [{"split": split, **row} for split, found in by_split.items() for row in summarise_folds(found)]
     populations = {split: [p for p in positions if p["split"] == split] for split in splits}
     if len(splits) > 1:
         populations["anywhere"] = positions
-    ranks = [{"split": split, **row} for split, found in populations.items() for row in rank_rows(found)]
-    held = [{"split": split, **row} for split, found in regions.items() for row in means(found, _LEVELS)]
+    ranks = [{"split": split, **row} for split, found in populations.items() for row in correlate_uncertainty(found)]
+    held = [{"split": split, **row} for split, found in regions.items() for row in average_folds(found, _LEVELS)]
     written = _write(output, rows, each, options, positions, ranks, held)
     for path in written:
         reporter.message(f"wrote {path}")
@@ -323,11 +323,11 @@ def print_folds(rays: Path, output: Path, options: FoldOptions, reporter: Report
     result = evaluate_folds(rays, output, options, reporter)
     for split in options.splits.split(","):
         rows = [{k: row.get(k, math.nan) for k in ("method", *SCORES)} for row in result.rows if row["split"] == split]
-        reporter.message(score_table(rows, f"{split}: means of {options.folds} folds"))
+        reporter.message(format_score_table(rows, f"{split}: means of {options.folds} folds"))
 
 
 @dataclass(frozen=True)
-class Folds:
+class FoldInputs:
     """What all folds have in common: ``options``, ``splits`` to score in, ``rays`` or their file, and the ``scene``."""
 
     options: FoldOptions
@@ -342,18 +342,18 @@ def fold_options(options: FoldOptions) -> FoldOptions:
     return replace(options, **{name: getattr(plain, name) for name in ("folds", "first", "splits", "most")})
 
 
-def train_and_score(common: Folds, seed: int, output: Path) -> None:
+def train_and_score(common: FoldInputs, seed: int, output: Path) -> None:
     """A fold: a gaze field that was trained without some people and zones (`FIELD`), and its rows in each split
     (`SCORED`), into the folder ``output``."""
     o, gaze = common.options, output / FIELD
     if common.scene is not None:
-        common.scene.checked()
+        common.scene.checked_path()
     training = GazeOptions(
         **shared_options(o, GazeOptions),
         **exposed_options(o),
         test_zones=o.zones,
         test_positions=o.positions,
-        test_people=o.people,
+        test_participants=o.test_participants,
         seed=seed,
     )
     train_gaze(common.rays, gaze, training)
@@ -386,7 +386,7 @@ def _sources(rays: Rays | str | Path, options: FoldOptions) -> tuple[Rays | Path
     """The rays of all folds, or their file, and the scene that they look around in."""
     if not isinstance(rays, Rays):
         rays = load_rays(rays, options.most, options.first) if is_dataset(rays) else Path(rays)
-    return rays, None if options.scene is None else PlannedScene.of(options.scene)
+    return rays, None if options.scene is None else PlannedScene.plan(options.scene)
 
 
 def _write(
@@ -410,8 +410,8 @@ def _write(
     for split in dict.fromkeys(row["split"] for row in (*rows, *ranks)):
         text += f"\n# {split}\n\n"
         if own := of(rows, split):
-            text += f"{markdown(own, ('method', *SCORES, 'integral', 'folds'))}\n"
-        text += uncertainty_text(of(ranks, split), of(regions, split))
+            text += f"{format_table(own, ('method', *SCORES, 'integral', 'folds'))}\n"
+        text += format_uncertainty(of(ranks, split), of(regions, split))
     write_text(files[0], text)
     write_csv(files[1], each)
     write_csv(files[2], positions)

@@ -9,14 +9,14 @@ from pathlib import Path
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField
-from nerg_mi.fields.occupancy import RefinedGrid, refine
+from nerg_mi.fields.occupancy import RefinedGrid, refine_occupancy
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import check_writable, file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
-from nerg_mi.formats.fields import load_radiance, occupancy_arrays, save_gaze, save_radiance
-from nerg_mi.formats.splats import splats_of_field, write_ply_splats
-from nerg_mi.formats.surfaces import Surface, density_and_color, mesh, points, write_glb, write_ply, write_volume
-from nerg_mi.formats.torch_ngp import Given, is_nerg, open_checkpoint, read_nerg, read_torch_ngp, write_torch_ngp
+from nerg_mi.formats.fields import load_radiance, encode_occupancy, save_gaze, save_radiance
+from nerg_mi.formats.splats import make_splats, write_ply_splats
+from nerg_mi.formats.surfaces import Surface, sample_density_and_color, extract_mesh, extract_points, write_glb, write_ply, write_volume
+from nerg_mi.formats.torch_ngp import ImportOptions, is_nerg_checkpoint, open_checkpoint, read_nerg, read_torch_ngp, write_torch_ngp
 
 from .base import SILENT, Reporter, argument, out, select_backend
 from .radiance_commands import (
@@ -60,17 +60,17 @@ def import_checkpoint(
     for path in (output, gaze):
         if path is not None:
             check_writable(path, ".safetensors")
-    given = Given(options.color_space, options.finest, options.bg_radius)
+    given = ImportOptions(options.color_space, options.finest_resolution, options.bg_radius)
     reporter.progress(0.0, f"converting {Path(file).name}")
     ns = select_backend(options.mode)
-    if is_nerg(open_checkpoint(file)[1]):
+    if is_nerg_checkpoint(open_checkpoint(file)[1]):
         field, attention, origin = read_nerg(file, ns, options.ema, given)
     else:
         if gaze is not None:
             raise NergError(f'"{file}" holds no gaze field: leave out --gaze')
         (field, origin), attention = read_torch_ngp(file, ns, options.ema, given), None
     if field is not None:
-        field.occupancy = refine(field) or field.occupancy
+        field.occupancy = refine_occupancy(field) or field.occupancy
     if output is not None:
         if field is None:
             raise NergError(f'"{file}" holds a gaze field without its NeRF: import that from its own file')
@@ -99,7 +99,7 @@ def import_to_files(
 def _about(field: RadianceField, origin: dict) -> str:
     cells = "no occupancy grid (marching evaluates all of space)"
     if field.occupancy is not None:
-        cells = f"{100 * field.occupancy.fraction:.1f} % of its box occupied"
+        cells = f"{100 * field.occupancy.occupied_fraction:.1f} % of its box occupied"
     behind = "" if field.background is None else f", background of radius {field.background.config.radius:g}"
     return f"radiance: bound {field.box.side / 2:g}, {origin['weights']} weights, {cells}{behind}"
 
@@ -137,13 +137,13 @@ def export_mesh(
     """
     options, output, start = options or MeshOptions(), Path(output), time.perf_counter()
     write = _surface_writer(output, options.up)
-    found = mesh(
+    found = extract_mesh(
         _load(field, options.mode, reporter),
         options.resolution,
         options.density,
-        options.fill,
-        options.keep,
-        options.unseen,
+        options.fill_holes,
+        options.min_component_area,
+        options.keep_unseen,
     )
     write(found, output)
     r = found.report
@@ -171,7 +171,7 @@ def export_points(
     mend."""
     options, output, start = options or PointOptions(), Path(output), time.perf_counter()
     write = _surface_writer(output, options.up)
-    found = points(_load(field, options.mode, reporter), options.resolution, options.density, options.count)
+    found = extract_points(_load(field, options.mode, reporter), options.resolution, options.density, options.max_points)
     write(found, output)
     reporter.message(f"{len(found.vertices):,} points, at a density of {found.report['threshold']:.4g} / unit")
     return _written([output], start, reporter, found)
@@ -186,7 +186,7 @@ def export_splats(
     """Write Gaussian splats on the field's surface: .ply. Raises `NergError` for what the user can mend."""
     options, output, start = options or SplatOptions(), Path(output), time.perf_counter()
     check_writable(output, ".ply")
-    splats, done = splats_of_field(_load(field, options.mode, reporter), options.resolution, options.density)
+    splats, done = make_splats(_load(field, options.mode, reporter), options.resolution, options.density)
     write_ply_splats(output, splats, comments=("Gaussian splats of a radiance field, by nerg_mi",))
     reporter.message(
         f"{len(splats):,} Gaussians, cells of {done['cell']:.4g} units; moved by {done['moved']:.2g} units (median) to "
@@ -207,7 +207,7 @@ def export_volume(
     for path in reversed(files):
         check_writable(path, ".vol")
     loaded = _load(field, options.mode, reporter)
-    density, color, lower, upper = density_and_color(loaded, options.resolution, options.color is not None)
+    density, color, lower, upper = sample_density_and_color(loaded, options.resolution, options.color is not None)
     write_volume(output, density, lower, upper)
     reporter.message(
         f"{_by(density.shape[::-1])} voxels from {_corner(lower)} to {_corner(upper)}; "
@@ -242,7 +242,7 @@ def _load(field: str | Path | RadianceField, mode: str, reporter: Reporter) -> R
     ns = select_backend(mode)
     loaded = field if isinstance(field, RadianceField) else load_radiance(field, ns)[0]
     reporter.progress(0.01, "looking through its volume")
-    if loaded.box.contracted:
+    if loaded.box.is_contracted:
         reporter.message("the place has no end: written is the box that it resolves best, not what is around it")
     return loaded
 
@@ -299,17 +299,17 @@ def refine_checkpoint(
     if loaded.occupancy is None:
         raise NergError(f'"{field}" has no occupancy grid to refine: its field is marched through all of its box')
     reporter.progress(0.0, f"refining {field.name}")
-    before, grid = loaded.occupancy.coarse.fraction, refine(loaded)
+    before, grid = loaded.occupancy.coarse.occupied_fraction, refine_occupancy(loaded)
     if grid is None:
         raise NergError(f'the occupancy of "{field}" is nested cubes, which are not refined: use the field as it is')
     tensors, meta = read_checkpoint(field, "radiance")
-    arrays, about = occupancy_arrays(grid)
+    arrays, about = encode_occupancy(grid)
     origin = meta.get("refined_from") or file_sha256(field)
     kept = {key: value for key, value in meta.items() if key not in ("format", "kind")}
     write_checkpoint(output, "radiance", tensors | arrays, kept | {"occupancy": about, "refined_from": origin})
     reporter.message(
-        f"matter in {100 * grid.fraction:.2f} % of the box, where it was {100 * before:.2f} %; a random line misses an "
-        f"optical depth of {grid.missed:.1e}"
+        f"matter in {100 * grid.occupied_fraction:.2f} % of the box, where it was {100 * before:.2f} %; a random line misses an "
+        f"optical depth of {grid.missed_optical_depth:.1e}"
     )
     seconds = time.perf_counter() - start
     reporter.message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB) in {seconds:.1f} s")

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.ranges import CHANGES_RESULT, COORDINATES, FLAG, RANGE, THREADS, Checked, Range, check_number
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.ranges import CHANGES_RESULT, COORDINATES, FLAG, RANGE, THREADS, ValidatedDataclass, Range, check_number
 
 # Key in the metadata of a field that `exposes` made.
 _EXPOSED = "nerg_mi.exposed"
@@ -21,7 +21,7 @@ Base = TypeVar("Base")
 Class = TypeVar("Class", bound=type)
 
 
-class Derived(Checked):
+class DerivedOptions(ValidatedDataclass):
     """Base of options of which some are declared elsewhere, by `exposes` or `repeats`."""
 
     if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def option(
     return field(default=default, metadata={**about, RANGE: within, FLAG: names[-1] if names else ""})
 
 
-def exposes(*kinds: type, default: str = "", without: Collection[str] = ()) -> Callable[[Class], Class]:
+def expose_settings(*kinds: type, default: str = "", without: Collection[str] = ()) -> Callable[[Class], Class]:
     """Decorator of a class, under ``dataclass``: gives it an option for each `nerg_mi.ranges.setting` of ``kinds``.
     `exposed_options` reads those that it gave.
 
@@ -86,7 +86,7 @@ def exposes(*kinds: type, default: str = "", without: Collection[str] = ()) -> C
     return decorate
 
 
-def chosen_settings(options: Any, kind: type) -> dict[str, Any]:
+def explicit_settings(options: Any, kind: type) -> dict[str, Any]:
     """Keywords of the settings ``kind``, for those of its exposed fields that are set in ``options``."""
     exposed = {f.name: f.metadata["option"] or f.name for f in fields(kind) if "help" in f.metadata}
     values = {name: getattr(options, option) for name, option in exposed.items()}
@@ -100,7 +100,7 @@ def exposed_options(options: Any) -> dict[str, Any]:
     return {name: value for name in names if (value := getattr(options, name)) is not None}
 
 
-def repeats(kind: type, *names: str) -> Callable[[Class], Class]:
+def repeat_options(kind: type, *names: str) -> Callable[[Class], Class]:
     """Decorator of a class, under ``dataclass``: gives it the options ``names`` of ``kind``, as they are there, which
     `shared_options` reads again."""
 
@@ -120,7 +120,7 @@ def shared_options(options: Any, kind: type) -> dict[str, Any]:
     return {f.name: getattr(options, f.name) for f in fields(kind) if declared.get(f.name) is f}
 
 
-def as_base(options: Any, kind: type[Base]) -> Base:
+def to_base(options: Any, kind: type[Base]) -> Base:
     """The fields of ``options`` that the dataclass ``kind`` has, of which theirs is derived: who is given it cannot
     depend on the others."""
     return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})  # pyright: ignore[reportArgumentType]
@@ -130,7 +130,7 @@ def parse_point(text: str, flag: str) -> tuple[float, ...]:
     """Three coordinates with commas between them. Raises `NergError` naming ``flag`` for other texts."""
     numbers = parse_numbers(text, flag)
     if len(numbers) != 3:
-        raise NergError(f"{flag} is three numbers x,y,z, got {plain(text, 60)!r}")
+        raise NergError(f"{flag} is three numbers x,y,z, got {sanitize(text, 60)!r}")
     for number in numbers:
         check_number(number, COORDINATES, flag)
     return numbers
@@ -141,7 +141,7 @@ def parse_numbers(text: str, flag: str) -> tuple[float, ...]:
     try:
         return tuple(float(v) for v in (text.split(",") if "," in text or not text else text.split()))
     except ValueError:
-        raise NergError(f"{flag} is numbers with commas between them, got {plain(text, 60)!r}") from None
+        raise NergError(f"{flag} is numbers with commas between them, got {sanitize(text, 60)!r}") from None
 
 
 def parse_definitions(pairs: Iterable[str], flag: str) -> dict[str, str]:
@@ -191,7 +191,7 @@ def cpu_threads(more: str = "") -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartOptions(Checked):
+class PartOptions(ValidatedDataclass):
     """Where finished parts of a job are kept, and who makes them."""
 
     store: Path | None = option(
@@ -216,7 +216,7 @@ class PartOptions(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlaceOptions(Checked):
+class GeometryOptions(ValidatedDataclass):
     """Exactly one of them is given."""
 
     field: Path | None = option(None, "Radiance field, or Gaussian splats, in which people looked around.")

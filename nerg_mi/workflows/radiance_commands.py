@@ -19,29 +19,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.ranges import LENGTHS, SECONDS, SEEDS, SPP, VALUES, Checked, Range
+from nerg_mi.ranges import LENGTHS, SECONDS, SEEDS, SPP, POSITIVE_VALUES, ValidatedDataclass, Range
 from nerg_mi.train.radiance_settings import RadianceSettings
 
 from .base import argument, declare, extra, out
-from .options import Derived, coordinates, cpu_threads, exposes, llvm_variant, option, repeats
+from .options import DerivedOptions, coordinates, cpu_threads, expose_settings, llvm_variant, option, repeat_options
 
 # ---- From photos to a field ----
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseOptions(Checked):
+class PoseOptions(ValidatedDataclass):
     """How the poses of photos are found."""
 
-    frames: int = option(
+    num_frames: int = option(
         80, "Of a video: frames to take, each the sharpest of an equally long stretch.", within=Range(3, 10**6)
     )
-    size: int = option(
+    max_image_size: int = option(
         960, "Longer side, in pixels, of the copies that features are found in.", within=Range(64, 65536)
     )
     matching: str = option(
         "auto", "Pictures to compare: exhaustive (all), sequential (in order), auto (all up to 100, else in order)."
     )
-    lens: str = option(
+    camera_model: str = option(
         "auto",
         "What is found of a lens: radial (f, k1), opencv (fx, fy, k1, k2, p1, p2), auto (opencv from 10 photos on).",
     )
@@ -66,7 +66,7 @@ declare(
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhotoOptions(Checked):
+class PhotoOptions(ValidatedDataclass):
     """How a posed image set is read."""
 
     holdout: int | None = option(
@@ -87,8 +87,8 @@ class PhotoOptions(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-@exposes(RadianceSettings)
-class RadianceOptions(Derived, PhotoOptions):
+@expose_settings(RadianceSettings)
+class RadianceOptions(DerivedOptions, PhotoOptions):
     """How a radiance field is trained."""
 
     size: str = option("small", "Size of the field: small, medium or paper.")
@@ -147,7 +147,7 @@ declare(
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckpointImportOptions(Checked):
+class CheckpointImportOptions(ValidatedDataclass):
     """What a checkpoint does not say of itself, and how its fields are stored."""
 
     ema: bool | None = option(
@@ -159,7 +159,7 @@ class CheckpointImportOptions(Checked):
         "What --bg_radius was in training, where there is a background network; 0: leave it out.",
         within=Range(0, 10**6),
     )
-    finest: int | None = option(
+    finest_resolution: int | None = option(
         None, "Finest resolution of the hash grid.  [default: 2048 x bound]", within=Range(2, 1 << 24)
     )
     half: bool = option(False, "Store the weights in fp16.")
@@ -167,14 +167,14 @@ class CheckpointImportOptions(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefineOptions(Checked):
+class RefineOptions(ValidatedDataclass):
     """On what a bound is refined."""
 
     mode: str = llvm_variant()
 
 
 @dataclass(frozen=True, kw_only=True)
-class LatticeOptions(Checked):
+class LatticeOptions(ValidatedDataclass):
     """Where a radiance field is evaluated."""
 
     resolution: int = option(256, "Lattice cells along the longest edge of the field's box.", within=Range(2, 2048))
@@ -188,7 +188,7 @@ class IsosurfaceOptions(LatticeOptions):
     density: float | None = option(
         None,
         "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]",
-        within=VALUES,
+        within=POSITIVE_VALUES,
     )
     up: str = option("z", "Up axis of the field, for .glb: z or y.")
 
@@ -197,21 +197,21 @@ class IsosurfaceOptions(LatticeOptions):
 class MeshOptions(IsosurfaceOptions):
     """What is left out of a mesh, and what is added to it."""
 
-    fill: int = option(1, "Close holes of up to twice so many cells; 0: none.", within=Range(0, 2048))
-    keep: float = option(0.001, "Drop pieces with less than this share of the largest one's area.", within=Range(0, 1))
-    unseen: bool = option(False, "Keep the backs and insides that training never looked at.")
+    fill_holes: int = option(1, "Close holes of up to twice so many cells; 0: none.", within=Range(0, 2048))
+    min_component_area: float = option(0.001, "Drop pieces with less than this share of the largest one's area.", within=Range(0, 1))
+    keep_unseen: bool = option(False, "Keep the backs and insides that training never looked at.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointOptions(IsosurfaceOptions):
     """Which points of a surface are written."""
 
-    count: int | None = option(None, "Points at most.  [default: all]", within=Range(1, 10**9))
+    max_points: int | None = option(None, "Points at most.  [default: all]", within=Range(1, 10**9))
 
 
 @dataclass(frozen=True, kw_only=True)
-@repeats(IsosurfaceOptions, "density")
-class SplatOptions(Derived, LatticeOptions):
+@repeat_options(IsosurfaceOptions, "density")
+class SplatOptions(DerivedOptions, LatticeOptions):
     """How many Gaussians a surface becomes, and where it lies."""
 
 
@@ -223,7 +223,7 @@ class VolumeOptions(LatticeOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TorchNgpOptions(Checked):
+class TorchNgpOptions(ValidatedDataclass):
     """How a field is read that becomes a torch-ngp checkpoint."""
 
     mode: str = llvm_variant()

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.figures import maps, style
-from nerg_mi.figures.style import files_among, provenance
-from nerg_mi.files.atomic import check_new_folder, check_writable, replacing_folder
+from nerg_mi.figures.style import existing_files, make_provenance
+from nerg_mi.files.atomic import check_new_folder, check_writable, create_folder_atomically
 from nerg_mi.files.tables import write_json
 from nerg_mi.rays import filters
-from nerg_mi.rays.dataset import MOST, RAY_BYTES, UNKNOWN, Conditions, RayDataset, is_dataset, load_rays, write_head
-from nerg_mi.rays.dataset_write import ImportRecipe, SourceWriter, Update, update_dataset
+from nerg_mi.rays.dataset import MAX_LOADED_RAYS, BYTES_PER_RAY, UNKNOWN, Conditions, RayDataset, is_dataset, load_rays, write_dataset_manifest
+from nerg_mi.rays.dataset_write import ImportRecipe, SourceWriter, DatasetUpdate, update_dataset
 from nerg_mi.rays.guess import Proposal, propose_imports
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
-from nerg_mi.rays.quality import RaysSummary, card_table, summarise, summarise_dataset
+from nerg_mi.rays.quality import RaysSummary, format_quality_report, summarise, summarise_dataset
 from nerg_mi.rays.rays import SUFFIXES, Rays, merge_rays
-from nerg_mi.rays.readers.registry import TABLE, parse_options, read_rays, reader_named
+from nerg_mi.rays.readers.registry import TABLE, parse_options, read_rays, get_reader
 
 from .base import SILENT, Reporter
 from .rays_commands import DATASET, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
@@ -74,19 +74,19 @@ class FilterSteps:
     def sample(self, n: int, seed: int) -> None:
         """Keep ``n`` rays, each as likely as any other."""
         lot = np.random.default_rng(seed).random(len(self.rays))
-        self._keep(least_mask(lot, n), "sample", {"seed": seed})
+        self._keep(smallest_mask(lot, n), "sample", {"seed": seed})
 
     def _fixations(self, options: FilterOptions) -> int:
         by_velocity = options.fixations == "ivt"
-        limit = {"velocity": options.velocity} if by_velocity else {"dispersion": options.dispersion}
-        limit |= {} if options.least is None else {"least": options.least}
+        limit = {"velocity": options.velocity_threshold} if by_velocity else {"dispersion": options.dispersion_threshold}
+        limit |= {} if options.min_fixation is None else {"least": options.min_fixation}
         label = np.zeros(0, np.int64)
         if len(self.rays):
-            label = (filters.ivt if by_velocity else filters.idt)(self.rays, **limit)
+            label = (filters.detect_fixations_ivt if by_velocity else filters.detect_fixations_idt)(self.rays, **limit)
         count = len(np.unique(label[label >= 0]))
         self._reporter.message(f"{count:,} fixations ({options.fixations})")
         about = {"by": options.fixations, **limit}
-        if options.one_ray:
+        if options.merge_fixations:
             self._replace(label, {**about, "one_ray": True})
         else:
             self._keep(label >= 0, "fixations", about)
@@ -95,7 +95,7 @@ class FilterSteps:
     def _replace(self, label: np.ndarray, about: dict[str, Any]) -> None:
         """Go on with a ray for each fixation."""
         before = len(self.rays)
-        rays = filters.fixation_rays(self.rays, label)[0] if before else self.rays
+        rays = filters.average_fixations(self.rays, label)[0] if before else self.rays
         self._reporter.message(f"fixations: one ray each, {len(rays):,} of {before:,} rays")
         self._take(rays, FilterStep("fixations", len(rays), before, about))
 
@@ -105,7 +105,7 @@ class FilterSteps:
         if not count and self._strict:
             raise NergError(f"{name} leaves none of {len(rays):,} rays; widen its conditions")
         self._reporter.message(f"{name}: {count:,} of {len(rays):,} rays")
-        kept = rays.keep_in_place(mask) if self._own else rays.select(mask)
+        kept = rays.filter_in_place(mask) if self._own else rays.select(mask)
         self._take(kept, FilterStep(name, count, len(rays), about))
 
     def _take(self, rays: Rays, step: FilterStep) -> None:
@@ -114,7 +114,7 @@ class FilterSteps:
         self.taken.append(step)
 
 
-def least_mask(lot: np.ndarray, n: int) -> np.ndarray:
+def smallest_mask(lot: np.ndarray, n: int) -> np.ndarray:
     """The ``n`` least of the numbers ``lot`` (N,), as a mask; all, where there are no more."""
     mask = np.ones(len(lot), bool)
     if n < len(lot):
@@ -134,18 +134,18 @@ def import_dataset(files: Sequence[FileName], options: RaysImportOptions, report
 
     Raises `NergError` where some could not be imported, after the others were.
     """
-    folder, place = Path(options.output or ""), options.place_name or UNKNOWN
+    folder, place = Path(options.output or ""), options.environment or UNKNOWN
     key = None
     if options.pseudonyms:
         key = secrets.token_bytes(32) if options.salt is None else read_salt(options.salt)
     recipe = ImportRecipe(
-        reader=reader_named(options.reader),
+        reader=get_reader(options.reader),
         settings=options.settings,
         skip_bad_lines=options.skip_bad_lines,
         place=place,
         day=options.day,
         key=key,
-        kept_salt=options.salt is not None,
+        is_salt_stored=options.salt is not None,
     )
     done: list[str] = []
 
@@ -158,25 +158,25 @@ def import_dataset(files: Sequence[FileName], options: RaysImportOptions, report
     if found.errors:
         more = f" ({len(found.errors)} of {len(files)} could not be imported; the others are)" if len(files) > 1 else ""
         raise NergError(found.errors[0] + more)
-    return summarise_dataset(RayDataset.open(folder).of_place(place))
+    return summarise_dataset(RayDataset.open(folder).select_place(place))
 
 
-def _tell(found: Update, reporter: Reporter) -> None:
+def _tell(found: DatasetUpdate, reporter: Reporter) -> None:
     """What an import came to, in a line."""
-    parts = [f"imported {found.imported:,} sources, {found.rays:,} rays" if found.imported else "nothing to import"]
+    parts = [f"imported {found.num_imported:,} sources, {found.num_rays:,} rays" if found.num_imported else "nothing to import"]
     parts += [
-        f"{count:,} {what}" for count, what in ((found.unchanged, "unchanged"), (found.alike, "given twice")) if count
+        f"{count:,} {what}" for count, what in ((found.num_unchanged, "unchanged"), (found.num_duplicates, "given twice")) if count
     ]
-    parts += [f"{found.replaced:,} replaced"] if found.replaced else []
+    parts += [f"{found.num_replaced:,} replaced"] if found.num_replaced else []
     reporter.message("; ".join(parts))
 
 
-def dataset_cards(path: FileName) -> Iterator[tuple[str, Card]]:
+def make_dataset_reports(path: FileName) -> Iterator[tuple[str, Card]]:
     """Of each place of a dataset what to call it, and its card."""
     dataset = RayDataset.open(path)
     for place in dataset.places:
         title = str(path) if len(dataset.places) == 1 else f"{path}: {place}"
-        yield title, summarise_dataset(dataset.of_place(place))
+        yield title, summarise_dataset(dataset.select_place(place))
 
 
 def filter_dataset(path: FileName, options: FilterOptions, reporter: Reporter) -> tuple[Rays | None, int | None]:
@@ -191,13 +191,13 @@ def filter_dataset(path: FileName, options: FilterOptions, reporter: Reporter) -
         if options.sample is not None:
             raise NergError("a --sample is written to a file; let the name of the output end in .npz or .parquet")
         check_new_folder(output)
-        with replacing_folder(output) as folder:
+        with create_folder_atomically(output) as folder:
             _write_filtered(dataset, options, steps, folder)
             steps.tell(options, reporter)
         return None, steps.fixations
     if output is not None:
         check_writable(output, *SUFFIXES)
-    dataset.one_place()
+    dataset.require_single_place()
     if options.sample is not None and not options.conditions and not options.follows:
         rays = dataset.sample(options.sample, options.seed)
         reporter.message(f"sample: {len(rays):,} of {len(dataset):,} rays")
@@ -222,7 +222,7 @@ class _Totals:
         """What is left of each part of ``dataset``."""
         conditions = Conditions(**options.conditions)
         selected = FilterStep("filter", 0, self._count, options.conditions)
-        for block in dataset.scan(conditions, whole=options.follows):
+        for block in dataset.scan(conditions, whole_parts=options.follows):
             steps = FilterSteps(block, own=True, strict=False)
             count = steps.follow(options)
             if count is not None:
@@ -261,9 +261,9 @@ def _all(dataset: RayDataset, options: FilterOptions, steps: _Totals) -> list[Ra
     for block in steps.filtered(dataset, options):
         found.append(block)
         count += len(block)
-        if count > MOST:
+        if count > MAX_LOADED_RAYS:
             raise NergError(
-                f"more than {MOST:,} rays are left, {MOST * RAY_BYTES / 1e9:.2g} GB: narrow the conditions, add "
+                f"more than {MAX_LOADED_RAYS:,} rays are left, {MAX_LOADED_RAYS * BYTES_PER_RAY / 1e9:.2g} GB: narrow the conditions, add "
                 f"--sample, or write another dataset (-o NAME{DATASET})"
             )
     return found
@@ -289,15 +289,15 @@ def _sampled(dataset: RayDataset, options: FilterOptions, steps: _Totals) -> lis
 
 def _least(held: list[Rays], lots: list[np.ndarray], n: int) -> tuple[list[Rays], list[np.ndarray]]:
     """The ``n`` rays with the least numbers, in their blocks."""
-    mask = least_mask(np.concatenate(lots) if lots else np.zeros(0), n)
+    mask = smallest_mask(np.concatenate(lots) if lots else np.zeros(0), n)
     masks = np.split(mask, np.cumsum([len(lot) for lot in lots])[:-1]) if lots else []
     return [rays.select(m) for rays, m in zip(held, masks)], [lot[m] for lot, m in zip(lots, masks)]
 
 
 def _write_filtered(dataset: RayDataset, options: FilterOptions, steps: _Totals, folder: Path) -> None:
     """Write what is left of each source to a new dataset; its accounts last, since they tell the steps of all."""
-    write_head(folder, replace(dataset.head, closed=True))
-    writers = {source.id: SourceWriter(folder, source.id, dataset.head.buckets) for source in dataset.sources}
+    write_dataset_manifest(folder, replace(dataset.manifest, closed=True))
+    writers = {source.id: SourceWriter(folder, source.id, dataset.manifest.buckets) for source in dataset.sources}
     for source, part in dataset.parts:
         for block in steps.filtered(replace(dataset, parts=((source, part),)), options):
             writers[source.id].add(block, part.place, part.day)
@@ -377,7 +377,7 @@ def import_files(
     reader = preset or TABLE
     options = replace(options, reader=reader, settings=parse_options(reader, settings))
     result = import_rays(files, options, reporter)
-    reporter.message(card_table(result.rays, result.summary, str(options.output), result.lines))
+    reporter.message(format_quality_report(result.rays, result.summary, str(options.output), result.lines))
     for path in (options.output, options.align_output):
         _tell_tracking(path, reporter)
 
@@ -398,27 +398,27 @@ def print_guesses(files: list[Path], reporter: Reporter) -> None:
     for k, proposal in enumerate(proposals):
         if len(proposals) > 1:
             more = f" and {len(proposal.paths) - 1} more" if len(proposal.paths) > 1 else ""
-            reporter.message("\n" * (k > 0) + plain(f"{proposal.paths[0]}{more}", 2000))
-        for name, sentences in (("sure", proposal.sure), ("guess", proposal.guessed), ("open", proposal.open)):
+            reporter.message("\n" * (k > 0) + sanitize(f"{proposal.paths[0]}{more}", 2000))
+        for name, sentences in (("sure", proposal.certain), ("guess", proposal.assumptions), ("open", proposal.questions)):
             for sentence in sentences:
-                reporter.message(f"{name:6} {plain(sentence, 2000)}")
+                reporter.message(f"{name:6} {sanitize(sentence, 2000)}")
         reporter.message("")
-        reporter.message(plain(proposal.command or "nothing can be proposed", 100_000))
+        reporter.message(sanitize(proposal.command or "nothing can be proposed", 100_000))
 
 
-def card_of(path: FileName, reporter: Reporter = SILENT) -> list[tuple[str, ImportResult]]:
+def make_quality_report(path: FileName, reporter: Reporter = SILENT) -> list[tuple[str, ImportResult]]:
     """Titles, figures and lines of the sanity cards of a file of rays, or of each place of a dataset."""
     reporter.progress(0.0, f"reading {Path(path).name}")
     if not is_dataset(path):
         rays = Rays.load(path)
         return [(str(path), ImportResult(rays, summarise(rays)))]
-    return [(title, ImportResult(*card)) for title, card in dataset_cards(path)]
+    return [(title, ImportResult(*card)) for title, card in make_dataset_reports(path)]
 
 
 def print_cards(rays: Path, reporter: Reporter) -> None:
     """`card_of` as tables."""
-    for title, card in card_of(rays, reporter):
-        reporter.message(card_table(card.rays, card.summary, title, card.lines))
+    for title, card in make_quality_report(rays, reporter):
+        reporter.message(format_quality_report(card.rays, card.summary, title, card.lines))
 
 
 @dataclass(frozen=True, eq=False)
@@ -472,26 +472,26 @@ def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter 
     reporter.progress(0.01, "splitting")
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     about: dict[str, Any] = {}
-    if options.zones:
+    if options.test_zones:
         where = {name: getattr(options, name) for name in ("zones", "zone_radius", "min_rays")}
-        held = filters.split_by_position(data, options.radius, test_probes=options.positions, seed=seed, **where)
-        parts.append(held.sides)
+        held = filters.split_by_position(data, options.radius, test_probes=options.test_positions, seed=seed, **where)
+        parts.append(held.masks)
         about["position"] = {
             "radius": options.radius,
-            "zones": options.zones,
+            "zones": options.test_zones,
             "zone_radius": options.zone_radius,
             "test_centres": held.test_centres.tolist(),
         }
-    if options.people or options.persons:
+    if options.test_participants or options.persons:
         sides = filters.split_by_person(
-            data, test_share=options.people or 0.5, test_persons=list(options.persons) or None, seed=seed
+            data, test_fraction=options.test_participants or 0.5, test_persons=list(options.persons) or None, seed=seed
         )
         parts.append(sides)
         about["person"] = {"test": sorted(data.persons[p] for p in np.unique(data.person[sides[1]]))}
-    if options.time:
-        parts.append(filters.split_by_time(data, test_share=options.time, gap=options.gap, of=options.clock))
-        about["time"] = {"share": options.time, "gap": options.gap, "of": options.clock}
-    train, test = filters.combine(*parts)
+    if options.test_time:
+        parts.append(filters.split_by_time(data, test_fraction=options.test_time, gap=options.gap, clock=options.clock))
+        about["time"] = {"share": options.test_time, "gap": options.gap, "of": options.clock}
+    train, test = filters.combine_splits(*parts)
     purged = int((~(train | test)).sum())
     reporter.message(f"{train.sum():,} training rays, {test.sum():,} test rays, {purged:,} purged of {len(data):,}")
     side = lambda name, mask: data.select(mask).with_step(
@@ -518,13 +518,13 @@ def plot_rays(rays: Rays | FileName, options: PlotOptions | None = None, reporte
     if options.output is not None:
         check_writable(options.output, *style.FORMATS)
     if options.kind == "density":
-        figure = maps.floor_plan(_load(rays), options.cell)
+        figure = maps.floor_plan(_load(rays), options.cell_size)
     else:
         test = None if options.test is None else _load(options.test)
-        where = {} if test is None else filters.position_of_split(test)
+        where = {} if test is None else filters.read_position_split(test)
         figure = maps.layout_figure(_load(rays), test, where.get("test_centres"), where.get("radius"))
     if options.output is not None:
-        about = provenance("nerg rays plot", files_among(rays, options.test), None, options)
+        about = make_provenance("nerg rays plot", existing_files(rays, options.test), None, options)
         style.save(figure, options.output, about)
         _tell_tracking(options.output, reporter)
     return figure

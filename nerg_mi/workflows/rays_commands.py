@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, Checked, Range
+from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, ValidatedDataclass, Range
 
 from .base import Parameter, argument, declare, extra, out
 from .options import coordinates, cpu_threads, llvm_variant, option
@@ -34,13 +34,13 @@ PLANS = ("density", "layout")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RaysImportOptions(Checked):
+class RaysImportOptions(ValidatedDataclass):
     """How tracking files become rays. Raises `NergError` for a salt without pseudonyms, and for what only a dataset
     has."""
 
     reader: str = option("table", "Name of a registered reader (nerg_mi.rays.readers.registry).")
     settings: Any = option(None, "An object of the reader's Options. Default: as they are by default.")
-    place_name: str | None = option(None, "Of a dataset: the place of all files.  [default: unknown]")
+    environment: str | None = option(None, "Of a dataset: the place of all files.  [default: unknown]")
     day: str | None = option(
         None, "Of a dataset: the day of all rays, as 2026-11-22.  [default: by their times, in UTC, else unknown]"
     )
@@ -84,7 +84,7 @@ class RaysImportOptions(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FilterOptions(Checked):
+class FilterOptions(ValidatedDataclass):
     """Which rays to keep: conditions first, then fixations, then fewer of those who stand still.
 
     Raises `NergError` for an unknown word, or where nothing is said.
@@ -99,10 +99,10 @@ class FilterOptions(Checked):
     min_confidence: float | None = option(None, "Only rays of at least this confidence.", within=Range(0, 1))
     with_hit: bool = option(False, "Only rays whose hit point is known.")
     fixations: str | None = option(None, "Only rays of fixations: ivt (by velocity) or idt (by dispersion).")
-    velocity: float = option(100.0, "ivt: degrees a second that end a fixation.", within=Range(0, 10**6))
-    dispersion: float = option(3.0, "idt: degrees within which a fixation stays.", within=Range(0, 180))
-    least: float | None = option(None, "Shortest fixation, seconds.  [default: ivt 0.06, idt 0.1]", within=SECONDS)
-    one_ray: bool = option(False, "One ray a fixation, its mean.")
+    velocity_threshold: float = option(100.0, "ivt: degrees a second that end a fixation.", within=Range(0, 10**6))
+    dispersion_threshold: float = option(3.0, "idt: degrees within which a fixation stays.", within=Range(0, 180))
+    min_fixation: float | None = option(None, "Shortest fixation, seconds.  [default: ivt 0.06, idt 0.1]", within=SECONDS)
+    merge_fixations: bool = option(False, "One ray a fixation, its mean.")
     thin: float | None = option(None, "A stop counts as at most this many seconds of rays.", within=SECONDS)
     thin_distance: float = option(0.1, "With --thin, a stop is a stay within this many metres.", within=Range(0, 10**6))
     sample: int | None = option(None, "So many of the rays that are left, each as likely as any other.", within=RAYS)
@@ -115,7 +115,7 @@ class FilterOptions(Checked):
         super().__post_init__()
         if self.fixations not in (None, *DETECTORS):
             raise NergError(f'--fixations is "{self.fixations}"; it is ivt or idt')
-        if self.one_ray and self.fixations is None:
+        if self.merge_fixations and self.fixations is None:
             raise NergError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
         if not self.conditions and not self.follows and self.sample is None:
             raise NergError(
@@ -144,22 +144,22 @@ class FilterOptions(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplitOptions(Checked):
+class SplitOptions(ValidatedDataclass):
     """How training and test rays are parted: by position, person or time, or several of them at once.
 
     Raises `NergError` where nothing is said.
     """
 
-    zones: int = option(0, "By position: zones held out; 0: not by position.", within=Range(0, 1000))
+    test_zones: int = option(0, "By position: zones held out; 0: not by position.", within=Range(0, 1000))
     radius: float = option(
         0.25, "By position: R of probes, metres; rays within 2R of a test position are purged.", within=LENGTHS
     )
     zone_radius: float = option(0.2, "By position: radius of a zone, metres.", within=Range(0, 10**6))
-    positions: int = option(150, "By position: test positions in the zones.", within=Range(1, 10**5))
+    test_positions: int = option(150, "By position: test positions in the zones.", within=Range(1, 10**5))
     min_rays: int = option(64, "By position: rays that a test position has within R.", within=Range(1, 10**6))
-    people: float = option(0.0, "By person: share held out, at random; 0: not by person.", within=Range(0, 1))
+    test_participants: float = option(0.0, "By person: share held out, at random; 0: not by person.", within=Range(0, 1))
     persons: tuple[str, ...] = option((), "By person: this one is held out; repeatable.", "--person")
-    time: float = option(0.0, "By time: share at the end that is held out; 0: not by time.", within=Range(0, 1))
+    test_time: float = option(0.0, "By time: share at the end that is held out; 0: not by time.", within=Range(0, 1))
     gap: float = option(5.0, "By time: seconds purged before the end part.", within=SECONDS)
     clock: str = option("all", "By time: all (one clock), or person (each their own).")
     seed: int = option(0, "Seed of zones, positions and people.", within=SEEDS)
@@ -168,16 +168,16 @@ class SplitOptions(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (self.zones or self.people or self.persons or self.time):
+        if not (self.test_zones or self.test_participants or self.persons or self.test_time):
             raise NergError("say how to split: --zones 3, --people 0.5, --person NAME, --time 0.2, or several of them")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlotOptions(Checked):
+class PlotOptions(ValidatedDataclass):
     """What a floor plan shows. Raises `NergError` for an unknown word, or test rays beside densities."""
 
     kind: str = option("density", "density: rays/m² with mean directions; layout: each ray's place, with dimensions.")
-    cell: float | None = option(
+    cell_size: float | None = option(
         None, "density: edge of a cell, metres.  [default: a fiftieth of the plan]", within=LENGTHS
     )
     # Or rays in memory.
@@ -194,10 +194,10 @@ class PlotOptions(Checked):
 
 def _reader_parameters() -> Mapping[str, Parameter]:
     """The options of all readers that are registered now."""
-    from nerg_mi.rays.readers.registry import preset_names, shared_options
+    from nerg_mi.rays.readers.registry import list_preset_names, collect_shared_options
 
-    parameters = {"preset": extra(None, f"Known recording: {', '.join(preset_names())}.", str, "--preset")}
-    for o in shared_options():
+    parameters = {"preset": extra(None, f"Known recording: {', '.join(list_preset_names())}.", str, "--preset")}
+    for o in collect_shared_options():
         parameters[o.name] = extra(False if o.kind is bool else None, o.help, o.kind, o.flag)
     return parameters
 
@@ -256,7 +256,7 @@ declare(
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlignOptions(Checked):
+class AlignOptions(ValidatedDataclass):
     """What an alignment is found from, and what is known beforehand. Lengths of the tracking are metres."""
 
     field: Path | None = option(None, "The place: a radiance field, or Gaussian splats.")
@@ -267,16 +267,16 @@ class AlignOptions(Checked):
     pairs: Path | None = option(
         None, "Evidence: picked points, CSV of x,y,z,place_x,place_y,place_z (three or more), or JSON."
     )
-    twin: Path | None = option(None, "Or: a mesh or points (as --surface) in the tracking's frame.")
-    cameras: Path | None = option(None, "Or: posed photos in the tracking's frame (transforms.json, COLMAP), with ...")
-    place_cameras: Path | None = option(None, "... the same photos' poses in the place's frame.")
-    start: Path | None = option(None, "Or: an alignment that is near, which the tracking refines.")
+    tracking_surface: Path | None = option(None, "Or: a mesh or points (as --surface) in the tracking's frame.")
+    tracking_cameras: Path | None = option(None, "Or: posed photos in the tracking's frame (transforms.json, COLMAP), with ...")
+    scene_cameras: Path | None = option(None, "... the same photos' poses in the place's frame.")
+    init: Path | None = option(None, "Or: an alignment that is near, which the tracking refines.")
     refine: bool = option(False, "Refine what the evidence gave by the tracking.")
     up: str | None = option(
         None, "Axis of the place that is up (z, -y, ... or x,y,z): only turns about it are left. The tracking's is z."
     )
-    floor: float = option(0.0, "Height of the floor in the tracking.", within=COORDINATES)
-    place_floor: float | None = option(
+    floor_height: float = option(0.0, "Height of the floor in the tracking.", within=COORDINATES)
+    scene_floor_height: float | None = option(
         None, "Height of the floor in the place, along --up. Default: found.", within=COORDINATES
     )
     scale: float | None = option(

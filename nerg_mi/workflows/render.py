@@ -15,29 +15,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.figures import style
 from nerg_mi.figures.overlay import Limits, Overlay, OverlayLayers, Style, find_overlay, shared_limits
-from nerg_mi.figures.style import Provenance, find_colors, provenance, rasterize, save
-from nerg_mi.files.atomic import check_writable, replacing, write_bytes
+from nerg_mi.figures.style import Provenance, find_colormap, make_provenance, rasterize, save
+from nerg_mi.files.atomic import check_writable, replace_atomically, write_bytes
 from nerg_mi.files.safe_read import read_npy
-from nerg_mi.files.video import check_video, video_frames
+from nerg_mi.files.video import check_video_output, open_video_writer
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering import bands
-from nerg_mi.rendering.bands import SamplePace, is_nerg, prepare_for, render_asked
-from nerg_mi.rendering.files import FORMATS, DisplayRows, numbered, picture_rows, read_frames
-from nerg_mi.rendering.scene import activate, files_of_scene, load_scene
-from nerg_mi.rendering.scene_writer import pixel_of
+from nerg_mi.rendering.bands import SamplePace, is_nerg, prepare_long_render, render_aovs
+from nerg_mi.rendering.files import IMAGE_FORMATS, DisplayRows, frame_path, open_image_rows, read_frames
+from nerg_mi.rendering.scene import activate_variant, list_scene_files, load_scene
+from nerg_mi.rendering.scene_writer import project_to_pixel
 from nerg_mi.threads import set_thread_count
 from nerg_mi.transport.aovs import AOVS
-from nerg_mi.transport.observer import center
+from nerg_mi.transport.observer import sensor_center
 
 from .base import SILENT, Reporter
-from .options import as_base
+from .options import to_base
 from .scene_commands import FilmOptions, PictureOptions
 
 if TYPE_CHECKING:
-    from .parts import Parts, PlannedScene
+    from .parts import PartRunner, PlannedScene
 
 
 # ---- Pictures with a quantity laid over their colour, alone or as a sequence with one scale ----
@@ -58,10 +58,10 @@ class RenderedPicture:
 
 OVERLAY_FORMATS = (*style.FORMATS, ".mp4")
 
-OnStrip = Callable[[int, int], None]
+OnBand = Callable[[int, int], None]
 """Is told how many samples are done, and of how many."""
 
-Make = Callable[[Any, Any, OnStrip], RenderedPicture]
+Make = Callable[[Any, Any, OnBand], RenderedPicture]
 """Makes a picture of a scene, a sensor, and a function that is told of each strip."""
 
 
@@ -69,7 +69,7 @@ _OF_OVERLAYS = (("top", None), ("cmap", None), ("decades", 0.0), ("hatching", Tr
 
 SUPPORT = 1.0
 """Support, in rays, below which an observer's gaze counts as not known: nobody was recorded within five radii of a
-probe (docs/gaze-evaluation.md)."""
+probe (docs/explanation/accuracy.md)."""
 
 
 def check_overlay(output: Path, options: PictureOptions) -> None:
@@ -87,10 +87,10 @@ def check_overlay(output: Path, options: PictureOptions) -> None:
             f"{' or '.join(OVERLAY_FORMATS)} (an .exr holds the quantity itself, if the scene's aovs name it)"
         )
     if options.cmap is not None:
-        find_colors(options.cmap, overlay.color_kind)
+        find_colormap(options.cmap, overlay.colormap_kind)
 
 
-def overlay_pictures(
+def render_overlays(
     path: Path,
     frames: Sequence[Mapping[str, str]],
     write: Callable[[Any], None],
@@ -106,10 +106,10 @@ def overlay_pictures(
     until the scale is known, and not at all where it is given. Raises `NergError` where the quantity is 0 everywhere.
     """
     overlay = find_overlay(options.overlay or "")
-    style = style_of(options)
+    style = overlay_style(options)
     limits: list[Limits] = []
     last = RenderedPicture((0, 0), 0)
-    waits = shares_a_scale(overlay, len(frames), options)
+    waits = uses_shared_scale(overlay, len(frames), options)
 
     def finish(layers: OverlayLayers, ends: Limits) -> None:
         overlay.check_limits(ends)
@@ -119,46 +119,46 @@ def overlay_pictures(
     with tempfile.TemporaryDirectory() as folder:
         kept: list[tuple[Path, tuple[int, ...], Any, bool, str]] = []
 
-        def make(loaded: Any, camera: Any, on_strip: OnStrip) -> RenderedPicture:
+        def make(loaded: Any, camera: Any, on_strip: OnBand) -> RenderedPicture:
             check_memory(path, camera, options)
-            layers = layers_of(path, loaded, camera, overlay, options.spp, options.seed, on_strip)
+            layers = render_layers(path, loaded, camera, overlay, options.spp, options.seed, on_strip)
             limits.append(overlay.limits(layers))
             height, width = layers.mask.shape
             if waits:
-                array = stacked(layers)
+                array = stack_layers(layers)
                 file = Path(folder, str(len(kept)))
                 write_bytes(file, array.data)
-                kept.append((file, array.shape, layers.marker, layers.supported, layers.basis))
+                kept.append((file, array.shape, layers.marker, layers.has_support, layers.support_note))
             else:
-                finish(layers, shared_limits(limits[-1:], options.top))
+                finish(layers, shared_limits(limits[-1:], options.vmax))
             return RenderedPicture((width, height), 3)
 
         for frame in frames:
             last = render(frame, make)
-        ends = shared_limits(limits, options.top)
+        ends = shared_limits(limits, options.vmax)
         for file, shape, marker, supported, basis in kept:
-            finish(unstacked(np.fromfile(file, np.float32).reshape(shape), marker, supported, basis), ends)
+            finish(unstack_layers(np.fromfile(file, np.float32).reshape(shape), marker, supported, basis), ends)
             file.unlink()
     return last, None if ends is None else ends[1]
 
 
-def style_of(options: PictureOptions) -> Style:
+def overlay_style(options: PictureOptions) -> Style:
     """How ``options`` have overlays drawn."""
-    return Style(options.cmap, options.decades, options.hatching)
+    return Style(options.cmap, options.log_decades, options.hatching)
 
 
-def shares_a_scale(overlay: Overlay, count: int, options: PictureOptions) -> bool:
+def uses_shared_scale(overlay: Overlay, count: int, options: PictureOptions) -> bool:
     """Whether none of ``count`` pictures can be drawn before all are rendered."""
-    return count > 1 and overlay.scaled and (options.top is None or not overlay.is_scaled_by_top)
+    return count > 1 and overlay.needs_limits and (options.vmax is None or not overlay.is_scaled_by_top)
 
 
-def stacked(layers: OverlayLayers) -> np.ndarray:
+def stack_layers(layers: OverlayLayers) -> np.ndarray:
     """Colour, values and mask of ``layers`` as one array (h, w, 5) of float32."""
     array = np.concatenate([layers.color, layers.values[..., None], layers.mask[..., None]], axis=-1)
     return np.ascontiguousarray(array, np.float32)
 
 
-def unstacked(array: np.ndarray, marker: tuple[float, float] | None, supported: bool, basis: str) -> OverlayLayers:
+def unstack_layers(array: np.ndarray, marker: tuple[float, float] | None, supported: bool, basis: str) -> OverlayLayers:
     """What `stacked` was given, with its ``marker``, whether it is ``supported``, and its ``basis`` in words."""
     return OverlayLayers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker, supported, basis)
 
@@ -174,23 +174,23 @@ def check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
         )
 
 
-def layers_of(
-    path: Path, loaded: Any, camera: Any, overlay: Overlay, spp: int = 0, seed: int = 0, on_strip: OnStrip | None = None
+def render_layers(
+    path: Path, loaded: Any, camera: Any, overlay: Overlay, spp: int = 0, seed: int = 0, on_strip: OnBand | None = None
 ) -> OverlayLayers:
     """What ``camera`` sees of the scene ``loaded`` from ``path`` with the quantity of ``overlay``, and who is there."""
     quantity = overlay.quantity
     asked = list(dict.fromkeys([quantity.name, "opacity", "depth"]))
-    with mitsuba_says():
-        found = render_asked(path, loaded, camera, asked, spp, seed, on_strip)
+    with translate_mitsuba_errors():
+        found = render_aovs(path, loaded, camera, asked, spp, seed, on_strip)
     if overlay.name not in found.aovs:
         raise NergError(f'"{path}" has no "{overlay.name}"; it has {", ".join(found.aovs)}')
     marker = observer_pixel(loaded, camera, found.aovs["depth"])
     supported = not quantity.needs_support or is_supported(loaded, camera)
-    basis = basis_words(loaded, quantity.rests_on)
+    basis = describe_basis(loaded, quantity.data_source)
     return OverlayLayers(found.color, found.aovs[overlay.name], found.mask, marker, supported, basis)
 
 
-def basis_words(loaded: Any, part: str = "gaze") -> str:
+def describe_basis(loaded: Any, part: str = "gaze") -> str:
     """Rays and people that a ``part`` of the scene rests on, "gaze" or "kde", in words; "" where that is not known."""
     volume = loaded.integrator().children.get(part)
     if volume is None:
@@ -199,13 +199,13 @@ def basis_words(loaded: Any, part: str = "gaze") -> str:
     return "" if basis is None else f"made of {basis.words()}"
 
 
-def basis_texts(loaded: Any) -> dict[str, str]:
+def describe_bases(loaded: Any) -> dict[str, str]:
     """The same for the header of a picture, by the names under which `workflows.draw` finds it: "gaze.basis" and
     "kde.basis", as far as they are known."""
     if not is_nerg(loaded.integrator()):
         return {}
-    parts = dict.fromkeys(aov.rests_on for aov in AOVS.values() if aov.rests_on)
-    words = {f"{part}.basis": basis_words(loaded, part) for part in parts}
+    parts = dict.fromkeys(aov.data_source for aov in AOVS.values() if aov.data_source)
+    words = {f"{part}.basis": describe_basis(loaded, part) for part in parts}
     return {name: text for name, text in words.items() if text}
 
 
@@ -216,7 +216,7 @@ def is_supported(loaded: Any, camera: Any) -> bool:
     gaze = integrator.gaze
     if gaze is None or gaze.field.support is None:
         return True
-    eye = center(integrator.observer or camera)
+    eye = sensor_center(integrator.observer or camera)
     return float(np.ravel(np.array(gaze.field.support.at(gaze.to_world.point_to_local(eye))))[0]) >= SUPPORT
 
 
@@ -225,12 +225,12 @@ def observer_pixel(loaded: Any, camera: Any, depth: np.ndarray) -> tuple[float, 
     observer = loaded.integrator().observer
     if observer is None or camera.class_name() != "PerspectiveCamera":
         return None
-    eye = center(observer)
-    found = pixel_of(camera, eye)
+    eye = sensor_center(observer)
+    found = project_to_pixel(camera, eye)
     if found is None:
         return None
     column, row = (int(np.clip(round(v), 0, n - 1)) for v, n in zip(found, depth.shape[::-1]))
-    away = float(np.linalg.norm(np.ravel(np.array(eye - center(camera)))))
+    away = float(np.linalg.norm(np.ravel(np.array(eye - sensor_center(camera)))))
     before = depth[row, column]
     return found if not 0 < before < away else None
 
@@ -258,11 +258,11 @@ class PictureResult:
     seconds: float
     whole: str | None
     files: tuple[Path, ...] = ()
-    top: float | None = None
+    vmax: float | None = None
 
 
 @dataclass(frozen=True)
-class AskedPictures:
+class RenderPlan:
     """What is to be rendered: values of `<default>`s for each of ``frames``, and the ``files`` to write, or the one
     ``video``."""
 
@@ -271,10 +271,10 @@ class AskedPictures:
     video: bool
 
 
-def asked_pictures(scene: Path, output: Path, options: PictureOptions) -> AskedPictures:
+def plan_render(scene: Path, output: Path, options: PictureOptions) -> RenderPlan:
     """What `render_file` would render. Raises `NergError` for options that contradict each other, and for files that
     cannot be read or written, before any work."""
-    check_writable(output, *dict.fromkeys((*FORMATS, *OVERLAY_FORMATS)))
+    check_writable(output, *dict.fromkeys((*IMAGE_FORMATS, *OVERLAY_FORMATS)))
     if not scene.exists():
         raise NergError(f'there is no scene file "{scene}"')
     check_overlay(output, options)
@@ -283,10 +283,10 @@ def asked_pictures(scene: Path, output: Path, options: PictureOptions) -> AskedP
     files = [output]
     if options.frames is not None:
         frames = read_frames(options.frames)
-        files = [output] if video else [numbered(output, k + 1, len(frames)) for k in range(len(frames))]
+        files = [output] if video else [frame_path(output, k + 1, len(frames)) for k in range(len(frames))]
         for file in files:
             check_writable(file)
-    return AskedPictures(frames, files, video)
+    return RenderPlan(frames, files, video)
 
 
 def render_file(
@@ -313,10 +313,10 @@ def render_file(
     """
     options = options or PictureOptions()
     scene, output = Path(scene), Path(output)
-    asked = asked_pictures(scene, output, options)
+    asked = plan_render(scene, output, options)
     frames, files, video = asked.frames, asked.files, asked.video
     reporter.progress(0.0, "reading the scene")
-    mode = activate(options.mode)
+    mode = activate_variant(options.mode)
     if options.threads:
         set_thread_count(options.threads)
     start, pace = time.perf_counter(), SamplePace()
@@ -334,17 +334,17 @@ def render_file(
             nonlocal done
             loaded = load_scene(scene, {**(options.defaults or {}), **frame})
             stop.check()
-            camera = sensor_of(scene, loaded, options.sensor)
-            prepare_for(len(frames) * samples_of(camera, options.spp), loaded)
+            camera = find_sensor(scene, loaded, options.sensor)
+            prepare_long_render(len(frames) * sample_count(camera, options.spp), loaded)
             made = make(loaded, camera, on_strip)
             done += 1
             return made
 
-        each = provenances(scene, frames, options, mode, video)
+        each = make_provenances(scene, frames, options, mode, video)
         with _writer(files, options, each, video) as write:
             if options.overlay is not None:
                 drawn = lambda figure: write(lambda path, about: save(figure, path, about), lambda: rasterize(figure))
-                picture, top = overlay_pictures(scene, frames, drawn, options, render, stop)
+                picture, top = render_overlays(scene, frames, drawn, options, render, stop)
             else:
                 for frame in frames:
                     picture = render(frame, partial(_picture, write, options, stop, pace))
@@ -352,18 +352,18 @@ def render_file(
         stop.check()
     seconds = time.perf_counter() - start
     result = PictureResult(files[0], picture.size, picture.channels, mode, seconds, picture.whole, tuple(files), top)
-    reporter.message(account(result, asked, options))
+    reporter.message(summary_line(result, asked, options))
     return result
 
 
-def account(result: PictureResult, asked: AskedPictures, options: PictureOptions) -> str:
+def summary_line(result: PictureResult, asked: RenderPlan, options: PictureOptions) -> str:
     """The line that says what was written."""
     files, frames = asked.files, asked.frames
     note = f" It was rendered in one piece, beyond {options.memory:g} GB, because of {result.whole}."
     width, height = result.size
     what = str(files[0]) if len(files) == 1 else f"{len(files)} pictures, {files[0]} to {files[-1]}"
     what += f", {len(frames)} pictures at {options.fps:g} a second" if asked.video else ""
-    scale = "" if result.top is None else f", scale to {result.top:.4g}"
+    scale = "" if result.vmax is None else f", scale to {result.vmax:.4g}"
     return (
         f"Wrote {what} ({width} x {height}, {result.channels} channels, {result.mode}, {result.seconds:.1f} s{scale})."
         f"{note if result.whole else ''}"
@@ -382,11 +382,11 @@ def _writer(files: Sequence[Path], options: PictureOptions, each: Iterator[Prove
         remaining = iter(files)
         yield lambda store, pixels: store(next(remaining), next(each))
         return
-    with video_frames(files[0], options.fps, next(each).text()) as add:
+    with open_video_writer(files[0], options.fps, next(each).text()) as add:
         yield lambda to_file, pixels: add(pixels())
 
 
-def provenances(
+def make_provenances(
     scene: Path, frames: Sequence[Mapping[str, str]], options: PictureOptions, mode: str, video: bool
 ) -> Iterator[Provenance]:
     """What each picture was made of, or the one video."""
@@ -395,10 +395,10 @@ def provenances(
     given |= {"mode": mode, "sensor": options.sensor, "spp": options.spp}
     for frame in frames[:1] if video else frames:
         values = {**(options.defaults or {}), **({} if video else frame)}
-        inputs = files_of_scene(scene, {**values, **frame})
+        inputs = list_scene_files(scene, {**values, **frame})
         if video and options.frames is not None:
             inputs, given["fps"] = [*inputs, options.frames], options.fps
-        yield provenance("nerg render", inputs, options.seed, given | {"defaults": values}, known)
+        yield make_provenance("nerg render", inputs, options.seed, given | {"defaults": values}, known)
 
 
 def _check_video(output: Path, options: PictureOptions) -> bool:
@@ -406,12 +406,12 @@ def _check_video(output: Path, options: PictureOptions) -> bool:
     if output.suffix.lower() == VIDEO:
         if options.frames is None:
             raise NergError(f'"{output}" is a video, and there is one picture; give --frames, or another name (.png)')
-        check_video(options.fps)
+        check_video_output(options.fps)
         return True
     if options.fps != PictureOptions().fps:
         raise NergError(f'--fps is of a video, and "{output}" is none; let its name end in {VIDEO}')
-    if options.overlay is None and output.suffix.lower() not in FORMATS:
-        raise NergError(f'"{output}" holds an overlay; give --overlay, or a name that ends in {" or ".join(FORMATS)}')
+    if options.overlay is None and output.suffix.lower() not in IMAGE_FORMATS:
+        raise NergError(f'"{output}" holds an overlay; give --overlay, or a name that ends in {" or ".join(IMAGE_FORMATS)}')
     return False
 
 
@@ -422,12 +422,12 @@ def _picture(
     pace: SamplePace,
     loaded: Any,
     camera: Any,
-    on_strip: OnStrip,
+    on_strip: OnBand,
 ) -> RenderedPicture:
     """Render what ``camera`` sees, and ``write`` it."""
     width, height = map(int, camera.film().crop_size())
-    rows = bands.rows_for(loaded, camera, 1e9 * options.memory - resident_bytes() - RESERVE)
-    whole = bands.why_whole(loaded, camera) if rows < height else None
+    rows = bands.fit_rows_to_memory(loaded, camera, 1e9 * options.memory - resident_bytes() - RESERVE)
+    whole = bands.undividable_reason(loaded, camera) if rows < height else None
     channels = 0
 
     def fill(add: Callable[[Any, int], None]) -> None:
@@ -442,7 +442,7 @@ def _picture(
             stop.check()
 
     def to_file(path: Path, about: Provenance) -> None:
-        with picture_rows(path, width, height, about.text() | basis_texts(loaded)) as add:
+        with open_image_rows(path, width, height, about.text() | describe_bases(loaded)) as add:
             fill(add)
 
     def pixels() -> np.ndarray:
@@ -450,12 +450,12 @@ def _picture(
         fill(display.add)
         return display.pixels()
 
-    with mitsuba_says():
+    with translate_mitsuba_errors():
         write(to_file, pixels)
     return RenderedPicture((width, height), channels, whole)
 
 
-def sensor_of(path: Path, scene, index: int):
+def find_sensor(path: Path, scene, index: int):
     """The sensor of ``scene`` with this ``index``. Raises `NergError` where there is none, or no integrator for it."""
     if scene.integrator() is None:
         raise NergError(f'the scene "{path}" has no integrator to render with; add one, as <integrator type="nerg"/>')
@@ -465,7 +465,7 @@ def sensor_of(path: Path, scene, index: int):
     return scene.sensors()[index]
 
 
-def samples_of(camera: Any, spp: int) -> int:
+def sample_count(camera: Any, spp: int) -> int:
     """Samples of a picture of ``camera``: ``spp`` a pixel, 0 for those of its sampler."""
     width, height = map(int, camera.film().crop_size())
     return width * height * (spp or camera.sampler().sample_count())
@@ -503,13 +503,13 @@ def render_film(
     if not options.in_parts:
         return render_file(scene, output, options, reporter)
     # A single picture needs neither time nor memory for it.
-    from .parts import Parts
+    from .parts import PartRunner
 
     scene, output = Path(scene), Path(output)
-    asked = asked_pictures(scene, output, options)
-    parts = Parts(options, output, reporter, options.threads)
+    asked = plan_render(scene, output, options)
+    parts = PartRunner(options, output, reporter, options.threads)
     reporter.progress(0.0, "reading the scene")
-    mode = activate(options.mode)
+    mode = activate_variant(options.mode)
     if options.threads:
         set_thread_count(options.threads)
     start = time.perf_counter()
@@ -517,13 +517,13 @@ def render_film(
     size, channels = (int(first["size"][0]), int(first["size"][1])), int(first.get("channels", 3))
     seconds = time.perf_counter() - start
     result = PictureResult(asked.files[0], size, channels, mode, seconds, first.get("whole"), tuple(asked.files), top)
-    reporter.message(account(result, asked, options))
+    reporter.message(summary_line(result, asked, options))
     reporter.message(f"The parts are kept in {parts.store.folder}; nerg jobs says what they take.")
     return result
 
 
 def _rendered(
-    scene: Path, asked: AskedPictures, options: FilmOptions, parts: Parts
+    scene: Path, asked: RenderPlan, options: FilmOptions, parts: PartRunner
 ) -> tuple[Mapping[str, Any], float | None]:
     """Make all pictures. Gives the notes of the last, and the upper end of the overlays' scale."""
     from nerg_mi.tasks.task import Part, Plan
@@ -532,33 +532,33 @@ def _rendered(
 
     suffix = ".png" if asked.video else asked.files[0].suffix.lower()
     what = f"nerg render {os.path.abspath(asked.files[0])}"
-    of_each = picture_options(options)
+    get_or_compute_each = picture_options(options)
     frames = [
-        Part(PlannedScene.of(scene, {**(options.defaults or {}), **frame}), f"picture {k + 1}")
+        Part(PlannedScene.plan(scene, {**(options.defaults or {}), **frame}), f"picture {k + 1}")
         for k, frame in enumerate(asked.frames)
     ]
     overlay = None if options.overlay is None else find_overlay(options.overlay)
-    if overlay is None or not shares_a_scale(overlay, len(frames), options):
-        last = _write(scene, asked, options, parts, Plan(what, make_picture, of_each, frames, suffix), 0.0)
+    if overlay is None or not uses_shared_scale(overlay, len(frames), options):
+        last = _write(scene, asked, options, parts, Plan(what, make_picture, get_or_compute_each, frames, suffix), 0.0)
         return last, last.get("top")
     # All are rendered, then the scale of all is known, and each is drawn by it.
-    layers = list(parts.run(Plan(f"{what} (values)", make_layers, of_each, frames, ".npy"), 0.0, _LAYERS_SHARE))
+    layers = list(parts.run(Plan(f"{what} (values)", make_layers, get_or_compute_each, frames, ".npy"), 0.0, _LAYERS_SHARE))
     limits = [None if made.notes["limits"] is None else tuple(made.notes["limits"]) for made in layers]
-    ends = shared_limits(limits, options.top)
+    ends = shared_limits(limits, options.vmax)
     overlay.check_limits(ends)
     drawings = []
     for k, (frame, made) in enumerate(zip(asked.frames, layers)):
         header = {}
         if not asked.video:
-            header = next(provenances(scene, [frame], options, str(options.mode), False)).text()
+            header = next(make_provenances(scene, [frame], options, str(options.mode), False)).text()
         notes = {name: made.notes[name] for name in ("marker", "supported", "basis")}
-        drawings.append(Part(LayersToDraw(made.path, ends, **notes, header=header), f"drawing {k + 1}"))
-    _write(scene, asked, options, parts, Plan(what, draw_layers, of_each, drawings, suffix), _LAYERS_SHARE)
+        drawings.append(Part(LayerDrawing(made.path, ends, **notes, header=header), f"drawing {k + 1}"))
+    _write(scene, asked, options, parts, Plan(what, draw_layers, get_or_compute_each, drawings, suffix), _LAYERS_SHARE)
     return layers[-1].notes, None if ends is None else ends[1]
 
 
 def _write(
-    scene: Path, asked: AskedPictures, options: FilmOptions, parts: Parts, plan: Any, since: float
+    scene: Path, asked: RenderPlan, options: FilmOptions, parts: PartRunner, plan: Any, since: float
 ) -> Mapping[str, Any]:
     """Bring the outputs of ``plan`` to where they belong, one after the other. Gives the notes of the last."""
     last: Mapping[str, Any] = {}
@@ -566,13 +566,13 @@ def _write(
     if not asked.video:
         for file, made in zip(asked.files, arriving):
             last = made.notes
-            with replacing(file) as temporary:
+            with replace_atomically(file) as temporary:
                 shutil.copyfile(made.path, temporary)
         return last
     import mitsuba as mi
 
-    headers = provenances(scene, asked.frames, options, str(options.mode), True)
-    with video_frames(asked.files[0], options.fps, next(headers).text()) as add:
+    headers = make_provenances(scene, asked.frames, options, str(options.mode), True)
+    with open_video_writer(asked.files[0], options.fps, next(headers).text()) as add:
         for made in arriving:
             last = made.notes
             add(np.array(mi.Bitmap(str(made.path)))[..., :3])
@@ -584,40 +584,40 @@ def _write(
 
 def picture_options(options: PictureOptions) -> PictureOptions:
     """The ``options`` of a single picture: a part has the values of its frame itself, and belongs to any video."""
-    return replace(as_base(options, PictureOptions), defaults=None, frames=None, fps=PictureOptions().fps)
+    return replace(to_base(options, PictureOptions), defaults=None, frames=None, fps=PictureOptions().fps)
 
 
 def make_picture(options: PictureOptions, scene: PlannedScene, output: Path) -> dict[str, Any]:
     """A picture file, as `render_file` writes it."""
-    made = render_file(scene.checked(), output, replace(options, defaults=scene.defaults))
-    return {"size": made.size, "channels": made.channels, "whole": made.whole, "top": made.top}
+    made = render_file(scene.checked_path(), output, replace(options, defaults=scene.defaults))
+    return {"size": made.size, "channels": made.channels, "whole": made.whole, "top": made.vmax}
 
 
 def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> dict[str, Any]:
     """A picture's colour and overlay as they are before they are drawn (.npy), with what a scale is made of."""
-    path = scene.checked()
-    activate(options.mode)
+    path = scene.checked_path()
+    activate_variant(options.mode)
     overlay = find_overlay(options.overlay or "")
     with Interruption() as stop:
         loaded = load_scene(path, scene.defaults)
-        camera = sensor_of(path, loaded, options.sensor)
+        camera = find_sensor(path, loaded, options.sensor)
         check_memory(path, camera, options)
-        layers = layers_of(path, loaded, camera, overlay, options.spp, options.seed, lambda *_: stop.check())
+        layers = render_layers(path, loaded, camera, overlay, options.spp, options.seed, lambda *_: stop.check())
         stop.check()
-    with replacing(output) as temporary, temporary.open("wb") as out:
-        np.save(out, stacked(layers))
+    with replace_atomically(output) as temporary, temporary.open("wb") as out:
+        np.save(out, stack_layers(layers))
     height, width = layers.mask.shape
     return {
         "size": (width, height),
         "limits": overlay.limits(layers),
         "marker": layers.marker,
-        "supported": bool(layers.supported),
-        "basis": layers.basis,
+        "supported": bool(layers.has_support),
+        "basis": layers.support_note,
     }
 
 
 @dataclass(frozen=True)
-class LayersToDraw:
+class LayerDrawing:
     """``layers`` (.npy) that `make_layers` made, with its notes; ``ends`` of the scale; ``header`` of the file."""
 
     layers: Path
@@ -628,9 +628,9 @@ class LayersToDraw:
     header: Mapping[str, str]
 
 
-def draw_layers(options: PictureOptions, drawing: LayersToDraw, output: Path) -> None:
+def draw_layers(options: PictureOptions, drawing: LayerDrawing, output: Path) -> None:
     """The figure of a picture's layers."""
     marker = None if drawing.marker is None else (drawing.marker[0], drawing.marker[1])
-    layers = unstacked(read_npy(drawing.layers, "layers"), marker, drawing.supported, drawing.basis)
-    figure = find_overlay(options.overlay or "").draw(layers, drawing.ends, style_of(options))
+    layers = unstack_layers(read_npy(drawing.layers, "layers"), marker, drawing.supported, drawing.basis)
+    figure = find_overlay(options.overlay or "").draw(layers, drawing.ends, overlay_style(options))
     save(figure, output, drawing.header)

@@ -11,62 +11,62 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, mitsuba_says, plain
+from nerg_mi.errors import MissingFile, NergError, translate_mitsuba_errors, sanitize
 from nerg_mi.evaluation.gaze_report import GazeResults, read_results
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures import maps, overlay
-from nerg_mi.figures.overlay import Heat, OverlayLayers, Style, find_overlay, srgb, to_bytes, top_of, unknown_of
+from nerg_mi.figures.overlay import Heat, OverlayLayers, Style, find_overlay, srgb, to_bytes, robust_max, unknown_mask
 from nerg_mi.figures.sphere import sphere_figure
 from nerg_mi.figures.style import Provenance, encode
 from nerg_mi.figures.style import versions as programs
 from nerg_mi.files.atomic import check_writable, file_sha256, write_text
 from nerg_mi.files.images import encode_png
-from nerg_mi.files.safe_read import real_path
+from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rays.dataset import is_dataset, load_rays, rays_digest
+from nerg_mi.rays.dataset import is_dataset, load_rays, hash_rays
 from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import Channels, render_channels
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.rendering.scene_writer import default_name, pixel_of
+from nerg_mi.rendering.scene_writer import free_default_name, project_to_pixel
 from nerg_mi.report.data import (
-    PATH_POINTS,
+    MAX_PATH_POINTS,
     EyePositions,
-    Labels,
+    ParticipantLabels,
     ObjectAttention,
-    Onlooker,
+    GazeSampler,
     ReportCamera,
     ReportPicture,
     Run,
     Stage,
-    attention_on,
-    eyes_of,
-    land_rays,
-    pack,
-    place_proxy,
-    rays_without_names,
-    results_without_names,
-    spread_out,
+    summarize_objects,
+    sample_eye_positions,
+    assign_ray_hits,
+    pack_stage,
+    make_proxy,
+    anonymize_rays,
+    anonymize_results,
+    farthest_point_sampling,
 )
-from nerg_mi.report.sections import page
-from nerg_mi.statistics.shares import ROUGH, gaze_shares
+from nerg_mi.report.sections import render_page
+from nerg_mi.statistics.shares import COARSE, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, BoxAoi
-from nerg_mi.train.geometry import GazePlace
-from nerg_mi.transport.geometry import Place
-from nerg_mi.transport.observer import center
+from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.transport.geometry import SceneGeometry
+from nerg_mi.transport.observer import sensor_center
 
-from .base import SILENT, Reporter, Silent, select_backend, versions
+from .base import SILENT, Reporter, SilentReporter, select_backend, versions
 from .evaluate import evaluate_gaze
 from .gaze_commands import GazeEvaluationOptions
-from .render import basis_words, is_supported
+from .render import describe_basis, is_supported
 from .scene import SceneResult, write_scene
-from .scene_cameras import support_of_rays, to_place
+from .scene_cameras import support_of_rays, to_scene_frame
 from .scene_commands import ReportOptions, SceneOptions
-from .scene_places import KINDS, PLACES, GivenFiles, kind_of_file, recognise
+from .scene_places import KINDS, PLACES, InputFiles, detect_kind, recognise
 
 # ---- What the files are that a report is made of, found from the files themselves ----
 
@@ -81,7 +81,7 @@ class ReportFiles:
     """``scene``: the place and the gaze field, as a scene is written for; ``gaze``; ``rays``: file or dataset, or None;
     ``results``: files of evaluations."""
 
-    scene: GivenFiles
+    scene: InputFiles
     gaze: Path
     rays: Path | None
     results: tuple[Path, ...]
@@ -98,7 +98,7 @@ class ReportFiles:
             role = "splats" if self.scene.splats else _ROLES[self.scene.kind]
             out.append((role, self.scene.place.name, file_sha256(self.scene.place)))
         if self.rays is not None:
-            out.append(("rays", self.rays.name, rays_digest(self.rays)))
+            out.append(("rays", self.rays.name, hash_rays(self.rays)))
         return out + [("evaluation", f"{p.parent.name}/{p.name}", file_sha256(p)) for p in self.results]
 
 
@@ -114,9 +114,9 @@ def sort_files(files: Sequence[Path]) -> ReportFiles:
         if path.suffix.lower() == ".json":
             results.append(path)
             continue
-        kind = "rays" if is_dataset(path) else kind_of_file(path)
+        kind = "rays" if is_dataset(path) else detect_kind(path)
         role = "place" if kind in PLACES else kind
-        if role in found and real_path(found[role]) != real_path(path):
+        if role in found and resolve_path(found[role]) != resolve_path(path):
             raise NergError(
                 f'"{found[role]}" and "{path}" are both a {role}; a report is of one of them: name the files'
             )
@@ -157,7 +157,7 @@ def _within(folder: Path) -> list[Path]:
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class RenderedViews:
     """What was rendered: ``seen`` from the "camera", the observer's "own" view and the "sphere"; ``marker``: pixel of
     the camera's picture at which the observer is; ``supported``: whether anybody was recorded around there; ``basis``:
     rays and people that the gaze rests on, in words."""
@@ -173,15 +173,15 @@ class Views:
         return OverlayLayers(view.color, view.aovs[quantity], view.mask, marker, self.supported, self.basis)
 
 
-def gaze_top(views: Mapping[str, Channels]) -> float | None:
+def gaze_vmax(views: Mapping[str, Channels]) -> float | None:
     """One end of the scale (1/sr) for all pictures of gaze, so that a colour means the same in each; None where there
     is no gaze."""
-    tops = [top_of(v.aovs["gaze"], v.mask) for v in views.values() if np.any(v.aovs["gaze"][v.mask] > 0)]
+    tops = [robust_max(v.aovs["gaze"], v.mask) for v in views.values() if np.any(v.aovs["gaze"][v.mask] > 0)]
     return max(tops) if tops else None
 
 
-def pictures_of_views(
-    views: Views, top: float | None, place_known: bool, about: Provenance
+def draw_views(
+    views: RenderedViews, top: float | None, place_known: bool, about: Provenance
 ) -> dict[str, ReportPicture]:
     """Colour and gaze from the camera, and the observer's own view and sphere, hatched where nothing is known;
     ``about``: what the header of each says."""
@@ -194,12 +194,12 @@ def pictures_of_views(
     if top is None:
         return out
     heat = Heat(top)
-    hatched = lambda of: unknown_of(of, True) if place_known or not of.supported else None
+    hatched = lambda of: unknown_mask(of, True) if place_known or not of.supported else None
 
     def draw(name: str, title: str) -> bytes:
         of = views.layers(name)
         arrays = of.color, of.values, of.mask
-        drawn = overlay.gaze_figure(*arrays, heat, title, marker=of.marker, unknown=hatched(of), note=of.basis)
+        drawn = overlay.gaze_figure(*arrays, heat, title, marker=of.marker, unknown=hatched(of), note=of.support_note)
         return encode(drawn, ".png", text)
 
     if place_known:
@@ -216,7 +216,7 @@ def pictures_of_views(
     )
     sphere = views.layers("sphere")
     arrays = sphere.color, sphere.values, sphere.mask
-    drawn = sphere_figure(*arrays, heat, unknown=hatched(sphere), note=sphere.basis)
+    drawn = sphere_figure(*arrays, heat, unknown=hatched(sphere), note=sphere.support_note)
     out["sphere"] = ReportPicture(
         encode(drawn, ".png", text),
         "Gaze in all directions around the observer.",
@@ -227,7 +227,7 @@ def pictures_of_views(
 
 def _spread(of: OverlayLayers, text: Mapping[str, str]) -> ReportPicture:
     spread = find_overlay("gaze_std")
-    drawn = spread.draw(of, spread.limits(of), Style(colors="viridis", title="Where the fields disagree"))
+    drawn = spread.draw(of, spread.limits(of), Style(colormap="viridis", title="Where the fields disagree"))
     return ReportPicture(
         encode(drawn, ".png", text),
         "Standard deviation of the gaze of the ensemble's members.",
@@ -235,7 +235,7 @@ def _spread(of: OverlayLayers, text: Mapping[str, str]) -> ReportPicture:
     )
 
 
-def pictures_of_rays(rays: Rays, test: Mapping[str, Any] | None, about: Provenance) -> dict[str, ReportPicture]:
+def draw_rays(rays: Rays, test: Mapping[str, Any] | None, about: Provenance) -> dict[str, ReportPicture]:
     """Plans of the floor. ``test``: what was held out of the training; ``about``: what the header of each says."""
     plan = encode(maps.floor_plan(rays), ".png", about.text())
     held_out = {}
@@ -259,7 +259,7 @@ def _png(display: np.ndarray, text: Mapping[str, str]) -> bytes:
 # ---- The evaluations that a report shows: those that were given, and those that are made for it ----
 
 
-def given_results(given: ReportFiles) -> tuple[list[GazeResults], list[str]]:
+def read_matching_results(given: ReportFiles) -> tuple[list[GazeResults], list[str]]:
     """The evaluations that were given, and doubts about them. Raises `NergError` for those of another field."""
     found, doubts, own = [], [], file_sha256(given.gaze)
     for path in given.results:
@@ -268,17 +268,17 @@ def given_results(given: ReportFiles) -> tuple[list[GazeResults], list[str]]:
             raise NergError(f'"{path}" is an evaluation of another gaze field than "{given.gaze}"; leave it out')
         if not results.sha256 and results.gaze != given.gaze.name:
             doubts.append(
-                f"An evaluation is of a field called {plain(results.gaze, 80)}; whether it is this one is not known."
+                f"An evaluation is of a field called {sanitize(results.gaze, 80)}; whether it is this one is not known."
             )
         found.append(results)
     splits = [r.split for r in found]
     twice = next((s for s in splits if splits.count(s) > 1), None)
     if twice is not None:
-        raise NergError(f'two of the evaluations are of the split "{plain(twice, 40)}"; leave out one of them')
+        raise NergError(f'two of the evaluations are of the split "{sanitize(twice, 40)}"; leave out one of them')
     return found, doubts
 
 
-def made_results(
+def compute_results(
     given: ReportFiles, options: ReportOptions, have: Sequence[GazeResults], reporter: Reporter
 ) -> list[GazeResults]:
     """Evaluations of the splits that there are and that nobody ``have``."""
@@ -320,15 +320,15 @@ _PAUSE, _STEP = 2.0, 2.0
 _STRIDE = 0.15
 
 
-def panorama_eyes(standing: np.ndarray, observer: np.ndarray, count: int = PANORAMAS) -> np.ndarray:
+def panorama_positions(standing: np.ndarray, observer: np.ndarray, count: int = PANORAMAS) -> np.ndarray:
     """Up to ``count`` eyes (K, 3): the ``observer`` (3,), and of the places where people stand (N, 3) those that are
     farthest apart."""
-    others = standing[spread_out(standing, count - 1, first=observer)]
+    others = standing[farthest_point_sampling(standing, count - 1, first=observer)]
     return np.concatenate([np.asarray(observer, float)[None], others])
 
 
-def free_places(
-    onlooker: Onlooker, box: tuple[np.ndarray, np.ndarray], up: np.ndarray, observer: np.ndarray
+def find_free_positions(
+    onlooker: GazeSampler, box: tuple[np.ndarray, np.ndarray], up: np.ndarray, observer: np.ndarray
 ) -> np.ndarray:
     """Places (N, 3) on the level of the ``observer`` (3,) within a ``box`` (lower and upper corner) where there is
     room, with surfaces in most directions: a grid of them."""
@@ -340,21 +340,21 @@ def free_places(
     axes[level] = np.array([np.asarray(observer, float)[level]])
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     directions = fibonacci_directions(_AROUND)
-    depth, met = onlooker.meet(np.repeat(grid, _AROUND, axis=0), np.tile(directions, (len(grid), 1)))
+    depth, met = onlooker.trace(np.repeat(grid, _AROUND, axis=0), np.tile(directions, (len(grid), 1)))
     depth, met = depth.reshape(-1, _AROUND), met.reshape(-1, _AROUND)
     near = np.where(met, depth, np.inf).min(axis=1)
     return grid[(near > _FREE * edges[level]) & (met.mean(axis=1) > 0.5)]
 
 
-def company(rays: Rays, eyes: np.ndarray, place: GazePlace, radius: float) -> tuple[int, ...]:
+def count_participants_near(rays: Rays, eyes: np.ndarray, place: TrainingGeometry, radius: float) -> tuple[int, ...]:
     """How many people have a ray from within ``radius`` metres of each of the ``eyes`` (P, 3) of the place."""
     from scipy.spatial import KDTree
 
-    found = KDTree(place.points_from_rays(rays.origin)).query_ball_point(eyes, radius * place.align.scale)
+    found = KDTree(place.points_to_field(rays.origin)).query_ball_point(eyes, radius * place.align.scale)
     return tuple(len(np.unique(rays.person[rows])) for rows in found)
 
 
-def paths_of(rays: Rays, place: GazePlace) -> list[np.ndarray]:
+def collect_paths(rays: Rays, place: TrainingGeometry) -> list[np.ndarray]:
     """People's paths, (n, 3) each, in the coordinates of the place, with gaps where nobody was followed: of more than a
     page can hold evenly chosen ones."""
     parts = []
@@ -366,13 +366,13 @@ def paths_of(rays: Rays, place: GazePlace) -> list[np.ndarray]:
         parts += [rows for rows in np.split(own, np.flatnonzero(jump) + 1) if len(rows) > 1]
     walked = [path for path in (_walked(rays.origin[rows]) for rows in parts) if len(path) > 1]
     total = sum(map(len, walked))
-    if total > PATH_POINTS:
+    if total > MAX_PATH_POINTS:
         # As many whole ones as fit if all are alike, and no more than fit.
-        count = max(1, len(walked) * PATH_POINTS // total)
+        count = max(1, len(walked) * MAX_PATH_POINTS // total)
         walked = [walked[k] for k in np.linspace(0, len(walked) - 1, count).astype(int)]
         ends = np.cumsum([len(path) for path in walked])
-        walked = [path for path, end in zip(walked, ends) if end <= PATH_POINTS] or [walked[0][:PATH_POINTS]]
-    return [place.points_from_rays(path) for path in walked]
+        walked = [path for path, end in zip(walked, ends) if end <= MAX_PATH_POINTS] or [walked[0][:MAX_PATH_POINTS]]
+    return [place.points_to_field(path) for path in walked]
 
 
 def _walked(points: np.ndarray) -> np.ndarray:
@@ -385,7 +385,7 @@ def _walked(points: np.ndarray) -> np.ndarray:
 # ---- What a report says of its place, its observer and itself ----
 
 
-def place_words(given: ReportFiles) -> str:
+def describe_scene(given: ReportFiles) -> str:
     """The place, in a sentence."""
     name = "" if given.scene.place is None else given.scene.place.name
     if given.scene.splats:
@@ -399,7 +399,7 @@ def place_words(given: ReportFiles) -> str:
     }[given.scene.kind]
 
 
-def observer_words(scene: SceneResult, asked: bool) -> str:
+def describe_observer(scene: SceneResult, asked: bool) -> str:
     """The observer, in a sentence; ``asked``: whether somebody said where."""
     if scene.observer is None:
         return "The camera is the observer, for nothing says where people were."
@@ -408,15 +408,15 @@ def observer_words(scene: SceneResult, asked: bool) -> str:
     return f"The observer stands {where}, at ({at})."
 
 
-def setting_words(options: ReportOptions) -> dict[str, str]:
+def describe_settings(options: ReportOptions) -> dict[str, str]:
     """What the report was made with, by what it is called."""
     return {
         "width": f"{options.width} pixels",
         "samples a pixel": str(options.spp),
         "seed": str(options.seed),
-        "places looked from": f"{options.eyes} at most",
-        "names of people": "shown" if options.names else "numbered",
-        "fewest people of a share": str(options.min_persons),
+        "places looked from": f"{options.viewpoints} at most",
+        "names of people": "shown" if options.show_names else "numbered",
+        "fewest people of a share": str(options.min_participants),
     }
 
 
@@ -458,15 +458,15 @@ def make_report(
     options, output = options or ReportOptions(), Path(output)
     check_writable(output, ".html", ".htm")
     given = sort_files([Path(file) for file in files])
-    areas = AreaSet(()) if options.objects is None else _objects(options.objects, reporter)
-    results, doubts = given_results(given)
+    areas = AreaSet(()) if options.aois is None else _objects(options.aois, reporter)
+    results, doubts = read_results(given)
     ns = select_backend(options.mode, options.threads)
     if options.evaluate:
-        results += made_results(given, options, results, reporter)
+        results += compute_results(given, options, results, reporter)
     with Interruption() as stop:
         work = _ReportWork(given, ns, options, reporter, stop)
         run = work.run(areas, results, doubts, rendered)
-    write_text(output, page(run))
+    write_text(output, render_page(run))
     size = output.stat().st_size / 1e6
     for _, verdict in run.verdicts:
         reporter.message(verdict.sentence)
@@ -500,47 +500,47 @@ class _ReportWork:
         import mitsuba as mi
 
         given, options = self.given, self.options
-        labels = Labels(self.rays, results)
-        rays = self.rays if self.rays is None or options.names else rays_without_names(self.rays, labels)
-        hide = (lambda text: text) if options.names else labels.hide
+        labels = ParticipantLabels(self.rays, results)
+        rays = self.rays if self.rays is None or options.show_names else anonymize_rays(self.rays, labels)
+        hide = (lambda text: text) if options.show_names else labels.anonymize
         with tempfile.TemporaryDirectory() as folder:
             scene = self._scene(Path(folder))
             views = self._views(scene, rendered)
             place = self._place(scene)
-            onlooker = Onlooker(self.field, place, self._kind())
+            onlooker = GazeSampler(self.field, place, self._kind())
             eyes = self._eyes(place, scene)
             objects = observed = self._objects(areas, onlooker, place, eyes, self.rays)
             if self.rays is not None and options.observer is not None:
                 observed = self._objects(areas, onlooker, place, self._observer(scene), None)
-            top = gaze_top(views.seen)
+            top = gaze_vmax(views.seen)
             stage, sizes = self._stage(scene, onlooker, place, eyes, areas.boxes)
         known = given.scene.kind != "none"
         inputs = tuple((role, hide(name), digest) for role, name, digest in self._inputs())
-        settings = setting_words(options)
+        settings = describe_settings(options)
         about = Provenance("nerg report", {n: d for _, n, d in inputs}, options.seed, settings, programs())
-        pictures: dict[str, ReportPicture] = pictures_of_views(views, top, known, about)
+        pictures: dict[str, ReportPicture] = draw_views(views, top, known, about)
         self._step(0.95, "writing")
         around: tuple[int, ...] = ()
         if rays is not None and self.rays is not None:
             test = given.scene.about.get("test")
-            pictures |= pictures_of_rays(rays, test if isinstance(test, dict) else None, about)
+            pictures |= draw_rays(rays, test if isinstance(test, dict) else None, about)
             radius = (given.scene.about.get("probes") or {}).get("radius")
-            around = company(self.rays, eyes.positions, place, radius if isinstance(radius, (int, float)) else 0.5)
-        shown = results if options.names else [results_without_names(r, labels) for r in results]
+            around = count_participants_near(self.rays, eyes.positions, place, radius if isinstance(radius, (int, float)) else 0.5)
+        shown = results if options.show_names else [anonymize_results(r, labels) for r in results]
         return Run(
             options.title or hide(f"The gaze field “{given.gaze.stem}”"),
             self.about,
-            hide(place_words(given)),
+            hide(describe_scene(given)),
             given.scene.kind,
             given.scene.field_about,
-            observer_words(scene, options.observer is not None),
+            describe_observer(scene, options.observer is not None),
             rays,
             None if rays is None else summarise(rays),
             tuple(shown),
             tuple(doubts),
             objects,
             len(eyes.positions),
-            options.min_persons,
+            options.min_participants,
             around,
             pictures,
             stage,
@@ -555,8 +555,8 @@ class _ReportWork:
 
     def _inputs(self) -> list[tuple[str, str, str]]:
         found = self.given.inputs()
-        if self.options.objects is not None:
-            path = Path(self.options.objects)
+        if self.options.aois is not None:
+            path = Path(self.options.aois)
             found.append(("objects", path.name, file_sha256(path)))
         return found
 
@@ -573,21 +573,21 @@ class _ReportWork:
         o = self.options
         observer = o.observer
         if observer is None and self.rays is not None:
-            observer = tuple(to_place(support_of_rays(self.rays).densest(), self.align).tolist())
+            observer = tuple(to_scene_frame(support_of_rays(self.rays).find_densest_position(), self.align).tolist())
         if observer is None and self.field.support is None and self.given.scene.kind != "none":
             self.reporter.message(
                 "nothing says where people were: the camera is the observer; --observer x,y,z places one"
             )
         chosen = SceneOptions(
-            observer=observer, camera_from=o.camera_from, camera_to=o.camera_to, fov=o.fov, width=o.width, mode=o.mode
+            observer=observer, camera=o.camera, target=o.target, fov=o.fov, width=o.width, mode=o.mode
         )
         return write_scene(self.given.shown, folder / "scene.xml", chosen, _Quiet(self.reporter))
 
     def _load(self, scene: SceneResult, **values: object):
-        named = {default_name(name, scene.taken): str(value) for name, value in values.items()}
+        named = {free_default_name(name, scene.taken): str(value) for name, value in values.items()}
         return load_scene(scene.path, named)
 
-    def _views(self, scene: SceneResult, rendered: Mapping[str, Channels] | None) -> Views:
+    def _views(self, scene: SceneResult, rendered: Mapping[str, Channels] | None) -> RenderedViews:
         """The pictures of the camera, of the observer's own view and sphere, and what is known of the observer."""
         o = self.options
         spread = len(self.field.members) > 1
@@ -598,30 +598,30 @@ class _ReportWork:
             if name in views:
                 continue
             self._step(0.2 + 0.12 * number, f"rendering: {name}")
-            with mitsuba_says():
+            with translate_mitsuba_errors():
                 views[name] = render_channels(
                     loaded, loaded.sensors()[number], o.spp, o.seed, lambda done, total: self.stop.check()
                 )
         marker = None
         if scene.observer is not None:
             camera, width = loaded.sensors()[0], views["camera"].mask.shape[1]
-            found = pixel_of(camera, center(loaded.sensors()[1]))
+            found = project_to_pixel(camera, sensor_center(loaded.sensors()[1]))
             share = width / camera.film().crop_size()[0]
             marker = None if found is None else tuple((v + 0.5) * share - 0.5 for v in found)
-        return Views(views, marker, is_supported(loaded, loaded.sensors()[0]), basis_words(loaded))
+        return RenderedViews(views, marker, is_supported(loaded, loaded.sensors()[0]), describe_basis(loaded))
 
-    def _place(self, scene: SceneResult) -> GazePlace:
+    def _place(self, scene: SceneResult) -> TrainingGeometry:
         """The place as the scene has it, in which depths are traced."""
         kind = self.given.scene.kind
         if kind == "none":
-            return GazePlace(None, self.field.box, kind, align=self.align)
+            return TrainingGeometry(None, self.field.box, kind, align=self.align)
         loaded = self._load(scene, radiance="false", aovs="opacity")
-        return GazePlace(Place(loaded.integrator().medium, loaded), self.field.box, kind, align=self.align)
+        return TrainingGeometry(SceneGeometry(loaded.integrator().medium, loaded), self.field.box, kind, align=self.align)
 
-    def _eyes(self, place: GazePlace, scene: SceneResult) -> EyePositions:
+    def _eyes(self, place: TrainingGeometry, scene: SceneResult) -> EyePositions:
         """Where people stood, or where the observer is."""
         if self.rays is not None:
-            return eyes_of(self.rays, place, self.options.eyes)
+            return sample_eye_positions(self.rays, place, self.options.viewpoints)
         return self._observer(scene)
 
     def _observer(self, scene: SceneResult) -> EyePositions:
@@ -629,21 +629,21 @@ class _ReportWork:
         return EyePositions(np.asarray(at.origin, float)[None], np.zeros(1, int))
 
     def _objects(
-        self, areas: AreaSet, onlooker: Onlooker, place: GazePlace, eyes: EyePositions, rays: Rays | None
+        self, areas: AreaSet, onlooker: GazeSampler, place: TrainingGeometry, eyes: EyePositions, rays: Rays | None
     ) -> tuple[ObjectAttention, ...]:
-        if not areas.solids or self.given.scene.kind == "none":
+        if not areas.box_indices or self.given.scene.kind == "none":
             return ()
-        things, members = [BoxAoi(box) for box in areas.boxes], list(areas.solids.values())
+        things, members = [BoxAoi(box) for box in areas.boxes], list(areas.box_indices.values())
         count, margin = len(eyes.positions), MARGIN * self.align.scale
         told = lambda done: self._step(0.55 + 0.2 * done / count, f"objects: place {done} of {count}")
-        shares = gaze_shares(onlooker.look_from, eyes.positions, things, members, margin, ROUGH, told)
+        shares = gaze_shares(onlooker.query_from, eyes.positions, things, members, margin, COARSE, told)
         recorded = None
         if rays is not None:
-            recorded = land_rays(rays, place, onlooker, RAYS, things, members, margin)
-        return attention_on(list(areas.solids), shares, eyes.person, recorded)
+            recorded = assign_ray_hits(rays, place, onlooker, RAYS, things, members, margin)
+        return summarize_objects(list(areas.box_indices), shares, eyes.participant, recorded)
 
     def _stage(
-        self, scene: SceneResult, onlooker: Onlooker, place: GazePlace, eyes: EyePositions, boxes: Sequence[Region]
+        self, scene: SceneResult, onlooker: GazeSampler, place: TrainingGeometry, eyes: EyePositions, boxes: Sequence[Region]
     ) -> tuple[str | None, tuple[int, int, int, int]]:
         """The packed 3D scene, None where there are no surfaces, and how many observers, paths, points and boxes it
         has."""
@@ -654,19 +654,19 @@ class _ReportWork:
         at = np.asarray((scene.observer or scene.camera).origin, float)
         standing = eyes.positions
         if self.rays is None:
-            standing = np.concatenate([at[None], free_places(onlooker, _corners(self.field.box), up, at)])
+            standing = np.concatenate([at[None], find_free_positions(onlooker, _corners(self.field.box), up, at)])
         loaded = self._load(scene, aovs="opacity,position")
-        others = standing[spread_out(standing, OBSERVERS - 1, first=at)] if self.rays is not None else at[None][:0]
+        others = standing[farthest_point_sampling(standing, OBSERVERS - 1, first=at)] if self.rays is not None else at[None][:0]
         observers = np.concatenate([at[None], others])
         told = lambda done, total: self._step(0.75 + 0.15 * done / total, f"3D: panorama {done} of {total}")
-        with mitsuba_says():
-            looked_from = panorama_eyes(standing, at)
-            proxy = place_proxy(loaded, looked_from, up, observers, onlooker.on_points, o.points, on_eye=told)
+        with translate_mitsuba_errors():
+            looked_from = panorama_positions(standing, at)
+            proxy = make_proxy(loaded, looked_from, up, observers, onlooker.density_at_points, o.max_points, on_panorama=told)
         if proxy is None:
             return nothing
-        paths = paths_of(self.rays, place) if self.rays is not None and o.paths else []
+        paths = collect_paths(self.rays, place) if self.rays is not None and o.paths else []
         camera = ReportCamera(np.asarray(scene.camera.origin, float), np.asarray(scene.camera.target, float))
-        packed = pack(Stage(proxy, observers, paths, boxes, up, camera))
+        packed = pack_stage(Stage(proxy, observers, paths, boxes, up, camera))
         return packed, (len(observers), len(paths), len(proxy.vertices), len(boxes))
 
     def _up(self) -> np.ndarray:
@@ -674,7 +674,7 @@ class _ReportWork:
         return self.align.matrix[:3, 2] / self.align.scale
 
 
-class _Quiet(Silent):
+class _Quiet(SilentReporter):
     """Passes on only what may be wrong: the lines of a job within this one name files that nobody keeps."""
 
     def __init__(self, reporter: Reporter):
@@ -686,9 +686,9 @@ class _Quiet(Silent):
 
 def _objects(path: Path, reporter: Reporter) -> AreaSet:
     areas = read_areas(path)
-    if len(areas.solids) < len(areas.areas):
+    if len(areas.box_indices) < len(areas.areas):
         reporter.warn(
-            f"{len(areas.areas) - len(areas.solids)} of {len(areas.areas)} areas are no boxes and no groups of boxes, "
+            f"{len(areas.areas) - len(areas.box_indices)} of {len(areas.areas)} areas are no boxes and no groups of boxes, "
             "and a report leaves them out; nerg stats counts them"
         )
     return areas

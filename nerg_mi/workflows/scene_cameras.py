@@ -8,22 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, mitsuba_says, plain
+from nerg_mi.errors import NergError, translate_mitsuba_errors, sanitize
 from nerg_mi.fields.gaze_base import RaySupport
-from nerg_mi.figures.overview import Judge, PinholeFrame, SeenSurfaces, Shot, around_observer, of_place
-from nerg_mi.maths.geometry import Similarity, box_of
+from nerg_mi.figures.overview import ViewScorer, PinholeFrame, SeenSurfaces, CameraView, view_of_observer, view_of_scene
+from nerg_mi.maths.geometry import Similarity, box_from_dict
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
-from nerg_mi.rendering.scene_writer import Eye, ahead_level
-from nerg_mi.transport.geometry import Place, pixel_directions, pixel_solid_angles, trace_depth
+from nerg_mi.rendering.scene_writer import LookAt, level_direction
+from nerg_mi.transport.geometry import SceneGeometry, pixel_directions, pixel_solid_angles, trace_depth
 
 from .scene_places import PhotoCamera
 
 # ---- From where a scene is shown: what an observer meets around, and the best camera for it ----
 
 
-GLANCE = (48, 32)
+PROBE_SIZE = (48, 32)
 """Pixels of the picture by which it is found out whether a camera shows anything."""
 
 PANORAMA = (96, 48)
@@ -39,7 +39,7 @@ _LEVEL, _STEEP = 1.0, 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Probe:
+class SceneProbe:
     """A scene as it is before its camera is chosen, loaded to look around in: ``scene``; ``quantity``: the AOV of
     attention, or None; ``up`` (3,)."""
 
@@ -48,18 +48,18 @@ class Probe:
     up: np.ndarray
 
     @property
-    def place(self) -> Place:
+    def place(self) -> SceneGeometry:
         """What its rays meet."""
-        return Place(self.scene.integrator().medium, self.scene)
+        return SceneGeometry(self.scene.integrator().medium, self.scene)
 
     def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Median depth, and opacity, along rays (N, 3)."""
-        with mitsuba_says():
+        with translate_mitsuba_errors():
             return trace_depth(self.place, origins, directions)
 
     def mean(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean depth at which light ends, and opacity, along rays (N, 3)."""
-        with mitsuba_says():
+        with translate_mitsuba_errors():
             return trace_depth(self.place, origins, directions, kind="expected")
 
     def within(self, points: np.ndarray) -> np.ndarray:
@@ -72,7 +72,7 @@ class Probe:
         around = fibonacci_directions(_AROUND)
         origins, directions = np.repeat(points, _AROUND, axis=0), np.tile(around, (len(points), 1))
         o, d = (np.ascontiguousarray(v.T, np.float32) for v in (origins, directions))
-        with mitsuba_says():
+        with translate_mitsuba_errors():
             found = self.scene.ray_intersect(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)))
         met, normal = np.array(found.is_valid()), np.array(found.n).T
         back = (met & ((normal * directions).sum(axis=1) > 0)).reshape(len(points), -1).sum(axis=1)
@@ -84,16 +84,16 @@ class Probe:
         assert bounds is not None, "a scene that is written shows something"
         return bounds
 
-    def extent(self, *eyes: Eye | None) -> float:
+    def extent(self, *eyes: LookAt | None) -> float:
         """Length of the diagonal of a box around what there is and ``eyes``."""
         return self.place.extent(*(eye.origin for eye in eyes if eye is not None))
 
-    def around(self, eye: Eye) -> SeenSurfaces:
+    def around(self, eye: LookAt) -> SeenSurfaces:
         """What somebody at ``eye`` meets, as the sensor of the sphere shows it."""
-        with mitsuba_says():
+        with translate_mitsuba_errors():
             found = render_channels(self.scene, self.scene.sensors()[SPHERE], spp=1)
         width, height = PANORAMA
-        front, up = ahead_level(eye, self.up), self.up / np.linalg.norm(self.up)
+        front, up = level_direction(eye, self.up), self.up / np.linalg.norm(self.up)
         # The panorama's own frame: x to the left, y up, z to the front.
         directions = pixel_directions(width, height).reshape(-1, 3) @ np.stack([np.cross(up, front), up, front])
         even = np.where(np.abs(directions @ up) < np.sin(np.radians(35)), _LEVEL, _STEEP)
@@ -110,50 +110,50 @@ class Probe:
 
 def probe_values() -> dict[str, str]:
     """Values of `<default>`s for the scene of a `Probe`."""
-    sizes = dict(zip(("width", "height", "sphere_width", "sphere_height"), map(str, (*GLANCE, *PANORAMA))))
+    sizes = dict(zip(("width", "height", "sphere_width", "sphere_height"), map(str, (*PROBE_SIZE, *PANORAMA))))
     return {**sizes, "radiance": "false", "spp": "1"}
 
 
-def shows_anything(scene: Any) -> bool:
+def sees_anything(scene: Any) -> bool:
     """Whether the first camera of ``scene``, loaded with `probe_values`, sees anything at all."""
-    with mitsuba_says():
+    with translate_mitsuba_errors():
         return bool(render_channels(scene, scene.sensors()[0], spp=1).aovs["opacity"].any())
 
 
-def turned_ahead(eye: Eye, seen: SeenSurfaces) -> Eye:
+def turn_to_attention(eye: LookAt, seen: SeenSurfaces) -> LookAt:
     """The observer at ``eye``, turned to where most of the attention goes."""
     towards = seen.main_direction
     at = int(np.argmax(seen.directions @ towards))
     # An observer within matter meets it at once, and a direction needs a length.
-    away = seen.depth[at] if seen.met[at] and seen.depth[at] > 0 else seen.usual or 1.0
+    away = seen.depth[at] if seen.is_hit[at] and seen.depth[at] > 0 else seen.median_depth or 1.0
     return replace(eye, target=eye.origin + away * towards, up=None)
 
 
-def best_camera(probe: Probe, seen: SeenSurfaces | None, frame: PinholeFrame, field_box: dict | None) -> Shot | None:
+def find_best_camera(probe: SceneProbe, seen: SeenSurfaces | None, frame: PinholeFrame, field_box: dict | None) -> CameraView | None:
     """The best overview: of what the observer of ``seen`` looks at, or of the whole place. ``field_box``: the box of
     the radiance field, as its checkpoint has it, or None where the place is none."""
     mean = None if field_box is None else probe.mean
     if seen is not None:
-        return around_observer(probe.trace, frame, seen, mean)
+        return view_of_observer(probe.trace, frame, seen, mean)
     if field_box is None:
-        return of_place(probe.trace, frame, *probe.bounds(), solid=probe.within)
-    box = box_of(field_box)
+        return view_of_scene(probe.trace, frame, *probe.bounds(), is_solid=probe.within)
+    box = box_from_dict(field_box)
     lower, upper = np.array(box.core.lower), np.array(box.core.upper)
-    return of_place(probe.trace, frame, lower, upper, not box.contracted, mean)
+    return view_of_scene(probe.trace, frame, lower, upper, not box.is_contracted, mean)
 
 
-def best_photo(probe: Probe, seen: SeenSurfaces | None, cameras: Sequence[PhotoCamera]) -> PhotoCamera:
+def find_best_photo(probe: SceneProbe, seen: SeenSurfaces | None, cameras: Sequence[PhotoCamera]) -> PhotoCamera:
     """That of the ``cameras`` of photos which shows best what the observer of ``seen`` looks at, or the place. They are
     compared as if all had the lens of the first and were held level."""
     lens = cameras[0].lens
     origins, targets = (np.array([getattr(c.eye, name) for c in cameras]) for name in ("origin", "target"))
     ahead = targets - origins
-    usual = seen.usual if seen is not None else float(np.median(probe.trace(origins, ahead)[0]))
-    judge = Judge(probe.trace, PinholeFrame(lens.fov, lens.aspect, probe.up), max(usual, 1e-6), seen, probe.mean)
-    return cameras[judge.best_of(origins, targets)]
+    usual = seen.median_depth if seen is not None else float(np.median(probe.trace(origins, ahead)[0]))
+    judge = ViewScorer(probe.trace, PinholeFrame(lens.fov, lens.aspect, probe.up), max(usual, 1e-6), seen, probe.mean)
+    return cameras[judge.best_index(origins, targets)]
 
 
-def given_point(values: tuple[float, ...] | None, option: str) -> np.ndarray | None:
+def check_point(values: tuple[float, ...] | None, option: str) -> np.ndarray | None:
     """Three numbers that were given by ``option``, (3,), or None. Raises `NergError` for other ones."""
     if values is None:
         return None
@@ -166,7 +166,7 @@ def given_point(values: tuple[float, ...] | None, option: str) -> np.ndarray | N
 _APART = 1e-4
 
 
-def upright(eye: Eye, up: np.ndarray) -> Eye:
+def make_upright(eye: LookAt, up: np.ndarray) -> LookAt:
     """``eye`` with an up of its own where it looks straight up or down, along ``up``, and with a target so far ahead
     that single precision tells it from the origin. Raises `NergError` for one that looks at where it is."""
     ahead = np.subtract(eye.target, eye.origin)
@@ -176,7 +176,7 @@ def upright(eye: Eye, up: np.ndarray) -> Eye:
     if np.linalg.norm(ahead) < nearest:
         eye = replace(eye, target=eye.origin + ahead * (nearest / np.linalg.norm(ahead)))
     if eye.up is None and np.linalg.norm(np.cross(ahead, up)) < 1e-3 * np.linalg.norm(ahead) * np.linalg.norm(up):
-        return replace(eye, up=ahead_level(eye, up))
+        return replace(eye, up=level_direction(eye, up))
     return eye
 
 
@@ -186,7 +186,7 @@ def upright(eye: Eye, up: np.ndarray) -> Eye:
 RADIUS = 0.5
 """Rays that started within so many metres of each other are counted as of one place."""
 
-FRAMES = 100_000
+MAX_FRAMES = 100_000
 """A walk may have so many frames."""
 
 _NAMED = 8
@@ -198,11 +198,11 @@ class ObserverPath:
     seconds; ``missing``: how many more frames there would be where nothing is known of them."""
 
     times: np.ndarray
-    eyes: list[Eye]
+    eyes: list[LookAt]
     missing: int
 
 
-def eye_of_person(rays: Rays, person: str, time: float, gap: float, align: Similarity) -> tuple[Eye, float]:
+def find_eye(rays: Rays, person: str, time: float, gap: float, align: Similarity) -> tuple[LookAt, float]:
     """The eye of ``person`` in the place at the ray nearest to ``time`` (seconds), and when that was.
 
     ``align``: from the rays to the place. Raises `NergError` where there is nobody of that name, and no ray of theirs
@@ -216,7 +216,7 @@ def eye_of_person(rays: Rays, person: str, time: float, gap: float, align: Simil
     return eye, float(rays.t[nearest])
 
 
-def walk_of_person(
+def interpolate_walk(
     rays: Rays, person: str, first: float, last: float, fps: float, gap: float, align: Similarity
 ) -> ObserverPath:
     """Where ``person`` was from ``first`` to ``last`` (seconds), ``fps`` times a second.
@@ -227,9 +227,9 @@ def walk_of_person(
     """
     if not first < last:
         raise NergError(f"--times is two times, the earlier first, got {first:g},{last:g}")
-    if (last - first) * fps > FRAMES:
+    if (last - first) * fps > MAX_FRAMES:
         raise NergError(
-            f"a walk has at most {FRAMES:,} frames, and {last - first:g} s with {fps:g} frames a second have "
+            f"a walk has at most {MAX_FRAMES:,} frames, and {last - first:g} s with {fps:g} frames a second have "
             "more; give a smaller --fps, or a shorter time"
         )
     own = _own(rays, person)
@@ -256,10 +256,10 @@ def walk_of_person(
 
 def support_of_rays(rays: Rays) -> RaySupport:
     """How many rays started where, in metres of their own frame."""
-    return RaySupport.of(rays.origin, RADIUS)
+    return RaySupport.from_origins(rays.origin, RADIUS)
 
 
-def to_place(points: np.ndarray, align: Similarity) -> np.ndarray:
+def to_scene_frame(points: np.ndarray, align: Similarity) -> np.ndarray:
     """Points (..., 3) of the rays' frame in the place's."""
     return np.asarray(points, float) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
 
@@ -267,7 +267,7 @@ def to_place(points: np.ndarray, align: Similarity) -> np.ndarray:
 def _own(rays: Rays, person: str) -> np.ndarray:
     """Indices of the rays of ``person``."""
     if person not in rays.persons:
-        some = ", ".join(plain(name, 40) for name in rays.persons[:_NAMED])
+        some = ", ".join(sanitize(name, 40) for name in rays.persons[:_NAMED])
         more = "" if len(rays.persons) <= _NAMED else f" and {len(rays.persons) - _NAMED} more"
         raise NergError(f'nobody in the rays is called "{person}"; they are of {some}{more}')
     own = np.flatnonzero(rays.person == rays.persons.index(person))
@@ -284,7 +284,7 @@ def _not_then(rays: Rays, own: np.ndarray, person: str, when: str, gap: float) -
     )
 
 
-def _eyes(origins: np.ndarray, directions: np.ndarray, align: Similarity) -> list[Eye]:
+def _eyes(origins: np.ndarray, directions: np.ndarray, align: Similarity) -> list[LookAt]:
     """Eyes in the place, which look at points a metre away."""
-    at, ahead = to_place(origins, align), to_place(origins + directions, align)
-    return [Eye(origin, target) for origin, target in zip(at, ahead)]
+    at, ahead = to_scene_frame(origins, align), to_scene_frame(origins + directions, align)
+    return [LookAt(origin, target) for origin, target in zip(at, ahead)]

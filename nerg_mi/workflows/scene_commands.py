@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.ranges import (
     COORDINATES,
-    DECADES,
+    LOG_DECADES,
     FIELDS_OF_VIEW,
     LENGTHS,
     RATES,
@@ -31,8 +31,8 @@ from nerg_mi.ranges import (
     SEEDS,
     SPP,
     TIMES,
-    VALUES,
-    Checked,
+    POSITIVE_VALUES,
+    ValidatedDataclass,
     Range,
 )
 
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PictureOptions(Checked):
+class PictureOptions(ValidatedDataclass):
     """How a scene file is rendered."""
 
     defaults: Mapping[str, str] | None = definitions()
@@ -64,13 +64,13 @@ class PictureOptions(Checked):
     overlay: str | None = option(
         None, "AOV to lay over the colour, with its scale (.png, .svg, .mp4): gaze, kde, depth or any other."
     )
-    top: float | None = option(
-        None, "Upper end of the overlay's scale, for gaze in 1/sr.  [default: the 99.5th percentile]", within=VALUES
+    vmax: float | None = option(
+        None, "Upper end of the overlay's scale, for gaze in 1/sr.  [default: the 99.5th percentile]", within=POSITIVE_VALUES
     )
     cmap: str | None = option(
         None, "Colour map of the overlay: inferno, magma, plasma, viridis, cividis.  [default: the overlay's own]"
     )
-    decades: float = option(0.0, "Powers of ten that the overlay's scale spans; 0: a linear scale.", within=DECADES)
+    log_decades: float = option(0.0, "Powers of ten that the overlay's scale spans; 0: a linear scale.", within=LOG_DECADES)
     hatching: bool = option(True, "Hatch the overlay where nothing is known.")
     frames: Path | None = option(
         None, "Render a sequence: CSV file whose header names <default>s, a line of values for each picture."
@@ -79,7 +79,7 @@ class PictureOptions(Checked):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemoOptions(Checked):
+class DemoOptions(ValidatedDataclass):
     """Which pictures the demo makes."""
 
     scene: Path | None = option(None, "Scene file.  [default: the demo store's]")
@@ -109,7 +109,7 @@ declare(
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions(Checked):
+class SceneOptions(ValidatedDataclass):
     """Who looks, and from where it is shown. Positions are in the coordinates of the place."""
 
     observer: tuple[float, ...] | None = coordinates(
@@ -117,19 +117,19 @@ class SceneOptions(Checked):
     )
     person: str | None = option(None, "Person of the rays whose eye the observer's is, at --time or --times.")
     time: float | None = option(None, "When, in seconds of the rays' clock.", within=TIMES)
-    times: tuple[float, ...] | None = option(
+    time_range: tuple[float, ...] | None = option(
         None,
         "From when to when, A,B: also writes the frames of a walk, for nerg render --frames.",
         parse=parse_numbers,
         within=TIMES,
     )
     fps: float = option(10.0, "Frames a second of --times.", within=RATES)
-    gap: float = option(0.5, "Seconds without a ray of that person that are bridged.", within=SECONDS)
-    camera_from: tuple[float, ...] | None = coordinates(
+    max_gap: float = option(0.5, "Seconds without a ray of that person that are bridged.", within=SECONDS)
+    camera: tuple[float, ...] | None = coordinates(
         "Position of the camera, x,y,z.  [default: the best overview]", "--from"
     )
-    camera_to: tuple[float, ...] | None = coordinates("Point that it looks at, x,y,z.", "--to")
-    own: bool = option(False, "The camera is the observer's own eye.")
+    target: tuple[float, ...] | None = coordinates("Point that it looks at, x,y,z.", "--to")
+    first_person: bool = option(False, "The camera is the observer's own eye.")
     photos: Path | None = option(None, "Photos that the radiance field was trained on: the camera is one of theirs.")
     photo: str | None = option(None, "Which of them: its name, or its number from 0 on.  [default: the best]")
     allow_outside: bool = option(False, "Read files outside of --photos' folder too, where it names them.")
@@ -167,17 +167,17 @@ commented; each of its defaults can be set when it is rendered (nerg render -D).
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewOptions(Checked):
+class ViewOptions(ValidatedDataclass):
     """Where the page is, how fine its pictures are, and what is shown first."""
 
     host: str = option("127.0.0.1", "Address to serve at; another than this machine's own asks pages for a token.")
     port: int = option(8080, "Port to serve at; 0: any that is free.", within=Range(0, 65535))
-    names: tuple[str, ...] = option((), "Name by which others reach this machine, beside its address.", "--name")
+    hostnames: tuple[str, ...] = option((), "Name by which others reach this machine, beside its address.", "--name")
     width: int = option(720, "Width of a refined picture in pixels.", within=Range(16, 8192))
     spp: int = option(0, "Samples a pixel of it; 0: as the scene says.", within=Range(0, SPP.high))
     observer: tuple[float, ...] | None = coordinates("Position of the observer's eye, x,y,z.  [default: the scene's]")
     up: tuple[float, ...] | None = coordinates("Which way is up in the place, x,y,z.  [default: as its files say]")
-    regions: Path | None = option(None, "JSON file of areas of interest: boxes with names.")
+    aois: Path | None = option(None, "JSON file of areas of interest: boxes with names.")
     align: Path | None = option(
         None, "JSON file with the 4x4 similarity from the rays' frame to the place's.  [default: the gaze field's]"
     )
@@ -221,38 +221,38 @@ With --store or --scheduler each picture is kept when it is done, and the same c
 
 
 @dataclass(frozen=True)
-class Kind:
+class FigureKind:
     """``name`` and ``summary`` for people; ``takes``: what its files are; ``most``: how many of them at most;
     ``options``: a dataclass, frozen and of keywords alone, whose fields ``option`` makes (`nerg_mi.workflows.options`);
     ``function``: what draws it from ``(files, options, reporter)``, as "MODULE:NAME"."""
 
     name: str
     summary: str
-    takes: str
-    most: int
+    inputs: str
+    max_files: int
     options: type
     function: str
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColorOptions(Checked):
+class ColorOptions(ValidatedDataclass):
     """The colours of a figure's values."""
 
-    top: float | None = option(
-        None, "Upper end of the scale, in its unit.  [default: the 99.5th percentile]", within=VALUES
+    vmax: float | None = option(
+        None, "Upper end of the scale, in its unit.  [default: the 99.5th percentile]", within=POSITIVE_VALUES
     )
     cmap: str | None = option(None, "Colour map: inferno, magma, plasma, viridis, cividis.  [default: inferno]")
-    decades: float = option(0.0, "Powers of ten that the scale spans; 0: a linear scale.", within=DECADES)
+    log_decades: float = option(0.0, "Powers of ten that the scale spans; 0: a linear scale.", within=LOG_DECADES)
 
     def style(self, title: str | None = None, kind: str = "sequential") -> Style:
         """How overlays are drawn by these options, with colour maps of that ``kind`` (`find_colors`). Raises
         `NergError` for what cannot be drawn."""
         from nerg_mi.figures.overlay import Style
-        from nerg_mi.figures.style import find_colors
+        from nerg_mi.figures.style import find_colormap
 
         if self.cmap is not None:
-            find_colors(self.cmap, kind)
-        return Style(self.cmap, self.decades, False, title)
+            find_colormap(self.cmap, kind)
+        return Style(self.cmap, self.log_decades, False, title)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,7 +264,7 @@ class ScaleOptions(ColorOptions):
     def style(self, title: str | None = None, kind: str = "sequential") -> Style:
         """How overlays are drawn by these options, with colour maps of that ``kind`` (`find_colors`). Raises
         `NergError` for what cannot be drawn."""
-        return replace(super().style(title, kind), hatched=self.hatching)
+        return replace(super().style(title, kind), hatch_unknown=self.hatching)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,18 +278,18 @@ class SceneFigureOptions(ScaleOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FloorOptions(Checked):
+class FloorOptions(ValidatedDataclass):
     """What a floor plan shows."""
 
     scene: Path | None = option(None, "Scene file of the place, whose walls and furniture are drawn.")
     defaults: Mapping[str, str] | None = definitions()
-    cut: float = option(1.2, "Height at which the place is cut, metres above its floor.", within=COORDINATES)
-    floor: float = option(0.0, "Height of the floor (z).", within=COORDINATES)
+    cut_height: float = option(1.2, "Height at which the place is cut, metres above its floor.", within=COORDINATES)
+    floor_height: float = option(0.0, "Height of the floor (z).", within=COORDINATES)
     paths: bool = option(True, "Draw where people walked.")
-    rays: int = option(0, "Draw so many rays, from the eye to what was looked at.", within=Range(0, 20000))
-    views: int = option(0, "Draw so many fields of view of each person.", within=Range(0, 1000))
+    num_rays: int = option(0, "Draw so many rays, from the eye to what was looked at.", within=Range(0, 20000))
+    num_views: int = option(0, "Draw so many fields of view of each person.", within=Range(0, 1000))
     fov: float = option(60.0, "Degrees that a field of view is wide.", within=Range(1, 180))
-    people: str | None = option(None, "Draw these people alone: names with commas between them.")
+    participants: str | None = option(None, "Draw these people alone: names with commas between them.")
     mode: str | None = best_variant()
 
 
@@ -312,11 +312,11 @@ class TriptychOptions(SceneFigureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DifferenceOptions(Checked):
+class DifferenceOptions(ValidatedDataclass):
     """How a difference is drawn."""
 
     channel: str = option("gaze", "Channel of both files.")
-    top: float | None = option(None, "Both ends of the scale.  [default: the 99.5th percentile]", within=VALUES)
+    vmax: float | None = option(None, "Both ends of the scale.  [default: the 99.5th percentile]", within=POSITIVE_VALUES)
     cmap: str = option("RdBu_r", "Colour map: RdBu_r, PuOr_r, BrBG_r, PRGn_r.")
 
 
@@ -328,7 +328,7 @@ class SheetOptions(ScaleOptions):
         None, "AOV of .exr files to lay over their colour, with one scale: gaze, kde, depth or any other."
     )
     columns: int | None = option(None, "Pictures in a row.  [default: about as many as rows]", within=Range(1, 1000))
-    width: int = option(480, "Pixels that a picture is wide at most; larger ones are shrunk.", within=Range(16, 4096))
+    max_width: int = option(480, "Pixels that a picture is wide at most; larger ones are shrunk.", within=Range(16, 4096))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -340,7 +340,7 @@ class BakedFigureOptions(ColorOptions):
     )
     target: tuple[float, ...] | None = coordinates("What the camera looks at, x,y,z.  [default: the middle]")
     up: tuple[float, ...] | None = coordinates("Which way is up, x,y,z.  [default: 0,0,1]")
-    below: float | None = option(
+    clip_above: float | None = option(
         None, "Leave out what is higher than this along up: a ceiling, for instance.", within=COORDINATES
     )
     fov: float = option(50.0, "Degrees that the picture is wide.", within=Range(1.0, 170.0))
@@ -352,7 +352,7 @@ class BakedFigureOptions(ColorOptions):
 
 _SCENE, _FILES = "nerg_mi.workflows.draw_scenes", "nerg_mi.workflows.draw"
 _TABLE = (
-    Kind(
+    FigureKind(
         "sphere",
         "The gaze of an observer over all directions.",
         "scene file (.xml)",
@@ -360,11 +360,11 @@ _TABLE = (
         SphereOptions,
         f"{_SCENE}:sphere",
     ),
-    Kind(
+    FigureKind(
         "triptych", "Occlusion: three views of a gaze.", "scene file (.xml)", 1, TriptychOptions, f"{_SCENE}:triptych"
     ),
-    Kind("floor", "The floor plan of rays in their place.", "file of rays (.npz)", 1, FloorOptions, f"{_SCENE}:floor"),
-    Kind(
+    FigureKind("floor", "The floor plan of rays in their place.", "file of rays (.npz)", 1, FloorOptions, f"{_SCENE}:floor"),
+    FigureKind(
         "sheet",
         "Several pictures on one page, with one scale.",
         "pictures (.png, .jpg, .exr)",
@@ -372,7 +372,7 @@ _TABLE = (
         SheetOptions,
         f"{_FILES}:sheet",
     ),
-    Kind(
+    FigureKind(
         "difference",
         "A quantity of one picture less that of another.",
         "two pictures (.exr)",
@@ -380,7 +380,7 @@ _TABLE = (
         DifferenceOptions,
         f"{_FILES}:difference",
     ),
-    Kind(
+    FigureKind(
         "surface",
         "Gaze on a mesh, with its scale.",
         "a baked surface (.ply)",
@@ -399,7 +399,7 @@ for _kind in KINDS.values():
         "nerg_mi.workflows.draw:draw_files",
         _kind.summary,
         options=_kind.options,
-        files=argument(f"{_kind.takes[:1].upper()}{_kind.takes[1:]}.", list[Path] if _kind.most > 1 else Path),
+        files=argument(f"{_kind.inputs[:1].upper()}{_kind.inputs[1:]}.", list[Path] if _kind.max_files > 1 else Path),
         output=out("Picture to write: .png or .svg."),
     )
 
@@ -419,13 +419,13 @@ class BakeOptions(PartOptions):
     observer: tuple[float, ...] | None = coordinates(
         "One observer's eye, x,y,z in the place, in place of the people of the rays."
     )
-    path: Path | None = option(
+    observer_file: Path | None = option(
         None, "Observers one by one: a CSV file with columns x, y, z in the place and, if they differ, weight."
     )
-    observers: int = option(
+    num_observers: int = option(
         64, "Observers that stand for all places of the people of --rays.", within=Range(1, 100_000)
     )
-    weights: str = option("time", "What rays count by: time, person (all people alike), or equal (all rays alike).")
+    ray_weights: str = option("time", "What rays count by: time, person (all people alike), or equal (all rays alike).")
     align: Path | None = option(
         None, "JSON file with the 4x4 similarity from the rays' frame to the place's.  [default: the gaze field's]"
     )
@@ -438,34 +438,34 @@ class BakeOptions(PartOptions):
         "[default: 1.5 of rays, 0 of a field]",
         within=Range(0, 30),
     )
-    bundle: int = option(16, "Rays that stand for the cone of a tracked one.", within=Range(1, 1024))
+    cone_samples: int = option(16, "Rays that stand for the cone of a tracked one.", within=Range(1, 1024))
     smooth: float = option(
         0.0, "Metres (standard deviation) of smoothing along the surface; 0: none.", within=Range(0, 10**6)
     )
-    detail: float | None = option(
+    max_edge: float | None = option(
         None,
         "Longest edge of a triangle in metres; longer ones are cut.  [default: about 100,000 triangles]",
         within=LENGTHS,
     )
-    angle: float = option(
+    max_angle: float = option(
         2.0,
         "Degrees under which an observer sees a piece of a surface at most: less is exacter.",
         within=Range(0.2, 30),
     )
     unit: str = option("share", "Values are: share (of gaze, 1/m²), or seconds (of the rays, s/m²).")
-    halves: bool = option(False, "Say how well two halves of the people agree (of rays).")
-    texture: int | None = option(
+    split_half: bool = option(False, "Say how well two halves of the people agree (of rays).")
+    texture_size: int | None = option(
         None, "Pixels a side of a texture in .glb, in place of colours of vertices.", within=Range(64, 8192)
     )
-    top: float | None = option(
-        None, "Upper end of the colours' scale.  [default: the 99.5th percentile]", within=VALUES
+    vmax: float | None = option(
+        None, "Upper end of the colours' scale.  [default: the 99.5th percentile]", within=POSITIVE_VALUES
     )
     cmap: str = option("inferno", "Colour map: inferno, magma, plasma, viridis, cividis.")
-    decades: float = option(0.0, "Powers of ten that the colours' scale spans; 0: a linear scale.", within=DECADES)
+    log_decades: float = option(0.0, "Powers of ten that the colours' scale spans; 0: a linear scale.", within=LOG_DECADES)
     resolution: int = option(
         256, "Of a radiance field, whose mesh is made: cells along its box's longest edge.", within=Range(8, 2048)
     )
-    most: int | None = option(None, "Rays of a dataset at most; of more, a sample by --seed.", within=RAYS)
+    max_samples: int | None = option(None, "Rays of a dataset at most; of more, a sample by --seed.", within=RAYS)
     seed: int = option(0, "Seed of what is drawn at random.", within=SEEDS)
     threads: int | None = cpu_threads()
     mode: str | None = best_variant()
@@ -515,29 +515,29 @@ full study takes up to half an hour.""",
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportOptions(Checked):
+class ReportOptions(ValidatedDataclass):
     """What a report shows. Positions are in the coordinates of the place."""
 
-    objects: Path | None = option(None, 'JSON file of named objects: {"shelf": [[x0, y0, z0], [x1, y1, z1]], ...}.')
+    aois: Path | None = option(None, 'JSON file of named objects: {"shelf": [[x0, y0, z0], [x1, y1, z1]], ...}.')
     evaluate: bool = option(
         False, "Score the field on the rays that were held out of its training (about a minute a split)."
     )
-    names: bool = option(False, "Show the names of people. Without it they are numbered.")
-    min_persons: int = option(1, "Hide shares of objects that fewer people could see.", within=Range(1, 10**6))
+    show_names: bool = option(False, "Show the names of people. Without it they are numbered.")
+    min_participants: int = option(1, "Hide shares of objects that fewer people could see.", within=Range(1, 10**6))
     paths: bool = option(True, "Draw people's paths in 3D. How somebody walks can tell who it is.")
     title: str | None = option(None, "Title.  [default: the gaze field's name]")
     observer: tuple[float, ...] | None = coordinates(
         "Position of the observer in the pictures, x,y,z.  [default: where most rays are]"
     )
-    camera_from: tuple[float, ...] | None = coordinates(
+    camera: tuple[float, ...] | None = coordinates(
         "Position of the camera, x,y,z.  [default: the best overview]", "--from"
     )
-    camera_to: tuple[float, ...] | None = coordinates("Point that it looks at, x,y,z.", "--to")
+    target: tuple[float, ...] | None = coordinates("Point that it looks at, x,y,z.", "--to")
     fov: float | None = option(
         None, "Degrees between the left and right border of its picture.  [default: 70]", within=FIELDS_OF_VIEW
     )
-    eyes: int = option(200, "Places of people from which objects are looked for.", within=Range(1, 10_000))
-    points: int = option(80_000, "Points of the 3D scene at most.", within=Range(100, 100_000))
+    viewpoints: int = option(200, "Places of people from which objects are looked for.", within=Range(1, 10_000))
+    max_points: int = option(80_000, "Points of the 3D scene at most.", within=Range(100, 100_000))
     width: int = option(480, "Width of the pictures in pixels.", within=Range(24, 1200))
     spp: int = option(2, "Samples a pixel.", within=SPP)
     seed: int = option(0, "Seed of the random numbers.", within=SEEDS)

@@ -8,35 +8,35 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, plain
-from nerg_mi.files.safe_read import reading, real_path, size_of
+from nerg_mi.errors import MissingFile, NergError, sanitize
+from nerg_mi.files.safe_read import translate_read_errors, resolve_path, check_regular_file
 from nerg_mi.formats.checkpoint import read_metadata
-from nerg_mi.formats.fields import is_field
-from nerg_mi.formats.meshes import GREY, READERS, MeshFile, read_mesh_file
-from nerg_mi.formats.splats import is_splats, plugin_of_field, read_splats, refuse_others
+from nerg_mi.formats.fields import matches_checksum
+from nerg_mi.formats.meshes import DEFAULT_GREY, READERS, MeshFile, read_mesh_file
+from nerg_mi.formats.splats import is_splat_file, choose_plugin, read_splats, refuse_unsupported_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.photos.colmap import find_source
-from nerg_mi.photos.images import read_photo, read_posed
+from nerg_mi.photos.colmap import find_pose_source
+from nerg_mi.photos.images import read_photo, read_posed_images
 from nerg_mi.photos.posed import PosedFrame, PosedImages
 from nerg_mi.rays.dataset import is_dataset, load_rays
 from nerg_mi.rendering.files import check_vol, write_mesh
-from nerg_mi.rendering.nested_scene import nested_place
+from nerg_mi.rendering.nested_scene import nest_scene
 from nerg_mi.rendering.scene_writer import (
     Comment,
-    Eye,
+    LookAt,
     Lens,
     Node,
     SceneContent,
     element,
     prop,
-    relative_name,
-    value_of,
+    relative_path,
+    check_attribute,
 )
-from nerg_mi.train.geometry import NOWHERE, shade_hits
+from nerg_mi.train.geometry import DEFAULT_DEPTH, shade_hits
 
 from .base import Reporter
-from .geometry import align_of_training, file_of_training, place_key
+from .geometry import read_training_alignment, find_training_file, geometry_key
 
 # ---- What the files are that a scene is written for, found from the files themselves ----
 
@@ -50,7 +50,7 @@ PLACES = ("field", "mesh", "hits", "scene")
 
 
 @dataclass(frozen=True)
-class GivenFiles:
+class InputFiles:
     """``place``: the file that shows where people are, of ``kind`` "field", "mesh", "hits", "scene", or None and "none"
     where nothing is known of it; ``gaze``, ``rays``: files or None; ``about``: provenance of the gaze field;
     ``field_about``: metadata of the radiance field; of Gaussian splats, which are a field as well, there are none."""
@@ -65,30 +65,30 @@ class GivenFiles:
     @property
     def splats(self) -> bool:
         """Whether the field is one of Gaussian splats."""
-        return self.kind == "field" and self.place is not None and is_splats(self.place)
+        return self.kind == "field" and self.place is not None and is_splat_file(self.place)
 
     @property
     def align(self) -> Similarity:
         """From the rays to the place, as the gaze field was trained."""
-        return align_of_training(self.about)
+        return read_training_alignment(self.about)
 
 
-def kind_of_file(path: Path) -> str:
+def detect_kind(path: Path) -> str:
     """What ``path`` holds: "field", "gaze", or a value of `KINDS`. Raises `NergError` for anything else."""
     if not path.exists():
         raise MissingFile(f'there is no file "{path}"; correct its name')
     if is_dataset(path):
         return "rays"
-    size_of(path)
+    check_regular_file(path)
     suffix = path.suffix.lower()
     if suffix == ".safetensors":
         kind = read_metadata(path).get("kind")
         if kind not in ("radiance", "gaze"):
-            raise NergError(f'"{path}" holds a {plain(kind, 40)} field; a scene shows radiance and gaze fields')
+            raise NergError(f'"{path}" holds a {sanitize(kind, 40)} field; a scene shows radiance and gaze fields')
         return {"radiance": "field", "gaze": "gaze"}[kind]
-    if is_splats(path):
+    if is_splat_file(path):
         return "field"
-    refuse_others(path)
+    refuse_unsupported_splats(path)
     if suffix in (".pth", ".pt"):
         raise NergError(f'"{path}" is a checkpoint of torch; make fields of it with "nerg import"')
     if suffix not in KINDS:
@@ -99,7 +99,7 @@ def kind_of_file(path: Path) -> str:
     return KINDS[suffix]
 
 
-def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -> GivenFiles:
+def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -> InputFiles:
     """What ``files`` are, and the place that a gaze field without one was trained in, found beside it by its name.
 
     ``geometry``: "hits" or "none", of rays alone; None: hits where there are any. A place of rays' hit points that has
@@ -109,7 +109,7 @@ def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -
         raise NergError(f'--geometry must be "hits" or "none", got "{geometry}"')
     found: dict[str, tuple[str, Path]] = {}
     for path in files:
-        kind = kind_of_file(path)
+        kind = detect_kind(path)
         role = "place" if kind in PLACES else kind
         if role in found:
             raise NergError(f'"{found[role][1]}" and "{path}" are both a {role}; a scene has one of them')
@@ -127,9 +127,9 @@ def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -
         kind, place = _trained_in(gaze, about)
     elif place is None:
         kind = geometry or ("hits" if _have_hits(rays) else "none")
-    trained = kind == "field" and place is not None and not is_splats(place)
+    trained = kind == "field" and place is not None and not is_splat_file(place)
     field_about = read_metadata(place) if trained and place is not None else {}
-    return GivenFiles(place, kind, gaze, rays, about, field_about)
+    return InputFiles(place, kind, gaze, rays, about, field_about)
 
 
 def _trained_in(gaze: Path, about: dict) -> tuple[str, Path | None]:
@@ -137,10 +137,10 @@ def _trained_in(gaze: Path, about: dict) -> tuple[str, Path | None]:
     if about.get("geometry") == "none":
         return "none", None
     try:
-        key = place_key(gaze, about)
+        key = geometry_key(gaze, about)
     except NergError as error:
         raise NergError(f"{error}; name its place, too: nerg scene PLACE GAZE") from error
-    path = file_of_training(
+    path = find_training_file(
         gaze,
         about,
         None,
@@ -158,14 +158,14 @@ def _compare(place: Path, gaze: Path, about: dict, reporter: Reporter) -> None:
         if about.get("geometry") == "none":
             reporter.warn(f'"{gaze}" was trained without a place; surfaces of "{place}" are not where it takes them')
         return
-    if not is_field(place, known.get("sha256")):
+    if not matches_checksum(place, known.get("sha256")):
         reporter.warn(
-            f'"{gaze}" was trained in another file than "{place}", {plain(known.get("file"), 80)}; gaze is right only '
+            f'"{gaze}" was trained in another file than "{place}", {sanitize(known.get("file"), 80)}; gaze is right only '
             "where surfaces and coordinates are the same"
         )
 
 
-def training_place(about: dict) -> str | None:
+def find_training_scene(about: dict) -> str | None:
     """The checksum of the file of the place that a gaze field was trained in, by its provenance ``about``; None where
     there was none."""
     known = _place_file(about)
@@ -181,7 +181,7 @@ def _have_hits(rays: Path | None) -> bool:
 
     if rays is None:
         return False
-    hit = load_rays(rays, most=_SOME).hit
+    hit = load_rays(rays, max_rays=_SOME).hit
     return hit is not None and bool(np.isfinite(hit).all(axis=1).any())
 
 
@@ -193,12 +193,12 @@ class PhotoCamera:
     """``eye`` and ``lens`` of the photo ``name``; ``bent``: whether its lens distorts, which no such camera does."""
 
     name: str
-    eye: Eye
+    eye: LookAt
     lens: Lens
     bent: bool
 
 
-def camera_of_photo(photos: Path, photo: str, provenance: dict, allow_outside: bool = False) -> PhotoCamera:
+def load_photo_camera(photos: Path, photo: str, provenance: dict, allow_outside: bool = False) -> PhotoCamera:
     """The camera of the ``photo`` (its name, or its number from 0 on) of the data set ``photos``.
 
     ``provenance``: of the radiance field, which says in which coordinates it was trained. Raises `NergError` for
@@ -207,7 +207,7 @@ def camera_of_photo(photos: Path, photo: str, provenance: dict, allow_outside: b
     return _camera(_frame(_posed(photos, provenance, allow_outside), photo))
 
 
-def cameras_of_photos(
+def load_photo_cameras(
     photos: Path, provenance: dict, allow_outside: bool = False, most: int = 200
 ) -> list[PhotoCamera]:
     """The cameras of the data set ``photos``, of ``most`` of them at most, evenly chosen; otherwise as
@@ -217,11 +217,11 @@ def cameras_of_photos(
 
 
 def _posed(photos: Path, provenance: dict, allow_outside: bool) -> PosedImages:
-    posed = read_posed(find_source(photos), allow_outside)
+    posed = read_posed_images(find_pose_source(photos), allow_outside)
     if "sha256" in provenance and provenance["sha256"] != posed.sha256:
         raise NergError(f'"{posed.path}" is not what the field was trained on; give those photos with --photos')
     if "to_file" in provenance:
-        posed = posed.moved(np.linalg.inv(np.asarray(provenance["to_file"], np.float64)))
+        posed = posed.transform(np.linalg.inv(np.asarray(provenance["to_file"], np.float64)))
     return posed
 
 
@@ -234,7 +234,7 @@ def _camera(frame: PosedFrame) -> PhotoCamera:
     ahead, up = -frame.to_world[:3, 2], frame.to_world[:3, 1]
     offset = (float(0.5 - i.cx / i.width), float(0.5 - i.cy / i.height))
     taken = Lens(float(np.degrees(2 * np.arctan(i.width / (2 * i.fx)))), i.width / i.height, offset)
-    return PhotoCamera(frame.name, Eye(origin, origin + ahead, up), taken, i.is_distorted)
+    return PhotoCamera(frame.name, LookAt(origin, origin + ahead, up), taken, i.is_distorted)
 
 
 def _size(frame: PosedFrame) -> tuple[int, int]:
@@ -250,8 +250,8 @@ def _frame(posed: PosedImages, photo: str) -> PosedFrame:
     if photo.isdecimal() and int(photo) < len(frames):
         return frames[int(photo)]
     raise NergError(
-        f'there is no photo "{plain(photo, 80)}" in "{posed.path}": give --photo a number from 0 to {len(frames) - 1}, '
-        f'or a name such as "{plain(frames[0].name, 80)}"'
+        f'there is no photo "{sanitize(photo, 80)}" in "{posed.path}": give --photo a number from 0 to {len(frames) - 1}, '
+        f'or a name such as "{sanitize(frames[0].name, 80)}"'
     )
 
 
@@ -262,7 +262,7 @@ LAMP = 2.5
 
 
 @dataclass(frozen=True)
-class WrittenPlace:
+class WrittenGeometry:
     """A place for a scene file in a folder: ``make(folder, lamps)`` gives its parts, with names of files as that folder
     has them and, where it has no light of its own, with lamps at ``$camera`` and ``$eye`` (names of `<default>`s) of
     that intensity. ``words``: what it is, for a comment; ``contracted``: whether it has no end; ``files`` written;
@@ -275,7 +275,7 @@ class WrittenPlace:
     notes: tuple[str, ...] = ()
 
 
-def place_of_files(given: GivenFiles, output: Path) -> WrittenPlace:
+def write_scene_geometry(given: InputFiles, output: Path) -> WrittenGeometry:
     """The place in ``given``; what has to be written for it stands beside ``output``: the colours of hit points, and a
     mesh that Mitsuba does not show as it is.
 
@@ -285,21 +285,21 @@ def place_of_files(given: GivenFiles, output: Path) -> WrittenPlace:
         contracted = "reach" in given.field_about.get("box", {})
         # A file that cannot be used is refused before a scene names it.
         splats = read_splats(_file(given)) if given.splats else None
-        notes = () if splats is None else (*splats.guesses, *splats.notes)
+        notes = () if splats is None else (*splats.assumptions, *splats.notes)
         make = lambda folder, lamps: _field(_file(given), folder)
-        return WrittenPlace(make, _words(given), contracted, notes=notes)
+        return WrittenGeometry(make, _words(given), contracted, notes=notes)
     if given.kind == "mesh":
         return _mesh(_file(given), output, _words(given))
     if given.kind == "scene":
         path = _file(given)
-        nested_place(path, output.parent)
-        return WrittenPlace(lambda folder, lamps: nested_place(path, folder), _words(given))
+        nest_scene(path, output.parent)
+        return WrittenGeometry(lambda folder, lamps: nest_scene(path, folder), _words(given))
     if given.kind == "hits":
         return _hits(_file(given), output, _words(given))
-    return WrittenPlace(lambda folder, lamps: _nowhere(lamps), _words(given))
+    return WrittenGeometry(lambda folder, lamps: _nowhere(lamps), _words(given))
 
 
-def _words(given: GivenFiles) -> str:
+def _words(given: InputFiles) -> str:
     name = "" if given.place is None else given.place.name
     if given.splats:
         return f"The Gaussian splats {name}"
@@ -312,30 +312,30 @@ def _words(given: GivenFiles) -> str:
     }[given.kind]
 
 
-def _file(given: GivenFiles) -> Path:
+def _file(given: InputFiles) -> Path:
     assert given.place is not None
     return given.place
 
 
 def _name(path: Path, folder: Path) -> str:
-    return value_of(relative_name(path, folder))
+    return check_attribute(relative_path(path, folder))
 
 
 def _field(path: Path, folder: Path) -> SceneContent:
-    volume = element("volume", prop("string", "filename", "$field"), name="field", type=plugin_of_field(path))
-    return SceneContent(inside=(volume,), files={"field": _name(path, folder)})
+    volume = element("volume", prop("string", "filename", "$field"), name="field", type=choose_plugin(path))
+    return SceneContent(integrator_children=(volume,), files={"field": _name(path, folder)})
 
 
-def mesh_of(output: Path) -> Path:
+def mesh_path(output: Path) -> Path:
     """The file of a mesh that Mitsuba does not show as it is, beside the scene file ``output``."""
     return output.with_name(f"{output.stem}.mesh.ply")
 
 
-def _mesh(path: Path, output: Path, words: str) -> WrittenPlace:
+def _mesh(path: Path, output: Path, words: str) -> WrittenGeometry:
     mesh, shown = read_mesh_file(path), path
-    if not mesh.is_plain:
-        shown = mesh_of(output)
-        if real_path(shown) == real_path(path):
+    if not mesh.is_readable_by_mitsuba:
+        shown = mesh_path(output)
+        if resolve_path(shown) == resolve_path(path):
             raise NergError(f'"{path}" would be written over by what Mitsuba shows of it; give the scene another name')
         write_mesh(shown, mesh)
     kind = shown.suffix.lower().lstrip(".")
@@ -346,8 +346,8 @@ def _mesh(path: Path, output: Path, words: str) -> WrittenPlace:
         bsdf = element("bsdf", element("bsdf", color, type="diffuse"), type="twosided")
         shape = element("shape", prop("string", "filename", "$place"), bsdf, type=kind, id="place")
         return SceneContent(
-            inside=(Comment("What lights the shape."), light),
-            beside=(
+            integrator_children=(Comment("What lights the shape."), light),
+            scene_children=(
                 shape,
                 Comment("A mesh brings no light: lamps where the camera and the observer are."),
                 *_lamps(lamps),
@@ -356,13 +356,13 @@ def _mesh(path: Path, output: Path, words: str) -> WrittenPlace:
             spp=64,
         )
 
-    return WrittenPlace(make, words, files=() if mesh.is_plain else (shown,), notes=mesh.notes)
+    return WrittenGeometry(make, words, files=() if mesh.is_readable_by_mitsuba else (shown,), notes=mesh.notes)
 
 
 def _mesh_color(mesh: MeshFile) -> Node:
     """The mesh's own colours, or grey."""
     if mesh.colors is None and mesh.face_colors is None:
-        return prop("rgb", "reflectance", GREY)
+        return prop("rgb", "reflectance", DEFAULT_GREY)
     name = "face_color" if mesh.colors is None else "vertex_color"
     return element("texture", prop("string", "name", name), name="reflectance", type="mesh_attribute")
 
@@ -379,15 +379,15 @@ def _lamps(lamps: dict[str, float]) -> list[Node]:
     ]
 
 
-def colors_of(output: Path) -> Path:
+def colors_path(output: Path) -> Path:
     """The file of the colours of hit points, beside the scene file ``output``."""
     return output.with_name(f"{output.stem}.color.vol")
 
 
-def _hits(path: Path, output: Path, words: str) -> WrittenPlace:
+def _hits(path: Path, output: Path, words: str) -> WrittenGeometry:
     check_vol(path)
-    colors = colors_of(output)
-    with reading(path, "place of hit points"):
+    colors = colors_path(output)
+    with translate_read_errors(path, "place of hit points"):
         shape = np.fromfile(path, "<i4", 4, offset=8)
         lower, upper = np.fromfile(path, "<f4", 6, offset=24).astype(float).reshape(2, 3)
         density = np.fromfile(path, "<f4", int(np.prod(shape, dtype=np.int64)), offset=48)
@@ -406,10 +406,10 @@ def _hits(path: Path, output: Path, words: str) -> WrittenPlace:
         raw = prop("boolean", "raw", "true")
         color = element("volume", file, box, raw, name="color", type="gridvolume")
         return SceneContent(
-            inside=(density, color), files={"density": _name(path, folder), "color": _name(colors, folder)}
+            integrator_children=(density, color), files={"density": _name(path, folder), "color": _name(colors, folder)}
         )
 
-    return WrittenPlace(make, words, files=(colors,))
+    return WrittenGeometry(make, words, files=(colors,))
 
 
 def _nowhere(lamps: dict[str, float]) -> SceneContent:
@@ -424,10 +424,10 @@ def _nowhere(lamps: dict[str, float]) -> SceneContent:
     sphere = element(
         "shape",
         element("point", name="center", value=f"${next(iter(lamps))}"),
-        prop("float", "radius", f"{NOWHERE:g}"),
+        prop("float", "radius", f"{DEFAULT_DEPTH:g}"),
         prop("boolean", "flip_normals", "true"),
         element("bsdf", cells, type="diffuse"),
         type="sphere",
         id="nowhere",
     )
-    return SceneContent(beside=(sphere,), spp=16)
+    return SceneContent(scene_children=(sphere,), spp=16)

@@ -13,18 +13,18 @@ from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import study, study_tables, study_truth
-from nerg_mi.evaluation.study import StudyRow, settings
-from nerg_mi.evaluation.study_subject import ExactSurfaces, FileSubject, Subject, open_subject
-from nerg_mi.figures.style import Provenance, files_among, provenance
+from nerg_mi.evaluation.study import StudyRow, list_rows
+from nerg_mi.evaluation.study_subject import ExactSurfaces, FileSubject, StudySubject, open_subject
+from nerg_mi.figures.style import Provenance, existing_files, make_provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
-from nerg_mi.rendering.scene import activate, files_of_scene
+from nerg_mi.rendering.scene import activate_variant, list_scene_files
 from nerg_mi.tasks.engines import prepare_once
-from nerg_mi.tasks.task import Part, Plan, processor
+from nerg_mi.tasks.task import Part, Plan, read_processor_name
 
 from .base import SILENT, Reporter, select_backend, versions
-from .parts import Parts, PlannedScene
+from .parts import PartRunner, PlannedScene
 from .scene_commands import StudyOptions
 
 # ---- The study of error against run time: a scene at many settings, each compared with what is true ----
@@ -65,13 +65,13 @@ def run_study(
     wanted = _expression(options.only)
     out = Path(out)
     check_folder(out)
-    mode = activate(options.mode)
+    mode = activate_variant(options.mode)
     import drjit as dr
 
     begin = time.perf_counter()
     reporter.progress(0.0, "open")
-    subject = open_subject(str(scene), options.scene_kind, width, height, options.defaults, twin_beside)
-    rows = _chosen(settings(subject, options.quick), wanted, options.only)
+    subject = open_subject(str(scene), options.scene_kind, width, height, options.defaults, find_reference_scene)
+    rows = _chosen(list_rows(subject, options.quick), wanted, options.only)
     repeats, samples = effort(options)
     timed_by: list[dict] = []
     done = 0
@@ -83,13 +83,13 @@ def run_study(
         done += 1
 
     if options.in_parts:
-        common = planned_study(subject, scene, replace(options, mode=mode))
-        table, scaling, timed_by = _measured_in_parts(common, subject, rows, Parts(options, out, reporter), out)
+        common = plan_study(subject, scene, replace(options, mode=mode))
+        table, scaling, timed_by = _measured_in_parts(common, subject, rows, PartRunner(options, out, reporter), out)
     else:
-        table = study.measure(subject, rows, repeats, samples, step)
-        scaling = study.scaling(subject, min(repeats, 3), options.quick, step)
-    study_tables.mark_fronts(table)
-    known = subject.truth(study.SEED, "expected", "depth")
+        table = study.measure_rows(subject, rows, repeats, samples, step)
+        scaling = study.measure_scaling(subject, min(repeats, 3), options.quick, step)
+    study_tables.mark_pareto_fronts(table)
+    known = subject.get_truth(study.SEED, "expected", "depth")
     report = {
         "scene": subject.name,
         "variant": mode,
@@ -99,7 +99,7 @@ def run_study(
         "tolerance": subject.tolerance,
         "reference": known.source,
         "reference_change_when_step_halved": known.convergence,
-        "precision": study.precision(),
+        "precision": study.describe_precision(),
         "gaze_kld_eps": study_truth.KLD_EPS,
         "repeats": repeats,
         "threads": timed_by[0]["threads"] if timed_by else dr.thread_count(),
@@ -107,13 +107,13 @@ def run_study(
         "peak_mb": "what Dr.Jit allocated at most during a first render, in MiB, beyond scene and field",
         "seconds_of_study": time.perf_counter() - begin,
         "versions": versions(mode),
-        "against_paper": study_tables.against_paper(table),
+        "against_paper": study_tables.compare_with_paper(table),
         "rows": table,
         "scaling": scaling,
     }
-    sources = files_of_scene(scene, options.defaults) if files_among(scene) else []
-    files = _write(out, subject, report, provenance("nerg study", sources, study.SEED, options))
-    for line in study_tables.summary(report):
+    sources = list_scene_files(scene, options.defaults) if existing_files(scene) else []
+    files = _write(out, subject, report, make_provenance("nerg study", sources, study.SEED, options))
+    for line in study_tables.summarise(report):
         reporter.message(line)
     for path in files:
         reporter.message(f"wrote {path}")
@@ -138,7 +138,7 @@ def _chosen(all_settings: list[StudyRow], wanted: re.Pattern, only: str) -> list
     return rows
 
 
-def _write(out: Path, subject: Subject, report: dict, about: Provenance) -> list[Path]:
+def _write(out: Path, subject: StudySubject, report: dict, about: Provenance) -> list[Path]:
     files = study_tables.write_tables(out, report)
     width, height = report["size"]
     title = f"{subject.name}, {width} x {height}, {report['variant']}"
@@ -152,7 +152,7 @@ def effort(options: StudyOptions) -> tuple[int, int]:
     return (1, 16) if options.quick else (options.repeats, study.PIXEL_SPP)
 
 
-def twin_beside(scene: Path) -> ExactSurfaces | None:
+def find_reference_scene(scene: Path) -> ExactSurfaces | None:
     """The surfaces of the shapes in ``twin.xml`` beside a scene file, which its field stands for; None where there is
     none."""
     file = scene.parent / _TWIN
@@ -161,7 +161,7 @@ def twin_beside(scene: Path) -> ExactSurfaces | None:
     from nerg_mi.scenes.store import twin  # pyright: ignore[reportMissingImports] at the root of a checkout
 
     shapes = twin.load_twin(file)
-    return ExactSurfaces(partial(twin.cast, scene=shapes), partial(twin.visible, scene=shapes))
+    return ExactSurfaces(partial(twin.cast_rays, scene=shapes), partial(twin.is_visible, scene=shapes))
 
 
 # ---- Parts ----
@@ -179,19 +179,19 @@ class PlannedStudy:
     scene: PlannedScene | str
 
 
-def planned_study(subject: Subject, scene: str | Path, options: StudyOptions) -> PlannedStudy:
+def plan_study(subject: StudySubject, scene: str | Path, options: StudyOptions) -> PlannedStudy:
     """That of the ``subject`` of ``scene``: parts have numbers of settings, whatever names were chosen."""
     kind = "file" if isinstance(subject, FileSubject) else "analytic"
     of_parts = replace(options, only="", defaults=None, scene_kind=kind)
     if kind == "analytic":
         return PlannedStudy(of_parts, str(scene))
     twin = Path(scene).parent / _TWIN
-    others = files_of_scene(twin) if twin.is_file() else ()
-    return PlannedStudy(of_parts, PlannedScene.of(scene, options.defaults, *others))
+    others = list_scene_files(twin) if twin.is_file() else ()
+    return PlannedStudy(of_parts, PlannedScene.plan(scene, options.defaults, *others))
 
 
 def _measured_in_parts(
-    common: PlannedStudy, subject: Subject, rows: Sequence[StudyRow], parts: Parts, out: Path
+    common: PlannedStudy, subject: StudySubject, rows: Sequence[StudyRow], parts: PartRunner, out: Path
 ) -> tuple[list[dict], list[dict], list[dict]]:
     """What `study.measure` finds of ``rows`` (the default first) and `study.scaling`, in parts; and who timed what:
     of each process its ``processor``, ``threads``, ``rows`` and, of the default there, the least and most ``seconds``.
@@ -199,7 +199,7 @@ def _measured_in_parts(
     Rows say in ``timed_by`` which process it was, counted from 1, and have ``default_seconds`` and
     ``default_cpu_seconds`` of that one.
     """
-    place = {row.name: k for k, row in enumerate(settings(subject, common.options.quick))}
+    place = {row.name: k for k, row in enumerate(list_rows(subject, common.options.quick))}
     chosen = [place[row.name] for row in rows[1:]]
     some = [tuple(chosen[k : k + ROWS]) for k in range(0, len(chosen), ROWS)]
     tasks = [Part(numbers, f"{len(numbers)} settings from number {numbers[0]}") for numbers in some]
@@ -217,20 +217,20 @@ def measure_part(common: PlannedStudy, numbers: Sequence[int] | None, output: Pa
     select_backend(o.mode)
     repeats, samples = effort(o)
 
-    def opened() -> Subject:
+    def opened() -> StudySubject:
         scene, defaults = common.scene, {}
         if isinstance(scene, PlannedScene):
-            scene, defaults = scene.checked(), scene.defaults
-        return open_subject(str(scene), o.scene_kind, o.width, o.height, defaults, twin_beside)
+            scene, defaults = scene.checked_path(), scene.defaults
+        return open_subject(str(scene), o.scene_kind, o.width, o.height, defaults, find_reference_scene)
 
     # Its truth may take longer than its settings.
     subject = prepare_once(common, opened)
     if numbers is None:
-        rows = study.scaling(subject, min(repeats, 3), o.quick)
+        rows = study.measure_scaling(subject, min(repeats, 3), o.quick)
     else:
-        every = settings(subject, o.quick)
-        rows = study.measure(subject, [every[k] for k in (0, *numbers)], repeats, samples)
-    timed_by = {"process": _PROCESS, "processor": processor(), "threads": dr.thread_count()}
+        every = list_rows(subject, o.quick)
+        rows = study.measure_rows(subject, [every[k] for k in (0, *numbers)], repeats, samples)
+    timed_by = {"process": _PROCESS, "processor": read_processor_name(), "threads": dr.thread_count()}
     write_json(output, {"rows": rows, "timed_by": timed_by}, allow_nan=True)
 
 

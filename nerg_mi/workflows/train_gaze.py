@@ -12,29 +12,29 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
-from nerg_mi.errors import NergError, chosen
+from nerg_mi.errors import NergError, blame_options
 from nerg_mi.fields.gaze_base import AnyGazeField
-from nerg_mi.files.atomic import check_writable, reserving
+from nerg_mi.files.atomic import check_writable, reserve_output
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.photos.salience import SalienceSet, open_salience
-from nerg_mi.rays.dataset import is_dataset, load_rays, rays_digest
+from nerg_mi.rays.dataset import is_dataset, load_rays, hash_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train import gaze_run
-from nerg_mi.train.gaze_data import Supervision, TargetNeeds, check_kernels, far_views, hold_out
+from nerg_mi.train.gaze_data import Supervision, TargetRequirements, check_prior_kappa, select_far_views, hold_out
 from nerg_mi.train.gaze_ensemble import train_ensemble
-from nerg_mi.train.gaze_log_density import KAPPA, prior_field
-from nerg_mi.train.gaze_recipes import FieldChoices, Recipe, gaze_recipe
-from nerg_mi.train.gaze_run import mixes
+from nerg_mi.train.gaze_log_density import ELEVATION_KAPPA, make_elevation_prior
+from nerg_mi.train.gaze_recipes import FieldOptions, Recipe, get_recipe
+from nerg_mi.train.gaze_run import selects_prior_weight
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan, GazeProgress, StateSettings
-from nerg_mi.train.geometry import GazePlace
+from nerg_mi.train.geometry import TrainingGeometry
 
 from .base import SILENT, Reporter, select_backend
 from .gaze_commands import GazeOptions, PriorOptions
-from .geometry import check_place, make_place, place_kind
-from .options import chosen_settings
+from .geometry import check_geometry, make_geometry, geometry_kind
+from .options import explicit_settings
 
 # ---- Training a gaze field on rays: what is trained on which rays, and the run ----
 
@@ -44,39 +44,39 @@ from .options import chosen_settings
 # What the options of a gaze training come to: whether they go together, and the plan that they make of a recipe.
 
 
-def plan_gaze(options: GazeOptions, place: GazePlace, views_alone: bool = False) -> GazePlan:
+def plan_gaze(options: GazeOptions, place: TrainingGeometry, views_alone: bool = False) -> GazePlan:
     """How ``options`` have a field trained in ``place``; ``views_alone``: there are no rays.
 
     Raises `NergError` for what does not go together.
     """
-    with chosen(_named(options)):
-        return gaze_recipe(options.recipe).plan(
+    with blame_options(_named(options)):
+        return get_recipe(options.recipe).make_plan(
             place,
             _choices(options, place.kind, views_alone),
-            settings=chosen_settings(options, GazeSettings),
-            probes=chosen_settings(options, ProbeSettings),
-            begin=options.begin == "field",
-            views_alone=views_alone,
+            settings=explicit_settings(options, GazeSettings),
+            probes=explicit_settings(options, ProbeSettings),
+            init_from_field=options.init == "field",
+            views_only=views_alone,
         )
 
 
 def check_plan(options: GazeOptions, views_alone: bool = False) -> ProbeSettings:
     """Find what cannot be trained before any time is spent on it; returns the settings of the probes, which do not
     depend on the place. Raises `NergError` for options that do not go together, and for values that are wrong."""
-    recipe = gaze_recipe(options.recipe)
+    recipe = get_recipe(options.recipe)
     _check(options, recipe, views_alone)
-    with chosen(_named(options)):
-        config = recipe.architectures(_choices(options, place_kind(options), views_alone))[0]
-    recipe.gaze_settings(chosen_settings(options, GazeSettings), views_alone)
-    probes = recipe.probe_settings(chosen_settings(options, ProbeSettings))
-    if rows := TargetNeeds.of(config).blind_rows:
-        check_kernels(rows, probes.mix_kappa)
+    with blame_options(_named(options)):
+        config = recipe.list_architectures(_choices(options, geometry_kind(options), views_alone))[0]
+    recipe.make_gaze_settings(explicit_settings(options, GazeSettings), views_alone)
+    probes = recipe.make_probe_settings(explicit_settings(options, ProbeSettings))
+    if rows := TargetRequirements.from_config(config).prior_rows:
+        check_prior_kappa(rows, probes.mix_kappa)
     return probes
 
 
 def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
     """Raise `NergError` for options that do not go together."""
-    kind = place_kind(options)
+    kind = geometry_kind(options)
     if views_alone and options.views is None:
         raise NergError("say what to learn from: a rays file, or --views with --salience, or both")
     mixed = options.mix_folds or options.mix_kappa is not None
@@ -88,7 +88,7 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
         )
     if options.geometry is not None and options.align is not None:
         raise NergError("--align belongs to --field and --scene; a place made from rays is in the rays' own frame")
-    if options.test_people and not options.test_zones:
+    if options.test_participants and not options.test_zones:
         raise NergError("--test-people leaves people out at test positions: say where, with --test-zones")
     if (options.views is None or options.salience is None) and (
         options.views or options.salience or options.align_views
@@ -96,11 +96,11 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
         raise NergError(
             "salience needs both: --views, the posed photos, and --salience, the images' folder or spectral-residual"
         )
-    if options.begin not in ("random", "field"):
-        raise NergError(f'--begin must be "random" or "field", got "{options.begin}"')
-    if options.freeze and options.begin != "field":
+    if options.init not in ("random", "field"):
+        raise NergError(f'--begin must be "random" or "field", got "{options.init}"')
+    if options.freeze and options.init != "field":
         raise NergError("--freeze keeps the weights that --begin field gives; add it, or leave --freeze out")
-    if options.field is None and (options.semantic or options.begin == "field"):
+    if options.field is None and (options.semantic or options.init == "field"):
         raise NergError(
             f"{'--semantic' if options.semantic else '--begin field'} needs a radiance field: give it with --field"
         )
@@ -108,34 +108,34 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
         "activation": options.activation,
         "size": options.size,
         "semantic": options.semantic,
-        "begin": options.begin == "field",
+        "begin": options.init == "field",
         "loss": options.loss,
         "integral": options.integral is not None,
-        "normalized": options.normalized,
+        "normalized": options.normalize,
         "mix-folds": bool(options.mix_folds),
         "mix-kappa": options.mix_kappa is not None,
     }
-    recipe.require([name for name, given in asked.items() if given])
+    recipe.check_options([name for name, given in asked.items() if given])
     if options.loss and options.loss not in recipe.losses:
         raise NergError(f'the loss must be one of {", ".join(recipe.losses)}, got "{options.loss}"')
 
 
 def _named(options: GazeOptions) -> str:
     """By which options the architecture was chosen."""
-    given = options.semantic or options.begin == "field"
+    given = options.semantic or options.init == "field"
     return "--semantic, --variant and --begin" if given else "--variant and --activation"
 
 
-def _choices(options: GazeOptions, kind: str, views_alone: bool) -> FieldChoices:
-    return FieldChoices(
+def _choices(options: GazeOptions, kind: str, views_alone: bool) -> FieldOptions:
+    return FieldOptions(
         variant=options.variant or "",
         activation=options.activation,
         size=options.size,
         # Views alone do not say how much is looked altogether.
-        normalized=options.normalized or views_alone,
+        normalized=options.normalize or views_alone,
         semantic=options.semantic,
-        semantic_own=options.semantic_own,
-        place=kind,
+        semantic_own=options.semantic_concat,
+        geometry_kind=kind,
     )
 
 
@@ -176,7 +176,7 @@ def train_gaze(
 
     Raises `NergError` for what the user can mend, before any time is spent on it.
     """
-    with reserving(output):
+    with reserve_output(output):
         return _train(rays, None if output is None else Path(output), options or GazeOptions(), reporter)
 
 
@@ -195,17 +195,17 @@ def _train(rays: Rays | str | Path | None, output: Path | None, options: GazeOpt
         reporter.progress(0.0, "reading rays")
     supervision, about = _supervision(rays, options, probes, align, reporter)
     volume = None if output is None else output.with_suffix(".vol")
-    place = make_place(options, supervision.rays, supervision.views, volume, ns, options.voxel, reporter)
+    place = make_geometry(options, supervision.rays, supervision.views, volume, ns, options.voxel, reporter)
     place = replace(place, align=align)
-    check_place(place, supervision.rays, _place_option(options), options.force, reporter)
-    about |= place.about
+    check_geometry(place, supervision.rays, _place_option(options), options.force, reporter)
+    about |= place.metadata
     reporter.progress(0.0, "placing probes and tracing their depths")
     plan = plan_gaze(options, place, views_alone=supervision.rays is None)
     if place.kind == "none" and options.variant is None:
-        choose = plan.alternatives and mixes(plan) and supervision.rays is not None
+        choose = plan.alternatives and selects_prior_weight(plan) and supervision.rays is not None
         how = "folds choose between capture alone and emit x capture" if choose else "capture alone is trained"
         reporter.message(f"no surfaces are known: {how}")
-    if plan.initial and options.field is not None:
+    if plan.initial_arrays and options.field is not None:
         about["begins_as"] = Path(options.field).name
     result = train_planned(
         supervision,
@@ -215,7 +215,7 @@ def _train(rays: Rays | str | Path | None, output: Path | None, options: GazeOpt
         output,
         ensemble=options.ensemble,
         state=StateSettings(
-            path=state, resume=options.resume, every=options.save_every or float("inf"), about=dict(about)
+            path=state, resume=options.resume, interval=options.save_every or float("inf"), identity=dict(about)
         ),
         half=options.half,
         reporter=reporter,
@@ -228,7 +228,7 @@ def _train(rays: Rays | str | Path | None, output: Path | None, options: GazeOpt
 
 def train_planned(
     supervision: Supervision,
-    place: GazePlace,
+    place: TrainingGeometry,
     plan: GazePlan,
     ns: ModuleType,
     output: Path | None = None,
@@ -243,11 +243,11 @@ def train_planned(
     state = state or StateSettings()
     write = None
     if output is not None:
-        write = lambda field, provenance: save_gaze(field, output, {**state.about, **provenance}, half)
+        write = lambda field, provenance: save_gaze(field, output, {**state.identity, **provenance}, half)
     train = partial(train_ensemble, ensemble) if ensemble else gaze_run.train_gaze
     tell = lambda progress: reporter.progress(progress.done, _progress(progress))
     field, provenance = train(supervision, place, plan, ns, state=state, tell=tell, write=write)
-    return GazeResult(field, {**state.about, **provenance}, output, provenance["interrupted"])
+    return GazeResult(field, {**state.identity, **provenance}, output, provenance["interrupted"])
 
 
 def _place_option(options: GazeOptions) -> str:
@@ -273,7 +273,7 @@ def _supervision(
         data = rays
     elif rays is not None:
         path, data = Path(rays), load_rays(rays, options.most, options.seed)
-        about["rays_file"] = {"file": path.name, "sha256": rays_digest(path), "persons": len(data.persons)}
+        about["rays_file"] = {"file": path.name, "sha256": hash_rays(path), "persons": len(data.persons)}
         if is_dataset(path):
             about["rays_file"] |= {"most": options.most, "seed": options.seed, "rays": len(data)}
             reporter.message(f"{len(data):,} rays of {path}")
@@ -281,7 +281,7 @@ def _supervision(
     if options.views is not None and options.salience is not None:
         found, similarity = _open_views(options, options.views, options.salience)
         views = found.views
-        about |= {"salience": found.about, **similarity}
+        about |= {"salience": found.provenance, **similarity}
         _tell_views(found, reporter)
     if options.test_zones and data is not None:
         data, test = hold_out(
@@ -291,14 +291,14 @@ def _supervision(
             options.test_positions,
             options.seed,
             max(64, probes.min_rays),
-            options.test_people,
+            options.test_participants,
         )
         about["test"] = test
         reporter.message(
             f"{len(test['centres'])} test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays left"
         )
         centres = np.array(test["centres"]) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
-        views = far_views(views, centres, 2 * probes.radius * align.scale)
+        views = select_far_views(views, centres, 2 * probes.radius * align.scale)
     return Supervision(data, tuple(views)), about
 
 
@@ -310,15 +310,15 @@ def _open_views(options: GazeOptions, photos: Path, salience: str) -> tuple[Sali
     trained = None
     if options.field is not None:
         trained = read_checkpoint(options.field, "radiance")[1].get("provenance")
-    found = open_salience(photos, salience, options.salience_per, matrix, trained, options.allow_outside)
+    found = open_salience(photos, salience, options.salience_unit, matrix, trained, options.allow_outside)
     return found, {} if matrix is None else {"align_views": matrix.tolist()}
 
 
 def _tell_views(found: SalienceSet, reporter: Reporter) -> None:
-    for line in found.unused:
+    for line in found.notes:
         reporter.message(line)
-    without = f"; without: {', '.join(found.missing)}" if found.missing else ""
-    stray = f"; images of no frame: {', '.join(found.stray)}" if found.stray else ""
+    without = f"; without: {', '.join(found.frames_without_map)}" if found.frames_without_map else ""
+    stray = f"; images of no frame: {', '.join(found.unmatched_files)}" if found.unmatched_files else ""
     reporter.message(f"{len(found.views)} views with salience{without}{stray}")
 
 
@@ -412,16 +412,16 @@ def learn_prior(
     learnt, files = [], []
     for k, place in enumerate(rays):
         reporter.progress(k / len(rays), "reading rays")
-        data = place if isinstance(place, Rays) else load_rays(place, options.most, options.seed)
-        of_file = {} if isinstance(place, Rays) else {"file": Path(place).name, "sha256": rays_digest(place)}
+        data = place if isinstance(place, Rays) else load_rays(place, options.max_samples, options.seed)
+        of_file = {} if isinstance(place, Rays) else {"file": Path(place).name, "sha256": hash_rays(place)}
         learnt.append(data)
         files.append({**of_file, "rays": len(data), "persons": len(data.persons)})
     if empty := [str(k + 1) for k, data in enumerate(learnt) if not len(data)]:
         raise NergError(f"no ray is in place {', '.join(empty)} of those that a prior is learnt from; leave it out")
-    field = prior_field(learnt, ns)
+    field = make_elevation_prior(learnt, ns)
     provenance = {
         "recipe": PRIOR,
-        "kappa": KAPPA,
+        "kappa": ELEVATION_KAPPA,
         "places": files,
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }

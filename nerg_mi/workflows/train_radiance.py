@@ -7,19 +7,19 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from nerg_mi.errors import NergError, chosen
+from nerg_mi.errors import NergError, blame_options
 from nerg_mi.evaluation.metrics import ViewScores, score_views
 from nerg_mi.fields.radiance import RadianceField
-from nerg_mi.files.atomic import check_folder, check_writable, reserving
+from nerg_mi.files.atomic import check_folder, check_writable, reserve_output
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.photos.dataset import Dataset, open_dataset
 from nerg_mi.train import radiance_run
-from nerg_mi.train.radiance_settings import RadianceSettings, sized_config
+from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
 
 from .base import SILENT, Reporter, select_backend
-from .options import chosen_settings
+from .options import explicit_settings
 from .radiance_commands import RadianceOptions, RadianceScoreOptions
 
 # ---- Radiance fields from posed photos: training, and scores on the photos that were held out ----
@@ -60,7 +60,7 @@ def train_radiance(
 
     Raises `NergError` for what the user can mend, before any time is spent on it.
     """
-    with reserving(output):
+    with reserve_output(output):
         return _train(dataset, None if output is None else Path(output), options or RadianceOptions(), reporter)
 
 
@@ -80,11 +80,11 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
     _tell_about(data, reporter)
     field, provenance = radiance_run.train_field(
         data,
-        sized_config(options.size, data.box, options.deferred),
+        make_radiance_config(options.size, data.box, options.deferred),
         settings,
         ns,
         options.depth,
-        lambda now: reporter.progress(now.done, _progress(now)),
+        lambda now: reporter.progress(now.fraction, _progress(now)),
         state=state,
         resume=options.resume,
         save_every=options.save_every or float("inf"),
@@ -99,14 +99,14 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
 
 
 def _settings(options: RadianceOptions) -> RadianceSettings:
-    given = chosen_settings(options, RadianceSettings)
+    given = explicit_settings(options, RadianceSettings)
     if options.steps is None:
         given.setdefault("minutes", 5.0)
     return RadianceSettings(**given)
 
 
 def _open(photos: str | Path, options: RadianceOptions) -> Dataset:
-    with chosen("--aabb") if options.aabb else nullcontext():
+    with blame_options("--aabb") if options.aabb else nullcontext():
         return open_dataset(
             photos,
             options.holdout,
@@ -125,10 +125,10 @@ def _tell_about(data: Dataset, reporter: Reporter) -> None:
     corner, core = lambda values: ", ".join(f"{x:.3g}" for x in values), data.box.core
     for line in (*data.unused, *data.notes):
         reporter.message(str(line))
-    reporter.message(f"taken for {data.kind}; --unbounded, --bounded or --aabb say otherwise")
-    reporter.message(f"box: ({corner(core.lower)}) to ({corner(core.upper)}), {data.box_from}")
-    reporter.message(data.unit)
-    reporter.message(data.up)
+    reporter.message(f"taken for {data.kind_note}; --unbounded, --bounded or --aabb say otherwise")
+    reporter.message(f"box: ({corner(core.lower)}) to ({corner(core.upper)}), {data.box_source}")
+    reporter.message(data.unit_note)
+    reporter.message(data.up_note)
     reporter.message(
         f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
         f"{data.source['width']} x {data.source['height']} pixels"
@@ -136,7 +136,7 @@ def _tell_about(data: Dataset, reporter: Reporter) -> None:
 
 
 def _progress(now: radiance_run.RadianceProgress) -> str:
-    left = now.seconds * (1 - now.done) / max(now.done, 1e-6)
+    left = now.seconds * (1 - now.fraction) / max(now.fraction, 1e-6)
     error = f", held out {now.psnr:.2f} dB" if now.psnr is not None else ""
     return f"{left:.0f} s left, step {now.steps}{error}"
 
@@ -218,8 +218,8 @@ def evaluate_radiance(
     if scores.depth is not None:
         d = scores.depth
         reporter.message(
-            f"depth: median error {d.median:.4f} units, {d.off:.1%} of the pixels off by more than 10 %; "
-            f"opacity {d.opacity:.3f}, {d.translucent:.1%} of the pixels below 0.9"
+            f"depth: median error {d.median:.4f} units, {d.outlier_fraction:.1%} of the pixels off by more than 10 %; "
+            f"opacity {d.opacity:.3f}, {d.translucent_fraction:.1%} of the pixels below 0.9"
         )
     if pictures is not None:
         reporter.message(f"wrote {len(views)} pictures to {pictures}")

@@ -13,20 +13,20 @@ from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.checkpoint import read_metadata
-from nerg_mi.formats.splats import READERS, is_splats
+from nerg_mi.formats.splats import READERS, is_splat_file
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.dataset import is_dataset, load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import is_nerg
-from nerg_mi.rendering.nested_scene import gaze_of_scene, with_gaze
+from nerg_mi.rendering.nested_scene import find_gaze_file, replace_gaze
 from nerg_mi.rendering.scene import load_scene
 
 from .base import SILENT, Reporter, select_backend
-from .geometry import align_of_training
+from .geometry import read_training_alignment
 from .scene import write_scene
-from .scene_cameras import given_point
+from .scene_cameras import check_point
 from .scene_commands import SceneOptions, ViewOptions
-from .scene_places import KINDS, kind_of_file, training_place
+from .scene_places import KINDS, detect_kind, find_training_scene
 
 RAYS = 2_000_000
 """Of larger datasets so many rays are shown, drawn at random."""
@@ -35,7 +35,7 @@ _SUFFIXES = {*KINDS, *READERS, ".safetensors", ".rays"}
 
 
 @dataclass(frozen=True, eq=False)
-class PlaceToView:
+class ViewerScene:
     """``scene``: a scene file with the integrator `nerg`; ``made``: whether it was written for the viewer, and ends
     with it; ``rays`` in their own frame, or None, and ``align`` from there to the place; ``up`` (3,), a unit vector;
     ``name`` for people; ``variants``: scene files that differ in their gaze field alone, by its name, of which
@@ -50,9 +50,9 @@ class PlaceToView:
     variants: dict[str, Path] = field(default_factory=dict)
 
 
-def place_to_view(
+def make_viewer_scene(
     files: Sequence[str | Path], folder: Path, options: ViewOptions | None = None, reporter: Reporter = SILENT
-) -> PlaceToView:
+) -> ViewerScene:
     """The scene of ``files``: a scene file with `nerg`, or whatever `write_scene` makes one of, in ``folder``.
 
     A folder stands for the files in it, of which there must be one of a kind, or is a dataset of rays (.rays). Rays
@@ -66,7 +66,7 @@ def place_to_view(
         raise NergError(
             "there is nothing to view; name a scene, a field, a mesh, a gaze field, rays, or a run's folder"
         )
-    kinds = {path: kind_of_file(path) for path in found}
+    kinds = {path: detect_kind(path) for path in found}
     rays_files = [path for path, kind in kinds.items() if kind == "rays"]
     if len(rays_files) > 1:
         raise NergError(f'"{rays_files[0]}" and "{rays_files[1]}" are both rays; a viewer shows one of them')
@@ -76,10 +76,10 @@ def place_to_view(
     gaze = [path for path, kind in kinds.items() if kind == "gaze"]
     if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays", "gaze"} and _is_nerg(scenes[0]):
         align = _given_align(options) or Similarity(np.eye(4))
-        own = gaze_of_scene(scenes[0]) if gaze else None
+        own = find_gaze_file(scenes[0]) if gaze else None
         variants = write_variants(scenes[0], [*([own] if own else []), *gaze], folder, reporter) if gaze else {}
         scene = next(iter(variants.values()), scenes[0])
-        return PlaceToView(scene, bool(gaze), rays, align, _up(options, np.array([0.0, 0, 1])), name, variants)
+        return ViewerScene(scene, bool(gaze), rays, align, _up(options, np.array([0.0, 0, 1])), name, variants)
     given = [path for path in found if not is_dataset(path) and path not in gaze[1:]]
     if rays is not None and rays_files[0] not in given:
         copy = folder / "rays.npz"
@@ -92,9 +92,9 @@ def place_to_view(
     write_scene(given, output, chosen, reporter)
     align = _given_align(options)
     if align is None:
-        align = align_of_training(read_metadata(gaze[0]).get("provenance", {}) if gaze else {})
+        align = read_training_alignment(read_metadata(gaze[0]).get("provenance", {}) if gaze else {})
     variants = write_variants(output, gaze, folder, reporter) if len(gaze) > 1 else {}
-    return PlaceToView(output, True, rays, align, _up(options, _up_of(output)), name, variants)
+    return ViewerScene(output, True, rays, align, _up(options, _up_of(output)), name, variants)
 
 
 def write_variants(scene: Path, gaze: Sequence[Path], folder: Path, reporter: Reporter = SILENT) -> dict[str, Path]:
@@ -106,14 +106,14 @@ def write_variants(scene: Path, gaze: Sequence[Path], folder: Path, reporter: Re
     first = read_metadata(gaze[0]).get("provenance", {})
     found: dict[str, Path] = {}
     for number, path in enumerate(gaze):
-        if training_place(read_metadata(path).get("provenance", {})) != training_place(first):
+        if find_training_scene(read_metadata(path).get("provenance", {})) != find_training_scene(first):
             reporter.warn(
                 f'"{path}" was trained in another place than "{gaze[0]}"; its gaze is right only where surfaces and '
                 "coordinates are the same"
             )
         name = next(n for n in _names(path, number) if n not in found)
         found[name] = folder / f"variant{number}.xml"
-        write_text(found[name], with_gaze(scene, path))
+        write_text(found[name], replace_gaze(scene, path))
     return found
 
 
@@ -132,7 +132,7 @@ def _expanded(path: Path) -> list[Path]:
         return [path]
     inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _SUFFIXES)
     # Of glTF a viewer shows splats alone.
-    inside = [p for p in inside if p.suffix.lower() != ".glb" or is_splats(p)]
+    inside = [p for p in inside if p.suffix.lower() != ".glb" or is_splat_file(p)]
     if not inside:
         raise NergError(f'the folder "{path}" holds nothing that a viewer shows; name a file, or another folder')
     ready = [p for p in inside if p.suffix.lower() == ".xml"]
@@ -152,7 +152,7 @@ def _given_align(options: ViewOptions) -> Similarity | None:
 
 
 def _up(options: ViewOptions, otherwise: np.ndarray) -> np.ndarray:
-    up = given_point(options.up, "--up")
+    up = check_point(options.up, "--up")
     up = otherwise if up is None else up
     length = float(np.linalg.norm(up))
     if not length > 0:

@@ -33,8 +33,8 @@ import numpy as np
 from nerg_mi.scenes.store import twin
 from scipy.special import ndtr, ndtri
 
-HERE = Path(__file__).resolve().parent
-REGIONS = HERE / "regions.json"
+FOLDER = Path(__file__).resolve().parent
+REGIONS = FOLDER / "regions.json"
 
 # a_k: what draws eyes in a convenience store
 ATTRACTIVENESS = {
@@ -106,7 +106,7 @@ class AttentionLaw:
         self.points = np.stack(fronts)  # (K, S, 3)
         self.spread2 = (np.square(sizes).sum(axis=1)) / 24.0  # square metres
 
-    def lobes(self, positions) -> Lobes:
+    def compute_lobes(self, positions) -> Lobes:
         """The mixture at positions (P, 3)."""
         positions = np.atleast_2d(np.asarray(positions, np.float64))
         parts = [self._lobes(positions[a : a + _CHUNK]) for a in range(0, len(positions), _CHUNK)]
@@ -120,7 +120,7 @@ class AttentionLaw:
         i, k, s = np.nonzero(facing)
         seen = np.zeros((P, K, S))
         if len(i):
-            seen[i, k, s] = twin.visible(p[i], self.points[k, s], self.scene)
+            seen[i, k, s] = twin.is_visible(p[i], self.points[k, s], self.scene)
         fraction = seen.mean(axis=2)
         # where nothing is visible the weight is zero; the centre stands in, so that nothing is 0/0
         share = np.where(fraction[..., None] > 0, seen, 1.0)
@@ -136,7 +136,7 @@ class AttentionLaw:
 
     def density(self, positions, directions) -> np.ndarray:
         """Density (P, D) in 1/sr at positions (P, 3) for unit directions (D, 3), the same for all, or (P, D, 3)."""
-        lobes = self.lobes(positions)
+        lobes = self.compute_lobes(positions)
         directions = np.asarray(directions, np.float64)
         P = len(lobes.weights)
         directions = np.broadcast_to(directions, (P, *directions.shape[-2:]))
@@ -147,19 +147,19 @@ class AttentionLaw:
             cos = directions[n] @ lobes.mu[n, use].T
             norm = kappa[use] / (2 * np.pi * -np.expm1(-2 * kappa[use]))
             out[n] = (np.exp(kappa[use] * (cos - 1.0)) * (norm * w[use])).sum(axis=1)
-            out[n] += w[-1] * band_density(directions[n, :, 2])
+            out[n] += w[-1] * background_density(directions[n, :, 2])
         return out
 
     def sample(self, positions, rng) -> np.ndarray:
         """One exact draw (P, 3) from the law at each of positions (P, 3). ``rng``: a NumPy Generator."""
-        lobes = self.lobes(positions)
+        lobes = self.compute_lobes(positions)
         P = len(lobes.weights)
         u = rng.random((P, 3))
         k = (np.cumsum(lobes.weights, axis=1) < u[:, :1] * lobes.weights.sum(axis=1, keepdims=True)).sum(axis=1)
         background = k == lobes.weights.shape[1] - 1
         row = np.flatnonzero(~background)
         mu = np.tile((0.0, 0.0, 1.0), (P, 1))
-        z = band_sample(u[:, 1])
+        z = sample_background(u[:, 1])
         mu[row], kappa = lobes.mu[row, k[row]], lobes.kappa[row, k[row]]
         # inversion of the vMF distribution of the cosine (Ulrich 1984; Jakob 2012)
         v = u[row, 1]
@@ -170,14 +170,14 @@ class AttentionLaw:
         return out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
-def band_density(z) -> np.ndarray:
+def background_density(z) -> np.ndarray:
     """The background b in 1/sr at directions of height z = omega_z."""
     z0, s = BAND
     total = ndtr((1 - z0) / s) - ndtr((-1 - z0) / s)
     return np.exp(-0.5 * ((z - z0) / s) ** 2) / (np.sqrt(2 * np.pi) * s * total * 2 * np.pi)
 
 
-def band_sample(u) -> np.ndarray:
+def sample_background(u) -> np.ndarray:
     """Heights z of draws from the background for uniform numbers u."""
     z0, s = BAND
     low, high = ndtr((-1 - z0) / s), ndtr((1 - z0) / s)

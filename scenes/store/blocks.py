@@ -14,7 +14,7 @@ from nerg_mi.maths.color import decode_srgb
 SOUTH, NORTH, WEST, EAST = (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)
 
 
-def srgb(code: str) -> np.ndarray:
+def parse_srgb(code: str) -> np.ndarray:
     """Linear reflectance (3,) of an sRGB colour written as six hex digits."""
     return decode_srgb(np.array([int(code[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0)
 
@@ -33,7 +33,7 @@ class Region:
     facing: tuple
     focus: tuple
 
-    def as_json(self) -> dict:
+    def to_json(self) -> dict:
         r = lambda v: [round(float(x), 4) for x in v]
         return {
             "name": self.name,
@@ -46,7 +46,7 @@ class Region:
 
 
 @dataclass
-class Place:
+class StoreBuilder:
     """Coloured quads and solid boxes under construction.
 
     ``quads`` (N, 4, 3) corners in metres, counter-clockwise seen from outside; ``colors`` (N, 3) linear reflectances;
@@ -59,7 +59,7 @@ class Place:
     solids: list = field(default_factory=list)
     regions: list = field(default_factory=list)
 
-    def patch(self, axis: int, sign: int, at: float, lo2, hi2, color) -> None:
+    def add_patch(self, axis: int, sign: int, at: float, lo2, hi2, color) -> None:
         """One rectangle in the plane ``axis = at``, facing ``sign``; lo2, hi2 in the two other axes in ascending
         order."""
         a, b = [k for k in range(3) if k != axis]
@@ -73,19 +73,19 @@ class Place:
         self.quads.append(corners)
         self.colors.append(np.asarray(color, float))
 
-    def grid(self, axis: int, sign: int, at: float, lo2, hi2, cells, color_of) -> None:
+    def add_grid(self, axis: int, sign: int, at: float, lo2, hi2, cells, color_of) -> None:
         """A rectangle cut into ``cells`` (n, m) patches; ``color_of(i, j)`` gives a colour, or None for a light
         panel."""
         us, vs = np.linspace(lo2[0], hi2[0], cells[0] + 1), np.linspace(lo2[1], hi2[1], cells[1] + 1)
         for i in range(cells[0]):
             for j in range(cells[1]):
                 color = color_of(i, j)
-                self.patch(axis, sign, at, (us[i], vs[j]), (us[i + 1], vs[j + 1]), 0 if color is None else color)
+                self.add_patch(axis, sign, at, (us[i], vs[j]), (us[i + 1], vs[j + 1]), 0 if color is None else color)
                 if color is None:
                     self.lights.append(self.quads.pop())
                     self.colors.pop()
 
-    def box(self, lo, hi, color, skip=(), fronts=None, solid=True) -> None:
+    def add_box(self, lo, hi, color, skip=(), fronts=None, solid=True) -> None:
         """A box. ``skip``: faces (axis, sign) that are left out, because something else covers them.
 
         ``fronts``: {(axis, sign): (cells, color_of)} for faces that carry a pattern.
@@ -98,6 +98,6 @@ class Place:
                     continue
                 at = (hi if sign > 0 else lo)[axis]
                 cells, color_of = (fronts or {}).get((axis, sign), ((1, 1), lambda i, j: color))
-                self.grid(axis, sign, at, lo[rest], hi[rest], cells, color_of)
+                self.add_grid(axis, sign, at, lo[rest], hi[rest], cells, color_of)
         if solid:
             self.solids.append(np.stack([lo, hi]))

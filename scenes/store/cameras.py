@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from nerg_mi.scenes.store import twin
-from nerg_mi.scenes.store.layout import ROOM, Layout
+from nerg_mi.scenes.store.layout import ROOM, StoreLayout
 
 SECTORS = 6  # directions of view are told apart by their azimuth about the surface normal
 HEIGHTS = (0.6, 2.4)
@@ -58,18 +58,18 @@ def pose_from_angles(position, yaw: float, pitch: float) -> np.ndarray:
     return pose
 
 
-def free_positions(layout: Layout, rng, count: int, heights=HEIGHTS, clearance: float = CLEARANCE) -> np.ndarray:
+def sample_free_positions(layout: StoreLayout, rng, count: int, heights=HEIGHTS, clearance: float = CLEARANCE) -> np.ndarray:
     """Uniform positions (count, 3) at least ``clearance`` metres away from everything solid."""
     found = np.empty((0, 3))
     for _ in range(1000):
         p = rng.uniform((0, 0, heights[0]), (ROOM[0], ROOM[1], heights[1]), (4 * count, 3))
-        found = np.concatenate([found, p[layout.clearance(p) >= clearance]])
+        found = np.concatenate([found, p[layout.compute_clearance(p) >= clearance]])
         if len(found) >= count:
             return found[:count]
     raise ValueError(f"No room for a clearance of {clearance} m; ask for less.")
 
 
-def surface_points(layout: Layout, rng, count: int, scene=None) -> tuple[np.ndarray, np.ndarray]:
+def sample_surface_points(layout: StoreLayout, rng, count: int, scene=None) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3), uniform by area on the surfaces that a camera in free space can see, and their normals (N, 3).
 
     Free space is where cameras may stand (`HEIGHTS`, `CLEARANCE`). ``count`` is how many are drawn; those behind goods,
@@ -82,19 +82,19 @@ def surface_points(layout: Layout, rng, count: int, scene=None) -> tuple[np.ndar
     s, t = rng.random((2, count, 1))
     normals = cross[k] / area[k, None]
     points = a[k] + s * (b[k] - a[k]) + t * (d[k] - a[k]) + 2e-3 * normals
-    eyes = free_positions(layout, rng, 400)
+    eyes = sample_free_positions(layout, rng, 400)
     seen = np.zeros(count, bool)
     for chunk in np.array_split(eyes, 10):
         rest = np.flatnonzero(~seen)
         towards = chunk[:, None] - points[None, rest]
         facing = np.einsum("enk,nk->en", towards, normals[rest]) > 0.05 * np.linalg.norm(towards, axis=-1)
         e, n = np.nonzero(facing)
-        hit = twin.visible(chunk[e], points[rest[n]], scene)
+        hit = twin.is_visible(chunk[e], points[rest[n]], scene)
         seen[rest[n[hit]]] = True
     return points[seen], normals[seen]
 
 
-def views_of(camera: Pinhole, poses, points, normals, scene=None):
+def find_visible_points(camera: Pinhole, poses, points, normals, scene=None):
     """Which view sees which surface point: arrays (pose index, point index, cosine of view, distance, sector)."""
     parts = []
     for i, pose in enumerate(poses):
@@ -105,7 +105,7 @@ def views_of(camera: Pinhole, poses, points, normals, scene=None):
         parts.append(np.stack([np.full(len(n), i), n]))
     i, n = np.concatenate(parts, axis=1)
     origins = np.stack([p[:3, 3] for p in poses])[i]
-    keep = twin.visible(origins, points[n], scene)
+    keep = twin.is_visible(origins, points[n], scene)
     i, n, origins = i[keep], n[keep], origins[keep]
     to_eye = origins - points[n]
     distance = np.linalg.norm(to_eye, axis=1)
@@ -118,7 +118,7 @@ def views_of(camera: Pinhole, poses, points, normals, scene=None):
     return i, n, cosine, distance, sector
 
 
-def choose_views(layout: Layout, camera: Pinhole, count: int, held_out: int, seed: int = 0, scene=None):
+def choose_views(layout: StoreLayout, camera: Pinhole, count: int, held_out: int, seed: int = 0, scene=None):
     """Training poses (count, 4, 4) and held-out poses (held_out, 4, 4).
 
     Greedy: each next view is the candidate that sees most of what was seen seldom, or from one side only, until now;
@@ -127,12 +127,12 @@ def choose_views(layout: Layout, camera: Pinhole, count: int, held_out: int, see
     """
     rng = np.random.default_rng([seed, 0xCA])
     candidates = 30 * (count + held_out)
-    positions = free_positions(layout, rng, candidates)
+    positions = sample_free_positions(layout, rng, candidates)
     yaw = rng.uniform(0, 2 * np.pi, candidates)
     pitch = np.radians(np.clip(rng.normal(-6, 20, candidates), -50, 40))
     poses = np.stack([pose_from_angles(*v) for v in zip(positions, yaw, pitch)])
-    points, normals = surface_points(layout, rng, 6000, scene)
-    i, n, cosine, distance, sector = views_of(camera, poses, points, normals, scene)
+    points, normals = sample_surface_points(layout, rng, 6000, scene)
+    i, n, cosine, distance, sector = find_visible_points(camera, poses, points, normals, scene)
     value = np.minimum(1.0, cosine / 0.3) * np.minimum(1.0, 1.2 / distance)
     seen = np.zeros(len(points))
     sides = np.zeros((len(points), SECTORS))
@@ -151,14 +151,14 @@ def choose_views(layout: Layout, camera: Pinhole, count: int, held_out: int, see
     return poses[chosen], _held_out_views(layout, rng, held_out, scene)
 
 
-def _held_out_views(layout: Layout, rng, count: int, scene) -> np.ndarray:
+def _held_out_views(layout: StoreLayout, rng, count: int, scene) -> np.ndarray:
     """Poses (count, 4, 4) far from each other in place and direction; a picture of one good from 40 cm would test
     little."""
-    positions = free_positions(layout, rng, 400, (1.2, 1.9))
+    positions = sample_free_positions(layout, rng, 400, (1.2, 1.9))
     yaw, pitch = rng.uniform(0, 2 * np.pi, 400), np.radians(rng.uniform(-18, 8, 400))
     poses = np.stack([pose_from_angles(*v) for v in zip(positions, yaw, pitch)])
     probe = Pinhole(16, 12).directions().reshape(-1, 3)
-    ahead = np.stack([twin.cast(p[:3, 3], probe @ p[:3, :3].T, scene) for p in poses])
+    ahead = np.stack([twin.cast_rays(p[:3, 3], probe @ p[:3, :3].T, scene) for p in poses])
     open_ = (np.median(ahead, axis=1) > 1.8) & (np.quantile(ahead, 0.1, axis=1) > 0.6)
     poses, positions, yaw = poses[open_], positions[open_], yaw[open_]
     picked = [0]
@@ -169,7 +169,7 @@ def _held_out_views(layout: Layout, rng, count: int, scene) -> np.ndarray:
     return poses[picked[:count]]
 
 
-def coverage(layout: Layout, camera: Pinhole, poses, seed: int = 1, scene=None) -> dict:
+def measure_coverage(layout: StoreLayout, camera: Pinhole, poses, seed: int = 1, scene=None) -> dict:
     """How well poses see the place: fractions of fresh surface points seen by so many views.
 
     "area": points uniform by area on what a camera in free space can see at all, slits behind and above goods included.
@@ -177,8 +177,8 @@ def coverage(layout: Layout, camera: Pinhole, poses, seed: int = 1, scene=None) 
     Also the fraction of the area seen by two views at least 30 degrees apart, and the median numbers of views.
     """
     rng = np.random.default_rng([seed, 0xC0])
-    points, normals = surface_points(layout, rng, 4000, scene)
-    i, n, _, _, _ = views_of(camera, poses, points, normals, scene)
+    points, normals = sample_surface_points(layout, rng, 4000, scene)
+    i, n, _, _, _ = find_visible_points(camera, poses, points, normals, scene)
     count = np.bincount(n, minlength=len(points))
     to_eye = np.stack([p[:3, 3] for p in poses])[i] - points[n]
     to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
@@ -189,14 +189,14 @@ def coverage(layout: Layout, camera: Pinhole, poses, seed: int = 1, scene=None) 
         v = to_eye[order[starts[k] : starts[k + 1]]]
         wide[k] = len(v) > 1 and (v @ v.T).min() < np.cos(np.radians(30))
 
-    eyes = free_positions(layout, rng, 4000)
+    eyes = sample_free_positions(layout, rng, 4000)
     directions = rng.normal(size=eyes.shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    met = eyes + (twin.cast(eyes, directions, scene) - 2e-3)[:, None] * directions
+    met = eyes + (twin.cast_rays(eyes, directions, scene) - 2e-3)[:, None] * directions
     sight = np.zeros(len(met))
     for pose in poses:
         k = np.flatnonzero(camera.project(pose, met)[1])
-        sight[k] += twin.visible(pose[:3, 3], met[k], scene)
+        sight[k] += twin.is_visible(pose[:3, 3], met[k], scene)
 
     out = {}
     for name, views in (("area", count), ("sight", sight)):

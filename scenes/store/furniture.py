@@ -7,7 +7,7 @@ boards are solid and closed, so that nobody sees through a shelf and a field has
 from __future__ import annotations
 
 import numpy as np
-from nerg_mi.scenes.store.blocks import EAST, NORTH, SOUTH, WEST, Place, Region, srgb
+from nerg_mi.scenes.store.blocks import EAST, NORTH, SOUTH, WEST, StoreBuilder, Region, parse_srgb
 
 # What a category's goods look like (sRGB), and the colour of its special offer.
 GOODS = {
@@ -27,7 +27,7 @@ GOODS = {
 }
 
 
-class Frame:
+class UnitFrame:
     """Local (u, w, z) to the world: the back of a unit starts at ``origin`` (x, y) and faces ``facing``."""
 
     def __init__(self, origin, facing):
@@ -46,7 +46,7 @@ class Frame:
         return np.array([*lo, z[0]]), np.array([*hi, z[1]])
 
 
-def _good(place: Place, frame: Frame, u, w, z, ground, label, style: int) -> None:
+def _good(place: StoreBuilder, frame: UnitFrame, u, w, z, ground, label, style: int) -> None:
     """One good: a box whose front carries a label band, an upper cap or a checked label."""
     patterns = {
         0: ((1, 3), lambda i, j: label if j == 1 else ground),
@@ -56,10 +56,10 @@ def _good(place: Place, frame: Frame, u, w, z, ground, label, style: int) -> Non
     }
     lo, hi = frame.box(u, w, z)
     skip = {frame.back, (2, -1)}  # they stand on a board, their backs are never seen
-    place.box(lo, hi, ground, skip=skip, fronts={frame.front: patterns[style]}, solid=False)
+    place.add_box(lo, hi, ground, skip=skip, fronts={frame.front: patterns[style]}, solid=False)
 
 
-def _stock(place: Place, rng, frame: Frame, u, depth: float, z0: float, room: float, category: str, focus_u=None):
+def _stock(place: StoreBuilder, rng, frame: UnitFrame, u, depth: float, z0: float, room: float, category: str, focus_u=None):
     """Fill one board from u[0] to u[1] with groups of equal goods; ``focus_u`` is kept for the special offer."""
     colors, offer = GOODS[category]
     pos, last = u[0], -1
@@ -70,7 +70,7 @@ def _stock(place: Place, rng, frame: Frame, u, depth: float, z0: float, room: fl
             for k in range(n):
                 a = focus_u[0] + k * width
                 box = (a, a + width), (0.02, depth - 0.01), (z0, z0 + room * 0.9)
-                _good(place, frame, *box, srgb(offer), srgb("ffffff"), 0)
+                _good(place, frame, *box, parse_srgb(offer), parse_srgb("ffffff"), 0)
             pos = focus_u[1]
             continue
         stop = focus_u[0] if focus_u and pos < focus_u[0] - 1e-6 else u[1]
@@ -86,16 +86,16 @@ def _stock(place: Place, rng, frame: Frame, u, depth: float, z0: float, room: fl
         front = depth - rng.uniform(0.01, 0.05)
         style = int(rng.integers(0, 4))
         for k in range(count):
-            ground = np.clip(srgb(colors[pick]) * rng.uniform(0.88, 1.12), 0.02, 0.9)
+            ground = np.clip(parse_srgb(colors[pick]) * rng.uniform(0.88, 1.12), 0.02, 0.9)
             a = pos + k * width
-            _good(place, frame, (a, a + width), (0.02, front), (z0, z0 + height), ground, srgb(other), style)
+            _good(place, frame, (a, a + width), (0.02, front), (z0, z0 + height), ground, parse_srgb(other), style)
         pos += count * width
 
 
-def shelf_unit(
-    place: Place,
+def add_shelf_unit(
+    place: StoreBuilder,
     rng,
-    frame: Frame,
+    frame: UnitFrame,
     width: float,
     depth: float,
     boards,
@@ -112,25 +112,25 @@ def shelf_unit(
     ``bays``: category of each bay; bays share the width equally. ``focus_level``: the board of the special offers.
     """
     edge = 0.04
-    trim = srgb(trim)
-    body = srgb("c9c6bf")
+    trim = parse_srgb(trim)
+    body = parse_srgb("c9c6bf")
     lo, hi = frame.box((0, width), (0, depth), (0, top))
     place.solids.append(np.stack([lo, hi]))
     back = frame.box((edge, width - edge), (0.0, 0.02), (kick, top))
-    place.box(*back, body * 0.8, skip={frame.back, (2, -1), *frame.ends}, solid=False)
+    place.add_box(*back, body * 0.8, skip={frame.back, (2, -1), *frame.ends}, solid=False)
     for a in (0.0, width - edge):
         panel = frame.box((a, a + edge), (0, depth), (0, top))
-        place.box(*panel, trim, skip={frame.back, (2, -1)}, solid=False)
+        place.add_box(*panel, trim, skip={frame.back, (2, -1)}, solid=False)
     plinth = frame.box((edge, width - edge), (0, depth), (0, kick))
-    place.box(*plinth, trim * 0.5, skip={frame.back, (2, -1), *frame.ends}, solid=False)
+    place.add_box(*plinth, trim * 0.5, skip={frame.back, (2, -1), *frame.ends}, solid=False)
     bay_width = (width - 2 * edge) / len(bays)
     for level, z in enumerate(boards):
         thick = 0.035
         strips = max(2, round(width / 0.45))
-        fronts = {frame.front: ((strips, 1), lambda i, j, s=level: (srgb("f2f0e6"), trim)[(i + s) % 2])}
+        fronts = {frame.front: ((strips, 1), lambda i, j, s=level: (parse_srgb("f2f0e6"), trim)[(i + s) % 2])}
         if z > kick + 1e-6:
             board = frame.box((edge, width - edge), (0.02, depth), (z - thick, z))
-            place.box(*board, body, skip={frame.back, *frame.ends}, fronts=fronts, solid=False)
+            place.add_box(*board, body, skip={frame.back, *frame.ends}, fronts=fronts, solid=False)
         room = (boards[level + 1] - thick if level + 1 < len(boards) else top) - z
         for b, category in enumerate(bays):
             u = (edge + b * bay_width, edge + (b + 1) * bay_width)
@@ -152,10 +152,10 @@ def _gondola(place, rng, number: int, x: float, west, east, cap: str, trim: str)
     y0, y1, top = 1.6, 4.2, 1.7
     boards = (0.12, 0.50, 0.82, 1.14, 1.44)
     for facing, bays, side in ((WEST, west, "west"), (EAST, east, "east")):
-        shelf_unit(
+        add_shelf_unit(
             place,
             rng,
-            Frame((x, y0), facing),
+            UnitFrame((x, y0), facing),
             y1 - y0,
             0.35,
             boards,
@@ -165,10 +165,10 @@ def _gondola(place, rng, number: int, x: float, west, east, cap: str, trim: str)
             f"gondola_{number}_{side}",
             focus_level=3 if side == "west" else 2,
         )
-    end = Frame((x - 0.35, y0), SOUTH)
-    shelf_unit(place, rng, end, 0.7, 0.3, (0.12, 0.55, 0.95, 1.30), top, (cap,), trim, f"endcap_{number}")
-    ground, light = srgb(trim), srgb("f4efe2")
-    place.box(
+    end = UnitFrame((x - 0.35, y0), SOUTH)
+    add_shelf_unit(place, rng, end, 0.7, 0.3, (0.12, 0.55, 0.95, 1.30), top, (cap,), trim, f"endcap_{number}")
+    ground, light = parse_srgb(trim), parse_srgb("f4efe2")
+    place.add_box(
         (x - 0.35, y1, 0),
         (x + 0.35, y1 + 0.03, top),
         ground,
@@ -184,10 +184,10 @@ def _gondola(place, rng, number: int, x: float, west, east, cap: str, trim: str)
     )
 
 
-def _counter(place: Place, rng) -> None:
+def _counter(place: StoreBuilder, rng) -> None:
     """The counter with till and impulse goods, the cabinet behind it, the coffee corner."""
-    wood, top, steel = srgb("8a5a3c"), srgb("ded5c4"), srgb("5b6670")
-    red = srgb("c8402f")
+    wood, top, steel = parse_srgb("8a5a3c"), parse_srgb("ded5c4"), parse_srgb("5b6670")
+    red = parse_srgb("c8402f")
     place.box(
         (6.85, 1.0, 0),
         (7.35, 3.4, 0.9),
@@ -202,68 +202,68 @@ def _counter(place: Place, rng) -> None:
         fronts={(2, 1): ((2, 8), lambda i, j: top * (0.8 + 0.25 * ((i + j) % 2)))},
     )
     till = (6.95, 2.75, 0.95), (7.3, 3.15, 1.3)
-    place.box(*till, steel, skip={(2, -1)}, fronts={(0, -1): ((2, 2), lambda i, j: srgb("9fd3c7") if j else steel)})
+    place.box(*till, steel, skip={(2, -1)}, fronts={(0, -1): ((2, 2), lambda i, j: parse_srgb("9fd3c7") if j else steel)})
     place.regions.append(Region("counter_till", "till", (6.8, 2.6, 0.0), (7.4, 3.45, 1.35), WEST, till))
     lo = (6.83, 1.1)
     for level, z in enumerate((0.95, 1.17)):
-        _stock(place, rng, Frame((lo[0] + 0.32, lo[1]), WEST), (0.0, 1.0), 0.3 - 0.1 * level, z, 0.2, "sweets")
+        _stock(place, rng, UnitFrame((lo[0] + 0.32, lo[1]), WEST), (0.0, 1.0), 0.3 - 0.1 * level, z, 0.2, "sweets")
     place.solids.append(np.array([(6.83, 1.1, 0.95), (7.15, 2.1, 1.4)]))
-    place.box((7.15, 1.1, 0.95), (7.19, 2.1, 1.45), srgb("6a3d9a"), skip={(2, -1)})
+    place.box((7.15, 1.1, 0.95), (7.19, 2.1, 1.45), parse_srgb("6a3d9a"), skip={(2, -1)})
     rack = (6.85, 1.3, 0.97), (7.15, 1.9, 1.37)
     place.regions.append(Region("counter_sweets", "sweets", (6.8, 1.0, 0.9), (7.2, 2.1, 1.45), WEST, rack))
-    cabinet = Frame((8.0, 0.8), WEST)
+    cabinet = UnitFrame((8.0, 0.8), WEST)
     boards = (0.12, 0.6, 1.0, 1.3, 1.6)
-    shelf_unit(
+    add_shelf_unit(
         place, rng, cabinet, 2.8, 0.25, boards, 1.95, ("counter_goods",), "7a2b2b", "counter_wall", focus_level=3
     )
     # coffee corner in the north-east
     place.box(
         (7.05, 5.35, 0),
         (8.0, 6.0, 0.92),
-        srgb("4a3428"),
+        parse_srgb("4a3428"),
         skip={(2, -1), (1, 1), (0, 1)},
-        fronts={(1, -1): ((4, 4), lambda i, j: srgb("d9a066") if (i + j) % 3 == 0 else srgb("6b4a36"))},
+        fronts={(1, -1): ((4, 4), lambda i, j: parse_srgb("d9a066") if (i + j) % 3 == 0 else parse_srgb("6b4a36"))},
     )
     place.box(
         (7.15, 5.55, 0.92),
         (7.55, 5.95, 1.5),
-        srgb("26292b"),
+        parse_srgb("26292b"),
         skip={(2, -1)},
-        fronts={(1, -1): ((3, 4), lambda i, j: (srgb("ff7a1a"), srgb("26292b"), srgb("a9b4b8"))[(i + j) % 3])},
+        fronts={(1, -1): ((3, 4), lambda i, j: (parse_srgb("ff7a1a"), parse_srgb("26292b"), parse_srgb("a9b4b8"))[(i + j) % 3])},
     )
     place.box(
         (7.62, 5.6, 0.92),
         (7.92, 5.9, 1.25),
-        srgb("e8dcc8"),
+        parse_srgb("e8dcc8"),
         skip={(2, -1)},
-        fronts={(1, -1): ((2, 3), lambda i, j: srgb("b5493b") if j == 1 else srgb("e8dcc8"))},
+        fronts={(1, -1): ((2, 3), lambda i, j: parse_srgb("b5493b") if j == 1 else parse_srgb("e8dcc8"))},
     )
     machine = (7.15, 5.55, 0.95), (7.55, 5.95, 1.5)
     place.regions.append(Region("coffee", "coffee", (7.05, 5.35, 0.0), (8.0, 6.0, 1.5), SOUTH, machine))
 
 
-def furnish(place: Place, rng) -> None:
+def furnish(place: StoreBuilder, rng) -> None:
     """Put everything into the empty room; the areas of interest are added in this order."""
     _gondola(place, rng, 1, 1.85, ("snacks", "sweets"), ("noodles", "snacks"), "offers", "c2572b")
     _gondola(place, rng, 2, 3.65, ("household", "cosmetics"), ("stationery", "household"), "offers", "2d6a8f")
     _gondola(place, rng, 3, 5.45, ("noodles", "bread"), ("bread", "sweets"), "offers", "4d7c3a")
     bays = ("cosmetics", "stationery", "household")
-    shelf_unit(
-        place, rng, Frame((0.0, 0.7), EAST), 4.2, 0.35, (0.12, 0.55, 0.92, 1.26, 1.6), 2.0, bays, "a8792c", "wall"
+    add_shelf_unit(
+        place, rng, UnitFrame((0.0, 0.7), EAST), 4.2, 0.35, (0.12, 0.55, 0.92, 1.26, 1.6), 2.0, bays, "a8792c", "wall"
     )
     # coolers: deeper, taller, dark inside frames, with a bright header
     for k, category in enumerate(("dairy", "meals", "drinks", "drinks")):
         x = 0.55 + 1.6 * k
-        frame = Frame((x, 6.0), SOUTH)
+        frame = UnitFrame((x, 6.0), SOUTH)
         boards = (0.25, 0.70, 1.10, 1.48)
-        shelf_unit(place, rng, frame, 1.6, 0.6, boards, 1.9, (category,), "dfe7ea", f"cooler_{k + 1}", kick=0.25)
-        sign = (srgb("2fa4d9"), srgb("ffffff"))
+        add_shelf_unit(place, rng, frame, 1.6, 0.6, boards, 1.9, (category,), "dfe7ea", f"cooler_{k + 1}", kick=0.25)
+        sign = (parse_srgb("2fa4d9"), parse_srgb("ffffff"))
         place.box(
             *frame.box((0, 1.6), (0, 0.6), (1.9, 2.2)),
             sign[0],
             skip={frame.back},
             fronts={frame.front: ((8, 2), lambda i, j, k=k, sign=sign: sign[(i // 2 + j + k) % 2])},
         )
-    rack = Frame((1.1, 0.0), NORTH)
-    shelf_unit(place, rng, rack, 2.2, 0.28, (0.12, 0.55, 0.95), 1.35, ("magazines", "magazines"), "5a5f66", "rack")
+    rack = UnitFrame((1.1, 0.0), NORTH)
+    add_shelf_unit(place, rng, rack, 2.2, 0.28, (0.12, 0.55, 0.95), 1.35, ("magazines", "magazines"), "5a5f66", "rack")
     _counter(place, rng)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from nerg_mi.scenes.store import furniture
-from nerg_mi.scenes.store.blocks import Place, Region, srgb
+from nerg_mi.scenes.store.blocks import StoreBuilder, Region, parse_srgb
 
 from nerg_mi.files.tables import write_json
 
@@ -23,7 +23,7 @@ ROOM = (8.0, 6.0, 3.0)  # metres
 
 
 @dataclass(frozen=True)
-class Layout:
+class StoreLayout:
     """The finished place as arrays, in metres; see `Place` for the fields. ``seed`` is what it was made from."""
 
     seed: int
@@ -38,7 +38,7 @@ class Layout:
         """(2, 3) bounds of the room."""
         return np.array([(0.0, 0.0, 0.0), ROOM])
 
-    def clearance(self, positions) -> np.ndarray:
+    def compute_clearance(self, positions) -> np.ndarray:
         """Distance (P,) in metres from positions (P, 3) to the nearest solid or room surface; 0 inside of a solid."""
         p = np.atleast_2d(positions)
         gap = np.maximum(self.solids[None, :, 0] - p[:, None], p[:, None] - self.solids[None, :, 1])
@@ -47,12 +47,12 @@ class Layout:
         return np.maximum(np.minimum(solid, wall), 0.0)
 
 
-def _shell(place: Place, rng) -> None:
+def _shell(place: StoreBuilder, rng) -> None:
     """Floor, walls and ceiling with the light panels."""
     X, Y, Z = ROOM
-    warm, grey, mat = srgb("d8cfc0"), srgb("b3aca2"), srgb("7f95a8")
+    warm, grey, mat = parse_srgb("d8cfc0"), parse_srgb("b3aca2"), parse_srgb("7f95a8")
     gain = 1.0 + 0.10 * rng.uniform(-1, 1, (16, 12))
-    place.grid(
+    place.add_grid(
         2,
         1,
         0.0,
@@ -62,7 +62,7 @@ def _shell(place: Place, rng) -> None:
         lambda i, j: gain[i, j] * (mat if j < 2 and 11 <= i <= 14 else (warm, grey)[(i + j) % 2]),
     )
     tile = 1.0 + 0.08 * rng.uniform(-1, 1, (16, 12))
-    place.grid(
+    place.add_grid(
         2,
         -1,
         Z,
@@ -70,7 +70,7 @@ def _shell(place: Place, rng) -> None:
         (X, Y),
         (16, 12),
         lambda i, j: (
-            None if i % 4 in (1, 2) and j % 3 == 1 else tile[i, j] * srgb("dedede" if (i + j) % 2 else "cfd3d8")
+            None if i % 4 in (1, 2) and j % 3 == 1 else tile[i, j] * parse_srgb("dedede" if (i + j) % 2 else "cfd3d8")
         ),
     )
 
@@ -91,24 +91,24 @@ def _shell(place: Place, rng) -> None:
         ):
             x = (i + 0.5) * 0.25
             if south and 6.0 < x < 7.25 and j < 8:  # the door
-                return srgb("3c4a57" if j in (0, 7) or i in (24, 28) else "7fa6b8") * gain[i, j]
+                return parse_srgb("3c4a57" if j in (0, 7) or i in (24, 28) else "7fa6b8") * gain[i, j]
             if j in (9,):
-                return srgb(stripe) * gain[i, j]
+                return parse_srgb(stripe) * gain[i, j]
             if j < 4:
-                return srgb(stripe) * 0.45 * gain[i, j] + 0.12
-            return srgb(band if wide[i] and j < 9 else base) * gain[i, j]
+                return parse_srgb(stripe) * 0.45 * gain[i, j] + 0.12
+            return parse_srgb(band if wide[i] and j < 9 else base) * gain[i, j]
 
-        place.grid(axis, sign, at, (0, 0), (length, Z), (n, 12), color_of)
+        place.add_grid(axis, sign, at, (0, 0), (length, Z), (n, 12), color_of)
 
 
-def _poster(place: Place, rng, axis: int, sign: int, at: float, lo2, hi2, colors) -> tuple:
+def _poster(place: StoreBuilder, rng, axis: int, sign: int, at: float, lo2, hi2, colors) -> tuple:
     """A picture board of 3 cm on a wall: a ground with bars and a bright square. Returns its box (lo, hi)."""
     rest = [k for k in range(3) if k != axis]
     lo, hi = np.empty(3), np.empty(3)
     lo[rest], hi[rest] = lo2, hi2
     lo[axis], hi[axis] = sorted((at, at + 0.03 * sign))
     n, m = (max(3, round((hi2[k] - lo2[k]) / 0.14)) for k in range(2))
-    ground, bar, mark = (srgb(c) for c in colors)
+    ground, bar, mark = (parse_srgb(c) for c in colors)
     hole = rng.integers(1, n - 1), rng.integers(1, m - 1)
 
     def color_of(i, j):
@@ -120,10 +120,10 @@ def _poster(place: Place, rng, axis: int, sign: int, at: float, lo2, hi2, colors
     return lo, hi
 
 
-def build(seed: int = 0) -> Layout:
+def build_store(seed: int = 0) -> StoreLayout:
     """The store of a seed. The furniture always stands at the same places; goods, shades and pictures vary."""
     rng = np.random.default_rng([seed, 0x570E])
-    place = Place()
+    place = StoreBuilder()
     _shell(place, rng)
     furniture.furnish(place, rng)
     for args, name in (
@@ -140,7 +140,7 @@ def build(seed: int = 0) -> Layout:
             facing = [0, 0, 0]
             facing[args[0]] = args[1]
             place.regions.append(Region(name, "poster", tuple(lo), tuple(hi), tuple(facing), (tuple(lo), tuple(hi))))
-    return Layout(
+    return StoreLayout(
         seed=seed,
         quads=np.array(place.quads),
         colors=np.array(place.colors),
@@ -150,13 +150,13 @@ def build(seed: int = 0) -> Layout:
     )
 
 
-def write_regions(layout: Layout, path) -> Path:
+def write_regions(layout: StoreLayout, path) -> Path:
     """Write ``areas.json``: the room's bounds and the areas of interest, boxes in metres."""
     path = Path(path)
     content = {
         "units": "metres, x east, y north, z up",
         "aabb": layout.aabb.tolist(),
-        "regions": [r.as_json() for r in layout.regions],
+        "regions": [r.to_json() for r in layout.regions],
     }
     write_json(path, content)
     return path

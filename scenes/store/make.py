@@ -11,8 +11,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-SAMPLED = 10
+FOLDER = Path(__file__).resolve().parent
+SAMPLE_DIVISOR = 10
 """One part in so many of each shopper's visit is packed with the store."""
 
 
@@ -21,15 +21,15 @@ class Job:
     """What a stage is told: the seed, the folder of the committed results and the folder of everything else."""
 
     seed: int
-    store: Path = HERE
-    build: Path = HERE / "build"
+    store: Path = FOLDER
+    build: Path = FOLDER / "build"
 
 
 def make_twin(job: Job) -> list[Path]:
     """The place as Mitsuba shapes, and its areas of interest: twin.xml, two meshes, regions.json."""
     from nerg_mi.scenes.store import layout, twin
 
-    place = layout.build(job.seed)
+    place = layout.build_store(job.seed)
     return [*twin.write_twin(place, job.store), layout.write_regions(place, job.store / "regions.json")]
 
 
@@ -37,7 +37,7 @@ def make_views(job: Job) -> list[Path]:
     """Posed pictures with exact depth, from the twin."""
     from nerg_mi.scenes.store import layout, twin, views
 
-    views.write_views(layout.build(job.seed), job.build, seed=job.seed, scene=twin.load_twin(job.store / "twin.xml"))
+    views.write_views(layout.build_store(job.seed), job.build, seed=job.seed, scene=twin.load_twin(job.store / "twin.xml"))
     return [job.build / "transforms.json", job.build / "transforms_test.json"]
 
 
@@ -46,7 +46,7 @@ def make_shoppers(job: Job) -> list[Path]:
     from nerg_mi.scenes.store import layout, shoppers, twin
 
     path = job.build / "shoppers.csv"
-    shoppers.write_shoppers(layout.build(job.seed), path, seed=job.seed, scene=twin.load_twin(job.store / "twin.xml"))
+    shoppers.write_shoppers(layout.build_store(job.seed), path, seed=job.seed, scene=twin.load_twin(job.store / "twin.xml"))
     return [path]
 
 
@@ -79,8 +79,8 @@ def make_rays(job: Job) -> list[Path]:
     sample = job.store / "shoppers.npz"
     visits = [np.flatnonzero(rays.person == k) for k in range(len(rays.persons))]
     # A run of each visit, from its begin for the first shopper to its end for the last.
-    starts = [int(k * (len(v) - len(v) // SAMPLED) / max(len(visits) - 1, 1)) for k, v in enumerate(visits)]
-    some = rays.select(np.sort(np.concatenate([v[s : s + len(v) // SAMPLED] for v, s in zip(visits, starts)])))
+    starts = [int(k * (len(v) - len(v) // SAMPLE_DIVISOR) / max(len(visits) - 1, 1)) for k, v in enumerate(visits)]
+    some = rays.select(np.sort(np.concatenate([v[s : s + len(v) // SAMPLE_DIVISOR] for v, s in zip(visits, starts)])))
     some.with_step(step="sample", kept=len(some), of=len(rays)).save(sample)
     return [path, sample]
 

@@ -14,8 +14,8 @@ import numpy as np
 from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.ply import write_columns
 
-HERE = Path(__file__).resolve().parent
-TWIN_XML = HERE / "twin.xml"
+FOLDER = Path(__file__).resolve().parent
+TWIN_XML = FOLDER / "twin.xml"
 
 # Reflectances stay away from black and white: interreflection keeps the light soft, and no texel is without a gradient.
 ALBEDO_RANGE = (0.03, 0.82)
@@ -88,7 +88,7 @@ def _write_ply(path: Path, quads: np.ndarray, colors: np.ndarray | None) -> None
     write_columns(path, dict(zip("xyz", vertices.T)), triangles, tints)
 
 
-def write_twin(layout, folder=HERE) -> list[Path]:
+def write_twin(layout, folder=FOLDER) -> list[Path]:
     """Write twin.xml, twin.ply and twin_lights.ply of a `Layout` into a folder; returns their paths."""
     folder = Path(folder)
     _write_ply(folder / "twin.ply", layout.quads, np.clip(layout.colors, *ALBEDO_RANGE))
@@ -130,10 +130,10 @@ def _rays(origins, directions, maxt=None):
     return ray, n
 
 
-CHUNK = 1 << 21  # rays a launch: bounds the memory of large queries
+RAYS_PER_LAUNCH = 1 << 21  # rays a launch: bounds the memory of large queries
 
 
-def cast(origins, directions, scene=None) -> np.ndarray:
+def cast_rays(origins, directions, scene=None) -> np.ndarray:
     """Distance in metres from origins (N, 3) along unit directions (N, 3) to the twin; float64 (N,), inf on a miss.
 
     One origin or one direction is broadcast. ``scene``: another scene than the store's own twin.
@@ -141,14 +141,14 @@ def cast(origins, directions, scene=None) -> np.ndarray:
     scene = load_twin() if scene is None else scene
     o, d = np.broadcast_arrays(np.atleast_2d(origins), np.atleast_2d(directions))
     out = np.empty(len(o))
-    for a in range(0, len(o), CHUNK):
-        ray, n = _rays(o[a : a + CHUNK], d[a : a + CHUNK])
+    for a in range(0, len(o), RAYS_PER_LAUNCH):
+        ray, n = _rays(o[a : a + RAYS_PER_LAUNCH], d[a : a + RAYS_PER_LAUNCH])
         t = scene.ray_intersect_preliminary(ray, coherent=False).t
         out[a : a + n] = np.asarray(t, np.float64)
     return out
 
 
-def visible(origins, points, scene=None, tolerance: float = 1e-3) -> np.ndarray:
+def is_visible(origins, points, scene=None, tolerance: float = 1e-3) -> np.ndarray:
     """Whether each of points (N, 3) is seen from origins (N, 3): nothing of the twin lies between them. Bool (N,).
 
     The last ``tolerance`` metres before the point are not tested, so that a point on a surface is not hidden by it.
@@ -156,11 +156,11 @@ def visible(origins, points, scene=None, tolerance: float = 1e-3) -> np.ndarray:
     scene = load_twin() if scene is None else scene
     o, p = np.broadcast_arrays(np.atleast_2d(origins), np.atleast_2d(points))
     out = np.empty(len(o), bool)
-    for a in range(0, len(o), CHUNK):
-        offset = (p[a : a + CHUNK] - o[a : a + CHUNK]).astype(np.float64)
+    for a in range(0, len(o), RAYS_PER_LAUNCH):
+        offset = (p[a : a + RAYS_PER_LAUNCH] - o[a : a + RAYS_PER_LAUNCH]).astype(np.float64)
         length = np.linalg.norm(offset, axis=1)
         ray, n = _rays(
-            o[a : a + CHUNK], offset / np.maximum(length, 1e-12)[:, None], np.maximum(length - tolerance, 0.0)
+            o[a : a + RAYS_PER_LAUNCH], offset / np.maximum(length, 1e-12)[:, None], np.maximum(length - tolerance, 0.0)
         )
         out[a : a + n] = ~np.asarray(scene.ray_test(ray), bool)
     return out

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 from nerg_mi.scenes.store import cameras, twin
-from nerg_mi.scenes.store.layout import Layout
+from nerg_mi.scenes.store.layout import StoreLayout
 
-from nerg_mi.files.atomic import replacing
+from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.images import write_png
 from nerg_mi.files.tables import write_json
 
@@ -25,12 +25,12 @@ BUILD = Path(__file__).resolve().parent / "build"
 _GL_TO_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
 
 
-def mitsuba_pose(pose: np.ndarray) -> np.ndarray:
+def to_mitsuba_pose(pose: np.ndarray) -> np.ndarray:
     """The ``to_world`` (4, 4) of a Mitsuba sensor for an OpenGL camera-to-world pose."""
     return np.asarray(pose) @ _GL_TO_MITSUBA
 
 
-class Photographer:
+class StorePhotographer:
     """Renders pictures and depths of a scene for poses; one sensor is moved about, so that nothing recompiles."""
 
     def __init__(self, camera: cameras.Pinhole, scene=None, spp: int = 64):
@@ -59,22 +59,22 @@ class Photographer:
         )
         self.params = mi.traverse(self.sensor)
 
-    def picture(self, pose: np.ndarray, seed: int, spp: int | None = None) -> np.ndarray:
+    def render_picture(self, pose: np.ndarray, seed: int, spp: int | None = None) -> np.ndarray:
         """Linear radiance (h, w, 3), float32."""
         import drjit as dr
         import mitsuba as mi
 
-        to_world = mi.Transform4f(mi.Matrix4f(mitsuba_pose(pose).tolist()))
+        to_world = mi.Transform4f(mi.Matrix4f(to_mitsuba_pose(pose).tolist()))
         # as literals the pose would be baked into the kernel, and every view compiled anew
         dr.make_opaque(to_world)
         self.params["to_world"] = to_world
         self.params.update()
         return np.array(mi.render(self.scene, sensor=self.sensor, spp=spp or self.spp, seed=mi.UInt32(seed)))
 
-    def depth(self, pose: np.ndarray) -> np.ndarray:
+    def render_depth(self, pose: np.ndarray) -> np.ndarray:
         """Distance (h, w) float32 in metres along the rays through the pixels' centres; 0 where nothing is hit."""
         directions = self.camera.directions().reshape(-1, 3) @ pose[:3, :3].T
-        t = twin.cast(pose[:3, 3], directions, self.scene)
+        t = twin.cast_rays(pose[:3, 3], directions, self.scene)
         return np.where(np.isfinite(t), t, 0.0).astype(np.float32).reshape(self.camera.height, self.camera.width)
 
 
@@ -86,7 +86,7 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
     write_png(path, bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True))
 
 
-def transforms(camera: cameras.Pinhole, layout: Layout, frames: list) -> dict:
+def make_transforms(camera: cameras.Pinhole, layout: StoreLayout, frames: list) -> dict:
     """The content of a ``transforms.json``: intrinsics in pixels, frames, bounds."""
     return {
         "camera_model": "OPENCV",
@@ -108,7 +108,7 @@ def transforms(camera: cameras.Pinhole, layout: Layout, frames: list) -> dict:
 
 
 def write_views(
-    layout: Layout,
+    layout: StoreLayout,
     folder=BUILD,
     *,
     camera=None,
@@ -117,7 +117,7 @@ def write_views(
     spp: int = 64,
     seed: int = 0,
     scene=None,
-    say=print,
+    log=print,
 ) -> dict:
     """Choose, render and write the picture set into ``folder``; returns the coverage figures, also in
     ``coverage.json``.
@@ -133,28 +133,28 @@ def write_views(
             old.unlink()
     start = time.perf_counter()
     sets = dict(zip(("train", "test"), cameras.choose_views(layout, camera, train, test, seed, scene)))
-    figures = cameras.coverage(layout, camera, sets["train"], seed + 1, scene)
-    say(f"chose {train} + {test} views in {time.perf_counter() - start:.1f} s")
+    figures = cameras.measure_coverage(layout, camera, sets["train"], seed + 1, scene)
+    log(f"chose {train} + {test} views in {time.perf_counter() - start:.1f} s")
     for name, value in figures.items():
-        say(f"  {name}: {value:.1%}" if value <= 1 else f"  {name}: {value:g}")
+        log(f"  {name}: {value:.1%}" if value <= 1 else f"  {name}: {value:g}")
 
-    photographer = Photographer(camera, scene, spp)
+    photographer = StorePhotographer(camera, scene, spp)
     start, done = time.perf_counter(), 0
     for kind, poses in sets.items():
         frames = []
         for k, pose in enumerate(poses):
             stem = f"{kind}_{k:03d}"
-            picture = photographer.picture(pose, seed * 10_000 + done, spp if kind == "train" else 4 * spp)
+            picture = photographer.render_picture(pose, seed * 10_000 + done, spp if kind == "train" else 4 * spp)
             write_picture(folder / "images" / f"{stem}.png", picture)
-            with replacing(folder / "depth" / f"{stem}.npy") as temporary:
-                np.save(temporary, photographer.depth(pose))
+            with replace_atomically(folder / "depth" / f"{stem}.npy") as temporary:
+                np.save(temporary, photographer.render_depth(pose))
             files = {"file_path": f"images/{stem}.png", "depth_file_path": f"depth/{stem}.npy"}
             frames.append(files | {"transform_matrix": pose.tolist()})
             done += 1
             if done % 30 == 0:
-                say(f"  {done} of {train + test} views, {time.perf_counter() - start:.0f} s")
+                log(f"  {done} of {train + test} views, {time.perf_counter() - start:.0f} s")
         name = "transforms.json" if kind == "train" else "transforms_test.json"
-        write_json(folder / name, transforms(camera, layout, frames))
+        write_json(folder / name, make_transforms(camera, layout, frames))
     write_json(folder / "coverage.json", figures)
-    say(f"rendered {done} views in {time.perf_counter() - start:.0f} s")
+    log(f"rendered {done} views in {time.perf_counter() - start:.0f} s")
     return figures

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from nerg_mi.scenes.tabletop.layout import stream
-from nerg_mi.scenes.tabletop.table import CENTRE
+from nerg_mi.scenes.tabletop.layout import make_random_stream
+from nerg_mi.scenes.tabletop.table import OBJECT_CENTER
 
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
 
@@ -17,13 +17,13 @@ FIELD_OF_VIEW = 60.0
 _STEP, _AIM, _ROLL = 0.05, 0.05, 2.0
 
 
-def walk(seed: int = 0, count: int = 64, width: int = 320, height: int = 240) -> list[PosedCamera]:
+def make_cameras(seed: int = 0, count: int = 64, width: int = 320, height: int = 240) -> list[PosedCamera]:
     """``count`` cameras in the order in which the photos are taken, ring after ring.
 
     Every `PORTRAIT_EVERY`-th photo is ``height`` pixels wide and ``width`` high. Hands shake: positions and aims
     by 5 cm (standard deviation), the horizon by 2 degrees.
     """
-    rng = stream(seed, "walk")
+    rng = make_random_stream(seed, "walk")
     focal = 0.5 * max(width, height) / np.tan(np.radians(FIELD_OF_VIEW / 2))
     out = []
     for k in range(count):
@@ -31,8 +31,8 @@ def walk(seed: int = 0, count: int = 64, width: int = 320, height: int = 240) ->
         tall, far, above = RINGS[ring]
         share = (place + 0.5) / count
         angle = 2 * np.pi * share + 0.9 * ring
-        position = CENTRE * (1, 1, 0) + (far * np.cos(angle), far * np.sin(angle), tall) + rng.normal(0, _STEP, 3)
-        aim = CENTRE + (0, 0, above) + rng.normal(0, _AIM, 3)
+        position = OBJECT_CENTER * (1, 1, 0) + (far * np.cos(angle), far * np.sin(angle), tall) + rng.normal(0, _STEP, 3)
+        aim = OBJECT_CENTER + (0, 0, above) + rng.normal(0, _AIM, 3)
         w, h = (height, width) if k % PORTRAIT_EVERY == PORTRAIT_EVERY - 1 else (width, height)
         pose = look_at(position, aim, np.radians(rng.normal(0, _ROLL)))
         out.append(PosedCamera(Intrinsics(w, h, focal, focal, w / 2, h / 2), pose))

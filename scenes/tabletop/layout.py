@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from nerg_mi.scenes.tabletop import outside, room, table
 from nerg_mi.scenes.tabletop import textures as t
-from nerg_mi.scenes.tabletop.mesh import Mesh, Place
+from nerg_mi.scenes.tabletop.mesh import Mesh, MeshBuilder
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,13 @@ class Material:
     paint: Callable[[np.random.Generator], np.ndarray]
     gloss: bool = False
     radiance: tuple[float, float, float] | None = None
-    share: float = 1.0
+    sampling_weight: float = 1.0
 
 
 def _plain(color: str, uneven: float = 0.3) -> Material:
     """One colour, lighter and darker by half of ``uneven``."""
     return Material(
-        lambda rng: t.code(color) * (1 - uneven / 2 + uneven * t.noise(rng, (128, 128), (8, 8), 4)[..., None])
+        lambda rng: t.parse_colors(color) * (1 - uneven / 2 + uneven * t.make_noise(rng, (128, 128), (8, 8), 4)[..., None])
     )
 
 
@@ -37,11 +37,11 @@ MATERIALS = {
     "stool": _plain("38506b"),
     "runner": Material(lambda rng: t.weave(rng, 256, 32, "b53a2d", "e6d7b5", "2c4a68", "d99a35")),
     "vase": Material(t.ceramic, gloss=True),
-    "bowl": Material(lambda rng: t.between(t.noise(rng, (256, 256), (4, 8)), "3d6f78", "5d97a0", "86b8ba"), gloss=True),
+    "bowl": Material(lambda rng: t.interpolate_colors(t.make_noise(rng, (256, 256), (4, 8)), "3d6f78", "5d97a0", "86b8ba"), gloss=True),
     "mug": Material(lambda rng: t.weave(rng, 256, 12, "e8e2d2", "cf5b3c", "e8e2d2", "2b4d73"), gloss=True),
-    "apple": Material(lambda rng: t.between(t.noise(rng, (128, 128), (12, 3)), "8f1f1c", "c23a2a", "d9a441"), True),
-    "orange": Material(lambda rng: t.between(t.noise(rng, (128, 128), (32, 32)), "d2741c", "e89232"), True),
-    "lemon": Material(lambda rng: t.between(t.noise(rng, (128, 128), (24, 24)), "cdb02c", "e8d25a"), True),
+    "apple": Material(lambda rng: t.interpolate_colors(t.make_noise(rng, (128, 128), (12, 3)), "8f1f1c", "c23a2a", "d9a441"), True),
+    "orange": Material(lambda rng: t.interpolate_colors(t.make_noise(rng, (128, 128), (32, 32)), "d2741c", "e89232"), True),
+    "lemon": Material(lambda rng: t.interpolate_colors(t.make_noise(rng, (128, 128), (24, 24)), "cdb02c", "e8d25a"), True),
     "soil": _plain("3a2a1e", 0.8),
     "leaf": Material(lambda rng: t.foliage(rng, 256, "2c4a1c", "4f7a31", "7fa34c")),
     "blossom": Material(t.blossoms),
@@ -67,13 +67,13 @@ MATERIALS = {
     "facade": Material(t.facades),
     "plaster": _plain("cdbfa3"),
     "roof": Material(t.tiles),
-    "panel": Material(lambda rng: np.full((2, 2, 3), 0.9), radiance=(6.3, 6.0, 5.5), share=3.0),
-    "shade": Material(lambda rng: np.full((2, 2, 3), 0.9), radiance=(0.9, 0.8, 0.6), share=0.1),
+    "panel": Material(lambda rng: np.full((2, 2, 3), 0.9), radiance=(6.3, 6.0, 5.5), sampling_weight=3.0),
+    "shade": Material(lambda rng: np.full((2, 2, 3), 0.9), radiance=(0.9, 0.8, 0.6), sampling_weight=0.1),
 }
 
 
 @dataclass(frozen=True)
-class Layout:
+class TabletopLayout:
     """The finished place: a mesh for each of `MATERIALS`. ``seed`` is what it was made from."""
 
     seed: int
@@ -85,14 +85,14 @@ class Layout:
         return np.concatenate([mesh.triangles for mesh in self.meshes.values()])
 
 
-def build(seed: int = 0) -> Layout:
+def build_tabletop(seed: int = 0) -> TabletopLayout:
     """The place of a seed. Furniture stands where it stands; flowers, books, houses and trees vary."""
-    place = Place()
-    for name, part in (("table", table.lay_table), ("room", room.furnish), ("outside", outside.lay_out)):
-        part(place, stream(seed, name))
-    return Layout(seed, place.meshes())
+    place = MeshBuilder()
+    for name, part in (("table", table.add_table), ("room", room.add_room), ("outside", outside.add_landscape)):
+        part(place, make_random_stream(seed, name))
+    return TabletopLayout(seed, place.meshes())
 
 
-def stream(seed: int, name: str) -> np.random.Generator:
+def make_random_stream(seed: int, name: str) -> np.random.Generator:
     """The random stream of a part of the place, which does not depend on what other parts draw."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])

@@ -14,7 +14,7 @@ BUILD = Path(__file__).resolve().parent / "build"
 
 
 def make_capture(
-    folder: str | Path = BUILD, *, seed: int = 0, count: int = 64, width: int = 320, spp: int = 24, say=print
+    folder: str | Path = BUILD, *, seed: int = 0, count: int = 64, width: int = 320, spp: int = 24, log=print
 ) -> Path:
     """Take ``count`` photos of 4 : 3, ``width`` pixels along their longer side, with ``spp`` samples of light a pixel,
     and write the capture into ``folder``, which is returned. ``say``: where progress goes."""
@@ -25,14 +25,14 @@ def make_capture(
     folder = Path(folder)
     check_folder(folder)
     start = time.perf_counter()
-    place = layout.build(seed)
+    place = layout.build_tabletop(seed)
     scene = stage.load_stage(place)
-    say(f"{len(place.triangles)} triangles in {time.perf_counter() - start:.0f} s")
-    views = cameras.walk(seed, count, width, round(0.75 * width))
-    taken = photos.take_photos(scene, views, spp, seed, say)
+    log(f"{len(place.triangles)} triangles in {time.perf_counter() - start:.0f} s")
+    views = cameras.make_cameras(seed, count, width, round(0.75 * width))
+    taken = photos.take_photos(scene, views, spp, seed, log)
     photos.write_photos(taken, folder)
     points = sparse.write_colmap(taken, folder / "sparse" / "0")
-    say(f"wrote {count} photos and {points} points to {folder} after {time.perf_counter() - start:.0f} s")
+    log(f"wrote {count} photos and {points} points to {folder} after {time.perf_counter() - start:.0f} s")
     return folder
 
 

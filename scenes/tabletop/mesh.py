@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-WHOLE = (0.0, 0.0, 1.0, 1.0)
+FULL_PATCH = (0.0, 0.0, 1.0, 1.0)
 """Texture coordinates of a face that shows all of its texture: u0, v0, u1, v1."""
 _QUAD = np.array([(0, 2, 3), (0, 3, 1)])
 
@@ -30,16 +30,16 @@ class Mesh(NamedTuple):
 
 
 @dataclass
-class Place:
+class MeshBuilder:
     """A place under construction: ``parts``, lists of meshes by the name of their material."""
 
     parts: dict[str, list[Mesh]] = field(default_factory=dict)
 
-    def meshes(self) -> dict[str, Mesh]:
+    def join_meshes(self) -> dict[str, Mesh]:
         """One mesh for each material."""
         return {material: _joined(parts) for material, parts in self.parts.items()}
 
-    def surface(self, material: str, points, patch=WHOLE) -> None:
+    def add_surface(self, material: str, points, patch=FULL_PATCH) -> None:
         """A smooth surface through a grid of ``points`` (N, M, 3); u runs along the second axis, v along the first.
 
         Its normals, of which no shading depends on the sign, are those of the derivatives along both axes.
@@ -54,7 +54,7 @@ class Place:
         uv = np.stack([u, v], axis=-1).reshape(-1, 2)
         self.parts.setdefault(material, []).append(Mesh(points.reshape(-1, 3), normals.reshape(-1, 3), uv, faces))
 
-    def quad(self, material: str, corner, along, up, tile: float | None = None, patch=WHOLE) -> None:
+    def add_quad(self, material: str, corner, along, up, tile: float | None = None, patch=FULL_PATCH) -> None:
         """A parallelogram. Its texture is repeated every ``tile`` metres from the origin of the frame, or shows its
         ``patch`` once."""
         corner, along, up = (np.asarray(v, float) for v in (corner, along, up))
@@ -70,7 +70,7 @@ class Place:
         uv = np.array([(u0, v0), (u1, v0), (u0, v1), (u1, v1)])
         self.parts.setdefault(material, []).append(Mesh(points, normals, uv, _QUAD))
 
-    def box(self, material: str, lo, hi, tile: float | None = None, patch=WHOLE, yaw: float = 0.0, skip="") -> None:
+    def add_box(self, material: str, lo, hi, tile: float | None = None, patch=FULL_PATCH, yaw: float = 0.0, skip="") -> None:
         """A box whose sides have the texture as `quad` says, upright. ``yaw``: turned about its vertical axis,
         radians. ``skip``: faces that are left out, of "wensbt" (west, east, north, south, bottom, top)."""
         lo, hi = np.minimum(lo, hi).astype(float), np.maximum(lo, hi).astype(float)
@@ -84,19 +84,19 @@ class Place:
             "t": (lo + z, x, y),
         }
         middle = (lo + hi) / 2
-        turn = rotation(yaw)
+        turn = rotate_about_z(yaw)
         for name, (corner, along, up) in sides.items():
             if name not in skip:
-                self.quad(material, middle + turn @ (corner - middle), turn @ along, turn @ up, tile, patch)
+                self.add_quad(material, middle + turn @ (corner - middle), turn @ along, turn @ up, tile, patch)
 
-    def revolve(self, material: str, centre, profile, around: int = 48, patch=WHOLE) -> None:
+    def add_revolved(self, material: str, centre, profile, around: int = 48, patch=FULL_PATCH) -> None:
         """The surface that a ``profile`` of radii and heights (N, 2) sweeps about the vertical through ``centre``."""
         r, h = np.asarray(profile, float).T
         angle = np.linspace(0, 2 * np.pi, around + 1)
         ring = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
-        self.surface(material, centre + r[:, None, None] * ring + h[:, None, None] * np.array([0, 0, 1.0]), patch)
+        self.add_surface(material, centre + r[:, None, None] * ring + h[:, None, None] * np.array([0, 0, 1.0]), patch)
 
-    def ball(self, material: str, centre, radius, lumps: float = 0.0, rng=None, patch=WHOLE, steps: int = 24) -> None:
+    def add_ball(self, material: str, centre, radius, lumps: float = 0.0, rng=None, patch=FULL_PATCH, steps: int = 24) -> None:
         """An ellipsoid of ``radius`` (a number or three); ``lumps``: how far waves drawn from ``rng`` displace it, in
         radii."""
         polar, azimuth = np.meshgrid(np.linspace(np.pi - 0.01, 0.01, steps), np.linspace(0, 2 * np.pi, 2 * steps))
@@ -106,9 +106,9 @@ class Place:
         if lumps:
             for wave, phase in zip(rng.normal(0, 5, (6, 3)), rng.uniform(0, 2 * np.pi, 6)):
                 gain += lumps / 2 * np.sin(d @ wave + phase)
-        self.surface(material, centre + gain[..., None] * d * np.broadcast_to(radius, 3), patch)
+        self.add_surface(material, centre + gain[..., None] * d * np.broadcast_to(radius, 3), patch)
 
-    def tube(self, material: str, path, radius: float, around: int = 10) -> None:
+    def add_tube(self, material: str, path, radius: float, around: int = 10) -> None:
         """A tube along a ``path`` (N, 3), open at its ends."""
         path = np.asarray(path, float)
         along = np.gradient(path, axis=0)
@@ -118,10 +118,10 @@ class Place:
         other /= np.linalg.norm(other, axis=1, keepdims=True)
         angle = np.linspace(0, 2 * np.pi, around + 1)[:, None]
         ring = np.cos(angle) * side[:, None] + np.sin(angle) * other[:, None]
-        self.surface(material, path[:, None] + radius * ring)
+        self.add_surface(material, path[:, None] + radius * ring)
 
 
-def rotation(yaw: float) -> np.ndarray:
+def rotate_about_z(yaw: float) -> np.ndarray:
     """The rotation (3, 3) about z by ``yaw`` radians."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([(c, -s, 0), (s, c, 0), (0, 0, 1.0)])

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from nerg_mi.scenes.tabletop.mesh import Place, rotation
+from nerg_mi.scenes.tabletop.mesh import MeshBuilder, rotate_about_z
 from nerg_mi.scenes.tabletop.room import ROOM
-from nerg_mi.scenes.tabletop.table import CENTRE
+from nerg_mi.scenes.tabletop.table import OBJECT_CENTER
 
 GROUND = -1.1
 """Height of the ground outside, in metres: the room is a few steps above the garden."""
@@ -13,10 +13,10 @@ GROUND = -1.1
 _SIGHT = (-12, 148)
 
 
-def lay_out(place: Place, rng) -> None:
+def add_landscape(place: MeshBuilder, rng) -> None:
     """The land around the house, all of it to the north and to the east, where the windows are."""
-    place.quad("grass", (-900, -900, GROUND - 0.02), (1800, 0, 0), (0, 1800, 0), tile=60)
-    place.quad("grass", (-40, -40, GROUND), (90, 0, 0), (0, 90, 0), tile=9)
+    place.add_quad("grass", (-900, -900, GROUND - 0.02), (1800, 0, 0), (0, 1800, 0), tile=60)
+    place.add_quad("grass", (-40, -40, GROUND), (90, 0, 0), (0, 90, 0), tile=9)
     _garden(place, rng)
     for distance, count, size in ((34, 5, 1.0), (62, 7, 1.15), (105, 9, 1.35), (170, 11, 1.6)):
         for bearing in np.linspace(*_SIGHT, count) + rng.uniform(-4, 4, count):
@@ -32,10 +32,10 @@ def lay_out(place: Place, rng) -> None:
 def _spot(bearing: float, distance: float) -> np.ndarray:
     """The place on the ground at a ``bearing`` in degrees and a ``distance`` in metres from the table."""
     a = np.radians(bearing)
-    return np.array([CENTRE[0] + distance * np.cos(a), CENTRE[1] + distance * np.sin(a), GROUND])
+    return np.array([OBJECT_CENTER[0] + distance * np.cos(a), OBJECT_CENTER[1] + distance * np.sin(a), GROUND])
 
 
-def _garden(place: Place, rng) -> None:
+def _garden(place: MeshBuilder, rng) -> None:
     north, east = ROOM[1], ROOM[0]
     place.box("paving", (-2, north + 0.3, GROUND), (east + 4, north + 2.6, GROUND + 0.12), tile=1.5)
     place.box("paving", (5.2, north + 2.6, GROUND), (6.4, north + 16, GROUND + 0.04), tile=1.5)
@@ -57,26 +57,26 @@ def _garden(place: Place, rng) -> None:
         place.box("paint", (x, 26.0, GROUND), (x + 0.09, 26.08, GROUND + 1.1), tile=0.3)
 
 
-def _house(place: Place, at: np.ndarray, size: float, rng) -> None:
+def _house(place: MeshBuilder, at: np.ndarray, size: float, rng) -> None:
     """A house of two floors with a gable roof, one of its fronts towards the table."""
     w, d, h = size * rng.uniform(4, 6), size * rng.uniform(3.5, 5), size * rng.uniform(5, 6.5)
-    yaw = np.arctan2(at[1] - CENTRE[1], at[0] - CENTRE[0]) + np.pi / 2 + rng.uniform(-0.4, 0.4)
-    turn = rotation(yaw)
+    yaw = np.arctan2(at[1] - OBJECT_CENTER[1], at[0] - OBJECT_CENTER[0]) + np.pi / 2 + rng.uniform(-0.4, 0.4)
+    turn = rotate_about_z(yaw)
     spot = lambda *p: at + turn @ np.array(p, float)
     k = int(rng.integers(4))
     place.box("facade", at - (w, d, 0), at + (w, d, h), patch=(k / 4, 0, (k + 1) / 4, 1), yaw=yaw, skip="bt")
     ridge, eaves = h + 0.75 * d, h - 0.35
     for s in (-1, 1):
         corner = spot(-w - 0.5, s * (d + 0.45), eaves)
-        place.quad("roof", corner, turn @ (2 * w + 1, 0, 0), spot(-w - 0.5, 0, ridge) - corner, patch=(0, 0, 4, 2))
+        place.add_quad("roof", corner, turn @ (2 * w + 1, 0, 0), spot(-w - 0.5, 0, ridge) - corner, patch=(0, 0, 4, 2))
         gable = [[spot(s * w, -d, h), spot(s * w, d, h)], [spot(s * w, 0, ridge), spot(s * w, 0, ridge)]]
         place.surface("plaster", gable, patch=(0, 0, 2, 1))
     chimney = at + turn @ (0.4 * w, 0, 0)
     place.box("roof", chimney + (-0.4, -0.4, h), chimney + (0.4, 0.4, ridge + 0.9), patch=(0, 0, 0.5, 1))
 
 
-def _tree(place: Place, at: np.ndarray, high: float, rng) -> None:
-    place.tube("bark", [at + (0, 0, z * high) for z in (0, 0.3, 0.6)], 0.028 * high, 8)
+def _tree(place: MeshBuilder, at: np.ndarray, high: float, rng) -> None:
+    place.add_tube("bark", [at + (0, 0, z * high) for z in (0, 0.3, 0.6)], 0.028 * high, 8)
     kind = "tree" if rng.random() < 0.6 else "oak"
     for k in range(5):
         angle, far = 2.4 * k + rng.uniform(0, 1), 0.17 * high * (k > 0)

@@ -17,17 +17,17 @@ import numpy as np
 from nerg_mi.scenes.store import twin
 from nerg_mi.scenes.tabletop.denoising import denoise
 
-from nerg_mi.files.atomic import replacing
+from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.images import write_png
 from nerg_mi.files.tables import write_json
 from nerg_mi.maths.color import encode_srgb
-from nerg_mi.photos.cameras import PosedCamera, pixel_directions, sensor_dict
+from nerg_mi.photos.cameras import PosedCamera, pixel_directions, make_sensor_dict
 
 DEPTH_FILE = "transforms_depth.json"
 """The same photos, with their depth."""
-SHARP = 100
+ALBEDO_SPP = 100
 """Samples a pixel of what is painted on surfaces, in a photo."""
-HELD_OUT = 8
+HOLDOUT_INTERVAL = 8
 """Every so many photos one is held out by default: it gets four times the samples, so that its noise does not limit
 what it can measure."""
 
@@ -41,7 +41,7 @@ class Photo(NamedTuple):
     depth: np.ndarray
 
 
-class Photographer:
+class TabletopPhotographer:
     """Takes photos in a scene, with ``spp`` samples a pixel of the light."""
 
     def __init__(self, scene, spp: int = 24):
@@ -51,28 +51,28 @@ class Photographer:
         self.guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal,position:position"})
         self.albedo = mi.load_dict({"type": "aov", "aovs": "albedo:albedo"})
 
-    def radiance(self, camera: PosedCamera, seed: int, times: int = 1) -> np.ndarray:
+    def render_radiance(self, camera: PosedCamera, seed: int, times: int = 1) -> np.ndarray:
         """Linear radiance (h, w, 3); ``times`` as many samples."""
         light = self._render(camera, seed, times * self.spp)
         # Equal seeds and numbers of samples: the same points of the film.
         guides = self._render(camera, seed, times * self.spp, self.guides)
-        return denoise(light, guides, self.paint(camera, seed + 1))
+        return denoise(light, guides, self.render_albedo(camera, seed + 1))
 
-    def paint(self, camera: PosedCamera, seed: int, spp: int = SHARP) -> np.ndarray:
+    def render_albedo(self, camera: PosedCamera, seed: int, spp: int = ALBEDO_SPP) -> np.ndarray:
         """Albedo (h, w, 3)."""
         return self._render(camera, seed, spp, self.albedo, "multijitter")
 
-    def depth(self, camera: PosedCamera) -> np.ndarray:
+    def render_depth(self, camera: PosedCamera) -> np.ndarray:
         """Exact distances (h, w) float32 along the rays through the pixels' centres; 0 where nothing is hit."""
         directions = pixel_directions(camera.intrinsics) @ camera.to_world[:3, :3].T
-        t = twin.cast(camera.center, directions.reshape(-1, 3), self.scene)
+        t = twin.cast_rays(camera.center, directions.reshape(-1, 3), self.scene)
         return np.where(np.isfinite(t), t, 0).astype(np.float32).reshape(directions.shape[:2])
 
     def _render(self, camera: PosedCamera, seed: int, spp: int, integrator=None, sampler="independent") -> np.ndarray:
         import drjit as dr
         import mitsuba as mi
 
-        sensor = mi.load_dict(sensor_dict(camera) | {"sampler": {"type": sampler, "sample_count": spp}})
+        sensor = mi.load_dict(make_sensor_dict(camera) | {"sampler": {"type": sampler, "sample_count": spp}})
         params = mi.traverse(sensor)
         # As a literal every pose would compile kernels of its own.
         pose = mi.Transform4f(params["to_world"])
@@ -83,15 +83,15 @@ class Photographer:
         return np.array(mi.render(self.scene, sensor=sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed)))
 
 
-def take_photos(scene, cameras: list[PosedCamera], spp: int = 24, seed: int = 0, say=print) -> list[Photo]:
+def take_photos(scene, cameras: list[PosedCamera], spp: int = 24, seed: int = 0, log=print) -> list[Photo]:
     """A photo of ``scene`` by each camera; ``say``: where progress goes."""
-    photographer, out, start = Photographer(scene, spp), [], time.perf_counter()
+    photographer, out, start = TabletopPhotographer(scene, spp), [], time.perf_counter()
     for k, camera in enumerate(cameras):
-        linear = photographer.radiance(camera, 2 * (10_000 * seed + k), 1 if k % HELD_OUT else 4)
+        linear = photographer.render_radiance(camera, 2 * (10_000 * seed + k), 1 if k % HOLDOUT_INTERVAL else 4)
         pixels = np.round(255 * encode_srgb(np.clip(linear, 0, 1))).astype(np.uint8)
-        out.append(Photo(f"photo_{k:03d}.png", camera, pixels, photographer.depth(camera)))
+        out.append(Photo(f"photo_{k:03d}.png", camera, pixels, photographer.render_depth(camera)))
         if (k + 1) % 8 == 0 or k + 1 == len(cameras):
-            say(f"  {k + 1} of {len(cameras)} photos, {time.perf_counter() - start:.0f} s")
+            log(f"  {k + 1} of {len(cameras)} photos, {time.perf_counter() - start:.0f} s")
     return out
 
 
@@ -107,7 +107,7 @@ def write_photos(photos: list[Photo], folder: str | Path) -> Path:
     for photo in photos:
         depth = f"depth/{Path(photo.name).stem}.npy"
         write_png(folder / "images" / photo.name, mi.Bitmap(np.ascontiguousarray(photo.pixels)))
-        with replacing(folder / depth) as temporary:
+        with replace_atomically(folder / depth) as temporary:
             np.save(temporary, photo.depth)
         i = photo.camera.intrinsics
         lens = {"w": i.width, "h": i.height, "fl_x": i.fx, "fl_y": i.fy, "cx": i.cx, "cy": i.cy}

@@ -17,7 +17,7 @@ from nerg_mi.scenes.tabletop.photos import Photo
 from nerg_mi.files.atomic import write_text
 from nerg_mi.photos.cameras import PosedCamera, project
 
-CORNERS = 700
+MAX_CORNERS = 700
 """Corners of a photo at most, the strongest."""
 _CONTRAST = 3e-4  # least change of brightness about a corner, in its direction of least change, squared
 _NEAR = 1.5  # pixels between a corner and where another photo's corner is to be seen
@@ -26,16 +26,16 @@ _LEAST_ANGLE = np.radians(1.5)  # as COLMAP has it: of rays that meet at flatter
 _MOST_ERROR = 4.0  # pixels, as COLMAP has it
 
 
-class Point(NamedTuple):
+class SparsePoint(NamedTuple):
     """``place`` (3,) in metres; ``error``: mean distance in pixels; ``track``: photos and corners in them."""
 
-    place: np.ndarray
+    position: np.ndarray
     color: np.ndarray
     error: float
     track: list[tuple[int, int]]
 
 
-def corners(pixels: np.ndarray) -> np.ndarray:
+def detect_corners(pixels: np.ndarray) -> np.ndarray:
     """Pixel coordinates (N, 2) of the corners of a picture (h, w, 3), strongest first (Shi and Tomasi 1994)."""
     from scipy.ndimage import gaussian_filter, maximum_filter
 
@@ -46,7 +46,7 @@ def corners(pixels: np.ndarray) -> np.ndarray:
     peak = (strength == maximum_filter(strength, 5)) & (strength > _CONTRAST)
     peak[:2], peak[-2:], peak[:, :2], peak[:, -2:] = False, False, False, False
     y, x = np.nonzero(peak)
-    order = np.argsort(-strength[y, x], kind="stable")[:CORNERS]
+    order = np.argsort(-strength[y, x], kind="stable")[:MAX_CORNERS]
     y, x = y[order], x[order]
     # the peak of the parabola through a pixel and its neighbours
     shift = [
@@ -56,9 +56,9 @@ def corners(pixels: np.ndarray) -> np.ndarray:
     return np.stack([x, y], axis=-1) + 0.5 + np.clip(np.stack(shift, axis=-1), -0.5, 0.5)
 
 
-def find_points(photos: Sequence[Photo]) -> tuple[list[np.ndarray], list[Point]]:
+def triangulate_points(photos: Sequence[Photo]) -> tuple[list[np.ndarray], list[SparsePoint]]:
     """The corners (N, 2) of each photo, and the points that at least two photos triangulate."""
-    found = [corners(p.pixels) for p in photos]
+    found = [detect_corners(p.pixels) for p in photos]
     rays = [_rays(at, p.camera) for at, p in zip(found, photos)]
     taken = [np.zeros(len(at), bool) for at in found]
     points = []
@@ -104,7 +104,7 @@ def _matches(places: np.ndarray, photos: Sequence[Photo], found: list[np.ndarray
     return out
 
 
-def _triangulate(track, photos: Sequence[Photo], found, rays, color) -> Point | None:
+def _triangulate(track, photos: Sequence[Photo], found, rays, color) -> SparsePoint | None:
     """The point nearest to all rays of a track (least squares); None where COLMAP would leave it out."""
     d = np.array([rays[j][m] for j, m in track])
     if (d @ d.T).min() > np.cos(_LEAST_ANGLE):
@@ -119,7 +119,7 @@ def _triangulate(track, photos: Sequence[Photo], found, rays, color) -> Point | 
             return None
         errors.append(np.linalg.norm(at[0] - found[j][m]))
     error = float(np.mean(errors))
-    return Point(place, color, error, track) if error < _MOST_ERROR else None
+    return SparsePoint(place, color, error, track) if error < _MOST_ERROR else None
 
 
 def write_colmap(photos: Sequence[Photo], folder: str | Path) -> int:
@@ -127,7 +127,7 @@ def write_colmap(photos: Sequence[Photo], folder: str | Path) -> int:
     from scipy.spatial.transform import Rotation
 
     folder = Path(folder)
-    found, points = find_points(photos)
+    found, points = triangulate_points(photos)
     lenses = list(dict.fromkeys(p.camera.intrinsics for p in photos))
     lines = ["# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY"]
     lines += [f"{k} PINHOLE {i.width} {i.height} {i.fx} {i.fy} {i.cx} {i.cy}" for k, i in enumerate(lenses, 1)]
@@ -150,7 +150,7 @@ def write_colmap(photos: Sequence[Photo], folder: str | Path) -> int:
 
     lines = ["# POINT3D_ID X Y Z R G B ERROR and, of each photo that shows it, IMAGE_ID POINT2D_IDX"]
     for number, p in enumerate(points, 1):
-        place, color = (" ".join(f"{v:.6g}" for v in values) for values in (p.place, p.color))
+        place, color = (" ".join(f"{v:.6g}" for v in values) for values in (p.position, p.color))
         track = " ".join(f"{j + 1} {m}" for j, m in p.track)
         lines.append(f"{number} {place} {color} {p.error:.4f} {track}")
     write_text(folder / "points3D.txt", "\n".join([*lines, ""]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from nerg_mi.scenes.tabletop import textures
-from nerg_mi.scenes.tabletop.layout import MATERIALS, Layout, Material, stream
+from nerg_mi.scenes.tabletop.layout import MATERIALS, TabletopLayout, Material, make_random_stream
 from nerg_mi.scenes.tabletop.mesh import Mesh
 
 from nerg_mi.maths.color import decode_srgb
@@ -14,19 +14,19 @@ _ALBEDO = (0.02, 0.8)
 _SKY = 0.95
 # From the south-west: it shines on the fronts that the windows show, and not into the room.
 _SUN = dict(direction=[0.55, 0.6, -0.75], irradiance=[1.5, 1.4, 1.2])
-DEPTH = 5
+MAX_PATH_DEPTH = 5
 """Longest path that is followed, in edges."""
 
 
-def load_stage(layout: Layout):
+def load_stage(layout: TabletopLayout):
     """The scene of a layout, with a path tracer."""
     import mitsuba as mi
 
-    sky = decode_srgb(textures.sky(stream(layout.seed, "sky"))) * _SKY
+    sky = decode_srgb(textures.sky(make_random_stream(layout.seed, "sky"))) * _SKY
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "path", "max_depth": DEPTH},
+            "integrator": {"type": "path", "max_depth": MAX_PATH_DEPTH},
             "sky": {
                 "type": "envmap",
                 "bitmap": mi.Bitmap(sky.astype(np.float32)),
@@ -50,7 +50,7 @@ def _shape(name: str, mesh: Mesh, material: Material, seed: int):
 
     texture = {
         "type": "bitmap",
-        "bitmap": mi.Bitmap(np.clip(decode_srgb(material.paint(stream(seed, name))), *_ALBEDO).astype(np.float32)),
+        "bitmap": mi.Bitmap(np.clip(decode_srgb(material.paint(make_random_stream(seed, name))), *_ALBEDO).astype(np.float32)),
         "raw": True,
     }
     bsdf = {"type": "diffuse", "reflectance": texture}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.alignment.constraints import PlaceTraces
+from nerg_mi.alignment.constraints import SceneTraces
 from nerg_mi.rays.rays import Rays
 
 BOXES = np.array([[(0.9, 0.7, 0), (1.7, 2.9, 1.2)], [(2.6, 0, 0), (4.0, 0.8, 2.0)]])
@@ -36,13 +36,13 @@ def directions(count: int, rng: np.random.Generator) -> np.ndarray:
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-def traces(count: int = 40_000) -> PlaceTraces:
+def traces(count: int = 40_000) -> SceneTraces:
     """What rays from free space find."""
     rng = np.random.default_rng(3)
     begin = rng.uniform(0, SIZE, (2 * count, 3))
     begin = begin[free(begin)][:count]
     along = directions(len(begin), rng)
-    return PlaceTraces(begin, begin + along * cast(begin, along)[:, None], np.ones(len(begin), bool))
+    return SceneTraces(begin, begin + along * cast(begin, along)[:, None], np.ones(len(begin), bool))
 
 
 def people(count: int = 3000, noise: float = 0.01) -> Rays:

@@ -11,7 +11,7 @@ from nerg_mi.alignment.check import Alignment, AlignmentCheck, check_alignment, 
 from nerg_mi.alignment.constraints import AlignmentFit
 from nerg_mi.errors import NergError
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.alignment import rooms
 
@@ -34,18 +34,18 @@ def room():
     }
     blocks = {f"b{k}": cube(low, high) for k, (low, high) in enumerate(rooms.BOXES)}
     scene = mi.load_dict({"type": "scene", "room": cube(np.zeros(3), rooms.SIZE), **blocks})
-    return Place(None, scene)
+    return SceneGeometry(None, scene)
 
 
 def test_people_in_their_place_give_no_doubts(room):
     found = check_alignment(room, RAYS, moved(0, 0, 0))
-    assert found == AlignmentCheck(0.0, 0.0, 0.0) and not found.doubts() and not found.impossible
+    assert found == AlignmentCheck(0.0, 0.0, 0.0) and not found.list_warnings() and not found.is_impossible
 
 
 def test_people_elsewhere_below_the_floor_and_in_walls_are_told(room):
-    assert check_alignment(room, RAYS, moved(100, 0, 0)).impossible
+    assert check_alignment(room, RAYS, moved(100, 0, 0)).is_impossible
     below = check_alignment(room, RAYS, moved(0, 0, -2.0))
-    assert below.below > 0.9 and "below the floor" in " ".join(below.doubts())
+    assert below.below > 0.9 and "below the floor" in " ".join(below.list_warnings())
 
 
 def test_heads_within_matter_are_inside_of_something():
@@ -53,21 +53,21 @@ def test_heads_within_matter_are_inside_of_something():
         mi.load_dict({"type": "constvolume", "value": 500.0, "to_world": mi.ScalarTransform4f().scale([9, 9, 9])})
     )
     found = check_alignment(solid, RAYS, moved(0, 0, 0))
-    assert found.inside > 0.9 and "inside of something solid" in " ".join(found.doubts())
+    assert found.inside > 0.9 and "inside of something solid" in " ".join(found.list_warnings())
 
 
 def test_no_rays_are_no_doubt(room):
-    assert check_alignment(room, RAYS.select(np.zeros(len(RAYS), bool)), moved(0, 0, 0)).doubts() == []
+    assert check_alignment(room, RAYS.select(np.zeros(len(RAYS), bool)), moved(0, 0, 0)).list_warnings() == []
 
 
 def test_gaze_that_would_meet_more_with_an_axis_negated_is_told():
     """A wall on one side: people who look at it, and the same in a mirror."""
     place = mi.ScalarTransform4f().translate([20, 0, 0]).scale([0.1, 60, 60])
-    wall = Place(None, mi.load_dict({"type": "scene", "wall": {"type": "cube", "to_world": place}}))
+    wall = SceneGeometry(None, mi.load_dict({"type": "scene", "wall": {"type": "cube", "to_world": place}}))
     rays = replace(RAYS, direction=np.tile([0.8, 0.6, 0.0], (len(RAYS), 1)))
     assert check_alignment(wall, rays, moved(0, 0, 0)) == AlignmentCheck(0.0, 0.0, 0.0)
     mirrored = check_alignment(wall, replace(rays, direction=rays.direction * (-1, 1, 1)), moved(0, 0, 0))
-    assert "with x of the directions negated" in mirrored.doubts()[-1] and mirrored.escaped > 0.9
+    assert "with x of the directions negated" in mirrored.list_warnings()[-1] and mirrored.escaped > 0.9
 
 
 # ---- The record of an alignment ----
@@ -79,9 +79,9 @@ def written(path):
         np.arange(5.0),
         np.array([1.0, np.nan]),
         np.diag([1e-4] * 3 + [4e-4] * 3 + [1e-4]),
-        about={"pairs": 5},
+        metadata={"pairs": 5},
     )
-    found = Alignment.of_fit("pairs", fit, {"rays": {"file": "a.npz", "sha256": "00"}}, False)
+    found = Alignment.from_fit("pairs", fit, {"rays": {"file": "a.npz", "sha256": "00"}}, False)
     found.save(path)
     return found
 

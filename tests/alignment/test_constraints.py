@@ -10,16 +10,16 @@ from scipy.interpolate import RegularGridInterpolator
 from nerg_mi.alignment.constraints import (
     AlignmentTarget,
     DistanceGrid,
-    PlaceTraces,
-    angles,
+    SceneTraces,
+    angles_between,
     pair_covariance,
     read_surface,
     surface_of_points,
     surface_of_traces,
-    thinned,
-    trace_place,
+    downsample,
+    trace_scene,
 )
-from nerg_mi.alignment.similarity import ALL, fit_similarity, scale_of
+from nerg_mi.alignment.similarity import ALL, fit_similarity, similarity_scale
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 
@@ -31,7 +31,7 @@ from .rooms import carried, similarity
 
 def test_angles_are_seen_from_the_viewpoint():
     at, to = np.array([[1.0, 0, 0], [0, 2, 0]]), np.array([[1.0, 1, 0], [0, 2, 2e-7]])
-    np.testing.assert_allclose(angles(np.zeros(3), at, to), [45, np.degrees(1e-7)], rtol=1e-6)
+    np.testing.assert_allclose(angles_between(np.zeros(3), at, to), [45, np.degrees(1e-7)], rtol=1e-6)
 
 
 def test_the_covariance_is_that_of_many_fits():
@@ -39,7 +39,7 @@ def test_the_covariance_is_that_of_many_fits():
     truth, x, noise = similarity(rng, scale=2.0), rng.normal(size=(12, 3)), 0.02
     exact = carried(truth, x)
     draws = [fit_similarity(x, exact + rng.normal(0, noise, x.shape)) for _ in range(2000)]
-    scales = np.log([scale_of(m) for m in draws])
+    scales = np.log([similarity_scale(m) for m in draws])
     middle = np.array([carried(m, x.mean(axis=0)[None])[0] for m in draws])
     y = exact + rng.normal(0, noise, x.shape)
     stated = [pair_covariance(x, exact + rng.normal(0, noise, x.shape), fit_similarity(x, y), ALL) for _ in range(50)]
@@ -62,10 +62,10 @@ GRID = DistanceGrid(np.random.default_rng(0).random((6, 7, 5)), np.array([-1.0, 
 def test_inside_it_is_the_trilinear_interpolation():
     axes = [GRID.lower[a] + GRID.step * np.arange(n) for a, n in enumerate(GRID.values.shape)]
     p = np.random.default_rng(1).uniform(GRID.lower, GRID.upper, (300, 3))
-    np.testing.assert_allclose(GRID.at(p), RegularGridInterpolator(axes, GRID.values)(p), atol=1e-12)
+    np.testing.assert_allclose(GRID.interpolate(p), RegularGridInterpolator(axes, GRID.values)(p), atol=1e-12)
     # Beyond it the distance to it is added, and a lattice of one layer has no slope across.
     p = GRID.upper + np.array([[3.0, 4, 0], [0, 0, 2]])
-    np.testing.assert_allclose(GRID.at(p), GRID.values[-1, -1, -1] + np.array([5, 2]))
+    np.testing.assert_allclose(GRID.interpolate(p), GRID.values[-1, -1, -1] + np.array([5, 2]))
     value, slope = DistanceGrid(np.arange(4.0).reshape(4, 1, 1), np.zeros(3), 1.0).with_slope(np.array([[1.5, 0, 0]]))
     assert value[0] == 1.5 and slope[0].tolist() == [1, 0, 0]
 
@@ -74,7 +74,7 @@ def test_gradients_are_those_of_central_differences():
     p = np.random.default_rng(2).uniform(GRID.lower - 1, GRID.upper + 1, (500, 3))
     slope = GRID.with_slope(p)[1]
     for a, e in enumerate(1e-7 * np.eye(3)):
-        np.testing.assert_allclose(slope[:, a], (GRID.at(p + e) - GRID.at(p - e)) / 2e-7, atol=1e-6)
+        np.testing.assert_allclose(slope[:, a], (GRID.interpolate(p + e) - GRID.interpolate(p - e)) / 2e-7, atol=1e-6)
 
 
 # ---- Point file ----
@@ -166,24 +166,24 @@ def test_the_inside_of_a_hollow_thing_is_no_free_space():
     begin = rng.uniform(*block, (4000, 3))
     along = rooms.directions(4000, rng)
     to_wall = np.where(along > 0, (block[1] - begin) / along, (block[0] - begin) / along).min(axis=1)
-    both = PlaceTraces(
-        np.concatenate([room.begin, begin]),
+    both = SceneTraces(
+        np.concatenate([room.start, begin]),
         np.concatenate([room.end, begin + along * to_wall[:, None]]),
-        np.ones(len(room.met) + 4000, bool),
+        np.ones(len(room.is_hit) + 4000, bool),
     )
     found = surface_of_traces(both, 1 << 16)
     middle = block.mean(axis=0)[None]
-    assert found.blocked.at(middle)[0] > 0.2
+    assert found.blocked.interpolate(middle)[0] > 0.2
 
 
 def test_the_floor_is_found(surface):
-    assert surface.floor() == pytest.approx(0, abs=0.5 * surface.step)
+    assert surface.find_floor() == pytest.approx(0, abs=0.5 * surface.step)
 
 
 def test_bare_points_know_no_free_space_and_must_be_some():
     points = rooms.traces().end
     found = surface_of_points(points, 1 << 15)
-    assert not found.bounded and found.distance.at(points[:500]).max() < 2 * found.step
+    assert not found.bounded and found.distance.interpolate(points[:500]).max() < 2 * found.step
     with pytest.raises(NergError, match="99 points, and 100"):
         surface_of_points(np.zeros((99, 3)))
     with pytest.raises(NergError, match="single point"):
@@ -192,7 +192,7 @@ def test_bare_points_know_no_free_space_and_must_be_some():
 
 def test_thinned_points_are_the_means_of_voxels():
     p = np.array([[0.0, 0, 0], [0.2, 0, 0], [1.1, 0, 0]])
-    np.testing.assert_allclose(thinned(p, 1.0), [[0.1, 0, 0], [1.1, 0, 0]])
+    np.testing.assert_allclose(downsample(p, 1.0), [[0.1, 0, 0], [1.1, 0, 0]])
 
 
 class _Nothing:
@@ -204,4 +204,4 @@ def test_a_place_without_surfaces_is_refused(monkeypatch):
         "nerg_mi.alignment.constraints.trace_depth", lambda s, o, d: (np.zeros(len(o)), np.zeros(len(o)))
     )
     with pytest.raises(NergError, match="no surfaces that rays could meet"):
-        trace_place(_Nothing(), np.zeros(3), np.ones(3), 1000)  # pyright: ignore[reportArgumentType] # traced by nothing
+        trace_scene(_Nothing(), np.zeros(3), np.ones(3), 1000)  # pyright: ignore[reportArgumentType] # traced by nothing

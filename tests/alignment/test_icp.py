@@ -5,7 +5,7 @@ import pytest
 
 from nerg_mi.alignment.constraints import AlignmentTarget, surface_of_traces
 from nerg_mi.alignment.icp import AtZero, GazeEnds, HeadHeight, Twin, groups_of, refine
-from nerg_mi.alignment.similarity import ALL, MIRROR, Chart, errors
+from nerg_mi.alignment.similarity import ALL, MIRROR, Chart, residual_distances
 from nerg_mi.errors import NergError
 
 from . import rooms
@@ -23,9 +23,9 @@ def quiet(share, text):
 def test_a_twin_in_millimetres_is_placed_and_a_mirrored_one_named():
     truth = rooms.similarity(np.random.default_rng(1), upright=True, scale=0.001)
     twin = rooms.carried(np.linalg.inv(truth), rooms.traces(9000).end)
-    target = AlignmentTarget(points=PLACE, upright=True)
+    target = AlignmentTarget(points=PLACE, is_upright=True)
     fit = Twin(twin).fit(target, quiet)
-    off = errors(fit.matrix, twin, rooms.carried(truth, twin))
+    off = residual_distances(fit.matrix, twin, rooms.carried(truth, twin))
     assert np.median(off) < 30 and fit.mirrored is None  # millimetres
     assert any("millimetres" in note for note in fit.notes)
     assert "x axis negated the twin fits" in Twin(rooms.carried(MIRROR, twin)).fit(target, quiet).mirrored
@@ -42,7 +42,7 @@ def test_a_twin_that_is_none_is_refused(points, why):
 
 def test_a_near_start_comes_to_the_truth_and_says_how_sure_it_is():
     rays, truth = rooms.people(1500), rooms.similarity(np.random.default_rng(6))
-    surface = surface_of_traces(rooms.traces().moved(truth), 1 << 18)
+    surface = surface_of_traces(rooms.traces().transform(truth), 1 << 18)
     nudge = np.eye(4)
     nudge[:2, :2] = 1.03 * np.array([[np.cos(0.06), -np.sin(0.06)], [np.sin(0.06), np.cos(0.06)]])
     nudge[2, 2], nudge[:3, 3] = 1.03, (0.12, -0.1, 0.05)
@@ -54,7 +54,7 @@ def test_a_near_start_comes_to_the_truth_and_says_how_sure_it_is():
     center = rooms.carried(truth, rays.origin).mean(axis=0)
     found = refine(scores, start, center, ALL)
     target = rooms.carried(truth, rays.origin)
-    assert errors(start, rays.origin, target).max() > 0.1 and errors(found.matrix, rays.origin, target).max() < 0.02
+    assert residual_distances(start, rays.origin, target).max() > 0.1 and residual_distances(found.matrix, rays.origin, target).max() < 0.02
     spread = np.sqrt(np.diag(found.covariance))
     assert found.covariance.shape == (7, 7) and (spread[:3] < 0.01).all() and 0 < spread[6] < 0.01
 
@@ -110,7 +110,7 @@ def test_all_is_well_in_the_right_place_and_not_elsewhere(surface, which):
 
 
 def test_residuals_are_metres_of_the_tracking_whatever_the_scale_of_the_place(surface):
-    grown = surface_of_traces(rooms.traces().moved(np.diag([7.0, 7, 7, 1])), 1 << 16)
+    grown = surface_of_traces(rooms.traces().transform(np.diag([7.0, 7, 7, 1])), 1 << 16)
     for a, b in zip(scores(surface), scores(grown)):
         if isinstance(a, HeadHeight):
             continue

@@ -8,14 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.alignment.constraints import AlignmentTarget
 from nerg_mi.alignment.points import Cameras, Pairs, mean_rotation, read_cameras, read_pairs
-from nerg_mi.alignment.similarity import MIRROR, errors, scale_of
+from nerg_mi.alignment.similarity import MIRROR, residual_distances, similarity_scale
 from nerg_mi.errors import NergError
 
 from .rooms import carried, similarity
 
 # ---- Camera poses ----
 
-FREE = AlignmentTarget(upright=False)
+FREE = AlignmentTarget(is_upright=False)
 
 
 def both(truth, count=12, seed=0):
@@ -25,7 +25,7 @@ def both(truth, count=12, seed=0):
     one[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
     one[:, :3, 3] = rng.normal(size=(count, 3))
     other = truth @ one
-    other[:, :3, :3] /= scale_of(truth)
+    other[:, :3, :3] /= similarity_scale(truth)
     return one, other
 
 
@@ -44,8 +44,8 @@ def test_wrong_poses_do_no_harm():
     other[:3, :3, 3] += 5
     other[2:4, :3, :3] = Rotation.random(2, random_state=9).as_matrix()
     fit = Cameras(one, other).fit(FREE, quiet)
-    assert errors(fit.matrix, one[:, :3, 3], carried(truth, one[:, :3, 3])).max() < 1e-3
-    assert fit.about == {"cameras": 12, "agreeing": 8}
+    assert residual_distances(fit.matrix, one[:, :3, 3], carried(truth, one[:, :3, 3])).max() < 1e-3
+    assert fit.metadata == {"cameras": 12, "agreeing": 8}
 
 
 def test_a_mirrored_model_is_named():
@@ -62,7 +62,7 @@ def test_a_mirrored_model_is_named():
 def test_another_convention_is_told():
     one, other = both(similarity(np.random.default_rng(4)), seed=5)
     other[:, :3, 1:3] *= -1
-    assert any("convention" in d for d in Cameras(one, other).fit(FREE, quiet).doubts)
+    assert any("convention" in d for d in Cameras(one, other).fit(FREE, quiet).warnings)
 
 
 def test_cameras_that_leave_it_open_are_refused():
@@ -115,9 +115,9 @@ def made(count=6, seed=0, noise=0.01):
 def test_picked_points_give_the_alignment_its_errors_and_its_uncertainty():
     truth, x, y = made()
     fit = Pairs(x, y).fit(FREE, quiet)
-    assert errors(fit.matrix, x, carried(truth, x)).max() < 0.03
-    assert np.median(fit.centimetres) < 3 and len(fit.degrees) == 6 and fit.mirrored is None
-    assert fit.covariance.shape == (7, 7) and fit.about["leave_one_out_cm"]["largest"] > max(fit.centimetres)
+    assert residual_distances(fit.matrix, x, carried(truth, x)).max() < 0.03
+    assert np.median(fit.residuals_cm) < 3 and len(fit.residuals_deg) == 6 and fit.mirrored is None
+    assert fit.covariance.shape == (7, 7) and fit.metadata["leave_one_out_cm"]["largest"] > max(fit.residuals_cm)
 
 
 def test_a_mirrored_frame_is_named():
@@ -135,7 +135,7 @@ def test_points_in_a_plane_do_not_tell_a_mirror():
 def test_a_pair_that_was_picked_wrong_is_named():
     _, x, y = made(7, noise=0.001)
     y[3] += 2.0
-    (doubt,) = Pairs(x, y, names=tuple("abcdefg")).fit(FREE, quiet).doubts
+    (doubt,) = Pairs(x, y, names=tuple("abcdefg")).fit(FREE, quiet).warnings
     assert 'pair 4 ("d")' in doubt and "picked wrong" in doubt
 
 
@@ -144,7 +144,7 @@ def test_two_pairs_and_up_that_is_another_axis():
     truth, x = similarity(rng, upright=True), rng.uniform(0, 4, (2, 3))
     turn = np.eye(4)[[0, 2, 1, 3]] * [[1], [-1], [1], [1]]
     y_up = carried(np.linalg.inv(turn) @ truth, x)
-    fit = Pairs(x, y_up).fit(AlignmentTarget(turn=turn, upright=True), quiet)
+    fit = Pairs(x, y_up).fit(AlignmentTarget(to_z_up=turn, is_upright=True), quiet)
     np.testing.assert_allclose(fit.matrix, np.linalg.inv(turn) @ truth, atol=1e-9)
 
 

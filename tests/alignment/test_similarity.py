@@ -11,12 +11,12 @@ from nerg_mi.alignment.similarity import (
     MIRROR,
     Chart,
     check_points,
-    errors,
+    residual_distances,
     fit_similarity,
     in_plane,
     leave_one_out,
     right_jacobian,
-    scale_of,
+    similarity_scale,
     upright_basis,
 )
 from nerg_mi.errors import NergError
@@ -44,13 +44,13 @@ def test_derivatives_are_those_of_central_differences(basis):
     rng = np.random.default_rng(0)
     chart = Chart(similarity(rng), rng.normal(size=3), basis)
     x, q, slope = rng.normal(size=(20, 3)), rng.normal(0, 0.4, basis.shape[1]), rng.normal(size=(20, 3))
-    moved = chart.moved(q, x)
+    moved = chart.transform(q, x)
     np.testing.assert_allclose(moved, carried(chart.matrix(q), x), atol=1e-12)
     by = chart.pulled(q, moved, slope)
     for k, e in enumerate(1e-6 * np.eye(len(q))):
-        numeric = np.sum(slope * (chart.moved(q + e, x) - chart.moved(q - e, x)), axis=1) / 2e-6
+        numeric = np.sum(slope * (chart.transform(q + e, x) - chart.transform(q - e, x)), axis=1) / 2e-6
         np.testing.assert_allclose(by[:, k], numeric, atol=1e-7)
-    assert chart.scale(q) == pytest.approx(scale_of(chart.matrix(q)))
+    assert chart.scale(q) == pytest.approx(similarity_scale(chart.matrix(q)))
 
 
 def test_upright_charts_keep_up_and_the_floor():
@@ -59,7 +59,7 @@ def test_upright_charts_keep_up_and_the_floor():
     floor = base[2, 3]
     chart = Chart(base, np.array([1.0, 2.0, floor]), upright_basis(True))
     m = chart.matrix(rng.normal(size=4))
-    np.testing.assert_allclose(m[:3, 2] / scale_of(m), [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(m[:3, 2] / similarity_scale(m), [0, 0, 1], atol=1e-12)
     assert m[2, 3] == pytest.approx(floor)
 
 
@@ -84,7 +84,7 @@ def test_noisy_points_give_the_least_squares_that_a_minimiser_finds():
         return w @ np.sum((moved - y) ** 2, axis=1)
 
     found = fit_similarity(x, y, w)
-    start = [*Rotation.from_matrix(found[:3, :3] / scale_of(found)).as_rotvec() + 0.1, *found[:3, 3], 0]
+    start = [*Rotation.from_matrix(found[:3, :3] / similarity_scale(found)).as_rotvec() + 0.1, *found[:3, 3], 0]
     best = minimize(cost, start, method="BFGS", options={"gtol": 1e-10})
     assert w @ np.sum((carried(found, x) - y) ** 2, axis=1) == pytest.approx(best.fun, rel=1e-6)
 
@@ -108,9 +108,9 @@ def test_leave_one_out_is_the_error_of_the_fit_to_the_others():
     rng = np.random.default_rng(4)
     truth, x = similarity(rng), rng.normal(size=(5, 3))
     y = carried(truth, x)
-    y[2] += scale_of(truth) * np.array([0.5, 0, 0])
+    y[2] += similarity_scale(truth) * np.array([0.5, 0, 0])
     left = leave_one_out(x, y)
-    assert left[2] == pytest.approx(0.5, rel=1e-6) and errors(fit_similarity(x, y), x, y).max() < 0.5
+    assert left[2] == pytest.approx(0.5, rel=1e-6) and residual_distances(fit_similarity(x, y), x, y).max() < 0.5
     assert np.isnan(leave_one_out(x[:3], y[:3])).all()
 
 

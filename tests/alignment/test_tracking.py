@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.alignment.constraints import AlignmentTarget, surface_of_traces
-from nerg_mi.alignment.similarity import MIRROR, errors
-from nerg_mi.alignment.tracking import DECLARED, Tracking, close, compare_flips, scale_range, search
+from nerg_mi.alignment.similarity import MIRROR, residual_distances
+from nerg_mi.alignment.tracking import DECLARED, Tracking, is_close, compare_flips, scale_range, search_placements
 from nerg_mi.errors import NergError
 from nerg_mi.photos.posed import read_semidense
 from nerg_mi.rays.readers.registry import read_rays
@@ -95,15 +95,15 @@ def test_heads_that_nobody_knows_are_left_out():
 
 def test_turn_shift_and_scale_are_guessed_from_hit_points_and_heads():
     rays, truth = rooms.people(1500), rooms.similarity(np.random.default_rng(2), upright=True)
-    surface = surface_of_traces(rooms.traces().moved(truth), 1 << 16)
+    surface = surface_of_traces(rooms.traces().transform(truth), 1 << 16)
     scales = scale_range(surface, rays.hit)
     scale = np.cbrt(np.linalg.det(truth[:3, :3]))
     assert scales[0] > scale > scales[-1] and np.abs(np.log(scales / scale)).min() < 0.04
     near = scales[np.abs(np.log(scales / scale)) < 0.3]
-    best, *others = search(surface, rays.hit, rays.origin, near, (0.0, truth[2, 3]))
+    best, *others = search_placements(surface, rays.hit, rays.origin, near, (0.0, truth[2, 3]))
     moved, right = (rooms.carried(m, rays.origin) for m in (best.matrix, truth))
     assert np.median(np.linalg.norm(moved - right, axis=1)) < 0.3 * scale
-    assert all(o.score <= best.score and not close(o.matrix, best.matrix, 0.02) for o in others)
+    assert all(o.score <= best.score and not is_close(o.matrix, best.matrix, 0.02) for o in others)
 
 
 # ---- Tracking ----
@@ -118,11 +118,11 @@ def quiet(share, text):
 @pytest.mark.nightly
 def test_the_tracking_alone_finds_its_place_and_a_mirrored_one_is_named():
     truth = rooms.similarity(np.random.default_rng(7), upright=True)
-    target = AlignmentTarget(traces=rooms.traces(25_000).moved(truth))
+    target = AlignmentTarget(traces=rooms.traces(25_000).transform(truth))
     fit = Tracking(RAYS).fit(target, quiet)
-    off = errors(fit.matrix, RAYS.origin, rooms.carried(truth, RAYS.origin))
-    assert np.median(off) < 0.03 and fit.mirrored is None and np.median(fit.centimetres) < 6
-    assert fit.about["heads_in_solids"] < 0.02 and np.median(fit.degrees) < 3
+    off = residual_distances(fit.matrix, RAYS.origin, rooms.carried(truth, RAYS.origin))
+    assert np.median(off) < 0.03 and fit.mirrored is None and np.median(fit.residuals_cm) < 6
+    assert fit.metadata["heads_in_solids"] < 0.02 and np.median(fit.residuals_deg) < 3
     flipped = replace(
         RAYS,
         origin=rooms.carried(MIRROR, RAYS.origin),
@@ -137,9 +137,9 @@ def test_a_start_is_refined_to_any_rotation():
     nudge = np.eye(4)
     nudge[:3, 3] = 0.08, -0.06, 0.05
     fit = Tracking(RAYS, truth @ nudge).fit(
-        AlignmentTarget(traces=rooms.traces(25_000).moved(truth), upright=False), quiet
+        AlignmentTarget(traces=rooms.traces(25_000).transform(truth), is_upright=False), quiet
     )
-    assert np.median(errors(fit.matrix, RAYS.origin, rooms.carried(truth, RAYS.origin))) < 0.02
+    assert np.median(residual_distances(fit.matrix, RAYS.origin, rooms.carried(truth, RAYS.origin))) < 0.02
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from nerg_mi.aoi import output
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.figures.statistics import things_figure
-from nerg_mi.statistics.tables import PLACES, PersonRows
+from nerg_mi.statistics.tables import MIN_VIEWPOINTS, ParticipantRows
 from nerg_mi.statistics.visits import ALL, VisitSums
 from tests.workflows.recorder import Recorder
 
@@ -31,7 +31,7 @@ THING = {
 def test01_what_there_is_and_nothing_else(tmp_path):
     place = {"x": 0.0, "y": 0.0, "z": 1.6, "area": 2.0}
     recorder = Recorder()
-    made = StatisticsResult(things=[THING], isovists=[place, place | {"x": 0.25}], blanked=2)
+    made = StatisticsResult(aois=[THING], isovists=[place, place | {"x": 0.25}], num_suppressed=2)
     files = write_results(tmp_path, made, [], StatisticsOptions(), recorder)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(p.name for p in files)
     names = {p.name for p in files}
@@ -41,7 +41,7 @@ def test01_what_there_is_and_nothing_else(tmp_path):
 
 
 def test02_equal_results_are_equal_files(tmp_path):
-    made = StatisticsResult(things=[THING])
+    made = StatisticsResult(aois=[THING])
     for name in "ab":
         (tmp_path / name).mkdir()
         write_results(tmp_path / name, made, [], StatisticsOptions(), Recorder())
@@ -95,7 +95,7 @@ def test04_what_a_field_foretells_with_its_spread_and_support():
 def test06_reach_from_few_places_is_marked_in_table_and_picture():
     row = {"cell": "all", "value": "", "thing": "a", "source": "field", "people": 5, "share": 0.1, "reach": 0.45}
     row |= {"dwell": 2.0, "support": 9.0}
-    for places, low in ((2.56, True), (PLACES - 0.01, True), (PLACES, False), (None, False)):
+    for places, low in ((2.56, True), (MIN_VIEWPOINTS - 0.01, True), (MIN_VIEWPOINTS, False), (None, False)):
         one = row | {"places": places}
         texts = output.thing_columns([one])[1](one)
         said = [text for text in texts if "too low" in str(text)]
@@ -134,7 +134,7 @@ def test07_many_people_are_written_in_parts(tmp_path, monkeypatch):
     sums = VisitSums.empty(("x", "y"), (ALL,), [(ALL, f"p{k}") for k in range(5)])
     # The first part of the file knows no first look.
     sums.looks[3:], sums.first_sum[3:], sums.first_count[3:] = 1, 2.5, 1
-    rows = PersonRows(sums, {f"p{k}": f"p{k}" for k in range(5)}, False)
+    rows = ParticipantRows(sums, {f"p{k}": f"p{k}" for k in range(5)}, False)
     monkeypatch.setattr(output, "_PART", 3)
     monkeypatch.setattr(output, "MOST_LINES", 4)
     files = output.write_rows(tmp_path, "people", rows, *output.plain_columns(rows))

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from nerg_mi.aoi import measured
-from nerg_mi.aoi.measured import AoiContext, TimeWindow, ViewpointSampler, ahead, blocks_of, count_block
+from nerg_mi.aoi.measured import AoiContext, TimeWindow, ViewpointSampler, facing_directions, iter_blocks, count_block
 from nerg_mi.aoi.options import PredictionOptions, StatisticsOptions
 from nerg_mi.aoi.parts import (
-    Places,
+    ObserverPoses,
     PlannedPrediction,
     PlannedSetting,
     _place_beside,
@@ -29,14 +29,14 @@ from nerg_mi.formats.areas import Region
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.visits import ALL, BoxAoi, Cell, VisitRules, VisitSums, merge
-from nerg_mi.tasks.task import Files
+from nerg_mi.statistics.visits import ALL, BoxAoi, Cell, VisitRules, VisitSums, merge_sums
+from nerg_mi.tasks.task import FileGroup
 from nerg_mi.workflows.parts import PlannedScene, account_for_store
 from nerg_mi.workflows.statistics import statistics
 from tests.conftest import ROOT
 from tests.plugins import fields
 from tests.rays.dataset.making import DAY, recipe, update_dataset, write_dataset, write_source
-from tests.tasks.works import laid_out
+from tests.tasks.works import lay_out
 from tests.workflows.recorder import Recorder
 
 from .place import SIGN, STAND, people, write_place
@@ -48,7 +48,7 @@ FAST = {"resamples": 199, "eyes": 40, "directions": 128, "samples": 6, "names": 
 def engine(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     # Blocks of about a person each.
-    monkeypatch.setattr(measured.blocks_of, "__defaults__", (100,))
+    monkeypatch.setattr(measured.iter_blocks, "__defaults__", (100,))
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def place(tmp_path, rgb):
 
 def count(place, folder, rays="rays.npz", **more):
     told = Recorder()
-    options = StatisticsOptions(areas=place / "areas.json", **{**FAST, **more})
+    options = StatisticsOptions(aois=place / "areas.json", **{**FAST, **more})
     statistics([place / "scene.xml", place / rays], place / folder, options, told)
     return {p.name: p.read_bytes() for p in (place / folder).iterdir()}, told
 
@@ -88,7 +88,7 @@ def test_two_processes_give_the_tables_of_one(place):
     assert parts == whole and {"things.csv", "moves.csv", "people.csv", "what_if.csv", "about.json"} <= set(whole)
     assert b"poster" in whole["what_if.csv"]
     account = account_for_store(place / "two.tasks", reporter=told)
-    assert [(job.what.partition(" /")[0], job.left) for job in account.jobs] == [("nerg stats", 0)] * 3
+    assert [(job.name.partition(" /")[0], job.remaining) for job in account.jobs] == [("nerg stats", 0)] * 3
     assert sorted(job.total for job in account.jobs) == [2, 2, 6]
     assert len(account.jobs[0].changed) == 0
 
@@ -123,7 +123,7 @@ def test_sums_come_back_one_by_one(tmp_path):
     cells = (ALL, Cell("window", "früh"))
     one = VisitSums.empty(("a", "b"), cells, [(cells[0], "p"), (cells[1], "p"), (cells[0], "q")])
     one.time[:] = (0.1, 1 / 3, 7)
-    two = replace(one, time=one.time * 2, moves=one.moves + 1)
+    two = replace(one, time=one.time * 2, transitions=one.transitions + 1)
     write_sums(tmp_path / "s.npz", [one, two])
     for back, sums in zip(read_sums(tmp_path / "s.npz"), (one, two), strict=True):
         for f in dataclass_fields(VisitSums):
@@ -131,11 +131,11 @@ def test_sums_come_back_one_by_one(tmp_path):
 
 
 def test_what_a_field_foretells_where_files_were_sent(place, tmp_path):
-    options = PredictionOptions(areas=place / "areas.json", samples=4, directions=64, mode="llvm_ad_rgb")
-    areas = Files(options.areas, (options.areas,))
-    setting = PlannedSetting(options, PlannedScene.of(place / "scene.xml"), None, None, areas)
-    common = laid_out(PlannedPrediction(setting, 120.0), tmp_path / "there")
-    places = Places(np.array([[1.0, 2, 1.6]] * 2), np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
+    options = PredictionOptions(aois=place / "areas.json", aoi_samples=4, directions=64, mode="llvm_ad_rgb")
+    areas = FileGroup(options.aois, (options.aois,))
+    setting = PlannedSetting(options, PlannedScene.plan(place / "scene.xml"), None, None, areas)
+    common = lay_out(PlannedPrediction(setting, 120.0), tmp_path / "there")
+    places = ObserverPoses(np.array([[1.0, 2, 1.6]] * 2), np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
     foretell_part(common, places, tmp_path / "f.npz")
     found = read_foretold(tmp_path / "f.npz")
     assert found.share.shape == (2, 3) and np.array_equal(found.share[0], found.share[1])
@@ -159,7 +159,7 @@ RULES = VisitRules()
 
 
 def counting(**changes):
-    things = [BoxAoi(Region.of("sign", *SIGN)), BoxAoi(Region.of("stand", *STAND))]
+    things = [BoxAoi(Region.create("sign", *SIGN)), BoxAoi(Region.create("stand", *STAND))]
     around = GazeScene(None, None, Similarity())
     made = AoiContext(around, things, ("sign", "stand", "both"), [(0,), (1,), (0, 1)], (0, 1), RULES, 0.0)
     return replace(made, **changes)
@@ -169,15 +169,15 @@ def test01_blocks_hold_sittings_as_a_whole_and_all_of_the_rays():
     rays = people(7, 60)
     # Two sittings each: a pause of two minutes in the middle.
     rays = replace(rays, t=rays.t + 120.0 * (rays.t >= 6))
-    whole = merge([count_block(rays, counting())])
+    whole = merge_sums([count_block(rays, counting())])
     for most in (1, 50, 100, 10_000):
-        blocks = list(blocks_of(rays, RULES, most))
+        blocks = list(iter_blocks(rays, RULES, most))
         assert sum(len(b) for b in blocks) == len(rays)
         if most == 1:
             assert [len(b) for b in blocks] == [30] * 14
         for b in blocks:
             assert not (np.diff(b.person) < 0).any()
-        found = merge(count_block(b, counting()) for b in blocks)
+        found = merge_sums(count_block(b, counting()) for b in blocks)
         for name in ("time", "on_time", "looks", "first_sum", "moves", "sittings"):
             assert np.allclose(getattr(found, name), getattr(whole, name)), name
 
@@ -203,7 +203,7 @@ def test02_a_sitting_that_runs_over_two_parts_of_a_dataset_is_one(tmp_path):
             nerg.import_rays(tmp_path / "day.csv", columns=columns, output=name)
         finally:
             dataset_write.PART_ROWS = before
-        found[rows] = merge(count_block(b, counting()) for b in blocks_of(name, RULES))
+        found[rows] = merge_sums(count_block(b, counting()) for b in iter_blocks(name, RULES))
         if rows == 50:
             assert len(dataset.RayDataset.open(name).parts) > 4 and dataset and dataset
     a, b = found.values()
@@ -215,7 +215,7 @@ def test02_a_sitting_that_runs_over_two_parts_of_a_dataset_is_one(tmp_path):
 
 def test03_no_rays():
     with pytest.raises(NergError, match="no rays to count"):
-        list(blocks_of(people().select(np.zeros(0, int)), RULES))
+        list(iter_blocks(people().select(np.zeros(0, int)), RULES))
 
 
 def test04_a_tolerance_lets_rays_pass_by():
@@ -225,17 +225,17 @@ def test04_a_tolerance_lets_rays_pass_by():
     angles = edge + np.radians([0.5, 1.9, 2.5])
     d = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
     rays = Rays(np.arange(3.0), np.zeros(3, int), ("a",), o, d, np.ones(3))
-    assert [len(rows) for rows in counting().land(rays).rows] == [0, 0, 0]
-    assert counting(tolerance=2.0).land(rays).rows[0].tolist() == [0, 1]
+    assert [len(rows) for rows in counting().assign_hits(rays).rows] == [0, 0, 0]
+    assert counting(tolerance=2.0).assign_hits(rays).rows[0].tolist() == [0, 1]
 
 
 def test05_rays_in_another_frame():
     align = np.diag([2.0, 2, 2, 1])
     align[:3, 3] = 1, 2, 3
     around = GazeScene(None, None, Similarity(align))
-    moved = [BoxAoi(Region.of(n, *(2 * c + (1, 2, 3)))) for n, c in (("sign", SIGN), ("stand", STAND))]
+    moved = [BoxAoi(Region.create(n, *(2 * c + (1, 2, 3)))) for n, c in (("sign", SIGN), ("stand", STAND))]
     rays = people()
-    one, two = counting().land(rays), counting(around=around, things=moved).land(rays)
+    one, two = counting().assign_hits(rays), counting(around=around, things=moved).assign_hits(rays)
     for a, b in zip(one.rows, two.rows):
         assert a.tolist() == b.tolist()
     for a, b in zip(one.distance, two.distance):
@@ -246,9 +246,9 @@ def test05_rays_in_another_frame():
 def test06_cells():
     rays = people()
     made = counting(
-        windows=[TimeWindow("w", 1.0, 2.0)], zones=[Region.of("z", [0, 0, 9], [1, 4, 9.1])], cohort_names=("even", "x")
+        windows=[TimeWindow("w", 1.0, 2.0)], zones=[Region.create("z", [0, 0, 9], [1, 4, 9.1])], cohort_names=("even", "x")
     )
-    cells = dict(made.cells(rays, rays.origin))
+    cells = dict(made.cell_masks(rays, rays.origin))
     assert cells[ALL] is None and not cells[Cell("cohort", "x")].any()
     assert np.array_equal(cells[Cell("cohort", "even")], rays.person % 2 == 0)
     assert np.array_equal(cells[Cell("window", "w")], (rays.t >= 1) & (rays.t < 2))
@@ -260,15 +260,15 @@ def test07_heads_tell_where_people_are_turned():
     rays = people(2, 3)
     head = np.tile(np.array([0, 1, 0], np.float32), (6, 1))
     head[0] = np.nan
-    found = ahead(replace(rays, head=head))
+    found = facing_directions(replace(rays, head=head))
     assert np.array_equal(found[0], rays.direction[0]) and np.allclose(found[1:], [0, 1, 0])
-    assert ahead(rays) is rays.direction
+    assert facing_directions(rays) is rays.direction
 
 
 def test08_eyes_are_taken_evenly_and_of_everybody():
     picker = ViewpointSampler(100)
-    for block in blocks_of(people(5, 80), RULES, 100):
-        picker.take(block, counting())
-    eyes = picker.eyes()
-    assert set(eyes.person) == {f"name {k}" for k in range(5)} and 5 <= len(eyes.person) <= 10
+    for block in iter_blocks(people(5, 80), RULES, 100):
+        picker.add(block, counting())
+    eyes = picker.viewpoints()
+    assert set(eyes.participants) == {f"name {k}" for k in range(5)} and 5 <= len(eyes.participants) <= 10
     assert all(ALL in cells for cells in eyes.cells) and eyes.positions.shape == eyes.ahead.shape

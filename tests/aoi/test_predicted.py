@@ -14,28 +14,28 @@ from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.predicted import (
     AoiScene,
     PredictedAttention,
-    add_trust,
-    eyes_of_some,
-    foretell,
-    foretold_people,
+    add_uncertainty,
+    subsample_participants,
+    predict_attention,
+    aggregate_by_participant,
     isovist_rows,
-    look_around,
-    places_of,
-    setting_of,
+    place_observers_on_floor,
+    viewpoints_at,
+    load_aoi_scene,
     support_of,
-    tell_places,
-    tell_support,
+    warn_few_viewpoints,
+    warn_missing_support,
     what_if_rows,
 )
-from nerg_mi.aoi.scene import Changes, GazeScene, Put, surroundings_of_files, things_of
+from nerg_mi.aoi.scene import Changes, GazeScene, NewShape, surroundings_of_files, make_aois
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.areas import AreaSet, MeshPart, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.statistics.shares import SamplePoints, isovists
-from nerg_mi.statistics.tables import PLACES, MinParticipantsFilter
+from nerg_mi.statistics.shares import SamplePoints, compute_isovists
+from nerg_mi.statistics.tables import MIN_VIEWPOINTS, MinParticipantsFilter
 from nerg_mi.statistics.visits import ALL, BoxAoi, Cell
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.workflows.base import SILENT
 from tests.workflows.recorder import Recorder
 
@@ -47,10 +47,10 @@ from .place import SIGN, write_place
 class Law(GazeScene):
     """A gaze that is known: twice as dense ahead (x > 0) as behind, and seven units of support."""
 
-    def look_from(self, eye):
+    def query_from(self, eye):
         return lambda d: (np.where(d[:, 0] > 0, 2.0, 1.0)[None], None)
 
-    def support(self, eye):
+    def support_at(self, eye):
         return 7.0
 
 
@@ -66,8 +66,8 @@ EYES = Viewpoints(
 
 def test01_shares_are_integrals():
     # A cube of which the eye sees a face of 2 x 2 at x = 1: a sixth of the sphere; of the hemisphere's gaze 2/3.
-    things = [BoxAoi(Region.of("ahead", [1, -1, -1], [2, 1, 1])), BoxAoi(Region.of("behind", [-2, -1, -1], [-1, 1, 1]))]
-    found = foretell(AROUND, EYES, things, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    things = [BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])), BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1]))]
+    found = predict_attention(AROUND, EYES, things, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
     assert np.allclose(found.share[0], [2 / 9, 1 / 9, 3 / 9], rtol=2e-3)
     # The mean distance to a square face, over its solid angle, by quadrature in its plane.
     u = (np.arange(400) + 0.5) / 200 - 1
@@ -79,45 +79,45 @@ def test01_shares_are_integrals():
 
 
 def test02_people():
-    things = [BoxAoi(Region.of("ahead", [1, -1, -1], [2, 1, 1]))]
-    found = foretell(AROUND, EYES, things, [(0,)], 0.0, 120.0, 24, 4096, SILENT)
-    people = foretold_people(found, EYES, ALL, {"Ada": 3.0, "Bo": 6.0}, 0.3)
+    things = [BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1]))]
+    found = predict_attention(AROUND, EYES, things, [(0,)], 0.0, 120.0, 24, 4096, SILENT)
+    people = aggregate_by_participant(found, EYES, ALL, {"Ada": 3.0, "Bo": 6.0}, 0.3)
     assert people.names == ("Ada", "Bo")
     share = found.share[:2].mean(axis=0)
-    assert people.on_time[0] == pytest.approx(3 * share)
+    assert people.dwell_time[0] == pytest.approx(3 * share)
     # Ten glances, five from each place.
     missed = np.prod([(1 - s) ** 5 for s in found.share[:2, 0]])
-    assert people.reached[0, 0] == pytest.approx(1 - missed)
-    (bo,) = foretold_people(found, EYES, Cell("zone", "z"), {"Bo": 6.0}, 0.3).names
-    assert bo == "Bo" and foretold_people(found, EYES, Cell("zone", "other"), {"Bo": 6.0}, 0.3) is None
+    assert people.hit_probability[0, 0] == pytest.approx(1 - missed)
+    (bo,) = aggregate_by_participant(found, EYES, Cell("zone", "z"), {"Bo": 6.0}, 0.3).names
+    assert bo == "Bo" and aggregate_by_participant(found, EYES, Cell("zone", "other"), {"Bo": 6.0}, 0.3) is None
 
 
 class Two(Law):
     """Two members who look to opposite sides, ten times as long at one as at the other."""
 
-    def look_from(self, eye):
+    def query_from(self, eye):
         return lambda d: (np.array([np.where(s * d[:, 0] > 0, 10.0, 1.0) for s in (1, -1)]), None)
 
 
 def test03_members_of_an_ensemble():
-    things = [BoxAoi(Region.of("ahead", [1, -1, -1], [2, 1, 1])), BoxAoi(Region.of("behind", [-2, -1, -1], [-1, 1, 1]))]
-    found = foretell(Two(None, None, Similarity()), EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    things = [BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])), BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1]))]
+    found = predict_attention(Two(None, None, Similarity()), EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT)
     # A sixth of the sphere each: evenly of both, and 10/11 or 1/11 of a hemisphere's third by one.
     assert found.members.shape == (2, 3, 2) and np.allclose(found.share[0], 1 / 6, rtol=3e-3)
     assert np.allclose(found.members[:, 0], [[10 / 33, 1 / 33], [1 / 33, 10 / 33]], rtol=3e-3)
-    assert foretell(AROUND, EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 64, SILENT).members.shape == (1, 3, 2)
+    assert predict_attention(AROUND, EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 64, SILENT).members.shape == (1, 3, 2)
 
 
 def test04_of_very_many_people_some_are_asked():
     names = tuple(f"{k // 2:04d}" for k in range(400))
     many = Viewpoints(np.arange(1200.0).reshape(400, 3), np.ones((400, 3)), names, (frozenset([ALL]),) * 400)
     told = Recorder()
-    some = eyes_of_some(many, 50, told)
-    assert len(set(some.person)) == 50 and len(some.person) == 100 and len(some.positions) == len(some.cells) == 100
-    assert all((some.positions[k] == many.positions[names.index(n) + k % 2]).all() for k, n in enumerate(some.person))
+    some = subsample_participants(many, 50, told)
+    assert len(set(some.participants)) == 50 and len(some.participants) == 100 and len(some.positions) == len(some.cells) == 100
+    assert all((some.positions[k] == many.positions[names.index(n) + k % 2]).all() for k, n in enumerate(some.participants))
     back = np.arange(400)[::-1]
-    turned = eyes_of_some(Viewpoints(many.positions[back], many.ahead, names[::-1], many.cells), 50, SILENT)
-    assert set(turned.person) == set(some.person) and eyes_of_some(many, 200, SILENT) is many
+    turned = subsample_participants(Viewpoints(many.positions[back], many.ahead, names[::-1], many.cells), 50, SILENT)
+    assert set(turned.participants) == set(some.participants) and subsample_participants(many, 200, SILENT) is many
     assert "50 of 200 people" in told.messages[0]
 
 
@@ -126,13 +126,13 @@ def test04_of_very_many_people_some_are_asked():
 
 def test01_on_the_floor_of_a_room(tmp_path):
     around = surroundings_of_files(write_place(tmp_path, gaze=False), None, None, None, ns)
-    found = look_around(around, 1.6, 0.25, 0.0)
+    found = place_observers_on_floor(around, 1.6, 0.25, 0.0)
     inside = ((found[:, :2] > (2.5, 1.0)) & (found[:, :2] < (2.9, 2.0))).all(axis=1)
     assert 330 < len(found) < 24 * 16 and not inside.any() and np.allclose(found[:, 2], 1.6)
     with pytest.raises(NergError, match="--floor"):
-        look_around(around, 1.6, 0.25, -2.0)
+        place_observers_on_floor(around, 1.6, 0.25, -2.0)
     rows = isovist_rows(
-        isovists(found[:4], around.depth, SamplePoints.of([BoxAoi(Region.of("s", *SIGN))], 24), 0.01, 9.0),
+        compute_isovists(found[:4], around.trace_depth, SamplePoints.sample([BoxAoi(Region.create("s", *SIGN))], 24), 0.01, 9.0),
         ("s", "g"),
         [(0,), (0,)],
     )
@@ -140,17 +140,17 @@ def test01_on_the_floor_of_a_room(tmp_path):
 
 
 def test02_observers_have_names():
-    eyes = places_of(np.zeros((12, 3)))
-    assert eyes.person[0] == "observer 01" and len(set(eyes.person)) == 12
+    eyes = viewpoints_at(np.zeros((12, 3)))
+    assert eyes.participants[0] == "observer 01" and len(set(eyes.participants)) == 12
 
 
 # ---- What a count needs besides rays ----
 
 
 def setting(folder, scene=True, **options):
-    asked = StatisticsOptions(areas=folder / "areas.json", **options)
+    asked = StatisticsOptions(aois=folder / "areas.json", **options)
     place = folder / "scene.xml" if scene else None
-    return setting_of(place, None, None, read_areas(folder / "areas.json"), asked, namespace("llvm_ad_rgb"))
+    return load_aoi_scene(place, None, None, read_areas(folder / "areas.json"), asked, namespace("llvm_ad_rgb"))
 
 
 def test_cohorts_are_those_of_the_table_or_of_the_rays(tmp_path, rgb):
@@ -158,8 +158,8 @@ def test_cohorts_are_those_of_the_table_or_of_the_rays(tmp_path, rgb):
     (tmp_path / "who.csv").write_text("person,cohort\na,old\nb,new\n")
     found = setting(tmp_path)
     assert found.members == [(0,), (1,), (0, 1)] and found.margin == 0.03
-    assert found.counting(False, ("x",)).cohort_names == ("x",) and found.counting(True, ()).hits
-    table = setting(tmp_path, cohorts=tmp_path / "who.csv").counting(False, ("x",))
+    assert found.make_context(False, ("x",)).cohort_names == ("x",) and found.make_context(True, ()).hits
+    table = setting(tmp_path, cohorts=tmp_path / "who.csv").make_context(False, ("x",))
     assert table.cohort_names == ("new", "old") and list(table.movable) == [0, 1]
 
 
@@ -169,7 +169,7 @@ def test_where_no_place_is_known_things_hide_each_other(tmp_path, rgb):
         (tmp_path / "areas.json").read_text().replace('"shape": "stand"', '"min": [2.5, 1, 0], "max": [2.9, 2, 2.2]')
     )
     (tmp_path / "areas.json").write_text(areas)
-    found = setting(tmp_path, scene=False, seen=True)
+    found = setting(tmp_path, scene=False, aoi_visibility=True)
     depth = found._depth_or_things(np.array([[0.0, 1.6, 1.5], [0, 2.4, 1.5]]), np.array([[1.0, 0, 0]] * 2))
     assert np.allclose(depth, (2.5, 4.0))
 
@@ -207,7 +207,7 @@ def rows():
 
 def test01_spread_and_support_of_each_cell():
     found = rows()
-    add_trust(found, foretold([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
+    add_uncertainty(found, foretold([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
     tracked, field, _, zone = found
     assert tracked["support"] is tracked["share_spread"] is None
     assert field["support"] == 3 and zone["support"] == 8
@@ -220,39 +220,39 @@ def test01_spread_and_support_of_each_cell():
 
 def test02_nothing_of_one_field_or_what_is_blank():
     found = rows()
-    add_trust(found, foretold([0.1, 0.3, 0.4]), TRUST_EYES, TIMES, 0.3)
+    add_uncertainty(found, foretold([0.1, 0.3, 0.4]), TRUST_EYES, TIMES, 0.3)
     assert all(row["share_spread"] is None for row in found)
     blank = [row | {"people": None, "share": None} for row in rows()]
-    add_trust(blank, foretold([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
+    add_uncertainty(blank, foretold([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
     assert all(row["share_spread"] is row["support"] is None for row in blank)
     assert blank[1]["dwell_spread"] is not None
 
 
 def test03_a_checkpoint_without_support_is_told_of():
     told = Recorder()
-    tell_support(foretold([0.1, 0.3, 0.4]), told)
+    warn_missing_support(foretold([0.1, 0.3, 0.4]), told)
     assert told.messages == []
     none = foretold([0.1, 0.3, 0.4], support=(np.nan,) * 3)
     assert support_of(none) is None and support_of(foretold([1, 1, 1]), np.zeros(3, bool)) is None
-    tell_support(none, told)
+    warn_missing_support(none, told)
     assert "keeps no support" in told.messages[0] and "nerg train gaze" in told.messages[0]
 
 
 def test_few_places_a_person_are_told():
     told = Recorder()
-    tell_places(TRUST_EYES, told)
+    warn_few_viewpoints(TRUST_EYES, told)
     assert len(told.messages) == 1 and "1.5 places a person" in told.messages[0] and "--eyes 32 " in told.messages[0]
-    count = 2 * PLACES
-    many = Viewpoints(np.zeros((count, 3)), np.ones((count, 3)), ("Ada", "Bo") * PLACES, (frozenset([ALL]),) * count)
-    tell_places(many, told)
-    tell_places(Viewpoints(np.zeros((0, 3)), np.zeros((0, 3)), (), ()), told)
+    count = 2 * MIN_VIEWPOINTS
+    many = Viewpoints(np.zeros((count, 3)), np.ones((count, 3)), ("Ada", "Bo") * MIN_VIEWPOINTS, (frozenset([ALL]),) * count)
+    warn_few_viewpoints(many, told)
+    warn_few_viewpoints(Viewpoints(np.zeros((0, 3)), np.zeros((0, 3)), (), ()), told)
     assert len(told.messages) == 1
 
 
 # ---- The table of a change, from foretold numbers that are known ----
 
-AREAS = AreaSet((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])))
-WHAT_IF_EYES = places_of(np.arange(15.0).reshape(5, 3))
+AREAS = AreaSet((Region.create("a", [0, 0, 0], [1, 1, 1]), Region.create("b", [2, 0, 0], [3, 1, 1])))
+WHAT_IF_EYES = viewpoints_at(np.arange(15.0).reshape(5, 3))
 
 
 def told(share, support=5.0, members=1):
@@ -267,11 +267,11 @@ def rows_what_if(tmp_path, changes, after, floor=None, members=1):
     asked = []
 
     def foretell(there, eyes):
-        asked.append((eyes, there.areas, there.things))
+        asked.append((eyes, there.areas, there.aois))
         return after
 
     before = told([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]], members=members)
-    around, things = GazeScene(None, None, Similarity()), things_of(AREAS.things, {}, {})
+    around, things = GazeScene(None, None, Similarity()), make_aois(AREAS.elements, {}, {})
     setting = AoiScene(around, AREAS, things, StatisticsOptions(), {})
     found = what_if_rows(
         tmp_path / "c.json", setting, WHAT_IF_EYES, before, foretell, floor or MinParticipantsFilter(), 199, 0
@@ -300,7 +300,7 @@ def test02_other_observers_are_other_people(tmp_path):
 def test03_a_floor_on_people(tmp_path):
     floor = MinParticipantsFilter(9)
     found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5), floor)
-    assert all(r["before"] is None and r["difference"] is None for r in found.values()) and floor.blanked == 4
+    assert all(r["before"] is None and r["difference"] is None for r in found.values()) and floor.num_suppressed == 4
 
 
 def test04_members_of_an_ensemble(tmp_path):
@@ -326,12 +326,12 @@ def test_what_of_meshes_is_not_used_is_named_once(tmp_path):
         (tmp_path / f"{name}.obj").write_text(extra + triangle)
     one, two = tmp_path / "one.obj", tmp_path / "two.obj"
     areas = AreaSet((MeshPart("a", one), MeshPart("b", one, ((0, 0),))))
-    setting = setting_of(None, None, None, areas, StatisticsOptions(), ns)
-    assert setting.notes == [f"of {one}: statements that are not used: usemtl"]
+    setting = load_aoi_scene(None, None, None, areas, StatisticsOptions(), ns)
+    assert setting.warnings == [f"of {one}: statements that are not used: usemtl"]
     scene = mi.load_dict({"type": "scene", "s": {"type": "sphere"}})
-    setting = replace(setting, around=GazeScene(Place(None, scene), None, Similarity(), scene))
-    changes = Changes(add=(Put("c", one), Put("d", two)))
-    assert setting.changed(changes).notes == [*setting.notes, f"of {two}: statements that are not used: vp"]
+    setting = replace(setting, gaze_scene=GazeScene(SceneGeometry(None, scene), None, Similarity(), scene))
+    changes = Changes(add=(NewShape("c", one), NewShape("d", two)))
+    assert setting.apply_changes(changes).warnings == [*setting.warnings, f"of {two}: statements that are not used: vp"]
 
 
 def test05_no_support(tmp_path):

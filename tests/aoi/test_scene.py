@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from nerg_mi.aoi.scene import (
-    changed_areas,
+    apply_to_areas,
     changed_scene,
     read_changes,
     read_cohorts,
     read_meshes,
-    scene_of,
+    scene_from_shapes,
     shape_named,
-    shapes_of,
+    shapes_by_id,
     surroundings_of_files,
     thing_of_shape,
-    things_of,
+    make_aois,
 )
 from nerg_mi.errors import NergError
 from nerg_mi.files.tables import write_csv
@@ -50,7 +50,7 @@ def change(scene, tmp_path, **changes):
 
 
 def things(areas, shapes):
-    return things_of(areas, shapes, read_meshes(AreaSet(tuple(areas)).meshes))
+    return make_aois(areas, shapes, read_meshes(AreaSet(tuple(areas)).meshes))
 
 
 def cast(scene, o, d):
@@ -92,20 +92,20 @@ def test02_removed_added_and_swapped(scene_changes, tmp_path):
 
 
 def test03_areas_follow(tmp_path):
-    box = Region.of("shelf", *SIGN)
+    box = Region.create("shelf", *SIGN)
     areas = AreaSet(
         (box, SceneShape("stand", "stand"), AreaGroup("all", ("shelf", "stand")), AreaGroup("g", ("stand",)))
     )
-    found = changed_areas(
+    found = apply_to_areas(
         areas, written(tmp_path, move=[{"area": "shelf", "by": [1, 0, 0], "turn": 90}], remove=["stand"])
     )
-    assert found.names == ("shelf", "all") and found.members()["all"] == (0,)
+    assert found.names == ("shelf", "all") and found.element_indices()["all"] == (0,)
     assert np.allclose(found.boxes[0].bounds, [[4.6, 1.9, 1.0], [5.6, 2.1, 2.0]])
-    more = changed_areas(areas, written(tmp_path, add=[{"name": "x", "min": [0, 0, 0], "max": [1, 1, 1]}]))
+    more = apply_to_areas(areas, written(tmp_path, add=[{"name": "x", "min": [0, 0, 0], "max": [1, 1, 1]}]))
     assert more.areas[-1] == SceneShape("x", "x")
     for wrong in ("stand", "nobody"):
         with pytest.raises(NergError, match="cannot be moved as an area"):
-            changed_areas(areas, written(tmp_path, move=[{"area": wrong}]))
+            apply_to_areas(areas, written(tmp_path, move=[{"area": wrong}]))
 
 
 def test04_observers(tmp_path):
@@ -204,7 +204,7 @@ def test01_depths_are_those_of_the_shapes(folder):
     around = surroundings_of_files(folder / "bare" / "scene.xml", None, None, None, ns)
     rays = people()
     expected = [first_box(o, d)[1] for o, d in zip(rays.origin, rays.direction)]
-    assert np.allclose(around.depth(rays.origin, rays.direction), expected, rtol=1e-4) and around.gaze is None
+    assert np.allclose(around.trace_depth(rays.origin, rays.direction), expected, rtol=1e-4) and around.gaze is None
     assert np.allclose(around.bounds(), [[0, 0, 0], [6, 4, 3]], atol=1e-5)
 
 
@@ -213,23 +213,23 @@ def test02_gaze_of_the_scene_or_beside_it(folder):
     own = surroundings_of_files(folder / "scene.xml", None, None, None, ns)
     beside = surroundings_of_files(folder / "bare" / "scene.xml", None, folder / "gaze.safetensors", None, ns)
     eye = np.array([1.0, 1.0, 1.5])
-    found, other = own.look_from(eye)(d), beside.look_from(eye)(d)
+    found, other = own.query_from(eye)(d), beside.query_from(eye)(d)
     assert found[0].shape == (1, 2) and np.allclose(found[0], other[0], rtol=1e-4)
-    assert np.allclose(found[1], own.depth(np.broadcast_to(eye, d.shape), d)) and np.allclose(found[1], other[1])
-    assert np.isnan(own.support(eye))
+    assert np.allclose(found[1], own.trace_depth(np.broadcast_to(eye, d.shape), d)) and np.allclose(found[1], other[1])
+    assert np.isnan(own.support_at(eye))
 
 
 def test03_frames(folder):
     matrix = np.diag([2.0, 2, 2, 1])
     matrix[:3, 3] = 1, 0, 0
     around = surroundings_of_files(folder / "scene.xml", None, None, Similarity(matrix), ns)
-    assert around.scale == pytest.approx(2) and np.allclose(around.points(np.ones(3)), [3, 2, 2])
-    assert np.allclose(around.directions(np.array([0, 0, 1.0])), [0, 0, 1])
+    assert around.scale == pytest.approx(2) and np.allclose(around.transform_points(np.ones(3)), [3, 2, 2])
+    assert np.allclose(around.transform_directions(np.array([0, 0, 1.0])), [0, 0, 1])
 
 
 def test04_nothing_is_known(folder):
     around = surroundings_of_files(None, None, None, None, ns)
-    assert np.isinf(around.depth(np.zeros((3, 3)), np.eye(3))).all()
+    assert np.isinf(around.trace_depth(np.zeros((3, 3)), np.eye(3))).all()
     with pytest.raises(NergError, match="no place"):
         around.bounds()
 
@@ -255,13 +255,13 @@ def scene_things(tmp_path_factory):
 def test01_one_of_each(scene_things, tmp_path):
     (tmp_path / "two.obj").write_text(TWO)
     areas = [
-        Region.of("box", *SIGN),
+        Region.create("box", *SIGN),
         MeshPart("both", tmp_path / "two.obj"),
         MeshPart("far", tmp_path / "two.obj", ((1, 1),)),
         SceneShape("stand", "stand"),
     ]
-    made = things(areas, shapes_of(scene_things))
-    assert [t.name for t in made] == ["box", "both", "far", "stand"] and [t.open for t in made] == [
+    made = things(areas, shapes_by_id(scene_things))
+    assert [t.name for t in made] == ["box", "both", "far", "stand"] and [t.is_surface for t in made] == [
         False,
         True,
         True,
@@ -271,18 +271,18 @@ def test01_one_of_each(scene_things, tmp_path):
     near = np.array([t.interval(o, d)[0] for t in made])
     assert np.allclose(near[1:], [[1.0, np.inf], [3.0, np.inf], [np.inf, 2.5]])
     # The scene's shapes have their names still.
-    assert set(shapes_of(scene_things)) == {"room", "sign", "stand"}
+    assert set(shapes_by_id(scene_things)) == {"room", "sign", "stand"}
 
 
 def test02_samples_lie_on_the_surface(scene_things, tmp_path):
     (tmp_path / "two.obj").write_text(TWO)
-    both, stand = things([MeshPart("m", tmp_path / "two.obj"), SceneShape("stand", "stand")], shapes_of(scene_things))
-    points, normals = both.samples(64)
+    both, stand = things([MeshPart("m", tmp_path / "two.obj"), SceneShape("stand", "stand")], shapes_by_id(scene_things))
+    points, normals = both.sample_points(64)
     assert points.shape == (64, 3) and not normals.any()
     assert (np.isclose(points[:, 0], 1) | np.isclose(points[:, 0], 3)).all() and 20 < np.isclose(
         points[:, 0], 1
     ).sum() < 44
-    points, _ = stand.samples(64)
+    points, _ = stand.sample_points(64)
     on = np.isclose(points, STAND[0], atol=1e-5) | np.isclose(points, STAND[1], atol=1e-5)
     assert on.any(axis=1).all() and (points > STAND[0] - 1e-5).all() and (points < STAND[1] + 1e-5).all()
 
@@ -294,15 +294,15 @@ def test03_a_sphere():
     ball = thing_of_shape("ball", mi.load_dict({"type": "sphere", "radius": 0.5, "center": [2, 0, 0]}))
     near, far = ball.interval(np.zeros((1, 3)), np.array([[1.0, 0, 0]]))
     assert near == pytest.approx(1.5) and far == near
-    points, _ = ball.samples(50)
+    points, _ = ball.sample_points(50)
     assert np.allclose(np.linalg.norm(points - (2, 0, 0), axis=1), 0.5, atol=1e-5)
 
 
 def test04_what_there_is_not(scene_things, tmp_path):
     with pytest.raises(NergError, match='"x"'):
-        shape_named(shapes_of(scene_things), "x")
+        shape_named(shapes_by_id(scene_things), "x")
     with pytest.raises(NergError, match="give a scene"):
-        shape_named(shapes_of(None), "x")
+        shape_named(shapes_by_id(None), "x")
     with pytest.raises(NergError, match="there is no mesh"):
         things([MeshPart("m", tmp_path / "none.ply")], {})
     (tmp_path / "two.obj").write_text(TWO)
@@ -316,4 +316,4 @@ def test05_meshes_keep_their_names_in_a_scene():
     mi.set_variant("llvm_ad_rgb")
     mesh = mitsuba_mesh(np.eye(3), np.array([[0, 1, 2]]), "tri")
     before = mesh.id()
-    assert len(scene_of({"tri": mesh}).shapes()) == 1 and mesh.id() == before
+    assert len(scene_from_shapes({"tri": mesh}).shapes()) == 1 and mesh.id() == before

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.arrays import Labelled, points, same_for_all, unit
-from nerg_mi.api.scene import active_mitsuba, array_module
+from nerg_mi.api.arrays import LabelledArrays, as_points, broadcast_to_observers, as_unit_vectors
+from nerg_mi.api.scene import activate_mitsuba, get_array_module
 from nerg_mi.errors import NergError
 
 # ---- The names at the top of the package ----
@@ -133,24 +133,24 @@ def test01_one_is_set_where_there_is_none():
 
 
 def test02_one_that_is_set_stays(mono):
-    assert active_mitsuba() is mono and mono.variant() == "llvm_ad_mono"
-    assert array_module().__name__ == "drjit.llvm.ad"
+    assert activate_mitsuba() is mono and mono.variant() == "llvm_ad_mono"
+    assert get_array_module().__name__ == "drjit.llvm.ad"
     assert mono.variant() == "llvm_ad_mono"
 
 
 def test03_scalar_variants_are_refused(rgb):
     rgb.set_variant("scalar_rgb")
     with pytest.raises(NergError, match='"scalar_rgb".*mi.set_variant'):
-        active_mitsuba()
+        activate_mitsuba()
 
 
 # ---- What comes in from NumPy and what goes out to it ----
 
 
 def test01_points_of_every_shape():
-    assert points((1, 2, 3), "x").shape == (1, 3)
-    assert points([[1, 2, 3], [4, 5, 6]], "x").dtype == np.float32
-    assert points(np.ones((5, 3), int)[::2], "x").flags.c_contiguous
+    assert as_points((1, 2, 3), "x").shape == (1, 3)
+    assert as_points([[1, 2, 3], [4, 5, 6]], "x").dtype == np.float32
+    assert as_points(np.ones((5, 3), int)[::2], "x").flags.c_contiguous
 
 
 @pytest.mark.parametrize(
@@ -168,22 +168,22 @@ def test01_points_of_every_shape():
 )
 def test02_wrong_points_are_told_by_name(wrong, said):
     with pytest.raises(NergError, match=said):
-        points(wrong, "eyes")
+        as_points(wrong, "eyes")
 
 
 def test03_directions_are_made_unit_and_one_serves_all():
-    d = unit((0, 3, 4), 5, "d")
+    d = as_unit_vectors((0, 3, 4), 5, "d")
     assert d.shape == (5, 3) and np.allclose(d, (0, 0.6, 0.8))
     with pytest.raises(NergError, match="d must not be zero, and row 1 is"):
-        unit([(1, 0, 0), (0, 0, 0)], 2, "d")
+        as_unit_vectors([(1, 0, 0), (0, 0, 0)], 2, "d")
     with pytest.raises(NergError, match="as many as the origins, 3, got 2"):
-        unit([(1, 0, 0), (0, 1, 0)], 3, "d")
+        as_unit_vectors([(1, 0, 0), (0, 1, 0)], 3, "d")
 
 
 def make():
-    depth = same_for_all(np.arange(6, dtype=np.float32).reshape(2, 3), 4)
+    depth = broadcast_to_observers(np.arange(6, dtype=np.float32).reshape(2, 3), 4)
     color = np.zeros((4, 2, 3, 3), np.float32)
-    return Labelled({"depth": depth, "color": color}, ("observer", "row", "column"), np.zeros((4, 3), np.float32))
+    return LabelledArrays({"depth": depth, "color": color}, ("observer", "row", "column"), np.zeros((4, 3), np.float32))
 
 
 def test04_arrays_have_names():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.render import split
+from nerg_mi.api.render import split_channels
 from tests.pictures import mitsuba_bitmap
 
 BALL = {"type": "sphere", "center": [1.4, -1.0, 0.3], "radius": 0.4}
@@ -157,6 +157,6 @@ def test11_without_gaze(files, camera):
 
 def test12_channels_by_name():
     pixels = np.arange(2 * 3 * 8, dtype=np.float32).reshape(2, 3, 8)
-    found = split(pixels, ["depth.T", "position.X", "position.Y", "position.Z"], ["position", "color", "depth"], True)
+    found = split_channels(pixels, ["depth.T", "position.X", "position.Y", "position.Z"], ["position", "color", "depth"], True)
     assert np.array_equal(found["color"], pixels[..., :3]) and np.array_equal(found["depth"], pixels[..., 4])
     assert np.array_equal(found["position"], pixels[..., 5:8]) and list(found) == ["position", "color", "depth"]

@@ -6,12 +6,12 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.aoi.options import StatisticsOptions
-from nerg_mi.api.query import ObserverOf, box_shares
+from nerg_mi.api.query import SceneObserver, compute_box_shares
 from nerg_mi.formats.areas import Region
-from nerg_mi.report.data import Onlooker
-from nerg_mi.statistics.shares import ROUGH, gaze_shares
+from nerg_mi.report.data import GazeSampler
+from nerg_mi.statistics.shares import COARSE, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, BoxAoi
-from nerg_mi.train.geometry import GazePlace
+from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import SIGN, STAND, write_place
 from tests.pictures import box_dict
@@ -62,7 +62,7 @@ def test01_the_share_is_the_integral_over_directions(empty):
     entry = eye + d * np.minimum(low, high).max(axis=1)[:, None]
     gaze = nerg.observe(empty, entry, eye, "gaze").gaze[0]
     # A field that is not normalised is divided by its own integral.
-    whole = box_shares(empty, [], eye[None].astype(np.float32)).whole[0]
+    whole = compute_box_shares(empty, [], eye[None].astype(np.float32)).integral[0]
     assert np.isclose(seen.share[0], gaze.sum() * 4 * np.pi / 400_000 / whole, rtol=1e-2) and abs(whole - 1) > 0.1
 
 
@@ -181,14 +181,14 @@ def rays_of_gaze(scene, eye, count=40_000, seed=0):
 def test10_a_larger_box_never_has_less_and_has_what_rays_say(room):
     _, scene = room
     grown = (0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 9.0)
-    regions = [Region.of("sign", SIGN[0] - g, SIGN[1] + g) for g in grown]
-    found = box_shares(scene, regions, np.float32([EYE]))
+    regions = [Region.create("sign", SIGN[0] - g, SIGN[1] + g) for g in grown]
+    found = compute_box_shares(scene, regions, np.float32([EYE]))
     share, error = found.share[0], found.error[0]
     assert (np.diff(share) >= -error[1:]).all() and share[-1] == pytest.approx(1, abs=2e-6)
     assert (error < 0.01 * share + 1e-4).all()
     ends = rays_of_gaze(scene, EYE)
     for region, value, err in zip(regions, share, error):
-        rays = region.holds(ends, 1e-4).mean()
+        rays = region.contains(ends, 1e-4).mean()
         assert abs(value - rays) < 3 * np.sqrt(rays * (1 - rays) / len(ends)) + err
     alone = nerg.attention(scene, "sign", EYE)
     assert share[0] == pytest.approx(alone.share[0], abs=error[0] + 5e-3 * share[0])
@@ -206,8 +206,8 @@ def test11_boxes_that_fill_space_share_out_all_of_the_gaze(files, eye):
     cuts = [sorted(set(c)) for c in cuts]
     spans = [list(zip(c[:-1], c[1:])) for c in cuts]
     corners = [np.transpose((a, b, c)) for a in spans[0] for b in spans[1] for c in spans[2]]
-    regions = [Region.of(f"{k}", *corner) for k, corner in enumerate(corners)]
-    found = box_shares(scene, regions, np.float32([eye]), margin=0.0)
+    regions = [Region.create(f"{k}", *corner) for k, corner in enumerate(corners)]
+    found = compute_box_shares(scene, regions, np.float32([eye]), margin=0.0)
     assert 0.2 < found.escaped[0] < 0.8
     assert found.share.sum() + found.escaped[0] == pytest.approx(1, abs=3 * np.linalg.norm(found.error))
     assert np.linalg.norm(found.error) < 2e-3
@@ -245,25 +245,25 @@ def test13_what_is_beyond_all_measure_is_told(empty, box, eye, said):
 
 
 def test14_statistics_viewer_and_report_say_the_same(room):
-    from nerg_mi.viewer.session import shares_in_steps
+    from nerg_mi.viewer.session import iter_attention_shares
 
     path, scene = room
-    regions = [Region.of("the sign", *SIGN), Region.of("corner", (4.5, 2.5, 0), (6.1, 4.1, 3.1), 20)]
+    regions = [Region.create("the sign", *SIGN), Region.create("corner", (4.5, 2.5, 0), (6.1, 4.1, 3.1), 20)]
     eye = np.array(EYE)
     here = nerg.attention(scene, SIGN, eye)
     options = StatisticsOptions(
-        areas=path.parent / "areas.json", observers=(",".join(map(str, EYE)),), resamples=199, mode="llvm_ad_rgb"
+        aois=path.parent / "areas.json", observers=(",".join(map(str, EYE)),), resamples=199, mode="llvm_ad_rgb"
     )
-    told = {row["thing"]: row["share"] for row in statistics([path], options=options).things}
+    told = {row["thing"]: row["share"] for row in statistics([path], options=options).aois}
     assert options.margin == MARGIN
     assert told["the sign"] == pytest.approx(here.share[0], rel=0.03)
     assert told["the stand"] == pytest.approx(nerg.attention(scene, "stand", eye).share[0], rel=0.03)
-    (viewer, *_) = shares_in_steps(scene, eye, regions, [])
+    (viewer, *_) = iter_attention_shares(scene, eye, regions, [])
     assert viewer["the sign"] == pytest.approx(here.share[0], rel=0.03)
     field = scene.integrator.gaze.field
-    onlooker = Onlooker(field, GazePlace(scene.place, field.box, "scene"))
+    onlooker = GazeSampler(field, TrainingGeometry(scene.place, field.box, "scene"))
     things = [BoxAoi(region) for region in regions]
-    report = gaze_shares(onlooker.look_from, eye[None], things, [(0,), (1,)], MARGIN, ROUGH)
+    report = gaze_shares(onlooker.query_from, eye[None], things, [(0,), (1,)], MARGIN, COARSE)
     assert report.share[0, 0] == pytest.approx(here.share[0], rel=0.03)
     assert report.share[0, 1] == pytest.approx(viewer["corner"], rel=0.03) and viewer["corner"] > 1e-3
 
@@ -272,29 +272,29 @@ def test14_statistics_viewer_and_report_say_the_same(room):
 
 
 def test01_the_density_is_the_fields(scene, rgb):
-    observer = ObserverOf(scene, np.float32((0.3, -3, 0.4)))
+    observer = SceneObserver(scene, np.float32((0.3, -3, 0.4)))
     p_od, r_o = rgb.Point3f(0.2, -0.5, 0.1), dr.normalize(rgb.Vector3f(-0.1, 2.5, -0.3))
     field = nerg.load_gaze(scene.integrator.children["gaze"].filename).network
     expected = field.evaluate(p_od, rgb.Point3f(0.3, -3, 0.4), r_o)[0]
-    assert np.isclose(observer.density(p_od, observer.center, r_o, True)[0], expected[0], rtol=1e-5)
+    assert np.isclose(observer.eval_gaze(p_od, observer.center, r_o, True)[0], expected[0], rtol=1e-5)
 
 
 def test02_one_kernel_serves_all_observers(scene, rgb):
     points = rgb.Point3f([0.1, 0.2, 0.3], [-1, -1, -1], [0, 0, 0.1])
     kernels = []
     for eye in ((0.3, -3, 0.4), (2.5, -1, 0.5), (0, -2, 0)):
-        observer = ObserverOf(scene, np.float32(eye))
+        observer = SceneObserver(scene, np.float32(eye))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
-            dr.eval(observer.sees(points, True))
+            dr.eval(observer.observe(points, True))
             kernels.append({k["hash"] for k in dr.kernel_history() if "hash" in k})
     assert kernels[0] and kernels[0] == kernels[1] == kernels[2]
 
 
 def test03_without_a_gaze_field_there_is_no_density(files):
-    observer = ObserverOf(nerg.make_scene(files / "field.safetensors"), np.float32((0, -3, 0)))
+    observer = SceneObserver(nerg.make_scene(files / "field.safetensors"), np.float32((0, -3, 0)))
     with pytest.raises(ValueError, match="without a gaze field"):
-        observer.density(None, None, None, True)
+        observer.eval_gaze(None, None, None, True)
 
 
 # ---- What rays meet and what observers see of points: against pictures, and where the answer is known ----
@@ -378,7 +378,7 @@ def test06_many_are_batches_of_few(scene, monkeypatch):
     o, d = np.tile((0.3, -3, 0.4), (50, 1)), rng.normal(size=(50, 3)) * 0.2 + (0, 1, 0)
     whole = nerg.trace(scene, o, d, observers=[(2.5, -1, 0.5)])
     points = nerg.observe(scene, rng.uniform(-1, 1, (50, 3)), (2.5, -1, 0.5))
-    monkeypatch.setattr(query, "BATCH", 16)
+    monkeypatch.setattr(query, "BATCH_SIZE", 16)
     rng = np.random.default_rng(0)
     d = rng.normal(size=(50, 3)) * 0.2 + (0, 1, 0)
     parts = nerg.trace(scene, o, d, observers=[(2.5, -1, 0.5)])

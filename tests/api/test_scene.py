@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.scene import TrainedField, asked_quantities, mesh_child, options_of, scene_children
+from nerg_mi.api.scene import TrainedField, resolve_quantities, load_mesh_child, build_options, to_scene_children
 from nerg_mi.api.workflows import bake, stats
 from nerg_mi.errors import NergError
 from tests.formats.splats.writers import random_splats, write_inria
@@ -19,7 +19,7 @@ def test01_a_field_is_what_its_file_says(files):
     field = nerg.load_field(files / "field.safetensors")
     assert field.kind == "radiance" and field.name == "field.safetensors" and field.provenance == {"test": 0}
     assert np.array_equal(field.bounds, [(-1, -1, -1), (1, 1, 1)])
-    assert field.weights == sum(value.numpy().size for value in field.network.parameters().values())
+    assert field.num_weights == sum(value.numpy().size for value in field.network.parameters().values())
     assert repr(field).startswith("<radiance field field.safetensors: ") and "box (-1, -1, -1) to (1, 1, 1)>" in repr(
         field
     )
@@ -83,19 +83,19 @@ class Options:
 
 
 def test01_changes_are_on_top_of_what_is_given(rgb):
-    assert options_of(Options, "job", None, {}) == Options(mode="llvm_ad_rgb")
-    assert options_of(Options, "job", Options(steps=9, seed=2), {"seed": 3}) == Options(
+    assert build_options(Options, "job", None, {}) == Options(mode="llvm_ad_rgb")
+    assert build_options(Options, "job", Options(steps=9, seed=2), {"seed": 3}) == Options(
         steps=9, seed=3, mode="llvm_ad_rgb"
     )
 
 
 def test02_the_variant_in_use_is_kept(mono):
-    assert options_of(Options, "job", Options(mode="llvm_ad_rgb"), {}).mode == "llvm_ad_mono"
+    assert build_options(Options, "job", Options(mode="llvm_ad_rgb"), {}).mode == "llvm_ad_mono"
 
 
 def test04_files_may_be_named_by_strings(rgb):
-    assert options_of(Options, "job", None, {"folder": "tests"}).folder == Path("tests")
-    assert options_of(Options, "job", None, {"store": "to be made"}).store == Path("to be made")
+    assert build_options(Options, "job", None, {"folder": "tests"}).folder == Path("tests")
+    assert build_options(Options, "job", None, {"store": "to be made"}).store == Path("to be made")
 
 
 def cube():
@@ -147,18 +147,18 @@ def test_what_is_natural_is_taken(rgb, tmp_path):
     scene = nerg.Scene.load(path)
     pictures = [nerg.render(given, quantities="opacity").opacity for given in (path, str(path), scene, scene.mitsuba)]
     assert all((picture == pictures[0]).all() for picture in pictures)
-    assert options_of(Options, "job", None, {"folder": scene}).folder == path
+    assert build_options(Options, "job", None, {"folder": scene}).folder == path
     # Values of `<default>`s make another scene of it than the file says.
     assert nerg.Scene.load(path).path == path and nerg.Scene(mi.load_file(str(path))).path is None
 
 
 def test03_unknown_options_are_told(rgb):
     with pytest.raises(NergError, match='job has no option "step"; did you mean "steps"?'):
-        options_of(Options, "job", None, {"step": 3})
+        build_options(Options, "job", None, {"step": 3})
     with pytest.raises(NergError, match="mi.set_variant"):
-        options_of(Options, "job", None, {"mode": "scalar_rgb"})
+        build_options(Options, "job", None, {"mode": "scalar_rgb"})
     with pytest.raises(NergError, match='"xyz"'):
-        options_of(Options, "job", None, {"xyz": 1})
+        build_options(Options, "job", None, {"xyz": 1})
 
 
 # ---- Scenes of fields, shapes, observers and cameras, without XML ----
@@ -333,14 +333,14 @@ def test11_cameras(scene, camera, rgb):
 
 
 def test12_quantities(scene):
-    assert asked_quantities(scene, None) == scene.default_quantities
-    assert asked_quantities(scene, "gaze") == ("gaze",)
-    assert asked_quantities(scene, ["depth", "gaze", "depth"]) == ("depth", "gaze")
+    assert resolve_quantities(scene, None) == scene.default_quantities
+    assert resolve_quantities(scene, "gaze") == ("gaze",)
+    assert resolve_quantities(scene, ["depth", "gaze", "depth"]) == ("depth", "gaze")
     for wrong in ([], 3, ["depth", 3]):
         with pytest.raises(nerg.NergError, match="quantities are names"):
-            asked_quantities(scene, wrong)
+            resolve_quantities(scene, wrong)
     with pytest.raises(nerg.NergError, match='"gazes"'):
-        asked_quantities(scene, "gazes", ("gaze", "depth"))
+        resolve_quantities(scene, "gazes", ("gaze", "depth"))
 
 
 def test_constant_weights_change_nothing_and_are_taken_back(files, camera):
@@ -377,16 +377,16 @@ def test_shapes_beyond_all_places_are_refused(rgb, radius):
 
 def test01_names(rgb):
     ball = {"type": "sphere"}
-    assert scene_children(None) == {}
-    assert list(scene_children(ball, "thing")) == ["thing"]
-    assert list(scene_children([ball, [ball, ball]])) == ["shape_0", "shape_1_0", "shape_1_1"]
-    assert list(scene_children({"left": ball, "right": rgb.load_dict(ball)})) == ["left", "right"]
+    assert to_scene_children(None) == {}
+    assert list(to_scene_children(ball, "thing")) == ["thing"]
+    assert list(to_scene_children([ball, [ball, ball]])) == ["shape_0", "shape_1_0", "shape_1_1"]
+    assert list(to_scene_children({"left": ball, "right": rgb.load_dict(ball)})) == ["left", "right"]
 
 
 def test02_a_scene_gives_its_shapes_and_lights(rgb):
     lamp = {"type": "sphere", "emitter": {"type": "area"}}
     scene = rgb.load_dict({"type": "scene", "lamp": lamp, "sky": {"type": "constant"}, "spot": {"type": "point"}})
-    children = scene_children(scene)
+    children = to_scene_children(scene)
     # The lamp brings its own light.
     assert set(children) == {"lamp", "shape_light_0", "shape_light_1"}
     again = rgb.load_dict({"type": "scene", **children})
@@ -416,17 +416,17 @@ end_header
 def test04_files_are_looked_at_first(rgb, tmp_path):
     path = tmp_path / "cube.ply"
     rgb.load_dict({"type": "cube"}).write_ply(str(path))
-    assert rgb.load_dict(mesh_child(path)).face_count() == 12
+    assert rgb.load_dict(load_mesh_child(path)).face_count() == 12
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(NergError, match="cube.ply"):
-        mesh_child(path)
+        load_mesh_child(path)
     # Mitsuba reads no quads; what takes a mesh does, with the material that others have.
     (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf -4 -3 -2 -1\n")
-    shape = rgb.load_dict({"type": "scene", **scene_children(tmp_path / "quad.obj", "quad")}).shapes()[0]
+    shape = rgb.load_dict({"type": "scene", **to_scene_children(tmp_path / "quad.obj", "quad")}).shapes()[0]
     assert shape.face_count() == 2 and shape.id() == "quad" and shape.bsdf().class_name() == "TwoSidedBRDF"
     (tmp_path / "empty.obj").write_text("v 0 0 0\n")
     with pytest.raises(NergError, match="empty.obj"):
-        mesh_child(tmp_path / "empty.obj")
+        load_mesh_child(tmp_path / "empty.obj")
 
 
 @pytest.mark.parametrize(
@@ -441,7 +441,7 @@ def test_colours_of_files_are_shown_and_the_rest_is_named(rgb, monkeypatch, tmp_
     (tmp_path / name).write_text(text)
     notes = []
     monkeypatch.setattr(rgb, "Log", lambda level, note: notes.append(note))
-    child = mesh_child(tmp_path / name)
+    child = load_mesh_child(tmp_path / name)
     shape = child if isinstance(child, rgb.Mesh) else rgb.load_dict(child)
     (note,) = notes
     assert said in note and str(tmp_path / name) in note

@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.store_visibility import PAIRS, measure, near_edges
-from nerg_mi.workflows.demo import store_scene
+from nerg_mi.workflows.demo import find_store_scene
 
 
 def test01_pixels_near_jumps_are_left_out():
@@ -19,7 +19,7 @@ def test01_pixels_near_jumps_are_left_out():
 
 
 def test02_blocks_where_the_furniture_stands_hide_what_it_hides(standins):
-    row = measure(store_scene(), "aisle 3, from the south", "median", "depth", standins, 48, 2)
+    row = measure(find_store_scene(), "aisle 3, from the south", "median", "depth", standins, 48, 2)
     # Blocks of 13 cm for shelves with boards and gaps
     assert row["agree"] > 0.85 and row["median cm"] < 15 and row["no surface"] < 0.05
     assert np.isclose(row["agree"] + row["wrongly seen"] + row["wrongly hidden"], 1)
@@ -27,12 +27,12 @@ def test02_blocks_where_the_furniture_stands_hide_what_it_hides(standins):
 
 def test03_a_field_elsewhere_disagrees(standins, monkeypatch):
     camera, target, eye = PAIRS["aisle 3, from the south"]
-    right = measure(store_scene(), "aisle 3, from the south", "median", "depth", standins, 48, 2)
+    right = measure(find_store_scene(), "aisle 3, from the south", "median", "depth", standins, 48, 2)
     # The field is asked about another eye than the twin
     monkeypatch.setitem(PAIRS, "moved", (camera, target, eye))
     from nerg_mi.scenes.store import twin
 
-    visible = twin.visible
-    monkeypatch.setattr(twin, "visible", lambda e, *a, **k: visible(np.asarray(e) + (1.7, 0, 0), *a, **k))
-    wrong = measure(store_scene(), "moved", "median", "depth", standins, 48, 2)
+    visible = twin.is_visible
+    monkeypatch.setattr(twin, "is_visible", lambda e, *a, **k: visible(np.asarray(e) + (1.7, 0, 0), *a, **k))
+    wrong = measure(find_store_scene(), "moved", "median", "depth", standins, 48, 2)
     assert wrong["agree"] < right["agree"] - 0.1

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 import nerg_mi.cli
 import nerg_mi.workflows
-from nerg_mi.cli.building import callback_of
+from nerg_mi.cli.building import make_callback
 from nerg_mi.workflows.base import COMMANDS, Command, argument, extra
 from nerg_mi.workflows.options import option, parse_numbers
 
@@ -42,7 +42,7 @@ def serve():
     cup, table = argument("What it is poured into.", str), extra(1, "Where it is served.", int, "--table")
     command = Command("tea", tea, "Make tea.", "", Brew, ("secret",), None, {"cup": cup, "table": table})
     app = typer.Typer(rich_markup_mode=None)
-    app.command(help="Make tea.")(callback_of(command))
+    app.command(help="Make tea.")(make_callback(command))
 
     def run(*line):
         done = CliRunner().invoke(app, list(line))

@@ -11,30 +11,30 @@ import time
 import pytest
 
 from nerg_mi.cli import main, progress
-from nerg_mi.cli.ending import FAULT, INTERRUPTED, USER_ERROR, CtrlC, end_of, open_streams, shorten_values
+from nerg_mi.cli.ending import INTERNAL_ERROR, INTERRUPTED, USER_ERROR, CtrlC, exit_code, open_streams, shorten_values
 from nerg_mi.cli.progress import TerminalReporter
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
 
 
 def test_what_the_user_can_mend_and_what_not():
-    assert end_of(NergError("write y")) == (USER_ERROR, "write y")
-    code, text = end_of(KeyError("x"))
-    assert code == FAULT and text.startswith("internal error (KeyError: 'x')")
+    assert exit_code(NergError("write y")) == (USER_ERROR, "write y")
+    code, text = exit_code(KeyError("x"))
+    assert code == INTERNAL_ERROR and text.startswith("internal error (KeyError: 'x')")
 
 
 def test_ctrl_c_is_found_behind_what_others_made_of_it():
     with CtrlC() as ctrl_c:
-        assert ctrl_c.behind(ValueError("x")) is None
+        assert ctrl_c.find_interrupt(ValueError("x")) is None
         with pytest.raises(RuntimeError) as raised:
             try:
                 signal.raise_signal(signal.SIGINT)
             except KeyboardInterrupt as error:
                 raise RuntimeError("of Mitsuba") from error
-        assert isinstance(ctrl_c.behind(raised.value), KeyboardInterrupt)
+        assert isinstance(ctrl_c.find_interrupt(raised.value), KeyboardInterrupt)
         # Also where only the text is left of it; but a command that was done is done.
-        assert isinstance(ctrl_c.behind(RuntimeError("of Mitsuba")), KeyboardInterrupt)
-        assert ctrl_c.behind(SystemExit(0)) is None
+        assert isinstance(ctrl_c.find_interrupt(RuntimeError("of Mitsuba")), KeyboardInterrupt)
+        assert ctrl_c.find_interrupt(SystemExit(0)) is None
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -53,7 +53,7 @@ def test_ctrl_c_within_a_finalizer_is_not_lost(monkeypatch):
             del thing
             time.sleep(10)
         assert not others
-    assert ctrl_c.behind(RuntimeError()) is not None and sys.unraisablehook == others.append
+    assert ctrl_c.find_interrupt(RuntimeError()) is not None and sys.unraisablehook == others.append
 
 
 @pytest.mark.parametrize("name", ["stdout", "stderr"])
@@ -182,7 +182,7 @@ def test_what_a_job_does_not_say_is_added(capsys, monkeypatch):
     with TerminalReporter() as reporter:
         reporter.progress(0.0, "reading")
         clock.now += 20
-        reporter.tell_when_due()
+        reporter.log_when_due()
         clock.now += 20
         reporter.progress(0.25, "scores")
         clock.now += 200
@@ -204,7 +204,7 @@ def test_what_is_prepared_is_no_measure_of_the_rest(capsys, monkeypatch):
 
 
 def test_a_long_step_that_tells_nothing_is_spoken_for(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "EVERY", 0.2)
+    monkeypatch.setattr(progress, "LOG_INTERVAL", 0.2)
     with TerminalReporter() as reporter:
         reporter.progress(0.5, "integrating")
         assert reporter._pulse is not None

@@ -13,10 +13,10 @@ import pytest
 
 from nerg_mi import diagnosis, llvm
 from nerg_mi.cli.building import GROUPS, find_commands
-from nerg_mi.errors import MissingFile, NergError, UnusableLLVM, chosen, mitsuba_says, sentence
+from nerg_mi.errors import MissingFile, NergError, UnusableLLVM, blame_options, translate_mitsuba_errors, format_error
 from nerg_mi.workflows.base import COMMANDS
 from tests.conftest import ROOT
-from tools.command_pages import commands
+from tools.command_pages import iter_commands
 
 HEAVY = {"mitsuba", "drjit", "numpy", "scipy", "matplotlib", "torch", "trimesh", "OpenEXR"}
 
@@ -66,7 +66,7 @@ def test04_wrong_command_line(nerg):
 
 def test05_mode_is_the_variant_of_commands_that_compute():
     having = set()
-    for path, command, _ in commands():
+    for path, command, _ in iter_commands():
         name = path.removeprefix("nerg ")
         options = {option: p for p in command.params for option in p.opts}
         having |= {name} if "--mode" in options else set()
@@ -168,14 +168,14 @@ def test07b_nothing_is_said_where_nobody_reads(lines):
 
 def test07c_what_a_contract_refuses_is_the_users_where_they_chose_it():
     with pytest.raises(NergError, match="^the corner is wrong; give other values by --aabb$") as raised:
-        with chosen("--aabb"):
+        with blame_options("--aabb"):
             raise ValueError("the corner is wrong.")
     assert isinstance(raised.value.__cause__, ValueError)
     with pytest.raises(NergError, match="^write y$"):
-        with chosen("--aabb"):
+        with blame_options("--aabb"):
             raise NergError("write y")
     with pytest.raises(TypeError):
-        with chosen("--aabb"):
+        with blame_options("--aabb"):
             raise TypeError("a bug")
 
 
@@ -195,7 +195,7 @@ QUOTED = (
 )
 def test07d_what_mitsuba_says_of_a_scene_is_the_users(said):
     with pytest.raises(NergError):
-        with mitsuba_says():
+        with translate_mitsuba_errors():
             raise RuntimeError(said)
 
 
@@ -210,7 +210,7 @@ def test07d_what_mitsuba_says_of_a_scene_is_the_users(said):
 )
 def test07e_a_mistake_in_a_plugin_is_not(said):
     with pytest.raises(RuntimeError) as raised:
-        with mitsuba_says():
+        with translate_mitsuba_errors():
             raise RuntimeError(said)
     assert not isinstance(raised.value, NergError)
 
@@ -220,7 +220,7 @@ def test07f_a_plugin_with_a_mistake(rgb, tmp_path, nerg, monkeypatch):
     scene = tmp_path / "a.xml"
     scene.write_text('<scene version="3.0.0"><integrator type="nerg"/><sensor type="perspective"/></scene>')
     rgb.set_variant("llvm_ad_rgb")
-    monkeypatch.setattr("nerg_mi.plugins.nerg.choice", lambda *a: 1 / 0)
+    monkeypatch.setattr("nerg_mi.plugins.nerg.read_choice", lambda *a: 1 / 0)
     ended = nerg("render", scene, "-o", tmp_path / "a.exr", "-m", "llvm_ad_rgb")
     assert ended.code == 70 and "internal error" in ended.err and "ZeroDivisionError: division by zero" in ended.err
 
@@ -231,7 +231,7 @@ def test08_sentence_of_a_mitsuba_error():
         'Traceback (most recent call last):\n  File "a.py", line 15, in <module>\n    f()\n'
         'ValueError: "filename" must\n be given.'
     )
-    assert sentence(error) == (
+    assert format_error(error) == (
         'At string (line 1, col 49): failed to instantiate volume plugin of type "nerf": "filename" must be given.'
     )
 
@@ -249,7 +249,7 @@ def test09_this_machine():
 def test10_unusable_llvm(tmp_path):
     bad = tmp_path / "libLLVM-15.so.1"
     bad.touch()
-    done = in_a_process("doctor", **{llvm.VARIABLE: str(bad)})
+    done = in_a_process("doctor", **{llvm.PATH_VARIABLE: str(bad)})
     assert "Traceback" not in done.stderr
     assert f"LLVM 15 ({bad}) cannot run the kernels of Dr.Jit" in done.stdout
     assert "llvm_ad_rgb" not in done.stdout

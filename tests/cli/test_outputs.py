@@ -16,7 +16,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.cli.building import callback_of, find_commands
+from nerg_mi.cli.building import make_callback, find_commands
 from nerg_mi.workflows.base import COMMANDS
 
 from .outputs import CASES, INPUTS, MAKES_A_FOLDER, OF_TORCH
@@ -179,7 +179,7 @@ def commands() -> dict:
     """Every command of `nerg`, a function, by its whole name."""
     for entry in find_commands().values():
         importlib.import_module(entry.module)
-    return {name: callback_of(command) for name, command in COMMANDS.items()}
+    return {name: make_callback(command) for name, command in COMMANDS.items()}
 
 
 def path_options(name: str, command) -> dict[str, tuple]:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerg_mi.evaluation.gaze_report import judge, read_results
+from nerg_mi.evaluation.gaze_report import compute_verdict, read_results
 from nerg_mi.evaluation.study import COLUMNS
 from nerg_mi.files import atomic
 from nerg_mi.files.images import write_exr
@@ -24,9 +24,9 @@ from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.tasks import engines
-from nerg_mi.tasks.engines import Local, run_plan
+from nerg_mi.tasks.engines import LocalEngine, run_plan
 from nerg_mi.tasks.store import Store
-from nerg_mi.threads import VARIABLE
+from nerg_mi.threads import THREADS_VARIABLE
 from nerg_mi.workflows import demo
 from nerg_mi.workflows import poses as posing
 from nerg_mi.workflows.scene_commands import KINDS, DemoOptions
@@ -237,11 +237,11 @@ def test_a_missing_checkpoint_names_the_command(standins, tmp_path, nerg, name):
 @pytest.mark.nightly
 def test_the_store_itself(rgb):
     """Committed checkpoints: the shelf hides what lies behind it, and gaze is what occlusion leaves of it."""
-    missing = [f for f in demo.CHECKPOINTS.values() if not (demo.store_scene().parent / f).is_file()]
+    missing = [f for f in demo.CHECKPOINTS.values() if not (demo.find_store_scene().parent / f).is_file()]
     if missing:
         pytest.skip(f"{', '.join(missing)} of the store are not made yet: {demo.MAKE}")
-    scene = rgb.load_file(str(demo.store_scene()), width="60", height="40")
-    without = rgb.load_file(str(demo.store_scene()), width="60", height="40", occlusion="false", radiance="false")
+    scene = rgb.load_file(str(demo.find_store_scene()), width="60", height="40")
+    without = rgb.load_file(str(demo.find_store_scene()), width="60", height="40", occlusion="false", radiance="false")
     hidden, plain = (render_channels(s, s.sensors()[demo.CAMERA], 1) for s in (scene, without))
     assert hidden.mask.mean() > 0.99
     seen = hidden.aovs["visibility"]
@@ -250,20 +250,20 @@ def test_the_store_itself(rgb):
     assert np.all(hidden.aovs["gaze"][seen == 0] == 0) and plain.aovs["gaze"][seen == 0].max() > 0
     x, y = demo.observer_pixel(scene)
     assert 0 < x < 60 and 0 < y < 40
-    small = rgb.load_file(str(demo.store_scene()), sphere_width="64", sphere_height="32")
+    small = rgb.load_file(str(demo.find_store_scene()), sphere_width="64", sphere_height="32")
     sphere = render_channels(small, small.sensors()[demo.SPHERE], 1)
     assert 0.7 < demo.sphere_integral(sphere) < 1.3  # a density over the sphere
 
 
 def test_the_demo_s_evaluation_is_of_the_field_that_it_carries(standins):
-    store = demo.store_scene()
+    store = demo.find_store_scene()
     gaze = store.parent / demo.CHECKPOINTS["gaze"]
-    assert demo.evaluation_beside(store, gaze) == [store.parent / "gaze.json"], "run make --stage evaluation"
+    assert demo.find_evaluation(store, gaze) == [store.parent / "gaze.json"], "run make --stage evaluation"
     # And of no other one.
-    assert demo.evaluation_beside(store, Path(standins["gaze"])) == []
+    assert demo.find_evaluation(store, Path(standins["gaze"])) == []
     results = read_results(store.parent / "gaze.json")
-    verdict = judge(results.rows, results.split, results.people, results.positions)
-    assert results.people == 100 and results.positions == 64
+    verdict = compute_verdict(results.rows, results.split, results.num_participants, results.num_positions)
+    assert results.num_participants == 100 and results.num_positions == 64
     assert verdict.sentence.startswith("Better than position-blind, the strongest baseline, and than nearest rays")
 
 
@@ -321,15 +321,15 @@ def test_options_reach_the_viewer_and_the_report(handed, nerg):
     assert nerg(*line.split()).code == 0
     ((files, options),) = ((call["files"], call["options"]) for call in given)
     assert [f.name for f in files] == ["a.xml", "b.npz"] and options.observer == (1, 2, 3)
-    assert (options.host, options.port, options.names, options.width) == ("::1", 0, ("lab",), 320)
+    assert (options.host, options.port, options.hostnames, options.width) == ("::1", 0, ("lab",), 320)
 
     given = handed("report")
     line = "report gaze.safetensors day.npz -o a.html --objects o.json --names --min-persons 3 --no-paths --from 1,2,3"
     assert nerg(*line.split(), "--to", "0,0,1", "--evaluate", "--title", "Mine").code == 0
     ((files, output, options),) = ((call["files"], call["output"], call["options"]) for call in given)
     assert files == [Path("gaze.safetensors"), Path("day.npz")] and output == Path("a.html")
-    assert options.objects == Path("o.json") and options.names and options.min_persons == 3 and not options.paths
-    assert options.camera_from == (1, 2, 3) and options.camera_to == (0, 0, 1)
+    assert options.objects == Path("o.json") and options.names and options.min_participants == 3 and not options.paths
+    assert options.camera == (1, 2, 3) and options.target == (0, 0, 1)
     assert options.evaluate and options.title == "Mine"
 
 
@@ -396,19 +396,19 @@ def test_a_quick_study(tmp_path, nerg):
 def test_a_store_is_told_of_and_swept(tmp_path, nerg):
     store = Store(tmp_path / "store")
     for count in (3, 1):
-        list(run_plan(works.plan(count, what="a film"), store, Local()))
+        list(run_plan(works.make_plan(count, what="a film"), store, LocalEngine()))
     ended = nerg("jobs", store.folder)
     assert ended.code == 0 and "| a film | 1 | 1 | 0 |" in ended.out and "stale: 2 outputs" in ended.out
-    assert len(list(store.receipts())) == 3
+    assert len(list(store.iter_manifests())) == 3
     assert "Removed 130 bytes." in nerg("jobs", store.folder, "--remove-stale").out
-    assert len(list(store.receipts())) == 1
+    assert len(list(store.iter_manifests())) == 1
 
 
 def test_a_worker_serves_an_address_and_warns_of_an_open_one(monkeypatch, nerg):
     served = []
-    monkeypatch.setattr(engines, "serve_cluster", lambda *a: served.append((*a[:2], a[3], os.environ.get(VARIABLE))))
+    monkeypatch.setattr(engines, "run_dask_worker", lambda *a: served.append((*a[:2], a[3], os.environ.get(THREADS_VARIABLE))))
     # What the command sets is taken back after the test.
-    monkeypatch.setenv(VARIABLE, "")
+    monkeypatch.setenv(THREADS_VARIABLE, "")
     ended = nerg(*"worker tcp://127.0.0.1:8786 --threads 3 --wait 5 --name a".split())
     assert ended.code == 0 and ended.err == ""
     assert served == [("tcp://127.0.0.1:8786", 5.0, "a", "3")]

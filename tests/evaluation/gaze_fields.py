@@ -6,7 +6,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_base import GazeEnsemble, blind_table
+from nerg_mi.fields.gaze_base import GazeEnsemble, make_prior_table
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze
@@ -24,7 +24,7 @@ def made(kind: str, box: Box, seed: int = 4, **more):
     rng = np.random.default_rng(seed)
     if kind == "default recipe":
         config = LogGazeConfig(grid=GRID, width=16, prior=16, heads=(box.lower, box.upper), mix=0.2, **more)
-        blind = blind_table(np.exp(0.5 * rng.normal(size=512)) / 14.2, 16, ns, fibonacci_directions(1 << 14))
+        blind = make_prior_table(np.exp(0.5 * rng.normal(size=512)) / 14.2, 16, ns, fibonacci_directions(1 << 14))
         field = LogGazeField.random(config, box, ns, seed, blind)
         steep = {k: 8 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")} | {
             "escaped": ns.Float(0.4)

@@ -12,16 +12,16 @@ import pytest
 from nerg_mi.evaluation import ablation
 from nerg_mi.evaluation.ablation import (
     COLUMNS,
-    all_variants,
-    frame_timer,
-    relate,
-    score,
+    list_variants,
+    make_frame_timer,
+    add_relative_losses,
+    score_density,
     summarise,
-    table,
+    format_table,
     write_ablation,
 )
 from nerg_mi.maths.geometry import Box
-from nerg_mi.train.geometry import GazePlace, place_of_field, place_of_hits, place_of_scene
+from nerg_mi.train.geometry import TrainingGeometry, load_field_geometry, make_hit_geometry, load_scene_geometry
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.plugins import fields
 from tests.train.gaze.looks import looking_at
@@ -47,19 +47,19 @@ def rows():
 
 
 def test_variants():
-    names = [(v.recipe, v.name) for v in all_variants(True)]
+    names = [(v.recipe, v.name) for v in list_variants(True)]
     assert [n for r, n in names if r == "default"] == ["emit", "capture", "emit_capture"]
     paper = [n for r, n in names if r == "paper"]
     assert len(paper) == 10 and "loss code" in paper and sum("semantic" in n for n in paper) == 4
     assert "begins as the field, frozen" in paper
-    assert len(all_variants(False)) == 7 and len(all_variants(True, ("small",))) == 10
+    assert len(list_variants(False)) == 7 and len(list_variants(True, ("small",))) == 10
 
 
 def test_losses_are_related_to_those_of_the_whole_field():
     made = [r for r in rows() if r["recipe"] == "default"] + [{**rows()[0], "recipe": "small"}]
     for r in made:
         r.pop("test_relative"), r.pop("train_relative")
-    relate(made)
+    add_relative_losses(made)
     assert [r.get("test_relative") for r in made] == [pytest.approx(x / 1.1) for x in (2.0, 1.0, 1.2)] + [None]
 
 
@@ -68,8 +68,8 @@ def test_spreads_are_over_seeds():
     assert both["test_loss"] == pytest.approx(1.1)
     assert both["test_loss.spread"] == pytest.approx(np.std([1, 1.2], ddof=1))
     assert "test_loss.spread" not in emit and both["seeds"] == 2 and paper["recipe"] == "paper"
-    assert "1.100 ± 0.141" in table([emit, both]) and len(table([emit, both]).splitlines()) == 4
-    assert len({line.count("|") for line in table([emit, both]).splitlines()}) == 1
+    assert "1.100 ± 0.141" in format_table([emit, both]) and len(format_table([emit, both]).splitlines()) == 4
+    assert len({line.count("|") for line in format_table([emit, both]).splitlines()}) == 1
 
 
 def test_files(tmp_path):
@@ -86,7 +86,7 @@ def test_the_loss_is_the_papers():
     rng = np.random.default_rng(0)
     truth, found = rng.random((2, 3, 50)) / 8
     test = SimpleNamespace(truth=truth, centres=None, directions=None)
-    row = score({"test": test}, lambda centres, directions: found)
+    row = score_density({"test": test}, lambda centres, directions: found)
     assert row["test_loss"] == pytest.approx(row["test_KLD"] + 1 - row["test_CC"] + row["test_MAE"])
     assert row["test_MAE"] == pytest.approx(np.abs(truth - found).mean()) and row["test_KLD"] > 0
 
@@ -108,22 +108,22 @@ def clock(monkeypatch):
 def made(kind, folder):
     if kind == "field":
         fields.radiance(folder / "place.safetensors", density_scale=30.0)
-        return place_of_field(folder / "place.safetensors", ns)
+        return load_field_geometry(folder / "place.safetensors", ns)
     if kind == "splats":
         write_inria(folder / "place.ply", random_splats(50))
-        return place_of_field(folder / "place.ply", ns)
+        return load_field_geometry(folder / "place.ply", ns)
     if kind == "hits":
-        return place_of_hits(looking_at((1.5, 0.4, 1.2)), folder / "place.vol", 0.2)
+        return make_hit_geometry(looking_at((1.5, 0.4, 1.2)), folder / "place.vol", 0.2)
     (folder / "room.xml").write_text(ROOM)
-    return place_of_scene(folder / "room.xml")
+    return load_scene_geometry(folder / "room.xml")
 
 
 @pytest.mark.parametrize("kind", ["field", "splats", "scene", "hits"])
 def test_it_is_the_mean_of_all_frames_but_the_first(rgb, tmp_path, clock, kind):
     saved(tmp_path / "gaze.safetensors", "linear", BOX)
-    render = frame_timer(made(kind, tmp_path), CENTRES, tmp_path, cameras=2, width=8, height=4)
+    render = make_frame_timer(made(kind, tmp_path), CENTRES, tmp_path, cameras=2, width=8, height=4)
     assert render(tmp_path / "gaze.safetensors") == pytest.approx((2 + 3) / 2)
 
 
 def test_without_anything_to_render_there_is_no_time(tmp_path):
-    assert frame_timer(GazePlace(None, BOX, "none"), CENTRES, tmp_path) is None
+    assert make_frame_timer(TrainingGeometry(None, BOX, "none"), CENTRES, tmp_path) is None

@@ -10,14 +10,14 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, metrics
-from nerg_mi.evaluation.gaze import FieldDensity, map_scores, position_blind, uniform
+from nerg_mi.evaluation.gaze import FieldDensity, compute_map_scores, make_position_blind_baseline, make_uniform_baseline
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import hold_out
-from nerg_mi.train.geometry import place_of_field, place_of_scene
+from nerg_mi.train.geometry import load_field_geometry, load_scene_geometry
 from tests.evaluation.gaze_fields import KINDS, made, saved
 from tests.plugins import fields
 from tests.plugins.scenes import camera, channels
@@ -40,21 +40,21 @@ def rays_baselines():
 
 
 def test_position_blind_is_the_kde_of_all(rays_baselines):
-    density = gaze.position_blind(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((3, 3)), X)
+    density = gaze.make_position_blind_baseline(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((3, 3)), X)
     want = reference(X, rays_baselines.direction, [0, len(rays_baselines)], [30.0])
     assert density.shape == (3, 1024) and np.allclose(density, want, rtol=2e-4)
-    own = gaze.position_blind(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((2, 3)), np.stack([X, X[::-1]]))
+    own = gaze.make_position_blind_baseline(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((2, 3)), np.stack([X, X[::-1]]))
     assert np.allclose(own[0], own[1, ::-1], rtol=1e-5)
 
 
 def test_nearest_probes(rays_baselines):
     probes = place_probes(rays_baselines, 0.4, count=50, kappa_rule="fixed", kappa=20.0)
     density = probes.density(X, "llvm")
-    one = gaze.nearest_probes(probes, 1, backend="llvm")(probes.positions[:5], X)
+    one = gaze.make_nearest_probes_baseline(probes, 1, backend="llvm")(probes.positions[:5], X)
     assert np.allclose(one, density[:5], rtol=1e-5)
     at = np.array([[1.0, 1.0, 1.55]])
     near = np.argsort(np.linalg.norm(probes.positions - at, axis=1))[:4]
-    four = gaze.nearest_probes(probes, 4, backend="llvm")
+    four = gaze.make_nearest_probes_baseline(probes, 4, backend="llvm")
     assert np.allclose(four(at, X)[0], density[near].mean(axis=0), rtol=1e-5)
     assert np.allclose(four(at, X[None])[0], four(at, X)[0], rtol=1e-5)
     # Averaged in float64 either way: float32 would lose digits of what differs little.
@@ -63,7 +63,7 @@ def test_nearest_probes(rays_baselines):
 
 def test_nearest_rays(rays_baselines):
     at = np.array([[1.0, 1.0, 1.55], [3.0, 2.0, 1.55]])
-    density = gaze.nearest_rays(rays_baselines, 300, kappa=20.0, backend="llvm")(at, X)
+    density = gaze.make_nearest_rays_baseline(rays_baselines, 300, kappa=20.0, backend="llvm")(at, X)
     near = np.argsort(np.linalg.norm(rays_baselines.origin - at[1], axis=1))[:300]
     assert np.allclose(density[1], reference(X, rays_baselines.direction[near], [0, 300], [20.0])[0], rtol=2e-4)
 
@@ -81,16 +81,16 @@ def test_probes_keep_their_weights(rays_baselines, weights):
     plain = place_probes(people, 0.4, count=50, kappa_rule="fixed", kappa=20.0).density(X, "llvm")
     assert np.abs(density - plain).max() > 0.02
     at = probes.positions[:4]
-    assert np.allclose(gaze.nearest_probes(probes, 1, backend="llvm")(at, X), density[:4], rtol=1e-4, atol=1e-5)
+    assert np.allclose(gaze.make_nearest_probes_baseline(probes, 1, backend="llvm")(at, X), density[:4], rtol=1e-4, atol=1e-5)
     near = np.argsort(np.linalg.norm(probes.positions - at[0], axis=1))[:3]
     assert np.allclose(
-        gaze.nearest_probes(probes, 3, backend="llvm")(at[:1], X)[0], density[near].mean(axis=0), rtol=1e-4, atol=1e-5
+        gaze.make_nearest_probes_baseline(probes, 3, backend="llvm")(at[:1], X)[0], density[near].mean(axis=0), rtol=1e-4, atol=1e-5
     )
 
 
 def test_a_remembered_density_is_asked_once_for_the_same_arrays():
     asked = []
-    method = gaze.CachedBaseline(lambda *given: asked.append(1) or gaze.uniform()(*given))
+    method = gaze.CachedBaseline(lambda *given: asked.append(1) or gaze.make_uniform_baseline()(*given))
     positions, directions = np.zeros((2, 3)), fibonacci_directions(8)
     first = method(positions, directions)
     assert method(positions, directions) is first and len(asked) == 1
@@ -140,21 +140,21 @@ def test_truth_is_the_probes(rays_evaluation, test_set):
         rays_evaluation,
         0.6,
         queries=test_set.centres,
-        cap=1024,
+        max_rays=1024,
         min_rays=1,
         kappa_rule="fixed",
         kappa=20.0,
         centre="query",
     )
     np.testing.assert_allclose(test_set.truth, probes.density(test_set.directions), rtol=1e-4, atol=1e-6)
-    assert (test_set.counts.sum(axis=1) == probes.counts).all() and set(test_set.persons) == set("abcd")
+    assert (test_set.counts.sum(axis=1) == probes.counts).all() and set(test_set.participants) == set("abcd")
 
 
 def test_scores_of_the_truth_and_of_nothing(test_set):
     rows = gaze.evaluate_gaze(
         test_set,
-        {"truth": lambda p, d: test_set.truth if d.ndim == 2 else np.ones(d.shape[:2]), "uniform": uniform()},
-        uniform(),
+        {"truth": lambda p, d: test_set.truth if d.ndim == 2 else np.ones(d.shape[:2]), "uniform": make_uniform_baseline()},
+        make_uniform_baseline(),
         20,
     )
     best, flat = rows
@@ -177,15 +177,15 @@ def test_other_rays_are_of_positions_farther_than_two_radii_where_there_are_any(
     centres = np.array([[-0.5, 0, 1.6], [-0.5, 1, 1.6], [-0.5, 4, 1.6]])
     of = lambda a: {tuple(v) for v in a.reshape(-1, 3)}
     found = gaze.make_test(rays_evaluation, centres, 0.6, 20.0, 64, min_rays=20)
-    (a, b, c), others = map(of, found.at), [of(o) for o in found.others]
+    (a, b, c), others = map(of, found.sample_directions), [of(o) for o in found.other_directions]
     assert a.isdisjoint(c) and b.isdisjoint(c)
     assert others[0] <= c and others[1] <= c and others[2] <= a | b and others[2] & a and others[2] & b
     # Where all are nearer, any other one, and its own where it is alone.
     found = gaze.make_test(rays_evaluation, centres[:2], 0.6, 20.0, 64, min_rays=20)
-    a, b = map(of, found.at)
-    assert of(found.others[0]) <= b and of(found.others[1]) <= a
+    a, b = map(of, found.sample_directions)
+    assert of(found.other_directions[0]) <= b and of(found.other_directions[1]) <= a
     found = gaze.make_test(rays_evaluation, centres[:1], 0.6, 20.0, 64, min_rays=20)
-    assert np.array_equal(found.others, found.at)
+    assert np.array_equal(found.other_directions, found.sample_directions)
 
 
 def by_hand(persons: int) -> gaze.GazeTest:
@@ -200,8 +200,8 @@ def by_hand(persons: int) -> gaze.GazeTest:
 def test_intervals_are_a_bootstrap_over_persons():
     """Of three persons all 27 draws can be made: the error of what one of them sees is the share of the others."""
     test = by_hand(3)
-    sees = lambda k: lambda p, d: test.parts[:, k] if d.ndim == 2 else np.ones(d.shape[:2])
-    row, _ = gaze.evaluate_gaze(test, {"first": sees(0), "second": sees(1)}, uniform(), resamples=1000)
+    sees = lambda k: lambda p, d: test.participant_densities[:, k] if d.ndim == 2 else np.ones(d.shape[:2])
+    row, _ = gaze.evaluate_gaze(test, {"first": sees(0), "second": sees(1)}, make_uniform_baseline(), resamples=1000)
     draws = list(itertools.product(range(3), repeat=3))
     mae = [2 * (1 - draw.count(0) / 3) / (4 * np.pi) for draw in draws]
     assert row["MAE"] == pytest.approx(np.mean(mae))
@@ -215,14 +215,14 @@ def test_intervals_are_a_bootstrap_over_persons():
 
 @pytest.mark.parametrize("persons, known", [(2, False), (3, True), (4, True)])
 def test_fewer_than_three_persons_have_no_interval(persons, known):
-    for row in gaze.evaluate_gaze(by_hand(persons), {"a": uniform(), "b": uniform()}, uniform(), resamples=5):
+    for row in gaze.evaluate_gaze(by_hand(persons), {"a": make_uniform_baseline(), "b": make_uniform_baseline()}, make_uniform_baseline(), resamples=5):
         assert all((f"{k}.low" in row) == known and (f"{k}.high" in row) == known for k in gaze.SCORES)
 
 
 def test_ray_scores_by_hand():
     maps = np.array([[0.0, 1.0, 2.0, 5.0]]) / (4 * np.pi * 2)
     at, others = maps[:, [3, 1]], maps[:, [0, 0, 1, 3]]
-    scores = gaze.ray_scores(maps, at, others, np.zeros((1, 2)))
+    scores = gaze.compute_ray_scores(maps, at, others, np.zeros((1, 2)))
     np.testing.assert_allclose(scores["AUC"], [[3.5 / 4, 1.5 / 4]])
     np.testing.assert_allclose(scores["sAUC"], [[3.5 / 4, 2.5 / 4]])
     np.testing.assert_allclose(scores["loglik"], np.log(at), rtol=1e-6)
@@ -232,9 +232,9 @@ def test_ray_scores_by_hand():
 
 
 def test_persons_are_scored_each_by_their_own(rays_evaluation, test_set):
-    blind = position_blind(rays_evaluation, kappa=50)
-    rows = gaze.person_rows(test_set, {"blind": blind}, blind, min_rays=10)
-    assert [r["person"] for r in rows] == list(test_set.persons)
+    blind = make_position_blind_baseline(rays_evaluation, kappa=50)
+    rows = gaze.score_participants(test_set, {"blind": blind}, blind, min_rays=10)
+    assert [r["person"] for r in rows] == list(test_set.participants)
     assert sum(r["rays"] for r in rows) == test_set.counts.sum()
     assert all(r["bits"] == pytest.approx(0) for r in rows)
     # The heights of what they look at differ, and so does how well one density for all fits.
@@ -242,18 +242,18 @@ def test_persons_are_scored_each_by_their_own(rays_evaluation, test_set):
 
 
 def test_nothing_is_on_both_sides(rays_evaluation):
-    _, account = hold_out(rays_evaluation, 0.3, zones=2, positions=8, min_rays=8, people=0.5)
+    _, account = hold_out(rays_evaluation, 0.3, zones=2, positions=8, min_rays=8, participant_fraction=0.5)
     for split in gaze.SPLITS:
-        train, scored, centres = gaze.held_out_rays(rays_evaluation, account, split)
+        train, scored, centres = gaze.select_held_out_rays(rays_evaluation, account, split)
         named = lambda r: {rays_evaluation.persons[i] for i in np.unique(r.person)}
         assert named(train).isdisjoint(account["people"])
         assert named(scored) == (named(train) if split == "pos" else set(account["people"]))
         assert np.linalg.norm(train.origin[:, None] - np.array(account["centres"])[None], axis=2).min() > 0.6
     _, without = hold_out(rays_evaluation, 0.3, zones=2, positions=8, min_rays=8)
     with pytest.raises(ValueError, match="--test-people"):
-        gaze.held_out_rays(rays_evaluation, without, "both")
+        gaze.select_held_out_rays(rays_evaluation, without, "both")
     with pytest.raises(ValueError, match="both, pos, people"):
-        gaze.held_out_rays(rays_evaluation, account, "time")
+        gaze.select_held_out_rays(rays_evaluation, account, "time")
 
 
 def test_positions_without_rays_are_refused(rays_evaluation):
@@ -268,21 +268,21 @@ def test_maps_that_no_memory_holds_are_refused(rays_evaluation, monkeypatch):
 
 
 def test_halves_of_the_people_are_compared_where_both_were(rays_evaluation, test_set):
-    row = gaze.split_half(
-        rays_evaluation, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, uniform(), min_rays=20
+    row = gaze.score_split_half(
+        rays_evaluation, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, make_uniform_baseline(), min_rays=20
     )
     assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0
     nobody = np.array([[40.0, 0, 0]])
-    assert gaze.split_half(rays_evaluation, nobody, 0.6, 20.0, uniform(), min_rays=20) is None
-    two = gaze.split_half(
-        rays_evaluation.select(rays_evaluation.person < 2), test_set.centres, 0.6, 20.0, uniform(), min_rays=20
+    assert gaze.score_split_half(rays_evaluation, nobody, 0.6, 20.0, make_uniform_baseline(), min_rays=20) is None
+    two = gaze.score_split_half(
+        rays_evaluation.select(rays_evaluation.person < 2), test_set.centres, 0.6, 20.0, make_uniform_baseline(), min_rays=20
     )
     assert two is not None and two["KLD"] > 0
     alone = rays_evaluation.select(rays_evaluation.person == 0)
-    assert gaze.split_half(alone, test_set.centres, 0.6, 20.0, uniform(), min_rays=20) is None
+    assert gaze.score_split_half(alone, test_set.centres, 0.6, 20.0, make_uniform_baseline(), min_rays=20) is None
     with pytest.raises(ValueError, match="kappa is negative"):
         # What is wrong is said, and not taken for "nobody was there".
-        gaze.split_half(rays_evaluation, test_set.centres, 0.6, -1.0, uniform(), min_rays=20)
+        gaze.score_split_half(rays_evaluation, test_set.centres, 0.6, -1.0, make_uniform_baseline(), min_rays=20)
 
 
 # ---- Scores ----
@@ -311,8 +311,8 @@ def places(tmp_path_factory):
     fields.radiance(folder / "field.safetensors", density_scale=30.0)
     volume = {"type": "nerf", "filename": str(folder / "field.safetensors")}
     return {
-        "shapes": (place_of_scene(folder / "room.xml").medium, {}, shapes),
-        "field": (place_of_field(folder / "field.safetensors", ns).medium, {"field": volume}, {}),
+        "shapes": (load_scene_geometry(folder / "room.xml").medium, {}, shapes),
+        "field": (load_field_geometry(folder / "field.safetensors", ns).medium, {"field": volume}, {}),
     }
 
 
@@ -401,7 +401,7 @@ def test_a_density_of_zero_costs_what_a_millionth_of_the_uniform_one_does():
     half = np.repeat([0.0, 2.0], 32)[None] / (4 * np.pi)
     flat = np.ones((1, 64)) / (4 * np.pi)
     millionth = np.where(half > 0, half, 1e-6 / (4 * np.pi))
-    assert map_scores(flat, half)["KLD"] == pytest.approx(0.5 * np.log(1e6 / 2), abs=1e-5)
-    assert map_scores(flat, half)["KLD"] == pytest.approx(np.mean(np.log(flat / millionth)), abs=1e-5)
+    assert compute_map_scores(flat, half)["KLD"] == pytest.approx(0.5 * np.log(1e6 / 2), abs=1e-5)
+    assert compute_map_scores(flat, half)["KLD"] == pytest.approx(np.mean(np.log(flat / millionth)), abs=1e-5)
     # The other way round nothing hinges on it.
-    assert map_scores(half, flat)["KLD"] == pytest.approx(np.log(2), abs=2e-5)
+    assert compute_map_scores(half, flat)["KLD"] == pytest.approx(np.log(2), abs=2e-5)

@@ -19,18 +19,18 @@ from nerg_mi.evaluation.gaze_report import (
     UNDECIDED,
     WORSE,
     Comparison,
-    Lead,
-    judge,
-    lead_of,
-    markdown,
+    ScoreDifference,
+    compute_verdict,
+    compare_scores,
+    format_table,
     read_results,
-    side_by_side,
-    widening,
+    draw_comparison,
+    small_sample_factor,
     write_report,
 )
-from nerg_mi.evaluation.uncertainty import mean_rows
+from nerg_mi.evaluation.uncertainty import summarise_folds
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.probes import LEVELS, calibrated_levels, level_name, region_levels
+from nerg_mi.probes.probes import REGION_LEVELS, calibrate_levels, format_level, compute_region_levels
 from tests.evaluation.test_gaze import crowd
 
 # ---- What an evaluation of gaze writes: cells by hand, files that are valid, and pictures of what was asked for ----
@@ -52,14 +52,14 @@ ROWS = [
 
 
 def test_a_table_by_hand():
-    assert markdown(ROWS, ("method", "KLD", "CC", "MAE", "NSS", "integral", "AUC")).splitlines() == [
+    assert format_table(ROWS, ("method", "KLD", "CC", "MAE", "NSS", "integral", "AUC")).splitlines() == [
         "| method | KLD | CC | MAE | NSS | integral |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
         "| field | 0.512 [0.400, 0.650] | 0.900 | 0.0123 |  |  |",
         "| uniform | 1.500 | 0.000 | 0.0500 |  | 1.000 |",
         "| split half | 0.250 |  |  |  |  |",
     ]
-    people = markdown([{"method": "a", "person": "ann", "rays": 12}], ("method", "person", "rays"))
+    people = format_table([{"method": "a", "person": "ann", "rays": 12}], ("method", "person", "rays"))
     assert people.splitlines()[1:] == ["| --- | --- | ---: |", "| a | ann | 12 |"]
 
 
@@ -91,7 +91,7 @@ def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
         asked.append(positions)
         return 2 * np.exp(3 * directions[:, 0]) * np.ones((len(positions), 1))
 
-    side_by_side(test, {"twice": twice}, tmp_path / "a.png", count=2, height=8)
+    draw_comparison(test, {"twice": twice}, tmp_path / "a.png", count=2, height=8)
     images = [a for a in drawn[0].axes if a.images]
     # Each row has a scale of its own, which says what its colours mean.
     scales = [a for a in drawn[0].axes if a not in images]
@@ -123,14 +123,14 @@ ABOUT = {"gaze": "g.safetensors", "split": "both", "kappa": 20.0, "positions": 1
 def test_as_it_was_written(tmp_path):
     write_report(tmp_path, RESULTS_ROWS, PERSONS, {**ABOUT, "people": 7, "gaze_sha256": "ab"}, "# notes")
     found = read_results(tmp_path / "gaze.json")
-    assert (found.gaze, found.split, found.positions, found.people, found.sha256) == (
+    assert (found.gaze, found.split, found.num_positions, found.num_participants, found.sha256) == (
         "g.safetensors",
         "both",
         12,
         7,
         "ab",
     )
-    assert found.rows[0]["KLD"] is None and found.rows[1]["KLD"] == 1.0 and found.persons[0]["person"] == "Ada"
+    assert found.rows[0]["KLD"] is None and found.rows[1]["KLD"] == 1.0 and found.participant_rows[0]["person"] == "Ada"
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_what_is_none(tmp_path, change):
     with pytest.raises(NergError, match='"nerg eval gaze"'):
         read_results(path)
     path.write_text(json.dumps(whole))
-    assert read_results(path).people == 1
+    assert read_results(path).num_participants == 1
 
 
 # ---- Verdict ----
@@ -199,20 +199,20 @@ def scored(field, nearest=(0.4, 0.65, 0.55), **more):
     ],
 )
 def test_each_grade(field, grade, words):
-    verdict = judge(scored(field, reach=0.02), "both", 30, 60)
+    verdict = compute_verdict(scored(field, reach=0.02), "both", 30, 60)
     assert verdict.grade == grade and words in verdict.sentence
     assert verdict.sentence.count(".") == 1 and verdict.sentence.endswith(".")
 
 
 @pytest.mark.parametrize("people, positions", [(4, 60), (30, 9), (0, 0), (1, 1)])
 def test_never_a_verdict_from_too_few(people, positions):
-    verdict = judge(scored((0.9, 0.85, 0.3), reach=0.0), "pos", people, positions)
+    verdict = compute_verdict(scored((0.9, 0.85, 0.3), reach=0.0), "pos", people, positions)
     assert verdict.grade == "none" and verdict.comparisons == () and "too few" in verdict.sentence
-    assert judge(scored((0.9, 0.85, 0.3)), "pos", 5, 10).grade != "none"
+    assert compute_verdict(scored((0.9, 0.85, 0.3)), "pos", 5, 10).grade != "none"
 
 
 def test_scores_that_contradict_each_other_decide_nothing():
-    leads = lambda *ends: tuple(Lead("x", (a + b) / 2, a, b) for a, b in ends)
+    leads = lambda *ends: tuple(ScoreDifference("x", (a + b) / 2, a, b) for a, b in ends)
     good, bad, open_ = (0.1, 0.3), (-0.3, -0.1), (-0.1, 0.2)
     cases = [
         ((good, good, good), BETTER),
@@ -242,18 +242,18 @@ def test_scores_that_contradict_each_other_decide_nothing():
 def test_the_strongest_baseline_is_named(strongest, words):
     rows = [*scored((0.9, 0.85, 0.3), reach=0.02), row("16 nearest probes", 0.1, 0.5, 0.6, 0.02)]
     next(r for r in rows if r["method"] == strongest).update(row(strongest, 0.5, 0.6, 0.6, 0.02))
-    verdict = judge(rows, "both", 30, 60)
+    verdict = compute_verdict(rows, "both", 30, 60)
     assert verdict.grade == "use" and verdict.sentence.startswith(words)
     # The other half of the people is no baseline, however well it does.
     rows[5]["bits"] = 2.0
-    assert judge(rows, "both", 30, 60).sentence == verdict.sentence
+    assert compute_verdict(rows, "both", 30, 60).sentence == verdict.sentence
 
 
 def test_a_baseline_stronger_than_nearest_rays_decides_too():
     rows = lambda bits, reach: [*scored((0.9, 0.85, 0.3), reach=0.02), row("16 nearest probes", bits, *reach)]
-    better = judge(rows(1.2, (0.9, 0.2, 0.02)), "both", 30, 60)
+    better = compute_verdict(rows(1.2, (0.9, 0.2, 0.02)), "both", 30, 60)
     assert better.grade == "limited" and "worse than 16 nearest probes for" in better.sentence
-    level = judge(rows(0.91, (0.84, 0.31, 0.2)), "both", 30, 60)
+    level = compute_verdict(rows(0.91, (0.84, 0.31, 0.2)), "both", 30, 60)
     assert level.grade == "limited" and "better than 16 nearest probes is undecided" in level.sentence
     assert {c.reference for c in level.comparisons} >= {"uniform", "position-blind", "16 nearest probes"}
 
@@ -261,29 +261,29 @@ def test_a_baseline_stronger_than_nearest_rays_decides_too():
 def test_the_stronger_of_the_blind_densities_is_the_reference():
     rows = scored((0.2, 0.5, 0.65), reach=0.02)
     rows[3] |= row("position-blind, kappa 50", 0.35, 0.6, 0.6, 0.02)
-    assert judge(rows, "both", 30, 60).grade == "reject"
+    assert compute_verdict(rows, "both", 30, 60).grade == "reject"
 
 
 def test_missing_numbers_and_methods():
     rows = scored((0.9, 0.85, 0.3), reach=0.02)
-    assert judge([r | {"bits": None} for r in rows], "both", 30, 60).grade == "use"
-    assert judge(
+    assert compute_verdict([r | {"bits": None} for r in rows], "both", 30, 60).grade == "use"
+    assert compute_verdict(
         [{k: None if k in ("bits", "CC") else v for k, v in r.items()} for r in rows], "both", 30, 60
     ).grade == ("unclear")
-    assert "not compared with nearest rays" in judge(rows[:4], "both", 30, 60).sentence
-    assert judge(rows[:2], "both", 30, 60).grade == "none"
+    assert "not compared with nearest rays" in compute_verdict(rows[:4], "both", 30, 60).sentence
+    assert compute_verdict(rows[:2], "both", 30, 60).grade == "none"
     bare = [{k: v for k, v in r.items() if "." not in k} for r in rows]
-    assert judge(bare, "both", 30, 60).grade == "unclear"
+    assert compute_verdict(bare, "both", 30, 60).grade == "unclear"
 
 
 def test_the_lead_by_its_own_interval_is_sharper_than_by_two():
     field, other = row("f", 0.6, 0.7, 0.5, 0.2), row("o", 0.4, 0.6, 0.6, 0.2)
-    wide = lead_of(field, other, "bits", 30)
-    assert wide.value == pytest.approx(0.2) and wide.high - wide.value == pytest.approx(0.4 * widening(30))
-    paired = lead_of(field, row("o", 0.4, 0.6, 0.6, 0.2, gap=0.1), "bits", 30)
+    wide = compare_scores(field, other, "bits", 30)
+    assert wide.value == pytest.approx(0.2) and wide.high - wide.value == pytest.approx(0.4 * small_sample_factor(30))
+    paired = compare_scores(field, row("o", 0.4, 0.6, 0.6, 0.2, gap=0.1), "bits", 30)
     assert paired.outcome == BETTER and wide.outcome == UNDECIDED
     # Less KLD is better.
-    assert lead_of(field, other, "KLD", 30).value == pytest.approx(0.1)
+    assert compare_scores(field, other, "KLD", 30).value == pytest.approx(0.1)
 
 
 def test_intervals_for_few_people_cover_as_they_should():
@@ -293,15 +293,15 @@ def test_intervals_for_few_people_cover_as_they_should():
     x = rng.normal(size=(trials, n))
     reach = 1.96 * x.std(axis=1) / np.sqrt(n)  # what a bootstrap of the mean has in the limit of many resamples
     mean = np.abs(x.mean(axis=1))
-    assert np.mean(mean <= reach * widening(n)) == pytest.approx(0.95, abs=0.012)
+    assert np.mean(mean <= reach * small_sample_factor(n)) == pytest.approx(0.95, abs=0.012)
     assert np.mean(mean <= reach) < 0.88
-    assert widening(10**6) == pytest.approx(1, abs=1e-3)
+    assert small_sample_factor(10**6) == pytest.approx(1, abs=1e-3)
 
 
 def test_the_way_to_the_other_half_of_the_people():
-    verdict = judge(scored((0.3, 0.55, 0.6)), "both", 30, 60)
-    assert verdict.half == pytest.approx((0.55 - 0.4) / (0.7 - 0.4))
-    assert judge(scored((0.3, 0.55, 0.6))[:5], "both", 30, 60).half is None
+    verdict = compute_verdict(scored((0.3, 0.55, 0.6)), "both", 30, 60)
+    assert verdict.split_half_fraction == pytest.approx((0.55 - 0.4) / (0.7 - 0.4))
+    assert compute_verdict(scored((0.3, 0.55, 0.6))[:5], "both", 30, 60).split_half_fraction is None
 
 
 # ---- Means over folds ----
@@ -314,7 +314,7 @@ def fold(ours, bar, half=None):
 
 def test_means_intervals_and_differences_of_pairs():
     ours, bars = np.array([0.4, 0.6, 0.5]), np.array([0.7, 0.8, 0.75])
-    rows = {row["method"]: row for row in mean_rows([fold(a, b) for a, b in zip(ours, bars)])}
+    rows = {row["method"]: row for row in summarise_folds([fold(a, b) for a, b in zip(ours, bars)])}
     assert list(rows) == ["gaze field", "nearest", "gaze field less nearest"]
     # SciPy's own interval of a mean.
     low, high = stats.ttest_1samp(ours, 0).confidence_interval(0.95)
@@ -327,11 +327,11 @@ def test_means_intervals_and_differences_of_pairs():
 
 
 def test_what_some_folds_lack_is_a_mean_of_the_others():
-    rows = {row["method"]: row for row in mean_rows([fold(0.4, 0.7, 0.2), fold(0.6, math.nan)])}
+    rows = {row["method"]: row for row in summarise_folds([fold(0.4, 0.7, 0.2), fold(0.6, math.nan)])}
     assert rows["split half"] == {"method": "split half", "folds": 1, "KLD": 0.2}
     assert rows["nearest"]["KLD"] == 0.7 and "KLD.low" not in rows["nearest"]
     # The bar is the last method, and no reference.
-    assert "gaze field less nearest" in rows and mean_rows([fold(1, 2)[:1]])[0]["KLD"] == 1
+    assert "gaze field less nearest" in rows and summarise_folds([fold(1, 2)[:1]])[0]["KLD"] == 1
 
 
 # ---- Ranks, risks and regions ----
@@ -354,7 +354,7 @@ def test_little_support_ranks_great_errors():
     support = rng.integers(0, 40, 60)
     error = 1 / (1 + support) + rng.normal(0, 0.1, 60)
     rows = [row_uncertainty(s, e, str(i // 6)) for i, (s, e) in enumerate(zip(support, error))]
-    (found,) = uncertainty.rank_rows(rows)
+    (found,) = uncertainty.correlate_uncertainty(rows)
     assert found["signal"] == "support" and found["error"] == "KLD" and found["positions"] == 60
     assert found["rho"] == pytest.approx(spearmanr(-support, error)[0])
     assert found["rho.low"] < found["rho"] < found["rho.high"]
@@ -363,7 +363,7 @@ def test_little_support_ranks_great_errors():
 
 def test_a_wide_spread_ranks_great_errors_and_a_few_groups_have_no_interval():
     rows = [row_uncertainty(5.0, float(k), str(k % 4), spread=float(k), excess=-float(k)) for k in range(12)]
-    found = {(r["signal"], r["error"]): r for r in uncertainty.rank_rows(rows)}
+    found = {(r["signal"], r["error"]): r for r in uncertainty.correlate_uncertainty(rows)}
     assert found["spread", "KLD"]["rho"] == pytest.approx(1) and found["spread", "excess"]["rho"] == pytest.approx(-1)
     assert found["spread", "KLD"]["25%"] == 1 and "rho.low" not in found["spread", "KLD"]
     # What is the same everywhere says nothing, and leaves out nobody.
@@ -373,21 +373,21 @@ def test_a_wide_spread_ranks_great_errors_and_a_few_groups_have_no_interval():
 
 def test_positions_tell_their_errors(asked):
     test, maps, uniform = asked
-    rows = uncertainty.position_rows(test, maps, uniform, support=np.array([1, 2, 3]), groups=["a", "a", "b"])
+    rows = uncertainty.score_positions(test, maps, uniform, support=np.array([1, 2, 3]), groups=["a", "a", "b"])
     assert [r["group"] for r in rows] == ["a", "a", "b"] and [r["support"] for r in rows] == [1, 2, 3]
     expected = metrics.kld(test.truth, maps, eps=1e-6)
     assert [r["KLD"] for r in rows] == pytest.approx(expected.tolist()) and "spread" not in rows[0]
     # Half of these four, who look at different heights, tells less of the other half than all tell of themselves.
     assert all(0 < r["half"] < r["blind"] and r["excess"] == r["KLD"] - r["half"] for r in rows)
     alone = gaze.make_test(crowd(people=1), test.centres, 0.6, 20.0, 256, min_rays=20)
-    assert "half" not in uncertainty.position_rows(alone, maps, uniform)[0]
+    assert "half" not in uncertainty.score_positions(alone, maps, uniform)[0]
 
 
 def test_halves_that_look_alike_agree():
-    test = gaze.make_test(crowd(20_000), np.array([[-0.5, 0, 1.6]]), 0.6, 20.0, 256, cap=4096)
-    apart = uncertainty.half_errors(test, np.zeros_like(test.truth))
+    test = gaze.make_test(crowd(20_000), np.array([[-0.5, 0, 1.6]]), 0.6, 20.0, 256, max_rays=4096)
+    apart = uncertainty.compute_split_half_errors(test, np.zeros_like(test.truth))
     alike = type(test)(**{**vars(test), "parts": np.repeat(test.truth[:, None], 4, axis=1)})
-    assert uncertainty.half_errors(alike, np.zeros_like(test.truth)) == pytest.approx(-np.log(1), abs=1e-6)
+    assert uncertainty.compute_split_half_errors(alike, np.zeros_like(test.truth)) == pytest.approx(-np.log(1), abs=1e-6)
     assert apart[0] > 0.05
 
 
@@ -398,10 +398,10 @@ def test_calibrated_regions_hold_what_is_asked(asked):
     chosen = np.stack([rng.choice(256, 4000, p=row / row.sum()) for row in test.truth])
     drawn = type(test)(**{**vars(test), "who": rng.integers(0, 4, chosen.shape)})
     sharp = test.truth**3, np.take_along_axis(test.truth**3, chosen, axis=1)
-    half = region_levels(sharp[0], sharp[1][:, :2000]).ravel()
-    found = calibrated_levels(half, np.ones(len(half)))
-    rows = uncertainty.calibration_rows(drawn, {"sharp": sharp, "other": sharp}, 0, 0, {"sharp": found})
+    half = compute_region_levels(sharp[0], sharp[1][:, :2000]).ravel()
+    found = calibrate_levels(half, np.ones(len(half)))
+    rows = uncertainty.measure_calibration(drawn, {"sharp": sharp, "other": sharp}, 0, 0, {"sharp": found})
     assert [r["method"] for r in rows] == ["sharp", "sharp, calibrated", "other"]
-    for share in LEVELS:
-        name = level_name(share)
+    for share in REGION_LEVELS:
+        name = format_level(share)
         assert rows[0][name] == rows[2][name] < share - 0.05 and rows[1][name] == pytest.approx(share, abs=0.03)

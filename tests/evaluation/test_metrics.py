@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation import metrics
-from nerg_mi.evaluation.metrics import Renderer, depth_score, score_views, ssim
+from nerg_mi.evaluation.metrics import FieldRenderer, compute_depth_score, score_views, ssim
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_radiance
@@ -50,10 +50,10 @@ def test_ssim_equals_scikit_image_and_its_definition():
 
 def test_depth_is_scored_where_it_is_known():
     truth = np.array([[1.0, 2.0, 0.0, 4.0]])
-    score = depth_score(np.array([[1.05, 2.5, 9.0, 0.0]]), np.array([[1, 0.5, 1, 0.0]]), truth)
-    assert score.median == pytest.approx(0.5) and score.off == pytest.approx(2 / 3)
-    assert score.opacity == pytest.approx(0.5) and score.translucent == pytest.approx(2 / 3)
-    assert depth_score(truth, truth, 0 * truth) is None
+    score = compute_depth_score(np.array([[1.05, 2.5, 9.0, 0.0]]), np.array([[1, 0.5, 1, 0.0]]), truth)
+    assert score.median == pytest.approx(0.5) and score.outlier_fraction == pytest.approx(2 / 3)
+    assert score.opacity == pytest.approx(0.5) and score.translucent_fraction == pytest.approx(2 / 3)
+    assert compute_depth_score(truth, truth, 0 * truth) is None
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def test_ctrl_c_ends_a_picture_between_two_parts(fog, monkeypatch):
 
     mi.set_variant("llvm_ad_rgb")
     monkeypatch.setattr(metrics, "_LAUNCH", 16 * 12)
-    seeds, rendered, render = [], mi.render, Renderer(fog, 4)
+    seeds, rendered, render = [], mi.render, FieldRenderer(fog, 4)
 
     def stopped(scene, **how):
         seeds.append(how["seed"])
@@ -100,7 +100,7 @@ def test_rendered_through_mitsuba_it_is_the_closed_form(fog):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    seen = Renderer(fog)(camera())
+    seen = FieldRenderer(fog)(camera())
     middle = np.s_[5:7, 7:9]
     alpha = 1 - np.exp(-3)
     assert np.allclose(seen.opacity[middle], alpha, atol=2e-3)
@@ -118,11 +118,11 @@ def test_many_samples_are_rendered_a_part_at_a_time(fog, rgb, monkeypatch):
 
     monkeypatch.setattr(rgb, "render", render_part)
     monkeypatch.setattr(metrics, "_LAUNCH", 4 * 16 * 12 + 5)
-    seen = Renderer(fog, 9)(camera())
+    seen = FieldRenderer(fog, 9)(camera())
     assert parts == [4, 4, 1]
     assert np.allclose(seen.opacity[5:7, 7:9], 1 - np.exp(-3), atol=2e-3)
     monkeypatch.setattr(metrics, "_LAUNCH", 1)
-    Renderer(fog, 2)(camera())
+    FieldRenderer(fog, 2)(camera())
     assert parts[3:] == [1, 1]
 
 
@@ -130,7 +130,7 @@ def test_a_distorted_camera_is_followed(fog):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    plain, bent = Renderer(fog)(camera()), Renderer(fog)(camera(0.1))
+    plain, bent = FieldRenderer(fog)(camera()), FieldRenderer(fog)(camera(0.1))
     assert bent.mask.all()
     assert np.allclose(bent.opacity[5:7, 7:9], plain.opacity[5:7, 7:9], atol=5e-3)
     assert bent.color.shape == plain.color.shape
@@ -140,12 +140,12 @@ def test_scores_of_views_and_what_is_written(fog, tmp_path):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    seen = Renderer(fog)(camera())
+    seen = FieldRenderer(fog)(camera())
     view = PhotoView("frame.png", camera(), (seen.color + 0.1).astype(np.float32), seen.depth.astype(np.float32))
-    scores = score_views(fog, [view, view], pictures=tmp_path / "out")
+    scores = score_views(fog, [view, view], picture_folder=tmp_path / "out")
     assert scores.psnr_mean == pytest.approx(20, abs=0.2) and len(scores.psnr) == 2
     assert (scores.width, scores.height, scores.views) == (16, 12, ["frame.png", "frame.png"])
-    assert scores.depth.off == 0 and scores.depth.median < 0.02
+    assert scores.depth.outlier_fraction == 0 and scores.depth.median < 0.02
     assert (tmp_path / "out" / "frame.png").is_file()
     written = json.loads(json.dumps(scores.to_dict()))
     assert written["psnr_mean"] == scores.psnr_mean and written["depth"]["median"] == scores.depth.median

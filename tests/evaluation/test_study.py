@@ -13,7 +13,7 @@ import pytest
 
 from nerg_mi.evaluation import study as study_paper
 from nerg_mi.evaluation import study_scenes
-from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, settings, traced_operations
+from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, list_rows, count_traced_operations
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.transport.medium import LocalRay
@@ -29,11 +29,11 @@ from tests.reference import march_numpy
 def test_what_the_second_frame_of_an_observer_compiles_is_in_no_time(monkeypatch):
     subject, calls = open_subject("slab", "auto", 6, 4), []
     render = subject.render
-    monkeypatch.setattr(study_paper, "timed", lambda *args: calls.append("timed") or (1.0, 1.0))
+    monkeypatch.setattr(study_paper, "time_render", lambda *args: calls.append("timed") or (1.0, 1.0))
     monkeypatch.setattr(subject, "render", lambda *args: calls.append("render") or render(*args))
     rows = [study_paper.StudyRow("depth only", "leave out", {"aovs": "depth,opacity", "radiance": False})]
     said = []
-    study_paper.measure(subject, rows, 2, on_step=said.append)
+    study_paper.measure_rows(subject, rows, 2, on_step=said.append)
     assert said == ["depth only", "time of depth only"]
     # For the rays of the truth, the errors, the counts, and what is compiled then.
     assert calls == ["render"] * 4 + ["timed"] * 2
@@ -44,15 +44,15 @@ def test_what_the_second_frame_of_an_observer_compiles_is_in_no_time(monkeypatch
 
 def test_more_work_has_more_operations_and_more_lanes_have_not():
     x = lambda n: dr.arange(ns.Float, n)
-    one, two = (traced_operations(lambda f=f: f(x(100))) for f in (dr.sin, lambda v: dr.sin(v) + dr.cos(v * v)))
+    one, two = (count_traced_operations(lambda f=f: f(x(100))) for f in (dr.sin, lambda v: dr.sin(v) + dr.cos(v * v)))
     assert 0 < one < two
-    assert traced_operations(lambda: dr.sin(x(100_000))) == one
+    assert count_traced_operations(lambda: dr.sin(x(100_000))) == one
 
 
 def test_what_was_computed_before_is_not_counted():
     y = dr.sin(dr.arange(ns.Float, 100))
     dr.eval(y)
-    assert traced_operations(lambda: y) == 0
+    assert count_traced_operations(lambda: y) == 0
 
 
 # ---- The paper's marching: what it counts, what it paints, and that leaving empty cells loses nothing ----
@@ -64,8 +64,8 @@ def seen(rgb):
     subject = open_subject("sphere", "auto", 24, 16)
 
     def render(aovs, radiance=True, steps=256):
-        made = subject.integrator({"aovs": aovs, "radiance": radiance})
-        return subject.channels(study_paper.as_in_the_paper(made, subject.sensor, subject.tolerance, steps), 1, 1)
+        made = subject.make_integrator({"aovs": aovs, "radiance": radiance})
+        return subject.render_channels(study_paper.make_paper_integrator(made, subject.sensor, subject.tolerance, steps), 1, 1)
 
     render.subject = subject
     return render
@@ -86,7 +86,7 @@ def test_the_observers_evaluations_are_added_and_gaze_takes_none(seen):
 
 
 def test_the_picture_tends_to_the_true_one_and_is_black_without_radiance(seen):
-    known = seen.subject.truth(1, "expected", "depth")
+    known = seen.subject.get_truth(1, "expected", "depth")
     off = [np.abs(seen("depth,opacity", steps=n)["color"] - known.color).mean() for n in (128, 2048)]
     assert known.color.max() > 0.5 and off[1] < off[0] / 4 < 0.01
     dark = seen("depth,opacity", radiance=False, steps=128)
@@ -102,7 +102,7 @@ def test_a_deferred_field_is_asked_for_colour_once_a_ray(rgb, tmp_path):
     known = np.array(rgb.render(scene, integrator=made, spp=1, seed=0))
     off = []
     for steps in (64, 1024):
-        paper = study_paper.as_in_the_paper(made, scene.sensors()[0], 0.01, steps)
+        paper = study_paper.make_paper_integrator(made, scene.sensors()[0], 0.01, steps)
         seen = np.array(rgb.render(scene, integrator=paper, spp=1, seed=0))
         off.append(np.abs(seen - known)[..., :3].mean())
         assert np.array_equal(seen[..., 5], seen[..., 4] > 0)
@@ -116,7 +116,7 @@ def test_empty_cells_are_left_without_a_loss(dt_gamma):
     grid = OccupancyGrid(rng.random((5, 4, 6)) < 0.4, ns, 0)
 
     def density(p, active):
-        full = grid.empty_cells(p) == 0
+        full = grid.distance_to_occupied(p) == 0
         return dr.select(full, 2 + 3 * p.x + p.z, 0)
 
     count, step = 200, 1 / 300
@@ -131,7 +131,7 @@ def test_empty_cells_are_left_without_a_loss(dt_gamma):
     for occupancy in (grid, SimpleNamespace(coarse=grid), None):
         medium = SimpleNamespace(occupancy=occupancy, to_unit=lambda p: p, vector_to_unit=lambda v: v, density=density)
         how = {"steps": 4096, "shortest": step, "longest": 0.02, "dt_gamma": dt_gamma}
-        alpha, depth, _, n = study_paper.march(medium, ray, t0, t1, True, None, **how)
+        alpha, depth, _, n = study_paper.march_as_in_paper(medium, ray, t0, t1, True, None, **how)
         found.append([np.array(v, float) for v in (alpha, depth, n)])
     leaping, refining, whole = found
     assert all(np.array_equal(a, b) for a, b in zip(leaping, refining))
@@ -153,11 +153,11 @@ def test_empty_cells_are_left_without_a_loss(dt_gamma):
 
 def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
     subject = open_subject("slab", "auto", 12, 8)
-    o, d = subject.rays(1)
+    o, d = subject.record_rays(1)
     steps = 64
     step = subject.extent / steps
-    seen = subject.channels(
-        study_paper.as_in_the_paper(subject.integrator(), subject.sensor, subject.tolerance, steps), 1, 1
+    seen = subject.render_channels(
+        study_paper.make_paper_integrator(subject.make_integrator(), subject.sensor, subject.tolerance, steps), 1, 1
     )
     for i in range(0, len(o), 7):
         hit = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
@@ -167,14 +167,14 @@ def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
             while t < hit[1]:
                 w = T * -math.expm1(-study_scenes.SLAB_DENSITY * step)
                 t += step
-                depth, last = depth + w * t, T < study_paper.STOP
+                depth, last = depth + w * t, T < study_paper.PAPER_STOP
                 T -= w
                 if last:
                     break
         assert abs(seen["depth"][i] - depth) < 2e-2 * step + 0.04 * (1 - seen["opacity"][i])
         assert abs(seen["opacity"][i] - (1 - T)) < 2e-2
     half = (seen["opacity"] > 0.3) & (seen["opacity"] < 0.9)
-    known = subject.truth(1, "expected", "depth")
+    known = subject.get_truth(1, "expected", "depth")
     assert half.any() and np.all(seen["depth"][half] < 0.95 * known.depth[half])
 
 
@@ -183,7 +183,7 @@ def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
 
 @pytest.fixture(scope="module")
 def rows():
-    return settings(
+    return list_rows(
         SimpleNamespace(marched=True, hits=False, extent=2.0, has_gaze=True, normalized=True, resampled=True)
     )
 
@@ -196,7 +196,7 @@ def test_sweeps_are_even_on_a_log_axis(rows):
         "dt_gamma": [r.params["dt_gamma"] for r in rows if r.group == "dt_gamma"],
         "coarse": [r.params["coarse"] for r in rows if r.group == "coarse"],
         "steps at a grid": [2.0 / r.params["step"] for r in rows if re.fullmatch(r"grid 64, cells, \d+ steps", r.name)],
-        "map heights": [r.params["map_height"] for r in rows if "map_height" in r.params and not r.first_frame],
+        "map heights": [r.params["map_height"] for r in rows if "map_height" in r.params and not r.is_first_frame],
         "tolerances": [r.params["integral_tolerance"] for r in rows if r.group == "integral"][1:],
         "samples": [r.spp for r in rows if r.group == "spp"],
     }
@@ -209,7 +209,7 @@ def test_sweeps_are_even_on_a_log_axis(rows):
 def test_rows_do_what_their_names_say(rows):
     assert rows[0].name == "default" and not rows[0].params and len({r.name for r in rows}) == len(rows)
     for row in rows:
-        assert row.first_frame == row.name.endswith("first frame"), row.name
+        assert row.is_first_frame == row.name.endswith("first frame"), row.name
         if found := re.search(r"(\d+) steps", row.name):
             n = row.paper[0] if row.paper else 2.0 / row.params["step"]
             assert n == int(found[1]), row.name

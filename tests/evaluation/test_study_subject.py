@@ -9,12 +9,12 @@ import pytest
 
 from nerg_mi.evaluation import study_scenes
 from nerg_mi.evaluation import study_truth as study_shapes
-from nerg_mi.evaluation.study_subject import open_subject, parameters
+from nerg_mi.evaluation.study_subject import open_subject, read_parameters
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.train.gaze_data import box_exit
+from nerg_mi.train.gaze_data import compute_box_exit
 from nerg_mi.workflows.scene_commands import StudyOptions
-from nerg_mi.workflows.study import run_study, twin_beside
+from nerg_mi.workflows.study import run_study, find_reference_scene
 from tests.evaluation.gaze_fields import KINDS, saved
 from tests.reference import march_numpy
 
@@ -47,9 +47,9 @@ def test_all_settings_are_read_back_and_make_the_same_integrator(rgb):
     }
     density = {"type": "constvolume", "value": 3.0}
     first = rgb.load_dict({"type": "nerg", "density": density, **given})
-    found = parameters(first)
+    found = read_parameters(first)
     assert found == given
-    assert parameters(rgb.load_dict({"type": "nerg", "density": density, **found})) == given
+    assert read_parameters(rgb.load_dict({"type": "nerg", "density": density, **found})) == given
     # None is forgotten of those that the manual page names.
     rows = re.findall(r"^ \* - ([\w, ]+)\n   - (?!:paramtype)", type(first).__doc__, re.MULTILINE)
     named = {name for row in rows for name in row.split(", ")}
@@ -77,10 +77,10 @@ def test_the_twin_says_what_the_observer_sees(rgb, tmp_path):
     eye = np.array([-2.0, -1.0, 3.0])
     (tmp_path / "scene.xml").write_text(SCENE.format(eye=", ".join(map(str, eye))))
     (tmp_path / "twin.xml").write_text(TWIN)
-    subject = open_subject(str(tmp_path / "scene.xml"), "auto", 24, 16, surfaces=twin_beside)
-    assert np.allclose(subject.eye(), eye)
-    t, visible = subject.exact(1)
-    o, d = subject.rays(1)
+    subject = open_subject(str(tmp_path / "scene.xml"), "auto", 24, 16, surfaces=find_reference_scene)
+    assert np.allclose(subject.observer_position(), eye)
+    t, visible = subject.find_exact_hits(1)
+    o, d = subject.record_rays(1)
     hit = np.isfinite(t)
     p = o[hit] + d[hit] * t[hit, None]
     face = np.argmax(np.abs(p - 0.5), axis=1)
@@ -91,8 +91,8 @@ def test_the_twin_says_what_the_observer_sees(rgb, tmp_path):
 
 def test_solids_are_met_where_geometry_says():
     subject = open_subject("sphere", "auto", 24, 16)
-    t, visible = subject.exact(1)
-    o, d = subject.rays(1)
+    t, visible = subject.find_exact_hits(1)
+    o, d = subject.record_rays(1)
     hit = np.isfinite(t)
     center, radius = study_scenes.SPHERE_CENTER, study_scenes.SPHERE_RADIUS
     p = o[hit] + d[hit] * t[hit, None]
@@ -101,7 +101,7 @@ def test_solids_are_met_where_geometry_says():
     # A convex body hides from an observer what faces away.
     towards = np.asarray(subject.analytic.observer) - p
     assert np.array_equal(visible[hit], (towards * normal).sum(-1) > 0) and 0 < visible[hit].mean() < 1
-    assert not visible[~hit].any() and open_subject("fog", "auto", 4, 4).exact(1) is None
+    assert not visible[~hit].any() and open_subject("fog", "auto", 4, 4).find_exact_hits(1) is None
 
 
 def test_a_scene_file_is_compared_with_its_own_limit(rgb, tmp_path):
@@ -115,9 +115,9 @@ def test_a_scene_file_is_compared_with_its_own_limit(rgb, tmp_path):
           <string name="component_format" value="float32"/></film>
       </sensor></scene>""")
     subject = open_subject(str(path), "auto", 12, 8)
-    known = subject.truth(1, "median", "depth")
-    assert known.depth.shape == (96,) and not subject.has_gaze and subject.exact(1) is None
-    o, d = subject.rays(1)
+    known = subject.get_truth(1, "median", "depth")
+    assert known.depth.shape == (96,) and not subject.has_gaze and subject.find_exact_hits(1) is None
+    o, d = subject.record_rays(1)
     slab = study_scenes.SCENES["slab"]
     for i in range(0, 96, 13):
         hit = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
@@ -174,8 +174,8 @@ def scene(folder, kind: str, shapes: bool):
 @pytest.mark.parametrize("kind", KINDS)
 def test01_shapes_agree_with_their_reference(rgb, tmp_path, kind):
     subject = open_subject(str(scene(tmp_path, kind, True)), "auto", 24, 16)
-    seen = subject.channels(subject.integrator(), 1, 1)
-    known = subject.truth(1, "median", "depth")
+    seen = subject.render_channels(subject.make_integrator(), 1, 1)
+    known = subject.get_truth(1, "median", "depth")
     assert np.ptp(known.gaze) > 1e-2
     off = np.abs(seen["gaze"] - known.gaze) > 1e-3 * known.gaze.max()
     assert off.mean() < 0.01
@@ -186,13 +186,13 @@ def test02_the_integral_is_that_of_exact_geometry(rgb, tmp_path, kind):
     """The reference takes the integrator's integral; here it is found again, by float64 intersections with the
     triangles."""
     subject = open_subject(str(scene(tmp_path, kind, True)), "auto", 8, 8)
-    eye = subject.eye()
-    observed = study_shapes.observed_gaze(subject, eye)
-    field = subject.integrator().gaze.field
+    eye = subject.observer_position()
+    observed = study_shapes.make_observed_gaze(subject, eye)
+    field = subject.make_integrator().gaze.field
     d = fibonacci_directions(4096)
-    t = study_shapes.first_hit(subject.corners, np.broadcast_to(eye, d.shape), d)
+    t = study_shapes.find_first_hit(subject.triangles, np.broadcast_to(eye, d.shape), d)
     escaped = np.isinf(t)
-    t[escaped] = box_exit(BOX, np.broadcast_to(eye, d.shape)[escaped], d[escaped])
+    t[escaped] = compute_box_exit(BOX, np.broadcast_to(eye, d.shape)[escaped], d[escaped])
     assert 0.1 < escaped.mean() < 0.9
     points = lambda kind, v: kind(np.ascontiguousarray(np.broadcast_to(v, d.shape).T, np.float32))
     emit, capture = field.unnormalized(
@@ -221,13 +221,13 @@ def test03_the_study_of_a_default_recipe(rgb, tmp_path, shapes):
 @pytest.mark.parametrize("kind", ["default recipe", "ensemble"])
 def test04_the_papers_marching_is_divided_by_the_same_integral(rgb, tmp_path, kind):
     """In an opaque box both rules meet the same surfaces; what they say of them is then the same density."""
-    from nerg_mi.evaluation.study import as_in_the_paper
+    from nerg_mi.evaluation.study import make_paper_integrator
 
     subject = open_subject(str(scene(tmp_path, kind, False)), "auto", 24, 16)
-    made = subject.integrator({"aovs": "depth,opacity,gaze,visibility,gaze_evals", "depth": "expected"})
+    made = subject.make_integrator({"aovs": "depth,opacity,gaze,visibility,gaze_evals", "depth": "expected"})
     # First: afterwards the field would face the observer whatever the paper's marching does.
-    theirs = subject.channels(as_in_the_paper(made, subject.sensor, subject.tolerance, 4096), 1, 1)
-    ours = subject.channels(made, 1, 1)
+    theirs = subject.render_channels(make_paper_integrator(made, subject.sensor, subject.tolerance, 4096), 1, 1)
+    ours = subject.render_channels(made, 1, 1)
     both = (ours["visibility"] > 0.8) & (theirs["visibility"] > 0.8) & (ours["opacity"] > 0.99)
     assert both.sum() > 10
     attended = lambda seen: seen["gaze"][both] / seen["visibility"][both]

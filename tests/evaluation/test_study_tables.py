@@ -51,11 +51,11 @@ def test_panels_show_all_rows_and_the_front_below_them(drawn):
     for axes in panels:
         (front,) = axes.lines
         # In the order of time; an error of zero stands on the axis' lower end.
-        assert np.allclose(front.get_xydata(), [(0.01, 2e-3), (0.02, 1e-3), (0.16, study_plots.FLOOR)])
+        assert np.allclose(front.get_xydata(), [(0.01, 2e-3), (0.02, 1e-3), (0.16, study_plots.MIN_PLOTTED_ERROR)])
         assert front.get_drawstyle() == "steps-post"
         points = {len(c.get_offsets()): c for c in axes.collections}
         assert sum(len(c.get_offsets()) for c in axes.collections) == 4
-        assert np.allclose(points[2].get_offsets(), [(0.01, 2e-3), (0.16, study_plots.FLOOR)])
+        assert np.allclose(points[2].get_offsets(), [(0.01, 2e-3), (0.16, study_plots.MIN_PLOTTED_ERROR)])
         assert all(c.get_zorder() > front.get_zorder() for c in axes.collections)
         assert axes.get_xscale() == axes.get_yscale() == "log"
     crosses = [c for c in panels[0].collections if np.allclose(c.get_offsets(), [(0.08, 5e-3)])]
@@ -80,13 +80,13 @@ def test_cost_is_drawn_over_named_axes_with_the_exponent(drawn):
 
 
 def test_pareto():
-    assert study_tables.pareto([(1, 5), (2, 3), (3, 4), (4, 1), (5, 1)]) == [True, True, False, True, False]
-    assert study_tables.pareto([(1, 1), (1, 1), (1, 2)]) == [True, True, False]
-    assert study_tables.pareto([]) == []
+    assert study_tables.find_pareto_front([(1, 5), (2, 3), (3, 4), (4, 1), (5, 1)]) == [True, True, False, True, False]
+    assert study_tables.find_pareto_front([(1, 1), (1, 1), (1, 2)]) == [True, True, False]
+    assert study_tables.find_pareto_front([]) == []
     rng = np.random.default_rng(0)
     points = [tuple(p) for p in rng.random((200, 2))]
     beaten = [any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points) for p in points]
-    assert study_tables.pareto(points) == [not b for b in beaten]
+    assert study_tables.find_pareto_front(points) == [not b for b in beaten]
 
 
 def test_a_page_shows_times_in_ms_shares_in_percent_and_errors_as_they_are():
@@ -96,7 +96,7 @@ def test_a_page_shows_times_in_ms_shares_in_percent_and_errors_as_they_are():
     row = {"setting": "a", "group": "leave out", "spp": 1, "resolution": "", "visibility": "depth"}
     row |= {name: (k + 1) / 128 for k, name in enumerate(names)}
     about = {"scene": "s", "size": (1, 1), "variant": "v", "reference": "r", "reference_change_when_step_halved": {}}
-    page = study_tables.markdown({"rows": [{**row, "group": "default"}, row], **about})
+    page = study_tables.format_report({"rows": [{**row, "group": "default"}, row], **about})
     assert "against the paper" not in page
     shown = [float(cell) for cell in page.split("| a |")[2].split("\n")[0].strip(" |").split("|")]
     assert sorted(shown) == sorted(float(f"{row[name] * units.get(name, 1):.3g}") for name in names)
@@ -125,7 +125,7 @@ def test_against_paper_takes_the_best_of_either_kind():
         row("fast", "paper", 0.5, 0.001),
     ]
     for clock in ("seconds", "cpu_seconds"):
-        first, second = study_tables.against_paper(rows, clock)
+        first, second = study_tables.compare_with_paper(rows, clock)
         assert first["equal_time"]["setting"] == "default" and math.isclose(first["equal_time"]["error_ratio"], 5)
         assert first["equal_error"]["setting"] == "short" and math.isclose(first["equal_error"]["time_ratio"], 4)
         assert second["equal_time"] is None and second["equal_error"] is None

@@ -9,9 +9,9 @@ import pytest
 
 from nerg_mi.cli import main
 from nerg_mi.evaluation import study_scenes, study_subject, study_truth
-from nerg_mi.evaluation.study import measure, settings
-from nerg_mi.evaluation.study_subject import extent, open_subject
-from nerg_mi.evaluation.study_truth import errors
+from nerg_mi.evaluation.study import measure_rows, list_rows
+from nerg_mi.evaluation.study_subject import read_splat_extent, open_subject
+from nerg_mi.evaluation.study_truth import compute_errors
 from nerg_mi.formats.splats import write_ply_splats
 from tests.formats.splats.writers import random_splats
 from tests.reference import march_numpy
@@ -22,7 +22,7 @@ from tests.reference import march_numpy
 def test_errors_of_known_pictures():
     n = 1000
     one, none = np.ones(n), np.zeros(n)
-    known = study_truth.Truth(np.full((n, 3), 0.5), one, 2 * one, one, np.linspace(1, 2, n), "", {})
+    known = study_truth.StudyTruth(np.full((n, 3), 0.5), one, 2 * one, one, np.linspace(1, 2, n), "", {})
     seen = {
         "color": np.full((n, 3), 0.6),
         "opacity": one,
@@ -30,17 +30,17 @@ def test_errors_of_known_pictures():
         "visibility": one,
         "gaze": np.linspace(1, 2, n),
     }
-    off = errors(seen, known, (2 * one, np.arange(n) >= 250))
+    off = compute_errors(seen, known, (2 * one, np.arange(n) >= 250))
     assert math.isclose(off["color_rmse"], 0.1, rel_tol=1e-9) and math.isclose(off["color_psnr"], 20, rel_tol=1e-9)
     assert math.isclose(off["depth_mae"], 0.05) and off["depth_p99"] == 0.5
     assert off["visibility_mae"] == 0 and off["visibility_wrong"] == 0.25
     assert off["gaze_mae"] == 0 and abs(off["gaze_kld"]) < 1e-12
     # Errors of either sign; and half seen is seen.
     half = np.where(np.arange(n) % 2, 0.4, 0.6)
-    off = errors({"opacity": 0.5 + half, "visibility": half}, known, (2 * one, one > 0))
+    off = compute_errors({"opacity": 0.5 + half, "visibility": half}, known, (2 * one, one > 0))
     assert math.isclose(off["opacity_mae"], 0.1) and off["visibility_wrong"] == 0.5
     # A ray that met nothing counts in full; what was not rendered has no error.
-    off = errors({"depth": none, "color": none[:, None]}, known)
+    off = compute_errors({"depth": none, "color": none[:, None]}, known)
     assert off["depth_mae"] == 2 and "color_rmse" not in off and "gaze_mae" not in off
 
 
@@ -62,7 +62,7 @@ def rays(scene, count=24, seed=0):
 def test_references_are_the_limit_of_a_float64_march(name):
     scene = study_scenes.SCENES[name]
     o, d = rays(scene, 12)
-    seen = study_truth.trace(scene, o, d)
+    seen = study_truth.trace_rays(scene, o, d)
     color, medians = seen.color(o, d), seen.quantile(0.5)
     for i in range(len(o) - 1):
         near, far = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
@@ -70,7 +70,7 @@ def test_references_are_the_limit_of_a_float64_march(name):
         # Steps end at the jumps of density, so that midpoints do not straddle them.
         borders = np.unique(np.concatenate([np.linspace(near, far, 20001), jumps[(jumps > near) & (jumps < far)]]))
         tau, expected, median, total, _ = march_numpy.march(
-            lambda p: scene.density(*p.T, study_scenes.NUMPY) + 0 * p[:, 0], o[i], d[i], borders, study_scenes.color
+            lambda p: scene.density(*p.T, study_scenes.NUMPY_FUNCTIONS) + 0 * p[:, 0], o[i], d[i], borders, study_scenes.evaluate_color
         )
         assert math.isclose(seen.tau[i], tau, rel_tol=1e-6)
         assert math.isclose(seen.expected[i], expected, rel_tol=1e-6) and math.isclose(medians[i], median, rel_tol=1e-6)
@@ -80,17 +80,17 @@ def test_references_are_the_limit_of_a_float64_march(name):
 def test_a_trace_that_ends_is_the_front_of_a_whole_one():
     for scene in study_scenes.SCENES.values():
         o, d = rays(scene, 8)
-        seen = study_truth.trace(scene, o, d)
-        half = study_truth.trace(scene, o, d, seen.quantile(0.5))
+        seen = study_truth.trace_rays(scene, o, d)
+        half = study_truth.trace_rays(scene, o, d, seen.quantile(0.5))
         assert np.allclose(half.opacity, seen.opacity / 2, rtol=1e-9)
 
 
 def test_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_depth():
     # A lift beyond the face would show a strip beyond the terminator, one short of it would hide a strip before it.
     subject = open_subject("sphere", "auto", 96, 64)
-    t, visible = subject.exact(1)
-    o, d = subject.rays(1)
-    seen = study_truth.trace(subject.analytic, o, d)
+    t, visible = subject.find_exact_hits(1)
+    o, d = subject.record_rays(1)
+    seen = study_truth.trace_rays(subject.analytic, o, d)
     thick = np.isfinite(t) & (seen.tau > 12)
     for kind in ("expected", "median"):
         known = study_truth.compute_truth(
@@ -121,7 +121,7 @@ def test_what_is_no_surface_is_not_visible(visibility):
 
 @pytest.mark.parametrize("x", [0, 1e-300, 1e-6, 9.9e-3, 1.01e-2, 1, 50, 1e9])
 def test_mean_share(x):
-    value = study_truth.mean_share(np.array([x]))[0]
+    value = study_truth.mean_depth_fraction(np.array([x]))[0]
     if x < 1e-5:
         assert abs(value - 0.5) < 1e-6
     else:
@@ -131,22 +131,22 @@ def test_mean_share(x):
 @pytest.mark.parametrize("name", NAMES)
 def test_integrator_agrees_with_the_reference(name):
     subject = open_subject(name, "auto", 12, 8)
-    known = subject.truth(1, "expected", "depth")
-    off = errors(
-        subject.channels(subject.integrator({"depth": "expected", "step": subject.extent / 2048}), 1, 1), known
+    known = subject.get_truth(1, "expected", "depth")
+    off = compute_errors(
+        subject.render_channels(subject.make_integrator({"depth": "expected", "step": subject.extent / 2048}), 1, 1), known
     )
     # Thin or hard matter is what steps of a finite length find late.
-    bound = 1e-3 if subject.opaque else 2e-6
+    bound = 1e-3 if subject.is_opaque else 2e-6
     assert off["depth_mae"] < bound and off["opacity_mae"] < bound and off["color_rmse"] < max(20 * bound, 1e-4)
     assert off["visibility_mae"] < 30 * bound and off["gaze_mae"] < 30 * bound
 
 
 def test_a_grid_tends_to_its_density():
     subject = open_subject("fog", "auto", 12, 8)
-    known = subject.truth(1, "expected", "depth")
+    known = subject.get_truth(1, "expected", "depth")
     off = [
-        errors(
-            subject.channels(subject.integrator({"quadrature": "cells", "depth": "expected"}, resolution=r), 1, 1),
+        compute_errors(
+            subject.render_channels(subject.make_integrator({"quadrature": "cells", "depth": "expected"}, resolution=r), 1, 1),
             known,
         )["depth_mae"]
         for r in (8, 32)
@@ -183,11 +183,11 @@ def scene(tmp_path):
 
 def test01_first_hits_are_those_of_a_ray_caster(rgb, scene):
     subject = study_subject.open_subject(str(scene), "auto", 24, 16)
-    o, d = subject.rays(3)
+    o, d = subject.record_rays(3)
     loaded = subject.scene
     ray = rgb.Ray3f(*(kind(np.ascontiguousarray(v.T, np.float32)) for kind, v in ((rgb.Point3f, o), (rgb.Vector3f, d))))
     expected = np.array(loaded.ray_intersect_preliminary(ray).t, float)
-    found = subject.first_hits(3)
+    found = subject.find_first_hits(3)
     assert np.array_equal(np.isfinite(found), np.isfinite(expected)) and np.isfinite(found).sum() > 200
     hit = np.isfinite(found)
     assert np.allclose(found[hit], expected[hit], rtol=1e-5)
@@ -197,9 +197,9 @@ def test02_rays_do_not_slip_between_triangles():
     corners = np.array([[[0, 0, 1], [1, 0, 1], [1, 1, 1]], [[0, 0, 1], [1, 1, 1], [0, 1, 1]]], float)
     s = np.linspace(0.01, 0.99, 99)
     o = np.stack([s, s, 0 * s], -1)
-    assert (study_truth.first_hit(corners, o, np.tile([0, 0, 1.0], (99, 1))) == 1).all()
-    away = study_truth.first_hit(corners, o, np.tile([0, 0, -1.0], (99, 1)))
-    parallel = study_truth.first_hit(corners, o, np.tile([1.0, 0, 0], (99, 1)))
+    assert (study_truth.find_first_hit(corners, o, np.tile([0, 0, 1.0], (99, 1))) == 1).all()
+    away = study_truth.find_first_hit(corners, o, np.tile([0, 0, -1.0], (99, 1)))
+    parallel = study_truth.find_first_hit(corners, o, np.tile([1.0, 0, 0], (99, 1)))
     assert np.isinf(away).all() and np.isinf(parallel).all()
 
 
@@ -208,12 +208,12 @@ def test02_rays_do_not_slip_between_triangles():
 def test03_the_integrator_agrees_with_the_reference(rgb, scene, falloff, visibility):
     scene.write_text(SCENE.format(falloff=falloff, more=""))
     subject = study_subject.open_subject(str(scene), "auto", 24, 16)
-    seen = subject.channels(subject.integrator({"visibility": visibility}), 1, 1)
-    known = subject.truth(1, "median", visibility)
+    seen = subject.render_channels(subject.make_integrator({"visibility": visibility}), 1, 1)
+    known = subject.get_truth(1, "median", visibility)
     assert np.array_equal(seen["opacity"], known.opacity)
     assert np.allclose(seen["depth"], known.depth, atol=2e-5)
     assert np.mean(np.abs(seen["visibility"] - known.visibility) > 1e-3) < 0.01
-    distance, visible = subject.exact(1)
+    distance, visible = subject.find_exact_hits(1)
     # A hair of tolerance lies between what is asked and what is exactly so.
     shown = known.visibility > 0.5 if falloff == 0 or visibility == "transmittance" else None
     if shown is not None:
@@ -244,22 +244,22 @@ def subject(rgb, tmp_path):
 
 
 def test_a_field_is_cut_off_elsewhere_and_else_the_same(subject):
-    first, other = subject.integrator(), subject.integrator({"extent": 5.0})
-    assert extent(first) == 3 and extent(other) == 5
+    first, other = subject.make_integrator(), subject.make_integrator({"extent": 5.0})
+    assert read_splat_extent(first) == 3 and read_splat_extent(other) == 5
     assert np.allclose(other.medium.to_world.matrix, first.medium.to_world.matrix, atol=1e-6)
     assert other.medium.color_space == "linear" and other.medium.arrays.count == 30
-    assert study_truth.cut_off({"stop": 0.5}) == {"stop": 0.5}
+    assert study_truth.apply_splat_extent({"stop": 0.5}) == {"stop": 0.5}
 
 
 @pytest.mark.nightly
 def test_settings_that_gaussians_know_buy_error_with_time(subject):
-    rows = [r for r in settings(subject) if r.group in ("default", "stop", "extent")]
-    assert {r.group for r in settings(subject)} >= {"stop", "extent", "depth", "visibility", "together"}
-    assert not {r.group for r in settings(subject)} & {"coarse", "paper", "dt_gamma"}
+    rows = [r for r in list_rows(subject) if r.group in ("default", "stop", "extent")]
+    assert {r.group for r in list_rows(subject)} >= {"stop", "extent", "depth", "visibility", "together"}
+    assert not {r.group for r in list_rows(subject)} & {"coarse", "paper", "dt_gamma"}
     rows = [r for r in rows if r.name in ("default", "extent 2", "extent 5")]
-    found = {row["setting"]: row for row in measure(subject, rows, 1, 4)}
+    found = {row["setting"]: row for row in measure_rows(subject, rows, 1, 4)}
     error = {name: row["color_rmse"] for name, row in found.items()}
     assert error["extent 5"] < 0.1 * error["default"] and error["default"] < 0.3 * error["extent 2"]
     assert found["extent 2"]["density_evals"] < found["extent 5"]["density_evals"]
     assert found["extent 2"]["extent"] == 2 and found["default"]["steps"] == ""
-    assert subject.truth(1, "median", "depth").convergence["depth_mae"] < 1e-4
+    assert subject.get_truth(1, "median", "depth").convergence["depth_mae"] < 1e-4

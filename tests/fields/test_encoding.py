@@ -14,7 +14,7 @@ from nerg_mi.fields.encoding import (
     config_type,
     encode_direction,
     encoding_config,
-    encoding_of,
+    encoding_from_parameters,
     random_encoding,
     register,
 )
@@ -269,6 +269,6 @@ def test_encodings_by_configuration():
     same = HashGrid.random(CONFIG, ns, np.random.default_rng(1))
     assert np.array_equal(grid.table.numpy(), same.table.numpy())
     parameters = {"behind.table": grid.table, "grid.table": grid.table * 0}
-    found = encoding_of(CONFIG, parameters, "behind", dr.ReduceMode.Expand)
+    found = encoding_from_parameters(CONFIG, parameters, "behind", dr.ReduceMode.Expand)
     assert found.table is grid.table and found.mode == dr.ReduceMode.Expand
-    assert not encoding_of(CONFIG, parameters).table.numpy().any()
+    assert not encoding_from_parameters(CONFIG, parameters).table.numpy().any()

@@ -10,7 +10,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields import extraction
-from nerg_mi.fields.extraction import Lattice, Sampler, crossings, opacity, surface_density
+from nerg_mi.fields.extraction import Lattice, FieldSampler, find_crossings, cell_opacity, surface_density
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.maths.geometry import Box
 
@@ -36,30 +36,30 @@ def sigma(p):
 
 
 def test_a_lattice_fills_the_box_evenly():
-    lattice = Lattice.over(Ramp(), 10)
+    lattice = Lattice.for_field(Ramp(), 10)
     assert lattice.step == pytest.approx(0.4) and lattice.shape == (10, 5, 3)
     # Three cells of 0.4 overhang the height of 1 by 0.1 on either side.
     assert np.allclose(lattice.lower, (-1, 0, 0.4))
     assert np.allclose(
         lattice.points([[0, 0, 0], [9, 4, 2], [0.5, 1, 0]]), [[-0.8, 0.2, 0.6], [2.8, 1.8, 1.4], [-0.6, 0.6, 0.6]]
     )
-    assert Lattice.over(SimpleNamespace(box=Box((0, 0, 0), (1, 1, 0.01))), 2).shape == (2, 2, 2)
+    assert Lattice.for_field(SimpleNamespace(box=Box((0, 0, 0), (1, 1, 0.01))), 2).shape == (2, 2, 2)
     with pytest.raises(ValueError, match="at least 2 cells"):
-        Lattice.over(Ramp(), 1)
+        Lattice.for_field(Ramp(), 1)
     with pytest.raises(NergError, match="--resolution"):
-        Lattice.over(SimpleNamespace(box=Box((0, 0, 0), (1, 1, 1))), 2048)
+        Lattice.for_field(SimpleNamespace(box=Box((0, 0, 0), (1, 1, 1))), 2048)
     assert -math.expm1(-surface_density(lattice) * 0.4) == pytest.approx(0.5)
-    assert np.allclose(opacity(np.array([0, surface_density(lattice), 1e9]), lattice), [0, 0.5, 1])
+    assert np.allclose(cell_opacity(np.array([0, surface_density(lattice), 1e9]), lattice), [0, 0.5, 1])
 
 
 @pytest.mark.parametrize("batch", [1 << 21, 7])
 def test_values_on_a_lattice(batch, monkeypatch):
     monkeypatch.setattr(extraction, "_BATCH", batch)
-    lattice, sampler = Lattice.over(Ramp(), 5), Sampler(Ramp())
+    lattice, sampler = Lattice.for_field(Ramp(), 5), FieldSampler(Ramp())
     nx, ny, nz = lattice.shape
     z, y, x = np.meshgrid(np.arange(nz), np.arange(ny), np.arange(nx), indexing="ij")
     p = lattice.points(np.stack([x, y, z], axis=-1).reshape(-1, 3))
-    assert np.allclose(sampler.on(lattice).ravel(), sigma(p), rtol=1e-5)
+    assert np.allclose(sampler.density_on(lattice).ravel(), sigma(p), rtol=1e-5)
     assert np.allclose(sampler.density(p), sigma(p), rtol=1e-5)
     # Cells in eighths: the mean opacity of their middles.
     parts = np.array(np.meshgrid(*[[-0.25, 0.25]] * 3)).reshape(3, -1).T * lattice.step
@@ -74,17 +74,17 @@ def test_empty_cells_have_no_density_unless_asked():
     bits[:, :, 1] = True  # the half of larger x
     field.occupancy = OccupancyGrid(bits, ns, 0.0)
     p = np.array([[-0.5, 1, 1], [2.5, 1, 1]])
-    assert np.allclose(Sampler(field).density(p), [0, sigma(p[1])])
-    assert np.allclose(Sampler(field).density(p, masked=False), sigma(p))
+    assert np.allclose(FieldSampler(field).density(p), [0, sigma(p[1])])
+    assert np.allclose(FieldSampler(field).density(p, masked=False), sigma(p))
 
 
 def test_colours_are_those_from_in_front_and_aslant():
-    sampler, rng = Sampler(Ramp()), np.random.default_rng(0)
+    sampler, rng = FieldSampler(Ramp()), np.random.default_rng(0)
     p, n = rng.uniform(0, 1, (9, 3)), rng.normal(size=(9, 3))
     n[0], n[1] = (1, 0, 0), (0, 0, -1)
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     assert np.allclose(sampler.color(p, n), np.stack([p[:, 0], n[:, 0] ** 2, n[:, 2]], axis=1), atol=1e-6)
-    found = sampler.diffuse(p, n)
+    found = sampler.diffuse_color(p, n)
     # Over the head-on direction and four at 45 degrees around it, d = -n and -(n + t) / sqrt 2 with t all around:
     # the mean of d is -n (1 + 4 / sqrt 2) / 5, that of d_x² is (n_x² + 4 (n_x² + (1 - n_x²) / 2) / 2) / 5.
     assert np.allclose(found[:, 0], p[:, 0], atol=1e-6)
@@ -100,10 +100,10 @@ class Wall(Ramp):
 
 
 def test_a_surface_is_moved_along_its_edge_to_where_it_is():
-    lattice, sampler = Lattice.over(Wall(), 10), Sampler(Wall())
+    lattice, sampler = Lattice.for_field(Wall(), 10), FieldSampler(Wall())
     # x = -0.8 + 0.4 i and y = 0.2 + 0.4 j. What crosses nothing, or lies on no edge, stays.
     index = np.array([[3.9, 1, 1], [3.1, 0, 0], [4, 1.1, 1], [5.5, 1, 1], [3.0, 1, 1], [1, 0.5, 1]])
-    moved, unseen = crossings(sampler, lattice, index, 50.0)
+    moved, unseen = find_crossings(sampler, lattice, index, 50.0)
     want = [[(0.68 - 0.15 + 0.8) / 0.4, 1, 1], [(0.68 - 0.05 + 0.8) / 0.4, 0, 0], [4, (0.9 - 0.2) / 0.4, 1]]
     assert np.allclose(moved[:3], want, atol=2**-8) and np.array_equal(moved[3:], index[3:]) and not unseen.any()
 
@@ -113,8 +113,8 @@ def test_the_end_of_what_was_looked_at_is_no_surface():
     bits = np.ones((4, 4, 4), bool)
     bits[:, :, 3] = False  # x from 2 on: nobody knows what is there
     field.occupancy = OccupancyGrid(bits, ns, 0.0)
-    lattice = Lattice.over(field, 10)
+    lattice = Lattice.for_field(field, 10)
     # Between i = 6 (1.6) and 7 (2.0) density ends at x = 2, but the networks go on with it, up to 2.1.
-    moved, unseen = crossings(Sampler(field), lattice, np.array([[6.5, 1, 1], [7.4, 1, 1], [3.5, 1, 1]]), 50.0)
+    moved, unseen = find_crossings(FieldSampler(field), lattice, np.array([[6.5, 1, 1], [7.4, 1, 1], [3.5, 1, 1]]), 50.0)
     assert unseen.tolist() == [True, False, False]
     assert np.allclose(moved[0, 0], 7, atol=2**-8) and np.allclose(moved[2, 0], 3.325, atol=2**-8)

@@ -9,14 +9,14 @@ import pytest
 from scipy.ndimage import distance_transform_cdt
 
 from nerg_mi.fields.occupancy import (
-    PARTS,
+    PARTS_PER_AXIS,
     STEP_DEPTH,
     CascadeGrid,
     OccupancyGrid,
     RefinedGrid,
     chessboard,
-    contracted_cascades,
-    refine,
+    cascades_from_contracted,
+    refine_occupancy,
 )
 from nerg_mi.maths.geometry import Box, ContractedBox
 
@@ -62,9 +62,9 @@ def test_cells_are_those_of_the_finest_level_and_leaps_pass_over_nothing(bound, 
     grid, bits = made(bound, 0.1, seed)
     full = occupied(grid, bits, bound)
     n = grid.cells[0]
-    assert n == R * bound and grid.fraction == pytest.approx(full.mean()) and 0 < full.mean() < 1
+    assert n == R * bound and grid.occupied_fraction == pytest.approx(full.mean()) and 0 < full.mean() < 1
     u = middles(grid).reshape(-1, 3)
-    k = grid.empty_cells(ns.Array3f(np.ascontiguousarray(u.T, np.float32))).numpy().reshape(full.shape)
+    k = grid.distance_to_occupied(ns.Array3f(np.ascontiguousarray(u.T, np.float32))).numpy().reshape(full.shape)
     assert np.array_equal(k == 0, full)
     held = np.argwhere(full)
     where = np.argwhere(~full)
@@ -81,32 +81,32 @@ def test_points_beyond_the_cube_count_as_its_nearest_cell():
     inside = np.random.default_rng(2).uniform(0, 1, (200, 3))
     inside[:, 1] = 0.001
     beyond = inside - (0, 3, 0)
-    of = lambda u: grid.empty_cells(ns.Array3f(np.ascontiguousarray(u.T, np.float32))).numpy()
+    of = lambda u: grid.distance_to_occupied(ns.Array3f(np.ascontiguousarray(u.T, np.float32))).numpy()
     assert np.array_equal(of(inside), of(beyond))
 
 
 @pytest.mark.parametrize("bound", [1, 2, 4])
 def test_bytes_and_back(bound):
     grid, bits = made(bound, 0.3)
-    again = CascadeGrid.from_packed(grid.packed(), R, bound, ns, 0.25)
+    again = CascadeGrid.from_packed(grid.pack_bits(), R, bound, ns, 0.25)
     assert np.array_equal(again.bits, bits) and again.threshold == 0.25 and again.resolution == R
     with pytest.raises(ValueError, match="bytes"):
-        CascadeGrid.from_packed(grid.packed()[:-1], R, bound, ns, 0.25)
+        CascadeGrid.from_packed(grid.pack_bits()[:-1], R, bound, ns, 0.25)
 
 
 @pytest.mark.parametrize("reach", [2.0, 8.0, 64.0])
 def test_cascades_of_a_contracted_box_hold_all_that_its_cells_hold(reach):
     rng, r = np.random.default_rng(int(reach)), 16
     box, bits = ContractedBox(Box((0, 0, 0), (2, 2, 2)), reach), rng.random((r, r, r)) < 0.02
-    grid = contracted_cascades(bits, reach, ns, 1.0)
+    grid = cascades_from_contracted(bits, reach, ns, 1.0)
     u = rng.random((3, 200_000)).astype(np.float32)
     x, y, z = np.minimum((u * r).astype(int), r - 1)
     p = box.from_unit(ns.Array3f(u))
     # Those of the corners beyond the outer cube come to stand on its face, in other cells.
     held = (np.abs((u - 0.5) * 4).max(axis=0) < 2 - 1 / reach) & bits[z, y, x]
-    assert held.sum() > 500 and np.all(grid.empty_cells(box.to_cube(p)).numpy()[held] == 0)
+    assert held.sum() > 500 and np.all(grid.distance_to_occupied(box.to_cube(p)).numpy()[held] == 0)
     # They are not much larger either: by the cells that touch.
-    assert grid.bits[0].mean() < 0.2 and not contracted_cascades(np.zeros((r, r, r), bool), reach, ns, 1.0).bits.any()
+    assert grid.bits[0].mean() < 0.2 and not cascades_from_contracted(np.zeros((r, r, r), bool), reach, ns, 1.0).bits.any()
 
 
 # ---- Occupancy: distances against brute force, look-ups, and the packed form ----
@@ -124,7 +124,7 @@ def test01_chessboard_distances(share):
     bits[2, 5, 7] = True
     grid = OccupancyGrid(bits, ns, 0.1)
     assert np.array_equal(grid.distance.numpy().reshape(bits.shape), brute_force(bits))
-    assert np.isclose(grid.fraction, bits.mean())
+    assert np.isclose(grid.occupied_fraction, bits.mean())
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (5, 3, 131), (3, 2, 64), (300, 1, 2)])
@@ -145,13 +145,13 @@ def test02_lookup_is_indexed_zyx_and_clamped():
     points = np.array(
         [[0.1, 0.4, 0.9], [0.3, 0.4, 0.9], [0.9, 0.4, 0.9], [0, 0.25, 0.75], [0.1, 0.4, 1.0], [-5, 0.4, 9], [1, 1, 0]]
     )
-    assert grid.empty_cells(ns.Array3f(points.T)).numpy().tolist() == [0, 1, 3, 0, 0, 0, 3]
+    assert grid.distance_to_occupied(ns.Array3f(points.T)).numpy().tolist() == [0, 1, 3, 0, 0, 0, 3]
 
 
 @pytest.mark.parametrize("resolution", [1, 3, 8, 13])
 def test05_packed_round_trip(resolution):
     bits = np.random.default_rng(1).random((resolution,) * 3) < 0.3
-    packed = OccupancyGrid(bits, ns, 0.5).packed()
+    packed = OccupancyGrid(bits, ns, 0.5).pack_bits()
     assert packed.dtype == np.uint8 and packed.size == -(-(resolution**3) // 8)
     again = OccupancyGrid.from_packed(packed, resolution, ns, 0.5)
     assert np.array_equal(again.bits, bits) and again.threshold == 0.5
@@ -173,7 +173,7 @@ def test07_grids_with_unequal_edges():
     grid = OccupancyGrid(bits, ns, 0)
     z, y, x = np.meshgrid(*(np.arange(n) for n in bits.shape), indexing="ij")
     centres = (np.stack([x, y, z], -1).reshape(-1, 3) + 0.5) / (7, 5, 2)
-    assert np.array_equal(grid.empty_cells(ns.Array3f(centres.T)).numpy(), brute_force(bits).ravel())
+    assert np.array_equal(grid.distance_to_occupied(ns.Array3f(centres.T)).numpy(), brute_force(bits).ravel())
     with pytest.raises(ValueError, match="no single resolution"):
         _ = grid.resolution
 
@@ -195,11 +195,11 @@ def centres(n):
 @pytest.mark.parametrize("share", [0.01, 0.2, 1.0])
 def test_no_leap_passes_an_occupied_part(share):
     grid = refined(share=share)
-    found = grid.empty_cells(ns.Array3f(centres(grid.resolution))).numpy().reshape(grid.bits.shape)
+    found = grid.distance_to_occupied(ns.Array3f(centres(grid.resolution))).numpy().reshape(grid.bits.shape)
     away = brute_force(grid.bits)
     assert np.array_equal(found == 0, grid.bits) and np.all(found <= away)
     # Nor is it much too short: never less than half of the way, but for a part.
-    assert np.all(2 * found + PARTS > away)
+    assert np.all(2 * found + PARTS_PER_AXIS > away)
 
 
 def test_parts_are_those_of_their_cells():
@@ -208,15 +208,15 @@ def test_parts_are_those_of_their_cells():
     # The part with the upper x, the lower y and the upper z.
     grid = RefinedGrid(bits, np.array([1 << 0b101]), ns, 0.1, 0.5, 0)
     assert np.argwhere(grid.bits).tolist() == [[5, 0, 3]]
-    assert grid.cells == (6, 6, 6) and grid.fraction == 1 / 216
+    assert grid.cells == (6, 6, 6) and grid.occupied_fraction == 1 / 216
     points = ns.Array3f([3.5 / 6, 2.5 / 6, 3.5 / 6], [0.1 / 6, 0.1 / 6, -4], [5.5 / 6, 5.5 / 6, 9])
-    assert grid.empty_cells(points).numpy().tolist() == [0, 1, 0]
+    assert grid.distance_to_occupied(points).numpy().tolist() == [0, 1, 0]
     assert np.array_equal(grid.coarse.bits, bits) and grid.coarse.threshold == 0.5
 
 
 def test_cells_without_parts_are_empty():
     grid = RefinedGrid(np.ones((2, 2, 2), bool), np.zeros(8, np.uint8), ns, 0, 0, 0)
-    assert np.all(grid.empty_cells(ns.Array3f(centres(4))).numpy() > 4)
+    assert np.all(grid.distance_to_occupied(ns.Array3f(centres(4))).numpy() > 4)
 
 
 def test_bytes_that_do_not_fit():
@@ -245,7 +245,7 @@ def field(density, step=0.01, occupancy=None):
 def held(grid, count=200_000):
     """Random points of the box, and whether they lie in occupied parts."""
     p = ns.Array3f(*(ns.Float(v) for v in np.random.default_rng(1).uniform(BOX.lower, BOX.upper, (count, 3)).T))
-    return p, grid.empty_cells(BOX.to_cube(p)).numpy() == 0
+    return p, grid.distance_to_occupied(BOX.to_cube(p)).numpy() == 0
 
 
 def test_what_counts_is_held_and_nothing_far_from_it():
@@ -254,54 +254,54 @@ def test_what_counts_is_held_and_nothing_far_from_it():
         away = dr.abs(x + 0.3 * y - 0.7 * z - 0.2) / np.sqrt(1 + 0.3**2 + 0.7**2)
         return dr.select(away < 0.02, ns.Float(1e6), 0)
 
-    grid = refine(field(wall))
+    grid = refine_occupancy(field(wall))
     p, inside = held(grid)
     dense = wall(*p).numpy() > 0
     assert dense.sum() > 2000 and inside[dense].mean() > 0.995
     # Parts are 4 / 32 long: what is a diagonal away from the wall cannot hold it.
     far = wall(p.x * 0.0 + p.x, p.y, p.z).numpy() == 0
     assert inside[far].mean() < 0.2
-    assert grid.missed < 0.02
+    assert grid.missed_optical_depth < 0.02
 
 
 def test_a_wire_is_missed_as_much_as_is_said():
     # A twentieth of a part thick: many parts are looked at beside it.
     radius, sigma, step = 0.003, 1e3, 0.01
     wire = lambda x, y, z: dr.select((x - 0.42) ** 2 + (y - 0.13) ** 2 < radius**2, ns.Float(sigma), 0)
-    grid = refine(field(wire, step))
+    grid = refine_occupancy(field(wire, step))
     through = ns.Float(np.linspace(0, 2, 4001)[1:-1])
-    inside = grid.empty_cells(BOX.to_cube(ns.Array3f(0.42, 0.13, through))).numpy() == 0
+    inside = grid.distance_to_occupied(BOX.to_cube(ns.Array3f(0.42, 0.13, through))).numpy() == 0
     lost = (1 - np.exp(-sigma * step)) / step * np.pi * radius**2 * 2 * (1 - inside.mean())
-    assert grid.missed == pytest.approx(lost * 4 / 64, abs=1e-3)
+    assert grid.missed_optical_depth == pytest.approx(lost * 4 / 64, abs=1e-3)
 
 
 def test_fog_below_the_threshold_is_missed_by_its_mean_depth():
     thin = 0.5 * STEP_DEPTH / 0.01
-    grid = refine(field(lambda x, y, z: thin + 0 * x))
+    grid = refine_occupancy(field(lambda x, y, z: thin + 0 * x))
     assert not grid.masks.any()
     # The mean chord of a box is 4 V / S: 4 x 4 x 2 has V = 32, S = 64.
-    assert grid.missed == pytest.approx(thin * 2, rel=0.02)
-    thick = refine(field(lambda x, y, z: 4 * thin + 0 * x))
+    assert grid.missed_optical_depth == pytest.approx(thin * 2, rel=0.02)
+    thick = refine_occupancy(field(lambda x, y, z: 4 * thin + 0 * x))
     # The box is half as high as the cube that cells divide.
-    assert thick.fraction == pytest.approx(0.5, abs=0.04) and thick.missed == 0
+    assert thick.occupied_fraction == pytest.approx(0.5, abs=0.04) and thick.missed_optical_depth == 0
 
 
 def test_cells_that_are_empty_stay_so_and_the_bound_is_one_of_the_field():
     bits = np.random.default_rng(2).random((R_REFINEMENT,) * 3) < 0.3
     smooth = lambda x, y, z: dr.exp(6 * dr.sin(3 * x) * dr.cos(2 * y) - 2)
-    one, other = (refine(field(smooth, occupancy=OccupancyGrid(bits, ns, 1.0))) for _ in range(2))
+    one, other = (refine_occupancy(field(smooth, occupancy=OccupancyGrid(bits, ns, 1.0))) for _ in range(2))
     assert np.array_equal(one.coarse_bits, bits) and np.array_equal(one.masks, other.masks)
     # Again, from the refined grid: the same.
-    again = refine(field(smooth, occupancy=one))
+    again = refine_occupancy(field(smooth, occupancy=one))
     assert np.array_equal(again.masks, one.masks) and again.threshold == one.threshold == STEP_DEPTH / 0.01
     assert again.coarse_threshold == 1.0
 
 
 def test_nested_cubes_and_nothing_are_not_refined():
     nested = CascadeGrid(np.ones((2, 4, 4, 4), bool), 2.0, ns, 0.1)
-    assert refine(field(lambda x, y, z: x, occupancy=nested)) is None
+    assert refine_occupancy(field(lambda x, y, z: x, occupancy=nested)) is None
     nothing = field(lambda x, y, z: x)
     nothing.occupancy = None
-    assert refine(nothing) is None
-    empty = refine(field(lambda x, y, z: x, occupancy=OccupancyGrid(np.zeros((R_REFINEMENT,) * 3, bool), ns, 0.1)))
-    assert empty.missed == 0 and empty.masks.size == 0
+    assert refine_occupancy(nothing) is None
+    empty = refine_occupancy(field(lambda x, y, z: x, occupancy=OccupancyGrid(np.zeros((R_REFINEMENT,) * 3, bool), ns, 0.1)))
+    assert empty.missed_optical_depth == 0 and empty.masks.size == 0

@@ -22,7 +22,7 @@ def solid_cells() -> np.ndarray:
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
     p = (np.stack([x, y, z], axis=-1) - 0.5) * box.side + np.array(box.center)
     bits = np.any((p < 0) | (p > layout.ROOM), axis=-1)
-    for low, high in layout.build().solids:
+    for low, high in layout.build_store().solids:
         bits |= np.all((p > low) & (p < high), axis=-1)
     return bits
 

@@ -8,7 +8,7 @@ from matplotlib.collections import LineCollection, PatchCollection
 
 from nerg_mi.figures.maps import (
     PEOPLE,
-    PersonWalk,
+    ParticipantPath,
     SightLines,
     Walls,
     alignment_figure,
@@ -106,7 +106,7 @@ def test_walls_lie_where_they_are():
 
 def test_paths_have_gaps_where_nobody_was_recorded():
     places = np.array([[0.5, 0.5], [1, 0.5], [3, 2], [3.2, 2.2]])
-    page = floor_figure(LOW, HIGH, walks=[PersonWalk("Ada", places, np.array([True, False, True, False]))])
+    page = floor_figure(LOW, HIGH, paths=[ParticipantPath("Ada", places, np.array([True, False, True, False]))])
     line = next(l for l in page.axes[0].lines if len(l.get_xdata()) > 2)
     xy = np.stack([line.get_xdata(), line.get_ydata()], axis=1)
     np.testing.assert_array_equal(xy[~np.isnan(xy[:, 0])], places)
@@ -132,7 +132,7 @@ def test_rays_and_fields_of_view():
 
 
 def test_many_people_share_a_legend_and_nothing_overlaps():
-    walk = lambda k: PersonWalk(
+    walk = lambda k: ParticipantPath(
         f"somebody with a rather long name {k}", np.array([[0.1 * k, 0.1], [1, 1]]), np.array([True, False])
     )
     page = floor_figure(LOW, HIGH, walls(), [walk(k) for k in range(20)], title="20 people")

@@ -12,12 +12,12 @@ from nerg_mi.figures.overlay import (
     OverlayLayers,
     find_overlay,
     overlay,
-    overlays_of,
+    list_overlays,
     scale_strip,
     shared_limits,
     srgb,
     to_bytes,
-    top_of,
+    robust_max,
     underlay,
     write_png,
 )
@@ -30,7 +30,7 @@ COLOR = np.random.default_rng(0).random((6, 8, 3))
 
 
 def test01_nothing_where_nobody_looks_and_where_there_is_no_surface():
-    heat = Heat(top=2.0)
+    heat = Heat(vmax=2.0)
     values = np.full((6, 8), 2.0)
     values[0] = 0
     mask = np.ones((6, 8), bool)
@@ -41,41 +41,41 @@ def test01_nothing_where_nobody_looks_and_where_there_is_no_surface():
 
 
 def test02_opacity_rises_and_ends_at_the_top():
-    heat = Heat(top=4.0, opacity=0.8, ramp=0.5)
+    heat = Heat(vmax=4.0, opacity=0.8, ramp=0.5)
     alpha = heat.alpha(np.linspace(0, 8, 50))
     assert alpha[0] == 0 and np.all(np.diff(alpha) >= 0)
     assert np.allclose(alpha[np.linspace(0, 8, 50) >= 2], 0.8)
 
 
 def test03_equal_values_have_equal_heat_in_the_scale_and_in_the_picture():
-    heat = Heat(top=3.0, opacity=1.0)
+    heat = Heat(vmax=3.0, opacity=1.0)
     shown = overlay(COLOR, np.full((6, 8), 3.0), heat)
     assert np.allclose(shown, scale_strip(heat)[-1])
 
 
 def test04_lightness_of_the_scale_rises():
     for colors in ("inferno", "viridis"):
-        strip = scale_strip(Heat(top=1.0, colors=colors, opacity=1.0, ramp=1e-6))
+        strip = scale_strip(Heat(vmax=1.0, colormap=colors, opacity=1.0, ramp=1e-6))
         assert np.all(np.diff((strip**2.2 @ [0.2126, 0.7152, 0.0722])[1:]) > -1e-3)
 
 
 def test05_top_from_a_percentile_of_the_surface():
     values = np.arange(100.0).reshape(10, 10)
     mask = values < 50
-    assert top_of(values, mask, 100) == 49
-    assert top_of(values, mask, 50) == 24.5
+    assert robust_max(values, mask, 100) == 49
+    assert robust_max(values, mask, 50) == 24.5
     spot = np.zeros((50, 50))
     spot[3, 3] = 2.5
-    assert top_of(spot, np.ones_like(spot, bool)) == 2.5
+    assert robust_max(spot, np.ones_like(spot, bool)) == 2.5
 
 
 def test06_errors_are_sentences():
     with pytest.raises(NergError, match="no gaze in this picture"):
-        top_of(np.zeros((3, 3)), np.ones((3, 3), bool))
+        robust_max(np.zeros((3, 3)), np.ones((3, 3), bool))
     with pytest.raises(NergError, match="must be positive"):
-        Heat(top=0.0)
+        Heat(vmax=0.0)
     with pytest.raises(NergError, match="choose one of inferno"):
-        Heat(top=1.0, colors="jet")
+        Heat(vmax=1.0, colormap="jet")
 
 
 # ---- The table of overlays: scales that are shared, and figures of each ----
@@ -84,11 +84,11 @@ X, Y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 16))
 LAYERS = OverlayLayers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))
 
 
-@pytest.mark.parametrize("name", [of.name for aov in AOVS.values() for of in overlays_of(aov)])
+@pytest.mark.parametrize("name", [of.name for aov in AOVS.values() for of in list_overlays(aov)])
 def test_each_is_drawn(name, tmp_path):
     overlay = find_overlay(name)
     limits = overlay.limits(LAYERS)
-    assert overlay.name == name and (limits is None) == (not overlay.scaled)
+    assert overlay.name == name and (limits is None) == (not overlay.needs_limits)
     save(overlay.draw(LAYERS, limits), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 500
 
@@ -122,7 +122,7 @@ RNG = np.random.default_rng(0)
 PLOTS_COLOR, GAZE = RNG.random((24, 36, 3)), RNG.random((24, 36))
 MASK = np.ones((24, 36), bool)
 MASK[:4] = False
-HEAT = Heat(top=0.8)
+HEAT = Heat(vmax=0.8)
 
 
 def read(mi, path):
@@ -186,7 +186,7 @@ def test04_one_scale_for_the_three_panels_says_what_it_clips():
     # A tip beyond the end of the scale, in the colour of the end.
     assert "1/sr" in bar.get_ylabel().replace("\n", " ") and len(bar.patches) == 1
     assert bar.patches[0].get_xy()[:, 1].max() > 1
-    calm = figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, Heat(top=2.0))
+    calm = figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, Heat(vmax=2.0))
     assert not calm.axes[-1].patches
 
 

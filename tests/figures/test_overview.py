@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.figures.overview import Judge, PinholeFrame, SeenSurfaces, around_observer, of_place
-from nerg_mi.maths.geometry import box_interval
+from nerg_mi.figures.overview import ViewScorer, PinholeFrame, SeenSurfaces, view_of_observer, view_of_scene
+from nerg_mi.maths.geometry import intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions
 
 UP = np.array([0.0, 0, 1])
@@ -17,12 +17,12 @@ def room(lower=(0, 0, 0), upper=(8, 6, 3), pillar=None):
     """Depths in a room with these corners, with a box in it."""
 
     def trace(o, d):
-        near, far = box_interval(o, d, np.array(lower, float), np.array(upper, float))
+        near, far = intersect_box_numpy(o, d, np.array(lower, float), np.array(upper, float))
         outside = (near < far) & (near > 0)
         depth = np.where(outside, near, np.where((near < far) & (far > 0), far, 0.0))
         opacity = (depth > 0).astype(float)
         if pillar is not None:
-            a, b = box_interval(o, d, *np.array(pillar, float))
+            a, b = intersect_box_numpy(o, d, *np.array(pillar, float))
             hit = (a < b) & (b > 0)
             depth = np.where(hit & ((np.maximum(a, 0) < depth) | (opacity == 0)), np.maximum(a, 0), depth)
             opacity = np.maximum(opacity, hit)
@@ -61,9 +61,9 @@ def test_where_attention_goes():
     seen = seen_from((4, 3, 1.5), room(), lambda d: np.exp(50 * (d @ towards - 1)) + 0.01)
     assert seen.main_direction @ towards > np.cos(np.radians(4))
     depth, _ = room()(np.array([[4, 3, 1.5]]), towards[None])
-    assert np.linalg.norm(seen.looked_at() - (seen.eye + depth[0] * towards)) < 0.6
+    assert np.linalg.norm(seen.mean_target() - (seen.observer + depth[0] * towards)) < 0.6
     nothing = seen_from((4, 3, 1.5), lambda o, d: (np.zeros(len(d)), np.zeros(len(d))), lambda d: np.ones(len(d)))
-    assert nothing.usual == 0 and nothing.looked_at() is None
+    assert nothing.median_depth == 0 and nothing.mean_target() is None
 
 
 def test_a_camera_sees_what_the_observer_looks_at():
@@ -71,9 +71,9 @@ def test_a_camera_sees_what_the_observer_looks_at():
     # The pillar hides the wall that is looked at from whoever stands behind it.
     trace = room(pillar=((5, 3.6, 0), (5.5, 5.9, 3)))
     seen = seen_from((2.5, 2.5, 1.6), trace, lambda d: np.exp(60 * (d @ towards - 1)))
-    shot = around_observer(trace, FRAME, seen)
-    assert shot.opaque == 1 and shot.attended > 0.9
-    assert (shot.origin > 0).all() and (shot.origin < (8, 6, 3)).all() and np.linalg.norm(shot.origin - seen.eye) > 0.3
+    shot = view_of_observer(trace, FRAME, seen)
+    assert shot.opaque == 1 and shot.attention_share > 0.9
+    assert (shot.origin > 0).all() and (shot.origin < (8, 6, 3)).all() and np.linalg.norm(shot.origin - seen.observer) > 0.3
     # The point that is looked at is in the picture, and not hidden.
     spot = np.array([8, 2.5, 1.6])
     way = spot - shot.origin
@@ -87,17 +87,17 @@ def test_attention_that_is_shown_is_counted():
     trace = room()
     towards = np.array([1.0, 0, 0])
     seen = seen_from((4, 3, 1.5), trace, lambda d: (d @ towards > np.cos(np.radians(10))).astype(float))
-    judge = Judge(trace, FRAME, seen.usual, seen)
+    judge = ViewScorer(trace, FRAME, seen.median_depth, seen)
     origins = np.array([[4, 3, 1.5], [4, 3, 1.5], [0.5, 3, 1.5]])
     targets = origins + np.array([[1.0, 0, 0], [-1, 0, 0], [1, 0, 0]])
     ahead, away, behind = judge.shots(origins, targets, (24, 16))
-    assert (ahead.attended, away.attended, behind.attended) == pytest.approx((1, 0, 1))
+    assert (ahead.attention_share, away.attention_share, behind.attention_share) == pytest.approx((1, 0, 1))
     assert ahead.score > 4 * away.score and behind.score > 4 * away.score
 
 
 def test_a_room_is_shown_from_within():
     trace = room(pillar=((3, 2, 0), (4, 3, 2)))
-    shot = of_place(trace, FRAME, np.zeros(3), np.array([8.0, 6, 3]))
+    shot = view_of_scene(trace, FRAME, np.zeros(3), np.array([8.0, 6, 3]))
     assert shot.opaque == 1 and (shot.origin > 0).all() and (shot.origin < (8, 6, 3)).all()
     # Not in the pillar, nor right before the wall that it looks at.
     assert not ((shot.origin > (2.9, 1.9, 0)) & (shot.origin < (4.1, 3.1, 2.1))).all()
@@ -109,17 +109,17 @@ def test_an_object_is_shown_from_around():
     lower, upper = np.array([-1.0, -1, -1]), np.array([1.0, 1, 1])
 
     def solid(o, d):
-        near, far = box_interval(o, d, lower, upper)
+        near, far = intersect_box_numpy(o, d, lower, upper)
         hit = (near < far) & (far > 0)
         return np.where(hit, np.maximum(near, 0), 0), hit.astype(float)
 
-    shot = of_place(solid, FRAME, lower, upper)
+    shot = view_of_scene(solid, FRAME, lower, upper)
     assert np.abs(shot.origin).max() > 1 and shot.origin[2] > 0 and shot.opaque > 0.1
     np.testing.assert_allclose(shot.target, 0, atol=1e-12)
-    assert of_place(solid, FRAME, lower, upper, outside=False) is None
+    assert view_of_scene(solid, FRAME, lower, upper, allow_outside=False) is None
 
 
 def test_nothing_has_no_picture():
     void = lambda o, d: (np.zeros(len(o)), np.zeros(len(o)))
-    assert of_place(void, FRAME, np.zeros(3), np.ones(3)) is None
-    assert around_observer(void, FRAME, seen_from((0, 0, 0), void, lambda d: np.ones(len(d)))) is None
+    assert view_of_scene(void, FRAME, np.zeros(3), np.ones(3)) is None
+    assert view_of_observer(void, FRAME, seen_from((0, 0, 0), void, lambda d: np.ones(len(d)))) is None

@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat
-from nerg_mi.figures.sphere import PROJECTIONS, find_projection, resample, sphere_figure
+from nerg_mi.figures.sphere import PROJECTIONS, find_projection, resample_panorama, sphere_figure
 from nerg_mi.figures.style import encode
 from nerg_mi.transport.geometry import pixel_directions
 
@@ -51,12 +51,12 @@ def test_mollweide_has_equal_areas():
 def test_resampled_pixels_are_the_panoramas():
     height, width = 20, 36
     panorama = np.arange(height * width, dtype=float).reshape(height, width)
-    flat, inside = resample(panorama, PROJECTIONS["equirectangular"], width)
+    flat, inside = resample_panorama(panorama, PROJECTIONS["equirectangular"], width)
     assert flat.shape == (18, 36) and inside.all()
     # Rows of the panorama are nodes from pole to pole, those of the paper are cells.
     rows = np.rint((np.arange(18) + 0.5) / 18 * 19).astype(int)
     np.testing.assert_array_equal(flat, panorama[rows])
-    round_, inside = resample(panorama, PROJECTIONS["mollweide"], 200)
+    round_, inside = resample_panorama(panorama, PROJECTIONS["mollweide"], 200)
     assert round_.shape == (100, 200) and not inside[0, 0] and inside[50, 100]
     assert round_[50, 100] in panorama[9:11, 17:19]
 
@@ -71,7 +71,7 @@ def test_one_that_is_not_there():
 HEIGHT, WIDTH = 90, 180
 BLACK, NOBODY = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
 ALL = np.ones((HEIGHT, WIDTH), bool)
-HEAT = Heat(top=1.0, ramp=1e-6, opacity=1.0)
+HEAT = Heat(vmax=1.0, ramp=1e-6, opacity=1.0)
 
 
 def spot(direction, half=0.15):

@@ -24,19 +24,19 @@ from nerg_mi.figures.style import (
     SEQUENTIAL,
     Provenance,
     Sheet,
-    color_values,
+    apply_colormap,
     contact_sheet,
     encode,
-    even,
-    files_among,
-    find_colors,
+    round_up_to_even,
+    existing_files,
+    find_colormap,
     hatch,
-    lines,
-    provenance,
+    hatch_lines,
+    make_provenance,
     rasterize,
     save,
     shrink,
-    swatch,
+    hatch_swatch,
     ticks_of,
     wrap,
 )
@@ -54,14 +54,14 @@ def lightness(colors):
 
 @pytest.mark.parametrize("name", SEQUENTIAL)
 def test_lightness_rises_evenly(name):
-    step = np.diff(lightness(color_values(name, np.linspace(0, 1, 64))))
+    step = np.diff(lightness(apply_colormap(name, np.linspace(0, 1, 64))))
     assert np.all(step > 0)
-    assert np.allclose(color_values(f"{name}_r", [0.2]), color_values(name, [0.8]), atol=0.02)
+    assert np.allclose(apply_colormap(f"{name}_r", [0.2]), apply_colormap(name, [0.8]), atol=0.02)
 
 
 @pytest.mark.parametrize("name", DIVERGING)
 def test_differences_darken_alike_to_both_sides(name):
-    level = lightness(color_values(name, np.linspace(0, 1, 65), kind="diverging"))
+    level = lightness(apply_colormap(name, np.linspace(0, 1, 65), kind="diverging"))
     assert level.argmax() in range(30, 35)
     assert np.all(np.diff(level[:30]) > 0) and np.all(np.diff(level[35:]) < 0)
     assert abs(level[0] - level[-1]) < 25
@@ -70,9 +70,9 @@ def test_differences_darken_alike_to_both_sides(name):
 def test_others_are_refused():
     for name in ("jet", "hsv", "rainbow", "RdBu_r", "nothing", ""):
         with pytest.raises(NergError, match="no perceptually uniform colour map: choose one of inferno"):
-            find_colors(name)
+            find_colormap(name)
     with pytest.raises(NergError, match="no diverging colour map: choose one of RdBu_r"):
-        find_colors("viridis", kind="diverging")
+        find_colormap("viridis", kind="diverging")
 
 
 # ---- Hatching: exactly where nothing is known, and plainly not a value ----
@@ -90,9 +90,9 @@ def test_only_what_is_unknown_changes_and_all_of_it():
 
 
 def test_lines_are_a_quarter_and_run_along_diagonals():
-    on = lines(64, 64)
+    on = hatch_lines(64, 64)
     assert on.mean() == 0.25 and np.array_equal(on[1:, :-1], on[:-1, 1:])
-    assert lines(64, 64, 2)[::2, ::2].mean() == 0.25
+    assert hatch_lines(64, 64, 2)[::2, ::2].mean() == 0.25
 
 
 def test_it_looks_like_no_value():
@@ -100,12 +100,12 @@ def test_it_looks_like_no_value():
     pale = hatch(np.zeros((16, 16, 3)), np.full((16, 16), True))
     assert np.ptp(np.unique(pale)) > 0.1 and np.allclose(pale[..., 0], pale[..., 2])
     for name in SEQUENTIAL[:4]:
-        colors = color_values(name, np.linspace(0.2, 1, 50))
+        colors = apply_colormap(name, np.linspace(0.2, 1, 50))
         assert np.ptp(colors, axis=1).min() > 0.15
 
 
 def test_the_swatch_is_hatched():
-    np.testing.assert_array_equal(swatch(16, 16), hatch(np.full((16, 16, 3), 0.5), np.full((16, 16), True)))
+    np.testing.assert_array_equal(hatch_swatch(16, 16), hatch(np.full((16, 16, 3), 0.5), np.full((16, 16), True)))
 
 
 # ---- Provenance ----
@@ -115,7 +115,7 @@ def test_the_swatch_is_hatched():
 
 def test_everything_is_said(tmp_path):
     (tmp_path / "scene.xml").write_text("<scene/>")
-    about = provenance("nerg render", [tmp_path / "scene.xml"], 7, {"spp": 4})
+    about = make_provenance("nerg render", [tmp_path / "scene.xml"], 7, {"spp": 4})
     found = json.loads(about.text()["Comment"])
     assert found["inputs"] == {"scene.xml": hashlib.sha256(b"<scene/>").hexdigest()}
     assert (found["what"], found["seed"], found["settings"]) == ("nerg render", 7, {"spp": 4})
@@ -124,8 +124,8 @@ def test_everything_is_said(tmp_path):
 
 
 def test_who_made_it_and_where_it_is_kept_is_not_said(tmp_path):
-    options = BakeOptions(store=tmp_path, scheduler="local:2", detail=0.5, seed=4)
-    assert dict(provenance("x", [], 4, options).settings) == {"detail": 0.5}
+    options = BakeOptions(store=tmp_path, scheduler="local:2", max_edge=0.5, seed=4)
+    assert dict(make_provenance("x", [], 4, options).settings) == {"detail": 0.5}
 
 
 def test_no_path_of_the_machine(tmp_path):
@@ -135,9 +135,9 @@ def test_no_path_of_the_machine(tmp_path):
         defaults={"field": f"{tmp_path}/deep/f.safetensors", "w": r"C:\Users\me\b.ply"},
         spp=2,
     )
-    text = json.dumps(provenance("x", [tmp_path / "a.csv"], 0, options).text())
+    text = json.dumps(make_provenance("x", [tmp_path / "a.csv"], 0, options).text())
     assert str(tmp_path) not in text and "Users" not in text and str(Path.home()) not in text
-    settings = provenance("x", [], 0, options).settings
+    settings = make_provenance("x", [], 0, options).settings
     assert settings == {"frames": "a.csv", "defaults": {"field": "f.safetensors", "w": "b.ply"}, "spp": 2}
 
 
@@ -147,24 +147,24 @@ def test_files_of_one_name_and_of_one_path(tmp_path):
         (tmp_path / k / "day.csv").write_text(k)
     paths = [tmp_path / "a/day.csv", tmp_path / "b/day.csv", tmp_path / "a/day.csv"]
     known = {paths[1]: "seen before"}
-    found = provenance("x", paths, known=known).inputs
+    found = make_provenance("x", paths, checksums=known).inputs
     assert found == {"day.csv": hashlib.sha256(b"a").hexdigest(), "day.csv (2)": "seen before"}
     assert known[paths[0]] == found["day.csv"]
 
 
 def test_one_that_is_not_there(tmp_path):
     with pytest.raises(NergError, match="gone.xml"):
-        provenance("x", [tmp_path / "gone.xml"])
+        make_provenance("x", [tmp_path / "gone.xml"])
 
 
 def test_files_among_other_things(tmp_path):
     (tmp_path / "a.csv").write_text("x")
-    assert files_among(tmp_path / "a.csv", str(tmp_path / "a.csv"), None, 3, tmp_path / "gone") == [
+    assert existing_files(tmp_path / "a.csv", str(tmp_path / "a.csv"), None, 3, tmp_path / "gone") == [
         tmp_path / "a.csv",
         tmp_path / "a.csv",
     ]
     # What has no name is told by its kind alone.
-    assert provenance("x", settings={"rays": object()}).settings == {"rays": "object"}
+    assert make_provenance("x", settings={"rays": object()}).settings == {"rays": "object"}
 
 
 # ---- Figures as files: read back by other libraries, whole in themselves, and equal for equal input ----
@@ -349,13 +349,13 @@ def test_ticks_stand_at_the_colours_of_their_values(decades):
     for place, name in zip(bar.get_yticks(), names):
         text = name.translate(power)
         value = 10.0 ** int(text[2:]) if decades and text not in ("1", "10") else float(text)
-        expected = np.log10(value / heat.low) / decades if decades else value / heat.top
+        expected = np.log10(value / heat.vmin) / decades if decades else value / heat.vmax
         assert place == pytest.approx(expected, abs=1e-6)
-        assert heat.shares(value) == pytest.approx(place, abs=1e-6)
+        assert heat.normalize(value) == pytest.approx(place, abs=1e-6)
 
 
 def test_helpers():
-    assert [even(v) for v in (3, 4, 4.2, 4.6)] == [4, 4, 4, 6]
+    assert [round_up_to_even(v) for v in (3, 4, 4.2, 4.6)] == [4, 4, 4, 6]
     assert wrap("one two three", 60, 10).count("\n") >= 1 and wrap("", 60, 10) == ""
 
 

@@ -5,31 +5,31 @@ from __future__ import annotations
 import struct
 
 
-def box(kind: bytes, *content: bytes) -> bytes:
+def make_box(kind: bytes, *content: bytes) -> bytes:
     joined = b"".join(content)
     return struct.pack(">I4s", 8 + len(joined), kind) + joined
 
 
-def box_table(kind: bytes, count: int, entries: bytes = b"", flags: int = 0) -> bytes:
-    return box(kind, struct.pack(">II", flags, count), entries)
+def make_box_table(kind: bytes, count: int, entries: bytes = b"", flags: int = 0) -> bytes:
+    return make_box(kind, struct.pack(">II", flags, count), entries)
 
 
-def track(*tables: bytes, edits: bytes = b"") -> bytes:
-    return box(b"trak", box(b"edts", edits), box(b"mdia", box(b"minf", box(b"stbl", *tables))))
+def make_track(*tables: bytes, edits: bytes = b"") -> bytes:
+    return make_box(b"trak", make_box(b"edts", edits), make_box(b"mdia", make_box(b"minf", make_box(b"stbl", *tables))))
 
 
-def sizes(same: int, count: int, entries: bytes = b"") -> bytes:
-    return box(b"stsz", struct.pack(">III", 0, same, count), entries)
+def make_size_table(same: int, count: int, entries: bytes = b"") -> bytes:
+    return make_box(b"stsz", struct.pack(">III", 0, same, count), entries)
 
 
-def clock(kind: bytes, ticks: int, version: int = 0) -> bytes:
+def make_clock(kind: bytes, ticks: int, version: int = 0) -> bytes:
     """The header of a movie (mvhd) or of a track (mdhd) of so many ``ticks`` a second."""
-    return box(kind, bytes([version, 0, 0, 0]), bytes(16 if version else 8), struct.pack(">I", ticks), bytes(8))
+    return make_box(kind, bytes([version, 0, 0, 0]), bytes(16 if version else 8), struct.pack(">I", ticks), bytes(8))
 
 
-def movie(scale: int, ticks: int, *tables: bytes, edits: bytes = b"", kind: bytes = b"vide", version: int = 0) -> bytes:
+def make_movie(scale: int, ticks: int, *tables: bytes, edits: bytes = b"", kind: bytes = b"vide", version: int = 0) -> bytes:
     """A file of one track of ``kind``, whose edits count ``scale`` ticks a second, and its ``tables`` ``ticks``."""
-    handler = box(b"hdlr", bytes(8), kind, bytes(13))
-    media = box(b"mdia", clock(b"mdhd", ticks, version), handler, box(b"minf", box(b"stbl", *tables)))
-    whole = box(b"trak", box(b"edts", edits), media)
-    return box(b"ftyp", b"isom") + box(b"mdat", bytes(1000)) + box(b"moov", clock(b"mvhd", scale, version), whole)
+    handler = make_box(b"hdlr", bytes(8), kind, bytes(13))
+    media = make_box(b"mdia", make_clock(b"mdhd", ticks, version), handler, make_box(b"minf", make_box(b"stbl", *tables)))
+    whole = make_box(b"trak", make_box(b"edts", edits), media)
+    return make_box(b"ftyp", b"isom") + make_box(b"mdat", bytes(1000)) + make_box(b"moov", make_clock(b"mvhd", scale, version), whole)

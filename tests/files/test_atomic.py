@@ -18,9 +18,9 @@ from nerg_mi.files.atomic import (
     check_new_folder,
     check_writable,
     make_folder,
-    replacing,
-    replacing_folder,
-    reserving,
+    replace_atomically,
+    create_folder_atomically,
+    reserve_output,
     write_bytes,
     write_text,
 )
@@ -38,7 +38,7 @@ def test_parents_are_made_and_nothing_else_is_left(tmp_path):
 def test_a_failing_writer_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.npz"
     path.write_bytes(b"old")
-    with pytest.raises(ZeroDivisionError), replacing(path) as temporary:
+    with pytest.raises(ZeroDivisionError), replace_atomically(path) as temporary:
         assert temporary.suffix == ".npz" and temporary.parent == tmp_path
         temporary.write_bytes(b"half")
         raise ZeroDivisionError
@@ -163,26 +163,26 @@ def test_a_killed_writer_leaves_a_whole_file(tmp_path):
 
 def test_a_folder_is_whole_or_absent(tmp_path):
     out = tmp_path / "new" / "capture"
-    with replacing_folder(out) as folder:
+    with create_folder_atomically(out) as folder:
         assert folder.parent == out.parent and not out.exists()
         write_text(folder / "a" / "b.txt", "1")
     assert (out / "a" / "b.txt").read_text() == "1" and os.listdir(out.parent) == ["capture"]
     for error in (KeyboardInterrupt, ZeroDivisionError):
-        with pytest.raises(error), replacing_folder(tmp_path / "other") as folder:
+        with pytest.raises(error), create_folder_atomically(tmp_path / "other") as folder:
             write_text(folder / "a" / "b.txt", "1")
             raise error
-    with pytest.raises(NergError, match="other.*the disk is full"), replacing_folder(tmp_path / "other"):
+    with pytest.raises(NergError, match="other.*the disk is full"), create_folder_atomically(tmp_path / "other"):
         raise OSError(28, "No space left on device")
     assert os.listdir(tmp_path) == ["new"]
 
 
 def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
     (tmp_path / "empty").mkdir()
-    with replacing_folder(tmp_path / "empty") as folder:
+    with create_folder_atomically(tmp_path / "empty") as folder:
         write_text(folder / "a", "1")
     for check in (
         lambda: check_new_folder(tmp_path / "empty"),
-        lambda: replacing_folder(tmp_path / "empty").__enter__(),
+        lambda: create_folder_atomically(tmp_path / "empty").__enter__(),
     ):
         with pytest.raises(NergError, match="empty: choose another name"):
             check()
@@ -202,14 +202,14 @@ with reserving(sys.argv[1]):
 
 def test_an_output_is_made_by_one_process_at_a_time(tmp_path):
     path = tmp_path / "new" / "a.bin"
-    with reserving(path), pytest.raises(NergError, match='a.bin" is being made by another process'):
-        with reserving(tmp_path / "new" / ".." / "new" / "a.bin"):
+    with reserve_output(path), pytest.raises(NergError, match='a.bin" is being made by another process'):
+        with reserve_output(tmp_path / "new" / ".." / "new" / "a.bin"):
             raise AssertionError("two at a time")
     assert not list(tmp_path.iterdir())
-    with pytest.raises(KeyboardInterrupt), reserving(path), reserving(path.with_name("b.bin")):
+    with pytest.raises(KeyboardInterrupt), reserve_output(path), reserve_output(path.with_name("b.bin")):
         raise KeyboardInterrupt
     assert not list(tmp_path.iterdir())
-    with reserving(None):
+    with reserve_output(None):
         pass
 
 
@@ -217,11 +217,11 @@ def test_a_killed_process_reserves_nothing(tmp_path):
     path = tmp_path / "a.bin"
     with subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE) as process:
         process.stdout.readline()
-        with pytest.raises(NergError, match="another process"), reserving(path):
+        with pytest.raises(NergError, match="another process"), reserve_output(path):
             pass
         process.kill()
         process.wait()
-    with reserving(path):
+    with reserve_output(path):
         write_bytes(path, b"x")
     assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
 

@@ -14,7 +14,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.files import images
-from nerg_mi.files.images import check_image, read_exr, threads_for_mitsuba, write_bitmap_exr, write_exr, write_png
+from nerg_mi.files.images import check_image, read_exr, ensure_two_threads, write_bitmap_exr, write_exr, write_png
 from tests.pictures import mitsuba_bitmap
 
 # ---- EXR files hold the channels that they were given, also where Dr.Jit has one thread ----
@@ -35,7 +35,7 @@ def test_channels_come_back_in_another_reader(tmp_path, rgb):
 
 def test_a_bitmap_is_written_as_mitsuba_writes_it(tmp_path, rgb):
     pixels = np.random.default_rng(2).random((6, 4, 3)).astype(np.float32)
-    with threads_for_mitsuba():
+    with ensure_two_threads():
         rgb.Bitmap(pixels).write(str(tmp_path / "theirs.exr"))
     write_bitmap_exr(tmp_path / "ours.exr", rgb.Bitmap(pixels))
     theirs, ours = (mitsuba_bitmap(tmp_path / f"{name}.exr") for name in ("theirs", "ours"))
@@ -177,7 +177,7 @@ def test_sizes_of_what_mitsuba_writes(rgb, tmp_path, name):
     else:
         bitmap.write(str(tmp_path / name))
     header = check_image(tmp_path / name)
-    assert header.size == (7, 5) and header.bytes >= 105
+    assert header.size == (7, 5) and header.decoded_bytes >= 105
     assert list(mitsuba_bitmap(tmp_path / name).size()) == [7, 5]
 
 
@@ -185,7 +185,7 @@ def test_exr_counts_the_bytes_of_all_channels(tmp_path):
     write_exr(
         tmp_path / "a.exr", {"R": np.zeros((2, 3), np.float32), "depth.T": np.zeros((2, 3), np.float16)}, {"note": "x"}
     )
-    assert check_image(tmp_path / "a.exr").bytes == 36
+    assert check_image(tmp_path / "a.exr").decoded_bytes == 36
 
 
 @pytest.mark.parametrize("size, bits, color", [((30000, 30000), 1, 0), ((1 << 31, 1), 8, 2), ((16000, 8000), 16, 6)])
@@ -201,13 +201,13 @@ def test_a_large_picture_in_a_large_file_is_read(tmp_path):
     with pytest.raises(NergError, match="make it smaller"):
         check_image(tmp_path / "a.png")
     with open(tmp_path / "a.png", "ab") as file:  # as many bytes as there may be, without room on the disk
-        file.truncate(3 * 16384 * 12288 // images.WARRANTED)
+        file.truncate(3 * 16384 * 12288 // images.MAX_EXPANSION)
     assert check_image(tmp_path / "a.png").size == (16384, 12288)
 
 
 def test_a_picture_of_the_largest_size_is_read(tmp_path):
     (tmp_path / "a.png").write_bytes(png(16384, 8192))
-    assert check_image(tmp_path / "a.png").bytes == images.DECODED_BYTES
+    assert check_image(tmp_path / "a.png").decoded_bytes == images.MAX_DECODED_BYTES
 
 
 @pytest.mark.parametrize("window", [(0, 0, 1 << 20, 1 << 20), (-(1 << 31), 0, (1 << 31) - 1, 0), (5, 0, 4, 1)])

@@ -17,21 +17,21 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files import safe_read
 from nerg_mi.files import safe_read as module
 from nerg_mi.files.safe_read import (
-    inflated_limit,
-    line_blocks,
+    compute_inflation_limit,
+    read_line_blocks,
     map_bytes,
     open_gzip,
     open_npz,
     open_zip,
     parse_json,
-    plain,
+    sanitize,
     read_bytes,
     read_json,
     read_member,
     read_npy,
     read_npz,
-    reading,
-    size_of,
+    translate_read_errors,
+    check_regular_file,
 )
 from nerg_mi.formats.areas import Region
 
@@ -54,7 +54,7 @@ from nerg_mi.formats.areas import Region
     ],
 )
 def test_what_a_damaged_file_raises_becomes_one_sentence(error):
-    with pytest.raises(NergError) as told, reading("a.bin", "depth file", "copy it again"):
+    with pytest.raises(NergError) as told, translate_read_errors("a.bin", "depth file", "copy it again"):
         raise error
     said = str(told.value)
     assert 'the depth file "a.bin" cannot be read: ' in said and said.endswith("; copy it again")
@@ -62,19 +62,19 @@ def test_what_a_damaged_file_raises_becomes_one_sentence(error):
 
 
 def test_programming_errors_and_finished_sentences_pass():
-    with pytest.raises(TypeError), reading("a.bin"):
+    with pytest.raises(TypeError), translate_read_errors("a.bin"):
         _ = None + 1
-    with pytest.raises(NergError, match="^as it is$"), reading("a.bin"):
+    with pytest.raises(NergError, match="^as it is$"), translate_read_errors("a.bin"):
         raise NergError("as it is")
-    with pytest.raises(AttributeError), reading("a.bin"):
+    with pytest.raises(AttributeError), translate_read_errors("a.bin"):
         _ = None.shape
-    with pytest.raises(NergError), reading("a.bin", also=(AttributeError,)):
+    with pytest.raises(NergError), translate_read_errors("a.bin", extra_errors=(AttributeError,)):
         _ = None.shape
 
 
 def test_the_safetensors_library_is_known_by_name(tmp_path):
     safetensors = pytest.importorskip("safetensors")
-    with pytest.raises(NergError, match="a.safetensors"), reading("a.safetensors"):
+    with pytest.raises(NergError, match="a.safetensors"), translate_read_errors("a.safetensors"):
         raise safetensors.SafetensorError("header too large")
 
 
@@ -86,7 +86,7 @@ def test_a_missing_file_is_both_kinds_of_error(tmp_path):
 
 def test_only_ordinary_files_of_bounded_size_are_read(tmp_path):
     (tmp_path / "a").write_bytes(b"12345")
-    assert read_bytes(tmp_path / "a", "file", 5) == b"12345" and size_of(tmp_path / "a") == 5
+    assert read_bytes(tmp_path / "a", "file", 5) == b"12345" and check_regular_file(tmp_path / "a") == 5
     with pytest.raises(NergError, match="5 bytes, more than the 4"):
         read_bytes(tmp_path / "a", "file", 4)
     with pytest.raises(NergError, match="is a folder"):
@@ -131,7 +131,7 @@ def test_deep_json_is_refused_before_it_is_parsed(tmp_path, raw, monkeypatch):
 
 
 def test_json_of_very_many_values_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(safe_read, "JSON_VALUES", 100)
+    monkeypatch.setattr(safe_read, "MAX_JSON_VALUES", 100)
     assert len(parse_json("[" + "[]," * 40 + "1]", "a.json")) == 41
     with pytest.raises(NergError, match="more than the 100 values"):
         parse_json("[" + "{}," * 99 + "1]", "a.json")
@@ -145,12 +145,12 @@ def test_what_is_no_json_is_told_with_the_file(tmp_path, raw):
 
 
 def test_words_of_a_file_are_made_fit_for_a_message():
-    assert plain("a\x1b[2J\nb") == "a?[2J?b" and plain("x" * 400) == "x" * 300 + "..."
+    assert sanitize("a\x1b[2J\nb") == "a?[2J?b" and sanitize("x" * 400) == "x" * 300 + "..."
 
 
 def test_limits_themselves_are_within(tmp_path, monkeypatch):
-    monkeypatch.setattr(safe_read, "JSON_VALUES", 100)
-    monkeypatch.setattr(safe_read, "JSON_DEPTH", 3)
+    monkeypatch.setattr(safe_read, "MAX_JSON_VALUES", 100)
+    monkeypatch.setattr(safe_read, "MAX_JSON_DEPTH", 3)
     # As many values as brackets are opened and commas stand there.
     assert parse_json("[[[" + "1," * 97 + "1]]]", "a.json") == [[[1] * 98]]
     for beyond in ("[[[" + "1," * 98 + "1]]]", "[[[[1]]]]"):
@@ -169,7 +169,7 @@ def test_integers_that_no_float_holds_are_infinite(digits):
 
 def test_documents_within_other_files_have_the_same_limit():
     with pytest.raises(NergError, match="12 bytes, more than the 11"):
-        parse_json(b'{"a": [1,2]}', "a.glb", most=11)
+        parse_json(b'{"a": [1,2]}', "a.glb", max_bytes=11)
 
 
 # ---- Compressed files are inflated no further than their size warrants ----
@@ -189,18 +189,18 @@ def test_what_is_sound_is_read(tmp_path):
         assert io.TextIOWrapper(stream).read() == "x,y\n1,2\n" * 1000
     with open_zip(_zip(tmp_path / "a.zip", a=b"1" * 3_000_000, b=b"")) as archive:
         assert read_member(archive, "a", "a.zip") == b"1" * 3_000_000 and read_member(archive, "b", "a.zip") == b""
-    assert inflated_limit(10) == safe_read.FREE and inflated_limit(1 << 30) == 100 << 30
+    assert compute_inflation_limit(10) == safe_read.MIN_INFLATION_LIMIT and compute_inflation_limit(1 << 30) == 100 << 30
 
 
 def test_inflation_stops_at_the_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(safe_read, "FREE", 1 << 20)
+    monkeypatch.setattr(safe_read, "MIN_INFLATION_LIMIT", 1 << 20)
     path = tmp_path / "a.gz"
     path.write_bytes(gzip.compress(bytes(20 << 20)))
     taken = 0
     with open_gzip(path, "table") as stream, pytest.raises(NergError, match='the table ".*a.gz" inflates to more than'):
         while data := stream.read(1 << 16):
             taken += len(data)
-    assert taken <= inflated_limit(path.stat().st_size)
+    assert taken <= compute_inflation_limit(path.stat().st_size)
     with pytest.raises(NergError, match="inflates to more than"), open_zip(_zip(tmp_path / "a.zip", a=bytes(20 << 20))):
         pytest.fail("it was opened")
 
@@ -267,7 +267,7 @@ def test_encrypted_doubled_and_missing_members_are_refused(tmp_path):
 
 def test_a_long_list_of_members_is_refused_before_it_is_read(tmp_path, monkeypatch):
     path = _zip(tmp_path / "a.zip", **{f"member{k}": b"" for k in range(50)})
-    monkeypatch.setattr(safe_read, "DIRECTORY_BYTES", 1000)
+    monkeypatch.setattr(safe_read, "MAX_DIRECTORY_BYTES", 1000)
     monkeypatch.setattr(zipfile, "ZipFile", lambda path: pytest.fail("it was read"))
     with pytest.raises(NergError, match="fewer members"), open_zip(path):
         pass
@@ -301,20 +301,20 @@ def test_errors_of_the_block_are_its_own(tmp_path):
 def test_inflating_limits_themselves_are_within(tmp_path, monkeypatch):
     path = tmp_path / "a.gz"
     path.write_bytes(gzip.compress(bytes(1000)))
-    with open_gzip(path, most=1000) as stream:
+    with open_gzip(path, max_bytes=1000) as stream:
         assert stream.read() == bytes(1000)
-    with open_gzip(path, most=999) as stream, pytest.raises(NergError, match="inflates to more than 999"):
+    with open_gzip(path, max_bytes=999) as stream, pytest.raises(NergError, match="inflates to more than 999"):
         stream.read()
     archive = _zip(tmp_path / "a.zip", a=b"1", b=b"23")
-    with open_zip(archive, most=3) as found:
+    with open_zip(archive, max_bytes=3) as found:
         assert found.read("b") == b"23"
-    with pytest.raises(NergError, match="inflates to more than 2 bytes"), open_zip(archive, most=2):
+    with pytest.raises(NergError, match="inflates to more than 2 bytes"), open_zip(archive, max_bytes=2):
         pass
     listed = safe_read._directory_bytes(archive, archive.stat().st_size)
-    monkeypatch.setattr(safe_read, "DIRECTORY_BYTES", listed)
+    monkeypatch.setattr(safe_read, "MAX_DIRECTORY_BYTES", listed)
     with open_zip(archive) as found:
         assert found.namelist() == ["a", "b"]
-    monkeypatch.setattr(safe_read, "DIRECTORY_BYTES", listed - 1)
+    monkeypatch.setattr(safe_read, "MAX_DIRECTORY_BYTES", listed - 1)
     with pytest.raises(NergError, match="fewer members"), open_zip(archive):
         pass
 
@@ -342,7 +342,7 @@ def test_what_nothing_comes_out_of_is_bounded(tmp_path, monkeypatch):
 
 
 def lines(path, most=1000):
-    return [line for block in line_blocks(path, "table", most) for line in block]
+    return [line for block in read_line_blocks(path, "table", most) for line in block]
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 3, 7, 1 << 20])
@@ -363,10 +363,10 @@ def test_lines_are_those_of_python(tmp_path, monkeypatch, text, chunk):
 def test_blocks_are_bounded_by_lines_and_characters(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     path.write_text("abc\n" * 100)
-    assert [len(b) for b in line_blocks(path, "table", 40)] == [40, 40, 20]
+    assert [len(b) for b in read_line_blocks(path, "table", 40)] == [40, 40, 20]
     monkeypatch.setattr(module, "_LINE_BLOCKS_CHUNK", 16)
     monkeypatch.setattr(module, "_BLOCK_CHARACTERS", 40)
-    sizes = [len(b) for b in line_blocks(path, "table", 1000)]
+    sizes = [len(b) for b in read_line_blocks(path, "table", 1000)]
     assert sum(sizes) == 100 and max(sizes) <= 14
 
 
@@ -378,7 +378,7 @@ def test_what_is_no_text(tmp_path, monkeypatch):
     path.write_bytes(b"a\xe2\x82")
     with pytest.raises(NergError, match="UTF-8"):
         lines(path)
-    monkeypatch.setattr(module, "LINE_CHARACTERS", 100)
+    monkeypatch.setattr(module, "MAX_LINE_LENGTH", 100)
     monkeypatch.setattr(module, "_LINE_BLOCKS_CHUNK", 64)
     path.write_text("a\n" + "x" * 300)
     with pytest.raises(NergError, match="line 2 .* more than the 100 characters"):
@@ -394,10 +394,10 @@ def test_what_is_no_text(tmp_path, monkeypatch):
 
 
 def test_line_blocks_limits_themselves_are_within(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "LINE_CHARACTERS", 4)
+    monkeypatch.setattr(module, "MAX_LINE_LENGTH", 4)
     path = tmp_path / "t.csv"
     path.write_text("abc\n" * 4)
-    assert [len(b) for b in line_blocks(path, "table", 2)] == [2, 2]
+    assert [len(b) for b in read_line_blocks(path, "table", 2)] == [2, 2]
     path.write_text("abcd\n")
     with pytest.raises(NergError, match="line 1 of the table"):
         lines(path)
@@ -443,7 +443,7 @@ def test_an_archive_tells_of_its_arrays_without_reading_them(tmp_path):
     np.savez(tmp_path / "a.npz", rays=np.zeros((5, 3), np.float32), names=np.array(["a"]))
     with open_npz(tmp_path / "a.npz") as archive:
         assert archive.names == ["rays", "names"] and "rays" in archive and "others" not in archive
-        assert archive.about("rays") == ((5, 3), np.float32)
+        assert archive.read_header("rays") == ((5, 3), np.float32)
         with pytest.raises(KeyError):
             archive["others"]
 

@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 
-from nerg_mi.files.tables import markdown_table, with_formula, write_csv, write_json
+from nerg_mi.files.tables import format_markdown_table, unescape_formula, write_csv, write_json
 
 
 def test_rows_come_back_and_what_they_lack_is_empty(tmp_path):
@@ -50,7 +50,7 @@ def test_no_cell_is_a_formula(tmp_path, name):
     with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
         (cell, _) = list(csv.reader(file))[1]
     assert cell == ("" if name is None else f"'{name}" if name in FORMULAS else str(name))
-    assert with_formula(cell) == ("" if name is None else str(name))
+    assert unescape_formula(cell) == ("" if name is None else str(name))
 
 
 def test_no_column_is_a_formula(tmp_path):
@@ -72,10 +72,10 @@ def test_no_column_is_a_formula(tmp_path):
     ],
 )
 def test_no_cell_of_markdown_is_html(text, cell):
-    assert markdown_table(["a"], [[text]]).splitlines()[-1] == f"| {cell} |"
+    assert format_markdown_table(["a"], [[text]]).splitlines()[-1] == f"| {cell} |"
 
 
 def test_a_markdown_table():
-    text = markdown_table(["what", "a|b"], [["x", 1.5], ["two\nlines", None]], right=["a|b"])
+    text = format_markdown_table(["what", "a|b"], [["x", 1.5], ["two\nlines", None]], right_aligned=["a|b"])
     assert text == "| what | a\\|b |\n| --- | ---: |\n| x | 1.5 |\n| two lines | None |"
-    assert markdown_table(["a"], []) == "| a |\n| --- |"
+    assert format_markdown_table(["a"], []) == "| a |\n| --- |"

@@ -11,25 +11,25 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.video import check_movie, check_video, frame_times, video_frames
-from tests.files.movies import box, box_table, movie, sizes, track
+from nerg_mi.files.video import check_video_tables, check_video_output, read_frame_times, open_video_writer
+from tests.files.movies import make_box, make_box_table, make_movie, make_size_table, make_track
 
 # ---- Times of frames, and MP4 files whose tables claim more samples than their bytes warrant ----
 
 
 def checked(path: Path, *boxes: bytes) -> None:
     path.write_bytes(b"".join(boxes))
-    check_movie(path)
+    check_video_tables(path)
 
 
-DATA = box(b"mdat", bytes(1000))
+DATA = make_box(b"mdat", bytes(1000))
 FILE = "film.mp4"
 
 
 def test_sound_tables_pass(tmp_path):
-    edits = box_table(b"elst", 2, bytes(40), flags=1 << 24)
-    whole = track(sizes(0, 3, bytes(12)), box_table(b"stts", 1, bytes(8)), box_table(b"stco", 1, bytes(4)), edits=edits)
-    checked(tmp_path / FILE, box(b"ftyp", b"isom"), DATA, box(b"moov", whole, track(sizes(2, 500))))
+    edits = make_box_table(b"elst", 2, bytes(40), flags=1 << 24)
+    whole = make_track(make_size_table(0, 3, bytes(12)), make_box_table(b"stts", 1, bytes(8)), make_box_table(b"stco", 1, bytes(4)), edits=edits)
+    checked(tmp_path / FILE, make_box(b"ftyp", b"isom"), DATA, make_box(b"moov", whole, make_track(make_size_table(2, 500))))
     # Of a size that takes eight bytes, and one that runs to the end.
     large = struct.pack(">I4sQ", 1, b"mdat", 16 + 1000) + bytes(1000)
     checked(tmp_path / FILE, large, struct.pack(">I4s", 0, b"moov") + whole)
@@ -42,7 +42,7 @@ def test_other_kinds_of_files_pass(tmp_path):
         b"\x1aE\xdf\xa3" + bytes(50),
         b"GP" * 500,
         bytes(100),
-        box(b"stsz", b"1"),
+        make_box(b"stsz", b"1"),
         b"\0\0\0\5moov",
     ):
         checked(tmp_path / FILE, data)
@@ -50,14 +50,14 @@ def test_other_kinds_of_files_pass(tmp_path):
 
 @pytest.mark.parametrize("within", [b"moov", b"free", b"udta", b"meta"])
 def test_samples_need_bytes(within, tmp_path):
-    head = {b"free": box(b"mvhd", bytes(100)), b"meta": bytes(4)}.get(within, b"")
+    head = {b"free": make_box(b"mvhd", bytes(100)), b"meta": bytes(4)}.get(within, b"")
     with pytest.raises(ValueError, match=r"claims 30,000,000 samples in [\d,]+ bytes"):
-        checked(tmp_path / FILE, DATA, box(within, head, track(sizes(1, 30_000_000))))
+        checked(tmp_path / FILE, DATA, make_box(within, head, make_track(make_size_table(1, 30_000_000))))
 
 
 def test_samples_of_parts_count_together(tmp_path):
-    parts = [box(b"moof", box(b"traf", box_table(b"trun", 400))) for _ in range(3)]
-    checked(tmp_path / FILE, DATA, parts[0], box(b"free", bytes(100)))
+    parts = [make_box(b"moof", make_box(b"traf", make_box_table(b"trun", 400))) for _ in range(3)]
+    checked(tmp_path / FILE, DATA, parts[0], make_box(b"free", bytes(100)))
     with pytest.raises(ValueError, match="claims 1,200 samples"):
         checked(tmp_path / FILE, DATA, *parts)
 
@@ -65,12 +65,12 @@ def test_samples_of_parts_count_together(tmp_path):
 def test_tables_that_are_too_short_run_on(tmp_path):
     """FFmpeg reads their beginning from what follows."""
     with pytest.raises(ValueError, match=r"claims 16,777,215 samples"):
-        checked(tmp_path / FILE, box(b"moof", box(b"traf", box(b"trun", bytes(2)))) + b"\0\0\0\xff\xff\xff" + bytes(9))
+        checked(tmp_path / FILE, make_box(b"moof", make_box(b"traf", make_box(b"trun", bytes(2)))) + b"\0\0\0\xff\xff\xff" + bytes(9))
 
 
 def test_edits_multiply_samples(tmp_path):
     for edits, passes in ((2, True), (40, False)):
-        whole = box(b"moov", track(sizes(1, 900), edits=box_table(b"elst", edits, bytes(12 * edits))))
+        whole = make_box(b"moov", make_track(make_size_table(1, 900), edits=make_box_table(b"elst", edits, bytes(12 * edits))))
         if passes:
             checked(tmp_path / FILE, DATA, whole)
             continue
@@ -80,29 +80,29 @@ def test_edits_multiply_samples(tmp_path):
 
 @pytest.mark.parametrize("kind, size", [(b"stts", 8), (b"ctts", 8), (b"stsc", 12), (b"stss", 4), (b"stco", 4)])
 def test_tables_hold_their_entries(kind, size, tmp_path):
-    checked(tmp_path / FILE, DATA, box(b"moov", track(box_table(kind, 3, bytes(3 * size)))))
+    checked(tmp_path / FILE, DATA, make_box(b"moov", make_track(make_box_table(kind, 3, bytes(3 * size)))))
     with pytest.raises(ValueError, match=f'"{kind.decode()}" claims 4 entries, and holds 3'):
-        checked(tmp_path / FILE, DATA, box(b"moov", track(box_table(kind, 4, bytes(3 * size)))))
+        checked(tmp_path / FILE, DATA, make_box(b"moov", make_track(make_box_table(kind, 4, bytes(3 * size)))))
     with pytest.raises(ValueError, match='"stsz".*268,435,456.*3'):
-        checked(tmp_path / FILE, DATA, box(b"moov", track(sizes(0, 1 << 28, bytes(12)))))
+        checked(tmp_path / FILE, DATA, make_box(b"moov", make_track(make_size_table(0, 1 << 28, bytes(12)))))
 
 
 def test_what_cannot_be_looked_into_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="is compressed"):
-        checked(tmp_path / FILE, box(b"moov", box(b"cmov", bytes(20))))
+        checked(tmp_path / FILE, make_box(b"moov", make_box(b"cmov", bytes(20))))
     monkeypatch.setattr("nerg_mi.files.video._BOXES", 5)
     with pytest.raises(ValueError, match="more than 5 boxes"):
-        checked(tmp_path / FILE, *[box(b"free")] * 6)
+        checked(tmp_path / FILE, *[make_box(b"free")] * 6)
 
 
 def runs(kind: bytes, *pairs: tuple[int, int], version: int = 0) -> bytes:
     entries = b"".join(struct.pack(">Ii", *pair) for pair in pairs)
-    return box_table(kind, len(pairs), entries, version << 24)
+    return make_box_table(kind, len(pairs), entries, version << 24)
 
 
 def edits(*entries: tuple[int, int, int], long: bool = False) -> bytes:
     form = ">QqI" if long else ">IiI"
-    return box_table(b"elst", len(entries), b"".join(struct.pack(form, *e) for e in entries), long << 24)
+    return make_box_table(b"elst", len(entries), b"".join(struct.pack(form, *e) for e in entries), long << 24)
 
 
 STEADY = runs(b"stts", (6, 1000))
@@ -134,29 +134,29 @@ ONCE = 1 << 16  # the speed of an edit
 @pytest.mark.parametrize("version", [0, 1])
 def test_times_of_frames(tables, edited, seconds, version, tmp_path):
     path = tmp_path / FILE
-    path.write_bytes(movie(1000, 24_950, *tables, edits=edited, version=version))
-    assert np.allclose(frame_times(path), seconds, rtol=0, atol=1e-12)
+    path.write_bytes(make_movie(1000, 24_950, *tables, edits=edited, version=version))
+    assert np.allclose(read_frame_times(path), seconds, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     "data, message",
     [
         (b"RIFF" + bytes(100), "no track of pictures, or is no MP4"),
-        (movie(1000, 48_000, STEADY, kind=b"soun"), "no track of pictures"),
-        (movie(1000, 0, STEADY), "no ticks"),
-        (movie(1000, 24_950, STEADY, edits=edits((100, 0, ONCE // 2))), "changes its speed"),
-        (movie(1000, 24_950, STEADY, runs(b"ctts", (5, 0))), "tell of 6 and of 5 frames"),
-        (movie(1000, 24_950, runs(b"stts", (1 << 30, 1))), "more than 16,777,216 frames"),
-        (movie(1000, 24_950, STEADY, edits=edits((100, 9000, ONCE))), "has no frames"),
-        (movie(1000, 24_950, STEADY, edits=edits((100, 0, ONCE))).replace(b"mvhd", b"free"), "a clock that it lacks"),
-        (movie(1000, 24_950, STEADY) + box(b"moof"), "in fragments.*ffmpeg -i VIDEO -c copy"),
-        (movie(1000, 24_950, box(b"stts", bytes(5))), "cannot be read"),
+        (make_movie(1000, 48_000, STEADY, kind=b"soun"), "no track of pictures"),
+        (make_movie(1000, 0, STEADY), "no ticks"),
+        (make_movie(1000, 24_950, STEADY, edits=edits((100, 0, ONCE // 2))), "changes its speed"),
+        (make_movie(1000, 24_950, STEADY, runs(b"ctts", (5, 0))), "tell of 6 and of 5 frames"),
+        (make_movie(1000, 24_950, runs(b"stts", (1 << 30, 1))), "more than 16,777,216 frames"),
+        (make_movie(1000, 24_950, STEADY, edits=edits((100, 9000, ONCE))), "has no frames"),
+        (make_movie(1000, 24_950, STEADY, edits=edits((100, 0, ONCE))).replace(b"mvhd", b"free"), "a clock that it lacks"),
+        (make_movie(1000, 24_950, STEADY) + make_box(b"moof"), "in fragments.*ffmpeg -i VIDEO -c copy"),
+        (make_movie(1000, 24_950, make_box(b"stts", bytes(5))), "cannot be read"),
     ],
 )
 def test_times_that_cannot_be_read(data, message, tmp_path):
     (tmp_path / FILE).write_bytes(data)
     with pytest.raises(NergError, match=f"film.mp4.*{message}"):
-        frame_times(tmp_path / FILE)
+        read_frame_times(tmp_path / FILE)
 
 
 def test_times_are_those_that_ffmpeg_shows(tmp_path):
@@ -175,7 +175,7 @@ def test_times_are_those_that_ffmpeg_shows(tmp_path):
         out.mux(stream.encode(None))
     with av.open(str(path)) as video:
         shown = [frame.time for frame in video.decode(video=0)]
-    assert shown[0] > 0.2 and np.allclose(frame_times(path), shown, rtol=0, atol=2e-5)
+    assert shown[0] > 0.2 and np.allclose(read_frame_times(path), shown, rtol=0, atol=2e-5)
 
 
 # ---- Videos read back by FFmpeg: every frame, its colours, the rate and what the header says ----
@@ -198,14 +198,14 @@ def frames(count):
 
 
 def write(path, count=12, fps=25.0, **more):
-    with video_frames(path, fps, **more) as add:
+    with open_video_writer(path, fps, **more) as add:
         for frame in frames(count):
             add(frame)
 
 
 @pytest.mark.parametrize("fps, rate", [(25.0, Fraction(25)), (12.5, Fraction(25, 2)), (29.97, Fraction(2997, 100))])
 def test_read_back(av, tmp_path, fps, rate):
-    write(tmp_path / "a.mp4", fps=fps, text={"Comment": '{"seed": 1, "ü": 2}', "Software": "nerg_mi 1"})
+    write(tmp_path / "a.mp4", fps=fps, metadata={"Comment": '{"seed": 1, "ü": 2}', "Software": "nerg_mi 1"})
     with av.open(str(tmp_path / "a.mp4")) as found:
         (stream,) = found.streams
         assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
@@ -247,30 +247,30 @@ def test_equal_frames_are_equal_videos(av, tmp_path):
     [((49, 80), "even sides"), ((48, 81), "even sides"), ((8, 80), "16 to 8192"), ((48, 9000), "16 to 8192")],
 )
 def test_sizes_that_players_do_not_show(av, tmp_path, shape, said):
-    with pytest.raises(NergError, match=said), video_frames(tmp_path / "a.mp4") as add:
+    with pytest.raises(NergError, match=said), open_video_writer(tmp_path / "a.mp4") as add:
         add(np.zeros((*shape, 3), np.uint8))
     assert not list(tmp_path.iterdir())
 
 
 def test_frames_of_one_size(av, tmp_path):
-    with pytest.raises(NergError, match="80.*48.*40.*48"), video_frames(tmp_path / "a.mp4") as add:
+    with pytest.raises(NergError, match="80.*48.*40.*48"), open_video_writer(tmp_path / "a.mp4") as add:
         add(np.zeros((48, 80, 3), np.uint8))
         add(np.zeros((48, 40, 3), np.uint8))
     assert not list(tmp_path.iterdir())
 
 
 def test_no_frames_and_no_rate(av, tmp_path):
-    with pytest.raises(NergError, match="a video without pictures"), video_frames(tmp_path / "a.mp4"):
+    with pytest.raises(NergError, match="a video without pictures"), open_video_writer(tmp_path / "a.mp4"):
         pass
     for fps in (0.0, -1.0, float("nan"), 1e9):
         with pytest.raises(NergError, match="give --fps 25"):
-            check_video(fps)
+            check_video_output(fps)
     assert not list(tmp_path.iterdir())
 
 
 def test_what_interrupts_leaves_nothing(av, tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"old")
-    with pytest.raises(KeyboardInterrupt), video_frames(tmp_path / "a.mp4") as add:
+    with pytest.raises(KeyboardInterrupt), open_video_writer(tmp_path / "a.mp4") as add:
         add(next(frames(1)))
         raise KeyboardInterrupt
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"] and (tmp_path / "a.mp4").read_bytes() == b"old"
@@ -279,4 +279,4 @@ def test_what_interrupts_leaves_nothing(av, tmp_path):
 def test_without_pyav(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(ImportError, match=r'"nerg-mi\[video\]\"'):
-        check_video(25.0)
+        check_video_output(25.0)

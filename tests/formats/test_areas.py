@@ -10,30 +10,30 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import (
-    MOST,
+    MAX_AREAS,
     AreaGroup,
     AreaSet,
     MeshPart,
     Region,
     SceneShape,
-    files_of_areas,
+    list_area_files,
     read_areas,
     read_regions,
     read_twin_objects,
-    to_json,
+    format_areas,
 )
 from nerg_mi.rays.readers.base import TrackingFrame
 from nerg_mi.workflows import demo
 
 # ---- What an area can be, and how groups resolve ----
 
-A, B = Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])
+A, B = Region.create("a", [0, 0, 0], [1, 1, 1]), Region.create("b", [2, 0, 0], [3, 1, 1])
 
 
 def test01_members_count_once():
     areas = AreaSet((AreaGroup("all", ("pair", "a")), A, B, AreaGroup("pair", ("a", "b"))))
-    assert areas.members() == {"all": (0, 1), "a": (0,), "b": (1,), "pair": (0, 1)}
-    assert areas.things == (A, B) and areas.names == ("all", "a", "b", "pair")
+    assert areas.element_indices() == {"all": (0, 1), "a": (0,), "b": (1,), "pair": (0, 1)}
+    assert areas.elements == (A, B) and areas.names == ("all", "a", "b", "pair")
 
 
 def test02_two_of_one_name():
@@ -44,7 +44,7 @@ def test02_two_of_one_name():
 def test03_many_groups_of_groups_are_resolved_at_once():
     # Each of the two holds all that came before: without care, two to the power of their number of ways.
     groups = [AreaGroup("g0", ("a", "b"))] + [AreaGroup(f"g{k}", (f"g{k - 1}", "a")) for k in range(1, 7)]
-    assert AreaSet((A, B, *groups)).members()["g6"] == (0, 1)
+    assert AreaSet((A, B, *groups)).element_indices()["g6"] == (0, 1)
 
 
 # ---- Areas of interest of every kind as files ----
@@ -69,20 +69,20 @@ def test01_one_of_every_kind(tmp_path):
     )
     areas = read_areas(path)
     assert areas.areas == (
-        Region.of("shelf", [0, 0, 0], [1, 2, 3]),
+        Region.create("shelf", [0, 0, 0], [1, 2, 3]),
         MeshPart("sign", tmp_path / "sign.ply", ((0, 0), (4, 9))),
         SceneShape("till", "till_0"),
         AreaGroup("all", ("shelf", "both")),
         AreaGroup("both", ("till", "shelf")),
     )
-    assert areas.members() == {"shelf": (0,), "sign": (1,), "till": (2,), "all": (0, 2), "both": (0, 2)}
-    assert areas.areas[1].chosen(12).nonzero()[0].tolist() == [0, 4, 5, 6, 7, 8, 9]
+    assert areas.element_indices() == {"shelf": (0,), "sign": (1,), "till": (2,), "all": (0, 2), "both": (0, 2)}
+    assert areas.areas[1].select_faces(12).nonzero()[0].tolist() == [0, 4, 5, 6, 7, 8, 9]
     with pytest.raises(NergError, match="face 9"):
-        areas.areas[1].chosen(9)
-    assert files_of_areas(path, areas) == [path, tmp_path / "sign.ply"] and files_of_areas(tmp_path, areas) == []
+        areas.areas[1].select_faces(9)
+    assert list_area_files(path, areas) == [path, tmp_path / "sign.ply"] and list_area_files(tmp_path, areas) == []
     # Boxes alone, for those who know nothing else; and what they save again has all of them.
     assert read_regions(path) == [areas.areas[0]] == areas.boxes
-    (tmp_path / "b.json").write_text(to_json(areas.boxes, areas.others))
+    (tmp_path / "b.json").write_text(format_areas(areas.boxes, areas.non_boxes))
     assert read_areas(tmp_path / "b.json") == areas
 
 
@@ -91,7 +91,7 @@ def test01_one_of_every_kind(tmp_path):
 def test02_old_files_read_alike(tmp_path, name, value):
     (tmp_path / "a.json").write_text(json.dumps({name: value}))
     assert list(read_areas(tmp_path / "a.json").areas) == read_regions(tmp_path / "a.json")
-    assert read_regions(tmp_path / "a.json") == [Region.of(name, [0, 0, 0], [1, 2, 3])]
+    assert read_regions(tmp_path / "a.json") == [Region.create(name, [0, 0, 0], [1, 2, 3])]
 
 
 def test03_a_turned_box(tmp_path):
@@ -100,27 +100,27 @@ def test03_a_turned_box(tmp_path):
     for box in read_areas(path).boxes:
         # Sizes 1 x 2 x 3 about (0.5, 1, 1.5): a quarter turn exchanges the first two.
         assert np.allclose(box.bounds, [[-0.5, 0.5, 0], [1.5, 1.5, 3]])
-        assert box.holds(np.array([[-0.4, 1.0, 1.0], [0.5, 0.2, 1.0]])).tolist() == [True, False]
-        assert np.allclose(box.place(box.to_own(np.array([0.3, 4.0, -2.0]))), [0.3, 4.0, -2.0])
+        assert box.contains(np.array([[-0.4, 1.0, 1.0], [0.5, 0.2, 1.0]])).tolist() == [True, False]
+        assert np.allclose(box.to_world(box.to_local(np.array([0.3, 4.0, -2.0]))), [0.3, 4.0, -2.0])
     # Turned by 30 degrees: the formula of a plane rotation.
-    box = Region.of("c", [0, 0, 0], [2, 1, 1], 30)
+    box = Region.create("c", [0, 0, 0], [2, 1, 1], 30)
     along = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0])
-    assert box.holds(box.middle + 0.99 * along) and not box.holds(box.middle + 1.01 * along)
+    assert box.contains(box.center + 0.99 * along) and not box.contains(box.center + 1.01 * along)
     assert read_regions(path) == read_areas(path).boxes
-    (tmp_path / "b.json").write_text(to_json([box]))
+    (tmp_path / "b.json").write_text(format_areas([box]))
     assert read_regions(tmp_path / "b.json") == [box]
 
 
 def test03b_what_lies_in_a_box():
-    box = Region.of("b", [0, 0, 0], [1, 1, 1])
+    box = Region.create("b", [0, 0, 0], [1, 1, 1])
     points = np.array([[0.5, 0.5, 0.5], [1.0, 0.0, 1.0], [1.01, 0.5, 0.5], [np.inf, 0, 0], [0.5, 0.5, -0.2]])
-    assert box.holds(points).tolist() == [True, True, False, False, False]
-    assert box.holds(points, 0.02).tolist() == [True, True, True, False, False]
-    assert box.holds(points.reshape(1, 5, 3)).shape == (1, 5)
+    assert box.contains(points).tolist() == [True, True, False, False, False]
+    assert box.contains(points, 0.02).tolist() == [True, True, True, False, False]
+    assert box.contains(points.reshape(1, 5, 3)).shape == (1, 5)
 
 
 def test03c_those_of_the_store():
-    regions = read_regions(demo.store_scene().parent / "regions.json")
+    regions = read_regions(demo.find_store_scene().parent / "regions.json")
     assert len(regions) > 20 and all((r.corners[0] < r.corners[1]).all() for r in regions)
 
 
@@ -129,7 +129,7 @@ def test04_groups_of_boxes_are_solids(tmp_path):
     mesh = {"name": "m", "mesh": "m.ply"}
     path = written(tmp_path, BOX, other, mesh, {"name": "g", "parts": ["shelf", "b"]}, {"name": "h", "parts": ["m"]})
     areas = read_areas(path)
-    assert areas.solids == {"shelf": (0,), "b": (1,), "g": (0, 1)} and [b.name for b in areas.boxes] == ["shelf", "b"]
+    assert areas.box_indices == {"shelf": (0,), "b": (1,), "g": (0, 1)} and [b.name for b in areas.boxes] == ["shelf", "b"]
 
 
 NO_REGIONS = [
@@ -155,7 +155,7 @@ NO_REGIONS = [
     {"regions": [BOX | {"name": "a\n"}]},
     {"regions": [BOX | {"name": "a" * 81}]},
     {"regions": [BOX, BOX]},
-    {"regions": [BOX] * (MOST + 1)},
+    {"regions": [BOX] * (MAX_AREAS + 1)},
 ]
 NO_AREAS = [
     [{"name": "g", "parts": ["g"]}],
@@ -207,8 +207,8 @@ def test05_others_are_told_in_a_sentence(tmp_path, read, value):
 def test06_groups_may_be_nested_so_deep(tmp_path):
     entries = [BOX, {"name": "0", "parts": ["shelf"]}]
     entries += [{"name": str(k), "parts": [str(k - 1)]} for k in range(1, 400)]
-    assert read_areas(written(tmp_path, *entries)).members()["399"] == (0,)
-    assert read_areas(written(tmp_path, *entries[60::-1])).members()["59"] == (0,)
+    assert read_areas(written(tmp_path, *entries)).element_indices()["399"] == (0,)
+    assert read_areas(written(tmp_path, *entries[60::-1])).element_indices()["59"] == (0,)
     with pytest.raises(NergError, match="deeper"):
         read_areas(written(tmp_path, *entries[::-1]))
 
@@ -246,7 +246,7 @@ def test01_boxes_lie_where_the_twin_has_them(tmp_path):
     in_twin = np.stack([corners[:, 2], corners[:, 1], -corners[:, 0]], axis=1) + (2, 0, 3)
     in_rays = in_twin @ TrackingFrame(up="y").to_rays()[:3, :3].T
     assert np.allclose(chair.bounds, [in_rays.min(axis=0), in_rays.max(axis=0)])
-    assert chair.holds(in_rays, 1e-9).all() and not chair.holds(in_rays + (0, 0, 0.3)).all()
+    assert chair.contains(in_rays, 1e-9).all() and not chair.contains(in_rays + (0, 0, 0.3)).all()
     assert np.allclose(found[1].bounds, [[0, -0.1, 1], [0.1, 0, 1.1]])
 
 
@@ -255,7 +255,7 @@ def test02_categories_and_groups(tmp_path):
     path = tmp_path / "a.json"
     path.write_text(json.dumps({"regions": [{"adt": "twin", "categories": ["cup"], "name": "cups"}]}))
     areas = read_areas(path)
-    assert areas.names == ("Cup 1", "Cup 2", "cups") and areas.members()["cups"] == (0, 1)
+    assert areas.names == ("Cup 1", "Cup 2", "cups") and areas.element_indices()["cups"] == (0, 1)
     assert len(read_areas(tmp_path / "twin").boxes) == 3
     path.write_text(json.dumps({"regions": [{"adt": "twin", "categories": ["sofa"]}]}))
     with pytest.raises(NergError, match="chair, cup"):

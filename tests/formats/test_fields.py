@@ -10,26 +10,26 @@ from safetensors.numpy import save_file
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_base import limits_of
+from nerg_mi.fields.gaze_base import max_sizes_of
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import MLP
-from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, contracted_cascades
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cascades_from_contracted
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import (
-    FINEST,
-    LARGEST,
-    OCCUPANCY_CELLS,
+    MAX_GRID_RESOLUTION,
+    MAX_WEIGHT,
+    MAX_OCCUPANCY_CELLS,
     StoredArrays,
-    building,
+    translate_build_errors,
     check_occupancy,
     check_sizes,
     load_gaze,
     load_radiance,
-    number,
+    read_number,
     save_gaze,
     save_radiance,
-    stored,
+    to_stored_arrays,
 )
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.rays.rays import Rays
@@ -49,11 +49,11 @@ def test_sizes_in_bounds_pass_as_they_are():
 def test_each_kind_of_gaze_field_has_its_own_bounds():
     """The word "geometry" of a log density is no size."""
     product, log = {"geometry": "surface"}, {"kind": "log_density", "geometry": "surface", "layers": 2}
-    assert check_sizes(log, most=limits_of(log)) is log
+    assert check_sizes(log, limits=max_sizes_of(log)) is log
     for about, name in ((product, "geometry"), ({**log, "layers": 65}, "layers"), ({**log, "prior": 0}, "prior")):
         with pytest.raises(ValueError, match=f'"{name}" of its architecture must be a whole number'):
-            check_sizes(about, most=limits_of(about))
-    assert not limits_of({"kind": "wavelet"}) and not limits_of({"kind": ["product"]}) and not limits_of("product")
+            check_sizes(about, limits=max_sizes_of(about))
+    assert not max_sizes_of({"kind": "wavelet"}) and not max_sizes_of({"kind": ["product"]}) and not max_sizes_of("product")
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_each_kind_of_gaze_field_has_its_own_bounds():
         ({"width": 2.0}, "not 2.0"),
         ({"width": 10**99}, r"\.\.\."),
         ({"grid": {**GRID, "levels": 65}}, '"levels".*1.*64'),
-        ({"grid": {**GRID, "finest": FINEST + 1}}, '"finest"'),
+        ({"grid": {**GRID, "finest": MAX_GRID_RESOLUTION + 1}}, '"finest"'),
         ({"grid": {**GRID, "finest": float("nan")}}, "must be a finite number"),
         ({"grid": "fine"}, '"grid"'),
         ({"grid": {**GRID, "kind": "octree"}}, "'octree'"),
@@ -77,10 +77,10 @@ def test_sizes_out_of_bounds_are_named(about, words):
 
 
 def test_numbers_are_finite_and_no_booleans():
-    assert number({"a": 2}, "a", "thing") == 2
+    assert read_number({"a": 2}, "a", "thing") == 2
     for wrong in ({"a": True}, {"a": "2"}, {"a": float("inf")}, {"a": None}, [2]):
         with pytest.raises(ValueError, match='"a"'):
-            number(wrong, "a", "thing")
+            read_number(wrong, "a", "thing")
 
 
 def test_occupancy_has_a_largest_size():
@@ -88,24 +88,24 @@ def test_occupancy_has_a_largest_size():
     assert check_occupancy(about) is about
     check_occupancy({**about, "resolution": 128, "bound": 16.0})
     for wrong in ({"resolution": 407}, {"resolution": 2.0}, {"resolution": 128, "bound": 2.0**40}):
-        with pytest.raises(ValueError, match=f"{OCCUPANCY_CELLS:,} cells at most"):
+        with pytest.raises(ValueError, match=f"{MAX_OCCUPANCY_CELLS:,} cells at most"):
             check_occupancy({**about, **wrong})
 
 
 @pytest.mark.parametrize("error", [KeyError("box"), ValueError("x"), TypeError("x"), OverflowError("x")])
 def test_what_building_raises_names_the_file(error):
     with pytest.raises(NergError, match='the checkpoint "a.safetensors" (lacks .box.|holds no usable field: x)') as e:
-        with building("a.safetensors"):
+        with translate_build_errors("a.safetensors"):
             raise error
     assert e.value.__cause__ is error
 
 
 def test_finished_sentences_and_faults_of_the_program_pass():
     own = NergError("as it is")
-    with pytest.raises(NergError) as e, building("a"):
+    with pytest.raises(NergError) as e, translate_build_errors("a"):
         raise own
     assert e.value is own
-    with pytest.raises(ZeroDivisionError), building("a"):
+    with pytest.raises(ZeroDivisionError), translate_build_errors("a"):
         _ = 1 / 0
 
 
@@ -116,58 +116,58 @@ ARRAYS_GRID = HashGridConfig(levels=1, log2_rows=3, base=1, finest=1)
 
 def test_arrays_are_float32_of_the_shape_that_is_asked_for():
     arrays = StoredArrays({"a": np.ones((2, 3), np.float16), "n": np.array([1, np.nan]), "big": np.array([1e300])}, ns)
-    found = arrays.array("a", 2, None)
+    found = arrays.get_array("a", 2, None)
     assert found.dtype == np.float32 and found.ctypes.data % 64 == 0
-    assert arrays.raw("a").dtype == np.float16
+    assert arrays.get_raw("a").dtype == np.float16
     for shape in ((3, 2), (2,), (2, 3, 1)):
         with pytest.raises(ValueError, match='"a".*2.*3'):
-            arrays.array("a", *shape)
+            arrays.get_array("a", *shape)
     for name, size in (("n", 2), ("big", 1)):
         with pytest.raises(ValueError, match=f'"{name}" is not finite'):
-            arrays.array(name, size)
+            arrays.get_array(name, size)
     with pytest.raises(KeyError, match="b"):
-        arrays.array("b", 1)
+        arrays.get_array("b", 1)
 
 
-@pytest.mark.parametrize("value, largest", [(1e30, LARGEST), (-1.1e6, LARGEST), (81.0, 80.0)])
+@pytest.mark.parametrize("value, largest", [(1e30, MAX_WEIGHT), (-1.1e6, MAX_WEIGHT), (81.0, 80.0)])
 def test_values_whose_products_single_precision_cannot_hold_are_refused(value, largest):
     arrays = StoredArrays({"a": np.array([0.0, value])}, ns)
     with pytest.raises(ValueError, match=f'"a" holds values beyond {largest:g}'.replace("+", ".")):
-        arrays.array("a", 2, largest=largest)
-    assert arrays.array("a", 2, largest=2 * abs(value)).shape == (2,)
+        arrays.get_array("a", 2, max_value=largest)
+    assert arrays.get_array("a", 2, max_value=2 * abs(value)).shape == (2,)
 
 
 def test_networks_and_encodings():
     net = MLP.random([3, 4, 2], ns, np.random.default_rng(0), normalized=True)
-    (size,) = ARRAYS_GRID.shapes()["table"]
+    (size,) = ARRAYS_GRID.parameter_shapes()["table"]
     tensors = {f"net.{k}": v.numpy() for k, v in net.named().items()} | {"grid.table": np.arange(size, dtype="f4")}
     arrays = StoredArrays(tensors, ns)
-    again = arrays.net("net", [3, 4, 2], normalized=True)
+    again = arrays.build_network("net", [3, 4, 2], normalized=True)
     assert all(np.array_equal(again.named()[k].numpy(), v.numpy()) for k, v in net.named().items())
-    assert arrays.net("net", [3, 4, 2]).norms is None
-    assert arrays.grid(ARRAYS_GRID).table.numpy().tolist() == list(range(size))
+    assert arrays.build_network("net", [3, 4, 2]).norms is None
+    assert arrays.build_grid(ARRAYS_GRID).table.numpy().tolist() == list(range(size))
     with pytest.raises(ValueError, match='"grid.table" has the shape'):
-        arrays.grid(HashGridConfig(levels=2, log2_rows=3, base=1, finest=2))
+        arrays.build_grid(HashGridConfig(levels=2, log2_rows=3, base=1, finest=2))
 
 
 def test_members_have_names_of_their_own():
     arrays = StoredArrays({"0.a": np.zeros(1), "1.a": np.ones(1), "10.a": np.full(1, 10)}, ns)
-    about, own = arrays.member(1, {"width": 4})
-    assert about == {"width": 4} and own.array("a", 1).tolist() == [1]
+    about, own = arrays.get_member(1, {"width": 4})
+    assert about == {"width": 4} and own.get_array("a", 1).tolist() == [1]
     with pytest.raises(ValueError, match="width"):
-        arrays.member(0, {"width": 0})
+        arrays.get_member(0, {"width": 0})
 
 
 def test_what_is_stored_is_finite():
     values = {"a": ns.Float([1.0, 70000.0])}
-    assert stored(values, False)["a"].dtype == np.float32
+    assert to_stored_arrays(values, False)["a"].dtype == np.float32
     with pytest.raises(NergError, match='"a".*fp16.*--half'):
-        stored(values, True)
+        to_stored_arrays(values, True)
     with pytest.raises(NergError, match='"a" is not finite.*diverged'):
-        stored({"a": ns.Float([np.inf])}, False)
+        to_stored_arrays({"a": ns.Float([np.inf])}, False)
     with pytest.raises(NergError, match='"a".*06'):
-        stored({"a": ns.Float([-2e6])}, True)
-    assert stored({"a": ns.TensorXf(np.ones((2, 2), np.float32))}, True)["a"].dtype == np.float16
+        to_stored_arrays({"a": ns.Float([-2e6])}, True)
+    assert to_stored_arrays({"a": ns.TensorXf(np.ones((2, 2), np.float32))}, True)["a"].dtype == np.float16
 
 
 # ---- Fields in and out of files: exact in fp32, rounded in fp16, and a sentence for what does not fit ----
@@ -336,7 +336,7 @@ def test_a_place_without_an_end(tmp_path):
         box,
         ns,
         1,
-        occupancy=contracted_cascades(np.random.default_rng(0).random((r, r, r)) < 0.2, 8.0, ns, 0.25),
+        occupancy=cascades_from_contracted(np.random.default_rng(0).random((r, r, r)) < 0.2, 8.0, ns, 0.25),
         march_step=0.01,
         march_growth=1 / 128,
     )
@@ -388,7 +388,7 @@ def test_radiance_fields(name, occupancy):
     assert np.allclose(sigma.numpy(), expected["density"], rtol=1e-4) and np.max(expected["density"]) > 0.1
     color = np.stack([c.numpy() for c in field.color(features, DIRECTIONS)], 1)
     assert np.allclose(color, expected["color"], atol=1e-4)
-    assert isinstance(field.occupancy, occupancy) and field.occupancy.fraction == pytest.approx(expected["occupied"])
+    assert isinstance(field.occupancy, occupancy) and field.occupancy.occupied_fraction == pytest.approx(expected["occupied"])
     if name == "radiance":
         behind = np.stack([c.numpy() for c in field.background(OBSERVERS, DIRECTIONS)], 1)
         assert np.allclose(behind, expected["background"], atol=1e-4)
@@ -404,8 +404,8 @@ def test_gaze_fields(name):
         assert np.allclose((emit * capture).numpy(), expected, rtol=1e-4, atol=1e-6)
     if "support" in EXPECTED[name]:
         # Kernels reached no farther than the radius then.
-        field.support.reach = field.support.radius
-        found = [field.support.at(ns.Array3f(*p))[0] for p in EXPECTED["observers"]]
+        field.support.cutoff = field.support.radius
+        found = [field.support.evaluate(ns.Array3f(*p))[0] for p in EXPECTED["observers"]]
         assert np.allclose(found, EXPECTED[name]["support"], rtol=1e-4) and max(found) >= 1
     else:
         assert field.support is None

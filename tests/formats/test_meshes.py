@@ -11,7 +11,7 @@ import trimesh
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.formats import meshes
-from nerg_mi.formats.gltf import pack_glb, parse_glb, read_parts, shown_unlit
+from nerg_mi.formats.gltf import pack_glb, parse_glb, read_glb_chunks, encode_unlit_glb
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.ply import write_columns
 from tests.surfaces.meshes import box
@@ -66,8 +66,8 @@ def test_polygons_become_triangles(tmp_path, order, faces, triangles, polygons):
     (tmp_path / "a.ply").write_bytes(ply(order, XYZ, LIST, CORNERS, faces))
     mesh = read_mesh_file(tmp_path / "a.ply")
     assert mesh.vertices.tolist() == np.array(CORNERS).tolist() and mesh.faces.tolist() == triangles
-    assert mesh.polygons.tolist() == polygons and mesh.is_plain == (len(triangles) == len(faces))
-    assert ("split" in "".join(mesh.notes)) == (not mesh.is_plain)
+    assert mesh.polygons.tolist() == polygons and mesh.is_readable_by_mitsuba == (len(triangles) == len(faces))
+    assert ("split" in "".join(mesh.notes)) == (not mesh.is_readable_by_mitsuba)
 
 
 FIFTH = ((0.2 + 0.055) / 1.055) ** 2.4
@@ -93,7 +93,7 @@ def test_colours_of_vertices(tmp_path, order, kind, values, expected, alpha):
     (tmp_path / "a.ply").write_bytes(ply(order, XYZ | dict.fromkeys(names, kind), LIST, rows, [((0, 1, 2),)]))
     mesh = read_mesh_file(tmp_path / "a.ply")
     assert np.allclose(mesh.colors, expected) and mesh.encodes_colors == (FIFTH in expected)
-    assert mesh.is_plain == (not alpha and FIFTH not in expected)
+    assert mesh.is_readable_by_mitsuba == (not alpha and FIFTH not in expected)
     assert mesh.notes == (("columns of vertex that are not used: alpha",) if alpha else ())
 
 
@@ -113,7 +113,7 @@ def test_what_is_not_used_is_named(tmp_path, normal):
     mesh = read_mesh_file(tmp_path / "a.ply")
     for said in ("normals are not used", "vertex that are not used: quality", "face that are not used: texnumbers"):
         assert said in "; ".join(mesh.notes)
-    assert mesh.normals is None and mesh.unreadable
+    assert mesh.normals is None and mesh.unreadable_reason
 
 
 @pytest.mark.parametrize(
@@ -164,7 +164,7 @@ def test_concave_polygons_are_covered(tmp_path, outline, area, beyond, suffix, o
     # Mitsuba takes fans from the first corner on.
     x, y = (np.array(outline) - outline[0])[1:].T
     fan = order * (x[:-1] * y[1:] - x[1:] * y[:-1])
-    assert suffix == ".ply" or bool(mesh.unreadable) == (fan.min() < 0)
+    assert suffix == ".ply" or bool(mesh.unreadable_reason) == (fan.min() < 0)
 
 
 @pytest.mark.parametrize("lines", [1, 3])
@@ -244,8 +244,8 @@ def test_files_that_are_none(tmp_path):
 
 def glb(path, attributes, document=None, primitive=None, faces=F):
     """A file of ``attributes``, whose JSON has other values."""
-    raw = b"".join(shown_unlit([("POSITION", V.astype("<f4"), False), *attributes], faces, up="y"))
-    changed, data = read_parts(raw, path)
+    raw = b"".join(encode_unlit_glb([("POSITION", V.astype("<f4"), False), *attributes], faces, up="y"))
+    changed, data = read_glb_chunks(raw, path)
     changed["meshes"][0]["primitives"][0] |= primitive or {}
     path.write_bytes(b"".join(pack_glb({**changed, **(document or {})}, data)))
     return read_mesh_file(path)
@@ -332,7 +332,7 @@ def test_other_units_are_read(tmp_path, scale, offset):
 def test_a_line_of_gigabytes_is_refused_in_bounded_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(meshes, "_BLOCK", 1 << 20)
     with (tmp_path / "a.obj").open("wb") as out:
-        out.truncate(meshes.TEXT_BYTES)
+        out.truncate(meshes.MAX_TEXT_BYTES)
     tracemalloc.start()
     with pytest.raises(NergError, match="a.obj.* line of more than"):
         read_mesh_file(tmp_path / "a.obj")
@@ -345,7 +345,7 @@ def test_a_line_of_gigabytes_is_refused_in_bounded_memory(tmp_path, monkeypatch)
 
 def test_what_of_a_gltf_is_not_used_takes_no_memory(tmp_path):
     corners = [("POSITION", np.eye(3, dtype="<f4"), False)]
-    raw, spare = b"".join(shown_unlit(corners, np.array([[0, 1, 2]]))), 512 << 20
+    raw, spare = b"".join(encode_unlit_glb(corners, np.array([[0, 1, 2]]))), 512 << 20
     at = 20 + struct.unpack_from("<I", raw, 12)[0]
     length = struct.unpack_from("<I", raw, at)[0]
     with (tmp_path / "a.glb").open("wb") as out:
@@ -395,12 +395,12 @@ def test_glb_trimesh_reads_what_is_written(tmp_path):
     colors[:, 0] = np.linspace(0, 65535, 8)
     parts = [("POSITION", V.astype("<f4"), False), ("COLOR_0", colors, True), ("_VALUE", V[:, 0].astype("<f4"), False)]
     path = tmp_path / "a.glb"
-    path.write_bytes(b"".join(shown_unlit(parts, F, up="y", extras={"unit": "1/m²"})))
+    path.write_bytes(b"".join(encode_unlit_glb(parts, F, up="y", extras={"unit": "1/m²"})))
     found = trimesh.load(path, process=False, force="mesh")
     assert np.allclose(found.vertices, V) and np.array_equal(found.faces, F)
-    assert read_parts(path.read_bytes(), path)[0]["asset"]["extras"] == {"unit": "1/m²"}
+    assert read_glb_chunks(path.read_bytes(), path)[0]["asset"]["extras"] == {"unit": "1/m²"}
     # All that is bound to a multiple of four bytes is.
-    document, _ = read_parts(path.read_bytes(), path)
+    document, _ = read_glb_chunks(path.read_bytes(), path)
     assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
 
 
@@ -470,13 +470,13 @@ def test_glb_what_is_written_keeps_the_rules_of_the_format(image, faces):
     """Of glTF 2.0, sections 3.6 and 4.4: lengths, alignment, bounds and kinds."""
     parts = [("POSITION", V.astype("<f4"), False), ("NORMAL", V.astype("<f4"), False)]
     parts += [("TEXCOORD_0", V[:, :2].astype("<f4"), False), ("COLOR_0", np.full((8, 4), 9, "<u2"), True)]
-    raw = b"".join(shown_unlit([*parts, ("_VALUE", V[:, 0].astype("<f4"), False)], faces, image=image))
+    raw = b"".join(encode_unlit_glb([*parts, ("_VALUE", V[:, 0].astype("<f4"), False)], faces, image=image))
     assert struct.unpack_from("<III", raw) == (0x46546C67, 2, len(raw))
     length, kind = struct.unpack_from("<II", raw, 12)
     rest, binary = struct.unpack_from("<II", raw, 20 + length)
     assert (kind, binary) == (0x4E4F534A, 0x004E4942) and length % 4 == rest % 4 == 0
     assert len(raw) == 28 + length + rest
-    document, data = read_parts(raw, "a.glb")
+    document, data = read_glb_chunks(raw, "a.glb")
     # The chunk is as long as the buffer, but for what fills it up to four bytes.
     assert 0 <= len(data) - document["buffers"][0]["byteLength"] < 4
     end = 0

@@ -13,27 +13,27 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats import ply as ply_tables
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.formats.gltf import pack_glb, read_parts, shown_unlit
+from nerg_mi.formats.gltf import pack_glb, read_glb_chunks, encode_unlit_glb
 from nerg_mi.formats.ply import parse_ply, write_columns
 from nerg_mi.formats.splats import (
     READERS,
-    is_splats,
-    plugin_of_field,
+    is_splat_file,
+    choose_plugin,
     read_gltf_splats,
     read_ply_splats,
     read_splat,
     read_splats,
     read_spz,
-    refuse_others,
-    splats_of_field,
+    refuse_unsupported_splats,
+    make_splats,
     write_ply_splats,
 )
-from nerg_mi.maths.sphere import C0
-from nerg_mi.train.geometry import place_of_field
+from nerg_mi.maths.sphere import SH_C0
+from nerg_mi.train.geometry import load_field_geometry
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
-from nerg_mi.workflows.scene_places import kind_of_file
+from nerg_mi.workflows.scene_places import detect_kind
 from tests.conftest import ROOT
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos, write_spz
 
@@ -47,8 +47,8 @@ def test_a_file_is_read_to_its_bytes(tmp_path):
     assert read.degree == 0
     assert np.array_equal(read.centers, splats.centers) and np.array_equal(read.scales, splats.scales)
     assert np.abs(read.opacities - splats.opacities).max() < 1 / 255
-    seen = np.clip(0.5 + C0 * splats.harmonics[:, 0], 0, 1)
-    assert np.abs(0.5 + C0 * read.harmonics[:, 0] - seen).max() < 1 / 255
+    seen = np.clip(0.5 + SH_C0 * splats.harmonics[:, 0], 0, 1)
+    assert np.abs(0.5 + SH_C0 * read.harmonics[:, 0] - seen).max() < 1 / 255
     # Up to its sign a quaternion is its rotation.
     assert np.abs(np.abs((read.rotations * splats.rotations).sum(axis=1)) - 1).max() < 1e-3
 
@@ -93,24 +93,24 @@ def test_other_formats_name_the_converter(tmp_path):
 
 def test_other_splats_are_refused_wherever_a_place_is_given(tmp_path):
     (tmp_path / "a.sog").write_bytes(b"PK")
-    for asked in (refuse_others, kind_of_file, lambda path: place_of_field(path, None)):
+    for asked in (refuse_unsupported_splats, detect_kind, lambda path: load_field_geometry(path, None)):
         with pytest.raises(NergError, match=r'splat-transform "a\.sog" out\.ply'):
             asked(tmp_path / "a.sog")
-    refuse_others(tmp_path / "a.obj")
-    assert plugin_of_field(tmp_path / "a.splat") == "splats" and plugin_of_field("a.safetensors") == "nerf"
+    refuse_unsupported_splats(tmp_path / "a.obj")
+    assert choose_plugin(tmp_path / "a.splat") == "splats" and choose_plugin("a.safetensors") == "nerf"
 
 
 def test_a_mesh_is_told_by_its_header(tmp_path):
     write_inria(tmp_path / "a.ply", random_splats(3))
-    assert is_splats(tmp_path / "a.ply") and is_splats("b.spz") and not is_splats("b.obj")
+    assert is_splat_file(tmp_path / "a.ply") and is_splat_file("b.spz") and not is_splat_file("b.obj")
     (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
-    assert not is_splats(tmp_path / "a.ply")
+    assert not is_splat_file(tmp_path / "a.ply")
     shaped = ("x", "y", "z", "opacity", "scale_0", "rot_0", "red")
     write_columns(tmp_path / "shaped.ply", {name: np.zeros(3) for name in shaped})
-    assert is_splats(tmp_path / "shaped.ply")
+    assert is_splat_file(tmp_path / "shaped.ply")
     write_khronos(tmp_path / "a.glb", random_splats(3))
-    (tmp_path / "b.glb").write_bytes(b"".join(shown_unlit([("POSITION", np.eye(3, dtype="<f4"), False)], None)))
-    assert is_splats(tmp_path / "a.glb") and not is_splats(tmp_path / "b.glb")
+    (tmp_path / "b.glb").write_bytes(b"".join(encode_unlit_glb([("POSITION", np.eye(3, dtype="<f4"), False)], None)))
+    assert is_splat_file(tmp_path / "a.glb") and not is_splat_file(tmp_path / "b.glb")
 
 
 def test_missing_files(tmp_path):
@@ -200,7 +200,7 @@ def test_a_damaged_file_is_one_sentence(tmp_path, old, new, said):
 
 def test_text_has_a_limit_of_its_own(tmp_path, monkeypatch):
     write_inria(tmp_path / "a.ply", random_splats(), "ascii")
-    monkeypatch.setattr(ply_tables, "TEXT_BYTES", 100)
+    monkeypatch.setattr(ply_tables, "MAX_TEXT_BYTES", 100)
     with pytest.raises(NergError, match="more than 100 bytes"):
         read_ply_splats(tmp_path / "a.ply")
     (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:2000])
@@ -222,7 +222,7 @@ def test_lengths_in_place_of_logarithms_are_recognised(tmp_path, size, room):
     splats = replace(splats, centers=splats.centers * np.float32([room, room, 0.01 * room]))
     write_columns_of(tmp_path / "a.ply", splats, **{f"scale_{i}": splats.scales[:, i] for i in range(3)})
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and "lengths" in read.guesses[0]
+    assert equal(read, splats) and "lengths" in read.assumptions[0]
 
 
 @pytest.mark.parametrize("low, high", [(0.001, 0.99), (0, 1), (0.5, 0.7)])
@@ -230,7 +230,7 @@ def test_shares_in_place_of_logits_are_recognised(tmp_path, low, high):
     splats = replace(random_splats(100, 1), opacities=np.linspace(low, high, 100, dtype=np.float32))
     write_columns_of(tmp_path / "a.ply", splats, opacity=splats.opacities)
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and "logits" in read.guesses[0]
+    assert equal(read, splats) and "logits" in read.assumptions[0]
 
 
 @pytest.mark.parametrize("low, high", [(0, 255), (10, 200), (0, 40)])
@@ -239,7 +239,7 @@ def test_bytes_in_place_of_logits_are_recognised(tmp_path, low, high):
     splats = replace(random_splats(100, 1), opacities=stored / np.float32(255))
     write_columns_of(tmp_path / "a.ply", splats, opacity=stored)
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and "255ths" in read.guesses[0]
+    assert equal(read, splats) and "255ths" in read.assumptions[0]
 
 
 @pytest.mark.parametrize(
@@ -257,7 +257,7 @@ def test_what_trainings_write_is_not_taken_for_anything_else(tmp_path, change):
     splats = change(random_splats(300, 0))
     write_ply_splats(tmp_path / "a.ply", splats)
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and not read.guesses
+    assert equal(read, splats) and not read.assumptions
 
 
 @pytest.mark.parametrize(
@@ -278,7 +278,7 @@ def test_the_3d_filter_widens_and_keeps_the_mass(tmp_path, degree, change):
     read = read_ply_splats(tmp_path / "a.ply")
     assert np.allclose(read.scales**2 - splats.scales**2, widths[:, None] ** 2, atol=1e-5)
     assert np.allclose(read.opacities * read.scales.prod(axis=1), splats.opacities * splats.scales.prod(axis=1))
-    assert len(read.guesses) == len({"lengths", "shares"} & change.keys())
+    assert len(read.assumptions) == len({"lengths", "shares"} & change.keys())
     # What is written again has the filter in it, and not twice.
     write_ply_splats(tmp_path / "b.ply", read)
     again = read_ply_splats(tmp_path / "b.ply")
@@ -339,7 +339,7 @@ def test_what_is_not_read_is_one_sentence(tmp_path, old, new, said):
 
 def test_two_degrees_are_refused(tmp_path):
     write_khronos(tmp_path / "a.glb", random_splats(degree=1))
-    document, data = read_parts((tmp_path / "a.glb").read_bytes(), "a.glb")
+    document, data = read_glb_chunks((tmp_path / "a.glb").read_bytes(), "a.glb")
     first = document["meshes"][0]["primitives"][0]
     few = {k: v for k, v in first["attributes"].items() if "DEGREE_1" not in k}
     document["meshes"][0]["primitives"].append(first | {"attributes": few})
@@ -367,7 +367,7 @@ def test_values_beyond_the_specification_are_refused(tmp_path, name, change, sai
 
 def test_the_colour_space_is_the_files_and_other_attributes_are_named(tmp_path):
     write_khronos(tmp_path / "a.glb", random_splats(degree=0))
-    document, data = read_parts((tmp_path / "a.glb").read_bytes(), "a.glb")
+    document, data = read_glb_chunks((tmp_path / "a.glb").read_bytes(), "a.glb")
     primitive = document["meshes"][0]["primitives"][0]
     primitive["attributes"]["_MARK"] = 0
     primitive["extensions"]["KHR_gaussian_splatting"]["colorSpace"] = "lin_rec709_display"
@@ -431,7 +431,7 @@ def store():
 
 
 def test_depths_are_the_fields(store):
-    splats, done = splats_of_field(store, 56)
+    splats, done = make_splats(store, 56)
     assert len(splats) > 5_000 and done["moved"] < 0.5 * done["cell"]
     rng = np.random.default_rng(0)
     d = rng.normal(size=(400, 3)).astype(np.float32)

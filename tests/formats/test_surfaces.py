@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.fields.extraction import Lattice, Sampler, surface_density
+from nerg_mi.fields.extraction import Lattice, FieldSampler, surface_density
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.formats import surfaces
-from nerg_mi.formats.surfaces import density_and_color, mesh, points, write_glb, write_ply, write_volume
+from nerg_mi.formats.surfaces import sample_density_and_color, extract_mesh, extract_points, write_glb, write_ply, write_volume
 from nerg_mi.maths.geometry import Box
 
 # ---- The ball ----
@@ -59,9 +59,9 @@ def expected_radius(ball, threshold):
 def test01_a_mesh_lies_on_the_surface():
     pytest.importorskip("skimage")
     ball = Ball()
-    m = mesh(ball, 48)
+    m = extract_mesh(ball, 48)
     threshold = math.log(2) / (2.4 / 48)
-    assert m.report["threshold"] == pytest.approx(threshold) == surface_density(Lattice.over(ball, 48))
+    assert m.report["threshold"] == pytest.approx(threshold) == surface_density(Lattice.for_field(ball, 48))
     r = np.linalg.norm(m.vertices - CENTER, axis=1)
     # Bisection of an edge: a 2^9th of a cell.
     assert np.abs(r - expected_radius(ball, threshold)).max() < 2.4 / 48 / 300
@@ -78,12 +78,12 @@ def test01_a_mesh_lies_on_the_surface():
 
 def test02_floaters_and_holes():
     pytest.importorskip("skimage")
-    both, alone = mesh(Ball(speck=True), 48, keep=0), mesh(Ball(speck=True), 48, keep=0.05)
+    both, alone = extract_mesh(Ball(speck=True), 48, min_piece_fraction=0), extract_mesh(Ball(speck=True), 48, min_piece_fraction=0.05)
     assert both.report["pieces"] == both.report["pieces_kept"] == 2 and alone.report["pieces_kept"] == 1
     assert np.linalg.norm(alone.vertices - CENTER, axis=1).min() > 0.5
     assert alone.face_count == len(alone.faces)
     assert alone.report["floater_faces"] == len(both.faces) - len(alone.faces) > 0
-    pierced, whole = mesh(Ball(hole=True), 48, fill=0), mesh(Ball(hole=True), 48, fill=1)
+    pierced, whole = extract_mesh(Ball(hole=True), 48, fill_cells=0), extract_mesh(Ball(hole=True), 48, fill_cells=1)
     euler = lambda m: trimesh.Trimesh(m.vertices, m.faces, process=False).euler_number
     assert (euler(pierced), euler(whole)) == (0, 2) and whole.report["cells_filled"] > 10
 
@@ -94,34 +94,34 @@ def test03_what_nobody_has_looked_at():
     bits = np.zeros((24, 24, 24), bool)
     bits[:, :, :12] = True
     half = Ball(OccupancyGrid(bits, ns, 0.1))
-    m, closed = mesh(half, 48), mesh(half, 48, unseen=True)
+    m, closed = extract_mesh(half, 48), extract_mesh(half, 48, keep_unseen=True)
     assert trimesh.Trimesh(closed.vertices, closed.faces, process=False).is_watertight
     r = np.linalg.norm(m.vertices - CENTER, axis=1)
     assert (r > 0.55).all() and (np.linalg.norm(closed.vertices - CENTER, axis=1) < 0.3).any()
     assert m.report["unseen_faces"] > 100 and m.report["edges_of_holes"] > 50 and m.vertices[:, 0].max() < 1.25
-    cloud = points(half, 48)
+    cloud = extract_points(half, 48)
     assert (np.linalg.norm(cloud.vertices - CENTER, axis=1) > 0.55).all()
 
 
 def test04_points_and_the_box():
     ball = Ball()
-    cloud = points(ball, 48, threshold=100.0)
+    cloud = extract_points(ball, 48, threshold=100.0)
     r = np.linalg.norm(cloud.vertices - CENTER, axis=1)
     assert np.abs(r - expected_radius(ball, 100.0)).max() < 2.4 / 48 / 300 and cloud.faces is None
     assert cloud.face_count == 0
     assert ((cloud.vertices - CENTER) / r[:, None] * cloud.normals).sum(1).min() > 0.97
-    assert len(points(ball, 48, count=100).vertices) == 100
+    assert len(extract_points(ball, 48, count=100).vertices) == 100
     with pytest.raises(ValueError, match="nowhere"):
-        points(ball, 48, threshold=1e6)
+        extract_points(ball, 48, threshold=1e6)
     pytest.importorskip("skimage")
     with pytest.raises(ValueError, match="nowhere.*--density"):
-        mesh(ball, 48, threshold=1e6)
+        extract_mesh(ball, 48, threshold=1e6)
     ball.box = Box((0, 0, 0), (1.2, 2, 1.8))
-    assert mesh(ball, 36).report["edges_at_the_box"] > 20
+    assert extract_mesh(ball, 36).report["edges_at_the_box"] > 20
 
 
 def test05_files(tmp_path):
-    cloud = points(Ball(color_space="linear"), 24)
+    cloud = extract_points(Ball(color_space="linear"), 24)
     triangles = cloud.__class__(
         cloud.vertices[:30], np.arange(30).reshape(10, 3), cloud.normals[:30], cloud.colors[:30], {}
     )
@@ -153,14 +153,14 @@ def test05_files(tmp_path):
 
 def test_voxels_render_as_the_field(rgb, tmp_path):
     ball = Ball()
-    density, color, lower, upper = density_and_color(ball, 24, samples=3)
+    density, color, lower, upper = sample_density_and_color(ball, 24, samples=3)
     assert density.shape == (18, 20, 24) and np.allclose(lower, 0) and np.allclose(upper, ball.box.upper)
     cell = 0.1
     points_of = lambda x, y, z: (
         (np.stack(np.meshgrid(*[(np.arange(3) + 0.5) / 3] * 3), -1).reshape(-1, 3) + [x, y, z]) * cell
     )
     for x, y, z in ((6, 9, 8), (5, 9, 8), (5, 8, 8), (8, 9, 8)):
-        share = np.mean(-np.expm1(-Sampler(ball).density(points_of(x, y, z)) * cell))
+        share = np.mean(-np.expm1(-FieldSampler(ball).density(points_of(x, y, z)) * cell))
         assert np.isclose(density[z, y, x], min(-math.log(max(1 - share, 1e-9)), 5) / cell, rtol=1e-3)
     # On the surface, from the side that the surface faces: its green depends on z of the direction alone.
     assert np.allclose(color[8, 9, 6, 0], ((1.2 - 0.6) / 2.4 / 1.055 + 0.055 / 1.055) ** 2.4, atol=0.01)
@@ -183,11 +183,11 @@ def test_a_full_field_takes_a_few_bytes_a_voxel(monkeypatch):
     """Every voxel of it has a colour: they are looked for in blocks, as if all at once."""
     fog = Ball()
     fog.density = lambda p, active=True: dr.select(active, 1 + p.x, 0)
-    whole = density_and_color(fog, 48, samples=1)
+    whole = sample_density_and_color(fog, 48, samples=1)
     monkeypatch.setattr(surfaces, "_BLOCK", 2500)
     tracemalloc.start()
     try:
-        blocks = density_and_color(fog, 48, samples=1)
+        blocks = sample_density_and_color(fog, 48, samples=1)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -197,6 +197,6 @@ def test_a_full_field_takes_a_few_bytes_a_voxel(monkeypatch):
 
 
 def test_an_empty_field_has_no_colour():
-    density, color, _, _ = density_and_color(Ball(sharp=0.0), 6, samples=1)
+    density, color, _, _ = sample_density_and_color(Ball(sharp=0.0), 6, samples=1)
     assert not color.any() and np.abs(density).max() < 1e-6
-    assert density_and_color(Ball(), 6, color=False, samples=1)[1] is None
+    assert sample_density_and_color(Ball(), 6, color=False, samples=1)[1] is None

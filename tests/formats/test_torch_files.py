@@ -176,7 +176,7 @@ _NUMBERS = b"](" + b"K\x01" * 100_000 + b"eq\x00"
     ],
 )
 def test_pickles_that_no_checkpoint_has(tmp_path, torch, monkeypatch, pickled, words):
-    monkeypatch.setattr(module, "OPERATIONS", 200_000)
+    monkeypatch.setattr(module, "MAX_OPERATIONS", 200_000)
     with pytest.raises(NergError, match=f"p.pth.*{words}") as error:
         read_torch(archive(tmp_path / "p.pth", b"\x80\x02" + pickled))
     assert str(error.value).isprintable()
@@ -273,9 +273,9 @@ def test_archives_that_inflate_are_refused(tmp_path, torch):
 
 def test_a_pickle_has_a_largest_size(tmp_path, torch, monkeypatch):
     path = archive(tmp_path / "t.pth", b"\x80\x02N.")
-    monkeypatch.setattr(module, "PICKLE_BYTES", 4)
+    monkeypatch.setattr(module, "MAX_PICKLE_BYTES", 4)
     assert read_torch(path) is None
-    monkeypatch.setattr(module, "PICKLE_BYTES", 3)
+    monkeypatch.setattr(module, "MAX_PICKLE_BYTES", 3)
     with pytest.raises(NergError, match=r"t.pth.*4 bytes.*the 3 that"):
         read_torch(path)
 

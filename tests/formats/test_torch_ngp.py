@@ -17,18 +17,18 @@ from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
 from nerg_mi.formats.torch_files import write_torch
 from nerg_mi.formats.torch_ngp import (
-    Given,
+    ImportOptions,
     StateDict,
-    bitfield,
-    decimals,
-    grid_config,
-    layers,
+    pack_bitfield,
+    shorten_floats,
+    infer_grid_config,
+    build_network,
     morton_order,
     open_checkpoint,
-    origin,
+    describe_origin,
     read_nerg,
     read_torch_ngp,
-    sh_degree,
+    infer_sh_degree,
     write_torch_ngp,
 )
 from nerg_mi.maths.geometry import Box
@@ -67,8 +67,8 @@ def worst(got, expected):
 @pytest.mark.parametrize("bound, behind", [(1, False), (2, True), (5, True)])
 def test01_equals_the_restatement(tmp_path, bound, behind):
     state = reference.nerf_state(bound, np.random.default_rng(bound), behind)
-    given = Given(background_radius=3.0 * bound if behind else None)
-    field, origin = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns, given=given)
+    given = ImportOptions(background_radius=3.0 * bound if behind else None)
+    field, origin = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns, options=given)
     p, d = points(bound)
     at, along = ns.Array3f(p.T), ns.Array3f(d.T)
 
@@ -106,7 +106,7 @@ def test05_there_and_back_is_exact(tmp_path, torch):
     for bound, behind in ((1, False), (2.7, True)):
         state = reference.nerf_state(bound, np.random.default_rng(6), behind)
         first = save(tmp_path / "ngp.pth", state)
-        field, origin = read_torch_ngp(first, ns, given=Given(background_radius=10.0))
+        field, origin = read_torch_ngp(first, ns, options=ImportOptions(background_radius=10.0))
         save_radiance(field, tmp_path / "f.safetensors", origin)
         again, meta = load_radiance(tmp_path / "f.safetensors", ns)
         assert meta["provenance"]["imported_from"] == "ngp.pth" and again.box == field.box
@@ -175,7 +175,7 @@ def test10_a_grid_of_another_resolution(tmp_path):
     where = reference.offsets(2, 4096)
     state["encoder.offsets"] = where
     # 2 levels: 17^3 and a hashed one, whatever the finest resolution is.
-    field, _ = read_torch_ngp(save(tmp_path / "a.pth", state), ns, given=Given(finest=4096))
+    field, _ = read_torch_ngp(save(tmp_path / "a.pth", state), ns, options=ImportOptions(finest=4096))
     assert field.config.grid == HashGridConfig(levels=2, finest=4096)
 
 
@@ -332,13 +332,13 @@ def test_marching_sees_the_kernels_bits(tmp_path, bound):
     state = reference.nerf_state(bound, rng, filled=0.02)
     field, _ = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns)
     p = rng.uniform(-bound, bound, (20000, 3)).astype(np.float32)
-    k = field.occupancy.empty_cells(field.box.to_unit(ns.Array3f(p.T))).numpy()
+    k = field.occupancy.distance_to_occupied(field.box.to_unit(ns.Array3f(p.T))).numpy()
     # Points within rounding of a cell's face may fall on either side of it: 128 is the finest, 0.5 b the largest cell.
     cells = (p[:, :, None] / np.minimum(2.0 ** np.arange(4), bound) + 1) * 64
     clear = np.abs(cells - np.round(cells)).min((1, 2)) > 1e-4
     assert clear.mean() > 0.95
     assert np.array_equal((k == 0)[clear], reference.occupied(state["density_bitfield"], bound, p)[clear])
-    assert np.isclose(field.occupancy.fraction, 0.02, rtol=0.05)
+    assert np.isclose(field.occupancy.occupied_fraction, 0.02, rtol=0.05)
 
 
 @pytest.mark.parametrize("bound", [2, 5])
@@ -349,7 +349,7 @@ def test_what_may_be_leapt_over_is_empty(tmp_path, bound):
     grid = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns)[0].occupancy
     p = rng.uniform(-bound, bound, (3000, 3)).astype(np.float32)
     u = ((p + bound) / (2 * bound)).astype(np.float32)
-    k, n = grid.empty_cells(ns.Array3f(u.T)).numpy().astype(int), grid.cells[0]
+    k, n = grid.distance_to_occupied(ns.Array3f(u.T)).numpy().astype(int), grid.cells[0]
     assert (k > 20).mean() > 0.3 and n == 128 * bound
     low = np.floor(u.astype(np.float64) * n) - (k[:, None] - 1)
     for _ in range(40):
@@ -385,7 +385,7 @@ def test_a_plain_grid_becomes_cascades(tmp_path):
     # Every cell of a cascade that overlaps an occupied one is set, and no other.
     bits = np.zeros((6, 6, 6), bool)
     bits[1, 2, 3] = bits[5, 5, 0] = True
-    packed = bitfield(OccupancyGrid(bits, ns, 0.1), 2.0)
+    packed = pack_bitfield(OccupancyGrid(bits, ns, 0.1), 2.0)
     p = np.random.default_rng(1).uniform(-2, 2, (20000, 3)).astype(np.float32)
     cell = np.clip((p / 4 + 0.5) * 6, 0, 5).astype(int)
     true = bits[cell[:, 2], cell[:, 1], cell[:, 0]]
@@ -395,13 +395,13 @@ def test_a_plain_grid_becomes_cascades(tmp_path):
 
 def test_cascades_are_packed_as_they_are():
     bits = np.random.default_rng(2).random((2, 128, 128, 128)) < 0.01
-    packed = bitfield(CascadeGrid(bits, 2.0, ns, 0.1), 2.0)
+    packed = pack_bitfield(CascadeGrid(bits, 2.0, ns, 0.1), 2.0)
     assert packed.dtype == np.uint8 and packed.size * 8 == bits.size
     ordered = np.unpackbits(packed, bitorder="little").reshape(2, -1)[:, morton_order()]
     assert np.array_equal(ordered.reshape(bits.shape), bits)
-    assert bitfield(None, 2.0).min() == 255
+    assert pack_bitfield(None, 2.0).min() == 255
     with pytest.raises(NergError, match="16.*no torch-ngp form"):
-        bitfield(CascadeGrid(bits[:, :16, :16, :16], 2.0, ns, 0.1), 2.0)
+        pack_bitfield(CascadeGrid(bits[:, :16, :16, :16], 2.0, ns, 0.1), 2.0)
 
 
 # ---- State dictionaries ----
@@ -432,10 +432,10 @@ def test_a_state_dictionary(state):
     assert tensors.weights("model.net.1.weight").dtype == np.float32
     with pytest.raises(NergError, match='"model.far.0.weight".*diverged'):
         tensors.weights("model.far.0.weight")
-    net = layers(tensors.below("model."), "net", ns)
+    net = build_network(tensors.below("model."), "net", ns)
     assert [w.shape for w in net.weights] == [(3, 2), (1, 3)]
     about = {"imported_from": "s.pth", "format": "torch-ngp", "weights": "moving averages", "epoch": 3}
-    assert origin(path, whole, "torch-ngp", True) == about
+    assert describe_origin(path, whole, "torch-ngp", True) == about
 
 
 def test_what_is_no_checkpoint(tmp_path):
@@ -448,12 +448,12 @@ def test_what_is_no_checkpoint(tmp_path):
 
 
 def test_numbers_that_were_typed(state):
-    assert decimals(np.float32([2.7, -0.1])).tolist() == [2.7, -0.1]
+    assert shorten_floats(np.float32([2.7, -0.1])).tolist() == [2.7, -0.1]
     _, _, tensors = state
-    assert sh_degree(tensors, 16) == 4
+    assert infer_sh_degree(tensors, 16) == 4
     for wrong in (15, 0, -1):
         with pytest.raises(NergError, match="not spherical harmonics"):
-            sh_degree(tensors, wrong)
+            infer_sh_degree(tensors, wrong)
 
 
 def test_a_grid_is_read_off_its_levels(tmp_path):
@@ -461,10 +461,10 @@ def test_a_grid_is_read_off_its_levels(tmp_path):
     tensors = {"e.embeddings": np.zeros((where[-1], 2), np.float32), "e.offsets": where}
     write_torch(tmp_path / "g.pth", {"model": tensors})
     grid = StateDict(tmp_path / "g.pth", open_checkpoint(tmp_path / "g.pth")[1])
-    config = grid_config(grid, "e", 512.0)
+    config = infer_grid_config(grid, "e", 512.0)
     assert config.offsets() == where.tolist() and config.finest == 512 and isinstance(config.finest, int)
     with pytest.raises(NergError, match="16.*32.*--finest"):
-        grid_config(grid, "e", 32)
+        infer_grid_config(grid, "e", 32)
 
 
 def test_moving_averages(tmp_path, torch):

@@ -30,7 +30,7 @@ with atheris.instrument_imports(include=["nerg_mi.formats", "nerg_mi.photos", "z
     from nerg_mi.files.safe_read import parse_json, read_npy, read_npz
     from nerg_mi.formats.fields import load_radiance
     from nerg_mi.formats.torch_files import check_pickle
-    from nerg_mi.formats.torch_ngp import Given, read_torch_ngp
+    from nerg_mi.formats.torch_ngp import ImportOptions, read_torch_ngp
     from nerg_mi.photos.colmap import read_colmap
     from nerg_mi.photos.images import read_image
 
@@ -54,7 +54,7 @@ def _pickle(path: Path) -> object:
 
 TARGETS = {
     "checkpoint": ("radiance checkpoint", "field.safetensors", lambda p: load_radiance(p, _namespace())),
-    "torch": ("torch-ngp checkpoint", "ngp.pth", lambda p: read_torch_ngp(p, _namespace(), given=Given(finest=32))),
+    "torch": ("torch-ngp checkpoint", "ngp.pth", lambda p: read_torch_ngp(p, _namespace(), options=ImportOptions(finest=32))),
     "pickle": ("torch-ngp checkpoint", "pickle", _pickle),
     "npy": ("picture a.npy", "a.npy", read_npy),
     "npz": ("rays rays.npz", "rays.npz", read_npz),

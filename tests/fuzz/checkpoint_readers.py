@@ -58,7 +58,7 @@ def _gaze(kind: str):
         return GazeField.random(GazeConfig(grid, width=4, geometry=3, sh_degree=2, trunk="layernorm"), box, ns, 2)
     one = lambda seed: LogGazeField.random(LogGazeConfig(grid, width=4, layers=1, sh_degree=2, prior=2), box, ns, seed)
     field = one(1) if kind == "log" else GazeEnsemble([one(1), one(2)])
-    field.support = RaySupport.of(np.random.default_rng(0).random((9, 3)), 0.5)
+    field.support = RaySupport.from_origins(np.random.default_rng(0).random((9, 3)), 0.5)
     return field
 
 
@@ -143,7 +143,7 @@ def _make_gaze_run(folder: Path) -> None:
     from nerg_mi.train.trainer import Trainer
 
     trainer = _trainer(Trainer)
-    GazeRunFile(folder / "gaze.run", _ABOUT).keep("fit", trainer, {"best": 1.5}, trainer.averaged, now=True)
+    GazeRunFile(folder / "gaze.run", _ABOUT).save("fit", trainer, {"best": 1.5}, trainer.averaged, force=True)
 
 
 def _read_gaze_run(folder: Path) -> object:
@@ -199,9 +199,9 @@ def _make_ngp(folder: Path) -> None:
 
 
 def _read_ngp(folder: Path) -> object:
-    from nerg_mi.formats.torch_ngp import Given, read_torch_ngp
+    from nerg_mi.formats.torch_ngp import ImportOptions, read_torch_ngp
 
-    return read_torch_ngp(folder / "ngp.pth", _parts()[0], given=Given(finest=32))
+    return read_torch_ngp(folder / "ngp.pth", _parts()[0], options=ImportOptions(finest=32))
 
 
 def _make_nerg(folder: Path) -> None:
@@ -228,9 +228,9 @@ def _make_nerg(folder: Path) -> None:
 
 
 def _read_nerg(folder: Path) -> object:
-    from nerg_mi.formats.torch_ngp import Given, read_nerg
+    from nerg_mi.formats.torch_ngp import ImportOptions, read_nerg
 
-    return read_nerg(folder / "nerg.pth", _parts()[0], given=Given(finest=32))
+    return read_nerg(folder / "nerg.pth", _parts()[0], options=ImportOptions(finest=32))
 
 
 CHECKPOINTS = [

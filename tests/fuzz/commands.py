@@ -24,7 +24,7 @@ import numpy as np
 from typer.core import TyperOption
 
 from nerg_mi.ranges import COORDINATES, TIMES
-from nerg_mi.train.gaze_recipes import recipes
+from nerg_mi.train.gaze_recipes import load_recipes
 from tests.cli import outputs
 from tests.fuzz.watch import Case, Reader
 
@@ -60,7 +60,7 @@ _REFUSED = {
 _TEXTS = dict(define=("level=0.5", "spp=1"), source=("field", "rays"), geometry=("hits", "none"), photo=("0", "3.png"))
 _TEXTS |= dict(person=("a", "b"), people=("a", "a,b"), persons=("a", "b"), without_persons=("a", "b"))
 _TEXTS |= dict(
-    recipe=recipes(), salience=("spectral-residual",), semantic=("accumulated", "snapshot"), windows=("w=0:1",)
+    recipe=load_recipes(), salience=("spectral-residual",), semantic=("accumulated", "snapshot"), windows=("w=0:1",)
 )
 _TEXTS |= dict(observers=("0,0,1.6", "1,1,1.6"), begin=("random", "field"))
 """Parameter of a command -> values that its help does not enumerate."""
@@ -113,7 +113,7 @@ def run(folder: Path, words: list[str], is_work: bool = False) -> None:
     too long, or is done without a result.
     """
     import nerg_mi.cli
-    from nerg_mi.cli.ending import FAULT, INTERRUPTED
+    from nerg_mi.cli.ending import INTERNAL_ERROR, INTERRUPTED
     from nerg_mi.errors import NergError
 
     output, printed, said = Path(tempfile.mkdtemp(prefix="nerg-out-")), io.StringIO(), io.StringIO()
@@ -129,7 +129,7 @@ def run(folder: Path, words: list[str], is_work: bool = False) -> None:
         # What is done just now needs no Ctrl-C.
         ended.append(True)
         last = " ".join(said.getvalue().split())[-900:]
-        if end.code == FAULT or "Traceback" in said.getvalue():
+        if end.code == INTERNAL_ERROR or "Traceback" in said.getvalue():
             raise RuntimeError(last) from None
         if end.code == INTERRUPTED and not is_work:
             raise RuntimeError(f"not done in {LIMIT:g} s of the processor: {last}") from None
@@ -184,9 +184,9 @@ def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) 
 @functools.lru_cache
 def _commands() -> dict[str, Any]:
     """The parser of each command, by its words."""
-    from tools.command_pages import commands
+    from tools.command_pages import iter_commands
 
-    return {path.removeprefix("nerg "): command for path, command, _ in commands()}
+    return {path.removeprefix("nerg "): command for path, command, _ in iter_commands()}
 
 
 def _options(words: list[str]) -> list[TyperOption]:

@@ -72,12 +72,12 @@ def _read(folder: Path) -> object:
 
 
 def _nest(folder: Path) -> object:
-    from nerg_mi.rendering.nested_scene import nested_place
-    from nerg_mi.rendering.scene_writer import Eye, GazeFiles, SceneText
+    from nerg_mi.rendering.nested_scene import nest_scene
+    from nerg_mi.rendering.scene_writer import LookAt, GazeFiles, SceneText
 
-    place = nested_place(folder / "theirs.xml", folder / "ours")
-    camera = Eye(np.zeros(3), np.ones(3))
-    return SceneText(place, GazeFiles(), camera, None, np.array([0.0, 0, 1])).xml()
+    place = nest_scene(folder / "theirs.xml", folder / "ours")
+    camera = LookAt(np.zeros(3), np.ones(3))
+    return SceneText(place, GazeFiles(), camera, None, np.array([0.0, 0, 1])).to_xml()
 
 
 def _make_nested(folder: Path) -> None:
@@ -115,21 +115,21 @@ def _read_frames(folder: Path) -> object:
 
 
 def _make_glb(folder: Path) -> None:
-    from nerg_mi.formats.gltf import shown_unlit
+    from nerg_mi.formats.gltf import encode_unlit_glb
 
     corners = [("POSITION", np.array(_CORNERS, "<f4"), False)]
-    whole = b"".join(shown_unlit(corners, np.array([[0, 1, 2]])))
+    whole = b"".join(encode_unlit_glb(corners, np.array([[0, 1, 2]])))
     (folder / "a.glb").write_bytes(whole)
     # Its document by itself, of which damage may keep the structure.
     (folder / "document.json").write_bytes(whole[20 : 20 + struct.unpack_from("<I", whole, 12)[0]])
 
 
 def _read_glb(folder: Path) -> object:
-    from nerg_mi.files.safe_read import JSON_BYTES, read_bytes
+    from nerg_mi.files.safe_read import MAX_JSON_BYTES, read_bytes
     from nerg_mi.formats.gltf import parse_glb
     from nerg_mi.formats.meshes import read_mesh_file
 
-    text = read_bytes(folder / "document.json", "document", JSON_BYTES)
+    text = read_bytes(folder / "document.json", "document", MAX_JSON_BYTES)
     data = np.array(_CORNERS, "<f4").tobytes() + np.array([0, 1, 2], "<u4").tobytes()
     head = struct.pack("<IIIII", 0x46546C67, 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
     made = head + text + struct.pack("<II", len(data), 0x004E4942) + data
@@ -141,9 +141,9 @@ def _make_path(folder: Path) -> None:
 
 
 def _read_path(folder: Path) -> object:
-    from nerg_mi.workflows.bake_chunks import read_path
+    from nerg_mi.workflows.bake_chunks import read_observer_file
 
-    return read_path(folder / "walk.csv")
+    return read_observer_file(folder / "walk.csv")
 
 
 def _reader(name: str, *kinds: str) -> Reader:
@@ -183,10 +183,10 @@ def _read_areas(folder: Path) -> object:
     from nerg_mi.formats.areas import read_areas
 
     areas = read_areas(folder / "areas.json")
-    assert all(of for of in areas.solids.values())
+    assert all(of for of in areas.box_indices.values())
     for box in areas.boxes:
-        box.holds(areas.boxes[0].vertices if areas.boxes else [[0.0, 0, 0]])
-    return areas.members()
+        box.contains(areas.boxes[0].vertices if areas.boxes else [[0.0, 0, 0]])
+    return areas.element_indices()
 
 
 def _make_twin(folder: Path) -> None:
@@ -214,10 +214,10 @@ def _make_changes(folder: Path) -> None:
 
 
 def _read_changes(folder: Path) -> object:
-    from nerg_mi.aoi.scene import changed_areas, read_changes
+    from nerg_mi.aoi.scene import apply_to_areas, read_changes
     from nerg_mi.formats.areas import AreaSet, Region
 
-    return changed_areas(AreaSet((Region.of("shelf", [0, 0, 0], [1, 1, 1]),)), read_changes(folder / "changes.json"))
+    return apply_to_areas(AreaSet((Region.create("shelf", [0, 0, 0], [1, 1, 1]),)), read_changes(folder / "changes.json"))
 
 
 def _make_cohorts(folder: Path) -> None:
@@ -265,10 +265,10 @@ def _make_results(folder: Path) -> None:
 def _read_results(folder: Path) -> None:
     from nerg_mi.evaluation.gaze_report import read_results
     from nerg_mi.report.data import Run
-    from nerg_mi.report.sections import page
+    from nerg_mi.report.sections import render_page
 
     found = read_results(folder / "gaze.json")
-    page(Run("Gaze", {}, "A place.", "none", results=(found,)))
+    render_page(Run("Gaze", {}, "A place.", "none", results=(found,)))
 
 
 def _make_boxes(folder: Path) -> None:
@@ -280,7 +280,7 @@ def _read_boxes(folder: Path) -> None:
     from nerg_mi.formats.areas import read_regions
 
     for box in read_regions(folder / "objects.json"):
-        box.holds(box.corners)
+        box.contains(box.corners)
 
 
 REPORTS = [
@@ -363,11 +363,11 @@ def _make_photo(name: str):
 
 def _read_photo(name: str):
     def read(folder: Path) -> object:
-        from nerg_mi.photos.structure import encoded, read_photo, shrunk, small_size
+        from nerg_mi.photos.structure import encode_image, read_photo, encode_small_image, fit_size
 
         photo = read_photo(folder / name)
         # What is done with it where it is turned, and in any case.
-        return [*(encoded(photo.image, kind) for kind in (".jpg", ".png")), shrunk(photo.image, small_size(_SIZE, 24))]
+        return [*(encode_image(photo.image, kind) for kind in (".jpg", ".png")), encode_small_image(photo.image, fit_size(_SIZE, 24))]
 
     return read
 
@@ -396,12 +396,12 @@ def _read_film(name: str):
     def read(folder: Path) -> object:
         from PIL import Image
 
-        from nerg_mi.photos.structure import encoded, shrunk, small_size
-        from nerg_mi.photos.video_frames import sharpest_frames
+        from nerg_mi.photos.structure import encode_image, encode_small_image, fit_size
+        from nerg_mi.photos.video_frames import select_sharpest_frames
 
         # By itself the decoder starts as many threads as there are cores.
-        frames = [Image.fromarray(frame.pixels) for frame in sharpest_frames(folder / name, 3, threads=2)]
-        return [(encoded(f, ".jpg"), shrunk(f, small_size(f.size, 24))) for f in frames]
+        frames = [Image.fromarray(frame.pixels) for frame in select_sharpest_frames(folder / name, 3, threads=2)]
+        return [(encode_image(f, ".jpg"), encode_small_image(f, fit_size(f.size, 24))) for f in frames]
 
     return read
 
@@ -426,29 +426,29 @@ def _make_plan(folder: Path) -> None:
     from tests.tasks import works
 
     (folder / "light.txt").write_text("light")
-    Store(folder).remember(works.plan(3, (folder / "light.txt",))).rename(folder / "plans" / "a.json")
+    Store(folder).save_plan(works.make_plan(3, (folder / "light.txt",))).rename(folder / "plans" / "a.json")
 
 
 def _read_plan(folder: Path) -> None:
-    from nerg_mi.tasks.store import Store, read_account
+    from nerg_mi.tasks.store import Store, read_status
 
-    read_account(Store(folder))
+    read_status(Store(folder))
 
 
 def _make_receipt(folder: Path) -> None:
-    from nerg_mi.tasks.store import Store, receipt_of
+    from nerg_mi.tasks.store import Store, make_manifest
     from tests.tasks import works
 
     (folder / "out.txt").write_text("abc")
-    (task,), store = works.plan(1).tasks, Store(folder)
-    store.add(receipt_of(task, folder / "out.txt", 1.5, {"limits": [0, 1]}))
-    store.receipt_file(task.key).rename(folder / "a.json")
+    (task,), store = works.make_plan(1).tasks, Store(folder)
+    store.add_manifest(make_manifest(task, folder / "out.txt", 1.5, {"limits": [0, 1]}))
+    store.manifest_path(task.key).rename(folder / "a.json")
 
 
 def _read_receipt(folder: Path) -> None:
-    from nerg_mi.tasks.store import read_receipt
+    from nerg_mi.tasks.store import read_manifest
 
-    read_receipt(folder / "a.json")
+    read_manifest(folder / "a.json")
 
 
 TASKS = [

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.readers.registry import reader_names
+from nerg_mi.rays.readers.registry import list_reader_names
 from tests.fuzz.watch import Reader
 from tests.rays.readers.examples import EXAMPLES, TABLE, VARIANTS, Example, write_walk
 
@@ -53,9 +53,9 @@ def _shown(rays) -> None:
 
     from nerg_mi.rays.filters import select_mask
     from nerg_mi.rays.pseudonyms import pseudonymise
-    from nerg_mi.rays.quality import card_table, summarise
+    from nerg_mi.rays.quality import format_quality_report, summarise
 
-    card_table(rays, summarise(rays), "rays.npz")
+    format_quality_report(rays, summarise(rays), "rays.npz")
     rays.select(select_mask(rays, time=(0, 1), with_hit=True))
     pseudonymise(rays, bytes(16))
 
@@ -83,10 +83,10 @@ def _make_metadata(folder: Path) -> None:
 def _read_metadata(folder: Path) -> None:
     from dataclasses import replace
 
-    from nerg_mi.files.safe_read import JSON_BYTES, read_bytes
+    from nerg_mi.files.safe_read import MAX_JSON_BYTES, read_bytes
     from nerg_mi.rays.rays import read_metadata
 
-    raw = read_bytes(folder / "metadata.json", "rays file", JSON_BYTES)
+    raw = read_bytes(folder / "metadata.json", "rays file", MAX_JSON_BYTES)
     about = read_metadata(raw, folder / "metadata.json")
     persons, cohorts = about.pop("persons"), about.pop("cohorts", [])
     _shown(replace(_rays(), metadata=about, persons=persons, cohorts=cohorts))
@@ -174,7 +174,7 @@ def _pairs(name: str, kind: str) -> Reader:
         from nerg_mi.alignment.constraints import AlignmentTarget
         from nerg_mi.alignment.points import read_pairs
 
-        read_pairs(folder / name).fit(AlignmentTarget(upright=False), lambda *_: None)
+        read_pairs(folder / name).fit(AlignmentTarget(is_upright=False), lambda *_: None)
 
     return Reader(f"alignment {name}", _make_pairs, {name: (kind,)}, read)
 
@@ -216,11 +216,11 @@ _PART = f"a.rays/place=shop/day=unknown/bucket=0/part-{_SOURCE}-0.parquet"
 
 
 def _make_dataset(folder: Path) -> None:
-    from nerg_mi.rays.dataset import Head, write_head
+    from nerg_mi.rays.dataset import DatasetManifest, write_dataset_manifest
     from nerg_mi.rays.dataset_write import SourceWriter
 
     rays = _rays()
-    write_head(folder / "a.rays", Head(1))
+    write_dataset_manifest(folder / "a.rays", DatasetManifest(1))
     writer = SourceWriter(folder / "a.rays", _SOURCE, 1)
     writer.add(rays, "shop")
     writer.finish(rays.metadata, file="a.csv", where="w", stamp=None, recipe="r", generation=0)
@@ -228,14 +228,14 @@ def _make_dataset(folder: Path) -> None:
 
 def _read_dataset(folder: Path) -> None:
     from nerg_mi.rays.dataset import Conditions, RayDataset
-    from nerg_mi.rays.quality import card_table
-    from nerg_mi.workflows.rays import card_of
+    from nerg_mi.rays.quality import format_quality_report
+    from nerg_mi.workflows.rays import make_quality_report
 
-    for title, card in card_of(folder / "a.rays"):
-        card_table(card.rays, card.summary, title, card.lines)
+    for title, card in make_quality_report(folder / "a.rays"):
+        format_quality_report(card.rays, card.summary, title, card.lines)
     dataset = RayDataset.open(folder / "a.rays")
     dataset.sample(7, runs=2)
-    list(dataset.scan(Conditions(time=(0, 0.3), box=[0, 1, 0, 1, 0, 3], with_hit=True), whole=True))
+    list(dataset.scan(Conditions(time=(0, 0.3), box=[0, 1, 0, 1, 0, 3], with_hit=True), whole_parts=True))
 
 
 def _dataset(name: str, target: str, *kinds: str) -> Reader:
@@ -246,7 +246,7 @@ TRACKING = [
     _rays_file("rays.npz", "zip"),
     _rays_file("rays.parquet"),
     Reader("rays metadata", _make_metadata, {"metadata.json": ("json",)}, _read_metadata),
-    *(_recording(name, EXAMPLES[name], kind) for name in reader_names() for kind in ("", " skipping")),
+    *(_recording(name, EXAMPLES[name], kind) for name in list_reader_names() for kind in ("", " skipping")),
     *(
         _recording(name, example, f" {k}")
         for name, examples in VARIANTS.items()

@@ -18,10 +18,10 @@ from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverSettings
-from nerg_mi.transport.observer_gaze import PlacedGaze
+from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
 # ---- Fields of random weights, and rays, that are asked through torch ----
 
@@ -253,10 +253,10 @@ def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
     """The default recipe's fields: integral and density of Dr.Jit's own marching, in a place of which half is open."""
     field = normalised(kind)
     shape = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.6]).scale(5)}
-    place, eye = Place(None, rgb.load_dict({"type": "scene", "s": shape})), rgb.Point3f(0.1, -0.2, 0.3)
-    placed, settings = PlacedGaze(field), ObserverSettings(march=MarchSettings(step=1), directions=1 << 12)
-    around = placed.outlook(place, eye, settings).trace()
-    observed = placed.at([eye], place, settings)
+    place, eye = SceneGeometry(None, rgb.load_dict({"type": "scene", "s": shape})), rgb.Point3f(0.1, -0.2, 0.3)
+    placed, settings = GazeFieldInstance(field), ObserverSettings(march=MarchSettings(step=1), directions=1 << 12)
+    around = placed.make_tracer(place, eye, settings).trace()
+    observed = placed.for_observers([eye], place, settings)
     tensor = lambda v: torch.tensor(np.ascontiguousarray(np.array(v).T, np.float32))
     r_o, escaped = tensor(around.directions), torch.tensor(np.array(around.escaped))
     assert 0.3 < escaped.float().mean() < 0.7

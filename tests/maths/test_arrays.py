@@ -5,7 +5,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.arrays import ALIGNMENT, aligned, log1p, one_minus_exp, quotient, sigmoid, vector_of
+from nerg_mi.maths.arrays import ALIGNMENT, copy_aligned, log1p, one_minus_exp, quotient, sigmoid, to_vector
 
 # ---- Arrays for Dr.Jit: the same values, and the same kernels for any number of them ----
 
@@ -13,19 +13,19 @@ from nerg_mi.maths.arrays import ALIGNMENT, aligned, log1p, one_minus_exp, quoti
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 1003])
 def test01_values_are_those_given_and_begin_at_packets(rgb, count):
     rows = np.random.default_rng(count).normal(size=(count, 3))
-    assert np.array_equal(np.array(vector_of(rgb.Point3f, rows)), rows.astype(np.float32).T)
-    assert np.array_equal(np.array(vector_of(rgb.Vector3f, rows[:, ::-1])), rows[:, ::-1].astype(np.float32).T)
+    assert np.array_equal(np.array(to_vector(rgb.Point3f, rows)), rows.astype(np.float32).T)
+    assert np.array_equal(np.array(to_vector(rgb.Vector3f, rows[:, ::-1])), rows[:, ::-1].astype(np.float32).T)
     for dtype in (np.float32, np.uint32, np.float64):
-        values = aligned(np.arange(count), dtype)
+        values = copy_aligned(np.arange(count), dtype)
         # Nothing begins nowhere.
         assert values.dtype == dtype and (count == 0 or values.ctypes.data % ALIGNMENT == 0)
         assert np.array_equal(values, np.arange(count))
-    assert np.array_equal(aligned(rows[:, ::-1]), rows[:, ::-1].astype(np.float32))
+    assert np.array_equal(copy_aligned(rows[:, ::-1]), rows[:, ::-1].astype(np.float32))
 
 
 def test02_what_is_given_may_change_afterwards(rgb):
     rows = np.ones((20, 3), np.float32)
-    made, column = vector_of(rgb.Point3f, rows), rgb.Float(aligned(rows[:, 0]))
+    made, column = to_vector(rgb.Point3f, rows), rgb.Float(copy_aligned(rows[:, 0]))
     rows[:] = 7
     assert np.all(np.array(made) == 1) and np.all(np.array(column) == 1)
 
@@ -37,8 +37,8 @@ def test03_another_number_is_no_other_kernel(rgb):
         spare = [np.empty(k) for k in range(1, 9)]
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            v, w = vector_of(rgb.Point3f, np.ones((count, 3))), rgb.UInt32(aligned(np.ones(count), np.uint32))
-            dr.eval(dr.norm(v) + rgb.Float(w) * rgb.Float(aligned(np.ones(count))))
+            v, w = to_vector(rgb.Point3f, np.ones((count, 3))), rgb.UInt32(copy_aligned(np.ones(count), np.uint32))
+            dr.eval(dr.norm(v) + rgb.Float(w) * rgb.Float(copy_aligned(np.ones(count))))
             kernels |= {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
         del spare
     assert len(kernels) == 1

@@ -6,12 +6,12 @@ import pytest
 
 from nerg_mi.maths.color import (
     composite_to_linear,
-    decibels,
+    psnr_from_mse,
     decode_srgb,
     encode_srgb,
     fit_colors,
     psnr,
-    psnr_of_fitted_half,
+    color_corrected_psnr,
     srgb_to_linear,
 )
 
@@ -135,16 +135,16 @@ def test_the_offset_does_not_reach_what_is_not_covered():
 
 def test_the_right_half_is_scored_after_a_fit_of_the_left():
     color, truth = pictures()
-    assert psnr(color, truth) < 25 < 40 < psnr_of_fitted_half(color, truth)
+    assert psnr(color, truth) < 25 < 40 < color_corrected_psnr(color, truth)
     # The odd column belongs to the left half: what is wrong there is not scored, and what is wrong right of it is.
     for column, scored in ((30, False), (31, True)):
         spoilt = truth.copy()
         spoilt[:, column] = 0
-        assert (psnr_of_fitted_half(truth, spoilt) < 25) == scored
+        assert (color_corrected_psnr(truth, spoilt) < 25) == scored
     # Nothing is learnt from the half that is scored.
     changed = color.copy()
     changed[:, 31:] = truth[:, 31:]
-    assert psnr_of_fitted_half(changed, truth) < 25
+    assert color_corrected_psnr(changed, truth) < 25
 
 
 def test_masks_leave_out_what_they_hide():
@@ -152,10 +152,10 @@ def test_masks_leave_out_what_they_hide():
     mask = np.ones(color.shape[:2], bool)
     mask[:, ::3] = False
     spoilt = np.where(mask[..., None], truth, 0)
-    assert psnr_of_fitted_half(color, spoilt, mask=mask) == pytest.approx(
-        psnr_of_fitted_half(color, truth, mask=mask), abs=1e-9
+    assert color_corrected_psnr(color, spoilt, mask=mask) == pytest.approx(
+        color_corrected_psnr(color, truth, mask=mask), abs=1e-9
     )
-    assert np.isnan(psnr_of_fitted_half(color, truth, mask=mask & False))
+    assert np.isnan(color_corrected_psnr(color, truth, mask=mask & False))
 
 
 # ---- The PSNR of pictures: known errors, masks, and no error at all ----
@@ -172,5 +172,5 @@ def test_psnr():
 
 
 def test_decibels_of_a_mean_square():
-    assert decibels(0.01) == pytest.approx(20) and decibels(1.0) == 0
-    assert decibels(0.0) == pytest.approx(120) and decibels(0.0, 1e-24) == pytest.approx(240)
+    assert psnr_from_mse(0.01) == pytest.approx(20) and psnr_from_mse(1.0) == 0
+    assert psnr_from_mse(0.0) == pytest.approx(120) and psnr_from_mse(0.0, 1e-24) == pytest.approx(240)

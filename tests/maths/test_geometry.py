@@ -12,8 +12,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import read_splats
 from nerg_mi.maths.coordinates import check_near_origin
-from nerg_mi.maths.geometry import Box, ContractedBox, Similarity, box_interval, box_of, intersect_box
-from nerg_mi.photos.posed import PosedFrame, settled
+from nerg_mi.maths.geometry import Box, ContractedBox, Similarity, intersect_box_numpy, box_from_dict, intersect_box
+from nerg_mi.photos.posed import PosedFrame, sort_frames
 from nerg_mi.rays.readers.base import UNITY, RaysBuilder
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos
 from tests.reference import march_numpy as reference
@@ -123,7 +123,7 @@ def test_bounds_and_the_straight_cube(rgb_contraction):
 
 def test_its_dictionary_makes_it_again():
     for box in (ContractedBox(CORE, 16), CORE, Box((-1, -1, -1), (1, 1, 1), 2.0)):
-        assert box_of(box.to_dict()) == box
+        assert box_from_dict(box.to_dict()) == box
 
 
 @pytest.mark.parametrize("reach", [1, 3, 0.5, float("nan"), float("inf"), 2**13])
@@ -147,7 +147,7 @@ def intersect(o, d, lower=LOWER, upper=UPPER):
     o, d = np.atleast_2d(np.asarray(o, np.float32)), np.atleast_2d(np.asarray(d, np.float32))
     near, far = intersect_box(ns.Array3f(o.T), ns.Array3f(d.T), lower, upper)
     near, far = np.broadcast_to(near.numpy(), len(o)), np.broadcast_to(far.numpy(), len(o))
-    first, last = box_interval(o.astype(float), d.astype(float), lower, upper)
+    first, last = intersect_box_numpy(o.astype(float), d.astype(float), lower, upper)
     scale, hit = np.abs(upper).max(), near < far
     with np.errstate(invalid="ignore"):
         clear = np.abs(far - near) > 1e-4 * scale
@@ -229,7 +229,7 @@ def test01_similarity(rgb, scale):
     s = Similarity(m)
     p = np.array([0.3, -0.2, 0.9])
     world = m @ [*p, 1]
-    assert np.isclose(s.scale, scale) and not s.identity
+    assert np.isclose(s.scale, scale) and not s.is_identity
     assert np.allclose(np.array(s.point_to_local(rgb.Point3f(world[:3].tolist()))).ravel(), p, atol=2e-6)
     w = m[:3, :3] @ p
     assert np.allclose(np.array(s.vector_to_local(rgb.Vector3f(w.tolist()))).ravel(), p, rtol=1e-5, atol=1e-6)
@@ -269,7 +269,7 @@ def test03_other_transforms_are_refused(row, column, value):
 def test04_the_identity_returns_what_it_is_given(rgb):
     p = rgb.Point3f(1, 2, 3)
     s = Similarity()
-    assert s.identity and s.scale == 1 and s.point_to_local(p) is p and s.direction_to_local(p) is p
+    assert s.is_identity and s.scale == 1 and s.point_to_local(p) is p and s.direction_to_local(p) is p
 
 
 # ---- Coordinates of surveys are refused by every reader, with the offset to subtract ----
@@ -301,7 +301,7 @@ def read_rays(path: Path, points: np.ndarray) -> None:
 def read_cameras(path: Path, points: np.ndarray) -> None:
     poses = np.tile(np.eye(4), (len(points), 1, 1))
     poses[:, :3, 3] = points
-    settled(path / "a.json", [PosedFrame(f"{k}", path / f"{k}", pose, {}) for k, pose in enumerate(poses)], [])
+    sort_frames(path / "a.json", [PosedFrame(f"{k}", path / f"{k}", pose, {}) for k, pose in enumerate(poses)], [])
 
 
 def splats_by(name, write):

@@ -6,20 +6,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.maths import sphere
-from nerg_mi.maths.sphere import DEGREES, fibonacci_directions, harmonics, rotated_harmonics
+from nerg_mi.maths.sphere import HARMONIC_DEGREES, fibonacci_directions, eval_harmonics, rotated_harmonics
 
 # ---- Harmonics ----
 
 
-@pytest.mark.parametrize("degree", DEGREES.values())
+@pytest.mark.parametrize("degree", HARMONIC_DEGREES.values())
 def test_they_are_those_of_drjit(degree):
     d = fibonacci_directions(50)
     theirs = dr.sh_eval(dr.llvm.Array3f(d.T.astype(np.float32)), degree)
-    assert np.abs(harmonics(d, degree) - np.stack(np.broadcast_arrays(*map(np.array, theirs)), axis=1)).max() < 1e-6
+    assert np.abs(eval_harmonics(d, degree) - np.stack(np.broadcast_arrays(*map(np.array, theirs)), axis=1)).max() < 1e-6
 
 
 def test_they_are_orthonormal():
-    y = harmonics(fibonacci_directions(20_000), 3)
+    y = eval_harmonics(fibonacci_directions(20_000), 3)
     assert np.abs(y.T @ y * (4 * np.pi / len(y)) - np.eye(16)).max() < 1e-3
 
 
@@ -28,7 +28,7 @@ def test_a_turned_function_is_turned():
     c, d = rng.normal(size=(5, 16, 3)), fibonacci_directions(100)
     turn = Rotation.random(random_state=rng).as_matrix()
     turned = rotated_harmonics(c, turn)
-    at = lambda c, d: np.einsum("dk,nkc->ndc", harmonics(d, 3), c)
+    at = lambda c, d: np.einsum("dk,nkc->ndc", eval_harmonics(d, 3), c)
     assert np.abs(at(turned, d) - at(c, d @ turn)).max() < 1e-12
 
 
@@ -58,7 +58,7 @@ def test_the_spiral_of_kernels_is_the_same(rgb, count):
 
 
 def test_uniform_directions_have_no_preference():
-    x = sphere.uniform_directions(100_000, np.random.default_rng(1))
+    x = sphere.sample_uniform_directions(100_000, np.random.default_rng(1))
     assert np.abs(x.mean(axis=0)).max() < 0.01
     assert np.allclose(np.cov(x.T), np.eye(3) / 3, atol=0.01)
 
@@ -100,6 +100,6 @@ def test_neighbours_follow_each_other():
 def test_numbers_in_a_cone_are_those_of_the_directions_in_it(angle):
     d = sphere.fibonacci_directions(5000)
     for axis in np.concatenate([np.eye(3), -np.eye(3), d[[17]]]):
-        numbers = sphere.numbers_in_cone(5000, axis, angle)
+        numbers = sphere.indices_in_cone(5000, axis, angle)
         assert np.array_equal(numbers, np.flatnonzero(d @ axis >= np.cos(angle)))
         assert np.array_equal(sphere.fibonacci_directions(5000, numbers), d[numbers])

@@ -9,15 +9,15 @@ from nerg_mi.photos import cameras
 from nerg_mi.photos.cameras import (
     Intrinsics,
     PosedCamera,
-    all_used,
-    area_average,
-    nearest,
-    overlap,
+    resize_mask,
+    resize_by_area,
+    resize_nearest,
+    make_area_weights,
     pixel_directions,
     pixel_grid,
     project,
-    sensor_dict,
-    view_tangents,
+    make_sensor_dict,
+    find_view_tangents,
 )
 from tests.reference import opencv
 
@@ -51,12 +51,12 @@ def test_view_tangents_hold_every_pixel(fisheye):
     i = replace(FOX, fisheye=True, p1=0.0, p2=0.0) if fisheye else FOX
     d = pixel_directions(i)
     x, y = d[..., 0] / -d[..., 2], d[..., 1] / d[..., 2]
-    left, right, up, down = view_tangents(i)
+    left, right, up, down = find_view_tangents(i)
     # The outermost centres lie half a pixel inside.
     for limit, reached in ((left, -x.min()), (right, x.max()), (up, -y.min()), (down, y.max())):
         assert reached < limit < reached + 0.01
-    assert view_tangents(Intrinsics(10, 20, 10.0, 10.0, 4.0, 9.0)) == pytest.approx((0.4, 0.6, 0.9, 1.1))
-    assert max(view_tangents(Intrinsics(10, 10, 2.0, 2.0, 5.0, 5.0, fisheye=True))) == pytest.approx(
+    assert find_view_tangents(Intrinsics(10, 20, 10.0, 10.0, 4.0, 9.0)) == pytest.approx((0.4, 0.6, 0.9, 1.1))
+    assert max(find_view_tangents(Intrinsics(10, 10, 2.0, 2.0, 5.0, 5.0, fisheye=True))) == pytest.approx(
         np.tan(np.radians(85))
     )
 
@@ -77,7 +77,7 @@ def test_mitsuba_sensor_sends_the_same_rays(rgb):
     """Principal point off the centre, no square picture."""
     i = Intrinsics(32, 20, 25.0, 25.0, 14.0, 11.5)
     camera = PosedCamera(i, pose(np.random.default_rng(3)))
-    sensor = rgb.load_dict(sensor_dict(camera))
+    sensor = rgb.load_dict(make_sensor_dict(camera))
     x, y = np.meshgrid((np.arange(32) + 0.5) / 32, (np.arange(20) + 0.5) / 20)
     ray, _ = sensor.sample_ray(0.0, 0.5, rgb.Point2f(x.ravel(), y.ravel()), rgb.Point2f(0.5, 0.5))
     expected = (pixel_directions(i) @ camera.to_world[:3, :3].T).reshape(-1, 3)
@@ -86,11 +86,11 @@ def test_mitsuba_sensor_sends_the_same_rays(rgb):
 
 def test_sensor_refuses_what_it_cannot_express():
     with pytest.raises(ValueError, match="distortion"):
-        sensor_dict(PosedCamera(FOX, np.eye(4)))
+        make_sensor_dict(PosedCamera(FOX, np.eye(4)))
     with pytest.raises(ValueError, match="fisheye"):
-        sensor_dict(PosedCamera(Intrinsics(8, 8, 10.0, 10.0, 4.0, 4.0, fisheye=True), np.eye(4)))
+        make_sensor_dict(PosedCamera(Intrinsics(8, 8, 10.0, 10.0, 4.0, 4.0, fisheye=True), np.eye(4)))
     with pytest.raises(ValueError, match="square pixels"):
-        sensor_dict(PosedCamera(Intrinsics(8, 8, 10.0, 11.0, 4.0, 4.0), np.eye(4)))
+        make_sensor_dict(PosedCamera(Intrinsics(8, 8, 10.0, 11.0, 4.0, 4.0), np.eye(4)))
 
 
 # ---- A lens on images of other sizes ----
@@ -147,7 +147,7 @@ def test_images_of_directions_equal_opencvs(name):
     d = np.concatenate([rng.uniform(-0.5, 0.5, (50, 2)), np.ones((50, 1))], axis=1) * rng.uniform(0.3, 3, (50, 1))
     if i.fisheye:
         d[:10, 2] *= -1
-    xy, shown = cameras.image(d, i)
+    xy, shown = cameras.directions_to_image(d, i)
     expected = (opencv.fisheye_project if i.fisheye else opencv.project)(d, *arguments(i)) + 0.5
     assert np.allclose((xy * [i.fx, i.fy] + [i.cx, i.cy])[shown], expected[shown], atol=1e-9)
     assert shown[10:].all()
@@ -157,7 +157,7 @@ def test_images_of_directions_equal_opencvs(name):
 def test_rays_project_back_to_their_pixels(name):
     i = LENSES[name]
     xy = pixel_grid(i)
-    back, shown = cameras.image(cameras.rays(xy, i), i)
+    back, shown = cameras.directions_to_image(cameras.image_to_directions(xy, i), i)
     assert shown.all() and np.allclose(back, xy, atol=1e-9)
 
 
@@ -173,22 +173,22 @@ def test_folding_distortion_is_refused():
 def test_a_fisheye_ends_where_its_polynomial_turns():
     """1 - 3 k θ² = 0 at θ = 1: radius 2/3."""
     i = Intrinsics(10, 10, 5.0, 5.0, 5.0, 5.0, -1 / 3, fisheye=True)
-    angle, radius = cameras.fisheye_limit(i)
+    angle, radius = cameras.find_fisheye_limit(i)
     assert angle == pytest.approx(1, abs=1e-3) and radius == pytest.approx(2 / 3, abs=1e-5)
-    assert cameras.fisheye_limit(replace(i, k1=0.0)) == pytest.approx((np.pi, np.pi))
-    assert not cameras.image(np.array([1.0, 0, -1.0]), i)[1]
+    assert cameras.find_fisheye_limit(replace(i, k1=0.0)) == pytest.approx((np.pi, np.pi))
+    assert not cameras.directions_to_image(np.array([1.0, 0, -1.0]), i)[1]
 
 
 def test_what_lies_beyond_the_fold_of_a_pinhole_lens_is_not_shown():
     """r (1 - r²/3) turns at r = 1; the model alone would put a point at r = 1.7 near the centre."""
     i = Intrinsics(10, 10, 5.0, 5.0, 5.0, 5.0, -1 / 3)
-    assert cameras.pinhole_limit(i) == pytest.approx(1)
+    assert cameras.find_pinhole_limit(i) == pytest.approx(1)
     assert np.array_equal(
-        cameras.image(np.array([[0.99, 0, 1], [1.01, 0, 1], [1.7, 0, 1]]), i)[1], [True, False, False]
+        cameras.directions_to_image(np.array([[0.99, 0, 1], [1.01, 0, 1], [1.7, 0, 1]]), i)[1], [True, False, False]
     )
-    assert cameras.pinhole_limit(LENSES["plain"]) == np.inf
+    assert cameras.find_pinhole_limit(LENSES["plain"]) == np.inf
     # A pole of the rational model: 1 - t/4.
-    assert cameras.pinhole_limit(replace(i, k1=0.0, k4=-0.25)) == pytest.approx(4)
+    assert cameras.find_pinhole_limit(replace(i, k1=0.0, k4=-0.25)) == pytest.approx(4)
 
 
 # ---- Pictures at another size, against sums over the pixels that each new one covers ----
@@ -204,28 +204,28 @@ def averaged(image, width, height):
 @pytest.mark.parametrize("size", [(3, 2), (5, 4), (7, 6), (1, 1)])
 def test_areas_are_averaged(size):
     image = np.random.default_rng(0).random((6, 7, 3)).astype(np.float32)
-    assert np.allclose(area_average(image, *size), averaged(image, *size), atol=1e-6)
+    assert np.allclose(resize_by_area(image, *size), averaged(image, *size), atol=1e-6)
 
 
 def test_colours_count_by_their_alpha():
     image = np.zeros((1, 2, 4), np.float32)
     image[0, 0], image[0, 1] = (1, 0.5, 0, 0.25), (0, 0, 1, 0.75)
-    assert np.allclose(area_average(image, 1, 1)[0, 0], [0.25, 0.125, 0.75, 0.5])
-    assert np.all(area_average(image * [1, 1, 1, 0], 1, 1) == 0)
+    assert np.allclose(resize_by_area(image, 1, 1)[0, 0], [0.25, 0.125, 0.75, 0.5])
+    assert np.all(resize_by_area(image * [1, 1, 1, 0], 1, 1) == 0)
 
 
 def test_every_old_pixel_is_shared_out():
-    shares = overlap(7, 3).toarray()
+    shares = make_area_weights(7, 3).toarray()
     assert np.allclose(shares.sum(axis=1), 1) and np.allclose(shares.sum(axis=0), 3 / 7)
 
 
 def test_the_nearest_value_is_that_of_the_centre():
     values = np.arange(12.0).reshape(3, 4)
-    assert np.array_equal(nearest(values, 2, 1), [[5, 7]]) and np.array_equal(nearest(values, 4, 3), values)
+    assert np.array_equal(resize_nearest(values, 2, 1), [[5, 7]]) and np.array_equal(resize_nearest(values, 4, 3), values)
 
 
 def test_a_pixel_counts_where_all_of_it_does():
     mask = np.ones((4, 4), bool)
     mask[1, 2] = False
-    assert np.array_equal(all_used(mask, 2, 2), [[True, False], [True, True]])
-    assert all_used(mask, 4, 4) is mask
+    assert np.array_equal(resize_mask(mask, 2, 2), [[True, False], [True, True]])
+    assert resize_mask(mask, 4, 4) is mask

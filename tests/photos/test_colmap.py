@@ -16,13 +16,13 @@ from nerg_mi.errors import NergError
 from nerg_mi.photos import colmap
 from nerg_mi.photos.colmap import (
     describe_other_models,
-    find_source,
-    find_up,
-    model_files,
+    find_pose_source,
+    estimate_up,
+    find_model_files,
     read_colmap,
     read_image_poses,
     read_named_poses,
-    turn_to_z,
+    rotation_to_z,
 )
 from nerg_mi.photos.transforms import read_transforms
 
@@ -163,7 +163,7 @@ def test_missing_images_and_masks_are_listed(model):
     (masks / (NAMES[1] + ".png")).write_bytes(b"")
     (masks / NAMES[2]).write_bytes(b"")
     posed = read_colmap(model, images, masks)
-    assert [f.name for f in posed.frames] == sorted(NAMES[1:3]) and not any(f.mask.hides for f in posed.frames)
+    assert [f.name for f in posed.frames] == sorted(NAMES[1:3]) and not any(f.mask.is_inverted for f in posed.frames)
     reasons = {u.name: u.reason for u in posed.unused}
     assert "does not exist" in reasons[NAMES[0]] and "mask" in reasons[NAMES[3]]
 
@@ -218,7 +218,7 @@ def test_a_bad_line_of_text_is_numbered(tmp_path, name):
 
 
 def test_a_folder_without_a_model(tmp_path):
-    assert model_files(tmp_path) is None
+    assert find_model_files(tmp_path) is None
     with pytest.raises(FileNotFoundError, match="no COLMAP model"):
         read_colmap(tmp_path, tmp_path)
 
@@ -382,7 +382,7 @@ def test_more_than_is_read_is_refused_before_it_is_read(tmp_path, monkeypatch, w
     monkeypatch.setattr(colmap, "file_sha256", lambda path: pytest.fail("it was read to its end"))
     write(tmp_path, NAMES[:1], {} if name == "images" else {1: CAMERAS[1]})
     with monkeypatch.context() as limits, pytest.raises(NergError, match=f"{name}.* more than the 0 that are read"):
-        limits.setattr(colmap, "POINTS" if name == "points3D" else "IMAGES", 0)
+        limits.setattr(colmap, "MAX_POINTS" if name == "points3D" else "MAX_IMAGES", 0)
         read_colmap(tmp_path, tmp_path)
     path = next(tmp_path.glob(f"{name}.*"))
     with path.open("r+b") as out:
@@ -461,7 +461,7 @@ def test_of_several_models_the_largest_is_taken(tmp_path, base, counts):
     for name, count in counts.items():
         write_colmap(tmp_path / base / name, some_poses(count))
     best = max(counts, key=lambda name: counts[name])
-    assert find_source(tmp_path).resolve() == (tmp_path / base / best).resolve()
+    assert find_pose_source(tmp_path).resolve() == (tmp_path / base / best).resolve()
     (note,) = describe_other_models(tmp_path / base / best)
     assert f"of {len(counts)} COLMAP models" in note and f"({max(counts.values())} images) is used" in note
 
@@ -472,7 +472,7 @@ def test_binary_models_are_counted_by_their_header(tmp_path):
         (tmp_path / "sparse" / name).mkdir(parents=True)
         for file in ("cameras.bin", "images.bin"):
             (tmp_path / "sparse" / name / file).write_bytes(count.to_bytes(8, "little"))
-    assert find_source(tmp_path).name == "1"
+    assert find_pose_source(tmp_path).name == "1"
     assert describe_other_models(tmp_path / "sparse/0")[0].endswith('"0" (2 images) is used, and not "1" (24 images)')
 
 
@@ -481,7 +481,7 @@ def test_notes_on_a_model_come_with_its_poses(tmp_path):
         write_colmap(tmp_path / "sparse" / name, some_poses(count))
     images = tmp_path / "sparse/1/images.txt"
     images.write_text("# Number of images: 24, mean observations per image: 0\n" + images.read_text())
-    few, other = read_named_poses(find_source(tmp_path)).notes
+    few, other = read_named_poses(find_pose_source(tmp_path)).notes
     assert "has 4 records, but its header states 24" in few and '"1" (4 images) is used' in other
 
 
@@ -520,13 +520,13 @@ NOTHING = np.zeros((0, 3))
 
 @pytest.mark.parametrize("arc, most", [(2 * np.pi, 0.01), (np.pi, 1.0), (np.pi / 2, 4.0)])
 def test_level_cameras_tell_it_wherever_they_look_down(arc, most):
-    up = find_up(*turned(around(arc=arc), NOTHING))
-    assert angle(up.direction) < most and up.roll < most and up.plane is None and up.sure
+    up = estimate_up(*turned(around(arc=arc), NOTHING))
+    assert angle(up.direction) < most and up.median_roll < most and up.plane_fraction is None and up.is_reliable
 
 
 def test_cameras_that_all_look_ahead_tell_it_by_their_pictures():
     """Their horizontal axes agree, and leave open how far they look down."""
-    up = find_up(*turned(np.repeat(around(1, down=10), 8, axis=0), NOTHING))
+    up = estimate_up(*turned(np.repeat(around(1, down=10), 8, axis=0), NOTHING))
     assert angle(up.direction) == pytest.approx(10, abs=0.01)
 
 
@@ -534,8 +534,8 @@ def test_a_few_that_are_held_on_end_do_not_matter():
     poses = around(30)
     quarter = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
     poses[::6, :3, :3] = poses[::6, :3, :3] @ quarter
-    up = find_up(*turned(poses, NOTHING))
-    assert angle(up.direction) < 1 and up.sure
+    up = estimate_up(*turned(poses, NOTHING))
+    assert angle(up.direction) < 1 and up.is_reliable
 
 
 def floor(count: int = 900, walls: int = 900) -> np.ndarray:
@@ -547,9 +547,9 @@ def floor(count: int = 900, walls: int = 900) -> np.ndarray:
 
 def test_a_floor_is_more_exact_than_hands():
     poses, points = turned(around(roll=20, seed=1), floor())
-    by_hands, up = find_up(poses, NOTHING), find_up(poses, points)
+    by_hands, up = estimate_up(poses, NOTHING), estimate_up(poses, points)
     assert angle(up.direction) < 0.3 < angle(by_hands.direction)
-    assert 0.35 < up.plane < 0.55 and up.between == pytest.approx(angle(by_hands.direction), abs=0.4)
+    assert 0.35 < up.plane_fraction < 0.55 and up.plane_angle == pytest.approx(angle(by_hands.direction), abs=0.4)
     assert "plane of" in str(up) and "no plane" in str(by_hands)
 
 
@@ -559,14 +559,14 @@ def test_walls_ceilings_and_lines_are_no_floor():
     ceiling = floor(walls=0) + [0, 0, 6]
     edge = np.random.default_rng(0).uniform(-2, 2, (900, 3)) * [1, 0.003, 0.003]
     for points in (walls, ceiling, edge):
-        assert find_up(*turned(poses, points)).plane is None
+        assert estimate_up(*turned(poses, points)).plane_fraction is None
 
 
 def test_cameras_that_do_not_agree_say_so():
-    assert not find_up(*turned(around(roll=180), NOTHING)).sure
+    assert not estimate_up(*turned(around(roll=180), NOTHING)).is_reliable
 
 
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.6, 0, -0.8]])
 def test_up_becomes_z(up):
-    turn = turn_to_z(np.array(up, float))
+    turn = rotation_to_z(np.array(up, float))
     assert np.allclose(turn @ up, [0, 0, 1]) and np.allclose(turn @ turn.T, np.eye(3)) and np.linalg.det(turn) > 0

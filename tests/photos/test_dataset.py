@@ -9,7 +9,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
-from nerg_mi.photos.dataset import explain_wrong_depth, open_dataset, place_extent, scene_box, unmatched
+from nerg_mi.photos.dataset import explain_wrong_depth, open_dataset, estimate_extent, estimate_box, find_unmatched
 from tests.photos.written_sets import (
     COUNT,
     FISHEYE,
@@ -56,20 +56,20 @@ INSIDE = [looking(c, c + d) for c, d in zip(np.random.default_rng(4).uniform(0, 
 
 
 def test_around_an_object():
-    box, _ = scene_box(AROUND)
+    box, _ = estimate_box(AROUND)
     assert np.allclose(box.center, [1, 2, 3], atol=1e-6) and box.side == pytest.approx(10)
-    assert scene_box(AROUND, object_only=True)[0].side == pytest.approx(4)
+    assert estimate_box(AROUND, object_only=True)[0].side == pytest.approx(4)
 
 
 def test_in_a_room():
-    box, how = scene_box(INSIDE)
+    box, how = estimate_box(INSIDE)
     assert "around the cameras" in how
     assert np.all(np.array(box.lower) < 0) and np.all(np.array(box.upper) > 4)
 
 
 def test_at_one_point():
     with pytest.raises(ValueError, match="--aabb"):
-        scene_box([looking(np.zeros(3), d) for d in directions(5)])
+        estimate_box([looking(np.zeros(3), d) for d in directions(5)])
 
 
 def walls(count=4000):
@@ -83,7 +83,7 @@ def walls(count=4000):
 def test_points_on_the_walls_of_a_room_give_its_box():
     """Stray points behind mirrors and windows do not widen it; the walls lie inside by a few percent."""
     strays = np.random.default_rng(7).uniform(-60, 60, (12, 3))
-    box, how = scene_box(INSIDE, points=np.concatenate([walls(), strays]))
+    box, how = estimate_box(INSIDE, points=np.concatenate([walls(), strays]))
     assert "points" in how
     assert np.all(np.array(box.lower) < -1) and np.all(np.array(box.lower) > -1.5)
     assert np.all(np.array(box.upper) > [5, 4, 2]) and np.all(np.array(box.upper) < [5.5, 4.5, 2.5])
@@ -92,34 +92,34 @@ def test_points_on_the_walls_of_a_room_give_its_box():
 def test_points_far_behind_an_object_do_not_count():
     far = 300 * directions(500, 8)
     near = np.array([1, 2, 3]) + directions(2000, 9)
-    box, _ = scene_box(AROUND, points=np.concatenate([far, near]))
+    box, _ = estimate_box(AROUND, points=np.concatenate([far, near]))
     assert box.side == pytest.approx(10)
-    assert scene_box(AROUND, points=near)[0].side == pytest.approx(2.2, rel=0.02)
+    assert estimate_box(AROUND, points=near)[0].side == pytest.approx(2.2, rel=0.02)
 
 
 def test_few_points_are_no_evidence():
-    assert "cameras" in scene_box(INSIDE, points=walls(50))[1]
+    assert "cameras" in estimate_box(INSIDE, points=walls(50))[1]
 
 
 def test_a_camera_that_sees_what_no_other_does_is_found():
     box = Box((-3, -3, -3), (5, 7, 9))
-    assert unmatched(AROUND, box) == []
+    assert find_unmatched(AROUND, box) == []
     away = looking(np.array([1, 2, 8.9]), [1, 2, 30])
     ring = [looking(np.array([1 + 4 * np.cos(a), 2 + 4 * np.sin(a), 3]), [1, 2, 3]) for a in np.arange(0, 6, 0.5)]
-    assert unmatched([*ring[:4], away, *ring[4:]], Box((-3, -3, -3), (5, 7, 40))) == [4]
+    assert find_unmatched([*ring[:4], away, *ring[4:]], Box((-3, -3, -3), (5, 7, 40))) == [4]
     outside = looking(np.array([100.0, 0, 0]), [200, 0, 0])
-    assert unmatched([*AROUND, outside], box) == [20]
+    assert find_unmatched([*AROUND, outside], box) == [20]
 
 
 def test_an_object_before_nothing_ends_at_its_box():
-    extent = place_extent(AROUND, object_only=True)
-    assert extent.kind == "object" and not extent.box.contracted and extent.box == scene_box(AROUND, True)[0]
+    extent = estimate_extent(AROUND, object_only=True)
+    assert extent.kind == "object" and not extent.box.is_contracted and extent.box == estimate_box(AROUND, True)[0]
 
 
 def test_a_room_ends_at_its_walls_in_spite_of_strays():
     strays = np.random.default_rng(7).uniform(-60, 60, (12, 3))
-    extent = place_extent(INSIDE, points=np.concatenate([walls(), strays]))
-    assert extent.kind == "room" and not extent.box.contracted and "0.3 % of the points" in extent.why
+    extent = estimate_extent(INSIDE, points=np.concatenate([walls(), strays]))
+    assert extent.kind == "room" and not extent.box.is_contracted and "0.3 % of the points" in extent.reason
 
 
 def test_a_place_whose_points_lie_beyond_its_box_has_no_end():
@@ -127,31 +127,31 @@ def test_a_place_whose_points_lie_beyond_its_box_has_no_end():
         1 + np.random.default_rng(8).uniform(0, 2, (900, 3)),
         np.random.default_rng(9).uniform(-90, 90, (100, 3)),
     )
-    extent = place_extent(AROUND, points=np.concatenate([near, far]))
-    assert extent.kind == "unbounded" and extent.box.contracted and "% of the points on surfaces lie" in extent.why
+    extent = estimate_extent(AROUND, points=np.concatenate([near, far]))
+    assert extent.kind == "unbounded" and extent.box.is_contracted and "% of the points on surfaces lie" in extent.reason
     # Nine tenths of the points lie within the box that the cameras bound, whose longest edge is the core's.
-    box = scene_box(AROUND, points=np.concatenate([near, far]))[0]
+    box = estimate_box(AROUND, points=np.concatenate([near, far]))[0]
     assert extent.box.side == pytest.approx(box.side) and np.allclose(extent.box.center, box.center)
 
 
 def test_the_core_holds_nine_tenths_of_the_points_within_reason():
     points = np.random.default_rng(9).uniform(-20, 20, (4000, 3)) + [1, 2, 3]
-    extent = place_extent(AROUND, points=points)
+    extent = estimate_extent(AROUND, points=points)
     inside = np.all((points > extent.box.core.lower) & (points < extent.box.core.upper), axis=1)
     assert extent.kind == "unbounded" and inside.mean() == pytest.approx(0.9, abs=0.01)
-    assert place_extent(AROUND, points=points * 100).box.side == pytest.approx(4 * 10)
+    assert estimate_extent(AROUND, points=points * 100).box.side == pytest.approx(4 * 10)
 
 
 def test_a_few_points_far_away_do_not_make_a_room_of_a_street():
     far = np.random.default_rng(10).uniform(-400, 400, (200, 3))
-    extent = place_extent(INSIDE, points=np.concatenate([walls(3800), far]))
-    assert extent.kind == "unbounded" and "nine tenths" in extent.how and extent.box.side < 12
+    extent = estimate_extent(INSIDE, points=np.concatenate([walls(3800), far]))
+    assert extent.kind == "unbounded" and "nine tenths" in extent.source and extent.box.side < 12
 
 
 def test_where_nothing_tells_a_place_ends_at_its_box():
     for cameras in (AROUND, INSIDE):
-        extent = place_extent(cameras)
-        assert extent.kind == "room" and extent.box == scene_box(cameras)[0] and "no points" in extent.why
+        extent = estimate_extent(cameras)
+        assert extent.kind == "room" and extent.box == estimate_box(cameras)[0] and "no points" in extent.reason
 
 
 def facing(distance):
@@ -165,8 +165,8 @@ def test_what_stands_between_cameras_and_points_is_within_the_box():
     """It may have no points: a plain wall, a blurred frame at the border of a photo."""
     cameras, points = facing(2)
     centers = np.array([c.center for c in cameras])
-    extent = place_extent(cameras, points=points)
-    assert extent.kind == "room" and extent.how.endswith("and the cameras") and not extent.box.contracted
+    extent = estimate_extent(cameras, points=points)
+    assert extent.kind == "room" and extent.source.endswith("and the cameras") and not extent.box.is_contracted
     for p in np.concatenate([centers, 0.5 * (centers + [0, 0, 1])]):
         assert np.all(p >= np.subtract(extent.box.lower, 1e-9)) and np.all(p <= extent.box.upper)
     # The wall itself ends where its points do.
@@ -175,28 +175,28 @@ def test_what_stands_between_cameras_and_points_is_within_the_box():
 
 def test_cameras_far_outside_of_the_points_make_a_place_without_an_end():
     cameras, points = facing(30)
-    extent = place_extent(cameras, points=points)
-    assert extent.kind == "unbounded" and extent.box.contracted and "far outside" in extent.why
+    extent = estimate_extent(cameras, points=points)
+    assert extent.kind == "unbounded" and extent.box.is_contracted and "far outside" in extent.reason
     assert extent.box.core.side < 6
 
 
 def test_nothing_stands_before_what_depth_shows():
     cameras, points = facing(2)
-    box = place_extent(cameras, points=points, complete=True).box
-    assert box == scene_box(cameras, points=points)[0] and box.lower[1] > -1
+    box = estimate_extent(cameras, points=points, are_points_complete=True).box
+    assert box == estimate_box(cameras, points=points)[0] and box.lower[1] > -1
 
 
 def test_cameras_within_leave_a_box_as_it_is():
     centers = np.random.default_rng(4).uniform(0, 1.5, (20, 3))
     cameras = [looking(c, c + d) for c, d in zip(centers, directions(20))]
-    extent = place_extent(cameras, points=walls())
-    assert extent.box == scene_box(cameras, points=walls())[0] and "cameras" not in extent.how
+    extent = estimate_extent(cameras, points=walls())
+    assert extent.box == estimate_box(cameras, points=walls())[0] and "cameras" not in extent.source
 
 
 def test_points_just_beyond_the_others_are_within_the_box_and_strays_are_not():
     """Plain parts of a place have few points, which are no strays for that."""
     few, strays = np.tile([[8.0, 2, 0.5]], (12, 1)), np.full((3, 3), 40.0)
-    box, _ = scene_box(INSIDE, points=np.concatenate([walls(), few, strays]))
+    box, _ = estimate_box(INSIDE, points=np.concatenate([walls(), few, strays]))
     assert 8 < box.upper[0] < 9 and box.upper[1] < 5 and box.upper[2] < 3
 
 
@@ -278,7 +278,7 @@ def test_masks_and_depth_arrive_at_the_chosen_size(ring, rgb):
     assert view.mask.shape == (5, 7) and view.mask[:, :2].all() and not view.mask[:, 2:].any()
     ahead = -pixel_directions(view.camera.intrinsics)[..., 2]
     assert np.allclose(view.depth * ahead, 2.5, rtol=1e-5) and view.pixels.dtype == np.uint16
-    assert "metre" in data.unit
+    assert "metre" in data.unit_note
     rgb.Bitmap(np.zeros((H, W), np.uint8)).write(str(ring / "mask.png"))
     with pytest.raises(ValueError, match="every pixel"):
         open_dataset(ring)
@@ -296,7 +296,7 @@ def test_box_unit_and_scale(ring):
     rewrite(ring, lambda c: c.update(aabb=box))
     data = open_dataset(ring, scale=0.5)
     assert np.allclose(data.box.lower, [-0.51875] * 3) and np.allclose(data.box.upper, [0.51875, 1.01875, 0.51875])
-    assert "counts 0.5" in data.unit and np.allclose(data.source["to_file"], np.diag([2, 2, 2, 1]))
+    assert "counts 0.5" in data.unit_note and np.allclose(data.source["to_file"], np.diag([2, 2, 2, 1]))
     centers = np.array([v.camera.center for v in open_dataset(ring, holdout=0).train])
     assert np.allclose([v.camera.center for v in open_dataset(ring, holdout=0, scale=0.5).train], centers / 2)
     given = open_dataset(ring, aabb=(0, 0, 0, 1, 1, 1))
@@ -313,9 +313,9 @@ def test_depth_finds_the_box(ring):
     data = open_dataset(ring, holdout=0)
     points = np.concatenate([(o + 2 * d).reshape(-1, 3) for o, d in (expected_rays(OPENCV, p) for p in cameras_())])
     lower, upper = np.quantile(points, [0.0005, 0.9995], axis=0)
-    assert "points on surfaces" in data.box_from
+    assert "points on surfaces" in data.box_source
     assert np.allclose(data.box.lower, lower - 0.05 * np.max(upper - lower), atol=1e-3)
-    assert data.train[0].depth.dtype == np.float32 and "box" not in open_dataset(ring, depth=False).box_from
+    assert data.train[0].depth.dtype == np.float32 and "box" not in open_dataset(ring, depth=False).box_source
 
 
 def test_the_fox_has_the_rays_that_it_always_had(recorded):

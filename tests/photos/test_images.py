@@ -14,17 +14,17 @@ from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.images import (
     PhotoView,
-    load_usable,
+    load_usable_views,
     load_view,
-    pinhole,
+    make_pinhole_camera,
     read_depth,
     read_image,
     read_mask,
     read_photo,
     read_split,
     split_holdout,
-    through_lens,
-    undistorted,
+    apply_lens,
+    undistort_photo,
 )
 from nerg_mi.photos.posed import DepthFile, MaskFile, PosedFrame
 from nerg_mi.photos.transforms import read_transforms
@@ -76,7 +76,7 @@ def dataset(tmp_path, rgb):
 
 def test_pixels_are_kept_as_stored(dataset):
     folder, pictures = dataset
-    views, unused = load_usable(read_transforms(folder / "transforms.json").frames, depth=True)
+    views, unused = load_usable_views(read_transforms(folder / "transforms.json").frames, depth=True)
     assert not unused and all(v.pixels.dtype == np.uint8 for v in views)
     assert np.array_equal(np.array([v.pixels for v in views]), pictures)
     assert np.allclose(views[2].color * 255, pictures[2], atol=1e-4)
@@ -109,7 +109,7 @@ def test_downscale_and_width_errors(dataset):
 def test_wrong_depth_is_named(dataset):
     folder, _ = dataset
     np.save(folder / "00.npy", np.zeros((3, 3), np.float32))
-    views, unused = load_usable(read_transforms(folder / "transforms.json").frames, depth=True)
+    views, unused = load_usable_views(read_transforms(folder / "transforms.json").frames, depth=True)
     assert len(views) == 9 and unused[0].name == "00.png" and "00.npy" in unused[0].reason
 
 
@@ -230,7 +230,7 @@ def test_masks_are_white_above_half(tmp_path, rgb, values):
     white = np.array([[0, 1, 0], [0, 0, 1]], bool)
     rgb.Bitmap(values).write(str(tmp_path / "a.png"))
     assert np.array_equal(read_mask(MaskFile(tmp_path / "a.png"), (2, 3)), white)
-    assert np.array_equal(read_mask(MaskFile(tmp_path / "a.png", hides=True), (2, 3)), ~white)
+    assert np.array_equal(read_mask(MaskFile(tmp_path / "a.png", is_inverted=True), (2, 3)), ~white)
     opaque = np.full_like(values, np.iinfo(values.dtype).max)
     rgb.Bitmap(np.dstack([*3 * [values], opaque]), rgb.Bitmap.PixelFormat.RGBA).write(str(tmp_path / "b.png"))
     assert np.array_equal(read_mask(MaskFile(tmp_path / "b.png"), (2, 3)), white)
@@ -345,7 +345,7 @@ def test_blender_style_folders_keep_their_split(tmp_path, rgb):
     assert [v.name for v in data.train] == [f"./train/r_{k}" for k in range(5)]
     assert [v.name for v in data.held_out] == [f"./test/r_{k}" for k in range(6, 9)]
     assert (
-        data.source["held_out"]["how"] == "transforms_test.json" and data.box_from == "the region that the views share"
+        data.source["held_out"]["how"] == "transforms_test.json" and data.box_source == "the region that the views share"
     )
     plain = Intrinsics(W, H, *2 * [W / 2 / np.tan(angle / 2)], W / 2, H / 2)
     for view, k in zip(data.train, parts["train"]):
@@ -398,14 +398,14 @@ def tip(content, turn):
 
 def test_upright_coordinates_have_up_along_z(ring):
     level = open_dataset(ring, holdout=0)
-    assert level.up.startswith("up is +z") and np.allclose(level.source["up"], [0, 0, 1], atol=0.02)
+    assert level.up_note.startswith("up is +z") and np.allclose(level.source["up"], [0, 0, 1], atol=0.02)
     turn = Rotation.from_euler("xyz", [100, -30, 70], degrees=True).as_matrix()
     rewrite(ring, lambda c: tip(c, turn))
     tipped = open_dataset(ring, holdout=0)
-    assert "--coordinates upright" in tipped.up and "degrees from +z" in tipped.up
+    assert "--coordinates upright" in tipped.up_note and "degrees from +z" in tipped.up_note
     assert np.allclose(tipped.source["up"], turn[:, 2], atol=0.02)
     data = open_dataset(ring, holdout=0, coordinates="upright")
-    assert data.up.startswith("up is +z to 0.0") and np.allclose(data.source["up"], [0, 0, 1], atol=1e-5)
+    assert data.up_note.startswith("up is +z to 0.0") and np.allclose(data.source["up"], [0, 0, 1], atol=1e-5)
     back = np.array(data.source["to_file"])
     for a, b, c in zip(data.train, tipped.train, level.train):
         assert np.allclose(back @ a.camera.to_world, b.camera.to_world, atol=1e-6)
@@ -421,7 +421,7 @@ def test_cameras_that_do_not_agree_on_up_say_so(ring):
 
     rewrite(ring, roll)
     data = open_dataset(ring, holdout=0)
-    assert data.up.startswith("the cameras do not agree") and "up" not in data.source
+    assert data.up_note.startswith("the cameras do not agree") and "up" not in data.source
     with pytest.raises(NergError, match='"file"'):
         open_dataset(ring, holdout=0, coordinates="upright")
 
@@ -518,7 +518,7 @@ def picture_undistort(intrinsics):
 def test_an_undistorted_photo_shows_what_its_sensor_renders(name, rgb):
     """The directions are those of the sensor's own rays, not of this module's idea of them."""
     i = LENSES[name]
-    image, mask, sensor = undistorted(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i)))
+    image, mask, sensor = undistort_photo(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i)))
     rays = rgb.load_dict(sensor)
     x, y = np.meshgrid((np.arange(90) + 0.5) / 90, (np.arange(70) + 0.5) / 70)
     ray, _ = rays.sample_ray(0.0, 0.5, rgb.Point2f(x.ravel(), y.ravel()), rgb.Point2f(0.5, 0.5))
@@ -530,14 +530,14 @@ def test_an_undistorted_photo_shows_what_its_sensor_renders(name, rgb):
 
 def test_an_undistorted_photo_of_a_plain_lens_is_the_photo():
     photo = picture_undistort(PLAIN)
-    image, mask, sensor = undistorted(PhotoView("a", PosedCamera(PLAIN, POSE), photo))
+    image, mask, sensor = undistort_photo(PhotoView("a", PosedCamera(PLAIN, POSE), photo))
     assert np.array_equal(image, photo) and mask.all() and sensor["film"]["width"] == 90
 
 
 def test_what_the_photo_does_not_show_is_masked():
     """A pincushion photo holds less than the pinhole picture of its size; the mask says so pixel by pixel."""
     i = replace(PLAIN, k1=0.3)
-    _, mask, _ = undistorted(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i)))
+    _, mask, _ = undistort_photo(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i)))
     d = pixel_directions(PLAIN)
     x, y = d[..., 0] / -d[..., 2], d[..., 1] / d[..., 2]
     grow = 1 + 0.3 * (x * x + y * y)
@@ -550,9 +550,9 @@ def test_transparent_pixels_lend_no_colour():
     i = LENSES["barrel"]
     color = np.concatenate([picture_undistort(i), np.ones((70, 90, 1), np.float32)], axis=2)
     color[:, 45:] = [1, 0, 1, 0]
-    image, mask, _ = undistorted(PhotoView("a", PosedCamera(i, POSE), color))
+    image, mask, _ = undistort_photo(PhotoView("a", PosedCamera(i, POSE), color))
     clear = mask & (image[..., 3] > 0.5)
-    plain = undistorted(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i))).image
+    plain = undistort_photo(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i))).image
     assert np.abs(image[..., :3] - plain)[clear].max() < 0.15
     assert np.all(image[..., 3][:, 50:] < 0.3)
 
@@ -561,8 +561,8 @@ def test_transparent_pixels_lend_no_colour():
 def test_a_rendering_bent_to_the_lens_equals_the_photo(name):
     i = LENSES[name]
     camera = PosedCamera(i, POSE)
-    source = pinhole(camera, oversample=2.0)
-    bent, mask = through_lens(picture_undistort(source.intrinsics), source, camera)
+    source = make_pinhole_camera(camera, oversample=2.0)
+    bent, mask = apply_lens(picture_undistort(source.intrinsics), source, camera)
     assert mask.all() and bent.shape == (70, 90, 3)
     assert np.abs(bent - picture_undistort(i)).max() < 1e-3
 
@@ -570,8 +570,8 @@ def test_a_rendering_bent_to_the_lens_equals_the_photo(name):
 def test_a_wide_fisheye_is_covered_as_far_as_a_pinhole_reaches():
     i = Intrinsics(80, 80, 26.0, 26.0, 40.0, 40.0, fisheye=True)
     camera = PosedCamera(i, POSE)
-    source = pinhole(camera)
-    bent, mask = through_lens(picture_undistort(source.intrinsics), source, camera)
+    source = make_pinhole_camera(camera)
+    bent, mask = apply_lens(picture_undistort(source.intrinsics), source, camera)
     angle = np.degrees(np.arccos(-pixel_directions(i)[..., 2]))
     assert np.all(mask[angle < 75]) and not np.any(mask[angle > 88])
     assert np.abs(bent - picture_undistort(i))[angle < 75].max() < 5e-3
@@ -579,8 +579,8 @@ def test_a_wide_fisheye_is_covered_as_far_as_a_pinhole_reaches():
 
 def test_errors_of_through_lens():
     camera = PosedCamera(LENSES["barrel"], POSE)
-    source = pinhole(camera)
+    source = make_pinhole_camera(camera)
     with pytest.raises(ValueError, match="pixels"):
-        through_lens(np.zeros((3, 3, 3)), source, camera)
+        apply_lens(np.zeros((3, 3, 3)), source, camera)
     with pytest.raises(ValueError, match="same place"):
-        through_lens(picture_undistort(source.intrinsics), source, PosedCamera(LENSES["barrel"], np.eye(4)))
+        apply_lens(picture_undistort(source.intrinsics), source, PosedCamera(LENSES["barrel"], np.eye(4)))

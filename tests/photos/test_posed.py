@@ -8,7 +8,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.photos import posed
-from nerg_mi.photos.posed import PosedFrame, drop_repeated, read_semidense, rigid_pose
+from nerg_mi.photos.posed import PosedFrame, drop_duplicates, read_semidense, rigid_pose
 from nerg_mi.photos.transforms import read_transforms
 from tests.photos.written_sets import frame
 
@@ -55,7 +55,7 @@ def test_a_scale_within_a_pose_is_taken_out(write):
 def test_a_mirroring_change_of_coordinates_is_refused(write):
     t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png")]}))
     with pytest.raises(ValueError, match="mirroring"):
-        t.moved(np.diag([1.0, 1, -1, 1]))
+        t.transform(np.diag([1.0, 1, -1, 1]))
 
 
 def test_the_nearest_rotation_is_what_a_rounded_pose_means():
@@ -85,7 +85,7 @@ def test_an_image_that_is_listed_again_counts_once(tmp_path):
     (tmp_path / "b.png").symlink_to(tmp_path / "a.png")
     first = PosedFrame("a.png", tmp_path / "a.png", np.eye(4), {})
     again = PosedFrame("b.png", tmp_path / "b.png", np.diag([1.0, -1, -1, 1]), {})
-    kept, unused = drop_repeated([first, again])
+    kept, unused = drop_duplicates([first, again])
     assert kept == [first] and "another pose" in unused[0].reason
 
 
@@ -109,11 +109,11 @@ def test_points_of_one_world_that_are_known_well(tmp_path, monkeypatch):
     points = read_semidense(path)
     assert points.dtype == np.float32 and points.tolist() == [[1, 2, 3], [0.5, 0, -1]]
     assert read_semidense(path, "b").tolist() == [[1, 1, 1]]
-    assert len(read_semidense(path, "a", inv_dist_std=1, dist_std=1)) == 4
+    assert len(read_semidense(path, "a", max_inv_dist_std=1, max_dist_std=1)) == 4
     with pytest.raises(ValueError, match='"c"'):
         read_semidense(path, "c")
     with pytest.raises(ValueError, match="holds no point that is known to 0.005 1/m and -1 m"):
-        read_semidense(path, dist_std=-1)
+        read_semidense(path, max_dist_std=-1)
     monkeypatch.setattr(posed, "_WORLDS", 1)
     with pytest.raises(ValueError, match="more than 1 worlds"):
         read_semidense(path)

@@ -47,7 +47,7 @@ def test_the_sum_is_that_of_the_border(i):
             for p in ((u, 0 * u), (0 * v + i.width, v), (i.width - u, 0 * u + i.height), (0 * v, i.height - v))
         ]
     )
-    d = cameras.rays((edge - [i.cx, i.cy]) / [i.fx, i.fy], i)
+    d = cameras.image_to_directions((edge - [i.cx, i.cy]) / [i.fx, i.fy], i)
     phi, height = np.unwrap(np.arctan2(d[:, 1], d[:, 0])), 1 - d[:, 2]
     turn = np.diff(phi, append=phi[0] + 2 * np.pi)
     expected = np.sum(turn * 0.5 * (height + np.roll(height, -1)))
@@ -70,7 +70,7 @@ def test_a_pixel_has_the_jacobian_of_its_lens(i):
     x, y = np.meshgrid(
         (np.arange(fine.width) + 0.5 - fine.cx) / fine.fx, (np.arange(fine.height) + 0.5 - fine.cy) / fine.fy
     )
-    ray = lambda dx, dy: cameras.rays(np.stack([x + dx, y + dy], axis=-1), i)
+    ray = lambda dx, dy: cameras.image_to_directions(np.stack([x + dx, y + dy], axis=-1), i)
     across = np.cross(ray(h, 0) - ray(-h, 0), ray(0, h) - ray(0, -h)) / (4 * h * h)
     jacobian = np.linalg.norm(across, axis=-1) / (fine.fx * fine.fy)
     assert np.allclose(pixel_solid_angles(fine), jacobian, rtol=5e-4)
@@ -210,10 +210,10 @@ def test_maps_belong_to_frames_by_name(posed):
     write(folder / "maps" / "d.png", np.ones((24, 32), np.uint8))
     found = open_salience(folder, folder / "maps")
     assert (
-        [v.name for v in found.views] == ["a.png", "c.png"] and found.missing == ["b.png"] and found.stray == ["d.png"]
+        [v.name for v in found.views] == ["a.png", "c.png"] and found.frames_without_map == ["b.png"] and found.unmatched_files == ["d.png"]
     )
-    assert found.views[1].share.shape == (24, 32) and np.allclose(found.views[1].camera.center, [2, 0, 0])
-    assert found.about["used"] == 2 and found.about["missing"] == 1
+    assert found.views[1].gaze_fraction.shape == (24, 32) and np.allclose(found.views[1].camera.center, [2, 0, 0])
+    assert found.provenance["used"] == 2 and found.provenance["missing"] == 1
 
     write(folder / "maps" / "a.png", np.ones((48, 64), np.uint8))
     with pytest.raises(ValueError, match='"a.npy" and "a.png"'):
@@ -264,7 +264,7 @@ def test_uniform_gaze_has_a_constant_density(name, posed):
     for per, image in (("steradian", np.ones((48, 64))), ("pixel", solid)):
         write(folder / "maps" / "a.npy", image)
         view = open_salience(folder, folder / "maps", per).views[0]
-        assert view.extent == pytest.approx(solid.sum(), rel=1e-6)
+        assert view.total_solid_angle == pytest.approx(solid.sum(), rel=1e-6)
         assert np.allclose(view.density, 1 / solid.sum(), rtol=1e-5)
 
 
@@ -274,10 +274,10 @@ def test_draws_stand_for_equal_areas(name, posed):
     folder = posed(("a",), **LENSES[name])
     write(folder / "maps" / "a.npy", np.ones((12, 16)))
     view = open_salience(folder, folder / "maps").views[0]
-    directions, which = view.draw(4096, np.random.default_rng(0))
+    directions, which = view.sample(4096, np.random.default_rng(0))
     assert np.allclose(np.linalg.norm(directions, axis=1), 1)
     counts = np.bincount(which, minlength=192)
-    due = 4096 * (view.solid_angle / view.extent).ravel()
+    due = 4096 * (view.solid_angle / view.total_solid_angle).ravel()
     assert np.all(np.abs(counts - due) <= 1.01)
     axis = np.array([-0.95, 0.2, -0.1]) / np.linalg.norm([-0.95, 0.2, -0.1])
     lobe = lambda d: np.exp(8 * (d @ axis - 1))
@@ -286,7 +286,7 @@ def test_draws_stand_for_equal_areas(name, posed):
 
     world = pixel_directions(fine) @ view.camera.to_world[:3, :3].T
     expected = np.sum(lobe(world) * pixel_solid_angles(fine))
-    assert view.extent * lobe(directions).mean() == pytest.approx(expected, rel=0.01)
+    assert view.total_solid_angle * lobe(directions).mean() == pytest.approx(expected, rel=0.01)
 
 
 def test_a_view_is_looked_up_where_it_looks(posed):
@@ -294,11 +294,11 @@ def test_a_view_is_looked_up_where_it_looks(posed):
     image = np.random.default_rng(3).uniform(0.1, 1, (48, 64))
     write(folder / "maps" / "a.npy", image)
     view = open_salience(folder, folder / "maps").views[0]
-    directions, which = view.draw(500, np.random.default_rng(1))
-    density, known = view.look_up(directions)
+    directions, which = view.sample(500, np.random.default_rng(1))
+    density, known = view.evaluate(directions)
     assert known.all() and np.allclose(density, view.density.ravel()[which], rtol=1e-5)
     # The camera looks along -x.
-    assert not view.look_up(np.array([[1.0, 0, 0], [0, 1, 0]]))[1].any()
+    assert not view.evaluate(np.array([[1.0, 0, 0], [0, 1, 0]]))[1].any()
 
 
 def test_fewer_pixels_hold_the_same_gaze(posed):
@@ -306,15 +306,15 @@ def test_fewer_pixels_hold_the_same_gaze(posed):
     image = np.random.default_rng(3).uniform(0, 1, (48, 64))
     write(folder / "maps" / "a.npy", image)
     view = open_salience(folder, folder / "maps").views[0]
-    small = view.reduced(64 * 48 // 16)
-    assert small.share.shape == (12, 16)
-    assert np.allclose(small.share, view.share.reshape(12, 4, 16, 4).sum(axis=(1, 3)), rtol=1e-4)
+    small = view.reduce(64 * 48 // 16)
+    assert small.gaze_fraction.shape == (12, 16)
+    assert np.allclose(small.gaze_fraction, view.gaze_fraction.reshape(12, 4, 16, 4).sum(axis=(1, 3)), rtol=1e-4)
     assert np.allclose(small.solid_angle, pixel_solid_angles(small.camera.intrinsics), rtol=1e-5)
-    odd = view.reduced(200)
+    odd = view.reduce(200)
     assert (
-        odd.share.size <= 200
-        and odd.extent == pytest.approx(view.extent, rel=1e-5)
-        and odd.share.sum() == pytest.approx(1)
+        odd.gaze_fraction.size <= 200
+        and odd.total_solid_angle == pytest.approx(view.total_solid_angle, rel=1e-5)
+        and odd.gaze_fraction.sum() == pytest.approx(1)
     )
 
 
@@ -333,7 +333,7 @@ def test_masked_pixels_are_unknown(posed):
         and (view.solid_angle[:, 16:] > 0).all()
         and (view.density[:, :16] == 0).all()
     )
-    assert (view.draw(200, np.random.default_rng(0))[1] % 32 >= 16).all()
+    assert (view.sample(200, np.random.default_rng(0))[1] % 32 >= 16).all()
     write(folder / "maps" / "a.npy", np.tile(np.arange(32) < 10, (24, 1)))
     with pytest.raises(ValueError, match="a.npy.*mask"):
         open_salience(folder, folder / "maps")
@@ -354,7 +354,7 @@ def test_a_model_makes_the_maps(posed, rgb):
     photo[20:28, 40:48] = 250
     write(folder / "a.png", photo)
     view = open_salience(folder, "spectral-residual").views[0]
-    y, x = np.unravel_index(np.argmax(view.share), view.share.shape)
+    y, x = np.unravel_index(np.argmax(view.gaze_fraction), view.gaze_fraction.shape)
     assert 16 <= y < 32 and 36 <= x < 52
     write(folder / "a.png", np.full((48, 64, 3), 90, np.uint8))
     with pytest.raises(ValueError, match="a.png.*one colour"):

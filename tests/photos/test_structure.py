@@ -24,20 +24,20 @@ from nerg_mi.photos import structure
 from nerg_mi.photos.colmap import read_colmap
 from nerg_mi.photos.images import read_image
 from nerg_mi.photos.structure import (
-    EXHAUSTIVE,
-    Folders,
+    MAX_EXHAUSTIVE,
+    PhotoFolders,
     PhotoCopy,
-    Settings,
-    cameras_of,
+    StructureSettings,
+    assign_cameras,
     check_installed,
-    chosen_pairs,
+    select_pairs,
     copy_photos,
-    encoded,
+    encode_image,
     list_photos,
     reconstruct,
-    shrunk,
-    small_name,
-    small_size,
+    encode_small_image,
+    small_file_name,
+    fit_size,
 )
 from tests.photos import rendered
 
@@ -45,23 +45,23 @@ from tests.photos import rendered
 
 
 def test_few_are_all_compared():
-    assert chosen_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
-    assert len(chosen_pairs(EXHAUSTIVE)) == EXHAUSTIVE * (EXHAUSTIVE - 1) // 2
-    assert chosen_pairs(4, "exhaustive") == chosen_pairs(4) and chosen_pairs(0) == []
+    assert select_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    assert len(select_pairs(MAX_EXHAUSTIVE)) == MAX_EXHAUSTIVE * (MAX_EXHAUSTIVE - 1) // 2
+    assert select_pairs(4, "exhaustive") == select_pairs(4) and select_pairs(0) == []
 
 
 def test_many_are_compared_with_neighbours_and_landmarks():
-    pairs = chosen_pairs(600)
+    pairs = select_pairs(600)
     assert pairs == sorted(set(pairs)) and all(0 <= i < j < 600 for i, j in pairs)
     assert {(5, 6), (5, 15), (5, 21), (5, 37), (0, 590)} <= set(pairs) and (5, 16) not in pairs
     # The work grows with their number, and not with its square.
-    assert len(pairs) < 600 * 16 + 60 * 60 and len(chosen_pairs(4000)) < 4000 * 19 + 60 * 60
+    assert len(pairs) < 600 * 16 + 60 * 60 and len(select_pairs(4000)) < 4000 * 19 + 60 * 60
 
 
 def test_all_of_many_where_it_is_asked_for():
-    assert len(chosen_pairs(150, "exhaustive")) == 150 * 149 // 2 > len(chosen_pairs(150, "sequential"))
+    assert len(select_pairs(150, "exhaustive")) == 150 * 149 // 2 > len(select_pairs(150, "sequential"))
     with pytest.raises(NergError, match="matching must be auto"):
-        chosen_pairs(4, "vocabulary")
+        select_pairs(4, "vocabulary")
 
 
 # ---- Photos of a folder: turned as they are to be looked at, and what is wrong with others named ----
@@ -74,14 +74,14 @@ def ramp(width: int = 48, height: int = 32, seed: int = 0) -> Image.Image:
 
 
 @pytest.fixture
-def folders(tmp_path) -> Folders:
-    made = Folders(tmp_path / "images", tmp_path / "small")
+def folders(tmp_path) -> PhotoFolders:
+    made = PhotoFolders(tmp_path / "images", tmp_path / "small")
     made.images.mkdir()
-    made.small.mkdir()
+    made.small_images.mkdir()
     return made
 
 
-def copied(folder: Path, folders: Folders, longest: int = 24):
+def copied(folder: Path, folders: PhotoFolders, longest: int = 24):
     steps = []
     pictures, unused = copy_photos(list_photos(folder)[0], folders, longest, lambda *now: steps.append(now))
     assert steps and steps[-1][0] == steps[-1][1] == len(steps)
@@ -102,7 +102,7 @@ def test_what_stands_upright_is_copied_byte_for_byte(folder, folders):
     assert [p.name for p in pictures] == ["a c.png", "b.JPG"] and not unused
     for k, p in enumerate(pictures):
         assert (folders.images / p.name).read_bytes() == (folder / p.name).read_bytes()
-        assert p.size == (48, 32) and p.small == (24, 16) == Image.open(folders.small / small_name(k)).size
+        assert p.size == (48, 32) and p.small_size == (24, 16) == Image.open(folders.small_images / small_file_name(k)).size
         assert p.focal is None
 
 
@@ -139,8 +139,8 @@ def test_notes_tell_focal_length_and_camera(folder, folders):
     ramp(360, 240).save(folder / "a.jpg", exif=notes)
     (picture,), _ = copied(folder, folders)
     # A picture of the shape of film, on which 36 mm are 360 pixels.
-    assert picture.focal == pytest.approx(260, rel=1e-4) and picture.made_by[:2] == ("Maker", "Model")
-    assert float(picture.made_by[2]) == 4.25
+    assert picture.focal == pytest.approx(260, rel=1e-4) and picture.camera_key[:2] == ("Maker", "Model")
+    assert float(picture.camera_key[2]) == 4.25
 
 
 def test_what_cannot_be_used_is_named(folder, folders):
@@ -223,7 +223,7 @@ def test_odd_notes_leave_a_photo_as_it_is(folder, folders):
     ramp(seed=4).save(folder / "4.jpg", exif=damaged)
     pictures, unused = copied(folder, folders)
     assert [p.size for p in pictures] == [(48, 32)] * 5 and not unused
-    assert pictures[4].made_by in ((), ("", "", ""))
+    assert pictures[4].camera_key in ((), ("", "", ""))
 
 
 def test_others_are_named_and_hidden_ones_are_not(folder):
@@ -259,23 +259,23 @@ def test_a_folder_without_photos_is_told(folder, tmp_path):
 
 
 def test_the_longer_side_is_bounded():
-    assert small_size((1080, 1920), 960) == (540, 960)
-    assert small_size((640, 480), 960) == (640, 480) and small_size((5000, 2), 960) == (960, 1)
-    assert small_name(7) == "000007.png"
+    assert fit_size((1080, 1920), 960) == (540, 960)
+    assert fit_size((640, 480), 960) == (640, 480) and fit_size((5000, 2), 960) == (960, 1)
+    assert small_file_name(7) == "000007.png"
 
 
 def test_small_copies_are_averages():
     pixels = np.zeros((40, 60, 3), np.uint8)
     pixels[:, ::2] = 200
-    small = np.asarray(Image.open(io.BytesIO(shrunk(Image.fromarray(pixels), (15, 10)))))
+    small = np.asarray(Image.open(io.BytesIO(encode_small_image(Image.fromarray(pixels), (15, 10)))))
     assert small.shape == (10, 15, 3) and abs(small.astype(int) - 100).max() <= 12
-    assert np.array_equal(np.asarray(Image.open(io.BytesIO(shrunk(Image.fromarray(pixels), (60, 40))))), pixels)
+    assert np.array_equal(np.asarray(Image.open(io.BytesIO(encode_small_image(Image.fromarray(pixels), (60, 40))))), pixels)
 
 
 @pytest.mark.parametrize("suffix, kind", [(".png", "PNG"), (".JPG", "JPEG"), (".jpeg", "JPEG")])
 def test_files_are_of_their_names_kind(suffix, kind):
     image = Image.fromarray(np.full((8, 9), 77, np.uint8))
-    opened = Image.open(io.BytesIO(encoded(image, suffix)))
+    opened = Image.open(io.BytesIO(encode_image(image, suffix)))
     assert opened.format == kind and opened.mode == "RGB" and opened.size == (9, 8)
 
 
@@ -283,9 +283,9 @@ def test_pictures_of_one_size_share_a_camera():
     upright, across = ((3, 4), (3, 4)), ((4, 3), (4, 3))
     sizes = [upright, across, upright, upright]
     pictures = [PhotoCopy(str(k), *size) for k, size in enumerate(sizes)]
-    assert cameras_of(pictures) == [0, 1, 0, 0] and cameras_of(pictures, share=False) == [0, 1, 2, 3]
-    made = [PhotoCopy(str(k), *upright, made_by=("maker", focal)) for k, focal in enumerate(["4.2", "4.2", "9"])]
-    assert cameras_of(made) == [0, 0, 1]
+    assert assign_cameras(pictures) == [0, 1, 0, 0] and assign_cameras(pictures, share_cameras=False) == [0, 1, 2, 3]
+    made = [PhotoCopy(str(k), *upright, camera_key=("maker", focal)) for k, focal in enumerate(["4.2", "4.2", "9"])]
+    assert assign_cameras(made) == [0, 0, 1]
 
 
 # ---- The process that finds poses, from outside: what it is given, and how its end is told ----
@@ -310,13 +310,13 @@ def ending(monkeypatch, program: str) -> None:
 
 def told(tmp_path: Path) -> str:
     with pytest.raises(NergError) as said:
-        reconstruct(PICTURES, tmp_path, Settings(), lambda *now: None)
+        reconstruct(PICTURES, tmp_path, StructureSettings(), lambda *now: None)
     return str(said.value)
 
 
 def test_without_pycolmap(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    for call in (check_installed, lambda: reconstruct(PICTURES, tmp_path, Settings(), lambda *now: None)):
+    for call in (check_installed, lambda: reconstruct(PICTURES, tmp_path, StructureSettings(), lambda *now: None)):
         with pytest.raises(ImportError, match=r'"nerg-mi\[poses\]"'):
             call()
 
@@ -331,7 +331,7 @@ def test_what_is_asked_for(installed, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "settings, said", [(Settings(lens="fish"), "lens must be auto"), (Settings(matching="a"), "matching must be auto")]
+    "settings, said", [(StructureSettings(lens="fish"), "lens must be auto"), (StructureSettings(matching="a"), "matching must be auto")]
 )
 def test_wrong_settings(installed, settings, said, tmp_path):
     with pytest.raises(NergError, match=said):
@@ -364,7 +364,7 @@ def test_it_ends_with_whoever_started_it(installed, monkeypatch, tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(PICTURES, tmp_path, Settings(), progress)
+        reconstruct(PICTURES, tmp_path, StructureSettings(), progress)
     with pytest.raises(ProcessLookupError):
         os.kill(found[0], 0)
 
@@ -380,11 +380,11 @@ def photos(tmp_path_factory):
 
 def found(photos, work):
     """A reconstruction, its model as it is read, and what was told on the way."""
-    folders, steps = Folders(work / "images", work / "small"), []
+    folders, steps = PhotoFolders(work / "images", work / "small"), []
     folders.images.mkdir()
-    folders.small.mkdir()
+    folders.small_images.mkdir()
     pictures, _ = copy_photos(list_photos(photos)[0], folders, 320, lambda *now: None)
-    made = reconstruct(pictures, work, Settings(threads=1), lambda *now: steps.append(now))
+    made = reconstruct(pictures, work, StructureSettings(threads=1), lambda *now: steps.append(now))
     return made, made and read_colmap(work / "sparse" / "0", folders.images), steps
 
 
@@ -419,7 +419,7 @@ def test_poses_and_lens_are_found(first):
     assert angles.max() < 1 and apart.max() < 0.01
     # The model stands upright, and its points are those of a floor and a box on it.
     truth = similarity[:3, :3] / np.cbrt(np.linalg.det(similarity[:3, :3]))
-    assert np.degrees(np.arccos(truth[2, 2])) < 1 and made.up.sure and made.up.plane > 0.3
+    assert np.degrees(np.arccos(truth[2, 2])) < 1 and made.up.sure and made.up.plane_fraction > 0.3
     points = model.points @ similarity[:3, :3].T + similarity[:3, 3]
     low, high = np.quantile(points[:, 2], [0.02, 0.98])
     assert low == pytest.approx(0, abs=0.03) and high == pytest.approx(0.7, abs=0.05)

@@ -63,7 +63,7 @@ def test_masks_of_nerfstudio_and_instant_ngp(write):
     folder = path.parent
     assert [f.mask for f in read_transforms(path).frames] == [
         MaskFile(folder / "m/a.png"),
-        MaskFile(folder / "dynamic_mask_b.png", hides=True),
+        MaskFile(folder / "dynamic_mask_b.png", is_inverted=True),
         None,
     ]
 
@@ -198,9 +198,9 @@ def test_original_coordinates_undo_what_was_applied(write):
             }
         )
     )
-    back = t.moved(t.original)
+    back = t.transform(t.to_original)
     assert np.allclose(back.frames[0].to_world, pose)
-    assert np.allclose(back.original, np.eye(4)) and np.allclose(back.to_file @ t.original, np.eye(4))
+    assert np.allclose(back.to_original, np.eye(4)) and np.allclose(back.to_file @ t.to_original, np.eye(4))
     assert np.allclose(back.aabb[1] - back.aabb[0], np.array([2, 1, 3]) / s)
 
 
@@ -226,7 +226,7 @@ def test_nerfstudios_lists_of_files_split(write):
             names,
         )
     )
-    assert (t.held_out, t.spare) == (["d.png"], ["c.png"])
+    assert (t.held_out, t.unassigned) == (["d.png"], ["c.png"])
 
 
 def test_the_fox(recorded):

@@ -15,8 +15,8 @@ from scipy.ndimage import gaussian_filter
 
 from nerg_mi.errors import NergError
 from nerg_mi.photos import video_frames as module
-from nerg_mi.photos.structure import Folders
-from nerg_mi.photos.video_frames import copy_frames, sharpest_frames, sharpness
+from nerg_mi.photos.structure import PhotoFolders
+from nerg_mi.photos.video_frames import copy_frames, select_sharpest_frames, compute_sharpness
 
 SHARP = (3, 8, 11)
 
@@ -57,12 +57,12 @@ def remux(av, film, path, **metadata):
 
 
 def test_blur_takes_sharpness():
-    assert sharpness(texture()) > 10 * sharpness(gaussian_filter(texture(), 2))
-    assert sharpness(np.full((5, 5), 7)) == 0
+    assert compute_sharpness(texture()) > 10 * compute_sharpness(gaussian_filter(texture(), 2))
+    assert compute_sharpness(np.full((5, 5), 7)) == 0
 
 
 def test_the_sharpest_of_each_stretch(film):
-    found = list(sharpest_frames(film, 3))
+    found = list(select_sharpest_frames(film, 3))
     assert [round(10 * frame.seconds) for frame in found] == list(SHARP)
     for *_, pixels in found:
         assert pixels.shape == (48, 64, 3) and pixels.dtype == np.uint8
@@ -70,17 +70,17 @@ def test_the_sharpest_of_each_stretch(film):
 
 
 def test_more_stretches_than_frames(film):
-    times = [frame.seconds for frame in sharpest_frames(film, 100, threads=1)]
+    times = [frame.seconds for frame in select_sharpest_frames(film, 100, threads=1)]
     assert len(times) == 15 and times == sorted(times)
 
 
 def test_frames_are_copied(film, tmp_path):
-    folders, steps = Folders(tmp_path / "images", tmp_path / "small"), []
+    folders, steps = PhotoFolders(tmp_path / "images", tmp_path / "small"), []
     pictures = copy_frames(film, 3, folders, 32, None, lambda *now: steps.append(now))
     assert [p.name for p in pictures] == [f"frame_{k + 1:06d}.jpg" for k in SHARP]
-    assert [p.small for p in pictures] == [(32, 24)] * 3 and steps == [(1, 3), (2, 3), (3, 3)]
+    assert [p.small_size for p in pictures] == [(32, 24)] * 3 and steps == [(1, 3), (2, 3), (3, 3)]
     assert [Image.open(folders.images / p.name).size for p in pictures] == [(64, 48)] * 3
-    assert len(list(folders.small.iterdir())) == 3 and pictures[1].seconds == pytest.approx(0.8)
+    assert len(list(folders.small_images.iterdir())) == 3 and pictures[1].seconds == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize("name, codec", [("a.mkv", "mpeg4"), ("a.ts", "mpeg2video"), ("a.mp4", "mpeg4")])
@@ -95,7 +95,7 @@ def test_frames_are_numbered_as_they_are_shown(av, tmp_path, name, codec, times)
             frame.pts, frame.time_base = time, Fraction(1, 25)
             out.mux(stream.encode(frame))
         out.mux(stream.encode())
-    frames = list(sharpest_frames(tmp_path / name, 1000, threads=1))
+    frames = list(select_sharpest_frames(tmp_path / name, 1000, threads=1))
     assert [f.number for f in frames] == [round(f.pixels.mean() / 30) for f in frames] == list(range(1, 7))
     assert np.allclose([f.seconds for f in frames], (np.array(times) - times[0]) / 25, atol=2e-3)
 
@@ -123,7 +123,7 @@ def test_what_is_no_video_is_told(av, tmp_path, film):
         ("nowhere.mp4", "there is no video"),
     ):
         with pytest.raises(NergError, match=said):
-            list(sharpest_frames(tmp_path / name, 3))
+            list(select_sharpest_frames(tmp_path / name, 3))
 
 
 def test_sound_alone_is_no_video(av, tmp_path):
@@ -134,13 +134,13 @@ def test_sound_alone_is_no_video(av, tmp_path):
         frame.sample_rate = 8000
         out.mux([*stream.encode(frame), *stream.encode()])
     with pytest.raises(NergError, match="only sound"):
-        list(sharpest_frames(tmp_path / "a.mp4", 3))
+        list(select_sharpest_frames(tmp_path / "a.mp4", 3))
 
 
 def test_frames_may_not_be_too_large(film, monkeypatch):
-    monkeypatch.setattr(module, "PIXELS", 64 * 48 - 1)
+    monkeypatch.setattr(module, "MAX_PIXELS", 64 * 48 - 1)
     with pytest.raises(NergError, match="no frame that can be decoded, of 3,071 pixels at most"):
-        list(sharpest_frames(film, 3))
+        list(select_sharpest_frames(film, 3))
     with pytest.raises(NergError, match="64.*48.*3,071"):
         module._check_size(film, 64, 48)
     with pytest.raises(NergError, match="a side of at most 65,500"):
@@ -163,7 +163,7 @@ def test_nothing_but_the_file_is_opened(name, av, film, tmp_path):
         server.settimeout(0)
         (tmp_path / name).write_text(LISTS[name].format(port=server.getsockname()[1]))
         with pytest.raises(NergError, match="no video of a kind that is read|invalid data found"):
-            list(sharpest_frames(tmp_path / name, 3))
+            list(select_sharpest_frames(tmp_path / name, 3))
         with pytest.raises(BlockingIOError):
             server.accept()
 
@@ -173,14 +173,14 @@ def test_what_a_file_refers_to_is_refused(film, tmp_path, monkeypatch):
     (tmp_path / "a.mp4").write_text(LISTS["a.mp4"])
     monkeypatch.setattr(module, "FORMATS", (*module.FORMATS, "concat"))
     with pytest.raises(NergError, match="cannot be read"):
-        list(sharpest_frames(tmp_path / "a.mp4", 3))
+        list(select_sharpest_frames(tmp_path / "a.mp4", 3))
 
 
 @pytest.mark.parametrize("name", ["12:30.mp4", "http:film.mp4", "concat:a|b.mp4", "-.mp4"])
 def test_a_name_is_no_address(name, film, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     film.rename(name)
-    assert len(list(sharpest_frames(name, 3))) == 3
+    assert len(list(select_sharpest_frames(name, 3))) == 3
 
 
 def test_titles_need_not_be_utf8(av, film, tmp_path):
@@ -188,7 +188,7 @@ def test_titles_need_not_be_utf8(av, film, tmp_path):
     raw = (tmp_path / "a.avi").read_bytes()
     assert b"XXXXXXXX" in raw
     (tmp_path / "a.avi").write_bytes(raw.replace(b"XXXXXXXX", b"caf\xe9\xff\xfe\x80 "))
-    assert len(list(sharpest_frames(tmp_path / "a.avi", 3))) == 3
+    assert len(list(select_sharpest_frames(tmp_path / "a.avi", 3))) == 3
 
 
 def test_unknown_codecs_are_told(film, tmp_path, av):
@@ -196,7 +196,7 @@ def test_unknown_codecs_are_told(film, tmp_path, av):
     # Both what the track says, and what its description does.
     (tmp_path / "a.mp4").write_bytes(raw.replace(b"mp4v", b"xyzw").replace(b"esds", b"free"))
     with pytest.raises(NergError, match="coded in a way"):
-        list(sharpest_frames(tmp_path / "a.mp4", 3))
+        list(select_sharpest_frames(tmp_path / "a.mp4", 3))
 
 
 def test_tables_that_claim_too_much_are_told(film, tmp_path):
@@ -205,7 +205,7 @@ def test_tables_that_claim_too_much_are_told(film, tmp_path):
     raw[at : at + 8] = (1).to_bytes(4, "big") + (30_000_000).to_bytes(4, "big")
     (tmp_path / "a.mp4").write_bytes(raw)
     with pytest.raises(NergError, match="cannot be read: it claims 30,000,000 samples in .*; give a video"):
-        list(sharpest_frames(tmp_path / "a.mp4", 3))
+        list(select_sharpest_frames(tmp_path / "a.mp4", 3))
 
 
 def test_ffmpeg_prints_nothing(film, tmp_path, capfd):
@@ -213,10 +213,10 @@ def test_ffmpeg_prints_nothing(film, tmp_path, capfd):
     at = raw.index(b"mdat") + 60
     raw[at : at + 500] = bytes(500)
     (tmp_path / "b.mp4").write_bytes(raw)
-    list(sharpest_frames(tmp_path / "b.mp4", 3))
+    list(select_sharpest_frames(tmp_path / "b.mp4", 3))
     (tmp_path / "c.mp4").write_bytes(raw[: len(raw) // 2])
     with pytest.raises(NergError, match="cannot be read: [a-z ]+; give a video"):
-        list(sharpest_frames(tmp_path / "c.mp4", 3))
+        list(select_sharpest_frames(tmp_path / "c.mp4", 3))
     assert capfd.readouterr() == ("", "")
 
 
@@ -224,7 +224,7 @@ def test_a_video_that_is_mostly_destroyed_is_told(film, monkeypatch):
     monkeypatch.setattr(module, "_LOST", 2)
     monkeypatch.setattr(module, "_LOST_EACH", -1)
     with pytest.raises(NergError, match="most of the video"):
-        list(sharpest_frames(film, 3))
+        list(select_sharpest_frames(film, 3))
 
 
 def test_a_damaged_stretch_is_passed_over(film, tmp_path):
@@ -233,7 +233,7 @@ def test_a_damaged_stretch_is_passed_over(film, tmp_path):
     middle = at + (len(raw) - at) // 3
     raw[middle : middle + 200] = bytes(200)
     (tmp_path / "b.mp4").write_bytes(raw)
-    assert len(list(sharpest_frames(tmp_path / "b.mp4", 3))) == 3
+    assert len(list(select_sharpest_frames(tmp_path / "b.mp4", 3))) == 3
 
 
 def test_frames_that_are_hardly_wide_are_compared():
@@ -247,4 +247,4 @@ def test_without_pyav(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     (tmp_path / "a.mp4").write_bytes(b"film")
     with pytest.raises(ImportError, match=r'"nerg-mi\[poses\]\"'):
-        list(sharpest_frames(tmp_path / "a.mp4", 3))
+        list(select_sharpest_frames(tmp_path / "a.mp4", 3))

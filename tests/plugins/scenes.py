@@ -3,7 +3,7 @@
 import drjit as dr
 import numpy as np
 
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverSettings
 
@@ -142,7 +142,7 @@ def room(mi, open_side=False):
     return walls
 
 
-def observer_at(mi, *origin, **kwargs):
+def make_observer(mi, *origin, **kwargs):
     return {"type": "perspective", "to_world": look_at(mi, origin, (0.1, 0.2, 0.3)), **kwargs}
 
 
@@ -164,7 +164,7 @@ def wall(mi, gap=0.3):
 def hidden_scene(mi, **kwargs):
     # The camera is behind the wall and sees the back wall; the observer is in front of it.
     sensor = camera(mi, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
-    how = {"aovs": "visibility,position,observer_depth", "step": 0.01, "observer": observer_at(mi, 0, 0, -0.9)} | kwargs
+    how = {"aovs": "visibility,position,observer_depth", "step": 0.01, "observer": make_observer(mi, 0, 0, -0.9)} | kwargs
     return channels(mi, plugin("nerg", density=wall(mi), **how), sensor)
 
 
@@ -174,4 +174,4 @@ GAZE = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth"
 def observed(mi, gaze, p_o, place=None):
     """The gaze field that the dict ``gaze`` describes, for the observer at ``p_o``."""
     settings = ObserverSettings(march=MarchSettings(step=1))
-    return mi.load_dict(gaze).placed_gaze().at([p_o], place or Place(None), settings)
+    return mi.load_dict(gaze).placed_gaze().at([p_o], place or SceneGeometry(None), settings)

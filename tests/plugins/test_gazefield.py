@@ -14,7 +14,7 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import REACH, GazeEnsemble, RaySupport
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.formats.fields import load_gaze, save_gaze
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from tests.reference import fields_numpy
 
 from . import fields
@@ -24,7 +24,7 @@ from .scenes import (
     channels,
     named,
     observed,
-    observer_at,
+    make_observer,
     picture,
     plugin,
     points,
@@ -116,7 +116,7 @@ class LobeField:
     """exp(sharpness axis . r_o), as a second recipe of log densities would be."""
 
     kind = "lobe"
-    networks, support, limits = 1, None, {}
+    networks, support, max_sizes = 1, None, {}
     DRJIT_STRUCT: ClassVar[dict] = {"axis": None}
 
     def __init__(self, config, box, axis):
@@ -125,7 +125,7 @@ class LobeField:
     @classmethod
     def from_arrays(cls, about, box, arrays):
         config = LobeConfig(**{k: v for k, v in about.items() if k != "kind"})
-        return cls(config, box, arrays.ns.TensorXf(arrays.array("axis", 3)))
+        return cls(config, box, arrays.ns.TensorXf(arrays.get_array("axis", 3)))
 
     def architecture(self):
         return self.config.to_dict()
@@ -163,7 +163,7 @@ def lobe(monkeypatch):
 
 def test01_it_is_rendered_as_its_formula_says(rgb, tmp_path, lobe):
     eye = np.array([0.2, 0.1, 0.0])
-    shown = gaze_only(saved(tmp_path / "g.safetensors", lobe()), observer=observer_at(rgb, *eye), falloff=0.0)
+    shown = gaze_only(saved(tmp_path / "g.safetensors", lobe()), observer=make_observer(rgb, *eye), falloff=0.0)
     out = channels(rgb, shown, camera(rgb, INSIDE, (0.5, 0, 0)), **room(rgb))
     r = points(out) - eye
     r /= np.linalg.norm(r, axis=-1, keepdims=True)
@@ -192,7 +192,7 @@ def test03_it_is_averaged_and_its_weights_are_parameters(rgb, tmp_path, lobe):
 def test04_it_is_scored_like_any_other(rgb, tmp_path, lobe):
     saved(tmp_path / "g.safetensors", lobe())
     field, _ = load_gaze(tmp_path / "g.safetensors", ns)
-    place = Place(None, rgb.load_dict({"type": "scene", **room(rgb)}))
+    place = SceneGeometry(None, rgb.load_dict({"type": "scene", **room(rgb)}))
     d = np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]])
     found = FieldDensity(field, place)(np.array([[0.1, 0.2, 0.3]]), d)[0]
     np.testing.assert_allclose(found, np.exp(2 * d[:, 2]) / TOTAL, rtol=2e-3)
@@ -249,7 +249,7 @@ def test02_what_escapes_counts(rgb, tmp_path):
     gaze, walls, eye = log_gaze(tmp_path / "g.safetensors", variant="emit"), room(rgb, True), rgb.Point3f(0)
     density, angle = around(rgb, (0, 0, 0), gaze, walls)
     assert (angle * (density == 0)).sum() / (4 * np.pi) == pytest.approx(1 / 6, abs=0.02)
-    place = Place(None, rgb.load_dict({"type": "scene", **walls}))
+    place = SceneGeometry(None, rgb.load_dict({"type": "scene", **walls}))
     lost = np.exp(0.4) / 6 / float(observed(rgb, gaze, eye, place).integrals(eye)[0][0])
     assert (density * angle).sum() == pytest.approx(1 - lost, abs=0.01)
 
@@ -310,7 +310,7 @@ def test01_emit_takes_the_fields_features(rgb, files, tmp_path, semantic, own, a
     sensor = camera(rgb, eye)
     if not aligned:
         # An observer a hair beside the camera sees the same, by a pass of its own.
-        integrator |= {"observer": observer_at(rgb, eye[0] + 1e-5, eye[1], eye[2]), "tolerance": 0.3}
+        integrator |= {"observer": make_observer(rgb, eye[0] + 1e-5, eye[1], eye[2]), "tolerance": 0.3}
     out = channels(rgb, integrator, sensor)
     seen = out["visibility.Y"] == 1
     name = "features" if semantic == "accumulated" else "features_at"
@@ -364,7 +364,7 @@ def ensemble(files):
     for m in members:
         # Random networks are nearly constant: these are not.
         m.set_parameters({k: 20 * v for k, v in m.parameters().items() if k in ("emit_head.0", "capture_head.0")})
-    return saved(files / "ensemble.safetensors", GazeEnsemble(members, RaySupport.of(ORIGINS, 1.0))), members
+    return saved(files / "ensemble.safetensors", GazeEnsemble(members, RaySupport.from_origins(ORIGINS, 1.0))), members
 
 
 @pytest.mark.parametrize("aligned", [True, False])
@@ -372,7 +372,7 @@ def test01_mean_and_spread_are_those_of_the_members(rgb, files, ensemble, aligne
     """In NumPy, at the surface that the camera sees."""
     gaze, members = ensemble
     eye = np.array([0.5, 0.4, -3] if aligned else [-2, 0.3, -2.0])
-    more = {} if aligned else {"observer": observer_at(rgb, *eye)}
+    more = {} if aligned else {"observer": make_observer(rgb, *eye)}
     out = channels(rgb, with_field(files, gaze=gaze, aovs="gaze,gaze_std,position,gaze_evals", occlusion=False, **more))
     p = points(out)
     seen = np.abs(p).sum(axis=-1) > 0
@@ -406,7 +406,7 @@ def test03_members_are_normalised_each_by_itself(rgb, tmp_path):
 
 @pytest.mark.parametrize("eye", [(-2, 0.3, -2), (-1.6, 0.3, -2.2), (5.0, 5, 5)])
 def test04_support_is_that_of_the_observer(rgb, files, ensemble, eye):
-    integrator = with_field(files, gaze=ensemble[0], aovs="support,position", observer=observer_at(rgb, *eye))
+    integrator = with_field(files, gaze=ensemble[0], aovs="support,position", observer=make_observer(rgb, *eye))
     out = channels(rgb, integrator, camera(rgb, fov=80))
     there = out["position.Z"] != 0
     np.testing.assert_allclose(out["support.Y"][there], support_at(*eye), rtol=0.03)
@@ -418,7 +418,7 @@ def test05_support_follows_the_observer_and_the_placement(rgb, files, ensemble):
     """Twice as large and moved: p_o = 2 p + (1, 0, 0) is where p was."""
     to_world = rgb.ScalarTransform4f().translate([1, 0, 0]).scale(2)
     field = stored("nerf", files / "field.safetensors", to_world=to_world)
-    gaze, eye = {**ensemble[0], "to_world": to_world}, observer_at(rgb, -3, 0.6, -4)
+    gaze, eye = {**ensemble[0], "to_world": to_world}, make_observer(rgb, -3, 0.6, -4)
     scene = scene_with(rgb, gaze_only(gaze, "support", field=field, observer=eye), camera(rgb, (2, 0.8, -6), (1, 0, 0)))
     assert picture(rgb, scene)[..., 3].max() == pytest.approx(support_at(-2, 0.3, -2), rel=0.03)
     moved = rgb.Transform4f().translate([-2.2, 0.6, -4.4])
@@ -427,7 +427,7 @@ def test05_support_follows_the_observer_and_the_placement(rgb, files, ensemble):
 
 
 def test06_what_is_not_asked_for_is_not_traced(rgb, files, ensemble):
-    eye, single = observer_at(rgb, -2, 0.3, -2), stored("gazefield", files / "member1.safetensors")
+    eye, single = make_observer(rgb, -2, 0.3, -2), stored("gazefield", files / "member1.safetensors")
     cost = lambda aovs, gaze=ensemble[0]: operations(rgb, with_field(files, gaze=gaze, aovs=aovs, observer=eye))
     depth, support, gaze, both = (cost(aovs) for aovs in ("depth", "support", "gaze", "gaze,gaze_std"))
     # Neither the observer's march nor a network for support; of the spread only squares and a root.

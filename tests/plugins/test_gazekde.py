@@ -7,7 +7,7 @@ from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.rays.rays import Rays
 from tests.reference import kde as reference
 
-from .scenes import camera, channels, named, observer_at, picture, plugin, points, put, room, scene_with, stored, wall
+from .scenes import camera, channels, named, make_observer, picture, plugin, points, put, room, scene_with, stored, wall
 
 KAPPA = 20.0
 # What the table may be off: a ten-thousandth of the highest density of one ray.
@@ -61,7 +61,7 @@ def test02_another_observer_and_what_is_hidden(rgb, rays):
     """No gaze field is needed; what the observer does not see is 0, the rest is the observer's density."""
     eye = (0, 0, -0.9)
     sensor = camera(rgb, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
-    how = {"density": wall(rgb), "step": 0.01, "falloff": 0.0, "observer": observer_at(rgb, *eye)}
+    how = {"density": wall(rgb), "step": 0.01, "falloff": 0.0, "observer": make_observer(rgb, *eye)}
     out = channels(rgb, shown(rays, "kde,position,visibility", **how), sensor)
     hidden, seen = out["visibility.Y"] == 0, out["visibility.Y"] == 1
     assert hidden.sum() > 20 and seen.sum() > 5 and not out["kde.Y"][hidden].any()
@@ -71,7 +71,7 @@ def test02_another_observer_and_what_is_hidden(rgb, rays):
 
 
 def test03_rays_are_gathered_once_an_observer(rgb, rays):
-    integrator = shown(rays, observer=observer_at(rgb, 0.2, 0.1, 0), falloff=0.0)
+    integrator = shown(rays, observer=make_observer(rgb, 0.2, 0.1, 0), falloff=0.0)
     scene = scene_with(rgb, integrator, camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0), size=70), **room(rgb))
     view = scene.integrator().views["kde"]
     kept = lambda: scene.integrator().cache.peek(view)[0].value
@@ -125,7 +125,7 @@ def test09_where_no_surface_is_there_is_no_density(rgb, rays):
     eye, sensor = (0.1, -0.2, 0.3), camera(rgb, (0.5, 0.4, -3), (0, 0, 0), fov=60)
     ball = {"type": "sphere", "center": [0.3, 0.2, -0.4], "radius": 0.5}
     thin = {"density": {"type": "constvolume", "value": 0.4}, "surface_opacity": 0.5, "occlusion": False}
-    out = channels(rgb, shown(rays, "kde,position,opacity", observer=observer_at(rgb, *eye), **thin), sensor, ball=ball)
+    out = channels(rgb, shown(rays, "kde,position,opacity", observer=make_observer(rgb, *eye), **thin), sensor, ball=ball)
     solid = out["opacity.Y"] == 1
     assert solid.sum() > 5 and (out["opacity.Y"][~solid] > 0).any() and (out["opacity.Y"] == 0).any()
     assert not out["kde.Y"][~solid].any()

@@ -19,7 +19,7 @@ from .scenes import (
     center_rays,
     channels,
     named,
-    observer_at,
+    make_observer,
     picture,
     plugin,
     put,
@@ -199,7 +199,7 @@ def median(start: float) -> float:
 # From within the inner cube out of it, from outside through it, and in uniform steps.
 @pytest.mark.parametrize("start, more", [(1, {}), (-5, {}), (1, {"dt_gamma": 0.0, "step": 0.01})])
 def test_depth_beyond_the_box_is_that_of_the_scene(rgb, endless, start, more):
-    eye = {} if more else {"observer": observer_at(rgb, 0, 0, -5)}
+    eye = {} if more else {"observer": make_observer(rgb, 0, 0, -5)}
     integrator = plugin("nerg", field=endless, aovs="depth,position,observer_depth", jitter=False, **eye, **more)
     assert rgb.load_dict(integrator).settings.dt_gamma == more.get("dt_gamma", 1 / 128)
     out = channels(rgb, integrator, camera(rgb, (0, 0, start), (0, 0, 9), fov=0.5, size=4, near_clip=1e-4))

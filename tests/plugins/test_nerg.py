@@ -15,7 +15,7 @@ from .scenes import (
     constant,
     look_at,
     named,
-    observer_at,
+    make_observer,
     picture,
     plugin,
     put,
@@ -63,7 +63,7 @@ def test04_below_the_surface_opacity(rgb, files):
 
 
 def test05_to_string(rgb, files):
-    text = str(rgb.load_dict(with_gaze(files, GAZE, observer=observer_at(rgb, 1, 2, 3), falloff=0.25)))
+    text = str(rgb.load_dict(with_gaze(files, GAZE, observer=make_observer(rgb, 1, 2, 3), falloff=0.25)))
     for part in ("NerfVolume[", "GazeFieldVolume[", "falloff = [0.25]", "1, 2, 3", "aovs = depth"):
         assert part in text, part
 
@@ -87,7 +87,7 @@ def test09_another_integrator_may_ask_for_some_rays_only(rgb):
 
 
 def test01_flags(rgb, files):
-    params = rgb.traverse(scene_with(rgb, with_gaze(files, observer=observer_at(rgb, -2, 0.3, -2))))
+    params = rgb.traverse(scene_with(rgb, with_gaze(files, observer=make_observer(rgb, -2, 0.3, -2))))
     D, edges = rgb.ParamFlags.Differentiable, rgb.ParamFlags.Discontinuous
     shown = {k: params.flags(k) for k in params.keys() if k.startswith("integrator.")}
     assert shown.pop("integrator.observer.to_world") == D | edges
@@ -108,7 +108,7 @@ def test01_flags(rgb, files):
     ],
 )
 def test06_an_update_is_seen(rgb, files, key, channel, factor):
-    integrator = with_gaze(files, GAZE, observer=observer_at(rgb, -2, 0.3, -2))
+    integrator = with_gaze(files, GAZE, observer=make_observer(rgb, -2, 0.3, -2))
     scene = scene_with(rgb, integrator)
     params, key = rgb.traverse(scene), f"integrator.{key}"
 
@@ -129,7 +129,7 @@ def test07_a_negative_falloff_is_refused_later_too(rgb):
 @pytest.mark.parametrize("kind", ["perspective", "panorama"])
 def test02_an_observer_is_moved(rgb, files, kind):
     def scene_of(*eye):
-        observer = {**observer_at(rgb, *eye), "type": kind}
+        observer = {**make_observer(rgb, *eye), "type": kind}
         return scene_with(rgb, with_gaze(files, "gaze", falloff=2.0, observer=observer), still(camera(rgb, size=6)))
 
     scene, key = scene_of(-2, 0.3, -2), "integrator.observer.to_world"

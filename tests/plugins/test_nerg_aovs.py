@@ -10,13 +10,13 @@ import pytest
 
 from nerg_mi.api.scene import Scene
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.study import traced_operations
+from nerg_mi.evaluation.study import count_traced_operations
 from nerg_mi.figures.overlay import find_overlay, to_bytes
 from nerg_mi.files.images import write_exr
 from nerg_mi.transport import aovs
-from nerg_mi.viewer.layers import automatic, available, colored, legend, usual_scale
+from nerg_mi.viewer.layers import choose_range, list_layers, colorize, format_legend, choose_scale
 from nerg_mi.workflows.draw import draw
-from nerg_mi.workflows.render import layers_of
+from nerg_mi.workflows.render import render_layers
 
 from . import fields
 from .scenes import (
@@ -26,7 +26,7 @@ from .scenes import (
     constant,
     look_at,
     named,
-    observer_at,
+    make_observer,
     picture,
     plugin,
     points,
@@ -58,7 +58,7 @@ def test01_an_entry_is_all_that_an_aov_is(rgb, files, table):
         channels="ZT",
         summary="of the surface above the plane z = -1, and the distance to it",
         compute=lambda p: [dr.select(p.surface, p.p_d.z + 1, 0), p.depth],
-        needs=(table.FIELD,),
+        dependencies=(table.FIELD,),
     )
     table.AOVS["height"] = entry
     integrator = with_field(files, aovs="position,height,depth")
@@ -70,21 +70,21 @@ def test01_an_entry_is_all_that_an_aov_is(rgb, files, table):
     assert not out["height.Z"][~met].any() and np.array_equal(out["height.T"], out["depth.T"])
     with pytest.raises(RuntimeError, match='"aovs".*"height".*"field"'):
         rgb.load_dict(constant(aovs="height"))
-    assert "- ``height`` (``.Z .T``): of the surface above the plane" in table.manual()
+    assert "- ``height`` (``.Z .T``): of the surface above the plane" in table.format_manual()
 
 
 def test02_the_manual_lists_the_table(rgb, table):
     rgb.load_dict(constant())
     manual = sys.modules["nerg_mi.plugins.nerg"].NergIntegrator.__doc__
-    assert table.manual() in manual and not any(w in manual for w in ("{aovs}", "{depths}", "{quadratures}"))
+    assert table.format_manual() in manual and not any(w in manual for w in ("{aovs}", "{depths}", "{quadratures}"))
     for name, aov in table.AOVS.items():
         assert f"- ``{name}`` (" in manual and name == aov.name
-    assert max(len(line) for line in table.manual().splitlines()) <= 120
+    assert max(len(line) for line in table.format_manual().splitlines()) <= 120
 
 
 def test03_every_aov_renders(rgb, files, table, tmp_path):
     """All that need nothing but a field and a gaze field, at once, with as many channels as they are said to have."""
-    eye = observer_at(rgb, -2, 0.3, -2)
+    eye = make_observer(rgb, -2, 0.3, -2)
     given = rgb.load_dict(with_gaze(files, observer=eye))
     names = [n for n, aov in table.AOVS.items() if all(need.is_met(given) for need in aov.needs)]
     assert {"features", "gaze", "density_evals"} < set(names) and "gaze_std" not in names
@@ -131,7 +131,7 @@ def test05_an_entry_is_shown_everywhere(rgb, table, tmp_path, kind):
     scene = scene_with(rgb, constant())
     # Overlays, with the title, the label and the unit of the table.
     overlay = find_overlay("rows")
-    layers = layers_of(Path("scene.xml"), scene, scene.sensors()[0], overlay)
+    layers = render_layers(Path("scene.xml"), scene, scene.sensors()[0], overlay)
     assert set(np.unique(layers.values[layers.mask])) <= set(range(9)) and layers.values.any()
     limits = overlay.limits(layers)
     if kind == "diverging":
@@ -140,11 +140,11 @@ def test05_an_entry_is_shown_everywhere(rgb, table, tmp_path, kind):
     said = [axes.get_ylabel().replace("\n", " ") for axes in overlay.draw(layers, limits).axes]
     assert "row of the shelf [rows]" in said
     # The viewer, with the same colours.
-    (layer,) = [la for la in available(Scene(scene)) if la.title == "shelf row"]
-    scale = usual_scale(layer, automatic(layer, layers.values, layers.mask), None)
-    shown = colored(layer, layers.color, layers.values, layers.mask, scale, hatched=False)
+    (layer,) = [la for la in list_layers(Scene(scene)) if la.title == "shelf row"]
+    scale = choose_scale(layer, choose_range(layer, layers.values, layers.mask), None)
+    shown = colorize(layer, layers.color, layers.values, layers.mask, scale, hatched=False)
     assert np.array_equal(shown[layers.mask], to_bytes(overlay.paint(layers, limits))[layers.mask])
-    assert ("rows" if kind not in ("shade", "categorical") else "row of the shelf") in legend(layer, scale)
+    assert ("rows" if kind not in ("shade", "categorical") else "row of the shelf") in format_legend(layer, scale)
     # Files: sheets and differences.
     file = tmp_path / "a.exr"
     write_exr(file, {"rows.Y": layers.values, "opacity.Y": layers.mask.astype(np.float32)})
@@ -246,7 +246,7 @@ def test05_derivatives_reach_the_field(rgb, files):
 def operations(mi, integrator, sensor=None):
     scene = scene_with(mi, integrator, sensor)
     mi.render(scene, spp=1)  # set-up that happens once is not counted
-    return traced_operations(lambda: mi.render(scene, spp=1))
+    return count_traced_operations(lambda: mi.render(scene, spp=1))
 
 
 def test01_no_colour(rgb, files):
@@ -268,7 +268,7 @@ def test03_no_gaze_unless_asked(rgb, files):
 
 def test04_an_aligned_observer_needs_no_second_march(rgb, files):
     sensor, none = camera(rgb, (0.5, 0.4, -3)), with_gaze(files, "gaze,density_evals")
-    here, there = (none | {"observer": observer_at(rgb, *o)} for o in ((0.5, 0.4, -3), (-2, 0.3, -2)))
+    here, there = (none | {"observer": make_observer(rgb, *o)} for o in ((0.5, 0.4, -3), (-2, 0.3, -2)))
     a, b, c = (channels(rgb, i, sensor)["density_evals.Y"] for i in (none, here, there))
     assert np.array_equal(a, b) and c.sum() > 1.3 * a.sum()
     first, second, third = (operations(rgb, i, sensor) for i in (none, here, there))
@@ -277,7 +277,7 @@ def test04_an_aligned_observer_needs_no_second_march(rgb, files):
 
 def test05_without_occlusion_no_observer_march(rgb, files):
     aligned = with_gaze(files, "gaze,density_evals")
-    off = aligned | {"observer": observer_at(rgb, -2, 0.3, -2), "occlusion": False}
+    off = aligned | {"observer": make_observer(rgb, -2, 0.3, -2), "occlusion": False}
     assert np.array_equal(*(channels(rgb, i)["density_evals.Y"] for i in (off, aligned)))
     assert operations(rgb, off) + 300 < operations(rgb, {**off, "occlusion": True})
 

@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.ranges import VALUES
+from nerg_mi.ranges import POSITIVE_VALUES
 from nerg_mi.transport.quadrature import RULES
 from tests.reference import march_numpy as reference
 
@@ -16,7 +16,7 @@ from .scenes import (
     camera,
     channels,
     constant,
-    observer_at,
+    make_observer,
     picture,
     plugin,
     points,
@@ -137,7 +137,7 @@ def test06_samples(rgb, step, spp):
 def test08_observers_anywhere_with_any_falloff(rgb, files, kind, falloff):
     for origin in ((0, 0, -1), (0.1, 0.1, 0.1), (0.6, 0.5, -5), (1e6, 0, -1e6), (1e-30, 0, 0)):
         how = {"visibility": kind, "falloff": falloff, "map_height": 32, "surface_opacity": 0.0}
-        out = channels(rgb, with_gaze(files, GAZE, observer=observer_at(rgb, *origin), **how))
+        out = channels(rgb, with_gaze(files, GAZE, observer=make_observer(rgb, *origin), **how))
         assert all(np.all(np.isfinite(v)) for v in out.values()), origin
         assert out["visibility.Y"].min() >= 0 and out["visibility.Y"].max() <= 1 + 1e-6
 
@@ -145,14 +145,14 @@ def test08_observers_anywhere_with_any_falloff(rgb, files, kind, falloff):
 @pytest.mark.parametrize("kind", ["depth", "transmittance", "map"])
 def test09_who_stands_in_solid_matter_sees_nothing_of_its_outside(rgb, kind):
     density = fog(1e3, rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2))
-    how = {"aovs": "visibility", "visibility": kind, "observer": observer_at(rgb, 0, 0, 0), "map_height": 64}
+    how = {"aovs": "visibility", "visibility": kind, "observer": make_observer(rgb, 0, 0, 0), "map_height": 64}
     out = channels(rgb, plugin("nerg", density=density, **how), camera(rgb, fov=20))
     assert np.all(out["visibility.Y"] <= 1e-6)  # the marches' "stop"
 
 
 @pytest.mark.parametrize("origin", [(0.5, 0.4, -3), (0, 0, -1), (0.2, 0.1, 0.1)])
 def test10_observers_in_odd_places_give_finite_derivatives(rgb, files, origin):
-    how = {"observer": observer_at(rgb, *origin), "surface_opacity": 0.0, "falloff": 0.5}
+    how = {"observer": make_observer(rgb, *origin), "surface_opacity": 0.0, "falloff": 0.5}
     scene = scene_with(rgb, with_gaze(files, "gaze,visibility,depth", **how), camera(rgb, size=4))
     params, key = rgb.traverse(scene), "integrator.field.density_net.1"
     attach(params, key)
@@ -169,9 +169,9 @@ def test11_observers_who_are_nowhere_are_refused(rgb, bad):
 
 
 @pytest.mark.parametrize("visibility", ["depth", "map", "transmittance"])
-@pytest.mark.parametrize("tolerance", [1e20, VALUES.high])
+@pytest.mark.parametrize("tolerance", [1e20, POSITIVE_VALUES.high])
 def test_observer_depth_is_finite_whatever_the_tolerance(rgb, tolerance, visibility):
-    how = {"visibility": visibility, "map_height": 16, "observer": observer_at(rgb, -3, 0.5, 0.5)}
+    how = {"visibility": visibility, "map_height": 16, "observer": make_observer(rgb, -3, 0.5, 0.5)}
     integrator = constant(1.0, aovs="observer_depth,visibility,position", tolerance=tolerance, **how)
     image = render(rgb, integrator, camera(rgb, size=6))
     assert image[..., 3].max() > 1e17 and np.all(np.isfinite(image))
@@ -236,7 +236,7 @@ def test01_extremes(rgb, files, visibility, depth, eyes):
     """Of all AOVs, summed, with respect to density, falloff, gaze weights, and where observer, camera and a shape
     are."""
     density = fog(1.0, rgb.ScalarTransform4f().translate(-1).scale(2))
-    gaze, observer = stored("gazefield", files / "gaze.safetensors"), observer_at(rgb, *EYES[0])
+    gaze, observer = stored("gazefield", files / "gaze.safetensors"), make_observer(rgb, *EYES[0])
     how = {"visibility": visibility, "depth": depth, "step": 0.2, "surface_opacity": 0.0, "falloff": 1.0}
     integrator = plugin("nerg", density=density, aovs=GAZE, gaze=gaze, observer=observer, **how)
     ball = {"type": "sphere", "center": [0, 0.9, 0], "radius": 0.3}

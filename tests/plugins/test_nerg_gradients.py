@@ -10,7 +10,7 @@ from .scenes import (
     camera,
     constant,
     look_at,
-    observer_at,
+    make_observer,
     picture,
     plugin,
     put,
@@ -79,7 +79,7 @@ def check(mi, scene, name, channels, h, picks=3, rtol=0.04):
         ends = []
         for sign in (1, -1):
             moved = base.copy()
-            moved.flat[i] += sign * h
+            moved.num_degenerate_faces[i] += sign * h
             put(params, name, type(value)(moved))
             ends.append(np.float64(loss_of(mi, scene, params, channels).numpy().item()))
         expected.append((ends[0] - ends[1]) / (2 * h))
@@ -203,7 +203,7 @@ def test12_poses_in_front_of_a_batch_go_backward_only(rgb, whose):
     """Forward mode is refused where Mitsuba would end the process."""
     film = {**small_camera(rgb)["film"], "width": 2 * SIZE}
     cameras = {n: small_camera(rgb, (x, 0.4, -3)) for n, x in (("a", 0.5), ("b", -0.5))}
-    integrator = plugin("nerg", aovs="observer_depth", occlusion=False, observer=observer_at(rgb, 2, 0.1, -3))
+    integrator = plugin("nerg", aovs="observer_depth", occlusion=False, observer=make_observer(rgb, 2, 0.1, -3))
     scene = scene_with(rgb, integrator, plugin("batch", film=film, **cameras), s={"type": "sphere"})
     params = rgb.traverse(scene)
     key = next(k for k in params.keys() if k.endswith(whose.split(".", 1)[1]))
@@ -246,7 +246,7 @@ def test01_adam_finds_falloff_and_density(rgb):
     """Both at once: visibility tells the first, opacity the second, in a fog that camera and observer see from two
     sides."""
     fog = plugin("constvolume", value=1.5, to_world=rgb.ScalarTransform4f().translate(-1).scale(2))
-    more = {"density": fog, "observer": observer_at(rgb, -2, 0.3, 2), "falloff": 2.0}
+    more = {"density": fog, "observer": make_observer(rgb, -2, 0.3, 2), "falloff": 2.0}
     scene = scene_with(rgb, constant(aovs="opacity,visibility") | more, still(camera(rgb, size=6)))
     target, params = rgb.render(scene, spp=1), rgb.traverse(scene)
     falloff, density = "integrator.falloff", "integrator.density.value.value"
@@ -262,7 +262,7 @@ def test01_adam_finds_falloff_and_density(rgb):
 def improves(rgb, files):
     """Whether gaze weights learn from ``batches(scene, views)``, a function of the step that gives a sensor and the
     gaze to be found there. It grows with x, e-fold over a unit: pictures agree about it, whichever camera made them."""
-    integrator = with_gaze(files, "gaze,position", falloff=2.0, radiance=False, observer=observer_at(rgb, -2, 0.3, -2))
+    integrator = with_gaze(files, "gaze,position", falloff=2.0, radiance=False, observer=make_observer(rgb, -2, 0.3, -2))
     sensors = {f"camera{i}": still(camera(rgb, origin, size=8)) for i, origin in enumerate((*SEEN, HELD_OUT))}
     scene = rgb.load_dict({"type": "scene", "integrator": integrator, **sensors})
     pictures = [np.array(rgb.render(scene, sensor=s, spp=1)) for s in scene.sensors()]
@@ -313,7 +313,7 @@ def test03_gaze_weights_learn_from_batches_of_rays(rgb, improves):
 def test04_a_batch_of_rays_shows_what_its_pixels_show(rgb, files):
     """All channels. Rays are almost parallel, as the loader moves each within its pixel: every camera shows but one
     number."""
-    integrator = with_gaze(files, observer=observer_at(rgb, -2, 0.3, -2), falloff=2.0)
+    integrator = with_gaze(files, observer=make_observer(rgb, -2, 0.3, -2), falloff=2.0)
     eyes = [(0.2 * i - 0.5, 0.3 - 0.1 * i, -3) for i in range(3)]
     sensors = {f"camera{i}": camera(rgb, o, (o[0], o[1], 0), size=6, fov=0.01) for i, o in enumerate(eyes)}
     scene = rgb.load_dict({"type": "scene", "integrator": integrator, **sensors})

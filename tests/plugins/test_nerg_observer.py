@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study import traced_operations
+from nerg_mi.evaluation.study import count_traced_operations
 
 from .scenes import (
     GAZE,
@@ -16,7 +16,7 @@ from .scenes import (
     look_at,
     named,
     observed,
-    observer_at,
+    make_observer,
     picture,
     plugin,
     points,
@@ -38,7 +38,7 @@ from .scenes import (
 def test01_an_observer_at_the_camera_is_none(rgb, files, near_clip):
     sensor = camera(rgb, near_clip=near_clip)
     a = render(rgb, with_gaze(files, GAZE), sensor, spp=2)
-    b = render(rgb, with_gaze(files, GAZE, observer=observer_at(rgb, 0.5, 0.4, -3, near_clip=0.5)), sensor, spp=2)
+    b = render(rgb, with_gaze(files, GAZE, observer=make_observer(rgb, 0.5, 0.4, -3, near_clip=0.5)), sensor, spp=2)
     assert np.array_equal(a, b)
     out = named(rgb, a, with_gaze(files, GAZE))
     assert set(np.unique(out["visibility.Y"])) <= {0, 0.5, 1} and out["gaze.Y"].max() > 0
@@ -49,7 +49,7 @@ def test03_cameras_without_a_centre_need_an_observer(rgb, files):
     scene = scene_with(rgb, with_gaze(files, "gaze"), sensor)
     with pytest.raises(ValueError, match="no centre to look from.*observer"):
         scene.integrator().render(scene, scene.sensors()[0])
-    out = channels(rgb, with_gaze(files, "gaze", observer=observer_at(rgb, 1, 0, -3)), sensor)
+    out = channels(rgb, with_gaze(files, "gaze", observer=make_observer(rgb, 1, 0, -3)), sensor)
     assert out["gaze.Y"].any()
     assert render(rgb, with_gaze(files, "depth"), sensor).shape[-1] == 4
 
@@ -125,7 +125,7 @@ def test31_an_observer_who_meets_nothing_is_not_blocked_by_it(rgb, kind):
     open."""
     eye = (-2, 0.5, -2.5)
     how = {"aovs": "visibility,observer_depth,position", "surface_opacity": 0.0, "visibility": kind}
-    integrator = plugin("nerg", observer=observer_at(rgb, *eye), **how)
+    integrator = plugin("nerg", observer=make_observer(rgb, *eye), **how)
     out = channels(rgb, integrator, camera(rgb, (0.3, 0.2, -3), fov=12), ball={"type": "sphere", "radius": 0.8})
     p = points(out)
     assert ((p * (eye - p)).sum(-1) > 0).all()
@@ -141,7 +141,7 @@ def test06_shapes_hide_from_the_observer(rgb, kind, veiled):
     if veiled:
         box = rgb.ScalarTransform4f().translate([-4, -4, -0.9]).scale([8, 8, 0.5])
         how["density"] = {"type": "constvolume", "value": 1e-4, "to_world": box}
-    integrator = plugin("nerg", observer=observer_at(rgb, 0, 0, -1), **how)
+    integrator = plugin("nerg", observer=make_observer(rgb, 0, 0, -1), **how)
     shapes = {"wall": square(rgb, 1.0, 3.0), "lid": square(rgb, 0.0, 0.5)}
     out = channels(rgb, integrator, camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24), **shapes)
     on_wall = np.abs(out["position.Z"] - 1) < 1e-3
@@ -187,7 +187,7 @@ def test05_a_shape_hides_the_field_and_the_field_a_shape(rgb):
 
 def test08_gaze_on_a_shape_is_equation_1(rgb, files):
     eye = (-2, 0.3, -2)
-    integrator = gaze_only(files, "gaze,emit,capture,visibility,position", observer=observer_at(rgb, *eye))
+    integrator = gaze_only(files, "gaze,emit,capture,visibility,position", observer=make_observer(rgb, *eye))
     out = channels(rgb, integrator, s=sphere(rgb, 0, 0, 0))
     seen = out["visibility.Y"] == 1
     p, p_o = rgb.Point3f(np.ascontiguousarray(points(out)[seen].T)), rgb.Point3f(*eye)
@@ -201,7 +201,7 @@ def test09_without_a_volume_no_march_without_shapes_no_cast(rgb):
     def operations(integrator, **more):
         scene = scene_with(rgb, integrator, **more)
         rgb.render(scene, spp=1)
-        return traced_operations(lambda: rgb.render(scene, spp=1))
+        return count_traced_operations(lambda: rgb.render(scene, spp=1))
 
     shape = {"s": sphere(rgb, 0, 0, 0)}
     shapes = operations({"type": "nerg"}, **shape)
@@ -216,7 +216,7 @@ def test11_a_map_keeps_gaze(rgb, files):
     """Looked up, gaze is that of the network but for interpolation, and costs no evaluation; weights are still
     differentiable."""
     network, table = (
-        gaze_only(files, "gaze,visibility,gaze_evals", visibility=kind, observer=observer_at(rgb, -2, 0.3, -2))
+        gaze_only(files, "gaze,visibility,gaze_evals", visibility=kind, observer=make_observer(rgb, -2, 0.3, -2))
         for kind in ("depth", "map")
     )
     scene = scene_with(rgb, table, s=sphere(rgb, 0, 0, 0))
@@ -270,7 +270,7 @@ def test12_depth_follows_a_moving_shape(rgb, depth, veiled):
 def test14_a_gaze_field_over_a_field_and_a_shape_in_it(rgb, files):
     """A ball put into a trained field hides what is behind it and carries gaze itself."""
     aovs, center = "depth,opacity,gaze,visibility,position", (0.5, 0.4, -1.6)
-    integrator = with_gaze(files, aovs, falloff=0.0, observer=observer_at(rgb, -2, 0.3, -2))
+    integrator = with_gaze(files, aovs, falloff=0.0, observer=make_observer(rgb, -2, 0.3, -2))
     bare, ball = channels(rgb, integrator), channels(rgb, integrator, s=sphere(rgb, *center, radius=0.2))
     on_ball = np.abs(np.linalg.norm(points(ball) - center, axis=-1) - 0.2) < 1e-3
     assert on_ball.sum() > 5 and (ball["opacity.Y"][on_ball] == 1).all()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from nerg_mi.transport import observer_gaze
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 
 from . import fields
-from .scenes import camera, look_at, named, observer_at, picture, plugin, scene_with, stored, with_gaze
+from .scenes import camera, look_at, named, make_observer, picture, plugin, scene_with, stored, with_gaze
 
 # ---- What is found along one camera ray, and when ----
 
@@ -18,8 +18,8 @@ from .scenes import camera, look_at, named, observer_at, picture, plugin, scene_
 @pytest.fixture
 def traced(monkeypatch):
     """One entry for each ray that is traced: the origin of its first lane."""
-    found, trace = [], Place.trace
-    monkeypatch.setattr(Place, "trace", lambda *a, **k: (found.append(np.array(a[1].o)[:, 0]), trace(*a, **k))[1])
+    found, trace = [], SceneGeometry.trace
+    monkeypatch.setattr(SceneGeometry, "trace", lambda *a, **k: (found.append(np.array(a[1].o)[:, 0]), trace(*a, **k))[1])
     return found
 
 
@@ -30,11 +30,11 @@ def pixel(mi, integrator, eye=(0.5, 0.4, -3), **more):
     target = mi.Point3f([0, 0.1, 9], [0, 0.1, 9], 0)
     ray = mi.Ray3f(o + dr.zeros(mi.Point3f, 3), dr.normalize(target - o))
     context = scene.integrator().context()
-    return context.trace(scene, scene.sensors(), None, ray, mi.Bool(True)).for_observer()
+    return context.trace(scene, scene.sensors(), None, ray, mi.Bool(True)).make_pixel()
 
 
 def test01_nothing_is_traced_before_it_is_asked_for(rgb, files, traced):
-    found = pixel(rgb, with_gaze(files, "gaze,visibility", observer=observer_at(rgb, -2, 0.3, -2)))
+    found = pixel(rgb, with_gaze(files, "gaze,visibility", observer=make_observer(rgb, -2, 0.3, -2)))
     assert len(traced) == 1
     found.camera.depth, found.camera.surface, found.camera.p_d, found.r_o  # noqa: B018
     assert len(traced) == 1
@@ -44,7 +44,7 @@ def test01_nothing_is_traced_before_it_is_asked_for(rgb, files, traced):
 
 @pytest.mark.parametrize("observer", [None, (0.5, 0.4, -3)])
 def test02_who_stands_at_the_camera_sees_what_it_sees(rgb, files, traced, observer):
-    more = {} if observer is None else {"observer": observer_at(rgb, *observer)}
+    more = {} if observer is None else {"observer": make_observer(rgb, *observer)}
     found = pixel(rgb, with_gaze(files, "gaze,visibility", **more))
     assert found.aligned and np.allclose(np.array(found.observer.p_o).T, (0.5, 0.4, -3))
     assert (found.sight.visibility.numpy() == 1).all() and len(traced) == 1
@@ -64,7 +64,7 @@ def test03b_networks_are_evaluated_where_gaze_is_seen(rgb, files):
     """And give what they give everywhere, as derivatives have it; with factors, wherever there is a surface."""
 
     def attention(aovs, attached):
-        integrator = with_gaze(files, aovs, observer=observer_at(rgb, -0.2, 3, 0.1), falloff=0.0)
+        integrator = with_gaze(files, aovs, observer=make_observer(rgb, -0.2, 3, 0.1), falloff=0.0)
         scene = scene_with(rgb, integrator, camera(rgb, (0.5, 0.4, -3)))
         if attached:
             params = rgb.traverse(scene)
@@ -85,7 +85,7 @@ def test03b_networks_are_evaluated_where_gaze_is_seen(rgb, files):
 
 
 def test04_evaluations_are_those_of_all_that_was_traced(rgb, files):
-    integrator = with_gaze(files, "visibility,density_evals", observer=observer_at(rgb, -2, 0.3, -2))
+    integrator = with_gaze(files, "visibility,density_evals", observer=make_observer(rgb, -2, 0.3, -2))
     found = pixel(rgb, integrator)
     alone = found.density_evaluations().numpy()
     found.sight  # noqa: B018
@@ -97,7 +97,7 @@ def test04_evaluations_are_those_of_all_that_was_traced(rgb, files):
 )
 def test05_a_map_stands_in_for_gaze_alone(rgb, files, aovs, looked_up):
     """It keeps neither factors nor what nobody asks for."""
-    observer = observer_at(rgb, -2, 0.3, -2)
+    observer = make_observer(rgb, -2, 0.3, -2)
     found = pixel(rgb, with_gaze(files, aovs, observer=observer, visibility="map", map_height=32))
     assert (found.sight.gaze is not None) == looked_up
     assert bool(found.context.cache.peek("gaze of map")) == looked_up
@@ -106,10 +106,10 @@ def test05_a_map_stands_in_for_gaze_alone(rgb, files, aovs, looked_up):
 
 def test07_another_observer_is_another_object(rgb, files):
     """All that a pixel computes follows its observer; the camera's part is one object that knows of none."""
-    first = pixel(rgb, with_gaze(files, "gaze,visibility,density_evals", observer=observer_at(rgb, -2, 0.3, -2)))
+    first = pixel(rgb, with_gaze(files, "gaze,visibility,density_evals", observer=make_observer(rgb, -2, 0.3, -2)))
     for name, value in vars(type(first)).items():
         assert not isinstance(value, cached_property) or getattr(first, name) is not None
-    other = first.camera.for_observer(first.context.observer_at((2, 0.3, -2)))
+    other = first.camera.make_pixel(first.context.make_observer((2, 0.3, -2)))
     assert other.camera is first.camera and not set(vars(other)) & {"observer", "sight", "gaze", "attention"}
     assert not np.allclose(np.array(other.r_o), np.array(first.r_o))
     assert not np.allclose(other.attention.gaze.numpy(), first.attention.gaze.numpy())
@@ -140,12 +140,12 @@ def sampler(mi):
 
 def traced_for(mi, scene, aovs, ray, sensors=()):
     """``(context for these AOVs, what the camera's ray meets)``."""
-    context = scene.integrator().for_aovs(aovs, False)
+    context = scene.integrator().make_context(aovs, False)
     return context, context.trace(scene, sensors, sampler(mi), ray, mi.Bool(True))
 
 
 def test01_what_depends_on_the_observer(scene):
-    context = scene.integrator().for_aovs(["depth", "gaze", "position", "visibility"], True)
+    context = scene.integrator().make_context(["depth", "gaze", "position", "visibility"], True)
     assert context.shared == ["depth", "position"] and context.own == ["gaze", "visibility"]
     assert context.channels(context.shared) == ["depth.T", "position.X", "position.Y", "position.Z"]
     # All else is the integrator's, which is left as it was.
@@ -158,7 +158,7 @@ def test03_the_values_of_a_render(rgb, scene, ray):
     context, camera = traced_for(rgb, scene, ["depth", *names], ray)
     camera.settle()
     for eye in EYES:
-        found = camera.for_observer(context.observer_at(eye)).channels(names)
+        found = camera.make_pixel(context.make_observer(eye)).channels(names)
         observer = {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate(list(eye))}
         alone = plugin("nerg", aovs=",".join(names), observer=observer, **scene.integrator().children)
         expected = rgb.load_dict(alone).sample(scene, sampler(rgb), ray)[2]
@@ -173,7 +173,7 @@ def test05_the_cameras_ray_is_traced_once_and_kernels_are_those_of_one_observer(
     for eye in EYES:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
-            dr.eval(camera.for_observer(context.observer_at(eye)).channels(["gaze", "visibility"]))
+            dr.eval(camera.make_pixel(context.make_observer(eye)).channels(["gaze", "visibility"]))
             kernels.append({k["hash"] for k in dr.kernel_history() if "hash" in k})
     assert kernels[0] and kernels[0] == kernels[1] == kernels[2] and len(traced) == 1 + len(EYES)
 
@@ -183,12 +183,12 @@ def test06_an_observer_where_the_camera_stands(rgb, scene):
     sensor = rgb.load_dict({"type": "perspective", "to_world": to_world})
     ray, _ = sensor.sample_ray_differential(0, 0, rgb.Point2f([0.4, 0.5], [0.5, 0.6]), rgb.Point2f(0.5))
     context, camera = traced_for(rgb, scene, ["gaze", "visibility", "density_evals"], ray, [sensor])
-    there, elsewhere = (camera.for_observer(context.observer_at(eye)) for eye in ((0, -3, 0), EYES[1]))
+    there, elsewhere = (camera.make_pixel(context.make_observer(eye)) for eye in ((0, -3, 0), EYES[1]))
     assert there.aligned and not elsewhere.aligned
     # For the others a second march decides what they see.
     evaluations = lambda pixel: np.array(pixel.channels(["visibility", "density_evals"])[1])
     assert np.all(evaluations(there) < evaluations(elsewhere))
-    own = camera.for_origins()
+    own = camera.make_pixel_per_origin()
     assert own.aligned and np.allclose(*(np.array(p.channels(["gaze"])[0]) for p in (own, there)), rtol=1e-3)
 
 
@@ -202,7 +202,7 @@ def test08_integrals_of_several_observers_are_kept(rgb, files, tmp_path, ray, mo
 
     def values():
         context, camera = traced_for(rgb, scene, ["gaze"], ray)
-        pixels = (camera.for_observer(context.observer_at(eye)) for eye in EYES[:2])
+        pixels = (camera.make_pixel(context.make_observer(eye)) for eye in EYES[:2])
         return [np.array(pixel.channels(["gaze"])[0]) for pixel in pixels]
 
     np.testing.assert_array_equal(values(), values())

@@ -11,7 +11,7 @@ from .scenes import (
     constant,
     look_at,
     named,
-    observer_at,
+    make_observer,
     picture,
     plugin,
     points,
@@ -105,7 +105,7 @@ def nerg(mi, sigma, eye, depth="expected", light=None, aovs="depth,opacity,posit
         more["density"] = {"type": "constvolume", "value": sigma, "to_world": box}
         more["color"] = {"type": "constvolume", "value": {"type": "rgb", "value": list(COLOR)}}
     if eye is not None:
-        more["observer"] = observer_at(mi, *eye)
+        more["observer"] = make_observer(mi, *eye)
     return plugin("nerg", aovs=aovs, depth=depth, visibility="transmittance", tolerance=TOLERANCE, **more)
 
 
@@ -203,7 +203,7 @@ def test05_instances_are_what_they_stand_for(rgb, kind):
         f"i{i}": plugin("instance", to_world=t, g={"type": "ref", "id": "group"}) for i, t in enumerate(places)
     }
     plain = {f"c{i}": plugin("cube", to_world=t @ T().scale(0.25)) for i, t in enumerate(places)}
-    how = {"visibility": kind, "map_height": 64, "falloff": 0.0, "observer": observer_at(rgb, *EYE)}
+    how = {"visibility": kind, "map_height": 64, "falloff": 0.0, "observer": make_observer(rgb, *EYE)}
     integrator = constant(0.3, aovs="depth,opacity,position,visibility", **how)
     a = render(rgb, integrator, group=group, **instances, back=square(rgb, 1.4, 1.5))
     b = render(rgb, integrator, **plain, back=square(rgb, 1.4, 1.5))
@@ -232,7 +232,7 @@ def mover(mi, name):
 def test06_what_moves_is_seen_where_it_is(rgb, name, kind):
     before, key, after = mover(rgb, name)
     integrator = plugin(
-        "nerg", aovs="depth,visibility", visibility=kind, map_height=64, falloff=0.0, observer=observer_at(rgb, *EYE)
+        "nerg", aovs="depth,visibility", visibility=kind, map_height=64, falloff=0.0, observer=make_observer(rgb, *EYE)
     )
     moved, new = (scene_with(rgb, integrator, back=square(rgb, 1.4, 1.5), **things) for things in (before, after))
     first = picture(rgb, moved)
@@ -324,7 +324,7 @@ def test11_hidden_emitters_are_hidden_from_the_picture_only(rgb):
 def test12_what_is_far_away_does_not_blunt_shadows(rgb):
     """A lid 20 cm before a wall hides it by a hard edge, also under a dome of a kilometre (1e-4 of its diagonal are 35
     cm)."""
-    integrator = {"type": "nerg", "aovs": "visibility,position", "falloff": 0.0, "observer": observer_at(rgb, 0, 0, -1)}
+    integrator = {"type": "nerg", "aovs": "visibility,position", "falloff": 0.0, "observer": make_observer(rgb, 0, 0, -1)}
     sensor = camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24)
     things = {"wall": square(rgb, 1.0, 3.0), "lid": square(rgb, 0.8, 0.5)}
     sky = plugin("sphere", radius=1000.0, bsdf={"type": "twosided", "b": {"type": "diffuse"}})
@@ -354,7 +354,7 @@ def test14_what_cannot_be_rendered_is_said_inside_of_other_integrators_too(rgb, 
     outer, things = {"aov": {"aovs": "z:depth"}, "moment": {}}.get(case), {}
     integrator, words = plugin(case, **{"in": {"type": "nerg"}}, **(outer or {})), "there is nothing to render"
     if outer is None:
-        integrator = plugin("nerg", aovs="visibility", observer=observer_at(rgb, *EYE))
+        integrator = plugin("nerg", aovs="visibility", observer=make_observer(rgb, *EYE))
         things = {"ball": sphere(rgb, 0, 0, 0), "leftover": rgb.Mesh("leftover", 0, 0)}
         words = 'the mesh "leftover" has no faces'
     with pytest.raises(Exception) as raised:

@@ -17,7 +17,7 @@ from .scenes import (
     channels,
     constant,
     look_at,
-    observer_at,
+    make_observer,
     plugin,
     points,
     put,
@@ -238,7 +238,7 @@ def test02_who_stands_below_sees_all(rgb):
 def test03_shapes_above_hide_nothing_from_the_camera_but_all_from_the_observer(rgb):
     sensor = camera(rgb, origin=(0.1, 0, -3), target=(0, 0, 0))
     lid, floor = sphere(rgb, 0, 0, -1, radius=0.4), square(rgb, 1.0, size=5.0)
-    given = {"type": "nerg", "aovs": "depth,visibility", "observer": observer_at(rgb, 0, 0, -3), "up": [0.0, 0.0, -1.0]}
+    given = {"type": "nerg", "aovs": "depth,visibility", "observer": make_observer(rgb, 0, 0, -3), "up": [0.0, 0.0, -1.0]}
     middle = lambda out, name: out[name][6, 6]
     whole = channels(rgb, given, sensor, lid=lid, floor=floor)
     out = channels(rgb, {**given, "ceiling": 0.5}, sensor, lid=lid, floor=floor)

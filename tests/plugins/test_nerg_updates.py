@@ -7,7 +7,7 @@ import pytest
 from nerg_mi.fields.gaze_base import GazeEnsemble, RaySupport
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.rays.rays import Rays
-from nerg_mi.registration import plugin_class
+from nerg_mi.registration import get_plugin_class
 from nerg_mi.transport import observer, volume_medium
 from tests.formats.splats.writers import random_splats
 
@@ -15,7 +15,7 @@ from . import fields
 from .scenes import (
     camera,
     channels,
-    observer_at,
+    make_observer,
     picture,
     plugin,
     put,
@@ -34,7 +34,7 @@ def behind_a_wall(mi, **more):
     """An observer before a wall with a gap, and a camera that sees what lies behind it."""
     sensor = camera(mi, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
     how = {"aovs": "visibility", "step": 0.01, "falloff": 0.0, "radiance": False, **more}
-    return scene_with(mi, plugin("nerg", density=wall(mi), observer=observer_at(mi, 0, 0, -0.9), **how), sensor)
+    return scene_with(mi, plugin("nerg", density=wall(mi), observer=make_observer(mi, 0, 0, -0.9), **how), sensor)
 
 
 def seen(mi, scene) -> np.ndarray:
@@ -70,7 +70,7 @@ def test01b_an_observer_who_moves_is_no_constant_of_the_kernel(rgb, of):
     params = rgb.traverse(scene if of == "scene" else scene.integrator())
     name = "integrator.observer.to_world" if of == "scene" else "observer.to_world"
     put(params, name, rgb.Transform4f().translate([0.2, 0, -0.8]))
-    center = observer.center(scene.integrator().observer)
+    center = observer.sensor_center(scene.integrator().observer)
     assert np.allclose(np.ravel(np.array(center)), [0.2, 0, -0.8])
     assert scene.integrator().observer.world_transform().matrix[0, 3].state == dr.VarState.Evaluated
 
@@ -109,7 +109,7 @@ def test03_a_map_follows_the_field(rgb, files, change):
         scene = behind_a_wall(rgb, visibility="map", map_height=64)
         key = "integrator.density.data"
     else:
-        how = {"falloff": 0.0, "visibility": "map", "map_height": 32, "observer": observer_at(rgb, -2, 0.3, -2)}
+        how = {"falloff": 0.0, "visibility": "map", "map_height": 32, "observer": make_observer(rgb, -2, 0.3, -2)}
         scene = scene_with(rgb, with_field(files, aovs="observer_depth", **how))
         key = "integrator.field.density_net.1"
     params = rgb.traverse(scene)
@@ -123,7 +123,7 @@ def test03_a_map_follows_the_field(rgb, files, change):
     after = seen(rgb, scene)
     assert np.abs(after - before).max() > 0.1
     # What a map that was made for it says.
-    scene.integrator().cache.forget()
+    scene.integrator().cache.clear()
     np.testing.assert_array_equal(seen(rgb, scene), after)
 
 
@@ -163,11 +163,11 @@ def test06_gaze_and_its_spread_fade_with_visibility(rgb, files, tmp_path):
     members = [fields.gaze(tmp_path / f"{k}.safetensors", seed=k) for k in (1, 2)]
     members[1].set_parameters({"emit_head.0": 20 * members[1].parameters()["emit_head.0"]})
     origins = np.random.default_rng(0).normal((-2, 0.3, -2), 0.3, (50, 3))
-    save_gaze(GazeEnsemble(members, RaySupport.of(origins, 1.0)), tmp_path / "e.safetensors", {})
+    save_gaze(GazeEnsemble(members, RaySupport.from_origins(origins, 1.0)), tmp_path / "e.safetensors", {})
     d = np.random.default_rng(1).normal(size=(50, 3)) + (2, -0.3, 2)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     Rays(np.arange(50), np.zeros(50), ("a",), origins, d, np.ones(50)).save(tmp_path / "rays.npz")
-    more = {"observer": observer_at(rgb, -2, 0.3, -2), "visibility": "transmittance"}
+    more = {"observer": make_observer(rgb, -2, 0.3, -2), "visibility": "transmittance"}
     more["gaze"] = stored("gazefield", tmp_path / "e.safetensors")
     more["kde"] = stored("gazekde", tmp_path / "rays.npz", kappa=2.0)
     aovs = "gaze,gaze_std,kde,support,visibility,opacity"
@@ -210,12 +210,12 @@ def small(mi):
 
 
 def scene_of(mi, files, shapes=(), **more):
-    how = {"aovs": "depth,gaze,visibility", "falloff": 2.0, "observer": observer_at(mi, -2, 0.3, -2), **more}
+    how = {"aovs": "depth,gaze,visibility", "falloff": 2.0, "observer": make_observer(mi, -2, 0.3, -2), **more}
     return scene_with(mi, with_gaze(files, **how), small(mi), **dict(shapes))
 
 
 def splat_scene(mi):
-    place = plugin_class("splats").of(random_splats(40, degree=1, size=0.2))
+    place = get_plugin_class("splats").of(random_splats(40, degree=1, size=0.2))
     return scene_with(mi, plugin("nerg", field=place, aovs="depth,opacity"), small(mi))
 
 
@@ -242,7 +242,7 @@ FROZEN = {
     "gaze weights": (scene_of, "integrator.gaze.grid.table", scaled),
     "field weights": (scene_of, "integrator.field.density_net.1", scaled),
     # What may be left out for one observer may not be for the next.
-    "from camera": (lambda mi, files: scene_of(mi, files, observer=observer_at(mi, 0.5, 0.4, -3)), OBSERVER, moved),
+    "from camera": (lambda mi, files: scene_of(mi, files, observer=make_observer(mi, 0.5, 0.4, -3)), OBSERVER, moved),
     "camera": (lambda mi, files: scene_with(mi, with_gaze(files), camera(mi, size=6)), "sensor.to_world", moved),
     "map": (lambda mi, files: scene_of(mi, files, visibility="map", map_height=32), OBSERVER, moved),
     "transmittance": (lambda mi, files: scene_of(mi, files, visibility="transmittance"), OBSERVER, moved),

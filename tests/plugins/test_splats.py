@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.fields.splats import Splats, harmonics_of, joined
+from nerg_mi.fields.splats import Splats, harmonics_from_colors, concatenate_splats
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.maths.color import decode_srgb, encode_srgb
-from nerg_mi.registration import plugin_class
+from nerg_mi.registration import get_plugin_class
 from tests.conftest import ROOT
 from tests.formats.splats.writers import random_splats
 
@@ -45,7 +45,7 @@ def wall(z=0.0, opacity=0.99, half=2.0, spacing=0.08, color=(0.2, 0.5, 0.8)):
     grid = np.stack(np.meshgrid(x, x, [z], indexing="ij"), axis=-1).reshape(-1, 3)
     n = len(grid)
     scales = np.tile([spacing, spacing, 1e-3], (n, 1))
-    return Splats(grid, scales, [[1, 0, 0, 0]] * n, np.full(n, opacity), harmonics_of(np.tile(color, (n, 1))))
+    return Splats(grid, scales, [[1, 0, 0, 0]] * n, np.full(n, opacity), harmonics_from_colors(np.tile(color, (n, 1))))
 
 
 def of_mitsuba(mi, path, sensor):
@@ -69,7 +69,7 @@ def test_colors_are_those_of_mitsubas_own_renderer(rgb, tmp_path, render):
 
 def test_a_gaussian_is_met_once(rgb, tmp_path, render):
     # Mitsuba 3.9.1 meets one that is thin a second time where a ray grazes it: its next ray starts outside again.
-    one = Splats([[0, 0, 0]], [[0.3, 0.05, 0.1]], [[0.8, 0.3, 0.4, 0.2]], [0.5], harmonics_of([[1, 1, 1]]))
+    one = Splats([[0, 0, 0]], [[0.3, 0.05, 0.1]], [[0.8, 0.3, 0.4, 0.2]], [0.5], harmonics_from_colors([[1, 1, 1]]))
     opacity = render(one, aovs="opacity", sensor=camera(rgb, size=64))["opacity"]
     theirs = of_mitsuba(rgb, tmp_path / "a.ply", camera(rgb, size=64))[..., 0]
     # Within the rim, where both cut it off.
@@ -97,7 +97,7 @@ def test_a_wall_is_where_it_stands_for_camera_and_observer(rgb, render):
 @pytest.mark.parametrize("visibility", ["depth", "transmittance", "map"])
 def test_what_stands_between_hides(rgb, render, visibility):
     back, front = wall(), wall(-1, half=0.6)
-    both = joined([back, front])
+    both = concatenate_splats([back, front])
     # The camera looks at the far wall below the near one, behind which the observer stands.
     observer = {"type": "perspective", "to_world": look_at(rgb, (0, 0, -3), (0, 0, 0))}
     sensor = camera(rgb, (0, 0, -0.5), (0, 0, 0), fov=140)
@@ -113,7 +113,7 @@ def test_what_stands_between_hides(rgb, render, visibility):
 
 def test_eyes_stand_inside_of_gaussians(rgb, render):
     # A haze around camera and wall: its peak lies behind the camera on one side, before it on the other.
-    haze = Splats([[0.5, 0.4, -2.5]], [[3, 3, 3]], [[1, 0, 0, 0]], [0.5], harmonics_of([[1, 1, 1]]))
+    haze = Splats([[0.5, 0.4, -2.5]], [[3, 3, 3]], [[1, 0, 0, 0]], [0.5], harmonics_from_colors([[1, 1, 1]]))
     found = render(haze, aovs="opacity,depth")
     assert found["opacity"].min() > 0.4 and found["depth"].max() <= 0.5
     away = render(haze, camera(rgb, (0.5, 0.4, -2), (0.5, 0.4, 0)), aovs="opacity")
@@ -168,7 +168,7 @@ def test_a_picture_is_differentiated(rgb, tmp_path):
 
 
 def test_the_page_on_fitting_runs(rgb, tmp_path, monkeypatch):
-    """The block of docs/splats.md."""
+    """The block of docs/how-to/environments.md."""
     write_ply_splats(tmp_path / "store.ply", random_splats(20, degree=0, size=0.2))
     monkeypatch.chdir(tmp_path)
     (text,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "splats.md").read_text("utf-8"), re.M | re.S)
@@ -184,9 +184,9 @@ def test_all_sizes_and_opacities_give_finite_pictures(rgb, tmp_path):
     n = 300
     sizes = np.array([[1e-6] * 3, [1e-6, 1e-6, 1], [1e-6, 1, 1], [1e3] * 3, [1e3, 1e-6, 1e3], [0.3] * 3])
     opacities = rng.choice([0, 1e-3, 0.05, 1], n)
-    colors = harmonics_of(rng.uniform(-1, 2, (n, 3)))
+    colors = harmonics_from_colors(rng.uniform(-1, 2, (n, 3)))
     some = Splats(rng.normal(0, 1, (n, 3)), rng.choice(sizes, n), rng.normal(size=(n, 4)), opacities, colors)
-    place = plugin_class("splats").of(some)
+    place = get_plugin_class("splats").of(some)
     integrator = {"type": "nerg", "id": "i", "field": place, "aovs": "depth,opacity,position"}
     scene = rgb.load_dict({"type": "scene", "i": integrator, "s": camera(rgb, (0, 0, 0), (0.3, 0.2, 1), size=8)})
     params = rgb.traverse(scene)
@@ -214,7 +214,7 @@ def test_the_volume_says_what_it_is(rgb, tmp_path):
     assert np.allclose(np.array(volume.bbox().max).ravel(), [3.24, 3.24, 1.003], atol=1e-3)
     with pytest.raises(Exception, match="no density at a point"):
         volume.eval_1(rgb.Interaction3f())
-    kind = plugin_class("splats")
+    kind = get_plugin_class("splats")
     assert kind.of(replace(wall(), color_space="linear")).medium().color_space == "linear"
     assert "in memory" in str(kind.of(wall()))
     with pytest.raises(Exception, match="splats in memory are needed"):

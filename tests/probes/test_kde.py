@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from nerg_mi.maths import vmf
-from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
+from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
 from nerg_mi.probes.kde import (
     SphericalKde,
     SphericalKdeTable,
-    kappa_grid,
-    leave_one_out_kappa,
-    leave_one_out_scores,
-    loo_kappas,
-    silverman_kappas,
+    make_kappa_grid,
+    select_loo_kappa,
+    compute_loo_scores,
+    select_loo_kappas,
+    compute_silverman_kappas,
 )
 from tests.reference.kde import kde as reference
 
@@ -23,7 +23,7 @@ from tests.reference.kde import kde as reference
 def ragged(seed=0, counts=(1, 7, 300, 64)):
     rng = np.random.default_rng(seed)
     offsets = np.concatenate([[0], np.cumsum(counts)])
-    return uniform_directions(offsets[-1], rng), offsets, rng.uniform(0.5, 90, len(counts)), rng
+    return sample_uniform_directions(offsets[-1], rng), offsets, rng.uniform(0.5, 90, len(counts)), rng
 
 
 def test_agrees_with_float64():
@@ -82,7 +82,7 @@ def test_a_part_is_the_same_densities(weighted):
     kde, x = SphericalKde(rays, offsets, kappa, weights, "llvm"), fibonacci_directions(200)
     whole = kde.evaluate(x)
     for first, last in [(0, 2), (1, 3), (2, 4), (3, 4), (0, 4)]:
-        part = kde.part(first, last)
+        part = kde.select_range(first, last)
         assert part.count == last - first
         assert np.allclose(part.evaluate(x), whole[first:last], rtol=1e-5, atol=1e-7)
 
@@ -94,14 +94,14 @@ def test_a_part_is_the_same_densities(weighted):
 @pytest.mark.parametrize("count", [1, 40])
 def test_close_to_exact_everywhere(kappa, count):
     rng = np.random.default_rng(0)
-    mu = uniform_directions(count, rng)
+    mu = sample_uniform_directions(count, rng)
     kde = SphericalKde(mu, [0, count], kappa, backend="llvm")
     # All over, near the peaks, and on the cube's edges and corners.
     edges = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
     edges = np.concatenate([edges, edges + 1e-6, edges - 1e-6])
     x = np.concatenate(
         [
-            uniform_directions(5000, rng),
+            sample_uniform_directions(5000, rng),
             mu,
             vmf.sample(np.repeat(mu, 9, 0), kappa, rng),
             edges / np.linalg.norm(edges, axis=1, keepdims=True),
@@ -117,17 +117,17 @@ def test_close_to_exact_everywhere(kappa, count):
 
 def test_only_what_is_used_is_evaluated():
     rng = np.random.default_rng(1)
-    kde = SphericalKde(uniform_directions(30, rng), [0, 30], 60.0, backend="llvm")
+    kde = SphericalKde(sample_uniform_directions(30, rng), [0, 30], 60.0, backend="llvm")
     x = vmf.sample(np.tile([0.6, 0.0, 0.8], (2000, 1)), 100.0, rng)
-    part, whole = SphericalKdeTable(kde, used=x), SphericalKdeTable(kde)
-    assert np.array_equal(part.evaluate(x), whole.evaluate(x)) and part.evaluated < 0.2 * whole.evaluated
+    part, whole = SphericalKdeTable(kde, directions=x), SphericalKdeTable(kde)
+    assert np.array_equal(part.evaluate(x), whole.evaluate(x)) and part.num_evaluated < 0.2 * whole.num_evaluated
 
 
 def test_one_probe_of_several_and_its_slope():
     import drjit.llvm.ad as ns
 
     rng = np.random.default_rng(2)
-    kde = SphericalKde(uniform_directions(50, rng), [0, 20, 50], [5.0, 30.0], backend=ns)
+    kde = SphericalKde(sample_uniform_directions(50, rng), [0, 20, 50], [5.0, 30.0], backend=ns)
     table = SphericalKdeTable(kde, probe=1)
     x0 = np.array([0.36, 0.48, 0.8])
     assert np.isclose(table.evaluate(x0[None])[0], kde.evaluate(x0[None])[1, 0], rtol=1e-3)
@@ -139,7 +139,7 @@ def test_one_probe_of_several_and_its_slope():
     ends = np.array([x0 + h * side for h in (1e-3, -1e-3)])
     a, b = reference(
         ends / np.linalg.norm(ends, axis=1, keepdims=True),
-        np.array(kde.part(1, 2)._rays).reshape(-1, 4)[:, :3],
+        np.array(kde.select_range(1, 2)._rays).reshape(-1, 4)[:, :3],
         [0, 30],
         [30.0],
     )[0]
@@ -150,7 +150,7 @@ def test_too_sharp_for_a_table():
     kde = SphericalKde(np.array([[0.0, 0, 1]]), [0, 1], 1e8, backend="llvm")
     with pytest.raises(ValueError, match="evaluate the density directly"):
         SphericalKdeTable(kde)
-    assert not SphericalKdeTable.fits(kde, 10**6)
+    assert not SphericalKdeTable.is_worthwhile(kde, 10**6)
 
 
 # ---- The width of a kernel ----
@@ -163,12 +163,12 @@ def gazes(n, kappa=30.0, seed=0):
 
 @pytest.mark.parametrize("most", [2.0, 30.0, 1000.0])
 def test_what_is_chosen_from_ends_at_the_bounds_in_steps_of_a_quarter(most):
-    grid = kappa_grid(most)
+    grid = make_kappa_grid(most)
     assert grid[0] == 1 and grid[-1] == pytest.approx(most)
     # As many equal steps as come nearest to a quarter each.
     assert abs(len(grid) - 1 - np.log(most) / np.log(1.25)) <= 0.5
     assert np.allclose(np.diff(np.log(grid)), np.log(grid[1] / grid[0]))
-    assert len(kappa_grid(1.01)) == 2
+    assert len(make_kappa_grid(1.01)) == 2
 
 
 @pytest.mark.parametrize("groups", [None, [0, 0, 1, 1, 1, 2, 0, 2, 2, 1, 0, 3]])
@@ -179,33 +179,33 @@ def test_the_score_is_the_log_likelihood_under_the_others(groups):
     for kappa in grid:
         density = np.exp(vmf.log_normaliser(kappa) + kappa * (x @ x.T - 1))
         want.append(np.mean([np.log(density[i][g != g[i]].mean()) for i in range(12)]))
-    assert np.allclose(leave_one_out_scores(x, None if groups is None else g, grid), want, rtol=1e-5)
+    assert np.allclose(compute_loo_scores(x, None if groups is None else g, grid), want, rtol=1e-5)
     # Of one person alone, the ray itself is left out.
-    assert np.allclose(leave_one_out_scores(x, np.zeros(12), grid), leave_one_out_scores(x, None, grid))
+    assert np.allclose(compute_loo_scores(x, np.zeros(12), grid), compute_loo_scores(x, None, grid))
 
 
 def test_one_width_for_all_is_that_of_the_sum_of_the_scores():
     x, offsets = np.concatenate([gazes(60, 5.0, 1), gazes(1, 5.0, 2), gazes(200, 60.0, 3)]), np.array([0, 60, 61, 261])
-    person, grid = np.arange(261), kappa_grid(500.0)
-    each = loo_kappas(x, person, offsets, 500.0, False, np.random.default_rng(0))
+    person, grid = np.arange(261), make_kappa_grid(500.0)
+    each = select_loo_kappas(x, person, offsets, 500.0, False, np.random.default_rng(0))
     runs = [(0, 60), (61, 261)]
-    assert [each[0], each[2]] == [leave_one_out_kappa(x[a:b], person[a:b], kappa_max=500.0) for a, b in runs]
+    assert [each[0], each[2]] == [select_loo_kappa(x[a:b], person[a:b], kappa_max=500.0) for a, b in runs]
     assert each[1] == 1
-    total = sum(leave_one_out_scores(x[a:b], person[a:b], grid) for a, b in runs)
+    total = sum(compute_loo_scores(x[a:b], person[a:b], grid) for a, b in runs)
     assert (
-        loo_kappas(x, person, offsets, 500.0, True, np.random.default_rng(0)).tolist() == [grid[np.argmax(total)]] * 3
+        select_loo_kappas(x, person, offsets, 500.0, True, np.random.default_rng(0)).tolist() == [grid[np.argmax(total)]] * 3
     )
-    assert loo_kappas(x[:2], person[:2], np.array([0, 1, 2]), 500.0, True, np.random.default_rng(0)).tolist() == [1, 1]
+    assert select_loo_kappas(x[:2], person[:2], np.array([0, 1, 2]), 500.0, True, np.random.default_rng(0)).tolist() == [1, 1]
 
 
 def test_the_published_rule_counts_weighted_rays_by_what_they_are_worth():
     x, offsets = gazes(90), np.array([0, 40, 90])
-    plain = silverman_kappas(x, None, offsets, 1e9, False)
-    doubled = silverman_kappas(x, np.full(90, 2.0), offsets, 1e9, False)
+    plain = compute_silverman_kappas(x, None, offsets, 1e9, False)
+    doubled = compute_silverman_kappas(x, np.full(90, 2.0), offsets, 1e9, False)
     assert np.allclose(plain, doubled)
     # Rays of no weight are not there.
     weights = np.r_[np.ones(40), np.zeros(20), np.ones(30)]
-    want = silverman_kappas(np.delete(x, np.s_[40:60], axis=0), None, np.array([0, 40, 70]), 1e9, False)
-    assert np.allclose(silverman_kappas(x, weights, offsets, 1e9, False), want)
-    shared = silverman_kappas(x, None, offsets, 1e9, True)
-    assert np.allclose(1 / shared, np.mean(1 / plain)) and (silverman_kappas(x, None, offsets, 2.0, False) == 2).all()
+    want = compute_silverman_kappas(np.delete(x, np.s_[40:60], axis=0), None, np.array([0, 40, 70]), 1e9, False)
+    assert np.allclose(compute_silverman_kappas(x, weights, offsets, 1e9, False), want)
+    shared = compute_silverman_kappas(x, None, offsets, 1e9, True)
+    assert np.allclose(1 / shared, np.mean(1 / plain)) and (compute_silverman_kappas(x, None, offsets, 2.0, False) == 2).all()

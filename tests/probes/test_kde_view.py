@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
-from nerg_mi.probes.kde_view import WORTH, KdeView, directions_to, kde_frame, probe_at
+from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
+from nerg_mi.probes.kde_view import MIN_TABLE_DIRECTIONS, KdeView, compute_directions, evaluate_kde_frame, make_probe_at
 from nerg_mi.rays.rays import RayIndex, Rays
-from nerg_mi.transport.observer import ObserverCache, view_along
+from nerg_mi.transport.observer import ObserverCache, evaluate_view
 from tests.reference.kde import kde as reference
 
 # ---- Frame ----
@@ -19,7 +19,7 @@ OBSERVER = np.array([1.0, 1.0, 1.6])
 
 def rays_of(origin, seed, people=1):
     n, who = len(origin), np.arange(len(origin)) % people
-    d = uniform_directions(n, np.random.default_rng(seed))
+    d = sample_uniform_directions(n, np.random.default_rng(seed))
     return Rays(np.arange(n) * 0.1, who, tuple("abcd"[:people]), origin, d, np.ones(n))
 
 
@@ -38,34 +38,34 @@ def wall(h=60, w=90):
 
 @pytest.mark.parametrize("method", ["exact", "table", "auto"])
 def test_every_pixel_has_the_density_of_its_direction(rays_frame, method):
-    probe = probe_at(rays_frame, OBSERVER, 0.3, kappa_rule="fixed", kappa=25.0, index=RayIndex(rays_frame))
+    probe = make_probe_at(rays_frame, OBSERVER, 0.3, kappa_rule="fixed", kappa=25.0, index=RayIndex(rays_frame))
     points = wall()
-    picture = kde_frame(probe, observer=OBSERVER, points=points, method=method, backend="llvm")
+    picture = evaluate_kde_frame(probe, observer=OBSERVER, points=points, method=method, backend="llvm")
     assert picture.shape == (60, 90) and (picture[:10, :10] == 0).all()
     d = points - OBSERVER
     d /= np.linalg.norm(d, axis=-1, keepdims=True)
     want = reference(d[20:].reshape(-1, 3), probe.directions, probe.offsets, probe.kappa)[0].reshape(40, 90)
     assert np.allclose(picture[20:], want, rtol=2e-3)
     there = np.isfinite(points).all(axis=-1)
-    again = kde_frame(probe, np.where(there[..., None], d, (0, 0, 1)), mask=there, method=method, backend="llvm")
+    again = evaluate_kde_frame(probe, np.where(there[..., None], d, (0, 0, 1)), mask=there, method=method, backend="llvm")
     assert np.allclose(again, picture, rtol=1e-4, atol=1e-6)
 
 
 def test_directions_to_points():
-    d, there = directions_to(OBSERVER, np.array([[[1, 1, 3.6], OBSERVER, [np.nan, 0, 0]]]))
+    d, there = compute_directions(OBSERVER, np.array([[[1, 1, 3.6], OBSERVER, [np.nan, 0, 0]]]))
     assert there.tolist() == [[True, False, False]] and np.allclose(d, [0, 0, 1])
 
 
 def test_refusals(rays_frame):
-    probe = probe_at(rays_frame, OBSERVER)
+    probe = make_probe_at(rays_frame, OBSERVER)
     with pytest.raises(ValueError, match="say where the pixels look"):
-        kde_frame(probe)
+        evaluate_kde_frame(probe)
     with pytest.raises(ValueError, match="say where the pixels look"):
-        kde_frame(probe, points=wall())
+        evaluate_kde_frame(probe, points=wall())
     with pytest.raises(ValueError, match="method"):
-        kde_frame(probe, observer=OBSERVER, points=wall(), method="guess")
+        evaluate_kde_frame(probe, observer=OBSERVER, points=wall(), method="guess")
     with pytest.raises(ValueError, match="enlarge the radius"):
-        probe_at(rays_frame, [50, 0, 0])
+        make_probe_at(rays_frame, [50, 0, 0])
 
 
 # ---- View ----
@@ -94,8 +94,8 @@ def test_the_rays_are_the_nearest(rays_view):
     for p in np.random.default_rng(1).normal(size=(5, 3)):
         apart = np.linalg.norm(rays_view.origin - p, axis=1)
         want = rays_view.direction[np.argsort(apart)[:COUNT]]
-        assert {tuple(x) for x in view.nearest(p)} == {tuple(x) for x in want}
-    assert len(KdeView(rays_view, 10_000, KAPPA).nearest(np.zeros(3))) == 300
+        assert {tuple(x) for x in view.find_nearest(p)} == {tuple(x) for x in want}
+    assert len(KdeView(rays_view, 10_000, KAPPA).find_nearest(np.zeros(3))) == 300
     with pytest.raises(ValueError, match="no rays"):
         KdeView(rays_view.select(np.zeros(300, bool)))
 
@@ -109,17 +109,17 @@ def test_each_lane_has_the_density_of_its_observer(rgb, rays_view):
     observers = [points(there[k : k + 1]) for k in (0, 1)]
     for k in (0, 1):
         p_o = points(np.repeat(there[k : k + 1], 50, axis=0))
-        value = view_along(view, observers, p_o, points(d @ turn[:3, :3].T / 2), ObserverCache())
+        value = evaluate_view(view, observers, p_o, points(d @ turn[:3, :3].T / 2), ObserverCache())
         assert np.allclose(value.numpy(), expected(rays_view, eyes[k], d), rtol=1e-4, atol=1e-6)
 
 
 def test_many_directions_are_looked_up_and_equal(rays_view):
     view, p = KdeView(rays_view, COUNT, KAPPA, backend=ns), np.array([0.1, 0.2, 0.0])
-    d = fibonacci_directions(max(WORTH, 20_000))
-    observed = view.at(points(p[None]))
-    found = observed.value(points(d)).numpy()
+    d = fibonacci_directions(max(MIN_TABLE_DIRECTIONS, 20_000))
+    observed = view.for_position(points(p[None]))
+    found = observed.evaluate(points(d)).numpy()
     want = expected(rays_view, p, d)
     assert np.abs(found - want).max() < 2e-3 * want.max()
-    few = observed.value(points(d[:30])).numpy()
+    few = observed.evaluate(points(d[:30])).numpy()
     assert np.allclose(few, want[:30], rtol=1e-4, atol=1e-6)
-    assert not dr.grad_enabled(observed.value(points(d[:1])))
+    assert not dr.grad_enabled(observed.evaluate(points(d[:1])))

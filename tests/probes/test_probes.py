@@ -7,19 +7,19 @@ import pytest
 
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.kde import leave_one_out_kappa
+from nerg_mi.probes.kde import select_loo_kappa
 from nerg_mi.probes.probes import (
-    LEVELS,
-    calibrated_levels,
-    effective_persons,
-    entropy,
-    integral,
-    level_name,
-    person_weights,
+    REGION_LEVELS,
+    calibrate_levels,
+    count_effective_participants,
+    compute_entropy,
+    compute_integral,
+    format_level,
+    compute_participant_weights,
     place_probes,
     place_queries,
-    region_levels,
-    sample,
+    compute_region_levels,
+    sample_directions,
 )
 from nerg_mi.rays.rays import Rays
 
@@ -46,26 +46,26 @@ def rays_measures():
 
 def test_integral_is_one_at_a_thousand_random_positions(rays_measures):
     probes = place_probes(
-        rays_measures, 0.2, placement="random", count=1100, cap=64, min_rays=4, kappa_max=100.0, weights="distance"
+        rays_measures, 0.2, placement="random", count=1100, max_rays=64, min_rays=4, kappa_max=100.0, weights="distance"
     )
     assert len(probes) > 1000
-    assert np.abs(integral(probes, 8192, "llvm") - 1).max() < 1e-3
+    assert np.abs(compute_integral(probes, 8192, "llvm") - 1).max() < 1e-3
 
 
 def test_entropy_of_known_laws(rays_measures):
-    probes = place_probes(rays_measures, 0.25, count=3, min_rays=1, cap=1, kappa_rule="fixed", kappa=40.0)
+    probes = place_probes(rays_measures, 0.25, count=3, min_rays=1, max_rays=1, kappa_rule="fixed", kappa=40.0)
     # One ray: von Mises-Fisher, whose entropy is κ (1 - A(κ)) - log C(κ).
     want = 40 * (1 - vmf.mean_resultant_length(40.0)) - vmf.log_normaliser(40.0)
-    assert np.allclose(entropy(probes, backend="llvm"), want, atol=1e-4)
+    assert np.allclose(compute_entropy(probes, backend="llvm"), want, atol=1e-4)
     flat = place_probes(rays_measures, 0.25, count=3, kappa_rule="fixed", kappa=0.0)
-    assert np.allclose(entropy(flat, backend="llvm"), np.log(4 * np.pi), atol=1e-6)
+    assert np.allclose(compute_entropy(flat, backend="llvm"), np.log(4 * np.pi), atol=1e-6)
 
 
 def test_samples_follow_the_density(rays_measures):
     probes = place_probes(
-        rays_measures, 0.3, count=2, cap=20, min_rays=20, kappa_rule="fixed", kappa=30.0, weights="distance"
+        rays_measures, 0.3, count=2, max_rays=20, min_rays=20, kappa_rule="fixed", kappa=30.0, weights="distance"
     )
-    x = sample(probes, 40_000, np.random.default_rng(0))
+    x = sample_directions(probes, 40_000, np.random.default_rng(0))
     assert np.allclose(np.linalg.norm(x, axis=2), 1)
     for p in range(2):
         run = slice(probes.offsets[p], probes.offsets[p + 1])
@@ -73,15 +73,15 @@ def test_samples_follow_the_density(rays_measures):
         assert np.allclose(x[p].mean(axis=0), vmf.mean_resultant_length(30.0) * (w @ probes.directions[run]), atol=0.01)
         # E[log p] under its own samples is minus the entropy.
         log = np.log(probes.density(np.stack([x[0], x[1]]), "llvm")[p])
-        assert np.isclose(-log.mean(), entropy(probes, backend="llvm")[p], atol=0.02)
+        assert np.isclose(-log.mean(), compute_entropy(probes, backend="llvm")[p], atol=0.02)
 
 
 def test_people_who_count(rays_measures):
     probes = place_probes(rays_measures, 0.3, count=20)
-    people = effective_persons(probes, rays_measures)
+    people = count_effective_participants(probes, rays_measures)
     assert ((people > 2.5) & (people < 4)).all()
-    even = place_probes(rays_measures, 0.3, queries=probes.queries, ray_weights=person_weights(rays_measures))
-    assert effective_persons(even, rays_measures).mean() > people.mean() + 0.1
+    even = place_probes(rays_measures, 0.3, queries=probes.queries, ray_weights=compute_participant_weights(rays_measures))
+    assert count_effective_participants(even, rays_measures).mean() > people.mean() + 0.1
 
 
 # ---- Placement ----
@@ -140,7 +140,7 @@ def test_places_that_are_far_enough_apart_all_have_a_probe():
 
 
 def test_holds_the_nearest_rays_within_the_radius(rays_measures):
-    probes = place_probes(rays_measures, 0.2, count=20, cap=40, min_rays=10)
+    probes = place_probes(rays_measures, 0.2, count=20, max_rays=40, min_rays=10)
     for p in range(len(probes)):
         held = probes.indices[probes.offsets[p] : probes.offsets[p + 1]]
         far = np.linalg.norm(rays_measures.origin - probes.queries[p], axis=1)
@@ -158,8 +158,8 @@ def test_leave_one_out_sees_through_repetition():
     rng = np.random.default_rng(0)
     centre = vmf.sample(np.tile([0, 0, 1.0], (12, 1)), 20.0, rng)
     rays, person = np.repeat(centre, 20, axis=0), np.repeat(np.arange(12), 20)
-    assert leave_one_out_kappa(rays) > 900
-    assert leave_one_out_kappa(rays, person) < 100
+    assert select_loo_kappa(rays) > 900
+    assert select_loo_kappa(rays, person) < 100
 
 
 def test_refusals(rays_measures):
@@ -170,7 +170,7 @@ def test_refusals(rays_measures):
     with pytest.raises(ValueError, match="enlarge the radius"):
         place_probes(rays_measures, 0.001, count=10)
     with pytest.raises(ValueError, match="min_rays"):
-        place_probes(rays_measures, 0.25, cap=10, min_rays=20)
+        place_probes(rays_measures, 0.25, max_rays=10, min_rays=20)
 
 
 def test_people_of_a_probe_can_count_alike():
@@ -211,7 +211,7 @@ def test_person_weights_of_people_without_rays():
     """Names without rays do not count as people: the mean stays one, and everybody who is there has the same sum."""
     person = np.array([0] * 6 + [3] * 2)
     rays = Rays(np.arange(8.0), person, tuple("abcd"), np.zeros((8, 3)), np.tile([1.0, 0, 0], (8, 1)), np.ones(8))
-    weights = person_weights(rays)
+    weights = compute_participant_weights(rays)
     assert weights == pytest.approx([8 / 2 / 6] * 6 + [8 / 2 / 2] * 2)
     assert weights.mean() == pytest.approx(1)
 
@@ -223,23 +223,23 @@ def test_regions_of_a_cap_hold_what_they_say():
     """A density that falls with the angle from z: the region that ends at cos a holds (e^k - e^ka) / (e^k - e^-k)."""
     d, kappa = fibonacci_directions(20_000), 3.0
     maps, at = np.exp(kappa * d[None, :, 2]), np.array([[1.0, 0.5, 0.0, -1.0]])
-    level = region_levels(maps, np.exp(kappa * at))
+    level = compute_region_levels(maps, np.exp(kappa * at))
     expected = (np.exp(kappa) - np.exp(kappa * at)) / (2 * np.sinh(kappa))
     np.testing.assert_allclose(level, expected, atol=1e-3)
-    assert region_levels(np.ones((1, 5)), np.ones((1, 2))).tolist() == [[0.5, 0.5]]
-    assert region_levels(np.zeros((1, 5)), np.zeros((1, 2))).tolist() == [[0.5, 0.5]]
+    assert compute_region_levels(np.ones((1, 5)), np.ones((1, 2))).tolist() == [[0.5, 0.5]]
+    assert compute_region_levels(np.zeros((1, 5)), np.zeros((1, 2))).tolist() == [[0.5, 0.5]]
 
 
 def test_calibrated_levels_are_weighted_quantiles():
     rng = np.random.default_rng(0)
     # Of a density whose looks lie at the square root of a uniform level, the share q holds q^2 of them.
     levels = np.sqrt(rng.random(40_000))
-    found = calibrated_levels(levels, np.ones(len(levels)))
-    np.testing.assert_allclose([found[level_name(q)] for q in LEVELS], np.sqrt(LEVELS), atol=0.01)
+    found = calibrate_levels(levels, np.ones(len(levels)))
+    np.testing.assert_allclose([found[format_level(q)] for q in REGION_LEVELS], np.sqrt(REGION_LEVELS), atol=0.01)
     # A look of weight 3 is three looks; those of weight zero are none.
     some = levels[:999]
     times = rng.integers(0, 4, len(some))
-    assert calibrated_levels(some, times.astype(float)) == calibrated_levels(
+    assert calibrate_levels(some, times.astype(float)) == calibrate_levels(
         np.repeat(some, times), np.ones(times.sum())
     )
-    assert calibrated_levels(np.array([0.3]), np.ones(1)) == {"50%": 0.3, "80%": 0.3, "95%": 0.3}
+    assert calibrate_levels(np.array([0.3]), np.ones(1)) == {"50%": 0.3, "80%": 0.3, "95%": 0.3}

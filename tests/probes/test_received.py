@@ -4,8 +4,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.probes.surface_attention import Patches, contributions, patches, received
-from nerg_mi.transport.geometry import Place, pixel_solid_angles
+from nerg_mi.probes.surface_attention import Patches, attention_per_patch, make_patches, attention_on
+from nerg_mi.transport.geometry import SceneGeometry, pixel_solid_angles
 from tests.plugins import fields
 from tests.plugins.scenes import camera
 
@@ -41,7 +41,7 @@ EYES = np.array([(0, 0, 1), (0.9, -0.3, 0.8), (2.0, 1.5, 0.5), (0.1, 0.2, -1.0)]
 
 
 def test01_patches_tile_the_mesh(rgb):
-    cube = patches(rgb.load_dict({"type": "cube", "to_world": rgb.ScalarTransform4f().scale([1, 2, 3])}), 3)
+    cube = make_patches(rgb.load_dict({"type": "cube", "to_world": rgb.ScalarTransform4f().scale([1, 2, 3])}), 3)
     assert dr.width(cube.p) == 12 * 9
     assert np.isclose(dr.sum(cube.area)[0], 2 * (2 * 4 + 4 * 6 + 2 * 6))
     # Gauss: the flux of x through a closed surface is three times its volume, exactly, facets being flat.
@@ -54,9 +54,9 @@ def test15_a_rectangle_is_a_mesh_that_follows_its_transform(rgb):
     dr.enable_grad(x)
     params["to_world"] = rgb.Transform4f().translate(rgb.Point3f(x, 0, -1)).scale(rgb.Point3f(0.6, 0.4, 1))
     params.update()
-    pieces = patches(flat, 24)
+    pieces = make_patches(flat, 24)
     assert np.isclose(dr.sum(pieces.area)[0], 4 * 0.6 * 0.4) and np.allclose(np.array(pieces.n), [[0], [0], [1]])
-    share = received(None, uniform, rgb.Point3f(0, 0, 1), pieces)
+    share = attention_on(None, uniform, rgb.Point3f(0, 0, 1), pieces)
     wanted = lambda x: solid_angle(0.6, 0.4, (-x, 0, 2)) / (4 * np.pi)
     assert np.isclose(share[0], wanted(0.5), rtol=1e-3)
     dr.backward(share)
@@ -67,24 +67,24 @@ def test15_a_rectangle_is_a_mesh_that_follows_its_transform(rgb):
 def test02_what_cannot_be_cut(rgb, bad):
     shape = rgb.load_dict({"type": "sphere" if bad == "sphere" else "cube"})
     with pytest.raises(ValueError, match="not a mesh" if bad == "sphere" else "divisions=0"):
-        patches(shape, 4 if bad == "sphere" else 0)
+        make_patches(shape, 4 if bad == "sphere" else 0)
 
 
 def test03_a_uniform_density_gives_the_share_of_the_solid_angle(rgb):
-    got = received(None, uniform, rgb.Point3f(EYES.T), patches(sheet(rgb), 24)).numpy()
+    got = attention_on(None, uniform, rgb.Point3f(EYES.T), make_patches(sheet(rgb), 24)).numpy()
     expected = [solid_angle(0.6, 0.4, p) / (4 * np.pi) for p in EYES[:3]]
     assert np.allclose(got[:3], expected, rtol=5e-4)
     assert got[3] == 0  # from behind
-    both = received(None, uniform, rgb.Point3f(EYES.T), patches(sheet(rgb), 24), two_sided=True).numpy()
+    both = attention_on(None, uniform, rgb.Point3f(EYES.T), make_patches(sheet(rgb), 24), two_sided=True).numpy()
     behind = solid_angle(0.6, 0.4, EYES[3] * [1, 1, -1]) / (4 * np.pi)
     assert np.allclose(both, [*expected, behind], rtol=5e-4)
 
 
 def test05_from_inside_of_a_box_everything_is_seen_once(rgb):
     eyes = rgb.Point3f([0.1, -0.3], [0.2, 0.0], [0.0, 0.4])
-    box = patches(rgb.load_dict({"type": "cube"}), 24)
-    assert np.allclose(received(None, uniform, eyes, box, two_sided=True).numpy(), 1, rtol=1e-3)
-    assert np.allclose(received(None, uniform, eyes, box).numpy(), 0)
+    box = make_patches(rgb.load_dict({"type": "cube"}), 24)
+    assert np.allclose(attention_on(None, uniform, eyes, box, two_sided=True).numpy(), 1, rtol=1e-3)
+    assert np.allclose(attention_on(None, uniform, eyes, box).numpy(), 0)
 
 
 def test06_what_stands_in_between_hides(rgb):
@@ -95,10 +95,10 @@ def test06_what_stands_in_between_hides(rgb):
         np.float32
     )
     vertices.update()
-    place = Place(None, rgb.load_dict({"type": "scene", "plate": plate}))
-    eye, surface = rgb.Point3f(0, 0, 1), patches(sheet(rgb), 8)
-    each = contributions(place, uniform, eye, surface).numpy()
-    free = contributions(None, uniform, eye, surface).numpy()
+    place = SceneGeometry(None, rgb.load_dict({"type": "scene", "plate": plate}))
+    eye, surface = rgb.Point3f(0, 0, 1), make_patches(sheet(rgb), 8)
+    each = attention_per_patch(place, uniform, eye, surface).numpy()
+    free = attention_per_patch(None, uniform, eye, surface).numpy()
     right = surface.p.numpy()[0] > 0
     assert np.array_equal(each[right], free[right]) and not each[~right].any() and right.mean() == 0.5
 
@@ -106,44 +106,44 @@ def test06_what_stands_in_between_hides(rgb):
 @pytest.mark.parametrize("falloff, share", [(0.0, 0.0), (0.5, 0.6), (4.0, 0.95)])
 def test07_the_fall_off_behind_a_plate(rgb, falloff, share):
     # The plate lies 0.2 above a small patch right below the eye.
-    place = Place(None, rgb.load_dict({"type": "scene", "plate": sheet(rgb, 0.5, 0.5, 0.2)}))
-    eye, surface = rgb.Point3f(0, 0, 1), patches(sheet(rgb, 0.01, 0.01), 2)
-    got = received(place, uniform, eye, surface, falloff)[0] / received(None, uniform, eye, surface)[0]
+    place = SceneGeometry(None, rgb.load_dict({"type": "scene", "plate": sheet(rgb, 0.5, 0.5, 0.2)}))
+    eye, surface = rgb.Point3f(0, 0, 1), make_patches(sheet(rgb, 0.01, 0.01), 2)
+    got = attention_on(place, uniform, eye, surface, falloff)[0] / attention_on(None, uniform, eye, surface)[0]
     assert got == pytest.approx(share, abs=1e-3)
 
 
 def test08_a_surface_in_the_place_does_not_hide_itself(rgb):
     box = rgb.load_dict({"type": "cube"})
-    place = Place(None, rgb.load_dict({"type": "scene", "box": {"type": "cube"}}))
+    place = SceneGeometry(None, rgb.load_dict({"type": "scene", "box": {"type": "cube"}}))
     eyes = rgb.Point3f(np.array([(3, 2, 1.5), (1.001, 4, 0), (0, 0, 1.2)], np.float32).T)
-    surface = patches(box, 6)
+    surface = make_patches(box, 6)
     assert np.allclose(
-        received(place, uniform, eyes, surface).numpy(), received(None, uniform, eyes, surface).numpy(), rtol=1e-5
+        attention_on(place, uniform, eyes, surface).numpy(), attention_on(None, uniform, eyes, surface).numpy(), rtol=1e-5
     )
 
 
 @pytest.mark.parametrize("z", [0.9, -0.9])
 def test14_neither_side_of_an_open_sheet_hides_itself(rgb, z):
-    surface, eye = patches(sheet(rgb), 8), rgb.Point3f(0.2, -0.1, z)
-    each = contributions(
-        Place(None, rgb.load_dict({"type": "scene", "sheet": sheet(rgb)})), uniform, eye, surface, two_sided=True
+    surface, eye = make_patches(sheet(rgb), 8), rgb.Point3f(0.2, -0.1, z)
+    each = attention_per_patch(
+        SceneGeometry(None, rgb.load_dict({"type": "scene", "sheet": sheet(rgb)})), uniform, eye, surface, two_sided=True
     )
-    free = contributions(None, uniform, eye, surface, two_sided=True).numpy()
+    free = attention_per_patch(None, uniform, eye, surface, two_sided=True).numpy()
     assert (free > 0).all() and np.allclose(each.numpy(), free, rtol=1e-5)
 
 
 def moved(rgb, surface, x, kind):
     if kind == "observer":
         return rgb.Point3f(0.4 + 0.5 * x, x, 0.9 - x), surface
-    return rgb.Point3f(0.4, 0, 0.9), surface.moved(rgb.Vector3f(-0.5 * x, -x, x))
+    return rgb.Point3f(0.4, 0, 0.9), surface.translate(rgb.Vector3f(-0.5 * x, -x, x))
 
 
 @pytest.mark.parametrize("kind", ["observer", "surface"])
 def test09_derivatives_of_a_solid_angle(rgb, kind):
-    surface, x = patches(sheet(rgb), 24), rgb.Float(0)
+    surface, x = make_patches(sheet(rgb), 24), rgb.Float(0)
     dr.enable_grad(x)
     eye, there = moved(rgb, surface, x, kind)
-    dr.backward(received(None, uniform, eye, there))
+    dr.backward(attention_on(None, uniform, eye, there))
     h = 1e-4
     ends = [solid_angle(0.6, 0.4, (0.4 + 0.5 * s, s, 0.9 - s)) / (4 * np.pi) for s in (h, -h)]
     assert np.isclose(dr.grad(x)[0], (ends[0] - ends[1]) / (2 * h), rtol=2e-3)
@@ -156,22 +156,22 @@ def test10_derivatives_of_vertices_and_of_the_fall_off(rgb):
     dr.enable_grad(scale, falloff)
     params["vertex_positions"] = scale * rgb.Float(params["vertex_positions"])
     params.update()
-    dr.backward(received(None, uniform, rgb.Point3f(0, 0, 1), patches(plate, 24)))
+    dr.backward(attention_on(None, uniform, rgb.Point3f(0, 0, 1), make_patches(plate, 24)))
     ends = [solid_angle(0.6 * s, 0.4 * s, (0, 0, 1)) / (4 * np.pi) for s in (1.0001, 0.9999)]
     assert np.isclose(dr.grad(scale)[0], (ends[0] - ends[1]) / 2e-4, rtol=2e-3)
 
-    place = Place(None, rgb.load_dict({"type": "scene", "plate": sheet(rgb, 0.5, 0.5, 0.2)}))
-    eye, surface = rgb.Point3f(0, 0, 1), patches(sheet(rgb, 0.01, 0.01), 2)
-    dr.backward(received(place, uniform, eye, surface, falloff))
+    place = SceneGeometry(None, rgb.load_dict({"type": "scene", "plate": sheet(rgb, 0.5, 0.5, 0.2)}))
+    eye, surface = rgb.Point3f(0, 0, 1), make_patches(sheet(rgb, 0.01, 0.01), 2)
+    dr.backward(attention_on(place, uniform, eye, surface, falloff))
     # d/dd_f of 1 - 0.2 / d_f
-    assert np.isclose(dr.grad(falloff)[0] / received(None, uniform, eye, surface)[0], 0.2 / 0.25, rtol=0.01)
+    assert np.isclose(dr.grad(falloff)[0] / attention_on(None, uniform, eye, surface)[0], 0.2 / 0.25, rtol=0.01)
 
 
 def test11_no_derivative_is_nan_where_the_eye_touches_the_surface(rgb):
     p, n = rgb.Point3f([0, 1], [0, 0], [0, 0]), rgb.Vector3f([0, 0], [0, 0], [1, 1])
     x = rgb.Float(0)
     dr.enable_grad(x)
-    total = dr.sum(received(None, uniform, rgb.Point3f(x, 0, 0), Patches(p, n, rgb.Float(0.1))))
+    total = dr.sum(attention_on(None, uniform, rgb.Point3f(x, 0, 0), Patches(p, n, rgb.Float(0.1))))
     dr.backward(total)
     assert np.isfinite(total[0]) and np.isfinite(dr.grad(x)[0])
 
@@ -196,12 +196,12 @@ def test12_the_integrator_sees_the_same_attention(rgb, tmp_path):
     gaze, p = picture[..., -4], picture[..., -3:]
     inside = np.all(np.abs(p - (0.3, 0.1, -0.2)) < np.array([0.3, 0.2, 0.25]) + 1e-3, axis=-1)
     expected = np.sum(gaze * inside * pixel_solid_angles(2 * h, h))
-    made, place = scene.integrator(), Place(None, scene)
-    observed = made.gaze.at([rgb.Point3f(*eye)], place, made.observer_settings)
+    made, place = scene.integrator(), SceneGeometry(None, scene)
+    observed = made.gaze.for_observers([rgb.Point3f(*eye)], place, made.observer_settings)
 
     def density(*args):
         return observed.evaluate(*args)[0]
 
     box = next(s for s in scene.shapes() if s.is_mesh())
-    got = received(place, density, rgb.Point3f(*eye), patches(box, 24))[0]
+    got = attention_on(place, density, rgb.Point3f(*eye), make_patches(box, 24))[0]
     assert expected > 0 and got == pytest.approx(expected, rel=0.03)

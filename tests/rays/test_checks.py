@@ -183,10 +183,10 @@ def test_a_moment_says_nothing_of_extents_and_elevations():
 # ---- Participants who are rows ----
 
 
-@pytest.mark.parametrize("of_each, is_counter", [(1, True), (2, True), (10, False), (6000, False)])
-def test_one_participant_a_row(of_each, is_counter):
+@pytest.mark.parametrize("get_or_compute_each, is_counter", [(1, True), (2, True), (10, False), (6000, False)])
+def test_one_participant_a_row(get_or_compute_each, is_counter):
     rays = walk(hit=False)
-    person = np.arange(len(rays)) // of_each
+    person = np.arange(len(rays)) // get_or_compute_each
     rays = replace(rays, person=person, persons=tuple(map(str, range(person.max() + 1))))
     assert ("does their column count rows" in warnings_of(rays)) == is_counter
     thinned = replace(rays, metadata={"frame": dict(FRAME), "steps": [{"step": "thin", "kept": 6000, "of": 9000}]})

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.rays import direction_checks
-from nerg_mi.rays.direction_checks import DECLARED, head_frames, hit_shares, mirror_warning, walking_agreement
+from nerg_mi.rays.direction_checks import DECLARED, compute_head_frames, compute_hit_fractions, describe_mirroring, walking_agreement
 from nerg_mi.rays.readers.base import TrackingFrame
 from tests.rays.people import change, walk, warnings_of, watch
 
@@ -112,13 +112,13 @@ def bare(rays):
 
 
 def own(rays):
-    return np.einsum("nij,nj->ni", head_frames(rays.head.astype(float)), rays.direction)
+    return np.einsum("nij,nj->ni", compute_head_frames(rays.head.astype(float)), rays.direction)
 
 
 def test_frames_of_heads():
     """Against the cross products written out: right of somebody who looks along x is -y."""
     ahead = np.array([[1.0, 0, 0], [0, 1, 0], [0.6, 0, 0.8]])
-    found = head_frames(ahead)
+    found = compute_head_frames(ahead)
     assert np.allclose(found[0], [[1, 0, 0], [0, -1, 0], [0, 0, 1]])
     assert np.allclose(found[1], [[0, 1, 0], [1, 0, 0], [0, 0, 1]])
     assert np.allclose(found[2], [[0.6, 0, 0.8], [0, -1, 0], [-0.8, 0, 0.6]])
@@ -137,7 +137,7 @@ def test_gaze_in_the_head_taken_for_the_worlds(rows, who):
 def test_another_axis_ahead():
     rays = bare(watch())
     assert "they look right from the head" in warnings_of(
-        replace(rays, direction=np.einsum("nij,ni->nj", head_frames(rays.head.astype(float)), own(rays)[:, [2, 0, 1]]))
+        replace(rays, direction=np.einsum("nij,ni->nj", compute_head_frames(rays.head.astype(float)), own(rays)[:, [2, 0, 1]]))
     )
     said = warnings_of(replace(rays, direction=-rays.direction))
     assert "100 % of the directions lie more than 60 degrees" in said and "with x and y and z of the dir" in said
@@ -192,7 +192,7 @@ def test_heads_that_are_not_known_say_nothing():
 
 def exchanged(rays, signs, rows=slice(None)):
     """Gaze with left and right, or up and down, of the eyes exchanged."""
-    frames = head_frames(rays.head.astype(float))
+    frames = compute_head_frames(rays.head.astype(float))
     own = np.einsum("nij,nj->ni", frames, rays.direction)
     d = rays.direction.copy()
     d[rows] = np.einsum("nij,ni->nj", frames, own * signs)[rows]
@@ -226,7 +226,7 @@ def test_gaze_that_is_the_heads_of_a_moment_ago():
     late = change(rays, slice(3000, 6000), direction=np.roll(rays.head, 1, axis=0)[3000:6000])
     assert "the gaze of bo stays at one place in the head, within 4 degrees" in warnings_of(late)
     # As well where it is turned, and not along the head.
-    turned = np.einsum("nij,i->nj", head_frames(rays.head.astype(float)), (0.96, 0.0, -0.28))
+    turned = np.einsum("nij,i->nj", compute_head_frames(rays.head.astype(float)), (0.96, 0.0, -0.28))
     noisy = turned + np.random.default_rng(0).normal(0, 0.02, turned.shape)
     noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
     assert "the gaze of ann, bo, cy stays at one place" in warnings_of(replace(rays, direction=noisy))
@@ -262,29 +262,29 @@ def gaze():
 
 def test_shares_and_names(gaze):
     origins, d = gaze
-    shares = hit_shares(counter, origins, d)
+    shares = compute_hit_fractions(counter, origins, d)
     assert set(shares) == {DECLARED, "x", "y", "z", "x and y", "x and z", "y and z", "x and y and z"}
     assert shares["z"] == np.isfinite(counter(origins, d * (1, 1, -1))).mean()
-    assert shares[DECLARED] > 0.99 and mirror_warning(shares, 4000) is None
+    assert shares[DECLARED] > 0.99 and describe_mirroring(shares, 4000) is None
     for axis in (0, 2):
         signs = np.where(np.arange(3) == axis, -1, 1)
-        said = mirror_warning(hit_shares(counter, origins, d * signs), 4000)
+        said = describe_mirroring(compute_hit_fractions(counter, origins, d * signs), 4000)
         assert f"with {'xyz'[axis]} of the directions negated" in said and "--hand" in said
     # A wall that is not there tells nothing of y.
-    assert mirror_warning(hit_shares(counter, origins, d * (1, -1, 1)), 4000) is None
+    assert describe_mirroring(compute_hit_fractions(counter, origins, d * (1, -1, 1)), 4000) is None
 
 
 def test_axes_of_the_file(gaze):
     """A file with y up, left-handed: its y is our z."""
     origins, d = gaze
     to_source = np.eye(3)[[0, 2, 1]]
-    assert "with y of the dir" in mirror_warning(hit_shares(counter, origins, d * (1, 1, -1), to_source), 4000)
+    assert "with y of the dir" in describe_mirroring(compute_hit_fractions(counter, origins, d * (1, 1, -1), to_source), 4000)
 
 
 def test_chance_is_no_mirror():
     shares = dict.fromkeys([DECLARED, "x", "y", "z"], 0.80)
-    assert mirror_warning({**shares, "y": 0.85}, 100) is None and mirror_warning({**shares, "y": 0.85}, 5000)
-    assert mirror_warning({**shares, "y": 0.81}, 10**7) is None
+    assert describe_mirroring({**shares, "y": 0.85}, 100) is None and describe_mirroring({**shares, "y": 0.85}, 5000)
+    assert describe_mirroring({**shares, "y": 0.81}, 10**7) is None
 
 
 # ---- Walking ----

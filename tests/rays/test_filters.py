@@ -12,14 +12,14 @@ from nerg_mi.errors import NergError
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays import filters
 from nerg_mi.rays.filters import (
-    combine,
+    combine_splits,
     find_frozen,
     find_sessions,
-    fixation_rays,
-    idt,
-    ivt,
+    average_fixations,
+    detect_fixations_idt,
+    detect_fixations_ivt,
     label_stays,
-    position_of_split,
+    read_position_split,
     purge,
     select_mask,
     split_by_person,
@@ -147,39 +147,39 @@ WANT = np.array([*[0] * 10, -1, -1, *[1] * 10, -1, *[2] * 10])
 
 
 def test_ivt_by_hand():
-    label = ivt(gaze(SEQUENCE), velocity=100)
+    label = detect_fixations_ivt(gaze(SEQUENCE), velocity=100)
     # A ray belongs to the run that its step leads into: the first of a run comes after a fast step.
     assert label.tolist() == WANT.tolist()
     # 8 degrees in 0.02 s are 400 a second: a limit above that joins the first two.
-    assert len(set(ivt(gaze(SEQUENCE), velocity=450)) - {-1}) == 2
+    assert len(set(detect_fixations_ivt(gaze(SEQUENCE), velocity=450)) - {-1}) == 2
     # Nine steps of 0.02 s are 0.18 s.
-    assert (ivt(gaze(SEQUENCE), velocity=100, least=0.19) == -1).all()
+    assert (detect_fixations_ivt(gaze(SEQUENCE), velocity=100, min_duration=0.19) == -1).all()
 
 
 def test_idt_by_hand():
-    assert idt(gaze(SEQUENCE), dispersion=1.0).tolist() == WANT.tolist()
+    assert detect_fixations_idt(gaze(SEQUENCE), dispersion=1.0).tolist() == WANT.tolist()
     # Within five degrees 16 joins 20.
-    assert idt(gaze(SEQUENCE), dispersion=5.0).tolist() == [*WANT[:11], 1, *WANT[12:]]
+    assert detect_fixations_idt(gaze(SEQUENCE), dispersion=5.0).tolist() == [*WANT[:11], 1, *WANT[12:]]
     # A slow drift of half a degree a ray: no velocity finds its end, the dispersion does, every seven rays (3 degrees).
     drift = gaze(0.5 * np.arange(28))
-    assert idt(drift, dispersion=3.01).tolist() == [k // 7 for k in range(28)] and (ivt(drift) == 0).all()
+    assert detect_fixations_idt(drift, dispersion=3.01).tolist() == [k // 7 for k in range(28)] and (detect_fixations_ivt(drift) == 0).all()
     # Sideways and upwards add up.
     both = gaze(0.5 * np.arange(28), 0.5 * np.arange(28))
-    assert idt(both, dispersion=3.05, least=0.04).tolist() == [k // 4 for k in range(28)]
+    assert detect_fixations_idt(both, dispersion=3.05, min_duration=0.04).tolist() == [k // 4 for k in range(28)]
 
 
 @pytest.mark.parametrize("degrees, parts", [(2.9, 1), (3.1, 2)])
 def test_straight_up_is_measured_as_anywhere(degrees, parts):
     """Who looks straight up has no level: what they look at next is as far away as it is."""
     up = gaze(np.zeros(10), 90 - np.r_[np.zeros(5), np.full(5, degrees)])
-    assert len(set(idt(up, dispersion=3.0, least=0.04))) == parts
+    assert len(set(detect_fixations_idt(up, dispersion=3.0, min_duration=0.04))) == parts
 
 
 @pytest.mark.parametrize("elevation", [0.0, 60.0, -85.0])
 def test_dispersion_is_measured_on_the_sphere(elevation):
     # Where gaze is steep, a degree of azimuth is less: 3 degrees of arc are kept together, 4 are not.
     arc = lambda degrees: gaze(np.linspace(0, degrees / np.cos(np.radians(elevation)), 12), elevation)
-    assert (idt(arc(2.0), dispersion=3.0) == 0).all() and len(set(idt(arc(6.0), dispersion=3.0, least=0.04))) > 1
+    assert (detect_fixations_idt(arc(2.0), dispersion=3.0) == 0).all() and len(set(detect_fixations_idt(arc(6.0), dispersion=3.0, min_duration=0.04))) > 1
 
 
 @settings(max_examples=30, deadline=None)
@@ -188,7 +188,7 @@ def test_idt_by_definition(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 120))
     azimuth = np.cumsum(rng.choice([0.2, 6.0], n, p=[0.9, 0.1]) * rng.choice([-1, 1], n))
-    label = idt(gaze(azimuth), dispersion=2.1)  # no sum of steps
+    label = detect_fixations_idt(gaze(azimuth), dispersion=2.1)  # no sum of steps
     # Salvucci and Goldberg's loop, for gaze that turns sideways only.
     want, s, number = np.full(n, -1), 0, 0
     while s < n:
@@ -213,19 +213,19 @@ def test_one_ray_a_fixation():
     rays = replace(rays, hit=hit, head=head)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # a fixation without a hit is nothing to be warned of
-        one, seconds = fixation_rays(rays, idt(rays))
+        one, seconds = average_fixations(rays, detect_fixations_idt(rays))
     assert len(one) == 2 and np.allclose(seconds, 0.18) and np.allclose(one.t, [0.09, 0.29])
     assert np.allclose(np.degrees(np.arctan2(one.direction[:, 1], one.direction[:, 0])), [1, 40])
     assert np.allclose(one.hit[0], hit[:4].mean(axis=0)) and np.isnan(one.hit[1]).all()
     want = np.array([8.0, 1, 0])
     assert np.allclose(one.head[0], want / np.linalg.norm(want)) and np.isnan(one.head[1]).all()
     with pytest.raises(NergError, match="no fixation"):
-        fixation_rays(rays, np.full(20, -1))
+        average_fixations(rays, np.full(20, -1))
     with pytest.raises(NergError, match="velocity must be positive"):
-        ivt(rays, velocity=0)
+        detect_fixations_ivt(rays, velocity=0)
 
 
-@pytest.mark.parametrize("find", [ivt, idt])
+@pytest.mark.parametrize("find", [detect_fixations_ivt, detect_fixations_idt])
 @pytest.mark.parametrize("gap", [0.02, -0.1, 0.0, -1000.0])
 def test_two_people_are_never_one_fixation(find, gap):
     """Somebody's first ray may come any time after, or before, another one's last, in the very same direction."""
@@ -233,10 +233,10 @@ def test_two_people_are_never_one_fixation(find, gap):
     still = gaze([0] * 40, person=np.r_[np.zeros(20), np.ones(20)], t=np.r_[t, t + t[-1] + gap])
     assert find(still).tolist() == [0] * 20 + [1] * 20
     # Each stay is too short by itself; together they would not be.
-    assert (find(still, least=0.5) == -1).all()
+    assert (find(still, min_duration=0.5) == -1).all()
 
 
-@pytest.mark.parametrize("find", [ivt, idt])
+@pytest.mark.parametrize("find", [detect_fixations_ivt, detect_fixations_idt])
 def test_the_order_of_rays_makes_no_difference(find):
     still = gaze([0] * 40, person=np.arange(40) // 20, t=np.tile(np.arange(20) * 0.02 + (np.arange(20) >= 10), 2))
     order = np.random.default_rng(0).permutation(40)
@@ -244,7 +244,7 @@ def test_the_order_of_rays_makes_no_difference(find):
     assert np.array_equal(find(still.select(order)), find(still)[order])
 
 
-@pytest.mark.parametrize("find", [ivt, idt])
+@pytest.mark.parametrize("find", [detect_fixations_ivt, detect_fixations_idt])
 @pytest.mark.parametrize(
     "count, dt, limits, expected",
     [
@@ -341,7 +341,7 @@ def test_recordings_end_where_clocks_go_back_or_pause():
     found = find_sessions(some_rays(len(t), t=t, person=person))
     assert found.order is None and found.starts.tolist() == [0, 7, 17, 57, 64]
     assert found.person.tolist() == [0, 0, 0, 1] and found.back.tolist() == [False, False, True, False]
-    assert found.label().tolist() == [0] * 7 + [1] * 10 + [2] * 40 + [3] * 7
+    assert found.label_rays().tolist() == [0] * 7 + [1] * 10 + [2] * 40 + [3] * 7
 
 
 def test_people_among_each_other_and_rays_that_were_mixed():
@@ -412,7 +412,7 @@ def test_zones_are_apart_and_repeatable(rays_splits):
 
 
 def test_people(rays_splits):
-    train, test = split_by_person(rays_splits, test_share=0.4, seed=0)
+    train, test = split_by_person(rays_splits, test_fraction=0.4, seed=0)
     people = [set(rays_splits.person[side]) for side in (train, test)]
     assert not people[0] & people[1] and len(people[1]) == 2 and (train ^ test).all()
     train, test = split_by_person(rays_splits, test_persons=["b"])
@@ -433,16 +433,16 @@ def test_refusals(rays_splits):
         with pytest.raises(NergError, match=message):
             split_by_position(rays_splits, radius)
     with pytest.raises(ValueError, match="how to split"):
-        combine()
+        combine_splits()
 
 
 def test_by_time_with_a_gap(rays_splits):
-    train, test = split_by_time(rays_splits, test_share=0.25, gap=10)
+    train, test = split_by_time(rays_splits, test_fraction=0.25, gap=10)
     t = rays_splits.t
     assert np.isclose(t[test].min(), 0.75 * np.ptp(t), atol=0.02) and t[test].min() - t[train].max() >= 10
     # Clocks of their own: everybody's last quarter.
     own = replace(rays_splits, t=t + 5000 * rays_splits.person)
-    train, test = split_by_time(own, test_share=0.25, gap=10, of="person")
+    train, test = split_by_time(own, test_fraction=0.25, gap=10, clock="person")
     for p in range(5):
         mine = own.person == p
         assert own.t[test & mine].min() - own.t[train & mine].max() >= 10 and 0.24 < test[mine].mean() < 0.26
@@ -459,11 +459,11 @@ def test_by_time_with_a_gap(rays_splits):
 def test_no_combination_shares_a_ray(rays_splits, seed, kinds):
     by_position = split_by_position(rays_splits, R, test_probes=20, seed=seed) if "position" in kinds else None
     made = {
-        "position": lambda: by_position.sides,
-        "person": lambda: split_by_person(rays_splits, test_share=0.4, seed=seed),
-        "time": lambda: split_by_time(rays_splits, test_share=0.4, gap=2.0),
+        "position": lambda: by_position.masks,
+        "person": lambda: split_by_person(rays_splits, test_fraction=0.4, seed=seed),
+        "time": lambda: split_by_time(rays_splits, test_fraction=0.4, gap=2.0),
     }
-    train, test = combine(*(made[k]() for k in kinds.split()))
+    train, test = combine_splits(*(made[k]() for k in kinds.split()))
     assert train.any() and test.any() and not (train & test).any()
     if "person" in kinds:
         assert not set(rays_splits.person[train]) & set(rays_splits.person[test])
@@ -486,16 +486,16 @@ def test_every_test_position_that_was_asked_for(rays_splits, count, each):
 
 def test_the_metadata_tell_how_rays_were_split(rays_splits):
     """What the layout draws; nothing where there was none."""
-    assert position_of_split(rays_splits) == {}
+    assert read_position_split(rays_splits) == {}
     by = {"position": {"radius": R, "test_centres": [[0.0, 0.0, 1.5]]}, "person": {"test": ["a"]}}
     split = rays_splits.with_step(step="filter", kept=9, of=9).with_step(step="split", side="test", kept=9, of=9, by=by)
-    assert position_of_split(split) == by["position"]
-    assert position_of_split(rays_splits.with_step(step="split", kept=9, of=9, by={"time": {"share": 0.2}})) == {}
+    assert read_position_split(split) == by["position"]
+    assert read_position_split(rays_splits.with_step(step="split", kept=9, of=9, by={"time": {"share": 0.2}})) == {}
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_of_two_people_one_is_on_each_side(rays_splits, share):
-    train, test = split_by_person(rays_splits.select(rays_splits.person < 2), test_share=share)
+    train, test = split_by_person(rays_splits.select(rays_splits.person < 2), test_fraction=share)
     assert train.any() and test.any()
 
 
@@ -513,7 +513,7 @@ def test_distances_and_times_on_the_bounds():
     assert split.test.tolist() == [True] * 74 + [False] * 10 and split.train.tolist() == [False] * 75 + [True] * 9
     assert purge(rays, np.zeros((1, 3)), 1.0).tolist() == split.train.tolist()
     some = rays.select(np.arange(11))
-    train, test = split_by_time(some, test_share=0.5, gap=2.0)
+    train, test = split_by_time(some, test_fraction=0.5, gap=2.0)
     assert some.t[train].tolist() == [0, 1, 2] and some.t[test].tolist() == [5, 6, 7, 8, 9, 10]
 
 
@@ -522,4 +522,4 @@ def test_both_sides_of_several_splits_have_rays(missing):
     a, b = np.array([True, False, False]), np.array([False, True, False])
     sides = (a, b), ((b, b) if missing == 0 else (a, a))
     with pytest.raises(ValueError, match="together the splits leave"):
-        combine(*sides)
+        combine_splits(*sides)

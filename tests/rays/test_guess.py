@@ -253,7 +253,7 @@ def test_a_map_does_for_presets_that_look_alike(tmp_path, name):
 def test_folders(tmp_path):
     EXAMPLES["neon"].make(tmp_path)
     proposal = propose_import(tmp_path)
-    assert proposal.preset == "neon" and proposal.open and "--poses MODEL" in (proposal.command or "")
+    assert proposal.preset == "neon" and proposal.questions and "--poses MODEL" in (proposal.command or "")
     (tmp_path / "info.json").unlink()
     assert propose_import(tmp_path).preset == "neon"
     (tmp_path / "world_timestamps.csv").unlink()
@@ -267,13 +267,13 @@ def test_what_is_not_known_is_to_be_said(tmp_path):
     rising = np.outer(np.arange(9.0), [1, 7, 5])
     path.write_text(csv(**xyz("a_", rising), **xyz("dir_", np.tile([1.0, 0, 0], (9, 1)))))
     proposal = propose_import(path)
-    assert proposal.options["--up"] == "UP" and any("which axis is up" in s for s in proposal.open)
-    assert any("the time" in s for s in proposal.open) and not proposal.sure
+    assert proposal.options["--up"] == "UP" and any("which axis is up" in s for s in proposal.questions)
+    assert any("the time" in s for s in proposal.questions) and not proposal.certain
     with pytest.raises(NergError, match='"UP up'):
         raise run(*shlex.split(proposal.command or "")[2:]).exception
     path.write_text(csv(speed=np.arange(9.0), note=["x"] * 9))
     proposal = propose_import(path)
-    assert proposal.command is None and "origin is missing" in proposal.open[-1]
+    assert proposal.command is None and "origin is missing" in proposal.questions[-1]
 
 
 def test_gravity_says_what_is_up(tmp_path):
@@ -282,7 +282,7 @@ def test_gravity_says_what_is_up(tmp_path):
     path = tmp_path / "log.csv"
     path.write_text(csv(**{k.replace("gaze_direction", "d"): v for k, v in table.items()}))
     proposal = propose_import(path)
-    assert proposal.options["--up"] == "y" and any("gravity" in s for s in proposal.sure)
+    assert proposal.options["--up"] == "y" and any("gravity" in s for s in proposal.certain)
 
 
 @pytest.mark.parametrize("text, message", [("1,2,3\n4,5,6\n", "holds no names of columns"), ("", "holds no names")])
@@ -323,7 +323,7 @@ def test_times_that_are_not_read_are_named(tmp_path, name, cell):
     eye, gaze, _ = frame(WALK, "y left")
     table = {name: [cell] * N, **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
     (tmp_path / "log.csv").write_text(csv(**table))
-    (sentence,) = (s for s in propose_import(tmp_path / "log.csv").open if "the time" in s)
+    (sentence,) = (s for s in propose_import(tmp_path / "log.csv").questions if "the time" in s)
     assert f"{name!r} holds {cell!r}" in sentence
 
 
@@ -336,7 +336,7 @@ def test_what_differs_in_each_row_is_no_participant(tmp_path, ids):
     name = "user_id"
     (tmp_path / "log.csv").write_text(alike(*frame(WALK, "y left")[:2], **{name: ids}))
     proposal = propose_import(tmp_path / "log.csv")
-    assert proposal.columns.person is None and any(f"{name!r} has another value" in s for s in proposal.open)
+    assert proposal.columns.person is None and any(f"{name!r} has another value" in s for s in proposal.questions)
 
 
 @pytest.mark.parametrize("form", ["2024-05-01T12:00:{:08.5f}", "12:00:{:08.5f}", "2024/05/01 12:00:{:08.5f}Z"])
@@ -345,7 +345,7 @@ def test_times_as_text(tmp_path, monkeypatch, form):
     table = {"when": [form.format(t - 100) for t in WALK.t], **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
     (tmp_path / "log.csv").write_text(csv(**table))
     assert np.allclose(np.diff(imported(tmp_path / "log.csv", monkeypatch).t), 0.02, atol=1e-5)
-    assert "'when' holds times of day" in propose_import(tmp_path / "log.csv").sure[0]
+    assert "'when' holds times of day" in propose_import(tmp_path / "log.csv").certain[0]
 
 
 def test_validity(tmp_path, monkeypatch):
@@ -353,7 +353,7 @@ def test_validity(tmp_path, monkeypatch):
     (tmp_path / "log.csv").write_text(alike(*frame(WALK, "y left")[:2], gaze_status=status, tracking_state=status))
     proposal = propose_import(tmp_path / "log.csv")
     assert proposal.options["--valid"] == "gaze_status=2"
-    assert any("which values of 'tracking_state' mark valid rows" in sentence for sentence in proposal.open)
+    assert any("which values of 'tracking_state' mark valid rows" in sentence for sentence in proposal.questions)
     assert len(imported(tmp_path / "log.csv", monkeypatch)) == N // 3
 
 
@@ -372,7 +372,7 @@ def test_repeated_names_and_mirrored_matrices(tmp_path):
     rows = np.concatenate([head.as_matrix() @ np.diag([1, 1, -1.0]), eye[:, :, None]], axis=2).reshape(N, 12)
     names = {f"m{r}{c}": rows[:, 4 * r + c] for r in range(3) for c in range(4)}
     (tmp_path / "log.csv").write_text(csv(t=WALK.t, **names, x=eye[:, 0], X=eye[:, 0]).replace(",X", ",x"))
-    found = propose_import(tmp_path / "log.csv").open
+    found = propose_import(tmp_path / "log.csv").questions
     assert any("1,500 of 1,500 rows: the head's matrix is mirrored" in sentence for sentence in found)
     assert any("several columns are called 'x'" in sentence for sentence in found)
 

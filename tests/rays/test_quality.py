@@ -5,7 +5,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays import quality
-from nerg_mi.rays.quality import WARNING, card_lines, card_table, summarise
+from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report, format_quality_report, summarise
 from nerg_mi.rays.rays import FRAME, Rays
 
 # ---- The card in words; what its figures are is tried in test_summary.py ----
@@ -23,7 +23,7 @@ def card(**change):
         confidence=np.ones(n),
     )
     rays = Rays(**{**values, **change})
-    return card_lines(rays, summarise(rays))
+    return make_quality_report(rays, summarise(rays))
 
 
 def test_lines():
@@ -43,7 +43,7 @@ def test_lines():
     assert lines["dropped"] == "10 (4.8 %): blink; lines 2-4, 7, 9, ... of a.csv and of 1 more"
     assert lines["then"] == "split test: 200 of 300 rays kept" and lines["from"] == "y up, left-handed, cm"
     assert lines["eye height"] == "1.60 m (5 to 95 %: 1.60 to 1.60)" and lines["speed"] == "95 % below 1.00 m/s"
-    assert not {"cohorts", "hit points", "duplicates", WARNING} & set(lines)
+    assert not {"cohorts", "hit points", "duplicates", WARNING_LABEL} & set(lines)
 
 
 def test_lines_that_are_not_always_there():
@@ -54,7 +54,7 @@ def test_lines_that_are_not_always_there():
     assert lines["cohorts"] == "new 100, old 100" and lines["hit points"].startswith("25.0 % of the rays")
     assert lines["recorded time"].startswith("unknown") and lines["speed"].startswith("unknown")
     assert lines["duplicates"] == "190 rays share person and time with another"
-    assert "have the same time" in lines[WARNING]
+    assert "have the same time" in lines[WARNING_LABEL]
     slow = dict(card(t=10.0 * np.arange(n)))
     assert slow["recorded time"].startswith("none: each ray of a person comes more than 1 s")
 
@@ -63,7 +63,7 @@ def test_names_are_shown_as_they_are():
     """A person or a file may be called what the terminal's library takes for a colour."""
     eyes, ahead = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0], (3, 1))
     rays = Rays(np.arange(3.0), [0, 0, 1], ("[red]", "[/b]"), eyes, ahead, np.ones(3))
-    shown = card_table(rays, summarise(rays), "[bold].npz")
+    shown = format_quality_report(rays, summarise(rays), "[bold].npz")
     assert "[bold].npz" in shown and "[red]" in shown and "[/b]" in shown
 
 

@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.rays.rays`, and the example of docs/rays.md."""
+"""Tests of `nerg_mi.rays.rays`, and the example of docs/how-to/recordings.md."""
 
 import importlib.util
 import json
@@ -36,7 +36,7 @@ def test_nearest_against_all_distances(block, monkeypatch):
     index = RayIndex(origin)
     apart = np.linalg.norm(origin[None] - places[:, None], axis=2)
     for most, radius in ((10, 0.2), (1000, 0.3), (7, np.inf)):
-        found = index.nearest(places, most, radius)
+        found = index.query(places, most, radius)
         for q in range(40):
             run = slice(found.offsets[q], found.offsets[q + 1])
             want = np.argsort(apart[q])[: min(most, (apart[q] <= radius).sum())]
@@ -45,16 +45,16 @@ def test_nearest_against_all_distances(block, monkeypatch):
 
 def test_the_rim_counts_and_nonsense_is_refused():
     index = RayIndex(np.array([[0.25, 0, 0], [0.3, 0, 0]]))
-    assert index.nearest([[0, 0, 0]], 5, 0.25).indices.tolist() == [0]
+    assert index.query([[0, 0, 0]], 5, 0.25).indices.tolist() == [0]
     with pytest.raises(ValueError, match="at least one ray"):
-        index.nearest([[0, 0, 0]], 0)
+        index.query([[0, 0, 0]], 0)
 
 
 def test_rays_that_are_equally_far_keep_their_order():
     """It decides bits of every training: that of scipy's cKDTree as it is by default."""
     rng = np.random.default_rng(3)
     origin = rng.integers(0, 30, (20_000, 3)).astype(float)  # on a lattice: many are equally far
-    near = RayIndex(origin).nearest(origin[:50], 300)
+    near = RayIndex(origin).query(origin[:50], 300)
     _, indices = cKDTree(origin, balanced_tree=False).query(origin[:50], k=300)
     assert np.array_equal(near.indices, indices.ravel())
 
@@ -395,7 +395,7 @@ def test_kept_in_place():
     rays = some_rays(n, t=rng.random(n), confidence=rng.random(n), hit=rng.random((n, 3)))
     mask = rng.random(n) < 0.6
     want = rays.select(mask)
-    kept = rays.keep_in_place(mask)
+    kept = rays.filter_in_place(mask)
     for name in ("t", "person", "origin", "direction", "confidence", "hit"):
         assert np.array_equal(getattr(kept, name), getattr(want, name))
         assert np.shares_memory(getattr(kept, name), getattr(rays, name))
@@ -487,7 +487,7 @@ def test_all_and_equal_seeds():
     assert not np.array_equal(sample_rows(10**12, 50, 4), sample_rows(10**12, 50, 5))
 
 
-# ---- The example of docs/rays.md runs ----
+# ---- The example of docs/how-to/recordings.md runs ----
 
 MANUAL = Path(__file__).resolve().parents[2] / "docs" / "rays.md"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.maths.sphere import harmonics
+from nerg_mi.maths.sphere import eval_harmonics
 
 
 def peaks(splats, o, d, extent=3.0):
@@ -28,7 +28,7 @@ def trace(splats, o, d, t0=0.0, t1=np.inf, stop=1e-4):
     through = np.cumprod(1 - absorbed, axis=1)
     before = np.concatenate([np.ones((len(t), 1)), through[:, :-1]], axis=1)
     weight = before * absorbed * (before > stop)
-    basis = harmonics(d, splats.degree)
+    basis = eval_harmonics(d, splats.degree)
     color = np.maximum(np.einsum("rk,nkc->rnc", basis, splats.harmonics.astype(np.float64)) + 0.5, 0)
     color = np.take_along_axis(color, order[..., None], 1)
     opacity = weight.sum(1)

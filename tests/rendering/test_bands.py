@@ -10,20 +10,20 @@ from nerg_mi.rendering import bands
 from nerg_mi.rendering.bands import (
     LEAST,
     PACKET,
-    SAMPLES,
+    LONG_RENDER_SAMPLES,
     Channels,
-    OwnLayer,
+    IntegratorLayer,
     SamplePace,
-    fields_of,
-    prepare_for,
-    render_asked,
+    get_trained_fields,
+    prepare_long_render,
+    render_aovs,
     render_bands,
     render_channels,
 )
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.workflows.demo import store_scene
+from nerg_mi.workflows.demo import find_store_scene
 from tests.plugins import fields
-from tests.plugins.scenes import camera, constant, observer_at, plugin, with_gaze
+from tests.plugins.scenes import camera, constant, make_observer, plugin, with_gaze
 
 # ---- A picture is the same however it is divided, and its memory is that of a band ----
 
@@ -106,7 +106,7 @@ def test_a_camera_in_fog_is_the_same_to_the_bit(rgb):
             ),
         )
     )
-    assert bands.why_whole(scene, scene.sensors()[0]) is None
+    assert bands.undividable_reason(scene, scene.sensors()[0]) is None
     assert np.array_equal(divided(scene, 4, rows=4), whole(rgb, scene, 4))
 
 
@@ -120,13 +120,13 @@ def test_an_integrator_that_renders_in_a_way_of_its_own_is_asked_to(rgb):
 
     rgb.register_integrator("own_render", Own)
     scene = rgb.load_dict({"type": "scene", "integrator": {"type": "own_render"}, "sensor": {"type": "perspective"}})
-    assert "a way of its own" in bands.why_whole(scene, scene.sensors()[0])
+    assert "a way of its own" in bands.undividable_reason(scene, scene.sensors()[0])
 
 
 @pytest.mark.parametrize("sensor", ["perspective", "panorama"])
 def test_fields_seen_by_an_observer_elsewhere_are_the_same_to_the_bit(rgb, tmp_path, sensor):
     eye = camera(rgb, size=17) if sensor == "perspective" else panorama(rgb)
-    scene = neural(rgb, tmp_path, eye, observer=observer_at(rgb, -3, 0.5, 0.5), falloff=1.0)
+    scene = neural(rgb, tmp_path, eye, observer=make_observer(rgb, -3, 0.5, 0.5), falloff=1.0)
     expected = whole(rgb, scene, 2)
     assert np.any(expected[..., 4] > 0)
     assert np.array_equal(divided(scene, 2, rows=9, strip=256), expected)
@@ -181,7 +181,7 @@ def test_mono(mono):
 
 def test_what_cannot_be_divided_comes_in_one_piece(rgb):
     scene = lit(rgb, BOX, sampler="stratified")
-    assert "StratifiedSampler" in bands.why_whole(scene, scene.sensors()[0])
+    assert "StratifiedSampler" in bands.undividable_reason(scene, scene.sensors()[0])
     assert len(list(bands.render_bands(scene, scene.sensors()[0], spp=4, rows=2))) == 1
     assert np.array_equal(divided(scene, 4, rows=2), whole(rgb, scene, 4))
 
@@ -190,20 +190,20 @@ def test_eight_times_the_pixels_take_eight_times_the_bands(rgb):
     memory = 10e6
     small = lit(rgb, BOX | {"width": 200, "height": 400})
     large = lit(rgb, BOX | {"width": 200, "height": 3200})
-    rows = [bands.rows_for(s, s.sensors()[0], memory) for s in (small, large)]
+    rows = [bands.fit_rows_to_memory(s, s.sensors()[0], memory) for s in (small, large)]
     assert rows[0] == rows[1] and 0 < rows[0] < 400
     for scene, count in ((small, -(-400 // rows[0])), (large, -(-3200 // rows[0]))):
         sizes = [
             np.array(b.film.bitmap()).nbytes for b in bands.render_bands(scene, scene.sensors()[0], spp=1, rows=rows[0])
         ]
         assert len(sizes) == count and max(sizes) < memory / 3
-    assert bands.rows_for(small, small.sensors()[0], 1.0) == 1
+    assert bands.fit_rows_to_memory(small, small.sensors()[0], 1.0) == 1
 
 
 def test_a_wide_filter_is_not_rendered_many_times_for_want_of_memory(rgb):
     """As where the scene itself takes all of it: each band renders the rows around it again."""
     scene = lit(rgb, {"width": 18, "height": 200, "rfilter": {"type": "gaussian"}})
-    rows = bands.rows_for(scene, scene.sensors()[0], -1e9)
+    rows = bands.fit_rows_to_memory(scene, scene.sensors()[0], -1e9)
     told = []
     for _ in bands.render_bands(
         scene, scene.sensors()[0], spp=1, rows=rows, on_strip=lambda done, total: told.append(total)
@@ -295,7 +295,7 @@ class Both:
 
 
 def test01_the_picture_of_an_integrator_is_one_layer(rgb, scene_layers):
-    layer = OwnLayer(scene_layers.integrator())
+    layer = IntegratorLayer(scene_layers.integrator())
     assert layer.names == [["depth.T", "opacity.Y"]] and layer.count == 2
     (band,) = render_bands(scene_layers, scene_layers.sensors()[0], spp=4, layers=layer)
     assert band.layer == 0
@@ -386,15 +386,15 @@ def test04_the_next_picture_goes_on_with_the_pace_of_the_last(rgb, monkeypatch):
 @pytest.mark.parametrize("base, seed", [(0, 0), (5, 9), (4294967295, 3)])
 def test_numbers_are_those_of_the_whole(rgb, base, seed):
     sampler = rgb.load_dict({"type": "independent", "seed": base, "sample_count": 2})
-    assert bands.base_seed(sampler) == base
+    assert bands.get_base_seed(sampler) == base
     sampler.seed(seed, 1000)
     theirs = np.array([sampler.next_1d(), *sampler.next_2d()])
-    part = bands.for_samples(2, base, seed, 137, 500)
+    part = bands.make_strip_sampler(2, base, seed, 137, 500)
     assert np.array_equal(np.array([part.next_1d(), *part.next_2d()]), theirs[:, 137:637])
 
 
 def test_a_copy_goes_its_own_way(rgb):
-    sampler = bands.for_samples(1, 0, 0, 0, 10)
+    sampler = bands.make_strip_sampler(1, 0, 0, 0, 10)
     copy = sampler.clone()
     first = np.array(sampler.next_1d())
     assert np.array_equal(np.array(copy.next_1d()), first)
@@ -402,12 +402,12 @@ def test_a_copy_goes_its_own_way(rgb):
 
 
 def test_beyond_two_to_the_32_numbers_do_not_repeat(rgb):
-    near, far = (np.array(bands.for_samples(1, 0, 0, first, 64).next_1d()) for first in (0, 1 << 32))
+    near, far = (np.array(bands.make_strip_sampler(1, 0, 0, first, 64).next_1d()) for first in (0, 1 << 32))
     assert not np.any(near == far)
 
 
 def test_other_samplers_are_none_of_ours(rgb):
-    assert bands.base_seed(rgb.load_dict({"type": "stratified"})) is None
+    assert bands.get_base_seed(rgb.load_dict({"type": "stratified"})) is None
 
 
 # ---- The integrator asked for what its own list lacks gives what it gives with a longer list ----
@@ -426,14 +426,14 @@ def files(tmp_path_factory):
 
 @pytest.mark.parametrize("observed", [False, True])
 def test_equal_to_a_list_that_has_it(rgb, files, observed):
-    observer = {"observer": observer_at(rgb, -0.4, 0.2, -2.5)} if observed else {}
+    observer = {"observer": make_observer(rgb, -0.4, 0.2, -2.5)} if observed else {}
     names = ["gaze", "opacity", "depth"]
     load = lambda aovs: rgb.load_dict(
         {"type": "scene", "integrator": with_gaze(files, aovs=aovs, **observer), "sensor": camera(rgb)}
     )
     own, bare = load(",".join(names)), load("depth")
     wanted = render_channels(own, own.sensors()[0], spp=2, seed=3)
-    found = render_asked("a.xml", bare, bare.sensors()[0], names, 2, 3)
+    found = render_aovs("a.xml", bare, bare.sensors()[0], names, 2, 3)
     assert found.aovs["gaze"].max() > 0
     np.testing.assert_array_equal(found.color, wanted.color)
     for name in names:
@@ -444,14 +444,14 @@ def test_what_cannot_be_asked(rgb, files):
     path = {"type": "scene", "integrator": {"type": "path"}, "sensor": camera(rgb), "shape": {"type": "sphere"}}
     scene = rgb.load_dict(path)
     with pytest.raises(NergError, match='"PathIntegrator".*"nerg scene a.xml -o new.xml"'):
-        render_asked("a.xml", scene, scene.sensors()[0], ["depth"])
+        render_aovs("a.xml", scene, scene.sensors()[0], ["depth"])
     scene = rgb.load_dict({"type": "scene", "integrator": with_gaze(files), "sensor": camera(rgb)})
     with pytest.raises(NergError, match='"kde", which needs'):
-        render_asked("a.xml", scene, scene.sensors()[0], ["kde"])
+        render_aovs("a.xml", scene, scene.sensors()[0], ["kde"])
     stratified = camera(rgb) | {"sampler": {"type": "stratified", "sample_count": 4}}
     scene = rgb.load_dict({"type": "scene", "integrator": with_gaze(files), "sensor": stratified})
     with pytest.raises(NergError, match="overlay because of the sampler"):
-        render_asked("a.xml", scene, scene.sensors()[0], ["gaze"])
+        render_aovs("a.xml", scene, scene.sensors()[0], ["gaze"])
 
 
 # ---- Renders of many samples: which are prepared, and that nothing else changes ----
@@ -460,14 +460,14 @@ SMALL = {"width": "24", "height": "16", "spp": "1"}
 
 
 def networks(scene):
-    return [net for field in fields_of(scene.integrator()) for net in field.mlps]
+    return [net for field in get_trained_fields(scene.integrator()) for net in field.mlps]
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("samples", "prepared"), [(SAMPLES - 1, False), (SAMPLES, True)])
+@pytest.mark.parametrize(("samples", "prepared"), [(LONG_RENDER_SAMPLES - 1, False), (LONG_RENDER_SAMPLES, True)])
 def test01_long_ones_are_prepared_and_show_the_same_to_the_bit(rgb, samples, prepared):
-    plain, scene = load_scene(store_scene(), SMALL), load_scene(store_scene(), SMALL)
-    assert prepare_for(samples, scene) is prepared
+    plain, scene = load_scene(find_store_scene(), SMALL), load_scene(find_store_scene(), SMALL)
+    assert prepare_long_render(samples, scene) is prepared
     assert [net.constant for net in networks(scene)] == [prepared] * 5
     found, expected = (np.array(rgb.render(s, sensor=0, spp=1)) for s in (scene, plain))
     assert expected[..., :3].max() > 0.1 and np.array_equal(found, expected)
@@ -476,4 +476,4 @@ def test01_long_ones_are_prepared_and_show_the_same_to_the_bit(rgb, samples, pre
 def test02_scenes_without_fields_are_left_alone(rgb):
     shapes = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg"}, "ball": {"type": "sphere"}})
     others = rgb.load_dict({"type": "scene", "integrator": {"type": "path"}, "ball": {"type": "sphere"}})
-    assert not prepare_for(SAMPLES, shapes) and not prepare_for(SAMPLES, others)
+    assert not prepare_long_render(LONG_RENDER_SAMPLES, shapes) and not prepare_long_render(LONG_RENDER_SAMPLES, others)

@@ -16,8 +16,8 @@ from nerg_mi.rendering.files import (
     check_mesh,
     check_points,
     check_vol,
-    numbered,
-    picture_rows,
+    frame_path,
+    open_image_rows,
     read_frames,
     write_frames,
 )
@@ -65,8 +65,8 @@ def test_bounds(tmp_path, monkeypatch):
 
 
 def test_numbers_in_names():
-    assert numbered(Path("a/walk.png"), 7, 12) == Path("a/walk_0007.png")
-    assert numbered(Path("walk.exr"), 7, 12345) == Path("walk_00007.exr")
+    assert frame_path(Path("a/walk.png"), 7, 12) == Path("a/walk_0007.png")
+    assert frame_path(Path("walk.exr"), 7, 12345) == Path("walk_00007.exr")
 
 
 # ---- Mesh file ----
@@ -205,7 +205,7 @@ def pixels():
 @pytest.mark.parametrize("step", [601, 300, 37])
 def test_png_is_rounded_as_mitsuba_rounds_it(rgb, tmp_path, pixels, step):
     rgb.util.write_bitmap(str(tmp_path / "whole.png"), rgb.Bitmap(pixels), write_async=False)
-    with picture_rows(tmp_path / "parts.png", 20, 601) as write:
+    with open_image_rows(tmp_path / "parts.png", 20, 601) as write:
         for top in range(0, 601, step):
             part = np.zeros((step, 20, 3), np.float32)
             rows = min(step, 601 - top)
@@ -215,7 +215,7 @@ def test_png_is_rounded_as_mitsuba_rounds_it(rgb, tmp_path, pixels, step):
 
 
 def test_exr_holds_every_row(rgb, tmp_path, pixels):
-    with picture_rows(tmp_path / "parts.exr", 20, 601) as write:
+    with open_image_rows(tmp_path / "parts.exr", 20, 601) as write:
         for top in range(0, 601, 100):
             write(rgb.Bitmap(pixels[top : top + 100]), min(100, 601 - top))
     assert np.array_equal(np.array(mitsuba_bitmap(tmp_path / "parts.exr")), pixels)
@@ -224,14 +224,14 @@ def test_exr_holds_every_row(rgb, tmp_path, pixels):
 @pytest.mark.parametrize("name", ["a.exr", "a.png"])
 def test_a_picture_with_rows_missing_is_none(rgb, tmp_path, pixels, name):
     with pytest.raises(ValueError, match="100 of 601|0 of 601"):
-        with picture_rows(tmp_path / name, 20, 601) as write:
+        with open_image_rows(tmp_path / name, 20, 601) as write:
             write(rgb.Bitmap(pixels[:100]), 100)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_name_says_the_format(tmp_path):
     with pytest.raises(NergError, match=".exr or .png"):
-        with picture_rows(tmp_path / "a.bmp", 2, 2):
+        with open_image_rows(tmp_path / "a.bmp", 2, 2):
             pass
 
 

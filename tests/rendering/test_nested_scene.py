@@ -8,9 +8,9 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.bands import render_channels
-from nerg_mi.rendering.nested_scene import gaze_of_scene, nested_place, with_gaze
+from nerg_mi.rendering.nested_scene import find_gaze_file, nest_scene, replace_gaze
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.rendering.scene_writer import Eye, GazeFiles, SceneText
+from nerg_mi.rendering.scene_writer import LookAt, GazeFiles, SceneText
 from nerg_mi.workflows import demo
 
 # ---- Nested scene ----
@@ -50,10 +50,10 @@ def theirs(tmp_path):
 
 
 def shown(path, out):
-    camera = Eye(np.array([0.3, 0, 4.0]), np.array([0, 0, 0.0]))
-    place = nested_place(path, out.parent)
+    camera = LookAt(np.array([0.3, 0, 4.0]), np.array([0, 0, 0.0]))
+    place = nest_scene(path, out.parent)
     scene = SceneText(place, GazeFiles(), camera, None, np.array([0.0, 1, 0]), width=12)
-    out.write_text(scene.xml())
+    out.write_text(scene.to_xml())
     return load_scene(out)
 
 
@@ -90,7 +90,7 @@ def test_their_integrator_stays_what_it_is(rgb, theirs, tmp_path):
 )
 def test_what_cannot_be_nested(theirs, tmp_path, text, said):
     with pytest.raises(NergError, match=said):
-        nested_place(theirs(text=text), tmp_path)
+        nest_scene(theirs(text=text), tmp_path)
 
 
 # ---- A scene with another gaze field: the same but for it, wherever the copy lies ----
@@ -103,11 +103,11 @@ NERG = """<integrator type="nerg"><volume name="gaze" type="gazefield"><string n
 def test01_the_gaze_field_of_a_file(tmp_path):
     path = tmp_path / "a.xml"
     path.write_text(PLAIN.format(NERG))
-    assert gaze_of_scene(path) == tmp_path / "a.bin"
+    assert find_gaze_file(path) == tmp_path / "a.bin"
     path.write_text(PLAIN.format('<integrator type="nerg"/>'))
-    assert gaze_of_scene(path) is None
-    store = demo.store_scene()
-    assert gaze_of_scene(store) == store.parent.resolve() / "shoppers.safetensors"
+    assert find_gaze_file(path) is None
+    store = demo.find_store_scene()
+    assert find_gaze_file(store) == store.parent.resolve() / "shoppers.safetensors"
 
 
 @pytest.mark.parametrize("count", [0, 2])
@@ -115,17 +115,17 @@ def test02_there_is_one_integrator(tmp_path, count):
     path = tmp_path / "a.xml"
     path.write_text(PLAIN.format('<integrator type="nerg"/>' * count))
     with pytest.raises(NergError, match=f"has {count} integrators"):
-        with_gaze(path, tmp_path / "b.bin")
+        replace_gaze(path, tmp_path / "b.bin")
 
 
 @pytest.mark.slow
 def test03_only_the_gaze_is_another(rgb, tmp_path):
     """The store with its own gaze field in a file of another name: the same picture."""
-    store = demo.store_scene()
+    store = demo.find_store_scene()
     other = tmp_path / "other.safetensors"
     other.write_bytes((store.parent / "shoppers.safetensors").read_bytes())
-    (tmp_path / "copy.xml").write_text(with_gaze(store, other))
-    assert gaze_of_scene(tmp_path / "copy.xml") == other.resolve()
+    (tmp_path / "copy.xml").write_text(replace_gaze(store, other))
+    assert find_gaze_file(tmp_path / "copy.xml") == other.resolve()
     at, ahead = [(4.4, 2.8, 1.6)] * 16, np.random.default_rng(1).normal(size=(16, 3))
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     found = [nerg.trace(nerg.Scene.load(path), at, ahead, ["gaze", "depth"]) for path in (store, tmp_path / "copy.xml")]

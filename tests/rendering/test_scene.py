@@ -10,8 +10,8 @@ import pytest
 
 from nerg_mi import llvm
 from nerg_mi.errors import NergError, UnusableLLVM
-from nerg_mi.rendering.scene import DEPTH, activate, check_scene_file, load_scene
-from nerg_mi.workflows.render import sensor_of
+from nerg_mi.rendering.scene import DEPTH, activate_variant, check_scene_file, load_scene
+from nerg_mi.workflows.render import find_sensor
 
 # ---- Variants that work and that do not, and scenes that are loaded ----
 
@@ -20,9 +20,9 @@ def test_the_best_variant_that_works(rgb, monkeypatch):
     tried = []
     monkeypatch.setattr(rgb, "set_variant", tried.append)
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)
-    assert activate() == "cuda_ad_rgb" and activate("llvm_ad_mono") == "llvm_ad_mono"
+    assert activate_variant() == "cuda_ad_rgb" and activate_variant("llvm_ad_mono") == "llvm_ad_mono"
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
-    assert activate() == "llvm_ad_rgb" and tried == ["cuda_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"]
+    assert activate_variant() == "llvm_ad_rgb" and tried == ["cuda_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"]
 
 
 def test_a_backend_that_cannot_start_is_followed_by_the_next(rgb, monkeypatch):
@@ -32,9 +32,9 @@ def test_a_backend_that_cannot_start_is_followed_by_the_next(rgb, monkeypatch):
 
     monkeypatch.setattr(rgb, "set_variant", only_llvm)
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)
-    assert activate() == "llvm_ad_rgb"
+    assert activate_variant() == "llvm_ad_rgb"
     with pytest.raises(NergError, match='"cuda_ad_rgb"'):
-        activate("cuda_ad_rgb")
+        activate_variant("cuda_ad_rgb")
 
 
 def test_an_unusable_libllvm_is_told_as_such(rgb, monkeypatch):
@@ -43,7 +43,7 @@ def test_an_unusable_libllvm_is_told_as_such(rgb, monkeypatch):
 
     monkeypatch.setattr(rgb, "set_variant", refuse)
     with pytest.raises(UnusableLLVM):
-        activate()
+        activate_variant()
 
 
 def test_values_of_a_scene(rgb, tmp_path):
@@ -101,7 +101,7 @@ def test_shapes_as_large_as_can_be_are_taken(rgb, tmp_path):
 def test_a_picture_needs_an_integrator(rgb, tmp_path):
     (tmp_path / "s.xml").write_text(SCENE.format('<sensor type="perspective"/>'))
     with pytest.raises(NergError, match="s.xml"):
-        sensor_of(tmp_path / "s.xml", load_scene(tmp_path / "s.xml"), 0)
+        find_sensor(tmp_path / "s.xml", load_scene(tmp_path / "s.xml"), 0)
 
 
 # ---- Scene file ----
@@ -266,15 +266,15 @@ def test_samples_of_the_option_are_bounded(tmp_path):
 
 def test_the_other_ways_in_are_guarded(standins, tmp_path):
     from nerg_mi.evaluation import study_subject
-    from nerg_mi.train.geometry import place_of_scene
+    from nerg_mi.train.geometry import load_scene_geometry
     from nerg_mi.workflows.demo import make_demo
     from nerg_mi.workflows.scene_commands import DemoOptions
 
     (tmp_path / "s.xml").write_text(scene(DEEP))
     with pytest.raises(NergError, match="deep"):
-        place_of_scene(tmp_path / "s.xml")
+        load_scene_geometry(tmp_path / "s.xml")
     with pytest.raises(NergError, match="there is no scene file"):
-        place_of_scene(tmp_path / "missing.xml")
+        load_scene_geometry(tmp_path / "missing.xml")
     with pytest.raises(NergError, match="deep"):
         study_subject.load_subject(tmp_path / "s.xml", 8, 8, {})
     with pytest.raises(NergError, match="deep"):

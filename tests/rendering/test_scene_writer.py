@@ -11,25 +11,25 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.rendering.scene_writer import (
-    Blank,
+    BlankLine,
     Comment,
-    Eye,
+    LookAt,
     GazeFiles,
     Lens,
     SceneContent,
     SceneText,
     Verbatim,
-    ahead_level,
-    default_name,
-    document,
+    level_direction,
+    free_default_name,
+    format_document,
     element,
     matrix,
-    numbers,
-    pixel_of,
+    format_numbers,
+    project_to_pixel,
     prop,
-    relative_name,
+    relative_path,
     transform,
-    value_of,
+    check_attribute,
 )
 from tests.plugins.scenes import plugin
 
@@ -59,25 +59,25 @@ def test_pixels_of_points(rgb, camera):
         x, y, z = (np.subtract(point, origin) @ v for v in (right, up, ahead))
         focal = 15 / np.tan(np.radians(30))
         wanted = 15 + focal * x / z - 0.5, 10 - focal * y / z - 0.5
-        np.testing.assert_allclose(pixel_of(camera, rgb.Point3f(*point)), wanted, atol=1e-3)
+        np.testing.assert_allclose(project_to_pixel(camera, rgb.Point3f(*point)), wanted, atol=1e-3)
 
 
 def test_what_is_not_in_the_picture(rgb, camera):
-    assert pixel_of(camera, rgb.Point3f(2, -8, 3)) is None  # behind
-    assert pixel_of(camera, rgb.Point3f(20, 0, 1)) is None  # beside
+    assert project_to_pixel(camera, rgb.Point3f(2, -8, 3)) is None  # behind
+    assert project_to_pixel(camera, rgb.Point3f(20, 0, 1)) is None  # beside
 
 
 # ---- A written scene, loaded by Mitsuba: its sensors look where they should, and its defaults can be set ----
 
-CUBE = SceneContent(beside=(element("shape", type="cube"),))
+CUBE = SceneContent(scene_children=(element("shape", type="cube"),))
 UP = np.array([0.0, 0, 1])
 
 
 def written(folder, **more):
-    eye, camera = Eye(np.array([0, 0, 5.0]), np.array([0, 0, 0.0])), Eye(np.array([4, 1, 2.0]), np.array([0, 0, 0.5]))
+    eye, camera = LookAt(np.array([0, 0, 5.0]), np.array([0, 0, 0.0])), LookAt(np.array([4, 1, 2.0]), np.array([0, 0, 0.5]))
     given = {"place": CUBE, "attention": GazeFiles(), "camera": camera, "observer": eye, "up": UP, "width": 24} | more
     scene = SceneText(**given)
-    (folder / "scene.xml").write_text(scene.xml())
+    (folder / "scene.xml").write_text(scene.to_xml())
     return scene
 
 
@@ -86,7 +86,7 @@ def axis(sensor):
 
 
 def test_sensors_stand_and_look_where_they_should(rgb, tmp_path):
-    scene = written(tmp_path, observer=Eye(np.array([0.0, -3, 1]), np.array([1.0, -2, 0])))
+    scene = written(tmp_path, observer=LookAt(np.array([0.0, -3, 1]), np.array([1.0, -2, 0])))
     camera, own, sphere = load_scene(tmp_path / "scene.xml").sensors()
     to = lambda eye: (eye.target - eye.origin) / np.linalg.norm(eye.target - eye.origin)
     np.testing.assert_allclose(axis(camera), to(scene.camera), atol=1e-6)
@@ -99,7 +99,7 @@ def test_sensors_stand_and_look_where_they_should(rgb, tmp_path):
 
 
 def test_defaults_move_them(rgb, tmp_path):
-    written(tmp_path, observer=Eye(np.array([0.0, -3, 1]), np.array([1.0, -2, 0])))
+    written(tmp_path, observer=LookAt(np.array([0.0, -3, 1]), np.array([1.0, -2, 0])))
     scene = load_scene(tmp_path / "scene.xml", {"eye": "1, 2, 3", "width": "12", "fov": "40", "spp": "3"})
     camera, own, sphere = scene.sensors()
     for sensor in (own, sphere):
@@ -118,27 +118,27 @@ def test_without_an_observer_the_camera_is_it(rgb, tmp_path):
 
 def test_names_that_others_have_taken(rgb, tmp_path):
     place = SceneContent(
-        first=(element("default", name="eye", value="9"),), beside=CUBE.beside, taken=frozenset({"eye", "camera"})
+        preamble=(element("default", name="eye", value="9"),), scene_children=CUBE.scene_children, reserved_names=frozenset({"eye", "camera"})
     )
     written(tmp_path, place=place, lens=Lens(50, 2.0))
     text = (tmp_path / "scene.xml").read_text()
     assert '<default name="nerg_eye"' in text and 'origin="$nerg_eye"' in text and 'id="nerg_camera"' in text
     scene = load_scene(tmp_path / "scene.xml", {"nerg_eye": "1, 2, 3"})
     assert tuple(scene.sensors()[0].film().crop_size()) == (24, 12)
-    assert default_name("eye", place.taken) == "nerg_eye" and default_name("ahead", place.taken) == "ahead"
+    assert free_default_name("eye", place.reserved_names) == "nerg_eye" and free_default_name("ahead", place.reserved_names) == "ahead"
 
 
 def test_a_level_direction():
     for target, level in (((2, 0, 7), (1, 0, 0)), ((0, -3, 0), (0, -1, 0))):
-        np.testing.assert_allclose(ahead_level(Eye(np.zeros(3), np.array(target, float)), 2 * UP), level, atol=1e-12)
-    straight = ahead_level(Eye(np.zeros(3), UP), UP)
+        np.testing.assert_allclose(level_direction(LookAt(np.zeros(3), np.array(target, float)), 2 * UP), level, atol=1e-12)
+    straight = level_direction(LookAt(np.zeros(3), UP), UP)
     assert straight @ UP == pytest.approx(0) and np.linalg.norm(straight) == pytest.approx(1)
 
 
 def test_names_are_relative_below_a_common_folder(tmp_path):
-    assert relative_name(tmp_path / "a" / "x.ply", tmp_path / "b") == "../a/x.ply"
-    assert relative_name(tmp_path / "x.ply", tmp_path) == "x.ply" and relative_name(tmp_path, tmp_path) == "."
-    assert relative_name(Path("/one/x.ply"), Path("/two")) == "/one/x.ply"
+    assert relative_path(tmp_path / "a" / "x.ply", tmp_path / "b") == "../a/x.ply"
+    assert relative_path(tmp_path / "x.ply", tmp_path) == "x.ply" and relative_path(tmp_path, tmp_path) == "."
+    assert relative_path(Path("/one/x.ply"), Path("/two")) == "/one/x.ply"
 
 
 # ---- Text of scene files: what is escaped, what is refused, and how it is laid out ----
@@ -149,41 +149,41 @@ NASTY = "a<b>&\"c\"'d' \n\té"
 def test_what_is_written_is_read_back():
     nodes = [
         prop("string", "filename", NASTY),
-        Blank(),
+        BlankLine(),
         element("shape", Comment("one\ntwo"), prop("float", "x", 1.5), type="cube", id="a"),
     ]
-    root = ElementTree.fromstring(document(nodes, "Head of the file"))
+    root = ElementTree.fromstring(format_document(nodes, "Head of the file"))
     assert root.tag == "scene" and root.get("version") == "3.0.0"
     assert root[0].attrib == {"name": "filename", "value": NASTY}
     assert root[1].attrib == {"type": "cube", "id": "a"} and root[1][0].get("value") == "1.5"
 
 
 def test_comments_hold_nothing_that_ends_them():
-    text = document([Comment("a -- b --> c ---")], "x--y -")
+    text = format_document([Comment("a -- b --> c ---")], "x--y -")
     assert text.count("-->") == 2 and "--" not in text.replace("<!--", "").replace("-->", "")
     ElementTree.fromstring(text)
 
 
 def test_lines_are_short_and_indented():
-    text = document(
+    text = format_document(
         [element("sensor", Comment("word " * 100), prop("float", "fov", 70), type="perspective")], "w " * 200
     )
     assert max(map(len, text.splitlines())) <= 120
     assert '\n        <float name="fov" value="70"/>\n    </sensor>\n' in text
-    assert document([Verbatim("<a>\n  <b/>\n</a>")], "h").endswith("    <a>\n      <b/>\n    </a>\n</scene>\n")
+    assert format_document([Verbatim("<a>\n  <b/>\n</a>")], "h").endswith("    <a>\n      <b/>\n    </a>\n</scene>\n")
 
 
 @pytest.mark.parametrize("name", ["a$b.ply", "a\x01.ply", "a\udc80.ply"])
 def test_names_that_no_scene_file_holds(name):
     with pytest.raises(NergError, match="rename the file"):
-        value_of(name)
+        check_attribute(name)
     with pytest.raises(NergError, match="no text") if "$" not in name else pytest.raises(NergError, match="rename"):
-        document([prop("string", "a", name if "$" not in name else value_of(name))], "h")
+        format_document([prop("string", "a", name if "$" not in name else check_attribute(name))], "h")
 
 
 def test_numbers_and_matrices():
-    assert numbers([np.float32(0.1), 5_600_000.25, np.float32(16777217)]) == "0.1, 5600000.25, 16777216"
-    assert numbers([1, -0.0, 0.1, 1e-7, 123456.789]) == "1, 0, 0.1, 1e-07, 123456.789"
+    assert format_numbers([np.float32(0.1), 5_600_000.25, np.float32(16777217)]) == "0.1, 5600000.25, 16777216"
+    assert format_numbers([1, -0.0, 0.1, 1e-7, 123456.789]) == "1, 0, 0.1, 1e-07, 123456.789"
     values = np.arange(16).reshape(4, 4) / 3
-    found = ElementTree.fromstring(document([transform(matrix(values))], "h"))[0][0].get("value")
+    found = ElementTree.fromstring(format_document([transform(matrix(values))], "h"))[0][0].get("value")
     np.testing.assert_allclose(np.array(found.split(), float).reshape(4, 4), values, rtol=1e-14)

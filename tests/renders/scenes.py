@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.plugins import fields
-from tests.plugins.scenes import camera, constant, observer_at
+from tests.plugins.scenes import camera, constant, make_observer
 
 REFERENCES = Path(__file__).parent / "references"
 SIZE = 24
@@ -103,7 +103,7 @@ def both(mi, folder, change=1.0):
         density={"type": "constvolume", "value": 1.0 * change, "to_world": box},
         aovs="depth,visibility",
         visibility="transmittance",
-        observer=observer_at(mi, -2, 0.8, -2),
+        observer=make_observer(mi, -2, 0.8, -2),
         background=0.1,
         color={"type": "constvolume", "value": rgb_of(0.2, 0.4, 0.8)},
     )
@@ -115,7 +115,7 @@ def observer(mi, folder, change=1.0):
     integrator = neural(
         folder,
         aovs="gaze,visibility,observer_depth",
-        observer=observer_at(mi, -3, 0.5, 0.5),
+        observer=make_observer(mi, -3, 0.5, 0.5),
         falloff=1.0 * change,
         radiance=False,
     )
@@ -136,7 +136,7 @@ def panorama(mi, folder, change=1.0):
         "aovs": "depth,opacity,visibility",
         "visibility": "transmittance",
         "surface_opacity": 0.0,
-        "observer": observer_at(mi, 0.9, 0.2, -0.9),
+        "observer": make_observer(mi, 0.9, 0.2, -0.9),
     }
     sensor = {
         "type": "panorama",

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from nerg_mi.files.images import threads_for_mitsuba
+from nerg_mi.files.images import ensure_two_threads
 
 from .scenes import REFERENCES, SCENES, scene, test_of
 
@@ -14,7 +14,7 @@ from .scenes import REFERENCES, SCENES, scene, test_of
 @pytest.fixture
 def references(tmp_path):
     # A test that fails writes pictures beside its references. Mitsuba's test reads and writes EXR files itself.
-    with threads_for_mitsuba():
+    with ensure_two_threads():
         yield shutil.copytree(REFERENCES, tmp_path / "references")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.formats.areas import Region
 from nerg_mi.rays.quality import summarise
-from nerg_mi.report.data import ObjectAttention, ReportCamera, ReportPicture, ReportProxy, Run, Share, Stage, pack
+from nerg_mi.report.data import ObjectAttention, ReportCamera, ReportPicture, ReportProxy, Run, MeanShare, Stage, pack_stage
 from tests.evaluation.test_gaze import crowd
 from tests.evaluation.test_gaze_report import scored
 
@@ -38,7 +38,7 @@ def cube(side: int = 12) -> ReportProxy:
     return ReportProxy(p.astype(np.float32), n.astype(np.float32), colors, gaze.astype(np.float32), 4 / side)
 
 
-SHELF = Region.of("shelf", np.zeros(3), np.ones(3))
+SHELF = Region.create("shelf", np.zeros(3), np.ones(3))
 
 
 def stage(boxes=(SHELF,)) -> Stage:
@@ -52,7 +52,7 @@ def whole(name: str = "shelf") -> Run:
     """Everything that can be shown; ``name``: what files, people and objects are called."""
     rays = crowd(400)
     picture = lambda words: ReportPicture(PNG, f"{words} {name}", f"{words} {name}.")
-    share = Share(0.25, 0.2, 0.3)
+    share = MeanShare(0.25, 0.2, 0.3)
     person = {"method": "gaze field", "person": name, "rays": 12, "bits": 0.1, "CC": None, "KLD": 0.5}
     results = GazeResults(
         f"{name}.safetensors", "", "both", 60, 30, 20.0, tuple(scored((0.9, 0.85, 0.3), reach=0.02)), (person,)
@@ -68,7 +68,7 @@ def whole(name: str = "shelf") -> Run:
         rays_file={"file": name},
     )
     # Areas have no such names as turn text round.
-    packed = stage((Region.of(name.replace("\u202e", "")[:80], np.zeros(3), np.ones(3)),))
+    packed = stage((Region.create(name.replace("\u202e", "")[:80], np.zeros(3), np.ones(3)),))
     return Run(
         f"Gaze of {name}",
         {"provenance": provenance, "architecture": {"kind": name, "members": [1, 2]}, "box": {}},
@@ -85,7 +85,7 @@ def whole(name: str = "shelf") -> Run:
         1,
         (4, 1, 3),
         {n: picture(n) for n in ("color", "gaze", "own", "sphere", "spread", "plan", "layout")},
-        pack(packed),
+        pack_stage(packed),
         2,
         2,
         len(packed.proxy.vertices),

@@ -14,7 +14,7 @@ import time
 
 import pytest
 
-from nerg_mi.report.sections import page
+from nerg_mi.report.sections import render_page
 from tests.report.made import HOSTILE, bare, whole
 
 REQUIRED = os.environ.get("NERG_REQUIRE_BROWSER", "0") not in ("", "0")
@@ -55,7 +55,7 @@ def browser(tmp_path_factory):
 def opened(browser, tmp_path, run):
     """The page of ``run`` in the browser, from disk; gives its console and the addresses that were asked for."""
     path = tmp_path / "report.html"
-    path.write_text(page(run), encoding="utf-8")
+    path.write_text(render_page(run), encoding="utf-8")
     browser.get("about:blank")
     browser.get_log("performance")
     browser.get(path.as_uri())

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.api.scene import make_scene
-from nerg_mi.evaluation.gaze_report import GazeResults, widening
+from nerg_mi.evaluation.gaze_report import GazeResults, small_sample_factor
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
@@ -20,26 +20,26 @@ from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.report.data import (
-    Labels,
-    Onlooker,
-    attention_on,
-    eyes_of,
-    land_rays,
+    ParticipantLabels,
+    GazeSampler,
+    summarize_objects,
+    sample_eye_positions,
+    assign_ray_hits,
     mean_over_people,
-    pack,
-    place_proxy,
-    rays_without_names,
-    results_without_names,
+    pack_stage,
+    make_proxy,
+    anonymize_rays,
+    anonymize_results,
     smooth_normals,
-    spread_out,
+    farthest_point_sampling,
     surface_normals,
-    thin,
+    downsample_points,
 )
 from nerg_mi.statistics.shares import Shares
 from nerg_mi.statistics.visits import BoxAoi as Solid
 from nerg_mi.statistics.visits import HitAssignment
-from nerg_mi.train.geometry import GazePlace
-from nerg_mi.transport.geometry import Place
+from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.transport.geometry import SceneGeometry
 from tests.evaluation.test_gaze import crowd
 from tests.report.made import bare, stage, whole
 
@@ -56,8 +56,8 @@ def hall(rgb):
     box = Box(tuple(LOW), tuple(HIGH))
     config = GazeConfig(grid=HashGridConfig(levels=4, log2_rows=10, base=4, finest=16), width=16, normalized=True)
     field = GazeField.random(config, box, namespace(rgb.variant()), 3)
-    place = GazePlace(Place(None, scene), box, "scene")
-    return Onlooker(field, place), place
+    place = TrainingGeometry(SceneGeometry(None, scene), box, "scene")
+    return GazeSampler(field, place), place
 
 
 def things(boxes):
@@ -74,7 +74,7 @@ def test_all_around_an_eye(hall):
     onlooker, _ = hall
     d = fibonacci_directions(512)
     for eye in np.array([[0.3, -2.0, 1.6], [-1.0, 4.0, 1.5]]):
-        (gaze,), distance = onlooker.look_from(eye)(d)
+        (gaze,), distance = onlooker.make_gaze_evaluator(eye)(d)
         assert np.allclose(distance, to_wall(eye, d), atol=1e-4)
         assert np.allclose(gaze, onlooker.density(eye, d), rtol=1e-5) and np.ptp(gaze) > 0
 
@@ -86,7 +86,7 @@ def test_gaze_on_points_is_the_density_where_nothing_hides_them(hall):
     points = np.array([on_wall, behind])
     away = points - eye
     direction = away / np.linalg.norm(away, axis=1, keepdims=True)
-    found = onlooker.on_points(eye, points, 0.02)
+    found = onlooker.density_at_points(eye, points, 0.02)
     assert found[0] == pytest.approx(onlooker.density(eye, direction)[0], rel=1e-5) and found[0] > 0
     assert found[1] == 0
 
@@ -100,12 +100,12 @@ def test_an_integral_of_few_directions_is_enough_for_a_picture(hall):
 def test_eyes_are_as_many_of_each_person(hall):
     _, place = hall
     rays = crowd(1000)
-    eyes = eyes_of(rays, place, 12)
-    assert np.bincount(eyes.person).tolist() == [3, 3, 3, 3]
-    times = [np.flatnonzero((rays.origin == p).all(axis=1))[0] for p in eyes.positions[eyes.person == 0]]
+    eyes = sample_eye_positions(rays, place, 12)
+    assert np.bincount(eyes.participant).tolist() == [3, 3, 3, 3]
+    times = [np.flatnonzero((rays.origin == p).all(axis=1))[0] for p in eyes.positions[eyes.participant == 0]]
     assert (np.diff(times) > 200).all()  # spread over the whole of the time
-    few = eyes_of(rays, place, 2)
-    assert len(few.positions) == 2 and len(set(few.person)) == 2
+    few = sample_eye_positions(rays, place, 2)
+    assert len(few.positions) == 2 and len(set(few.participant)) == 2
 
 
 def test_eyes_are_spread_over_whole_visits(hall):
@@ -118,7 +118,7 @@ def test_eyes_are_spread_over_whole_visits(hall):
     names = tuple(f"p{k}" for k in range(people))
     rays = Rays(t, person, names, origin, np.tile([1.0, 0, 0], (len(t), 1)), np.ones(len(t)))
     for most in (people, 3 * people):
-        along = np.sort(eyes_of(rays, place, most).positions[:, 1])
+        along = np.sort(sample_eye_positions(rays, place, most).positions[:, 1])
         assert len(along) == most and np.abs(along - np.linspace(-5, 5, most)).max() < 0.5
 
 
@@ -126,30 +126,30 @@ def test_rays_end_at_their_own_points_or_at_the_place(hall):
     onlooker, place = hall
     rays = crowd(300)
     rows = np.linspace(0, 299, 100).round().astype(int)
-    boxes = [Region.of("left", (-9, -9, -9), (9, 0.1, 9)), Region.of("low", (-9, -9, -9), (9, 9, 1.2))]
-    landed, person = land_rays(rays, place, onlooker, 100, *things(boxes), 0.0)
+    boxes = [Region.create("left", (-9, -9, -9), (9, 0.1, 9)), Region.create("low", (-9, -9, -9), (9, 9, 1.2))]
+    landed, person = assign_ray_hits(rays, place, onlooker, 100, *things(boxes), 0.0)
     assert landed.count == 100 and np.array_equal(person, rays.person[rows])
-    expected = [np.flatnonzero(box.holds(rays.hit[rows])) for box in boxes]
+    expected = [np.flatnonzero(box.contains(rays.hit[rows])) for box in boxes]
     assert all(np.array_equal(a, b) and len(b) for a, b in zip(landed.rows, expected))
-    landed, _ = land_rays(replace(rays, hit=None), place, onlooker, 300, *things(boxes), 0.0)
+    landed, _ = assign_ray_hits(replace(rays, hit=None), place, onlooker, 300, *things(boxes), 0.0)
     inside = np.flatnonzero(((rays.origin > LOW) & (rays.origin < HIGH)).all(axis=1))
     met = rays.origin + to_wall(rays.origin, rays.direction)[:, None] * rays.direction
     for box, found in zip(boxes, landed.rows):
-        assert np.array_equal(np.intersect1d(found, inside), inside[box.holds(met[inside])])
+        assert np.array_equal(np.intersect1d(found, inside), inside[box.contains(met[inside])])
 
 
 def test_rays_of_another_frame(hall, rgb):
     """Turned by 90 degrees about z, twice as large and moved."""
     onlooker, place = hall
     matrix = np.array([[0, -0.1, 0, 1], [0.1, 0, 0, 0], [0, 0, 0.1, 0.5], [0, 0, 0, 1.0]])
-    turned = GazePlace(place.medium, place.box, "scene", align=Similarity(matrix))
+    turned = TrainingGeometry(place.medium, place.box, "scene", align=Similarity(matrix))
     rays = crowd(50)
-    eyes = eyes_of(rays, turned, 4)
+    eyes = sample_eye_positions(rays, turned, 4)
     every = rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
     assert all(np.isclose(every, e).all(axis=1).any() for e in eyes.positions)
-    box = Region.of("some", (-9, -9, -9), (9, 9, 0.65))
-    landed, _ = land_rays(rays, turned, onlooker, 50, *things([box]), 0.0)
-    expected = np.flatnonzero(box.holds(rays.hit @ matrix[:3, :3].T + matrix[:3, 3]))
+    box = Region.create("some", (-9, -9, -9), (9, 9, 0.65))
+    landed, _ = assign_ray_hits(rays, turned, onlooker, 50, *things([box]), 0.0)
+    expected = np.flatnonzero(box.contains(rays.hit @ matrix[:3, :3].T + matrix[:3, 3]))
     assert np.array_equal(landed.rows[0], expected) and 0 < len(expected) < 50
 
 
@@ -157,8 +157,8 @@ def test_where_no_place_is_known_nothing_is_met(rgb):
     box = Box((-2.0,) * 3, (2.0,) * 3)
     grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8)
     field = GazeField.random(GazeConfig(grid=grid, width=16), box, namespace(rgb.variant()), 1)
-    onlooker = Onlooker(field, GazePlace(None, box, "none"))
-    depth, met = onlooker.meet(np.zeros((3, 3)), np.eye(3))
+    onlooker = GazeSampler(field, TrainingGeometry(None, box, "none"))
+    depth, met = onlooker.trace(np.zeros((3, 3)), np.eye(3))
     assert not met.any() and not depth.any()
 
 
@@ -183,17 +183,17 @@ def named():
 def test_people_are_numbered_by_their_rays():
     rays = named()
     count = np.bincount(rays.person)
-    labels = Labels(rays)
+    labels = ParticipantLabels(rays)
     order = [NAMES[i] for i in np.argsort(-count, kind="stable")]
-    assert [labels.of(name) for name in order] == ["person 1", "person 2", "person 3", "person 4"]
-    shown = rays_without_names(rays, labels)
+    assert [labels.label(name) for name in order] == ["person 1", "person 2", "person 3", "person 4"]
+    shown = anonymize_rays(rays, labels)
     assert shown.persons == ("person 1", "person 2", "person 3", "person 4")
-    assert [shown.persons[p] for p in shown.person] == [labels.of(rays.persons[p]) for p in rays.person]
+    assert [shown.persons[p] for p in shown.person] == [labels.label(rays.persons[p]) for p in rays.person]
     assert np.array_equal(shown.origin, rays.origin)
 
 
 def test_no_name_is_left():
-    shown = rays_without_names(named(), Labels(named()))
+    shown = anonymize_rays(named(), ParticipantLabels(named()))
     text = repr(shown.metadata) + repr(shown.persons)
     assert "Ada" not in text and "Grace" not in text and shown.metadata["dropped"][0]["file"] == "file 1"
     assert shown.metadata["steps"] == [{"step": "filter", "kept": 9, "of": 10}]
@@ -202,15 +202,15 @@ def test_no_name_is_left():
 def test_names_of_files_and_evaluations():
     row = {"method": "gaze field", "person": "Ada", "bits": 1.0}
     found = GazeResults("g", "", "both", 1, 2, 20.0, (), (row, {**row, "person": "somebody else"}))
-    labels = Labels(named(), [found])
-    shown = results_without_names(found, labels)
-    assert [r["person"] for r in shown.persons] == [labels.of("Ada"), "person 5"] and row["person"] == "Ada"
-    assert labels.hide("ada_lovelace-ADA LOVELACE.npz") == (
-        f"{labels.of('Ada')}_lovelace-{labels.of('Ada Lovelace')}.npz"
+    labels = ParticipantLabels(named(), [found])
+    shown = anonymize_results(found, labels)
+    assert [r["person"] for r in shown.participant_rows] == [labels.label("Ada"), "person 5"] and row["person"] == "Ada"
+    assert labels.anonymize("ada_lovelace-ADA LOVELACE.npz") == (
+        f"{labels.label('Ada')}_lovelace-{labels.label('Ada Lovelace')}.npz"
     )
     # A letter is hidden where it stands alone.
-    assert labels.hide("X and axis") == f"{labels.of('X')} and axis"
-    assert Labels(None).hide("a.b") == "a.b" and Labels(None).of("Ada") == "a person"
+    assert labels.anonymize("X and axis") == f"{labels.label('X')} and axis"
+    assert ParticipantLabels(None).anonymize("a.b") == "a.b" and ParticipantLabels(None).label("Ada") == "a person"
 
 
 # ---- Shares of attention on boxes, counted again another way; intervals by a bootstrap that is one ----
@@ -231,30 +231,30 @@ def test_shares_of_people_count_alike():
     rng = np.random.default_rng(0)
     who, person = np.array([3, 3, 3, 5, 9, 9, 9, 9]), rng.choice([3, 5, 9], 300)
     share, rows = rng.random(len(who)), np.flatnonzero(rng.random(300) < 0.3)
-    (found,) = attention_on(["unit"], of_field(share), who, (on_rows(rows, 300), person))
+    (found,) = summarize_objects(["unit"], of_field(share), who, (on_rows(rows, 300), person))
     field, rays = {}, {}
     for value, one in zip(share, who.tolist()):
         field.setdefault(one, []).append(value)
     for k, one in enumerate(person.tolist()):
         rays.setdefault(one, []).append(k in rows)
     mean = lambda each: sum(sum(v) / len(v) for v in each.values()) / len(each)
-    assert found.field.mean == pytest.approx(mean(field)) and found.recorded.mean == pytest.approx(mean(rays))
-    assert (found.saw, found.looked, found.people) == (3, 3, 3)
+    assert found.predicted.mean == pytest.approx(mean(field)) and found.recorded.mean == pytest.approx(mean(rays))
+    assert (found.num_could_see, found.num_looked, found.num_participants) == (3, 3, 3)
 
 
 def test_who_could_see_it():
     # The second place of person 0 sees the box; no gaze goes there.
     field, who, person = of_field([0, 0, 0, 0], [False, True, False, False]), np.array([0, 0, 1, 2]), np.arange(4)
-    (found,) = attention_on(["unit"], field, who, (on_rows([], 4), person))
-    assert (found.saw, found.looked, found.people) == (1, 0, 4)
+    (found,) = summarize_objects(["unit"], field, who, (on_rows([], 4), person))
+    assert (found.num_could_see, found.num_looked, found.num_participants) == (1, 0, 4)
     # Somebody who looks at it could see it.
-    (found,) = attention_on(["unit"], field, who, (on_rows([1, 2], 4), person))
-    assert (found.saw, found.looked) == (2, 2)
+    (found,) = summarize_objects(["unit"], field, who, (on_rows([1, 2], 4), person))
+    assert (found.num_could_see, found.num_looked) == (2, 2)
 
 
 def test_nobody_recorded():
-    (found,) = attention_on(["unit"], of_field([0.25]), np.zeros(1, int))
-    assert found.recorded is None and found.people is None and math.isnan(found.field.low)
+    (found,) = summarize_objects(["unit"], of_field([0.25]), np.zeros(1, int))
+    assert found.recorded is None and found.num_participants is None and math.isnan(found.predicted.low)
 
 
 def test_the_interval_is_that_of_a_bootstrap_over_people():
@@ -263,7 +263,7 @@ def test_the_interval_is_that_of_a_bootstrap_over_people():
     found = mean_over_people(values)
     means = [rng.choice(values, 40).mean() for _ in range(20_000)]
     assert found.mean == pytest.approx(values.mean())
-    assert found.high - found.mean == pytest.approx(1.96 * np.std(means) * widening(40), rel=0.02)
+    assert found.high - found.mean == pytest.approx(1.96 * np.std(means) * small_sample_factor(40), rel=0.02)
     assert found.mean - found.low == pytest.approx(found.high - found.mean)
 
 
@@ -298,7 +298,7 @@ def test_points_lie_on_the_walls_and_face_inwards(room):
     told = []
     gaze = lambda observer, points, spacing: np.linalg.norm(points - observer, axis=1)
     up = np.array([0.0, 0, 1])
-    found = place_proxy(room, eyes, up, eyes[:1], gaze, 3000, (96, 48), lambda *done: told.append(done))
+    found = make_proxy(room, eyes, up, eyes[:1], gaze, 3000, (96, 48), lambda *done: told.append(done))
     p = found.vertices
     to_wall = np.minimum(np.abs(p - PROXY_LOW), np.abs(p - PROXY_HIGH)).min(axis=1)
     assert 500 < len(p) <= 3000 and to_wall.max() < 0.5 * found.spacing + 1e-3 and told == [(1, 2), (2, 2)]
@@ -322,7 +322,7 @@ def test_thinning_keeps_the_two_sides_of_a_wall_apart():
     points = np.concatenate([flat, flat + [0, 0, 1e-4]])
     normals = np.repeat([[0.0, 0, -1], [0, 0, 1]], 4000, axis=0)
     colors = np.repeat([[1.0, 0, 0], [0, 0, 1]], 4000, axis=0)
-    p, c, edge = thin(points, normals, colors, 500)
+    p, c, edge = downsample_points(points, normals, colors, 500)
     assert len(p) <= 500 and set(map(tuple, np.round(c, 6))) == {(1, 0, 0), (0, 0, 1)}
     # Every point has a representative in its cube.
     apart = np.linalg.norm(points[:, None, :] - p[None], axis=2).min(axis=1)
@@ -331,9 +331,9 @@ def test_thinning_keeps_the_two_sides_of_a_wall_apart():
 
 def test_thinning_leaves_few_points_alone():
     p = np.array([[0.0, 0, 0], [1, 1, 1]])
-    found = thin(p, np.array([[0.0, 0, 1]] * 2), np.ones((2, 3)), 10)
+    found = downsample_points(p, np.array([[0.0, 0, 1]] * 2), np.ones((2, 3)), 10)
     assert np.allclose(found[0], p)
-    alone = thin(p[:1], np.array([[0.0, 0, 1]]), np.ones((1, 3)), 10)
+    alone = downsample_points(p[:1], np.array([[0.0, 0, 1]]), np.ones((1, 3)), 10)
     assert np.allclose(alone[0], p[:1]) and alone[2] > 0
 
 
@@ -362,11 +362,11 @@ def test_smooth_normals_of_a_noisy_ball():
 
 def test_places_far_apart():
     line = np.linspace(0, 10, 11)[:, None] * [1.0, 0, 0]
-    assert sorted(spread_out(line, 3, first=np.zeros(3)).tolist()) == [3, 5, 10] or spread_out(
+    assert sorted(farthest_point_sampling(line, 3, first=np.zeros(3)).tolist()) == [3, 5, 10] or farthest_point_sampling(
         line, 2, first=np.zeros(3)
     ).tolist() == [10, 5]
-    assert spread_out(line, 2).tolist() == [0, 10]
-    assert len(spread_out(np.zeros((5, 3)), 3)) == 1 and len(spread_out(np.zeros((0, 3)), 3)) == 0
+    assert farthest_point_sampling(line, 2).tolist() == [0, 10]
+    assert len(farthest_point_sampling(np.zeros((5, 3)), 3)) == 1 and len(farthest_point_sampling(np.zeros((0, 3)), 3)) == 0
 
 
 # ---- A run judges its evaluations ----
@@ -395,7 +395,7 @@ def positions(about, array):
 
 def test_positions_normals_and_colours_come_back():
     given = stage()
-    about, arrays = unpacked(pack(given))
+    about, arrays = unpacked(pack_stage(given))
     close = np.array(about["size"]).max() / 65535
     assert np.abs(positions(about, arrays["place"]) - given.proxy.vertices).max() <= close
     assert np.abs(arrays["normal"].reshape(-1, 3) / 255 * 2 - 1 - given.proxy.normals).max() <= 1 / 255 + 1e-6
@@ -409,7 +409,7 @@ def test_positions_normals_and_colours_come_back():
 
 def test_gaze_of_all_and_of_each():
     given = stage()
-    about, arrays = unpacked(pack(given))
+    about, arrays = unpacked(pack_stage(given))
     heat = (arrays["gaze"].reshape(3, -1) / 255) ** 2
     for values, shown, who in zip([given.proxy.gaze.mean(axis=0), *given.proxy.gaze], heat, about["observers"]):
         assert who["top"] == pytest.approx(np.percentile(values, 99), rel=0.01)
@@ -418,7 +418,7 @@ def test_gaze_of_all_and_of_each():
 
 
 def test_boxes_are_their_twelve_edges():
-    about, arrays = unpacked(pack(stage((Region.of("b", np.array([0.0, 1, 2]), np.array([1.0, 3, 4])),))))
+    about, arrays = unpacked(pack_stage(stage((Region.create("b", np.array([0.0, 1, 2]), np.array([1.0, 3, 4])),))))
     edges = positions(about, arrays["boxes"]).reshape(12, 2, 3)
     lengths = np.sort(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1))
     assert np.allclose(lengths, [1] * 4 + [2] * 8, atol=1e-3)
@@ -428,10 +428,10 @@ def test_boxes_are_their_twelve_edges():
 def test_nothing_but_points():
     given = stage(())
     empty = replace(given.proxy, gaze=np.zeros((0, len(given.proxy.vertices)), np.float32))
-    text = pack(replace(given, proxy=empty, observers=np.zeros((0, 3)), paths=[]))
+    text = pack_stage(replace(given, proxy=empty, observers=np.zeros((0, 3)), paths=[]))
     about, arrays = unpacked(text)
     assert about["observers"] == [{"marks": [], "top": 0.0}] and not arrays["gaze"].any() and about["paths"] == []
 
 
 def test_equal_scenes_are_equal_bytes_and_safe_in_a_page():
-    assert pack(stage()) == pack(stage()) and "<" not in pack(stage())
+    assert pack_stage(stage()) == pack_stage(stage()) and "<" not in pack_stage(stage())

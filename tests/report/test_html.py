@@ -15,7 +15,7 @@ import pytest
 
 from nerg_mi.report import html
 from nerg_mi.report.html import Point, interval_chart, nice_ticks
-from nerg_mi.report.sections import SECTIONS, SETTINGS, page
+from nerg_mi.report.sections import SECTIONS, SETTINGS, render_page
 from tests.report.made import HOSTILE, PNG, bare, packed_scene, whole
 
 # ---- Charts: values where their scale says, and scales of round numbers ----
@@ -94,7 +94,7 @@ def test_tables():
     parsed = Parsed(found)
     assert [t for t, _ in parsed.tags].count("tr") == 3 and parsed.text == "namevaluea<b1c2.5"
     assert [a for t, a in parsed.tags if t == "td"] == [{}, {"class": "number"}] * 2
-    assert Parsed(html.pairs([("x", "<y>")])).text == "x<y>"
+    assert Parsed(html.key_value_table([("x", "<y>")])).text == "x<y>"
 
 
 def test_pictures_are_within_the_page():
@@ -110,27 +110,27 @@ SIZE = 6_000_000
 
 def test_every_section_is_there():
     for run in (whole(), bare()):
-        tags = Parsed(page(run)).tags
+        tags = Parsed(render_page(run)).tags
         assert [a["id"] for t, a in tags if t == "section"] == [s.name for s in SECTIONS]
         assert [a["href"] for t, a in tags if t == "a"] == [f"#{s.name}" for s in SECTIONS]
 
 
 def test_equal_runs_give_equal_bytes():
-    assert page(whole()) == page(whole()) and len(page(whole()).encode()) < SIZE
+    assert render_page(whole()) == render_page(whole()) and len(render_page(whole()).encode()) < SIZE
 
 
 def test_names_never_become_markup():
-    tame, hostile = (Parsed(page(whole(name))) for name in ("shelf", HOSTILE))
+    tame, hostile = (Parsed(render_page(whole(name))) for name in ("shelf", HOSTILE))
     assert [t for t, _ in hostile.tags] == [t for t, _ in tame.tags]
     keys = lambda found: [sorted(a) for _, a in found.tags]
     assert keys(hostile) == keys(tame)
     assert not any(key.startswith("on") for _, a in hostile.tags for key in a)
-    assert "alert(1)" in hostile.text and "\u202e" not in page(whole(HOSTILE))
+    assert "alert(1)" in hostile.text and "\u202e" not in render_page(whole(HOSTILE))
 
 
 @pytest.mark.parametrize("run", [whole(), bare(), whole(HOSTILE)], ids=["whole", "bare", "hostile"])
 def test_nothing_is_loaded(run):
-    text = page(run)
+    text = render_page(run)
     for tag, attributes in Parsed(text).tags:
         assert tag not in ("link", "iframe", "object", "embed", "form", "base", "video", "audio", "source"), tag
         assert attributes.get("src", "data:image/png;base64,").startswith("data:image/png;base64,"), tag
@@ -140,7 +140,7 @@ def test_nothing_is_loaded(run):
 
 
 def test_the_policy_allows_what_is_in_the_page_and_no_more():
-    text = page(whole())
+    text = render_page(whole())
     (policy,) = [a["content"] for t, a in Parsed(text).tags if a.get("http-equiv") == "Content-Security-Policy"]
     rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
     hashed = lambda kind: [
@@ -155,12 +155,12 @@ def test_the_policy_allows_what_is_in_the_page_and_no_more():
 
 
 def test_a_report_without_a_scene_has_no_script():
-    text = page(bare())
+    text = render_page(bare())
     assert "<script" not in text and "script-src 'none'" in text.replace("&#x27;", "'")
 
 
 def test_the_scene_is_data():
-    assert packed_scene(page(whole(HOSTILE)))["count"] == whole().stage_points
+    assert packed_scene(render_page(whole(HOSTILE)))["count"] == whole().stage_points
 
 
 # ---- Every section: shown from what there is, and told in one sentence where it is left out ----
@@ -170,7 +170,7 @@ ABSENT = {"verdict", "data", "people", "gaze", "stage", "objects", "scores"}
 
 
 def text_of(section, run) -> str:
-    return Parsed(section.body(run)).text
+    return Parsed(section.render(run)).text
 
 
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda s: s.name)
@@ -209,7 +209,7 @@ def test_who_was_held_out_is_counted_and_not_named():
 
 def test_shares_that_few_people_could_see_are_hidden():
     objects = next(s for s in SECTIONS if s.name == "objects")
-    said = text_of(objects, replace(whole(), least=3))
+    said = text_of(objects, replace(whole(), min_participants=3))
     assert "otherhidden" in said and "fewer than 3" in said and said.count("25.00") == 2
     assert "hidden" not in text_of(objects, whole())
 
@@ -217,15 +217,15 @@ def test_shares_that_few_people_could_see_are_hidden():
 def test_without_people_there_are_no_intervals_of_shares():
     objects = next(s for s in SECTIONS if s.name == "objects")
     (first, *_) = whole().objects
-    alone = replace(first, recorded=None, saw=None, looked=None, people=None)
-    said = text_of(objects, replace(whole(), objects=(alone,), eyes=1))
+    alone = replace(first, recorded=None, num_could_see=None, num_looked=None, num_participants=None)
+    said = text_of(objects, replace(whole(), objects=(alone,), num_viewpoints=1))
     assert "at 1 place" in said and "rays recorded" not in said
 
 
 def test_one_split_each():
     both = whole().results[0]
-    run = replace(whole(), results=(both, replace(both, split="pos", people=3)))
+    run = replace(whole(), results=(both, replace(both, split="pos", num_participants=3)))
     verdict, scores = (next(s for s in SECTIONS if s.name == n) for n in ("verdict", "scores"))
     assert "No verdict for known people at new places: 3 people" in text_of(verdict, run)
     assert "Known people at new places (3 people, 60 places)" in text_of(scores, run)
-    assert HOSTILE not in scores.body(replace(run, results=(replace(both, split=HOSTILE),)))
+    assert HOSTILE not in scores.render(replace(run, results=(replace(both, split=HOSTILE),)))

@@ -13,7 +13,7 @@ from nerg_mi.scenes.store import attention_law, cameras, layout, shoppers, twin,
 @pytest.fixture(scope="module")
 def store():
     mi.set_variant("llvm_ad_rgb")
-    return layout.build(0)
+    return layout.build_store(0)
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +36,9 @@ def equal_area(n):
 
 
 def test_layout_is_deterministic_and_varies_with_the_seed(store):
-    again, other = layout.build(0), layout.build(1)
+    again, other = layout.build_store(0), layout.build_store(1)
     assert np.array_equal(store.quads, again.quads) and np.array_equal(store.colors, again.colors)
-    assert [r.as_json() for r in store.regions] == [r.as_json() for r in again.regions]
+    assert [r.to_json() for r in store.regions] == [r.to_json() for r in again.regions]
     assert store.quads.shape != other.quads.shape or not np.array_equal(store.quads, other.quads)
 
 
@@ -53,15 +53,15 @@ def test_layout_fills_the_room_and_names_its_regions(store):
 
 
 def test_quads_face_outwards():
-    place = layout.Place()
-    place.box((0, 0, 0), (1, 2, 3), (0.5, 0.5, 0.5))
+    place = layout.StoreBuilder()
+    place.add_box((0, 0, 0), (1, 2, 3), (0.5, 0.5, 0.5))
     for quad in place.quads:
         normal = np.cross(quad[1] - quad[0], quad[3] - quad[0])
         assert np.dot(normal, quad.mean(axis=0) - (0.5, 1.0, 1.5)) > 0
 
 
 def test_clearance_is_the_distance_to_the_nearest_solid(store):
-    room = store.clearance([[0.9, 5.0, 2.6], [1.85, 3.0, 1.0]])
+    room = store.compute_clearance([[0.9, 5.0, 2.6], [1.85, 3.0, 1.0]])
     assert room[0] == pytest.approx(0.4) and room[1] == 0.0
 
 
@@ -69,7 +69,7 @@ def test_committed_files_are_those_of_seed_zero(store, tmp_path):
     twin.write_twin(store, tmp_path)
     layout.write_regions(store, tmp_path / "regions.json")
     for name in ("twin.xml", "twin.ply", "twin_lights.ply", "regions.json"):
-        assert (tmp_path / name).read_bytes() == (twin.HERE / name).read_bytes(), f"run make --stage twin: {name}"
+        assert (tmp_path / name).read_bytes() == (twin.FOLDER / name).read_bytes(), f"run make --stage twin: {name}"
     assert sum(f.stat().st_size for f in tmp_path.iterdir()) < 1e6
 
 
@@ -78,18 +78,18 @@ def test_committed_files_are_those_of_seed_zero(store, tmp_path):
 
 def test_twin_casts_exact_distances(store):
     up, east = (0, 0, 1.0), (1.0, 0, 0)
-    assert twin.cast([(0.9, 5.0, 1.0)], [up])[0] == pytest.approx(2.0, abs=1e-5)
+    assert twin.cast_rays([(0.9, 5.0, 1.0)], [up])[0] == pytest.approx(2.0, abs=1e-5)
     # the trim panel at the north end of the first gondola
-    assert twin.cast([(1.0, 4.19, 1.0)], [east])[0] == pytest.approx(0.5, abs=1e-5)
-    assert np.isinf(twin.cast([(-1.0, 1.0, 1.0)], [(-1.0, 0, 0)])[0])
+    assert twin.cast_rays([(1.0, 4.19, 1.0)], [east])[0] == pytest.approx(0.5, abs=1e-5)
+    assert np.isinf(twin.cast_rays([(-1.0, 1.0, 1.0)], [(-1.0, 0, 0)])[0])
 
 
 def test_twin_is_closed(store):
     rng = np.random.default_rng(0)
-    eyes = cameras.free_positions(store, rng, 2000)
+    eyes = cameras.sample_free_positions(store, rng, 2000)
     d = rng.normal(size=eyes.shape)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    t = twin.cast(eyes, d)
+    t = twin.cast_rays(eyes, d)
     assert np.isfinite(t).all()
     end = eyes + t[:, None] * d
     assert np.all(end > -1e-4) and np.all(end < np.array(layout.ROOM) + 1e-4)
@@ -97,9 +97,9 @@ def test_twin_is_closed(store):
 
 def test_visible_agrees_with_cast(store):
     rng = np.random.default_rng(1)
-    a, b = cameras.free_positions(store, rng, 500), cameras.free_positions(store, rng, 500)
+    a, b = cameras.sample_free_positions(store, rng, 500), cameras.sample_free_positions(store, rng, 500)
     length = np.linalg.norm(b - a, axis=1)
-    assert np.array_equal(twin.visible(a, b), twin.cast(a, (b - a) / length[:, None]) > length - 1e-3)
+    assert np.array_equal(twin.is_visible(a, b), twin.cast_rays(a, (b - a) / length[:, None]) > length - 1e-3)
 
 
 def test_missing_twin_is_a_sentence(tmp_path):
@@ -127,7 +127,7 @@ def test_views_agree_with_each_other(store, tmp_path):
     """A pixel moved into another view by its depth meets its own colour there: poses, depth and pictures are one
     frame."""
     camera = cameras.Pinhole(80, 60)
-    views.write_views(store, tmp_path, camera=camera, train=8, test=2, spp=16, say=lambda text: None)
+    views.write_views(store, tmp_path, camera=camera, train=8, test=2, spp=16, log=lambda text: None)
     sets = [json.loads((tmp_path / n).read_text()) for n in ("transforms.json", "transforms_test.json")]
     assert [len(s["frames"]) for s in sets] == [8, 2]
     assert sets[0]["aabb"] == [[0, 0, 0], list(layout.ROOM)] and sets[0]["fl_x"] == pytest.approx(camera.focal)
@@ -137,7 +137,7 @@ def test_views_agree_with_each_other(store, tmp_path):
     depths = [np.load(tmp_path / f["depth_file_path"]) for f in frames]
     assert pictures[0].shape == (60, 80, 3) and depths[0].dtype == np.float32 and depths[0].shape == (60, 80)
     for pose in poses:
-        assert store.clearance(pose[:3, 3])[0] >= cameras.CLEARANCE - 1e-9
+        assert store.compute_clearance(pose[:3, 3])[0] >= cameras.CLEARANCE - 1e-9
 
     near, shuffled = [], []
     rng = np.random.default_rng(0)
@@ -147,7 +147,7 @@ def test_views_agree_with_each_other(store, tmp_path):
             if a == b:
                 continue
             uv, inside = camera.project(poses[b], points)
-            inside[inside] = twin.visible(poses[b][:3, 3], points[inside] + 2e-3 * (pose[:3, 3] - points[inside]))
+            inside[inside] = twin.is_visible(poses[b][:3, 3], points[inside] + 2e-3 * (pose[:3, 3] - points[inside]))
             x, y = uv[inside].astype(int).T
             # the depth of the other view at that pixel is the distance to the same point
             gap = np.abs(depths[b][y, x] - np.linalg.norm(points[inside] - poses[b][:3, 3], axis=1))
@@ -177,7 +177,7 @@ def test_law_depends_on_position_and_hides_what_is_hidden(law):
     d = law.density(EYES, equal_area(4096))
     assert np.corrcoef(d)[np.triu_indices(4, 1)].max() < 0.8
     z = equal_area(512)  # above the ceiling nothing of the store is visible
-    assert np.allclose(law.density([(4.0, 3.0, 5.0)], z)[0], attention_law.band_density(z[:, 2]))
+    assert np.allclose(law.density([(4.0, 3.0, 5.0)], z)[0], attention_law.background_density(z[:, 2]))
 
 
 @pytest.mark.nightly
@@ -207,17 +207,17 @@ def test_law_names_an_unknown_category():
 def test_shoppers_keep_clear_of_furniture_and_return_to_the_skeleton_file(store, law, tmp_path):
     from nerg_mi.rays.readers.skeleton import LEFT_EAR, NOSE, RIGHT_EAR, head_poses, read_skeleton
 
-    ids, times, origins, directions = shoppers.simulate(store, shoppers=3, stops=(2, 4), seed=5, law=law)
-    again = shoppers.simulate(store, shoppers=3, stops=(2, 4), seed=5, law=law)
+    ids, times, origins, directions = shoppers.simulate_shoppers(store, shoppers=3, stops=(2, 4), seed=5, law=law)
+    again = shoppers.simulate_shoppers(store, shoppers=3, stops=(2, 4), seed=5, law=law)
     assert np.array_equal(directions, again[3]) and len(set(ids)) == 3
-    assert shoppers.floor_clearance(store, origins[:, :2]).min() > 0.1
+    assert shoppers.compute_floor_clearance(store, origins[:, :2]).min() > 0.1
     for name in set(ids):
         mine = ids == name
         assert np.all(np.diff(times[mine]) == 200)
         assert np.linalg.norm(np.diff(origins[mine], axis=0), axis=1).max() < 0.5  # metres in 0.2 s
 
     path = shoppers.write_shoppers(
-        store, tmp_path / "s.csv", shoppers=3, stops=(2, 4), seed=5, law=law, say=lambda text: None
+        store, tmp_path / "s.csv", shoppers=3, stops=(2, 4), seed=5, law=law, log=lambda text: None
     )
     rows = read_skeleton(path)
     o, d = head_poses(*(rows.keypoints[:, k] for k in (LEFT_EAR, RIGHT_EAR, NOSE)))

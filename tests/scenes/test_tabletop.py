@@ -14,7 +14,7 @@ from nerg_mi.photos.dataset import open_dataset  # noqa: E402
 
 @pytest.fixture(scope="module")
 def place():
-    return layout.build(0)
+    return layout.build_tabletop(0)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def scene(place):
 def capture(place, scene, tmp_path_factory):
     """The folder of a tiny capture, and its photos."""
     folder = tmp_path_factory.mktemp("tabletop")
-    taken = photos.take_photos(scene, cameras.walk(0, 6, 32, 24), spp=4, say=lambda text: None)
+    taken = photos.take_photos(scene, cameras.make_cameras(0, 6, 32, 24), spp=4, log=lambda text: None)
     photos.write_photos(taken, folder)
     sparse.write_colmap(taken, folder / "sparse" / "0")
     return folder, taken
@@ -37,7 +37,7 @@ def capture(place, scene, tmp_path_factory):
 
 
 def test_layout_is_deterministic_and_varies_with_the_seed(place):
-    again, other = layout.build(0), layout.build(1)
+    again, other = layout.build_tabletop(0), layout.build_tabletop(1)
     assert set(place.meshes) == set(layout.MATERIALS)
     for name, made in place.meshes.items():
         assert all(np.array_equal(a, b) for a, b in zip(made, again.meshes[name])), name
@@ -53,27 +53,27 @@ def test_meshes_are_sound(place):
 
 
 def test_things_are_far_away_and_near(place):
-    far = lambda name: np.linalg.norm(place.meshes[name].points[:, :2] - table.CENTRE[:2], axis=1)
+    far = lambda name: np.linalg.norm(place.meshes[name].points[:, :2] - table.OBJECT_CENTER[:2], axis=1)
     assert far("vase").min() < 0.1 and far("facade").min() > 15 and 150 < far("facade").max() < 250
 
 
 @pytest.mark.parametrize("name", layout.MATERIALS)
 def test_paints_are_bitmaps(name):
-    paint = np.asarray(layout.MATERIALS[name].paint(layout.stream(0, name)))
+    paint = np.asarray(layout.MATERIALS[name].paint(layout.make_random_stream(0, name)))
     assert paint.ndim == 3 and paint.shape[2] == 3 and -0.01 < paint.min() and paint.max() < 1.6
 
 
 def test_noise_fills_its_range_and_has_no_seam():
-    n = t.noise(np.random.default_rng(0), (64, 96), (4, 6))
+    n = t.make_noise(np.random.default_rng(0), (64, 96), (4, 6))
     assert n.shape == (64, 96) and n.min() < 0.1 and n.max() > 0.9
     steps = np.abs(np.diff(n, axis=0))
     assert np.abs(n[0] - n[-1]).max() < 1.5 * steps.max()
 
 
 def test_a_box_is_closed_and_turns_about_its_middle():
-    made = mesh.Place()
-    made.box("x", (1, 2, 3), (2, 4, 4), yaw=np.pi / 2)
-    (box,) = made.meshes().values()
+    made = mesh.MeshBuilder()
+    made.add_box("x", (1, 2, 3), (2, 4, 4), yaw=np.pi / 2)
+    (box,) = made.join_meshes().values()
     assert np.allclose(box.points.min(axis=0), (0.5, 2.5, 3)) and np.allclose(box.points.max(axis=0), (2.5, 3.5, 4))
     a, b, c = np.moveaxis(box.triangles, 1, 0)
     assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(2 * (2 + 1 + 2))
@@ -83,14 +83,14 @@ def test_a_box_is_closed_and_turns_about_its_middle():
 
 
 def test_cameras_walk_around_the_object_and_see_it():
-    walk = cameras.walk(0)
+    walk = cameras.make_cameras(0)
     assert len(walk) == 64 and [c.intrinsics.width for c in walk[:5]] == [320, 320, 320, 320, 240]
     for camera in walk:
-        (at,), (shown,) = project(table.CENTRE[None], camera)
+        (at,), (shown,) = project(table.OBJECT_CENTER[None], camera)
         i = camera.intrinsics
         assert shown and 0.25 < at[0] / i.width < 0.75 and 0.2 < at[1] / i.height < 0.95
-        assert 0.9 < np.linalg.norm(camera.center - table.CENTRE) < 2.2
-    angles = np.sort([np.arctan2(*(c.center - table.CENTRE)[[1, 0]]) for c in walk])
+        assert 0.9 < np.linalg.norm(camera.center - table.OBJECT_CENTER) < 2.2
+    angles = np.sort([np.arctan2(*(c.center - table.OBJECT_CENTER)[[1, 0]]) for c in walk])
     assert np.diff(angles).max() < np.radians(25)
 
 
@@ -169,8 +169,8 @@ def test_the_capture_is_read_back(capture):
 
 def test_points_are_triangulated_where_surfaces_are(scene):
     """From photos of the paint alone, which take no light to make."""
-    photographer = photos.Photographer(scene)
-    walk = cameras.walk(0, 96, 160, 120)[34:40]
+    photographer = photos.TabletopPhotographer(scene)
+    walk = cameras.make_cameras(0, 96, 160, 120)[34:40]
     taken = [
         photos.Photo(
             f"{k}.png",
@@ -180,8 +180,8 @@ def test_points_are_triangulated_where_surfaces_are(scene):
         )
         for k, camera in enumerate(walk)
     ]
-    found, points = sparse.find_points(taken)
-    assert len(points) > 100 and max(len(at) for at in found) <= sparse.CORNERS
+    found, points = sparse.triangulate_points(taken)
+    assert len(points) > 100 and max(len(at) for at in found) <= sparse.MAX_CORNERS
     gaps = []
     for p in points:
         assert len(p.track) >= 2 and len({j for j, _ in p.track}) == len(p.track)
@@ -194,7 +194,7 @@ def test_points_are_triangulated_where_surfaces_are(scene):
 def test_a_corner_is_found_where_it_is():
     picture = np.zeros((40, 40, 3), np.uint8)
     picture[20:, 15:] = 255
-    assert np.abs(sparse.corners(picture)[0] - (15, 20)).max() < 1.6  # within the blur
+    assert np.abs(sparse.detect_corners(picture)[0] - (15, 20)).max() < 1.6  # within the blur
 
 
 def test_the_command_says_what_it_makes(capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nerg_mi.statistics.estimates import adjusted, mid_p, proportion_differences, proportions, ratio_differences, ratios
+from nerg_mi.statistics.estimates import adjust_p_values, mid_p_interval, estimate_proportion_differences, estimate_proportions, estimate_ratio_differences, estimate_ratios
 
 # ---- p-values of many hypotheses, adjusted for the false discovery rate ----
 
@@ -23,7 +23,7 @@ from nerg_mi.statistics.estimates import adjusted, mid_p, proportion_differences
     ],
 )
 def test_hypotheses_without_a_p_value_do_not_count(p, expected):
-    assert np.allclose(adjusted(np.array(p)), expected, rtol=1e-12, equal_nan=True)
+    assert np.allclose(adjust_p_values(np.array(p)), expected, rtol=1e-12, equal_nan=True)
 
 
 # ---- Intervals of ratios of sums over people, and of their differences ----
@@ -33,9 +33,9 @@ ONES = np.ones
 
 def test01_of_many_normal_people_it_is_that_of_student():
     x = np.random.default_rng(0).normal(5, 1, (60, 1))
-    found = ratios(x, ONES(x.shape), resamples=4000)
+    found = estimate_ratios(x, ONES(x.shape), resamples=4000)
     reach = stats.t.ppf(0.975, 59) * x.std(ddof=1) / np.sqrt(60)
-    assert found.value == pytest.approx(x.mean()) and found.people.tolist() == [60]
+    assert found.value == pytest.approx(x.mean()) and found.participants.tolist() == [60]
     assert found.low[0] == pytest.approx(x.mean() - reach, abs=0.15 * reach)
     assert found.high[0] == pytest.approx(x.mean() + reach, abs=0.15 * reach)
 
@@ -43,7 +43,7 @@ def test01_of_many_normal_people_it_is_that_of_student():
 def test02_a_loop_over_draws_gives_the_same():
     rng = np.random.default_rng(1)
     x, y = rng.gamma(1, 1, (9, 1)), rng.gamma(2, 1, (9, 1))
-    found = ratios(x, y, resamples=500, seed=7)
+    found = estimate_ratios(x, y, resamples=500, seed=7)
     m = x.sum() / y.sum()
     linear = np.sqrt(((x - m * y) ** 2).sum() * 9 / 8) / y.sum()
     without = [np.delete(x, k).sum() / np.delete(y, k).sum() for k in range(9)]
@@ -63,19 +63,19 @@ def test02_a_loop_over_draws_gives_the_same():
 def test03_people_hold_together():
     # 4 people whose thousands of rays agree: as uncertain as 4 numbers.
     x = np.array([[0.1], [0.2], [0.3], [0.4]])
-    found = ratios(x, ONES(x.shape))
+    found = estimate_ratios(x, ONES(x.shape))
     assert found.low[0] < 0.13 and found.high[0] > 0.37
 
 
 def test04_nobody_few_and_nothing():
     x = np.array([[0.0, 0.2, 0.3], [0.0, 0.2, 0.1], [0.0, 0.2, 0.0], [0.0, 0.2, 0.0]])
     y = np.array([[1.0, 1, 1], [1, 1, 1], [1, 1, 0], [1, 1, 0]])
-    found = ratios(x, y)
-    assert found.value == pytest.approx([0, 0.2, 0.2]) and found.people.tolist() == [4, 4, 2]
+    found = estimate_ratios(x, y)
+    assert found.value == pytest.approx([0, 0.2, 0.2]) and found.participants.tolist() == [4, 4, 2]
     assert np.isnan(found.low).all() and np.isnan(found.high).all()
-    nobody = ratios(np.zeros((0, 2)), np.zeros((0, 2)))
-    assert np.isnan(nobody.value).all() and nobody.people.tolist() == [0, 0]
-    one = ratios(ONES((1, 1)), ONES((1, 1)))
+    nobody = estimate_ratios(np.zeros((0, 2)), np.zeros((0, 2)))
+    assert np.isnan(nobody.value).all() and nobody.participants.tolist() == [0, 0]
+    one = estimate_ratios(ONES((1, 1)), ONES((1, 1)))
     assert one.value == 1 and np.isnan(one.low).all()
 
 
@@ -84,12 +84,12 @@ def test05_a_difference_of_the_same_people_is_of_their_differences():
     base = rng.normal(10, 5, (40, 1))
     after = base + rng.normal(1, 0.1, (40, 1))
     y = ONES((40, 1))
-    same = ratio_differences((base, y), (after, y))
+    same = estimate_ratio_differences((base, y), (after, y))
     assert same.value == pytest.approx((after - base).mean()) and same.high - same.low < 0.1 and same.p < 0.01
     # Of others it is as wide as their spread.
     x = np.concatenate([base, 0 * after])
     z = np.concatenate([0 * base, after])
-    apart = ratio_differences((x, np.concatenate([y, 0 * y])), (z, np.concatenate([0 * y, y])))
+    apart = estimate_ratio_differences((x, np.concatenate([y, 0 * y])), (z, np.concatenate([0 * y, y])))
     welch = stats.ttest_ind(after[:, 0], base[:, 0], equal_var=False)
     assert apart.value == pytest.approx(same.value)
     assert apart.high - apart.low == pytest.approx(np.ptp(welch.confidence_interval()), rel=0.15)
@@ -101,7 +101,7 @@ def test06_equal_groups_are_found_different_as_often_as_said():
     x = rng.exponential(1, (24, 600))
     first, second = np.zeros((24, 600)), np.zeros((24, 600))
     first[:12], second[12:] = 1, 1
-    found = ratio_differences((x * first, first), (x * second, second), resamples=399)
+    found = estimate_ratio_differences((x * first, first), (x * second, second), resamples=399)
     assert 0.01 < (found.p <= 0.05).mean() < 0.09
     assert 0.92 < ((found.low <= 0) & (found.high >= 0)).mean() <= 0.995
     # What is found is what the interval does not hold, but for the p-values' own step.
@@ -115,7 +115,7 @@ def test07_few_people_hold_the_truth():
     y = rng.gamma(3, 1, (8, 1200))
     x = y * rng.beta(0.5, 2, (8, 1200))
     truth = 0.5 / 2.5
-    found = ratios(x, y, resamples=399)
+    found = estimate_ratios(x, y, resamples=399)
     assert 0.92 < ((found.low <= truth) & (truth <= found.high)).mean() < 0.98
     # Student's t of the linearised residuals, which is as simple, holds it less often.
     m = x.sum(axis=0) / y.sum(axis=0)
@@ -129,11 +129,11 @@ def test08_people_of_both_and_of_one_alone():
     x, u, none, one = rng.gamma(2, 1, (9, 1)), rng.gamma(3, 1, (14, 1)), np.zeros, ONES
     first = (np.concatenate([x, none((14, 1))]), np.concatenate([one((9, 1)), none((14, 1))]))
     second = (np.concatenate([none((9, 1)), u]), np.concatenate([none((9, 1)), one((14, 1))]))
-    apart = ratio_differences(first, second, resamples=4000)
+    apart = estimate_ratio_differences(first, second, resamples=4000)
     welch = stats.ttest_ind(u[:, 0], x[:, 0], equal_var=False)
     half = np.ptp(welch.confidence_interval()) / 2
     assert (apart.high - apart.low) / 2 == pytest.approx(half, rel=0.2)
-    same = ratio_differences((x, one((9, 1))), (u[:9], one((9, 1))), resamples=4000)
+    same = estimate_ratio_differences((x, one((9, 1))), (u[:9], one((9, 1))), resamples=4000)
     paired = stats.ttest_rel(u[:9, 0], x[:, 0])
     assert (same.high - same.low) / 2 == pytest.approx(np.ptp(paired.confidence_interval()) / 2, rel=0.2)
     assert same.value == pytest.approx((u[:9] - x).mean())
@@ -141,15 +141,15 @@ def test08_people_of_both_and_of_one_alone():
 
 def test09_equal_seeds_give_equal_intervals():
     x = np.random.default_rng(5).random((12, 3))
-    a, b = ratios(x, ONES(x.shape), seed=4), ratios(x, ONES(x.shape), seed=4)
-    assert np.array_equal(a.low, b.low) and not np.array_equal(a.low, ratios(x, ONES(x.shape), seed=5).low)
+    a, b = estimate_ratios(x, ONES(x.shape), seed=4), estimate_ratios(x, ONES(x.shape), seed=4)
+    assert np.array_equal(a.low, b.low) and not np.array_equal(a.low, estimate_ratios(x, ONES(x.shape), seed=5).low)
 
 
 def test10_what_two_people_have_done_has_no_interval():
     x = np.zeros((40, 2))
     x[:2, 0], x[:3, 1] = 1, 1
-    found = ratios(x, ONES(x.shape), resamples=99)
-    assert found.value == pytest.approx([0.05, 0.075]) and found.people.tolist() == [40, 40]
+    found = estimate_ratios(x, ONES(x.shape), resamples=99)
+    assert found.value == pytest.approx([0.05, 0.075]) and found.participants.tolist() == [40, 40]
     assert np.isnan(found.low[0]) and np.isnan(found.high[0]) and found.high[1] > 0.075
 
 
@@ -162,9 +162,9 @@ def test11_what_few_decide_is_as_uncertain_as_that():
     x = y * np.where(far, 4.0, 1.0)
     truth = (0.1 * 4 + 0.9 * 0.3) / (0.1 + 0.9 * 0.3)
     held = lambda e: ((e.low <= truth) & (truth <= e.high))[np.isfinite(e.low)].mean()
-    found = ratios(x, y, resamples=199)
+    found = estimate_ratios(x, y, resamples=199)
     # As if most others were there too, and had hardly looked at it: then they are not few, and draws alone tell.
-    by_draws = ratios(x, np.where(looks, y, 1e-9), resamples=199)
+    by_draws = estimate_ratios(x, np.where(looks, y, 1e-9), resamples=199)
     assert held(by_draws) < 0.8 and held(found) > held(by_draws) + 0.05
 
 
@@ -177,7 +177,7 @@ def test12_a_difference_from_what_one_has_done_has_no_interval():
         u[10 + some :, k] = 0
     pair = lambda v, who: (v, np.repeat(who, 5, axis=1))
     for a, b in ((pair(x, first), pair(u, second)), (pair(u, second), pair(x, first))):
-        found = ratio_differences(a, b, resamples=199)
+        found = estimate_ratio_differences(a, b, resamples=199)
         assert np.isfinite(found.value).all()
         for ends in (found.low, found.high, found.p):
             assert np.isfinite(ends).tolist() == [False, False, True, True, False]
@@ -185,12 +185,12 @@ def test12_a_difference_from_what_one_has_done_has_no_interval():
     before, after, there = x[:10], np.zeros((10, 5)), ONES((10, 5))
     for some in (1, 2):
         after[:some] = 1
-        assert np.isnan(ratio_differences((before, there), (after, there), resamples=199).low).all()
-    gone = ratio_differences((before, there), (0 * after, there), resamples=199)
-    alone = ratios(before, there, resamples=199)
+        assert np.isnan(estimate_ratio_differences((before, there), (after, there), resamples=199).low).all()
+    gone = estimate_ratio_differences((before, there), (0 * after, there), resamples=199)
+    alone = estimate_ratios(before, there, resamples=199)
     assert gone.value == pytest.approx(-alone.value) and gone.low == pytest.approx(-2 * alone.value - gone.high)
     assert (gone.high < 0).all() and (gone.p <= 0.05).all()
-    two = ratio_differences((after, there), (0 * after, there), resamples=199)
+    two = estimate_ratio_differences((after, there), (0 * after, there), resamples=199)
     assert np.isnan(two.low).all() and np.isnan(two.p).all()
 
 
@@ -200,7 +200,7 @@ def test13_groups_of_unequal_size_are_drawn_apart():
     n = few + many
     first = (np.arange(n) < few).astype(float)[:, None]
     x, u = rng.gamma(2, 1, (n, 1)) * first, rng.gamma(3, 1, (n, 1)) * (1 - first)
-    found = ratio_differences((x, first), (u, 1 - first), resamples=resamples, seed=3)
+    found = estimate_ratio_differences((x, first), (u, 1 - first), resamples=resamples, seed=3)
     sides = x[:few, 0], u[few:, 0]
     error = lambda v: v.std(ddof=1) ** 2 / len(v)
     value, whole = sides[1].mean() - sides[0].mean(), error(sides[0]) + error(sides[1])
@@ -220,13 +220,13 @@ def test13_groups_of_unequal_size_are_drawn_apart():
 def test14_a_p_value_is_no_less_than_draws_can_tell(resamples):
     rng = np.random.default_rng(11)
     x = rng.random((12, 5))
-    found = ratio_differences((x, ONES(x.shape)), (x + 100 + rng.random(x.shape), ONES(x.shape)), resamples=resamples)
+    found = estimate_ratio_differences((x, ONES(x.shape)), (x + 100 + rng.random(x.shape), ONES(x.shape)), resamples=resamples)
     assert found.p == pytest.approx(1 / (resamples + 1))
 
 
 def test15_the_least_number_of_people():
     x = np.array([[0.1], [0.2], [0.4]])
-    assert np.isfinite(ratios(x, ONES(x.shape)).low).all() and np.isnan(ratios(x[:2], ONES((2, 1))).low).all()
+    assert np.isfinite(estimate_ratios(x, ONES(x.shape)).low).all() and np.isnan(estimate_ratios(x[:2], ONES((2, 1))).low).all()
 
 
 def test16_half_of_the_people_are_few():
@@ -242,7 +242,7 @@ def test16_half_of_the_people_are_few():
     least = stats.t.ppf(0.975, max(people - 1, 1.0)) * np.sqrt((parts**2).sum())
     reach = []
     for others in (20, 19):
-        found = ratios(*(np.pad(v, (0, others))[:, None] for v in (x, y)), resamples=199)
+        found = estimate_ratios(*(np.pad(v, (0, others))[:, None] for v in (x, y)), resamples=199)
         reach.append(found.high[0] - found.value[0])
     assert reach[0] == pytest.approx(least) and reach[1] < 0.9 * least
 
@@ -252,7 +252,7 @@ def test17_people_of_both_are_drawn_together():
     rng, n, resamples = np.random.default_rng(12), 10, 300
     x = rng.gamma(2, 1, (n, 1))
     u = x + rng.normal(0.3, 0.1, (n, 1))
-    found = ratio_differences((x, ONES(x.shape)), (u, ONES(x.shape)), resamples=resamples, seed=4)
+    found = estimate_ratio_differences((x, ONES(x.shape)), (u, ONES(x.shape)), resamples=resamples, seed=4)
     apart = (u - x)[:, 0]
     error, value, t = apart.std(ddof=1) / np.sqrt(n), apart.mean(), []
     for draw in np.random.default_rng(4).multinomial(n, np.full(n, 1 / n), size=resamples):
@@ -272,19 +272,19 @@ def column(k, n):
 
 def test01_tails_of_the_binomial_distribution_at_the_ends():
     for k, n in ((1, 3), (3, 10), (9, 10), (17, 200), (0, 8), (8, 8)):
-        (low,), (high,) = mid_p(np.array([k]), np.array([n]))
+        (low,), (high,) = mid_p_interval(np.array([k]), np.array([n]))
         below, at = stats.binom.cdf(k - 1, n, high), stats.binom.pmf(k, n, high)
         assert high == 1 if k == n else below + at / 2 == pytest.approx(0.025, abs=1e-9)
         above, at = stats.binom.sf(k, n, low), stats.binom.pmf(k, n, low)
         assert low == 0 if k == 0 else above + at / 2 == pytest.approx(0.025, abs=1e-9)
     # Nobody of 8: half of (1 - p)^8 is 0.025.
-    assert mid_p(np.array([0]), np.array([8]))[1] == pytest.approx(1 - 0.05 ** (1 / 8))
+    assert mid_p_interval(np.array([0]), np.array([8]))[1] == pytest.approx(1 - 0.05 ** (1 / 8))
 
 
 @pytest.mark.parametrize("n", [3, 5, 8, 16, 40])
 def test02_it_holds_whatever_the_truth(n):
     k = np.arange(n + 1)
-    low, high = mid_p(k, np.full(n + 1, n))
+    low, high = mid_p_interval(k, np.full(n + 1, n))
     inside = (low[:, None] <= P) & (P <= high[:, None])
     held = (stats.binom.pmf(k[:, None], n, P) * inside).sum(axis=0)
     assert held.min() > 0.92 and held.mean() < 0.99
@@ -293,8 +293,8 @@ def test02_it_holds_whatever_the_truth(n):
 def test03_whom_it_concerns():
     x = np.array([[1.0, 0, 1, 0], [1, 0, 1, 1], [0, 0, 1, 0], [0, 0, 1, 0]])
     y = np.array([[1.0, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 0]])
-    found = proportions(x, y)
-    assert found.value.tolist() == [0.5, 0, 1, 0.5] and found.people.tolist() == [4, 4, 4, 2]
+    found = estimate_proportions(x, y)
+    assert found.value.tolist() == [0.5, 0, 1, 0.5] and found.participants.tolist() == [4, 4, 4, 2]
     assert found.low[1] == 0 and found.high[2] == 1 and found.high[1] > 0.4 and found.low[2] < 0.6
     assert np.isnan([found.low[3], found.high[3]]).all()
 
@@ -305,7 +305,7 @@ def test04_differences_of_other_people():
     none = np.zeros
     first = (np.concatenate([x, none((15, 1))]), np.concatenate([y, none((15, 1))]))
     second = (np.concatenate([none((12, 1)), u]), np.concatenate([none((12, 1)), v]))
-    found = proportion_differences(first, second)
+    found = estimate_proportion_differences(first, second)
     a, b = 3 / 14, 10 / 17
     s = np.sqrt(a * (1 - a) / 14 + b * (1 - b) / 17)
     assert found.value == pytest.approx(9 / 15 - 2 / 12)
@@ -318,13 +318,13 @@ def test05_differences_of_the_same_people():
     x = np.array([[1.0]] * 10 + [[0.0]] * 10)
     u = np.array([[1.0]] * 9 + [[0.0]] + [[1.0]] * 6 + [[0.0]] * 4)
     ones = np.ones((20, 1))
-    found = proportion_differences((x, ones), (u, ones))
+    found = estimate_proportion_differences((x, ones), (u, ones))
     alone, also = 2 / 22, 7 / 22
     s = np.sqrt((alone + also - (also - alone) ** 2) / 22)
     assert found.low == pytest.approx(also - alone - 1.959964 * s)
     assert found.high == pytest.approx(also - alone + 1.959964 * s)
     # That the same people are alike makes it narrower than of others.
-    apart = proportion_differences(
+    apart = estimate_proportion_differences(
         (np.concatenate([x, 0 * x]), np.concatenate([ones, 0 * ones])),
         (np.concatenate([0 * u, u]), np.concatenate([0 * ones, ones])),
     )
@@ -339,23 +339,23 @@ def test06_equal_groups_are_seldom_found_different():
     here = np.concatenate([np.ones((8, 81)), np.zeros((8, 81))])
     none = np.zeros((8, 81))
     first, second = np.concatenate([spread(a), none]), np.concatenate([none, spread(b)])
-    found = proportion_differences((first, here), (second, 1 - here))
+    found = estimate_proportion_differences((first, here), (second, 1 - here))
     assert ((found.p <= 0.05) == ((found.low > 0) | (found.high < 0))).all()
     weight = stats.binom.pmf(a[:, None], 8, P) * stats.binom.pmf(b[:, None], 8, P)
     assert 0.03 < (weight * (found.p <= 0.05)[:, None]).sum(axis=0).max() < 0.06
 
 
 def test07_few_and_nobody():
-    found = proportion_differences(column(1, 2), column(1, 2))
+    found = estimate_proportion_differences(column(1, 2), column(1, 2))
     assert np.isnan([found.low, found.high, found.p]).all() and found.value == 0
-    nobody = proportions(np.zeros((0, 2)), np.zeros((0, 2)))
-    assert np.isnan(nobody.value).all() and np.isnan(nobody.high).all() and nobody.people.tolist() == [0, 0]
+    nobody = estimate_proportions(np.zeros((0, 2)), np.zeros((0, 2)))
+    assert np.isnan(nobody.value).all() and np.isnan(nobody.high).all() and nobody.participants.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("m, n, known", [(3, 3, True), (2, 3, False), (3, 2, False)])
 def test08_three_people_have_an_interval_and_two_have_none(m, n, known):
-    found = proportions(*column(1, m))
+    found = estimate_proportions(*column(1, m))
     assert np.isfinite(found.low).all() == np.isfinite(found.high).all() == (m == 3)
     first, second = np.r_[np.ones(m), np.zeros(n)][:, None], np.r_[np.zeros(m), np.ones(n)][:, None]
-    difference = proportion_differences((first * 0, first), (second, second))
+    difference = estimate_proportion_differences((first * 0, first), (second, second))
     assert [np.isfinite(v).all() for v in (difference.low, difference.high, difference.p)] == [known] * 3

@@ -7,29 +7,29 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
-from nerg_mi.maths.geometry import box_interval
-from nerg_mi.maths.sphere import fibonacci_directions, numbers_in_cone
+from nerg_mi.maths.geometry import intersect_box_numpy
+from nerg_mi.maths.sphere import fibonacci_directions, indices_in_cone
 from nerg_mi.statistics.shares import (
-    FIRST,
-    CellsInView,
+    INITIAL_DIRECTIONS,
+    VisibilityCache,
     SamplePoints,
-    SumRule,
+    QuadratureRule,
     gaze_shares,
-    in_view,
-    isovists,
-    standing,
+    visible_in_fov,
+    compute_isovists,
+    find_standing_positions,
     unhidden,
 )
-from nerg_mi.statistics.visits import BoxAoi, land
+from nerg_mi.statistics.visits import BoxAoi, assign_hits
 
 LOW, HIGH = np.array([-2.0, -6.0, 0.0]), np.array([2.0, 6.0, 3.0])
 AHEAD = np.array([0.6, 0.8, 0.0])
 EYES = np.array([[0.3, -2.0, 1.6], [-1.0, 4.0, 1.5]])
 BOXES = [
-    Region.of("wall", (1.9, -3, 0), (2.1, 1, 2)),
-    Region.of("a spot on it", (1.9, -0.01, 1), (2.1, 0.02, 1.03)),
-    Region.of("corner", (1, 5, -0.1), (2.1, 6.1, 0.7), 10),
-    Region.of("air", (0.5, 1, 1), (0.7, 1.2, 1.3)),
+    Region.create("wall", (1.9, -3, 0), (2.1, 1, 2)),
+    Region.create("a spot on it", (1.9, -0.01, 1), (2.1, 0.02, 1.03)),
+    Region.create("corner", (1, 5, -0.1), (2.1, 6.1, 0.7), 10),
+    Region.create("air", (0.5, 1, 1), (0.7, 1.2, 1.3)),
 ]
 
 
@@ -39,7 +39,7 @@ class Hall:
     def __init__(self):
         self.asked: list[int] = []
 
-    def look_from(self, eye):
+    def make_gaze_evaluator(self, eye):
         def look(d):
             self.asked.append(len(d))
             with np.errstate(divide="ignore"):
@@ -59,19 +59,19 @@ def exact(eye, region=None):
         away = center - eye
         # A few hundred thousand on the box, however small.
         count = 1 << 23 if radius < 0.2 else count
-        numbers = numbers_in_cone(count, away / np.linalg.norm(away), np.arcsin(min(radius / np.linalg.norm(away), 1)))
+        numbers = indices_in_cone(count, away / np.linalg.norm(away), np.arcsin(min(radius / np.linalg.norm(away), 1)))
     d = fibonacci_directions(count, numbers)
-    (gaze,), depth = Hall().look_from(eye)(d)
+    (gaze,), depth = Hall().make_gaze_evaluator(eye)(d)
     if region is None:
         return gaze[~np.isfinite(depth)].sum() / gaze.sum(), gaze.mean()
-    return gaze[land([BoxAoi(region)], np.broadcast_to(eye, d.shape), d, depth).rows[0]].sum() / count
+    return gaze[assign_hits([BoxAoi(region)], np.broadcast_to(eye, d.shape), d, depth).rows[0]].sum() / count
 
 
 @pytest.fixture(scope="module")
 def found():
     hall = Hall()
     members = [(0,), (1,), (2,), (3,), (0, 1, 2)]
-    return hall, gaze_shares(hall.look_from, EYES, [BoxAoi(r) for r in BOXES], members, 0.0)
+    return hall, gaze_shares(hall.make_gaze_evaluator, EYES, [BoxAoi(r) for r in BOXES], members, 0.0)
 
 
 def test01_shares_are_integrals_and_errors_are_kept(found):
@@ -87,14 +87,14 @@ def test01_shares_are_integrals_and_errors_are_kept(found):
     # A group is the union: the spot lies on the wall.
     assert np.allclose(shares.share[:, 4], shares.share[:, 0] + shares.share[:, 2], rtol=0.02)
     # The spot, of 3 cm at up to six metres, took no more than what the whole sphere takes.
-    assert 0 < shares.share[1, 1] < 1e-4 and sum(hall.asked) < 2 * 6 * FIRST
+    assert 0 < shares.share[1, 1] < 1e-4 and sum(hall.asked) < 2 * 6 * INITIAL_DIRECTIONS
 
 
 def test02_each_eye_is_by_itself(found):
     _, shares = found
-    alone = gaze_shares(Hall().look_from, EYES[1:], [BoxAoi(BOXES[0])], [(0,)], 0.0)
+    alone = gaze_shares(Hall().make_gaze_evaluator, EYES[1:], [BoxAoi(BOXES[0])], [(0,)], 0.0)
     assert alone.share[0, 0] == shares.share[1, 0] and alone.error[0, 0] == shares.error[1, 0]
-    many = gaze_shares(Hall().look_from, np.tile(EYES, (20, 1)), [BoxAoi(BOXES[0])], [(0,)], 0.0)
+    many = gaze_shares(Hall().make_gaze_evaluator, np.tile(EYES, (20, 1)), [BoxAoi(BOXES[0])], [(0,)], 0.0)
     assert np.array_equal(many.share[:, 0], np.tile(shares.share[:, 0], 20))
 
 
@@ -102,16 +102,16 @@ def test03_a_closer_tolerance_takes_more_directions():
     errors, asked = [], []
     for tolerance in (0.1, 0.01, 0.001):
         hall = Hall()
-        shares = gaze_shares(hall.look_from, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0, SumRule(tolerance=tolerance))
+        shares = gaze_shares(hall.make_gaze_evaluator, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0, QuadratureRule(rtol=tolerance))
         errors.append(shares.error[0, 0])
         asked.append(sum(hall.asked))
     assert errors[0] > errors[2] and asked[0] < asked[2] < 1 << 19
 
 
 def test04_without_areas_eyes_or_gaze():
-    shares = gaze_shares(Hall().look_from, EYES, [], [], 0.0)
-    assert shares.share.shape == (2, 0) and (shares.whole > 0).all()
-    assert gaze_shares(Hall().look_from, EYES[:0], [BoxAoi(BOXES[0])], [(0,)], 0.0).share.shape == (0, 1)
+    shares = gaze_shares(Hall().make_gaze_evaluator, EYES, [], [], 0.0)
+    assert shares.share.shape == (2, 0) and (shares.integral > 0).all()
+    assert gaze_shares(Hall().make_gaze_evaluator, EYES[:0], [BoxAoi(BOXES[0])], [(0,)], 0.0).share.shape == (0, 1)
     dark = lambda eye: lambda d: (np.zeros((1, len(d))), np.ones(len(d)))
     assert gaze_shares(dark, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0).share.tolist() == [[0.0]]
     broken = lambda eye: lambda d: (np.full((1, len(d)), np.nan), np.ones(len(d)))
@@ -127,52 +127,52 @@ PILLAR = np.array([[2.0, 1.5, 0], [3, 2.5, 2.0]])
 
 def room_depth(o, d):
     """A room with a pillar that reaches to 2 m."""
-    reach = box_interval(o, d, *ROOM)[1]
-    near, far = box_interval(o, d, *PILLAR)
+    reach = intersect_box_numpy(o, d, *ROOM)[1]
+    near, far = intersect_box_numpy(o, d, *PILLAR)
     reach = np.where((near < far) & (far > 0) & (near > 0), np.minimum(near, reach), reach)
     # From within one meets the pillar's inner faces.
     return np.where((near < far) & (near <= 0) & (far > 0), np.minimum(far, reach), reach)
 
 
 def thing(name, lower, upper):
-    return BoxAoi(Region.of(name, lower, upper))
+    return BoxAoi(Region.create(name, lower, upper))
 
 
 def test01_what_is_behind_a_pillar_is_hidden():
     things = [thing("near", [1.0, 1.9, 1], [1.2, 2.1, 1.2]), thing("behind", [4, 1.9, 1], [4.2, 2.1, 1.2])]
-    targets = SamplePoints.of(things, 24)
+    targets = SamplePoints.sample(things, 24)
     eyes = np.array([[0.2, 2.0, 1.1], [3.5, 2.0, 1.1]])
     seen = unhidden(targets, eyes, room_depth, 0.0)
-    by_thing = [[seen[e, targets.thing == k].any() for k in range(2)] for e in range(2)]
+    by_thing = [[seen[e, targets.aoi_index == k].any() for k in range(2)] for e in range(2)]
     assert by_thing == [[True, False], [False, True]]
     # A face that is turned away is not seen, whatever is between.
-    back = (targets.normals[:, 0] > 0.5) & (targets.thing == 0)
+    back = (targets.normals[:, 0] > 0.5) & (targets.aoi_index == 0)
     assert back.any() and not seen[0, back].any()
 
 
 def test02_the_view_is_a_cone():
-    targets = SamplePoints.of([thing("a", [3.0, -0.05, -0.05], [3.1, 0.05, 0.05])], 6)
+    targets = SamplePoints.sample([thing("a", [3.0, -0.05, -0.05], [3.1, 0.05, 0.05])], 6)
     eyes = np.zeros((4, 3))
     turns = np.radians([0, 29.0, 31.5, 180])
     ahead = np.column_stack([np.cos(turns), np.sin(turns), np.zeros(4)])
     seen = np.ones((4, len(targets.points)), bool)
-    assert in_view(targets, eyes, ahead, seen, 60.0)[:, 0].tolist() == [True, True, False, False]
-    assert in_view(targets, eyes, ahead, seen, 360.0).all()
-    assert not in_view(targets, eyes, ahead, ~seen, 360.0).any()
+    assert visible_in_fov(targets, eyes, ahead, seen, 60.0)[:, 0].tolist() == [True, True, False, False]
+    assert visible_in_fov(targets, eyes, ahead, seen, 360.0).all()
+    assert not visible_in_fov(targets, eyes, ahead, ~seen, 360.0).any()
 
 
 def test03_against_a_loop():
     rng = np.random.default_rng(0)
     things = [thing(str(k), c, c + 0.3) for k, c in enumerate(rng.uniform(0.2, 2.5, (5, 3)))]
-    targets = SamplePoints.of(things, 20)
+    targets = SamplePoints.sample(things, 20)
     eyes, d = rng.uniform(0.2, 2.5, (30, 3)), rng.normal(size=(30, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     seen = rng.random((30, len(targets.points))) < 0.2
-    found = in_view(targets, eyes, d, seen, 100.0)
+    found = visible_in_fov(targets, eyes, d, seen, 100.0)
     for i in range(30):
         for k in range(5):
             expected = False
-            for s in np.flatnonzero(targets.thing == k):
+            for s in np.flatnonzero(targets.aoi_index == k):
                 away = targets.points[s] - eyes[i]
                 angle = np.degrees(np.arccos(np.clip(away @ d[i] / np.linalg.norm(away), -1, 1)))
                 expected |= bool(seen[i, s]) and angle <= 50
@@ -180,31 +180,31 @@ def test03_against_a_loop():
 
 
 def test04_cells_are_traced_once_and_forgotten_without_harm():
-    targets = SamplePoints.of([thing("a", [4, 1.9, 1], [4.2, 2.1, 1.2])], 24)
+    targets = SamplePoints.sample([thing("a", [4, 1.9, 1], [4.2, 2.1, 1.2])], 24)
     asked = []
 
     def depth(o, d):
         asked.append(len(o))
         return room_depth(o, d)
 
-    cells = CellsInView(targets, depth, 0.1, 0.0)
+    cells = VisibilityCache(targets, depth, 0.1, 0.0)
     eyes = np.random.default_rng(1).uniform(0.1, 1.4, (50, 3))
-    points, of = cells.seen(eyes)
+    points, of = cells.get_visibility(eyes)
     middle = (np.floor(eyes / 0.1) + 0.5) * 0.1
     assert np.array_equal(points[of], unhidden(targets, middle, room_depth, 0.0))
     before = len(asked)
-    assert np.array_equal(cells.seen(eyes[:9])[0][cells.seen(eyes[:9])[1]], points[of][:9]) and len(asked) == before
+    assert np.array_equal(cells.get_visibility(eyes[:9])[0][cells.get_visibility(eyes[:9])[1]], points[of][:9]) and len(asked) == before
     cells.MOST = 0
-    cells.seen(eyes[:2])
-    again, whose = cells.seen(eyes)
+    cells.get_visibility(eyes[:2])
+    again, whose = cells.get_visibility(eyes)
     assert np.array_equal(again[whose], points[of]) and len(asked) > before
     with pytest.raises(NergError, match="--cell"):
-        CellsInView(targets, depth, 0.0, 0.0)
+        VisibilityCache(targets, depth, 0.0, 0.0)
 
 
 def test05_the_isovist_of_a_room_is_its_floor():
-    empty = lambda o, d: box_interval(o, d, *ROOM)[1]
-    found = isovists(np.array([[1.0, 1, 1.6], [3, 2, 1.6]]), empty, SamplePoints.of([], 4), 0.0, 100.0, directions=7200)
+    empty = lambda o, d: intersect_box_numpy(o, d, *ROOM)[1]
+    found = compute_isovists(np.array([[1.0, 1, 1.6], [3, 2, 1.6]]), empty, SamplePoints.sample([], 4), 0.0, 100.0, directions=7200)
     assert np.allclose(found.area, 24, rtol=2e-3) and np.allclose(found.perimeter, 20, rtol=2e-3)
     assert np.allclose(found.nearest, [1, 2], atol=1e-3)
     assert np.allclose(found.farthest, [np.hypot(5, 3), np.hypot(3, 2)], rtol=1e-3)
@@ -212,7 +212,7 @@ def test05_the_isovist_of_a_room_is_its_floor():
 
 def test06_a_pillar_takes_its_shadow():
     # From (1, 2): the pillar from y 1.5 to 2.5 at x = 2 hides the strip between the lines through its corners.
-    found = isovists(np.array([[1.0, 2.0, 1.6]]), room_depth, SamplePoints.of([], 4), 0.0, 100.0, directions=14400)
+    found = compute_isovists(np.array([[1.0, 2.0, 1.6]]), room_depth, SamplePoints.sample([], 4), 0.0, 100.0, directions=14400)
     # Lines of slope 1/2 from the eye meet the walls y = 0 and 4 at x = 5, and x = 6 beyond these: the shadow is the
     # region |y - 2| < (x - 1) / 2, 2 < x, within the room: a trapezium to x = 5 and a rectangle behind.
     shadow = (1 + 4) / 2 * 3 + 4 * 1
@@ -220,13 +220,13 @@ def test06_a_pillar_takes_its_shadow():
 
 
 def test07_where_one_can_stand():
-    found = standing(*ROOM, 0.5, 1.6, room_depth, 0.0)
+    found = find_standing_positions(*ROOM, 0.5, 1.6, room_depth, 0.0)
     assert len(found) == 12 * 8 - 4 and np.allclose(found[:, 2], 1.6)
     inside = ((found[:, :2] > PILLAR[0, :2]) & (found[:, :2] < PILLAR[1, :2])).all(axis=1)
     assert not inside.any()
     # Above a low thing nobody stands either, since the floor is not below; there is no floor at -1.
     low = lambda o, d: np.minimum(room_depth(o, d), np.where((d[:, 2] < 0) & (o[:, 0] < 1), o[:, 2] - 0.5, np.inf))
-    assert (standing(*ROOM, 0.5, 1.6, low, 0.0)[:, 0] > 1).all()
-    assert len(standing(*ROOM, 0.5, 1.6, room_depth, -1.0)) == 0
+    assert (find_standing_positions(*ROOM, 0.5, 1.6, low, 0.0)[:, 0] > 1).all()
+    assert len(find_standing_positions(*ROOM, 0.5, 1.6, room_depth, -1.0)) == 0
     with pytest.raises(NergError, match="--step"):
-        standing(*ROOM, 1e-4, 1.6, room_depth, 0.0)
+        find_standing_positions(*ROOM, 1e-4, 1.6, room_depth, 0.0)

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from nerg_mi.statistics.tables import (
-    BY_NAME,
+    MEASURES_BY_NAME,
     MEASURES,
-    TRACKED,
+    MEASURED,
     MinParticipantsFilter,
     Participants,
-    PersonRows,
+    ParticipantRows,
     difference_rows,
     duration_rows,
-    move_rows,
-    shown,
-    thing_rows,
+    transition_rows,
+    format_measure,
+    aoi_rows,
 )
 from nerg_mi.statistics.visits import ALL, BINS, Cell, VisitSums
 
@@ -27,10 +27,10 @@ from nerg_mi.statistics.visits import ALL, BINS, Cell, VisitSums
 PEOPLE = Participants(
     ("Ada", "Bo", "Cy"),
     np.array([10.0, 20.0, 0.0]),
-    on_time=np.array([[2.0, 0], [4, 1], [0, 0]]),
+    dwell_time=np.array([[2.0, 0], [4, 1], [0, 0]]),
     distance=np.array([[6.0, 0], [4, 3], [0, 0]]),
-    visible=np.array([[5.0, 1], [4, 2], [0, 0]]),
-    reached=np.array([[1.0, 0], [1, 1], [0, 0]]),
+    visible_time=np.array([[5.0, 1], [4, 2], [0, 0]]),
+    hit_probability=np.array([[1.0, 0], [1, 1], [0, 0]]),
     looks=np.array([[3.0, 0], [1, 1], [0, 0]]),
     first_sum=np.array([[4.0, 0], [6, 8], [0, 0]]),
     first_count=np.array([[2.0, 0], [1, 1], [0, 0]]),
@@ -51,35 +51,35 @@ EXPECTED = {
 
 
 def test01_every_measure_is_written_out_here():
-    assert set(EXPECTED) == {m.name for m in MEASURES} == set(BY_NAME)
+    assert set(EXPECTED) == {m.name for m in MEASURES} == set(MEASURES_BY_NAME)
 
 
 @pytest.mark.parametrize("name", list(EXPECTED))
 def test02_values_and_people(name):
-    found = BY_NAME[name].estimate(PEOPLE, 199, 0)
-    assert found.value == pytest.approx(EXPECTED[name][0]) and found.people.tolist() == EXPECTED[name][1]
+    found = MEASURES_BY_NAME[name].estimate(PEOPLE, 199, 0)
+    assert found.value == pytest.approx(EXPECTED[name][0]) and found.participants.tolist() == EXPECTED[name][1]
 
 
 def test03_a_field_tells_less():
-    told = Participants(PEOPLE.names, PEOPLE.time, PEOPLE.on_time, PEOPLE.distance, None, np.full((3, 2), 0.5))
+    told = Participants(PEOPLE.names, PEOPLE.time, PEOPLE.dwell_time, PEOPLE.distance, None, np.full((3, 2), 0.5))
     known = {m.name for m in MEASURES if m.estimate(told, 199, 0) is not None}
     assert known == {"share", "dwell", "reach", "distance"}
-    assert BY_NAME["reach"].estimate(told, 199, 0).value == pytest.approx([0.5, 0.5])
+    assert MEASURES_BY_NAME["reach"].estimate(told, 199, 0).value == pytest.approx([0.5, 0.5])
 
 
 def test04_those_who_are_not_there_count_for_nothing():
     more = PEOPLE.aligned(["Ada", "Bo", "Cy", "Dee", "Eve"])
-    assert more.there.tolist() == [True, True, True, False, False]
+    assert more.is_in_cell.tolist() == [True, True, True, False, False]
     for measure in MEASURES:
         a, b = measure.estimate(PEOPLE, 199, 0), measure.estimate(more, 199, 0)
-        assert np.allclose(a.value, b.value, equal_nan=True) and a.people.tolist() == b.people.tolist(), measure.name
+        assert np.allclose(a.value, b.value, equal_nan=True) and a.participants.tolist() == b.participants.tolist(), measure.name
 
 
 def test05_nobody():
     none = Participants((), np.zeros(0), *(np.zeros((0, 2)) for _ in range(7)))
     for measure in MEASURES:
         found = measure.estimate(none, 199, 0)
-        assert np.isnan(found.value).all() and found.people.tolist() == [0, 0]
+        assert np.isnan(found.value).all() and found.participants.tolist() == [0, 0]
 
 
 # ---- The table of single people ----
@@ -91,15 +91,15 @@ def sums():
     )
     found.time[:] = 10, 5, 20
     found.rays[:] = 50, 25, 100
-    found.on_time[:] = [[1, 2], [9, 9], [3, 0]]
+    found.dwell_time[:] = [[1, 2], [9, 9], [3, 0]]
     found.looks[:] = [[1, 1], [1, 1], [2, 0]]
-    found.visible[:] = [[4, 5], [9, 9], [6, 7]]
+    found.visible_time[:] = [[4, 5], [9, 9], [6, 7]]
     found.first_sum[:], found.first_count[:] = [[4, 6], [0, 0], [1, 0]], [[1, 2], [1, 1], [1, 0]]
     return found
 
 
 def test01_each_persons_own_in_the_order_of_their_names():
-    rows = PersonRows(sums(), {"Ada": "p2", "Bo": "p1"}, True)
+    rows = ParticipantRows(sums(), {"Ada": "p2", "Bo": "p1"}, True)
     assert len(rows) == 4 and list(rows) == rows[:] == [rows[k] for k in range(-4, 0)]
     assert [(r["person"], r["thing"]) for r in rows] == [("p1", "x"), ("p1", "y"), ("p2", "x"), ("p2", "y")]
     bo = {"person": "p1", "thing": "y", "time": 10.0, "rays": 50, "dwell": 2.0, "looks": 1, "first_look": 3.0}
@@ -110,7 +110,7 @@ def test01_each_persons_own_in_the_order_of_their_names():
 
 
 def test02_nobody_knows_what_was_visible():
-    assert [r["visible"] for r in PersonRows(sums(), {"Ada": "a", "Bo": "b"}, False)] == [None] * 4
+    assert [r["visible"] for r in ParticipantRows(sums(), {"Ada": "a", "Bo": "b"}, False)] == [None] * 4
 
 
 # ---- Tables of numbers, and the floor on people ----
@@ -129,15 +129,15 @@ def people(n, share, seed, prefix="p"):
 
 
 def test01_a_row_for_each_cell_thing_and_source():
-    cells = {ALL: {TRACKED: people(12, 0.2, 0)}, A: {TRACKED: people(2, 0.2, 1)}}
-    rows = thing_rows(("x", "y"), cells, MinParticipantsFilter(), **HOW)
+    cells = {ALL: {MEASURED: people(12, 0.2, 0)}, A: {MEASURED: people(2, 0.2, 1)}}
+    rows = aoi_rows(("x", "y"), cells, MinParticipantsFilter(), **HOW)
     assert [(r["cell"], r["value"], r["thing"]) for r in rows] == [
         ("all", "", "x"),
         ("all", "", "y"),
         ("cohort", "a", "x"),
         ("cohort", "a", "y"),
     ]
-    mean = (cells[ALL][TRACKED].on_time[:, 0] / 100).mean()
+    mean = (cells[ALL][MEASURED].dwell_time[:, 0] / 100).mean()
     assert rows[0]["share"] == pytest.approx(mean) and rows[0]["share_low"] < mean < rows[0]["share_high"]
     assert rows[0]["visible"] is None and rows[0]["people"] == 12
     # Of two people there is no interval.
@@ -146,20 +146,20 @@ def test01_a_row_for_each_cell_thing_and_source():
 
 def test02_cells_of_few_people_are_blank_and_counted():
     floor = MinParticipantsFilter(5)
-    cells = {ALL: {TRACKED: people(12, 0.2, 0)}, A: {TRACKED: people(4, 0.2, 1)}}
-    rows = thing_rows(("x", "y"), cells, floor, **HOW)
+    cells = {ALL: {MEASURED: people(12, 0.2, 0)}, A: {MEASURED: people(4, 0.2, 1)}}
+    rows = aoi_rows(("x", "y"), cells, floor, **HOW)
     assert rows[0]["share"] is not None
     blank = [k for k, v in rows[2].items() if v is not None]
     assert blank == ["cell", "value", "thing", "source"]
     # Of both things: the number of people, and the measures that rays tell.
-    told = sum(measure.pair(cells[A][TRACKED]) is not None for measure in MEASURES)
-    assert floor.blanked == 2 * (1 + told) and told >= 7
+    told = sum(measure.numerator_denominator(cells[A][MEASURED]) is not None for measure in MEASURES)
+    assert floor.num_suppressed == 2 * (1 + told) and told >= 7
     nobody = MinParticipantsFilter(5)
-    assert nobody.passes(0) and nobody.passes(5) and not nobody.passes(4) and nobody.blanked == 1
+    assert nobody.passes(0) and nobody.passes(5) and not nobody.passes(4) and nobody.num_suppressed == 1
 
 
 def test03_differences_are_found_where_they_are():
-    cells = {A: {TRACKED: people(15, 0.2, 0, "a")}, B: {TRACKED: people(15, 0.4, 1, "b")}}
+    cells = {A: {MEASURED: people(15, 0.2, 0, "a")}, B: {MEASURED: people(15, 0.4, 1, "b")}}
     rows = difference_rows(("x", "y"), cells, MinParticipantsFilter(), compared=("share", "reach"), **HOW)
     shares = [r for r in rows if r["measure"] == "share"]
     assert len(rows) == 4 and all(r["found"] and 0.1 < r["low"] < r["difference"] < r["high"] < 0.3 for r in shares)
@@ -171,35 +171,35 @@ def test03_differences_are_found_where_they_are():
 
 
 def test04_one_value_has_nothing_to_be_compared_with():
-    assert difference_rows(("x", "y"), {ALL: {TRACKED: people(5, 0.2, 0)}}, MinParticipantsFilter(), **HOW) == []
+    assert difference_rows(("x", "y"), {ALL: {MEASURED: people(5, 0.2, 0)}}, MinParticipantsFilter(), **HOW) == []
 
 
 def sums_tables():
     found = VisitSums.empty(("x", "y"), (ALL,), [(ALL, "Bo"), (ALL, "Ada")])
     found.time[:] = 10, 20
     found.rays[:] = 50, 100
-    found.on_time[:] = [[1, 2], [3, 0]]
+    found.dwell_time[:] = [[1, 2], [3, 0]]
     found.looks[:] = [[1, 1], [2, 0]]
     found.first_sum[:], found.first_count[:] = [[4, 6], [1, 0]], [[1, 2], [1, 0]]
-    found.moves[0] = [[0, 3], [1, 0]]
+    found.transitions[0] = [[0, 3], [1, 0]]
     found.lasted[0, 0, 2] = 3
     return found
 
 
 def test05_moves_and_durations():
-    rows = move_rows(sums_tables(), MinParticipantsFilter())
+    rows = transition_rows(sums_tables(), MinParticipantsFilter())
     assert [(r["from"], r["to"], r["moves"], r["share"]) for r in rows] == [("x", "y", 3, 1.0), ("y", "x", 1, 1.0)]
-    assert all(r["moves"] is None for r in move_rows(sums_tables(), MinParticipantsFilter(3)))
+    assert all(r["moves"] is None for r in transition_rows(sums_tables(), MinParticipantsFilter(3)))
     lasted = duration_rows(sums_tables(), MinParticipantsFilter())
     assert len(lasted) == 2 and lasted[0]["0.2 to 0.5 s"] == 3 and len(lasted[0]) == 3 + len(BINS) - 1
 
 
 def test06_as_markdown_has_it():
     row = {"share": 0.1234, "share_low": 0.1, "share_high": 0.2, "dwell": 3.456, "dwell_low": None, "dwell_high": None}
-    assert shown(row, BY_NAME["share"]) == "12.3 % [10.0, 20.0]" and shown(row, BY_NAME["dwell"]) == "3.46"
-    assert shown(row, BY_NAME["reach"]) == ""
+    assert format_measure(row, MEASURES_BY_NAME["share"]) == "12.3 % [10.0, 20.0]" and format_measure(row, MEASURES_BY_NAME["dwell"]) == "3.46"
+    assert format_measure(row, MEASURES_BY_NAME["reach"]) == ""
 
 
 def test09_nobody_is_compared_with_nobody():
-    cells = {A: {TRACKED: people(15, 0.2, 0, "a")}, B: {TRACKED: people(0, 0.4, 1, "b")}}
+    cells = {A: {MEASURED: people(15, 0.2, 0, "a")}, B: {MEASURED: people(0, 0.4, 1, "b")}}
     assert difference_rows(("x", "y"), cells, MinParticipantsFilter(), **HOW) == []

@@ -19,11 +19,11 @@ from nerg_mi.statistics.visits import (
     HitAssignment,
     VisitRules,
     VisitSums,
-    concatenate,
-    cone,
-    land,
+    concatenate_hits,
+    sample_cone,
+    assign_hits,
     looks_at,
-    merge,
+    merge_sums,
     partial_sums,
     regroup,
     timeline,
@@ -34,7 +34,7 @@ from nerg_mi.statistics.visits import (
 
 
 def box(name, lower, upper, turn=None):
-    return BoxAoi(Region.of(name, lower, upper, turn))
+    return BoxAoi(Region.create(name, lower, upper, turn))
 
 
 def brute(region, o, d):
@@ -67,7 +67,7 @@ def test01_surfaces_in_boxes():
         box("c", [1.5, -2, -1], [2, 2, 0]),
     ]
     o, d, depth = some_rays()
-    found = land(things, o, d, depth, 0.03).matrix()
+    found = assign_hits(things, o, d, depth, 0.03).to_matrix()
     expected = np.zeros_like(found)
     for i in range(len(o)):
         for k, thing in enumerate(things):
@@ -77,19 +77,19 @@ def test01_surfaces_in_boxes():
             near, far = span
             expected[i, k] = near - 0.03 <= depth[i] < far + 0.03
     assert np.array_equal(found, expected) and 20 < expected.sum() and not expected.all(axis=1).all()
-    inside = np.array([thing.region.holds(o) for thing in things]).T
+    inside = np.array([thing.region.contains(o) for thing in things]).T
     assert (inside & expected).any() and (inside & ~expected).any()
 
 
 def test02_distances_are_those_of_the_entrance_or_from_within_of_the_surface():
     things = [box("a", [1, -1, -1], [2, 1, 1]), box("around", [-1, -1, -1], [3, 1, 1])]
     o, d = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
-    landed = land(things, o, d, np.array([1.7]))
+    landed = assign_hits(things, o, d, np.array([1.7]))
     assert [v.tolist() for v in landed.distance] == [[1.0], [1.7]]
     # Beyond a box, or nowhere: they look through it, or out of that in which they stand.
-    assert [len(v) for v in land(things, o, d, np.array([2.5])).rows] == [0, 1]
-    assert [len(v) for v in land(things, o, d, np.array([3.5])).rows] == [0, 0]
-    assert [len(v) for v in land(things, o, d, np.array([np.inf])).rows] == [0, 0]
+    assert [len(v) for v in assign_hits(things, o, d, np.array([2.5])).rows] == [0, 1]
+    assert [len(v) for v in assign_hits(things, o, d, np.array([3.5])).rows] == [0, 0]
+    assert [len(v) for v in assign_hits(things, o, d, np.array([np.inf])).rows] == [0, 0]
 
 
 def test03_without_surfaces_things_are_solid():
@@ -99,7 +99,7 @@ def test03_without_surfaces_things_are_solid():
         box("i", [1.5, 0, 0], [2.5, 1, 1]),
     )
     o, d = np.array([[0, 0.5, 0.5], [0, -0.5, -0.5], [0, 5.0, 0]]), np.tile([1.0, 0, 0], (3, 1))
-    found = land([front, behind, in_front], o, d, None).matrix()
+    found = assign_hits([front, behind, in_front], o, d, None).to_matrix()
     # Overlapping ones share a look, what begins behind the end of another is hidden.
     assert found.tolist() == [[True, False, True], [True, False, False], [False, False, False]]
 
@@ -108,13 +108,13 @@ def test04_a_box_that_is_grazed_or_behind_is_not_met():
     thing = box("a", [1, 0, 0], [2, 1, 1])
     o = np.array([[0.0, 1, 0.5], [3, 0.5, 0.5], [0, 0.5, 0.5]])
     d = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
-    assert land([thing], o, d, np.array([1.5, 0.5, 1.5])).matrix()[1:, 0].tolist() == [False, True]
+    assert assign_hits([thing], o, d, np.array([1.5, 0.5, 1.5])).to_matrix()[1:, 0].tolist() == [False, True]
 
 
 def test05_groups_are_unions_at_their_least_distance():
     things = [box("a", [1, -1, -1], [2, 1, 1]), box("b", [1.5, 0, -1], [4, 1, 1])]
     o, d = np.array([[0, 0.5, 0.0], [0, -0.5, 0], [3, 0.5, -5]]), np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1]])
-    landed = regroup(land(things, o, d, np.array([1.6, 1.0, 5.0])), [(0,), (1,), (0, 1)])
+    landed = regroup(assign_hits(things, o, d, np.array([1.6, 1.0, 5.0])), [(0,), (1,), (0, 1)])
     assert [rows.tolist() for rows in landed.rows] == [[0, 1], [0, 2], [0, 1, 2]]
     assert landed.distance[2].tolist() == [1.0, 1.0, 4.0]
 
@@ -122,15 +122,15 @@ def test05_groups_are_unions_at_their_least_distance():
 def test06_parts_and_ways_are_put_together():
     things = [box("a", [1, -1, -1], [2, 1, 1])]
     o, d = np.zeros((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]])
-    one, two = land(things, o, d, None), land(things, o, d[::-1], None)
-    assert concatenate([one, two]).rows[0].tolist() == [0, 3]
+    one, two = assign_hits(things, o, d, None), assign_hits(things, o, d[::-1], None)
+    assert concatenate_hits([one, two]).rows[0].tolist() == [0, 3]
     assert unite([one, two]).rows[0].tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("degrees", [0.5, 2.0, 10.0])
 def test07_a_cone_leaves_no_hole_wider_than_half_of_it(degrees):
     d = np.array([[0, 0, 1.0], [0, 0, -1], [0.6, 0, 0.8], [0.36, -0.48, -0.8]])
-    ways = np.stack(cone(d, degrees))
+    ways = np.stack(sample_cone(d, degrees))
     assert len(ways) == 19 and np.allclose(np.linalg.norm(ways, axis=2), 1)
     angle = np.degrees(np.arccos(np.clip((ways * d).sum(axis=2), -1, 1)))
     assert np.allclose(angle[0], 0, atol=1e-5) and np.allclose(angle[1:7], degrees / 2, rtol=1e-3)
@@ -150,12 +150,12 @@ def test07_a_cone_leaves_no_hole_wider_than_half_of_it(degrees):
 
 def test08_samples_cover_a_box_evenly():
     thing = box("a", [0, 0, 0], [2, 1, 0.5], 20)
-    points, normals = thing.samples(70)
-    own = thing.region.to_own(points)
+    points, normals = thing.sample_points(70)
+    own = thing.region.to_local(points)
     lower, upper = thing.region.corners
     on_face = np.isclose(own, lower) | np.isclose(own, upper)
     assert (on_face.sum(axis=1) == 1).all() and ((own > lower - 1e-9) & (own < upper + 1e-9)).all()
-    assert np.allclose(((points - thing.region.middle) * normals).sum(axis=1) > 0, True)
+    assert np.allclose(((points - thing.region.center) * normals).sum(axis=1) > 0, True)
     assert 40 < len(points) < 110
 
 
@@ -186,7 +186,7 @@ def slow_looks(rows, t, weight, sitting, rules):
     looks, now = [], None
     for r in rows:
         start, end = t[r], t[r] + weight[r]
-        if now is not None and sitting[now[0]] == sitting[r] and start - now[2] <= rules.merge + 1e-9:
+        if now is not None and sitting[now[0]] == sitting[r] and start - now[2] <= rules.merge_gap + 1e-9:
             now = (now[0], now[1], end)
         else:
             if now is not None:
@@ -198,7 +198,7 @@ def slow_looks(rows, t, weight, sitting, rules):
 @pytest.mark.parametrize("seed", range(4))
 def test01_against_loops(seed):
     rng = np.random.default_rng(seed)
-    rules = VisitRules(gap=0.5, pause=5.0, merge=0.25, least=0.15)
+    rules = VisitRules(max_gap=0.5, session_pause=5.0, merge_gap=0.25, min_visit=0.15)
     person = np.sort(rng.integers(0, 4, 120))
     step = rng.choice([0.0, 0.1, 0.2, 0.2, 0.3, 0.7, 6.0], 120)
     t = np.concatenate([np.cumsum(step[person == p]) for p in range(4)])
@@ -216,7 +216,7 @@ def test02_one_ray_stands_for_no_time():
     line = timeline(np.array([0, 1, 1]), np.array([5.0, 1.0, 1.2]), VisitRules())
     assert np.allclose(line.weight, [0, 0.2, 0.2])
     assert len(looks_at(np.array([0]), line, VisitRules())) == 0
-    assert len(looks_at(np.array([0]), line, VisitRules(least=0.0))) == 1
+    assert len(looks_at(np.array([0]), line, VisitRules(min_visit=0.0))) == 1
     assert len(looks_at(np.zeros(0, int), line, VisitRules())) == 0
 
 
@@ -243,7 +243,7 @@ def test06_rules_that_are_none(bad):
 
 def test07_times_on_the_bounds():
     """A pause as long as it may be joins sittings, an interruption as long as it may be looks."""
-    rules = VisitRules(gap=0.5, pause=4.0, merge=0.25, least=0.25)
+    rules = VisitRules(max_gap=0.5, session_pause=4.0, merge_gap=0.25, min_visit=0.25)
     line = timeline(np.zeros(4, int), np.array([0.0, 4.0, 8.0, 12.5]), rules)
     assert line.sitting.tolist() == [0, 0, 0, 1]
     line = timeline(np.zeros(6, int), np.arange(6) * 0.25, rules)
@@ -254,7 +254,7 @@ def test07_times_on_the_bounds():
 
 # ---- Sums of blocks, against dictionaries filled ray by ray, and in any number of parts ----
 
-RULES = VisitRules(gap=0.5, pause=5.0, merge=0.25, least=0.15)
+RULES = VisitRules(max_gap=0.5, session_pause=5.0, merge_gap=0.25, min_visit=0.15)
 AREAS = ("a", "b", "c")
 
 
@@ -347,10 +347,10 @@ def test01_sums_against_loops(seed):
             assert getattr(sums, name)[r] == pytest.approx(expected), name
     for c, (cell, _) in enumerate(cells):
         assert sums.lasted[c].tolist() == [[slow["lasted", cell, a, b] for b in range(len(BINS) - 1)] for a in range(3)]
-        assert sums.moves[c].tolist() == [[slow["moves", cell, a, b] for b in range(3)] for a in range(3)]
-    assert {cell for cell, _ in sums.rows} == {ALL, Cell("window", "early")} and sums.moves[0].sum() > 3
+        assert sums.transitions[c].tolist() == [[slow["moves", cell, a, b] for b in range(3)] for a in range(3)]
+    assert {cell for cell, _ in sums.rows} == {ALL, Cell("window", "early")} and sums.transitions[0].sum() > 3
     # Nobody looks at c.
-    assert sums.on_time[:, 2].sum() == 0 and np.isinf(sums.first[:, 2]).all() and sums.visible[:, 2].sum() > 0
+    assert sums.dwell_time[:, 2].sum() == 0 and np.isinf(sums.first_start[:, 2]).all() and sums.visible_time[:, 2].sum() > 0
 
 
 def pick(landed, rows):
@@ -367,22 +367,22 @@ def test02_in_parts_it_is_the_same():
     for p in range(6):
         rows = np.flatnonzero(rays.person == p)
         parts.append(partial_sums(rays.select(rows), pick(landed, rows), AREAS, [(ALL, None)], RULES, visible[rows]))
-    merged = merge(parts)
+    merged = merge_sums(parts)
     assert merged.rows == whole.rows
     for f in fields(VisitSums):
         value = getattr(whole, f.name)
         if isinstance(value, np.ndarray):
             assert np.array_equal(getattr(merged, f.name), value), f.name
     # And so in parts of parts, to the bit, in the same order.
-    again = merge([merge(parts[:1]), *parts[1:]])
+    again = merge_sums([merge_sums(parts[:1]), *parts[1:]])
     assert all(np.array_equal(getattr(again, n), getattr(merged, n)) for n in ("time", "on_time", "moves", "first"))
 
 
 def test03_somebody_who_comes_twice_is_one_person():
     rays, landed, _, _, visible = made(3)
     one = partial_sums(rays, landed, AREAS, [(ALL, None)], RULES, visible)
-    twice = merge([one, one])
-    assert twice.rows == one.rows and np.allclose(twice.time, 2 * one.time) and np.array_equal(twice.first, one.first)
+    twice = merge_sums([one, one])
+    assert twice.rows == one.rows and np.allclose(twice.time, 2 * one.time) and np.array_equal(twice.first_start, one.first_start)
 
 
 def test04_others_cannot_be_added():
@@ -390,9 +390,9 @@ def test04_others_cannot_be_added():
     one = partial_sums(rays, landed, AREAS, [(ALL, None)], RULES)
     other = partial_sums(rays, landed, ("x", "b", "c"), [(ALL, None)], RULES)
     with pytest.raises(ValueError, match="other areas"):
-        merge([one, other])
+        merge_sums([one, other])
     with pytest.raises(ValueError, match="nothing"):
-        merge([])
+        merge_sums([])
 
 
 def test03b_the_last_visit_ends_when_its_last_ray_does():
@@ -403,14 +403,14 @@ def test03b_the_last_visit_ends_when_its_last_ray_does():
     on = np.array([1, 2, 5, 6])
     landed = HitAssignment(8, (on,), (np.ones(4),))
     early = partial_sums(rays, landed, ("a",), [(ALL, None)], VisitRules())
-    assert early.looks[0, 0] == 2 and early.first[0, 0] == 0.25 and early.last[0, 0] == 1.75
+    assert early.looks[0, 0] == 2 and early.first_start[0, 0] == 0.25 and early.last_end[0, 0] == 1.75
     late = partial_sums(replace(rays, t=t + 100), landed, ("a",), [(ALL, None)], VisitRules())
     for parts in ([early, late], [late, early]):
-        assert merge(parts).first[0, 0] == 0.25 and merge(parts).last[0, 0] == 101.75
+        assert merge_sums(parts).first_start[0, 0] == 0.25 and merge_sums(parts).last_end[0, 0] == 101.75
 
 
 def test05_no_rays_at_all():
     rays, landed, *_ = made()
     none = partial_sums(rays.select(np.zeros(0, int)), pick(landed, []), AREAS, [(ALL, None)], RULES)
-    assert none.rows == () and none.time.shape == (0,) and none.moves.sum() == 0
-    assert none.persons_of(ALL)[1] == []
+    assert none.rows == () and none.time.shape == (0,) and none.transitions.sum() == 0
+    assert none.find_participants(ALL)[1] == []

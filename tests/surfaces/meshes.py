@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.fields.splats import Splats
-from nerg_mi.surfaces.mesh import Mesh, weld
+from nerg_mi.surfaces.mesh import Mesh, weld_mesh
 from nerg_mi.surfaces.sources import SurfaceObserver
 
 _QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -23,7 +23,7 @@ def joined(*parts) -> Mesh:
     """One mesh of several vertices and faces."""
     start = np.cumsum([0, *(len(v) for v, _ in parts)])
     faces = np.concatenate([f + s for (_, f), s in zip(parts, start)])
-    return weld(np.concatenate([v for v, _ in parts]), faces)[0]
+    return weld_mesh(np.concatenate([v for v, _ in parts]), faces)[0]
 
 
 def longest_edge(mesh: Mesh) -> float:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, delaunay, deposit, heron, laplacian, merge, twins
-from nerg_mi.surfaces.mesh import Mesh, weld
+from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, delaunay, deposit, heron, make_laplacian, merge_sums, twins
+from nerg_mi.surfaces.mesh import Mesh, weld_mesh
 from tests.surfaces.meshes import box, joined, plate
 
 # ---- Intrinsic flips: no weight is negative any more, and the surface is what it was ----
@@ -62,7 +62,7 @@ def sound(matrix):
 
 
 def test01_of_a_square_grid_it_is_the_five_point_stencil():
-    dense = sound(laplacian(joined(plate(7))))
+    dense = sound(make_laplacian(joined(plate(7))))
     middle = 24
     assert np.isclose(dense[middle, middle], 4)
     assert sorted(np.flatnonzero(np.abs(dense[middle]) > 1e-12)) == [17, 23, 24, 25, 31]
@@ -72,7 +72,7 @@ def test02_linear_functions_have_none_on_any_triangles_of_a_plane():
     mesh = joined(plate(15, 0.3))
     inner = (np.abs(mesh.vertices[:, :2]) < 0.35).all(axis=1)
     for along in ((1, 0, 0), (0.3, -2, 0)):
-        assert np.abs((laplacian(mesh) @ (mesh.vertices @ along))[inner]).max() < 1e-9
+        assert np.abs((make_laplacian(mesh) @ (mesh.vertices @ along))[inner]).max() < 1e-9
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
@@ -84,11 +84,11 @@ def test03_needles_books_and_components(scale):
     book = np.array([(0, 0, 0), (0, 0, 1), (1, 0, 0), (0, 1, 0), (-1, -1, 0), (5, 5, 5), (6, 5, 5), (5, 6, 5)]) * scale
     pages = Mesh(book, np.array([(0, 1, 2), (0, 1, 3), (0, 1, 4), (5, 6, 7)]))
     for mesh in (needle, pages, joined(box((0, 0, 0), (1, 1, 1e-4)))):
-        dense = sound(laplacian(mesh))
-    dense = sound(laplacian(pages))
+        dense = sound(make_laplacian(mesh))
+    dense = sound(make_laplacian(pages))
     assert (dense[:5, 5:] == 0).all() and dense[0, 1] < 0
     # Free of the unit of length.
-    assert np.allclose(dense, laplacian(Mesh(book / scale, pages.faces)).toarray(), rtol=1e-6, atol=1e-9)
+    assert np.allclose(dense, make_laplacian(Mesh(book / scale, pages.faces)).toarray(), rtol=1e-6, atol=1e-9)
 
 
 # ---- Smoothing ----
@@ -132,7 +132,7 @@ def test02_on_a_sphere_harmonics_decay(degree):
 def test03_nothing_crosses_a_gap_of_5_cm(scale):
     """Two plates 5 cm apart: what is on one stays there, all of it, and exactly nothing comes to the other."""
     v, f = plate(20, 0.3)
-    mesh, _, _ = weld(scale * np.concatenate([v, v + [0, 0, 0.05]]), np.concatenate([f, f + len(v)]))
+    mesh, _, _ = weld_mesh(scale * np.concatenate([v, v + [0, 0, 0.05]]), np.concatenate([f, f + len(v)]))
     upper = mesh.vertices[:, 2] > 0.02 * scale
     start = np.where(upper, 0, np.random.default_rng(0).random(len(upper)))
     found = Smoother(mesh, 0.3 * scale)(start)
@@ -173,10 +173,10 @@ def test01_a_deposit_is_divided_among_corners_and_keeps_its_sum():
 def test02_sums_add_up_in_their_order():
     rng = np.random.default_rng(0)
     parts = [SurfaceSums(rng.random(3), rng.random(4), *rng.random(4), 1) for _ in range(5)]
-    whole = merge(parts)
+    whole = merge_sums(parts)
     assert np.array_equal(
-        whole.face, ((((parts[0].face + parts[1].face) + parts[2].face) + parts[3].face) + parts[4].face)
+        whole.face_sums, ((((parts[0].face_sums + parts[1].face_sums) + parts[2].face_sums) + parts[3].face_sums) + parts[4].face_sums)
     )
     assert whole.count == 5 and np.isclose(whole.weight, sum(p.weight for p in parts))
-    assert np.isclose(whole.unaccounted, whole.total - whole.face.sum() - whole.elsewhere - whole.escaped)
-    assert SurfaceSums.none(2, 3).on_surface == 0
+    assert np.isclose(whole.unaccounted, whole.total - whole.face_sums.sum() - whole.elsewhere - whole.escaped)
+    assert SurfaceSums.zeros(2, 3).on_surface == 0

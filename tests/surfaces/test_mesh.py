@@ -8,7 +8,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces import mesh
-from nerg_mi.surfaces.mesh import SurfaceTarget, refine, shape_triangles, texture_rows, unroll, weld
+from nerg_mi.surfaces.mesh import SurfaceTarget, refine, shape_triangles, iter_texture_rows, unwrap_uv, weld_mesh
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.surfaces.meshes import box, joined, longest_edge, plate
 
@@ -17,7 +17,7 @@ from tests.surfaces.meshes import box, joined, longest_edge, plate
 
 def test01_a_box_whose_sides_repeat_its_corners_is_one_surface():
     v, f = box((0, 0, 0), (1, 2, 3))
-    mesh, index, repairs = weld(v[f].reshape(-1, 3), np.arange(f.size).reshape(-1, 3))
+    mesh, index, repairs = weld_mesh(v[f].reshape(-1, 3), np.arange(f.size).reshape(-1, 3))
     assert (len(mesh.vertices), len(mesh.faces), repairs.merged) == (8, 12, 28)
     assert np.array_equal(index, np.arange(12)) and np.isclose(mesh.area.sum(), 22)
     assert np.allclose(mesh.corners, v[f]) and np.isclose(mesh.vertex_area.sum(), 22)
@@ -27,27 +27,27 @@ def test01_a_box_whose_sides_repeat_its_corners_is_one_surface():
 
 def test02_a_hair_keeps_plates_apart_and_zeros_of_both_signs_are_one_place():
     v = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (-0.0, 0, 0), (0, 1, 1e-9), (1, 0, 0)])
-    mesh, _, _ = weld(v, [(0, 1, 2), (3, 4, 5)])
+    mesh, _, _ = weld_mesh(v, [(0, 1, 2), (3, 4, 5)])
     assert len(mesh.vertices) == 4
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e6])
 def test03_flat_and_repeated_faces_are_left_out_at_any_scale(scale):
     v = scale * np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 0, 0), (9, 9, 9)])
-    mesh, index, repairs = weld(v, [(0, 1, 2), (0, 1, 3), (1, 1, 2), (2, 0, 1), (2, 1, 0)])
-    assert index.tolist() == [0] and (repairs.flat, repairs.repeated) == (2, 2)
-    assert repairs.sentence == "2 faces without area left out, 2 faces that repeat others left out"
+    mesh, index, repairs = weld_mesh(v, [(0, 1, 2), (0, 1, 3), (1, 1, 2), (2, 0, 1), (2, 1, 0)])
+    assert index.tolist() == [0] and (repairs.num_degenerate_faces, repairs.repeated) == (2, 2)
+    assert repairs.summary == "2 faces without area left out, 2 faces that repeat others left out"
     assert len(mesh.vertices) == 3 and np.isclose(mesh.area[0], scale**2 / 2)
-    assert weld(v, [(0, 1, 2)])[2].sentence is None
+    assert weld_mesh(v, [(0, 1, 2)])[2].summary is None
 
 
 def test04_what_is_no_surface():
     with pytest.raises(NergError, match="vertices of the wall"):
-        weld([(0, 0, np.nan)], [(0, 0, 0)], "the wall")
+        weld_mesh([(0, 0, np.nan)], [(0, 0, 0)], "the wall")
     with pytest.raises(NergError, match="row 1 is"):
-        weld([(0, 0, 0), (0, 0, 1.1e7), (1, 0, 0)], [(0, 1, 2)])
+        weld_mesh([(0, 0, 0), (0, 0, 1.1e7), (1, 0, 0)], [(0, 1, 2)])
     with pytest.raises(NergError, match="no face with an area"):
-        weld([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2)])
+        weld_mesh([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2)])
 
 
 # ---- Shapes of scenes as triangles ----
@@ -84,7 +84,7 @@ def test01_a_closed_box_stays_closed_and_its_area_what_it_is(longest):
     flux = lambda m: np.einsum("fi,fi->", m.corners.mean(1), m.normals * m.area[:, None])
     assert np.isclose(flux(found.mesh), flux(whole)) and np.isclose(abs(flux(whole)), 18)
     # Each corner is where its place in the parent says.
-    told = np.einsum("fij,fjk->fik", found.place, whole.corners[found.parent])
+    told = np.einsum("fij,fjk->fik", found.barycentric, whole.corners[found.parent])
     assert np.allclose(told, found.mesh.corners, atol=1e-12)
 
 
@@ -108,7 +108,7 @@ def test01_each_ray_ends_where_it_should(rgb):
     target = SurfaceTarget(room, [inner])
     d = fibonacci_directions(4000)[1:]
     eye = np.array([1.0, 1.5, 1.0])
-    found = target.ends(np.broadcast_to(eye, d.shape), d)
+    found = target.trace(np.broadcast_to(eye, d.shape), d)
     # Slabs, in NumPy: the inner box first, then the open side, then the room.
     with np.errstate(divide="ignore"):
         t = (np.array([(2, 1, 0.5), (3, 2, 1.5)])[:, None] - eye) / d
@@ -119,7 +119,7 @@ def test01_each_ray_ends_where_it_should(rgb):
     assert np.array_equal(found.elsewhere, hits)
     assert np.mean((found.face < 0) == (hits | out)) > 0.9995
     on = found.face >= 0
-    p = np.einsum("pi,pik->pk", found.place, room.corners[found.face])[on]
+    p = np.einsum("pi,pik->pk", found.barycentric, room.corners[found.face])[on]
     assert np.allclose(p, (eye + walls.min(1)[:, None] * d)[on], atol=1e-5)
 
 
@@ -128,7 +128,7 @@ def test02_a_ray_may_end_in_a_medium_before(rgb):
     sheet = (np.array([(-2.0, -2, 2), (2, -2, 2), (2, 2, 2), (-2, 2, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
     target = SurfaceTarget(joined(sheet), medium=VolumeMedium(fog))
     origins = np.array([(0.25, 0.25, -1), (1.0, 1.0, -1)])
-    found = target.ends(origins, np.broadcast_to([0.0, 0, 1], (2, 3)))
+    found = target.trace(origins, np.broadcast_to([0.0, 0, 1], (2, 3)))
     assert found.elsewhere.tolist() == [True, False] and (found.face >= 0).tolist() == [False, True]
 
 
@@ -142,11 +142,11 @@ def test01_a_texture_has_at_each_point_what_the_surface_has(rgb, scale, rows, mo
     monkeypatch.setattr("nerg_mi.surfaces.mesh.TEXTURE_ROWS", rows)
     mesh, pixels = joined(box((0, 0, 0), (scale, 2 * scale, 0.5 * scale))), 256
     refined = refine(mesh, 0.2 * scale)
-    charts = unroll(mesh, pixels)
+    charts = unwrap_uv(mesh, pixels)
     assert charts.uv.min() >= 0 and charts.uv.max() <= 1
     assert np.array_equal(charts.vertex[charts.faces], mesh.faces)
     values = refined.mesh.vertices @ [1.0, 2, 3] / scale
-    blocks = list(texture_rows(charts, refined, values, pixels))
+    blocks = list(iter_texture_rows(charts, refined, values, pixels))
     found, known = (np.concatenate([block[k] for block in blocks]) for k in (1, 2))
     assert [block[0].start for block in blocks] == list(range(0, pixels, rows))
     assert found.shape == known.shape == (256, 256) and 0.3 < known.mean() < 1
@@ -164,10 +164,10 @@ def test02_what_does_not_fit(rgb, monkeypatch):
     cube = joined(box((0, 0, 0), (1, 1, 1)))
     monkeypatch.setattr(mesh, "MOST_CHART_FACES", 4)
     with pytest.raises(NergError, match="leave out --texture"):
-        unroll(cube, 64)
+        unwrap_uv(cube, 64)
 
 
 def test03_without_xatlas_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.raises(ImportError, match=r'pip install "nerg-mi\[bake\]"'):
-        unroll(joined(box((0, 0, 0), (1, 1, 1))), 64)
+        unwrap_uv(joined(box((0, 0, 0), (1, 1, 1))), 64)

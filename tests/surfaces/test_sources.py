@@ -11,19 +11,19 @@ from scipy.stats import norm
 from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.laplacian import merge
+from nerg_mi.surfaces.laplacian import merge_sums
 from nerg_mi.surfaces.mesh import SurfaceTarget, refine
 from nerg_mi.surfaces.sources import (
     GazeSumSettings,
     RaySettings,
     TrackedRays,
-    blurred,
-    bundle,
+    blur_density,
+    sample_cone,
     cluster_observers,
-    gaze_sums,
+    sum_gaze,
     pieces_of,
-    ray_seconds,
-    ray_sums,
+    ray_durations,
+    sum_rays,
     ray_weights,
     solid_angles,
     sphere_rule,
@@ -52,7 +52,7 @@ def test01_a_harmonic_is_multiplied_by_a_number(rgb, degree):
         assert isinstance(u, rgb.Vector3f)
         return zonal[degree](dr.dot(u, axis))
 
-    found = np.array(blurred(density, d, sigma))
+    found = np.array(blur_density(density, d, sigma))
     expected = 0.5 * (1 + eval_legendre(degree, np.cos(2 * sigma))) * np.array(zonal[degree](dr.dot(d, axis)))
     assert np.allclose(found, expected, atol=1e-5)
 
@@ -67,14 +67,14 @@ def test02_it_is_heat_on_the_sphere_to_the_fourth_order():
 
 def test03_bundles_are_gaussian_unit_and_the_same_for_a_seed():
     d = fibonacci_directions(400)
-    out = bundle(d, 0.05, 64, np.random.default_rng(3))
+    out = sample_cone(d, 0.05, 64, np.random.default_rng(3))
     assert out.shape == (400, 64, 3) and np.allclose(np.linalg.norm(out, axis=2), 1)
     angle = np.arccos(np.clip(np.einsum("nik,nk->ni", out, d), -1, 1)).ravel()
     for share in (0.1, 0.5, 0.9):
         assert abs(np.quantile(angle, share) / (0.05 * np.sqrt(-2 * np.log1p(-share))) - 1) < 0.01
     assert np.linalg.norm(out.mean(axis=1) - d, axis=1).mean() < 0.01
-    assert np.array_equal(out, bundle(d, 0.05, 64, np.random.default_rng(3)))
-    assert np.array_equal(bundle(d, 0, 2, np.random.default_rng(0)), np.repeat(d[:, None], 2, axis=1))
+    assert np.array_equal(out, sample_cone(d, 0.05, 64, np.random.default_rng(3)))
+    assert np.array_equal(sample_cone(d, 0, 2, np.random.default_rng(0)), np.repeat(d[:, None], 2, axis=1))
 
 
 # ---- Gaze on surfaces: conserved, and what `nerg.attention` says of the same ----
@@ -89,10 +89,10 @@ MEAN = np.array([0.84, 0.5, -0.2]) / np.linalg.norm([0.84, 0.5, -0.2])
 def test01_a_closed_room_receives_all(rgb, kappa, eye):
     """Also an observer a millimetre from a wall."""
     target = SurfaceTarget(refine(joined(ROOM, SHELF), 0.4).mesh)
-    sums = gaze_sums(target, lookers_of_law(vmf(rgb, MEAN, kappa)), np.array([eye]), [1.0], SETTINGS)
+    sums = sum_gaze(target, lookers_of_law(vmf(rgb, MEAN, kappa)), np.array([eye]), [1.0], SETTINGS)
     assert abs(sums.total - 1) < 3e-4 and sums.escaped == 0 and sums.elsewhere == 0
     assert abs(sums.unaccounted) < 1e-3
-    assert np.isclose(sums.vertex.sum(), sums.face.sum(), rtol=1e-12)
+    assert np.isclose(sums.vertex_sums.sum(), sums.face_sums.sum(), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("y", "kappa"), [(0.7, 500.0), (0.69, 5000.0)])
@@ -101,7 +101,7 @@ def test02_surfaces_what_hides_them_and_what_escapes_are_what_they_are(rgb, y, k
     cuts of a wall included."""
     for without in (None, 1):
         room = joined(box((0, 0, 0), (4, 3, 2.5), without))
-        sums = gaze_sums(
+        sums = sum_gaze(
             SurfaceTarget(room, [SHELF]),
             lookers_of_law(vmf(rgb, MEAN, kappa)),
             np.array([(1.0, y, 1.5)]),
@@ -134,8 +134,8 @@ def test03_a_uniform_law_gives_solid_angles_and_a_cone_changes_nothing_of_it(rgb
     uniform = lambda d: dr.full(rgb.Float, 1 / (4 * np.pi), dr.width(d))
     target, eye = SurfaceTarget(joined(ROOM)), np.array([(1.0, 0.7, 1.5)])
     for cone in (0.0, 0.03):
-        sums = gaze_sums(target, lookers_of_law(uniform), eye, [1.0], GazeSumSettings(angle=0.1, cone=cone))
-        floor = sums.face[(target.mesh.corners[:, :, 2] == 0).all(axis=1)].sum()
+        sums = sum_gaze(target, lookers_of_law(uniform), eye, [1.0], GazeSumSettings(max_angle=0.1, cone_sigma=cone))
+        floor = sums.face_sums[(target.mesh.corners[:, :, 2] == 0).all(axis=1)].sum()
         # Of a rectangle, by the four rectangles between the foot point and its corners.
         x, y, h = np.array([1.0, 3.0]), np.array([0.7, 2.3]), 1.5
         exact = sum(np.arctan2(a * b, h * np.sqrt(a * a + b * b + h * h)) for a in x for b in y)
@@ -145,12 +145,12 @@ def test03_a_uniform_law_gives_solid_angles_and_a_cone_changes_nothing_of_it(rgb
 def test04_a_cone_widens_a_law_and_keeps_its_total(rgb):
     target, eye = SurfaceTarget(refine(joined(ROOM), 0.2).mesh), np.array([(2.0, 1.5, 1.2)])
     law, cone = lookers_of_law(vmf(rgb, (1, 0.1, 0), 400.0)), 0.026
-    plain = gaze_sums(target, law, eye, [1.0], SETTINGS)
-    wide = gaze_sums(target, law, eye, [1.0], dataclasses.replace(SETTINGS, cone=cone))
+    plain = sum_gaze(target, law, eye, [1.0], SETTINGS)
+    wide = sum_gaze(target, law, eye, [1.0], dataclasses.replace(SETTINGS, cone_sigma=cone))
     # A vMF law after a Gaussian is nearly one whose variance is the sum.
-    expected = gaze_sums(target, lookers_of_law(vmf(rgb, (1, 0.1, 0), 1 / (1 / 400 + cone**2))), eye, [1.0], SETTINGS)
-    assert abs(wide.face.sum() - 1) < 1e-3
-    assert np.abs(wide.face - expected.face).sum() < 0.03 < np.abs(plain.face - expected.face).sum()
+    expected = sum_gaze(target, lookers_of_law(vmf(rgb, (1, 0.1, 0), 1 / (1 / 400 + cone**2))), eye, [1.0], SETTINGS)
+    assert abs(wide.face_sums.sum() - 1) < 1e-3
+    assert np.abs(wide.face_sums - expected.face_sums).sum() < 0.03 < np.abs(plain.face_sums - expected.face_sums).sum()
 
 
 def test05_it_is_what_attention_says(rgb, tmp_path):
@@ -173,29 +173,29 @@ def test05_it_is_what_attention_says(rgb, tmp_path):
     twin = read.vertices, read.faces
     target = SurfaceTarget(joined(thing), [twin])
     # Looked at as if it stood there: the goods in the box hide it, as they hide the box of `attention`.
-    make = observers_from_field(scene.integrator.gaze, target.place, target.settings)
-    sums = gaze_sums(target, make, np.array([eye]), [1.0], SETTINGS)
+    make = observers_from_field(scene.integrator.gaze, target.geometry, target.settings)
+    sums = sum_gaze(target, make, np.array([eye]), [1.0], SETTINGS)
     assert expected.share[0] > 0.001
     # The field is normalised over what is seen: with the box there, and without it.
     gaze, at = scene.integrator.gaze, rgb.Point3f(eye)
     there, without = (
-        float(gaze.at([at], place, target.settings).integrals(at)[0][0])
-        for place in (target.place, SurfaceTarget(joined(twin)).place)
+        float(gaze.for_observers([at], place, target.settings).integrals(at)[0][0])
+        for place in (target.geometry, SurfaceTarget(joined(twin)).geometry)
     )
     assert abs(there / without - 1) > 0.03
-    assert np.isclose(sums.face.sum() * there / without, expected.share[0], rtol=0.01)
+    assert np.isclose(sums.face_sums.sum() * there / without, expected.share[0], rtol=0.01)
 
 
 def test06_parts_add_up_to_the_whole_bit_by_bit(rgb):
     target, law, coarse = (
         SurfaceTarget(joined(ROOM)),
         lookers_of_law(vmf(rgb, (0, 1, 0), 5.0)),
-        GazeSumSettings(angle=0.2),
+        GazeSumSettings(max_angle=0.2),
     )
     eyes, weights = np.random.default_rng(0).uniform(0.5, 2, (3, 3)), np.array([0.2, 0.3, 0.5])
-    each = [gaze_sums(target, law, eyes[k : k + 1], weights[k : k + 1], coarse) for k in range(3)]
-    whole = gaze_sums(target, law, eyes, weights, coarse)
-    assert np.array_equal(merge(each).vertex, whole.vertex) and whole.count == 3
+    each = [sum_gaze(target, law, eyes[k : k + 1], weights[k : k + 1], coarse) for k in range(3)]
+    whole = sum_gaze(target, law, eyes, weights, coarse)
+    assert np.array_equal(merge_sums(each).vertex_sums, whole.vertex_sums) and whole.count == 3
 
 
 # ---- Pieces that an outline crosses are cut until what is left out is little ----
@@ -215,7 +215,7 @@ def test01_the_edge_of_a_shadow_along_the_cuts_of_a_face(rgb):
         # Of the strip from -1 to x, by the four corners of half of each of its two parts.
         exact = sum(2 * np.arctan2(a, 2 * np.sqrt(a * a + 5)) for a in (1.0, x))
         assert abs(found - exact) < 1e-3
-        uncut = pieces.solid_angle[target.sees(eye, pieces.center, pieces.face)].sum()
+        uncut = pieces.solid_angle[target.is_visible(eye, pieces.centroids, pieces.face)].sum()
         assert abs(uncut - exact) > 1e-3
 
 
@@ -244,11 +244,11 @@ def test01_a_room_around_an_observer_is_the_whole_sphere(eye, scale):
     room = joined(box((0, 0, 0), (scale, scale, scale)))
     found = pieces_of(room, scale * np.array(eye), 0.2)
     assert np.isclose(found.solid_angle.sum(), 4 * np.pi, rtol=1e-9)
-    center = np.einsum("pi,pik->pk", found.place, room.corners[found.face])
-    assert np.allclose(center, found.center, atol=1e-9 * scale)
+    center = np.einsum("pi,pik->pk", found.centroid_barycentric, room.corners[found.face])
+    assert np.allclose(center, found.centroids, atol=1e-9 * scale)
     # As many pieces as the sphere has room for, not as the nearness would ask.
     assert len(found.face) < 50_000
-    away = np.linalg.norm(found.center - scale * np.array(eye), axis=1)
+    away = np.linalg.norm(found.centroids - scale * np.array(eye), axis=1)
     assert np.all(np.sqrt(found.solid_angle) < 0.2) and away.min() > 0
 
 
@@ -289,9 +289,9 @@ def rays(t, person):
 def test01_a_ray_stands_for_the_time_until_the_next_of_its_person():
     of = rays([0, 0.1, 0.3, 9.0, 9.1, 0.0, 0.2], [0, 0, 0, 0, 0, 1, 1])
     # Pauses count as half a second at most; the last of each as the median of theirs.
-    assert np.allclose(ray_seconds(of), [0.1, 0.2, 0.5, 0.1, 0.15, 0.2, 0.2])
-    assert np.allclose(ray_seconds(of, gap=0.05), 0.05)
-    assert np.allclose(ray_seconds(rays([5.0], [0])), 0.5)
+    assert np.allclose(ray_durations(of), [0.1, 0.2, 0.5, 0.1, 0.15, 0.2, 0.2])
+    assert np.allclose(ray_durations(of, gap=0.05), 0.05)
+    assert np.allclose(ray_durations(rays([5.0], [0])), 0.5)
 
 
 @pytest.mark.parametrize("by, share", [("time", 1.05 / 1.45), ("person", 0.5), ("equal", 5 / 7)])
@@ -314,18 +314,18 @@ def test03_observers_stand_where_somebody_was_with_the_time_of_all_near():
     assert all((positions == p).all(axis=1).any() for p in found.positions)
     # The error that is told is that of the positions from the nearest observer.
     near = np.linalg.norm(positions[:, None] - found.positions, axis=2).min(axis=1)
-    assert np.isclose(found.mean, np.sqrt((weights * near**2).sum() / weights.sum()))
-    assert abs(np.mean(near <= found.farthest) - 0.95) < 0.02
+    assert np.isclose(found.rms_distance, np.sqrt((weights * near**2).sum() / weights.sum()))
+    assert abs(np.mean(near <= found.p95_distance) - 0.95) < 0.02
     again = cluster_observers(positions, weights, 3, seed=1)
     assert np.array_equal(again.positions, found.positions)
 
 
 def test04_more_observers_are_nearer_and_fewer_places_than_observers_are_all_taken():
     positions = np.random.default_rng(2).uniform(0, 5, (2000, 3))
-    errors = [cluster_observers(positions, np.ones(2000), n).mean for n in (4, 32, 256)]
+    errors = [cluster_observers(positions, np.ones(2000), n).rms_distance for n in (4, 32, 256)]
     assert errors[0] > 1.5 * errors[1] > 2 * errors[2]
     few = cluster_observers(np.tile([[1.0, 2, 3], [4, 5, 6]], (50, 1)), np.ones(100), 10)
-    assert len(few.weights) == 2 and few.mean == few.farthest == 0 and np.allclose(few.weights, 0.5)
+    assert len(few.weights) == 2 and few.rms_distance == few.p95_distance == 0 and np.allclose(few.weights, 0.5)
 
 
 # ---- Tracked rays as cones: what passes a gap, and what parts of them add up to ----
@@ -347,36 +347,36 @@ def test01_a_line_goes_through_a_gap_whole_and_a_cone_by_what_passes(rgb):
     wall = box((-5, -5, 4), (5, 5, 4.1))
     mesh = joined(left, right, wall)
     target, behind = SurfaceTarget(mesh), mesh.corners[:, :, 2].min(axis=1) > 3
-    line = ray_sums(target, rays_ray_source(1000), RaySettings())
-    assert line.face[behind].sum() == np.float64(1000) * (1 / 1000) or np.isclose(line.face[behind].sum(), 1)
-    cone = ray_sums(target, rays_ray_source(4000), RaySettings(cone=SIGMA, bundle=16))
+    line = sum_rays(target, rays_ray_source(1000), RaySettings())
+    assert line.face_sums[behind].sum() == np.float64(1000) * (1 / 1000) or np.isclose(line.face_sums[behind].sum(), 1)
+    cone = sum_rays(target, rays_ray_source(4000), RaySettings(cone_sigma=SIGMA, rays_per_cone=16))
     # One of the two angles of the Gaussian has to stay within the slit's.
     passes = 2 * norm.cdf(np.arctan(slit / 2) / SIGMA) - 1
-    assert abs(cone.face[behind].sum() - passes) < 0.01 and 0.3 < passes < 0.4
+    assert abs(cone.face_sums[behind].sum() - passes) < 0.01 and 0.3 < passes < 0.4
     left_of = mesh.corners[:, :, 0].max(axis=1) < 0
-    assert abs(cone.face[left_of & ~behind].sum() - (1 - passes) / 2) < 0.01
-    assert np.isclose(cone.face.sum() + cone.escaped + cone.elsewhere, cone.total)
+    assert abs(cone.face_sums[left_of & ~behind].sum() - (1 - passes) / 2) < 0.01
+    assert np.isclose(cone.face_sums.sum() + cone.escaped + cone.elsewhere, cone.total)
 
 
 def test02_a_thin_edge_gets_its_part(rgb):
     """A rod of 1 cm, which hardly any line meets that is aimed at it with an error of a degree."""
     rod = joined(box((-0.005, -3, 2), (0.005, 3, 2.01)))
-    sums = ray_sums(SurfaceTarget(rod), rays_ray_source(20_000), RaySettings(cone=SIGMA))
+    sums = sum_rays(SurfaceTarget(rod), rays_ray_source(20_000), RaySettings(cone_sigma=SIGMA))
     expected = 2 * norm.cdf(np.arctan(0.005 / 2) / SIGMA) - 1
-    assert np.isclose(sums.face.sum(), expected, rtol=0.05)
-    assert np.isclose(sums.escaped, 1 - sums.face.sum())
+    assert np.isclose(sums.face_sums.sum(), expected, rtol=0.05)
+    assert np.isclose(sums.escaped, 1 - sums.face_sums.sum())
 
 
 def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
-    target, settings = SurfaceTarget(joined(plate(9, side=4.0, z=2.0))), RaySettings(cone=SIGMA, bundle=8, seed=5)
+    target, settings = SurfaceTarget(joined(plate(9, side=4.0, z=2.0))), RaySettings(cone_sigma=SIGMA, rays_per_cone=8, seed=5)
     every = rays_ray_source(1000, spread=0.2, seed=1)
-    parts = [every.part(a, a + 300) for a in range(0, 1000, 300)]
-    assert [p.first for p in parts] == [0, 300, 600, 900] and len(parts[-1]) == 100
-    first, again = (merge(ray_sums(target, p, settings) for p in parts) for _ in range(2))
-    assert np.array_equal(first.vertex, again.vertex) and first.count == 1000
+    parts = [every.select(a, a + 300) for a in range(0, 1000, 300)]
+    assert [p.first_index for p in parts] == [0, 300, 600, 900] and len(parts[-1]) == 100
+    first, again = (merge_sums(sum_rays(target, p, settings) for p in parts) for _ in range(2))
+    assert np.array_equal(first.vertex_sums, again.vertex_sums) and first.count == 1000
     assert np.isclose(first.total, 1) and abs(first.unaccounted) < 1e-12
-    other = ray_sums(target, parts[0], RaySettings(cone=SIGMA, bundle=8, seed=6))
-    assert not np.array_equal(other.vertex, ray_sums(target, parts[0], settings).vertex)
+    other = sum_rays(target, parts[0], RaySettings(cone_sigma=SIGMA, rays_per_cone=8, seed=6))
+    assert not np.array_equal(other.vertex_sums, sum_rays(target, parts[0], settings).vertex_sums)
 
 
 @pytest.mark.parametrize("cone", [0.0, SIGMA])
@@ -386,7 +386,7 @@ def test04_on_elsewhere_and_escaped_add_up_where_something_hides_the_surface(rgb
     hiding = (np.array([(-9.0, -9, 1), (9, -9, 1), (9, 0, 1), (-9, 0, 1)]), np.array([(0, 1, 2), (0, 2, 3)]))
     some = rays_ray_source(4000, spread=0.3, seed=2)
     some = TrackedRays(some.origins, some.directions, np.linspace(0.5, 1.5, 4000))
-    sums = ray_sums(SurfaceTarget(joined(plate_left), [hiding]), some, RaySettings(cone=cone, bundle=8))
+    sums = sum_rays(SurfaceTarget(joined(plate_left), [hiding]), some, RaySettings(cone_sigma=cone, rays_per_cone=8))
     hidden, left = some.directions[:, 1] < 0, some.directions[:, 0] < 0
     expected = [some.weights[rows].sum() for rows in (~hidden & left, hidden, ~hidden & ~left)]
     found = [sums.on_surface, sums.elsewhere, sums.escaped]

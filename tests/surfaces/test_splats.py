@@ -5,23 +5,23 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.fields.splats import Splats, joined, matrices_of
+from nerg_mi.fields.splats import Splats, concatenate_splats, quaternions_to_matrices
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.surfaces.laplacian import merge
+from nerg_mi.surfaces.laplacian import merge_sums
 from nerg_mi.surfaces.sources import RaySettings, TrackedRays
 from nerg_mi.surfaces.splats import (
-    HIDDEN,
+    MIN_VISIBLE_FRACTION,
     SplatSmoother,
-    gaze_and_escaped,
+    integrate_gaze,
     groups_of_hits,
     shortest_axes,
     sides_of,
-    splat_areas,
+    compute_splat_areas,
     splat_densities,
-    splat_ray_sums,
-    whole_areas,
+    sum_rays_on_splats,
+    unoccluded_areas,
 )
-from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.splat_medium import SplatArrays
 from tests.reference import splats as reference
@@ -33,14 +33,14 @@ from tests.transport.test_splat_medium import medium_of, rays, stack
 
 
 def areas(splats, tolerance=0.002):
-    return splat_areas(splats, SplatArrays(splats, ns), tolerance)
+    return compute_splat_areas(splats, SplatArrays(splats, ns), tolerance)
 
 
 def test01_one_that_nothing_hides_and_its_sides(rgb):
     turn = [np.cos(0.4), np.sin(0.4), 0.1, 0]
     one = Splats([[1, 2, 3]], [[0.2, 0.01, 0.1]], [turn], [0.5], np.zeros((1, 1, 3)))
     expected = 2 * np.pi * 0.2 * 0.1 * 0.5 * (1 - np.exp(-4.5))
-    assert np.allclose(areas(one), expected, rtol=1e-6) and np.allclose(whole_areas(one, 3.0), expected)
+    assert np.allclose(areas(one), expected, rtol=1e-6) and np.allclose(unoccluded_areas(one, 3.0), expected)
     axis = shortest_axes(one)
     assert np.allclose(axis[0], one.axes()[0, :, 1]) and list(sides_of(np.r_[axis, -axis], np.r_[axis, axis])) == [0, 1]
 
@@ -50,17 +50,17 @@ def test02_overlapping_ones_share_what_there_is(rgb):
     plain = wall(jitter=0.0005)
     found = areas(plain)
     edge = 4 * 0.014  # the last of the disks lie over the edge
-    assert whole_areas(plain, 3.0).sum() > 2.5
+    assert unoccluded_areas(plain, 3.0).sum() > 2.5
     assert (found.sum(axis=1) > 0.99).all() and (found.sum(axis=1) < (1 + edge) ** 2).all()
 
 
 def test03_one_behind_another_is_hidden_from_there_and_what_stands_before_it_hides_nothing(rgb):
-    both = joined([wall(0.0, 0.2), wall(0.003, 0.2, turned=TURN_X)])
+    both = concatenate_splats([wall(0.0, 0.2), wall(0.003, 0.2, turned=TURN_X)])
     found, n = areas(both, 0.004), len(both) // 2
     # Along +z the first wall is seen: that is side 0 of it, whose axis is +z, and side 1 of the other.
     assert (found[0, :n] > 4 * found[1, n:]).mean() > 0.8 and found[1, n:].sum() < 0.3 * found[0, :n].sum()
-    far = joined([wall(0.0, 0.2), wall(0.05, 0.2)])
-    assert np.allclose(areas(far, 0.004)[:, :n], areas(wall(0.0, 0.2), 0.004)) and 0 < HIDDEN < 1
+    far = concatenate_splats([wall(0.0, 0.2), wall(0.05, 0.2)])
+    assert np.allclose(areas(far, 0.004)[:, :n], areas(wall(0.0, 0.2), 0.004)) and 0 < MIN_VISIBLE_FRACTION < 1
 
 
 # ---- Splat hits ----
@@ -79,8 +79,8 @@ def shares(splats, o, d, **more):
     taken, left, count = np.zeros((len(o), len(splats))), np.ones(len(o)), 0
     for group in groups_of_hits(SplatArrays(splats, ns), o, d, **more):
         ray, hit = np.nonzero(group.index >= 0)
-        taken[group.rows[ray], group.index[ray, hit]] += (group.arriving * group.absorbed)[ray, hit]
-        left[group.rows] = group.left
+        taken[group.rows[ray], group.index[ray, hit]] += (group.arriving * group.alpha)[ray, hit]
+        left[group.rows] = group.remaining
         count += 1
     return taken, left, count
 
@@ -116,7 +116,7 @@ def test02_up_to_a_distance_and_no_farther_than_is_asked_for(rgb):
 # ---- Tracked rays on Gaussians: what is left where, to whom it adds up, and per area ----
 
 LINE = RaySettings()
-CONE = RaySettings(cone=np.radians(1.5), bundle=8, seed=5)
+CONE = RaySettings(cone_sigma=np.radians(1.5), rays_per_cone=8, seed=5)
 
 
 def falling(n, side=1.2, z=-1.0, seed=0):
@@ -127,16 +127,16 @@ def falling(n, side=1.2, z=-1.0, seed=0):
 
 
 def sums(splats, rays, settings=LINE):
-    return splat_ray_sums(SplatArrays(splats, ns), shortest_axes(splats), rays, settings)
+    return sum_rays_on_splats(SplatArrays(splats, ns), shortest_axes(splats), rays, settings)
 
 
 def test01_all_is_found_again_and_each_has_its_share_of_the_ray(rgb):
     splats, rays = some(), falling(500, 3.0)
     found = sums(splats, rays)
     taken, left, _ = shares(splats, rays.origins, rays.directions)
-    assert np.allclose(found.face.reshape(2, -1).sum(axis=0), taken.mean(axis=0))
+    assert np.allclose(found.face_sums.reshape(2, -1).sum(axis=0), taken.mean(axis=0))
     axes = shortest_axes(splats)
-    assert not found.face.reshape(2, -1)[np.where(axes[:, 2] > 0, 1, 0), np.arange(len(splats))].any()
+    assert not found.face_sums.reshape(2, -1)[np.where(axes[:, 2] > 0, 1, 0), np.arange(len(splats))].any()
     # What a march leaves behind where it ends is a ten-thousandth of a ray at most.
     assert abs(found.unaccounted) < 1e-4 and 0.2 < found.escaped < 0.8 and np.isclose(found.total, 1)
     assert np.isclose(found.escaped + found.unaccounted, left.mean())
@@ -146,10 +146,10 @@ def test01_all_is_found_again_and_each_has_its_share_of_the_ray(rgb):
 
 def test02_per_area_it_is_what_falls_on_a_square_metre(rgb):
     """On a wall of overlapping Gaussians in two layers, whichever of them a ray ends at."""
-    splats = joined([wall(0.0, 0.6, 0.03, 0.0005), wall(0.004, 0.6, 0.05, turned=TURN_X, seed=1)])
+    splats = concatenate_splats([wall(0.0, 0.6, 0.03, 0.0005), wall(0.004, 0.6, 0.05, turned=TURN_X, seed=1)])
     rays = falling(20_000, 1.2)
-    found = sums(splats, rays).face.reshape(2, -1)
-    areas = splat_areas(splats, SplatArrays(splats, ns), 0.006)
+    found = sums(splats, rays).face_sums.reshape(2, -1)
+    areas = compute_splat_areas(splats, SplatArrays(splats, ns), 0.006)
     inner = (np.abs(splats.centers[:, :2]) < 0.25).all(axis=1)
     side = (shortest_axes(splats)[:, 2] <= 0).astype(int)
     of, own = found[side, np.arange(len(splats))], areas[side, np.arange(len(splats))]
@@ -160,10 +160,10 @@ def test02_per_area_it_is_what_falls_on_a_square_metre(rgb):
 
 def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
     splats, every = wall(1.0, 1.0, 0.05), falling(900)
-    parts = [every.part(a, a + 400) for a in range(0, 900, 400)]
-    first, again = (merge(sums(splats, part, CONE) for part in parts) for _ in range(2))
-    assert np.array_equal(first.face, again.face) and first.count == 900 and first.escaped == again.escaped
-    assert not np.array_equal(sums(splats, parts[0], RaySettings(cone=CONE.cone, bundle=8, seed=6)).face, first.face)
+    parts = [every.select(a, a + 400) for a in range(0, 900, 400)]
+    first, again = (merge_sums(sums(splats, part, CONE) for part in parts) for _ in range(2))
+    assert np.array_equal(first.face_sums, again.face_sums) and first.count == 900 and first.escaped == again.escaped
+    assert not np.array_equal(sums(splats, parts[0], RaySettings(cone_sigma=CONE.cone_sigma, rays_per_cone=8, seed=6)).face_sums, first.face_sums)
 
 
 @pytest.mark.parametrize("cone", [0.0, 0.03])
@@ -171,7 +171,7 @@ def test04_of_gaze_meets_none_what_comes_through(rgb, cone):
     """A density along z, most of which a wall stops, and the light of every ray by all Gaussians in float64."""
     splats, eye, kappa = some(), np.array([0.1, -0.2, -1.5]), 8.0
     looker = lookers_of_law(vmf(rgb, (0, 0, 1), kappa))(eye)
-    total, escaped = gaze_and_escaped(SplatArrays(splats, ns), looker, eye, cone)
+    total, escaped = integrate_gaze(SplatArrays(splats, ns), looker, eye, cone)
     d = fibonacci_directions(20_000)
     share = np.exp(kappa * (d[:, 2] - 1))
     left = shares(splats, np.broadcast_to(eye, d.shape), d)[1]
@@ -224,7 +224,7 @@ def test01_a_point_becomes_a_gaussian_of_that_width(length):
 @pytest.mark.parametrize("length", [0.05, 0.2])
 def test02_walls_5_cm_apart_stay_apart(turned, length):
     """Parallel ones and such that face each other, whichever side is looked at."""
-    both = joined([wall(0.0, 0.8), wall(0.05, 0.8, turned=turned)])
+    both = concatenate_splats([wall(0.0, 0.8), wall(0.05, 0.8, turned=turned)])
     flow, _ = smoother(both, length)
     n = len(both) // 2
     for side in (0, 1):
@@ -233,7 +233,7 @@ def test02_walls_5_cm_apart_stay_apart(turned, length):
 
 
 def test03_neither_through_a_board_nor_around_its_edge():
-    board = joined([wall(0.0, 0.4), wall(0.001, 0.4, turned=TURN_X)])
+    board = concatenate_splats([wall(0.0, 0.4), wall(0.001, 0.4, turned=TURN_X)])
     n = len(board) // 2
     front = spike(board, (0.1, 0.1, 0))
     found = smoother(board, 0.05)[0](front)
@@ -250,7 +250,7 @@ def test03_neither_through_a_board_nor_around_its_edge():
         [0.9] * n,
         np.zeros((n, 1, 3)),
     )
-    corner = joined([wall(0.0, 0.4), upright])
+    corner = concatenate_splats([wall(0.0, 0.4), upright])
     assert not smoother(corner, 0.1)[0](spike(corner, (0.19, 0, 0)))[:, n:].any()
 
 
@@ -275,8 +275,8 @@ ALONG = np.array([0.0, 0, 1])
 
 
 def found(splats, law, eyes=EYE, weights=(1.0,), **more):
-    place = Place(medium_of(splats))
-    settings = ObserverSettings(march=default_settings(place))
+    place = SceneGeometry(medium_of(splats))
+    settings = ObserverSettings(march=default_march_settings(place))
     make, eyes, weights = lookers_of_law(law), np.asarray(eyes), np.asarray(weights)
     return splat_densities(splats, place, make, eyes, weights, settings, **more).sum(axis=0)
 
@@ -309,7 +309,7 @@ def test02_a_disk_by_its_cosine_and_any_by_the_area_under_which_it_is_seen(rgb):
     # The outline of an ellipsoid has the area pi det(S) |S^-1 w| (of semi-axes S), and the largest one pi s0 s1.
     scales = np.array([0.1, 0.05, 0.02])
     for k in range(4):
-        w = matrices_of(turned[k : k + 1])[0].T @ [0, 0, 1]
+        w = quaternions_to_matrices(turned[k : k + 1])[0].T @ [0, 0, 1]
         area = np.prod(scales) * np.linalg.norm(w / scales) / (scales[0] * scales[1])
         assert np.isclose(found(make(scales), uniform(rgb), [eyes(k)])[k] * 16 * np.pi, area, rtol=1e-4)
 

@@ -16,20 +16,20 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.tasks import engines
 from nerg_mi.tasks.engines import (
-    Cluster,
-    Done,
-    FilesElsewhere,
-    Local,
+    ClusterEngine,
+    TaskResult,
+    MissingInputFiles,
+    LocalEngine,
     PlanProgress,
-    Processes,
+    ProcessEngine,
     import_distributed,
     open_engine,
-    own_host,
+    find_local_host,
     prepare_once,
     run_plan,
-    security_for,
-    serve_cluster,
-    unprotected,
+    make_security,
+    run_dask_worker,
+    describe_exposure,
 )
 from nerg_mi.tasks.store import Store
 from tests.conftest import ROOT
@@ -55,24 +55,24 @@ class Backwards:
     """Runs everything at once, the last first."""
 
     def run(self, shared, tasks, store, warn):
-        yield from reversed(list(Local().run(shared, tasks, store, warn)))
+        yield from reversed(list(LocalEngine().run(shared, tasks, store, warn)))
 
 
 def contents(plan, store, engine=None, **more):
-    return [output.path.read_bytes() for output in run_plan(plan, store, engine or Local(), **more)]
+    return [output.path.read_bytes() for output in run_plan(plan, store, engine or LocalEngine(), **more)]
 
 
 # ---- Plans carried out ----
 
 
-@pytest.mark.parametrize("engine", [Local(), Backwards()])
+@pytest.mark.parametrize("engine", [LocalEngine(), Backwards()])
 def test_outputs_come_in_the_order_of_the_plan(store, engine):
-    assert contents(works.plan(5), store, engine) == [works.expected(k) for k in range(5)]
+    assert contents(works.make_plan(5), store, engine) == [works.expected(k) for k in range(5)]
 
 
 def test_sums_in_the_order_of_the_plan_are_equal_to_the_bit(tmp_path):
     """Of terms whose sum depends on the order in which they are added."""
-    plan = works.some(*(f"term {k}" for k in range(40)))
+    plan = works.make_small_plan(*(f"term {k}" for k in range(40)))
 
     def total(engine, name):
         out = 0.0
@@ -80,8 +80,8 @@ def test_sums_in_the_order_of_the_plan_are_equal_to_the_bit(tmp_path):
             out += made.notes["term"]
         return struct.pack("<d", out)
 
-    terms = [works.mixed(None, f"term {k}", tmp_path / "t")["term"] for k in range(40)]
-    assert total(Local(), "a") == total(Backwards(), "b") == struct.pack("<d", in_order(terms))
+    terms = [works.write_mixture(None, f"term {k}", tmp_path / "t")["term"] for k in range(40)]
+    assert total(LocalEngine(), "a") == total(Backwards(), "b") == struct.pack("<d", in_order(terms))
     assert in_order(terms) != in_order(terms[::-1])
 
 
@@ -93,11 +93,11 @@ def in_order(terms):
 
 
 def test_what_is_done_is_kept_and_a_damaged_output_is_made_again(store, runs):
-    plan = works.plan(4, runs=runs)
+    plan = works.make_plan(4, runs=runs)
     first = contents(plan, store)
-    assert contents(plan, store) == first and works.runs_of(runs) == dict.fromkeys(range(4), 1)
-    store.output(plan.tasks[2].key, ".txt").write_text("damaged")
-    assert contents(plan, store) == first and works.runs_of(runs) == {0: 1, 1: 1, 2: 2, 3: 1}
+    assert contents(plan, store) == first and works.count_runs(runs) == dict.fromkeys(range(4), 1)
+    store.output_path(plan.tasks[2].key, ".txt").write_text("damaged")
+    assert contents(plan, store) == first and works.count_runs(runs) == {0: 1, 1: 1, 2: 2, 3: 1}
 
 
 def test_a_changed_input_invalidates_what_depends_on_it_and_nothing_more(store, tmp_path):
@@ -120,70 +120,70 @@ def test_an_input_that_changes_in_the_middle_ends_the_job_and_leaves_nothing_mix
     file = tmp_path / "a"
     file.write_text("before")
     with pytest.raises(NergError, match="was changed while the job was running"):
-        for k, _ in enumerate(run_plan(works.plan(4, (file,), runs=runs), store, Local())):
+        for k, _ in enumerate(run_plan(works.make_plan(4, (file,), runs=runs), store, LocalEngine())):
             if k == 1:
                 file.write_text("after it")
-    assert works.runs_of(runs) == {0: 1, 1: 1} and len(list(store.receipts())) == 2
+    assert works.count_runs(runs) == {0: 1, 1: 1} and len(list(store.iter_manifests())) == 2
 
 
 def test_an_input_that_changes_while_it_is_read_is_noticed(store, tmp_path):
     (tmp_path / "a").write_text("before")
     with pytest.raises(NergError, match="was changed while the job was running"):
         contents(works.change_one(tmp_path / "a"), store)
-    assert not list(store.receipts())
+    assert not list(store.iter_manifests())
 
 
 def test_equal_parts_are_run_once_and_given_as_often_as_they_are_planned(store):
     shares, counts = [], []
-    plan = works.some("a", "a", "a")
-    assert contents(plan, store, on_progress=lambda p: shares.append(p.share)) == [b"a\n"] * 3
+    plan = works.make_small_plan("a", "a", "a")
+    assert contents(plan, store, on_progress=lambda p: shares.append(p.fraction)) == [b"a\n"] * 3
     contents(plan, store, on_progress=lambda p: counts.append((p.reused, p.done, p.total)))
     assert shares == [0.0, 1.0] and counts == [(3, 3, 3)]
 
 
 def test_errors_name_the_part(store):
     with pytest.raises(NergError, match=r"^the part refused: the scene has no light; give it one$"):
-        contents(works.some("a", "refused"), store)
-    assert [receipt.label for receipt in store.receipts()] == ["the part a"]
+        contents(works.make_small_plan("a", "refused"), store)
+    assert [receipt.label for receipt in store.iter_manifests()] == ["the part a"]
     with pytest.raises(RuntimeError, match="the part fault: TypeError: a mistake"):
-        contents(works.some("fault"), store)
+        contents(works.make_small_plan("fault"), store)
 
 
 def test_parts_that_another_version_planned_are_refused(store, monkeypatch):
-    plan = works.some("a")
-    assert plan.shared.code
-    monkeypatch.setattr(engines, "code_digest", lambda: "0" * 16)
+    plan = works.make_small_plan("a")
+    assert plan.shared.code_digest
+    monkeypatch.setattr(engines, "compute_code_digest", lambda: "0" * 16)
     with pytest.raises(NergError, match="the part a was planned by another version"):
         contents(plan, store)
 
 
 def test_progress_has_rate_and_time_left():
     progress = PlanProgress(10, reused=2, done=2)
-    assert progress.line() == "2 of 10 parts" and progress.left is None and progress.share == 0.2
+    assert progress.format_line() == "2 of 10 parts" and progress.remaining_seconds is None and progress.fraction == 0.2
     progress.done, progress.seconds = 6, 8.0
-    assert progress.left == pytest.approx(8.0) and progress.line() == "6 of 10 parts, 30 a minute, 8 s left"
+    assert progress.remaining_seconds == pytest.approx(8.0) and progress.format_line() == "6 of 10 parts, 30 a minute, 8 s left"
     progress.seconds = 2.0
-    assert progress.line(False) == "6 of 10 parts, 2 a second" and PlanProgress(0).share == 1.0
+    assert progress.format_line(False) == "6 of 10 parts, 2 a second" and PlanProgress(0).fraction == 1.0
 
 
 def test_other_processors_are_told_of_once(store):
     class Elsewhere:
         def run(self, shared, tasks, store, warn):
-            for k, done in enumerate(Local().run(shared, tasks, store, warn)):
-                receipt = type(done.receipt)(**{**vars(done.receipt), "processor": "another" if k else "one"})
-                yield Done(done.task, receipt)
+            for k, done in enumerate(LocalEngine().run(shared, tasks, store, warn)):
+                receipt = type(done.manifest)(**{**vars(done.manifest), "processor": "another" if k else "one"})
+                yield TaskResult(done.task, receipt)
 
     told = []
-    contents(works.plan(4), store, Elsewhere(), warn=told.append)
+    contents(works.make_plan(4), store, Elsewhere(), warn=told.append)
     (line,) = told
     assert '"another" and "one"' in line
 
 
 def test_closing_stops_the_work(store, runs):
-    taken = run_plan(works.plan(9, runs=runs), store, Local())
+    taken = run_plan(works.make_plan(9, runs=runs), store, LocalEngine())
     next(taken), next(taken)
     taken.close()
-    assert works.runs_of(runs) == {0: 1, 1: 1}
+    assert works.count_runs(runs) == {0: 1, 1: 1}
 
 
 def test_what_parts_have_in_common_is_prepared_once():
@@ -193,9 +193,9 @@ def test_what_parts_have_in_common_is_prepared_once():
 
 
 def test_engines_by_their_names():
-    assert isinstance(open_engine(None), Local) and isinstance(open_engine("local"), Local)
+    assert isinstance(open_engine(None), LocalEngine) and isinstance(open_engine("local"), LocalEngine)
     two = open_engine("local:2", 3)
-    assert isinstance(two, Processes) and (two.count, two.threads) == (2, 3)
+    assert isinstance(two, ProcessEngine) and (two.count, two.threads) == (2, 3)
     with pytest.raises(NergError, match="there is no scheduler"):
         open_engine("nowhere")
     for name in ("local:0", "local:100000"):
@@ -203,7 +203,7 @@ def test_engines_by_their_names():
             open_engine(name)
     for name in ("tcp://a", "tcp://a:0", "http://a:1", "tcp://a:b"):
         with pytest.raises(NergError, match="is no address of a scheduler"):
-            Cluster(name)
+            ClusterEngine(name)
 
 
 # ---- Processes ----
@@ -211,35 +211,35 @@ def test_engines_by_their_names():
 
 def test_two_processes_work_at_once_with_their_threads(store, tmp_path, runs):
     (tmp_path / "a").write_text("light")
-    plan = works.plan(4, (tmp_path / "a",), seconds=0.5, runs=runs)
-    assert contents(plan, store, Processes(2)) == [works.expected(k, (tmp_path / "a",)) for k in range(4)]
+    plan = works.make_plan(4, (tmp_path / "a",), seconds=0.5, runs=runs)
+    assert contents(plan, store, ProcessEngine(2)) == [works.expected(k, (tmp_path / "a",)) for k in range(4)]
     assert len({path.name.split("-")[1] for path in runs.iterdir()}) == 2
-    (made,) = run_plan(works.some("threads"), store, Processes(1, threads=1))
+    (made,) = run_plan(works.make_small_plan("threads"), store, ProcessEngine(1, threads=1))
     assert made.notes == {"threads": 1} and dr.thread_count() >= 1
 
 
 def test_a_process_that_dies_costs_time_and_nothing_else(store, tmp_path, runs):
     (tmp_path / "die").touch()
     told = []
-    plan = works.plan(5, die=tmp_path / "die", runs=runs)
-    assert contents(plan, store, Processes(2), warn=told.append) == [works.expected(k) for k in range(5)]
+    plan = works.make_plan(5, die=tmp_path / "die", runs=runs)
+    assert contents(plan, store, ProcessEngine(2), warn=told.append) == [works.expected(k) for k in range(5)]
     (line,) = told
     # All parts that were being made end with the process: which of them has ended it cannot be told.
-    assert "a process was ended at part" in line and works.runs_of(runs)[0] <= 2
+    assert "a process was ended at part" in line and works.count_runs(runs)[0] <= 2
 
 
 def test_a_part_that_always_kills_its_process_is_named(store):
     told = []
     with pytest.raises(NergError, match="a process was ended at the part deadly, 3 times"):
-        contents(works.some("a", "deadly"), store, Processes(1), warn=told.append)
-    assert len(told) == 2 and [receipt.label for receipt in store.receipts()] == ["the part a"]
+        contents(works.make_small_plan("a", "deadly"), store, ProcessEngine(1), warn=told.append)
+    assert len(told) == 2 and [receipt.label for receipt in store.iter_manifests()] == ["the part a"]
 
 
 def test_errors_of_processes_are_those_of_this_one(store):
     with pytest.raises(NergError, match=r"^the part refused: the scene has no light; give it one$"):
-        contents(works.some("refused"), store, Processes(1))
+        contents(works.make_small_plan("refused"), store, ProcessEngine(1))
     with pytest.raises(RuntimeError, match="the part fault: TypeError: a mistake") as fault:
-        contents(works.some("fault"), store, Processes(1))
+        contents(works.make_small_plan("fault"), store, ProcessEngine(1))
     assert "works.py" in str(fault.value.__cause__)
 
 
@@ -250,7 +250,7 @@ def test_ctrl_c_ends_the_processes_at_once(store):
     start = time.monotonic()
     timer.start()
     with pytest.raises(KeyboardInterrupt):
-        contents(works.plan(4, seconds=600), store, Processes(2))
+        contents(works.make_plan(4, seconds=600), store, ProcessEngine(2))
     assert time.monotonic() - start < 60
 
 
@@ -264,7 +264,7 @@ def test_a_job_that_is_killed_leaves_no_process_and_goes_on_where_it_ended(store
     (tmp_path / "job.py").write_text(code)
     job = subprocess.Popen([sys.executable, tmp_path / "job.py"], cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)})
     until = time.monotonic() + 90
-    while len(list(store.receipts())) < 2 and time.monotonic() < until:
+    while len(list(store.iter_manifests())) < 2 and time.monotonic() < until:
         time.sleep(0.05)
     job.kill()
     job.wait()
@@ -272,12 +272,12 @@ def test_a_job_that_is_killed_leaves_no_process_and_goes_on_where_it_ended(store
     while any(os.path.exists(f"/proc/{pid}") for pid in pids) and time.monotonic() < until:
         time.sleep(0.05)
     assert not any(os.path.exists(f"/proc/{pid}") for pid in pids)
-    done = {receipt.label for receipt in store.receipts()}
+    done = {receipt.label for receipt in store.iter_manifests()}
     assert 2 <= len(done) < 6
-    before = works.runs_of(runs)
-    plan = works.plan(6, seconds=0.5, runs=runs)
+    before = works.count_runs(runs)
+    plan = works.make_plan(6, seconds=0.5, runs=runs)
     assert contents(plan, store) == [works.expected(k) for k in range(6)]
-    after = works.runs_of(runs)
+    after = works.count_runs(runs)
     assert all(after[k] == before[k] for k in range(6) if f"part {k}" in done)
 
 
@@ -295,32 +295,32 @@ def cluster(tmp_path):
 
 def test_a_worker_that_is_killed_and_one_that_comes_late(cluster, tmp_path, runs):
     store, outputs = Store(tmp_path / "store"), []
-    for made in run_plan(works.plan(12, runs=runs, seconds=0.3), store, Cluster(cluster.address)):
+    for made in run_plan(works.make_plan(12, runs=runs, seconds=0.3), store, ClusterEngine(cluster.address)):
         outputs.append(made.path.read_bytes())
         if len(outputs) == 2:
             cluster.workers[0].kill()
             cluster.start_worker()
-    assert outputs == [works.expected(k) for k in range(12)] and set(works.runs_of(runs)) == set(range(12))
+    assert outputs == [works.expected(k) for k in range(12)] and set(works.count_runs(runs)) == set(range(12))
     # A process of a worker that ends, as where memory is short, is started again, and its part is run again.
     (tmp_path / "die").touch()
-    plan = works.plan(3, die=tmp_path / "die", runs=runs, seconds=0.1)
-    assert contents(plan, store, Cluster(cluster.address)) == [works.expected(k) for k in range(3)]
+    plan = works.make_plan(3, die=tmp_path / "die", runs=runs, seconds=0.1)
+    assert contents(plan, store, ClusterEngine(cluster.address)) == [works.expected(k) for k in range(3)]
     assert not (tmp_path / "die").exists() and cluster.workers[1].poll() is None
 
 
 def test_errors_of_parts_are_the_jobs_and_threads_those_it_asks_for(cluster, tmp_path, monkeypatch):
-    store, engine = Store(tmp_path / "s"), Cluster(cluster.address, threads=1)
+    store, engine = Store(tmp_path / "s"), ClusterEngine(cluster.address, threads=1)
     with pytest.raises(NergError, match=r"^the part refused: the scene has no light; give it one$"):
-        contents(works.some("refused"), store, engine)
+        contents(works.make_small_plan("refused"), store, engine)
     with pytest.raises(RuntimeError, match=r"the part fault: TypeError: a mistake(?s:.*)works\.py"):
-        contents(works.some("fault"), store, engine)
+        contents(works.make_small_plan("fault"), store, engine)
     with pytest.raises(NergError, match="the part deadly was begun by several workers"):
-        contents(works.some("deadly"), store, engine)
-    (made,) = run_plan(works.some("threads"), store, engine)
+        contents(works.make_small_plan("deadly"), store, engine)
+    (made,) = run_plan(works.make_small_plan("threads"), store, engine)
     assert made.notes == {"threads": 1}
     folders = list(run_plan(works.folders(5), store, engine))
     assert (folders[0].path / "below" / "b.txt").is_file() and folders[0].notes == {}
-    plan = works.some("b")
+    plan = works.make_small_plan("b")
     monkeypatch.setitem(plan.__dict__, "shared", type(plan.shared)(plan.work, None, (), "0" * 16))
     with pytest.raises(NergError, match="the part b was planned by another version"):
         contents(plan, store, engine)
@@ -333,32 +333,32 @@ def test_workers_that_have_no_files_are_sent_them(cluster, tmp_path, runs, monke
         (tmp_path / folder / "light.txt").write_text("light")
         (tmp_path / folder / "large.txt").write_text("x" * 20_000_000)
     files = (tmp_path / "here" / "light.txt", tmp_path / "here" / "large.txt")
-    plan = works.plan(4, files, runs=runs, seconds=1.0)
+    plan = works.make_plan(4, files, runs=runs, seconds=1.0)
     expected = [works.expected(k, files) for k in range(4)]
     assert len(plan.tasks) == 4 and plan.shared.files
     for file in files:
         file.unlink()
     original = engines.read_bytes
     monkeypatch.setattr(engines, "read_bytes", lambda path, *more: original(path.replace("here", "away"), *more))
-    assert contents(plan, Store(tmp_path / "store"), Cluster(cluster.address)) == expected
+    assert contents(plan, Store(tmp_path / "store"), ClusterEngine(cluster.address)) == expected
     # Few parts go to all workers too, and not to the one that has what they need first.
     assert len({path.name.split("-")[1] for path in runs.iterdir()}) == 2
 
 
 def test_a_scheduler_that_ends_ends_the_job_which_goes_on_with_another(cluster, tmp_path, runs):
-    plan, store, count = works.plan(8, runs=runs, seconds=0.3), Store(tmp_path / "store"), 0
+    plan, store, count = works.make_plan(8, runs=runs, seconds=0.3), Store(tmp_path / "store"), 0
     with pytest.raises(NergError, match=f"the scheduler at {cluster.address} is gone"):
-        for _ in run_plan(plan, store, Cluster(cluster.address)):
+        for _ in run_plan(plan, store, ClusterEngine(cluster.address)):
             count += 1
             if count == 2:
                 cluster.kill_scheduler()
-    kept, before = {receipt.label for receipt in store.receipts()}, works.runs_of(runs)
+    kept, before = {receipt.label for receipt in store.iter_manifests()}, works.count_runs(runs)
     assert 2 <= len(kept) < 8
     assert cluster.workers[1].wait(60) == 0 and "is gone; start the worker again" in cluster.log("worker1")
     cluster.start_scheduler()
     cluster.start_worker()
-    assert contents(plan, store, Cluster(cluster.address)) == [works.expected(k) for k in range(8)]
-    assert all(works.runs_of(runs)[k] == before[k] for k in range(8) if f"part {k}" in kept)
+    assert contents(plan, store, ClusterEngine(cluster.address)) == [works.expected(k) for k in range(8)]
+    assert all(works.count_runs(runs)[k] == before[k] for k in range(8) if f"part {k}" in kept)
 
 
 def test_a_batch_systems_end_leaves_nothing_behind(cluster, tmp_path):
@@ -373,23 +373,23 @@ def test_nobody_there(tmp_path):
     pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
     address = f"tcp://127.0.0.1:{free_port()}"
     with pytest.raises(NergError, match=f"no scheduler answers at {address}"):
-        contents(works.plan(1), Store(tmp_path / "s"), Cluster(address, patience=0.5))
+        contents(works.make_plan(1), Store(tmp_path / "s"), ClusterEngine(address, timeout=0.5))
     with pytest.raises(NergError, match=f"no scheduler has answered at {address} for 1 s"):
-        serve_cluster(address, 1.0, print)
+        run_dask_worker(address, 1.0, print)
 
 
 def test_files_are_where_they_were_planned_or_laid_out_alike(tmp_path):
     """What a worker does with them, without the worker."""
     for name in ("a", "b"):
         (tmp_path / name).write_text(name)
-    plan = works.plan(1, (tmp_path / "a", tmp_path / "b"))
+    plan = works.make_plan(1, (tmp_path / "a", tmp_path / "b"))
     inputs, common = plan.shared.files, plan.shared.common
-    assert engines.placed(inputs, common, {}, tmp_path) == (inputs, common)
+    assert engines.localize_inputs(inputs, common, {}, tmp_path) == (inputs, common)
     (tmp_path / "b").write_text("of somebody else")
-    with pytest.raises(FilesElsewhere):
-        engines.placed(inputs, common, {inputs[0].sha256: b"a"}, tmp_path)
+    with pytest.raises(MissingInputFiles):
+        engines.localize_inputs(inputs, common, {inputs[0].sha256: b"a"}, tmp_path)
     files = {file.sha256: name for file, name in zip(inputs, (b"a", b"b"))}
-    there, moved = engines.placed(inputs, common, files, tmp_path)
+    there, moved = engines.localize_inputs(inputs, common, files, tmp_path)
     assert [path.read_text() for path in moved.files] == ["a", "b"] and [f.name for f in there] == [
         f.name for f in inputs
     ]
@@ -401,30 +401,30 @@ def test_files_are_where_they_were_planned_or_laid_out_alike(tmp_path):
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.9.9.9", "localhost", "[::1]"])
 def test_this_machine_is_silent(host):
-    assert unprotected(f"tcp://{host}:8786") is None
+    assert describe_exposure(f"tcp://{host}:8786") is None
 
 
 def test_tls_is_silent_and_all_else_is_told_in_a_sentence():
-    assert unprotected("tls://192.0.2.1:8786") is None
+    assert describe_exposure("tls://192.0.2.1:8786") is None
     for host in ("192.0.2.1", "cluster.example", "[2001:db8::1]", "0.0.0.0"):
-        said = unprotected(f"tcp://{host}:8786")
+        said = describe_exposure(f"tcp://{host}:8786")
         assert said is not None and said.startswith(f"nothing protects tcp://{host}:8786")
 
 
 def test_workers_listen_where_their_scheduler_reaches_them():
-    assert own_host("tcp://localhost:1") == own_host("tcp://127.0.0.1:1") == "127.0.0.1"
-    assert own_host("tcp://[::1]:1") == "::1"
+    assert find_local_host("tcp://localhost:1") == find_local_host("tcp://127.0.0.1:1") == "127.0.0.1"
+    assert find_local_host("tcp://[::1]:1") == "::1"
 
 
 def test_tls_needs_certificates():
     distributed = pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
     import dask
 
-    assert security_for("tcp://a:1") is None
+    assert make_security("tcp://a:1") is None
     with pytest.raises(NergError, match="tls:// needs certificates"):
-        security_for("tls://a:1")
+        make_security("tls://a:1")
     with dask.config.set({"distributed.comm.tls.ca-file": "ca.pem"}):
-        security = security_for("tls://a:1")
+        security = make_security("tls://a:1")
     assert isinstance(security, distributed.Security) and security.require_encryption
 
 

@@ -16,20 +16,20 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.tasks import task as module
-from nerg_mi.tasks.engines import Local, run_plan
-from nerg_mi.tasks.store import Store, content_of, files_in, read_account, read_plan, remove_stale
+from nerg_mi.tasks.engines import LocalEngine, run_plan
+from nerg_mi.tasks.store import Store, read_contents, list_files, read_status, read_plan, remove_stale
 from nerg_mi.tasks.task import (
-    RENDERS,
+    RENDER_LIBRARIES,
     Checksums,
-    Files,
+    FileGroup,
     InputFile,
     Part,
     Plan,
-    code_digest,
-    digest_of_sources,
-    digest_of_value,
-    inputs_of,
-    relocated,
+    compute_code_digest,
+    compute_sources_digest,
+    compute_value_digest,
+    find_inputs,
+    relocate_paths,
 )
 from tests.tasks import works
 
@@ -48,15 +48,15 @@ class Other:
     second: object = None
 
 
-def key(value=1, common=None, work=works.mixed, suffix=".txt", label="", libraries=RENDERS):
+def key(value=1, common=None, work=works.write_mixture, suffix=".txt", label="", libraries=RENDER_LIBRARIES):
     (task,) = Plan("p", work, common, [Part(value, label)], suffix, libraries).tasks
     return task.key
 
 
 def test_what_changes_a_key_and_what_does_not(monkeypatch):
     assert key() == key(label="called otherwise") == key(1)
-    others = [key(2), key(common=1), key(work=works.folder), key(suffix=".csv"), key(libraries=("numpy",)), key("1")]
-    monkeypatch.setattr(module, "code_digest", lambda: "other")
+    others = [key(2), key(common=1), key(work=works.write_folder), key(suffix=".csv"), key(libraries=("numpy",)), key("1")]
+    monkeypatch.setattr(module, "compute_code_digest", lambda: "other")
     assert len({key(), *others}) == 7
 
 
@@ -79,22 +79,22 @@ def test_what_changes_a_key_and_what_does_not(monkeypatch):
     ],
 )
 def test_values_that_differ_have_other_digests(one, other):
-    assert digest_of_value(one) != digest_of_value(other)
+    assert compute_value_digest(one) != compute_value_digest(other)
 
 
 def test_equal_values_have_equal_digests():
-    assert digest_of_value({"b": 1, "a": [2]}) == digest_of_value({"a": (2,), "b": np.int64(1)})
+    assert compute_value_digest({"b": 1, "a": [2]}) == compute_value_digest({"a": (2,), "b": np.int64(1)})
     whole = np.arange(6.0).reshape(2, 3)
-    assert digest_of_value(whole[:, ::2]) == digest_of_value(whole[:, ::2].copy())
+    assert compute_value_digest(whole[:, ::2]) == compute_value_digest(whole[:, ::2].copy())
     for value in (object(), np.array([object()]), {1, 2}):
         with pytest.raises(TypeError, match="cannot be part of a key"):
-            digest_of_value(value)
+            compute_value_digest(value)
 
 
 def test_a_plan_has_bounds_and_works_that_processes_find(monkeypatch):
-    monkeypatch.setattr(module, "MOST", 3)
+    monkeypatch.setattr(module, "MAX_PARTS", 3)
     with pytest.raises(NergError, match="has 4 parts"):
-        works.plan(4)
+        works.make_plan(4)
     with pytest.raises(ValueError, match="is not a function of a module"):
         key(work=lambda common, value, output: None)
     for wrong in ("png", "/..", ".a/b", "..", ".part/"):
@@ -115,17 +115,17 @@ def place(tmp_path):
 
 
 def scene_of(place):
-    return Files(place / "scene" / "scene.xml", (place / "scene" / "scene.xml", place / "scene" / "meshes" / "a.ply"))
+    return FileGroup(place / "scene" / "scene.xml", (place / "scene" / "scene.xml", place / "scene" / "meshes" / "a.ply"))
 
 
 def test_names_tell_how_files_lie_to_each_other_and_nothing_of_the_machine(place, tmp_path):
     value = {"scene": scene_of(place), "again": place / "scene" / "scene.xml", "gaze": place / "gaze.safetensors"}
-    names = [file.name for file in inputs_of(value, Checksums()).values()]
+    names = [file.name for file in find_inputs(value, Checksums()).values()]
     assert names == ["value/scene/scene.xml", "value/scene/meshes/a.ply", "value/gaze/gaze.safetensors"]
     before = key(value)
     place.joinpath("scene").rename(place / "moved")
     path = place / "moved" / "scene.xml"
-    moved = Files(path, (path, place / "moved" / "meshes" / "a.ply"))
+    moved = FileGroup(path, (path, place / "moved" / "meshes" / "a.ply"))
     assert key({"scene": moved, "again": moved.path, "gaze": place / "gaze.safetensors"}) == before
     (place / "moved" / "meshes" / "a.ply").write_text("plx")
     assert key({"scene": moved, "again": moved.path, "gaze": place / "gaze.safetensors"}) != before
@@ -133,17 +133,17 @@ def test_names_tell_how_files_lie_to_each_other_and_nothing_of_the_machine(place
 
 def test_a_file_that_a_text_names_by_its_whole_path_is_its_bytes(place):
     scene = scene_of(place)
-    texts = {"mesh": str(scene.all[1]), "level": "0.5"}
+    texts = {"mesh": str(scene.members[1]), "level": "0.5"}
     before = key(Pair(scene, texts))
     assert key(Pair(scene, {**texts, "level": "0.6"})) != before
-    laid = works.laid_out(Pair(scene, texts), place / "there")
+    laid = works.lay_out(Pair(scene, texts), place / "there")
     assert Path(laid.second["mesh"]).read_text() == "ply" and str(place / "there") in laid.second["mesh"]
     assert laid.second["level"] == "0.5" and key(laid) == before
 
 
 def test_a_folder_is_the_files_that_are_read_in_it(place):
-    files = Files(place / "scene", (place / "scene" / "meshes" / "a.ply",))
-    laid = works.laid_out(files, place / "there")
+    files = FileGroup(place / "scene", (place / "scene" / "meshes" / "a.ply",))
+    laid = works.lay_out(files, place / "there")
     assert laid.path.is_dir() and (laid.path / "meshes" / "a.ply").read_text() == "ply" and key(laid) == key(files)
     (place / "scene" / "scene.xml").write_text("of no account")
     assert key(files) == key(laid)
@@ -151,10 +151,10 @@ def test_a_folder_is_the_files_that_are_read_in_it(place):
 
 def test_what_is_laid_out_replaces_paths_of_its_inputs_alone(place):
     value = Pair(place / "gaze.safetensors", ("text", 1, np.zeros(2)))
-    inputs = tuple(inputs_of(value, Checksums()).values())
-    there = relocated(value, inputs, place / "there")
+    inputs = tuple(find_inputs(value, Checksums()).values())
+    there = relocate_paths(value, inputs, place / "there")
     assert there.first == place / "there" / inputs[0].name and there.second is value.second
-    assert relocated(value, (), place) is value
+    assert relocate_paths(value, (), place) is value
 
 
 @pytest.mark.parametrize("name", ["", "/etc/passwd", "../a", "a/../../b", "a\\b"])
@@ -172,10 +172,10 @@ def test_a_file_is_read_once_while_it_stays(place, monkeypatch):
     read, checksums, original = [], Checksums(), module.file_sha256
     monkeypatch.setattr(module, "file_sha256", lambda path: read.append(path) or original(path))
     file = place / "gaze.safetensors"
-    first = checksums.of(file)
-    assert checksums.of(file) == first and len(read) == 1
+    first = checksums.compute(file)
+    assert checksums.compute(file) == first and len(read) == 1
     file.write_text("longer than before")
-    assert checksums.of(file) != first and len(read) == 2
+    assert checksums.compute(file) != first and len(read) == 2
 
 
 def test_a_file_that_changes_while_it_is_read_is_not_remembered(place, monkeypatch):
@@ -190,18 +190,18 @@ def test_a_file_that_changes_while_it_is_read_is_not_remembered(place, monkeypat
         return original(path)
 
     monkeypatch.setattr(module, "file_sha256", change_and_read)
-    assert checksums.of(file) == hashlib.sha256(b"FIELD").hexdigest()
+    assert checksums.compute(file) == hashlib.sha256(b"FIELD").hexdigest()
     monkeypatch.setattr(module, "file_sha256", original)
     file.write_bytes(b"field")
     os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
-    assert checksums.of(file) == hashlib.sha256(b"field").hexdigest()
+    assert checksums.compute(file) == hashlib.sha256(b"field").hexdigest()
 
 
 # ---- Code ----
 
 
 def test_keys_name_code_and_programs():
-    assert len(code_digest()) == 16 and int(code_digest(), 16) >= 0 and all(version(name) for name in RENDERS)
+    assert len(compute_code_digest()) == 16 and int(compute_code_digest(), 16) >= 0 and all(version(name) for name in RENDER_LIBRARIES)
 
 
 def test_the_digest_follows_the_sources_that_compute(tmp_path):
@@ -209,10 +209,10 @@ def test_the_digest_follows_the_sources_that_compute(tmp_path):
     for name in sources:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("x = 1\n")
-    before = digest_of_sources([("nerg_mi", tmp_path)])
+    before = compute_sources_digest([("nerg_mi", tmp_path)])
     for name in sources:
         (tmp_path / name).write_text("x = 2\n")
-        changed = digest_of_sources([("nerg_mi", tmp_path)])
+        changed = compute_sources_digest([("nerg_mi", tmp_path)])
         assert (changed != before) == (name in sources[:2]), name
         before = changed
 
@@ -226,29 +226,29 @@ def store(tmp_path):
 
 
 def made(store, plan):
-    return list(run_plan(plan, store, Local()))
+    return list(run_plan(plan, store, LocalEngine()))
 
 
 def test_an_output_is_named_by_its_key_and_signed_for(store):
-    plan = works.plan(1)
+    plan = works.make_plan(1)
     made(store, plan)
-    (task,), (receipt,) = plan.tasks, store.receipts()
-    output = store.output(task.key, ".txt")
+    (task,), (receipt,) = plan.tasks, store.iter_manifests()
+    output = store.output_path(task.key, ".txt")
     assert output == store.folder / task.key[:2] / f"{task.key}.txt" and output.read_bytes() == works.expected(0)
     assert receipt.sha256 == hashlib.sha256(works.expected(0)).hexdigest() and receipt.size == 65
-    assert store.find(task.key, ".txt") == store.receipt(task.key) == receipt and receipt.label == "part 0"
+    assert store.find_valid(task.key, ".txt") == store.read_manifest(task.key) == receipt and receipt.label == "part 0"
 
 
 def test_nothing_is_there_before(store):
-    assert store.find(works.plan(1).tasks[0].key, ".txt") is None and not store.folder.exists()
+    assert store.find_valid(works.make_plan(1).tasks[0].key, ".txt") is None and not store.folder.exists()
 
 
 @pytest.mark.parametrize("harm", ["flip", "shorten", "remove", "receipt", "empty receipt", "another's", "version 1"])
 def test_what_is_damaged_or_of_another_version_counts_as_not_made(store, harm):
-    plan = works.plan(2)
+    plan = works.make_plan(2)
     task, other = plan.tasks
     made(store, plan)
-    output, receipt = store.output(task.key, ".txt"), store.receipt_file(task.key)
+    output, receipt = store.output_path(task.key, ".txt"), store.manifest_path(task.key)
     if harm == "flip":
         raw = bytearray(output.read_bytes())
         raw[3] ^= 1
@@ -264,48 +264,48 @@ def test_what_is_damaged_or_of_another_version_counts_as_not_made(store, harm):
     elif harm == "version 1":
         receipt.write_text(json.dumps(json.loads(receipt.read_text()) | {"format": 1}))
     else:
-        shutil.copy(store.receipt_file(other.key), receipt)
-    assert store.find(task.key, ".txt") is None and store.find(other.key, ".txt") is not None
+        shutil.copy(store.manifest_path(other.key), receipt)
+    assert store.find_valid(task.key, ".txt") is None and store.find_valid(other.key, ".txt") is not None
     made(store, plan)
-    assert store.find(task.key, ".txt") is not None and output.read_bytes() == works.expected(0)
+    assert store.find_valid(task.key, ".txt") is not None and output.read_bytes() == works.expected(0)
 
 
 def test_a_folder_is_an_output_too(store):
     plan = works.folders(3)
     made(store, plan)
     (task,) = plan.tasks
-    output = store.output(task.key, "/")
-    assert [f.relative_to(output).as_posix() for f in files_in(output)] == ["a.txt", "below/b.txt"]
+    output = store.output_path(task.key, "/")
+    assert [f.relative_to(output).as_posix() for f in list_files(output)] == ["a.txt", "below/b.txt"]
     (output / "below" / "b.txt").write_text("c\n")
-    assert store.find(task.key, "/") is None
+    assert store.find_valid(task.key, "/") is None
     made(store, plan)
-    assert (output / "below" / "b.txt").read_text() == "b\n" and store.find(task.key, "/") is not None
+    assert (output / "below" / "b.txt").read_text() == "b\n" and store.find_valid(task.key, "/") is not None
     store.remove(task.key, "/")
-    assert not output.exists() and list(store.receipts()) == []
+    assert not output.exists() and list(store.iter_manifests()) == []
 
 
 def test_what_arrives_is_compared_with_its_receipt(store, tmp_path):
     there = Store(tmp_path / "elsewhere")
-    for plan in (works.plan(1), works.folders(3)):
+    for plan in (works.make_plan(1), works.folders(3)):
         (output,) = made(there, plan)
         (task,) = plan.tasks
-        receipt = there.receipt(task.key)
+        receipt = there.read_manifest(task.key)
         with pytest.raises(NergError, match="arrived with other bytes"):
-            store.put(task, receipt, [("a" if task.suffix == "/" else "", b"something else")])
-        assert store.find(task.key, task.suffix) is None and not store.output(task.key, task.suffix).exists()
-        store.put(task, receipt, content_of(output.path))
-        assert store.find(task.key, task.suffix) == receipt
+            store.import_output(task, receipt, [("a" if task.suffix == "/" else "", b"something else")])
+        assert store.find_valid(task.key, task.suffix) is None and not store.output_path(task.key, task.suffix).exists()
+        store.import_output(task, receipt, read_contents(output.path))
+        assert store.find_valid(task.key, task.suffix) == receipt
 
 
 def test_a_full_disk_leaves_no_half(store):
     """As if no file could grow beyond some hundred bytes, which a plan needs."""
-    plan = works.plan(1)
-    store.remember(plan)
+    plan = works.make_plan(1)
+    store.save_plan(plan)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10, before[1]))
     try:
         with pytest.raises(NergError, match="raise the limit"):
-            next(Local().run(plan.shared, plan.tasks, store, print))
+            next(LocalEngine().run(plan.shared, plan.tasks, store, print))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not [p for p in store.folder.glob("??/*") if p.is_file()]
@@ -318,9 +318,9 @@ def test_where_nothing_can_be_written(tmp_path):
 
 
 def test_scratch_goes_with_the_block_and_is_left_over_otherwise(store):
-    with store.scratch() as folder:
+    with store.make_scratch_folder() as folder:
         (folder / "rays.npz").write_text("12345")
-        assert store.leftovers(3600) == [] and store.leftovers(-1) == [folder]
+        assert store.find_leftovers(3600) == [] and store.find_leftovers(-1) == [folder]
     assert not folder.exists()
 
 
@@ -331,15 +331,15 @@ def test_a_plan_is_remembered_and_replaced_by_its_name(store, tmp_path):
     (tmp_path / "a").write_text("x")
     (store.folder / "b").parent.mkdir()
     (store.folder / "b").write_text("made by a part")
-    plan = works.plan(2, (tmp_path / "a", store.folder / "b"))
-    path = store.remember(plan)
+    plan = works.make_plan(2, (tmp_path / "a", store.folder / "b"))
+    path = store.save_plan(plan)
     found = read_plan(path)
     sha256 = hashlib.sha256(b"x").hexdigest()
-    assert (found.what, found.keys) == ("p", {t.key: ".txt" for t in plan.tasks})
+    assert (found.name, found.keys) == ("p", {t.key: ".txt" for t in plan.tasks})
     assert found.inputs == {str(tmp_path / "a"): sha256} and found.common == {sha256}
-    assert store.remember(works.plan(1)) == path
-    store.remember(works.plan(3, what="a film"))
-    assert [(p.what, len(p.keys)) for p in store.plans()] == [("a film", 3), ("p", 1)]
+    assert store.save_plan(works.make_plan(1)) == path
+    store.save_plan(works.make_plan(3, what="a film"))
+    assert [(p.name, len(p.keys)) for p in store.read_plans()] == [("a film", 3), ("p", 1)]
 
 
 GOOD = {"format": 2, "what": "p", "inputs": {}, "common": [], "keys": {"a" * 64: ".png"}}
@@ -362,7 +362,7 @@ GOOD = {"format": 2, "what": "p", "inputs": {}, "common": [], "keys": {"a" * 64:
 def test_what_is_no_plan_is_refused(tmp_path, change):
     path = tmp_path / "plan.json"
     path.write_text(json.dumps(GOOD))
-    assert read_plan(path).what == "p"
+    assert read_plan(path).name == "p"
     path.write_text(json.dumps({**GOOD, **change}))
     with pytest.raises(NergError, match=r"plan\.json.*start (its|the) job again"):
         read_plan(path)
@@ -372,21 +372,21 @@ def test_what_is_no_plan_is_refused(tmp_path, change):
 
 
 def test_a_job_that_was_interrupted(store):
-    arriving = run_plan(works.plan(5), store, Local())
+    arriving = run_plan(works.make_plan(5), store, LocalEngine())
     next(arriving), next(arriving)
     arriving.close()
-    account = read_account(store)
+    account = read_status(store)
     (job,) = account.jobs
-    assert (job.what, job.total, job.done, job.left, job.bytes) == ("p", 5, 2, 3, 130)
+    assert (job.name, job.total, job.done, job.remaining, job.bytes) == ("p", 5, 2, 3, 130)
     assert account.stale == () and account.leftovers == () and account.bytes == 130 and job.seconds >= 0
 
 
 def test_what_no_job_asks_for_is_stale(store):
-    made(store, works.plan(4)), made(store, works.plan(2, what="another")), made(store, works.plan(1))
-    account = read_account(store)
+    made(store, works.make_plan(4)), made(store, works.make_plan(2, what="another")), made(store, works.make_plan(1))
+    account = read_status(store)
     assert sorted(r.label for r in account.stale) == ["part 2", "part 3"]
     assert account.stale_bytes == 130 == remove_stale(store, account)
-    left = read_account(store)
+    left = read_status(store)
     assert left.stale == () and [job.done for job in left.jobs] == [2, 1] and left.bytes == 130
 
 
@@ -394,18 +394,18 @@ def test_what_was_made_of_a_file_that_has_changed_is_stale(store, tmp_path):
     """A file of all parts, one of a single part, and one that is gone."""
     for name in "abc":
         (tmp_path / name).write_text(f"{name} before")
-    made(store, works.plan(2, (tmp_path / "a",), what="all"))
+    made(store, works.make_plan(2, (tmp_path / "a",), what="all"))
     made(store, works.read_one(tmp_path / "b", tmp_path / "c"))
     for name in "ab":
         (tmp_path / name).write_text("after")
     (tmp_path / "c").unlink()
-    account = read_account(store)
+    account = read_status(store)
     both, each = account.jobs
     assert both.changed == (str(tmp_path / "a"),) and both.outdated == 2
-    assert each.changed == (str(tmp_path / "b"),) and each.gone == (str(tmp_path / "c"),) and each.outdated == 1
+    assert each.changed == (str(tmp_path / "b"),) and each.missing == (str(tmp_path / "c"),) and each.outdated == 1
     assert {r.label for r in account.stale} == {"part 0", "part 1", "of b"}
     remove_stale(store, account)
-    assert [r.label for r in store.receipts()] == ["of c"]
+    assert [r.label for r in store.iter_manifests()] == ["of c"]
 
 
 def test_bytes_that_another_file_still_has_are_not_out_of_date(store, tmp_path):
@@ -413,34 +413,34 @@ def test_bytes_that_another_file_still_has_are_not_out_of_date(store, tmp_path):
         (tmp_path / name).write_text("alike")
     made(store, works.read_one(tmp_path / "a", tmp_path / "b"))
     (tmp_path / "a").write_text("other")
-    account = read_account(store)
+    account = read_status(store)
     assert account.jobs[0].changed == (str(tmp_path / "a"),) and account.jobs[0].outdated == 0 and account.stale == ()
 
 
 def test_leftovers_are_removed_when_they_are_old(store):
-    made(store, works.plan(2))
+    made(store, works.make_plan(2))
     hidden = next(store.folder.glob("??")) / ".abc.part.txt"
     hidden.write_text("half")
     folder = hidden.with_name(".abd.part")
     (folder / "below").mkdir(parents=True)
     (folder / "below" / "x").write_text("12345")
-    unsigned = works.plan(2).tasks[1].key
-    store.receipt_file(unsigned).unlink()
-    assert read_account(store).leftovers == ()
-    for path in (hidden, folder, store.output(unsigned, ".txt")):
+    unsigned = works.make_plan(2).tasks[1].key
+    store.manifest_path(unsigned).unlink()
+    assert read_status(store).leftovers == ()
+    for path in (hidden, folder, store.output_path(unsigned, ".txt")):
         os.utime(path, (1, 1))
-    account = read_account(store)
+    account = read_status(store)
     assert len(account.leftovers) == 3 and account.leftover_bytes == 9 + 65 == remove_stale(store, account)
-    assert not hidden.exists() and not folder.exists() and read_account(store).jobs[0].done == 1
+    assert not hidden.exists() and not folder.exists() and read_status(store).jobs[0].done == 1
 
 
 def test_a_folder_that_is_no_store(tmp_path):
     with pytest.raises(NergError, match="holds no parts of jobs"):
-        read_account(Store(tmp_path))
+        read_status(Store(tmp_path))
 
 
 def test_receipts_of_others_are_no_receipts(store):
-    made(store, works.plan(1))
-    (receipt,) = store.receipts()
-    store.add(replace(receipt, key="f" * 64))
-    assert store.find("f" * 64, ".txt") is None and Path(store.receipt_file("f" * 64)).exists()
+    made(store, works.make_plan(1))
+    (receipt,) = store.iter_manifests()
+    store.add_manifest(replace(receipt, key="f" * 64))
+    assert store.find_valid("f" * 64, ".txt") is None and Path(store.manifest_path("f" * 64)).exists()

@@ -13,7 +13,7 @@ from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import write_text
-from nerg_mi.tasks.task import FOLDER, Checksums, Part, Plan, inputs_of, relocated
+from nerg_mi.tasks.task import FOLDER_SUFFIX, Checksums, Part, Plan, find_inputs, relocate_paths
 from nerg_mi.workflows.options import PartOptions, option
 
 
@@ -37,7 +37,7 @@ class Run:
     die: str = ""
 
 
-def hashed(common: Settings, value: Run, output: Path) -> None:
+def write_hash(common: Settings, value: Run, output: Path) -> None:
     """A line of the number and of what is read."""
     if value.runs:
         Path(value.runs, f"{value.number}-{os.getpid()}-{time.time_ns()}").touch()
@@ -49,7 +49,7 @@ def hashed(common: Settings, value: Run, output: Path) -> None:
     write_text(output, hashlib.sha256(f"{value.number} {text}".encode()).hexdigest() + "\n")
 
 
-def mixed(common: Any, value: str, output: Path) -> dict[str, Any] | None:
+def write_mixture(common: Any, value: str, output: Path) -> dict[str, Any] | None:
     """What is called by ``value``."""
     if value == "fault":
         raise TypeError("a mistake of the program")
@@ -72,45 +72,45 @@ def mixed(common: Any, value: str, output: Path) -> dict[str, Any] | None:
     return None
 
 
-def changes(common: Path, value: Any, output: Path) -> None:
+def change_input(common: Path, value: Any, output: Path) -> None:
     """Reads a file that changes meanwhile."""
     write_text(output, common.read_text())
     common.write_text("in between")
 
 
-def reads(common: None, value: Path, output: Path) -> None:
+def read_input(common: None, value: Path, output: Path) -> None:
     write_text(output, value.read_text())
 
 
-def folder(common: Any, value: int, output: Path) -> None:
+def write_folder(common: Any, value: int, output: Path) -> None:
     """Two files, one of them in a folder."""
     write_text(output / "a.txt", f"{value}\n")
     write_text(output / "below" / "b.txt", "b\n")
 
 
-def plan(count: int, files: tuple[Path, ...] = (), what: str = "p", seconds: float = 0.0, **more: Any) -> Plan:
+def make_plan(count: int, files: tuple[Path, ...] = (), what: str = "p", seconds: float = 0.0, **more: Any) -> Plan:
     """So many parts of `hashed`, of which each reads all ``files``."""
     parts = [Part(Run(k, seconds, **{k: str(v) for k, v in more.items()}), f"part {k}") for k in range(count)]
-    return Plan(what, hashed, Settings(files=files), parts, ".txt")
+    return Plan(what, write_hash, Settings(files=files), parts, ".txt")
 
 
-def some(*values: str, what: str = "p") -> Plan:
+def make_small_plan(*values: str, what: str = "p") -> Plan:
     """Parts of `mixed`, each called by its value."""
-    return Plan(what, mixed, None, [Part(value, f"the part {value}") for value in values], ".txt")
+    return Plan(what, write_mixture, None, [Part(value, f"the part {value}") for value in values], ".txt")
 
 
 def read_one(*files: Path) -> Plan:
     """A part for each of ``files``, which it reads."""
-    return Plan("p", reads, None, [Part(file, f"of {file.name}") for file in files], ".txt")
+    return Plan("p", read_input, None, [Part(file, f"of {file.name}") for file in files], ".txt")
 
 
 def change_one(file: Path) -> Plan:
     """A part that changes the file that it reads."""
-    return Plan("p", changes, file, [Part(None)], ".txt")
+    return Plan("p", change_input, file, [Part(None)], ".txt")
 
 
 def folders(*numbers: int) -> Plan:
-    return Plan("p", folder, None, [Part(k, f"folder {k}") for k in numbers], FOLDER)
+    return Plan("p", write_folder, None, [Part(k, f"folder {k}") for k in numbers], FOLDER_SUFFIX)
 
 
 def expected(number: int, files: tuple[Path, ...] = ()) -> bytes:
@@ -119,16 +119,16 @@ def expected(number: int, files: tuple[Path, ...] = ()) -> bytes:
     return (hashlib.sha256(f"{number} {text}".encode()).hexdigest() + "\n").encode()
 
 
-def laid_out(value: Any, folder: Path) -> Any:
+def lay_out(value: Any, folder: Path) -> Any:
     """``value`` on a machine that has none of its files, and was sent them into ``folder``."""
-    inputs = tuple(inputs_of(value, Checksums()).values())
+    inputs = tuple(find_inputs(value, Checksums()).values())
     for file in inputs:
         (folder / file.name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file.path, folder / file.name)
-    return relocated(value, inputs, folder)
+    return relocate_paths(value, inputs, folder)
 
 
-def runs_of(folder: Path) -> dict[int, int]:
+def count_runs(folder: Path) -> dict[int, int]:
     """How often each part was run."""
     counts: dict[int, int] = {}
     for path in folder.iterdir():

@@ -10,25 +10,25 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.splats import Splats, joined
+from nerg_mi.fields.splats import Splats, concatenate_splats
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.scene import files_of_scene
+from nerg_mi.rendering.scene import list_scene_files
 from nerg_mi.train.geometry import (
-    PAD,
-    VOXEL,
-    GazePlace,
+    PADDING_VOXELS,
+    DEFAULT_VOXEL,
+    TrainingGeometry,
     HitExtent,
-    hit_extent,
-    place_of_field,
-    place_of_hits,
-    place_of_nothing,
-    place_of_scene,
-    place_of_volume,
+    compute_hit_extent,
+    load_field_geometry,
+    make_hit_geometry,
+    no_geometry,
+    load_scene_geometry,
+    load_volume_geometry,
     shade_hits,
-    volume_dict,
+    make_volume_dict,
     voxelise_hits,
 )
 from nerg_mi.transport.geometry import trace_depth
@@ -75,60 +75,60 @@ def rays_hit_extent():
 
 @pytest.fixture(scope="module")
 def extent(rays_hit_extent):
-    return hit_extent(rays_hit_extent, most=MOST)
+    return compute_hit_extent(rays_hit_extent, max_voxels=MOST)
 
 
 def test_the_box_of_an_office_is_the_room(rays_hit_extent, extent):
     """At the voxels' usual edge, though the hits outside would make it 45 x 60 m."""
     spread = np.ptp(np.quantile(rays_hit_extent.hit, [0.005, 0.995], axis=0), axis=0)
-    assert np.prod(spread / VOXEL) > 16 * MOST
-    assert extent.cut and extent.voxel == VOXEL and np.prod(extent.shape) <= MOST
+    assert np.prod(spread / DEFAULT_VOXEL) > 16 * MOST
+    assert extent.is_cut and extent.voxel == DEFAULT_VOXEL and np.prod(extent.shape) <= MOST
     low, high = extent.shell
-    assert np.abs(low - ROOM[0]).max() < VOXEL and np.abs(high - ROOM[1]).max() < 1.5 * VOXEL
-    assert extent.beyond == pytest.approx(looks_out(rays_hit_extent.origin, rays_hit_extent.direction).mean(), abs=2e-3)
+    assert np.abs(low - ROOM[0]).max() < DEFAULT_VOXEL and np.abs(high - ROOM[1]).max() < 1.5 * DEFAULT_VOXEL
+    assert extent.outside_fraction == pytest.approx(looks_out(rays_hit_extent.origin, rays_hit_extent.direction).mean(), abs=2e-3)
 
 
 def test_depths_in_an_office(rgb, rays_hit_extent, extent, tmp_path, monkeypatch):
     """What is in the room is where it is; what is outside is met where it is looked at through the box's shell."""
-    monkeypatch.setattr("nerg_mi.train.geometry.hit_extent", lambda *_: extent)
-    place = place_of_hits(rays_hit_extent, tmp_path / "office.vol")
-    assert place.about["geometry_file"]["beyond"] == pytest.approx(extent.beyond, abs=1e-4)
+    monkeypatch.setattr("nerg_mi.train.geometry.compute_hit_extent", lambda *_: extent)
+    place = make_hit_geometry(rays_hit_extent, tmp_path / "office.vol")
+    assert place.metadata["geometry_file"]["beyond"] == pytest.approx(extent.beyond, abs=1e-4)
     seen = office(4000, seed=1)  # other rays than the place was made of
     depth, opacity = trace_depth(place.medium, seen.origin, seen.direction)
     out = looks_out(seen.origin, seen.direction)
     true = np.linalg.norm(seen.hit - seen.origin, axis=1)
     off = np.abs(depth - true)[~out]
     assert (opacity[~out] > 0.99).mean() > 0.995
-    assert np.median(off) < 1.5 * VOXEL and np.quantile(off, 0.99) < 4 * VOXEL
+    assert np.median(off) < 1.5 * DEFAULT_VOXEL and np.quantile(off, 0.99) < 4 * DEFAULT_VOXEL
     # The shell stands in the plane of the window, which is where the box was cut.
     window = ((ROOM[1, 0] - seen.origin[:, 0]) / seen.direction[:, 0])[out]
     assert out.sum() > 100 and (opacity[out] > 0.99).mean() > 0.97
-    assert np.quantile(np.abs(depth[out] - window), 0.95) < 4 * VOXEL
+    assert np.quantile(np.abs(depth[out] - window), 0.95) < 4 * DEFAULT_VOXEL
 
 
 def test_a_place_that_is_not_too_large_is_left_as_it_was(rays_hit_extent):
     room = rays_hit_extent.select(~looks_out(rays_hit_extent.origin, rays_hit_extent.direction))
-    extent = hit_extent(room)
-    assert not extent.cut and extent.beyond == 0 and extent.voxel == VOXEL
-    low = np.minimum(np.quantile(room.hit, 0.005, axis=0), room.origin.min(axis=0)) - PAD * VOXEL
+    extent = compute_hit_extent(room)
+    assert not extent.is_cut and extent.outside_fraction == 0 and extent.voxel == DEFAULT_VOXEL
+    low = np.minimum(np.quantile(room.hit, 0.005, axis=0), room.origin.min(axis=0)) - PADDING_VOXELS * DEFAULT_VOXEL
     np.testing.assert_array_equal(extent.lower, low)
-    assert not extent.beyond_shell(np.full((1, 3), 1e6)).any()
+    assert not extent.is_outside_shell(np.full((1, 3), 1e6)).any()
 
 
 def test_what_stands_on_the_shell_is_more_than_half_a_voxel_beyond_it():
-    extent = HitExtent(np.array([1.0, 2.0, 3.0]), (PAD * 2 + 4,) * 3, 0.5, cut=True)
+    extent = HitExtent(np.array([1.0, 2.0, 3.0]), (PADDING_VOXELS * 2 + 4,) * 3, 0.5, is_cut=True)
     low, high = extent.shell
     np.testing.assert_allclose([low, high], [[4, 5, 6], [6, 7, 8]])
     for axis in np.eye(3):
         hits = [end + side * by * 0.5 * axis for end, side in ((low, -1), (high, 1)) for by in (0.45, 0.55)]
-        assert extent.beyond_shell(np.array(hits)).tolist() == [False, True, False, True]
+        assert extent.is_outside_shell(np.array(hits)).tolist() == [False, True, False, True]
 
 
 def test_a_place_is_a_file_of_64_mib_at_most():
     """A cube of 24 m, all of which people looked at, is nearly twice as many voxels."""
     corners = np.array(list(np.ndindex(2, 2, 2))) * 24.0
-    extent = hit_extent(replace(office(8), origin=corners, hit=corners))
-    assert 4 * np.prod(extent.shape) <= 64 * 2**20 and (extent.cut or extent.voxel > VOXEL)
+    extent = compute_hit_extent(replace(office(8), origin=corners, hit=corners))
+    assert 4 * np.prod(extent.shape) <= 64 * 2**20 and (extent.is_cut or extent.voxel > DEFAULT_VOXEL)
 
 
 def test_voxels_grow_where_people_were_everywhere():
@@ -136,8 +136,8 @@ def test_voxels_grow_where_people_were_everywhere():
     rng = np.random.default_rng(0)
     room = office(2000)
     hall = replace(room, origin=room.origin * 20, hit=room.origin * 20 + rng.normal(0, 2, (2000, 3)))
-    extent = hit_extent(hall, most=1 << 18)
-    assert extent.voxel > VOXEL and np.prod(extent.shape) <= 1 << 18
+    extent = compute_hit_extent(hall, max_voxels=1 << 18)
+    assert extent.voxel > DEFAULT_VOXEL and np.prod(extent.shape) <= 1 << 18
     low, high = extent.shell
     assert ((hall.hit >= low) & (hall.hit <= high)).all(axis=1).mean() >= 0.74
 
@@ -145,21 +145,21 @@ def test_voxels_grow_where_people_were_everywhere():
 def test_one_lost_head_does_not_make_the_box(rays_hit_extent):
     origin = rays_hit_extent.origin.copy()
     origin[7] = [900.0, -900.0, 50.0]
-    extent = hit_extent(replace(rays_hit_extent, origin=origin), most=MOST)
-    assert extent.voxel == VOXEL and np.abs(extent.shell[1] - ROOM[1]).max() < 2 * VOXEL
+    extent = compute_hit_extent(replace(rays_hit_extent, origin=origin), max_voxels=MOST)
+    assert extent.voxel == DEFAULT_VOXEL and np.abs(extent.shell[1] - ROOM[1]).max() < 2 * DEFAULT_VOXEL
 
 
 def test_a_voxel_that_is_asked_for_is_kept(rays_hit_extent):
-    assert hit_extent(rays_hit_extent, 0.2, MOST).voxel == 0.2
-    fine = hit_extent(rays_hit_extent, 0.05, 1 << 21)
-    assert fine.voxel == 0.05 and fine.cut
+    assert compute_hit_extent(rays_hit_extent, 0.2, MOST).voxel == 0.2
+    fine = compute_hit_extent(rays_hit_extent, 0.05, 1 << 21)
+    assert fine.voxel == 0.05 and fine.is_cut
     with pytest.raises(NergError, match=r"enlarge the voxel \(--voxel\)"):
-        hit_extent(rays_hit_extent, 0.005, MOST)
+        compute_hit_extent(rays_hit_extent, 0.005, MOST)
     for bad in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(NergError, match="--voxel"):
-            hit_extent(rays_hit_extent, bad)
+            compute_hit_extent(rays_hit_extent, bad)
     with pytest.raises(NergError, match="--field"):
-        hit_extent(replace(rays_hit_extent, hit=None))
+        compute_hit_extent(replace(rays_hit_extent, hit=None))
 
 
 def test_hits_seen_from_outside_of_the_box_are_left_out(rays_hit_extent, extent):
@@ -186,7 +186,7 @@ def test_a_place_made_of_hits(rgb, rays_hit_geometry, tmp_path):
     density, box = voxelise_hits(rays_hit_geometry, 0.1)
     assert density.dtype == np.float32 and (density > 0).any()
     write_volume(tmp_path / "place.vol", density, box.lower, box.upper)
-    medium = VolumeMedium(rgb.load_dict(volume_dict(tmp_path / "place.vol")))
+    medium = VolumeMedium(rgb.load_dict(make_volume_dict(tmp_path / "place.vol")))
     np.testing.assert_allclose(medium.bounds(), [box.lower, box.upper], atol=1e-5)
     central = np.abs(rays_hit_geometry.hit - np.median(rays_hit_geometry.hit, axis=0)).max(axis=1) < 0.1
     depth, opacity = trace_depth(medium, rays_hit_geometry.origin[central], rays_hit_geometry.direction[central])
@@ -247,7 +247,7 @@ def volume(tmp_path):
 
 def test_a_whole_one(rgb, volume):
     # Mitsuba returns the box by a transform in single precision.
-    assert np.allclose(place_of_volume(volume).box.upper, (1, 2, 3), rtol=1e-6)
+    assert np.allclose(load_volume_geometry(volume).box.upper, (1, 2, 3), rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -269,29 +269,29 @@ def test_a_header_that_lies(rgb, volume, at, value):
     data = volume.read_bytes()
     volume.write_bytes(data[:at] + value + data[at + len(value) :])
     with pytest.raises(NergError, match="place.vol"):
-        place_of_volume(volume)
+        load_volume_geometry(volume)
 
 
 @pytest.mark.parametrize("size", [0, 10, 30, 48, 100])
 def test_one_that_is_cut_off(rgb, volume, size):
     volume.write_bytes(volume.read_bytes()[:size])
     with pytest.raises(NergError, match="place.vol"):
-        place_of_volume(volume)
+        load_volume_geometry(volume)
 
 
 def test_frames_of_rays_and_place():
     """Twice the size, a quarter turn about z, and moved."""
     align = Similarity([[0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
-    place = GazePlace(None, Box((0, 0, 0), (1, 1, 1)), "none", align=align)
-    np.testing.assert_allclose(place.points_from_rays(np.array([[1.0, 0, 0], [0, 1, 1]])), [[1, 4, 3], [-1, 2, 5]])
+    place = TrainingGeometry(None, Box((0, 0, 0), (1, 1, 1)), "none", align=align)
+    np.testing.assert_allclose(place.points_to_field(np.array([[1.0, 0, 0], [0, 1, 1]])), [[1, 4, 3], [-1, 2, 5]])
     d = np.array([[[0.6, 0.8, 0], [0, 0, 1.0]]])
-    turned = place.directions_from_rays(d)
+    turned = place.directions_to_field(d)
     np.testing.assert_allclose(turned, [[[-0.8, 0.6, 0], [0, 0, 1]]], atol=1e-12)
     np.testing.assert_allclose(place.directions_to_rays(turned), d, atol=1e-12)
 
 
 def test_without_geometry_the_box_is_around_whoever_looked():
-    assert place_of_nothing(np.array([[0.0, 1, 2], [1, 0, 2]])).box == Box((-2, -2, 0), (3, 3, 4))
+    assert no_geometry(np.array([[0.0, 1, 2], [1, 0, 2]])).box == Box((-2, -2, 0), (3, 3, 4))
 
 
 def test_a_scenes_box_holds_its_field_and_its_shapes_and_a_hundredth_more(rgb, tmp_path):
@@ -299,7 +299,7 @@ def test_a_scenes_box_holds_its_field_and_its_shapes_and_a_hundredth_more(rgb, t
       <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="1"/>
       </volume></integrator>
       <shape type="cube"><transform name="to_world"><translate x="-2" y="-2" z="-3"/></transform></shape></scene>""")
-    box = place_of_scene(tmp_path / "both.xml").box
+    box = load_scene_geometry(tmp_path / "both.xml").box
     np.testing.assert_allclose([box.lower, box.upper], [[-3.05, -3.05, -4.05], [1.05, 1.05, 1.05]], atol=1e-6)
 
 
@@ -308,30 +308,30 @@ def test_a_mesh_is_a_scene_of_its_own(rgb, tmp_path, name):
     rgb.load_dict({"type": "cube"}).write_ply(str(tmp_path / "a.ply"))
     corners, faces = "-1 -1 -1|1 -1 -1|1 1 -1|-1 1 1".split("|"), ("1 2 3", "1 3 4")
     (tmp_path / "a.obj").write_text("".join(f"v {c}\n" for c in corners) + "".join(f"f {f}\n" for f in faces))
-    place = place_of_scene(tmp_path / name)
+    place = load_scene_geometry(tmp_path / name)
     np.testing.assert_allclose([place.box.lower, place.box.upper], [[-1.02] * 3, [1.02] * 3], atol=1e-6)
-    assert place.kind == "scene" and place.about["scene_file"]["file"] == name
-    assert files_of_scene(tmp_path / name) == [tmp_path / name]
+    assert place.kind == "scene" and place.metadata["scene_file"]["file"] == name
+    assert list_scene_files(tmp_path / name) == [tmp_path / name]
 
 
 def test_splats_are_no_scene(rgb, tmp_path):
     write_ply_splats(tmp_path / "a.ply", random_splats(10))
     with pytest.raises(NergError, match="--field"):
-        place_of_scene(tmp_path / "a.ply")
+        load_scene_geometry(tmp_path / "a.ply")
 
 
 def test_a_scene_without_anything_is_no_place(rgb, tmp_path):
     (tmp_path / "empty.xml").write_text('<scene version="3.0.0"/>')
     with pytest.raises(NergError, match="neither shapes nor a field"):
-        place_of_scene(tmp_path / "empty.xml")
+        load_scene_geometry(tmp_path / "empty.xml")
 
 
 def test_splats_are_a_place_without_their_strays(tmp_path):
     splats = random_splats(1000, degree=0, size=0.02)
     far = Splats([[90, 0, 0]], [[1, 1, 1]], [[1, 0, 0, 0]], [0.5], np.zeros((1, 1, 3)))
-    write_ply_splats(tmp_path / "a.ply", joined([splats, far]))
-    place = place_of_field(tmp_path / "a.ply", ns)
-    assert place.kind == "field" and place.radiance is None and place.about["field_file"]["file"] == "a.ply"
+    write_ply_splats(tmp_path / "a.ply", concatenate_splats([splats, far]))
+    place = load_field_geometry(tmp_path / "a.ply", ns)
+    assert place.kind == "field" and place.radiance is None and place.metadata["field_file"]["file"] == "a.ply"
     assert np.allclose(place.box.upper, 1, atol=0.15) and np.allclose(place.box.lower, -1, atol=0.15)
     origin, along = np.float32([[0, 0, -3]]), np.float32([[0, 0, 1]])
     # Trained in as it is rendered.

@@ -92,7 +92,7 @@ def test_rays_equal_those_of_the_cameras(lenses):
     rng = np.random.default_rng(0)
     views = [view(lens, rng) for lens in lenses]
     bank = PixelBank(ns, views)
-    batch = bank.batch(dr.arange(ns.UInt32, bank.size))
+    batch = bank.gather_batch(dr.arange(ns.UInt32, bank.size))
     o, d, rgb, _, _ = expected(views)
     assert np.allclose(batch.o.numpy().T, o, atol=1e-6)
     # The last lens ends within its picture, where its inverse has no finite slope.
@@ -118,7 +118,7 @@ def test_colours_alpha_depth_and_masks(dtype, channels, depth, mask):
     views = [view(lens, rng, dtype, channels, depth, mask) for lens in LENSES[:3]]
     bank = PixelBank(ns, views)
     pick = np.random.default_rng(2).permutation(bank.size).astype(np.uint32)
-    batch = bank.batch(ns.UInt32(pick))
+    batch = bank.gather_batch(ns.UInt32(pick))
     o, d, rgb, alpha, distance = (x[pick] for x in expected(views))
     assert bank.size == sum(v.shape[0] * v.shape[1] if v.mask is None else int(v.mask.sum()) for v in views)
     tolerance = 1e-6 if dtype == np.uint8 else 5e-4
@@ -129,7 +129,7 @@ def test_colours_alpha_depth_and_masks(dtype, channels, depth, mask):
     if depth:
         assert np.allclose(batch.depth.numpy(), distance, atol=9 / 65535)
         assert np.array_equal(batch.depth.numpy() > 0, distance > 0)
-        assert not bank.depth_everywhere
+        assert not bank.has_full_depth
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -138,7 +138,7 @@ def test_what_has_no_alpha_is_opaque_among_what_has(dtype):
     views = [view(PLAIN, rng, dtype, channels=4), view(PLAIN, rng, dtype)]
     bank = PixelBank(ns, views)
     count = PLAIN.width * PLAIN.height
-    alpha = bank.batch(dr.arange(ns.UInt32, bank.size)).alpha.numpy()
+    alpha = bank.gather_batch(dr.arange(ns.UInt32, bank.size)).alpha.numpy()
     assert bank.size == 2 * count and np.abs(alpha[count:] - 1).max() < 1e-6 and alpha[:count].min() < 0.1
 
 
@@ -147,15 +147,15 @@ def test_known_depth_never_rounds_to_unknown():
     depth = np.full(v.shape, 1e-3, np.float32)
     depth[0, 0] = 1e4
     bank = PixelBank(ns, [replace(v, depth=depth)])
-    assert bank.depth_everywhere
-    points = np.concatenate([p.numpy().T for p in bank.surface_points(100)])
+    assert bank.has_full_depth
+    points = np.concatenate([p.numpy().T for p in bank.iter_surface_points(100)])
     assert len(points) == bank.size
 
 
 def test_surface_points_lie_at_the_depth_of_their_rays():
     rng = np.random.default_rng(6)
     views = [view(lens, rng, depth=True, mask=True) for lens in LENSES[:2]]
-    points = np.concatenate([p.numpy().T for p in PixelBank(ns, views).surface_points(100)])
+    points = np.concatenate([p.numpy().T for p in PixelBank(ns, views).iter_surface_points(100)])
     o, d, _, _, depth = expected(views)
     known = depth > 0
     assert not known.all() and np.allclose(points, (o + d * depth[:, None])[known], atol=2e-4)
@@ -182,7 +182,7 @@ def directions(lenses, which):
     """Directions (N, 3), x right, y down, z forward, of all pixels of one of several lenses."""
     column, row = pixels(lenses[which])
     frame = np.full(len(row), which)
-    d = LensTable(ns, lenses).directions(*(ns.UInt32(v.astype(np.uint32)) for v in (frame, column, row)))
+    d = LensTable(ns, lenses).compute_directions(*(ns.UInt32(v.astype(np.uint32)) for v in (frame, column, row)))
     x, y, z = (np.broadcast_to(np.array(v, np.float64), len(row)) for v in d)
     return np.stack([x, -y, -z], axis=1)
 

@@ -11,12 +11,12 @@ from nerg_mi.maths.geometry import Box
 from nerg_mi.train.radiance_sampling import (
     Segments,
     StepTable,
-    Thinned,
-    occupied_steps,
-    ray_sum,
-    rays_in_box,
-    visible_samples,
-    weights,
+    ThinnedSamples,
+    find_occupied_steps,
+    sum_along_rays,
+    clip_rays,
+    select_visible_samples,
+    compute_weights,
 )
 
 # ---- Compositing of packed samples against a float64 reference and against finite differences ----
@@ -59,12 +59,12 @@ def packed():
 
 def test_weights_and_sums_equal_the_reference(packed):
     ray, tau, padded_tau, segments = packed
-    w = weights(ns.Float(padded_tau), segments)
+    w = compute_weights(ns.Float(padded_tau), segments)
     expected = weights_numpy(tau, ray)
     assert np.allclose(w.numpy()[: len(ray)], expected, atol=2e-7)
     assert np.all(w.numpy()[len(ray) :] == 0)
     x = np.r_[tau, np.full(len(padded_tau) - len(tau), 100.0)]
-    assert np.allclose(ray_sum(ns.Float(x), segments).numpy(), ray_sum_numpy(tau, ray, RAYS), atol=1e-6)
+    assert np.allclose(sum_along_rays(ns.Float(x), segments).numpy(), ray_sum_numpy(tau, ray, RAYS), atol=1e-6)
 
 
 def test_the_ends_of_a_ray_are_written_once(packed, monkeypatch):
@@ -80,7 +80,7 @@ def test_opaque_samples_leave_the_other_rays_alone():
     """An astronomically dense sample must not cost the rays after it their precision."""
     tau = np.array([1e12, 1e12, 0.1, 0.2])
     segments = Segments(ns.UInt32([0, 0, 1, 1]), ns.Bool([True] * 4), 2)
-    w = weights(ns.Float(tau), segments).numpy()
+    w = compute_weights(ns.Float(tau), segments).numpy()
     assert np.allclose(w, [1, 0, -np.expm1(-0.1), np.exp(-0.1) * -np.expm1(-0.2)], atol=1e-7)
 
 
@@ -95,7 +95,7 @@ def test_gradient_agrees_with_finite_differences(packed):
 
     x = ns.Float(padded_tau)
     dr.enable_grad(x)
-    sums = ray_sum(weights(x, segments) * ns.Float(value), segments)
+    sums = sum_along_rays(compute_weights(x, segments) * ns.Float(value), segments)
     dr.backward(dr.sum(sums * sums * ns.Float(per_ray)))
     g = dr.grad(x).numpy()
     h = 1e-5
@@ -110,7 +110,7 @@ def test_forward_mode_agrees_with_reverse_mode(packed):
     direction, out = rng.normal(size=len(padded_tau)), rng.normal(size=RAYS)
 
     def sums(x):
-        return dr.sum(ray_sum(weights(x, segments), segments) * ns.Float(out))
+        return dr.sum(sum_along_rays(compute_weights(x, segments), segments) * ns.Float(out))
 
     x = ns.Float(padded_tau)
     dr.enable_grad(x)
@@ -128,10 +128,10 @@ def test_forward_mode_agrees_with_reverse_mode_of_samples_that_stand_for_others(
     rng = np.random.default_rng(4)
     n = len(padded_tau)
     copies, before, out = ns.Float(rng.uniform(1, 9, n)), ns.Float(rng.uniform(0, 2, n)), ns.Float(rng.normal(size=n))
-    thinned = Thinned(copies, before, ns.Float(rng.random(RAYS)))
+    thinned = ThinnedSamples(copies, before, ns.Float(rng.random(RAYS)))
     x = ns.Float(padded_tau)
     dr.enable_grad(x)
-    w = weights(x, segments, thinned)
+    w = compute_weights(x, segments, thinned)
     want = copies.numpy() * np.exp(-before.numpy()) * -np.expm1(-padded_tau) * (np.arange(n) < len(ray))
     assert np.allclose(dr.detach(w).numpy(), want, rtol=1e-5)
     dr.backward(dr.sum(w * out))
@@ -139,7 +139,7 @@ def test_forward_mode_agrees_with_reverse_mode_of_samples_that_stand_for_others(
     for direction in np.eye(n)[[0, 3, 20, len(ray) - 1, n - 1]]:
         dr.enable_grad(x)
         dr.set_grad(x, ns.Float(direction))
-        forward = dr.forward_to(dr.sum(weights(x, segments, thinned) * out))
+        forward = dr.forward_to(dr.sum(compute_weights(x, segments, thinned) * out))
         assert np.allclose(forward.numpy()[0], back @ direction, rtol=1e-4, atol=1e-5)
 
 
@@ -201,7 +201,7 @@ def rays(count, seed=0):
     d = dr.normalize(
         ns.Array3f(*[ns.Float(x.astype(np.float32)) for x in (*rng.normal(0, 0.1, (2, count)), np.ones(count))])
     )
-    return rays_in_box(o, d, BOX, 0.01), ns.Float(rng.random(count).astype(np.float32))
+    return clip_rays(o, d, BOX, 0.01), ns.Float(rng.random(count).astype(np.float32))
 
 
 @pytest.mark.parametrize("step", [0.2, 0.01, 0.0007])
@@ -233,8 +233,8 @@ def test_the_pass_stays_within_its_bound_in_fog(stride):
         asked.append(dr.width(p))
         return dr.full(ns.Float, 0.1, dr.width(p))
 
-    samples, covered = visible_samples(r, table, offset, lambda p, a: a, density, 1e-9, most=most)
-    whole, everything = visible_samples(r, table, offset, lambda p, a: a, density, 1e-9)
+    samples, covered = select_visible_samples(r, table, offset, lambda p, a: a, density, 1e-9, max_prepass_samples=most)
+    whole, everything = select_visible_samples(r, table, offset, lambda p, a: a, density, 1e-9)
     assert everything == 300 and asked[0] <= most and asked[1] == whole.count
     counts = np.bincount(whole.ray.numpy(), minlength=300)
     assert covered == min(300, int(np.searchsorted(np.cumsum(counts), most, side="right")))
@@ -243,25 +243,25 @@ def test_the_pass_stays_within_its_bound_in_fog(stride):
     for name in ("ray", "t", "length"):
         got, expected = getattr(samples, name).numpy(), getattr(whole, name).numpy()
         assert np.array_equal(got, expected[: counts[:covered].sum()])
-    assert samples.looked == pytest.approx(asked[0] / covered)
+    assert samples.prepass_samples_per_ray == pytest.approx(asked[0] / covered)
 
 
 def test_the_batch_and_the_pass_may_both_be_full():
     table = StepTable(ns, 0.01, 4, 0.02, 0)
     r, offset = rays(300)
     fog = lambda p, a: dr.full(ns.Float, 0.1, dr.width(p))
-    samples, covered = visible_samples(r, table, offset, lambda p, a: a, fog, 1e-9, pad=2000, most=5000)
+    samples, covered = select_visible_samples(r, table, offset, lambda p, a: a, fog, 1e-9, pad=2000, max_prepass_samples=5000)
     assert dr.width(samples.ray) == 2000 and 0 < covered < 40
     counts = np.bincount(samples.ray.numpy()[samples.segments.active.numpy()], minlength=300)
     assert (counts[:covered] > 50).all() and not counts[covered:].any()
     # Of all that the pass looked at, not only of what the batch took.
-    assert samples.looked == pytest.approx(100, rel=0.1)
+    assert samples.prepass_samples_per_ray == pytest.approx(100, rel=0.1)
 
 
 def test_a_ray_that_alone_is_too_long_is_refused():
     r, offset = rays(3)
     with pytest.raises(ValueError, match="a single ray has more than 50 steps"):
-        occupied_steps(r, StepTable(ns, 0.01, 4, 0.01, 0), offset, lambda p, a: a, most=50)
+        find_occupied_steps(r, StepTable(ns, 0.01, 4, 0.01, 0), offset, lambda p, a: a, max_steps=50)
 
 
 @pytest.mark.parametrize("growth", [0, 1 / 16])
@@ -277,4 +277,4 @@ def test_more_candidates_than_indices_are_refused():
     """They are counted in 32 bits: one more would be the first again."""
     table = SimpleNamespace(steps=2, split=lambda index: pytest.fail("candidates are made"))
     with pytest.raises(ValueError, match="2147483648.*2"):
-        occupied_steps(SimpleNamespace(count=2**31), table, ns.Float(0), lambda p, a: a)
+        find_occupied_steps(SimpleNamespace(count=2**31), table, ns.Float(0), lambda p, a: a)

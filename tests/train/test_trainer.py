@@ -41,7 +41,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thre
     expected, got = state(whole), state(second)
     for name, value in expected.items():
         assert np.array_equal(value, got[name]), name
-    assert whole.settling.at == second.settling.at > 0
+    assert whole.extraction.pieces_done == second.extraction.pieces_done > 0
 
 
 def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):
@@ -174,7 +174,7 @@ def test_a_damaged_state_is_told_with_its_name(dataset, tmp_path, change):
 def timed(*seconds):
     clock = StepClock()
     for s in seconds:
-        clock.add(s)
+        clock.add_step(s)
     return clock
 
 
@@ -183,16 +183,16 @@ def test_a_state_is_restored_with_and_without_steps(seconds):
     clock, again = timed(*seconds), StepClock()
     again.restore(json.loads(json.dumps(clock.to_dict())))
     assert again.to_dict() == clock.to_dict() and again.summary() == clock.summary()
-    again.add(2.0)
-    clock.add(2.0)
+    again.add_step(2.0)
+    clock.add_step(2.0)
     assert again.summary() == clock.summary() and again.summary()["step_ms"]["max"] == 2000
 
 
 def test_durations_are_kept_of_steps_that_are_equally_far_apart(monkeypatch):
-    monkeypatch.setattr(shared, "KEPT", 4)
+    monkeypatch.setattr(shared, "MAX_DURATIONS", 4)
     for steps, each in ((4, 1), (5, 2), (9, 4), (30, 8)):
         clock = timed(*range(steps))
-        assert clock.each == each and clock.durations == list(range(0, steps, each))
+        assert clock.keep_every == each and clock.durations == list(range(0, steps, each))
 
 
 @pytest.mark.parametrize("change", [{"durations": []}, {"steps": 0}, {"steps": -1}, {"each": 0}, {"extremes": [0.5]}])
@@ -223,7 +223,7 @@ def test_no_pass_of_a_run_is_larger_than_its_bound(dataset, monkeypatch):
         dataset.train,
         BOX,
         TINY,
-        settings(steps=60, look_most=1.5, march_step=1 / 512, grid_every=10**6),
+        settings(steps=60, max_prepass_batches=1.5, march_step=1 / 512, grid_interval=10**6),
         ns,
         depth=False,
     )
@@ -233,23 +233,23 @@ def test_no_pass_of_a_run_is_larger_than_its_bound(dataset, monkeypatch):
     while t.progress < 1:
         t.step()
         strides.add(t.stride)
-    assert t.grid.fraction > 0.5 and t.stride == 1 and len(strides) > 1
-    assert 0.5 * t.settings.most_looked < max(asked) <= t.settings.most_looked
+    assert t.grid.occupied_fraction > 0.5 and t.stride == 1 and len(strides) > 1
+    assert 0.5 * t.settings.max_prepass_samples < max(asked) <= t.settings.max_prepass_samples
 
 
 def test_the_clock_counts_what_steps_evaluate():
     clock = StepClock()
-    clock.count(1000)
+    clock.add_evaluations(1000)
     assert clock.summary() == {}
     for _ in range(3):
         with clock:
-            clock.count(100)
-    clock.count(1000)
+            clock.add_evaluations(100)
+    clock.add_evaluations(1000)
     assert clock.evaluations == 300 and len(clock.durations) == 3
     clock = StepClock()
     clock.evaluations = 300
     for seconds in (0.01, 0.06, 0.02):
-        clock.add(seconds)
+        clock.add_step(seconds)
     assert clock.summary() == {"evaluations_a_second": 3333, "step_ms": {"min": 10.0, "median": 20.0, "max": 60.0}}
 
 

@@ -14,9 +14,9 @@ from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import (
     Ceiling,
-    Place,
+    SceneGeometry,
     Shading,
-    default_settings,
+    default_march_settings,
     pixel_directions,
     pixel_solid_angles,
     trace_depth,
@@ -128,23 +128,23 @@ def test_a_shape_is_opaque_and_a_medium_as_thick_as_it_is(rgb, sigma):
     medium = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": sigma}))
     ball = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [0.25, 0.25, 3], "radius": 0.2}})
     # Through the unit cube to the ball, past the ball, and past both.
-    view = look(rgb, Place(medium, ball), [(0.25, 0.25, -1), (0.75, 0.75, -1), (1.75, 0.75, -1)])
+    view = look(rgb, SceneGeometry(medium, ball), [(0.25, 0.25, -1), (0.75, 0.75, -1), (1.75, 0.75, -1)])
     thick = -np.expm1(-sigma)
     assert np.allclose(view.opacity.numpy(), [1, thick, 0], rtol=1e-5)
-    assert np.allclose(view.front.numpy(), [thick, thick, 0], rtol=1e-5)
-    assert view.hit.numpy().tolist() == [True, False, False]
-    assert view.meets(0.5).numpy().tolist() == [True, thick > 0.5, False]
-    assert view.meets(0.0).numpy().tolist() == [True, True, False]
+    assert np.allclose(view.medium_opacity.numpy(), [thick, thick, 0], rtol=1e-5)
+    assert view.hits_shape.numpy().tolist() == [True, False, False]
+    assert view.has_surface(0.5).numpy().tolist() == [True, thick > 0.5, False]
+    assert view.has_surface(0.0).numpy().tolist() == [True, True, False]
 
 
 def test_distances_follow_the_ray_where_no_shape_moves(rgb):
-    place = Place(
+    place = SceneGeometry(
         None, rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [0, 0, 5], "radius": 2.0}})
     )
     x, z = np.float32([-1.0, 0.0, 0.5, 1.2]), rgb.Float([0, 0, 0, 0])
     across = rgb.Float(x)
     dr.enable_grad(across, z)
-    distance = place.trace(rgb.Ray3f(rgb.Point3f(across, 0, z), rgb.Vector3f(0, 0, 1)), True, SETTINGS).distance
+    distance = place.trace(rgb.Ray3f(rgb.Point3f(across, 0, z), rgb.Vector3f(0, 0, 1)), True, SETTINGS).shape_distance
     dr.backward(dr.sum(distance))
     assert np.allclose(distance.numpy(), 5 - np.sqrt(4 - x**2), rtol=1e-5)
     assert np.allclose(dr.grad(across).numpy(), x / np.sqrt(4 - x**2), rtol=1e-4, atol=1e-6)
@@ -161,9 +161,9 @@ def test_distances_follow_a_shape_where_no_ray_moves(rgb):
     # Twice as far as it is lifted, whatever the place on it.
     params[key] = rgb.Transform4f().translate(rgb.Point3f(0, 0, 4 + 2 * lift))
     params.update()
-    view = look(rgb, Place(None, scene), [(0, 0, 0), (0.4, -0.7, 1)])
+    view = look(rgb, SceneGeometry(None, scene), [(0, 0, 0), (0.4, -0.7, 1)])
     dr.forward(lift)
-    assert np.allclose(view.distance.numpy(), [4, 3]) and np.allclose(dr.grad(view.distance).numpy(), 2, rtol=1e-5)
+    assert np.allclose(view.shape_distance.numpy(), [4, 3]) and np.allclose(dr.grad(view.shape_distance).numpy(), 2, rtol=1e-5)
 
 
 # ---- Shading ----
@@ -189,7 +189,7 @@ def scene_of(mi, *emitters, shapes=True):
 def shade(mi, scene, nested=None, medium=None, hide=False):
     """``(radiance, AOVs, shown)`` of a ray that meets the square and of one that does not, each the mean of many
     samples; arrays a row each."""
-    place = Place(medium, scene)
+    place = SceneGeometry(medium, scene)
     across = mi.Float(np.repeat(np.float32([0.5, -0.5]), SAMPLES))
     ray = mi.RayDifferential3f(mi.Point3f(across, 0.5, -1), mi.Vector3f(0, 0, 1))
     active = dr.full(mi.Bool, True, 2 * SAMPLES)
@@ -304,7 +304,7 @@ def test_a_wall_is_where_it_stands(wall):
     depth, opacity = trace_depth(wall, o, d)
     hit = np.abs(0.5 + d[:, 1:] * (0.4 / d[:, :1]) - 0.5).max(axis=1) < 0.49
     assert hit.sum() > 50
-    np.testing.assert_allclose(depth[hit], 0.4 / d[hit, 0], atol=default_settings(wall).step)
+    np.testing.assert_allclose(depth[hit], 0.4 / d[hit, 0], atol=default_march_settings(wall).step)
     assert (opacity[hit] > 0.999).all()
 
 

@@ -11,11 +11,11 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.occupancy import OccupancyGrid, contracted_cascades
+from nerg_mi.fields.occupancy import OccupancyGrid, cascades_from_contracted
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
 from nerg_mi.maths.geometry import Box, ContractedBox, Similarity
-from nerg_mi.transport.field_medium import FeaturePainter, FieldMedium, color_painter, observed_features
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.field_medium import FeaturePainter, FieldMedium, make_color_shader, observed_features
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.medium import MAX_DENSITY, ColorPainter, LocalRay, Medium, bound, bounded
@@ -41,7 +41,7 @@ def test_no_matter_lies_in_an_empty_cell(rgb, wrap_mode, filter_type, voxel):
     cells = bound(data, ns)
     it = dr.zeros(rgb.Interaction3f)
     it.p = rgb.Point3f(np.random.default_rng(0).random((3, 100_000)).astype(np.float32))
-    matter, away = volume.eval_1(it).numpy() > 0, cells.empty_cells(it.p).numpy()
+    matter, away = volume.eval_1(it).numpy() > 0, cells.distance_to_occupied(it.p).numpy()
     assert matter.any() and not away[matter].any()
     # A bound that holds for all wrap modes, and yet leaves most of the box out.
     assert (away > 0).mean() > 0.8
@@ -65,11 +65,11 @@ def test01_the_mediums_colour(rgb, kind):
         ColorPainter(array_type),
     )
     p, w = rgb.Point3f(0.5, 0.5, 0.5), rgb.Vector3f(0, 0, 1)
-    found = painter.paint(medium, [], p, w, rgb.Bool(True))
+    found = painter.shade(medium, [], p, w, rgb.Bool(True))
     assert type(found) is type(painter.zero()) is array_type
     assert np.allclose(np.array(found).ravel(), [0.2, 0.5, 0.8], atol=1e-6)
     assert not np.array(painter.zero()).any()
-    assert painter.color(medium, found, rgb.Float(0.5), medium.local(p, w), rgb.Bool(True)) is found
+    assert painter.resolve_color(medium, found, rgb.Float(0.5), medium.ray_to_local(p, w), rgb.Bool(True)) is found
 
 
 # ---- Every medium answers all that the protocol asks, and densities are fit to be marched ----
@@ -162,7 +162,7 @@ def test01_scaling_place_and_camera_changes_no_opacity(rgb):
         assert np.isclose(got[0], plain[0], rtol=1e-4) and np.isclose(got[1], plain[1] * scale, rtol=1e-4)
         # The direction that colour depends on turns with the field.
         assert np.allclose(got[2], plain[2], rtol=1e-3)
-        assert np.isclose(moved.step, 0.05 * scale) and np.isclose(moved.length_scale, 6**0.5 * scale)
+        assert np.isclose(moved.default_step, 0.05 * scale) and np.isclose(moved.length_scale, 6**0.5 * scale)
 
 
 def test02_its_box_in_the_scene(rgb):
@@ -196,7 +196,7 @@ def test04_empty_cells_hold_nothing_also_where_no_march_has_looked(rgb):
     # The longest edge of the box, two units, spans the four cells, and the others lie in the middle of them.
     p = ns.Array3f([0.1, 0.1, 0.9], [0.1, 0.1, 0.9], [0.1, 1.9, 1.0])
     found, inside = medium.occupied_density(p, True).numpy(), medium.density(p, True).numpy()
-    occupied = medium.occupancy.empty_cells(medium.to_unit(p)).numpy() == 0
+    occupied = medium.occupancy.distance_to_occupied(medium.to_unit(p)).numpy() == 0
     assert (inside > 0).all() and np.array_equal(found, np.where(occupied, inside, 0))
 
 
@@ -253,7 +253,7 @@ def absorbed(mi, medium, o, d, settings):
 @pytest.mark.parametrize("growth, tolerance", [(1 / 16, 2e-3), (1 / 128, 5e-5)])
 def test_rays_through_the_contracted_part(rgb, growth, tolerance):
     medium, (o, d) = FieldMedium(plain_field()), rays()
-    far, tau, depth = absorbed(rgb, medium, o, d, MarchSettings(medium.step, dt_gamma=growth))
+    far, tau, depth = absorbed(rgb, medium, o, d, MarchSettings(medium.default_step, dt_gamma=growth))
     wanted = [by_sums(*ray, stop) for *ray, stop in zip(o, d, far)]
     np.testing.assert_allclose(tau, [w[0] for w in wanted], rtol=tolerance)
     np.testing.assert_allclose(depth, [w[1] for w in wanted], rtol=tolerance)
@@ -265,7 +265,7 @@ def test_depths_are_those_of_the_scene_wherever_it_is_placed(rgb):
     _, tau, depth = absorbed(rgb, FieldMedium(field), o, d, MarchSettings(0.02, dt_gamma=GROWTH))
     m = turn(10.0)
     moved = FieldMedium(field, Similarity(m))
-    assert np.isclose(moved.step, 0.2) and moved.growth == GROWTH
+    assert np.isclose(moved.default_step, 0.2) and moved.default_dt_gamma == GROWTH
     at, along = o @ m[:3, :3].T + m[:3, 3], d @ m[:3, :3].T / 10
     _, tau_m, depth_m = absorbed(rgb, moved, at, along, MarchSettings(0.2, dt_gamma=GROWTH))
     np.testing.assert_allclose(tau_m, tau, rtol=1e-4)
@@ -277,7 +277,7 @@ def test_empty_cells_are_passed_over_and_full_ones_are_not(rgb):
     r = 32
     bits = np.zeros((r, r, r), bool)
     bits[:, :, -3] = True
-    cascades = contracted_cascades(bits, 64, ns, 0.01)
+    cascades = cascades_from_contracted(bits, 64, ns, 0.01)
     near, far = (ENDLESS.from_unit(ns.Array3f((r - k) / r, 0.5, 0.5)).x.numpy()[0] for k in (3, 2))
     o, d = np.array([[1.0, 0.1, 0.2]]), np.array([[1.0, 0.0, 0.0]])
     settings = MarchSettings(0.02, dt_gamma=GROWTH)
@@ -292,7 +292,7 @@ def test_empty_cells_are_passed_over_and_full_ones_are_not(rgb):
 
 def test_the_medium_of_a_bounded_field_does_not_grow(rgb):
     config = RadianceConfig(GRID, width=16, geometry=3, sh_degree=2)
-    assert FieldMedium(RadianceField.random(config, ENDLESS.core, ns, march_step=0.02)).growth == 0
+    assert FieldMedium(RadianceField.random(config, ENDLESS.core, ns, march_step=0.02)).default_dt_gamma == 0
 
 
 # ---- Mitsuba volumes as a medium: errors, what a march skips, and what a change of their data changes ----
@@ -319,7 +319,7 @@ def test02_volume_answers(rgb):
     # Negative density would make light.
     assert np.allclose(medium.density(p, True).numpy(), [0, 5]) and not medium.has_color and medium.occupancy is None
     assert np.isclose(medium.length_scale, 3**0.5)
-    ray = medium.local(rgb.Point3f(0.5, 0.5, -2), rgb.Vector3f(0, 0, 1))
+    ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, -2), rgb.Vector3f(0, 0, 1))
     assert (ray.t_near.numpy()[0], ray.t_far.numpy()[0]) == (2, 3)
 
 
@@ -336,11 +336,11 @@ def grid_of(mi, data):
 
 def test03_a_grid_is_skipped_and_its_steps_are_short_enough_for_its_voxels(rgb):
     medium = VolumeMedium(grid_of(rgb, corner()))
-    assert medium.occupancy is not None and medium.occupancy.fraction < 0.1
-    assert medium.step == pytest.approx(min(3**0.5 / 1024, 0.5 / 8)) and medium.cells.edge == pytest.approx(1 / 8)
-    assert VolumeMedium(grid_of(rgb, np.ones((200, 2, 2), np.float32))).step == pytest.approx(3**0.5 / 1024)
+    assert medium.occupancy is not None and medium.occupancy.occupied_fraction < 0.1
+    assert medium.default_step == pytest.approx(min(3**0.5 / 1024, 0.5 / 8)) and medium.cells.edge == pytest.approx(1 / 8)
+    assert VolumeMedium(grid_of(rgb, np.ones((200, 2, 2), np.float32))).default_step == pytest.approx(3**0.5 / 1024)
     fog = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0}))
-    assert fog.occupancy is None and fog.cells is None and fog.step is None
+    assert fog.occupancy is None and fog.cells is None and fog.default_step is None
 
 
 def test04_nothing_is_skipped_while_derivatives_of_it_are_tracked(rgb):
@@ -374,7 +374,7 @@ def test05_refreshing_reads_voxels_that_have_changed_and_no_others(rgb, monkeypa
     medium.refresh()
     far = rgb.Point3f(0.97, 0.97, 0.97)
     assert len(read) == 3
-    assert medium.density(far, True).numpy()[0] > 0 and medium.occupancy.empty_cells(far).numpy()[0] == 0
+    assert medium.density(far, True).numpy()[0] > 0 and medium.occupancy.distance_to_occupied(far).numpy()[0] == 0
 
 
 def test06_voxels_that_are_not_finite_are_refused(rgb):
@@ -418,7 +418,7 @@ def place(rgb):
     config = RadianceConfig(HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=3, sh_degree=2)
     field, rng = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0), np.random.default_rng(0)
     field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
-    return Place(FieldMedium(field, Similarity(np.diag([2.0, 2, 2, 1])))), field
+    return SceneGeometry(FieldMedium(field, Similarity(np.diag([2.0, 2, 2, 1])))), field
 
 
 def asked(rgb, place, kind, p, active=True):
@@ -463,14 +463,14 @@ def test_colours_of_a_deferred_medium_come_of_what_is_accumulated(rgb, place):
         field = place[1]
         config = replace(field.config, deferred=deferred)
         medium = FieldMedium(RadianceField(config, field.box, field.grid, field.density_net, field.color_net))
-        ray = medium.local(rgb.Point3f(0.1, -0.2, -3), rgb.Vector3f(*map(float, D)))
-        one, both = color_painter(medium, rgb.Color3f), color_painter(medium, rgb.Color3f, features=True)
+        ray = medium.ray_to_local(rgb.Point3f(0.1, -0.2, -3), rgb.Vector3f(*map(float, D)))
+        one, both = make_color_shader(medium, rgb.Color3f), make_color_shader(medium, rgb.Color3f, features=True)
         kinds.append(type(one))
         found = []
         for painter in (one, both):
             r = march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / 64, color_cutoff=0.0), color=painter)
-            found.append(np.array(painter.color(medium, r.color, r.opacity, ray, rgb.Bool(True))).ravel())
-            hidden = painter.color(medium, r.color, r.opacity, ray, rgb.Bool(False))
+            found.append(np.array(painter.resolve_color(medium, r.color, r.opacity, ray, rgb.Bool(True))).ravel())
+            hidden = painter.resolve_color(medium, r.color, r.opacity, ray, rgb.Bool(False))
             assert not deferred or not np.array(hidden).any()
         sums = both.features(r.color)
         assert len(sums) == 3 and np.allclose(found[0], found[1], atol=1e-6) and found[0].max() > 0.01
@@ -479,4 +479,4 @@ def test_colours_of_a_deferred_medium_come_of_what_is_accumulated(rgb, place):
             want = np.array(r.opacity * medium.field.color(means, ray.w)).ravel()
             assert np.allclose(found[0], want, atol=1e-6)
     assert kinds == [ColorPainter, FeaturePainter]
-    assert FeaturePainter(medium).color(medium, r.color, r.opacity, ray, True) is None
+    assert FeaturePainter(medium).resolve_color(medium, r.color, r.opacity, ray, True) is None

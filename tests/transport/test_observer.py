@@ -15,7 +15,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.transport import observer
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.jit import Fingerprint, no_collection, of_shapes, recording
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import (
@@ -24,7 +24,7 @@ from nerg_mi.transport.observer import (
     ObserverSettings,
     SupportView,
     fingerprint_of,
-    view_along,
+    evaluate_view,
     visibility,
 )
 from nerg_mi.transport.volume_medium import VolumeMedium
@@ -52,16 +52,16 @@ def values(known):
 def test_the_same_position_is_served_again(rgb, made):
     cache, (calls, make) = ObserverCache(), made
     eyes = [rgb.Point3f(1, 2, 3), rgb.Point3f(4, 5, 6)]
-    first = cache.of_each("thing", eyes, 0, make)
+    first = cache.get_or_compute_each("thing", eyes, 0, make)
     assert values(first) == [1, 2] and calls == [[1, 2, 3], [4, 5, 6]]
     assert np.allclose(np.array(first[1].center).ravel(), [4, 5, 6])
     # In another order, and one of them alone: the other one is not kept then.
-    assert values(cache.of_each("thing", eyes[::-1], 0, make)) == [2, 1]
-    assert values(cache.of_each("thing", eyes[:1], 0, make)) == [1]
-    assert values(cache.of_each("thing", eyes, 0, make)) == [1, 3]
+    assert values(cache.get_or_compute_each("thing", eyes[::-1], 0, make)) == [2, 1]
+    assert values(cache.get_or_compute_each("thing", eyes[:1], 0, make)) == [1]
+    assert values(cache.get_or_compute_each("thing", eyes, 0, make)) == [1, 3]
     # To the bit.
     next_to = rgb.Point3f(1, 2, float(np.nextafter(np.float32(3), np.float32(4))))
-    assert values(cache.of_each("thing", [next_to], 0, make)) == [4]
+    assert values(cache.get_or_compute_each("thing", [next_to], 0, make)) == [4]
 
 
 def test_numbers_of_others_are_kept(rgb, made):
@@ -87,22 +87,22 @@ def test_numbers_of_others_are_kept(rgb, made):
 
 def test_two_who_stand_at_one_place_share(rgb, made):
     cache, (_, make) = ObserverCache(), made
-    assert values(cache.of_each("thing", [rgb.Point3f(1, 2, 3)] * 2, 0, make)) == [1, 1]
+    assert values(cache.get_or_compute_each("thing", [rgb.Point3f(1, 2, 3)] * 2, 0, make)) == [1, 1]
 
 
 def test_each_thing_has_its_own(rgb, made):
     cache, (_, make) = ObserverCache(), made
     eye = [rgb.Point3f(1, 2, 3)]
-    assert [values(cache.of_each(t, eye, 0, make)) for t in ("a", "b", "a")] == [[1], [2], [1]]
+    assert [values(cache.get_or_compute_each(t, eye, 0, make)) for t in ("a", "b", "a")] == [[1], [2], [1]]
     assert values(cache.peek("a")) == [1] and cache.peek("c") == []
-    cache.forget()
-    assert values(cache.of_each("a", eye, 0, make)) == [3] and cache.peek("b") == []
+    cache.clear()
+    assert values(cache.get_or_compute_each("a", eye, 0, make)) == [3] and cache.peek("b") == []
 
 
 def test_other_arrays_make_it_anew(rgb, made):
     cache, (_, make) = ObserverCache(), made
     eye, weights = [rgb.Point3f(1, 2, 3)], rgb.Float([1, 2, 3])
-    ask = lambda: values(cache.of_each("thing", eye, Fingerprint([weights]), make))
+    ask = lambda: values(cache.get_or_compute_each("thing", eye, Fingerprint([weights]), make))
     assert ask() == ask() == [1]
     weights += 0
     # Equal in value, and another array: it may be another one in every lane.
@@ -116,7 +116,7 @@ def test_positions_carry_no_derivatives(rgb, made):
     cache, (_, make) = ObserverCache(), made
     p = rgb.Point3f(1, 2, 3)
     dr.enable_grad(p)
-    (known,) = cache.of_each("thing", [p], 0, make)
+    (known,) = cache.get_or_compute_each("thing", [p], 0, make)
     assert not dr.grad_enabled(known.center)
 
 
@@ -126,7 +126,7 @@ def test_nothing_is_kept_of_a_recording(rgb):
 
     @dr.freeze
     def double(p):
-        (known,) = cache.of_each("thing", [p], 0, lambda center: center.x * 2)
+        (known,) = cache.get_or_compute_each("thing", [p], 0, lambda center: center.x * 2)
         return known.value + 0
 
     for x in (1.0, 2.0, 3.0):
@@ -137,20 +137,20 @@ def test_nothing_is_kept_of_a_recording(rgb):
 def test_a_place_is_told_by_its_shapes_and_its_medium(rgb):
     scene = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
     of = fingerprint_of
-    first = of(Place(None, scene))
-    assert first == of(Place(None, scene)) != of(Place(None))
+    first = of(SceneGeometry(None, scene))
+    assert first == of(SceneGeometry(None, scene)) != of(SceneGeometry(None))
     params = rgb.traverse(scene)
     params[next(k for k in params.keys() if k.endswith("to_world"))] = rgb.Transform4f().translate([0, 0, 0.5])
     params.update()
-    assert of(Place(None, scene)) != first
+    assert of(SceneGeometry(None, scene)) != first
     volume = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.ones((2, 2, 2), np.float32))})
     medium = VolumeMedium(volume)
-    before = of(Place(medium))
-    assert before == of(Place(medium))
+    before = of(SceneGeometry(medium))
+    assert before == of(SceneGeometry(medium))
     params = rgb.traverse(volume)
     params["data"] = params["data"] * 2
     params.update()
-    assert of(Place(medium)) != before
+    assert of(SceneGeometry(medium)) != before
 
 
 # ---- Settings of what is traced from an observer: which of them decide where a ray meets its surface ----
@@ -208,8 +208,8 @@ def test01_center_is_not_the_near_plane(rgb, kind):
     extra = {"aperture_radius": 0.1, "focus_distance": 3.0} if kind == "thinlens" else {}
     extra |= {} if kind == "panorama" else {"near_clip": 1.0}
     sensor = rgb.load_dict(camera(rgb, [1, 2, 3], kind=kind, **extra))
-    assert np.allclose(np.array(observer.center(sensor)).ravel(), [1, 2, 3], atol=1e-6)
-    observer.require_center(sensor, "x")
+    assert np.allclose(np.array(observer.sensor_center(sensor)).ravel(), [1, 2, 3], atol=1e-6)
+    observer.check_center(sensor, "x")
     got = np.array(observer.center_of_ray([sensor], rays_of(rgb, sensor)))
     assert np.allclose(got.reshape(3, -1).T, [1, 2, 3], atol=1e-6)
 
@@ -224,7 +224,7 @@ def test02_sensors_without_a_center(rgb, kind):
             {"type": kind, "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}}
         )
     with pytest.raises(ValueError, match='"observer"'):
-        observer.require_center(sensor, "the camera")
+        observer.check_center(sensor, "the camera")
     with pytest.raises(ValueError, match="no centre"):
         observer.center_of_ray([sensor], rays_of(rgb, rgb.load_dict(camera(rgb, [0, 0, 1]))))
 
@@ -251,11 +251,11 @@ def test03_rays_of_a_batch_find_their_camera(rgb, near):
 def test04_same_center(rgb):
     a, b = rgb.load_dict(camera(rgb, [1, 2, 3], near_clip=1.0)), rgb.load_dict(camera(rgb, [1, 2, 3.001]))
     turned = rgb.load_dict(camera(rgb, [1, 2, 3], target=(5, 0, 1), fov=70))
-    assert observer.same_center([a], observer.center(turned)) and not observer.same_center([a], observer.center(b))
-    assert not observer.same_center([a, b], observer.center(a)) and not observer.same_center([], observer.center(a))
+    assert observer.same_center([a], observer.sensor_center(turned)) and not observer.same_center([a], observer.sensor_center(b))
+    assert not observer.same_center([a, b], observer.sensor_center(a)) and not observer.same_center([], observer.sensor_center(a))
     ortho = rgb.load_dict({"type": "orthographic"})
-    assert not observer.same_center([ortho], observer.center(ortho))
-    assert observer.same_center([batch(rgb, camera(rgb, [1, 2, 3]), camera(rgb, [1, 2, 3]))], observer.center(a))
+    assert not observer.same_center([ortho], observer.sensor_center(ortho))
+    assert observer.same_center([batch(rgb, camera(rgb, [1, 2, 3]), camera(rgb, [1, 2, 3]))], observer.sensor_center(a))
 
 
 def test05_no_sensor(rgb):
@@ -271,7 +271,7 @@ def test06_center_is_attached_to_the_placement(rgb):
     dr.enable_grad(x)
     params["to_world"] = rgb.Transform4f().translate([x, 2 * x, 0]) @ rgb.Transform4f(params["to_world"])
     params.update()
-    c = observer.center(sensor)
+    c = observer.sensor_center(sensor)
     dr.backward(c.x + c.y)
     assert np.isclose(dr.grad(x).numpy()[0], 3)
 
@@ -301,12 +301,12 @@ def test_each_lane_has_what_belongs_to_the_nearest(rgb, count):
 class Counting:
     """A view that counts for whom it was made: the x of the observer, plus that of the direction."""
 
-    occluded = True
+    is_occluded = True
 
     def __init__(self):
         self.made = 0
 
-    def at(self, p_o):
+    def for_position(self, p_o):
         self.made += 1
         return Of(p_o.x)
 
@@ -315,7 +315,7 @@ class Of:
     def __init__(self, x):
         self.x = x
 
-    def value(self, r_o):
+    def evaluate(self, r_o):
         return self.x + r_o.x
 
 
@@ -324,7 +324,7 @@ def test_a_view_is_made_once_an_observer(rgb):
     eyes = [rgb.Point3f(1, 0, 0), rgb.Point3f(5, 0, 0)]
     p_o, r_o = rgb.Point3f([1, 5, 5], 0, 0), rgb.Vector3f([0.1, 0.2, 0.3], 0, 0)
     for _ in range(2):
-        assert np.allclose(view_along(view, eyes, p_o, r_o, cache).numpy(), [1.1, 5.2, 5.3])
+        assert np.allclose(evaluate_view(view, eyes, p_o, r_o, cache).numpy(), [1.1, 5.2, 5.3])
         assert view.made == 2
 
 
@@ -333,7 +333,7 @@ def test_a_frozen_function_is_refused(rgb):
 
     @dr.freeze
     def frozen(p):
-        return view_along(Counting(), [p], p, rgb.Vector3f(0, 0, 1), cache)
+        return evaluate_view(Counting(), [p], p, rgb.Vector3f(0, 0, 1), cache)
 
     with pytest.raises(RuntimeError) as refused:
         frozen(rgb.Point3f(rgb.Float([1]), 0, 0))
@@ -342,12 +342,12 @@ def test_a_frozen_function_is_refused(rgb):
 
 def test_support_is_that_of_the_place_in_the_scene(rgb):
     origins = np.random.default_rng(0).normal(size=(100, 3))
-    support = RaySupport.of(origins, 2.0)
+    support = RaySupport.from_origins(origins, 2.0)
     m = np.array([[0, -2.0, 0, 5], [2, 0, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]])
     p = np.array([0.2, -0.3, 0.4])
-    alone = support.at(rgb.Point3f(*map(float, p)))[0]
+    alone = support.evaluate(rgb.Point3f(*map(float, p)))[0]
     there = rgb.Point3f(*map(float, (m @ [*p, 1])[:3]))
-    found = SupportView(support, Similarity(m)).at(there).value(rgb.Vector3f(0, 0, 1))
+    found = SupportView(support, Similarity(m)).for_position(there).evaluate(rgb.Vector3f(0, 0, 1))
     assert found[0] == pytest.approx(alone, rel=1e-5) and alone > 1
 
 
@@ -427,13 +427,13 @@ def test02_no_later_variable_takes_the_place_of_one(rgb):
 
 def test03_shapes_that_move(rgb):
     scene = rgb.load_dict({"type": "scene", "s": {"type": "sphere"}})
-    first, params = of_shapes(Place(None, scene)), rgb.traverse(scene)
+    first, params = of_shapes(SceneGeometry(None, scene)), rgb.traverse(scene)
     key = next(k for k in params.keys() if k.endswith("to_world"))
     for k in range(4):
         params[key] = rgb.Transform4f().translate([1 + k, 0, 0])
         params.update()
-        assert of_shapes(Place(None, scene)) != first
-    assert of_shapes(Place(None)) == []
+        assert of_shapes(SceneGeometry(None, scene)) != first
+    assert of_shapes(SceneGeometry(None)) == []
 
 
 # ---- What is minded while a function is recorded: that it is, and that garbage waits until it is over ----

@@ -16,12 +16,12 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.train.geometry import place_of_volume
-from nerg_mi.transport.geometry import Place, default_settings
+from nerg_mi.train.geometry import load_volume_geometry
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings
-from nerg_mi.transport.observer_gaze import FEWEST, FIRST, USUAL, PlacedGaze, integrate, nearest_depth
-from nerg_mi.transport.occlusion import trace_sight
+from nerg_mi.transport.observer_gaze import FEWEST, FIRST, USUAL, GazeFieldInstance, integrate, interpolate_nearest_depth
+from nerg_mi.transport.occlusion import trace_from_observer
 from tests.fields.gaze.test_log_density import BOX, SMALL
 from tests.plugins.scenes import plugin
 
@@ -35,7 +35,7 @@ SETTINGS = ObserverSettings(march=MarchSettings(0.1))
 
 def integral_at(mi, gaze, place, p, settings=SETTINGS, count=1 << 12, **more):
     p_o = mi.Point3f(*map(float, p))
-    return float(gaze.at([p_o], place, replace(settings, directions=count), **more).integrals(p_o)[0][0])
+    return float(gaze.for_observers([p_o], place, replace(settings, directions=count), **more).integrals(p_o)[0][0])
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def speckled(tmp_path_factory):
     density[8:16, 12:20, 12:20] = 0
     path = tmp_path_factory.mktemp("place") / "hits.vol"
     write_volume(path, density, BOX.lower, BOX.upper)
-    return place_of_volume(path).medium
+    return load_volume_geometry(path).medium
 
 
 @pytest.mark.parametrize("escaped", ["constant", "nearest"])
@@ -57,8 +57,8 @@ def test_does_not_depend_on_the_number_of_directions(speckled, escaped):
     rng = np.random.default_rng(1)
     # Steep, so that it matters where what escapes is taken to end.
     field.set_parameters({"grid.table": ns.Float(10 * rng.normal(size=len(field.grid.table)).astype(np.float32))})
-    place, settings = Place(speckled), ObserverSettings(march=default_settings(speckled))
-    integral = lambda count, p: integral_at(mi, PlacedGaze(field), place, p, settings, count)
+    place, settings = SceneGeometry(speckled), ObserverSettings(march=default_march_settings(speckled))
+    integral = lambda count, p: integral_at(mi, GazeFieldInstance(field), place, p, settings, count)
     for p in ((0, 0, 1.5), (0.3, -0.2, 1.6)):
         assert integral(1 << 17, p) == pytest.approx(integral(1 << 19, p), rel=3e-4), p
 
@@ -78,7 +78,7 @@ def test_is_the_sum_over_what_is_seen_all_around(rgb, variant):
         )
     )
     o = np.array([0.4, -0.7, 1.7])
-    found = integral_at(rgb, PlacedGaze(field), Place(None, room), o, SETTINGS, 1 << 16)
+    found = integral_at(rgb, GazeFieldInstance(field), SceneGeometry(None, room), o, SETTINGS, 1 << 16)
     d = fibonacci_directions(20_000)
     walls = np.where(d > 0, [1.9, 1.9, 2.9], [-1.9, -1.9, 0.1])
     # Parallel to a wall, a direction never meets it.
@@ -89,7 +89,7 @@ def test_is_the_sum_over_what_is_seen_all_around(rgb, variant):
 
 
 def room(mi):
-    return Place(None, mi.load_dict({"type": "scene", "walls": {"type": "cube"}}))
+    return SceneGeometry(None, mi.load_dict({"type": "scene", "walls": {"type": "cube"}}))
 
 
 def normalized():
@@ -102,24 +102,24 @@ def normalized():
 
 def test_a_placed_field_has_no_densities(rgb):
     """Neither the field's own are offered, nor those of observers whom nobody named."""
-    gaze = PlacedGaze(normalized())
+    gaze = GazeFieldInstance(normalized())
     assert not any(hasattr(gaze, name) for name in ("evaluate", "spread", "along"))
     with pytest.raises(ValueError, match="needs to know the observers"):
-        gaze.at([], room(rgb), SETTINGS)
+        gaze.for_observers([], room(rgb), SETTINGS)
 
 
 def test_what_is_observed_stays_as_it_was(rgb):
     """Other observers, who are asked for with the same cache, change nothing of it."""
-    gaze, place, cache = PlacedGaze(normalized()), room(rgb), ObserverCache()
+    gaze, place, cache = GazeFieldInstance(normalized()), room(rgb), ObserverCache()
     eyes = [rgb.Point3f(0.1, 0.2, 0.3), rgb.Point3f(-0.4, 0.1, 0)]
     point, d = rgb.Point3f(0.2, 0.9, 0.4), rgb.Vector3f(0, 1, 0)
-    first = gaze.at(eyes[:1], place, replace(SETTINGS, directions=1 << 10), cache)
+    first = gaze.for_observers(eyes[:1], place, replace(SETTINGS, directions=1 << 10), cache)
     before = first.evaluate(point, eyes[0], d, True)[0].numpy()
-    second = gaze.at(eyes[1:], place, replace(SETTINGS, directions=1 << 10), cache)
+    second = gaze.for_observers(eyes[1:], place, replace(SETTINGS, directions=1 << 10), cache)
     assert first.evaluate(point, eyes[0], d, True)[0].numpy() == before
     assert first.integrals(eyes[0])[0].numpy() != second.integrals(eyes[1])[0].numpy()
     # Of both together each lane has that of its own observer.
-    both = gaze.at(eyes, place, replace(SETTINGS, directions=1 << 10), cache)
+    both = gaze.for_observers(eyes, place, replace(SETTINGS, directions=1 << 10), cache)
     lanes = rgb.Point3f([0.1, -0.4], [0.2, 0.1], [0.3, 0.0])
     each = np.concatenate([o.integrals(eye)[0].numpy() for o, eye in zip((first, second), eyes)])
     assert np.array_equal(both.integrals(lanes)[0].numpy(), each)
@@ -127,10 +127,10 @@ def test_what_is_observed_stays_as_it_was(rgb):
 
 def test_surroundings_are_traced_once_an_observer(rgb, monkeypatch):
     """Whatever becomes of the weights; anew for another observer, another place or other settings."""
-    traced, trace = [], Place.trace
-    monkeypatch.setattr(Place, "trace", lambda *a, **k: (traced.append(a), trace(*a, **k))[1])
+    traced, trace = [], SceneGeometry.trace
+    monkeypatch.setattr(SceneGeometry, "trace", lambda *a, **k: (traced.append(a), trace(*a, **k))[1])
     field = normalized()
-    gaze, place, cache = PlacedGaze(field), room(rgb), ObserverCache()
+    gaze, place, cache = GazeFieldInstance(field), room(rgb), ObserverCache()
     counts = []
 
     def ask(p=(0.1, 0.2, 0.3), place=place, **more):
@@ -154,13 +154,13 @@ def test_surroundings_are_traced_once_an_observer(rgb, monkeypatch):
 
 def test_derivatives_pass_the_integral_and_are_not_kept(rgb):
     field, eye = normalized(), rgb.Point3f(0.1, 0.2, 0.3)
-    gaze, place, cache = PlacedGaze(field), room(rgb), ObserverCache()
+    gaze, place, cache = GazeFieldInstance(field), room(rgb), ObserverCache()
     prior = field.prior
     for _ in range(2):
         shift = rgb.Float(0)
         dr.enable_grad(shift)
         field.set_parameters({"prior": prior + shift})
-        value = gaze.at([eye], place, replace(SETTINGS, directions=1 << 10), cache).integrals(eye)[0]
+        value = gaze.for_observers([eye], place, replace(SETTINGS, directions=1 << 10), cache).integrals(eye)[0]
         dr.forward_from(shift)
         assert dr.grad(value)[0] == pytest.approx(float(value[0]), rel=1e-4)
     assert cache.peek((gaze, "integral", field)) == []
@@ -176,11 +176,11 @@ def test_gaze_turns_and_does_not_scale(rgb):
 
     def evaluate(gaze, p_od, p_o, r):
         p_od, p_o, r = (kind(v.tolist()) for kind, v in zip((rgb.Point3f, rgb.Point3f, rgb.Vector3f), (p_od, p_o, r)))
-        return [v.numpy()[0] for v in gaze.at([p_o], Place(None), SETTINGS).evaluate(p_od, p_o, r, True)]
+        return [v.numpy()[0] for v in gaze.for_observers([p_o], SceneGeometry(None), SETTINGS).evaluate(p_od, p_o, r, True)]
 
-    plain = evaluate(PlacedGaze(g), p_od, p_o, r)
+    plain = evaluate(GazeFieldInstance(g), p_od, p_o, r)
     m = np.array([[0, -50.0, 0, 3], [50, 0, 0, -7], [0, 0, 50, 11], [0, 0, 0, 1]])
-    moved = evaluate(PlacedGaze(g, Similarity(m)), (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r / 50)
+    moved = evaluate(GazeFieldInstance(g, Similarity(m)), (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r / 50)
     assert np.allclose(plain, moved, rtol=1e-4)
 
 
@@ -190,7 +190,7 @@ def test_derivatives_of_the_observer_pass_the_integral(rgb, trained):
     field = normalized()
     # Steep, so that it matters where walls are.
     field.set_parameters({k: 16 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")})
-    gaze, place, o = PlacedGaze(field), room(rgb), np.array([0.3, -0.2, 0.4])
+    gaze, place, o = GazeFieldInstance(field), room(rgb), np.array([0.3, -0.2, 0.4])
     array = lambda v: namespace("llvm_ad_rgb").Array3f(np.ascontiguousarray(v.T, np.float32))
     d = fibonacci_directions(200_000)
 
@@ -207,7 +207,7 @@ def test_derivatives_of_the_observer_pass_the_integral(rgb, trained):
     dr.enable_grad(p_o)
     if trained:
         dr.enable_grad(field.grid.table)
-    found = gaze.at([p_o], place, replace(SETTINGS, directions=1 << 15)).integrals(p_o)[0]
+    found = gaze.for_observers([p_o], place, replace(SETTINGS, directions=1 << 15)).integrals(p_o)[0]
     assert float(dr.detach(found)[0]) == pytest.approx(integral(o), rel=2e-3)
     dr.backward(found)
     assert np.linalg.norm(true) > 0.1 * integral(o)
@@ -220,13 +220,13 @@ def test_a_cache_tells_tolerances_of_the_integral_apart(rgb):
     field, eye = normalized(), rgb.Point3f(0.1, 0.2, 0.3)
     # Steep, so that sums over few directions are off.
     field.set_parameters({k: 16 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")})
-    gaze, place, cache = PlacedGaze(field), room(rgb), ObserverCache()
+    gaze, place, cache = GazeFieldInstance(field), room(rgb), ObserverCache()
     point, ray = rgb.Point3f(0.2, 1, 0.4), rgb.Ray3f(rgb.Point3f(0.2, 0, 0.4), rgb.Vector3f(0, 1, 0))
 
     def ask(cache, **settings):
         chosen = replace(SETTINGS, directions=1 << 15, visibility="map", map_height=16, **settings)
-        observed = gaze.at([eye], place, chosen, cache)
-        sight = trace_sight(
+        observed = gaze.for_observers([eye], place, chosen, cache)
+        sight = trace_from_observer(
             place, ray, point, eye, rgb.Float(0), rgb.Bool(True), 0.0, chosen, gaze=observed, cache=cache
         )
         return float(observed.integrals(eye)[0][0]), float(sight.gaze[0])
@@ -339,6 +339,6 @@ def test_depths_of_what_escapes_are_those_of_its_neighbours(count):
         near = np.argsort(apart)[:8]
         weight = 1 / (apart[near] ** 2 + 1e-3)
         expected.append(np.exp(np.sum(weight * np.log(depth[near])) / weight.sum()))
-    np.testing.assert_allclose(nearest_depth(known, depth, wanted), expected, rtol=1e-5)
+    np.testing.assert_allclose(interpolate_nearest_depth(known, depth, wanted), expected, rtol=1e-5)
     # A depth of zero has a logarithm too.
-    assert nearest_depth(known, np.zeros(count), wanted) == pytest.approx(1e-6)
+    assert interpolate_nearest_depth(known, np.zeros(count), wanted) == pytest.approx(1e-6)

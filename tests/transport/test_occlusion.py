@@ -6,10 +6,10 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings
-from nerg_mi.transport.occlusion import ObserverMap, trace_sight
+from nerg_mi.transport.occlusion import ObserverMap, trace_from_observer
 from nerg_mi.transport.volume_medium import VolumeMedium
 
 # ---- Depth map ----
@@ -24,7 +24,7 @@ SETTINGS = ObserverSettings(march=MarchSettings(0.1), depth="expected", map_heig
 def around(rgb):
     """The map of an observer in the middle of a ball of radius 2."""
     ball = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
-    return ObserverMap(Place(None, ball), rgb.Point3f(0.0), SETTINGS)
+    return ObserverMap(SceneGeometry(None, ball), rgb.Point3f(0.0), SETTINGS)
 
 
 def unit(phi, theta):
@@ -114,7 +114,7 @@ def test_the_gaze_of_a_map_is_that_of_its_directions(rgb):
             return (p_od.x + 10 * r_o.z + 100 * p_o.y,)
 
     half = {"type": "disk", "to_world": rgb.ScalarTransform4f().translate([0, 0, 2]).scale(1e3)}
-    around = ObserverMap(Place(None, rgb.load_dict({"type": "scene", "half": half})), rgb.Point3f(0, 1, 0), SETTINGS)
+    around = ObserverMap(SceneGeometry(None, rgb.load_dict({"type": "scene", "half": half})), rgb.Point3f(0, 1, 0), SETTINGS)
     width = np.pi / HEIGHT
     theta, phi = np.meshgrid((np.arange(HEIGHT) + 0.5) * width, (np.arange(2 * HEIGHT) + 0.5) * width, indexing="ij")
     x, _, z = unit(phi.ravel(), theta.ravel()).astype(float)
@@ -131,7 +131,7 @@ STEP = 0.01
 
 def slab(mi, sigma):
     """Matter between z = 0 and z = 1."""
-    return Place(VolumeMedium(mi.load_dict({"type": "constvolume", "value": float(sigma)})))
+    return SceneGeometry(VolumeMedium(mi.load_dict({"type": "constvolume", "value": float(sigma)})))
 
 
 def look(
@@ -154,7 +154,7 @@ def look(
     march = MarchSettings(STEP, dt_gamma=dt_gamma)
     settings = ObserverSettings(march=march, visibility=kind, tolerance=tolerance, map_height=64)
     points = (mi.Point3f(*map(float, p)) for p in (p_d, p_o))
-    return trace_sight(place, ray, *points, penetration, mi.Bool(True), mi.Float(falloff), settings, **more)
+    return trace_from_observer(place, ray, *points, penetration, mi.Bool(True), mi.Float(falloff), settings, **more)
 
 
 @pytest.mark.parametrize(

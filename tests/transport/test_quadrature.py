@@ -23,12 +23,12 @@ from nerg_mi.transport.quadrature import (
     RULES,
     MarchStep,
     Registry,
-    absorbed_share,
+    absorbed_fraction,
     boundaries,
     color_share,
     linear_crossing,
     linear_share,
-    mean_depth_share,
+    mean_depth_fraction,
     register_quadrature,
 )
 from nerg_mi.transport.volume_medium import VolumeMedium
@@ -69,12 +69,12 @@ def test01_the_reference_agrees_with_quadrature():
 
 def test02_mean_depth_share():
     tau = np.concatenate([TAU[::8], np.nextafter(np.float32(0.5), [0, 1]).astype(np.float32)])
-    got = mean_depth_share(ns.Float(tau)).numpy()
+    got = mean_depth_fraction(ns.Float(tau)).numpy()
     assert np.all(np.abs(got - exact_share(tau)) <= 1e-6 * exact_share(tau))
 
 
 def test03_its_ends():
-    got = mean_depth_share(ns.Float([0, 1e-38, 3e38, np.inf])).numpy()
+    got = mean_depth_fraction(ns.Float([0, 1e-38, 3e38, np.inf])).numpy()
     assert got[0] == 0.5 and got[1] == 0.5 and abs(got[2]) < 1e-34 and abs(got[3]) < 1e-34
 
 
@@ -93,7 +93,7 @@ def slope_of(function, x, mode):
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 def test04_derivatives_are_finite_and_right(mode):
     tau = np.concatenate([[0], TAU[::8], [np.inf]]).astype(np.float32)
-    got = slope_of(mean_depth_share, tau, mode)
+    got = slope_of(mean_depth_fraction, tau, mode)
     assert np.all(np.isfinite(got))
     t = tau[1:-1].astype(float)
     with np.errstate(over="ignore"):
@@ -109,10 +109,10 @@ def test05_splitting_a_step_changes_nothing(share):
     tau = TAU[TAU < 1e4]
     a, b = ns.Float(tau * np.float32(share)), ns.Float(tau * np.float32(1 - share))
     whole = ns.Float(tau)
-    behind = dr.exp(-a) * absorbed_share(b)
-    assert np.allclose((absorbed_share(a) + behind).numpy(), absorbed_share(whole).numpy(), rtol=1e-6)
-    moment = absorbed_share(a) * share * mean_depth_share(a) + behind * (share + (1 - share) * mean_depth_share(b))
-    expected = (absorbed_share(whole) * mean_depth_share(whole)).numpy()
+    behind = dr.exp(-a) * absorbed_fraction(b)
+    assert np.allclose((absorbed_fraction(a) + behind).numpy(), absorbed_fraction(whole).numpy(), rtol=1e-6)
+    moment = absorbed_fraction(a) * share * mean_depth_fraction(a) + behind * (share + (1 - share) * mean_depth_fraction(b))
+    expected = (absorbed_fraction(whole) * mean_depth_fraction(whole)).numpy()
     assert np.allclose(moment.numpy(), expected, rtol=2e-6)
 
 
@@ -166,7 +166,7 @@ def test08_linear_share():
     got = linear_share(ns.Float(a), ns.Float(b)).numpy()
     assert np.abs(got / exact_linear_share(a, b) - 1).max() < 1e-6
     equal = linear_share(ns.Float(TAU), ns.Float(TAU)).numpy()
-    assert np.allclose(equal, mean_depth_share(ns.Float(TAU)).numpy(), rtol=1e-6)
+    assert np.allclose(equal, mean_depth_fraction(ns.Float(TAU)).numpy(), rtol=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["forward", "backward"])
@@ -222,7 +222,7 @@ def things():
 def test01_names_come_in_the_order_of_registration(things):
     assert things.names() == ("sweet", "bitter") and [t.name for t in things] == ["sweet", "bitter"]
     assert things.find("bitter").summary == "like tea"
-    assert things.manual() == "``sweet``: like honey. ``bitter``: like tea."
+    assert things.format_manual() == "``sweet``: like honey. ``bitter``: like tea."
 
 
 def test02_what_is_missing_is_said_beside_what_there_is(things):
@@ -275,7 +275,7 @@ def ramp(mi, n=8, gain=4.0):
 
 
 def gather(mi, medium, o, d, settings, **kwargs):
-    ray = medium.local(mi.Point3f(*map(float, o)), mi.Vector3f(*map(float, d)))
+    ray = medium.ray_to_local(mi.Point3f(*map(float, o)), mi.Vector3f(*map(float, d)))
     return march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, settings, **kwargs)
 
 
@@ -284,7 +284,7 @@ def gather(mi, medium, o, d, settings, **kwargs):
 def test03_exact_in_opacity_for_linear_densities(rgb, kind, step):
     # From inside the ramp, where the interpolant is one line.
     medium = ramp(rgb)
-    ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+    ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
     r = march(medium, ray, rgb.Float(0.0625), rgb.Float(0.9375), True, MarchSettings(step, quadrature=kind, stop=0))
     assert np.isclose(r.tau.numpy()[0], 2 * (0.9375**2 - 0.0625**2), rtol=1e-5)
 
@@ -513,7 +513,7 @@ class Simpson:
 
     name = "simpson"
     summary = "three samples a step"
-    in_cells = False
+    ends_at_cells = False
 
     def start(self, Float):
         return None
@@ -526,7 +526,7 @@ class Simpson:
             dtau,
             linear_share(first * delta, last * delta),
             lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),
-            lambda painter, lit: painter.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit),
+            lambda painter, lit: painter.shade(medium, medium.density_features(p, lit)[1], p, ray.w, lit),
             None,
             dr.select(active, 3.0, 0.0),
         )
@@ -600,5 +600,5 @@ def test04_shapes_and_other_depths_go_with_it(rgb, simpson):
 
 def test05_it_is_offered_wherever_rules_are(rgb, simpson):
     subject = SimpleNamespace(marched=True, hits=False, extent=1.0, has_gaze=True, normalized=False, resampled=True)
-    assert {s.params.get("quadrature") for s in study.settings(subject)} >= {"constant", "linear", "simpson"}
-    assert RULES.manual().endswith("``simpson``: three samples a step.")
+    assert {s.params.get("quadrature") for s in study.list_rows(subject)} >= {"constant", "linear", "simpson"}
+    assert RULES.format_manual().endswith("``simpson``: three samples a step.")

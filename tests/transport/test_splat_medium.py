@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.fields.splats import Splats, harmonics_of
+from nerg_mi.fields.splats import Splats, harmonics_from_colors
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.maths.sphere import harmonics
+from nerg_mi.maths.sphere import eval_harmonics
 from nerg_mi.transport.medium import LastHit
 from nerg_mi.transport.splat_medium import AT_ONCE, SplatArrays, SplatMedium, build_tree
 from tests.formats.splats.writers import random_splats
@@ -28,7 +28,7 @@ def stack(depths, opacities, scale=0.1, colors=None) -> Splats:
     n = len(depths)
     centers = np.stack([np.zeros(n), np.zeros(n), np.asarray(depths, float)], axis=1)
     colors = np.full((n, 3), 0.5) if colors is None else colors
-    return Splats(centers, np.full((n, 3), scale), [[1, 0, 0, 0]] * n, opacities, harmonics_of(colors))
+    return Splats(centers, np.full((n, 3), scale), [[1, 0, 0, 0]] * n, opacities, harmonics_from_colors(colors))
 
 
 def rays(count: int, seed: int = 0, size: float = 1.2) -> tuple[np.ndarray, np.ndarray]:
@@ -47,12 +47,12 @@ def test_peaks_and_colors_are_those_of_float64():
     o, d = rays(200)
     place = np.random.default_rng(0).integers(0, 30, 200)
     index = np.array(arrays.order)[place]
-    t, absorbed, distance = arrays.peak(ns.UInt32(place), ns.Array3f(o.T), ns.Array3f(d.T), True)
+    t, absorbed, distance = arrays.find_peak(ns.UInt32(place), ns.Array3f(o.T), ns.Array3f(d.T), True)
     wanted = [v[np.arange(200), index] for v in peaks(splats, o, d, extent=np.inf)]
     assert np.allclose(t, wanted[0], atol=1e-5) and np.allclose(absorbed, wanted[1], atol=1e-5)
     assert np.allclose(np.minimum(splats.opacities[index] * np.exp(-0.5 * np.array(distance)), 0.9999), wanted[1])
     color = np.stack([np.array(c) for c in arrays.color(ns.UInt32(place), ns.Array3f(d.T), True)], axis=1)
-    seen = np.einsum("rk,rkc->rc", harmonics(d, 3), splats.harmonics[index].astype(float)) + 0.5
+    seen = np.einsum("rk,rkc->rc", eval_harmonics(d, 3), splats.harmonics[index].astype(float)) + 0.5
     assert np.allclose(color, np.maximum(seen, 0), atol=1e-5)
 
 
@@ -78,16 +78,16 @@ def test_a_placed_medium_meets_what_placed_splats_would(rgb):
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 2.5 * Rotation.random(random_state=np.random.default_rng(1)).as_matrix(), [1, 0, 2]
     to_world = Similarity(matrix)
-    placed, there = medium_of(splats, to_world), medium_of(splats.placed(to_world))
-    assert np.isclose(placed.step, there.step, rtol=1e-5)
+    placed, there = medium_of(splats, to_world), medium_of(splats.transform(to_world))
+    assert np.isclose(placed.default_step, there.default_step, rtol=1e-5)
     # A turned box has a larger one around it.
     (low, high), (least, most) = placed.bounds(), there.bounds()
     assert (low <= least + 1e-5).all() and (most <= high + 1e-5).all()
     of = []
     for medium in (placed, there):
-        ray = medium.local(rgb.Point3f((2.5 * o).T), rgb.Vector3f(d.T))
+        ray = medium.ray_to_local(rgb.Point3f((2.5 * o).T), rgb.Vector3f(d.T))
         index = np.argsort(np.array(medium.arrays.order))[np.arange(50) % 20]
-        t, share = medium.hits.again(ray, rgb.UInt32(index), True)
+        t, share = medium.hits.reevaluate(ray, rgb.UInt32(index), True)
         color = medium.color([rgb.UInt32(index)], None, ray.w, True)
         of.append(np.stack([np.array(v) for v in (t, share, *color)]))
     assert np.allclose(of[0], of[1], rtol=1e-3, atol=1e-4)
@@ -109,13 +109,13 @@ def test_there_is_no_density(rgb):
 def test_groups_are_the_next_of_all_in_their_order(rgb):
     splats = random_splats(80, degree=0, size=0.3)
     medium, (o, d) = medium_of(splats), rays(300)
-    ray = medium.local(rgb.Point3f(o.T), rgb.Vector3f(d.T))
+    ray = medium.ray_to_local(rgb.Point3f(o.T), rgb.Vector3f(d.T))
     all_t, share = peaks(splats, o, d)
     wanted = np.sort(np.where((share > 0) & (all_t > 0), all_t, np.inf), axis=1)
     after, everywhere = LastHit(rgb.Float(0), rgb.UInt32(0)), dr.full(rgb.Bool, True, 300)
     # No light is ever used up: three groups hold the first of them, and nothing twice.
     for group in range(3):
-        found = medium.hits.nearest(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), everywhere)
+        found = medium.hits.find_next(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), everywhere)
         dr.eval(found.t, found.absorbed, found.index)
         t = np.stack([np.array(v) for v in found.t], axis=1)
         part = wanted[:, group * AT_ONCE : (group + 1) * AT_ONCE]
@@ -123,7 +123,7 @@ def test_groups_are_the_next_of_all_in_their_order(rgb):
         assert np.array_equal(np.isfinite(t), met) and np.allclose(t[met], part[met], atol=1e-5)
         after = LastHit(found.t[-1], found.index[-1])
         everywhere = everywhere & dr.isfinite(found.t[-1])
-    again = medium.hits.again(ray, found.index[0], dr.isfinite(found.t[0]))
+    again = medium.hits.reevaluate(ray, found.index[0], dr.isfinite(found.t[0]))
     first = np.isfinite(t[:, 0])
     assert np.array_equal(np.array(again[0])[first], t[first, 0])
     assert np.array_equal(np.array(again[1])[first], np.array(found.absorbed[0])[first])
@@ -132,10 +132,10 @@ def test_groups_are_the_next_of_all_in_their_order(rgb):
 def test_peaks_at_one_place_are_all_met(rgb):
     count = 2 * AT_ONCE + 3
     medium = medium_of(stack([1.0] * count, np.full(count, 0.1)))
-    ray = medium.local(rgb.Point3f(0, 0, 0), rgb.Vector3f(0, 0, 1))
+    ray = medium.ray_to_local(rgb.Point3f(0, 0, 0), rgb.Vector3f(0, 0, 1))
     after, seen = LastHit(rgb.Float(0), rgb.UInt32(0)), []
     for _ in range(3):
-        found = medium.hits.nearest(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), rgb.Bool(True))
+        found = medium.hits.find_next(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), rgb.Bool(True))
         dr.eval(found.t, found.absorbed, found.index)
         seen += [i[0] for i, t in zip(found.index, found.t) if np.isfinite(t[0])]
         after = LastHit(found.t[-1], found.index[-1])
@@ -144,8 +144,8 @@ def test_peaks_at_one_place_are_all_met(rgb):
 
 def test_behind_what_takes_all_light_nothing_is_looked_at(rgb):
     medium = medium_of(stack(np.arange(1, 65), [0.9999] * 64))
-    ray = medium.local(rgb.Point3f(0, 0, 0), rgb.Vector3f(0, 0, 1))
-    look = lambda stop: medium.hits.nearest(
+    ray = medium.ray_to_local(rgb.Point3f(0, 0, 0), rgb.Vector3f(0, 0, 1))
+    look = lambda stop: medium.hits.find_next(
         ray, LastHit(rgb.Float(0), rgb.UInt32(0)), ray.t_far, rgb.Float(1), rgb.Float(stop), rgb.Bool(True)
     )
     assert look(1e-3).evals[0] <= 2 < look(0).evals[0]

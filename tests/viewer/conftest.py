@@ -87,7 +87,7 @@ def gaze_fields(rgb, tmp_path):
 @pytest.fixture
 def store(rgb):
     """The file of the demo store's scene, with its trained fields."""
-    path = demo.store_scene()
+    path = demo.find_store_scene()
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
     return path

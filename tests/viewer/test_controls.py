@@ -11,9 +11,9 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat, overlay, to_bytes
-from nerg_mi.figures.style import LINE, lines
+from nerg_mi.figures.style import LINE, hatch_lines
 from nerg_mi.formats.areas import Region
-from nerg_mi.rendering.nested_scene import with_gaze
+from nerg_mi.rendering.nested_scene import replace_gaze
 from nerg_mi.viewer import layers
 from nerg_mi.viewer.controls import Inset, box_around, edges, png_bytes, slider_end, table
 from nerg_mi.viewer.layers import STALE, Scale, Shade, layer_of
@@ -44,7 +44,7 @@ def test02_a_rectangle_to_the_right_and_above():
 
 
 def test03_a_box_has_twelve_edges():
-    found = edges(Region.of("a", [0, 0, 0], [1, 2, 3]))
+    found = edges(Region.create("a", [0, 0, 0], [1, 2, 3]))
     lengths = np.sort(np.abs(found[:, 1] - found[:, 0]).sum(axis=1))
     assert found.shape == (12, 2, 3) and np.allclose(lengths, [1] * 4 + [2] * 4 + [3] * 4)
     assert len(np.unique(found.reshape(12, -1), axis=0)) == 12 and len(np.unique(found.reshape(-1, 3), axis=0)) == 8
@@ -130,9 +130,9 @@ OF_ALL = "visible to the observer", "observer depth", "evaluations of density", 
 
 
 def test01_only_what_the_scene_has(store, room_scene):
-    titles = [la.title for la in layers.available(room_scene)]
+    titles = [la.title for la in layers.list_layers(room_scene)]
     assert titles == ["colour", "depth", "opacity", *(f"position {axis}" for axis in "XYZ"), *OF_ALL]
-    found = [la.title for la in layers.available(nerg.Scene.load(store))]
+    found = [la.title for la in layers.list_layers(nerg.Scene.load(store))]
     assert {"gaze", "colour", "depth", *OF_ALL, "features 0"} < set(found) and "uncertainty of gaze" not in found
 
 
@@ -140,8 +140,8 @@ def test01_a_factor_that_a_variant_lacks_is_no_layer(room, gaze_fields, tmp_path
     factors = {"what surfaces attract", "what the observer gives"}
     for path, expected in zip(gaze_fields, (factors, {"what surfaces attract"})):
         scene = tmp_path / "with.xml"
-        scene.write_text(with_gaze(room, path))
-        titles = {la.title for la in layers.available(nerg.Scene.load(scene))}
+        scene.write_text(replace_gaze(room, path))
+        titles = {la.title for la in layers.list_layers(nerg.Scene.load(scene))}
         assert "gaze" in titles and titles & factors == expected
 
 
@@ -156,10 +156,10 @@ def test01_a_channel_is_a_layer():
 def test02_heat_is_that_of_pictures():
     rng = np.random.default_rng(2)
     color, gaze, mask = rng.random((8, 9, 3)), rng.random((8, 9)), np.ones((8, 9), bool)
-    found = layers.colored(layer_of("gaze"), color, gaze, mask, Scale(0, 0.7, "magma"))
+    found = layers.colorize(layer_of("gaze"), color, gaze, mask, Scale(0, 0.7, "magma"))
     assert np.array_equal(found, to_bytes(overlay(color, gaze, Heat(0.7, "magma"), mask)))
     # Points are coloured as pixels are.
-    points = layers.colored(layer_of("gaze"), color.reshape(-1, 3), gaze.ravel(), mask.ravel(), Scale(0, 0.7, "magma"))
+    points = layers.colorize(layer_of("gaze"), color.reshape(-1, 3), gaze.ravel(), mask.ravel(), Scale(0, 0.7, "magma"))
     assert np.array_equal(points, found.reshape(-1, 3))
 
 
@@ -167,22 +167,22 @@ def test03_no_data_is_hatched():
     mask = np.ones((24, 24), bool)
     mask[:12] = False
     given = layer_of("depth"), np.zeros((24, 24, 3)), np.full((24, 24), 0.5), mask, Scale(0, 1)
-    shown, plain = layers.colored(*given), layers.colored(*given, hatched=False)
+    shown, plain = layers.colorize(*given), layers.colorize(*given, hatched=False)
     assert np.array_equal(shown[12:], plain[12:]) and len(np.unique(shown[12:].reshape(-1, 3), axis=0)) == 1
     # As pictures are: lines over paled colours.
-    drawn = lines(24, 24)[:12]
+    drawn = hatch_lines(24, 24)[:12]
     assert (shown[:12][drawn] == round(255 * LINE)).all()
     assert (shown[:12][~drawn] > plain[:12][~drawn]).all()
 
 
 def test04_ranges_are_those_of_the_values():
     values, mask = np.linspace(1, 3, 1000), np.ones(1000, bool)
-    low, high = layers.automatic(layer_of("depth"), values, mask)
+    low, high = layers.choose_range(layer_of("depth"), values, mask)
     assert low == pytest.approx(1.01) and high == pytest.approx(2.99)
-    assert layers.automatic(layer_of("gaze"), values, mask) == (0.0, pytest.approx(2.99))
-    assert layers.automatic(layer_of("gaze"), 0 * values, mask) is None
-    assert layers.automatic(layer_of("depth"), values, ~mask) is None
-    low, high = layers.automatic(layer_of("depth"), np.ones(5), np.ones(5, bool))
+    assert layers.choose_range(layer_of("gaze"), values, mask) == (0.0, pytest.approx(2.99))
+    assert layers.choose_range(layer_of("gaze"), 0 * values, mask) is None
+    assert layers.choose_range(layer_of("depth"), values, ~mask) is None
+    low, high = layers.choose_range(layer_of("depth"), np.ones(5), np.ones(5, bool))
     assert low < high
 
 
@@ -196,11 +196,11 @@ def test05_wrong_ranges_are_told(given):
 
 def test06_hidden_is_dark():
     color, mask = np.full((1, 2, 3), 0.5), np.ones((1, 2), bool)
-    seen, hidden = layers.colored(layer_of("visibility"), color, np.array([[1.0, 0.0]]), mask, Scale())[0].astype(int)
+    seen, hidden = layers.colorize(layer_of("visibility"), color, np.array([[1.0, 0.0]]), mask, Scale())[0].astype(int)
     assert seen.sum() > 2 * hidden.sum() and hidden[2] > hidden[0]
 
 
 def test07_the_legend_has_both_ends():
-    text = layers.legend(layer_of("gaze"), Scale(0.0, 0.1234))
+    text = layers.format_legend(layer_of("gaze"), Scale(0.0, 0.1234))
     assert ">0<" in text and ">0.123<" in text and ">1/sr<" in text
-    assert "hidden" in layers.legend(layer_of("visibility"), Scale())
+    assert "hidden" in layers.format_legend(layer_of("visibility"), Scale())

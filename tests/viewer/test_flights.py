@@ -108,11 +108,11 @@ def test05_sides_are_even(aspect, width):
 def test06_it_is_drawn_as_the_layer_is():
     frames = Path("frames.csv")
     gaze = film_options(layer_of("gaze"), Scale(0, 0.4, "magma"), frames, 25, "llvm_ad_rgb")
-    assert (gaze.overlay, gaze.top, gaze.cmap) == ("gaze", 0.4, "magma")
-    assert film_options(layer_of("visibility"), Scale(), frames, 25, "llvm_ad_rgb").top is None
+    assert (gaze.overlay, gaze.vmax, gaze.cmap) == ("gaze", 0.4, "magma")
+    assert film_options(layer_of("visibility"), Scale(), frames, 25, "llvm_ad_rgb").vmax is None
     assert film_options(layer_of("color"), Scale(), frames, 25, "llvm_ad_rgb").overlay is None
     depth = film_options(layer_of("depth"), Scale(1, 7), frames, 25, "llvm_ad_rgb")
-    assert (depth.overlay, depth.top, depth.cmap) == ("depth", 7, "inferno")
+    assert (depth.overlay, depth.vmax, depth.cmap) == ("depth", 7, "inferno")
 
 
 # ---- Flights of a camera: through the views that were kept, as frames that are read again ----

@@ -69,12 +69,12 @@ def drag(driver, start, end):
 
 @pytest.fixture(scope="module")
 def running():
-    from nerg_mi.rendering.scene import activate
+    from nerg_mi.rendering.scene import activate_variant
     from nerg_mi.workflows import demo
 
     require("viser")
-    activate("llvm_ad_rgb")
-    path = demo.store_scene()
+    activate_variant("llvm_ad_rgb")
+    path = demo.find_store_scene()
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
     with viewer([path], ViewOptions(port=0, width=160, spp=1)) as found:

@@ -151,12 +151,12 @@ def two_people() -> nerg.Rays:
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory):
-    from nerg_mi.rendering.scene import activate
+    from nerg_mi.rendering.scene import activate_variant
     from nerg_mi.workflows import demo
 
     require("viser")
-    activate("llvm_ad_rgb")
-    path = demo.store_scene()
+    activate_variant("llvm_ad_rgb")
+    path = demo.find_store_scene()
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
     rays = tmp_path_factory.mktemp("rays") / "rays.npz"

@@ -164,7 +164,7 @@ def test01_the_last_picture_is_that_of_the_integrator(room_scene):
 
 
 def test02_equal_seeds_give_equal_pictures_whatever_the_bands(room_scene):
-    view = PinholeView.of_sensor(room_scene.sensor(0))
+    view = PinholeView.of_sensor(room_scene.resolve_sensor(0))
     names = ["depth", "opacity"]
     one, other = BandPace(), BandPace()
     other._at = 2
@@ -179,7 +179,7 @@ def test03_a_picture_that_is_left_off_is_not_gone_on_with(room_scene, monkeypatc
     traced = []
     original = module.trace
     monkeypatch.setattr(module, "trace", lambda *a, **k: traced.append(len(a[2])) or original(*a, **k))
-    view = PinholeView.of_sensor(room_scene.sensor(0))
+    view = PinholeView.of_sensor(room_scene.resolve_sensor(0))
     steps = refine(room_scene, view, None, ["depth", "opacity"], 400, 4, BandPace())
     next(steps)
     steps.close()

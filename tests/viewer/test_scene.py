@@ -48,9 +48,9 @@ def test02_the_settings_are_those_that_were_viewed(store, tmp_path):
     path.write_text(copied(store, Shown(VIEW, EYE, ("depth",), 48, 3, 0.25)))
     scene = nerg.Scene.load(path, view_camera="1, 2, 1.5", view_observer="2, 2, 1.7")
     assert float(np.ravel(np.array(scene.integrator.falloff))[0]) == pytest.approx(0.25)
-    assert scene.sensor(0).sampler().sample_count() == 3 and len(scene.mitsuba.sensors()) == 4
+    assert scene.resolve_sensor(0).sampler().sample_count() == 3 and len(scene.mitsuba.sensors()) == 4
     assert np.allclose(scene.observer, [2, 2, 1.7])
-    assert np.allclose(PinholeView.of_sensor(scene.sensor(0)).origin, [1, 2, 1.5])
+    assert np.allclose(PinholeView.of_sensor(scene.resolve_sensor(0)).origin, [1, 2, 1.5])
 
 
 def test03_shapes_and_no_observer(room, tmp_path):

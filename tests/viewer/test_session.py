@@ -14,13 +14,13 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.nested_scene import with_gaze
+from nerg_mi.rendering.nested_scene import replace_gaze
 from nerg_mi.viewer import session as module
 from nerg_mi.viewer.layers import layer_of
 from nerg_mi.viewer.page import Page
 from nerg_mi.viewer.session import ALL, GAP, Listener, Session, Tracks, Worker
 from nerg_mi.workflows.scene_commands import ViewOptions
-from nerg_mi.workflows.view import place_to_view
+from nerg_mi.workflows.view import make_viewer_scene
 
 # ---- The page is told all that a session tells ----
 
@@ -59,7 +59,7 @@ def session_of(tmp_path):
 
     def make(path, *others, **options) -> Session:
         chosen = ViewOptions(**options)
-        session = Session(lambda: place_to_view([path, *others], tmp_path, chosen), chosen, Heard())
+        session = Session(lambda: make_viewer_scene([path, *others], tmp_path, chosen), chosen, Heard())
         made.append(session)
         session.start()
         return session
@@ -129,7 +129,7 @@ def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
     session.set_falloff(0.2)
     assert session.stale_points == "gaze of earlier settings" and session.stale_shares
     settle(session)
-    session.regions = [Region.of("a", (1, -1, 0), (2, 1, 1))]
+    session.regions = [Region.create("a", (1, -1, 0), (2, 1, 1))]
     assert session.stale_points == "" and session.stale_shares
 
 
@@ -189,8 +189,8 @@ def test03_layers_have_ranges_of_their_own(session_of, room):
 def test04_shares_are_those_of_the_library(session_of, store):
     session = session_of(store, observer=(4.6, 3.0, 1.6))
     session.regions = [
-        Region.of("drinks", (4.4, 4.65, 0), (4.9, 5.0, 1.45)),
-        Region.of("floor", (4, 2, -0.1), (5, 3, 0)),
+        Region.create("drinks", (4.4, 4.65, 0), (4.9, 5.0, 1.45)),
+        Region.create("floor", (4, 2, -0.1), (5, 3, 0)),
     ]
     settle(session)
     session.set_falloff(0.05)
@@ -269,7 +269,7 @@ def test08_what_cannot_be_counted_is_told_once(session_of, room, gaze_fields, mo
         raise NergError("no")
         yield
 
-    monkeypatch.setattr(module, "shares_in_steps", refuse)
+    monkeypatch.setattr(module, "iter_attention_shares", refuse)
     session = session_of(room, gaze_fields[0])
     assert session.worker.wait_idle(120)
     while not session.follow_shares():
@@ -287,15 +287,15 @@ AT = np.array([0.2, 0.1, 0.6])
 @pytest.fixture
 def scene(room, gaze_fields, tmp_path):
     path = tmp_path / "with.xml"
-    path.write_text(with_gaze(room, gaze_fields[0]))
+    path.write_text(replace_gaze(room, gaze_fields[0]))
     return nerg.Scene.load(path)
 
 
 def test01_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
     faces = {"floor": 2, "box": 12}
-    regions = [Region.of("left", (0, 0.5, -0.1), (2, 2, 0.4)), Region.of("right", (0, -2, -0.1), (2, -0.5, 0.4))]
+    regions = [Region.create("left", (0, 0.5, -0.1), (2, 2, 0.4)), Region.create("right", (0, -2, -0.1), (2, -0.5, 0.4))]
     shapes = [name for name in faces if name in {s.id() for s in scene.mitsuba.shapes() if s.is_mesh()}]
-    steps = list(module.shares_in_steps(scene, AT, regions, shapes))
+    steps = list(module.iter_attention_shares(scene, AT, regions, shapes))
     assert [sorted(step) for step in steps] == [["left", "right"], sorted(shapes)]
     one = nerg.attention(scene, regions[0].corners, observers=AT[None]).share[0]
     assert steps[0]["left"] == pytest.approx(float(one), rel=0.03) and steps[0]["left"] > 0
@@ -304,7 +304,7 @@ def test01_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
 
 
 def test02_without_areas_and_shapes_there_is_nothing(scene):
-    assert list(module.shares_in_steps(scene, AT, [], [])) == []
+    assert list(module.iter_attention_shares(scene, AT, [], [])) == []
 
 
 # ---- Paths of people, and where they are at a moment ----

@@ -18,16 +18,16 @@ import trimesh
 from nerg_mi.scenes import store
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.style import color_values
+from nerg_mi.figures.style import apply_colormap
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.maths.sphere import C0
+from nerg_mi.maths.sphere import SH_C0
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.laplacian import merge
+from nerg_mi.surfaces.laplacian import merge_sums
 from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings, TrackedRays, WeightedObservers
-from nerg_mi.tasks.engines import Output
+from nerg_mi.tasks.engines import TaskOutput
 from nerg_mi.workflows import bake_chunks
 from nerg_mi.workflows.bake import bake, check_texture, vertex_normals
 from nerg_mi.workflows.bake_chunks import (
@@ -37,30 +37,30 @@ from nerg_mi.workflows.bake_chunks import (
     SplatScene,
     bake_part,
     check_values,
-    cone_of,
-    cut,
-    find_crowd,
-    halves_of,
-    parts_of,
-    read_path,
-    read_receivers,
+    cone_radians,
+    refine_target,
+    make_observers,
+    split_halves,
+    split_into_parts,
+    read_observer_file,
+    read_target,
     read_sums,
-    source_of,
-    splat_place,
-    sums_in_one_go,
-    sums_in_parts,
-    tracked_rays,
+    select_source,
+    make_splat_geometry,
+    sum_directly,
+    sum_in_parts,
+    make_tracked_rays,
 )
 from nerg_mi.workflows.bake_splats import COLUMN, bake_splats
 from nerg_mi.workflows.options import PartOptions
-from nerg_mi.workflows.parts import Parts
+from nerg_mi.workflows.parts import PartRunner
 from nerg_mi.workflows.scene_commands import BakeOptions
 from tests.conftest import ROOT
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.plugins import fields
 from tests.surfaces.meshes import box, joined, longest_edge, wall
 from tests.surfaces.test_splats import falling
-from tests.tasks.works import laid_out
+from tests.tasks.works import lay_out
 from tests.workflows.recorder import Recorder
 
 # ---- Bakes from files to sums: a field's people, rays, units, and options that contradict each other ----
@@ -83,7 +83,7 @@ def rays(n=40, people=2):
 
 def test01_the_field_of_people_where_they_were(rgb, room):
     told = Recorder()
-    options = BakeOptions(gaze=GAZE, observers=2, angle=6.0, detail=2.0, mode="llvm_ad_rgb")
+    options = BakeOptions(gaze=GAZE, num_observers=2, max_angle=6.0, max_edge=2.0, mode="llvm_ad_rgb")
     found = bake(room, (), options, told, rays=rays())
     assert found.summary["source"] == "field" and found.summary["lookers"] == 1
     assert abs(found.unaccounted) < 1e-3 and found.escaped < 1e-6
@@ -92,9 +92,9 @@ def test01_the_field_of_people_where_they_were(rgb, room):
 
 
 def test02_rays_alone_in_shares_and_seconds(rgb, room):
-    share = bake(room, (), BakeOptions(cone=0.0, detail=2.0, mode="llvm_ad_rgb"), rays=rays())
+    share = bake(room, (), BakeOptions(cone=0.0, max_edge=2.0, mode="llvm_ad_rgb"), rays=rays())
     assert share.summary["source"] == "rays" and np.isclose(share.on_surface, 1) and share.escaped == 0
-    seconds = bake(room, (), BakeOptions(cone=0.0, detail=2.0, unit="seconds", mode="llvm_ad_rgb"), rays=rays())
+    seconds = bake(room, (), BakeOptions(cone=0.0, max_edge=2.0, unit="seconds", mode="llvm_ad_rgb"), rays=rays())
     # Of two people twenty rays each, 0.2 seconds apart.
     assert np.isclose((seconds.density * seconds.mesh.vertex_area).sum(), 8.0)
     assert np.allclose(seconds.density, 8 * share.density)
@@ -122,11 +122,11 @@ def test06_what_is_not_asked_for_is_not_made(rgb, room, monkeypatch):
     def never(*given, **more):
         raise AssertionError("nobody asked for this")
 
-    monkeypatch.setattr(laplacian, "laplacian", never)
-    monkeypatch.setattr(outputs, "unroll", never)
-    bake(room, [room.with_name("a.glb")], BakeOptions(detail=3.0, mode="llvm_ad_rgb"), rays=rays())
+    monkeypatch.setattr(laplacian, "make_laplacian", never)
+    monkeypatch.setattr(outputs, "unwrap_uv", never)
+    bake(room, [room.with_name("a.glb")], BakeOptions(max_edge=3.0, mode="llvm_ad_rgb"), rays=rays())
     with pytest.raises(AssertionError):
-        bake(room, (), BakeOptions(detail=3.0, smooth=0.1, mode="llvm_ad_rgb"), rays=rays())
+        bake(room, (), BakeOptions(max_edge=3.0, smooth=0.1, mode="llvm_ad_rgb"), rays=rays())
 
 
 def test07_a_mesh_in_millimetres_is_told(rgb, tmp_path):
@@ -158,7 +158,7 @@ GAZE_FILE, RAYS_FILE = Path("gaze.safetensors"), Path("rays.npz")
     ],
 )
 def test01_whose_gaze(options, with_gaze, source):
-    assert source_of(BakeOptions(**options), None, with_gaze) == source
+    assert select_source(BakeOptions(**options), None, with_gaze) == source
 
 
 @pytest.mark.parametrize(
@@ -173,12 +173,12 @@ def test01_whose_gaze(options, with_gaze, source):
 )
 def test02_what_contradicts_itself(options, said):
     with pytest.raises(NergError, match=said):
-        source_of(BakeOptions(**options), None)
+        select_source(BakeOptions(**options), None)
 
 
 def test03_cones():
-    assert cone_of(BakeOptions(), "rays") == np.radians(CONE) and cone_of(BakeOptions(), "field") == 0
-    assert cone_of(BakeOptions(cone=3.0), "field") == np.radians(3.0)
+    assert cone_radians(BakeOptions(), "rays") == np.radians(CONE) and cone_radians(BakeOptions(), "field") == 0
+    assert cone_radians(BakeOptions(cone=3.0), "field") == np.radians(3.0)
 
 
 # ---- Files of a bake open elsewhere, with the same mesh, colours and values ----
@@ -204,7 +204,7 @@ def baked(tmp_path_factory):
         np.ones(n),
     )
     names = [folder / f"a{suffix}" for suffix in (".ply", ".glb", ".csv", ".json")]
-    options = BakeOptions(detail=0.5, smooth=0.1, halves=True, mode="llvm_ad_rgb")
+    options = BakeOptions(max_edge=0.5, smooth=0.1, split_half=True, mode="llvm_ad_rgb")
     return folder, bake(folder / "room.ply", names, options, rays=rays)
 
 
@@ -252,7 +252,7 @@ def test03_a_texture(baked, tmp_path):
     pytest.importorskip("xatlas", reason="xatlas is not installed")
     folder, _ = baked
     rays = Rays([0.0, 0.1], [0, 0], ("a",), np.ones((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]]), np.ones(2))
-    options = BakeOptions(detail=0.4, texture=128, mode="llvm_ad_rgb")
+    options = BakeOptions(max_edge=0.4, texture_size=128, mode="llvm_ad_rgb")
     bake(folder / "room.ply", [tmp_path / "t.glb"], options, rays=rays)
     found = trimesh.load(tmp_path / "t.glb", process=False, force="mesh")
     picture = np.asarray(found.visual.material.baseColorTexture)
@@ -275,7 +275,7 @@ def test04_normals_and_textures_that_go_nowhere(tmp_path):
 
 
 ROOM = joined(box((0, 0, 0), (8, 6, 3)))
-OF_RAYS = RaySettings(cone=0.03, bundle=4)
+OF_RAYS = RaySettings(cone_sigma=0.03, rays_per_cone=4)
 
 
 @pytest.fixture
@@ -296,7 +296,7 @@ def directed(n, seed=0):
 
 
 def parts(folder, told=None, **options):
-    return Parts(PartOptions(store=folder, **options), folder / "a.ply", told or Recorder(), 1)
+    return PartRunner(PartOptions(store=folder, **options), folder / "a.ply", told or Recorder(), 1)
 
 
 def made(told):
@@ -316,14 +316,14 @@ def equal(one, other):
 @pytest.mark.usefixtures("engine")
 @pytest.mark.nightly
 def test_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again(tmp_path):
-    scene = BakeScene(ROOM, gaze=GAZE, of_gaze=GazeSumSettings(angle=0.5, directions=1024), of_rays=OF_RAYS)
+    scene = BakeScene(ROOM, gaze=GAZE, gaze_settings=GazeSumSettings(max_angle=0.5, directions=1024), ray_settings=OF_RAYS)
     groups = [crowd(3), directed(500)]
-    whole = sums_in_one_go(scene, groups, Recorder())
-    assert equal(sums_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake"), whole)
+    whole = sum_directly(scene, groups, Recorder())
+    assert equal(sum_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake"), whole)
     # Started again with two observers more: one part is another one, and one is new.
     told = Recorder()
     more = [WeightedObservers(np.r_[groups[0].positions, groups[0].positions[:2]], np.full(5, 1 / 3)), groups[1]]
-    sums_in_parts(scene, more, parts(tmp_path, told), "a bake")
+    sum_in_parts(scene, more, parts(tmp_path, told), "a bake")
     assert told.steps[-1][1].startswith("5 of 5 parts") and made(told) == 2
 
 
@@ -331,10 +331,10 @@ def test_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again(t
 def test_a_part_depends_on_what_it_reads_and_on_nothing_else(tmp_path):
     def bake_rays(scene, who):
         told = Recorder()
-        sums_in_parts(scene, [who], parts(tmp_path, told), "a bake")
+        sum_in_parts(scene, [who], parts(tmp_path, told), "a bake")
         return made(told)
 
-    scene = BakeScene(ROOM, of_rays=OF_RAYS)
+    scene = BakeScene(ROOM, ray_settings=OF_RAYS)
     who = directed(900)
     assert bake_rays(scene, who) == 3 and bake_rays(scene, who) == 0
     # Some rays of the second part are others.
@@ -343,7 +343,7 @@ def test_a_part_depends_on_what_it_reads_and_on_nothing_else(tmp_path):
     # The mesh is another one.
     higher = replace(ROOM, vertices=ROOM.vertices * (1, 1, 1.5))
     assert bake_rays(replace(scene, mesh=higher), who) == 3
-    assert bake_rays(replace(scene, of_rays=RaySettings(cone=0.02, bundle=4)), who) == 3
+    assert bake_rays(replace(scene, ray_settings=RaySettings(cone_sigma=0.02, rays_per_cone=4)), who) == 3
 
 
 @pytest.mark.usefixtures("engine")
@@ -353,15 +353,15 @@ def test_files_that_were_sent_serve_as_those_that_lie_there(tmp_path):
     write_ply_splats(tmp_path / "wall.ply", plain)
     for scene, who in (
         (
-            BakeScene(ROOM, (box((1, 1, 0), (2, 2, 1)),), GAZE, of_gaze=GazeSumSettings(angle=0.5, directions=1024)),
+            BakeScene(ROOM, (box((1, 1, 0), (2, 2, 1)),), GAZE, gaze_settings=GazeSumSettings(max_angle=0.5, directions=1024)),
             crowd(1),
         ),
-        (SplatScene(tmp_path / "wall.ply", len(plain), of_rays=OF_RAYS), falling(100)),
+        (SplatScene(tmp_path / "wall.ply", len(plain), ray_settings=OF_RAYS), falling(100)),
     ):
-        there = laid_out(PlannedBake.of(scene), tmp_path / "there")
+        there = lay_out(PlannedBake.plan(scene), tmp_path / "there")
         notes = bake_part(there, who, tmp_path / "a.npy")
-        found = read_sums(Output(tmp_path / "a.npy", notes), len(scene.nothing.face))
-        assert there != PlannedBake.of(scene) and equal([found], sums_in_one_go(scene, [who], Recorder()))
+        found = read_sums(TaskOutput(tmp_path / "a.npy", notes), len(scene.empty_sums.face_sums))
+        assert there != PlannedBake.plan(scene) and equal([found], sum_directly(scene, [who], Recorder()))
 
 
 @pytest.mark.usefixtures("engine")
@@ -370,10 +370,10 @@ def test_two_processes_give_the_sums_of_splats(tmp_path):
     plain = wall(0.0, 0.4, 0.05)
     write_ply_splats(tmp_path / "wall.ply", plain)
     fields.gaze(tmp_path / "gaze.safetensors")
-    scene = SplatScene(tmp_path / "wall.ply", len(plain), tmp_path / "gaze.safetensors", of_rays=OF_RAYS)
+    scene = SplatScene(tmp_path / "wall.ply", len(plain), tmp_path / "gaze.safetensors", ray_settings=OF_RAYS)
     groups = [falling(500, 0.5), crowd(2)]
-    there = sums_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake")
-    assert equal(there, sums_in_one_go(scene, groups, Recorder()))
+    there = sum_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake")
+    assert equal(there, sum_directly(scene, groups, Recorder()))
 
 
 @pytest.mark.usefixtures("engine")
@@ -382,10 +382,10 @@ def test_halves_are_of_people():
     given = Rays(
         np.arange(n) / 10, np.arange(n) % 4, tuple("abcd"), np.ones((n, 3)), np.eye(3)[np.arange(n) % 3], np.ones(n)
     )
-    first, second = halves_of(directed(n), given, 0)
-    assert len(first) == len(second) == 20 and (first.first, second.first) == (0, 20)
+    first, second = split_halves(directed(n), given, 0)
+    assert len(first) == len(second) == 20 and (first.first_index, second.first_index) == (0, 20)
     with pytest.raises(NergError, match="two people at least"):
-        halves_of(directed(n), replace(given, person=np.zeros(n, int)), 0)
+        split_halves(directed(n), replace(given, person=np.zeros(n, int)), 0)
 
 
 @pytest.mark.usefixtures("engine")
@@ -411,20 +411,20 @@ def test_the_files_of_a_bake_have_the_same_bytes(tmp_path):
 
 def test01_parts_are_cut_alike_and_a_pickled_scene_gives_the_same(rgb, monkeypatch):
     monkeypatch.setattr(bake_chunks, "RAYS", 300)
-    scene = BakeScene(ROOM, of_rays=RaySettings(cone=0.03, bundle=4))
-    parts = list(parts_of(directed(1000)))
-    assert [len(p) for p in parts] == [300, 300, 300, 100] and [p.first for p in parts] == [0, 300, 600, 900]
+    scene = BakeScene(ROOM, ray_settings=RaySettings(cone_sigma=0.03, rays_per_cone=4))
+    parts = list(split_into_parts(directed(1000)))
+    assert [len(p) for p in parts] == [300, 300, 300, 100] and [p.first_index for p in parts] == [0, 300, 600, 900]
     first = [scene.sums(part) for part in parts]
     again = pickle.loads(pickle.dumps(scene))
     late = [again.sums(part) for part in reversed(parts)][::-1]
-    assert np.array_equal(merge(first).vertex, merge(late).vertex)
-    assert np.isclose(merge(first).face.sum(), 1)
+    assert np.array_equal(merge_sums(first).vertex_sums, merge_sums(late).vertex_sums)
+    assert np.isclose(merge_sums(first).face_sums.sum(), 1)
 
 
 def test02_observers_of_a_field(rgb):
-    scene = BakeScene(ROOM, gaze=files(store) / "shoppers.safetensors", of_gaze=GazeSumSettings(angle=0.2))
+    scene = BakeScene(ROOM, gaze=files(store) / "shoppers.safetensors", gaze_settings=GazeSumSettings(max_angle=0.2))
     crowd = WeightedObservers(np.array([(4.4, 2.8, 1.6)] * 5), np.full(5, 0.2))
-    parts = list(parts_of(crowd))
+    parts = list(split_into_parts(crowd))
     assert [len(p.weights) for p in parts] == [4, 1]
     found = scene.sums(parts[1])
     assert 0.5 < found.on_surface / found.weight < 1.5 and found.count == 1 and abs(found.escaped) < 1e-6
@@ -449,10 +449,10 @@ def rays_lookers():
 
 def test01_a_path(tmp_path):
     (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n4,5,6\n")
-    found = read_path(tmp_path / "a.csv")
+    found = read_observer_file(tmp_path / "a.csv")
     assert found.positions.tolist() == [[1, 2, 3], [4, 5, 6]] and found.weights.tolist() == [0.5, 0.5]
     (tmp_path / "b.csv").write_text("weight;x;y;z\n3;1;2;3\n1;4;5;6\n")
-    assert read_path(tmp_path / "b.csv").weights.tolist() == [0.75, 0.25]
+    assert read_observer_file(tmp_path / "b.csv").weights.tolist() == [0.75, 0.25]
 
 
 @pytest.mark.parametrize(
@@ -471,30 +471,30 @@ def test01_a_path(tmp_path):
 def test02_paths_that_are_none(tmp_path, text, said):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(NergError, match=said):
-        read_path(tmp_path / "a.csv")
+        read_observer_file(tmp_path / "a.csv")
 
 
 def test03_people_stand_in_the_place():
     told = Recorder()
-    found = find_crowd(BakeOptions(observers=4), rays_lookers(), TURNED, told)
+    found = make_observers(BakeOptions(num_observers=4), rays_lookers(), TURNED, told)
     assert len(found.weights) == 4 and np.allclose(found.positions[:, 0], 1) and np.allclose(found.positions[:, 2], 3.2)
     # Metres are told, of which the place has two units each.
-    assert f"{found.mean / 2:.2f} m away" in told.messages[0] and "1 people at 20 moments" in told.messages[0]
-    who = tracked_rays(rays_lookers(), TURNED, "time")
+    assert f"{found.rms_distance / 2:.2f} m away" in told.messages[0] and "1 people at 20 moments" in told.messages[0]
+    who = make_tracked_rays(rays_lookers(), TURNED, "time")
     assert np.allclose(who.directions, [0, 1, 0]) and np.allclose(who.origins[:, 1], 2 * rays_lookers().origin[:, 0])
     assert np.isclose(who.weights.sum(), 1)
 
 
 def test04_one_observer_or_nobody():
-    assert find_crowd(BakeOptions(observer=(1, 2, 3)), None, TURNED, Recorder()).positions.tolist() == [[1, 2, 3]]
+    assert make_observers(BakeOptions(observer=(1, 2, 3)), None, TURNED, Recorder()).positions.tolist() == [[1, 2, 3]]
     for options, said in (
         (BakeOptions(), "nobody looks"),
         (BakeOptions(observer=(1, 2)), "three numbers"),
-        (BakeOptions(observer=(1, 2, 3), path="a.csv"), "give one of them"),
+        (BakeOptions(observer=(1, 2, 3), observer_file="a.csv"), "give one of them"),
     ):
         with pytest.raises(NergError, match=said):
-            find_crowd(options, None, TURNED, Recorder())
-    for options, said in ((BakeOptions(weights="money"), "--weights"), (BakeOptions(cmap="jet"), "no perceptually")):
+            make_observers(options, None, TURNED, Recorder())
+    for options, said in ((BakeOptions(ray_weights="money"), "--weights"), (BakeOptions(cmap="jet"), "no perceptually")):
         with pytest.raises(NergError, match=said):
             check_values(options)
 
@@ -514,37 +514,37 @@ def test01_a_mesh_is_cut_as_finely_as_asked_in_metres(rgb, tmp_path):
     v, f = box((0, 0, 0), (2, 2, 2))
     write_columns(tmp_path / "a.ply", dict(zip("xyz", v.T)), np.concatenate([f, f[:2, ::-1]]))
     told = Recorder()
-    found = read_receivers(tmp_path / "a.ply", (), 16, ns, told)
+    found = read_target(tmp_path / "a.ply", (), 16, ns, told)
     assert found.names == ("a",) and found.index.tolist() == list(range(12)) and not found.others
     assert told.messages == ["a.ply: 2 faces that repeat others left out"]
     # Two scene units a metre.
-    assert longest_edge(cut(found, 0.25, 2.0).mesh) <= 0.5
-    assert 50_000 < len(cut(found, None, 1.0).mesh.faces) < 250_000
+    assert longest_edge(refine_target(found, 0.25, 2.0).mesh) <= 0.5
+    assert 50_000 < len(refine_target(found, None, 1.0).mesh.faces) < 250_000
 
 
 def test02_shapes_of_a_scene_receive_or_hide(rgb, tmp_path):
     (tmp_path / "a.xml").write_text(SCENE.format(more=""))
-    both = read_receivers(tmp_path / "a.xml", (), 16, ns, Recorder())
+    both = read_target(tmp_path / "a.xml", (), 16, ns, Recorder())
     assert both.names == ("sign", "wall") and np.bincount(both.shape).tolist() == [12, 2]
-    sign = read_receivers(tmp_path / "a.xml", ("sign",), 16, ns, Recorder())
+    sign = read_target(tmp_path / "a.xml", ("sign",), 16, ns, Recorder())
     assert sign.names == ("sign",) and len(sign.mesh.faces) == 12 and len(sign.others) == 1
     with pytest.raises(NergError, match='"door"'):
-        read_receivers(tmp_path / "a.xml", ("door",), 16, ns, Recorder())
+        read_target(tmp_path / "a.xml", ("door",), 16, ns, Recorder())
     (tmp_path / "b.xml").write_text(SCENE.format(more='<shape type="sphere" id="ball"/>'))
     with pytest.raises(NergError, match='"ball" .* is a Sphere'):
-        read_receivers(tmp_path / "b.xml", (), 16, ns, Recorder())
+        read_target(tmp_path / "b.xml", (), 16, ns, Recorder())
     (tmp_path / "c.xml").write_text('<scene version="3.0.0"/>')
     with pytest.raises(NergError, match="has no shapes"):
-        read_receivers(tmp_path / "c.xml", (), 16, ns, Recorder())
+        read_target(tmp_path / "c.xml", (), 16, ns, Recorder())
 
 
 def test03_a_field_gives_its_surface(rgb, tmp_path):
     pytest.importorskip("skimage", reason="scikit-image is not installed")
     fields.radiance(tmp_path / "f.safetensors")
-    found = read_receivers(tmp_path / "f.safetensors", (), 8, ns, Recorder())
+    found = read_target(tmp_path / "f.safetensors", (), 8, ns, Recorder())
     assert found.names == ("f",) and len(found.mesh.faces) > 10
     with pytest.raises(NergError, match="--shape"):
-        read_receivers(tmp_path / "f.safetensors", ("a",), 8, ns, Recorder())
+        read_target(tmp_path / "f.safetensors", ("a",), 8, ns, Recorder())
 
 
 # ---- Parts of a bake of splats: the same wherever and however often they are computed ----
@@ -554,18 +554,18 @@ def test03_a_field_gives_its_surface(rgb, tmp_path):
 def scene(tmp_path, rgb):
     plain = wall(0.0, 0.4, 0.05)
     write_ply_splats(tmp_path / "wall.ply", plain)
-    return SplatScene(tmp_path / "wall.ply", len(plain), of_rays=OF_RAYS)
+    return SplatScene(tmp_path / "wall.ply", len(plain), ray_settings=OF_RAYS)
 
 
 def test01_a_pickled_scene_gives_the_same_and_another_file_is_another_scene(scene):
     rays = falling(100, 0.5)
     first = scene.sums(rays)
     again = pickle.loads(pickle.dumps(scene))
-    assert np.array_equal(again.sums(rays).face, first.face)
-    assert len(first.face) == len(scene.nothing.face) == 2 * 64 and not len(first.vertex)
+    assert np.array_equal(again.sums(rays).face_sums, first.face_sums)
+    assert len(first.face_sums) == len(scene.empty_sums.face_sums) == 2 * 64 and not len(first.vertex_sums)
     write_ply_splats(scene.splats, wall(0.1, 0.4, 0.05))
     moved = replace(scene)
-    assert not np.array_equal(moved.sums(rays).face, first.face)
+    assert not np.array_equal(moved.sums(rays).face_sums, first.face_sums)
 
 
 def test02_without_a_field_nobody_looks(scene):
@@ -574,7 +574,7 @@ def test02_without_a_field_nobody_looks(scene):
 
 
 def test03_how_far_apart_two_ideas_of_a_surface_may_be(rgb):
-    assert np.isclose(splat_place(wall(0.0, 0.2)).tolerance, 2 * 1e-3)
+    assert np.isclose(make_splat_geometry(wall(0.0, 0.2)).tolerance, 2 * 1e-3)
 
 
 # ---- Gaze that is written back to Gaussian splats: from files to a file ----
@@ -618,8 +618,8 @@ def test01_each_gaussian_has_what_the_field_says_and_all_else_is_kept(rgb, place
     for name in ("centers", "scales", "rotations", "opacities"):
         assert np.allclose(getattr(back, name), getattr(given, name), rtol=1e-5, atol=1e-6)
     # The hottest is nine tenths of the map's last colour.
-    hot = 0.5 + C0 * back.harmonics[found.attention.argmax(), 0]
-    assert np.abs(hot - color_values("inferno", np.ones(1))[0]).max() < 0.1
+    hot = 0.5 + SH_C0 * back.harmonics[found.attention.argmax(), 0]
+    assert np.abs(hot - apply_colormap("inferno", np.ones(1))[0]).max() < 0.1
 
 
 def test02_people_on_a_path_and_places_in_other_units(rgb, place):

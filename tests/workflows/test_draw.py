@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.figures.overlay import Heat, Style, find_overlay, find_stored, overlay, srgb, top_of, write_png
-from nerg_mi.figures.style import color_values
+from nerg_mi.figures.overlay import Heat, Style, find_overlay, find_channel_overlay, overlay, srgb, robust_max, write_png
+from nerg_mi.figures.style import apply_colormap
 from nerg_mi.files.images import write_exr
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.ranges import RANGE
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rendering.bands import render_asked
+from nerg_mi.rendering.bands import render_aovs
 from nerg_mi.transport.geometry import pixel_directions
 from nerg_mi.workflows import draw_scenes as scenes
 from nerg_mi.workflows.draw import draw, find_kind, read_baked, read_stored, shared_note
-from nerg_mi.workflows.draw_scenes import cut_place, film, open_scene, upright_pose
+from nerg_mi.workflows.draw_scenes import cut_scene, make_film, open_scene, upright_pose
 from nerg_mi.workflows.scene_commands import KINDS, ScaleOptions, SceneFigureOptions, SphereOptions
 from tests.pictures import SCENE
 from tests.surfaces.meshes import wall
@@ -43,27 +43,27 @@ def write(path, text=None, **more):
 
 
 def test_colour_values_and_mask(tmp_path):
-    found = read_stored(write(tmp_path / "a.exr", **{"opacity.Y": OPACITY}), find_stored("gaze"))
+    found = read_stored(write(tmp_path / "a.exr", **{"opacity.Y": OPACITY}), find_channel_overlay("gaze"))
     np.testing.assert_array_equal(found.color, COLOR)
     np.testing.assert_array_equal(found.values, GAZE)
     np.testing.assert_array_equal(found.mask, np.tile(np.arange(8) >= 3, (6, 1)))
-    assert read_stored(write(tmp_path / "b.exr"), find_stored("gaze.Y")).mask.all()
+    assert read_stored(write(tmp_path / "b.exr"), find_channel_overlay("gaze.Y")).mask.all()
 
 
 def test_what_gaze_rests_on(tmp_path):
     text = {"gaze.basis": "made of 5 rays of 2 people", "kde.basis": "made of 3 rays of 1 person"}
     path = write(tmp_path / "a.exr", text, **{"kde.Y": GAZE, "depth.T": GAZE})
-    bases = [read_stored(path, find_stored(channel)).basis for channel in ("gaze", "kde.Y", "depth")]
-    assert bases == [*text.values(), ""] and read_stored(write(tmp_path / "b.exr"), find_stored("gaze")).basis == ""
+    bases = [read_stored(path, find_channel_overlay(channel)).support_note for channel in ("gaze", "kde.Y", "depth")]
+    assert bases == [*text.values(), ""] and read_stored(write(tmp_path / "b.exr"), find_channel_overlay("gaze")).support_note == ""
     assert shared_note("ab", bases[:1] * 2) == bases[0]
     assert shared_note("ab", ["x", ""]) == "a: x; b: not known"
 
 
 def test_what_is_refused(tmp_path):
     with pytest.raises(NergError, match='has no "depth"; it has R, G, B, gaze.Y'):
-        read_stored(write(tmp_path / "a.exr"), find_stored("depth"))
+        read_stored(write(tmp_path / "a.exr"), find_channel_overlay("depth"))
     with pytest.raises(NergError, match="holds no quantities"):
-        read_stored(tmp_path / "a.png", find_stored("gaze"))
+        read_stored(tmp_path / "a.png", find_channel_overlay("gaze"))
 
 
 # ---- Differences of two files ----
@@ -76,7 +76,7 @@ def test_the_first_less_the_second(tmp_path):
     figure = draw("difference", [a, b], top=0.5)
     shown = figure.axes[0].images[0].get_array()
     mask = OPACITY > 0.5
-    wanted = color_values("RdBu_r", np.clip(0.5 + (GAZE - other), 0, 1), kind="diverging")
+    wanted = apply_colormap("RdBu_r", np.clip(0.5 + (GAZE - other), 0, 1), kind="diverging")
     np.testing.assert_allclose(shown[mask], wanted[mask], atol=1e-6)
     assert np.ptp(shown[~mask], axis=-1).max() < 1e-9 and figure.axes[0].get_title() == "a less b"
 
@@ -108,7 +108,7 @@ def test_one_scale_for_all(tmp_path):
     assert [a.get_title() for a in figure.axes[:2]] == ["first", "second"]
     bar = figure.axes[-1 if figure.axes[-1].get_ylabel() else -2]
     bar = next(a for a in figure.axes if a.get_ylabel())
-    top = top_of(bright, OPACITY > 0.5)
+    top = robust_max(bright, OPACITY > 0.5)
     said = [float(t.get_text()) for t in bar.get_yticklabels()]
     np.testing.assert_allclose(bar.get_yticks(), np.array(said) / top, atol=1e-6)
     assert "no data" in [t.get_text() for a in figure.axes for t in a.texts]
@@ -199,7 +199,7 @@ def test_the_header_says_what_it_is_made_of(tmp_path):
     comments = ("value: seconds per square metre [s/m²]", 'nerg_mi {"inputs": {"day.npz": "ab", "shop.ply": "cd"}}')
     path = write_surface(tmp_path / "a.ply", [1, 2, 3, 4], comments=comments)
     baked = read_baked(path)
-    assert baked.label == "seconds per square metre [s/m²]" and baked.made_of == ("day.npz", "shop.ply")
+    assert baked.label == "seconds per square metre [s/m²]" and baked.gaze_files == ("day.npz", "shop.ply")
     np.testing.assert_array_equal(baked.values, [1, 2, 3, 4])
     figure = draw("surface", path, width=32, height=32, mode="llvm_ad_rgb")
     assert figure.axes[0].get_title().replace("\n", " ") == "Seconds per square metre"
@@ -238,7 +238,7 @@ def test_splats_show_their_gaze_themselves(tmp_path):
 
 
 def test_a_style_of_options():
-    assert ScaleOptions(cmap="viridis", decades=3, hatching=False).style("a") == Style("viridis", 3, False, "a")
+    assert ScaleOptions(cmap="viridis", log_decades=3, hatching=False).style("a") == Style("viridis", 3, False, "a")
     for given, said in (({"top": 0.0}, "--top"), ({"decades": -1}, "--decades"), ({"cmap": "jet"}, '"jet" is no')):
         with pytest.raises(NergError, match=said):
             ScaleOptions(**given).style()
@@ -279,12 +279,12 @@ def test_straight_down_there_is_some_heading(rgb):
 
 
 def test_a_film_that_is_too_large():
-    assert film(30, 20)["rfilter"] == {"type": "box"}
+    assert make_film(30, 20)["rfilter"] == {"type": "box"}
     with pytest.raises(NergError, match="4,096.*4,096"):
-        film(4096, 4096)
+        make_film(4096, 4096)
     # What the widest sphere needs, a gigabyte to draw, is allowed.
     (width,) = (f.metadata[RANGE].high for f in fields(SphereOptions) if f.name == "width")
-    assert film(width, width // 2)["width"] == width
+    assert make_film(width, width // 2)["width"] == width
 
 
 def test_another_integrator_is_refused(tmp_path):
@@ -353,8 +353,8 @@ def scene_triptych(tmp_path_factory):
 
 def test_three_pictures_with_one_scale(rgb, scene_triptych, monkeypatch):
     seen = []
-    see = scenes.OpenScene.see
-    monkeypatch.setattr(scenes.OpenScene, "see", lambda self, *of: seen.append(see(self, *of)) or seen[-1])
+    see = scenes.OpenScene.render
+    monkeypatch.setattr(scenes.OpenScene, "render", lambda self, *of: seen.append(see(self, *of)) or seen[-1])
     told = Recorder()
     behind = {"eye": "0.2, 0.1, 2.5"}
     figure = draw("triptych", scene_triptych, reporter=told, mode=MODE, spp=2, defaults=behind)
@@ -366,8 +366,8 @@ def test_three_pictures_with_one_scale(rgb, scene_triptych, monkeypatch):
     assert (without.color == with_.color).all() and own.values.shape == with_.values.shape
     # The first is what a camera at the observer's place sees, with its own gaze.
     with scenes.open_scene(scene_triptych, SceneFigureOptions(mode=MODE, spp=2, defaults=behind), told) as opened:
-        plain = opened.see(opened.camera(0), find_overlay("gaze"))
-        again = render_asked(scene_triptych, opened.scene, opened.camera(0), ["gaze", "opacity"], spp=2)
+        plain = opened.render(opened.camera(0), find_overlay("gaze"))
+        again = render_aovs(scene_triptych, opened.scene, opened.camera(0), ["gaze", "opacity"], spp=2)
     assert (plain.values == with_.values).all() and (again.aovs["gaze"] == with_.values).all()
     assert own.values.max() > 0
 
@@ -396,10 +396,10 @@ WALLS_SCENE = """<scene version="3.0.0"><integrator type="nerg"/>
 def test_boxes(rgb, tmp_path):
     (tmp_path / "scene.xml").write_text(WALLS_SCENE)
     scene = rgb.load_file(str(tmp_path / "scene.xml"))
-    plan = cut_place(scene.integrator(), scene, LOW, HIGH, 1.2, 0.0)
+    plan = cut_scene(scene.integrator(), scene, LOW, HIGH, 1.2, 0.0)
     ny, nx = plan.height.shape
     side = (plan.high - plan.low) / (nx, ny)
-    assert plan.level == 1.2 and np.allclose(side, side[0])
+    assert plan.cut_height == 1.2 and np.allclose(side, side[0])
     x, y = plan.low[0] + (np.arange(nx) + 0.5) * side[0], plan.low[1] + (np.arange(ny) + 0.5) * side[0]
     x, y = np.meshgrid(x, y)
     low_box = (np.abs(x + 1) < 0.3) & (np.abs(y) < 0.4)
@@ -408,7 +408,7 @@ def test_boxes(rgb, tmp_path):
     np.testing.assert_allclose(plan.height[~low_box & ~tall_box], 0.0, atol=1e-4)
     # The cut goes along the walls of the tall box, a cell wide to each side, and nowhere else.
     edge = np.maximum(np.abs(x - 1) - 0.5, np.abs(y - 0.3) - 0.2)
-    assert plan.cut[np.abs(edge) < 0.4 * side[0]].all() and not plan.cut[np.abs(edge) > 1.01 * side[0]].any()
+    assert plan.is_cut[np.abs(edge) < 0.4 * side[0]].all() and not plan.is_cut[np.abs(edge) > 1.01 * side[0]].any()
 
 
 # ---- Floor plans of rays: paths by person and recording, sights, fields of view ----
@@ -509,7 +509,7 @@ def test_what_any_figure_refuses(tmp_path):
 @pytest.mark.parametrize("name", KINDS)
 def test_each_tells_what_it_is(name):
     kind = find_kind(name)
-    assert kind.name == name and kind.summary.endswith(".") and kind.most >= 1
+    assert kind.name == name and kind.summary.endswith(".") and kind.max_files >= 1
     assert kind.options() is not None and all(f.metadata["help"] for f in dataclasses.fields(kind.options))
 
 

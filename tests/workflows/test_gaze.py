@@ -19,13 +19,13 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rays.rays import Rays
 from nerg_mi.threads import set_thread_count
-from nerg_mi.train.gaze_log_density import elevation_density
+from nerg_mi.train.gaze_log_density import compute_elevation_density
 from nerg_mi.workflows import ablation, evaluate
-from nerg_mi.workflows.ablation import Bench, ablate, law_of, plan_of
+from nerg_mi.workflows.ablation import AblationBenchmark, ablate, load_ground_truth, make_plan
 from nerg_mi.workflows.evaluate import SCORED, evaluate_folds, evaluate_gaze
 from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeEvaluationOptions, GazeOptions
-from nerg_mi.workflows.geometry import make_place, place_of_training
-from nerg_mi.workflows.options import PlaceOptions
+from nerg_mi.workflows.geometry import make_geometry, load_training_geometry
+from nerg_mi.workflows.options import GeometryOptions
 from nerg_mi.workflows.parts import account_for_store
 from nerg_mi.workflows.train_gaze import learn_prior, train_gaze
 from tests.conftest import ROOT
@@ -163,7 +163,7 @@ def test_folds_that_are_kept_are_not_trained_again(tmp_path, folds_trained):
     # Other rays, and another recipe, are another evaluation; a change of how it is computed is none.
     assert go(crowd(301)) == [0, 1] and go(steps=3) == [0, 1] and go(threads=2) == []
     (job,) = account_for_store(tmp_path / "store").jobs
-    assert (job.what, job.total, job.left) == (f"nerg eval folds {tmp_path / 'out'}", 2, 0)
+    assert (job.name, job.total, job.remaining) == (f"nerg eval folds {tmp_path / 'out'}", 2, 0)
 
 
 def test_what_is_plainly_wrong(tmp_path):
@@ -190,12 +190,12 @@ ABLATION_OPTIONS = AblationOptions(
     variant=("capture", "emit_capture"),
     seeds=2,
     default_steps=2,
-    zones=2,
+    test_zones=2,
     positions=6,
     min_rays=8,
     radius=0.5,
-    cameras=1,
-    size="16x8",
+    timing_cameras=1,
+    timing_size="16x8",
     probes=12,
 )
 
@@ -222,7 +222,7 @@ def test_rows_are_made_once(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "_train", lambda made, plan, path, bench: trained.append(path.stem) or found.rows[0])
     ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
     assert trained == []
-    other = replace(ABLATION_OPTIONS, law="tests.workflows.test_gaze:Uniform", seeds=1, variant=("capture",))
+    other = replace(ABLATION_OPTIONS, ground_truth="tests.workflows.test_gaze:Uniform", seeds=1, variant=("capture",))
     ablate(crowd(3000), tmp_path, other)
     assert trained == ["default_capture_0"]
 
@@ -265,13 +265,13 @@ def test_only_quick_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, s
         return {**made, **row}
 
     monkeypatch.setattr(ablation, "_train", kept)
-    options = replace(ABLATION_OPTIONS, recipes=recipe, variant=("emit",), steps=5, refit=False, cameras=0)
+    options = replace(ABLATION_OPTIONS, recipes=recipe, variant=("emit",), steps=5, refit=False, timing_cameras=0)
     ablate(crowd(1000), tmp_path, options)
     assert sorted(plans) == seeds
     for seed, plan in plans.items():
         s = plan.settings
         assert (s.seed, s.steps, s.refit, plan.config.variant, plan.probes.count) == (seed, steps, refit, "emit", 12)
-        assert s.watched_rays == 8
+        assert s.validation_min_rays == 8
 
 
 def test_another_first_seed_holds_others_out(tmp_path, monkeypatch):
@@ -285,7 +285,7 @@ def test_another_first_seed_holds_others_out(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "_train", kept)
     monkeypatch.setattr(scoring, "write_ablation", lambda *args: [])
     for first in (0, 5):
-        ablate(crowd(1000), tmp_path / str(first), replace(ABLATION_OPTIONS, first=first, variant=("emit",), cameras=0))
+        ablate(crowd(1000), tmp_path / str(first), replace(ABLATION_OPTIONS, seed=first, variant=("emit",), timing_cameras=0))
     assert [m[:2] for m in made] == [(0, 0), (1, 1), (5, 5), (6, 6)]
     assert made[0][2] == made[1][2] != made[2][2] == made[3][2]
 
@@ -296,34 +296,34 @@ def test_another_first_seed_holds_others_out(tmp_path, monkeypatch):
 def test_a_semantic_variant_is_planned_with_the_features_of_the_place(tmp_path):
     import drjit.llvm.ad as ns
 
-    from nerg_mi.train.geometry import place_of_field
+    from nerg_mi.train.geometry import load_field_geometry
     from tests.plugins import fields
 
     fields.radiance(tmp_path / "field.safetensors")
-    place = place_of_field(tmp_path / "field.safetensors", ns)
-    bench = Bench(None, {}, None, 0, place, tmp_path, ns, replace(ABLATION_OPTIONS, geometry=None))
-    for variant in scoring.all_variants(True, ["small"]):
-        plan = plan_of(variant, 0, bench)
+    place = load_field_geometry(tmp_path / "field.safetensors", ns)
+    bench = AblationBenchmark(None, {}, None, 0, place, tmp_path, ns, replace(ABLATION_OPTIONS, geometry=None))
+    for variant in scoring.list_variants(True, ["small"]):
+        plan = make_plan(variant, 0, bench)
         c = plan.config
-        assert (c.variant, c.semantic, c.semantic_own) == (variant.gaze, variant.semantic, variant.semantic_own)
-        assert (plan.initial is not None, plan.settings.frozen) == (variant.begin, variant.frozen)
+        assert (c.variant, c.semantic, c.semantic_own) == (variant.field_variant, variant.semantic, variant.semantic_own)
+        assert (plan.initial_arrays is not None, plan.settings.frozen) == (variant.init_from_field, variant.frozen)
         assert plan.settings.loss == (variant.loss or "paper")
-        if variant.semantic or variant.begin:
+        if variant.semantic or variant.init_from_field:
             assert c.geometry == place.radiance.config.geometry
 
 
 def test_a_law_is_that_of_the_class_that_is_named():
-    assert law_of("tests.workflows.test_gaze:Uniform")([[0, 0, 0]], [[1, 0, 0]] * 3).shape == (1, 3)
+    assert load_ground_truth("tests.workflows.test_gaze:Uniform")([[0, 0, 0]], [[1, 0, 0]] * 3).shape == (1, 3)
     for name in ("nowhere:Law", "tests.workflows.test_gaze:Nobody", "tests.workflows.test_gaze"):
         with pytest.raises(NergError, match="MODULE:CLASS"):
-            law_of(name)
+            load_ground_truth(name)
 
 
 # ---- Trainings of an ablation in parts: kept, and run by a process of its own as by this one ----
 
 
 TIMES = ("train_seconds", "frame_seconds")
-ONE = replace(ABLATION_OPTIONS, variant=("emit_capture",), seeds=1, cameras=0, threads=1)
+ONE = replace(ABLATION_OPTIONS, variant=("emit_capture",), seeds=1, timing_cameras=0, threads=1)
 
 
 def scores(found):
@@ -353,7 +353,7 @@ def test_a_training_elsewhere_scores_as_one_here_and_is_kept(tmp_path, rgb, trai
     assert [seed for _, seed in trainings] == [1]
     told = Recorder()
     (job,) = account_for_store(tmp_path / "a.tasks", reporter=told).jobs
-    assert (job.what, job.total, job.left) == (f"nerg ablate {tmp_path / 'a'}", 2, 0)
+    assert (job.name, job.total, job.remaining) == (f"nerg ablate {tmp_path / 'a'}", 2, 0)
 
 
 # ---- A gaze field of other places: what it says, what its checkpoint holds, and what is refused ----
@@ -383,7 +383,7 @@ def test_its_checkpoint_is_the_density_of_other_places_anywhere(tmp_path, rgb):
     r = ns.Array3f(np.stack([np.sqrt(1 - sine**2), 0 * sine, sine]).astype(np.float32))
     gaze = np.array(field.evaluate(r, ns.Array3f(30.0, 4.0, 1.6), r, integral=ns.Float(1.0))[0])
     # Rows of the table are 2.8 degrees, and a thousandth is uniform.
-    np.testing.assert_allclose(gaze, elevation_density(places, sine), atol=0.006)
+    np.testing.assert_allclose(gaze, compute_elevation_density(places, sine), atol=0.006)
     with pytest.raises(NergError, match="learnt in other places"):
         evaluate_gaze(path, places[0])
     assert learn_prior(tmp_path / "1.npz").provenance["places"] == found.provenance["places"][1:]
@@ -420,12 +420,12 @@ def made(folder, kind, rays):
         fields.radiance(folder / "place.safetensors")
     (folder / "place.xml").write_text(WALL)
     options = {
-        "field": PlaceOptions(field=folder / "place.safetensors"),
-        "scene": PlaceOptions(scene=folder / "place.xml"),
-        "hits": PlaceOptions(geometry="hits"),
-        "none": PlaceOptions(geometry="none"),
+        "field": GeometryOptions(field=folder / "place.safetensors"),
+        "scene": GeometryOptions(scene=folder / "place.xml"),
+        "hits": GeometryOptions(geometry="hits"),
+        "none": GeometryOptions(geometry="none"),
     }[kind]
-    return make_place(options, rays, (), folder / "place.vol", ns, voxel=0.2)
+    return make_geometry(options, rays, (), folder / "place.vol", ns, voxel=0.2)
 
 
 @pytest.mark.parametrize("kind", ["field", "scene", "hits", "none"])
@@ -433,8 +433,8 @@ def test_a_place_is_found_again_where_its_checkpoint_is(rays, tmp_path, kind):
     place = made(tmp_path, kind, rays)
     assert place.kind == kind and (place.radiance is not None) == (kind == "field")
     matrix = np.diag([2.0, 2, 2, 1])
-    provenance = json.loads(json.dumps(place.about)) | {"align": matrix.tolist()}
-    again = place_of_training(tmp_path / "gaze.safetensors", provenance, BOX, GazeEvaluationOptions(), ns)
+    provenance = json.loads(json.dumps(place.metadata)) | {"align": matrix.tolist()}
+    again = load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, GazeEvaluationOptions(), ns)
     assert again.kind == kind and again.align.scale == pytest.approx(2)
     assert again.box == (BOX if kind == "none" else place.box)
     if kind == "none":
@@ -442,25 +442,25 @@ def test_a_place_is_found_again_where_its_checkpoint_is(rays, tmp_path, kind):
     option = {"field": "field", "scene": "scene", "hits": "geometry"}[kind]
     elsewhere = GazeEvaluationOptions(**{option: tmp_path / "other"})
     with pytest.raises(NergError, match=f"does not exist; say where it is with --{option}"):
-        place_of_training(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
+        load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
     (tmp_path / "other").write_bytes(b"something else")
     with pytest.raises(NergError, match=f"is not the file .* give that one with --{option}"):
-        place_of_training(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
+        load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
 
 
 def test_a_checkpoint_that_does_not_say_where_it_was_trained():
     with pytest.raises(NergError, match="does not say"):
-        place_of_training(Path("gaze.safetensors"), {}, BOX, GazeEvaluationOptions(), ns)
+        load_training_geometry(Path("gaze.safetensors"), {}, BOX, GazeEvaluationOptions(), ns)
 
 
 def test_without_geometry_the_box_holds_whoever_looked(rays):
     views = around(5)
     for given, seen in ((rays, ()), (None, views), (rays, views)):
-        place = make_place(PlaceOptions(geometry="none"), given, seen, None, ns)
+        place = make_geometry(GeometryOptions(geometry="none"), given, seen, None, ns)
         eyes = np.concatenate(([given.origin] if given else []) + [v.camera.center[None] for v in seen])
         np.testing.assert_allclose(place.box.lower, eyes.min(axis=0) - 2)
     with pytest.raises(NergError, match="made of rays and written"):
-        make_place(PlaceOptions(geometry="hits"), None, views, None, ns)
+        make_geometry(GeometryOptions(geometry="hits"), None, views, None, ns)
 
 
 def test_a_similarity_is_four_rows_of_a_file(tmp_path):

@@ -18,9 +18,9 @@ import nerg_mi.workflows
 from nerg_mi.aoi.options import CountOptions, PredictionOptions, StatisticsOptions
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.ablation import Variant
-from nerg_mi.ranges import Checked
+from nerg_mi.ranges import ValidatedDataclass
 from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
-from nerg_mi.tasks.task import Part, Plan, rebuilt
+from nerg_mi.tasks.task import Part, Plan, rebuild_value
 from nerg_mi.train.gaze_settings import GazeSettings as TrainingSettings
 from nerg_mi.train.gaze_settings import ProbeSettings
 from nerg_mi.workflows import ablation, evaluate, options
@@ -34,11 +34,11 @@ from nerg_mi.workflows.gaze_commands import (
     GazeOptions,
     PriorOptions,
 )
-from nerg_mi.workflows.options import PartOptions, as_base, exposed_options, option, shared_options
+from nerg_mi.workflows.options import PartOptions, to_base, exposed_options, option, shared_options
 from nerg_mi.workflows.rays_commands import FilterOptions, SplitOptions
 from nerg_mi.workflows.render import picture_options
 from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions
-from nerg_mi.workflows.study import planned_study
+from nerg_mi.workflows.study import plan_study
 from tests.tasks import works
 
 # ---- Typed options of every workflow: frozen, of keywords alone, each with its help ----
@@ -56,7 +56,7 @@ KINDS = [
     for kind in vars(module).values()
     if is_dataclass(kind)
     and isinstance(kind, type)
-    and issubclass(kind, Checked)
+    and issubclass(kind, ValidatedDataclass)
     and kind.__module__ == module.__name__
 ]
 
@@ -108,7 +108,7 @@ def test_definitions():
 
 def test_a_sample_is_drawn_of_datasets_alone():
     options = PriorOptions()
-    assert (options.most, options.seed, options.mode) == (10_000_000, 0, "llvm_ad_rgb")
+    assert (options.max_samples, options.seed, options.mode) == (10_000_000, 0, "llvm_ad_rgb")
 
 
 # ---- Options of folds: those of places and of parts among them ----
@@ -116,7 +116,7 @@ def test_a_sample_is_drawn_of_datasets_alone():
 
 def test_they_say_a_place_and_who_makes_parts():
     options = FoldOptions(geometry="hits", store=Path("kept"))
-    assert options.in_parts and (options.folds, options.first, options.people) == (5, 0, 0.5)
+    assert options.in_parts and (options.folds, options.seed, options.test_participants) == (5, 0, 0.5)
     assert set(options.splits.split(",")) == {"both", "pos", "people"}
 
 
@@ -158,7 +158,7 @@ def training(monkeypatch):
 def test_folds_have_them(training, tmp_path):
     options = FoldOptions(geometry="hits", **CHOSEN)
     with pytest.raises(Stop):
-        evaluate.train_and_score(evaluate.Folds(options, ("both",), None, None), 3, tmp_path)
+        evaluate.train_and_score(evaluate.FoldInputs(options, ("both",), None, None), 3, tmp_path)
     assert {name: getattr(training[0], name) for name in CHOSEN} == CHOSEN and training[0].seed == 3
     # What tests are made by has the same words, and is left out.
     assert training[0].kappa is training[0].radius is None
@@ -167,7 +167,7 @@ def test_folds_have_them(training, tmp_path):
 def test_ablations_have_them(training):
     bench = SimpleNamespace(options=AblationOptions(**CHOSEN, default_steps=3), place=None)
     with pytest.raises(Stop):
-        ablation.plan_of(Variant(name="emit", recipe="default", gaze="emit"), 3, bench)
+        ablation.make_plan(Variant(name="emit", recipe="default", field_variant="emit"), 3, bench)
     assert {name: getattr(training[0], name) for name in CHOSEN} == CHOSEN
     assert training[0].kappa is training[0].radius is None and training[0].steps == 3
 
@@ -192,7 +192,7 @@ def test_a_detector_is_a_known_one():
     with pytest.raises(NergError, match='"dbscan"'):
         FilterOptions(fixations="dbscan")
     with pytest.raises(NergError, match="add --fixations"):
-        FilterOptions(one_ray=True, thin=1.0)
+        FilterOptions(merge_fixations=True, thin=1.0)
 
 
 def test_conditions_are_what_was_asked_for():
@@ -213,7 +213,7 @@ COMMANDS = {
     "ablate": (AblationOptions, training_options, STORE | {"recipes", "variant", "seeds", "cameras", "size"}),
     "study": (
         StudyOptions,
-        lambda o: planned_study(None, "sphere", o).options,
+        lambda o: plan_study(None, "sphere", o).options,
         STORE - {"threads"} | {"only", "defaults", "scene_kind"},
     ),
     "folds": (FoldOptions, fold_options, STORE | {"folds", "first", "splits", "most"}),
@@ -221,8 +221,8 @@ COMMANDS = {
 AFTER_COUNTS = {"eyes", "glance", "what_if", "visibility", "observers", "height", "floor", "step", "min_people"}
 AFTER_COUNTS |= {"names", "salt", "resamples", "seed"} | STORE
 OF_COUNTS = {f.name for f in fields(CountOptions)} - {f.name for f in fields(PredictionOptions)}
-COMMANDS["stats, counts"] = (StatisticsOptions, lambda o: as_base(o, CountOptions), AFTER_COUNTS | {"directions"})
-COMMANDS["stats, a field"] = (StatisticsOptions, lambda o: as_base(o, PredictionOptions), AFTER_COUNTS | OF_COUNTS)
+COMMANDS["stats, counts"] = (StatisticsOptions, lambda o: to_base(o, CountOptions), AFTER_COUNTS | {"directions"})
+COMMANDS["stats, a field"] = (StatisticsOptions, lambda o: to_base(o, PredictionOptions), AFTER_COUNTS | OF_COUNTS)
 COMMANDS["bake, a field"] = (GazeSumSettings, lambda o: o, set())
 COMMANDS["bake, rays"] = (RaySettings, lambda o: o, set())
 
@@ -255,7 +255,7 @@ def is_union(hint):
 
 
 def key(value):
-    (task,) = Plan("p", works.mixed, value, [Part("a")], ".txt").tasks
+    (task,) = Plan("p", works.write_mixture, value, [Part("a")], ".txt").tasks
     return task.key
 
 
@@ -266,7 +266,7 @@ def test_each_option_changes_the_key_of_a_part_exactly_when_it_changes_its_work(
     before, left_out = key(of_parts(options)), set()
     for f in fields(kind):
         changed = of_parts(replace(options, **{f.name: other_value(kind, f, options, tmp_path)}))
-        same_work = rebuilt(changed) == rebuilt(of_parts(options))
+        same_work = rebuild_value(changed) == rebuild_value(of_parts(options))
         assert (key(changed) == before) == same_work, f.name
         if same_work:
             left_out.add(f.name)
@@ -283,7 +283,7 @@ class Later(CountOptions):
 
 def test_a_new_option_is_in_the_key_and_one_of_the_schedule_is_not():
     assert key(Later(weight=2.0)) != key(Later()) and key(Later(processes=2)) == key(Later())
-    assert rebuilt(Later(processes=2)).processes == 1
+    assert rebuild_value(Later(processes=2)).processes == 1
 
 
 def test_a_file_is_its_bytes_wherever_it_lies(tmp_path):
@@ -302,7 +302,7 @@ def test_parts_are_asked_for_by_either_option():
 
 
 def test_what_runs_has_what_cannot_change_a_result_at_its_default():
-    (task,) = Plan("p", works.mixed, None, [Part(PartOptions(store=Path("s"), scheduler="tcp://a:1"))], ".txt").tasks
+    (task,) = Plan("p", works.write_mixture, None, [Part(PartOptions(store=Path("s"), scheduler="tcp://a:1"))], ".txt").tasks
     assert task.value == PartOptions() and not task.files
 
 

@@ -17,9 +17,9 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint
-from nerg_mi.formats.fields import is_field, load_radiance
+from nerg_mi.formats.fields import matches_checksum, load_radiance
 from nerg_mi.formats.splats import read_splats
-from nerg_mi.photos.colmap import Up
+from nerg_mi.photos.colmap import UpEstimate
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.structure import Reconstruction
 from nerg_mi.train.radiance_settings import RadianceSettings
@@ -169,7 +169,7 @@ def field(tmp_path):
 
 
 def test_a_field_and_its_file_are_exported_alike(field, tmp_path):
-    options, told = PointOptions(resolution=16, density=3.0, count=50), Recorder()
+    options, told = PointOptions(resolution=16, density=3.0, max_points=50), Recorder()
     first = export_points(field, tmp_path / "a.ply", options, told)
     second = export_points(load_radiance(field, ns)[0], tmp_path / "b.ply", options)
     assert first.files == [tmp_path / "a.ply"] and len(first.surface.vertices) == 50
@@ -222,15 +222,15 @@ def test_only_the_bound_is_another(files):
     # Of readers that know no parts the cells are what they were.
     assert {k: v for k, v in about["occupancy"].items() if k != "refined"} == meta["occupancy"]
     loaded = load_radiance(new, ns)[0].occupancy
-    assert np.array_equal(loaded.masks, found.occupancy.masks) and loaded.missed == found.occupancy.missed
-    assert 0 < loaded.fraction < found.before == loaded.coarse.fraction
+    assert np.array_equal(loaded.masks, found.occupancy.masks) and loaded.missed_optical_depth == found.occupancy.missed_optical_depth
+    assert 0 < loaded.occupied_fraction < found.before == loaded.coarse.occupied_fraction
 
 
 def test_a_gaze_field_knows_it(files, tmp_path):
     old, new, _ = files
     known = file_sha256(old)
-    assert is_field(old, known) and is_field(new, known)
-    assert not is_field(new, "0" * 64) and not is_field(new, None)
+    assert matches_checksum(old, known) and matches_checksum(new, known)
+    assert not matches_checksum(new, "0" * 64) and not matches_checksum(new, None)
     refine_checkpoint(new, tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == new.read_bytes()
 
@@ -286,7 +286,7 @@ def written(pictures, work: Path, keep: int) -> Reconstruction:
     rows = [f"{k} {p[0]} {p[1]} {p[2]} 9 9 9 0.3 1 0 2 0 3 0\n" for k, p in enumerate(points)]
     (model / "points3D.txt").write_text("".join(rows))
     names = [p.name for p in pictures]
-    up = Up(np.array([0, 0, 1.0]), 0.5, 0.4, 0.7)
+    up = UpEstimate(np.array([0, 0, 1.0]), 0.5, 0.4, 0.7)
     parts = [names[:keep]] + ([names[keep:]] if len(names) - keep >= 3 else [])
     colors = np.full((400, 3), 99, np.uint8)
     return Reconstruction(parts, 0.4, 400, up, [{"model": "OPENCV"}], to_world, points, colors)
@@ -315,7 +315,7 @@ def finds(monkeypatch):
 def test_the_capture_is_read_as_it_was_found(photos, finds, tmp_path):
     asked = finds(COUNT)
     told = Recorder()
-    options = PoseOptions(lens="radial", threads=1, seed=3, single_camera=False)
+    options = PoseOptions(camera_model="radial", threads=1, seed=3, single_camera=False)
     result = find_poses(photos, tmp_path / "new" / "capture", options, told)
     (settings,) = asked
     assert (settings.lens, settings.threads, settings.seed, settings.share) == ("radial", 1, 3, False)
@@ -325,7 +325,7 @@ def test_the_capture_is_read_as_it_was_found(photos, finds, tmp_path):
     assert [v.name for v in data.held_out] == ["0.png", "8.png"] and len(data.train) == 7
     poses = {v.name: v.camera.to_world for v in (*data.train, *data.held_out)}
     assert np.allclose([poses[f"{k}.png"] for k in range(COUNT)], rendered.poses(COUNT), atol=1e-9)
-    assert "points on surfaces" in data.box_from and not data.unused
+    assert "points on surfaces" in data.box_source and not data.unused
     for k in range(COUNT):
         assert (result.output / "images" / f"{k}.png").read_bytes() == (photos / f"{k}.png").read_bytes()
     assert result.unregistered == [] and result.points == 400 and not told.warnings
@@ -371,7 +371,7 @@ def test_an_up_that_is_unsure_or_not_asked_for_is_told(photos, finds, tmp_path):
     from dataclasses import replace
 
     told = Recorder()
-    finds(COUNT, lambda made: replace(made, up=Up(np.array([0, 0, 1.0]), 40.0)))
+    finds(COUNT, lambda made: replace(made, up=UpEstimate(np.array([0, 0, 1.0]), 40.0)))
     find_poses(photos, tmp_path / "a", None, told)
     assert "do not agree on what is up" in told.warnings[0] and "--no-orient" in told.warnings[0]
     finds(COUNT, lambda made: replace(made, up=None))
@@ -436,7 +436,7 @@ def test_frames_of_a_video(finds, tmp_path):
             out.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
         out.mux(stream.encode())
     finds(4)
-    result = find_poses(tmp_path / "film.mp4", tmp_path / "capture", PoseOptions(frames=4))
+    result = find_poses(tmp_path / "film.mp4", tmp_path / "capture", PoseOptions(num_frames=4))
     seconds = list(result.report["seconds"].values())
     assert result.registered == [f"frame_{round(10 * s) + 1:06d}.jpg" for s in seconds]
     assert len(seconds) == 4 and seconds == sorted(seconds) and seconds[-1] >= 0.8

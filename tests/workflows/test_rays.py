@@ -9,13 +9,13 @@ import pytest
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
-from nerg_mi.rays.dataset import Head, RayDataset, load_rays, write_head
+from nerg_mi.rays.dataset import DatasetManifest, RayDataset, load_rays, write_dataset_manifest
 from nerg_mi.rays.dataset_write import SourceWriter
 from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.rays.readers.registry import make_options
 from nerg_mi.workflows import rays
 from nerg_mi.workflows.evaluate import evaluate_gaze
-from nerg_mi.workflows.rays import FilterSteps, card_of, filter_rays, import_rays, least_mask, plot_rays, split_rays
+from nerg_mi.workflows.rays import FilterSteps, make_quality_report, filter_rays, import_rays, smallest_mask, plot_rays, split_rays
 from nerg_mi.workflows.rays_commands import FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 from nerg_mi.workflows.train_gaze import train_gaze
 from tests.cli.rays.running import write_walk
@@ -45,18 +45,18 @@ def test_nothing_is_left():
         steps.select({"time": (1e6, None)})
     steps = FilterSteps(crowd().select(np.zeros(1000, bool)), own=True, strict=False)
     for fixations, one_ray in (("ivt", False), ("idt", True)):
-        assert steps.follow(FilterOptions(fixations=fixations, one_ray=one_ray, thin=2)) == 0
+        assert steps.follow(FilterOptions(fixations=fixations, merge_fixations=one_ray, thin=2)) == 0
     assert [s.of for s in steps.taken] == [0] * 4
 
 
 def test_the_least_numbers_are_any_as_likely():
     counts = np.zeros(20)
     for seed in range(2000):
-        mask = least_mask(np.random.default_rng(seed).random(20), 5)
+        mask = smallest_mask(np.random.default_rng(seed).random(20), 5)
         assert mask.sum() == 5
         counts += mask
     assert ((counts - 500) ** 2 / 500).sum() < 43.8  # chi-square of 19 degrees of freedom at one in a thousand
-    assert least_mask(np.zeros(3), 5).all() and not least_mask(np.arange(3.0), 0).any()
+    assert smallest_mask(np.zeros(3), 5).all() and not smallest_mask(np.arange(3.0), 0).any()
 
 
 # ---- Jobs on tracking, as a notebook calls them: rays or files in, results out, the reporter told ----
@@ -135,7 +135,7 @@ def test_an_output_that_cannot_be_written_is_found_first(tmp_path, walk):
         for job in (
             lambda output=output: import_rays("absent.csv", RaysImportOptions(reader="varjo", output=output)),
             lambda output=output: filter_rays("absent.npz", FilterOptions(start=0, output=output)),
-            lambda output=output: split_rays("absent.npz", SplitOptions(people=0.5, test_output=output)),
+            lambda output=output: split_rays("absent.npz", SplitOptions(test_participants=0.5, test_output=output)),
         ):
             with pytest.raises(NergError, match=output.name):
                 job()
@@ -144,7 +144,7 @@ def test_an_output_that_cannot_be_written_is_found_first(tmp_path, walk):
 def test_filter_leaves_the_rays_that_it_was_given(walk):
     rays, heard = Rays.load(walk), Heard()
     before = [column.copy() for column in columns(rays)]
-    options = FilterOptions(persons=["a", "c"], start=10, end=30, fixations="idt", dispersion=30, thin=1)
+    options = FilterOptions(persons=["a", "c"], start=10, end=30, fixations="idt", dispersion_threshold=30, thin=1)
     found = filter_rays(rays, options, heard)
     assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(before, columns(rays))) and len(rays) == 12_000
     assert [s["step"] for s in found.rays.metadata["steps"]] == ["filter", "fixations", "thin"]
@@ -156,7 +156,7 @@ def test_filter_leaves_the_rays_that_it_was_given(walk):
 
 
 def test_one_ray_a_fixation(walk):
-    found = filter_rays(walk, FilterOptions(fixations="ivt", velocity=300, least=0.1, one_ray=True))
+    found = filter_rays(walk, FilterOptions(fixations="ivt", velocity_threshold=300, min_fixation=0.1, merge_fixations=True))
     (step,) = found.rays.metadata["steps"]
     assert len(found.rays) == found.fixations == step["kept"] and step["one_ray"] and step["velocity"] == 300
     assert step["least"] == 0.1 and step["of"] == 12_000
@@ -165,7 +165,7 @@ def test_one_ray_a_fixation(walk):
 def test_split(walk, tmp_path):
     heard = Heard()
     rays = Rays.load(walk)
-    options = SplitOptions(people=0.5, time=0.3, gap=1, seed=2, train_output=tmp_path / "train.npz")
+    options = SplitOptions(test_participants=0.5, test_time=0.3, gap=1, seed=2, train_output=tmp_path / "train.npz")
     found = split_rays(rays, options, heard)
     assert len(found.train) + len(found.test) + found.purged == len(rays) and found.purged > 0
     assert not set(found.train.t) & set(found.test.t) and not (tmp_path / "test.npz").exists()
@@ -178,7 +178,7 @@ def test_split(walk, tmp_path):
 
 
 def test_plot(walk, tmp_path):
-    split = split_rays(walk, SplitOptions(zones=2, min_rays=8, positions=10))
+    split = split_rays(walk, SplitOptions(test_zones=2, min_rays=8, test_positions=10))
     figure = plot_rays(split.train, PlotOptions(kind="layout", test=split.test, output=tmp_path / "p.png"))
     assert figure.axes and (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
     assert plot_rays(walk).axes
@@ -189,7 +189,7 @@ def test_plot(walk, tmp_path):
     [
         (FilterOptions, "say which rays"),
         (lambda: FilterOptions(fixations="magic"), "ivt or idt"),
-        (lambda: FilterOptions(one_ray=True), "add --fixations"),
+        (lambda: FilterOptions(merge_fixations=True), "add --fixations"),
         (SplitOptions, "say how to split"),
         (lambda: PlotOptions(kind="map"), "density or layout"),
         (lambda: PlotOptions(test="a.npz"), "add --kind layout"),
@@ -219,7 +219,7 @@ def files(tmp_path):
 
 def test_import_into_a_dataset(parquet, files, tmp_path):
     heard, output = Recorder(), tmp_path / "shop.rays"
-    found = import_rays(files, options(output=output, place_name="shop"), heard)
+    found = import_rays(files, options(output=output, environment="shop"), heard)
     at_once = import_rays(files, options(workers=None))
     assert_same(found.rays, at_once.rays)
     assert found.summary.rays == 597 and found.lines[0][0] == "dataset" and at_once.lines == ()
@@ -229,11 +229,11 @@ def test_import_into_a_dataset(parquet, files, tmp_path):
     more = write_source(tmp_path / "north.csv", 5, 100)
     card = import_rays([more], options(output=output, place_name="north"), heard)
     assert card.summary.rays == 99 and len(RayDataset.open(output)) == 696
-    assert [(title, c.summary.rays) for title, c in card_of(output)] == [
+    assert [(title, c.summary.rays) for title, c in make_quality_report(output)] == [
         (f"{output}: north", 99),
         (f"{output}: shop", 597),
     ]
-    assert [title for title, _ in card_of(output / "place=north")] == [str(output / "place=north")]
+    assert [title for title, _ in make_quality_report(output / "place=north")] == [str(output / "place=north")]
 
 
 def test_what_could_not_be_imported_is_told_in_the_end(parquet, files, tmp_path):
@@ -327,7 +327,7 @@ def test_filters_that_cannot_be(parquet, tmp_path, monkeypatch):
     with pytest.raises(NergError, match="nothing is left of 1,197 rays"):
         filter_rays(dataset.folder, FilterOptions(start=0, end=1, output=tmp_path / "a.rays"))
     assert not (tmp_path / "a.rays").exists()
-    monkeypatch.setattr(rays, "MOST", 500)
+    monkeypatch.setattr(rays, "MAX_LOADED_RAYS", 500)
     with pytest.raises(NergError, match="more than 500 rays are left"):
         filter_rays(dataset.folder, FilterOptions(with_hit=True))
     with pytest.raises(NergError, match="not empty"):
@@ -339,7 +339,7 @@ def crowded(tmp_path_factory):
     """A dataset of 3,000 rays of four people in a corridor."""
     pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
     folder = tmp_path_factory.mktemp("crowded") / "corridor.rays"
-    write_head(folder, Head(2))
+    write_dataset_manifest(folder, DatasetManifest(2))
     writer = SourceWriter(folder, "0" * 32, 2)
     writer.add(evaluated_crowd(3000), "corridor")
     writer.finish({"frame": dict(FRAME)}, file="a", where="w", stamp=None, recipe="r", generation=0)
@@ -349,7 +349,7 @@ def crowded(tmp_path_factory):
 @pytest.mark.parametrize("most", [10_000, 2500])
 def test_training_and_scores_are_of_the_same_rays(parquet, crowded, tmp_path, most):
     heard, gaze = Recorder(), tmp_path / "gaze.safetensors"
-    trained = train_gaze(crowded, gaze, replace(TRAINING, most=most, seed=3), heard)
+    trained = train_gaze(crowded, gaze, replace(TRAINING, max_samples=most, seed=3), heard)
     about = trained.provenance["rays_file"]
     count = min(most, 3000)
     assert about["file"] == "corridor.rays" and (about["rays"], about["most"], about["seed"]) == (count, most, 3)

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import top_of
+from nerg_mi.figures.overlay import robust_max
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.images import read_exr_text
+from nerg_mi.files.images import read_exr_attributes
 from nerg_mi.rendering import bands
-from nerg_mi.rendering.bands import prepare_for, render_asked
+from nerg_mi.rendering.bands import prepare_long_render, render_aovs
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.tasks.engines import Local, Processes, run_plan
+from nerg_mi.tasks.engines import LocalEngine, ProcessEngine, run_plan
 from nerg_mi.tasks.store import Store
 from nerg_mi.workflows import render
-from nerg_mi.workflows.demo import store_scene
+from nerg_mi.workflows.demo import find_store_scene
 from nerg_mi.workflows.options import PartOptions
-from nerg_mi.workflows.parts import Parts, PlannedScene, account_for_store, size
+from nerg_mi.workflows.parts import PartRunner, PlannedScene, account_for_store, format_bytes
 from nerg_mi.workflows.render import make_picture, render_file, render_film
 from nerg_mi.workflows.scene_commands import FilmOptions, PictureOptions
 from nerg_mi.workflows.scene_commands import PictureOptions as PicturesPictureOptions
@@ -76,19 +76,19 @@ def test_a_quantity_that_the_scene_does_not_name(rgb, scene_overlays, tmp_path):
     told = Recorder()
     made = render_file(scene_overlays, tmp_path / "a.png", PictureOptions(overlay="gaze", mode=MODE), told)
     loaded = load_scene(scene_overlays)
-    found = render_asked(scene_overlays, loaded, loaded.sensors()[0], ["gaze", "opacity"])
-    assert made.top == pytest.approx(top_of(found.aovs["gaze"], found.mask)) and made.files == (tmp_path / "a.png",)
+    found = render_aovs(scene_overlays, loaded, loaded.sensors()[0], ["gaze", "opacity"])
+    assert made.vmax == pytest.approx(robust_max(found.aovs["gaze"], found.mask)) and made.files == (tmp_path / "a.png",)
     # The picture, pixel for pixel, and the scale beside it.
     width, height = mitsuba_bitmap(made.path).size()
-    assert width > 18 + 60 and height > 12 and f"scale to {made.top:.4g}" in told.messages[0]
-    fixed = render_file(scene_overlays, tmp_path / "b.png", PictureOptions(overlay="gaze", top=9.0, mode=MODE))
-    assert fixed.top == 9.0 and (tmp_path / "b.png").read_bytes() != (tmp_path / "a.png").read_bytes()
+    assert width > 18 + 60 and height > 12 and f"scale to {made.vmax:.4g}" in told.messages[0]
+    fixed = render_file(scene_overlays, tmp_path / "b.png", PictureOptions(overlay="gaze", vmax=9.0, mode=MODE))
+    assert fixed.vmax == 9.0 and (tmp_path / "b.png").read_bytes() != (tmp_path / "a.png").read_bytes()
 
 
 @pytest.mark.parametrize("name", ["visibility", "depth", "emit"])
 def test_other_quantities(rgb, scene_overlays, tmp_path, name):
     made = render_file(scene_overlays, tmp_path / "a.png", PictureOptions(overlay=name, mode=MODE))
-    assert made.path.stat().st_size > 500 and (made.top is None) == (name == "visibility")
+    assert made.path.stat().st_size > 500 and (made.vmax is None) == (name == "visibility")
 
 
 def test_a_sequence_has_one_scale(rgb, scene_overlays, tmp_path):
@@ -97,12 +97,12 @@ def test_a_sequence_has_one_scale(rgb, scene_overlays, tmp_path):
     tops = []
     for k, eye in enumerate(("0.2, 0.1, -2.5", "-1.5, 0.4, -2")):
         one = PictureOptions(overlay="gaze", defaults={"eye": eye}, mode=MODE)
-        tops.append(render_file(scene_overlays, tmp_path / f"one{k}.png", one).top)
-    assert tops[0] != tops[1] and both.top == max(tops)
+        tops.append(render_file(scene_overlays, tmp_path / f"one{k}.png", one).vmax)
+    assert tops[0] != tops[1] and both.vmax == max(tops)
     assert [p.name for p in both.files] == ["walk_0001.png", "walk_0002.png"]
     # The one whose scale it is looks as it does alone; the other does not.
     alone = [(tmp_path / f"one{k}.png").read_bytes() == p.read_bytes() for k, p in enumerate(both.files)]
-    assert alone == [t == both.top for t in tops]
+    assert alone == [t == both.vmax for t in tops]
 
 
 def test_a_sequence_without_an_overlay(rgb, scene_overlays, tmp_path):
@@ -127,7 +127,7 @@ def test_a_video_has_the_pictures_of_the_sequence(rgb, scene_overlays, tmp_path,
     av = pytest.importorskip("av", reason='PyAV is not installed (pip install "nerg-mi[video]")')
     kept = []
     monkeypatch.setattr(render, "write_bytes", lambda path, *parts: kept.append(path) or write_bytes(path, *parts))
-    options = PictureOptions(overlay="gaze", frames=scene_overlays.with_name("walk.csv"), top=top, mode=MODE)
+    options = PictureOptions(overlay="gaze", frames=scene_overlays.with_name("walk.csv"), vmax=top, mode=MODE)
     render_file(scene_overlays, tmp_path / "walk.png", options)
     # With a scale that is given no picture waits for the others.
     assert len(kept) == (0 if top else 2)
@@ -171,12 +171,12 @@ def test_each_picture_of_a_sequence_says_its_own_values(rgb, scene_overlays, tmp
 
 def test_hatched_where_no_surface_is(rgb, scene_overlays, tmp_path):
     """The picture within the page, against the opacity that the scene itself renders."""
-    made = render_file(scene_overlays, tmp_path / "a.png", PictureOptions(overlay="gaze", top=1.0, mode=MODE))
+    made = render_file(scene_overlays, tmp_path / "a.png", PictureOptions(overlay="gaze", vmax=1.0, mode=MODE))
     plain = render_file(
-        scene_overlays, tmp_path / "b.png", PictureOptions(overlay="gaze", top=1.0, hatching=False, mode=MODE)
+        scene_overlays, tmp_path / "b.png", PictureOptions(overlay="gaze", vmax=1.0, hatching=False, mode=MODE)
     )
     loaded = load_scene(scene_overlays)
-    mask = render_asked(scene_overlays, loaded, loaded.sensors()[0], ["gaze", "opacity"]).mask
+    mask = render_aovs(scene_overlays, loaded, loaded.sensors()[0], ["gaze", "opacity"]).mask
     assert 0 < mask.sum() < mask.size
     a, b = (np.array(mitsuba_bitmap(m.path)).astype(int)[..., :3] for m in (made, plain))
     # Each pixel is a square of 9 x 9; the scale and its legend lie to the right of the picture.
@@ -270,7 +270,7 @@ def test_a_sensor_that_is_not_there(scene_pictures, tmp_path):
 def test_the_header_says_what_the_gaze_rests_on(tmp_path):
     small = {"width": "12", "height": "8"}
     options = PicturesPictureOptions(defaults=small, spp=1, mode="llvm_ad_rgb")
-    text = read_exr_text(render_file(store_scene(), tmp_path / "a.exr", options).path)
+    text = read_exr_attributes(render_file(find_store_scene(), tmp_path / "a.exr", options).path)
     assert text["gaze.basis"].startswith("made of ") and text["gaze.basis"].endswith(" people")
     assert "nerg render" in text["Comment"] and "kde.basis" not in text
 
@@ -279,13 +279,13 @@ def test_the_header_says_what_the_gaze_rests_on(tmp_path):
 @pytest.mark.slow
 def test_long_renders_are_prepared_and_the_same_to_the_byte(tmp_path, monkeypatch):
     options = PicturesPictureOptions(defaults={"width": "24", "height": "16"}, spp=2, mode="llvm_ad_rgb")
-    render_file(store_scene(), tmp_path / "a.png", options)
+    render_file(find_store_scene(), tmp_path / "a.png", options)
     prepared = []
-    monkeypatch.setattr(bands, "SAMPLES", 24 * 16 * 2)
+    monkeypatch.setattr(bands, "LONG_RENDER_SAMPLES", 24 * 16 * 2)
     monkeypatch.setattr(
-        render, "prepare_for", lambda samples, scene: prepared.append(prepare_for(samples, scene)) or prepared[-1]
+        render, "prepare_long_render", lambda samples, scene: prepared.append(prepare_long_render(samples, scene)) or prepared[-1]
     )
-    render_file(store_scene(), tmp_path / "b.png", options)
+    render_file(find_store_scene(), tmp_path / "b.png", options)
     assert prepared == [True]
     assert mitsuba_bitmap(tmp_path / "a.png") == mitsuba_bitmap(tmp_path / "b.png")
 
@@ -331,7 +331,7 @@ def test_parts_give_the_bytes_of_one_go(scene, name, overlay):
     parts = film_of(scene, "parts", name, store=scene.parent / "store", **overlay)
     found = files(scene.parent / "parts")
     assert found == files(scene.parent / "whole") and found
-    assert (parts.size, parts.top, len(parts.files)) == (whole.size, whole.top, len(whole.files))
+    assert (parts.size, parts.vmax, len(parts.files)) == (whole.size, whole.vmax, len(whole.files))
 
 
 def test_pictures_that_are_kept_are_not_rendered_again(scene, monkeypatch):
@@ -405,17 +405,17 @@ def test_options_that_contradict_are_told_before_any_work(scene, tmp_path):
 
 
 def test_the_store_is_beside_the_output_unless_it_is_named(tmp_path):
-    beside = Parts(PartOptions(scheduler="local:2"), tmp_path / "walk.mp4", Recorder())
-    assert beside.store.folder == tmp_path / "walk.tasks" and isinstance(beside.engine, Processes)
-    named = Parts(PartOptions(store=tmp_path / "s"), tmp_path / "walk.mp4", Recorder())
+    beside = PartRunner(PartOptions(scheduler="local:2"), tmp_path / "walk.mp4", Recorder())
+    assert beside.store.folder == tmp_path / "walk.tasks" and isinstance(beside.engine, ProcessEngine)
+    named = PartRunner(PartOptions(store=tmp_path / "s"), tmp_path / "walk.mp4", Recorder())
     assert named.store.folder == tmp_path / "s"
 
 
 def test_progress_of_a_share_of_the_job(tmp_path):
     told = Recorder()
-    parts = Parts(PartOptions(store=tmp_path / "s"), tmp_path / "a", told)
-    assert len(list(parts.run(works.plan(2), 0.0, 0.8))) == 2
-    assert len(list(parts.run(works.some(*"abcd"), 0.8))) == 4
+    parts = PartRunner(PartOptions(store=tmp_path / "s"), tmp_path / "a", told)
+    assert len(list(parts.run(works.make_plan(2), 0.0, 0.8))) == 2
+    assert len(list(parts.run(works.make_small_plan(*"abcd"), 0.8))) == 4
     assert [round(share, 2) for share, _ in told.steps] == [0.0, 0.4, 0.8, 0.8, 0.85, 0.9, 0.95, 1.0]
     texts = [text for _, text in told.steps]
     assert all(" left" not in text for text in texts[:3]) and texts[0] == "0 of 2 parts"
@@ -427,9 +427,9 @@ def test_ctrl_c_says_where_the_parts_are(tmp_path):
         def progress(self, share, text=""):
             raise KeyboardInterrupt
 
-    parts = Parts(PartOptions(store=tmp_path / "s"), tmp_path / "a", Impatient())
+    parts = PartRunner(PartOptions(store=tmp_path / "s"), tmp_path / "a", Impatient())
     with pytest.raises(KeyboardInterrupt, match=r"kept in .*/s: the same command goes on"):
-        list(parts.run(works.plan(2)))
+        list(parts.run(works.make_plan(2)))
 
 
 def test_a_scene_that_reads_another_file_than_was_planned_is_refused(tmp_path):
@@ -437,15 +437,15 @@ def test_a_scene_that_reads_another_file_than_was_planned_is_refused(tmp_path):
     (tmp_path / "more.xml").write_text('<scene version="3.0.0"/>')
     scene = tmp_path / "scene.xml"
     scene.write_text(f'<scene version="3.0.0"><include filename="{tmp_path / "more.xml"}"/></scene>')
-    planned = PlannedScene.of(scene)
-    assert planned.checked() == scene and len(planned.files.all) == 2
-    there = works.laid_out(planned, tmp_path / "worker")
+    planned = PlannedScene.plan(scene)
+    assert planned.checked_path() == scene and len(planned.files.members) == 2
+    there = works.lay_out(planned, tmp_path / "worker")
     with pytest.raises(NergError, match="is not the file that the job was planned with"):
         make_picture(PictureOptions(), there, tmp_path / "a.png")
     scene.write_text('<scene version="3.0.0"><include filename="more.xml"/></scene>')
-    there = works.laid_out(PlannedScene.of(scene), tmp_path / "relative")
+    there = works.lay_out(PlannedScene.plan(scene), tmp_path / "relative")
     shutil.move(tmp_path / "more.xml", tmp_path / "gone.xml")
-    assert there.checked().read_text() == scene.read_text() and there.checked() != scene
+    assert there.checked_path().read_text() == scene.read_text() and there.checked_path() != scene
 
 
 # ---- What is said of a store ----
@@ -454,10 +454,10 @@ def test_a_scene_that_reads_another_file_than_was_planned_is_refused(tmp_path):
 def test_lines_and_removal(tmp_path):
     (tmp_path / "a").write_text("before")
     store = Store(tmp_path / "store")
-    arriving = run_plan(works.plan(5, what="nerg render walk.mp4"), store, Local())
+    arriving = run_plan(works.make_plan(5, what="nerg render walk.mp4"), store, LocalEngine())
     next(arriving), next(arriving)
     arriving.close()
-    list(run_plan(works.plan(2, (tmp_path / "a",), what="another"), store, Local()))
+    list(run_plan(works.make_plan(2, (tmp_path / "a",), what="another"), store, LocalEngine()))
     (tmp_path / "a").write_text("after")
     told = Recorder()
     account = account_for_store(store.folder, reporter=told)
@@ -469,7 +469,7 @@ def test_lines_and_removal(tmp_path):
     assert "--remove-stale" in told.messages[3] and len(account.stale) == 2
     told = Recorder()
     account_for_store(store.folder, True, told)
-    assert told.messages[-1] == "Removed 130 bytes." and len(list(store.receipts())) == 2
+    assert told.messages[-1] == "Removed 130 bytes." and len(list(store.iter_manifests())) == 2
 
 
 def test_a_folder_that_is_not_there(tmp_path):
@@ -479,4 +479,4 @@ def test_a_folder_that_is_not_there(tmp_path):
 
 def test_sizes():
     counts = (0, 999, 1200, 34_000, 5_600_000, 7.8e9, 2e12)
-    assert [size(n) for n in counts] == ["0 bytes", "999 bytes", "1.2 kB", "34 kB", "5.6 MB", "7.8 GB", "2.0 TB"]
+    assert [format_bytes(n) for n in counts] == ["0 bytes", "999 bytes", "1.2 kB", "34 kB", "5.6 MB", "7.8 GB", "2.0 TB"]

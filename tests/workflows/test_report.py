@@ -13,25 +13,25 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze_report import write_report
-from nerg_mi.figures.style import provenance
+from nerg_mi.figures.style import make_provenance
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.report.data import PATH_POINTS
-from nerg_mi.train.geometry import GazePlace
+from nerg_mi.report.data import MAX_PATH_POINTS
+from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.workflows import report
 from nerg_mi.workflows.gaze_commands import GazeOptions
 from nerg_mi.workflows.report import (
-    Views,
-    company,
-    free_places,
-    gaze_top,
+    RenderedViews,
+    count_participants_near,
+    find_free_positions,
+    gaze_vmax,
     make_report,
-    panorama_eyes,
-    paths_of,
-    pictures_of_rays,
-    pictures_of_views,
-    place_words,
+    panorama_positions,
+    collect_paths,
+    draw_rays,
+    draw_views,
+    describe_scene,
     sort_files,
 )
 from nerg_mi.workflows.scene_commands import ReportOptions
@@ -45,7 +45,7 @@ from tests.workflows.recorder import Recorder
 # ---- The report as a job: from files to a page, with what is missing left out ----
 
 
-SMALL = ReportOptions(width=24, spp=1, points=600, eyes=4, mode="llvm_ad_rgb")
+SMALL = ReportOptions(width=24, spp=1, max_points=600, viewpoints=4, mode="llvm_ad_rgb")
 NAMES = ("Ada", "Grace", "Mary", "Edsger")
 
 
@@ -72,7 +72,7 @@ def without_3d(monkeypatch):
 
 def test_everything_of_a_folder(run, tmp_path):
     told = Recorder()
-    options = replace(SMALL, objects=run / "objects.json")
+    options = replace(SMALL, aois=run / "objects.json")
     result = make_report([run], tmp_path / "a.html", options, told)
     text = result.path.read_text(encoding="utf-8")
     assert told.messages[0] == "Better than nearest rays, the strongest baseline, for new people at new places." in text
@@ -81,17 +81,17 @@ def test_everything_of_a_folder(run, tmp_path):
     assert {"color", "own", "sphere", "plan", "layout"} <= set(found.pictures)
     assert {role for role, *_ in found.inputs} == {"gaze field", "hit points", "rays", "evaluation", "objects"}
     wall, nothing = found.objects
-    assert wall.recorded.mean > 0.5 and wall.saw == wall.people == 4 and wall.field.mean > 0
-    assert nothing.field.mean == 0 and nothing.saw == nothing.looked == 0
+    assert wall.recorded.mean > 0.5 and wall.num_could_see == wall.num_participants == 4 and wall.predicted.mean > 0
+    assert nothing.predicted.mean == 0 and nothing.num_could_see == nothing.num_looked == 0
     scene = packed_scene(text)
-    assert 100 < scene["count"] <= 600 and len(scene["observers"]) == 6 and found.company and min(found.company) >= 1
+    assert 100 < scene["count"] <= 600 and len(scene["observers"]) == 6 and found.nearby_participants and min(found.nearby_participants) >= 1
     # Nobody's name, neither of rays nor of evaluations.
     assert not any(name in text for name in NAMES) and "person 1" in text
     # How many rays of how many people the gaze rests on, and what all of it was made of.
-    assert re.fullmatch(r"made of [\d,]+ rays of [1-4] people", found.basis) and text.count(found.basis) >= 2
-    made = json.loads(found.made)
+    assert re.fullmatch(r"made of [\d,]+ rays of [1-4] people", found.support_note) and text.count(found.support_note) >= 2
+    made = json.loads(found.provenance_json)
     assert made["what"] == "nerg report" and set(made["inputs"].values()) == {digest for *_, digest in found.inputs}
-    assert found.made.encode("latin-1") in found.pictures["own"].png and 'name="provenance"' in text
+    assert found.provenance_json.encode("latin-1") in found.pictures["own"].png and 'name="provenance"' in text
 
 
 @pytest.mark.nightly
@@ -103,7 +103,7 @@ def test_equal_files_make_an_equal_report(run, tmp_path):
 
 
 def test_names_where_they_are_asked_for(run, tmp_path):
-    options = replace(SMALL, names=True, paths=False)
+    options = replace(SMALL, show_names=True, paths=False)
     text = make_report([run], tmp_path / "a.html", options).path.read_text(encoding="utf-8")
     assert "Ada" in text and packed_scene(text)["paths"] == []
 
@@ -124,9 +124,9 @@ def test_a_gaze_field_alone(run, tmp_path):
 
 
 def test_objects_without_rays(without_3d, run, tmp_path):
-    options = replace(SMALL, objects=run / "objects.json", observer=(-0.5, 0.0, 1.6))
+    options = replace(SMALL, aois=run / "objects.json", observer=(-0.5, 0.0, 1.6))
     found = make_report([run / "gaze.safetensors"], tmp_path / "a.html", options).run
-    assert found.objects[0].recorded is None and 0 < found.objects[0].field.mean < 1
+    assert found.objects[0].recorded is None and 0 < found.objects[0].predicted.mean < 1
     assert "where it was asked for, at (-0.50, 0.00, 1.60)" in found.observer
 
 
@@ -163,7 +163,7 @@ def test_evaluations_of_others_are_refused_or_doubted(without_3d, run, tmp_path)
     with pytest.raises(NergError, match='"pos"'):
         make_report([gaze, evaluation(), evaluation()], tmp_path / "a.html", SMALL)
     found = make_report([gaze, evaluation(gaze="other.safetensors")], tmp_path / "a.html", SMALL).run
-    assert "a field called other.safetensors" in found.doubts[0]
+    assert "a field called other.safetensors" in found.warnings[0]
 
 
 def test_without_a_place(tmp_path):
@@ -171,7 +171,7 @@ def test_without_a_place(tmp_path):
     crowd(600).save(tmp_path / "rays.npz")
     train_gaze(tmp_path / "rays.npz", tmp_path / "gaze.safetensors", job)
     (tmp_path / "objects.json").write_text('{"a": [[0, 0, 0], [1, 1, 1]]}')
-    options = replace(SMALL, objects=tmp_path / "objects.json")
+    options = replace(SMALL, aois=tmp_path / "objects.json")
     result = make_report([tmp_path / "gaze.safetensors", tmp_path / "rays.npz"], tmp_path / "a.html", options)
     text = result.path.read_text(encoding="utf-8")
     assert "Nothing is known of the place" in text and "There is no 3D scene" in text and result.run.objects == ()
@@ -246,8 +246,8 @@ def test_inputs_have_their_checksums(folder):
 def test_splats_are_called_so(folder, tmp_path):
     write_inria(tmp_path / "place.ply", random_splats(5))
     found = sort_files([folder / "shoppers.safetensors", tmp_path / "place.ply"])
-    assert found.inputs()[1][0] == "splats" and place_words(found) == "Gaussian splats, place.ply."
-    assert place_words(sort_files([folder])).startswith("A radiance field")
+    assert found.inputs()[1][0] == "splats" and describe_scene(found) == "Gaussian splats, place.ply."
+    assert describe_scene(sort_files([folder])).startswith("A radiance field")
 
 
 def test_what_makes_no_report(folder, tmp_path):
@@ -286,17 +286,17 @@ def three(own=0.5):
 
 
 def drawn(seen, top=0.5, known=True, **about):
-    return pictures_of_views(Views(seen, **about), top, known, ABOUT)
+    return draw_views(RenderedViews(seen, **about), top, known, ABOUT)
 
 
-ABOUT = provenance("nerg report", seed=7, settings={"width": 48})
+ABOUT = make_provenance("nerg report", seed=7, settings={"width": 48})
 
 
 def test_one_scale_for_all():
-    assert gaze_top(three()) == pytest.approx(0.5)
-    assert gaze_top({"camera": view(0.0)}) is None
+    assert gaze_vmax(three()) == pytest.approx(0.5)
+    assert gaze_vmax({"camera": view(0.0)}) is None
     # Where there is no surface gaze does not count.
-    assert gaze_top({"camera": view(np.where(np.arange(32)[:, None] < 4, 9.0, 0.0))}) is None
+    assert gaze_vmax({"camera": view(np.where(np.arange(32)[:, None] < 4, 9.0, 0.0))}) is None
 
 
 def test_which_pictures_there_are():
@@ -315,7 +315,7 @@ def test_they_are_png_files_with_words_and_the_same_again():
 
 
 def test_each_says_in_its_header_what_it_was_made_of():
-    every = drawn(three()) | pictures_of_rays(crowd(300), None, ABOUT)
+    every = drawn(three()) | draw_rays(crowd(300), None, ABOUT)
     assert set(every) == {"color", "gaze", "own", "sphere", "plan", "layout"}
     for name, picture in every.items():
         assert ABOUT.json().encode("latin-1") in picture.png, name
@@ -359,16 +359,16 @@ def test_the_rays_that_it_rests_on_are_named():
 
 
 def test_plans():
-    found = pictures_of_rays(crowd(300), {"centres": [[-0.5, 0, 1.6]], "radius": 0.5}, ABOUT)
+    found = draw_rays(crowd(300), {"centres": [[-0.5, 0, 1.6]], "radius": 0.5}, ABOUT)
     assert set(found) == {"plan", "layout"} and "held out" in found["layout"].caption
-    assert "held out" not in pictures_of_rays(crowd(300), None, ABOUT)["layout"].caption
+    assert "held out" not in draw_rays(crowd(300), None, ABOUT)["layout"].caption
 
 
 # ---- Where a report looks from, and the paths that it draws ----
 
 
 BOX = Box((0.0, 0.0, 0.0), (8.0, 6.0, 3.0))
-PLACE = GazePlace(None, BOX, "none")
+PLACE = TrainingGeometry(None, BOX, "none")
 
 
 class Walls:
@@ -396,7 +396,7 @@ def walkers(count=4, n=400):
 
 
 def test_free_places_are_in_the_room_and_not_in_the_block():
-    found = free_places(Walls(), (np.zeros(3), np.array([8.0, 6, 3])), np.array([0.0, 0, 1]), np.array([1.0, 1, 1.6]))
+    found = find_free_positions(Walls(), (np.zeros(3), np.array([8.0, 6, 3])), np.array([0.0, 0, 1]), np.array([1.0, 1, 1.6]))
     assert len(found) > 30 and (found[:, 2] == 1.6).all()
     inside = ((found[:, :2] > [2.9, 1.9]) & (found[:, :2] < [5.1, 4.1])).all(axis=1)
     assert not inside.any() and (found > 0.1).all() and (found[:, 0] < 7.9).all()
@@ -404,26 +404,26 @@ def test_free_places_are_in_the_room_and_not_in_the_block():
 
 def test_panoramas_begin_with_the_observer():
     standing = np.stack([np.linspace(0, 8, 50), np.zeros(50), np.full(50, 1.6)], axis=1)
-    eyes = panorama_eyes(standing, np.array([4.0, 0, 1.6]), 3)
+    eyes = panorama_positions(standing, np.array([4.0, 0, 1.6]), 3)
     assert np.allclose(eyes, [[4, 0, 1.6], [0, 0, 1.6], [8, 0, 1.6]]) or np.allclose(
         eyes, [[4, 0, 1.6], [8, 0, 1.6], [0, 0, 1.6]]
     )
-    assert len(panorama_eyes(standing[:0], np.zeros(3))) == 1
+    assert len(panorama_positions(standing[:0], np.zeros(3))) == 1
 
 
 def test_company_counts_people_and_not_rays():
     rays = walkers()
     eyes = np.array([[2.0, 1.0, 1.6], [2.0, 1.5, 1.6], [2.0, 9.0, 1.6]])
-    assert company(rays, eyes, PLACE, 0.55) == (1, 2, 0)
+    assert count_participants_near(rays, eyes, PLACE, 0.55) == (1, 2, 0)
     # In a place of other units the radius is still in metres.
     scaled = replace(PLACE, align=Similarity(np.diag([0.1, 0.1, 0.1, 1.0])))
-    assert company(rays, 0.1 * eyes, scaled, 0.55) == (1, 2, 0)
+    assert count_participants_near(rays, 0.1 * eyes, scaled, 0.55) == (1, 2, 0)
 
 
 def test_paths_follow_people_with_gaps():
     rays = walkers(2)
     gap = rays.select(~((rays.person == 0) & (rays.t > 10) & (rays.t < 14)))
-    paths = paths_of(gap, PLACE)
+    paths = collect_paths(gap, PLACE)
     assert len(paths) == 3
     for path in paths:
         steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
@@ -433,10 +433,10 @@ def test_paths_follow_people_with_gaps():
 
 def test_somebody_who_stands_is_no_path():
     rays = walkers(1)
-    assert paths_of(replace(rays, origin=np.tile([1.0, 1, 1.6], (len(rays), 1))), PLACE) == []
+    assert collect_paths(replace(rays, origin=np.tile([1.0, 1, 1.6], (len(rays), 1))), PLACE) == []
 
 
 def test_no_more_of_paths_than_fits():
     rays = walkers(8, 40_000)
-    paths = paths_of(rays, PLACE)
-    assert 0 < sum(map(len, paths)) <= PATH_POINTS and all(len(p) > 1 for p in paths)
+    paths = collect_paths(rays, PLACE)
+    assert 0 < sum(map(len, paths)) <= MAX_PATH_POINTS and all(len(p) > 1 for p in paths)

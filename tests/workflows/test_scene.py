@@ -16,22 +16,22 @@ from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
-from nerg_mi.formats.gltf import shown_unlit
+from nerg_mi.formats.gltf import encode_unlit_glb
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.rendering.files import read_frames
-from nerg_mi.rendering.nested_scene import gaze_of_scene
+from nerg_mi.rendering.nested_scene import find_gaze_file
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.workflows import demo, scene
-from nerg_mi.workflows.geometry import make_place
-from nerg_mi.workflows.options import PlaceOptions
+from nerg_mi.workflows.geometry import make_geometry
+from nerg_mi.workflows.options import GeometryOptions
 from nerg_mi.workflows.render import render_file
 from nerg_mi.workflows.scene import write_scene
 from nerg_mi.workflows.scene_commands import PictureOptions, SceneOptions, ViewOptions
-from nerg_mi.workflows.view import place_to_view, write_variants
+from nerg_mi.workflows.view import make_viewer_scene, write_variants
 from tests.formats.splats.writers import random_splats, write_inria, write_spz
 from tests.pictures import mitsuba_bitmap
 from tests.plugins import fields
@@ -171,7 +171,7 @@ def test_places_of_any_unit(rgb, tmp_path, kind, scale):
 
 
 def test_a_picture_that_would_be_empty_is_refused(rgb, folder, tmp_path):
-    away = SceneOptions(camera_from=(9, 0, 0), camera_to=(20, 0, 0), mode=MODE)
+    away = SceneOptions(camera=(9, 0, 0), target=(20, 0, 0), mode=MODE)
     with pytest.raises(NergError, match="--from"):
         write_scene([folder / "mesh.ply"], tmp_path / "a.xml", away)
     assert not (tmp_path / "a.xml").exists()
@@ -190,8 +190,8 @@ def test_a_field_without_an_end(rgb, tmp_path):
 
 
 def test_gaze_alone_finds_its_place_by_its_name_and_sum(rgb, folder, tmp_path):
-    place = make_place(PlaceOptions(field=folder / "field.safetensors"), None, (), None, _ns())
-    gaze = trained(folder, "of_field.safetensors", place.about)
+    place = make_geometry(GeometryOptions(field=folder / "field.safetensors"), None, (), None, _ns())
+    gaze = trained(folder, "of_field.safetensors", place.metadata)
     result = write_scene([gaze], tmp_path / "a.xml", SceneOptions(observer=(0, 0, 0), mode=MODE))
     _, found = shown(result.path)
     assert found.mask.any() and found.aovs["gaze"].max() > 0
@@ -213,8 +213,8 @@ def _ns():
 
 
 def test_hit_points_are_a_place_with_colours(rgb, folder, tmp_path):
-    place = make_place(PlaceOptions(geometry="hits"), rays(), (), folder / "hits.vol", _ns(), 0.1)
-    gaze = trained(folder, "of_hits.safetensors", {**place.about, "rays_file": {}})
+    place = make_geometry(GeometryOptions(geometry="hits"), rays(), (), folder / "hits.vol", _ns(), 0.1)
+    gaze = trained(folder, "of_hits.safetensors", {**place.metadata, "rays_file": {}})
     result = write_scene([gaze, folder / "rays.npz"], tmp_path / "a.xml", SceneOptions(mode=MODE))
     assert [path.name for path in result.files] == ["a.xml", "a.color.vol"]
     np.testing.assert_allclose(result.observer.origin, (0.3, 0.2, 0.1), atol=0.1)
@@ -269,19 +269,19 @@ def test_rays_in_another_frame_than_the_place(rgb, folder, tmp_path):
 
 def test_cameras_that_are_given(rgb, folder, tmp_path):
     files, at = [folder / "mesh.ply"], tmp_path / "a.xml"
-    given = SceneOptions(camera_from=(0, 0, 1.5), camera_to=(0, 0, -1), fov=50, width=30, mode=MODE)
+    given = SceneOptions(camera=(0, 0, 1.5), target=(0, 0, -1), fov=50, width=30, mode=MODE)
     result = write_scene(files, at, given)
     np.testing.assert_allclose(result.camera.target, (0, 0, -1))
     # It looks straight down, and has an up all the same.
     scene = load_scene(at)
     assert np.isfinite(np.array(scene.sensors()[0].world_transform().matrix)).all()
     assert tuple(scene.sensors()[0].film().crop_size()) == (30, 20)
-    own = write_scene(files, at, SceneOptions(observer=(0.5, 0, 0), own=True, mode=MODE))
+    own = write_scene(files, at, SceneOptions(observer=(0.5, 0, 0), first_person=True, mode=MODE))
     np.testing.assert_allclose(own.camera.origin, (0.5, 0, 0))
 
 
 def test_a_walk(rgb, folder, tmp_path):
-    options = SceneOptions(person="Bob", times=(2.0, 2.4), fps=5, own=True, mode=MODE)
+    options = SceneOptions(person="Bob", time_range=(2.0, 2.4), fps=5, first_person=True, mode=MODE)
     result = write_scene([folder / "mesh.ply", folder / "rays.npz"], tmp_path / "a.xml", options)
     assert result.frames == 3 and result.files[-1].name == "a.frames.csv"
     frames = read_frames(result.files[-1])
@@ -294,7 +294,7 @@ def test_a_walk(rgb, folder, tmp_path):
     pictures = PictureOptions(overlay="kde", frames=result.files[-1], defaults=SMALL, mode=MODE)
     made = render_file(result.path, tmp_path / "walk.png", pictures)
     assert [p.name for p in made.files] == ["walk_0001.png", "walk_0002.png", "walk_0003.png"]
-    assert len({p.read_bytes() for p in made.files}) == 3 and made.top > 0
+    assert len({p.read_bytes() for p in made.files}) == 3 and made.vmax > 0
     sizes = {tuple(mitsuba_bitmap(p).size()) for p in made.files}
     assert len(sizes) == 1
 
@@ -346,9 +346,9 @@ def test_a_file_is_shown_as_it_is(tmp_path):
     rays = Rays(np.zeros(1), np.zeros(1, int), ("Ada",), np.zeros((1, 3)), np.eye(3)[:1], np.ones(1))
     rays.save(tmp_path / "rays.npz")
     found = scene.load_scene_rays(tmp_path / "rays.npz", tmp_path / "a.xml", Recorder())
-    assert found.file == tmp_path / "rays.npz" and found.made == () and found.of_person("Ada") is found.rays
+    assert found.file == tmp_path / "rays.npz" and found.written_files == () and found.select_person("Ada") is found.rays
     none = scene.load_scene_rays(None, tmp_path / "a.xml", Recorder())
-    assert none.rays is None and none.file is None and none.of_person("Ada") is None
+    assert none.rays is None and none.file is None and none.select_person("Ada") is None
 
 
 def test_a_sample_of_a_dataset_is_kept_beside_the_scene(parquet, tmp_path, monkeypatch):
@@ -356,13 +356,13 @@ def test_a_sample_of_a_dataset_is_kept_beside_the_scene(parquet, tmp_path, monke
     _, rays = write_dataset(tmp_path)
     recorder = Recorder()
     whole = scene.load_scene_rays(tmp_path / "shop.rays", tmp_path / "a.xml", recorder)
-    assert whole.file == tmp_path / "a.rays.npz" and whole.made == (whole.file,)
+    assert whole.file == tmp_path / "a.rays.npz" and whole.written_files == (whole.file,)
     assert_same(Rays.load(whole.file), rays)
     assert any(f"{len(rays):,} rays" in line for line in recorder.messages)
-    monkeypatch.setattr(scene, "MOST", 100)
+    monkeypatch.setattr(scene, "MAX_SCENE_RAYS", 100)
     some = scene.load_scene_rays(tmp_path / "shop.rays", tmp_path / "a.xml", recorder)
     assert some.rays is not None and len(some.rays) == 100 == len(Rays.load(whole.file))
-    own = some.of_person("p1_0")
+    own = some.select_person("p1_0")
     assert own is not None and own.persons == ("p1_0",)
     assert len(own) == int((rays.person == rays.persons.index("p1_0")).sum())
 
@@ -400,8 +400,8 @@ def rays_file(tmp_path):
 
 
 def test01_a_scene_with_nerg_is_taken_as_it_is(rgb, tmp_path, rays_file):
-    store = demo.store_scene()
-    place = place_to_view([store, rays_file], tmp_path / "new", ViewOptions(up=(0, 0, 2)))
+    store = demo.find_store_scene()
+    place = make_viewer_scene([store, rays_file], tmp_path / "new", ViewOptions(up=(0, 0, 2)))
     assert place.scene == store and not place.made and len(place.rays) == 3
     assert np.array_equal(place.up, [0, 0, 1]) and place.name == f"{store.name} + rays.npz"
 
@@ -409,7 +409,7 @@ def test01_a_scene_with_nerg_is_taken_as_it_is(rgb, tmp_path, rays_file):
 def test02_of_others_a_scene_is_made(rgb, tmp_path):
     (tmp_path / "a.obj").write_text(MESH)
     told = Recorder()
-    place = place_to_view([tmp_path / "a.obj"], tmp_path, ViewOptions(up=(0, 1, 0)), told)
+    place = make_viewer_scene([tmp_path / "a.obj"], tmp_path, ViewOptions(up=(0, 1, 0)), told)
     assert place.made and place.rays is None and np.allclose(place.up, [0, 1, 0])
     assert type(nerg.Scene.load(place.scene)).__name__ == "Scene"
 
@@ -418,36 +418,36 @@ def test03_a_folder_stands_for_what_is_in_it(rgb, tmp_path, rays_file):
     run = tmp_path / "run"
     run.mkdir()
     with pytest.raises(NergError, match="holds nothing"):
-        place_to_view([run], tmp_path)
+        make_viewer_scene([run], tmp_path)
     (run / "a.obj").write_text(MESH)
     (run / "notes.txt").write_text("x")
-    (run / "mesh.glb").write_bytes(b"".join(shown_unlit([("POSITION", np.eye(3, dtype="<f4"), False)], None)))
-    assert place_to_view([run], tmp_path).name == "a.obj"
+    (run / "mesh.glb").write_bytes(b"".join(encode_unlit_glb([("POSITION", np.eye(3, dtype="<f4"), False)], None)))
+    assert make_viewer_scene([run], tmp_path).name == "a.obj"
     for name in ("scene.xml", "other.xml"):
-        shutil.copy(demo.store_scene().parent / "shapes.xml", run / name)
+        shutil.copy(demo.find_store_scene().parent / "shapes.xml", run / name)
     for name in ("twin.ply", "twin_lights.ply", "display.xml"):
-        shutil.copy(demo.store_scene().parent / name, run / name)
+        shutil.copy(demo.find_store_scene().parent / name, run / name)
     (run / "scene.xml").unlink()
     with pytest.raises(NergError, match="name the one to view"):
-        place_to_view([run], tmp_path)
+        make_viewer_scene([run], tmp_path)
 
 
 def test03_splats_in_a_folder(rgb, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
     write_spz(run / "a.spz", random_splats(9))
-    place = place_to_view([run], tmp_path, ViewOptions(observer=(0.0, 0.0, -3.0)))
+    place = make_viewer_scene([run], tmp_path, ViewOptions(observer=(0.0, 0.0, -3.0)))
     assert place.made and place.name == "a.spz" and 'type="splats"' in place.scene.read_text()
 
 
 def test04_two_of_a_kind_are_told(rgb, tmp_path, rays_file):
     shutil.copy(rays_file, tmp_path / "more.npz")
     with pytest.raises(NergError, match="both rays"):
-        place_to_view([rays_file, tmp_path / "more.npz"], tmp_path)
+        make_viewer_scene([rays_file, tmp_path / "more.npz"], tmp_path)
     with pytest.raises(NergError, match="nothing to view"):
-        place_to_view([], tmp_path)
+        make_viewer_scene([], tmp_path)
     with pytest.raises(NergError, match="up must be a direction"):
-        place_to_view([demo.store_scene()], tmp_path, ViewOptions(up=(0, 0, 0)))
+        make_viewer_scene([demo.find_store_scene()], tmp_path, ViewOptions(up=(0, 0, 0)))
 
 
 def test05_a_place_of_a_dataset(parquet, rgb, tmp_path):
@@ -455,20 +455,20 @@ def test05_a_place_of_a_dataset(parquet, rgb, tmp_path):
     _, rays = write_dataset(tmp_path)
     (tmp_path / "a.obj").write_text(MESH)
     for name in ("shop.rays", "shop.rays/place=shop"):
-        place = place_to_view([tmp_path / "a.obj", tmp_path / name], tmp_path, ViewOptions(up=(0, 0, 1)))
+        place = make_viewer_scene([tmp_path / "a.obj", tmp_path / name], tmp_path, ViewOptions(up=(0, 0, 1)))
         assert place.rays is not None and len(place.rays) == len(rays) and place.made
 
 
 @pytest.mark.nightly
 def test06_several_gaze_fields_are_variants(rgb, tmp_path):
-    store = demo.store_scene()
+    store = demo.find_store_scene()
     run, told = tmp_path / "run", Recorder()
     run.mkdir()
     for name in ("a", "b"):
         shutil.copy(store.parent / "shoppers.safetensors", run / f"{name}.safetensors")
-    place = place_to_view([store, run], tmp_path, reporter=told)
+    place = make_viewer_scene([store, run], tmp_path, reporter=told)
     assert list(place.variants) == ["shoppers", "a", "b"] and place.scene == place.variants["shoppers"]
-    assert gaze_of_scene(place.variants["b"]) == (run / "b.safetensors").resolve() and place.made and not told.warnings
+    assert find_gaze_file(place.variants["b"]) == (run / "b.safetensors").resolve() and place.made and not told.warnings
     # Where a name is taken, the folder's is put before it; a field of another place is told.
     shutil.copy(run / "a.safetensors", tmp_path / "a.safetensors")
     metadata = {"provenance": {"field_file": {"file": "x", "sha256": "y"}}}
@@ -479,5 +479,5 @@ def test06_several_gaze_fields_are_variants(rgb, tmp_path):
     assert len(told.warnings) == 1 and "another place" in told.warnings[0]
     # Of fields alone a scene is made, in the place of their training.
     shutil.copy(store.parent / "store.safetensors", run / "store.safetensors")
-    place = place_to_view([run], tmp_path)
+    place = make_viewer_scene([run], tmp_path)
     assert place.made and list(place.variants) == ["a", "b"]

@@ -13,32 +13,32 @@ from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.color import encode_srgb
-from nerg_mi.maths.geometry import Similarity, box_interval
+from nerg_mi.maths.geometry import Similarity, intersect_box_numpy
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.rendering.scene_writer import Eye, GazeFiles, Lens, SceneContent, SceneText, document, element
-from nerg_mi.train.geometry import file_identity
+from nerg_mi.rendering.scene_writer import LookAt, GazeFiles, Lens, SceneContent, SceneText, format_document, element
+from nerg_mi.train.geometry import identify_file
 from nerg_mi.workflows.scene_cameras import (
-    Probe,
-    best_camera,
-    best_photo,
-    eye_of_person,
-    given_point,
+    SceneProbe,
+    find_best_camera,
+    find_best_photo,
+    find_eye,
+    check_point,
     probe_values,
     support_of_rays,
-    to_place,
-    turned_ahead,
-    upright,
-    walk_of_person,
+    to_scene_frame,
+    turn_to_attention,
+    make_upright,
+    interpolate_walk,
 )
 from nerg_mi.workflows.scene_places import (
-    GivenFiles,
+    InputFiles,
     PhotoCamera,
-    camera_of_photo,
-    cameras_of_photos,
-    colors_of,
-    kind_of_file,
-    place_of_files,
+    load_photo_camera,
+    load_photo_cameras,
+    colors_path,
+    detect_kind,
+    write_scene_geometry,
     recognise,
 )
 from tests.formats.splats.writers import random_splats, write_inria
@@ -47,28 +47,28 @@ from tests.workflows.recorder import Recorder
 # ---- What is looked around with before a camera is chosen: directions, depths and bounds of a known room ----
 
 
-EYE = Eye(np.array([0.3, -0.2, 0.1]), np.array([1.0, 0.6, 0.4]))
+EYE = LookAt(np.array([0.3, -0.2, 0.1]), np.array([1.0, 0.6, 0.4]))
 
 
 @pytest.fixture
 def probe(rgb, tmp_path):
     """A cube of ±1, whose up is +y."""
     up = np.array([0.0, 1, 0])
-    place = SceneContent(beside=(element("shape", type="cube"),))
-    (tmp_path / "a.xml").write_text(SceneText(place, GazeFiles(), EYE, EYE, up).xml())
-    return Probe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
+    place = SceneContent(scene_children=(element("shape", type="cube"),))
+    (tmp_path / "a.xml").write_text(SceneText(place, GazeFiles(), EYE, EYE, up).to_xml())
+    return SceneProbe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
 
 
 def test_what_is_met_around(probe):
     seen = probe.around(EYE)
-    _, far = box_interval(np.broadcast_to(EYE.origin, seen.directions.shape), seen.directions, -np.ones(3), np.ones(3))
-    assert seen.met.all() and np.sum(seen.weight) == pytest.approx(4 * np.pi)
+    _, far = intersect_box_numpy(np.broadcast_to(EYE.origin, seen.directions.shape), seen.directions, -np.ones(3), np.ones(3))
+    assert seen.is_hit.all() and np.sum(seen.weight) == pytest.approx(4 * np.pi)
     # Pixels are sampled anywhere in them: a few degrees.
     assert np.quantile(np.abs(seen.depth - far) / far, 0.95) < 0.08
     depth, opacity = probe.trace(EYE.origin[None], np.array([[1.0, 0, 0]]))
     assert depth[0] == pytest.approx(0.7) and opacity[0] == 1
     np.testing.assert_allclose(np.array(probe.bounds()), [[-1] * 3, [1] * 3], atol=1e-6)
-    turned = turned_ahead(EYE, seen)
+    turned = turn_to_attention(EYE, seen)
     np.testing.assert_allclose(turned.origin, EYE.origin)
     assert np.abs(turned.target).max() == pytest.approx(1, abs=0.1)
 
@@ -79,47 +79,47 @@ def test_observers_within_matter_are_turned_ahead(depths, length):
     directions = np.array([[0.6, 0.8, 0], *[[0, 0, 1.0]] * 3])
     depth = np.array([depths[0], *[depths[1]] * 3], float)
     seen = SeenSurfaces(EYE.origin, directions, depth, np.ones(4, bool), np.array([9.0, 0, 0, 0]), np.ones(4))
-    np.testing.assert_allclose(turned_ahead(EYE, seen).target, EYE.origin + length * directions[0])
+    np.testing.assert_allclose(turn_to_attention(EYE, seen).target, EYE.origin + length * directions[0])
 
 
 def test_points_and_ups():
-    assert given_point(None, "--to") is None and given_point((1, 2, 3), "--to").tolist() == [1, 2, 3]
+    assert check_point(None, "--to") is None and check_point((1, 2, 3), "--to").tolist() == [1, 2, 3]
     with pytest.raises(NergError, match="--to is three numbers"):
-        given_point((1.0, 2.0), "--to")
+        check_point((1.0, 2.0), "--to")
     up = np.array([0.0, 0, 1])
-    assert upright(EYE, up) is EYE
-    down = upright(Eye(np.zeros(3), np.array([0, 0, -2.0])), up)
+    assert make_upright(EYE, up) is EYE
+    down = make_upright(LookAt(np.zeros(3), np.array([0, 0, -2.0])), up)
     assert abs(down.up @ up) < 1e-9
-    far = upright(Eye(np.array([-1e7, 0, 1e7]), np.array([-1e7, 1.0, 1e7])), up)
+    far = make_upright(LookAt(np.array([-1e7, 0, 1e7]), np.array([-1e7, 1.0, 1e7])), up)
     assert np.allclose(np.float32(far.target) - np.float32(far.origin), [0, 1000, 0])
     with pytest.raises(NergError, match="cannot look at the point"):
-        upright(Eye(np.ones(3), np.ones(3)), up)
+        make_upright(LookAt(np.ones(3), np.ones(3)), up)
 
 
 def test_the_best_photo(probe):
     # Of three cameras in the cube one has the whole of it before it, one a wall, and one looks out of it.
     looks = [((0.9, 0, 0), (1, 0, 0)), ((-0.9, 0.1, 0.1), (0, 0.1, 0.1)), ((3, 0, 0), (4, 0, 0))]
-    eyes = [Eye(np.array(o, float), np.array(t, float)) for o, t in looks]
+    eyes = [LookAt(np.array(o, float), np.array(t, float)) for o, t in looks]
     cameras = [PhotoCamera(str(k), eye, Lens(), False) for k, eye in enumerate(eyes)]
-    assert best_photo(probe, None, cameras).name == "1"
+    assert find_best_photo(probe, None, cameras).name == "1"
 
 
 @pytest.mark.parametrize("room", [False, True], ids=["a thing", "a room"])
 def test_a_thing_is_seen_from_outside_and_a_room_from_within(rgb, tmp_path, room):
     """A cube whose faces look outwards is a thing, one whose faces look inwards a room."""
     place = SceneContent(
-        beside=(element("shape", element("boolean", name="flip_normals", value=str(room)), type="cube"),)
+        scene_children=(element("shape", element("boolean", name="flip_normals", value=str(room)), type="cube"),)
     )
     up = np.array([0.0, 0, 1])
-    (tmp_path / "a.xml").write_text(SceneText(place, GazeFiles(), EYE, EYE, up).xml())
-    probe = Probe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
+    (tmp_path / "a.xml").write_text(SceneText(place, GazeFiles(), EYE, EYE, up).to_xml())
+    probe = SceneProbe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
     assert probe.within(np.array([[0, 0, 0], [0.9, -0.5, 0.3], [3, 0, 0], [0, 0, -1.1]])).tolist() == [
         not room,
         not room,
         False,
         False,
     ]
-    shot = best_camera(probe, None, PinholeFrame(70, 1.5, up), None)
+    shot = find_best_camera(probe, None, PinholeFrame(70, 1.5, up), None)
     assert (np.abs(shot.origin).max() < 1) == room and shot.opaque > 0.2
 
 
@@ -139,11 +139,11 @@ def rays():
 
 
 def test_the_nearest_ray_of_a_person(rays):
-    eye, when = eye_of_person(rays, "Ada", 1.2, 0.5, ALIGN)
+    eye, when = find_eye(rays, "Ada", 1.2, 0.5, ALIGN)
     assert when == 1
     np.testing.assert_allclose(eye.origin, [1, 2.5, 3.5])  # (1, 0, 1) turned is (0, 1, 1), half of it, moved
     np.testing.assert_allclose(eye.target - eye.origin, [-0.5, 0, 0])  # +y turned is -x, a metre is half a unit
-    np.testing.assert_allclose(to_place([[1, 0, 1]], ALIGN)[0], eye.origin)
+    np.testing.assert_allclose(to_scene_frame([[1, 0, 1]], ALIGN)[0], eye.origin)
 
 
 @pytest.mark.parametrize(
@@ -152,11 +152,11 @@ def test_the_nearest_ray_of_a_person(rays):
 )
 def test_nobody_then(rays, person, time, said):
     with pytest.raises(NergError, match=said):
-        eye_of_person(rays, person, time, 0.5, Similarity())
+        find_eye(rays, person, time, 0.5, Similarity())
 
 
 def test_a_walk_is_interpolated(rays):
-    walk = walk_of_person(rays, "Ada", 0, 2, 4, 1.0, Similarity())
+    walk = interpolate_walk(rays, "Ada", 0, 2, 4, 1.0, Similarity())
     np.testing.assert_allclose(walk.times, np.arange(9) / 4)
     np.testing.assert_allclose([e.origin[0] for e in walk.eyes], np.arange(9) / 4)
     ahead = np.array([e.target - e.origin for e in walk.eyes])
@@ -166,17 +166,17 @@ def test_a_walk_is_interpolated(rays):
 
 
 def test_pauses_have_no_frames(rays):
-    walk = walk_of_person(rays, "Ada", 1, 12, 1, 1.0, Similarity())
+    walk = interpolate_walk(rays, "Ada", 1, 12, 1, 1.0, Similarity())
     assert walk.times.tolist() == [1, 2, 10, 11, 12] and walk.missing == 7
     # Opposite directions have no mean.
-    turned = walk_of_person(rays, "Ada", 10, 11, 2, 1.0, Similarity())
+    turned = interpolate_walk(rays, "Ada", 10, 11, 2, 1.0, Similarity())
     assert np.abs(turned.eyes[1].target - turned.eyes[1].origin).max() == 1
     with pytest.raises(NergError, match="within 1 s from 4 to 6 s"):
-        walk_of_person(rays, "Ada", 4, 6, 1, 1.0, Similarity())
+        interpolate_walk(rays, "Ada", 4, 6, 1, 1.0, Similarity())
     with pytest.raises(NergError, match="the earlier first"):
-        walk_of_person(rays, "Ada", 2, 1, 1, 1.0, Similarity())
+        interpolate_walk(rays, "Ada", 2, 1, 1, 1.0, Similarity())
     with pytest.raises(NergError, match="at most 100,000 frames"):
-        walk_of_person(rays, "Ada", 0, 11, 1e5, 1.0, Similarity())
+        interpolate_walk(rays, "Ada", 0, 11, 1e5, 1.0, Similarity())
 
 
 def test_where_most_rays_are():
@@ -184,7 +184,7 @@ def test_where_most_rays_are():
     origin = np.concatenate([rng.normal((1, 2, 1.6), 0.1, (300, 3)), rng.normal((5, 5, 1.6), 0.1, (900, 3))])
     n = len(origin)
     rays = Rays(np.arange(n), np.zeros(n, int), ("a",), origin, np.tile([1.0, 0, 0], (n, 1)), np.ones(n))
-    assert np.linalg.norm(support_of_rays(rays).densest() - (5, 5, 1.6)) < 0.15
+    assert np.linalg.norm(support_of_rays(rays).find_densest_position() - (5, 5, 1.6)) < 0.15
 
 
 # ---- What files are, by what is in them, and what goes together ----
@@ -201,7 +201,7 @@ def some_rays(hit):
 @pytest.fixture
 def folder(tmp_path):
     write_checkpoint(tmp_path / "field.safetensors", "radiance", ONE, {"provenance": {"up": [0, 0, 1]}})
-    place = {"field_file": file_identity(tmp_path / "field.safetensors")}
+    place = {"field_file": identify_file(tmp_path / "field.safetensors")}
     align = np.diag([2.0, 2, 2, 1]).tolist()
     write_checkpoint(tmp_path / "gaze.safetensors", "gaze", ONE, {"provenance": {**place, "align": align}})
     write_checkpoint(tmp_path / "nowhere.safetensors", "gaze", ONE, {"provenance": {"geometry": "none"}})
@@ -223,7 +223,7 @@ def test_kinds(folder):
         "a.xml": "scene",
         "a.vol": "hits",
     }
-    assert {name: kind_of_file(folder / name) for name in kinds} == kinds
+    assert {name: detect_kind(folder / name) for name in kinds} == kinds
     for name, said in (
         ("odd.safetensors", "holds a sound field"),
         ("a.pth", 'make fields of it with "nerg import"'),
@@ -231,17 +231,17 @@ def test_kinds(folder):
         ("a.png", "there is no file"),
     ):
         with pytest.raises(NergError, match=said):
-            kind_of_file(folder / name)
+            detect_kind(folder / name)
 
 
 def test_splats_are_a_field_and_a_mesh_is_not(folder):
     write_inria(folder / "place.ply", random_splats(3))
     given = recognise([folder / "place.ply", folder / "nowhere.safetensors"], None, Recorder())
     assert given.kind == "field" and given.field_about == {}
-    place = place_of_files(given, folder / "scene.xml")
-    (volume,) = place.make(folder, {}).inside
-    assert place.words == "The Gaussian splats place.ply" and 'type="splats"' in document([volume], "h")
-    assert kind_of_file(folder / "a.ply") == "mesh"
+    place = write_scene_geometry(given, folder / "scene.xml")
+    (volume,) = place.make(folder, {}).integrator_children
+    assert place.words == "The Gaussian splats place.ply" and 'type="splats"' in format_document([volume], "h")
+    assert detect_kind(folder / "a.ply") == "mesh"
 
 
 def test_the_place_of_a_gaze_field_is_beside_it(folder):
@@ -297,7 +297,7 @@ def photos(rgb, tmp_path):
 
 @pytest.mark.parametrize("photo", ["1", "p1", "p1.png"])
 def test_pose_and_lens(photos, photo):
-    found = camera_of_photo(photos, photo, {})
+    found = load_photo_camera(photos, photo, {})
     assert found.name == "p1.png" and not found.bent
     np.testing.assert_allclose(found.eye.origin, [1.5, -3, 1.2])
     np.testing.assert_allclose(found.eye.target - found.eye.origin, [0, 1, 0], atol=1e-12)
@@ -311,24 +311,24 @@ def test_coordinates_of_the_training(photos):
     to_file = np.diag([0.5, 0.5, 0.5, 1.0])
     to_file[:3, 3] = -1
     about = {"sha256": file_sha256(photos / "transforms.json"), "to_file": to_file.tolist()}
-    found = camera_of_photo(photos, "0", about)
+    found = load_photo_camera(photos, "0", about)
     np.testing.assert_allclose(to_file[:3, :3] @ found.eye.origin + to_file[:3, 3], POSE[:3, 3])
     np.testing.assert_allclose(found.eye.target - found.eye.origin, [0, 1, 0], atol=1e-12)
 
 
 def test_other_photos(photos):
     with pytest.raises(NergError, match="field was trained"):
-        camera_of_photo(photos, "0", {"sha256": "0" * 64})
+        load_photo_camera(photos, "0", {"sha256": "0" * 64})
     for photo in ("3", "p9", "-1"):
         with pytest.raises(NergError, match='--photo.*0.*2.*"p0.png"'):
-            camera_of_photo(photos, photo, {})
+            load_photo_camera(photos, photo, {})
 
 
 def test_all_of_them(photos):
-    assert [c.name for c in cameras_of_photos(photos, {})] == ["p0.png", "p1.png", "p2.png"]
-    assert [c.name for c in cameras_of_photos(photos, {}, most=2)] == ["p0.png", "p2.png"]
-    for k, camera in enumerate(cameras_of_photos(photos, {})):
-        np.testing.assert_array_equal(camera.eye.origin, camera_of_photo(photos, str(k), {}).eye.origin)
+    assert [c.name for c in load_photo_cameras(photos, {})] == ["p0.png", "p1.png", "p2.png"]
+    assert [c.name for c in load_photo_cameras(photos, {}, most=2)] == ["p0.png", "p2.png"]
+    for k, camera in enumerate(load_photo_cameras(photos, {})):
+        np.testing.assert_array_equal(camera.eye.origin, load_photo_camera(photos, str(k), {}).eye.origin)
 
 
 # ---- Places as parts of a scene: colours of meshes, lamps, and files that are no such place ----
@@ -352,12 +352,12 @@ end_header
 
 
 def given(path, kind):
-    return GivenFiles(path, kind, None, None, {}, {})
+    return InputFiles(path, kind, None, None, {}, {})
 
 
 def text_of(folder, path, kind, lamps=None):
-    place = place_of_files(given(path, kind), folder / "out.xml").make(folder, lamps or {"eye": 3.0, "camera": 1.5})
-    return place, document([*place.inside, *place.beside], "h")
+    place = write_scene_geometry(given(path, kind), folder / "out.xml").make(folder, lamps or {"eye": 3.0, "camera": 1.5})
+    return place, format_document([*place.integrator_children, *place.scene_children], "h")
 
 
 @pytest.mark.parametrize(
@@ -402,7 +402,7 @@ def test_colours_of_a_mesh(rgb, tmp_path, names, values, said):
 )
 def test_a_mesh_that_mitsuba_does_not_show_is_written_again(rgb, tmp_path, name, text):
     (tmp_path / name).write_text(text)
-    written = place_of_files(given(tmp_path / name, "mesh"), tmp_path / "out.xml")
+    written = write_scene_geometry(given(tmp_path / name, "mesh"), tmp_path / "out.xml")
     place, xml = text_of(tmp_path, tmp_path / name, "mesh")
     assert written.files == (tmp_path / "out.mesh.ply",) and place.files == {"place": "out.mesh.ply"}
     assert '"vertex_color"' in xml and 'type="ply"' in xml
@@ -416,15 +416,15 @@ def test_the_given_mesh_is_not_written_over(tmp_path):
     text = PLY.format(colors="comment grey", a="").replace("3 0 1 2", "4 0 1 2 0")
     (tmp_path / "out.mesh.ply").write_text(text)
     with pytest.raises(NergError, match="another name"):
-        place_of_files(given(tmp_path / "out.mesh.ply", "mesh"), tmp_path / "out.xml")
+        write_scene_geometry(given(tmp_path / "out.mesh.ply", "mesh"), tmp_path / "out.xml")
     assert (tmp_path / "out.mesh.ply").read_text() == text
 
 
 @pytest.mark.parametrize("shape", [(1, 6, 8), (6, 1, 8), (6, 8, 1), (2, 2, 2), (1, 1, 1)])
 def test_hit_points_of_one_cell_are_shaded(tmp_path, shape):
     write_volume(tmp_path / "a.vol", np.full(shape, 100.0), (0, 0, 0), (1, 1, 1))
-    place_of_files(given(tmp_path / "a.vol", "hits"), tmp_path / "out.xml")
-    colors = np.fromfile(colors_of(tmp_path / "out.xml"), "<f4", offset=48)
+    write_scene_geometry(given(tmp_path / "a.vol", "hits"), tmp_path / "out.xml")
+    colors = np.fromfile(colors_path(tmp_path / "out.xml"), "<f4", offset=48)
     assert np.isfinite(colors).all() and (colors > 0.1).all()
     if shape.count(1) == 1:
         # A sheet faces along the axis in which it has no extent.
@@ -436,7 +436,7 @@ def test_splats_that_cannot_be_read_are_refused_by_their_own_name(tmp_path):
     splats.centers[0] = np.nan
     write_inria(tmp_path / "a.ply", splats)
     with pytest.raises(NergError, match=r'"[^"]*a\.ply" cannot be read: some of the centers'):
-        place_of_files(given(tmp_path / "a.ply", "field"), tmp_path / "out.xml")
+        write_scene_geometry(given(tmp_path / "a.ply", "field"), tmp_path / "out.xml")
 
 
 def test_hit_points_get_colours_beside_the_scene(rgb, tmp_path):
@@ -445,11 +445,11 @@ def test_hit_points_get_colours_beside_the_scene(rgb, tmp_path):
     write_volume(tmp_path / "a.vol", density, (0, 0, 0), (1, 0.8, 0.6))
     place, text = text_of(tmp_path, tmp_path / "a.vol", "hits")
     assert place.files == {"density": "a.vol", "color": "out.color.vol"} and '"nearest"' in text
-    colors = rgb.load_dict({"type": "gridvolume", "filename": str(colors_of(tmp_path / "out.xml")), "raw": True})
+    colors = rgb.load_dict({"type": "gridvolume", "filename": str(colors_path(tmp_path / "out.xml")), "raw": True})
     assert tuple(np.array(rgb.traverse(colors)["data"]).shape) == (3, 4, 5, 3)
     write_volume(tmp_path / "rgb.vol", np.zeros((2, 2, 2, 3)), (0, 0, 0), (1, 1, 1))
     with pytest.raises(NergError, match="is no place of hit points"):
-        place_of_files(given(tmp_path / "rgb.vol", "hits"), tmp_path / "out.xml")
+        write_scene_geometry(given(tmp_path / "rgb.vol", "hits"), tmp_path / "out.xml")
 
 
 def test_a_sphere_where_nothing_is_known(tmp_path):

@@ -35,14 +35,14 @@ def table(rows, **which):
 def test01_counts_are_those_of_a_loop(folder):
     found = statistics(
         [folder / "bare" / "scene.xml", folder / "rays.npz"],
-        options=StatisticsOptions(areas=folder / "areas.json", margin=0.001, least=0.0, **FAST),
+        options=StatisticsOptions(aois=folder / "areas.json", margin=0.001, min_visit=0.0, **FAST),
     )
     rays = people()
     met = [first_box(o, d) for o, d in zip(rays.origin, rays.direction)]
     for name, kinds in (("the sign", {"sign"}), ("the stand", {"stand"}), ("both", {"sign", "stand"})):
         on = np.array([kind in kinds for kind, _ in met])
         shares = [on[rays.person == p].mean() for p in range(6)]
-        (row,) = table(found.things, cell="all", thing=name)
+        (row,) = table(found.aois, cell="all", thing=name)
         assert row["source"] == "tracked" and row["people"] == 6
         assert row["share"] == pytest.approx(np.mean(shares)) and row["reach"] == np.mean([s > 0 for s in shares])
         # Every ray stands for 0.2 s, the last one too.
@@ -61,23 +61,23 @@ def test01_counts_are_those_of_a_loop(folder):
             reached += seen.any()
         assert row["looks"] == pytest.approx(looks / 6) and row["first_look"] == pytest.approx(firsts / reached)
         for cohort, code in (("even", 0), ("odd", 1)):
-            (row,) = table(found.things, cell="cohort", value=cohort, thing=name)
+            (row,) = table(found.aois, cell="cohort", value=cohort, thing=name)
             mine = [s for p, s in enumerate(shares) if p % 2 == code]
             assert row["share"] == pytest.approx(np.mean(mine)) and row["people"] == 3
     assert {r["cell"] for r in found.differences} == {"cohort"}
-    assert sum(r["moves"] for r in found.moves if r["cell"] == "all") > 5
+    assert sum(r["moves"] for r in found.transitions if r["cell"] == "all") > 5
 
 
 def test02_what_could_be_seen_contains_what_was(folder):
-    options = StatisticsOptions(areas=folder / "areas.json", seen=True, cell=0.05, **FAST)
+    options = StatisticsOptions(aois=folder / "areas.json", aoi_visibility=True, cell_size=0.05, **FAST)
     found = statistics([folder / "bare" / "scene.xml", people()], options=options)
-    (sign,) = table(found.things, cell="all", thing="the sign")
-    (stand,) = table(found.things, cell="all", thing="the stand")
+    (sign,) = table(found.aois, cell="all", thing="the sign")
+    (stand,) = table(found.aois, cell="all", thing="the stand")
     assert 0.05 < sign["share"] < sign["visible"] < stand["visible"] < 1
     sums = found.sums
-    assert (sums.on_time <= sums.visible + 1e-9).all()
-    rows = sums.persons_of(sums.cells[0])[0]
-    on, could = sums.on_time[rows, 0].sum(), sums.visible[rows, 0].sum()
+    assert (sums.dwell_time <= sums.visible_time + 1e-9).all()
+    rows = sums.find_participants(sums.cells[0])[0]
+    on, could = sums.dwell_time[rows, 0].sum(), sums.visible_time[rows, 0].sum()
     assert sign["given_visible"] == pytest.approx(on / could)
 
 
@@ -85,7 +85,7 @@ def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
     (tmp_path / "zones.json").write_text(json.dumps({"south": [[0, 0, 0], [6, 2, 0.1]]}))
     (tmp_path / "cohorts.csv").write_text("person,cohort\n" + "".join(f"name {k},{'xy'[k // 3]}\n" for k in range(6)))
     options = StatisticsOptions(
-        areas=folder / "areas.json",
+        aois=folder / "areas.json",
         zones=tmp_path / "zones.json",
         cohorts=tmp_path / "cohorts.csv",
         windows=("early=0,8", "late=8,100", "never=1e6,2e6"),
@@ -103,7 +103,7 @@ def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
         ("cohort", "x"): rays.person < 3,
     }
     for (cell, value), mask in masks.items():
-        (row,) = table(found.things, cell=cell, value=value, thing="the sign")
+        (row,) = table(found.aois, cell=cell, value=value, thing="the sign")
         mine = [on[mask & (rays.person == p)].mean() for p in np.unique(rays.person[mask])]
         assert row["share"] == pytest.approx(np.mean(mine)), (cell, value)
     assert {r["cell"] for r in found.differences} == {"window", "cohort"}
@@ -116,12 +116,12 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     }
     (folder / "tile.obj").write_text("usemtl red\nv 5.9 0 0\nv 5.9 1 0\nv 5.9 0 1\nf 1 2 3\n")
     (folder / "changes.json").write_text(json.dumps(changes))
-    options = StatisticsOptions(areas=folder / "areas.json", what_if=folder / "changes.json", **FAST)
+    options = StatisticsOptions(aois=folder / "areas.json", what_if=folder / "changes.json", **FAST)
     recorder = Recorder()
     found = statistics([folder / "scene.xml", folder / "rays.npz"], tmp_path / "out", options, recorder)
     # A shape as a thing is still the scene's, by its name.
     assert found.what_if
-    field = table(found.things, cell="all", source="field")
+    field = table(found.aois, cell="all", source="field")
     assert len(field) == 3 and all(0 < r["share"] < 1 and r["looks"] is None for r in field)
     assert field[2]["share"] == pytest.approx(field[0]["share"] + field[1]["share"], rel=0.02)
     rows = {(r["thing"], r["measure"]): r for r in found.what_if}
@@ -139,7 +139,7 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     assert all(p.is_file() for p in found.files)
     with (tmp_path / "out" / "things.csv").open() as file:
         first = next(csv.DictReader(file))
-    assert float(first["share"]) == found.things[0]["share"] and first["thing"] == "the sign"
+    assert float(first["share"]) == found.aois[0]["share"] and first["thing"] == "the sign"
     text = "".join(p.read_text() for p in found.files if p.suffix in (".csv", ".md", ".json"))
     assert "name 0" not in text
 
@@ -147,31 +147,31 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
 def test05_names_salts_and_a_floor(folder, tmp_path):
     given = [folder / "bare" / "scene.xml", people()]
     (tmp_path / "salt").write_bytes(b"0123456789abcdef")
-    keep = StatisticsOptions(areas=folder / "areas.json", salt=tmp_path / "salt", **FAST)
-    one, two = (statistics(given, options=keep).people for _ in range(2))
+    keep = StatisticsOptions(aois=folder / "areas.json", salt=tmp_path / "salt", **FAST)
+    one, two = (statistics(given, options=keep).participants for _ in range(2))
     assert list(one) == list(two) and all(r["person"].startswith("p") and len(r["person"]) == 17 for r in one)
-    named = StatisticsOptions(areas=folder / "areas.json", names=True, **FAST)
-    assert {r["person"] for r in statistics(given, options=named).people} == {f"name {k}" for k in range(6)}
+    named = StatisticsOptions(aois=folder / "areas.json", show_names=True, **FAST)
+    assert {r["person"] for r in statistics(given, options=named).participants} == {f"name {k}" for k in range(6)}
     recorder = Recorder()
-    floor = StatisticsOptions(areas=folder / "areas.json", min_people=5, **FAST)
+    floor = StatisticsOptions(aois=folder / "areas.json", min_participants=5, **FAST)
     found = statistics(given, None, floor, recorder)
-    assert not found.people and found.blanked > 0
-    assert all(r["share"] is None for r in table(found.things, cell="cohort")) and found.things[0]["share"] is not None
+    assert not found.participants and found.num_suppressed > 0
+    assert all(r["share"] is None for r in table(found.aois, cell="cohort")) and found.aois[0]["share"] is not None
 
 
 def test06_one_person_has_no_interval_and_that_is_said(folder):
     recorder = Recorder()
     one = people(1, cohorts=False)
     found = statistics(
-        [folder / "bare" / "scene.xml", one], None, StatisticsOptions(areas=folder / "areas.json", **FAST), recorder
+        [folder / "bare" / "scene.xml", one], None, StatisticsOptions(aois=folder / "areas.json", **FAST), recorder
     )
-    assert found.things[0]["share"] is not None and found.things[0]["share_low"] is None
+    assert found.aois[0]["share"] is not None and found.aois[0]["share_low"] is None
     assert any("no intervals" in text and "fewer than 3 people" in text for text in recorder.messages)
 
 
 def test07_without_a_place(folder):
     recorder = Recorder()
-    options = StatisticsOptions(areas=folder / "boxes.json", **FAST)
+    options = StatisticsOptions(aois=folder / "boxes.json", **FAST)
     (folder / "boxes.json").write_text(
         json.dumps({"sign": [[4, 1.5, 1], [4.2, 2.5, 2]], "far": [[5, 0, 0], [6, 4, 3]], "tile": {"mesh": "tile.obj"}})
     )
@@ -187,24 +187,24 @@ def test07_without_a_place(folder):
     assert any("hit points" in text for text in recorder.messages)
     on = np.array([first_box(o, d)[0] == "sign" for o, d in zip(rays.origin, rays.direction)])
     expected = np.mean([on[rays.person == p].mean() for p in range(6)])
-    assert found.things[0]["share"] == pytest.approx(expected, abs=0.01)
+    assert found.aois[0]["share"] == pytest.approx(expected, abs=0.01)
 
 
 def test08_isovists_and_nobody_at_all(folder, tmp_path):
-    options = StatisticsOptions(areas=folder / "areas.json", visibility=True, step=0.5, **FAST)
+    options = StatisticsOptions(aois=folder / "areas.json", visibility=True, grid_step=0.5, **FAST)
     found = statistics([folder / "bare" / "scene.xml"], tmp_path / "out", options)
     west = [r for r in found.isovists if r["x"] < 2 and 1 < r["y"] < 2]
     north = [r for r in found.isovists if r["x"] < 2 and r["y"] > 3]
     assert np.mean([r["sees the sign"] for r in west]) < np.mean([r["sees the sign"] for r in north])
     assert all(0 < r["area"] < 24.01 for r in found.isovists) and (tmp_path / "out" / "isovists.png").is_file()
     with pytest.raises(NergError, match="nobody to tell of"):
-        statistics([folder / "bare" / "scene.xml"], options=StatisticsOptions(areas=folder / "areas.json", **FAST))
+        statistics([folder / "bare" / "scene.xml"], options=StatisticsOptions(aois=folder / "areas.json", **FAST))
 
 
 def test09_observers_who_were_not_tracked(folder):
-    options = StatisticsOptions(areas=folder / "areas.json", observers=("1,1.5,1.6", "1,3.5,1.6", "1,0.5,1.6"), **FAST)
+    options = StatisticsOptions(aois=folder / "areas.json", observers=("1,1.5,1.6", "1,3.5,1.6", "1,0.5,1.6"), **FAST)
     found = statistics([folder / "scene.xml"], options=options)
-    assert {r["source"] for r in found.things} == {"field"} and found.things[0]["people"] == 3
+    assert {r["source"] for r in found.aois} == {"field"} and found.aois[0]["people"] == 3
 
 
 def test10_datasets_count_as_files_do(folder, tmp_path):
@@ -221,10 +221,10 @@ def test10_datasets_count_as_files_do(folder, tmp_path):
 
     columns = "origin=x,y,z direction=a,b,c t=t person=p"
     nerg.import_rays(tmp_path / "day.csv", columns=columns, output=tmp_path / "day.rays")
-    options = StatisticsOptions(areas=folder / "areas.json", **FAST)
+    options = StatisticsOptions(aois=folder / "areas.json", **FAST)
     scene = folder / "bare" / "scene.xml"
-    a = statistics([scene, tmp_path / "day.rays"], options=options).things
-    b = statistics([scene, nerg.import_rays(tmp_path / "day.csv", columns=columns)], options=options).things
+    a = statistics([scene, tmp_path / "day.rays"], options=options).aois
+    b = statistics([scene, nerg.import_rays(tmp_path / "day.csv", columns=columns)], options=options).aois
     # Origins in a dataset are of single precision.
     assert [r["share"] for r in a] == pytest.approx([r["share"] for r in b], abs=0.01) and tracking
 

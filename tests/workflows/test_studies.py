@@ -11,24 +11,24 @@ import pytest
 
 from nerg_mi.alignment.check import AlignmentCheck
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.study import measure, settings
+from nerg_mi.evaluation.study import measure_rows, list_rows
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.maths.geometry import Box
 from nerg_mi.rays.rays import Rays
-from nerg_mi.train.geometry import GazePlace
+from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.workflows import align as alignment
 from nerg_mi.workflows import demo, geometry, study
 from nerg_mi.workflows.align import align
 from nerg_mi.workflows.demo import STAGES, make_demo
-from nerg_mi.workflows.geometry import check_place
+from nerg_mi.workflows.geometry import check_geometry
 from nerg_mi.workflows.rays_commands import AlignOptions
 from nerg_mi.workflows.scene_commands import DemoOptions, StudyOptions
-from nerg_mi.workflows.study import measure_part, planned_study, run_study, twin_beside
+from nerg_mi.workflows.study import measure_part, plan_study, run_study, find_reference_scene
 from tests.alignment import rooms
 from tests.evaluation.test_study_subject import SCENE, TWIN
 from tests.figures.standins import write_standins
 from tests.tasks.clusters import ClusterOfProcesses, wait_until
-from tests.tasks.works import laid_out
+from tests.tasks.works import lay_out
 from tests.workflows.recorder import Recorder
 
 # ---- The study as a job: which settings it takes, and what it tells meanwhile ----
@@ -90,14 +90,14 @@ def test_two_workers_find_the_errors_of_this_process(tmp_path, rgb, monkeypatch)
 def test_a_scene_file_is_measured_with_its_twin_where_a_worker_has_laid_them(rgb, tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE.format(eye="-2, -1, $height"))
     (tmp_path / "twin.xml").write_text(TWIN)
-    subject = open_subject(str(tmp_path / "scene.xml"), "auto", 12, 8, {"height": "3"}, twin_beside)
-    every = settings(subject, True)
+    subject = open_subject(str(tmp_path / "scene.xml"), "auto", 12, 8, {"height": "3"}, find_reference_scene)
+    every = list_rows(subject, True)
     (number,) = (k for k, row in enumerate(every) if row.name == "jitter")
     options = StudyOptions(**SMALL, defaults={"height": "3"})
-    common = planned_study(subject, tmp_path / "scene.xml", options)
-    measure_part(laid_out(common, tmp_path / "elsewhere"), (number,), tmp_path / "rows.json")
+    common = plan_study(subject, tmp_path / "scene.xml", options)
+    measure_part(lay_out(common, tmp_path / "elsewhere"), (number,), tmp_path / "rows.json")
     found = json.loads((tmp_path / "rows.json").read_text())
-    here = {"rows": measure(subject, [every[0], every[number]], 1, 16), "scaling": []}
+    here = {"rows": measure_rows(subject, [every[0], every[number]], 1, 16), "scaling": []}
     assert errors(found | {"scaling": []}) == errors(here) and found["rows"][1]["surface_mae"] > 0
 
 
@@ -193,7 +193,7 @@ def test_another_up_axis_and_a_start_lead_to_the_same_frame(tmp_path, monkeypatc
     truth, path = pairs(tmp_path)
     np.save(tmp_path / "points.npy", rooms.carried(truth, rooms.traces(8000).end))
     aligned = align(None, tmp_path / "a.json", AlignOptions(pairs=path))
-    options = AlignOptions(start=tmp_path / "a.json", surface=tmp_path / "points.npy")
+    options = AlignOptions(init=tmp_path / "a.json", surface=tmp_path / "points.npy")
     again = align(RAYS, None, options).alignment
     off = rooms.carried(again.matrix, RAYS.origin) - rooms.carried(aligned.alignment.matrix, RAYS.origin)
     assert np.linalg.norm(off, axis=1).max() < 0.1 and again.evidence["kind"] == "tracking"
@@ -202,22 +202,22 @@ def test_another_up_axis_and_a_start_lead_to_the_same_frame(tmp_path, monkeypatc
 
 def place(found, monkeypatch):
     monkeypatch.setattr(geometry, "check_alignment", lambda *_: found)
-    return GazePlace(object(), Box((0, 0, 0), (1, 1, 1)), "field")  # pyright: ignore[reportArgumentType] # not asked
+    return TrainingGeometry(object(), Box((0, 0, 0), (1, 1, 1)), "field")  # pyright: ignore[reportArgumentType] # not asked
 
 
 def test_gaze_that_meets_nothing_is_refused_and_doubts_are_told_with_the_next_command(monkeypatch):
     reporter = Recorder()
     nowhere = place(AlignmentCheck(1.0, 0.0, 0.0), monkeypatch)
     with pytest.raises(NergError, match="100.0.*--field.*--force"):
-        check_place(nowhere, RAYS, "--field f", False, reporter)
-    check_place(nowhere, RAYS, "--field f", True, reporter)
-    check_place(place(AlignmentCheck(0.4, 0.3, 0.2), monkeypatch), RAYS, "--scene s", False, reporter)
+        check_geometry(nowhere, RAYS, "--field f", False, reporter)
+    check_geometry(nowhere, RAYS, "--field f", True, reporter)
+    check_geometry(place(AlignmentCheck(0.4, 0.3, 0.2), monkeypatch), RAYS, "--scene s", False, reporter)
     assert len(reporter.warnings) == 2 and "30 % of the heads are inside of something" in reporter.warnings[1]
     assert "nerg align RAYS --scene s -o alignment.json" in reporter.warnings[1]
-    check_place(place(AlignmentCheck(0.05, 0.0, 0.0), monkeypatch), RAYS, "--field f", False, reporter)
+    check_geometry(place(AlignmentCheck(0.05, 0.0, 0.0), monkeypatch), RAYS, "--field f", False, reporter)
     for kind in ("hits", "none"):
         bare = replace(nowhere, kind=kind, medium=None if kind == "none" else nowhere.medium)
-        check_place(bare, RAYS, "", False, reporter)
+        check_geometry(bare, RAYS, "", False, reporter)
     assert len(reporter.warnings) == 2
 
 

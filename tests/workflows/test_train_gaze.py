@@ -13,13 +13,13 @@ from nerg_mi.cli import main
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig
-from nerg_mi.files.atomic import reserving
+from nerg_mi.files.atomic import reserve_output
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.train import gaze_recipes
-from nerg_mi.train.gaze_data import surface_distances
-from nerg_mi.train.gaze_log_density import LikelihoodTrainer, surroundings
+from nerg_mi.train.gaze_data import compute_surface_distances
+from nerg_mi.train.gaze_log_density import LikelihoodTrainer, get_geometry_options
 from nerg_mi.train.gaze_recipes import Recipe, register_recipe
-from nerg_mi.train.geometry import GazePlace, place_of_scene
+from nerg_mi.train.geometry import TrainingGeometry, load_scene_geometry
 from nerg_mi.workflows.gaze_commands import GazeOptions
 from nerg_mi.workflows.train_gaze import check_plan, plan_gaze, train_gaze
 from nerg_mi.workflows.train_radiance import train_radiance
@@ -104,7 +104,7 @@ def test_folds_choose_the_variant_where_no_surfaces_are_known(rays):
 
 def test_a_job_writes_what_the_command_writes(rays, tmp_path, capsys):
     rays.save(tmp_path / "rays.npz")
-    options = replace(QUICK, geometry="hits", voxel=0.2, half=True, threads=1)
+    options = replace(QUICK, geometry="hits", voxel_size=0.2, half=True, threads=1)
     train_gaze(tmp_path / "rays.npz", tmp_path / "job" / "gaze.safetensors", options)
     line = "--geometry hits --voxel 0.2 --radius 0.5 --probes 6 --min-rays 8 --steps 3 --directions 64 --zones 0 --half"
     code, said, _ = nerg(
@@ -139,9 +139,9 @@ def test_recipes_in_a_scene_of_shapes(rays, tmp_path, recipe):
         "activation": {"default": "log", "small": "softplus", "paper": "linear"}[recipe],
         "normalized": recipe == "default",
     }
-    place = place_of_scene(tmp_path / "scene.xml")
+    place = load_scene_geometry(tmp_path / "scene.xml")
     o, d = np.array([[-0.5, 0.2, 1.6]]), np.array([[[1.0, 0, 0], [0.8, 0.6, 0], [-1.0, 0, 0]]])
-    distance, escaped = surface_distances(place, o, d)
+    distance, escaped = compute_surface_distances(place, o, d)
     np.testing.assert_allclose(distance[0, :2], [2.0, 2.5], rtol=1e-5)
     assert escaped.tolist() == [[False, False, True]]
 
@@ -157,12 +157,12 @@ def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, mo
         Recipe(
             name="coarse",
             summary="a log density on two levels",
-            config=lambda c: LogGazeConfig(grid, c.variant, width=8, **surroundings(c.place)),
+            make_config=lambda c: LogGazeConfig(grid, c.variant, width=8, **get_geometry_options(c.geometry_kind)),
             trainer=LikelihoodTrainer,
             losses=("likelihood",),
             settings={"steps": 3, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 4, "directions": 32},
             probes={"radius": 0.5, "count": 6, "min_rays": 8, "directions": 64},
-            quick=True,
+            is_quick=True,
         )
     )
     result = train_gaze(rays, options=GazeOptions(geometry="none", recipe="coarse", variant="emit", threads=1))
@@ -186,7 +186,7 @@ def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, mo
 
 def test_positions_and_people_are_held_out_and_told(tmp_path):
     heard = Listener()
-    options = replace(QUICK, test_zones=2, test_positions=6, test_people=0.5)
+    options = replace(QUICK, test_zones=2, test_positions=6, test_participants=0.5)
     result = train_gaze(RAYS, options=replace(options, min_rays=8), reporter=heard)
     test = result.provenance["test"]
     assert result.provenance["rays"] == test["rays_to_train"] < test["rays"] == len(RAYS) and len(test["people"]) == 1
@@ -261,7 +261,7 @@ def test_a_place_of_hits_needs_a_file(rays):
 
 @pytest.mark.parametrize("train", [train_gaze, train_radiance])
 def test_an_output_is_trained_once_at_a_time(tmp_path, train):
-    with reserving(tmp_path / "a.safetensors"), pytest.raises(NergError, match="made by another process"):
+    with reserve_output(tmp_path / "a.safetensors"), pytest.raises(NergError, match="made by another process"):
         train(tmp_path / "nothing", tmp_path / "a.safetensors")
 
 
@@ -271,7 +271,7 @@ def test_an_output_is_trained_once_at_a_time(tmp_path, train):
 HITS = GazeOptions(geometry="hits")
 FIELD = GazeOptions(field=Path("field.safetensors"), recipe="small")
 VIEWS = GazeOptions(geometry="none", views=Path("photos"), salience="maps")
-SCENE = GazePlace(None, BOX, "scene")
+SCENE = TrainingGeometry(None, BOX, "scene")
 
 
 @pytest.mark.parametrize(
@@ -288,10 +288,10 @@ SCENE = GazePlace(None, BOX, "scene")
         (replace(VIEWS, salience=None), False, "salience needs both"),
         (replace(HITS, align_views=Path("a.json")), False, "salience needs both"),
         (replace(HITS, align=Path("a.json")), False, "--align.*--field.*--scene"),
-        (replace(HITS, test_people=0.5), False, "say where, with --test-zones"),
-        (replace(FIELD, begin="nerf"), False, '"random".*"field"'),
+        (replace(HITS, test_participants=0.5), False, "say where, with --test-zones"),
+        (replace(FIELD, init="nerf"), False, '"random".*"field"'),
         (replace(FIELD, freeze=True), False, "--freeze"),
-        (replace(HITS, recipe="small", begin="field"), False, "--begin"),
+        (replace(HITS, recipe="small", init="field"), False, "--begin"),
         (replace(HITS, recipe="small", semantic="snapshot"), False, "--semantic"),
         (replace(HITS, loss="paper"), False, "add --recipe small"),
         (replace(HITS, integral=1.0), False, "no choice of --integral"),

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine, real_path
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import BadLineCallback, resolve_path
 
 from . import poses
 from .base import RECORDINGS, RaysBuilder, Signature, TrackingFrame, option
 from .poses import PoseTrack
-from .tables import TableBlock, iterate_table, table_columns
+from .tables import TableBlock, iterate_table, read_table_columns
 
 # ---- Gaze files of Project Aria: three schemas told apart by their headers, and directions of their angles ----
 #
@@ -48,14 +48,14 @@ GEN2 = GazeSchema("gen2", 2, (TIME, "yaw_rads_cpf", "pitch_rads_cpf", *_EYES))
 def schema_of(path: Path) -> GazeSchema:
     """The schema of the gaze file ``path`` by its header: a combined yaw beside a pitch of each eye is the second
     generation's. Raises `NergError` for another header."""
-    columns = set(table_columns(path))
+    columns = set(read_table_columns(path))
     if {"yaw_rads_cpf", "left_pitch_rads_cpf", "right_pitch_rads_cpf"} <= columns:
         return GEN2
     if {"left_yaw_rads_cpf", "right_yaw_rads_cpf"} <= columns:
         return VERGENCE
     if "yaw_rads_cpf" in columns:
         return LEGACY
-    there = ", ".join(plain(c, 40) for c in sorted(columns)[:8]) or "none"
+    there = ", ".join(sanitize(c, 40) for c in sorted(columns)[:8]) or "none"
     raise NergError(
         f"{path} has no columns of gaze angles (yaw_rads_cpf, or left_yaw_rads_cpf and right_yaw_rads_cpf); its "
         f"columns are {there}; give the folder of an Aria recording, or the gaze file in it"
@@ -115,7 +115,7 @@ def device_named(given: str | None, generation: int) -> str:
     known = [model for model, about in _MODELS.items() if about[0] == generation]
     if name not in known:
         what = "is of the other generation than the gaze file" if name in _MODELS else "is no model of Aria glasses"
-        raise NergError(f'--device "{plain(given, 40)}" {what}; choose one of {", ".join(known)}, or leave it out')
+        raise NergError(f'--device "{sanitize(given, 40)}" {what}; choose one of {", ".join(known)}, or leave it out')
     return name
 
 
@@ -177,7 +177,7 @@ class _World:
 class Trajectory:
     """Poses of the glasses in a recording, of which those around the times that are asked for are kept."""
 
-    def __init__(self, path: Path, times: np.ndarray, on_bad: OnBadLine | None) -> None:
+    def __init__(self, path: Path, times: np.ndarray, on_bad: BadLineCallback | None) -> None:
         """Read ``path`` for gaze at ``times`` (n,) seconds. Raises `NergError` for a file that is no trajectory."""
         self.path, self.lines = path, 0
         self._times = np.sort(times[np.isfinite(times)])
@@ -209,7 +209,7 @@ class Trajectory:
             off = np.abs(v[:, 8:] - world.gravity).max()
             if off > 0.02 * np.linalg.norm(world.gravity):
                 raise NergError(
-                    f"the gravity of the world {plain(name, 40)} changes in the trajectory {self.path}, so that nobody "
+                    f"the gravity of the world {sanitize(name, 40)} changes in the trajectory {self.path}, so that nobody "
                     "knows which way is up; have it made again by MPS"
                 )
             v = v[np.argsort(v[:, 0], kind="stable")]
@@ -314,7 +314,7 @@ class Aria:
         for recording in recordings:
             if world in recording.trajectory.tracks and recording.trajectory.up(world) != up:
                 raise NergError(
-                    f"{recording.trajectory.path} has {recording.trajectory.up(world)} up in the world {plain(world)}, "
+                    f"{recording.trajectory.path} has {recording.trajectory.up(world)} up in the world {sanitize(world)}, "
                     f"and {recordings[0].trajectory.path} begins with {up} up; import recordings with one up axis "
                     "together, the others apart"
                 )
@@ -353,16 +353,16 @@ def _open(gaze: Path, options: AriaOptions, builder: RaysBuilder) -> _Recording:
 def _choose_world(recordings: Sequence[_Recording], wanted: str | None) -> str:
     """The world that is wanted, or that of the most gaze; `NergError` where a recording has none of it."""
     rows = sum((r.rows for r in recordings), Counter())
-    named = ", ".join(plain(w, 40) for w, _ in rows.most_common(4))
+    named = ", ".join(sanitize(w, 40) for w, _ in rows.most_common(4))
     if wanted is not None:
         if wanted not in rows and not any(wanted in r.trajectory.tracks for r in recordings):
-            raise NergError(f'there is no world "{plain(wanted, 40)}" (--world) in these recordings; there are {named}')
+            raise NergError(f'there is no world "{sanitize(wanted, 40)}" (--world) in these recordings; there are {named}')
         return wanted
     world = min((w for r in recordings for w in r.trajectory.tracks), key=lambda w: (-rows[w], w))
     for recording in recordings:
         if world not in recording.trajectory.tracks:
             raise NergError(
-                f"{recording.gaze} was recorded in another world (graph_uid) than {plain(world, 40)}, each a frame of "
+                f"{recording.gaze} was recorded in another world (graph_uid) than {sanitize(world, 40)}, each a frame of "
                 f"its own ({named}); import them apart, have MPS make one world of them (Multi-SLAM), or choose one "
                 "with --world"
             )
@@ -449,5 +449,5 @@ def _first(paths: Iterator[Path]) -> Path | None:
 
 def _person(gaze: Path) -> str:
     """The recording's folder: the first above ``gaze`` that is not one of MPS."""
-    folders = (re.sub(r"^mps_(.+)_vrs$", r"\1", p) for p in reversed(real_path(gaze).parent.parts))
+    folders = (re.sub(r"^mps_(.+)_vrs$", r"\1", p) for p in reversed(resolve_path(gaze).parent.parts))
     return next((p for p in folders if p not in (*_GAZE_FOLDERS, "mps")), gaze.stem)

@@ -16,14 +16,14 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import file_sha256
-from nerg_mi.files.safe_read import OnBadLine, size_of
+from nerg_mi.files.safe_read import BadLineCallback, check_regular_file
 from nerg_mi.maths.coordinates import check_near_origin
-from nerg_mi.ranges import FARTHEST, FLAG, RANGE, TICKS, Checked, Range
+from nerg_mi.ranges import MAX_COORDINATE, FLAG, RANGE, TIME_UNITS, ValidatedDataclass, Range
 from nerg_mi.rays.rays import COLUMNS, FRAME, Rays
 
 from .columns import ColumnFinder, looks_like_validity
 from .poses import FilledOrigins, fill_values, is_aimed
-from .tables import TableBlock, iterate_table, table_columns
+from .tables import TableBlock, iterate_table, read_table_columns
 
 # ---- Frames ----
 #
@@ -174,7 +174,7 @@ class RaysBuilder:
         """Blocks of a table of the present source, as `iterate_table` gives them, with an account of the lines that
         cannot be read and of the columns that are not used; ``also_used``: those that are read in another way."""
         used = {*numbers, *texts, *also_used}
-        there = table_columns(path) if header is None else header
+        there = read_table_columns(path) if header is None else header
         self.note_unused(name for name in there if name and name not in used)
         how = {"first_line": first_line, "clocks": clocks, "on_note": self.note}
         return iterate_table(path, numbers, texts, header, self.on_bad, **how)
@@ -191,7 +191,7 @@ class RaysBuilder:
         self._unused.update(dict.fromkeys(columns))
 
     @property
-    def on_bad(self) -> OnBadLine | None:
+    def on_bad(self) -> BadLineCallback | None:
         """Called with each line that cannot be read: its number, from 1, and why. None where it ends the import."""
         return self._bad_line if self._skips else None
 
@@ -232,7 +232,7 @@ class RaysBuilder:
 
         The checksum is computed at the file's end: what is not of the format is refused before gigabytes are read."""
         self._end_source()
-        size_of(path, "tracking file", SOURCE_BYTES)
+        check_regular_file(path, "tracking file", SOURCE_BYTES)
         if self._on_source is not None:
             self._on_source(name or path.name)
         self._path = path
@@ -282,7 +282,7 @@ class RaysBuilder:
             **{f"direction is the fill value {f:g}, {f:g}, {f:g}": fill == f for f in np.unique(fill[abs(fill) > 0])},
             "time is missing": ~np.isfinite(t),
             "origin is missing": ~np.isfinite(origin).all(axis=1),
-            f"origin is beyond {FARTHEST:g} m": ~(np.abs(self._moved(origin)) <= FARTHEST).all(axis=1),
+            f"origin is beyond {MAX_COORDINATE:g} m": ~(np.abs(self._moved(origin)) <= MAX_COORDINATE).all(axis=1),
             "direction is missing": ~np.isfinite(length),
             "direction is zero": length == 0,
             "confidence is missing or outside [0, 1]": ~((confidence >= 0) & (confidence <= 1)),
@@ -307,10 +307,10 @@ class RaysBuilder:
         if hit is not None:
             hit = self._without_filled(hit, origin, direction, keep)
             part["hit"] = self._moved(hit[keep])
-            beyond = (np.abs(part["hit"]) > FARTHEST).any(axis=1)
+            beyond = (np.abs(part["hit"]) > MAX_COORDINATE).any(axis=1)
             if beyond.any():
                 part["hit"][beyond] = np.nan
-                self._missing[f"hit points beyond {FARTHEST:g} m"] += int(np.count_nonzero(beyond))
+                self._missing[f"hit points beyond {MAX_COORDINATE:g} m"] += int(np.count_nonzero(beyond))
         if head is not None:
             with np.errstate(invalid="ignore", divide="ignore"):
                 unit = head[keep] / np.linalg.norm(head[keep], axis=1, keepdims=True)
@@ -495,7 +495,7 @@ def option(
 
 def tick_option(default: float = 1.0) -> Any:
     """The unit of the file's time, in seconds."""
-    return option(default, "Seconds in one unit of the file's time.", within=TICKS)
+    return option(default, "Seconds in one unit of the file's time.", within=TIME_UNITS)
 
 
 def valid_option() -> Any:
@@ -513,7 +513,7 @@ class NoOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TickOption(Checked):
+class TickOption(ValidatedDataclass):
     """For readers of files whose unit of time is not known. Raises `NergError` for what is no length of time."""
 
     tick: float = tick_option()
@@ -521,7 +521,7 @@ class TickOption(Checked):
 
 # Annotations are evaluated as code: once, when a reader is registered, and not beside files that are read.
 @functools.cache
-def options_of(kind: type) -> tuple[Option, ...]:
+def list_options(kind: type) -> tuple[Option, ...]:
     """The options of a dataclass, in the order of its fields.
 
     Raises ``TypeError`` for one that is no frozen dataclass, or a field that was not made by :func:`option`.
@@ -555,7 +555,7 @@ def options_of(kind: type) -> tuple[Option, ...]:
 def recorded_options(options: Any) -> dict[str, Any]:
     """The values that go into the metadata of rays: those that are set, tuples as lists. Files are kept there as
     sources, when a reader begins them."""
-    known = [o for o in options_of(type(options)) if o.recorded and o.kind is not Path]
+    known = [o for o in list_options(type(options)) if o.recorded and o.kind is not Path]
     values = {o.name: getattr(options, o.name) for o in known}
     return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v is not None}
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, sanitize
 
-from .tables import table_columns
+from .tables import read_table_columns
 
 # ---- Columns of a table by the names that they usually have ----
 
@@ -27,7 +27,7 @@ class ColumnFinder:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.columns = path, table_columns(path)
+        self.path, self.columns = path, read_table_columns(path)
         self._by_name = {re.sub(r"[ .]", "_", c).lower(): c for c in reversed(self.columns)}
         self._by_words = {column_words(c): c for c in reversed(self.columns)}
 
@@ -47,7 +47,7 @@ class ColumnFinder:
         found = self.find_vector(*stems, axes=axes)
         if found is None:
             wanted = " or ".join(f"{s}{'_' if s else ''}{{{','.join(axes)}}}" for s in stems)
-            there = ", ".join(plain(c, 40) for c in self.columns[:16])
+            there = ", ".join(sanitize(c, 40) for c in self.columns[:16])
             raise NergError(f"{self.path} has no columns {wanted}; its columns are {there}; name them with --map")
         return found
 
@@ -301,11 +301,11 @@ def require_valid_values(source: str, column: str, counts: Mapping[str, int]) ->
     valid = valid_values(column, counts)
     if valid is None:
         some = sorted(counts, key=lambda value: -counts[value])[:_SHOWN]
-        shown = ", ".join(f"{plain(value, 20) or 'nothing'} ({counts[value]:,} rows)" for value in some)
+        shown = ", ".join(f"{sanitize(value, 20) or 'nothing'} ({counts[value]:,} rows)" for value in some)
         more = f" and {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
         raise NergError(
-            f"{source}: the column {plain(column, 40)!r} holds {shown}{more}, and nothing says which of them mark "
-            f'valid rows; name those (--valid "{plain(column, 40)}=VALUE,VALUE"), or use no such column (--valid none)'
+            f"{source}: the column {sanitize(column, 40)!r} holds {shown}{more}, and nothing says which of them mark "
+            f'valid rows; name those (--valid "{sanitize(column, 40)}=VALUE,VALUE"), or use no such column (--valid none)'
         )
     return valid
 
@@ -335,7 +335,7 @@ def parse_valid(text: str | None) -> dict[str, tuple[str, ...]] | None:
     except ValueError:
         pairs = {"": ()}
     if any(not name or not any(values) for name, values in pairs.items()) or (not pairs and "none" not in text.lower()):
-        raise NergError(f'--valid is {plain(text, 60)!r}; it is COLUMN=VALUE,VALUE (several between spaces), or "none"')
+        raise NergError(f'--valid is {sanitize(text, 60)!r}; it is COLUMN=VALUE,VALUE (several between spaces), or "none"')
     return pairs
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import real_path
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import resolve_path
 
 from . import poses
 from .base import OPENGL, RECORDINGS, InFrame, RaysBuilder, Signature, option
 from .poses import rotations_from_quaternions
-from .tables import TableBlock, iterate_table, table_columns
+from .tables import TableBlock, iterate_table, read_table_columns
 
 # ---- Scene settings ----
 #
@@ -55,7 +55,7 @@ class SceneSetting:
 def read_scene_settings(path: Path) -> dict[str, SceneSetting]:
     """The settings of each place in ``path``, by its name. Raises `NergError` for a file that is none."""
     texts = ["Scene_Name", "Quaternion"]
-    if "Initial_Position" in table_columns(path):
+    if "Initial_Position" in read_table_columns(path):
         texts.append("Initial_Position")
     found = {}
     for block in iterate_table(path, ["Scale"], texts):
@@ -68,7 +68,7 @@ def read_scene_settings(path: Path) -> dict[str, SceneSetting]:
                 or not 0.5 < np.hypot.reduce(quaternion) < 2
             ):
                 raise NergError(
-                    f"{path}, line {line}: {plain(cells[0], 40)!r} needs a scale above 0, a quaternion x, y, z, w and "
+                    f"{path}, line {line}: {sanitize(cells[0], 40)!r} needs a scale above 0, a quaternion x, y, z, w and "
                     "an initial position of three numbers; copy the file again"
                 )
             found[cells[0]] = SceneSetting(cells[0], scale, quaternion, start)
@@ -110,7 +110,7 @@ class EyeNavGSOptions:
 
     def __post_init__(self) -> None:
         if self.eye not in ("both", "left", "right"):
-            raise NergError(f'--eye is "{plain(self.eye, 40)}"; it is both, left or right')
+            raise NergError(f'--eye is "{sanitize(self.eye, 40)}"; it is both, left or right')
 
 
 class EyeNavGS(InFrame):
@@ -149,7 +149,7 @@ class EyeNavGS(InFrame):
             found = _of_place(path, names[settings], settings)
             if setting is not None and found != setting:
                 raise NergError(
-                    f"{path} is of {plain(found.place, 40)} and {recordings[0]} of {plain(setting.place, 40)}, or of "
+                    f"{path} is of {sanitize(found.place, 40)} and {recordings[0]} of {sanitize(setting.place, 40)}, or of "
                     "another site's copy of it, each a frame of its own; import them apart"
                 )
             setting = found
@@ -264,7 +264,7 @@ def _person_and_place(path: Path) -> tuple[str, str]:
 def _find_settings(path: Path) -> Path:
     if not path.is_file():
         raise NergError(f"there is no {path}; correct its name")
-    for folder in list(real_path(path).parents)[: _ABOVE + 1]:
+    for folder in list(resolve_path(path).parents)[: _ABOVE + 1]:
         if (folder / _SETTINGS).is_file():
             return folder / _SETTINGS
     raise NergError(
@@ -275,12 +275,12 @@ def _find_settings(path: Path) -> Path:
 def _of_place(path: Path, settings: dict[str, SceneSetting], where: Path) -> SceneSetting:
     place = _person_and_place(path)[1]
     if place not in settings:
-        there = ", ".join(plain(name, 40) for name in list(settings)[:16])
-        raise NergError(f'{path} is of "{plain(place, 40)}", of which {where} has nothing (it has {there}); rename it')
+        there = ", ".join(sanitize(name, 40) for name in list(settings)[:16])
+        raise NergError(f'{path} is of "{sanitize(place, 40)}", of which {where} has nothing (it has {there}); rename it')
     return settings[place]
 
 
 def _time(path: Path) -> str:
     """The column of times, which the sites call differently."""
-    columns = table_columns(path)
+    columns = read_table_columns(path)
     return next((name for name in _TIMES if name in columns), _TIMES[0])

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.safe_read import read_bytes, real_path
+from nerg_mi.files.safe_read import read_bytes, resolve_path
 
 from .base import DESCRIPTION, RaysBuilder, Signature
 from .scene_glasses import POSES, WHERE_CAMERA, GazeBlock, Recording, SceneCamera, SceneReader
@@ -49,7 +49,7 @@ class GlassesTools(SceneReader[_Glasses]):
     )
 
     def open(self, folder: Path, builder: RaysBuilder) -> _Glasses:
-        name = real_path(folder).name
+        name = resolve_path(folder).name
         camera = _camera(folder, builder)
         return _Glasses(name=name, person=name, frames=_frame_times(folder, builder), camera=camera)
 

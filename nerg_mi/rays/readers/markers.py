@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import reading, size_of
-from nerg_mi.ranges import ANGLES, Checked
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import translate_read_errors, check_regular_file
+from nerg_mi.ranges import ELEVATIONS, ValidatedDataclass
 
 from . import poses
 from .base import DESCRIPTION, UNITS, UPS, RaysBuilder, Signature, TrackingFrame, option
@@ -92,8 +92,8 @@ def _opened(path: Path) -> Iterator[Any]:
         import c3d
     except ImportError:
         raise ImportError('C3D files need c3d, which is not installed: pip install "nerg-mi[mocap]"') from None
-    size_of(path, "C3D file")
-    with reading(path, "C3D file", "export it again", _DAMAGED), open(path, "rb") as file:
+    check_regular_file(path, "C3D file")
+    with translate_read_errors(path, "C3D file", "export it again", _DAMAGED), open(path, "rb") as file:
         if file.read(2)[1:] != b"\x50":
             raise ValueError("it does not begin as a C3D file does")
         file.seek(0)
@@ -124,7 +124,7 @@ _NAMED = 12  # markers, in messages
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarkerOptions(Checked):
+class MarkerOptions(ValidatedDataclass):
     """Which markers are on a head, and what the file does not say of the laboratory."""
 
     keypoints: Places | None = option(
@@ -134,7 +134,7 @@ class MarkerOptions(Checked):
         parse=parse_keypoints,
         recorded=False,
     )
-    pitch: float = option(0.0, PITCH, within=ANGLES)
+    pitch: float = option(0.0, PITCH, within=ELEVATIONS)
     units: str | None = option(None, "Unit of length: m, cm or mm.", shown="the file's", recorded=False)
     up: str | None = option(None, "Up axis: x, y, z, -x, -y or -z.", shown="the file's, or z", recorded=False)
 
@@ -167,7 +167,7 @@ class C3d:
             unit = _unit(path, header, options)
             up = poses.axis(self.frame([path], options).up, "up")
             if options.up is None and _up(header) is None:
-                builder.complain(f'"{plain(path.name, 60)}" does not say which axis points up; z was taken (--up)')
+                builder.complain(f'"{sanitize(path.name, 60)}" does not say which axis points up; z was taken (--up)')
             if not header.rate > 0:
                 raise NergError(f'"{path}" does not say how many frames a second it has; export it again')
             places = next(iter(heads.values()))[0]
@@ -194,14 +194,14 @@ class C3d:
             # Whether frames count from 0 or 1 is not said.
             if count < header.frames - 1:
                 builder.complain(
-                    f'"{plain(path.name, 60)}" ends after {count:,} of the {header.frames:,} frames of its header: was '
+                    f'"{sanitize(path.name, 60)}" ends after {count:,} of the {header.frames:,} frames of its header: was '
                     "it copied whole?"
                 )
             checks.finish()
             middle = median_of(elevations)
             if abs(middle) > _LEVEL:
                 builder.complain(
-                    f'the heads in "{plain(path.name, 60)}" point {middle:.0f} degrees up (median): are the markers at '
+                    f'the heads in "{sanitize(path.name, 60)}" point {middle:.0f} degrees up (median): are the markers at '
                     "the front of the head as high as those at its sides? "
                     f"--pitch {options.pitch - middle:.0f} levels them"
                 )
@@ -220,7 +220,7 @@ def _unit(path: Path, header: MarkerHeader, options: MarkerOptions) -> float:
     """Metres of the file's unit of length."""
     name = options.units or header.unit.lower()
     if name not in UNITS:
-        problem = f'is in "{plain(header.unit, 20)}"' if header.unit else "names no unit of length"
+        problem = f'is in "{sanitize(header.unit, 20)}"' if header.unit else "names no unit of length"
         raise NergError(f'"{path}" {problem}; say whether it is in m, cm or mm (--units)')
     return UNITS[name]
 
@@ -242,7 +242,7 @@ def _heads(path: Path, header: MarkerHeader, options: MarkerOptions) -> dict[str
                 heads[person or person_from_filename(path)] = places, whole
                 break
     if not heads:
-        there = [plain(label, 40) for label in header.labels]
+        there = [sanitize(label, 40) for label in header.labels]
         more = "" if len(there) <= _NAMED else f" and {len(there) - _NAMED} more"
         raise NergError(
             f'no markers of a head are recognised in "{path}", whose markers are {", ".join(there[:_NAMED])}{more}; '

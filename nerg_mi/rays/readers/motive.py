@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import line_blocks
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import read_line_blocks
 
 from . import poses
 from .base import DESCRIPTION, RaysBuilder, Signature, TrackingFrame, option
@@ -85,7 +85,7 @@ class Motive:
             body = _choose(path, layout, options.rigid_body)
             if options.forward is None:
                 builder.complain(
-                    f"no file tells along which of its axes the rigid body {plain(body, 40)!r} looks: {_FORWARD} was "
+                    f"no file tells along which of its axes the rigid body {sanitize(body, 40)!r} looks: {_FORWARD} was "
                     f"taken; say it (--forward, {_FORWARD} too) once you have checked it"
                 )
             builder.source(path)
@@ -114,13 +114,13 @@ def _choose(path: Path, layout: MotiveLayout, wanted: str | None) -> str:
         fits = [n for n in names if _HEADS.search(n)]
     if len(fits) == 1:
         return fits[0]
-    shown = ", ".join(plain(n, 40) for n in names[:12]) or "none"
+    shown = ", ".join(sanitize(n, 40) for n in names[:12]) or "none"
     raise NergError(f"{path} has the rigid bodies {shown}; name the head's with --rigid-body, or export its rotation")
 
 
 def _read_layout(path: Path) -> MotiveLayout:
     """What the lines above the samples tell. Raises `NergError` for another file, or another export."""
-    with closing(line_blocks(path, "table", _HEAD_LINES)) as blocks:
+    with closing(read_line_blocks(path, "table", _HEAD_LINES)) as blocks:
         rows = list(csv.reader(line.lstrip("\ufeff") for line in next(blocks, [])))
     rows = [[cell.strip() for cell in row] for row in rows]
     at = next((k for k, row in enumerate(rows) if row[:1] == ["Frame"]), None)
@@ -133,12 +133,12 @@ def _read_layout(path: Path) -> MotiveLayout:
     for key, needed in (("Rotation Type", "Quaternion"), ("Coordinate Space", "Global")):
         if metadata.get(key) != needed:
             raise NergError(
-                f"{path} has the {key.lower()} {plain(metadata.get(key, 'none'), 40)!r}; export it again with {needed}"
+                f"{path} has the {key.lower()} {sanitize(metadata.get(key, 'none'), 40)!r}; export it again with {needed}"
             )
     units = _UNITS.get(metadata.get("Length Units", "").lower())
     if units is None:
         raise NergError(
-            f"{path} has the length units {plain(metadata.get('Length Units', 'none'), 40)!r}; export it in meters, "
+            f"{path} has the length units {sanitize(metadata.get('Length Units', 'none'), 40)!r}; export it in meters, "
             "centimeters or millimeters"
         )
     # Lines that name something of each column, by their second cell; that above the axes has no name.

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import read_json, real_path
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import read_json, resolve_path
 
 from .base import DESCRIPTION, RaysBuilder, Signature
 from .scene_glasses import POSES, WHERE_CAMERA, GazeBlock, Recording, SceneCamera, SceneReader, directions_from_angles
-from .tables import table_columns
+from .tables import read_table_columns
 
 _TIME = "timestamp [ns]"
 _PIXELS = ("gaze x [px]", "gaze y [px]")
@@ -70,7 +70,7 @@ class Neon(SceneReader[_Neon]):
     accounts = "pixels and angles"
 
     def open(self, folder: Path, builder: RaysBuilder) -> _Neon:
-        name = real_path(folder).name
+        name = resolve_path(folder).name
         frames = _frame_times(folder, builder)
         start, person = _info(folder, builder)
         starts_with_video = start is None
@@ -81,7 +81,7 @@ class Neon(SceneReader[_Neon]):
                     "count; export them beside the gaze"
                 )
             builder.complain(
-                f'there is no info.json beside the gaze of "{plain(name, 60)}": times count from the first frame of '
+                f'there is no info.json beside the gaze of "{sanitize(name, 60)}": times count from the first frame of '
                 "the scene video, not from the recording's start, and the person is the folder"
             )
             start = float(frames[0])
@@ -95,13 +95,13 @@ class Neon(SceneReader[_Neon]):
         )
 
     def blocks(self, gaze: Path, recording: _Neon, builder: RaysBuilder) -> Iterator[GazeBlock]:
-        there = set(table_columns(gaze))
+        there = set(read_table_columns(gaze))
         angles = set(_ANGLES) <= there
         camera = recording.camera
         if not angles and camera is None:
             camera = SceneCamera.of_opencv(*_NOMINAL, _SIZE)
             builder.complain(
-                f'the gaze of "{plain(recording.name, 60)}" has no angles, and no calibration of the scene camera '
+                f'the gaze of "{sanitize(recording.name, 60)}" has no angles, and no calibration of the scene camera '
                 f"({' or '.join(_CALIBRATIONS)}) lies beside it: pixels go through the nominal lens of Neon, some two "
                 "degrees off; export either"
             )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.ranges import FARTHEST, TIMES
+from nerg_mi.ranges import MAX_COORDINATE, TIMES
 
 # ---- Where something was and how it was turned, sample by sample, and in between ----
 
@@ -24,7 +24,7 @@ class PoseTrack:
     def of_samples(cls, times: np.ndarray, vectors: np.ndarray, places: np.ndarray) -> PoseTrack | None:
         """A track of samples in any order; those with something missing, or beyond `FARTHEST`, are left out, and of
         those at one time all but the first. None where fewer than two are left."""
-        within = lambda v: (np.abs(v) <= FARTHEST).all(axis=1)
+        within = lambda v: (np.abs(v) <= MAX_COORDINATE).all(axis=1)
         good = (np.abs(times) <= TIMES.high) & within(vectors) & within(places)
         kept = np.flatnonzero(good)
         kept = kept[np.unique(times[kept], return_index=True)[1]]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.safe_read import real_path
-from nerg_mi.ranges import LENGTHS, Checked, Range
+from nerg_mi.files.safe_read import resolve_path
+from nerg_mi.ranges import LENGTHS, ValidatedDataclass, Range
 
 from . import poses
 from .base import DESCRIPTION, RaysBuilder, Signature, TrackingFrame, option
@@ -21,7 +21,7 @@ _CENTRES = [f"eye_center{eye}_3d_{axis}" for eye in "01" for axis in "xyz"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PupilOptions(Checked):
+class PupilOptions(ValidatedDataclass):
     """What the exports do not say."""
 
     marker: float | None = option(None, "Edge of a tracking marker in metres.", within=LENGTHS)  # needed
@@ -103,5 +103,5 @@ def _read_heads(path: Path, person: str, builder: RaysBuilder) -> PoseTrack:
 
 def _person(gaze: Path) -> str:
     """The recording's folder: the first above ``gaze`` that is neither a number nor ``exports``."""
-    folders = reversed(real_path(gaze).parent.parts)
+    folders = reversed(resolve_path(gaze).parent.parts)
     return next((p for p in folders if not p.isdigit() and p != "exports"), gaze.stem)

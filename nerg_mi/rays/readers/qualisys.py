@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine, line_blocks, real_path
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, resolve_path
 
 from .base import DESCRIPTION, RaysBuilder, Signature, TrackingFrame, option
 from .columns import ColumnFinder
@@ -53,14 +53,14 @@ class GazeVectorLayout:
     width: int  # cells of a line
 
 
-def iterate_gaze_vectors(path: Path, on_bad: OnBadLine | None = None) -> Iterator[GazeVectors]:
+def iterate_gaze_vectors(path: Path, on_bad: BadLineCallback | None = None) -> Iterator[GazeVectors]:
     """The samples of ``path`` in blocks.
 
     Raises `NergError` for what is no such file, for times that nothing tells, and, unless ``on_bad`` is given, for a
     line that cannot be read; ``on_bad`` is told of such lines, which are left out.
     """
     layout, count, sample = _read_layout(path), 0, 0
-    with closing(line_blocks(path, _WHAT, _BLOCK)) as blocks:
+    with closing(read_line_blocks(path, _WHAT, _BLOCK)) as blocks:
         for lines in blocks:
             found: list[tuple[float, list[float], int, int]] = []
             for number, line in enumerate(lines, count + 1):
@@ -73,7 +73,7 @@ def iterate_gaze_vectors(path: Path, on_bad: OnBadLine | None = None) -> Iterato
                     time = layout.start + sample * layout.step if layout.time is None else _number(cells[layout.time])
                     found.append((time, [_number(cells[i]) for i in layout.cells], sample, number))
                 except ValueError as error:
-                    why = f": {plain(line, 60)!r} is no sample ({plain(error)}); correct or remove the line"
+                    why = f": {sanitize(line, 60)!r} is no sample ({sanitize(error)}); correct or remove the line"
                     if on_bad is None:
                         raise NergError(
                             f"{path}, line {number}{why}, or leave such lines out with --skip-bad-lines"
@@ -88,7 +88,7 @@ def iterate_gaze_vectors(path: Path, on_bad: OnBadLine | None = None) -> Iterato
 
 def _read_layout(path: Path) -> GazeVectorLayout:
     """What the head of the file, or its first sample, tells."""
-    with closing(line_blocks(path, _WHAT, _HEADER_LINES)) as blocks:
+    with closing(read_line_blocks(path, _WHAT, _HEADER_LINES)) as blocks:
         head = next(blocks, [])
     about: dict[str, str] = {}
     for number, line in enumerate(head, 1):
@@ -268,12 +268,12 @@ class NeonMocap:
             columns = ColumnFinder(path)
             time = columns.find("timestamp_[ns]")
             if time is None:
-                there = ", ".join(plain(c, 40) for c in columns.columns[:8])
+                there = ", ".join(sanitize(c, 40) for c in columns.columns[:8])
                 raise NergError(f'{path} has no column "timestamp [ns]"; its columns are {there}')
             names = [time, *columns.vector("gaze_origin"), *columns.vector("gaze_dir")]
             builder.source(path)
             usual = path.name.startswith("gaze_in_mocap_space")
-            person = real_path(path).parent.name if usual else person_from_filename(path)
+            person = resolve_path(path).parent.name if usual else person_from_filename(path)
             for v, _, lines in builder.read_table(path, names):
                 lost = np.asarray(np.isnan(v[:, 1:]).any(axis=1))
                 builder.add(

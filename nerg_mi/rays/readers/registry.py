@@ -15,7 +15,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
 from . import skeleton, table
-from .base import Option, RaysBuilder, Reader, options_of, recorded_options
+from .base import Option, RaysBuilder, Reader, list_options, recorded_options
 
 TABLE = table.TABLE.name
 """The reader of tables through a column map; the others know their columns, and are the presets."""
@@ -42,8 +42,8 @@ def register_reader(reader: Reader[Any]) -> None:
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", reader.name) or reader.name in _READERS:
         raise ValueError(f'a reader cannot be called "{reader.name}": the name is taken, or no word in lower case')
-    known = {o.flag: o for r in _READERS.values() for o in options_of(r.Options)}
-    for option in options_of(reader.Options):
+    known = {o.flag: o for r in _READERS.values() for o in list_options(r.Options)}
+    for option in list_options(reader.Options):
         other = known.get(option.flag, option)
         if (other.name, other.kind) != (option.name, option.kind):
             raise ValueError(
@@ -53,12 +53,12 @@ def register_reader(reader: Reader[Any]) -> None:
     _READERS[reader.name] = reader
 
 
-def unregister(name: str) -> None:
+def unregister_reader(name: str) -> None:
     """Forget a reader. Raises ``KeyError`` where there is none of this name."""
     del _READERS[name]
 
 
-def reader_names() -> tuple[str, ...]:
+def list_reader_names() -> tuple[str, ...]:
     """Names of all readers, in the order in which they were registered."""
     return tuple(_READERS)
 
@@ -68,16 +68,16 @@ def readers() -> Iterable[Reader[Any]]:
     return _READERS.values()
 
 
-def preset_names() -> tuple[str, ...]:
+def list_preset_names() -> tuple[str, ...]:
     """Names of the readers that know their columns."""
     return tuple(name for name in _READERS if name != TABLE)
 
 
-def reader_named(name: str) -> Reader[Any]:
+def get_reader(name: str) -> Reader[Any]:
     """The reader of this name, or of one that it had. Raises `NergError` naming those there are."""
     name = _FORMER_NAMES.get(name, name)
     if name not in _READERS:
-        raise NergError(f'there is no preset "{name}"; choose one of {", ".join(preset_names())}, or give a column map')
+        raise NergError(f'there is no preset "{name}"; choose one of {", ".join(list_preset_names())}, or give a column map')
     return _READERS[name]
 
 
@@ -86,8 +86,8 @@ def make_options(name: str, given: Mapping[str, Any]) -> Any:
 
     Raises `NergError` for an option that the reader does not have, naming its flag, or a value that it refuses.
     """
-    reader = reader_named(name)
-    known, flags = {o.name for o in options_of(reader.Options)}, {o.name: o.flag for o in shared_options()}
+    reader = get_reader(name)
+    known, flags = {o.name for o in list_options(reader.Options)}, {o.name: o.flag for o in collect_shared_options()}
     foreign = ", ".join(flags.get(key, key) for key in given if key not in known)
     if foreign and name == TABLE:
         raise NergError(f"{foreign} belongs to a preset; leave it out, or give --preset in place of --map")
@@ -98,7 +98,7 @@ def make_options(name: str, given: Mapping[str, Any]) -> Any:
 
 def parse_options(name: str, given: Mapping[str, Any]) -> Any:
     """As :func:`make_options`, of values as the command line has them: texts where an option makes its value of one."""
-    parse = {o.name: o.parse for o in options_of(reader_named(name).Options)}
+    parse = {o.name: o.parse for o in list_options(get_reader(name).Options)}
     return make_options(name, {key: f(value) if (f := parse.get(key)) else value for key, value in given.items()})
 
 
@@ -122,7 +122,7 @@ def read_rays(
     Raises `NergError` for files that are not of the format, or give no ray; ``TypeError`` for options of another
     reader.
     """
-    reader = reader_named(reader) if isinstance(reader, str) else reader
+    reader = get_reader(reader) if isinstance(reader, str) else reader
     options = reader.Options() if options is None else options
     if not isinstance(options, reader.Options):
         raise TypeError(f"{reader.name} takes {reader.Options.__qualname__}, not {type(options).__qualname__}")
@@ -147,12 +147,12 @@ class SharedOption:
     help: str  # with the readers it belongs to and their defaults
 
 
-def shared_options() -> tuple[SharedOption, ...]:
+def collect_shared_options() -> tuple[SharedOption, ...]:
     """The options of all readers, those of tables first, as the command line has them."""
     order = sorted(_READERS, key=lambda name: name != TABLE)
     found: dict[str, dict[str, Option]] = {}
     for name in order:
-        for option in options_of(_READERS[name].Options):
+        for option in list_options(_READERS[name].Options):
             found.setdefault(option.name, {})[name] = option
     return tuple(SharedOption(name, *_shared(of)) for name, of in found.items())
 
@@ -172,13 +172,13 @@ def _shared(of: dict[str, Option]) -> tuple[str, type, str]:
     return first.flag, first.kind, " ".join(words) + (f"  [default: {'; '.join(shown)}]" if shown else "")
 
 
-def preset_table() -> str:
+def format_preset_table() -> str:
     """The readers that know their columns as a table in Markdown, for the manual."""
     rows = ["| preset | files | frame | checked on |", "|---|---|---|---|"]
-    for reader in map(reader_named, preset_names()):
+    for reader in map(get_reader, list_preset_names()):
         options = "; ".join(
             f"`{o.flag}`: {o.help[:1].lower()}{o.help[1:].rstrip('.')}" + (f" ({o.shown})" if o.shown else "")
-            for o in options_of(reader.Options)
+            for o in list_options(reader.Options)
         )
         files = f"{reader.files}. {options}" if options else reader.files
         cells = [f"`{reader.name}`", files, reader.world, reader.checked_on]

@@ -11,12 +11,12 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine, read_json
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import BadLineCallback, read_json
 from nerg_mi.formats.checkpoint import read_checkpoint
-from nerg_mi.photos.cameras import Intrinsics, undistort_where
-from nerg_mi.photos.colmap import find_source, find_up, read_named_poses
-from nerg_mi.ranges import LENGTHS, RATES, Checked, Range
+from nerg_mi.photos.cameras import Intrinsics, undistort_with_mask
+from nerg_mi.photos.colmap import find_pose_source, estimate_up, read_named_poses
+from nerg_mi.ranges import LENGTHS, RATES, ValidatedDataclass, Range
 
 from . import poses
 from .base import RaysBuilder, TrackingFrame, option
@@ -46,7 +46,7 @@ class FrameNames:
 
     def __post_init__(self) -> None:
         if sum(self.pattern.count(field) for field in _FIELDS) != 1:
-            raise NergError(f'--frames is "{plain(self.pattern, 80)}"; {_HOW}')
+            raise NergError(f'--frames is "{sanitize(self.pattern, 80)}"; {_HOW}')
 
     @classmethod
     def parse(cls, text: str) -> FrameNames:
@@ -85,10 +85,10 @@ class FrameNames:
                 ((kind, text),) = found.groupdict().items()
                 out[i] = self._time(kind, text, name, frames, fps, start)
         if not np.isfinite(out).any():
-            shown = ", ".join(plain(n, 60) for n in names[:3])
+            shown = ", ".join(sanitize(n, 60) for n in names[:3])
             raise NergError(
-                f'no image of the model is called "{plain(self.pattern, 80)}" for the recording '
-                f'"{plain(recording, 60)}" (its first are {shown}); correct --frames: {_HOW}'
+                f'no image of the model is called "{sanitize(self.pattern, 80)}" for the recording '
+                f'"{sanitize(recording, 60)}" (its first are {shown}); correct --frames: {_HOW}'
             )
         return out
 
@@ -112,7 +112,7 @@ class FrameNames:
             of = "" if frames is None else f", which has {len(frames)}"
             of += "" if fps is None else f" ({fps:g} a second were counted)"
             raise NergError(
-                f'"{plain(name, 80)}" is frame {index} of the video, counted from 0{of}; check --frames, and --fps '
+                f'"{sanitize(name, 80)}" is frame {index} of the video, counted from 0{of}; check --frames, and --fps '
                 "where not every frame was taken"
             )
         return float(frames[position])
@@ -226,7 +226,7 @@ class SceneCamera:
             with np.errstate(invalid="ignore"):
                 good &= ((pixels >= -0.5) & (pixels <= [lens.width - 0.5, lens.height - 0.5])).all(axis=1)
         out = np.full((len(pixels), 3), np.nan)
-        xy, shown = undistort_where((pixels[good] - [lens.cx, lens.cy]) / [lens.fx, lens.fy], lens)
+        xy, shown = undistort_with_mask((pixels[good] - [lens.cx, lens.cy]) / [lens.fx, lens.fy], lens)
         d = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
         out[good] = np.where(shown[:, None], d / np.linalg.norm(d, axis=1, keepdims=True), np.nan)
         return out
@@ -263,7 +263,7 @@ def is_timed(path: Path) -> bool:
     return path.suffix.lower() in (".csv", ".p") or path.name == "camera_pose.json"
 
 
-def read_timed_poses(path: Path, on_bad: OnBadLine | None = None) -> tuple[PoseTrack, int]:
+def read_timed_poses(path: Path, on_bad: BadLineCallback | None = None) -> tuple[PoseTrack, int]:
     """The track in ``aligned_poses.csv`` or ``camera_pose.json``, and how many poses the file lists.
 
     A pose holds from ``start_timestamp``, when its frame was taken. Raises `NergError` for a file that is neither, or
@@ -278,7 +278,7 @@ def read_timed_poses(path: Path, on_bad: OnBadLine | None = None) -> tuple[PoseT
     return track, len(times)
 
 
-def _of_csv(path: Path, on_bad: OnBadLine | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _of_csv(path: Path, on_bad: BadLineCallback | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     from scipy.spatial.transform import Rotation
 
     blocks = iterate_table(path, ["start_timestamp", *_PLACE, *_QUATERNION], on_bad=on_bad)
@@ -322,7 +322,7 @@ _COMPARED = 1 << 20  # rows of a recording whose two accounts are compared
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneCameraOptions(Checked):
+class SceneCameraOptions(ValidatedDataclass):
     """Where the scene camera was. Raises `NergError` for a scale beside a place, or a rate or gap that is none."""
 
     poses: Path | None = option(  # needed
@@ -462,7 +462,7 @@ def _camera_track(options: SceneCameraOptions, recording: Recording, builder: Ra
     if is_timed(options.poses):
         if recording.starts_with_video:
             raise NergError(
-                f'the poses of "{options.poses}" count from the start of the recording "{plain(recording.name, 60)}", '
+                f'the poses of "{options.poses}" count from the start of the recording "{sanitize(recording.name, 60)}", '
                 "which no file of it says; put its info.json beside the gaze"
             )
         builder.source(options.poses)
@@ -483,14 +483,14 @@ def _of_model(
     from scipy.spatial.transform import Rotation
 
     assert options.poses is not None
-    model = read_named_poses(find_source(options.poses))
+    model = read_named_poses(find_pose_source(options.poses))
     builder.source(model.path)
     for note in model.notes:
         builder.complain(note)
     if options.frames is None:
         raise NergError(
             f'which images of "{model.path}" are frames of the video, and when they were taken, has to be said, such '
-            f'as --frames "frame_{{frame1}}"; its first are {", ".join(plain(n, 60) for n in model.names[:3])}'
+            f'as --frames "frame_{{frame1}}"; its first are {", ".join(sanitize(n, 60) for n in model.names[:3])}'
         )
     times = options.frames.times(model.names, recording.name, recording.frames, options.fps, recording.start)
     if recording.frames is None and options.frames.needs_frames:
@@ -503,7 +503,7 @@ def _of_model(
     track = PoseTrack.of_samples(times, turns.as_rotvec(), model.to_world[:, :3, 3])
     if track is None:
         raise NergError(
-            f'one image of "{model.path}" alone is a frame of the recording "{plain(recording.name, 60)}"; two are '
+            f'one image of "{model.path}" alone is a frame of the recording "{sanitize(recording.name, 60)}"; two are '
             "needed to interpolate between: register more of them"
         )
     if to_place.sha256 is not None and to_place.sha256 != model.sha256:
@@ -512,8 +512,8 @@ def _of_model(
             "registered anew, train the place on it"
         )
     if to_place.up is None:
-        found = find_up(model.to_world, np.zeros((0, 3)))
-        up = to_place.rotation @ found.direction if found.sure else None
+        found = estimate_up(model.to_world, np.zeros((0, 3)))
+        up = to_place.rotation @ found.direction if found.is_reliable else None
     else:
         up = to_place.up
     return track, up

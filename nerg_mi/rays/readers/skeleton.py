@@ -15,10 +15,10 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.atomic import replacing
-from nerg_mi.files.safe_read import OnBadLine, line_blocks
-from nerg_mi.ranges import ANGLES
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.atomic import replace_atomically
+from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks
+from nerg_mi.ranges import ELEVATIONS
 
 from .base import DESCRIPTION, UNITS, RaysBuilder, Signature, TickOption, TrackingFrame, option
 from .poses import fill_values
@@ -87,14 +87,14 @@ def write_skeleton(
 
     flat = keypoints.reshape(n, -1)
     form = ", ".join([f"%.{decimals}f"] * flat.shape[1])
-    with replacing(path) as temporary, _written(temporary, Path(path).name) as out:
+    with replace_atomically(path) as temporary, _written(temporary, Path(path).name) as out:
         for name, time, values in zip(ids, times, flat):
             out.write(f"{name}|{int(time)}|[{form % tuple(values)}]\n")
 
 
 def count_values(path: str | os.PathLike) -> int | None:
     """How many numbers the first line has that follows the format; None where none of the first lines does."""
-    for block in line_blocks(path, "skeleton file", _SNIFFED):
+    for block in read_line_blocks(path, "skeleton file", _SNIFFED):
         bodies = [fields[2].strip() for line in block if len(fields := line.split("|")) == 3]
         return next((body.count(",") + 1 for body in bodies if body[:1] == "[" and body[-1:] == "]"), None)
     return None
@@ -104,7 +104,7 @@ def iterate_skeleton(
     path: str | os.PathLike,
     chunk: int = 8192,
     keypoints: Sequence[int] | None = None,
-    on_bad: OnBadLine | None = None,
+    on_bad: BadLineCallback | None = None,
     layout: Layout = PAPER_LAYOUT,
 ) -> Iterator[SkeletonRows]:
     """Yield the poses of a file in runs of at most ``chunk`` lines, so that
@@ -117,7 +117,7 @@ def iterate_skeleton(
     wanted = range(layout.keypoints) if keypoints is None else sorted(set(keypoints))
     columns = [layout.width * k + i for k in wanted for i in range(layout.width)]
     before = 0
-    for block in line_blocks(path, "skeleton file", chunk):
+    for block in read_line_blocks(path, "skeleton file", chunk):
         ids: list[str] = []
         times: list[int] = []
         texts: list[str] = []
@@ -154,13 +154,13 @@ def _fields(line: str, layout: Layout) -> tuple[str, int, str] | str:
     try:
         time = int(fields[1])
     except ValueError:
-        return f": the time {plain(fields[1], 40)!r} is not an integer"
+        return f": the time {sanitize(fields[1], 40)!r} is not an integer"
     if not -(1 << 63) <= time < 1 << 63:
-        return f": the time {plain(fields[1], 40)!r} is too large for 64 bits"
+        return f": the time {sanitize(fields[1], 40)!r} is too large for 64 bits"
     return fields[0].strip(), time, body[1:-1]
 
 
-def _refuse(path: str | os.PathLike, line: int, why: str, on_bad: OnBadLine | None) -> None:
+def _refuse(path: str | os.PathLike, line: int, why: str, on_bad: BadLineCallback | None) -> None:
     if on_bad is None:
         raise NergError(
             f"{path}, line {line}{why}; mend or remove the line, or leave such lines out with --skip-bad-lines"
@@ -183,7 +183,7 @@ def _rows(
     texts: list[str],
     lines: list[int],
     columns: list[int],
-    on_bad: OnBadLine | None,
+    on_bad: BadLineCallback | None,
     layout: Layout,
 ) -> SkeletonRows:
     # One conversion for the whole run; only when it fails is the line searched for.
@@ -197,7 +197,7 @@ def _rows(
             if word is None:
                 kept.append(i)
             else:
-                _refuse(path, line, f": {plain(word.strip(), 60)!r} is not a number", on_bad)
+                _refuse(path, line, f": {sanitize(word.strip(), 60)!r} is not a number", on_bad)
         ids, times, texts, lines = ([column[i] for i in kept] for column in (ids, times, texts, lines))
         # NumPy knows fewer spellings than Python.
         found = _numbers(texts, columns, pick, fast=False)
@@ -458,7 +458,7 @@ class SkeletonOptions(TickOption):
         parse=parse_keypoints,
         recorded=False,
     )
-    pitch: float = option(0.0, PITCH, within=ANGLES)
+    pitch: float = option(0.0, PITCH, within=ELEVATIONS)
     units: str = option("m", "Unit of length: m, cm or mm.", recorded=False)
     up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", recorded=False)
     handedness: str = option("right", "Handedness: right or left.", flag="--hand", recorded=False)
@@ -568,12 +568,12 @@ class PlaceChecks:
         width, distance = (median_of(values) for values in (self._widths, self._hips))
         if not np.isnan(width) and not _EARS[0] < width < _EARS[1]:
             self._builder.complain(
-                f'the sides of the heads in "{plain(self._file, 60)}" are {width:.3g} m apart (median), which no ears '
+                f'the sides of the heads in "{sanitize(self._file, 60)}" are {width:.3g} m apart (median), which no ears '
                 "are: are the skeleton, the keypoints and the units those of the file?"
             )
         if distance < _AT_THE_HIPS:
             self._builder.complain(
-                f'the bodies in "{plain(self._file, 60)}" stand with their hips at the origin: positions are relative '
+                f'the bodies in "{sanitize(self._file, 60)}" stand with their hips at the origin: positions are relative '
                 "to them, and where people were is not in the file"
             )
 
@@ -607,7 +607,7 @@ def _skeleton_of(path: Path, options: SkeletonOptions, builder: RaysBuilder) -> 
     if options.skeleton is None and name != PAPER:
         others = "".join(f" (or {other}, with as many)" for other, _ in fits[1:])
         builder.complain(
-            f'"{plain(path.name, 60)}" has {layout.keypoints} keypoints and was taken for {SKELETONS[name].title}'
+            f'"{sanitize(path.name, 60)}" has {layout.keypoints} keypoints and was taken for {SKELETONS[name].title}'
             f"{others}: say which it is with --skeleton"
         )
     return name, layout

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.ranges import Checked, Range
+from nerg_mi.ranges import ValidatedDataclass, Range
 
 from . import poses
 from .base import RECORDINGS, RaysBuilder, Signature, TrackingFrame, option, tick_option, valid_option
@@ -19,7 +19,7 @@ from .tables import TableBlock, iterate_table
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableOptions(Checked):
+class TableOptions(ValidatedDataclass):
     """What no table says of itself. Raises `NergError` for words that are not known."""
 
     columns: ColumnMap | None = option(  # needed

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine, line_blocks, reading
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, translate_read_errors
 from nerg_mi.rays.rays import open_parquet
 
 BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
@@ -42,12 +42,12 @@ class TableBlock(NamedTuple):
     lines: np.ndarray  # (n,) 1-based lines of the file; rows for Parquet
 
 
-def table_columns(path: str | os.PathLike) -> list[str]:
+def read_table_columns(path: str | os.PathLike) -> list[str]:
     """Names of a table's columns; of a CSV those of its first line. Raises `NergError` for a damaged file."""
     if str(path).lower().endswith(".parquet"):
         with open_parquet(path, "table", _ROW_BYTES) as table:
             return list(table.schema_arrow.names)
-    with closing(line_blocks(path, "table", 1)) as blocks:
+    with closing(read_line_blocks(path, "table", 1)) as blocks:
         return _header(path, next(blocks, [""])[0])[0]
 
 
@@ -56,7 +56,7 @@ def iterate_table(
     numbers: Sequence[str],
     texts: Sequence[str] = (),
     header: Sequence[str] | None = None,
-    on_bad: OnBadLine | None = None,
+    on_bad: BadLineCallback | None = None,
     *,
     first_line: int = 1,
     clocks: Mapping[str, float] | None = None,
@@ -93,7 +93,7 @@ def iterate_table(
         return
     count, layout, convert = 0, None, None
     days: dict[int, DayCounter] = {}
-    for raw in line_blocks(path, "table", BLOCK):
+    for raw in read_line_blocks(path, "table", BLOCK):
         skip = max(0, first_line - 1 - count)
         raw, count = raw[skip:], count + min(skip, len(raw))
         if layout is None and raw:
@@ -265,7 +265,7 @@ def _clock(cell: str, tick: float, dated: bool) -> float | None:
 
 
 def _convert(
-    path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad: OnBadLine | None
+    path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad: BadLineCallback | None
 ) -> TableBlock:
     too_long = layout.text_at and len(rows) * max(map(len, rows)) > _TEXT_BLOCK
     if too_long or layout.decimal != "." or layout.clocks or not all(_has_all_cells(row, layout) for row in rows):
@@ -299,7 +299,7 @@ def _has_all_cells(row: str, layout: _Layout) -> bool:
 
 
 def _convert_slowly(
-    path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad: OnBadLine | None
+    path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad: BadLineCallback | None
 ) -> TableBlock:
     """Line by line, cell by cell: knows more spellings of "missing", and names the bad cell."""
     values, words, kept = [], [], []
@@ -332,7 +332,7 @@ def _cells(row: str, layout: _Layout) -> tuple[list[str], list[float]] | str:
     for k in layout.text_at:
         if len(cells[k]) > TEXT_CHARACTERS:
             what = (
-                f"column {plain(layout.columns[k], 40)!r}: more than the {TEXT_CHARACTERS:,} characters that are read"
+                f"column {sanitize(layout.columns[k], 40)!r}: more than the {TEXT_CHARACTERS:,} characters that are read"
             )
             return f", {what}; correct or remove the line"
     numbers = []
@@ -340,7 +340,7 @@ def _cells(row: str, layout: _Layout) -> tuple[list[str], list[float]] | str:
         word = cells[k].strip()
         number = np.nan if word.lower() in _MISSING else _number(word, k, layout)
         if number is None:
-            cell = f"column {plain(layout.columns[k], 40)!r}: {plain(word, 60)!r}"
+            cell = f"column {sanitize(layout.columns[k], 40)!r}: {sanitize(word, 60)!r}"
             return f", {cell} {_why_no_number(word, k, layout)}"
         numbers.append(number)
     return cells, numbers
@@ -395,10 +395,10 @@ def _iterate_parquet(
         names = table.schema_arrow.names
         check_columns(path, [*numbers, *texts], names)
         first, wanted = 1, [*numbers, *texts]
-        with reading(path, "table", also=(pa.ArrowException,)):
+        with translate_read_errors(path, "table", extra_errors=(pa.ArrowException,)):
             batches = table.iter_batches(batch_size=BLOCK, columns=wanted)
         while True:
-            with reading(path, "table", also=(pa.ArrowException,)):
+            with translate_read_errors(path, "table", extra_errors=(pa.ArrowException,)):
                 batch = next(batches, None)
                 if batch is None:
                     return
@@ -418,7 +418,7 @@ def _as_texts(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:
     words = ["" if v is None else str(v) for v in column.to_pylist()]
     if max(map(len, words), default=0) > TEXT_CHARACTERS:
         raise NergError(
-            f'the column {plain(name, 40)!r} of the table "{path}" has cells of more than the {TEXT_CHARACTERS:,} '
+            f'the column {sanitize(name, 40)!r} of the table "{path}" has cells of more than the {TEXT_CHARACTERS:,} '
             "characters that are read; name another one"
         )
     return np.array(words, dtype=str)
@@ -441,7 +441,7 @@ def _as_numbers(path: str | os.PathLike, name: str, column: Any, days: DayCounte
         return values.astype(np.float64)
     except (TypeError, ValueError):
         raise NergError(
-            f'the column {plain(name, 40)!r} of the table "{path}" holds no numbers; name another one'
+            f'the column {sanitize(name, 40)!r} of the table "{path}" holds no numbers; name another one'
         ) from None
 
 
@@ -449,16 +449,16 @@ def check_columns(path: str | os.PathLike, wanted: Sequence[str], there: Sequenc
     """Raise `NergError` for a ``wanted`` column that is not ``there``, is there several times, or is wanted twice."""
     missing = [c for c in wanted if c not in there]
     if missing:
-        brief = lambda names: ", ".join(plain(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
+        brief = lambda names: ", ".join(sanitize(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
         raise NergError(
             f"{path} has no column {brief(missing)}; its columns are {brief(there) or 'none'}; name those by --map"
         )
     repeated = next((c for c in wanted if there.count(c) > 1), None)
     if repeated is not None:
-        raise NergError(f'the table "{path}" has several columns called {plain(repeated, 40)!r}; rename all but one')
+        raise NergError(f'the table "{path}" has several columns called {sanitize(repeated, 40)!r}; rename all but one')
     twice = next((c for c in wanted if wanted.count(c) > 1), None)
     if twice is not None:
-        raise NergError(f"the column {plain(twice, 40)!r} of {path} is used in two roles; name another one in --map")
+        raise NergError(f"the column {sanitize(twice, 40)!r} of {path} is used in two roles; name another one in --map")
 
 
 # ---- Times of day, and dates with one, as text: ISO 8601 and what is close to it ----

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine, line_blocks, parse_json, read_json, real_path
-from nerg_mi.files.video import frame_times
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, parse_json, read_json, resolve_path
+from nerg_mi.files.video import read_frame_times
 
 from .base import DESCRIPTION, RaysBuilder, Signature
 from .scene_glasses import POSES, WHERE_CAMERA, GazeBlock, Recording, SceneCamera, SceneReader, angles_between
@@ -57,7 +57,7 @@ class Tobii3(SceneReader[_Tobii]):
     accounts = "gaze2d and gaze3d"
 
     def open(self, folder: Path, builder: RaysBuilder) -> _Tobii:
-        name = real_path(folder).name
+        name = resolve_path(folder).name
         camera = _scene_camera(folder, builder)
         return _Tobii(
             name=name, person=name, frames=_frames(folder, camera, builder), glasses=_calibration(folder, camera)
@@ -101,7 +101,7 @@ def _frames(folder: Path, camera: dict[str, Any], builder: RaysBuilder) -> np.nd
     if not video.is_file():
         return None
     builder.source(video)
-    return frame_times(video, "scene video")
+    return read_frame_times(video, "scene video")
 
 
 def _calibration(folder: Path, camera: dict[str, Any]) -> CalibratedGlasses:
@@ -127,7 +127,7 @@ def _calibration(folder: Path, camera: dict[str, Any]) -> CalibratedGlasses:
 def _samples(path: Path, builder: RaysBuilder) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Blocks of seconds, gaze2d and gaze3d (n, 6), NaN where there is none, and their lines (n,)."""
     count, unused = 0, dict[str, None]()
-    for raw in line_blocks(path, "gaze of Tobii glasses", _BLOCK):
+    for raw in read_line_blocks(path, "gaze of Tobii glasses", _BLOCK):
         rows, lines = [], []
         for line, text in enumerate(raw, count + 1):
             row = _sample(text, path, line, builder.on_bad, unused) if not text.isspace() else None
@@ -140,7 +140,7 @@ def _samples(path: Path, builder: RaysBuilder) -> Iterator[tuple[np.ndarray, np.
             yield np.array(rows, np.float64), np.array(lines)
 
 
-def _sample(text: str, path: Path, line: int, on_bad: OnBadLine | None, unused: dict[str, None]) -> list[float] | None:
+def _sample(text: str, path: Path, line: int, on_bad: BadLineCallback | None, unused: dict[str, None]) -> list[float] | None:
     """The six numbers of a line; None for one of another type, and for a bad one that ``on_bad`` is told of. What else
     there is goes into ``unused`` by its name."""
     try:
@@ -169,4 +169,4 @@ def _sample(text: str, path: Path, line: int, on_bad: OnBadLine | None, unused: 
 
 def _name_unused(name: str, unused: dict[str, None]) -> None:
     if len(unused) < _UNUSED:
-        unused[plain(name, 60)] = None
+        unused[sanitize(name, 60)] = None

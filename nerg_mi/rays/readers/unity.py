@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError, sanitize
 
 from . import columns as names
 from .base import DESCRIPTION, UNITY, InFrame, RaysBuilder, Signature, TickOption, valid_option
@@ -50,7 +50,7 @@ class UnityReader(InFrame):
             # Tables of one recording have the same columns.
             if (found := str(self._map(other, find_person(other, builder)))) != str(columns):
                 raise NergError(
-                    f"{other.path} has other columns ({plain(found)}) than {first.path} ({plain(columns)}); "
+                    f"{other.path} has other columns ({sanitize(found)}) than {first.path} ({sanitize(columns)}); "
                     "import them apart, or with one column map (--map)"
                 )
         settings = TableOptions(

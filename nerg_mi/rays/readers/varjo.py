@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError, plain
-from nerg_mi.files.safe_read import OnBadLine
+from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.safe_read import BadLineCallback
 
 from . import poses
 from .base import DESCRIPTION, UNITY, InFrame, NoOptions, RaysBuilder, Signature
@@ -75,14 +75,14 @@ def _is_valid(path: Path, status: np.ndarray) -> np.ndarray:
     unknown = ~np.isin(status, [*_STATUS, ""])
     if unknown.any():
         raise NergError(
-            f"{path} has the GazeStatus {plain(status[unknown][0], 20)!r}, whose meaning is not certain; it is one of "
+            f"{path} has the GazeStatus {sanitize(status[unknown][0], 20)!r}, whose meaning is not certain; it is one of "
             f"{', '.join(_STATUS)}: correct the cells, or import with --map and --valid"
         )
     return np.isin(status, _STATUS[-2:])
 
 
 def _parse_vectors(
-    words: np.ndarray, size: int, path: Path, name: str, lines: np.ndarray, bad: np.ndarray, on_bad: OnBadLine | None
+    words: np.ndarray, size: int, path: Path, name: str, lines: np.ndarray, bad: np.ndarray, on_bad: BadLineCallback | None
 ) -> np.ndarray:
     """Vectors written ``(x, y, z)`` in one cell, (n, size); NaN where the cell is empty. Lines in which it is no vector
     are marked in ``bad`` (n,) bool and told to ``on_bad``; without it they raise `NergError`."""
@@ -92,7 +92,7 @@ def _parse_vectors(
             try:
                 out[i] = [float(v) for v in word.strip("()").split(",")]
             except ValueError:
-                why = f", column {name!r}: {plain(word, 60)!r} is not {size} numbers; mend the cell"
+                why = f", column {name!r}: {sanitize(word, 60)!r} is not {size} numbers; mend the cell"
                 if on_bad is None:
                     raise NergError(
                         f"{path}, line {lines[i]}{why}, or leave such lines out with --skip-bad-lines"

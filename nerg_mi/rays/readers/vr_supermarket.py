@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.ranges import Checked, Range
+from nerg_mi.ranges import ValidatedDataclass, Range
 
 from . import poses
 from .base import RECORDINGS, UNITY, InFrame, RaysBuilder, Signature, option
@@ -29,7 +29,7 @@ _FLIP = np.array([1.0, 1.0, -1.0])
 
 
 @dataclass(frozen=True, kw_only=True)
-class SupermarketOptions(Checked):
+class SupermarketOptions(ValidatedDataclass):
     """Which rows are kept."""
 
     min_openness: float = option(

@@ -12,11 +12,11 @@ from nerg_mi.fields.encoding import Encoding, EncodingConfig
 
 @dataclass(frozen=True)
 class DenseConfig(EncodingConfig):
-    kind, limits, dimensions = "dense_of_the_tests", {"finest": 64, "size": 16}, 3
+    kind, max_sizes, dimensions = "dense_of_the_tests", {"finest": 64, "size": 16}, 3
     finest: int = 8
     size: int = 4
 
-    def shapes(self):
+    def parameter_shapes(self):
         return {"values": (self.size, (self.finest + 1) ** 3)}
 
     def describe(self):
@@ -31,7 +31,7 @@ class DenseGrid(Encoding):
 
     @classmethod
     def random(cls, config, ns, rng):
-        return cls(config, ns.TensorXf(rng.uniform(-0.1, 0.1, config.shapes()["values"]).astype(np.float32)))
+        return cls(config, ns.TensorXf(rng.uniform(-0.1, 0.1, config.parameter_shapes()["values"]).astype(np.float32)))
 
     def __call__(self, p, active=True):
         n, Float, inside = self.config.finest, type(p.x), active & dr.all((p >= 0) & (p <= 1))

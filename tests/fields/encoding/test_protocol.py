@@ -10,8 +10,8 @@ from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
-from nerg_mi.train.gaze_log_density import log_gaze
-from nerg_mi.train.gaze_product import gaze_density
+from nerg_mi.train.gaze_log_density import evaluate_log_density
+from nerg_mi.train.gaze_product import evaluate_gaze_density
 from nerg_mi.train.radiance_trainer import RadianceTrainer
 from tests.fields.encoding.dense import DenseConfig, DenseGrid
 from tests.plugins.scenes import camera, look_at
@@ -32,7 +32,7 @@ def trained():
     for _ in range(40):
         trainer.step()
         losses.append(float(trainer.loss[0]))
-    return trainer.field(), losses
+    return trainer.make_field(), losses
 
 
 def test_a_dense_grid_trains(trained):
@@ -86,9 +86,9 @@ def test_gaze_fields_of_a_dense_grid_are_stored_and_have_the_same_fast_form(tmp_
     for v in parameters.values():
         dr.enable_grad(v)
     if kind == "product":
-        fast = gaze_density(again.config, BOX, parameters, p_od, p_o, r_o, ns)
+        fast = evaluate_gaze_density(again.config, BOX, parameters, p_od, p_o, r_o, ns)
     else:
-        fast = dr.exp(log_gaze(again.config, BOX, parameters, p_od, p_o, r_o, dr.full(ns.Bool, False, 20), ns))
+        fast = dr.exp(evaluate_log_density(again.config, BOX, parameters, p_od, p_o, r_o, dr.full(ns.Bool, False, 20), ns))
     assert np.allclose(fast.numpy(), (emit * capture).numpy(), rtol=1e-4)
     dr.backward(dr.sum(fast))
     assert np.abs(dr.grad(parameters["grid.values"]).numpy()).max() > 0
@@ -117,7 +117,7 @@ def test_what_the_protocol_gives():
     assert grid.kernel_parameters()[0].index == values.array.index
     grid.replace("values", values * 2)
     p = ns.Array3f(0.5 + 0.5 * POINTS)
-    assert np.allclose(np.array(grid.evaluated(p)), np.array(grid(p)))
+    assert np.allclose(np.array(grid.evaluate_eagerly(p)), np.array(grid(p)))
     grid.require(DenseConfig())
     with pytest.raises(ValueError, match="where its field needs"):
         grid.require(DenseConfig(size=5))

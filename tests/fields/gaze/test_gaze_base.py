@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields import gaze_base
-from nerg_mi.fields.gaze_base import REACH, Basis, GazeEnsemble, RaySupport, basis_of
+from nerg_mi.fields.gaze_base import REACH, DataSummary, GazeEnsemble, RaySupport, summarize_provenance
 from nerg_mi.fields.gaze_log_density import LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
@@ -23,12 +23,12 @@ from tests.fields.gaze.test_log_density import BOX, GRID, SMALL, made
 @pytest.mark.parametrize(
     ("basis", "words"),
     [
-        (Basis(81_751, 100), "81,751 rays of 100 people"),
-        (Basis(1, 1), "1 ray of 1 person"),
-        (Basis(300), "300 rays"),
-        (Basis(300, 3, 1), "300 rays of 3 people and 1 salience image"),
-        (Basis(0, None, 12), "12 salience images"),
-        (Basis(0), ""),
+        (DataSummary(81_751, 100), "81,751 rays of 100 people"),
+        (DataSummary(1, 1), "1 ray of 1 person"),
+        (DataSummary(300), "300 rays"),
+        (DataSummary(300, 3, 1), "300 rays of 3 people and 1 salience image"),
+        (DataSummary(0, None, 12), "12 salience images"),
+        (DataSummary(0), ""),
     ],
 )
 def test_words(basis, words):
@@ -36,16 +36,16 @@ def test_words(basis, words):
 
 
 def test_of_a_checkpoint():
-    assert basis_of({"rays": 5, "people": 2, "salience_views": 0}) == Basis(5, 2)
+    assert summarize_provenance({"rays": 5, "people": 2, "salience_views": 0}) == DataSummary(5, 2)
     # Checkpoints of earlier versions do not count people, and those of views have no rays.
-    assert basis_of({"rays": 5}) == Basis(5)
-    assert basis_of({"rays": 0, "people": 0, "salience_views": 3}) == Basis(0, None, 3)
-    assert basis_of({"made": "random"}) is None
+    assert summarize_provenance({"rays": 5}) == DataSummary(5)
+    assert summarize_provenance({"rays": 0, "people": 0, "salience_views": 3}) == DataSummary(0, None, 3)
+    assert summarize_provenance({"made": "random"}) is None
 
 
 @pytest.mark.parametrize("value", [-1, 1e300, "5", [5], True, None, 1 << 70, float("nan")])
 def test_what_is_no_count_is_not_shown(value):
-    assert basis_of({"rays": value}) is None and basis_of({"rays": 7, "people": value}) == Basis(7)
+    assert summarize_provenance({"rays": value}) is None and summarize_provenance({"rays": 7, "people": value}) == DataSummary(7)
 
 
 # ---- Kinds of gaze fields by the names that checkpoints give them ----
@@ -73,7 +73,7 @@ def test_kinds_of_the_library(kind):
 @pytest.mark.parametrize("kind", ["wavelet", ["product"], 3])
 def test_an_unknown_kind_is_refused(kind):
     with pytest.raises((ValueError, TypeError), match="wavelet|kind|unhashable"):
-        gaze_base.build({"kind": kind}, BOX, None)
+        gaze_base.build_gaze_field({"kind": kind}, BOX, None)
 
 
 # ---- How much data there is around a position: cells against the sum over all rays ----
@@ -84,7 +84,7 @@ def exact(origins, radius, p, reach=REACH):
 
 
 def at(support, p):
-    return float(support.at(ns.Array3f(*map(float, p)))[0])
+    return float(support.evaluate(ns.Array3f(*map(float, p)))[0])
 
 
 def paths(n=20_000, seed=0):
@@ -97,8 +97,8 @@ def paths(n=20_000, seed=0):
 def test_where_it_is_greatest():
     rng = np.random.default_rng(0)
     origins = np.concatenate([rng.normal(c, 0.05, (n, 3)) for c, n in (((0, 0, 1), 400), ((3, 1, 2), 900))])
-    support = RaySupport.of(origins, 0.3)
-    densest = support.densest()
+    support = RaySupport.from_origins(origins, 0.3)
+    densest = support.find_densest_position()
     assert np.linalg.norm(densest - (3, 1, 2)) < 0.1
     everywhere = [exact(origins, 0.3, p, 1) for p in origins[::7]]
     assert exact(origins, 0.3, densest, 1) > 0.9 * max(everywhere)
@@ -107,7 +107,7 @@ def test_where_it_is_greatest():
 @pytest.mark.parametrize("radius", [0.1, 0.6])
 def test_cells_stand_for_their_rays(radius):
     origins = paths()
-    support = RaySupport.of(origins, radius)
+    support = RaySupport.from_origins(origins, radius)
     assert support.cells[:, 3].sum() == len(origins) and len(support.cells) < len(origins)
     rng = np.random.default_rng(1)
     places = np.concatenate([origins[rng.integers(0, len(origins), 200)], rng.uniform(-6, 10, (100, 3))])
@@ -123,14 +123,14 @@ def test_cells_stand_for_their_rays(radius):
 
 def test_inside_of_the_radius_cells_are_exact():
     origins = np.random.default_rng(0).normal(0, 0.05, (1000, 3))
-    support = RaySupport.of(origins, 1.0)
+    support = RaySupport.from_origins(origins, 1.0)
     assert at(support, (1.2, 2.1, 0)) == pytest.approx(exact(origins, 1.0, [1.2, 2.1, 0]), rel=1e-5)
 
 
 def test_one_ray_counts_one_where_it_started_and_nothing_five_radii_away():
-    support = RaySupport.of([[1.0, 2, 3]], 0.5)
+    support = RaySupport.from_origins([[1.0, 2, 3]], 0.5)
     assert at(support, (1, 2, 3)) == 1 and at(support, (1, 2, 4.25)) == 0.75 and at(support, (3.5, 2, 3)) < 1e-6
-    assert support.reach == 2.5
+    assert support.cutoff == 2.5
 
 
 def test_what_is_no_support_is_refused():
@@ -168,7 +168,7 @@ def test_arrays_are_the_members():
 def test_a_file_holds_all_members_and_the_support(half, tmp_path):
     """Counts and places are never rounded to fp16."""
     members = [made(seed=1), made(replace(SMALL, heads=((0, 0, 1), (1, 1, 2))), seed=2)]
-    support = RaySupport.of(np.random.default_rng(0).uniform(0, 9, (5000, 3)), 0.25)
+    support = RaySupport.from_origins(np.random.default_rng(0).uniform(0, 9, (5000, 3)), 0.25)
     save_gaze(GazeEnsemble(members, support), tmp_path / "g.safetensors", {"made": "here"}, half)
     again, meta = load_gaze(tmp_path / "g.safetensors", namespace("llvm"))
     assert meta["provenance"] == {"made": "here"} and meta["output"] == {"activation": "log", "normalized": True}
@@ -191,7 +191,7 @@ def test_ensembles_of_ensembles_are_refused(tmp_path):
     for _ in range(500):
         about = {"kind": "ensemble", "members": [about, about]}
     with pytest.raises(ValueError, match="is an ensemble itself, which this version does not read"):
-        gaze_base.build(about, pair.box, NoArrays())
+        gaze_base.build_gaze_field(about, pair.box, NoArrays())
 
 
 class NoArrays:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_base import blind_table, look_up, table_directions
+from nerg_mi.fields.gaze_base import make_prior_table, interpolate_table, table_directions
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import load_gaze, save_gaze
@@ -68,7 +68,7 @@ def test_is_what_it_says():
             )[0]
         )
     )
-    blind = np.exp(np.array(field.log_blind(jit(r)), np.float64))
+    blind = np.exp(np.array(field.log_prior(jit(r)), np.float64))
     gaze, e, c = (np.array(v) for v in field.evaluate(jit(p_od), jit(p_o), jit(r), integral=2.0))
     np.testing.assert_allclose(e, np.exp(emit) * blind / 2, rtol=1e-4)
     np.testing.assert_allclose(c, capture, rtol=1e-4)
@@ -104,8 +104,8 @@ def test_table_of_a_known_density_integrates_to_one():
     ns, kappa, mean = namespace("llvm"), 20.0, np.array([0.6, 0, 0.8])
     truth = lambda d: np.exp(log_normaliser(kappa) + kappa * (d @ mean - 1))
     fine = fibonacci_directions(20_000)
-    table = blind_table(truth(table_directions(64)), 64, ns, fine)
-    found = np.exp(np.array(look_up(ns.Float(table.ravel()), 64, jit(fine)), np.float64))
+    table = make_prior_table(truth(table_directions(64)), 64, ns, fine)
+    found = np.exp(np.array(interpolate_table(ns.Float(table.ravel()), 64, jit(fine)), np.float64))
     assert 4 * np.pi * found.mean() == pytest.approx(1, abs=1e-5)
     np.testing.assert_allclose(found, truth(fine), atol=0.03 * truth(mean))
 
@@ -124,7 +124,7 @@ def test_the_table_is_interpolated_all_around():
     i, j = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), rows - 2)
     at = lambda column, row: table[row, column % (2 * rows)]
     above, below = ((1 - (x - i)) * at(i, row) + (x - i) * at(i + 1, row) for row in (j, j + 1))
-    found = np.array(look_up(ns.Float(table.astype(np.float32).ravel()), rows, jit(d)))
+    found = np.array(interpolate_table(ns.Float(table.astype(np.float32).ravel()), rows, jit(d)))
     np.testing.assert_allclose(found, (1 - (y - j)) * above + (y - j) * below, atol=2e-4)
 
 
@@ -135,7 +135,7 @@ def test_the_table_is_not_read_beyond_its_end():
         [np.full(2 * rows, 1.0), np.full(4 * rows, 7.0), np.full(2 * rows, 2.0), np.full(8 * rows, np.nan)]
     )
     found = np.array(
-        look_up(
+        interpolate_table(
             ns.Float(table.astype(np.float32)),
             rows,
             jit([[0, 0, 1.0], [0, 0, -1.0], [1e-4, 0, -1.0], [1e-4, -1e-5, 1.0]]),

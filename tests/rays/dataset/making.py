@@ -10,7 +10,7 @@ from nerg_mi.rays.dataset import RayDataset
 from nerg_mi.rays.dataset_write import ImportRecipe, update_dataset
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.columns import ColumnMap
-from nerg_mi.rays.readers.registry import make_options, read_rays, reader_named
+from nerg_mi.rays.readers.registry import make_options, read_rays, get_reader
 
 MAP = "origin=x,y,z direction=a,b,c t=t person=p confidence=q hit=h,i,j cohort=g"
 DAY = 20_000 * 86_400.0  # midnight of 2024-10-04, seconds since 1970
@@ -38,7 +38,7 @@ def settings():
 
 
 def recipe(**changes) -> ImportRecipe:
-    return ImportRecipe(**{"reader": reader_named("table"), "settings": settings(), "place": "shop", **changes})
+    return ImportRecipe(**{"reader": get_reader("table"), "settings": settings(), "place": "shop", **changes})
 
 
 def write_dataset(folder: Path, files: int = 3, **changes) -> tuple[RayDataset, Rays]:

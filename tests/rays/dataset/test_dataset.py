@@ -14,7 +14,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.rays import dataset, dataset_write
-from nerg_mi.rays.dataset import Conditions, RayDataset, is_dataset, load_rays, rays_digest, read_groups
+from nerg_mi.rays.dataset import Conditions, RayDataset, is_dataset, load_rays, hash_rays, read_groups
 from nerg_mi.rays.dataset_write import update_dataset
 from nerg_mi.rays.filters import select_mask
 from nerg_mi.rays.quality import summarise, summarise_dataset
@@ -64,7 +64,7 @@ def test_conditions_are_those_of_a_file(made, given):
     found = dataset.load(Conditions(**given))
     assert 0 < len(found) < len(rays)
     assert_same(found, rays.select(select_mask(rays, **given)))
-    whole = list(dataset.scan(Conditions(**given), whole=True))
+    whole = list(dataset.scan(Conditions(**given), whole_parts=True))
     assert sum(map(len, whole)) == len(found)
     for block in whole:
         names = [block.persons[k] for k in block.person]
@@ -132,7 +132,7 @@ def test_places_have_frames_of_their_own(tmp_path):
         with pytest.raises(NergError, match="2 places, each in a frame of its own; name one .*place=north"):
             ask()
     north = RayDataset.open(tmp_path / "shop.rays" / "place=north")
-    assert north.persons == ("p7_0", "p7_1", "p7_2") and len(north.load()) == 399 == len(both.of_place("north"))
+    assert north.persons == ("p7_0", "p7_1", "p7_2") and len(north.load()) == 399 == len(both.select_place("north"))
     day = RayDataset.open(tmp_path / "shop.rays" / "place=shop" / "day=2024-10-04")
     assert day.days == ("2024-10-04",) and 0 < len(day) == len(day.load())
     with pytest.raises(NergError, match="holds no rays of place south"):
@@ -242,8 +242,8 @@ def test_files_and_datasets(tmp_path):
     for path in (tmp_path / "rays.npz", dataset.folder, dataset.folder / "place=shop"):
         assert_same(load_rays(path), rays)
         assert is_dataset(path) is (path.suffix != ".npz")
-    assert rays_digest(tmp_path / "rays.npz") == file_sha256(tmp_path / "rays.npz")
-    assert rays_digest(dataset.folder) == dataset.digest
+    assert hash_rays(tmp_path / "rays.npz") == file_sha256(tmp_path / "rays.npz")
+    assert hash_rays(dataset.folder) == dataset.digest
     some = load_rays(dataset.folder, 100, seed=2)
     assert np.array_equal(some.t, dataset.sample(100, 2).t) and len(load_rays(dataset.folder, 5000)) == len(rays)
     assert len(load_rays(tmp_path / "rays.npz", 100)) == len(rays)

@@ -12,13 +12,13 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.dataset import (
     EVERYTHING,
     Conditions,
-    Head,
+    DatasetManifest,
     PartFile,
     Source,
     bucket_of,
-    read_head,
+    read_dataset_manifest,
     read_sources,
-    write_head,
+    write_dataset_manifest,
     write_source,
 )
 from nerg_mi.rays.rays import FRAME
@@ -31,13 +31,13 @@ PART = PartFile("shop", "unknown", 3, 0, 5, 100, "a", "b", 0.0, 1.0, [0.0] * 3, 
 
 SOURCE = Source("0" * 32, "a.csv", "w", None, "r", 0, {"a": 2, "b": 3}, {}, [PART], {"frame": dict(FRAME)})
 
-HEAD = Head(16)
+HEAD = DatasetManifest(16)
 
 
 def test_what_is_written_is_read(tmp_path):
-    write_head(tmp_path, replace(HEAD, salt="s", closed=True))
+    write_dataset_manifest(tmp_path, replace(HEAD, salt="s", closed=True))
     write_source(tmp_path, SOURCE)
-    assert read_head(tmp_path) == Head(16, "s", True) and read_sources(tmp_path, HEAD) == [SOURCE]
+    assert read_dataset_manifest(tmp_path) == DatasetManifest(16, "s", True) and read_sources(tmp_path, HEAD) == [SOURCE]
 
 
 def test_of_one_path_the_latest_counts(tmp_path):
@@ -112,7 +112,7 @@ def test_a_damaged_account_is_one_sentence(tmp_path, change, why):
 def test_a_damaged_head_is_one_sentence(tmp_path, text, why):
     (tmp_path / "_dataset.json").write_text(text)
     with pytest.raises(NergError, match=why):
-        read_head(tmp_path)
+        read_dataset_manifest(tmp_path)
 
 
 # ---- What need not be read: never what holds a ray that is asked for ----

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import file_sha256, locked
+from nerg_mi.files.atomic import file_sha256, lock_file
 from nerg_mi.rays import dataset, dataset_write
-from nerg_mi.rays.dataset import Head, RayDataset, read_sources, write_head
+from nerg_mi.rays.dataset import DatasetManifest, RayDataset, read_sources, write_dataset_manifest
 from nerg_mi.rays.dataset_write import ImportTask, Marks, SourceWriter, has_parts, import_source, update_dataset
 from nerg_mi.rays.pseudonyms import pseudonymise
 from nerg_mi.rays.rays import FRAME, Rays
@@ -49,11 +49,11 @@ def content(folder: Path) -> dict[str, str]:
 def test_again_does_nothing(tmp_path, monkeypatch):
     files, dataset, names = sources(tmp_path), tmp_path / "shop.rays", []
     one = update_dataset(dataset, files, recipe(), on_done=names.append)
-    assert (one.imported, one.rays, one.unchanged) == (3, 177, 0) and sorted(names) == ["0.csv", "1.csv", "2.csv"]
+    assert (one.num_imported, one.num_rays, one.num_unchanged) == (3, 177, 0) and sorted(names) == ["0.csv", "1.csv", "2.csv"]
     before = {p: p.stat().st_mtime_ns for p in dataset.rglob("*") if p.is_file()}
     monkeypatch.setattr(dataset_write, "import_source", lambda task: pytest.fail("work"))
     two = update_dataset(dataset, files, recipe())
-    assert (two.imported, two.unchanged, two.replaced) == (0, 3, 0)
+    assert (two.num_imported, two.num_unchanged, two.num_replaced) == (0, 3, 0)
     assert {p: p.stat().st_mtime_ns for p in dataset.rglob("*") if p.is_file()} == before
 
 
@@ -65,14 +65,14 @@ def test_the_same_content_is_not_imported_again(tmp_path):
     (tmp_path / "moved").mkdir()
     files[1] = files[1].rename(tmp_path / "moved" / files[1].name)
     found = update_dataset(dataset, files, recipe())
-    assert (found.imported, found.unchanged, found.replaced) == (0, 3, 0) and content(dataset) == parts
+    assert (found.num_imported, found.num_unchanged, found.num_replaced) == (0, 3, 0) and content(dataset) == parts
     # From its new place it is known again.
     write_source(files[1], 9, 60)
-    assert update_dataset(dataset, files, recipe()).replaced == 1
+    assert update_dataset(dataset, files, recipe()).num_replaced == 1
     (tmp_path / "twice").mkdir()
     (tmp_path / "twice" / "0.csv").write_bytes(files[0].read_bytes())
     found = update_dataset(tmp_path / "other.rays", [files[0], tmp_path / "twice" / "0.csv"], recipe())
-    assert (found.imported, found.alike) == (1, 1) and len(RayDataset.open(tmp_path / "other.rays")) == 59
+    assert (found.num_imported, found.num_duplicates) == (1, 1) and len(RayDataset.open(tmp_path / "other.rays")) == 59
 
 
 def test_what_has_changed_is_replaced(tmp_path):
@@ -80,14 +80,14 @@ def test_what_has_changed_is_replaced(tmp_path):
     update_dataset(dataset, files, recipe())
     write_source(files[1], 8, 90)
     found = update_dataset(dataset, files, recipe())
-    assert (found.imported, found.rays, found.unchanged, found.replaced) == (1, 89, 2, 1)
+    assert (found.num_imported, found.num_rays, found.num_unchanged, found.num_replaced) == (1, 89, 2, 1)
     assert_same(RayDataset.open(dataset).load(), read_rays("table", files, settings()))
     # And back again; read in another way; at another place.
     write_source(files[1], 1, 60)
-    assert update_dataset(dataset, files, recipe()).replaced == 1
-    assert update_dataset(dataset, files, recipe(day="2024-01-01")).replaced == 3
+    assert update_dataset(dataset, files, recipe()).num_replaced == 1
+    assert update_dataset(dataset, files, recipe(day="2024-01-01")).num_replaced == 3
     assert RayDataset.open(dataset).days == ("2024-01-01",)
-    assert update_dataset(dataset, files[:1], recipe(place="north")).replaced == 1
+    assert update_dataset(dataset, files[:1], recipe(place="north")).num_replaced == 1
     assert RayDataset.open(dataset).places == ("north", "shop")
     (tmp_path / "new").mkdir()
     update_dataset(tmp_path / "new" / "shop.rays", files, recipe())
@@ -99,14 +99,14 @@ def test_what_is_missing_is_imported_again(tmp_path):
     update_dataset(dataset, files, recipe())
     before = content(dataset)
     next(dataset.rglob("part-*.parquet")).unlink()
-    assert update_dataset(dataset, files, recipe()).imported == 1 and content(dataset) == before
+    assert update_dataset(dataset, files, recipe()).num_imported == 1 and content(dataset) == before
 
 
 def test_one_that_cannot_be_read_does_not_stop_the_others(tmp_path):
     files, dataset = sources(tmp_path), tmp_path / "shop.rays"
     files[1].write_text("t,p\n1,2\n")
     found = update_dataset(dataset, files, recipe())
-    assert found.imported == 2 and len(found.errors) == 1 and "1.csv" in found.errors[0]
+    assert found.num_imported == 2 and len(found.errors) == 1 and "1.csv" in found.errors[0]
     assert len(list(dataset.rglob("_sources/*.json"))) == 2
     # Broken in its last line: what was written of it is not left.
     write_source(files[1], 1, 60)
@@ -134,7 +134,7 @@ def test_under_pseudonyms(tmp_path):
     files, dataset, key = sources(tmp_path, 2), tmp_path / "shop.rays", bytes(range(32))
     update_dataset(dataset, files[:1], recipe(key=key))
     write_source(files[1], 0, 90)  # the same people
-    assert update_dataset(dataset, files, recipe(key=key)).unchanged == 1
+    assert update_dataset(dataset, files, recipe(key=key)).num_unchanged == 1
     opened = RayDataset.open(dataset)
     assert len(opened.persons) == 3 and all(name.startswith("p") and len(name) == 17 for name in opened.persons)
     assert len(opened.load()) == 59 + 89 and opened.metadata["pseudonyms"] == "HMAC-SHA256, salt of a file"
@@ -174,7 +174,7 @@ def test_what_stands_in_the_way_of_all(tmp_path):
             update_dataset(tmp_path / folder, given, recipe(**how))
     assert not (tmp_path / "a.rays").exists()
     update_dataset(tmp_path / "a.rays", files, recipe())
-    with locked(tmp_path / "a.rays" / dataset.HEAD, "busy"), pytest.raises(NergError, match="another import"):
+    with lock_file(tmp_path / "a.rays" / dataset.DATASET_MANIFEST, "busy"), pytest.raises(NergError, match="another import"):
         update_dataset(tmp_path / "a.rays", files, recipe())
 
 
@@ -188,9 +188,9 @@ def test_an_import_of_nothing_leaves_no_dataset(tmp_path):
     (tmp_path / "c.rays").mkdir()
     assert update_dataset(tmp_path / "c.rays", [bad], recipe()).errors and not any((tmp_path / "c.rays").iterdir())
     done = update_dataset(tmp_path / "c.rays", [bad, *good], recipe())
-    assert done.imported == 1 and done.errors
+    assert done.num_imported == 1 and done.errors
     assert update_dataset(tmp_path / "c.rays", [bad], recipe()).errors
-    assert update_dataset(tmp_path / "c.rays", good, recipe()).unchanged == 1
+    assert update_dataset(tmp_path / "c.rays", good, recipe()).num_unchanged == 1
 
 
 def test_an_import_that_is_interrupted_leaves_no_empty_dataset(tmp_path, monkeypatch):
@@ -243,7 +243,7 @@ def test_killed_in_the_middle_it_goes_on(tmp_path):
     opened = RayDataset.open(dataset)
     assert len(opened.load()) == len(opened) == 2999 * there
     found = update_dataset(dataset, files, recipe())
-    assert (found.imported, found.unchanged) == (len(files) - there, there)
+    assert (found.num_imported, found.num_unchanged) == (len(files) - there, there)
     update_dataset(tmp_path / "undisturbed.rays", files, recipe())
     assert content(dataset) == content(tmp_path / "undisturbed.rays")
     assert not list(dataset.rglob("*.part.*"))
@@ -270,7 +270,7 @@ def test_two_processes_give_what_one_does(tmp_path):
     one = update_dataset(tmp_path / "one.rays", files, recipe())
     two = update_dataset(tmp_path / "two.rays", files, recipe(), workers=2)
     assert content(tmp_path / "one.rays") == content(tmp_path / "two.rays")
-    assert (two.imported, two.rays) == (one.imported, one.rays) == (3, 177) and len(two.errors) == 1 == len(one.errors)
+    assert (two.num_imported, two.num_rays) == (one.num_imported, one.num_rays) == (3, 177) and len(two.errors) == 1 == len(one.errors)
 
 
 def ended(task):
@@ -284,7 +284,7 @@ def test_a_process_that_is_ended_from_outside(tmp_path, monkeypatch):
 
 
 # ---- The import of one source: block by block, under pseudonyms, and without any ray ----
-HEAD = Head(4)
+HEAD = DatasetManifest(4)
 
 
 def task(folder, path, **changes) -> ImportTask:
@@ -297,7 +297,7 @@ def test_in_blocks_as_at_once(tmp_path, monkeypatch, key):
     monkeypatch.setattr("nerg_mi.rays.readers.tables.BLOCK", 50)
     monkeypatch.setattr("nerg_mi.rays.readers.base.STREAMED", 120)
     path, folder = write_source(tmp_path / "a.csv", people=5), tmp_path / "a.rays"
-    write_head(folder, HEAD)
+    write_dataset_manifest(folder, HEAD)
     found = import_source(task(folder, path, key=key))
     assert (found.rays, found.unchanged, found.error) == (399, False, None)
     (source,) = read_sources(folder, HEAD)
@@ -335,7 +335,7 @@ class Headset:
 def test_heads_eyes_and_complaints(tmp_path, monkeypatch, key):
     monkeypatch.setattr("nerg_mi.rays.readers.base.STREAMED", 40)
     (tmp_path / "a.bin").write_bytes(b"x")
-    write_head(tmp_path / "a.rays", HEAD)
+    write_dataset_manifest(tmp_path / "a.rays", HEAD)
     given = task(tmp_path / "a.rays", tmp_path / "a.bin", reader=Headset(), settings=None, key=key)
     assert import_source(given).rays == 150
     rays = RayDataset.open(tmp_path / "a.rays").load()
@@ -352,7 +352,7 @@ def test_heads_eyes_and_complaints(tmp_path, monkeypatch, key):
 def test_a_source_without_a_ray_has_an_account(tmp_path):
     path, folder = write_source(tmp_path / "a.csv", count=1), tmp_path / "a.rays"
     path.write_text(path.read_text().replace("0.000,", ",", 1))
-    write_head(folder, HEAD)
+    write_dataset_manifest(folder, HEAD)
     assert import_source(task(folder, path)).rays == 0
     (source,) = read_sources(folder, HEAD)
     assert source.parts == [] and source.metadata["dropped"][0]["reason"] == "time is missing"
@@ -360,7 +360,7 @@ def test_a_source_without_a_ray_has_an_account(tmp_path):
 
 def test_what_is_no_recording_is_refused_before_all_of_it_is_read(tmp_path, monkeypatch):
     folder, path = tmp_path / "a.rays", tmp_path / "a.csv"
-    write_head(folder, HEAD)
+    write_dataset_manifest(folder, HEAD)
     monkeypatch.setattr(Marks, "source", lambda *_: pytest.fail("it was read to its end"))
     with path.open("wb") as out:
         out.truncate(3 << 30)
@@ -371,7 +371,7 @@ def test_a_copy_of_an_imported_source_is_known_by_its_first_rays(tmp_path, monke
     monkeypatch.setattr("nerg_mi.rays.readers.tables.BLOCK", 50)
     monkeypatch.setattr("nerg_mi.rays.readers.base.STREAMED", 120)
     path, folder = write_source(tmp_path / "a.csv", people=5), tmp_path / "a.rays"
-    write_head(folder, HEAD)
+    write_dataset_manifest(folder, HEAD)
     first = import_source(task(folder, path))
     (tmp_path / "b").mkdir()
     copy = write_source(tmp_path / "b" / "a.csv", people=5)
@@ -452,8 +452,8 @@ def test_parts_by_day_and_bucket_in_the_order_of_people_and_times(tmp_path):
     writer.add(rays, "shop / 1")
     writer.add(rays.select(rays.t < 0))
     source = writer.finish({"frame": dict(FRAME)}, **ABOUT)
-    write_head(tmp_path, Head(4))
-    assert read_sources(tmp_path, Head(4)) == [source] and source.rays == 1000
+    write_dataset_manifest(tmp_path, DatasetManifest(4))
+    assert read_sources(tmp_path, DatasetManifest(4)) == [source] and source.rays == 1000
     names = np.array(rays.persons)[rays.person]
     assert source.persons == {name: int((names == name).sum()) for name in sorted(rays.persons)}
     for part in source.parts:

@@ -19,7 +19,7 @@ from nerg_mi.rays.readers.columns import ColumnMap
 from nerg_mi.rays.readers.registry import make_options, read_rays
 from nerg_mi.rays.readers.scene_glasses import FrameNames
 from nerg_mi.rays.readers.skeleton import keypoints_from_head, write_skeleton
-from tests.files.movies import box_table, movie
+from tests.files.movies import make_box_table, make_movie
 
 
 def read(name: str, *files, skip_bad_lines: bool = False, **options) -> Rays:
@@ -241,7 +241,7 @@ def video(times: np.ndarray, ticks: int = 24_950) -> Callable[[Path], None]:
     durations = np.diff(shown, append=2 * shown[-1:] - shown[-2:-1])
     runs = struct.pack(f">{2 * len(durations)}I", *np.stack([np.ones_like(durations), durations], axis=1).ravel())
     edits = struct.pack(">IiiIii", shown[0], -1, 1 << 16, durations.sum(), 0, 1 << 16)
-    data = movie(ticks, ticks, box_table(b"stts", len(durations), runs), edits=box_table(b"elst", 2, edits))
+    data = make_movie(ticks, ticks, make_box_table(b"stts", len(durations), runs), edits=make_box_table(b"elst", 2, edits))
 
     def write(path: Path) -> None:
         path.write_bytes(data)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.quality import card_lines, summarise
+from nerg_mi.rays.quality import make_quality_report, summarise
 from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.rays.readers import base as builder_module
 from nerg_mi.rays.readers import registry
@@ -23,7 +23,7 @@ from nerg_mi.rays.readers.base import (
     TickOption,
     TrackingFrame,
     option,
-    options_of,
+    list_options,
     recorded_options,
 )
 from tests.rays.readers.examples import EXAMPLES, dropped
@@ -270,7 +270,7 @@ def test_decimal_commas_and_times_past_midnight_are_named(tmp_path, text, time, 
     assert block.numbers[:, 0].tolist() == time
     add(builder, 2)
     rays = builder.build()
-    assert {"numbers", "times"} & set(dict(card_lines(rays, summarise(rays)))) == ({line} if line else set())
+    assert {"numbers", "times"} & set(dict(make_quality_report(rays, summarise(rays)))) == ({line} if line else set())
 
 
 @pytest.mark.parametrize("word", ["", "NaN", " nan ", "None", "null", "N/A", "<NA>"])
@@ -294,7 +294,7 @@ def test_unused_columns_are_named_once(tmp_path):
     assert rays.metadata["unused_columns"] == ["note", "left_valid", *(f"c{k}" for k in range(20))]
     (sentence,) = rays.metadata["complaints"]
     assert sentence.startswith("'left_valid' may say by name which rows are valid")
-    lines = dict(card_lines(rays, summarise(rays)))
+    lines = dict(make_quality_report(rays, summarise(rays)))
     assert lines["not used"] == "note, left_valid, c0, c1, c2, c3, c4, c5 and 14 more"
 
 
@@ -343,12 +343,12 @@ class Some(TickOption):
 
 
 def test_what_is_said_of_each():
-    tick, height, poses, pair, rough, secret = options_of(Some)
+    tick, height, poses, pair, rough, secret = list_options(Some)
     assert (tick.flag, tick.kind, tick.shown, tick.default) == ("--tick", float, "1", 1.0)
     assert (height.flag, height.shown, height.help, height.recorded) == ("--min-height", "1.5", "Metres.", True)
     assert (poses.kind, poses.shown, poses.default) == (Path, "", None)
     assert (pair.flag, pair.kind, pair.shown, pair.parse("9,9")) == ("--two", str, "1,2", (0, 0))
-    assert (rough.kind, rough.shown) == (bool, "") and not secret.recorded and options_of(NoOptions) == ()
+    assert (rough.kind, rough.shown) == (bool, "") and not secret.recorded and list_options(NoOptions) == ()
 
 
 def test_what_goes_into_the_metadata():
@@ -366,30 +366,30 @@ def test_refusals():
         a: int = 1
 
     with pytest.raises(TypeError, match="Silent.a says nothing of itself"):
-        options_of(Silent)
+        list_options(Silent)
     with pytest.raises(TypeError, match="is no dataclass"):
-        options_of(int)
+        list_options(int)
 
 
 # ---- What every reader keeps to, of those that are registered ----
 
 
-@pytest.mark.parametrize("name", registry.reader_names())
+@pytest.mark.parametrize("name", registry.list_reader_names())
 def test_what_they_say_of_themselves(name):
-    reader = registry.reader_named(name)
+    reader = registry.get_reader(name)
     assert reader.name == name and all(
         isinstance(text, str) and text.strip() for text in (reader.files, reader.world, reader.checked_on)
     )
     assert isinstance(reader.frame([], reader.Options()), TrackingFrame)
 
 
-READABLE = [name for name in registry.reader_names() if name != "c3d" or find_spec("c3d")]
+READABLE = [name for name in registry.list_reader_names() if name != "c3d" or find_spec("c3d")]
 
 
 @pytest.mark.parametrize("name", READABLE)
 def test_what_all_readers_keep(tmp_path, name):
     """Of the example of each: rays in the frame that is declared, with an account of all rows."""
-    example, reader = EXAMPLES[name], registry.reader_named(name)
+    example, reader = EXAMPLES[name], registry.get_reader(name)
     given, options = example.make(tmp_path), registry.make_options(name, example.options_in(tmp_path))
     begun_files = []
     rays = registry.read_rays(name, given, options, on_source=begun_files.append)

@@ -398,7 +398,7 @@ def test_real_supermarket(recorded):
     # Gaze is about where heads point.
     assert np.median(np.einsum("ij,ij->i", rays.head, rays.direction)) > np.cos(np.radians(20))
     assert 1.2 < np.median(rays.origin[:, 2]) < 1.8  # z is up: eye heights
-    probes = place_probes(rays, 0.25, count=64, min_rays=8, cap=100_000)
+    probes = place_probes(rays, 0.25, count=64, min_rays=8, max_rays=100_000)
     assert 200 < np.median(probes.counts) < 2000
 
 

@@ -78,7 +78,7 @@ def write_recording(folder: Path) -> tuple[Path, Path]:
 def made_up():
     registry.register_reader(MadeUp())
     yield
-    registry.unregister("made_up")
+    registry.unregister_reader("made_up")
 
 
 def test_a_format_is_added_by_one_object(tmp_path, made_up):
@@ -104,7 +104,7 @@ def test_a_format_is_added_by_one_object(tmp_path, made_up):
     shown = " ".join(run("import", "--help").output.replace("│", " ").split())
     assert "made_up: What a unit of the heads' places is, in metres." in shown and "made_up" in shown
     assert run("guess", eyes).output.rstrip().endswith("--preset made_up --heads HEADS")
-    assert "| `made_up` | directions, with the file of the heads in `--heads`" in registry.preset_table()
+    assert "| `made_up` | directions, with the file of the heads in `--heads`" in registry.format_preset_table()
 
 
 def test_what_cannot_be_registered(made_up):
@@ -121,16 +121,16 @@ def test_what_cannot_be_registered(made_up):
         reader.name, reader.Options = name, options
         with pytest.raises(ValueError, match=message):
             registry.register_reader(reader)
-    assert "other" not in registry.reader_names()
+    assert "other" not in registry.list_reader_names()
     with pytest.raises(KeyError):
-        registry.unregister("other")
+        registry.unregister_reader("other")
 
 
 def test_names():
-    assert registry.TABLE not in registry.preset_names()
-    assert set(registry.reader_names()) == {*registry.preset_names(), registry.TABLE}
+    assert registry.TABLE not in registry.list_preset_names()
+    assert set(registry.list_reader_names()) == {*registry.list_preset_names(), registry.TABLE}
     with pytest.raises(NergError, match="choose one of aria"):
-        registry.reader_named("etch")
+        registry.get_reader("etch")
     with pytest.raises(NergError, match="choose one of aria"):
         registry.read_rays("etch", "a.csv")
 
@@ -148,7 +148,7 @@ def test_options_of_another_reader():
 
 
 def test_options_that_several_have(made_up):
-    shared = {o.name: o for o in registry.shared_options()}
+    shared = {o.name: o for o in registry.collect_shared_options()}
     assert shared["up"].help == "Up axis: x, y, z, -x, -y or -z.  [default: z; c3d: the file's, or z; motive, pupil: y]"
     sure = shared["min_confidence"].help
     assert sure.startswith("Drop rows below this confidence.  [default: 0; ") and "pupil: 0.6" in sure

@@ -5,7 +5,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.readers import tables as ray_tables
-from nerg_mi.rays.readers.tables import iterate_table, table_columns
+from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
 
 
 def read(path, numbers, texts=()):
@@ -61,7 +61,7 @@ def test_table_without_a_header_and_its_columns(tmp_path):
     (block,) = list(iterate_table(path, ["c", "b"], header=["a", "b", "c"]))
     assert np.array_equal(block.numbers, [[3, 2], [6, np.nan]], equal_nan=True) and list(block.lines) == [1, 2]
     path.write_text("\ufeffx; y ;z\n")
-    assert table_columns(path) == ["x", "y", "z"]
+    assert read_table_columns(path) == ["x", "y", "z"]
 
 
 def test_with_and_without_pyarrow(tmp_path, monkeypatch):

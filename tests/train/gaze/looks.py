@@ -18,17 +18,17 @@ from nerg_mi.train.gaze_product import ProductTrainer
 from nerg_mi.train.gaze_run import train_gaze
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan, StateSettings
-from nerg_mi.train.geometry import GazePlace
+from nerg_mi.train.geometry import TrainingGeometry
 
 BOX = Box((-2, -2, 0), (2, 2, 3))
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=8)
 SMALL = GazeConfig(grid=GRID, width=16, geometry=4)
 LOG = LogGazeConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=2, finest=4), width=16, prior=16, mix=0.1)
 PROBES = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, directions=64)
-NOWHERE = GazePlace(None, BOX, "none")
-PRODUCT = GazeSettings(steps=16, looks=8, zones=2, watched=6, probes=4, directions=32)
+NOWHERE = TrainingGeometry(None, BOX, "none")
+PRODUCT = GazeSettings(steps=16, num_validations=8, zones=2, validation_probes=6, probes=4, directions=32)
 LIKELIHOOD = GazeSettings(
-    steps=16, looks=8, zones=2, watched=6, probes=4, directions=32, loss="likelihood", integral=0.0, rays=16
+    steps=16, num_validations=8, zones=2, validation_probes=6, probes=4, directions=32, loss="likelihood", integral=0.0, rays=16
 )
 
 
@@ -55,7 +55,7 @@ def train(place, settings, config, probes=PROBES, supervision=None, *, tell=None
     """A training on ``RAYS``, unless others are given; ``state``: of `StateSettings`."""
     plan = planned(config, settings, probes)
     supervision = supervision or Supervision(RAYS)
-    return train_gaze(supervision, place, plan, ns, state=StateSettings(**state), tell=tell, write=write)
+    return train_gaze(supervision, place, plan, ns, state=StateSettings(**state), on_progress=tell, write=write)
 
 
 def stopping(stage, step):

@@ -23,7 +23,7 @@ from tests.evaluation.test_gaze import crowd
 from tests.plugins.scenes import camera, look_at, render
 
 HEADS = Path(__file__).parents[2] / "heads"
-OPTIONS = GazeOptions(recipe="place", geometry="hits", voxel=0.3, threads=1, min_rays=4, seed=1)
+OPTIONS = GazeOptions(recipe="place", geometry="hits", voxel_size=0.3, threads=1, min_rays=4, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_it_is_stored_rendered_and_a_torch_module(rgb, trained, tmp_path):
     from nerg_mi.interop.torch import GazeModule
 
     # Whatever the folds chose, the networks count.
-    again.set_mix(0.1)
+    again.set_prior_weight(0.1)
     module, rng, box = GazeModule(again), np.random.default_rng(0), again.box
     p_od, p_o, r_o = (rng.uniform(box.lower, box.upper, size=(20, 3)).astype(np.float32) for _ in range(3))
     r_o /= np.linalg.norm(r_o, axis=1, keepdims=True)
@@ -89,11 +89,11 @@ def test_members_of_an_ensemble_and_an_ablation_are_of_its_kind(head, tmp_path):
         variant=("emit", "capture"),
         seeds=1,
         default_steps=2,
-        zones=1,
+        test_zones=1,
         positions=3,
         min_rays=4,
         radius=0.5,
-        cameras=0,
+        timing_cameras=0,
         probes=8,
     )
     rows = ablate(rays, tmp_path, options).rows

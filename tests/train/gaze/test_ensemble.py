@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import Basis
+from nerg_mi.fields.gaze_base import DataSummary
 from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
-from nerg_mi.train.gaze_ensemble import blocks_of, resample, resample_views, train_ensemble
+from nerg_mi.train.gaze_ensemble import assign_blocks, resample_rays, resample_views, train_ensemble
 from nerg_mi.train.gaze_trainer import StateSettings
 
 from .looks import LIKELIHOOD, LOG, NOWHERE, PROBES, around, looking_at, planned, train
@@ -40,7 +40,7 @@ def together(members=3, rays=None, *, place=NOWHERE, config=PLACE, settings=SHOR
         planned(config, settings, probes),
         ns,
         state=StateSettings(**options),
-        tell=tell,
+        on_progress=tell,
         write=write,
     )
 
@@ -51,21 +51,21 @@ def arrays(field):
 
 def test_people_are_blocks_and_else_stretches_of_their_time():
     rays = crowd()
-    block, kind = blocks_of(rays)
+    block, kind = assign_blocks(rays)
     assert kind == "people" and np.array_equal(block, rays.person)
     few = crowd(people=2)
-    block, kind = blocks_of(few)
+    block, kind = assign_blocks(few)
     assert kind == "blocks of 30 s" and block.max() + 1 == 8
     for b in range(8):
         assert len(set(few.person[block == b])) == 1 and np.ptp(few.t[block == b]) < 30
     with pytest.raises(ValueError, match="2 stretches of 30 s of 1 people are too few"):
-        blocks_of(crowd(people=1, seconds=40.0))
+        assign_blocks(crowd(people=1, seconds=40.0))
 
 
 def test_a_resample_holds_whole_people_as_often_as_they_were_drawn():
     rays, times = crowd(), []
     for seed in range(300):
-        drawn = resample(rays, seed)
+        drawn = resample_rays(rays, seed)
         # One who is drawn twice is two people, of 200 rays each, who are told apart by their names.
         each = np.bincount(drawn.person, minlength=len(drawn.persons))
         assert set(each) <= {0, 200} and drawn.persons[:6] == rays.persons
@@ -83,14 +83,14 @@ def test_members_are_trainings_of_resamples(threads):
     rays = crowd()
     ensemble, about = together(3, rays)
     for k, member in enumerate(ensemble.members):
-        own = Supervision(resample(rays, (SHORT.seed, k)))
+        own = Supervision(resample_rays(rays, (SHORT.seed, k)))
         alone, _ = train(NOWHERE, replace(SHORT, seed=100 * k), PLACE, supervision=own)
         for name, value in arrays(alone).items():
             np.testing.assert_array_equal(arrays(member)[name], value, err_msg=name)
     assert about["ensemble"] == {"members": 3, "resampled": "people", "seeds": [0, 100, 200]} and about["steps"] == 12
     # Of all rays, not of a resample.
     assert ensemble.support.cells[:, 3].sum() == len(rays) == about["rays"] and ensemble.support.radius == PROBES.radius
-    assert ensemble.basis == Basis(len(rays), len(rays.persons)) and about["people"] == len(rays.persons)
+    assert ensemble.basis == DataSummary(len(rays), len(rays.persons)) and about["people"] == len(rays.persons)
 
 
 def test_an_interrupted_ensemble_goes_on(threads, tmp_path):

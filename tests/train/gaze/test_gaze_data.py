@@ -12,7 +12,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_base import look_up, table_directions
+from nerg_mi.fields.gaze_base import interpolate_table, table_directions
 from nerg_mi.fields.gaze_product import GazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
@@ -26,31 +26,31 @@ from nerg_mi.train.gaze_data import (
     GazeTargets,
     Supervision,
     TargetArrays,
-    TargetNeeds,
-    blind_of_rays,
-    blind_of_views,
-    box_exit,
-    concatenate,
-    far_views,
+    TargetRequirements,
+    make_prior_from_rays,
+    make_prior_from_views,
+    compute_box_exit,
+    concatenate_targets,
+    select_far_views,
     hold_out,
-    observe,
-    probes_of_rays,
-    rotated_sets,
-    semantic_features,
+    make_observer_targets,
+    make_probes,
+    make_rotated_directions,
+    compute_semantic_features,
     split_validation,
     split_views,
-    surface_distances,
-    targets_of_probes,
-    targets_of_rays,
-    targets_of_views,
+    compute_surface_distances,
+    make_targets_from_probes,
+    make_targets_from_rays,
+    make_targets_from_views,
 )
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer
-from nerg_mi.train.gaze_product import ProductTrainer, gaze_density, initial_weights, sized_gaze_config, trunk_config
+from nerg_mi.train.gaze_product import ProductTrainer, evaluate_gaze_density, extract_initial_weights, make_gaze_config, match_trunk_config
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
-from nerg_mi.train.geometry import NOWHERE as NOWHERE_FAR
-from nerg_mi.train.geometry import GazePlace, place_of_field
+from nerg_mi.train.geometry import DEFAULT_DEPTH as NOWHERE_FAR
+from nerg_mi.train.geometry import TrainingGeometry, load_field_geometry
 from nerg_mi.transport.field_medium import FieldMedium
-from nerg_mi.transport.geometry import default_settings
+from nerg_mi.transport.geometry import default_march_settings
 from tests.fields.gaze.test_log_density import SMALL as VIEW_TARGETS_SMALL
 from tests.plugins.scenes import camera, look_at, with_gaze
 
@@ -70,7 +70,7 @@ def drawn():
     positions, truth, distance = rng.uniform(-1, 1, (3, 3)), rng.random((3, 4)), rng.uniform(1, 2, (3, 4))
     extent = np.array([4 * np.pi, 1.5, 0.5], np.float32)
     escaped, semantic = rng.random((3, 4)) < 0.5, rng.normal(size=(3, 4, 2)).astype(np.float16)
-    data = GazeTargets(positions, directions, truth, distance, escaped, semantic, extent=extent)
+    data = GazeTargets(positions, directions, truth, distance, escaped, semantic, solid_angle=extent)
     return data, TargetArrays(data, ns)
 
 
@@ -97,7 +97,7 @@ def test_only_views_are_given_what_they_show(drawn, known):
     batch = arrays.batch(np.arange(3), np.tile(np.arange(4), (3, 1)))
     density = np.array([[1.0, 2, 3, 4], [0, 1, 0, 2], [0, 0, 0, 0]])
     flat = lambda v: ns.Float(v.ravel().astype(np.float32))
-    got = batch.given_view(flat(density), flat(data.truth) if known else None).numpy().reshape(3, 4)
+    got = batch.condition_on_view(flat(density), flat(data.truth) if known else None).numpy().reshape(3, 4)
     goal = data.truth[1].mean() * 1.5 if known else 1.0
     np.testing.assert_allclose(got, [density[0], density[1] * goal / (0.75 * 1.5), density[2]], rtol=1e-5)
 
@@ -116,7 +116,7 @@ def test_the_blind_density_counts_people_or_rays():
     direction = np.array(9 * [[1.0, 0, 0]] + [[0, 1.0, 0]])
     rays = Rays(np.arange(10.0), np.array(9 * [0] + [1]), ("a", "b"), np.zeros((10, 3)), direction, np.ones(10))
     for weights, ratio in (("equal", 9), ("person", 1)):
-        table = np.exp(blind_of_rays(rays, 64, weights=weights).astype(np.float64).ravel())
+        table = np.exp(make_prior_from_rays(rays, 64, weights=weights).astype(np.float64).ravel())
         x, y = (table[np.argmax(table_directions(64) @ d)] for d in ((1, 0, 0), (0, 1, 0)))
         tail = np.exp(-10.0)  # of the other kernel, at a right angle
         expected = (ratio + tail) / (1 + ratio * tail)
@@ -126,27 +126,27 @@ def test_the_blind_density_counts_people_or_rays():
 def test_kernels_that_the_table_cannot_show_are_refused():
     """Of one much narrower than a texel nothing would be left but the uniform part."""
     rays = Rays(np.arange(3.0), np.zeros(3), ("a",), np.zeros((3, 3)), np.tile([0.6, 0.0, 0.8], (3, 1)), np.ones(3))
-    assert np.exp(blind_of_rays(rays, 64, kappa=400.0)).max() > 40  # 1/sr; its peak is 400 / 2π
+    assert np.exp(make_prior_from_rays(rays, 64, kappa=400.0)).max() > 40  # 1/sr; its peak is 400 / 2π
     with pytest.raises(NergError, match="64.*1660"):
-        blind_of_rays(rays, 64, kappa=1700.0)
+        make_prior_from_rays(rays, 64, kappa=1700.0)
 
 
 def test_it_is_in_the_frame_of_the_place():
     """Everybody looks along x, which is y in a place that lies a quarter turn from the rays."""
     direction = np.tile([1.0, 0, 0], (10, 1))
     rays = Rays(np.arange(10.0), np.zeros(10), ("a",), np.zeros((10, 3)), direction, np.ones(10))
-    turned = GazePlace(None, BOX, "none", align=Similarity([[0, -3, 0, 1], [3, 0, 0, 2], [0, 0, 3, 0], [0, 0, 0, 1]]))
+    turned = TrainingGeometry(None, BOX, "none", align=Similarity([[0, -3, 0, 1], [3, 0, 0, 2], [0, 0, 3, 0], [0, 0, 0, 1]]))
     for place, towards in ((None, (1, 0, 0)), (turned, (0, 1, 0))):
-        peak = table_directions(32)[np.argmax(blind_of_rays(rays, 32, place).ravel())]
+        peak = table_directions(32)[np.argmax(make_prior_from_rays(rays, 32, place).ravel())]
         assert peak @ towards > 0.99
 
 
 def test_a_blind_law_is_put_together_from_its_parts():
     """No view shows more than a sixth of the sphere; the law does not depend on the position."""
     law = lambda p, d: np.exp(1.5 * d[:, 0] - 4 * (d[:, 2] + 0.1) ** 2)
-    table = blind_of_views(around(60, density=law), 24)
+    table = make_prior_from_views(around(60, density=law), 24)
     ns, d = namespace("llvm"), fibonacci_directions(4000)
-    found = np.exp(np.array(look_up(ns.Float(table.ravel()), 24, ns.Array3f(np.ascontiguousarray(d.T, np.float32)))))
+    found = np.exp(np.array(interpolate_table(ns.Float(table.ravel()), 24, ns.Array3f(np.ascontiguousarray(d.T, np.float32)))))
     assert 4 * np.pi * found.mean() == pytest.approx(1, abs=1e-3)
     seen = np.abs(d[:, 2]) < 0.7
     found, expected = (v[seen] / v[seen].mean() for v in (found, law(None, d)))
@@ -157,13 +157,13 @@ def test_one_view_counts_as_much_as_the_uniform_one_that_links_all():
     """Closed form for one view of A sr, of density p in it: inside b is in proportion to p + 1/4π."""
     right = lambda p, d: (d[:, 1] < 0).astype(float)
     one = view(right, (0, 0, 1.6), (1.0, 0, 0))
-    table = blind_of_views([one], 24)
+    table = make_prior_from_views([one], 24)
     ns = namespace("llvm")
     # Farther from the middle than densities are smoothed.
     angle = np.radians(32)
     d = np.array([[np.cos(angle), s * np.sin(angle), z] for s in (1, -1) for z in (-0.1, 0, 0.1)])
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    log = look_up(ns.Float(table.ravel()), 24, ns.Array3f(np.ascontiguousarray(d.T, np.float32)))
+    log = interpolate_table(ns.Float(table.ravel()), 24, ns.Array3f(np.ascontiguousarray(d.T, np.float32)))
     found = np.exp(np.array(log)).reshape(2, 3).mean(axis=1)
     extent = pixel_solid_angles(LENS).sum()
     assert found[0] / found[1] == pytest.approx(1 / (1 + 8 * np.pi / extent), rel=0.2)
@@ -173,7 +173,7 @@ def test_one_view_counts_as_much_as_the_uniform_one_that_links_all():
 
 
 def test_sets_of_directions_are_turned_each_its_own_way():
-    sets = rotated_sets(64, 3, np.random.default_rng(0))
+    sets = make_rotated_directions(64, 3, np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(sets, axis=-1), 1)
     np.testing.assert_allclose(
         sets @ sets.transpose(0, 2, 1), np.broadcast_to((sets @ sets.transpose(0, 2, 1))[0], (3, 64, 64)), atol=1e-12
@@ -191,14 +191,14 @@ def test_rays_are_aligned_with_the_field(rays, wall):
         rays, origin=rays.origin @ inverse[:3, :3].T + inverse[:3, 3], direction=rays.direction @ turn, hit=None
     )
     probes = lambda r, radius: place_probes(r, radius, count=8, min_rays=8, kappa_rule="fixed", seed=1)
-    a = targets_of_probes(probes(rays, 0.5), wall, 32)
-    b = targets_of_probes(probes(moved, 0.25), replace(wall, align=Similarity(matrix)), 32)
+    a = make_targets_from_probes(probes(rays, 0.5), wall, 32)
+    b = make_targets_from_probes(probes(moved, 0.25), replace(wall, align=Similarity(matrix)), 32)
     np.testing.assert_allclose(b.positions, a.positions, atol=1e-5)
     back = b.directions @ turn
     np.testing.assert_allclose(back, a.directions, atol=1e-6)
     # The distances are those from the field's frame: traced again along the same rays.
     np.testing.assert_allclose(np.linalg.norm(b.directions, axis=-1), 1, atol=1e-6)
-    inside = ~b.escaped
+    inside = ~b.misses
     p = b.positions[:, None] + b.directions * b.distance[..., None]
     assert inside.any() and np.abs(p[inside][:, 0] - 1.5).max() < 0.02
 
@@ -206,24 +206,24 @@ def test_rays_are_aligned_with_the_field(rays, wall):
 def test_kernels_that_vanish_between_all_directions_are_refused(rays, wall):
     probes = place_probes(rays, 0.5, count=2, min_rays=8, kappa_rule="fixed", kappa=1e8, seed=1)
     with pytest.raises(NergError, match="16.*--kappa"):
-        targets_of_probes(probes, wall, 16)
+        make_targets_from_probes(probes, wall, 16)
 
 
 def test_probes_are_placed_as_the_settings_say(rays):
-    probes = probes_of_rays(rays, PROBES, seed=3)
+    probes = make_probes(rays, PROBES, seed=3)
     assert 1 <= len(probes) <= PROBES.count and (probes.kappa == PROBES.kappa).all()
     assert probes.radius == PROBES.radius
     assert PROBES.min_rays <= probes.counts.min() <= probes.counts.max() <= PROBES.cap
     at = np.array([[-0.6, 0, 1.6]])
-    np.testing.assert_array_equal(probes_of_rays(rays, PROBES, at).queries, at)
-    lattice = probes_of_rays(rays, replace(PROBES, placement="grid", spacing=0.3))
+    np.testing.assert_array_equal(make_probes(rays, PROBES, at).queries, at)
+    lattice = make_probes(rays, replace(PROBES, placement="grid", spacing=0.3))
     assert np.diff(np.unique(lattice.queries[:, 1].round(9))) == pytest.approx(0.3)
 
 
 def test_the_blind_density_is_made_for_whoever_needs_it(rays, wall):
-    assert targets_of_rays(rays, wall, PROBES).blind is None
+    assert make_targets_from_rays(rays, wall, PROBES).prior_table is None
     wide, narrow = (
-        targets_of_rays(rays, wall, replace(PROBES, mix_kappa=kappa), TargetNeeds(blind_rows=12)).blind
+        make_targets_from_rays(rays, wall, replace(PROBES, mix_kappa=kappa), TargetRequirements(prior_rows=12)).prior_table
         for kappa in (10.0, 40.0)
     )
     assert wide.shape == narrow.shape == (12, 24)
@@ -236,11 +236,11 @@ def test_the_blind_density_is_made_for_whoever_needs_it(rays, wall):
 
 def gaze_config(radiance, variant="emit_capture", **more):
     """Of a gaze field that can begin as the radiance field."""
-    return replace(trunk_config(sized_gaze_config("small", variant), radiance.config), **more)
+    return replace(match_trunk_config(make_gaze_config("small", variant), radiance.config), **more)
 
 
 def place_of(field):
-    return GazePlace(FieldMedium(field), BOX, "field", radiance=field)
+    return TrainingGeometry(FieldMedium(field), BOX, "field", radiance=field)
 
 
 @pytest.fixture
@@ -259,7 +259,7 @@ def radiance(rgb):
 def test01_the_trunk_gives_the_fields_features(radiance):
     ns = namespace("llvm")
     gaze = GazeField.random(gaze_config(radiance), BOX, ns, 3)
-    gaze.set_parameters(initial_weights(radiance, gaze.config))
+    gaze.set_parameters(extract_initial_weights(radiance, gaze.config))
     p = ns.Array3f(np.random.default_rng(2).uniform(BOX.lower, BOX.upper, (50, 3)).astype(np.float32).T)
     expected = radiance.density_features(p)[1]
     got = gaze.position_net(gaze.grid(gaze.box.to_unit(p)))
@@ -267,7 +267,7 @@ def test01_the_trunk_gives_the_fields_features(radiance):
     for a, b in zip(got, expected):
         assert np.allclose(np.array(a), np.array(b), atol=1e-6)
     with pytest.raises(ValueError, match="must have its sizes"):
-        initial_weights(radiance, replace(gaze.config, geometry=6))
+        extract_initial_weights(radiance, replace(gaze.config, geometry=6))
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -281,7 +281,7 @@ def test02_the_fast_path_is_the_field(radiance, own):
     d = rng.normal(size=(B * D, 3))
     r_o = ns.Array3f((d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32).T)
     features = [ns.Float(rng.normal(size=B * D).astype(np.float32)) for _ in range(5)]
-    fast = gaze_density(config, BOX, gaze.parameters(), p_od, p_o, r_o, ns, features)
+    fast = evaluate_gaze_density(config, BOX, gaze.parameters(), p_od, p_o, r_o, ns, features)
     at = dr.arange(ns.UInt32, B * D) // D
     slow = gaze.evaluate(p_od, dr.gather(ns.Array3f, p_o, at), r_o, True, features)[0]
     assert np.allclose(np.array(fast), np.array(slow), rtol=1e-5) and np.ptp(np.array(slow)) > 0
@@ -291,18 +291,18 @@ def test02_the_fast_path_is_the_field(radiance, own):
 def test04_frozen_trunks_stay_and_others_move(rgb, radiance, rays, frozen):
     ns = namespace("llvm")
     config = gaze_config(radiance, semantic="accumulated", semantic_own=True)
-    data = targets_of_rays(rays, place_of(radiance), PROBES, TargetNeeds(semantic="accumulated"))
+    data = make_targets_from_rays(rays, place_of(radiance), PROBES, TargetRequirements(semantic="accumulated"))
     assert data.semantic.shape == (*data.truth.shape, 5)
     trainer = ProductTrainer(
-        data, BOX, config, GazeSettings(steps=30, frozen=frozen), ns, initial=initial_weights(radiance, config)
+        data, BOX, config, GazeSettings(steps=30, frozen=frozen), ns, initial_field=extract_initial_weights(radiance, config)
     )
-    before = trainer.measure(data).loss
+    before = trainer.evaluate(data).loss
     while trainer.progress < 1:
         trainer.step()
-    field, start = trainer.field().parameters(), initial_weights(radiance, config)
+    field, start = trainer.make_field().parameters(), extract_initial_weights(radiance, config)
     for name, value in start.items():
         assert np.array_equal(np.array(field[name]), np.array(value)) == frozen, name
-    assert trainer.measure(data).loss < 0.9 * before
+    assert trainer.evaluate(data).loss < 0.9 * before
 
 
 @pytest.mark.parametrize("cutoff", [None, 0.0, 0.05])
@@ -321,7 +321,7 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
     scene, given = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor}), []
     made = scene.integrator()
     if cutoff is None:
-        assert made.settings == default_settings(made.medium)
+        assert made.settings == default_march_settings(made.medium)
     field = made.gaze.field
     evaluate = field.evaluate
     # Kept as the render hands them over, and evaluated with the picture.
@@ -331,8 +331,8 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
     met = picture[:, 0] >= 0.5
     way = picture[:, 1:4] - eye
     distance = np.linalg.norm(way, axis=1)
-    trained = semantic_features(
-        place_of_field(tmp_path / "field.safetensors", namespace("llvm")),
+    trained = compute_semantic_features(
+        load_field_geometry(tmp_path / "field.safetensors", namespace("llvm")),
         np.broadcast_to(eye, way.shape)[met],
         (way / distance[:, None])[met],
         distance[met],
@@ -357,7 +357,7 @@ def test_held_out_positions_are_purged():
 
 def test_people_and_positions_are_held_out():
     rays = looking_at((1.5, 0, 1.2), 4000, spread=6.0)
-    kept, account = hold_out(rays, 0.25, zones=2, positions=10, min_rays=8, people=0.5)
+    kept, account = hold_out(rays, 0.25, zones=2, positions=10, min_rays=8, participant_fraction=0.5)
     assert len(account["people"]) == 1 and set(np.unique(kept.person)) == {1 - rays.persons.index(account["people"][0])}
     assert np.linalg.norm(kept.origin[:, None] - np.array(account["centres"])[None], axis=2).min() > 0.5
 
@@ -372,8 +372,8 @@ def test_watched_views_are_far_from_the_others():
         split_views(views, 3, 5.0)
     moved = Similarity([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
     at = (views[0].camera.center - [1, 0, 0]) / 2
-    near = far_views(views, at[None] @ moved.matrix[:3, :3].T + moved.matrix[:3, 3], 0.1 * moved.scale)
-    assert views[0] not in near and far_views(near, views[0].camera.center[None], 0.2) == near
+    near = select_far_views(views, at[None] @ moved.matrix[:3, :3].T + moved.matrix[:3, 3], 0.1 * moved.scale)
+    assert views[0] not in near and select_far_views(near, views[0].camera.center[None], 0.2) == near
 
 
 def in_a_row(count):
@@ -389,22 +389,22 @@ def test_as_many_views_must_be_left_as_a_quarter():
         except ValueError:
             break
         assert len(learn) >= 3
-    left = len(far_views(views, np.array([v.camera.center for v in split_views(views, 1, 0.5, 3)[1]]), distance))
+    left = len(select_far_views(views, np.array([v.camera.center for v in split_views(views, 1, 0.5, 3)[1]]), distance))
     assert left < 3
 
 
 def test_zones_of_rays_are_watched_with_all_rays_around_them():
-    double = GazePlace(None, BOX, "none", align=Similarity(np.diag([2.0, 2, 2, 1])))
-    settings = GazeSettings(steps=1, zones=2, watched=6)
+    double = TrainingGeometry(None, BOX, "none", align=Similarity(np.diag([2.0, 2, 2, 1])))
+    settings = GazeSettings(steps=1, zones=2, validation_probes=6)
     for place in (NOWHERE, double):
-        eyes = place.points_from_rays(RAYS.origin[::60])
+        eyes = place.points_to_field(RAYS.origin[::60])
         views = [view(lobe, eye, (1, 0, 0), name=f"v{k}") for k, eye in enumerate(eyes)]
         split = split_validation(Supervision(RAYS, views), place, settings, PROBES)
-        apart = np.linalg.norm(split.learn.rays.origin[:, None] - split.centres, axis=2)
-        assert apart.min() > 2 * PROBES.radius and split.rays_held_out == len(RAYS) - len(split.learn.rays) > 0
-        assert split.watched.rays is RAYS and not split.watched.views
-        near = place.points_from_rays(split.centres)
-        left = {v.name for v in split.learn.views}
+        apart = np.linalg.norm(split.training.rays.origin[:, None] - split.centres, axis=2)
+        assert apart.min() > 2 * PROBES.radius and split.rays_held_out == len(RAYS) - len(split.training.rays) > 0
+        assert split.validation.rays is RAYS and not split.validation.views
+        near = place.points_to_field(split.centres)
+        left = {v.name for v in split.training.views}
         for v in views:
             far = np.linalg.norm(near - v.camera.center, axis=1).min() > 2 * PROBES.radius * place.align.scale
             assert (v.name in left) == far
@@ -415,8 +415,8 @@ def test_of_views_alone_some_are_watched():
     split = split_validation(
         Supervision(None, around(80)), NOWHERE, GazeSettings(steps=1, zones=3), replace(PROBES, radius=0.15)
     )
-    assert split.learn.rays is None and split.watched.rays is None and split.centres is None
-    assert split.views_held_out == 80 - len(split.learn.views) >= len(split.watched.views) > 0
+    assert split.training.rays is None and split.validation.rays is None and split.centres is None
+    assert split.views_held_out == 80 - len(split.training.views) >= len(split.validation.views) > 0
 
 
 # ---- What is learnt from: at least something, told apart by digests, and its support ----
@@ -424,12 +424,12 @@ def test_of_views_alone_some_are_watched():
 
 def test_the_support_is_of_all_rays_in_the_frame_of_the_place():
     rays = looking_at((1.5, 0, 1.2))
-    double = GazePlace(None, BOX, "none", align=Similarity([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]))
-    plain, moved = (Supervision(rays).support(0.5, place) for place in (NOWHERE, double))
+    double = TrainingGeometry(None, BOX, "none", align=Similarity([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]))
+    plain, moved = (Supervision(rays).make_support(0.5, place) for place in (NOWHERE, double))
     assert plain.radius == 0.5 and moved.radius == pytest.approx(1.0)
     assert plain.cells[:, 3].sum() == moved.cells[:, 3].sum() == 400
     np.testing.assert_allclose(moved.cells[:, :3], plain.cells[:, :3] * 2 + [1, 0, 0], atol=1e-5)
-    assert Supervision(None, around(1)).support(0.5, NOWHERE) is None
+    assert Supervision(None, around(1)).make_support(0.5, NOWHERE) is None
 
 
 # ---- Targets: what escapes, features for those who need them, two sets in one ----
@@ -439,20 +439,20 @@ def test_what_escapes_is_counted_by_directions_and_by_gaze():
     rng = np.random.default_rng(0)
     directions, truth, escaped = rng.normal(size=(3, 5, 3)), rng.random((3, 5)), rng.random((3, 5)) < 0.4
     targets = GazeTargets(np.zeros((3, 3)), directions, truth, truth, escaped)
-    assert targets.escape_share == pytest.approx(escaped.sum() / 15)
-    assert targets.escaped_gaze == pytest.approx(truth[escaped].sum() / truth.sum())
+    assert targets.miss_fraction == pytest.approx(escaped.sum() / 15)
+    assert targets.miss_gaze_fraction == pytest.approx(truth[escaped].sum() / truth.sum())
     extent = np.array([1.0, 2.0, 3.0])
     gaze = truth * extent[:, None]
-    assert replace(targets, extent=extent).escaped_gaze == pytest.approx(gaze[escaped].sum() / gaze.sum())
+    assert replace(targets, solid_angle=extent).miss_gaze_fraction == pytest.approx(gaze[escaped].sum() / gaze.sum())
 
 
 def test_features_are_those_of_a_radiance_field():
     positions, directions = np.zeros((1, 3)), np.array([[[1.0, 0, 0], [0, 1.0, 0]]])
-    targets = observe(positions, directions, np.ones((1, 2)), NOWHERE)
-    assert targets.semantic is None and (targets.distance == 2).all() and not targets.escaped.any()
+    targets = make_observer_targets(positions, directions, np.ones((1, 2)), NOWHERE)
+    assert targets.semantic is None and (targets.distance == 2).all() and not targets.misses.any()
     assert targets.positions.dtype == targets.directions.dtype == targets.truth.dtype == np.float32
     with pytest.raises(NergError, match="give one with --field"):
-        observe(positions, directions, np.ones((1, 2)), NOWHERE, needs=TargetNeeds(semantic="snapshot"))
+        make_observer_targets(positions, directions, np.ones((1, 2)), NOWHERE, requirements=TargetRequirements(semantic="snapshot"))
 
 
 # ---- Views as targets: what they hold, likelihood and losses given a view, a law learnt from views ----
@@ -462,32 +462,32 @@ VIEW_TARGETS_PROBES = ProbeSettings(directions=512, radius=0.25, min_rays=1)
 
 def test_directions_and_densities_of_a_view():
     views = around(3)
-    found = targets_of_views(views, NOWHERE, VIEW_TARGETS_PROBES)
-    assert found.truth.shape == (3, 512) and found.blind is None
-    np.testing.assert_allclose(found.truth.mean(axis=1) * found.extent, 1, rtol=1e-5)
-    np.testing.assert_allclose(found.extent, pixel_solid_angles(LENS).sum(), rtol=1e-5)
+    found = make_targets_from_views(views, NOWHERE, VIEW_TARGETS_PROBES)
+    assert found.truth.shape == (3, 512) and found.prior_table is None
+    np.testing.assert_allclose(found.truth.mean(axis=1) * found.solid_angle, 1, rtol=1e-5)
+    np.testing.assert_allclose(found.solid_angle, pixel_solid_angles(LENS).sum(), rtol=1e-5)
     for k, v in enumerate(views):
         np.testing.assert_allclose(found.positions[k], v.camera.center, atol=1e-6)
-        assert v.look_up(found.directions[k])[1].all()
+        assert v.evaluate(found.directions[k])[1].all()
         # Pixels of 6 degrees are averages: the law is as steep as it is.
         given = lobe(v.camera.center, found.directions[k].astype(float))
-        given /= given.mean() * found.extent[k]
+        given /= given.mean() * found.solid_angle[k]
         assert np.corrcoef(given, found.truth[k])[0, 1] > 0.9
 
 
 def test_the_likelihood_is_given_the_view():
     """Drawn loss and validation against the field's own densities, divided by their sum over the view in NumPy."""
-    data = targets_of_views(around(4), NOWHERE, VIEW_TARGETS_PROBES, TargetNeeds.of(VIEW_TARGETS_SMALL))
+    data = make_targets_from_views(around(4), NOWHERE, VIEW_TARGETS_PROBES, TargetRequirements.from_config(VIEW_TARGETS_SMALL))
     settings = GazeSettings(steps=1, loss="likelihood", integral=0.0, probes=4, directions=512, rays=2048, zones=0)
     trainer = LikelihoodTrainer(data, BOX, replace(VIEW_TARGETS_SMALL, mix=0.0, geometry="none"), settings, ns)
-    field = trainer.initial
+    field = trainer.initial_field
     r_o, p_o = data.directions.reshape(-1, 3), np.repeat(data.positions, 512, axis=0)
     jit = lambda v: ns.Array3f(np.ascontiguousarray(v.T, np.float32))
     emit, capture = field.unnormalized(jit(p_o), jit(p_o), jit(r_o))
     density = np.array(emit * capture, np.float64).reshape(4, 512)
-    density /= density.mean(axis=1, keepdims=True) * data.extent[:, None]
-    part = data.truth.astype(float) * data.extent[:, None] / 512
-    scores = trainer.measure(data)
+    density /= density.mean(axis=1, keepdims=True) * data.solid_angle[:, None]
+    part = data.truth.astype(float) * data.solid_angle[:, None] / 512
+    scores = trainer.evaluate(data)
     assert scores.kld == pytest.approx(np.mean(np.sum(part * np.log(data.truth / density), axis=1)), abs=1e-4)
     assert scores.mae == pytest.approx(np.abs(density - data.truth).mean(), rel=1e-3)
     assert scores.integral == pytest.approx(1, abs=1e-5)
@@ -497,20 +497,20 @@ def test_the_likelihood_is_given_the_view():
 
 def test_the_losses_of_a_density_do_not_see_its_scale_through_views():
     """But do for probes of rays that are beside them."""
-    data = targets_of_views(around(3), NOWHERE, VIEW_TARGETS_PROBES)
+    data = make_targets_from_views(around(3), NOWHERE, VIEW_TARGETS_PROBES)
     sphere = GazeTargets(
         data.positions,
         np.broadcast_to(fibonacci_directions(512), (3, 512, 3)).astype(np.float32),
         np.full((3, 512), 1 / (4 * np.pi), np.float32),
         data.distance,
-        data.escaped,
+        data.misses,
     )
     settings = GazeSettings(steps=1, zones=0)
-    of = lambda data, scale: ProductTrainer(data, BOX, replace(PLAIN, emit_scale=scale), settings, ns).measure(data)
+    of = lambda data, scale: ProductTrainer(data, BOX, replace(PLAIN, emit_scale=scale), settings, ns).evaluate(data)
     np.testing.assert_allclose(of(data, 0.1), of(data, 0.7), rtol=1e-4, atol=1e-6)
     assert of(data, 0.1).integral == pytest.approx(1, abs=1e-5)
-    both = concatenate(sphere, data)
-    assert both.truth.shape == (6, 512) and both.extent[0] == pytest.approx(4 * np.pi)
+    both = concatenate_targets(sphere, data)
+    assert both.truth.shape == (6, 512) and both.solid_angle[0] == pytest.approx(4 * np.pi)
     for scale in (0.1, 0.7):
         parts = np.array(of(sphere, scale)), np.array(of(data, scale))
         np.testing.assert_allclose(of(both, scale), np.mean(parts, axis=0), rtol=1e-4, atol=1e-6)
@@ -529,8 +529,8 @@ def test_a_law_is_learnt_from_views_alone_and_holds_around():
         learning_rate=1e-2,
         weight_decay=0.1,
         zones=2,
-        average=0.9,
-        looks=4,
+        ema_decay=0.9,
+        num_validations=4,
     )
     config = replace(VIEW_TARGETS_SMALL, mix=0.05, geometry="none", prior=16)
     views = Supervision(None, around(90))
@@ -552,7 +552,7 @@ def test_a_law_is_learnt_from_views_alone_and_holds_around():
 
 def test_rays_and_views_train_one_field():
     both = Supervision(looking_at((1.5, 0.4, 1.2)), around(6))
-    settings = GazeSettings(steps=4, probes=4, directions=32, zones=1, watched=4, looks=2)
+    settings = GazeSettings(steps=4, probes=4, directions=32, zones=1, validation_probes=4, num_validations=2)
     probes = ProbeSettings(radius=0.25, count=8, cap=64, min_rays=4, directions=64)
     for config, more in ((PLAIN, {}), (VIEW_TARGETS_SMALL, {"loss": "likelihood"})):
         field, about = train(NOWHERE, replace(settings, **more), config, probes, both)
@@ -566,7 +566,7 @@ def test_rays_and_views_train_one_field():
 def test_what_meets_nothing_ends_where_the_box_ends(wall):
     positions = np.array([[-0.5, 0, 1.6], [0.2, -0.4, 1.5]])
     directions = np.tile(fibonacci_directions(256), (2, 1, 1))
-    distance, escaped = surface_distances(wall, positions, directions)
+    distance, escaped = compute_surface_distances(wall, positions, directions)
     p = positions[:, None] + directions * distance[..., None]
     # The wall is met from x = 1.5 on, everything else ends on the box.
     assert np.abs(p[~escaped][:, 0] - 1.5).max() < 0.02
@@ -577,21 +577,21 @@ def test_what_meets_nothing_ends_where_the_box_ends(wall):
 def test_holes_are_filled_with_the_depth_around_them(wall):
     """Of directions that look past the wall, the ones beside it are as far as it is."""
     positions, directions = np.array([[-0.5, 0, 1.6]]), fibonacci_directions(1024)[None]
-    plain, escaped = surface_distances(wall, positions, directions)
-    filled, same = surface_distances(wall, positions, directions, fill=True)
+    plain, escaped = compute_surface_distances(wall, positions, directions)
+    filled, same = compute_surface_distances(wall, positions, directions, fill_misses=True)
     np.testing.assert_array_equal(escaped, same)
     np.testing.assert_array_equal(filled[~escaped], plain[~escaped])
     assert plain[~escaped].min() <= filled[escaped].min() and filled[escaped].max() <= plain[~escaped].max()
     nothing = np.array([[[-1.0, 0, 0], [-0.8, 0.6, 0]]])
-    np.testing.assert_array_equal(*(surface_distances(wall, positions, nothing, fill=f)[0] for f in (True, False)))
+    np.testing.assert_array_equal(*(compute_surface_distances(wall, positions, nothing, fill_misses=f)[0] for f in (True, False)))
 
 
 def test_without_geometry_everything_is_equally_far():
-    distance, escaped = surface_distances(NOWHERE, np.zeros((3, 3)), np.ones((3, 5, 3)))
+    distance, escaped = compute_surface_distances(NOWHERE, np.zeros((3, 3)), np.ones((3, 5, 3)))
     assert distance.shape == (3, 5) and (distance == NOWHERE_FAR).all() and not escaped.any()
 
 
 def test_exits_of_a_box():
     o = np.array([[0, 0, 1.0], [0, 0, 1], [5, 0, 1], [5, 0, 1], [0, 2, 1]])
     d = np.array([[1.0, 0, 0], [0, 0, -1], [-1, 0, 0], [1, 0, 0], [1, 0, 0]])
-    np.testing.assert_allclose(box_exit(BOX, o, d), [2, 1, 7, BOX.diagonal, 2])
+    np.testing.assert_allclose(compute_box_exit(BOX, o, d), [2, 1, 7, BOX.diagonal, 2])

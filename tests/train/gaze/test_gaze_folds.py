@@ -14,16 +14,16 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
 from nerg_mi.train.gaze_ensemble import train_ensemble
 from nerg_mi.train.gaze_run import (
-    CHOICE,
-    SHARES,
-    JudgedFolds,
-    MixChoice,
+    SELECTION_KEY,
+    PRIOR_WEIGHTS,
+    FoldResults,
+    PriorWeightSelection,
     _best,
     _choose,
     _Judgement,
     _regions,
-    inner_folds,
-    judge_folds,
+    iter_folds,
+    evaluate_folds,
     train_gaze,
 )
 from nerg_mi.train.gaze_settings import ProbeSettings
@@ -60,7 +60,7 @@ def plan_of(**changes):
 
 def test01_those_who_are_judged_are_not_learnt_from():
     rays = people(1.0)
-    folds = list(inner_folds(rays, plan_of()))
+    folds = list(iter_folds(rays, plan_of()))
     assert len(folds) == 3
     for learn, held, centres in folds:
         assert not set(learn.person) & set(held.person) and len(np.unique(held.person)) == 2
@@ -69,21 +69,21 @@ def test01_those_who_are_judged_are_not_learnt_from():
     # People who sit: the zones take all that is theirs.
     seated = people(1.0)
     seated = replace(seated, origin=np.column_stack([seated.person, 0 * seated.person, 1.2 + 0 * seated.person]))
-    assert [len(learn) for learn, _, _ in inner_folds(seated, plan_of())] == [1600] * 3
-    for learn, held, _ in inner_folds(people(1.0, count=1), plan_of()):
+    assert [len(learn) for learn, _, _ in iter_folds(seated, plan_of())] == [1600] * 3
+    for learn, held, _ in iter_folds(people(1.0, count=1), plan_of()):
         assert len(held) == 400 and 0 < len(learn) < 400
 
 
 def test02_of_shares_that_cannot_be_told_apart_the_largest():
-    low = np.linspace(1, 2, len(SHARES))
-    assert _choose(np.array([low, low])).mix == SHARES[0]
+    low = np.linspace(1, 2, len(PRIOR_WEIGHTS))
+    assert _choose(np.array([low, low])).mix == PRIOR_WEIGHTS[0]
     assert _choose(np.array([low[::-1], low[::-1]])).mix == 1.0
     # One fold likes the field as much as the other likes the blind density.
     unsure = _choose(np.array([low, 3.01 - low]))
     assert unsure.mix == 1.0 and unsure.folds == 2 and np.isclose(unsure.kld_blind, (2 + 1.01) / 2)
     assert np.isclose(_choose(low[None]).kld, 1)
     # The blind density alone is worse by .1 of KLD, with a standard error of .1, .15 and .25.
-    for error, mix in ((0.1, SHARES[0]), (0.15, SHARES[0]), (0.25, 1.0)):
+    for error, mix in ((0.1, PRIOR_WEIGHTS[0]), (0.15, PRIOR_WEIGHTS[0]), (0.25, 1.0)):
         curves = np.stack([low * 0 + 2, low * 0 + 2])
         curves[:, 1:], curves[:, -1] = 3, (2.1 - error, 2.1 + error)
         assert _choose(curves).mix == mix
@@ -94,7 +94,7 @@ def test04_a_field_counts_where_position_tells(law, kept, rgb):
     """Where all look at one point the field stays as it is; where each person has a way of their own, position tells
     nothing of others."""
     told = []
-    found = judge_folds(Supervision(people(law)), NOWHERE, plan_of(), ns, told.append).choose()
+    found = evaluate_folds(Supervision(people(law)), NOWHERE, plan_of(), ns, told.append).select_weight()
     assert found is not None and told[-1].stage.startswith("fold") and 0 < told[-1].done <= 1
     assert found.regions is not None and 0 < found.regions["50%"] < found.regions["80%"] < found.regions["95%"] < 1
     if kept:
@@ -107,21 +107,21 @@ def test05_of_a_training_and_of_an_ensemble(rgb):
     rays = people(0.0)
     plan = plan_of(steps=20)
     field, about = train_gaze(Supervision(rays), NOWHERE, plan, ns)
-    assert field.config.mix == about["mix"]["mix"] == SHARES[np.isclose(SHARES, about["mix"]["mix"])][0]
+    assert field.config.mix == about["mix"]["mix"] == PRIOR_WEIGHTS[np.isclose(PRIOR_WEIGHTS, about["mix"]["mix"])][0]
     ensemble, about = train_ensemble(2, Supervision(rays), NOWHERE, plan, ns)
     assert [f.config.mix for f in ensemble.members] == [about["mix"]["mix"]] * 2
     # Nobody can be held out at places that hold too few rays: the share stays.
     few, about = train_gaze(Supervision(people(0.0, each=12)), NOWHERE, plan, ns)
     assert few.config.mix == LOG.mix and about["mix"]["mix"] == LOG.mix and about["mix"]["folds"] == 0
     assert about["mix"]["regions"] is None
-    assert MixChoice(0.5, 1, regions={"80%": 0.71234}).to_dict()["regions"] == {"80%": 0.7123}
+    assert PriorWeightSelection(0.5, 1, regions={"80%": 0.71234}).to_dict()["regions"] == {"80%": 0.7123}
 
     # After Ctrl-C the field is there, as it was before.
     def stop(progress):
         if progress.stage.startswith("fold"):
             raise KeyboardInterrupt
 
-    field, about = train_gaze(Supervision(rays), NOWHERE, plan, ns, tell=stop)
+    field, about = train_gaze(Supervision(rays), NOWHERE, plan, ns, on_progress=stop)
     assert about["interrupted"] and "mix" not in about and field.config.mix == LOG.mix
 
 
@@ -151,8 +151,8 @@ def two(**changes):
 def judged(*klds, mix=0.1):
     """Folds in which a field has these KLD with the least share, and is worse with any other."""
     look = _Judgement(np.ones((1, 4)), np.ones((1, 4)), np.array([0]), np.array([0, 1]))
-    curves = np.array([k + np.linspace(0, 1, len(SHARES)) for k in klds])
-    return JudgedFolds(mix, curves, [look] * len(klds))
+    curves = np.array([k + np.linspace(0, 1, len(PRIOR_WEIGHTS)) for k in klds])
+    return FoldResults(mix, curves, [look] * len(klds))
 
 
 def test01_the_first_counts_unless_another_is_better_by_half_a_standard_error():
@@ -167,10 +167,10 @@ def test01_the_first_counts_unless_another_is_better_by_half_a_standard_error():
         ((1.0, 1.0, 0.1), (0.9, 0.9), BOTH),
     ):
         found, choice = _best(plan, (CAPTURE, BOTH), [judged(*first), judged(*second)])
-        assert found.config == chosen and choice.variant == chosen.variant and choice.mix == SHARES[0]
+        assert found.config == chosen and choice.variant == chosen.variant and choice.mix == PRIOR_WEIGHTS[0]
         assert choice.variants == pytest.approx({"capture": np.mean(first[:2]), "emit_capture": np.mean(second)})
-    found, choice = _best(plan, (CAPTURE, BOTH), [JudgedFolds(0.1, np.empty(0), [])] * 2)
-    assert found.config == CAPTURE and choice == MixChoice(0.1, 0)
+    found, choice = _best(plan, (CAPTURE, BOTH), [FoldResults(0.1, np.empty(0), [])] * 2)
+    assert found.config == CAPTURE and choice == PriorWeightSelection(0.1, 0)
 
 
 @pytest.mark.nightly
@@ -180,7 +180,7 @@ def test02_what_foretells_those_who_are_held_out_is_trained(rgb):
     told = []
     flat = replace(CAPTURE, sh_degree=1)
     plan = replace(two(), config=flat, alternatives=(replace(BOTH, reach=1.9, sh_degree=1),))
-    field, about = train_gaze(Supervision(people(1.0)), NOWHERE, plan, ns, tell=told.append)
+    field, about = train_gaze(Supervision(people(1.0)), NOWHERE, plan, ns, on_progress=told.append)
     klds = about["mix"]["variants"]
     assert about["mix"]["variant"] == field.config.variant == "emit_capture"
     assert klds["emit_capture"] < klds["capture"] and field.config.mix == about["mix"]["mix"]
@@ -206,18 +206,18 @@ def test04_a_run_that_goes_on_keeps_what_was_chosen(members, tmp_path, rgb, monk
             return train_ensemble(members, supervision, NOWHERE, plan, ns, **more)
         return train_gaze(supervision, NOWHERE, plan, ns, write=lambda field, about: None, **more)
 
-    state = StateSettings(path=path, every=0.0)
+    state = StateSettings(path=path, interval=0.0)
     if members:
         with pytest.raises(KeyboardInterrupt):
             trained(state=state, tell=stop)
     else:
         assert trained(state=state, tell=stop).provenance["interrupted"]
-    chosen = read_checkpoint(path, KIND)[1]["about"][CHOICE]
+    chosen = read_checkpoint(path, KIND)[1]["about"][SELECTION_KEY]
     # Folds do not choose again.
-    monkeypatch.setattr("nerg_mi.train.gaze_run.judge_folds", None)
+    monkeypatch.setattr("nerg_mi.train.gaze_run.evaluate_folds", None)
     tensors, meta = read_checkpoint(path, KIND)
     for wrong in ({"mix": 2.0, "folds": 1}, {"colour": 1}, "capture"):
-        write_checkpoint(path, KIND, tensors, {**meta, "about": {**meta["about"], CHOICE: wrong}})
+        write_checkpoint(path, KIND, tensors, {**meta, "about": {**meta["about"], SELECTION_KEY: wrong}})
         with pytest.raises(NergError, match="damaged.*start anew"):
             trained(state=replace(state, resume=True))
     write_checkpoint(path, KIND, tensors, meta)
@@ -233,4 +233,4 @@ def test05_ctrl_c_while_folds_choose_says_that_nothing_was_kept(rgb):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt, match="emit_capture"):
-        train_gaze(Supervision(people(1.0)), NOWHERE, two(), ns, tell=stop)
+        train_gaze(Supervision(people(1.0)), NOWHERE, two(), ns, on_progress=stop)

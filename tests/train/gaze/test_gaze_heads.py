@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation import metrics
-from nerg_mi.fields.gaze_base import blind_table
+from nerg_mi.fields.gaze_base import make_prior_table
 from nerg_mi.fields.gaze_product import GazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.train import gaze_log_density, gaze_product
-from nerg_mi.train.gaze_data import GazeTargets, targets_of_probes
-from nerg_mi.train.gaze_log_density import LikelihoodTrainer, log_gaze, log_mean_exp
-from nerg_mi.train.gaze_product import ProductTrainer, gaze_density
+from nerg_mi.train.gaze_data import GazeTargets, make_targets_from_probes
+from nerg_mi.train.gaze_log_density import LikelihoodTrainer, evaluate_log_density, log_mean_exp
+from nerg_mi.train.gaze_product import ProductTrainer, evaluate_gaze_density
 from nerg_mi.train.gaze_settings import GazeSettings
 from nerg_mi.train.gaze_trainer import KLD_EPS
 from tests.fields.gaze.test_log_density import BOX, SMALL, jit, made, vectors
@@ -37,7 +37,7 @@ FAST = GazeSettings(
     learning_rate=1e-2,
     weight_decay=0.1,
     zones=0,
-    average=0.9,
+    ema_decay=0.9,
 )
 
 
@@ -59,7 +59,7 @@ def targets(probes=6, count=512, seed=0):
         truth.astype(np.float32),
         np.where(escaped, 3, t).astype(np.float32),
         escaped,
-        blind=np.full((8, 16), -np.log(4 * np.pi)),
+        prior_table=np.full((8, 16), -np.log(4 * np.pi)),
     )
 
 
@@ -77,7 +77,7 @@ def test_the_loss_is_the_cross_entropy():
     )
     trainer.backward()
     drawn = float(trainer.loss[0])
-    scores = trainer.measure(data)
+    scores = trainer.evaluate(data)
     entropy = -(4 * np.pi * data.truth * np.log(data.truth + 1e-30)).mean()
     assert drawn == pytest.approx(scores.kld + entropy, abs=0.01)
     assert scores.integral == pytest.approx(1, abs=1e-5)
@@ -88,15 +88,15 @@ def test_a_validation_sees_the_density_that_the_field_has(mix):
     """With its share of the blind density, and its integral, taken over the same directions."""
     data, ns = targets(2), namespace("llvm")
     rows = np.random.default_rng(3).normal(size=(SMALL.prior, 2 * SMALL.prior))
-    data = replace(data, blind=blind_table(np.exp(rows).ravel(), SMALL.prior, ns, data.directions[0].astype(float)))
+    data = replace(data, prior_table=make_prior_table(np.exp(rows).ravel(), SMALL.prior, ns, data.directions[0].astype(float)))
     trainer = LikelihoodTrainer(data, BOX, replace(SMALL, mix=mix), replace(FAST, probes=2), ns)
-    scores = trainer.measure(data)
+    scores = trainer.evaluate(data)
     assert scores.integral == pytest.approx(1, abs=1e-4)
-    field, kld = trainer.field(), []
-    for p_o, d, t, gone, truth in zip(data.positions, data.directions, data.distance, data.escaped, data.truth):
+    field, kld = trainer.make_field(), []
+    for p_o, d, t, gone, truth in zip(data.positions, data.directions, data.distance, data.misses, data.truth):
         args = jit(p_o + d * t[:, None]), jit(np.broadcast_to(p_o, d.shape)), jit(d)
         product = np.multiply(*(np.array(v, np.float64) for v in field.unnormalized(*args, escaped=ns.Bool(gone))))
-        density = (1 - mix) * product / (4 * np.pi * product.mean()) + mix * np.exp(np.array(field.log_blind(args[2])))
+        density = (1 - mix) * product / (4 * np.pi * product.mean()) + mix * np.exp(np.array(field.log_prior(args[2])))
         kld.append(metrics.kld(truth[None], density[None], eps=KLD_EPS)[0])
     assert scores.kld == pytest.approx(np.mean(kld), rel=1e-4)
 
@@ -104,13 +104,13 @@ def test_a_validation_sees_the_density_that_the_field_has(mix):
 def test_a_law_is_learnt_and_holds_elsewhere():
     ns = namespace("llvm")
     trainer = LikelihoodTrainer(targets(24), BOX, replace(SMALL, mix=0.0), FAST, ns)
-    before = trainer.measure(targets(6, seed=9))
+    before = trainer.evaluate(targets(6, seed=9))
     while trainer.progress < 1:
         trainer.step()
-    after = trainer.measure(targets(6, seed=9))
+    after = trainer.evaluate(targets(6, seed=9))
     assert before.kld > 1.0 and after.kld < 0.25 and after.cc > 0.85
-    field = trainer.field()
-    np.testing.assert_array_equal(np.array(field.prior.array), np.array(trainer.initial.prior.array))
+    field = trainer.make_field()
+    np.testing.assert_array_equal(np.array(field.prior.array), np.array(trainer.initial_field.prior.array))
 
 
 # ---- The log density's fast path: it is the field, and its gradients reach what the variant uses ----
@@ -123,7 +123,7 @@ def test_the_fast_path_is_the_field(variant, escape):
     p_o, p_od, r = vectors(12)
     p_o = np.repeat(p_o[:3], 4, axis=0)
     gone = ns.Bool([i % 3 == 0 for i in range(12)])
-    fast = log_gaze(field.config, BOX, field.parameters(), jit(p_od), jit(p_o[::4]), jit(r), gone, ns)
+    fast = evaluate_log_density(field.config, BOX, field.parameters(), jit(p_od), jit(p_o[::4]), jit(r), gone, ns)
     emit, capture = field.unnormalized(jit(p_od), jit(p_o), jit(r), escaped=gone)
     np.testing.assert_allclose(np.array(fast), np.log(np.array(emit * capture)), atol=2e-5)
 
@@ -131,10 +131,10 @@ def test_the_fast_path_is_the_field(variant, escape):
 @pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
 def test_gradients_reach_what_the_variant_uses(variant):
     field, ns = made(replace(SMALL, variant=variant)), namespace("llvm")
-    parameters = gaze_log_density.used_parameters(field.config, field.parameters())
+    parameters = gaze_log_density.select_trainable_parameters(field.config, field.parameters())
     dr.enable_grad(parameters)
     p_o, p_od, r = vectors(4)
-    logit = log_gaze(
+    logit = evaluate_log_density(
         field.config,
         BOX,
         {**field.parameters(), **parameters},
@@ -155,14 +155,14 @@ def test_gradients_reach_what_the_variant_uses(variant):
 
 def test_one_probe_is_learnt(rays, wall):
     probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
-    targets = targets_of_probes(probes, wall, 256)
+    targets = make_targets_from_probes(probes, wall, 256)
     np.testing.assert_allclose(4 * np.pi * targets.truth.mean(), 1, atol=0.01)
     settings = GazeSettings(steps=200, learning_rate=1e-2, weight_decay=0.0, zones=0)
     trainer = ProductTrainer(targets, BOX, PRODUCT, settings, ns)
-    before = trainer.measure(targets)
+    before = trainer.evaluate(targets)
     for _ in range(200):
         trainer.step()
-    after = trainer.measure(targets)
+    after = trainer.evaluate(targets)
     assert before.kld > 0.5
     assert after.kld < 0.05 and after.cc > 0.97 and abs(after.integral - 1) < 0.15
 
@@ -171,8 +171,8 @@ def test_one_probe_is_learnt(rays, wall):
 def test_a_validation_is_judged_by_the_loss_that_is_trained(rays, wall, loss, judged):
     probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
     settings = GazeSettings(steps=1, loss=loss, integral=2.0, zones=0)
-    trainer = ProductTrainer(targets_of_probes(probes, wall, 64), BOX, PRODUCT, settings, ns)
-    assert trainer.judge(kld=0.5, cc=0.75, mae=0.01, off=0.1) == pytest.approx(judged + 0.2)
+    trainer = ProductTrainer(make_targets_from_probes(probes, wall, 64), BOX, PRODUCT, settings, ns)
+    assert trainer.validation_objective(kld=0.5, cc=0.75, mae=0.01, off=0.1) == pytest.approx(judged + 0.2)
 
 
 # ---- The product's fast path: it is the field, and its gradients reach what the variant uses ----
@@ -190,7 +190,7 @@ def test_the_fast_path_is_the_field_product(variant, activation):
     r_o = rng.normal(size=(3, B * D))
     r_o /= np.linalg.norm(r_o, axis=0)
     p_o, p_od, r_o = (ns.Array3f(np.ascontiguousarray(v, np.float32)) for v in (p_o, p_od, r_o))
-    fast = gaze_density(field.config, BOX, field.parameters(), p_od, p_o, r_o, ns)
+    fast = evaluate_gaze_density(field.config, BOX, field.parameters(), p_od, p_o, r_o, ns)
     each = dr.gather(ns.Array3f, p_o, dr.arange(ns.UInt32, B * D) // D)
     np.testing.assert_allclose(np.array(fast), np.array(field.evaluate(p_od, each, r_o)[0]), rtol=2e-5, atol=1e-6)
 
@@ -199,9 +199,9 @@ def test_the_fast_path_is_the_field_product(variant, activation):
 def test_gradients_reach_what_the_variant_uses_product(variant):
     ns = namespace("llvm")
     config = replace(PRODUCT, variant=variant)
-    parameters = gaze_product.used_parameters(config, GazeField.random(config, BOX, ns, 5).parameters())
+    parameters = gaze_product.select_trainable_parameters(config, GazeField.random(config, BOX, ns, 5).parameters())
     dr.enable_grad(parameters)
     p_o, r_o = ns.Array3f([0.1], [0.2], [1.0]), ns.Array3f([0, 0.6], [0.8, 0], [0.6, 0.8])
-    dr.backward(dr.sum(gaze_density(config, BOX, parameters, ns.Array3f([0.1, 1], [1, 0.2], [2, 2]), p_o, r_o, ns)))
+    dr.backward(dr.sum(evaluate_gaze_density(config, BOX, parameters, ns.Array3f([0.1, 1], [1, 0.2], [2, 2]), p_o, r_o, ns)))
     for name, value in parameters.items():
         assert np.any(np.array(dr.grad(value)) != 0), name

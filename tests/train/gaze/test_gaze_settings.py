@@ -14,11 +14,11 @@ from nerg_mi.evaluation import metrics
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.sphere import latlong_grid
-from nerg_mi.train.gaze_product import sized_gaze_config
-from nerg_mi.train.gaze_recipes import DEFAULT, FieldChoices, gaze_recipe, recipes, register_recipe
+from nerg_mi.train.gaze_product import make_gaze_config
+from nerg_mi.train.gaze_recipes import DEFAULT_RECIPE, FieldOptions, get_recipe, load_recipes, register_recipe
 from nerg_mi.train.gaze_settings import CODE, LOSSES, PAPER, GazeSettings
-from nerg_mi.train.gaze_trainer import KLD_EPS, gaze_loss
-from nerg_mi.train.geometry import GazePlace
+from nerg_mi.train.gaze_trainer import KLD_EPS, compute_gaze_loss
+from nerg_mi.train.geometry import TrainingGeometry
 
 from .looks import BOX, NOWHERE
 
@@ -37,7 +37,7 @@ def densities():
 
 
 def loss(Float, guess, truth, w=W, **weights):
-    return gaze_loss(Float(guess.ravel()), Float(truth.ravel()), D, None if w is None else Float(w), **weights)
+    return compute_gaze_loss(Float(guess.ravel()), Float(truth.ravel()), D, None if w is None else Float(w), **weights)
 
 
 @pytest.mark.parametrize("w", [W, np.tile(W, P), None], ids=["shared", "own", "equal"])
@@ -62,7 +62,7 @@ def test_gradient_is_that_of_finite_differences(densities, weights):
     truth, guess = densities
     x = ns.Float64(guess.ravel())
     dr.enable_grad(x)
-    dr.backward(gaze_loss(x, ns.Float64(truth.ravel()), D, ns.Float64(W), **weights).total)
+    dr.backward(compute_gaze_loss(x, ns.Float64(truth.ravel()), D, ns.Float64(W), **weights).total)
     slope = np.array(x.grad).reshape(P, D)
     h = 1e-5
     for p, d in [(0, 3), (1, 50), (2, 127), (4, 9)]:
@@ -82,7 +82,7 @@ def test_constants_give_numbers(densities, value, Float):
     for target in (truth, np.zeros_like(truth)):
         x = Float(np.full(P * D, value))
         dr.enable_grad(x)
-        got = gaze_loss(x, Float(target.ravel()), D, Float(W))
+        got = compute_gaze_loss(x, Float(target.ravel()), D, Float(W))
         dr.backward(got.total)
         assert all(np.isfinite(v[0]) for v in got) and np.isfinite(np.array(x.grad)).all()
         assert got.cc[0] == 0
@@ -97,7 +97,7 @@ def test_negative_predictions_count_as_zero_in_the_divergence(densities, Float):
     assert (guess < 0).any(axis=1).all() and (guess > 0).any(axis=1)[:3].all()
     x = Float(guess.ravel())
     dr.enable_grad(x)
-    got = gaze_loss(x, Float(truth.ravel()), D, Float(W), kld=1, cc=0, mae=0)
+    got = compute_gaze_loss(x, Float(truth.ravel()), D, Float(W), kld=1, cc=0, mae=0)
     dr.backward(got.total)
     clamped = np.maximum(guess, 0)
     assert np.isclose(got.kld[0], metrics.kld(truth, clamped, W, eps=KLD_EPS).mean(), rtol=1e-5)
@@ -108,20 +108,20 @@ def test_negative_predictions_count_as_zero_in_the_divergence(densities, Float):
 def test_refusals():
     x = ns.Float(np.ones(12))
     with pytest.raises(ValueError, match="do not fit"):
-        gaze_loss(x, x, 5)
+        compute_gaze_loss(x, x, 5)
     with pytest.raises(ValueError, match="solid angles"):
-        gaze_loss(x, x, 4, ns.Float(1, 2))
+        compute_gaze_loss(x, x, 4, ns.Float(1, 2))
     with pytest.raises(ValueError, match="every weight"):
-        gaze_loss(x, x, 4, kld=0, cc=0, mae=0)
+        compute_gaze_loss(x, x, 4, kld=0, cc=0, mae=0)
 
 
 # ---- Settings of a gaze training: their limits, and the learning rate over a run ----
 
 
 def test_the_learning_rate_is_held_and_then_falls_to_its_last():
-    s = GazeSettings(steps=10, learning_rate=0.02, final_rate=0.04, hold=0.25)
-    assert s.rate(0) == s.rate(0.25) == 0.02
-    assert s.rate(0.625) == pytest.approx(0.02 * 0.2) and s.rate(1) == s.rate(1.5) == pytest.approx(0.02 * 0.04)
+    s = GazeSettings(steps=10, learning_rate=0.02, lr_final_ratio=0.04, lr_hold_fraction=0.25)
+    assert s.learning_rate_at(0) == s.learning_rate_at(0.25) == 0.02
+    assert s.learning_rate_at(0.625) == pytest.approx(0.02 * 0.2) and s.learning_rate_at(1) == s.learning_rate_at(1.5) == pytest.approx(0.02 * 0.04)
 
 
 @pytest.mark.parametrize("wrong", [{}, {"steps": 1, "minutes": 1.0}, {"steps": 1, "loss": "mse"}])
@@ -136,7 +136,7 @@ def test_settings_that_make_no_sense_are_refused(wrong):
 @pytest.mark.parametrize("variant", ["emit", "emit_capture"])
 @pytest.mark.parametrize("activation", ["softplus", "exp"])
 def test_weights_of_zero_are_the_uniform_density(variant, activation):
-    config = sized_gaze_config("small", variant, activation)
+    config = make_gaze_config("small", variant, activation)
     field = GazeField.random(config, BOX, namespace("llvm"), 0)
     field.set_parameters({k: v * 0 for k, v in field.parameters().items()})
     ns = namespace("llvm")
@@ -147,69 +147,69 @@ def test_weights_of_zero_are_the_uniform_density(variant, activation):
 
 
 def test_the_papers_size_is_the_papers():
-    assert sized_gaze_config("paper").grid == GazeConfig().grid
+    assert make_gaze_config("paper").grid == GazeConfig().grid
     with pytest.raises(NergError, match="one of small, paper"):
-        sized_gaze_config("huge")
+        make_gaze_config("huge")
 
 
 # ---- Recipes: what they make of choices and places, and what they take ----
 
-HITS = GazePlace(None, BOX, "hits")
-SCENE = GazePlace(None, BOX, "scene")
+HITS = TrainingGeometry(None, BOX, "hits")
+SCENE = TrainingGeometry(None, BOX, "scene")
 
 
 def test_there_are_three():
-    assert tuple(recipes())[:3] == ("default", "small", "paper") and gaze_recipe().name == DEFAULT == "default"
+    assert tuple(load_recipes())[:3] == ("default", "small", "paper") and get_recipe().name == DEFAULT_RECIPE == "default"
     with pytest.raises(NergError, match='one of default, small, paper.*, got "best"'):
-        gaze_recipe("best")
+        get_recipe("best")
     with pytest.raises(ValueError, match="already"):
-        register_recipe(gaze_recipe())
+        register_recipe(get_recipe())
 
 
-@pytest.mark.parametrize("name", recipes())
+@pytest.mark.parametrize("name", load_recipes())
 def test_each_is_whole(name):
-    recipe = gaze_recipe(name)
-    plan = recipe.plan(SCENE, FieldChoices(variant="emit"))
-    assert plan.config.variant == "emit" and plan.trainer is recipe.trainer and plan.initial is None
+    recipe = get_recipe(name)
+    plan = recipe.make_plan(SCENE, FieldOptions(variant="emit"))
+    assert plan.config.variant == "emit" and plan.trainer is recipe.trainer and plan.initial_arrays is None
     assert plan.settings.loss == recipe.losses[0] and set(recipe.losses) <= set(LOSSES)
     assert plan.settings.steps and recipe.summary
-    assert recipe.plan(SCENE, views_alone=True).settings.patience == 10
+    assert recipe.make_plan(SCENE, views_only=True).settings.patience == 10
 
 
 def test_the_default_one_looks_longer_where_there_are_views_alone():
-    plain, alone = (gaze_recipe().plan(SCENE, views_alone=alone).settings for alone in (False, True))
+    plain, alone = (get_recipe().make_plan(SCENE, views_only=alone).settings for alone in (False, True))
     assert plain.zones == 0 and alone.zones == 3 and alone.steps > plain.steps
     # The others' lengths stay their own.
-    assert all("steps" not in gaze_recipe(name).views_alone for name in ("small", "paper"))
+    assert all("steps" not in get_recipe(name).views_only_settings for name in ("small", "paper"))
 
 
 def test_a_log_density_is_told_of_its_place():
-    told = lambda place: (c := gaze_recipe().plan(place).config) and (c.geometry, c.escaped)
+    told = lambda place: (c := get_recipe().make_plan(place).config) and (c.geometry, c.escaped)
     assert told(SCENE) == ("surface", "constant") and told(HITS) == ("surface", "nearest")
     assert told(NOWHERE) == ("none", "constant")
     with pytest.raises(NergError, match="needs surfaces"):
-        gaze_recipe("small").plan(NOWHERE)
+        get_recipe("small").make_plan(NOWHERE)
 
 
 def test_without_surfaces_folds_choose_between_capture_and_both_unless_told_otherwise():
     def variants(place, *choices, recipe="default"):
-        plan = gaze_recipe(recipe).plan(place, *choices)
+        plan = get_recipe(recipe).make_plan(place, *choices)
         return [c.variant for c in (plan.config, *plan.alternatives)]
 
     assert [variants(place) for place in (SCENE, HITS)] == [["emit_capture"]] * 2
     assert variants(NOWHERE) == ["capture", "emit_capture"]
     for v in ("emit_capture", "emit", "capture"):
-        assert variants(NOWHERE, FieldChoices(variant=v)) == [v]
+        assert variants(NOWHERE, FieldOptions(variant=v)) == [v]
     assert variants(SCENE, recipe="small") == ["emit_capture"]
 
 
 def test_what_is_chosen_arrives():
-    choices = FieldChoices(activation="exp", size="small", normalized=True)
-    config = gaze_recipe("paper").plan(SCENE, choices).config
+    choices = FieldOptions(activation="exp", size="small", normalized=True)
+    config = get_recipe("paper").make_plan(SCENE, choices).config
     assert config.activation == "exp" and config.normalized
-    assert config == gaze_recipe("small").plan(SCENE, choices).config
-    assert gaze_recipe("paper").plan(SCENE).config.activation == "linear"
-    plan = gaze_recipe("small").plan(SCENE, settings={"seed": 4, "loss": "code"}, probes={"radius": 0.5})
+    assert config == get_recipe("small").make_plan(SCENE, choices).config
+    assert get_recipe("paper").make_plan(SCENE).config.activation == "linear"
+    plan = get_recipe("small").make_plan(SCENE, settings={"seed": 4, "loss": "code"}, probes={"radius": 0.5})
     assert (plan.settings.seed, plan.settings.loss, plan.settings.steps, plan.probes.radius) == (4, "code", 600, 0.5)
 
 
@@ -217,31 +217,31 @@ def test_what_is_chosen_arrives():
     "given, steps, minutes", [({}, 600, None), ({"minutes": 2.0}, None, 2.0), ({"steps": 5}, 5, None)]
 )
 def test_of_minutes_and_steps_the_one_that_is_given_counts(given, steps, minutes):
-    settings = gaze_recipe("small").gaze_settings(given)
+    settings = get_recipe("small").make_gaze_settings(given)
     assert (settings.steps, settings.minutes) == (steps, minutes)
 
 
-@pytest.mark.parametrize("name, takes", [(DEFAULT, False), ("small", True), ("paper", True)])
+@pytest.mark.parametrize("name, takes", [(DEFAULT_RECIPE, False), ("small", True), ("paper", True)])
 def test_what_a_recipe_does_not_take_is_refused(name, takes):
-    recipe = gaze_recipe(name)
-    recipe.require([])
+    recipe = get_recipe(name)
+    recipe.check_options([])
     if takes:
-        recipe.require(["loss", "semantic", "begin"])
+        recipe.check_options(["loss", "semantic", "begin"])
         return
     with pytest.raises(NergError, match="no choice of --loss, --begin field, but ways of its own; add --recipe small"):
-        recipe.require(["loss", "begin"])
+        recipe.check_options(["loss", "begin"])
 
 
 def test_features_and_weights_are_those_of_a_radiance_field():
-    for wrong in ({"begin": True}, {"choices": FieldChoices(semantic="snapshot")}):
+    for wrong in ({"begin": True}, {"choices": FieldOptions(semantic="snapshot")}):
         with pytest.raises(NergError, match="needs a radiance field: give it with --field"):
-            gaze_recipe("small").plan(SCENE, **wrong)
+            get_recipe("small").make_plan(SCENE, **wrong)
 
 
 def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start():
     """Each probe is drawn fifty times; the rate is lower with every step, down to a tenth."""
-    recipe = gaze_recipe("paper")
+    recipe = get_recipe("paper")
     assert recipe.settings["steps"] * recipe.settings["probes"] == 50 * recipe.probes["count"]
     settings = GazeSettings(**recipe.settings)
-    assert settings.rate(0) == 1e-3 and settings.rate(0.01) < 1e-3
-    assert settings.rate(0.5) == pytest.approx(1e-3 * 0.1**0.5) and settings.rate(1) == pytest.approx(1e-4)
+    assert settings.learning_rate_at(0) == 1e-3 and settings.learning_rate_at(0.01) < 1e-3
+    assert settings.learning_rate_at(0.5) == pytest.approx(1e-3 * 0.1**0.5) and settings.learning_rate_at(1) == pytest.approx(1e-4)

@@ -15,12 +15,12 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
-from nerg_mi.train.gaze_data import Supervision, TargetNeeds, targets_of_probes, targets_of_rays
-from nerg_mi.train.gaze_log_density import elevation_density, prior_field
+from nerg_mi.train.gaze_data import Supervision, TargetRequirements, make_targets_from_probes, make_targets_from_rays
+from nerg_mi.train.gaze_log_density import compute_elevation_density, make_elevation_prior
 from nerg_mi.train.gaze_product import ProductTrainer
 from nerg_mi.train.gaze_run import make_targets
 from nerg_mi.train.gaze_settings import GazeSettings
-from nerg_mi.train.gaze_trainer import GazeRunFile, GazeTrainer, StateSettings, fit_again, fit_watched
+from nerg_mi.train.gaze_trainer import GazeRunFile, GazeTrainer, StateSettings, refit, fit_with_validation
 
 from .looks import (
     BOX,
@@ -45,7 +45,7 @@ NO_FILE = GazeRunFile(None, {})
 
 @pytest.fixture(scope="module")
 def targets_fit():
-    return targets_of_rays(looking_at((1.5, 0.4, 1.2)), NOWHERE, PROBES)
+    return make_targets_from_rays(looking_at((1.5, 0.4, 1.2)), NOWHERE, PROBES)
 
 
 @pytest.mark.parametrize("patience, looks", [(3, 4), (1, 2), (0, 10)])
@@ -53,10 +53,10 @@ def test_a_fit_ends_when_looking_has_been_in_vain_for_long_enough(wall, patience
     """Nothing is learnt at a rate of next to nothing: the first look is the best, and ``patience`` more are taken."""
     settings = GazeSettings(
         steps=20,
-        looks=10,
+        num_validations=10,
         patience=patience,
         zones=2,
-        watched=6,
+        validation_probes=6,
         probes=4,
         directions=32,
         learning_rate=1e-30,
@@ -70,16 +70,16 @@ def test_a_fit_ends_when_looking_has_been_in_vain_for_long_enough(wall, patience
 
 def test_a_fit_that_nobody_watches_ends_with_its_schedule(targets_fit):
     told = []
-    fit = fit_watched(targets_fit, None, BOX, planned(SMALL, replace(PRODUCT, zones=0)), ns, 1.0, NO_FILE, told.append)
+    fit = fit_with_validation(targets_fit, None, BOX, planned(SMALL, replace(PRODUCT, zones=0)), ns, 1.0, NO_FILE, told.append)
     assert (fit.best_step, fit.schedule, fit.scores, fit.history, fit.interrupted) == (16, 16, None, [], False)
-    assert [p.steps for p in told] == list(range(1, 17)) and told[-1].done == 1 and {p.stage for p in told} == {"fit"}
+    assert [p.steps for p in told] == list(range(1, 17)) and told[-1].fraction == 1 and {p.stage for p in told} == {"fit"}
 
 
 def test_the_second_fit_has_as_many_steps_as_were_best_along_the_same_schedule(targets_fit):
     plan, told = planned(SMALL, PRODUCT), []
-    first = fit_watched(targets_fit, targets_fit, BOX, plan, ns, 1.0, NO_FILE, lambda progress: None)
+    first = fit_with_validation(targets_fit, targets_fit, BOX, plan, ns, 1.0, NO_FILE, lambda progress: None)
     first.best_step = 5
-    second = fit_again(targets_fit, first, BOX, plan, ns, NO_FILE, told.append)
+    second = refit(targets_fit, first, BOX, plan, ns, NO_FILE, told.append)
     assert second.trainer.steps == second.best_step == 5 and second.scores is first.scores
     assert second.trainer.progress == pytest.approx(5 / 16) and [p.done for p in told] == [0.2, 0.4, 0.6, 0.8, 1.0]
     # The same seed and targets: the first five steps of the first fit.
@@ -87,7 +87,7 @@ def test_the_second_fit_has_as_many_steps_as_were_best_along_the_same_schedule(t
     trainer = plain.trainer(targets_fit, BOX, SMALL, plain.settings, ns)
     for _ in range(5):
         trainer.step()
-    for name, value in trainer.weights().items():
+    for name, value in trainer.copy_weights().items():
         np.testing.assert_allclose(second.weights[name].numpy(), value.numpy(), atol=1e-6, err_msg=name)
 
 
@@ -101,7 +101,7 @@ def test_a_schedule_of_minutes_is_told_in_steps(targets_fit, monkeypatch, stoppe
             raise KeyboardInterrupt
 
     plan = planned(SMALL, replace(PRODUCT, steps=None, minutes=1.0, zones=0))
-    fit = fit_watched(targets_fit, None, BOX, plan, ns, 0.5, NO_FILE, stop)
+    fit = fit_with_validation(targets_fit, None, BOX, plan, ns, 0.5, NO_FILE, stop)
     assert fit.schedule == 5 and fit.best_step == min(stopped, 5)
 
 
@@ -124,9 +124,9 @@ MOVED = replace(NOWHERE, align=Similarity(np.diag([2.0, 2, 2, 1])))
     ],
 )
 def test_runs_differ_in_what_they_are_made_of(name, plan, supervision, place, about):
-    base = planned(SMALL, PRODUCT).identity(Supervision(RAYS), NOWHERE, StateSettings())
-    other = (plan or planned(SMALL, PRODUCT)).identity(
-        supervision or Supervision(RAYS), place, StateSettings(about=about)
+    base = planned(SMALL, PRODUCT).make_identity(Supervision(RAYS), NOWHERE, StateSettings())
+    other = (plan or planned(SMALL, PRODUCT)).make_identity(
+        supervision or Supervision(RAYS), place, StateSettings(identity=about)
     )
     assert {k for k in other if other[k] != base.get(k)} == {name}
 
@@ -197,9 +197,9 @@ def test_the_state_is_kept_every_so_often_and_when_asked(monkeypatch, tmp_path):
     )
     file = gaze_state.GazeRunFile(tmp_path / "a.run", {}, 10.0, False)
     for clock[0] in (105.0, 109.0, 111.0, 112.0, 120.0, 122.5):
-        file.keep("fit", None, {}, {}, now=clock[0] == 112.0)
+        file.save("fit", None, {}, {}, force=clock[0] == 112.0)
     assert kept == [(111.0, 11.0), (112.0, 12.0), (122.5, 22.5)]
-    gaze_state.GazeRunFile(None, {}, 10.0, False).keep("fit", None, {}, {}, now=True)
+    gaze_state.GazeRunFile(None, {}, 10.0, False).save("fit", None, {}, {}, force=True)
 
 
 def test_what_was_found_is_kept_before_the_second_fit_is_prepared(wall, monkeypatch, tmp_path):
@@ -254,14 +254,14 @@ def test_a_result_that_cannot_be_written_is_kept(wall, refit, threads, tmp_path)
 def targets_trainer(rays, wall):
     """Of one probe in 64 directions."""
     probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
-    return targets_of_probes(probes, wall, 64)
+    return make_targets_from_probes(probes, wall, 64)
 
 
 @pytest.mark.parametrize("average", [0.0, 0.3, 0.999])
 def test_what_is_kept_is_the_average_of_the_weights_so_far(targets_trainer, average):
     """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) after k steps, of ``average``
     later."""
-    settings = GazeSettings(steps=5, learning_rate=1e-2, zones=0, average=average)
+    settings = GazeSettings(steps=5, learning_rate=1e-2, zones=0, ema_decay=average)
     trainer = ProductTrainer(targets_trainer, BOX, SMALL, settings, ns)
     expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
     for k in range(1, 6):
@@ -269,7 +269,7 @@ def test_what_is_kept_is_the_average_of_the_weights_so_far(targets_trainer, aver
         memory = min(average, (k + 1) / (k + 10))
         for name, value in trainer.optimiser.items():
             expected[name] = memory * expected[name] + (1 - memory) * value.numpy()
-    for name, value in trainer.weights().items():
+    for name, value in trainer.copy_weights().items():
         np.testing.assert_allclose(value.numpy(), expected[name], atol=1e-6)
     assert average == 0 or np.abs(expected["emit_head.0"] - trainer.optimiser["emit_head.0"].numpy()).max() > 1e-4
 
@@ -297,22 +297,22 @@ def test_it_is_the_kernel_density_of_rays_that_are_turned_to_every_azimuth():
         at = np.stack([np.sqrt(1 - sine**2), 0 * sine, sine], axis=1)
         expected = SphericalKde(turned, np.array([0, len(turned)]), kappa, backend="llvm").evaluate(at)[0]
         # Bins of the sine are two degrees wide at the poles.
-        assert elevation_density([rays], sine, kappa) == pytest.approx(expected, rel=2e-2, abs=2e-4)
+        assert compute_elevation_density([rays], sine, kappa) == pytest.approx(expected, rel=2e-2, abs=2e-4)
 
 
 def test_places_count_alike_and_people_within_them():
     """One place has nine rays up of one person and one down of another; the other place has one up."""
     first = looking(9 * [[0, 0, 1.0]] + [[0, 0, -1.0]], 9 * [0] + [1])
-    down, up = elevation_density([first, looking([[0, 0, 1.0]])], np.array([-1.0, 1.0]))
+    down, up = compute_elevation_density([first, looking([[0, 0, 1.0]])], np.array([-1.0, 1.0]))
     assert up / down == pytest.approx(3, rel=1e-2)
 
 
 def test_the_field_is_that_density_wherever_somebody_stands():
     ns, d = namespace("llvm"), fibonacci_directions(20_000)
     rays = looking(np.random.default_rng(1).normal(size=(50, 3)) * [1, 1, 0.3] - [0, 0, 0.2])
-    field = prior_field([rays], ns)
+    field = make_elevation_prior([rays], ns)
     sine = np.linspace(-1, 1, 201)
-    expected = np.interp(d[:, 2], sine, elevation_density([rays], sine))
+    expected = np.interp(d[:, 2], sine, compute_elevation_density([rays], sine))
     r = ns.Array3f(np.ascontiguousarray(d.T, np.float32))
     for place in ((0.0, 0.0, 0.0), (40.0, -7.0, 1.6)):
         gaze, _, _ = field.evaluate(r * 3 + ns.Array3f(*place), ns.Array3f(*place), r, integral=ns.Float(1.0))
@@ -330,8 +330,8 @@ def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):
     """16 probes, 4 a step: an epoch is four steps. Without it there is one set of directions."""
     from nerg_mi.train import gaze_data
 
-    drawn, sets = [], gaze_data.rotated_sets
-    monkeypatch.setattr(gaze_data, "rotated_sets", lambda *given: drawn.append(sets(*given)) or drawn[-1])
+    drawn, sets = [], gaze_data.make_rotated_directions
+    monkeypatch.setattr(gaze_data, "make_rotated_directions", lambda *given: drawn.append(sets(*given)) or drawn[-1])
     settings = replace(PRODUCT, zones=0, steps=9)
     train(wall, settings, SMALL, replace(PROBES, fresh=True))
     assert len(drawn) == 3 and np.abs(drawn[0] - drawn[1]).max() > 0.1 and np.abs(drawn[1] - drawn[2]).max() > 0.1
@@ -341,10 +341,10 @@ def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):
 
 
 def test_the_blind_density_of_rays_and_views_is_that_of_the_rays():
-    needs = TargetNeeds(blind_rows=8)
+    needs = TargetRequirements(prior_rows=8)
     plan, views = planned(LOG, LIKELIHOOD), around(4)
     rays = make_targets(Supervision(RAYS), NOWHERE, plan, needs, 3)
     both = make_targets(Supervision(RAYS, views), NOWHERE, plan, needs, 3)
     alone = make_targets(Supervision(None, views), NOWHERE, plan, needs, 3)
-    np.testing.assert_array_equal(both.blind, rays.blind)
-    assert np.abs(alone.blind - rays.blind).max() > 0.1 and len(both.truth) == len(rays.truth) + 4
+    np.testing.assert_array_equal(both.prior_table, rays.prior_table)
+    assert np.abs(alone.prior_table - rays.prior_table).max() > 0.1 and len(both.truth) == len(rays.truth) + 4

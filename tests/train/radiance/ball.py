@@ -54,7 +54,7 @@ def settings(**changes):
         "batch": 2**12,
         "resolution": 32,
         "march_step": 1 / 64,
-        "stride_share": 0.2,
+        "stride_fraction": 0.2,
         "seed": 1,
         "depth_weight": 2e-3,
         "grid_decay": 1e-3,
@@ -65,11 +65,11 @@ def settings(**changes):
 
 def trainer(dataset, **changes):
     depth = changes.pop("depth", True)
-    return RadianceTrainer(dataset.train, BOX, TINY, settings(**{"steps": 40, "settle": 0.75, **changes}), ns, depth)
+    return RadianceTrainer(dataset.train, BOX, TINY, settings(**{"steps": 40, "extraction_start": 0.75, **changes}), ns, depth)
 
 
 def state(t):
     arrays = {k: v[0].numpy() for k, v in t.optimiser.state.items()}
     arrays |= {f"first.{k}": v[3][1].numpy() for k, v in t.optimiser.state.items()}
     arrays |= {f"averaged.{k}": v.numpy() for k, v in t.averaged.items()}
-    return arrays | {"bits": t.grid.bits.numpy(), "value": t.grid.value.numpy(), "hard": t.hard, "rays": t.rays}
+    return arrays | {"bits": t.grid.bits.numpy(), "value": t.grid.value.numpy(), "hard": t.hard_pixels, "rays": t.rays}

@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
-from nerg_mi.train.radiance_grid import DensityGrid, Settling
+from nerg_mi.train.radiance_grid import DensityGrid, OccupancyExtraction
 
 # ---- Density grid ----
 #
@@ -93,9 +93,9 @@ def test_points_find_their_cells():
     p = rng().uniform(-1, 1, (500, 3))
     x, y, z = np.minimum(((p + 1) / 2 * R).astype(int), R - 1).T
     active = rng().random(500) < 0.5
-    found = grid.occupied(ns.Array3f(np.ascontiguousarray(p.T, np.float32)), ns.Bool(active)).numpy()
+    found = grid.is_occupied(ns.Array3f(np.ascontiguousarray(p.T, np.float32)), ns.Bool(active)).numpy()
     assert np.array_equal(found, marked[z, y, x] & active)
-    assert grid.fraction == pytest.approx(marked.mean())
+    assert grid.occupied_fraction == pytest.approx(marked.mean())
 
 
 def test_surface_points_keep_their_cells_and_the_neighbours():
@@ -175,7 +175,7 @@ def everything(density, occupied):
 def test_the_stored_bound_holds_the_neighbours_of_what_has_density():
     grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
     point = centres()[3, 4, 2]
-    bound = grid.bound(around(point, 0.1), rng(), everything)
+    bound = grid.extract_occupancy(around(point, 0.1), rng(), everything)
     held = np.zeros((R, R, R), bool)
     held[3, 4, 2] = True
     assert np.array_equal(bound.bits, grown(held)) and bound.threshold == pytest.approx(0.01 / 0.1)
@@ -193,7 +193,7 @@ def test_the_stored_bound_leaves_out_what_lights_no_ray_but_not_its_neighbours()
 
     lit = np.zeros((R, R, R), bool)
     lit[5, 1, 6] = True
-    assert np.array_equal(grid.bound(fog, rng(), one).bits, grown(lit)) and asked == [True]
+    assert np.array_equal(grid.extract_occupancy(fog, rng(), one).bits, grown(lit)) and asked == [True]
 
 
 def test_the_bound_finds_what_fills_a_small_part_of_a_cell():
@@ -213,7 +213,7 @@ def test_the_bound_finds_what_fills_a_small_part_of_a_cell():
     held = np.zeros((R, R, R), bool)
     held[3, 4, 2] = True
     for seed in range(5):
-        assert np.array_equal(grid.bound(inside, np.random.default_rng(seed), everything).bits, grown(held))
+        assert np.array_equal(grid.extract_occupancy(inside, np.random.default_rng(seed), everything).bits, grown(held))
 
 
 def test_cells_and_steps_of_a_contracted_box_grow_outwards():
@@ -221,10 +221,10 @@ def test_cells_and_steps_of_a_contracted_box_grow_outwards():
     box = ContractedBox(BOX, 16)
     grid = DensityGrid(ns, box, R, 0.01, above(), 1, growth=1 / 128)
     p = ns.Array3f([0.5, 0.0, 4.0], [0.0, -0.9, 0.0], [0.0, 0.2, 3.0])
-    assert np.allclose(grid.cell_at(p).numpy(), np.array([1, 1, 4]) * 2 / (R / 2))
-    assert np.allclose(grid.step_at(p).numpy(), [0.01, 0.01, 5 / 128])
+    assert np.allclose(grid.cell_size_at(p).numpy(), np.array([1, 1, 4]) * 2 / (R / 2))
+    assert np.allclose(grid.step_length_at(p).numpy(), [0.01, 0.01, 5 / 128])
     plain = DensityGrid(ns, BOX, R, 0.01, above(), 1, growth=1 / 128)
-    assert plain.cell_at(p) == 2 / R and plain.step_at(p) == 0.01
+    assert plain.cell_size_at(p) == 2 / R and plain.step_length_at(p) == 0.01
 
 
 # ---- Settling ----
@@ -233,8 +233,8 @@ def test_cells_and_steps_of_a_contracted_box_grow_outwards():
 
 
 def settle(grid, density, lit, settling=None):
-    settling = settling or Settling(grid)
-    while not settling.done:
+    settling = settling or OccupancyExtraction(grid)
+    while not settling.is_done:
         settling.advance(density, lit, 0)
     return settling
 
@@ -283,7 +283,7 @@ def test_no_piece_asks_for_more_than_a_part_of_the_cells():
     settling = settle(grid, density, everywhere)
     assert max(asked) <= R**3 / 8 and sum(asked) == 4 * R**3
     settling.advance(density, everywhere, 0)
-    assert sum(asked) == 4 * R**3 and settling.at == Settling.PIECES
+    assert sum(asked) == 4 * R**3 and settling.pieces_done == OccupancyExtraction.NUM_PIECES
 
 
 def test_settling_goes_on_from_a_stored_state():
@@ -293,10 +293,10 @@ def test_settling_goes_on_from_a_stored_state():
     density, whole, resumed = around((0.2, 0.1, 0), 0.6), *(DensityGrid(ns, BOX, R, 0.1, above(), 1) for _ in range(2))
     settle(whole, density, lit)
     for stop in (5, 40):
-        first, second = Settling(DensityGrid(ns, BOX, R, 0.1, above(), 1)), Settling(resumed)
-        while first.at < stop:
+        first, second = OccupancyExtraction(DensityGrid(ns, BOX, R, 0.1, above(), 1)), OccupancyExtraction(resumed)
+        while first.pieces_done < stop:
             first.advance(density, lit, 0)
-        second.restore(first.at, first.found.numpy(), first.shown.numpy())
+        second.restore(first.pieces_done, first.dense_cells.numpy(), first.contributing_cells.numpy())
         settle(resumed, density, lit, second)
         assert np.array_equal(whole.always.numpy(), resumed.always.numpy())
         resumed = DensityGrid(ns, BOX, R, 0.1, above(), 1)

@@ -10,15 +10,15 @@ import pytest
 
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.train.radiance_losses import (
-    PHOTOS,
+    PHOTO_PARAMETER,
     PhotoColors,
     color_loss,
-    density,
-    density_of,
-    density_summand,
+    evaluate_density,
+    evaluate_density_from_features,
+    evaluate_samples,
     depth_loss,
-    huber,
-    ray_color,
+    huber_loss,
+    evaluate_ray_color,
     stack,
     unstack,
 )
@@ -90,7 +90,7 @@ def test_color_loss(alpha):
 def test_huber_is_smooth_where_its_pieces_meet():
     x = ns.Float([-0.3, -0.1001, -0.0999, 0, 0.0999, 0.1001, 0.3])
     dr.enable_grad(x)
-    y = huber(x, 0.1)
+    y = huber_loss(x, 0.1)
     dr.backward(dr.sum(y))
     assert np.allclose(dr.grad(x).numpy(), [-0.1, -0.1, -0.0999, 0, 0.0999, 0.1, 0.1], atol=1e-6)
     assert np.allclose(y.numpy()[[0, 3, 6]], [0.1 * 0.25, 0, 0.1 * 0.25])
@@ -120,7 +120,7 @@ def test_known_features_change_no_value_and_no_derivative():
     for features in (None, known):
         parameters = {k: type(v)(v) for k, v in f.parameters().items()}
         dr.enable_grad(parameters)
-        sigma, rgb = density_summand(TINY, BOX, parameters, p, d, ns, features)
+        sigma, rgb = evaluate_samples(TINY, BOX, parameters, p, d, ns, features)
         dr.backward(dr.sum(sigma + rgb[0] - 2 * rgb[1] * rgb[2]))
         found.append([dr.detach(sigma).numpy()] + [dr.grad(v).numpy() for v in parameters.values()])
     for a, b in zip(*found):
@@ -130,9 +130,9 @@ def test_known_features_change_no_value_and_no_derivative():
 def test_density_alone_is_that_of_the_field():
     f, (p, _) = field(), points()
     want = f.density(p).numpy()
-    assert np.allclose(density(TINY, BOX, f.parameters(), p, ns).numpy(), want, rtol=1e-4)
+    assert np.allclose(evaluate_density(TINY, BOX, f.parameters(), p, ns).numpy(), want, rtol=1e-4)
     features = [ns.Float(x) for x in f.grid(BOX.to_unit(p))]
-    assert np.allclose(density_of(TINY, BOX, f.parameters(), p, features).numpy(), want, rtol=1e-4)
+    assert np.allclose(evaluate_density_from_features(TINY, BOX, f.parameters(), p, features).numpy(), want, rtol=1e-4)
 
 
 def test_rows_are_stacked_and_taken_apart():
@@ -152,7 +152,7 @@ def test_tensor_products_equal_the_fields_own_evaluation():
     field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
     p = ns.Array3f(rng.uniform(-0.99, 0.99, (3, 200)).astype(np.float32))
     d = dr.normalize(ns.Array3f(rng.normal(size=(3, 200)).astype(np.float32)))
-    sigma, rgb = density_summand(TINY, BOX, field.parameters(), p, d, ns)
+    sigma, rgb = evaluate_samples(TINY, BOX, field.parameters(), p, d, ns)
     expected, features = field.density_features(p)
     assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4)
     assert np.allclose(np.array([c.numpy() for c in rgb]), field.color(features, d).numpy(), atol=1e-5)
@@ -161,14 +161,14 @@ def test_tensor_products_equal_the_fields_own_evaluation():
 def test_a_deferred_field_composites_features_and_colours_rays():
     config, (p, d) = replace(TINY, deferred=True), points()
     made = RadianceField.random(config, BOX, ns, 0)
-    sigma, parts = density_summand(config, BOX, made.parameters(), p, d, ns)
+    sigma, parts = evaluate_samples(config, BOX, made.parameters(), p, d, ns)
     expected, features = made.density_features(p)
     assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4) and len(parts) == TINY.geometry
     assert np.allclose([x.numpy() for x in parts], [x.numpy() for x in features], atol=1e-6)
     opacity = ns.Float(np.linspace(0, 1, 40).astype(np.float32))
-    rgb = ray_color(config, made.parameters(), [opacity * f for f in features], opacity, d, ns)
+    rgb = evaluate_ray_color(config, made.parameters(), [opacity * f for f in features], opacity, d, ns)
     assert np.allclose([c.numpy() for c in rgb], opacity.numpy() * made.color(features, d).numpy(), atol=1e-5)
-    assert ray_color(TINY, {}, parts, opacity, d, ns) is parts
+    assert evaluate_ray_color(TINY, {}, parts, opacity, d, ns) is parts
 
 
 # ---- Photo colors ----
@@ -183,18 +183,18 @@ def numbers(count=3):
 def test_colors_change_by_a_matrix_and_an_offset_of_each_photo():
     """Against NumPy; the mean over the photos is no change."""
     photos, given = PhotoColors(ns, 3), numbers()
-    matrices = photos.matrices(ns.Float(given))
+    matrices = photos.compute_matrices(ns.Float(given))
     shifted = 0.01 * (given.reshape(3, 3, 4) - given.reshape(3, 3, 4).mean(axis=0))
     assert np.allclose(matrices, np.eye(3, 4) + shifted, atol=1e-6)
     assert np.allclose(matrices.mean(axis=0), np.eye(3, 4), atol=1e-6)
     color, opacity, frame = np.random.default_rng(1).random((3, 5)), np.linspace(0, 1, 5), [0, 2, 1, 2, 0]
     out = photos.apply(
-        photos.changes(ns.Float(given)), [ns.Float(c) for c in color], ns.Float(opacity), ns.UInt32(frame)
+        photos.compute_changes(ns.Float(given)), [ns.Float(c) for c in color], ns.Float(opacity), ns.UInt32(frame)
     )
     m = matrices[frame]
     expected = np.einsum("nij,jn->in", m[..., :3], color) + m[..., 3].T * opacity
     assert np.allclose(np.array([c.numpy() for c in out]), expected, atol=1e-6)
-    assert photos.decay(photos.changes(ns.Float(given)))[0] == pytest.approx(np.sum(shifted**2) / 3, rel=1e-5)
+    assert photos.decay_loss(photos.compute_changes(ns.Float(given)))[0] == pytest.approx(np.sum(shifted**2) / 3, rel=1e-5)
 
 
 def test_stops_of_photos_with_twice_and_half_the_light():
@@ -204,7 +204,7 @@ def test_stops_of_photos_with_twice_and_half_the_light():
     given = np.zeros((2, 3, 4), np.float32)
     for k, sign in enumerate((1, -1)):
         given[k, :, :3] = sign * half / 0.01 * np.eye(3)
-    assert photos.stops(ns.Float(given.ravel())) == pytest.approx(0.5, rel=1e-5)
+    assert photos.compute_exposure_spread(ns.Float(given.ravel())) == pytest.approx(0.5, rel=1e-5)
 
 
 @pytest.mark.nightly
@@ -220,7 +220,7 @@ def test_exposures_are_found():
     trainer = RadianceTrainer(views, BOX, TINY, settings(steps=500, photo_decay=1e-4), ns, depth=False)
     while trainer.progress < 1:
         trainer.step()
-    found = trainer.photos.matrices(trainer.averaged[PHOTOS])
+    found = trainer.photos.compute_matrices(trainer.averaged[PHOTO_PARAMETER])
     # What becomes of the mean colour of the ball.
     mean = view.pixels[view.pixels[..., 3] > 0.5][:, :3].mean(axis=0)
     changed = (found[..., :3] @ mean + found[..., 3]) / mean
@@ -230,7 +230,7 @@ def test_exposures_are_found():
 def test_a_single_photo_has_nothing_to_differ_from(dataset):
     alone = RadianceTrainer(dataset.train[:1], BOX, TINY, settings(), ns, depth=False)
     without = RadianceTrainer(dataset.train, BOX, TINY, settings(photo_colors=False), ns, depth=False)
-    assert alone.photos is None and without.photos is None and PHOTOS not in without.averaged
+    assert alone.photos is None and without.photos is None and PHOTO_PARAMETER not in without.averaged
     alone.step()
     without.step()
 
@@ -238,5 +238,5 @@ def test_a_single_photo_has_nothing_to_differ_from(dataset):
 def test_the_field_is_the_place_without_any_photos_colors(dataset):
     trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns, depth=False)
     trainer.step()
-    trainer.averaged[PHOTOS] = ns.Float(numbers(len(dataset.train)))
-    assert PHOTOS not in trainer.field(bound=False).parameters()
+    trainer.averaged[PHOTO_PARAMETER] = ns.Float(numbers(len(dataset.train)))
+    assert PHOTO_PARAMETER not in trainer.make_field(with_occupancy=False).parameters()

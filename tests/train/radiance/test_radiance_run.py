@@ -10,12 +10,12 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import load_radiance, save_radiance
-from nerg_mi.maths.color import psnr, psnr_of_fitted_half
+from nerg_mi.maths.color import psnr, color_corrected_psnr
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.train import radiance_run
-from nerg_mi.train.radiance_run import complaints, measure, share_beyond, train_field, warm_up, write_preview
+from nerg_mi.train.radiance_run import find_problems, evaluate_views, compute_outside_fraction, train_field, warm_up, write_preview
 from nerg_mi.train.radiance_trainer import Preview, RadianceTrainer
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import trace_depth
@@ -48,13 +48,13 @@ def test_half_of_a_plane_lies_beyond(every):
         return Preview(seen.color[part, part], seen.opacity[part, part], seen.depth[part, part])
 
     ahead, aside = (views[x][0] for x in (0.0, -50.0))
-    assert share_beyond([ahead], render, core, every) == 0.5
-    assert share_beyond([ahead, aside], render, core, every) == 0.75
+    assert compute_outside_fraction([ahead], render, core, every) == 0.5
+    assert compute_outside_fraction([ahead, aside], render, core, every) == 0.75
 
 
 def test_what_lets_light_through_shows_nothing_within():
     view, seen = made(0.0, opacity=0.3)
-    assert share_beyond([view], lambda v: seen, Box((-9, -9, -9), (9, 9, 0))) == 1
+    assert compute_outside_fraction([view], lambda v: seen, Box((-9, -9, -9), (9, 9, 0))) == 1
 
 
 # ---- The error on views that are not learnt from: of which pixels, of which colours ----
@@ -66,7 +66,7 @@ def test_what_a_mask_hides_does_not_count_in_the_progress(dataset):
     mask = np.arange(24)[:, None] < np.full(24, 12)
     spoilt = view.pixels.copy()
     spoilt[~mask] = 1 - spoilt[~mask]
-    whole, other, masked, same = measure(
+    whole, other, masked, same = evaluate_views(
         trainer,
         [
             view,
@@ -80,13 +80,13 @@ def test_what_a_mask_hides_does_not_count_in_the_progress(dataset):
 
 def test_both_errors_are_those_of_the_rendered_view(dataset):
     trainer, views = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns, depth=False), dataset.held_out[:2]
-    field = trainer.field(bound=False)
-    error = measure(trainer, views, 2, field)
+    field = trainer.make_field(with_occupancy=False)
+    error = evaluate_views(trainer, views, 2, field)
     for k, view in enumerate(views):
         seen, truth = trainer.render(view, 2, field).color, view.over(0)[1::2, 1::2]
         assert error.psnr[k] == pytest.approx(psnr(seen, truth), rel=1e-6)
         alpha = view.color[1::2, 1::2, 3]
-        assert error.fitted[k] == pytest.approx(psnr_of_fitted_half(seen, truth, alpha), rel=1e-6)
+        assert error.psnr_fitted[k] == pytest.approx(color_corrected_psnr(seen, truth, alpha), rel=1e-6)
 
 
 # ---- Whole radiance trainings: they learn, and show how they do ----
@@ -122,7 +122,7 @@ def test_a_preview_shows_colours_within_their_range_beside_the_truth(dataset, tm
 def test_previews_show_the_first_watched_view(dataset, tmp_path, monkeypatch):
     shown = []
     monkeypatch.setattr(radiance_run, "write_preview", lambda trainer, view, path: shown.append(view))
-    monkeypatch.setattr(radiance_run, "LOOK_GAP", 1)
+    monkeypatch.setattr(radiance_run, "MIN_EVALUATION_INTERVAL", 1)
     train_field(dataset, TINY, settings(steps=3), ns, preview=tmp_path / "a.png")
     assert len(shown) > 1 and all(view is dataset.held_out[0] for view in shown)
 
@@ -140,22 +140,22 @@ def looks(*psnr):
 
 
 def test_a_fall_below_an_earlier_look_is_named_with_its_numbers():
-    (said,) = complaints(looks(18, 24.31, 22, 23.2), 2000, 1, 2.0, 120.0)
+    (said,) = find_problems(looks(18, 24.31, 22, 23.2), 2000, 1, 2.0, 120.0)
     assert "23.20 dB" in said and "step 200 had 24.31 dB" in said and "1.1 dB worse" in said and "--minutes" in said
-    assert complaints(looks(18, 24.2, 22, 23.3), 2000, 1, 2.0, 120.0) == []
+    assert find_problems(looks(18, 24.2, 22, 23.3), 2000, 1, 2.0, 120.0) == []
 
 
 def test_an_end_at_a_coarse_stride_is_named():
-    (said,) = complaints([], 2000, 4, None)
+    (said,) = find_problems([], 2000, 4, None)
     assert "4 times coarser" in said and "--steps" in said and "--minutes" not in said
 
 
 def test_few_steps_are_named_with_the_machine_s_rate():
-    (said,) = complaints(looks(10, 12.6), 44, 1, 2.0, 120.0)
+    (said,) = find_problems(looks(10, 12.6), 44, 1, 2.0, 120.0)
     assert "only 44 steps (0.37 a second: this machine is slow or busy)" in said and "--minutes" in said
-    (said,) = complaints(looks(10, 12.6), 40, 1, None, 2.0)
+    (said,) = find_problems(looks(10, 12.6), 40, 1, None, 2.0)
     assert "only 40 steps," in said and "machine" not in said and "--minutes" not in said
-    assert complaints([], 500, 1, None) == [] != complaints([], 499, 1, None)
+    assert find_problems([], 500, 1, None) == [] != find_problems([], 499, 1, None)
 
 
 # ---- Compiling before a run's clock starts changes nothing of the run, and leaves nothing to be compiled in it ----
@@ -180,7 +180,7 @@ def kernels_of_a_run(t) -> list[tuple[int, int, int]]:
 def test_a_run_is_the_same_bit_for_bit(dataset, one_thread, depth):
     plain, warm = (trainer(dataset, steps=24, depth=depth) for _ in range(2))
     warm_up(warm)
-    assert warm.steps == warm.settling.at == 0 and not warm.clock.durations
+    assert warm.steps == warm.extraction.pieces_done == 0 and not warm.clock.durations
     for t in (plain, warm):
         while t.progress < 1:
             t.step()
@@ -192,19 +192,19 @@ def test_a_run_is_the_same_bit_for_bit(dataset, one_thread, depth):
 @pytest.mark.parametrize("depth", [True, False])
 def test_nothing_is_compiled_in_a_run(dataset, depth):
     """Through all strides, grid updates, the drawing of hard pixels, the end of damping near cameras, and settling."""
-    t = trainer(dataset, steps=120, depth=depth, settle=0.4)
+    t = trainer(dataset, steps=120, depth=depth, extraction_start=0.4)
     # Other trainings of this process have made most kernels already.
     dr.flush_kernel_cache()
     warm_up(t)
     assert not kernels_of_a_run(t)
-    assert t.stride == 1 and t.settling.done
+    assert t.stride == 1 and t.extraction.is_done
 
 
 def test_nothing_is_compiled_once_fog_has_cleared(dataset):
     """Where all is fog at first nothing is known to be empty, and the bound of rendering holds nothing."""
-    t = trainer(dataset, steps=60, depth=False, settle=0.4)
+    t = trainer(dataset, steps=60, depth=False, extraction_start=0.4)
     value = type(t.grid.value)(t.grid.value)
-    t.grid.value, t.grid.grown = (
+    t.grid.value, t.grid.dilate_cells = (
         dr.full(type(value), 1, len(value)),
         lambda found: np.zeros((t.grid.resolution,) * 3, bool),
     )
@@ -212,7 +212,7 @@ def test_nothing_is_compiled_once_fog_has_cleared(dataset):
     dr.flush_kernel_cache()
     warm_up(t)
     t.grid.value = value
-    del t.grid.grown
+    del t.grid.dilate_cells
     assert not kernels_of_a_run(t)
 
 
@@ -248,8 +248,8 @@ def trained():
     trainer = RadianceTrainer(views[4:], ContractedBox(BOX, 32), TINY, settings(steps=300, photo_colors=False), ns)
     while trainer.progress < 1:
         trainer.step()
-    field = trainer.field()
-    return field, measure(trainer, views[:4], 1, field).mean, trainer
+    field = trainer.make_field()
+    return field, evaluate_views(trainer, views[:4], 1, field).mean, trainer
 
 
 @pytest.mark.nightly

@@ -14,16 +14,16 @@ from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.train import radiance_trainer
 from nerg_mi.train.radiance_data import PixelBank
-from nerg_mi.train.radiance_losses import color_loss, composite, density_summand, depth_loss, feature_decay, ray_color
-from nerg_mi.train.radiance_run import measure
-from nerg_mi.train.radiance_sampling import StepTable, Thinning, damp_near, ray_sum, rays_in_box, visible_samples
+from nerg_mi.train.radiance_losses import color_loss, composite, evaluate_samples, depth_loss, feature_decay_loss, evaluate_ray_color
+from nerg_mi.train.radiance_run import evaluate_views
+from nerg_mi.train.radiance_sampling import StepTable, RussianRoulette, damp_near, sum_along_rays, clip_rays, select_visible_samples
 from nerg_mi.train.radiance_settings import (
-    FEW_RAYS,
+    MIN_RAYS_TO_REFINE,
     RadianceSettings,
-    adapted_rays,
-    affordable_rays,
-    refined,
-    sized_config,
+    adapt_ray_count,
+    limit_ray_count,
+    refine_stride,
+    make_radiance_config,
 )
 from nerg_mi.train.radiance_trainer import RadianceTrainer, render_view
 
@@ -81,7 +81,7 @@ def expected():
 def test_pictures(every, chunk, monkeypatch):
     monkeypatch.setattr(radiance_trainer, "_CHUNK", chunk)
     table = StepTable(ns, 0.0, 4.4, STEP, 0.0)
-    seen = render_view(Lump(), lambda p, active: active, table, view(), NEAR, every=every, stop=0.0)
+    seen = render_view(Lump(), lambda p, active: active, table, view(), NEAR, every=every, min_transmittance=0.0)
     color, opacity, depth = (v[every // 2 :: every, every // 2 :: every] for v in expected())
     assert seen.color.shape == color.shape and np.allclose(seen.color, color, atol=2e-5)
     assert np.allclose(seen.opacity, opacity, atol=2e-5) and 0.8 < opacity.max()
@@ -93,10 +93,10 @@ def test_a_deferred_field_has_the_colour_of_its_mean_features():
     lump = Lump()
     lump.config = RadianceConfig(deferred=True)
     table, anywhere = StepTable(ns, 0.0, 4.4, STEP, 0.0), lambda p, active: active
-    seen = render_view(lump, anywhere, table, view(), NEAR, stop=0.0)
+    seen = render_view(lump, anywhere, table, view(), NEAR, min_transmittance=0.0)
     assert np.allclose(seen.color, expected()[0], atol=2e-5)
     lump.color = lambda features, d: ns.Array3f(dr.square(features[0]))
-    squares = render_view(lump, lambda p, a: a, StepTable(ns, 0.0, 4.4, STEP, 0.0), view(), NEAR, stop=0.0).color[
+    squares = render_view(lump, lambda p, a: a, StepTable(ns, 0.0, 4.4, STEP, 0.0), view(), NEAR, min_transmittance=0.0).color[
         ..., 0
     ]
     opacity = expected()[1]
@@ -119,7 +119,7 @@ DEFERRED = replace(TINY, deferred=True)
 def test_what_is_kept_is_the_average_of_every_fourth_steps_weights(dataset, average):
     """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) a step after k steps, of ``average``
     later."""
-    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(average=average), ns)
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(ema_decay=average), ns)
     expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
     for k in range(1, 13):
         trainer.step()
@@ -139,12 +139,12 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset, conf
     field = RadianceField.random(config, BOX, ns, 0)
     table = rng.normal(size=len(field.grid.table)).astype(np.float32)
     field.set_parameters({"grid.table": ns.Float(table)})
-    pixels = PixelBank(ns, dataset.train).batch(ns.UInt32(rng.integers(0, 24 * 24, 64).astype(np.uint32)))
-    rays = rays_in_box(pixels.o, pixels.d, BOX, 0.01)
+    pixels = PixelBank(ns, dataset.train).gather_batch(ns.UInt32(rng.integers(0, 24 * 24, 64).astype(np.uint32)))
+    rays = clip_rays(pixels.o, pixels.d, BOX, 0.01)
     offset = ns.Float(rng.random(64).astype(np.float32))
     background = ns.Array3f(rng.random((3, 64)).astype(np.float32))
     with dr.suspend_grad():
-        samples, covered = visible_samples(
+        samples, covered = select_visible_samples(
             rays, StepTable(ns, 0.01, 4, 0.03, 0), offset, lambda p, a: a, field.density, 2e-3, pad=2**13
         )
     assert covered == 64
@@ -152,9 +152,9 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset, conf
 
     def loss(parameters):
         d = dr.gather(ns.Array3f, pixels.d, samples.ray)
-        sigma, parts = density_summand(config, BOX, parameters, samples.p, d, ns)
+        sigma, parts = evaluate_samples(config, BOX, parameters, samples.p, d, ns)
         weight, tau, sums, opacity = composite(sigma, parts, samples)
-        color = ray_color(config, parameters, sums, opacity, pixels.d, ns)
+        color = evaluate_ray_color(config, parameters, sums, opacity, pixels.d, ns)
         terms = color_loss(color, opacity, pixels, background, 0.1)
         terms += 0.1 * depth_loss(weight, tau, samples, pixels.depth, 0.1, 0.1)
         return dr.sum(ns.Float64(terms))
@@ -180,9 +180,9 @@ def test_a_deferred_field_learns_the_same_pictures(dataset):
         trainer = RadianceTrainer(dataset.train, BOX, config, settings(steps=150), ns)
         while trainer.progress < 1:
             trainer.step()
-        field = trainer.field()
+        field = trainer.make_field()
         assert field.config == config
-        errors.append(measure(trainer, dataset.held_out, field=field).mean)
+        errors.append(evaluate_views(trainer, dataset.held_out, field=field).mean)
     assert min(errors) > 22 and errors[1] > errors[0] - 1.5, errors
 
 
@@ -194,22 +194,22 @@ def test_thinned_samples_stand_for_all():
     d = dr.normalize(
         ns.Array3f(*[ns.Float(rng.normal(size=16).astype(np.float32) * 0.3) for _ in range(2)], ns.Float(np.ones(16)))
     )
-    rays, table = rays_in_box(o, d, BOX, 0.01), StepTable(ns, 0.01, 4, 0.03, 0)
+    rays, table = clip_rays(o, d, BOX, 0.01), StepTable(ns, 0.01, 4, 0.03, 0)
     offset, per_ray = ns.Float(rng.random(16).astype(np.float32)), ns.Float(rng.normal(size=16).astype(np.float32))
     density = lambda p, active=True: 0.3 + 20 * dr.exp(-40 * dr.square(p.z - 0.3 * p.x))
 
     def render(thinning):
-        samples, _ = visible_samples(rays, table, offset, lambda p, a: a, density, 1e-9, thinning=thinning)
+        samples, _ = select_visible_samples(rays, table, offset, lambda p, a: a, density, 1e-9, roulette=thinning)
         gain = ns.Float(1)
         dr.enable_grad(gain)
         rgb = [0.5 + 0.4 * dr.sin(4 * samples.p.z + k) for k in range(3)]
         weight, _, color, opacity = composite(gain * density(samples.p), rgb, samples)
-        plain = sum(ray_sum(weight * c, samples.segments) for c in rgb)
+        plain = sum(sum_along_rays(weight * c, samples.segments) for c in rgb)
         dr.backward(dr.sum((plain + opacity) * per_ray))
         return (samples.count, np.array([c.numpy() for c in color]), opacity.numpy(), dr.grad(gain).numpy()[0])
 
     count, color, opacity, slope = render(None)
-    found = [render(Thinning(1 / 16, 1 / 32, k)) for k in range(400)]
+    found = [render(RussianRoulette(1 / 16, 1 / 32, k)) for k in range(400)]
     assert max(f[0] for f in found) < 0.5 * count
     for f in found[::40]:
         assert np.allclose(f[2], opacity, atol=1e-6)
@@ -229,7 +229,7 @@ def test_damping_near_cameras(dataset):
     def first_step(reach):
         # All samples are nearer than a reach of a thousand sides: nothing of the pictures reaches the weights.
         trainer = RadianceTrainer(
-            dataset.train, BOX, TINY, settings(reach=reach, empty_weight=0.0, photo_colors=False), ns, False
+            dataset.train, BOX, TINY, settings(damping_distance=reach, empty_weight=0.0, photo_colors=False), ns, False
         )
         trainer.step()
         return max(np.abs(state[3][1].numpy()).max() for state in trainer.optimiser.state.values())
@@ -245,16 +245,16 @@ def test_a_box_that_no_camera_sees_is_refused(dataset):
 def test_features_that_no_ray_shapes_are_let_go(dataset):
     x = ns.Float([1, -2, 0, 4])
     dr.enable_grad(x)
-    y = feature_decay(x)
+    y = feature_decay_loss(x)
     dr.backward(y)
     assert float(y[0]) == pytest.approx(21 / 4) and np.allclose(dr.grad(x).numpy(), [0.5, -1, 0, 2])
 
     def left(weight):
         # Nearer than a reach of a thousand sides: nothing of the pictures reaches the features.
         trainer = RadianceTrainer(
-            dataset.train, BOX, TINY, settings(reach=1000.0, empty_weight=0.0, grid_decay=weight), ns, depth=False
+            dataset.train, BOX, TINY, settings(damping_distance=1000.0, empty_weight=0.0, grid_decay=weight), ns, depth=False
         )
-        trainer.optimiser["grid.table"] = dr.full(ns.Float, 0.5, len(trainer.live.parameters()["grid.table"]))
+        trainer.optimiser["grid.table"] = dr.full(ns.Float, 0.5, len(trainer.current_field.parameters()["grid.table"]))
         for _ in range(10):
             trainer.step()
         return float(dr.mean(dr.abs(trainer.optimiser["grid.table"]))[0])
@@ -269,10 +269,10 @@ def test_free_space_is_carved_where_all_depth_is_known(dataset, depth):
     """Cells far in front of the surface are then empty from the start; without depth nothing is known of them."""
     views = [replace(v, depth=np.where(v.depth > 0, v.depth, 9).astype(np.float32)) for v in dataset.train]
     trainer = RadianceTrainer(views, BOX, TINY, settings(), ns, depth=depth)
-    assert trainer.carved == depth and trainer.pixels.depth_everywhere
+    assert trainer.is_carved == depth and trainer.pixels.has_full_depth
     # Where the cameras are looking from to the ball: nearer to them than its surface by four cells and more.
     p = dr.normalize(ns.Array3f(*np.random.default_rng(0).normal(size=(3, 500)).astype(np.float32))) * 0.9
-    seen = trainer.grid.occupied(p, dr.full(ns.Bool, True, 500)).numpy()
+    seen = trainer.grid.is_occupied(p, dr.full(ns.Bool, True, 500)).numpy()
     assert (seen.mean() < 0.2) == depth
 
 
@@ -283,7 +283,7 @@ def test_places_count_first_and_colours_later(dataset, monkeypatch):
     monkeypatch.setattr(radiance, "color_loss", lambda *given: 0 * color_loss(*given))
     monkeypatch.setattr(radiance, "depth_loss", lambda *given: 0 * depth_loss(*given) + 1)
     for steps in (0, 49, 99):
-        given = settings(steps=100, depth_weight=0.3, final_depth=0.04, distortion_weight=0.0)
+        given = settings(steps=100, depth_weight=0.3, depth_weight_final_ratio=0.04, distortion_weight=0.0)
         trainer = RadianceTrainer(dataset.train, BOX, TINY, given, ns)
         trainer.steps = steps
         trainer.step()
@@ -297,10 +297,10 @@ def test_rays_that_do_not_fit_into_a_batch_do_not_count(dataset, monkeypatch):
     monkeypatch.setattr(module, "color_loss", lambda _, opacity, *rest: dr.ones(ns.Float, dr.width(opacity)))
     trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(batch=2**10), ns, depth=False)
     trainer.rays, seen = 2**10, []
-    visible = module.visible_samples
+    visible = module.select_visible_samples
     monkeypatch.setattr(
         module,
-        "visible_samples",
+        "select_visible_samples",
         lambda rays, *a, **k: seen.append((rays.count, visible(rays, *a, **k))) or seen[-1][1],
     )
     trainer.step()
@@ -314,19 +314,19 @@ STRIDES = (16, 8, 4, 2)
 
 
 def test_rays_fill_the_batch_or_the_pass_before_it_whichever_is_full_first():
-    assert adapted_rays(1000, kept=10, looked=20, batch=16000, most=128000) == 1260  # half way to .95 * 1600
-    assert adapted_rays(1000, kept=10, looked=100, batch=16000, most=128000) == 1108  # half way to .95 * 1280
+    assert adapt_ray_count(1000, samples_per_ray=10, prepass_samples_per_ray=20, batch=16000, max_prepass_samples=128000) == 1260  # half way to .95 * 1600
+    assert adapt_ray_count(1000, samples_per_ray=10, prepass_samples_per_ray=100, batch=16000, max_prepass_samples=128000) == 1108  # half way to .95 * 1280
     rays = 1000
     for _ in range(40):
-        rays = adapted_rays(rays, kept=2, looked=300, batch=16000, most=128000)
+        rays = adapt_ray_count(rays, samples_per_ray=2, prepass_samples_per_ray=300, batch=16000, max_prepass_samples=128000)
     assert rays * 300 <= 0.95 * 128000 < (rays + 2) * 300
 
 
 def test_rays_change_by_a_factor_of_two_at_most_and_stay_in_bounds():
-    assert adapted_rays(1000, kept=0, looked=0, batch=16000, most=128000) == 2000
-    assert adapted_rays(1000, kept=1e6, looked=1e6, batch=16000, most=128000) == 500
-    assert adapted_rays(2**14, kept=0, looked=0, batch=16000, most=128000) == 2**14
-    assert adapted_rays(64, kept=1e6, looked=1e6, batch=16000, most=128000) == 64
+    assert adapt_ray_count(1000, samples_per_ray=0, prepass_samples_per_ray=0, batch=16000, max_prepass_samples=128000) == 2000
+    assert adapt_ray_count(1000, samples_per_ray=1e6, prepass_samples_per_ray=1e6, batch=16000, max_prepass_samples=128000) == 500
+    assert adapt_ray_count(2**14, samples_per_ray=0, prepass_samples_per_ray=0, batch=16000, max_prepass_samples=128000) == 2**14
+    assert adapt_ray_count(64, samples_per_ray=1e6, prepass_samples_per_ray=1e6, batch=16000, max_prepass_samples=128000) == 64
 
 
 @pytest.mark.parametrize(
@@ -339,29 +339,29 @@ def test_rays_change_by_a_factor_of_two_at_most_and_stay_in_bounds():
     ],
 )
 def test_rays_of_a_step_are_those_that_are_affordable(rays, looked, steps, expected):
-    assert affordable_rays(rays, looked, steps, most=128000, candidates=2_100_000) == expected
+    assert limit_ray_count(rays, looked, steps, max_prepass_samples=128000, max_candidates=2_100_000) == expected
 
 
 def test_marching_gets_finer_by_one_stride_a_step_when_it_is_time_to():
-    assert refined(16, STRIDES, 16, 1, 128000) == 16
-    assert refined(16, STRIDES, 8, 1, 128000) == 8
-    assert refined(16, STRIDES, 1, 1, 128000) == 8
-    assert refined(2, STRIDES, 1, 1, 128000) == 1
-    assert refined(1, STRIDES, 1, 1, 128000) == 1
+    assert refine_stride(16, STRIDES, 16, 1, 128000) == 16
+    assert refine_stride(16, STRIDES, 8, 1, 128000) == 8
+    assert refine_stride(16, STRIDES, 1, 1, 128000) == 8
+    assert refine_stride(2, STRIDES, 1, 1, 128000) == 1
+    assert refine_stride(1, STRIDES, 1, 1, 128000) == 1
     # Never coarser again.
-    assert refined(2, STRIDES, 4, 1, 128000) == 2
-    assert refined(4, (), 1, 1, 128000) == 1
+    assert refine_stride(2, STRIDES, 4, 1, 128000) == 2
+    assert refine_stride(4, (), 1, 1, 128000) == 1
 
 
 def test_marching_waits_while_the_next_stride_has_no_room_for_enough_rays():
     most = 128000
-    fits = most / FEW_RAYS / 2  # samples a ray, of which the finer stride has twice as many
-    assert refined(8, STRIDES, 1, 0.99 * fits, most) == 4
-    assert refined(8, STRIDES, 1, 1.01 * fits, most) == 8
-    assert refined(8, STRIDES, 1, 1.01 * fits, most, waits=False) == 4
+    fits = most / MIN_RAYS_TO_REFINE / 2  # samples a ray, of which the finer stride has twice as many
+    assert refine_stride(8, STRIDES, 1, 0.99 * fits, most) == 4
+    assert refine_stride(8, STRIDES, 1, 1.01 * fits, most) == 8
+    assert refine_stride(8, STRIDES, 1, 1.01 * fits, most, wait_for_clearing=False) == 4
     # From 16 to 1 is sixteen times as many.
-    assert refined(16, (16,), 1, 0.99 * fits, most) == 16
-    assert refined(16, (16,), 1, 0.99 * fits / 8, most) == 1
+    assert refine_stride(16, (16,), 1, 0.99 * fits, most) == 16
+    assert refine_stride(16, (16,), 1, 0.99 * fits / 8, most) == 1
 
 
 # ---- What a radiance training is asked for: sizes, schedules, and what is refused ----
@@ -373,25 +373,25 @@ def test_settings_and_sizes_are_checked():
         {"steps": 5, "minutes": 1.0},
         {"steps": 0},
         {"steps": 5, "resolution": 100},
-        {"steps": 5, "thin_least": 0},
-        {"steps": 5, "reach_share": 0},
+        {"steps": 5, "rr_min_probability": 0},
+        {"steps": 5, "damping_fraction": 0},
     ):
         with pytest.raises(ValueError):
             RadianceSettings(**wrong)
     with pytest.raises(ValueError, match="small, medium, paper"):
-        sized_config("huge", BOX)
-    assert sized_config("paper", BOX).grid.log2_rows == 19
+        make_radiance_config("huge", BOX)
+    assert make_radiance_config("paper", BOX).grid.log2_rows == 19
 
 
 def test_damping_near_cameras_ends_when_surfaces_stand():
-    s = RadianceSettings(steps=5, reach=0.4, reach_share=0.5)
-    assert [s.damped_within(p) for p in (0, 0.25, 0.5, 1)] == pytest.approx([0.4, 0.2, 0, 0])
+    s = RadianceSettings(steps=5, damping_distance=0.4, damping_fraction=0.5)
+    assert [s.damping_distance_at(p) for p in (0, 0.25, 0.5, 1)] == pytest.approx([0.4, 0.2, 0, 0])
 
 
 def test_a_size_is_a_grid_and_a_contracted_box_has_one_twice_as_fine():
     """Its inner cube takes half of each edge."""
-    small = sized_config("small", BOX)
+    small = make_radiance_config("small", BOX)
     assert small.grid == HashGridConfig(levels=8, log2_rows=16, base=32, finest=512) and small.density_scale == 0.5
-    around = sized_config("small", ContractedBox(BOX))
+    around = make_radiance_config("small", ContractedBox(BOX))
     assert around.grid == HashGridConfig(levels=8, log2_rows=16, base=64, finest=1024)
     assert around.density_scale == small.density_scale

@@ -22,7 +22,7 @@ from tests.reference import march_numpy as reference
 
 def depth(mi, medium, kind, settings, o=(0.5, 0.5, 0), d=(0, 0, 1)):
     o, d = np.atleast_2d(np.asarray(o, np.float32)), np.atleast_2d(np.asarray(d, np.float32))
-    ray = medium.local(mi.Point3f(o.T), mi.Vector3f(d.T))
+    ray = medium.ray_to_local(mi.Point3f(o.T), mi.Vector3f(d.T))
     t0, t1, active = dr.maximum(ray.t_near, 0), ray.t_far, mi.Bool(True)
     result = march(medium, ray, t0, t1, active, settings)
     return surface_depth(kind, result, medium, ray, t0, t1, active, settings).numpy()
@@ -89,7 +89,7 @@ def test05_median_gradient_equals_central_differences(rgb):
         params.update()
         medium = VolumeMedium(volume)
         for kind, form in (("median", 2), ("expected", 1)):
-            ray = medium.local(rgb.Point3f(0.5, 0.5, -1), rgb.Vector3f(0, 0, 1))
+            ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, -1), rgb.Vector3f(0, 0, 1))
             settings = MarchSettings(1 / 32)
             result = march(medium, ray, ray.t_near, ray.t_far, True, settings)
             d = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
@@ -105,7 +105,7 @@ def test06_the_escape_distance_ends_at_the_face(rgb, kind):
     # The surface of thick matter lies as deep in it as light goes; in fog the way is kept short.
     for sigma, near in ((200, 1), (1e3, 1), (1e6, 2), (20, 1), (0.5, 1)):
         medium = slab(rgb, sigma, near)
-        ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+        ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
         result = march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / 64))
         d = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), MarchSettings(1 / 64))
         out, d = escape_distance(kind, result, d).numpy()[0], d.numpy()[0]
@@ -119,7 +119,7 @@ def test06_the_escape_distance_ends_at_the_face(rgb, kind):
 @pytest.mark.parametrize("sigma", [0.4, 60.0])
 def test07_evaluations_that_a_depth_takes_are_added(rgb, sigma):
     medium, settings = slab(rgb, sigma), MarchSettings(0.01, stop=1e-3)
-    ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+    ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
     counts = {}
     for kind in DEPTHS.names():
         result = march(medium, ray, ray.t_near, ray.t_far, True, settings, count=True)
@@ -154,7 +154,7 @@ def test08_a_refined_depth_finds_what_a_step_hides(rgb, stop):
 def test09_no_depth_where_none_is_asked_for(rgb, kind):
     """Of rays that have all been marched."""
     medium, settings = slab(rgb, 60), MarchSettings(0.1)
-    ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+    ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
     result = march(medium, ray, ray.t_near, ray.t_far, True, settings)
     asked = rgb.Bool([True, False])
     found = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, asked, settings).numpy()
@@ -171,9 +171,9 @@ class Entered:
     summary = "where the march begins"
     mean_free_paths = 0.0
     at_half = False
-    finds = "entered"
+    surface_kind = "entered"
 
-    def exact(self, profile):
+    def find_exact(self, profile):
         return profile.quantile(0)
 
     def inside(self, marched):
@@ -210,7 +210,7 @@ def test02_it_is_rendered_with_and_without_shapes(rgb, entered):
 
 def test03_it_is_offered_where_depths_are_and_only_while_it_is_registered(rgb, entered):
     assert DEPTHS.names()[-1] == "entered"
-    assert DEPTHS.manual().endswith("``entered``: where the march begins.")
+    assert DEPTHS.format_manual().endswith("``entered``: where the march begins.")
     DEPTHS.unregister("entered")
     with pytest.raises(RuntimeError, match='"depth"'):
         rgb.load_dict(constant(depth="entered"))
@@ -231,12 +231,12 @@ def test04_the_surface_lies_as_deep_as_light_goes(rgb):
 def test05_a_study_has_it(entered, hits):
     """Among its settings, but for splats not what finds the depth of another kind."""
     subject = SimpleNamespace(marched=True, hits=hits, extent=1.0, has_gaze=True, normalized=False, resampled=True)
-    kinds = {s.params["depth"] for s in study.settings(subject) if s.group == "depth"}
+    kinds = {s.params["depth"] for s in study.list_rows(subject) if s.group == "depth"}
     assert kinds >= {"expected", "median", "entered"} and ("refined" in kinds) is not hits
 
 
 def test06_a_study_compares_it_with_its_own_exact_value(rgb, entered):
     subject = open_subject("slab", "auto", 8, 8)
-    entry, median, refined = (subject.truth(1, kind, "depth") for kind in ("entered", "median", "refined"))
-    rendered = subject.channels(subject.integrator({"depth": "entered"}), 1, 1)["depth"]
+    entry, median, refined = (subject.get_truth(1, kind, "depth") for kind in ("entered", "median", "refined"))
+    rendered = subject.render_channels(subject.make_integrator({"depth": "entered"}), 1, 1)["depth"]
     assert np.allclose(entry.depth, rendered, rtol=1e-4) and (entry.depth < median.depth).any() and refined is median

@@ -8,7 +8,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.fields.splats import matrices_of
+from nerg_mi.fields.splats import quaternions_to_matrices
 from nerg_mi.transport import march as front
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings, march_primal
@@ -208,7 +208,7 @@ class Double:
             setattr(self, n, value if n == name else getattr(splats, n).astype(np.float64))
 
     def axes(self):
-        return matrices_of(self.rotations / np.linalg.norm(self.rotations, axis=1, keepdims=True))
+        return quaternions_to_matrices(self.rotations / np.linalg.norm(self.rotations, axis=1, keepdims=True))
 
 
 def outputs(mi, medium, o, d):
@@ -276,7 +276,7 @@ def test_memory_does_not_grow_with_hits(rgb):
     def gradient(end):
         o = rgb.Point3f(dr.linspace(rgb.Float, -0.1, 0.1, count), 0, 0)
         dr.enable_grad(o)
-        ray = medium.local(o, rgb.Vector3f(0, 0, 1))
+        ray = medium.ray_to_local(o, rgb.Vector3f(0, 0, 1))
         result = march(medium, ray, rgb.Float(0), rgb.Float(end), True, SETTINGS, color=ColorPainter(rgb.Color3f))
         dr.backward(result.tau + result.color.x)
         dr.eval(dr.grad(o))
@@ -354,7 +354,7 @@ def test04_fine_steps_begin_before_matter_does(rgb):
         data = np.zeros((200, 1, 1))
         data[round(200 * face) :] = 30
         medium = grid(rgb, data, filter_type="nearest")
-        ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+        ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
         settings = MarchSettings(0.01, coarse=8)
         start, evals = front.fine_start(medium, ray, rgb.Float(0), rgb.Float(1), rgb.Bool(True), settings)
         assert face - 2.1 * 0.08 < start[0] < face and 1 <= evals[0] <= 14

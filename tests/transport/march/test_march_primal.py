@@ -15,10 +15,10 @@ from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.depth import escape_distance, surface_depth
 from nerg_mi.transport.field_medium import FieldMedium
-from nerg_mi.transport.geometry import Place
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import (
-    HITS_STOP,
+    DEFAULT_HITS_STOP,
     MarchResult,
     MarchSettings,
     Occlusion,
@@ -30,7 +30,7 @@ from nerg_mi.transport.march_primal import (
 )
 from nerg_mi.transport.medium import ColorPainter, VoxelCells
 from nerg_mi.transport.observer import ObserverSettings
-from nerg_mi.transport.occlusion import trace_sight
+from nerg_mi.transport.occlusion import trace_from_observer
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.formats.splats.writers import random_splats
 from tests.reference import march_numpy as reference
@@ -41,7 +41,7 @@ from tests.transport.test_splat_medium import medium_of, rays, stack
 #
 # Depth, opacity and colour of Gaussian splats against closed forms and against a look at all of them in float64.
 
-SETTINGS = MarchSettings(0.01, stop=HITS_STOP)
+SETTINGS = MarchSettings(0.01, stop=DEFAULT_HITS_STOP)
 
 
 def marched(mi, medium, o, d, t1=np.inf, kinds=("expected", "median", "refined"), **options):
@@ -57,7 +57,7 @@ def test_random_places_are_as_in_float64(rgb):
     splats, (o, d) = random_splats(60, degree=3, size=0.3), rays(400)
     medium = medium_of(splats)
     result, depths = marched(rgb, medium, o, d, color=ColorPainter(rgb.Color3f), count=True)
-    opacity, color, expected, median = trace(splats, o, d, stop=HITS_STOP)
+    opacity, color, expected, median = trace(splats, o, d, stop=DEFAULT_HITS_STOP)
     assert np.abs(result.opacity.numpy() - opacity).max() < 2e-6
     assert np.abs(result.color.numpy().T - color).max() < 5e-6
     assert np.abs(depths[0] - expected).max() < 1e-5
@@ -106,7 +106,7 @@ def test_a_question_ends_a_ray_with_its_answer(rgb, before, hides, known, far):
 
 def test_light_goes_on_as_far_as_splats_are_trained(rgb):
     medium = medium_of(stack([2], [0.9]))
-    assert default_stop(medium) == HITS_STOP and default_stop(None) == MarchSettings.stop
+    assert default_stop(medium) == DEFAULT_HITS_STOP and default_stop(None) == MarchSettings.stop
 
 
 # ---- Occlusion ----
@@ -125,7 +125,7 @@ def clouds(rgb):
     medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": grid, "filter_type": "nearest"}))
     turned = rng.normal(size=(2, COUNT, 3))
     eyes = 0.5 + 2 * turned / np.linalg.norm(turned, axis=-1, keepdims=True)
-    return Place(medium), *eyes, rng.uniform(0.1, 0.9, (COUNT, 3))
+    return SceneGeometry(medium), *eyes, rng.uniform(0.1, 0.9, (COUNT, 3))
 
 
 def sights(mi, clouds, settings, falloff):
@@ -134,7 +134,7 @@ def sights(mi, clouds, settings, falloff):
     o, d = camera, (at - camera) / np.linalg.norm(at - camera, axis=1, keepdims=True)
     ray = mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))
     about = place, ray, mi.Point3f(at.T), mi.Point3f(observer.T), 0, mi.Bool(True), mi.Float(falloff), settings
-    return [trace_sight(*about, count=True, whole=whole) for whole in (True, False)]
+    return [trace_from_observer(*about, count=True, needs_depth=whole) for whole in (True, False)]
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_what_is_known_of_a_hidden_point_lies_before_it(rgb, clouds):
 def test_by_shapes_in_the_medium_too(rgb, clouds):
     ball = {"type": "sphere", "center": [0.5, 0.5, 0.5], "radius": 0.3}
     scene = rgb.load_dict({"type": "scene", "ball": ball})
-    place = Place(clouds[0].medium, scene)
+    place = SceneGeometry(clouds[0].medium, scene)
     settings = ObserverSettings(march=MarchSettings(0.02), tolerance=0.05)
     whole, short = sights(rgb, (place, *clouds[1:]), settings, 0.1)
     assert np.array_equal(short.visibility.numpy(), whole.visibility.numpy())
@@ -186,7 +186,7 @@ def test_derivatives_take_whole_rays(rgb, clouds):
     dr.enable_grad(p_o)
     d = (at - camera) / np.linalg.norm(at - camera, axis=1, keepdims=True)
     ray = rgb.Ray3f(rgb.Point3f(camera.T), rgb.Vector3f(d.T))
-    sight = trace_sight(place, ray, rgb.Point3f(at.T), p_o, 0, rgb.Bool(True), rgb.Float(0.3), settings, whole=False)
+    sight = trace_from_observer(place, ray, rgb.Point3f(at.T), p_o, 0, rgb.Bool(True), rgb.Float(0.3), settings, needs_depth=False)
     dr.backward(dr.sum(sight.visibility))
     assert np.all(np.isfinite(np.array(p_o.grad))) and np.abs(np.array(p_o.grad)).max() > 0
 
@@ -222,7 +222,7 @@ def grid(mi, data, **kwargs):
 
 def run(mi, medium, o, d, settings=DEFAULT, **kwargs):
     o, d = np.atleast_2d(np.asarray(o, np.float32)), np.atleast_2d(np.asarray(d, np.float32))
-    ray = medium.local(mi.Point3f(o.T), mi.Vector3f(d.T))
+    ray = medium.ray_to_local(mi.Point3f(o.T), mi.Vector3f(d.T))
     t0 = dr.maximum(ray.t_near, 0)
     return march(medium, ray, t0, ray.t_far, True, settings, **kwargs)
 
@@ -284,7 +284,7 @@ def test07_misses_and_masks(rgb):
     r = run(rgb, medium, [(0.5, 0.5, 0), (2, 0.5, 0), (0.5, 0.5, 5), (0.5, 0.5, 1.75)], [(0, 0, 1)] * 4)
     assert np.allclose(r.opacity.numpy(), [1 - math.exp(-5), 0, 0, 1 - math.exp(-1.25)], rtol=1e-5)
     assert r.expected_depth.numpy()[1:3].tolist() == [0, 0]
-    ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+    ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
     masked = march(medium, ray, rgb.Float([1, 1]), rgb.Float([2, 2]), rgb.Bool([True, False]), DEFAULT, count=True)
     assert masked.opacity.numpy()[1] == 0 < masked.opacity.numpy()[0] and masked.density_evals.numpy()[1] == 0
     empty = march(medium, ray, rgb.Float([1.5, 1.7]), rgb.Float([1.5, 1.6]), True, DEFAULT)
@@ -450,7 +450,7 @@ class Masked:
         import drjit.llvm.ad as ns
 
         grid = OccupancyGrid(self.bits, ns, 0)
-        return grid.empty_cells(self.medium.to_unit(p)) == 0
+        return grid.distance_to_occupied(self.medium.to_unit(p)) == 0
 
     def density(self, p, active):
         return dr.select(self._full(p), self.medium.density(p, active), 0)
@@ -557,7 +557,7 @@ def test01_every_step_moves_on(rgb, distance):
     medium = grid(rgb, np.ones((64, 64, 64)))
     wall = np.float32(distance + (np.arange(64) + 0.5) / 64)
     t = rgb.Float(np.concatenate([wall, np.nextafter(wall, np.float32(0)), np.nextafter(wall, np.float32(2e6))]))
-    ray = medium.local(rgb.Point3f(0.4, 0.6, -float(distance)), rgb.Vector3f(0, 0, 1))
+    ray = medium.ray_to_local(rgb.Point3f(0.4, 0.6, -float(distance)), rgb.Vector3f(0, 0, 1))
     for step in (1e-12, 1e-3, 0.5):
         _, begin, delta, after = advance(
             medium, ray, t, rgb.Float(1e9), rgb.Float(1), MarchSettings(step, cell_step=step), rgb.Bool(True), planes
@@ -576,7 +576,7 @@ def test02_a_march_goes_on_where_it_begins_on_a_wall(rgb):
 
     medium = grid(rgb, np.ones((4, 4, 4)))
     t = rgb.Float([0, 1e-30, 1e-3, 5, 1e6])
-    ray = medium.local(rgb.Point3f(0.4, 0.6, 0), rgb.Vector3f(0, 0, 1))
+    ray = medium.ray_to_local(rgb.Point3f(0.4, 0.6, 0), rgb.Vector3f(0, 0, 1))
     _, begin, delta, after = advance(
         medium, ray, t, rgb.Float(1e9), rgb.Float(1), MarchSettings(0.01), rgb.Bool(True), Reached()
     )

@@ -192,7 +192,7 @@ def test09_rays_of_any_direction_from_anywhere(rgb, direction, origin):
     hit = reference.box(np.float32(origin).astype(float), d, (0, 0, 0), (1, 1, 1))
     length = 0 if hit is None else max(hit[1] - max(hit[0], 0), 0)
     medium = _cube(rgb)
-    ray = medium.local(
+    ray = medium.ray_to_local(
         rgb.Point3f(*[dr.opaque(rgb.Float, float(v)) for v in origin]),
         rgb.Vector3f(*[dr.opaque(rgb.Float, float(v)) for v in d]),
     )
@@ -241,7 +241,7 @@ def test10_second_order_in_smooth_densities(rgb, quadrature):
 def test11_cells_do_not_depend_on_the_step(rgb):
     data = np.random.default_rng(3).exponential(2, (4, 4, 4)).astype(np.float32)
     medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True}))
-    ray = medium.local(rgb.Point3f(0.2, 0.3, -1), rgb.Vector3f(*(np.array([0.1, 0.2, 1]) / math.sqrt(1.05)).tolist()))
+    ray = medium.ray_to_local(rgb.Point3f(0.2, 0.3, -1), rgb.Vector3f(*(np.array([0.1, 0.2, 1]) / math.sqrt(1.05)).tolist()))
     tau = [
         one(
             march(
