@@ -17,7 +17,7 @@ project_copyright = "the authors of nerg_mi, Apache-2.0"
 release = version = __version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc"]
-include_patterns = ["docs/*.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/*.ipynb"]
+include_patterns = ["docs/index.md", "docs/*/*.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/*.ipynb"]
 root_doc = "docs/index"
 language = "en"
 # Two dashes begin an option.
