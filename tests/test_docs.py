@@ -23,7 +23,7 @@ from nerg_mi.transport.march_primal import MarchSettings
 from tests.conftest import ROOT
 from tools import command_pages, generated
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 OF_DASK = {"--dashboard-address", "--no-dashboard", "--protocol", "--tls-ca-file", "--tls-cert", "--tls-key"}
 FOREIGN = {"--tcnn", "--ff", "--hook-type"} | OF_DASK  # of torch-ngp, pre-commit and dask
 NUMBERS = "zero one two three four five six seven eight nine ten".split()
@@ -185,13 +185,13 @@ def test_types_come_with_the_package():
 
 
 def test20_names_of_the_page_on_python_are_those_of_the_package():
-    text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
     table = text.partition("## All names")[2]
     assert set(re.findall(r"`(\w+)`", table)) - {"save"} == set(nerg.__all__)
     assert set(re.findall(r"\bnerg\.(?!py\b)(\w+)", text)) <= set(nerg.__all__)
 
 
-REFERENCE = (ROOT / "docs" / "python-reference.md").read_text(encoding="utf-8")
+REFERENCE = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
 LISTED = re.findall(r"^\.\. auto(?:function|class|exception):: (\S+)", REFERENCE, re.M)
 
 

@@ -20,13 +20,13 @@ def lines(text: str) -> list[str]:
 
 
 def page(name: str) -> list[str]:
-    return lines((ROOT / "docs" / name).read_text(encoding="utf-8"))
+    return lines((ROOT / "docs" / "explanation" / name).read_text(encoding="utf-8"))
 
 
 def test01_errors_of_derivatives(benchmark, capsys):
     benchmark("gradients").main(["--case", "silhouette"])
     head, rule, *rows = lines(capsys.readouterr().out)
-    assert {head, *rows} <= set(page("gradients.md")) and len(rows) == 2
+    assert {head, *rows} <= set(page("numerics.md")) and len(rows) == 2
 
 
 def test02_samples_and_opacities(benchmark, rgb):
@@ -40,7 +40,7 @@ def test03_alignments(benchmark):
 
     alignment = benchmark("alignment")
     world = alignment.World(rooms.traces(2000), rooms.traces(2000).end, rooms.people(200))
-    there = page("tracking.md")
+    there = page("accuracy.md")
     assert f"| {' | '.join(alignment.HEAD)} |" in there
     for kind in ("pairs", "cameras"):
         cells = alignment.cells(alignment.evaluate(world, kind, 2, 1))
@@ -53,7 +53,7 @@ SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if "__main__
 
 @pytest.mark.parametrize("script", SCRIPTS)
 def test04_every_script_stands_on_a_page_and_says_its_options(benchmark, monkeypatch, capsys, script):
-    assert any(f"benchmarks/{script}.py" in p.read_text(encoding="utf-8") for p in (ROOT / "docs").glob("*.md")) or (
+    assert any(f"benchmarks/{script}.py" in p.read_text(encoding="utf-8") for p in (ROOT / "docs").rglob("*.md")) or (
         script == "bench"
     )
     monkeypatch.setattr("sys.argv", [script, "--help"])

@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.rays.rays`, and the example of docs/how-to/recordings.md."""
+"""Tests of `nerg_mi.rays.rays`, and the example of docs/how-to/training.md."""
 
 import importlib.util
 import json
@@ -487,9 +487,9 @@ def test_all_and_equal_seeds():
     assert not np.array_equal(sample_rows(10**12, 50, 4), sample_rows(10**12, 50, 5))
 
 
-# ---- The example of docs/how-to/recordings.md runs ----
+# ---- The example of docs/how-to/training.md runs ----
 
-MANUAL = Path(__file__).resolve().parents[2] / "docs" / "rays.md"
+MANUAL = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "training.md"
 
 
 def test_example_runs(tmp_path, monkeypatch):
