@@ -26,9 +26,7 @@ from tests.workflows.watched import write_scene
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
-RUN_ELSEWHERE = {
-    ("training.md", "python"): "tests/rays/test_rays.py",
-}
+RUN_ELSEWHERE = {("training.md", "python"): "tests/rays/test_rays.py"}
 """All blocks of a language on a page -> the tests elsewhere that run them."""
 
 NOT_RUN = {

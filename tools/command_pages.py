@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from tools.page import table
+from tools.page import wrapped
 
 
 def iter_commands() -> Iterator[tuple[str, Any, Any]]:
@@ -33,23 +33,29 @@ def format_reference() -> str:
     for path, command, context in iter_commands():
         sections += [f"## {path}", _paragraphs(command.help or "")]
         usage = " ".join([path, *command.collect_usage_pieces(context)])
-        sections += [f"Usage: `{usage}`", *_tables(command, context)]
+        sections += [f"Usage: `{usage}`", *_lists(command, context)]
     return "\n\n".join(sections)
 
 
-def _tables(command: Any, context: Any) -> Iterator[str]:
-    """One of arguments and one of options, those that there are."""
-    rows: dict[str, list[tuple[str, ...]]] = {"argument": [], "option": []}
+def _lists(command: Any, context: Any) -> Iterator[str]:
+    """The arguments, then the options by their groups; each with its meaning and its default."""
+    groups: dict[str, list[str]] = {}
     for parameter in command.params:
         record = parameter.get_help_record(context)
         if record is None or parameter.name == "help":
             continue
         meaning, default = split_default(record[1])
-        cells = (f"`{record[0]}`", escape_cell(meaning), f"`{default}`" if default else "")
-        rows[parameter.param_type_name].append(cells)
-    for kind, found in rows.items():
-        if found:
-            yield table((kind, "meaning", "default"), found)
+        text = cell(meaning)
+        if default == "required":
+            text += " Required."
+        elif default:
+            text += f" Default: `{default}`."
+        panel = getattr(parameter, "rich_help_panel", None)
+        name = "Arguments" if parameter.param_type_name == "argument" else panel or "Options"
+        groups.setdefault(name, []).append(wrapped(f"- `{record[0]}`: {text}"))
+    for name, items in groups.items():
+        yield f"**{name}**"
+        yield "\n".join(items)
 
 
 _RANGE = re.compile(r"(?:[-+\w.]+<=?)?x(?:[<>]=?[-+\w.]+)?")
@@ -77,4 +83,4 @@ def escape_cell(text: str) -> str:
 
 def _paragraphs(text: str) -> str:
     """The help of a command, whose lines may be broken anywhere."""
-    return "\n\n".join(escape_cell(part) for part in re.split(r"\n\s*\n", text.strip()))
+    return "\n\n".join(wrapped(cell(part)) for part in re.split(r"\n\s*\n", text.strip()))

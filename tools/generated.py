@@ -18,7 +18,7 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before Dr.Jit and Mitsuba)
 from tools import command_pages, manual
-from tools.page import table
+from tools.page import aligned, cells, table, table_or_list, wrapped
 
 ROOT = Path(__file__).resolve().parents[1]
 PLUGINS = ("nerg", "nerf", "splats", "gazefield", "gazekde", "panorama")
@@ -29,8 +29,8 @@ def plugins() -> str:
     _choose_variant()
     sections = []
     for name in PLUGINS:
-        page = manual.parse_manual(import_module(f"nerg_mi.plugins.{name}").__doc__ or "")
-        sections += [f"## {page.title}", page.format_parameter_table(), page.body]
+        page = manual.read(import_module(f"nerg_mi.plugins.{name}").__doc__ or "")
+        sections += [f"## {page.title}", page.parameter_list(), page.body]
     return "\n\n".join(sections)
 
 
@@ -38,22 +38,28 @@ def presets() -> str:
     """The readers of tracking files that know their columns."""
     from nerg_mi.rays.readers.registry import format_preset_table
 
-    return format_preset_table()
+    return _relisted(preset_table())
 
 
 def checks() -> str:
     """What the sanity card of rays looks for."""
     from nerg_mi.rays.quality import format_check_table
 
-    return format_check_table()
+    return _relisted(check_table())
+
+
+def _relisted(text: str) -> str:
+    """A Markdown table as a list where its lines are too long to be read."""
+    head, _, *rows = map(cells, text.strip().split("\n"))
+    return table_or_list(head, rows)
 
 
 def recipes() -> str:
     """What each gaze recipe sets: its field, length, losses and probes."""
     from nerg_mi.train import gaze_recipes
 
-    found = list(gaze_recipes.load_recipes().values())
-    rows = [("what it is", *(recipe.summary for recipe in found))]
+    found = list(gaze_recipes.recipes().values())
+    rows: list[tuple[str, ...]] = []
     parts = (("", "settings", "gaze_settings"), ("probes: ", "probes", "probe_settings"))
     for prefix, given, made in parts:
         values = [getattr(recipe, made)() for recipe in found]
@@ -62,7 +68,8 @@ def recipes() -> str:
     configs = [_flat(recipe.list_architectures(gaze_recipes.FieldOptions())[0]) for recipe in found]
     names = dict.fromkeys(name for config in configs for name in config)
     rows += [(f"field: `{name}`", *(_shown(c.get(name)) for c in configs)) for name in names]
-    return table(("", *(f"`{recipe.name}`" for recipe in found)), rows)
+    summaries = "\n".join(wrapped(f"- `{recipe.name}`: {recipe.summary}.") for recipe in found)
+    return f"{summaries}\n\n{table(('setting', *(f'`{recipe.name}`' for recipe in found)), rows)}"
 
 
 def _flat(config: object, prefix: str = "") -> dict[str, object]:
@@ -108,8 +115,8 @@ def registered() -> str:
         ("statistic", "nerg_mi/statistics/tables.py", MEASURES_BY_NAME),
         ("gaze recipe", "nerg_mi/train/gaze_recipes.py", gaze_recipes.load_recipes()),
     )
-    cells = [(what, f"`{file}`", ", ".join(f"`{name}`" for name in names)) for what, file, names in rows]
-    return table(("what", "protocol, or table", "there are"), cells)
+    rows = [(what, f"`{file}`", ", ".join(f"`{name}`" for name in names)) for what, file, names in rows]
+    return table_or_list(("what", "protocol, or table", "entries"), rows)
 
 
 def _choose_variant() -> None:
@@ -125,8 +132,8 @@ def measures() -> str:
     """The numbers of `nerg stats`: how each is defined, and over whom."""
     from nerg_mi.statistics.tables import MEASURES
 
-    rows = [(m.title.partition(" [")[0], m.definition, m.population, "yes" if m.is_compared else "") for m in MEASURES]
-    return table(("number", "definition", "over", "differences"), rows)
+    rows = [(m.title.partition(" [")[0], m.definition, m.over, "yes" if m.compared else "") for m in MEASURES]
+    return table_or_list(("statistic", "definition", "over", "differences"), rows)
 
 
 PARTS: dict[str, Callable[[], str]] = {
@@ -150,7 +157,7 @@ def pages() -> list[Path]:
 
 def renewed(text: str) -> str:
     """`text`, a page, with each of its parts made anew. Raises `KeyError` for a part that nothing makes."""
-    return _PART.sub(lambda m: f"{m[1]}\n{PARTS[m[2]]().strip()}\n\n{m[4]}", text)
+    return _PART.sub(lambda m: f"{m[1]}\n{aligned(PARTS[m[2]]().strip())}\n\n{m[4]}", text)
 
 
 def stale(write: bool = False) -> list[str]:

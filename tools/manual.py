@@ -11,7 +11,7 @@ import re
 import textwrap
 from dataclasses import dataclass
 
-from tools.page import table
+from tools.page import wrapped
 
 FLAGS = {
     "exposed": "set through `mi.traverse`",
@@ -39,10 +39,10 @@ class PluginManual:
     parameters: list[PluginParameter]
     body: str
 
-    def format_parameter_table(self) -> str:
+    def parameter_list(self) -> str:
         flags = lambda p: f" *({', '.join(FLAGS[f] for f in p.flags)})*" if p.flags else ""
-        rows = [(f"`{p.name}`", p.type, p.meaning + flags(p)) for p in self.parameters]
-        return table(("parameter", "type", "meaning"), rows)
+        items = (f"- `{p.name}` ({p.type}): {p.meaning}{flags(p)}" for p in self.parameters)
+        return "\n".join(map(wrapped, items))
 
 
 def convert_inline(text: str) -> str:
@@ -94,5 +94,5 @@ def parse_manual(docstring: str) -> PluginManual:
         elif block.startswith(".. "):
             raise ValueError(f'the manual page "{title}" has a {block.split()[1]}, which tools/manual.py does not know')
         else:
-            body.append(convert_inline(block))
-    return PluginManual(title, listed, "\n\n".join(body))
+            body.append(inline(block))
+    return Manual(title, listed, wrapped("\n\n".join(body)))

@@ -5,6 +5,7 @@ import importlib
 import pytest
 
 from tests.conftest import ROOT
+from tools.page import cells
 
 
 @pytest.fixture
@@ -15,8 +16,8 @@ def benchmark(monkeypatch):
 
 
 def lines(text: str) -> list[str]:
-    """Lines of the tables in ``text``."""
-    return [line for line in text.splitlines() if line.startswith("|")]
+    """Lines of the tables in ``text``, whether their columns are padded or not."""
+    return [f"| {' | '.join(cells(line))} |" for line in text.splitlines() if line.startswith("|")]
 
 
 def page(name: str) -> list[str]:
