@@ -427,7 +427,7 @@ SMALLER = {
 
 def quick_start() -> list[str]:
     """The commands of the page; the viewer serves until somebody ends it: tests/viewer tries it."""
-    lines = [line for block in blocks("sh", page="quickstart.md") for line in block.text.splitlines()]
+    lines = [line for block in blocks("sh", page="quickstart.md") for line in block.lines]
     return [line for line in lines if line.startswith("nerg ") and not line.startswith("nerg view")]
 
 
