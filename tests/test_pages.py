@@ -87,9 +87,9 @@ def blocks(*languages: str, page: str = "") -> list[Block]:
 
 
 def test01_no_block_is_left_out():
-    here = {"sh", ("README.md", "python"), ("README.md", "xml"), ("figures.md", "py"), ("python.md", "py")}
+    here = {"sh", ("README.md", "python"), ("figures.md", "py"), ("python.md", "py")}
     here |= {(f"{page}.md", "json") for page in ("viewer", "store", "statistics")}
-    here |= {(f"{page}.md", "python") for page in "cluster derivatives environments python store recordings".split()}
+    here |= {(f"{page}.md", "python") for page in "cluster derivatives exchange python store recordings".split()}
     here |= {(b.page, b.language) for b in blocks("xml", "python") if b.page in ("plugins.md", *XML_PAGES)}
     for block in blocks():
         key = (block.page, block.language)
@@ -181,7 +181,7 @@ def test06_dicts_of_plugins_are_loaded(rgb, place, block):
 
 def test07_torch(rgb, place):
     pytest.importorskip("torch", reason="torch is not installed")
-    (block,) = blocks("python", page="environments.md")
+    (block,) = blocks("python", page="exchange.md")
     names = run(block.text, block.page)
     assert names["sigma"].shape == (100,) and names["color"].shape == (100, 3)
 
@@ -258,8 +258,8 @@ def clone(rgb, tmp_path, monkeypatch):
     return make
 
 
-def of_readme(text: str) -> str:
-    """An example of the README with a smaller picture."""
+def with_smaller_image(text: str) -> str:
+    """An example with a smaller picture."""
     size = r'(width=|height=|name="(?:width|height)" value=")(480|320)'
     small, count = re.subn(size, lambda m: f"{m[1]}{int(m[2]) // 20 + 12}", text)
     assert count, "the example has no resolution to make smaller"
@@ -277,9 +277,9 @@ def readme(clone):
     return store
 
 
-def test10_the_scene_of_the_readme(rgb, readme):
-    (block,) = blocks("xml", page="README.md")
-    (readme / "example.xml").write_text(of_readme(block.text))
+def test10_the_scene_file(rgb, readme):
+    block = blocks("xml", page="environments.md")[0]
+    (readme / "example.xml").write_text(with_smaller_image(block.text))
     picture = np.array(rgb.render(rgb.load_file(str(readme / "example.xml"))))
     assert picture.shape == (28, 36, 7) and np.isfinite(picture).all()
     assert picture[..., 3].max() > 0 and picture[..., 5].max() > 0
@@ -287,7 +287,7 @@ def test10_the_scene_of_the_readme(rgb, readme):
 
 def test11_the_python_of_the_readme(readme):
     (block,) = blocks("python", page="README.md")
-    names = run(of_readme(block.text), "README.md")
+    names = run(with_smaller_image(block.text), "README.md")
     one, other = names["gaze"]
     assert one.shape == (28, 36) and one.max() > 0 and not np.array_equal(one, other)
     assert names["share"].shape == (2,) and (names["share"] >= 0).all()

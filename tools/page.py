@@ -19,8 +19,8 @@ WIDTH = 100
 
 _BAR = re.compile(r"(?<!\\)\|")
 _RULE = re.compile(r":?-+:?")
-# A code span or the target of a link stays on one line, and so does what would begin a list or a heading there.
-_WORD = re.compile(r"(?:(`+)(?!`).+?(?<!`)\1(?!`)|\]\([^)\s]*\)|\S)+")
+# A code span, a short link or the target of a link stays on one line, and so does what would begin a list there.
+_WORD = re.compile(r"(?:(`+)(?!`).+?(?<!`)\1(?!`)|\[[^\[\]]{1,40}\]\([^)\s]*\)|\]\([^)\s]*\)|\S)+")
 _MARK = re.compile(r"[-+*#>|]+|\d+[.)]|=+")
 _LONGEST_SPAN = 60
 
