@@ -26,16 +26,12 @@ from tests.workflows.watched import write_scene
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
-RUN_ELSEWHERE = {("training.md", "python"): "tests/rays/test_rays.py"}
-"""All blocks of a language on a page -> the tests elsewhere that run them."""
-
 NOT_RUN = {
     ("accuracy.md", "text"): "a formula",
     ("baking.md", "text"): "formulas, and what a command prints",
     ("plugins.md", "math"): "a formula",
     ("python.md", "{eval-rst}"): "what Sphinx is told; `make manual` builds the page",
     ("quickstart.md", "text"): "what commands print",
-    ("recordings.md", ""): "what commands print, and a list of files",
     ("photos.md", "text"): "installs a package, which needs the network",
 }
 """All blocks of a language on a page -> why nothing is there to be run."""
@@ -93,10 +89,8 @@ def test01_no_block_is_left_out():
     here |= {(b.page, b.language) for b in blocks("xml", "python") if b.page in ("plugins.md", *XML_PAGES)}
     for block in blocks():
         key = (block.page, block.language)
-        assert block.language in here or key in here or key in RUN_ELSEWHERE or key in NOT_RUN, key
-    for table in (RUN_ELSEWHERE, NOT_RUN):
-        assert set(table) <= {(b.page, b.language) for b in blocks()}, "the table names blocks that are gone"
-    assert not [file for file in RUN_ELSEWHERE.values() if not (ROOT / file).is_file()]
+        assert block.language in here or key in here or key in NOT_RUN, key
+    assert set(NOT_RUN) <= {(b.page, b.language) for b in blocks()}, "the table names blocks that are gone"
 
 
 def test03_every_line_of_a_shell_is_known():

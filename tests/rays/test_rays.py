@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.rays.rays`, and the example of docs/how-to/training.md."""
+"""Tests of `nerg_mi.rays.rays`, and the example of docs/reference/python.md."""
 
 import importlib.util
 import json
@@ -487,9 +487,9 @@ def test_all_and_equal_seeds():
     assert not np.array_equal(sample_rows(10**12, 50, 4), sample_rows(10**12, 50, 5))
 
 
-# ---- The example of docs/how-to/training.md runs ----
+# ---- The example of docs/reference/python.md runs ----
 
-MANUAL = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "training.md"
+MANUAL = Path(__file__).resolve().parents[2] / "docs" / "reference" / "python.md"
 
 
 def test_example_runs(tmp_path, monkeypatch):
@@ -504,6 +504,7 @@ def test_example_runs(tmp_path, monkeypatch):
         "observer": np.array([0.5, 0.5, 1.6]),
         "position": rng.uniform(2, 3, (6, 8, 3)),
     }
-    (example,) = re.findall(r"```python\n(.*?)```", MANUAL.read_text(), re.S)
+    blocks = re.findall(r"```python\n(.*?)```", MANUAL.read_text("utf-8"), re.S)
+    (example,) = [block for block in blocks if "place_probes" in block]
     exec(compile(example, str(MANUAL), "exec"), names)
     assert np.allclose(names["density"].mean(axis=1) * 4 * np.pi, 1, atol=0.05) and names["picture"].shape == (6, 8)
