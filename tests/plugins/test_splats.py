@@ -168,13 +168,13 @@ def test_a_picture_is_differentiated(rgb, tmp_path):
 
 
 def test_the_page_on_fitting_runs(rgb, tmp_path, monkeypatch):
-    """The block of docs/how-to/derivatives.md on fitting."""
+    """The block of docs/how-to/exchange.md on fitting."""
     write_ply_splats(tmp_path / "store.ply", random_splats(20, degree=0, size=0.2))
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "how-to" / "derivatives.md").read_text("utf-8")
+    page = (ROOT / "docs" / "how-to" / "exchange.md").read_text("utf-8")
     (text,) = [block for block in re.findall(r"^```python\n(.*?)^```", page, re.M | re.S) if '"splats"' in block]
     names: dict = {}
-    exec(compile(text, "derivatives.md", "exec"), names)
+    exec(compile(text, "exchange.md", "exec"), names)
     losses = [loss.numpy().item() for loss in names["losses"]]
     assert len(losses) == 4 and losses[-1] < 0.9 * losses[0]
 
