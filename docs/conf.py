@@ -1,6 +1,6 @@
-"""Settings of Sphinx for the manual (`make manual`). Nothing here reaches for the network, and no page does.
+"""Sphinx configuration of the manual (`make manual`). Neither the build nor a page uses the network.
 
-The source is the whole checkout, so that links between pages, notebooks and files are those that a code host follows.
+The source folder is the whole checkout, so that links between pages, notebooks and files also work on a code host.
 """
 
 import re
@@ -20,14 +20,14 @@ extensions = ["myst_nb", "sphinx.ext.autodoc"]
 include_patterns = ["docs/index.md", "docs/*/*.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/*.ipynb"]
 root_doc = "docs/index"
 language = "en"
-# Two dashes begin an option.
+# Options begin with two dashes.
 smartquotes = False
 
-# Pages are read as a code host reads them.
+# Pages are parsed as a code host parses them.
 myst_enable_extensions = ["dollarmath"]
 myst_fence_as_directive = ["math"]
 myst_heading_anchors = 4
-# A page may begin with a part of a notebook, whose headings are its own.
+# Notebooks have headings of their own.
 suppress_warnings = ["myst.header"]
 nb_execution_mode = "off"
 highlight_language = "none"
@@ -54,7 +54,7 @@ html_theme_options = {"navigation_with_keys": True}
 
 
 def add_contents(app, page, source):
-    """The contents, hidden: a tree for each heading of docs/index.md, of the pages that are listed below it."""
+    """Add hidden tables of contents: one per heading of docs/index.md, with the pages listed below it."""
     if page != root_doc:
         return
     for part in re.split(r"^## ", source[0], flags=re.M)[1:]:
@@ -65,13 +65,13 @@ def add_contents(app, page, source):
 
 
 def add_inline(writer, node):
-    """A formula as MathML, which browsers draw without scripts."""
+    """Write an inline formula as MathML, which browsers render without scripts."""
     writer.body.append(tex2mathml(node.astext()))
     raise nodes.SkipNode
 
 
 def add_displayed(writer, node):
-    """A formula on its own as MathML."""
+    """Write a displayed formula as MathML."""
     writer.body.append(f'<div class="math-block">{tex2mathml(node.astext(), as_block=True)}</div>')
     raise nodes.SkipNode
 

@@ -1,9 +1,9 @@
-"""Parts of the documentation that are made of the code: tables of presets, recipes, rules, AOVs, commands and so on.
+"""Generate parts of the manual from the code: commands, plugins, presets, recipes, checks, statistics, registries.
 
     python -m tools.generated [--check]
 
-In a page such a part stands between `<!-- made by make docs: NAME -->` and `<!-- end -->`; what stands there is
-replaced. With `--check` nothing is written: exit code 1 where a part is not what the code says now.
+In a page, a generated part is between `<!-- made by make docs: NAME -->` and `<!-- end -->`, and is replaced. With
+`--check` nothing is written, and the exit code is 1 if a part is out of date.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PLUGINS = ("nerg", "nerf", "splats", "gazefield", "gazekde", "panorama")
 
 
 def plugins() -> str:
-    """A section for each plugin: its parameters and its manual."""
+    """A section for each plugin: its parameters and its documentation."""
     _choose_variant()
     sections = []
     for name in PLUGINS:
@@ -35,14 +35,14 @@ def plugins() -> str:
 
 
 def presets() -> str:
-    """The readers of tracking files that know their columns."""
+    """The presets of `nerg rays import`."""
     from nerg_mi.rays.readers.registry import format_preset_table
 
     return _relisted(preset_table())
 
 
 def checks() -> str:
-    """What the sanity card of rays looks for."""
+    """The data-quality checks."""
     from nerg_mi.rays.quality import format_check_table
 
     return _relisted(check_table())
@@ -55,33 +55,33 @@ def _relisted(text: str) -> str:
 
 
 def recipes() -> str:
-    """What each gaze recipe sets: its field, length, losses and probes."""
+    """The settings of each gaze recipe: field, length, losses and probes."""
     from nerg_mi.train import gaze_recipes
 
-    found = list(gaze_recipes.recipes().values())
+    entries = list(gaze_recipes.recipes().values())
     rows: list[tuple[str, ...]] = []
     parts = (("", "settings", "gaze_settings"), ("probes: ", "probes", "probe_settings"))
-    for prefix, given, made in parts:
-        values = [getattr(recipe, made)() for recipe in found]
-        names = dict.fromkeys(name for recipe in found for name in getattr(recipe, given))
+    for prefix, keys, build in parts:
+        values = [getattr(recipe, build)() for recipe in entries]
+        names = dict.fromkeys(name for recipe in entries for name in getattr(recipe, keys))
         rows += [(f"{prefix}`{name}`", *(_shown(getattr(v, name)) for v in values)) for name in names]
-    configs = [_flat(recipe.list_architectures(gaze_recipes.FieldOptions())[0]) for recipe in found]
+    configs = [_flat(recipe.list_architectures(gaze_recipes.FieldOptions())[0]) for recipe in entries]
     names = dict.fromkeys(name for config in configs for name in config)
     rows += [(f"field: `{name}`", *(_shown(c.get(name)) for c in configs)) for name in names]
-    summaries = "\n".join(wrapped(f"- `{recipe.name}`: {recipe.summary}.") for recipe in found)
-    return f"{summaries}\n\n{table(('setting', *(f'`{recipe.name}`' for recipe in found)), rows)}"
+    summaries = "\n".join(wrapped(f"- `{recipe.name}`: {recipe.summary}.") for recipe in entries)
+    return f"{summaries}\n\n{table(('setting', *(f'`{recipe.name}`' for recipe in entries)), rows)}"
 
 
 def _flat(config: object, prefix: str = "") -> dict[str, object]:
-    """The settings of a field, those of its parts by "part.setting"."""
-    found: dict[str, object] = {}
+    """The settings of a field; those of its parts as "part.setting"."""
+    flat: dict[str, object] = {}
     for f in fields(config):
         value = getattr(config, f.name)
         if is_dataclass(value):
-            found |= _flat(value, f"{prefix}{f.name}.")
-        elif not isinstance(value, tuple):  # a box, which is the place's
-            found[prefix + f.name] = value
-    return found
+            flat |= _flat(value, f"{prefix}{f.name}.")
+        elif not isinstance(value, tuple):  # a box, which belongs to the environment
+            flat[prefix + f.name] = value
+    return flat
 
 
 def _shown(value: object) -> str:
@@ -94,7 +94,7 @@ def _shown(value: object) -> str:
 
 
 def registered() -> str:
-    """What there is of each kind of which there are several, and where."""
+    """The extension points with their registered entries."""
     _choose_variant()
     from nerg_mi.fields import encoding as encodings
     from nerg_mi.fields import gaze_base as gaze_fields
@@ -120,8 +120,7 @@ def registered() -> str:
 
 
 def _choose_variant() -> None:
-    """A plugin's modules belong to a variant. Their manual and tables do not, but list what is registered when they are
-    loaded."""
+    """Choose a Mitsuba variant, which the modules of plugins need to be imported."""
     import mitsuba as mi
 
     if mi.variant() is None:
@@ -129,7 +128,7 @@ def _choose_variant() -> None:
 
 
 def measures() -> str:
-    """The numbers of `nerg stats`: how each is defined, and over whom."""
+    """The statistics of `nerg stats` with their definitions."""
     from nerg_mi.statistics.tables import MEASURES
 
     rows = [(m.title.partition(" [")[0], m.definition, m.over, "yes" if m.compared else "") for m in MEASURES]
@@ -145,42 +144,42 @@ PARTS: dict[str, Callable[[], str]] = {
     "recipes": recipes,
     "registered": registered,
 }
-"""Name of a part -> what makes its text."""
+"""Name of a part -> the function that generates its text."""
 
 _PART = re.compile(r"(<!-- made by make docs: (\w+) -->\n)(.*?)(<!-- end -->)", re.S)
 
 
 def pages() -> list[Path]:
-    """The pages that may hold such parts."""
+    """The pages that can contain generated parts."""
     return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def renewed(text: str) -> str:
-    """`text`, a page, with each of its parts made anew. Raises `KeyError` for a part that nothing makes."""
+def regenerate(text: str) -> str:
+    """The page `text` with each part generated again. Raises `KeyError` for an unknown part."""
     return _PART.sub(lambda m: f"{m[1]}\n{aligned(PARTS[m[2]]().strip())}\n\n{m[4]}", text)
 
 
-def stale(write: bool = False) -> list[str]:
-    """The pages of which a part is not what the code says now; `write` mends them."""
-    found = []
+def find_outdated(write: bool = False) -> list[str]:
+    """The pages with a part that is out of date; `write` updates them."""
+    outdated = []
     for page in pages():
         before = page.read_text(encoding="utf-8")
-        after = renewed(before)
+        after = regenerate(before)
         if after != before:
-            found.append(str(page.relative_to(ROOT)))
+            outdated.append(str(page.relative_to(ROOT)))
             if write:
                 page.write_text(after, encoding="utf-8")
-    return found
+    return outdated
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="write nothing, and fail where a page is out of date")
+    parser.add_argument("--check", action="store_true", help="write nothing; fail if a page is out of date")
     options = parser.parse_args(arguments)
-    found = stale(write=not options.check)
-    for page in found:
+    outdated = find_outdated(write=not options.check)
+    for page in outdated:
         print(f"{page} is out of date: run make docs" if options.check else f"wrote {page}")
-    return int(options.check and bool(found))
+    return int(options.check and bool(outdated))
 
 
 if __name__ == "__main__":
