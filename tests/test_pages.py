@@ -33,7 +33,6 @@ NOT_RUN = {
     ("plugins.md", "math"): "a formula",
     ("python.md", "{eval-rst}"): "what Sphinx is told; `make manual` builds the page",
     ("quickstart.md", "text"): "what commands print",
-    ("photos.md", "text"): "installs a package, which needs the network",
 }
 """All blocks of a language on a page -> why nothing is there to be run."""
 
