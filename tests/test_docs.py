@@ -147,7 +147,7 @@ def test_lines_have_at_most_100_columns(page):
     """Prose and lists of every page; tables and code may be wider where a name or a number has no room."""
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
     lines = [line for line in text.splitlines() if not line.startswith("|") and "](" not in line]
-    assert not [line for line in lines if len(line) > 100]
+    assert not [line for line in lines if len(line) > 100 and " " in line.strip()]
 
 
 @pytest.mark.parametrize("page", sorted((ROOT / "docs" / "how-to").glob("*.md")), ids=lambda p: p.name)
