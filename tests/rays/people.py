@@ -1,4 +1,4 @@
-"""People made up for checks of rays."""
+"""Synthetic participants for tests of the checks of rays."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from nerg_mi.rays.readers.base import TrackingFrame
 
 
 def walk(hit=True, frame=None, seed=0):
-    """Two minutes of somebody who walks about at eye height and looks roughly ahead, at things two metres away."""
+    """Two minutes of a person who walks at eye height and looks roughly ahead, at surfaces two metres away."""
     rng = np.random.default_rng(seed)
     n = 6000
     t = np.arange(n) * 0.02
@@ -29,8 +29,8 @@ def warnings_of(rays):
 
 
 def watch(people=3, n=3000, seed=0):
-    """A minute each of people who walk about a room of 6 x 4 m, and look at one point of it after the other: their
-    eyes jump every third of a second, and their heads follow."""
+    """A minute each of participants who walk in a room of 6 x 4 m and look at one point after another: their eyes make
+    a saccade every third of a second, and their heads follow."""
     rng, parts = np.random.default_rng(seed), []
     t = np.arange(n) * 0.02
     for _ in range(people):

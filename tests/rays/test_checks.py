@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.rays.checks import group_medians
-from nerg_mi.rays.direction_checks import walking_agreement
+from nerg_mi.rays.direction_checks import correlate_gaze_with_walking
 from nerg_mi.rays.rays import FRAME
 from tests.rays.people import change, walk, warnings_of, watch
 
@@ -16,17 +16,17 @@ BO = slice(3000, 6000)
 
 
 @pytest.mark.parametrize("by, text", [(-20.0, "-20 s"), (3600.0, "+3,600 s"), (-3600.0, "-3,600 s")])
-def test_a_clock_that_jumps_while_people_go_on(by, text):
+def test_clock_jumps_during_motion(by, text):
     said = warnings_of(change(watch(), slice(4500, 6000), t=lambda t: t + by))
-    assert f"the clock of bo jumps once, by {text} at most" in said and "mend the times" in said
+    assert f"the clock of bo jumps once, by at most {text}" in said and "correct the times" in said
 
 
-def test_pauses_and_recordings_one_after_the_other_are_right():
+def test_pauses_and_consecutive_recordings_are_valid():
     rays = watch()
-    # Whoever goes away for ten minutes is somewhere else afterwards.
+    # After ten minutes away, a person is at another position.
     gone = np.r_[0:1000, 1700:3000]
     assert warnings_of(change(rays, slice(1700, 3000), t=lambda t: t + 600.0).select(gone)) == ""
-    # Files in another order than their times.
+    # The order of files may differ from that of their times.
     later = change(rays, slice(0, 1500), t=lambda t: t + 1000.0)
     assert warnings_of(later.select(np.r_[0:1400, 1700:9000])) == ""
 
@@ -35,34 +35,34 @@ def test_recordings_under_one_name():
     rays = watch()
     shared = replace(rays, person=np.where(rays.person == 2, 1, rays.person))
     said = warnings_of(shared)
-    assert "bo is at two places at the same times: do several people share a name? (--person-from" in said
+    assert "bo is at two positions at the same time: do several people share a name? (--person-from" in said
     between = change(shared, slice(6000, None), t=lambda t: t + 0.003)
     assert "recordings of bo overlap in time" in warnings_of(between)
     twice = rays.select(np.r_[0:9000, 3000:6000])
-    assert warnings_of(twice) == "rays of bo are there twice: was a file imported two times?"
+    assert warnings_of(twice) == "rays of bo are duplicated: was a file imported twice?"
 
 
 def test_clocks_in_other_units():
     rays = watch(5)
     said = warnings_of(change(rays, BO, t=lambda t: 1000 * t))
-    assert "a ray of bo comes every 20 s, and of others every 0.02 s" in said and "--tick" in said
+    assert "the sampling interval of bo is 20 s, that of other participants 0.02 s" in said and "--tick" in said
     said = warnings_of(change(rays, slice(4500, 6000), t=lambda t: 30 + 1000 * (t - 30)))
-    assert "the clock of bo changes its pace" in said and "two units" in said
+    assert "the sampling interval of bo changes" in said and "two units" in said
 
 
-def test_clocks_that_count_from_other_moments():
+def test_clocks_with_other_epochs():
     rays = watch()
-    assert "the clock of bo counts from another moment" in warnings_of(change(rays, BO, t=lambda t: t + 1.7e9))
+    assert "the clock of bo starts from another epoch" in warnings_of(change(rays, BO, t=lambda t: t + 1.7e9))
     assert "(--clock person)" in warnings_of(change(rays, BO, t=lambda t: t + 1.7e9))
-    # Recordings of one study may lie months apart.
+    # Recordings of one study may be months apart.
     assert warnings_of(change(rays, BO, t=lambda t: t + 2e7)) == ""
 
 
-def test_rays_that_were_chosen_say_nothing_of_clocks():
+def test_subsampled_rays_have_no_clock_warnings():
     rays = watch()
     slow = np.r_[0:3000, 3000:6000:40, 6000:9000]
     thinned = rays.select(slow).with_step(step="thin", kept=len(slow), of=len(rays))
-    assert "comes every" in warnings_of(rays.select(slow)) and warnings_of(thinned) == ""
+    assert "sampling interval of" in warnings_of(rays.select(slow)) and warnings_of(thinned) == ""
 
 
 # ---- Eyes ----
@@ -70,9 +70,9 @@ def test_rays_that_were_chosen_say_nothing_of_clocks():
 
 def said(units="m", **distances):
     rays = watch(max(3, len(distances)), 400)
-    about = {**rays.metadata, "eye_distance": distances}
-    about["source_frame"] = {"units": units, "up": "z", "handedness": "right"}
-    return warnings_of(replace(rays, metadata=about))
+    metadata = {**rays.metadata, "eye_distance": distances}
+    metadata["source_frame"] = {"units": units, "up": "z", "handedness": "right"}
+    return warnings_of(replace(rays, metadata=metadata))
 
 
 @pytest.mark.parametrize(
@@ -86,16 +86,16 @@ def said(units="m", **distances):
         ("cm", 0.0315, "is about 0.02 m: scale"),
     ],
 )
-def test_the_unit_by_the_eyes(units, metres, remedy):
+def test_unit_from_eye_distances(units, metres, remedy):
     assert remedy in said(units, ann=metres, bo=metres * 1.02, cy=metres * 0.99)
 
 
-def test_people_differ():
+def test_normal_variation_of_eye_distances():
     assert said(ann=0.052, bo=0.076) == "" and "the eyes of bo are 82 mm apart" in said(ann=0.06, bo=0.082)
-    # Half of several people are not all small.
+    # Half of several participants are not all small.
     few, several = dict(ann=0.053, bo=0.054), dict(ann=0.053, bo=0.054, cy=0.053, di=0.052, ed=0.055)
     assert said(**few) == "" and "the eyes are 53 mm apart" in said(**several)
-    # Nobody who is not there any more.
+    # Participants without rays are ignored.
     assert said(ann=0.06, zoe=63.0) == "" and said() == ""
 
 
@@ -106,37 +106,37 @@ def test_people_differ():
 def test_medians_of_groups(seed):
     rng = np.random.default_rng(seed)
     values, group = rng.normal(size=97), rng.integers(0, 7, 97) * 2
-    found = group_medians(values, group, 15)
+    result = group_medians(values, group, 15)
     for g in range(15):
         mine = values[group == g]
-        assert found[g] == np.median(mine) if mine.size else np.isnan(found[g])
+        assert result[g] == np.median(mine) if mine.size else np.isnan(result[g])
     assert np.isnan(group_medians(np.empty(0), np.empty(0, int), 3)).all()
 
 
 # ---- Files ----
 
 
-def test_what_a_reader_complained_of_is_on_the_card():
+def test_warnings_of_readers_are_reported():
     rays = watch(3, 400)
     assert warnings_of(rays) == ""
-    found = ["the two accounts of ann's gaze differ by 7 degrees: check the calibration"]
-    assert warnings_of(replace(rays, metadata={**rays.metadata, "complaints": found})) == found[0]
+    result = ["the two accounts of ann's gaze differ by 7 degrees: check the calibration"]
+    assert warnings_of(replace(rays, metadata={**rays.metadata, "complaints": result})) == result[0]
 
 
 # ---- Frozen ----
 
 
-def test_who_lost_the_eyes_and_when():
+def test_frozen_gaze_of_participants_and_times():
     rays = watch()
     assert warnings_of(rays) == ""
     rows = slice(3000, 6000)
-    whole = change(rays, rows, direction=rays.direction[3000])
-    assert "the gaze of bo (100 % of the rays) stands still" in warnings_of(whole)
-    assert "--without-person" in warnings_of(whole)
+    complete = change(rays, rows, direction=rays.direction[3000])
+    assert "the gaze of bo (100 % of the rays) does not move" in warnings_of(complete)
+    assert "--without-person" in warnings_of(complete)
     part = change(rays, slice(4000, 5000), direction=rays.direction[4000])
     assert "bo (33 % of the rays)" in warnings_of(part) and "--from, --to" in warnings_of(part)
-    # A moment is not worth a word.
-    assert "stands still" not in warnings_of(change(rays, slice(4000, 4100), direction=rays.direction[4000]))
+    # Short losses are not reported.
+    assert "does not move" not in warnings_of(change(rays, slice(4000, 4100), direction=rays.direction[4000]))
 
 
 # ---- Lengths ----
@@ -148,8 +148,8 @@ def test_units(scale, word):
     assert word in warnings_of(replace(rays, origin=rays.origin * scale))
 
 
-def test_the_axis_that_is_up():
-    # A file with y up that was declared with z up: heights stand in y.
+def test_up_axis_is_suggested():
+    # A file with y up that was declared with z up: heights are in y.
     rays = walk(hit=False)
     assert "--up y" in warnings_of(replace(rays, origin=rays.origin[:, [0, 2, 1]]))
     assert "--up -x" in warnings_of(replace(rays, origin=rays.origin[:, [2, 0, 1]] * (-1, 1, 1)))
@@ -157,8 +157,8 @@ def test_the_axis_that_is_up():
 
 
 @pytest.mark.parametrize("along", [0, 1])
-def test_a_kilometre_is_the_most_that_origins_in_metres_span(along):
-    """Heads at eye height: nothing but how far they are apart gives the unit away."""
+def test_extents_above_a_kilometre_suggest_millimetres(along):
+    """Heads at eye height: only the extent reveals the unit."""
     rays = walk(hit=False)
     for span, warned in ((999.5, False), (1000.5, True)):
         origin = rays.origin.copy()
@@ -167,13 +167,13 @@ def test_a_kilometre_is_the_most_that_origins_in_metres_span(along):
         assert ("--units mm" in warnings_of(slow)) == warned
 
 
-def test_heights_over_a_floor_that_is_not_known():
+def test_heights_above_an_unknown_floor():
     rays = walk(hit=False)
     low = replace(rays, origin=rays.origin - (0, 0, 1.8), metadata={**rays.metadata, "floor": "unknown"})
     assert warnings_of(low) == ""
 
 
-def test_a_moment_says_nothing_of_extents_and_elevations():
+def test_short_recordings_have_no_extent_warnings():
     down = np.array([0.1, 0.1, -1.0]) / np.linalg.norm([0.1, 0.1, -1.0])
     moment = walk(hit=False).select(slice(0, 2))
     moment = replace(moment, direction=np.tile(down, (2, 1)))
@@ -184,7 +184,7 @@ def test_a_moment_says_nothing_of_extents_and_elevations():
 
 
 @pytest.mark.parametrize("get_or_compute_each, is_counter", [(1, True), (2, True), (10, False), (6000, False)])
-def test_one_participant_a_row(get_or_compute_each, is_counter):
+def test_one_participant_per_row(get_or_compute_each, is_counter):
     rays = walk(hit=False)
     person = np.arange(len(rays)) // get_or_compute_each
     rays = replace(rays, person=person, persons=tuple(map(str, range(person.max() + 1))))
@@ -198,7 +198,7 @@ def test_one_participant_a_row(get_or_compute_each, is_counter):
 
 def test_times_and_steep_gaze():
     rays = walk(hit=False)
-    assert "a ray comes every 20 s" in warnings_of(replace(rays, t=rays.t * 1000))
+    assert "the median sampling interval is 20 s" in warnings_of(replace(rays, t=rays.t * 1000))
     down = np.tile([0.1, 0.1, -1.0], (len(rays), 1)) / np.linalg.norm([0.1, 0.1, -1.0])
     assert "degrees down" in warnings_of(replace(rays, direction=down))
 
@@ -206,6 +206,6 @@ def test_times_and_steep_gaze():
 # ---- The list of checks ----
 
 
-def test_nothing_to_say_of_a_plausible_walk():
+def test_plausible_walk_has_no_warnings():
     assert warnings_of(walk()) == "" and warnings_of(walk(hit=False)) == ""
-    assert (walking_agreement(walk())[:2] > 0.5).all()
+    assert (correlate_gaze_with_walking(walk())[:2] > 0.5).all()
