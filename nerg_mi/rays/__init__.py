@@ -1,2 +1,2 @@
-"""Gaze samples as rays: sets and datasets of them, their readers, filters and splits, and the checks of their
-quality."""
+"""Gaze samples as rays: sets and datasets of rays, readers of tracking files, filters and splits, and quality
+checks."""

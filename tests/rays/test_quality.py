@@ -5,10 +5,10 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays import quality
-from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report, format_quality_report, summarise
+from nerg_mi.rays.quality import WARNING_LABEL, format_quality_report, make_quality_report, summarise
 from nerg_mi.rays.rays import FRAME, Rays
 
-# ---- The card in words; what its figures are is tried in test_summary.py ----
+# ---- Quality report as text ----
 
 
 def card(**change):
@@ -26,8 +26,8 @@ def card(**change):
     return make_quality_report(rays, summarise(rays))
 
 
-def test_lines():
-    about = {
+def test_lines_of_the_quality_report():
+    content = {
         "frame": dict(FRAME),
         "source_frame": {"up": "y", "handedness": "left", "units": "cm"},
         "rows_read": 210,
@@ -37,32 +37,32 @@ def test_lines():
         ],
         "steps": [{"step": "split", "side": "test", "kept": 200, "of": 300}],
     }
-    lines = dict(card(metadata=about))
-    assert lines["rays"] == "200 of 210 rows" and lines["persons"] == "10: a, b, c, d, e, f, g, h, ..."
-    assert lines["recorded time"] == "3.8 s at 50 rays a second"
+    lines = dict(card(metadata=content))
+    assert lines["samples"] == "200 of 210 rows" and lines["participants"] == "10: a, b, c, d, e, f, g, h, ..."
+    assert lines["recorded time"] == "3.8 s, sampling rate 50 Hz"
     assert lines["dropped"] == "10 (4.8 %): blink; lines 2-4, 7, 9, ... of a.csv and of 1 more"
-    assert lines["then"] == "split test: 200 of 300 rays kept" and lines["from"] == "y up, left-handed, cm"
+    assert lines["step"] == "split test: 200 of 300 rays kept" and lines["source frame"] == "y up, left-handed, cm"
     assert lines["eye height"] == "1.60 m (5 to 95 %: 1.60 to 1.60)" and lines["speed"] == "95 % below 1.00 m/s"
     assert not {"cohorts", "hit points", "duplicates", WARNING_LABEL} & set(lines)
 
 
-def test_lines_that_are_not_always_there():
+def test_optional_lines_of_the_quality_report():
     n = 200
     hit = np.tile([9.0, 0, 1.6], (n, 1))
     hit[50:] = np.nan
     lines = dict(card(hit=hit, cohort=np.arange(n) % 2, cohorts=("new", "old"), t=np.zeros(n)))
-    assert lines["cohorts"] == "new 100, old 100" and lines["hit points"].startswith("25.0 % of the rays")
+    assert lines["cohorts"] == "new 100, old 100" and lines["hit points"].startswith("in 25.0 % of the samples")
     assert lines["recorded time"].startswith("unknown") and lines["speed"].startswith("unknown")
-    assert lines["duplicates"] == "190 rays share person and time with another"
+    assert lines["duplicates"] == "190 samples have the participant and time of another"
     assert "have the same time" in lines[WARNING_LABEL]
     slow = dict(card(t=10.0 * np.arange(n)))
-    assert slow["recorded time"].startswith("none: each ray of a person comes more than 1 s")
+    assert slow["recorded time"].startswith("none: all intervals between samples of a participant exceed 1 s")
 
 
-def test_names_are_shown_as_they_are():
-    """A person or a file may be called what the terminal's library takes for a colour."""
-    eyes, ahead = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0], (3, 1))
-    rays = Rays(np.arange(3.0), [0, 0, 1], ("[red]", "[/b]"), eyes, ahead, np.ones(3))
+def test_names_are_not_interpreted_as_markup():
+    """Names of persons and files may look like markup of the terminal library."""
+    both_eyes, ahead = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0], (3, 1))
+    rays = Rays(np.arange(3.0), [0, 0, 1], ("[red]", "[/b]"), both_eyes, ahead, np.ones(3))
     shown = format_quality_report(rays, summarise(rays), "[bold].npz")
     assert "[bold].npz" in shown and "[red]" in shown and "[/b]" in shown
 
@@ -80,12 +80,12 @@ def walk(scale=1.0, height=1.6, n=100):
 def test_figures_of_a_walk():
     s = summarise(walk())
     assert (s.rays, s.persons, s.duplicates, s.warnings) == (100, 1, 0, ())
-    assert np.isclose(s.rate, 50) and np.isclose(s.duration, 1.98) and np.isclose(s.speed_p95, 1)
-    assert np.isclose(s.hit_distance, 2) and s.hit_share == 1 and np.isclose(s.eye_height[1], 1.6)
+    assert np.isclose(s.sampling_rate, 50) and np.isclose(s.duration, 1.98) and np.isclose(s.speed_p95, 1)
+    assert np.isclose(s.hit_distance, 2) and s.hit_fraction == 1 and np.isclose(s.eye_height[1], 1.6)
 
 
 @pytest.mark.parametrize("rays, word", [(walk(20), "walking pace"), (walk(0.001, 0.0016), "larger")])
-def test_names_the_likely_mistake(rays, word):
+def test_likely_mistakes_are_reported(rays, word):
     assert any(word in w for w in summarise(rays).warnings)
 
 
@@ -95,8 +95,9 @@ def test_no_rays():
 
 
 @pytest.mark.parametrize("block", [7, 64, 1 << 18])
-def test_figures_do_not_depend_on_order_or_blocks(monkeypatch, block):
-    """Against the definitions, on rays of three people in any order, with pauses, duplicates and missing hits."""
+def test_figures_do_not_depend_on_order_or_block_size(monkeypatch, block):
+    """Compare with the definitions, on rays of three participants in any order, with pauses, duplicates and missing
+    hits."""
     monkeypatch.setattr(quality, "_BLOCK", block)
     rng = np.random.default_rng(0)
     n = 500
@@ -104,7 +105,7 @@ def test_figures_do_not_depend_on_order_or_blocks(monkeypatch, block):
     origin, d = rng.random((n, 3)), np.tile([1.0, 0, 0], (n, 1))
     hit = np.where(rng.random((n, 1)) < 0.3, np.nan, origin + rng.random((n, 1)) * d)
     rays = Rays(t, person, ("a", "b", "c", "nobody"), origin, d, np.ones(n), hit)
-    found = summarise(rays)
+    result = summarise(rays)
     step, speed = [], []
     for p in range(3):
         mine = np.flatnonzero(person == p)
@@ -115,21 +116,27 @@ def test_figures_do_not_depend_on_order_or_blocks(monkeypatch, block):
         speed.append(np.linalg.norm(np.diff(origin[mine], axis=0), axis=1)[moving] / dt[moving])
     step, speed = np.concatenate(step), np.concatenate(speed)
     moving = step[(step > 0) & (step <= 1)]
-    assert found.duration == pytest.approx(moving.sum()) and found.rate == pytest.approx(1 / np.median(moving))
-    assert found.speed_p95 == pytest.approx(np.percentile(speed, 95)) and found.duplicates == (step == 0).sum() > 0
+    assert result.duration == pytest.approx(moving.sum()) and result.sampling_rate == pytest.approx(
+        1 / np.median(moving)
+    )
+    assert result.speed_p95 == pytest.approx(np.percentile(speed, 95)) and result.duplicates == (step == 0).sum() > 0
     distance = np.linalg.norm(hit - origin, axis=1)
-    assert found.hit_share == np.isfinite(distance).mean() and found.hit_distance == pytest.approx(
+    assert result.hit_fraction == np.isfinite(distance).mean() and result.hit_distance == pytest.approx(
         np.nanmedian(distance)
     )
-    assert found.persons == 3
+    assert result.persons == 3
 
 
-def test_rate_of_rays_far_apart():
-    """Rays every two seconds have a rate, although no recorded time."""
+def test_sampling_rate_of_sparse_rays():
+    """Rays every two seconds have a sampling rate, but no recorded time."""
     ahead = np.tile([1.0, 0, 0], (9, 1))
     rays = Rays(np.arange(9) * 2.0, np.zeros(9, int), ("a",), np.full((9, 3), 1.6), ahead, np.ones(9))
-    found = summarise(rays)
-    assert found.rate == 0.5 and found.duration == 0 and np.isnan(found.speed_p95)
-    assert "--tick 0.001" in found.warnings[-1]
+    result = summarise(rays)
+    assert result.sampling_rate == 0.5 and result.duration == 0 and np.isnan(result.speed_p95)
+    assert "--tick 0.001" in result.warnings[-1]
     alone = summarise(rays.select([0]))
-    assert np.isnan(alone.rate) and alone.duplicates == 0 and not any("tick" in w or "t=" in w for w in alone.warnings)
+    assert (
+        np.isnan(alone.sampling_rate)
+        and alone.duplicates == 0
+        and not any("tick" in w or "t=" in w for w in alone.warnings)
+    )
