@@ -1,5 +1,5 @@
-"""Filters and splits of rays: by time, person and confidence, fixations, frozen gaze, recordings, and held-out
-parts."""
+"""Filters and splits of rays: selection by conditions, thinning, fixations, frozen gaze, recordings, and splits into
+training and test rays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nerg_mi.maths import vmf
 
 from .rays import RayIndex, Rays
 
-# ---- Choosing among rays: by time, person, cohort, place and confidence; and fewer of those who stand still ----
+# ---- Selection by time, participant, cohort, position and confidence, and thinning of stationary rays ----
 
 
 def select_mask(
@@ -28,29 +28,43 @@ def select_mask(
     min_confidence: float | None = None,
     with_hit: bool = False,
 ) -> np.ndarray:
-    """Rays (N,) bool that meet every condition given.
+    """Mask (N,) bool of the rays that meet every given condition.
 
-    ``time``: from (inclusive) and to (exclusive), seconds, either may be ``None``. ``persons``, ``without_persons``,
-    ``cohorts``: names. ``box``: x0, x1, y0, y1, z0, z1 in metres that hold the origin. ``min_confidence``: at least
-    this. ``with_hit``: a hit point is known. Raises `NergError` for an unknown name or a box that is none.
+    Parameters
+    ----------
+    time
+        Start (inclusive) and end (exclusive) in seconds; None for no limit.
+    persons, without_persons, cohorts
+        Names of participants to select or to exclude, and of cohorts to select.
+    box
+        x0, x1, y0, y1, z0, z1 in metres; the origin must be inside.
+    min_confidence
+        Minimum confidence.
+    with_hit
+        Whether a ray must have a hit point.
+
+    Raises
+    ------
+    NergError
+        For an unknown name or an invalid box.
     """
     keep = np.ones(len(rays), bool)
     if time is not None:
         start, end = time
         keep &= (rays.t >= (-np.inf if start is None else start)) & (rays.t < (np.inf if end is None else end))
     if persons is not None:
-        keep &= np.isin(rays.person, _codes(persons, rays.persons, "person"))
+        keep &= np.isin(rays.person, _find_codes(persons, rays.persons, "person"))
     if without_persons is not None:
-        keep &= ~np.isin(rays.person, _codes(without_persons, rays.persons, "person"))
+        keep &= ~np.isin(rays.person, _find_codes(without_persons, rays.persons, "person"))
     if cohorts is not None:
         if rays.cohort is None:
             raise NergError("these rays have no cohorts; import them with a cohort column (--map cohort=...)")
-        keep &= np.isin(rays.cohort, _codes(cohorts, rays.cohorts, "cohort"))
+        keep &= np.isin(rays.cohort, _find_codes(cohorts, rays.cohorts, "cohort"))
     if box is not None:
         sides = np.asarray(box, dtype=np.float64)
         if sides.shape != (6,) or not (sides[0::2] < sides[1::2]).all():
             raise NergError(
-                f"a box is x0, x1, y0, y1, z0, z1 in metres with each first below its second, got {sides.tolist()}"
+                f"a box needs x0, x1, y0, y1, z0, z1 in metres with x0 < x1, y0 < y1, z0 < z1, got {sides.tolist()}"
             )
         keep &= ((rays.origin >= sides[0::2]) & (rays.origin <= sides[1::2])).all(axis=1)
     if min_confidence is not None:
@@ -60,15 +74,15 @@ def select_mask(
     return keep
 
 
-def _codes(names: Sequence[str], known: tuple[str, ...], what: str) -> list[int]:
-    unknown = [n for n in names if n not in known]
+def _find_codes(names: Sequence[str], available: tuple[str, ...], what: str) -> list[int]:
+    unknown = [n for n in names if n not in available]
     if unknown:
-        raise NergError(f"no {what} is called {', '.join(map(repr, unknown))}; there are {', '.join(known)}")
-    return [known.index(n) for n in names]
+        raise NergError(f"no {what} is called {', '.join(map(repr, unknown))}; there are {', '.join(available)}")
+    return [available.index(n) for n in names]
 
 
 def argsort_by_person_time(rays: Rays) -> np.ndarray | None:
-    """The rays' order by person and time (N,); None where they are in that order already."""
+    """Order (N,) of the rays by participant and time; None if they are already in that order."""
     earlier = (rays.person[1:] < rays.person[:-1]) | (
         (rays.person[1:] == rays.person[:-1]) & (rays.t[1:] < rays.t[:-1])
     )
@@ -76,18 +90,21 @@ def argsort_by_person_time(rays: Rays) -> np.ndarray | None:
 
 
 def group_by_person(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
-    """The rays' order by person and time (N,), and where in it each person's run starts, with N at the end."""
+    """Order (N,) of the rays by participant and time, and the start of each participant in it, with N at the end."""
     order = np.lexsort((rays.t, rays.person))
     starts = np.flatnonzero(np.r_[True, np.diff(rays.person[order]) != 0])
     return order, np.r_[starts, len(rays)]
 
 
 def label_stays(rays: Rays, distance: float = 0.1, gap: float = 1.0) -> np.ndarray:
-    """Which stay each ray belongs to, (N,) int64: the rays of a person from a first one on, as long as the origins lie
-    within ``distance`` metres of its origin and no pause is longer than ``gap`` seconds. Numbered from 0."""
+    """Label each ray with the number of its stay, from 0, (N,) int64.
+
+    A stay is a run of rays of one participant whose origins are within ``distance`` metres of the origin of its first
+    ray, without a pause longer than ``gap`` seconds.
+    """
     order, starts = group_by_person(rays)
     origin, t = rays.origin[order], rays.t[order]
-    # A pause or another person ends a stay in any case.
+    # A pause or another participant always ends a stay.
     new = np.r_[True, np.diff(t) > gap]
     new[starts[:-1]] = True
     bounds = np.r_[np.flatnonzero(new), len(t)]
@@ -113,11 +130,11 @@ def label_stays(rays: Rays, distance: float = 0.1, gap: float = 1.0) -> np.ndarr
 
 
 def thin_mask(rays: Rays, seconds: float = 2.0, distance: float = 0.1, gap: float = 1.0) -> np.ndarray:
-    """Rays (N,) bool that are left where people stand still: of a stay (:func:`label_stays`) longer than ``seconds``,
-    as many as ``seconds`` hold at its own rate, evenly over all of it.
+    """Mask (N,) bool that thins stationary rays: keep at most ``seconds`` of each stay, evenly spread over it.
 
-    Somebody who waits at a counter for ten minutes then counts as much as somebody who stops there for ``seconds``, and
-    what they looked at keeps its shares. Walking is left as it is.
+    Ten minutes of waiting at a counter then count as much as a stop of ``seconds`` there, and the distribution of gaze
+    within the stay is preserved. Rays of walking people are unchanged. See `label_stays` for ``distance`` (metres) and
+    ``gap`` (seconds).
     """
     if not (seconds > 0 and distance > 0):
         raise NergError(f"seconds {seconds} and distance {distance} must be positive")
@@ -126,35 +143,38 @@ def thin_mask(rays: Rays, seconds: float = 2.0, distance: float = 0.1, gap: floa
     counts = np.bincount(label)
     first = np.r_[0, np.cumsum(counts)[:-1]]
     t = rays.t[order]
-    lasted = t[first + counts - 1] - t[first]
-    share = np.minimum(1.0, seconds / np.maximum(lasted, 1e-9))
-    # Within a stay, rank r is kept where r * share passes a whole number.
+    duration = t[first + counts - 1] - t[first]
+    fraction = np.minimum(1.0, seconds / np.maximum(duration, 1e-9))
+    # Within a stay, keep rank r if r * fraction passes an integer.
     rank = np.arange(len(t)) - np.repeat(first, counts)
-    s = np.repeat(share, counts)
-    kept = np.floor(rank * s) != np.floor((rank - 1) * s)
+    ray_fraction = np.repeat(fraction, counts)
+    is_kept = np.floor(rank * ray_fraction) != np.floor((rank - 1) * ray_fraction)
     out = np.empty(len(t), bool)
-    out[order] = kept
+    out[order] = is_kept
     return out
 
 
-# ---- Fixations: when gaze rests ----
+# ---- Fixations ----
 #
-# I-VT and I-DT of Salvucci and Goldberg (2000), on directions in the world.
+# I-VT and I-DT of Salvucci and Goldberg (2000), on directions in the world frame.
 #
-# Angles are in degrees, times in seconds. A pause of a person longer than ``gap`` ends a fixation. Both return for each
-# ray the number of its fixation, or -1; numbers run person after person in time.
+# Angles are in degrees, times in seconds. A pause of a participant longer than ``gap`` ends a fixation. Both functions
+# return the number of the fixation of each ray, or -1; numbers increase by participant and time.
 
-_GAP = 0.1
+_MAX_GAP = 0.1
 
 
-def detect_fixations_ivt(rays: Rays, velocity: float = 100.0, min_duration: float = 0.06, gap: float = _GAP) -> np.ndarray:
-    """By velocity (I-VT): runs of rays that turn no faster than ``velocity`` degrees a second, of ``least`` seconds or
-    more.
+def detect_fixations_ivt(
+    rays: Rays, velocity: float = 100.0, min_duration: float = 0.06, gap: float = _MAX_GAP
+) -> np.ndarray:
+    """Detect fixations by velocity (I-VT): runs of rays that turn at most by ``velocity`` degrees per second and last
+    at least ``min_duration`` seconds.
 
-    The velocity of a ray is that from the one before it (of the first of a run, to the one after). 100 degrees a second
-    is for gaze in the world of people who walk and turn, 30 is usual where the head rests. Returns (N,) int64.
+    The velocity of a ray is measured from the previous ray; that of the first ray of a run, to the next one. The
+    default of 100 degrees per second suits gaze in the world frame of people who walk and turn; 30 is common for a
+    stationary head. Returns (N,) int64.
     """
-    _positive(velocity=velocity, least=min_duration, gap=gap)
+    _require_positive(velocity=velocity, min_duration=min_duration, gap=gap)
     order, starts = group_by_person(rays)
     t, d = rays.t[order], rays.direction[order]
     step = np.diff(t)
@@ -162,19 +182,22 @@ def detect_fixations_ivt(rays: Rays, velocity: float = 100.0, min_duration: floa
     joined[starts[1:-1] - 1] = False
     with np.errstate(divide="ignore", invalid="ignore"):
         slow = joined & (_angles(d[1:], d[:-1]) <= velocity * step)
-    # Rays joined by slow steps are one run; a ray after a fast step begins one.
+    # Slow steps join rays into a run; a ray after a fast step starts a new one.
     run = np.cumsum(np.r_[True, ~slow]) - 1
-    return _numbered(run, t, order, min_duration)
+    return _number_long_runs(run, t, order, min_duration)
 
 
-def detect_fixations_idt(rays: Rays, dispersion: float = 3.0, min_duration: float = 0.1, gap: float = _GAP) -> np.ndarray:
-    """By dispersion (I-DT): a window of ``least`` seconds whose directions lie within ``dispersion`` degrees grows as
-    long as they do; otherwise it starts one ray later.
+def detect_fixations_idt(
+    rays: Rays, dispersion: float = 3.0, min_duration: float = 0.1, gap: float = _MAX_GAP
+) -> np.ndarray:
+    """Detect fixations by dispersion (I-DT): a window of ``min_duration`` seconds with a dispersion of at most
+    ``dispersion`` degrees grows as long as this holds; otherwise the window starts one ray later.
 
-    Dispersion is the spread of the angle sideways plus the spread upwards, max - min each, in the plane that touches
-    the sphere at the window's first direction (azimuthal equidistant, its axes level and upright). Returns (N,) int64.
+    Dispersion is the horizontal plus the vertical range (max - min) of the directions, in the tangent plane of the
+    sphere at the window's first direction (azimuthal equidistant projection, horizontal and vertical axes). Returns
+    (N,) int64.
     """
-    _positive(dispersion=dispersion, least=min_duration, gap=gap)
+    _require_positive(dispersion=dispersion, min_duration=min_duration, gap=gap)
     order, starts = group_by_person(rays)
     t, d = rays.t[order], rays.direction[order]
     bounds = np.flatnonzero(np.r_[True, np.diff(t) > gap])
@@ -182,13 +205,13 @@ def detect_fixations_idt(rays: Rays, dispersion: float = 3.0, min_duration: floa
     label = np.full(len(t), -1, np.int64)
     number = 0
     for a, b in zip(bounds[:-1], bounds[1:]):
-        # The last ray of the shortest window that starts at each; b where the time does not suffice.
+        # The last ray of the shortest window from each start; b if too little time is left.
         full = np.searchsorted(t[a:b], t[a:b] + min_duration - 1e-9) + a
-        start, possible = a, _may_start(d[a:b], full - a, b - a, dispersion)
+        start, possible = a, _find_window_starts(d[a:b], full - a, b - a, dispersion)
         for s in np.flatnonzero(possible) + a:
             if s < start:
                 continue
-            start = _grow(d, s, full[s - a] + 1, b, dispersion)
+            start = _grow_window(d, s, full[s - a] + 1, b, dispersion)
             label[s:start] = number
             number += 1
     out = np.empty_like(label)
@@ -197,68 +220,69 @@ def detect_fixations_idt(rays: Rays, dispersion: float = 3.0, min_duration: floa
 
 
 def average_fixations(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
-    """One ray a fixation, and how long each lasted (F,), seconds.
+    """Average the rays of each fixation.
 
-    Time of the middle, mean origin, mean direction, mean confidence, mean hit point and mean head (of those known) of
-    the rays with the same number in ``label`` (N,), -1 left out. Raises `NergError` when there is no fixation.
+    Returns F rays, with the mid time and the mean origin, direction, confidence, hit point and head (of those that are
+    finite) of the rays with the same number in ``label`` (N,; -1: none), and the durations (F,) in seconds. Raises
+    `NergError` if there is no fixation.
     """
-    kept = np.flatnonzero(label >= 0)
-    if not kept.size:
+    rows = np.flatnonzero(label >= 0)
+    if not rows.size:
         raise NergError(
-            "there is no fixation among these rays; raise the velocity or the dispersion, or lower the duration"
+            "no fixation was detected; raise the velocity or the dispersion threshold, or lower the minimum duration"
         )
-    _, index, number = np.unique(label[kept], return_index=True, return_inverse=True)
+    _, index, number = np.unique(label[rows], return_index=True, return_inverse=True)
     n = np.bincount(number).astype(np.float64)
-    mean = lambda v: np.stack([np.bincount(number, weights=c) for c in v[kept].T], axis=1) / n[:, None]
+    mean = lambda v: np.stack([np.bincount(number, weights=c) for c in v[rows].T], axis=1) / n[:, None]
     direction = mean(rays.direction)
     first, last = np.full(len(n), np.inf), np.full(len(n), -np.inf)
-    np.minimum.at(first, number, rays.t[kept])
-    np.maximum.at(last, number, rays.t[kept])
-    hit = None if rays.hit is None else _mean_of_known(rays.hit[kept], number)
-    head = None if rays.head is None else _mean_of_known(rays.head[kept], number)
+    np.minimum.at(first, number, rays.t[rows])
+    np.maximum.at(last, number, rays.t[rows])
+    hit = None if rays.hit is None else _nanmean_by_group(rays.hit[rows], number)
+    head = None if rays.head is None else _nanmean_by_group(rays.head[rows], number)
     if head is not None:
         head /= np.linalg.norm(head, axis=1, keepdims=True)
-    one = replace(
-        rays.select(kept[index]),
+    fixations = replace(
+        rays.select(rows[index]),
         t=0.5 * (first + last),
         origin=mean(rays.origin),
         hit=hit,
         head=head,
         direction=direction / np.linalg.norm(direction, axis=1, keepdims=True),
-        confidence=np.clip(np.bincount(number, weights=rays.confidence[kept]) / n, 0.0, 1.0),
+        confidence=np.clip(np.bincount(number, weights=rays.confidence[rows]) / n, 0.0, 1.0),
     )
-    return one, last - first
+    return fixations, last - first
 
 
-def _mean_of_known(values: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Means (F, C) of the rows of ``values`` (N, C) with the same ``number`` (N,); NaN where all hold a NaN."""
-    known = np.isfinite(values).all(axis=1)
-    weight = np.bincount(number, weights=known.astype(float))
-    sums = np.stack([np.bincount(number, weights=np.where(known, c, 0.0)) for c in values.T], axis=1)
+def _nanmean_by_group(values: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Means (F, C) of the finite rows of ``values`` (N, C) per ``number`` (N,); NaN for groups without finite rows."""
+    is_finite = np.isfinite(values).all(axis=1)
+    weight = np.bincount(number, weights=is_finite.astype(float))
+    sums = np.stack([np.bincount(number, weights=np.where(is_finite, c, 0.0)) for c in values.T], axis=1)
     with np.errstate(invalid="ignore"):
         return sums / weight[:, None]
 
 
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Degrees between unit vectors."""
+    """Angles in degrees between unit vectors."""
     return np.degrees(2.0 * np.arcsin(np.minimum(1.0, np.sqrt(0.5 * vmf.one_minus_cosine(a, b)))))
 
 
-def _numbered(run: np.ndarray, t: np.ndarray, order: np.ndarray, least: float) -> np.ndarray:
+def _number_long_runs(run: np.ndarray, t: np.ndarray, order: np.ndarray, min_duration: float) -> np.ndarray:
     counts = np.bincount(run)
     first = np.r_[0, np.cumsum(counts)[:-1]]
-    long = t[first + counts - 1] - t[first] >= least - 1e-9
+    long = t[first + counts - 1] - t[first] >= min_duration - 1e-9
     number = np.where(long, np.cumsum(long) - 1, -1)
     out = np.empty(len(t), np.int64)
     out[order] = number[run]
     return out
 
 
-def _plane(d: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Degrees sideways and upwards (..., 2) of directions (..., 3), seen from ``first`` (..., 3): azimuthal
-    equidistant."""
+def _project_to_plane(d: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Horizontal and vertical angles (..., 2) in degrees of directions (..., 3) from ``first`` (..., 3), in the
+    azimuthal equidistant projection."""
     level = np.hypot(first[..., 0], first[..., 1])
-    steep = level < 1e-9  # who looks straight up has no level of their own
+    steep = level < 1e-9  # a vertical direction has no horizontal axis of its own
     side = np.stack(
         [np.where(steep, 1.0, first[..., 1]), np.where(steep, 0.0, -first[..., 0]), np.zeros_like(level)], axis=-1
     )
@@ -271,8 +295,9 @@ def _plane(d: np.ndarray, first: np.ndarray) -> np.ndarray:
     return np.stack([x * scale, y * scale], axis=-1)
 
 
-def _may_start(d: np.ndarray, full: np.ndarray, n: int, dispersion: float) -> np.ndarray:
-    """Where a window of the least duration holds together, (n,) bool: all starts at once, since most of them fail."""
+def _find_window_starts(d: np.ndarray, full: np.ndarray, n: int, dispersion: float) -> np.ndarray:
+    """Mask (n,) bool of starts whose window of minimum duration passes the threshold. Tests all starts at once, since
+    most of them fail."""
     out = full < n
     starts = np.flatnonzero(out)
     if not starts.size:
@@ -280,141 +305,141 @@ def _may_start(d: np.ndarray, full: np.ndarray, n: int, dispersion: float) -> np
     width = int((full[starts] - starts).max()) + 1
     for block in np.array_split(starts, max(1, starts.size * width >> 20)):
         at = np.minimum(block[:, None] + np.arange(width), full[block][:, None])
-        plane = _plane(d[at], d[block][:, None, :])
+        plane = _project_to_plane(d[at], d[block][:, None, :])
         out[block] = np.ptp(plane, axis=1).sum(axis=1) <= dispersion
     return out
 
 
-def _grow(d: np.ndarray, start: int, end: int, limit: int, dispersion: float) -> int:
-    """Where the window from ``start`` ends that holds together and is at least up to ``end``."""
+def _grow_window(d: np.ndarray, start: int, end: int, limit: int, dispersion: float) -> int:
+    """End of the largest window from ``start`` that passes the threshold, at least ``end``."""
     step = 32
     while True:
         upto = min(end + step, limit)
-        plane = _plane(d[start:upto], d[start])
+        plane = _project_to_plane(d[start:upto], d[start])
         spread = (np.maximum.accumulate(plane) - np.minimum.accumulate(plane)).sum(axis=1)
-        apart = np.flatnonzero(spread > dispersion)
-        if apart.size:
-            return start + int(apart[0])
+        exceeding = np.flatnonzero(spread > dispersion)
+        if exceeding.size:
+            return start + int(exceeding[0])
         if upto == limit:
             return limit
         end, step = upto, 4 * step
 
 
-def _positive(**values: float) -> None:
+def _require_positive(**values: float) -> None:
     for name, value in values.items():
         if not value > 0:
             raise NergError(f"{name} must be positive, got {value}")
 
 
-# ---- Recordings of people among rays: what one person did in one go, as it was stored ----
+# ---- Recordings: continuous runs of one participant, in storage order ----
 
-PAUSE = 60.0  # Seconds: a longer pause ends a recording
-_BACK = 1.0  # seconds by which time goes back where another recording begins; less is a row in the wrong place
-_MIXED = 10, 0.01  # rows, and share of them, at which time goes back in an order in which nobody recorded
+MAX_PAUSE = 60.0  # seconds; a longer pause ends a recording
+_MIN_CLOCK_RESET = 1.0  # seconds; a step back by more starts a recording, a smaller one is a misplaced row
+_MIXED_LIMITS = 10, 0.01  # number and fraction of backward steps above which rays are not in recorded order
 
 
 @dataclass(frozen=True, eq=False)
 class Sessions:
-    """Rays in the order of recordings, those of a person together; S recordings."""
+    """S recordings, and an order of the rays in which each recording is contiguous."""
 
-    order: np.ndarray | None  # (N,) of the rays; None: they are in it already
-    starts: np.ndarray  # (S + 1,) where each begins in that order, with N at the end
-    person: np.ndarray  # (S,) of each
-    back: np.ndarray  # (S,) bool: it begins since time went back
+    order: np.ndarray | None  # (N,) indices of rays; None: the rays are in that order
+    starts: np.ndarray  # (S + 1,) start of each recording in that order, with N at the end
+    person: np.ndarray  # (S,) code of the participant
+    is_clock_reset: np.ndarray  # (S,) bool: the recording starts because time went back
 
     def rows(self, part: slice) -> slice | np.ndarray:
-        """Which rays a part of the order is."""
+        """Indices of the rays in a slice of the order."""
         return part if self.order is None else self.order[part]
 
     def label_rays(self) -> np.ndarray:
-        """Number of the recording of each place of the order, (N,)."""
+        """Number of the recording at each position of the order, (N,)."""
         return np.repeat(np.arange(len(self.person)), np.diff(self.starts))
 
 
 def find_sessions(rays: Rays) -> Sessions:
-    """Recordings: of a person, from one time at which their clock goes back by more than a second, or makes a pause of
-    more than `PAUSE`, to the next.
+    """Find the recordings of each participant: a new one starts when the clock goes back by more than a second, or
+    after a pause longer than `MAX_PAUSE`.
 
-    Rays are stored as they were imported. Where they were mixed since, so that time goes back again and again, they are
-    taken in the order of time.
+    Rays are expected in the order of the import. If their order was changed since, so that time goes back repeatedly,
+    they are sorted by time first.
     """
     person = rays.person
     order = np.argsort(person, kind="stable") if (person[1:] < person[:-1]).any() else None
     sorted_ = lambda values: values if order is None else values[order]
     other, step = np.diff(sorted_(person)) != 0, np.diff(sorted_(rays.t))
-    if np.count_nonzero(~other & (step < -_BACK)) > max(_MIXED[0], _MIXED[1] * len(rays)):
+    if np.count_nonzero(~other & (step < -_MIN_CLOCK_RESET)) > max(_MIXED_LIMITS[0], _MIXED_LIMITS[1] * len(rays)):
         order = argsort_by_person_time(rays)
         other, step = np.diff(sorted_(person)) != 0, np.diff(sorted_(rays.t))
-    back = ~other & (step < -_BACK)
-    new = np.flatnonzero(other | back | (step > PAUSE)) + 1
+    back = ~other & (step < -_MIN_CLOCK_RESET)
+    new = np.flatnonzero(other | back | (step > MAX_PAUSE)) + 1
     starts = np.r_[0, new, len(rays)]
     return Sessions(order, starts, sorted_(person)[starts[:-1]], np.r_[False, back[new - 1]])
 
 
-# ---- Gaze that stands still while the head does not: what trackers write that have lost the eyes ----
+# ---- Frozen gaze: gaze that does not move while the head does, as trackers write when they lose the eyes ----
 
-_STILL = 2e-4  # radians between one ray and the next; trackers that see the eyes make more noise
-_LASTS = 1.0  # seconds; such trackers reach 0.4 at most in 58 recordings
-_PAUSE = 0.5  # seconds without a ray after which gaze is new
-_MOVED, _TURNED = 0.02, 0.05  # metres and radians of a head that moves meanwhile
+_MAX_STILL_STEP = 2e-4  # radians between successive rays; tracked eyes have more noise
+_MIN_FROZEN_SECONDS = 1.0  # seconds; tracked eyes reach at most 0.4 in 58 recordings
+_MAX_INTERVAL = 0.5  # seconds; a longer interval ends a frozen run
+_MIN_HEAD_MOVEMENT, _MIN_HEAD_ROTATION = 0.02, 0.05  # metres and radians of the head's motion during the run
 _BLOCK = 1 << 18
 
 
-def find_frozen(rays: Rays, sessions: Sessions) -> np.ndarray:
-    """Rays (N,) bool of a second or more in which the gaze does not turn though the head moves or turns: the gaze in
-    the world or, where heads are known, its angle to the head."""
+def find_frozen_gaze(rays: Rays, sessions: Sessions) -> np.ndarray:
+    """Mask (N,) bool of frozen gaze: runs of a second or more in which the gaze in the world, or its angle to the head,
+    is constant although the head moves or turns."""
     out = np.zeros(len(rays), bool)
-    for still in _still_steps(rays, sessions):
+    for still in _find_still_steps(rays, sessions):
         edges = np.flatnonzero(np.diff(np.r_[False, still, False]))
         first, last = edges[::2], edges[1::2]
         at = lambda k: k if sessions.order is None else sessions.order[k]
-        long = rays.t[at(last)] - rays.t[at(first)] >= _LASTS
+        long = rays.t[at(last)] - rays.t[at(first)] >= _MIN_FROZEN_SECONDS
         for a, b in zip(first[long].tolist(), last[long].tolist()):
             rows = sessions.rows(slice(a, b + 1))
-            moved = np.ptp(rays.origin[rows], axis=0).max() > _MOVED
-            turned = rays.head is not None and np.ptp(rays.head[rows], axis=0).max() > _TURNED
-            if moved or turned:
+            has_moved = np.ptp(rays.origin[rows], axis=0).max() > _MIN_HEAD_MOVEMENT
+            has_turned = rays.head is not None and np.ptp(rays.head[rows], axis=0).max() > _MIN_HEAD_ROTATION
+            if has_moved or has_turned:
                 out[rows] = True
     return out
 
 
-def _still_steps(rays: Rays, sessions: Sessions) -> list[np.ndarray]:
-    """Whether gaze stands still from each place of the order to the next, (N - 1,) bool: in the world and, where heads
-    are known, against them."""
+def _find_still_steps(rays: Rays, sessions: Sessions) -> list[np.ndarray]:
+    """Masks (N - 1,) bool of steps in that order without motion of the gaze: in the world and, if heads are recorded,
+    relative to the head."""
     n = len(rays)
     world = np.zeros(n - 1, bool)
     head = None if rays.head is None else np.zeros(n - 1, bool)
     for a in range(0, n - 1, _BLOCK):
         rows = sessions.rows(slice(a, a + _BLOCK + 1))
-        d, here = rays.direction[rows], slice(a, min(a + _BLOCK, n - 1))
+        d, block = rays.direction[rows], slice(a, min(a + _BLOCK, n - 1))
         dt = np.diff(rays.t[rows])
-        near = (dt >= 0) & (dt <= _PAUSE)
-        way = np.diff(d, axis=0)
-        world[here] = near & (np.einsum("ij,ij->i", way, way) < _STILL**2)
+        near = (dt >= 0) & (dt <= _MAX_INTERVAL)
+        step = np.diff(d, axis=0)
+        world[block] = near & (np.einsum("ij,ij->i", step, step) < _MAX_STILL_STEP**2)
         if rays.head is not None and head is not None:
-            off = rays.head[rows] - d
-            head[here] = near & (np.abs(np.diff(np.sqrt(np.einsum("ij,ij->i", off, off)))) < _STILL)
-    found = [world] if head is None else [world, head]
-    for still in found:
+            distance = rays.head[rows] - d
+            head[block] = near & (np.abs(np.diff(np.sqrt(np.einsum("ij,ij->i", distance, distance)))) < _MAX_STILL_STEP)
+    masks = [world] if head is None else [world, head]
+    for still in masks:
         still[sessions.starts[1:-1] - 1] = False
-    return found
+    return masks
 
 
-# ---- Splits of rays into training and test that share no ray ----
+# ---- Splits into training and test rays without shared rays ----
 #
-# Neighbouring probes hold the same rays: a random choice of test probes is tested on what it was trained on. So
-# positions are held out in zones, with every ray within reach of a test probe purged, and people are held out whole.
+# Neighbouring probes contain the same rays, so that a random choice of test probes would test on training data.
+# Therefore positions are held out in zones, with all rays near a test probe purged, and participants as a whole.
 
 
 @dataclass(frozen=True, eq=False)
 class PositionSplit:
-    """Rays split by position; those on neither side were purged."""
+    """Rays split by position; rays on neither side are purged."""
 
     train: np.ndarray  # (N,) bool: farther than 2R from every test centre
-    test: np.ndarray  # (N,) bool: within R of one
+    test: np.ndarray  # (N,) bool: within R of a test centre
     test_centres: np.ndarray  # (T, 3) metres
     zone_centres: np.ndarray  # (Z, 3) metres
-    zone: np.ndarray  # (T,) the zone of each test centre
+    zone: np.ndarray  # (T,) zone of each test centre
 
     @property
     def masks(self) -> tuple[np.ndarray, np.ndarray]:
@@ -422,8 +447,8 @@ class PositionSplit:
         return self.train, self.test
 
     @property
-    def purged(self) -> np.ndarray:
-        """Rays used on neither side, (N,) bool."""
+    def is_purged(self) -> np.ndarray:
+        """Mask (N,) bool of rays on neither side."""
         return ~(self.train | self.test)
 
 
@@ -440,67 +465,79 @@ def split_by_position(
 ) -> PositionSplit:
     """Hold out zones of positions for probes of ``radius`` R (metres).
 
-    Zones are vertical cylinders of ``zone_radius`` metres around ray origins, chosen far from each other; the test
-    centres are up to ``test_probes`` ray origins inside them with at least ``min_rays`` rays within R. Training rays
-    lie farther than 2R from each test centre, so that no probe of radius R on the training side comes within R of a
-    test centre. A few zones purge far less than scattered centres would. ``min_train``: training rays that are left at
-    least (``min_rays``). The same seed gives the same split.
+    Zones are vertical cylinders around ray origins, far from each other. Training rays are farther than 2R from each
+    test centre, so that no training probe of radius R shares a ray with a test probe. A few zones purge far fewer rays
+    than scattered centres would. Equal seeds give equal splits.
 
-    Raises `NergError` when the rays hold no such zone or too little is left.
+    Parameters
+    ----------
+    zones, zone_radius
+        Number of zones, and their radius in metres.
+    test_probes
+        Maximum number of test centres: ray origins within the zones.
+    min_rays
+        Minimum number of rays within R of a test centre.
+    min_train
+        Minimum number of training rays. Default: ``min_rays``.
+
+    Raises
+    ------
+    NergError
+        If there is no such zone, or too few training rays are left.
     """
     if zones < 1 or not radius > 0 or not zone_radius > 0:
         raise NergError(f"zones {zones}, radius {radius}, zone_radius {zone_radius}: all must be positive")
     rng = np.random.default_rng(seed)
     index = RayIndex(rays)
 
-    # Farthest-point choice among random origins, which follow where people are;
-    # candidates with too few rays around are no use as a test.
+    # Farthest-point sampling of random origins, whose density follows that of people;
+    # candidates with too few rays around them cannot be tested.
     candidates = rays.origin[rng.permutation(len(rays))[:256]]
-    candidates = candidates[_enough(index, candidates, radius, min_rays)]
+    candidates = candidates[_has_enough_rays(index, candidates, radius, min_rays)]
     if len(candidates) < zones:
         raise NergError(
             f"only {len(candidates)} of 256 positions have {min_rays} rays within {radius} m; "
             "enlarge the radius or lower min_rays"
         )
-    chosen = [0]
-    while len(chosen) < zones:
-        apart = np.linalg.norm(candidates[:, None, :2] - candidates[chosen][None, :, :2], axis=2).min(axis=1)
-        # Among the far half at random: always the farthest would be the corners.
-        order = np.argsort(-apart)
-        chosen.append(int(rng.choice(order[: max(1, len(order) // 4)])))
-    zone_centres = candidates[chosen]
+    selected = [0]
+    while len(selected) < zones:
+        distances = np.linalg.norm(candidates[:, None, :2] - candidates[selected][None, :, :2], axis=2).min(axis=1)
+        # A random one of the farthest quarter: the farthest would always be a corner.
+        order = np.argsort(-distances)
+        selected.append(int(rng.choice(order[: max(1, len(order) // 4)])))
+    zone_centres = candidates[selected]
 
     centres, zone = [], []
     for z, centre in enumerate(zone_centres):
-        found = rng.permutation(np.flatnonzero(((rays.origin[:, :2] - centre[:2]) ** 2).sum(axis=1) <= zone_radius**2))
-        # A few times as many as are wanted will do; of millions of rays not each can be asked.
-        found = found[: 16 * test_probes]
-        enough = found[_enough(index, rays.origin[found], radius, min_rays)]
-        share = test_probes // zones + (z < test_probes % zones)
-        centres.append(rays.origin[enough[:share]])
+        rows = rng.permutation(np.flatnonzero(((rays.origin[:, :2] - centre[:2]) ** 2).sum(axis=1) <= zone_radius**2))
+        # A multiple of the number required suffices; testing all of millions of rays would take too long.
+        rows = rows[: 16 * test_probes]
+        enough = rows[_has_enough_rays(index, rays.origin[rows], radius, min_rays)]
+        count = test_probes // zones + (z < test_probes % zones)
+        centres.append(rays.origin[enough[:count]])
         zone.append(np.full(len(centres[-1]), z))
     test_centres, zone = np.concatenate(centres), np.concatenate(zone)
 
-    near = _distance_to(test_centres, rays.origin)
+    near = _distance_to_nearest(test_centres, rays.origin)
     train = near > 2.0 * radius
     if train.sum() < (min_rays if min_train is None else min_train):
-        raise NergError(f"{train.sum()} rays are left to train on; choose fewer or smaller zones, or a smaller radius")
+        raise NergError(f"only {train.sum()} training rays are left; use fewer or smaller zones, or a smaller radius")
     return PositionSplit(train, near <= radius, test_centres, zone_centres, zone)
 
 
 def purge(rays: Rays, centres: np.ndarray, distance: float) -> np.ndarray:
-    """Rays whose origins are farther than ``distance`` metres from every one of
-    ``centres`` (T, 3): the mask (N,) of what may be trained on."""
-    return _distance_to(np.asarray(centres, dtype=np.float64).reshape(-1, 3), rays.origin) > distance
+    """Mask (N,) of rays that may be used for training: origins farther than ``distance`` metres from all ``centres``
+    (T, 3)."""
+    return _distance_to_nearest(np.asarray(centres, dtype=np.float64).reshape(-1, 3), rays.origin) > distance
 
 
 def split_by_person(
     rays: Rays, *, test_fraction: float = 0.5, test_persons: Sequence[str] | None = None, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Hold out people: masks (N,) of training and test rays.
+    """Hold out participants: masks (N,) of training and test rays.
 
-    ``test_persons`` by name, or a random ``test_share`` of those who have rays, at least one on each side. Raises
-    `NergError` for an unknown name or when a side is empty.
+    Test participants are ``test_persons`` by name, or a random ``test_fraction`` of those with rays, at least one on
+    each side. Raises `NergError` for an unknown name, or if a side is empty.
     """
     present = np.unique(rays.person)
     if test_persons is not None:
@@ -509,29 +546,41 @@ def split_by_person(
             raise NergError(
                 f"no person is called {', '.join(map(repr, unknown))}; the persons are {', '.join(rays.persons)}"
             )
-        held = np.array([rays.persons.index(p) for p in test_persons])
+        test_codes = np.array([rays.persons.index(p) for p in test_persons])
     else:
         count = int(np.clip(round(test_fraction * len(present)), 1, max(1, len(present) - 1)))
-        held = np.random.default_rng(seed).permutation(present)[:count]
-    test = np.isin(rays.person, held)
+        test_codes = np.random.default_rng(seed).permutation(present)[:count]
+    test = np.isin(rays.person, test_codes)
     if test.all() or not test.any():
-        raise NergError(f"{len(present)} persons cannot be split into training and test; give rays of at least two")
+        raise NergError(f"{len(present)} persons cannot be split into training and test; provide rays of at least two")
     return ~test, test
 
 
 def split_by_time(
     rays: Rays, *, test_fraction: float = 0.2, gap: float = 5.0, clock: str = "all"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Hold out the end: masks (N,) of training and test rays.
+    """Hold out the end of the recorded time: masks (N,) of training and test rays.
 
-    Test is the last ``test_share`` of the time from the first ray to the last one, training what lies more than ``gap``
-    seconds before it; rays between are on neither side, since gaze repeats itself for seconds. ``of``: ``all``, one cut
-    for all (a day of a shop), or ``person``, each person's own time (recordings with clocks of their own). Raises
-    `NergError` when a side is empty.
+    Rays between the two sides are used on neither, since gaze is correlated over seconds.
+
+    Parameters
+    ----------
+    test_fraction
+        Fraction of the time from the first to the last ray that is the test side.
+    gap
+        Seconds between the training and the test side.
+    clock
+        ``all``: one cut for all rays (such as a day in a shop); ``person``: one cut per participant (recordings with
+        separate clocks).
+
+    Raises
+    ------
+    NergError
+        If a side is empty.
     """
     if clock not in ("all", "person") or not 0 < test_fraction < 1 or not gap >= 0:
         raise NergError(
-            'a split by time needs the clock "all" or "person", a share between 0 and 1 and a gap of 0 s or more, '
+            'a split by time needs the clock "all" or "person", a fraction between 0 and 1 and a gap of 0 s or more, '
             f'got "{clock}", {test_fraction} and {gap}'
         )
     group = np.zeros(len(rays), np.int64) if clock == "all" else rays.person
@@ -542,45 +591,44 @@ def split_by_time(
     train, test = rays.t < cut - gap, rays.t >= cut
     if not train.any() or not test.any():
         raise NergError(
-            f"{train.sum()} rays are left to train on and {test.sum()} to test; choose a smaller gap or another share"
+            f"only {train.sum()} training rays and {test.sum()} test rays are left; use a smaller gap or another "
+            "fraction"
         )
     return train, test
 
 
 def combine_splits(*sides: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Masks (N,) of training and test rays of several splits at once.
+    """Combine several splits: masks (N,) of training and test rays.
 
-    Training rays are those of every training side, test rays those of every test side (unseen people at unseen places,
-    say). What is on the training side of one and the test side of another is used on neither.
-
-    Raises `NergError` when a side is empty.
+    Training rays are on the training side of each split, test rays on the test side of each (such as unseen
+    participants at unseen positions). All other rays are used on neither side. Raises `NergError` if a side is empty.
     """
     if not sides:
-        raise ValueError("say how to split: by position, person or time")
+        raise ValueError("no split was given; split by position, person or time")
     train, test = (np.logical_and.reduce(side) for side in zip(*sides))
     if not train.any() or not test.any():
         raise NergError(
-            f"together the splits leave {train.sum()} rays to train on and {test.sum()} to test; "
-            "hold out more of one of them"
+            f"the splits together leave only {train.sum()} training rays and {test.sum()} test rays; "
+            "hold out more in one of them"
         )
     return train, test
 
 
 def read_position_split(rays: Rays) -> dict[str, Any]:
-    """How ``rays``, one side of a split by position, were parted: ``test_centres`` (lists of 3), ``radius`` and so on,
-    as their metadata tell; empty where they do not."""
+    """Read from the metadata how ``rays`` were split by position: ``test_centres`` (lists of 3), ``radius`` and so on;
+    empty if they were not."""
     for step in rays.metadata.get("steps", []):
         if step["step"] == "split" and isinstance(step.get("by"), dict):
             return step["by"].get("position", {})
     return {}
 
 
-def _enough(index: RayIndex, places: np.ndarray, radius: float, least: int) -> np.ndarray:
-    """Which places have at least ``least`` rays within ``radius``: no need to count the others."""
-    return np.diff(index.query(places, least, radius).offsets) >= least
+def _has_enough_rays(index: RayIndex, positions: np.ndarray, radius: float, min_rays: int) -> np.ndarray:
+    """Mask of positions with at least ``min_rays`` rays within ``radius``, without counting all of them."""
+    return np.diff(index.query(positions, min_rays, radius).offsets) >= min_rays
 
 
-def _distance_to(centres: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _distance_to_nearest(centres: np.ndarray, points: np.ndarray) -> np.ndarray:
     from scipy.spatial import KDTree
 
     return KDTree(centres).query(points)[0]

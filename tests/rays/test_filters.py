@@ -12,15 +12,15 @@ from nerg_mi.errors import NergError
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays import filters
 from nerg_mi.rays.filters import (
-    combine_splits,
-    find_frozen,
-    find_sessions,
     average_fixations,
+    combine_splits,
     detect_fixations_idt,
     detect_fixations_ivt,
+    find_frozen_gaze,
+    find_sessions,
     label_stays,
-    read_position_split,
     purge,
+    read_position_split,
     select_mask,
     split_by_person,
     split_by_position,
@@ -34,7 +34,7 @@ from tests.rays.people import change, watch
 
 
 def some_rays(n, **columns):
-    """Rays of one person who stands at the origin and looks along x, but for ``columns``."""
+    """Rays of one person at the origin who looks along x, except for ``columns``."""
     ahead = np.tile([1.0, 0, 0], (n, 1))
     values = {"t": np.arange(n) * 0.1, "person": np.zeros(n), "origin": np.zeros((n, 3)), "direction": ahead}
     return Rays(**{**values, "persons": ("ann", "bo"), "confidence": np.ones(n), **columns})
@@ -57,7 +57,7 @@ def line(x):
         ({"cohorts": ["new"]}, [3, 4, 5]),
         ({"persons": ["bo"], "cohorts": ["old"]}, [1]),
         ({"with_hit": True}, [1]),
-        # Bounds that rays lie on: times from the first up to the second, boxes and confidences with both.
+        # Rays at the limits: start is inclusive and end exclusive, boxes and confidences are inclusive.
         ({"time": (0.25, 0.75)}, [1, 2]),
         ({"time": (None, 0.25)}, [0]),
         ({"time": (1.25, None)}, [5]),
@@ -79,12 +79,12 @@ def test_conditions(conditions, rows):
     "conditions, message",
     [
         ({"persons": ["cy"]}, "no person is called 'cy'"),
-        ({"box": [0, 1, 0, 1]}, "a box is"),
-        ({"box": [1, 0, 0, 1, 0, 1]}, "a box is"),
+        ({"box": [0, 1, 0, 1]}, "a box needs"),
+        ({"box": [1, 0, 0, 1, 0, 1]}, "a box needs"),
         ({"cohorts": ["new"]}, "no cohorts"),
     ],
 )
-def test_conditions_that_are_none(conditions, message):
+def test_invalid_conditions_are_refused(conditions, message):
     with pytest.raises(NergError, match=message):
         select_mask(walk(line(np.arange(3.0))), **conditions)
 
@@ -112,11 +112,11 @@ def test_stays_by_definition(seed, distance):
     assert label.tolist() == want
 
 
-def test_thinning_counts_a_stop_as_long_as_asked():
+def test_thinning_keeps_the_requested_seconds_of_a_stop():
     rays, stop = walk(line(np.r_[np.arange(0, 5, 0.5), np.full(1001, 5.0), np.arange(5.5, 10, 0.5)])), slice(10, 1011)
-    kept = thin_mask(rays, seconds=2.0)
-    assert kept[:10].all() and kept[1011:].all() and 20 <= kept[stop].sum() <= 22
-    where = np.flatnonzero(kept[stop])
+    selected = thin_mask(rays, seconds=2.0)
+    assert selected[:10].all() and selected[1011:].all() and 20 <= selected[stop].sum() <= 22
+    where = np.flatnonzero(selected[stop])
     assert where[0] == 0 and np.ptp(np.diff(where)) <= 1  # even
     assert thin_mask(rays, seconds=1000).all()
     for wrong in ({"seconds": 0}, {"distance": 0}):
@@ -124,7 +124,7 @@ def test_thinning_counts_a_stop_as_long_as_asked():
             thin_mask(rays, **wrong)
 
 
-def test_stays_as_long_and_as_far_as_they_may_be():
+def test_stays_at_the_limits():
     t = np.array([0, 1, 2, 3.25])
     assert label_stays(walk(line(np.zeros(4)), t=t), gap=1.0).tolist() == [0, 0, 0, 1]
     assert label_stays(walk(line(np.array([0, 0.5, -0.5, 0.75])), t=t * 0), distance=0.5).tolist() == [0, 0, 0, 1]
@@ -134,7 +134,7 @@ def test_stays_as_long_and_as_far_as_they_may_be():
 
 
 def gaze(azimuth, elevation=0.0, dt=0.02, **columns):
-    """Rays of somebody whose gaze turns: degrees at steps of ``dt`` seconds."""
+    """Rays of a person whose gaze turns by degrees at steps of ``dt`` seconds."""
     a, e = np.broadcast_arrays(np.radians(np.asarray(azimuth, float)), np.radians(elevation))
     d = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=1)
     return some_rays(len(d), **{"t": np.arange(len(d)) * dt, "direction": d, **columns})
@@ -148,9 +148,9 @@ WANT = np.array([*[0] * 10, -1, -1, *[1] * 10, -1, *[2] * 10])
 
 def test_ivt_by_hand():
     label = detect_fixations_ivt(gaze(SEQUENCE), velocity=100)
-    # A ray belongs to the run that its step leads into: the first of a run comes after a fast step.
+    # A ray belongs to the run that its step leads to: the first of a run follows a fast step.
     assert label.tolist() == WANT.tolist()
-    # 8 degrees in 0.02 s are 400 a second: a limit above that joins the first two.
+    # 8 degrees in 0.02 s are 400 per second: a higher limit joins the first two.
     assert len(set(detect_fixations_ivt(gaze(SEQUENCE), velocity=450)) - {-1}) == 2
     # Nine steps of 0.02 s are 0.18 s.
     assert (detect_fixations_ivt(gaze(SEQUENCE), velocity=100, min_duration=0.19) == -1).all()
@@ -158,28 +158,33 @@ def test_ivt_by_hand():
 
 def test_idt_by_hand():
     assert detect_fixations_idt(gaze(SEQUENCE), dispersion=1.0).tolist() == WANT.tolist()
-    # Within five degrees 16 joins 20.
+    # Within five degrees, 16 joins 20.
     assert detect_fixations_idt(gaze(SEQUENCE), dispersion=5.0).tolist() == [*WANT[:11], 1, *WANT[12:]]
-    # A slow drift of half a degree a ray: no velocity finds its end, the dispersion does, every seven rays (3 degrees).
+    # A slow drift of half a degree per ray: I-VT finds no end, I-DT ends it every seven rays (3 degrees).
     drift = gaze(0.5 * np.arange(28))
-    assert detect_fixations_idt(drift, dispersion=3.01).tolist() == [k // 7 for k in range(28)] and (detect_fixations_ivt(drift) == 0).all()
-    # Sideways and upwards add up.
+    assert (
+        detect_fixations_idt(drift, dispersion=3.01).tolist() == [k // 7 for k in range(28)]
+        and (detect_fixations_ivt(drift) == 0).all()
+    )
+    # Horizontal and vertical ranges are added.
     both = gaze(0.5 * np.arange(28), 0.5 * np.arange(28))
     assert detect_fixations_idt(both, dispersion=3.05, min_duration=0.04).tolist() == [k // 4 for k in range(28)]
 
 
 @pytest.mark.parametrize("degrees, parts", [(2.9, 1), (3.1, 2)])
-def test_straight_up_is_measured_as_anywhere(degrees, parts):
-    """Who looks straight up has no level: what they look at next is as far away as it is."""
+def test_dispersion_at_the_zenith(degrees, parts):
+    """Dispersion also works for vertical gaze, which has no horizontal axis of its own."""
     up = gaze(np.zeros(10), 90 - np.r_[np.zeros(5), np.full(5, degrees)])
     assert len(set(detect_fixations_idt(up, dispersion=3.0, min_duration=0.04))) == parts
 
 
 @pytest.mark.parametrize("elevation", [0.0, 60.0, -85.0])
 def test_dispersion_is_measured_on_the_sphere(elevation):
-    # Where gaze is steep, a degree of azimuth is less: 3 degrees of arc are kept together, 4 are not.
+    # For steep gaze a degree of azimuth is shorter: 3 degrees of arc are one fixation, 4 are not.
     arc = lambda degrees: gaze(np.linspace(0, degrees / np.cos(np.radians(elevation)), 12), elevation)
-    assert (detect_fixations_idt(arc(2.0), dispersion=3.0) == 0).all() and len(set(detect_fixations_idt(arc(6.0), dispersion=3.0, min_duration=0.04))) > 1
+    assert (detect_fixations_idt(arc(2.0), dispersion=3.0) == 0).all() and len(
+        set(detect_fixations_idt(arc(6.0), dispersion=3.0, min_duration=0.04))
+    ) > 1
 
 
 @settings(max_examples=30, deadline=None)
@@ -189,7 +194,7 @@ def test_idt_by_definition(seed):
     n = int(rng.integers(1, 120))
     azimuth = np.cumsum(rng.choice([0.2, 6.0], n, p=[0.9, 0.1]) * rng.choice([-1, 1], n))
     label = detect_fixations_idt(gaze(azimuth), dispersion=2.1)  # no sum of steps
-    # Salvucci and Goldberg's loop, for gaze that turns sideways only.
+    # The loop of Salvucci and Goldberg, for gaze that only turns horizontally.
     want, s, number = np.full(n, -1), 0, 0
     while s < n:
         e = s + 5  # 0.1 s
@@ -205,14 +210,14 @@ def test_idt_by_definition(seed):
     assert label.tolist() == want.tolist()
 
 
-def test_one_ray_a_fixation():
+def test_one_ray_per_fixation():
     rays = gaze([*[0, 2] * 5, *[40] * 10])
     hit, head = np.full((20, 3), np.nan), np.tile([1.0, 0, 0], (20, 1))
     hit[:4] = rays.origin[:4] + 2 * rays.direction[:4]
     head[1], head[2], head[10:] = [0, 1, 0], [np.nan] * 3, np.nan
     rays = replace(rays, hit=hit, head=head)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # a fixation without a hit is nothing to be warned of
+        warnings.simplefilter("error")  # a fixation without a hit must not warn
         one, seconds = average_fixations(rays, detect_fixations_idt(rays))
     assert len(one) == 2 and np.allclose(seconds, 0.18) and np.allclose(one.t, [0.09, 0.29])
     assert np.allclose(np.degrees(np.arctan2(one.direction[:, 1], one.direction[:, 0])), [1, 40])
@@ -227,17 +232,17 @@ def test_one_ray_a_fixation():
 
 @pytest.mark.parametrize("find", [detect_fixations_ivt, detect_fixations_idt])
 @pytest.mark.parametrize("gap", [0.02, -0.1, 0.0, -1000.0])
-def test_two_people_are_never_one_fixation(find, gap):
-    """Somebody's first ray may come any time after, or before, another one's last, in the very same direction."""
+def test_fixations_do_not_span_participants(find, gap):
+    """The first ray of a participant may follow the last one of another at any time, in the same direction."""
     t = np.arange(20) * 0.02
     still = gaze([0] * 40, person=np.r_[np.zeros(20), np.ones(20)], t=np.r_[t, t + t[-1] + gap])
     assert find(still).tolist() == [0] * 20 + [1] * 20
-    # Each stay is too short by itself; together they would not be.
+    # Each stay is too short by itself; joined they would not be.
     assert (find(still, min_duration=0.5) == -1).all()
 
 
 @pytest.mark.parametrize("find", [detect_fixations_ivt, detect_fixations_idt])
-def test_the_order_of_rays_makes_no_difference(find):
+def test_fixations_do_not_depend_on_the_order_of_rays(find):
     still = gaze([0] * 40, person=np.arange(40) // 20, t=np.tile(np.arange(20) * 0.02 + (np.arange(20) >= 10), 2))
     order = np.random.default_rng(0).permutation(40)
     assert find(still).tolist() == [0] * 10 + [1] * 10 + [2] * 10 + [3] * 10
@@ -252,35 +257,35 @@ def test_the_order_of_rays_makes_no_difference(find):
         (9, 0.11, {}, -1),  # a pause of a tenth of a second ends a fixation
         (9, 0.11, {"gap": 0.12}, 0),
         (9, 0.125, {"gap": 0.125}, 0),  # one as long as it may be does not
-        (3, 0.125, {"least": 0.25, "gap": 0.2}, 0),  # as short as a fixation may be
-        (3, 0.125, {"least": 0.251, "gap": 0.2}, -1),
+        (3, 0.125, {"min_duration": 0.25, "gap": 0.2}, 0),  # as short as a fixation may be
+        (3, 0.125, {"min_duration": 0.251, "gap": 0.2}, -1),
     ],
 )
-def test_pauses_and_durations_on_the_bounds(find, count, dt, limits, expected):
+def test_pauses_and_durations_at_the_limits(find, count, dt, limits, expected):
     assert (find(gaze([0] * count, dt=dt), **limits) == expected).all()
 
 
 # ---- Frozen ----
 
 
-def found(rays):
-    return find_frozen(rays, find_sessions(rays))
+def find_frozen_rows(rays):
+    return find_frozen_gaze(rays, find_sessions(rays))
 
 
 @pytest.mark.parametrize("block", [100, 1 << 18])
-def test_gaze_that_stands_still(monkeypatch, block):
+def test_frozen_gaze(monkeypatch, block):
     monkeypatch.setattr(filters, "_BLOCK", block)
     rays = watch()
-    assert not found(rays).any()
+    assert not find_frozen_rows(rays).any()
     still = slice(3100, 3400)
     world = change(rays, still, direction=rays.direction[3100])
-    assert np.flatnonzero(found(world)).tolist() == list(range(3100, 3400))
+    assert np.flatnonzero(find_frozen_rows(world)).tolist() == list(range(3100, 3400))
     # Less than a second is a fixation or a blink.
-    assert not found(change(rays, slice(3100, 3140), direction=rays.direction[3100])).any()
-    # The head in place of the eyes; without it, nothing is seen of that.
+    assert not find_frozen_rows(change(rays, slice(3100, 3140), direction=rays.direction[3100])).any()
+    # The head's direction as gaze; without a recorded head it is not detected.
     as_head = change(rays, still, direction=rays.head[still])
-    assert found(as_head)[3101:3399].all() and found(as_head).sum() <= 302
-    assert not found(replace(as_head, head=None)).any()
+    assert find_frozen_rows(as_head)[3101:3399].all() and find_frozen_rows(as_head).sum() <= 302
+    assert not find_frozen_rows(replace(as_head, head=None)).any()
 
 
 @pytest.mark.parametrize("turns, moves", [(True, False), (False, True)])
@@ -292,44 +297,44 @@ def test_a_head_that_only_turns_or_only_moves(turns, moves):
     if not moves:
         columns["origin"] = rays.origin[3100]
     frozen_rays = change(rays, rows, **columns)
-    assert np.flatnonzero(found(frozen_rays)).tolist() == list(range(3100, 3400))
-    # Where no head is recorded, only a movement tells.
-    assert found(replace(frozen_rays, head=None))[3101:3399].all() == moves
+    assert np.flatnonzero(find_frozen_rows(frozen_rays)).tolist() == list(range(3100, 3400))
+    # Without a recorded head, only movement is detected.
+    assert find_frozen_rows(replace(frozen_rays, head=None))[3101:3399].all() == moves
 
 
 @pytest.mark.parametrize("seconds, expected", [(1.0, True), (0.98, False)])
-def test_a_second_is_long_enough(seconds, expected):
+def test_minimum_duration_of_frozen_gaze(seconds, expected):
     rays = watch(1)
     t = np.arange(len(rays)) / 64
     rays = change(rays, slice(None), t=lambda _: t)
     count = round(seconds * 64) + 1
-    assert found(change(rays, slice(640, 640 + count), direction=rays.direction[640])).any() == expected
+    assert find_frozen_rows(change(rays, slice(640, 640 + count), direction=rays.direction[640])).any() == expected
 
 
 def test_a_headset_on_a_table_is_not_frozen_gaze():
     rays = watch()
     rows = slice(3100, 3400)
     put = change(rays, rows, direction=rays.direction[3100], head=rays.head[3100], origin=rays.origin[3100])
-    assert not found(put).any()
+    assert not find_frozen_rows(put).any()
 
 
-def test_people_among_each_other():
+def test_frozen_gaze_of_interleaved_participants():
     rays = watch()
     mixed = change(rays, slice(3000, 3600), direction=rays.direction[3000])
     order = np.argsort(mixed.t, kind="stable")
-    assert set(order[found(mixed.select(order))]) == set(range(3000, 3600))
+    assert set(order[find_frozen_rows(mixed.select(order))]) == set(range(3000, 3600))
 
 
-def test_pauses_and_the_next_person_end_what_stands_still():
+def test_pauses_and_other_participants_end_frozen_gaze():
     rays, rows = watch(1), slice(1470, 1530)
     still = change(rays, rows, direction=rays.direction[1470])
-    assert found(still)[1470:1530].all()
-    assert not found(change(still, slice(1500, None), t=lambda t: t + 0.6)).any()
+    assert find_frozen_rows(still)[1470:1530].all()
+    assert not find_frozen_rows(change(still, slice(1500, None), t=lambda t: t + 0.6)).any()
     two = replace(still, person=(np.arange(len(rays)) >= 1500).astype(int), persons=("ann", "bo"))
-    assert not found(two).any()
-    # Half a second is as long as a pause may be.
+    assert not find_frozen_rows(two).any()
+    # Half a second is the maximum interval.
     slow = change(change(rays, slice(0, 4), direction=rays.direction[0]), slice(0, 4), t=np.array([-2, -1.5, -1, -0.5]))
-    assert found(slow)[:4].all()
+    assert find_frozen_rows(slow)[:4].all()
 
 
 # ---- Sessions ----
@@ -338,29 +343,29 @@ def test_pauses_and_the_next_person_end_what_stands_still():
 def test_recordings_end_where_clocks_go_back_or_pause():
     t = [*range(5), *range(10, 100, 50), *range(300, 310), *np.arange(0, 40), *range(7)]
     person = [0] * 57 + [1] * 7
-    found = find_sessions(some_rays(len(t), t=t, person=person))
-    assert found.order is None and found.starts.tolist() == [0, 7, 17, 57, 64]
-    assert found.person.tolist() == [0, 0, 0, 1] and found.back.tolist() == [False, False, True, False]
-    assert found.label_rays().tolist() == [0] * 7 + [1] * 10 + [2] * 40 + [3] * 7
+    result = find_sessions(some_rays(len(t), t=t, person=person))
+    assert result.order is None and result.starts.tolist() == [0, 7, 17, 57, 64]
+    assert result.person.tolist() == [0, 0, 0, 1] and result.is_clock_reset.tolist() == [False, False, True, False]
+    assert result.label_rays().tolist() == [0] * 7 + [1] * 10 + [2] * 40 + [3] * 7
 
 
-def test_people_among_each_other_and_rays_that_were_mixed():
+def test_recordings_of_interleaved_and_shuffled_rays():
     t, person = np.repeat(np.arange(300) * 0.02, 2), np.tile([0, 1], 300)
-    found = find_sessions(some_rays(len(t), t=t, person=person))
-    assert found.order.tolist() == [*range(0, 600, 2), *range(1, 600, 2)] and found.starts.tolist() == [0, 300, 600]
-    assert found.rows(slice(1, 3)).tolist() == [2, 4]
-    # Rows in the wrong place by less than a second are no other recording.
+    result = find_sessions(some_rays(len(t), t=t, person=person))
+    assert result.order.tolist() == [*range(0, 600, 2), *range(1, 600, 2)] and result.starts.tolist() == [0, 300, 600]
+    assert result.rows(slice(1, 3)).tolist() == [2, 4]
+    # Rows misplaced by less than a second do not start another recording.
     swapped = t.copy()
     swapped[[10, 20]] = t[[20, 10]]
     assert find_sessions(some_rays(600, t=swapped, person=person)).starts.tolist() == [0, 300, 600]
     mixed = some_rays(600, t=10 * t, person=person)
     mixed = mixed.select(np.random.default_rng(0).permutation(600))
-    found = find_sessions(mixed)
-    assert found.starts.tolist() == [0, 300, 600] and not found.back.any()
-    assert (np.diff(mixed.t[found.order[:300]]) > 0).all()
+    result = find_sessions(mixed)
+    assert result.starts.tolist() == [0, 300, 600] and not result.is_clock_reset.any()
+    assert (np.diff(mixed.t[result.order[:300]]) > 0).all()
 
 
-def test_nobody_is_two():
+def test_participants_have_single_recordings():
     one = some_rays(1, person=[1])
     assert find_sessions(one).starts.tolist() == [0, 1] and find_sessions(one).person.tolist() == [1]
 
@@ -381,7 +386,7 @@ def rays_splits():
 
 
 def rows(mask, probes):
-    """Rays held by probes made on a part, as rows of the whole."""
+    """Rays in probes made from a part, as rows of the complete set."""
     return set(np.flatnonzero(mask)[probes.indices].tolist())
 
 
@@ -393,16 +398,16 @@ def test_train_and_test_probes_share_no_ray(rays_splits):
     assert len(test) == 30 and len(train) > 300
     a, b, c = rows(split.train, train), rows(split.test, test), rows(np.ones(len(rays_splits), bool), everywhere)
     assert a and b and not a & b and not a & c
-    assert b == c  # a test probe loses nothing to the split
-    # And training probes keep their distance: no training ray within 2R.
-    apart = np.linalg.norm(rays_splits.origin[split.train][:, None] - split.test_centres[None], axis=2)
-    assert apart.min() > 2 * R
+    assert b == c  # a test probe has all of its rays
+    # Training probes keep their distance: no training ray within 2R.
+    distances = np.linalg.norm(rays_splits.origin[split.train][:, None] - split.test_centres[None], axis=2)
+    assert distances.min() > 2 * R
     within = np.linalg.norm(rays_splits.origin[:, None] - split.test_centres[None], axis=2).min(axis=1)
-    assert np.array_equal(split.test, within <= R) and np.array_equal(split.purged, (within > R) & (within <= 2 * R))
-    assert not (split.train & split.test).any() and (split.train | split.test | split.purged).all()
+    assert np.array_equal(split.test, within <= R) and np.array_equal(split.is_purged, (within > R) & (within <= 2 * R))
+    assert not (split.train & split.test).any() and (split.train | split.test | split.is_purged).all()
 
 
-def test_zones_are_apart_and_repeatable(rays_splits):
+def test_zones_are_separate_and_repeatable(rays_splits):
     a, b = (split_by_position(rays_splits, R, zones=4, zone_radius=0.3, seed=7) for _ in range(2))
     assert np.array_equal(a.train, b.train) and np.array_equal(a.test_centres, b.test_centres)
     gaps = np.linalg.norm(a.zone_centres[:, None, :2] - a.zone_centres[None, :, :2], axis=2)
@@ -411,7 +416,7 @@ def test_zones_are_apart_and_repeatable(rays_splits):
         assert np.linalg.norm(a.test_centres[a.zone == z][:, :2] - a.zone_centres[z, :2], axis=1).max() <= 0.3
 
 
-def test_people(rays_splits):
+def test_split_by_person(rays_splits):
     train, test = split_by_person(rays_splits, test_fraction=0.4, seed=0)
     people = [set(rays_splits.person[side]) for side in (train, test)]
     assert not people[0] & people[1] and len(people[1]) == 2 and (train ^ test).all()
@@ -429,23 +434,23 @@ def test_refusals(rays_splits):
         split_by_person(rays_splits, test_persons=["zoe"])
     with pytest.raises(NergError, match="cannot be split"):
         split_by_person(rays_splits.select(rays_splits.person == 0))
-    for radius, message in ((0.01, "enlarge the radius"), (3.0, "left to train on")):
+    for radius, message in ((0.01, "enlarge the radius"), (3.0, "training rays are left")):
         with pytest.raises(NergError, match=message):
             split_by_position(rays_splits, radius)
-    with pytest.raises(ValueError, match="how to split"):
+    with pytest.raises(ValueError, match="no split was given"):
         combine_splits()
 
 
-def test_by_time_with_a_gap(rays_splits):
+def test_split_by_time_with_a_gap(rays_splits):
     train, test = split_by_time(rays_splits, test_fraction=0.25, gap=10)
     t = rays_splits.t
     assert np.isclose(t[test].min(), 0.75 * np.ptp(t), atol=0.02) and t[test].min() - t[train].max() >= 10
-    # Clocks of their own: everybody's last quarter.
-    own = replace(rays_splits, t=t + 5000 * rays_splits.person)
-    train, test = split_by_time(own, test_fraction=0.25, gap=10, clock="person")
+    # Separate clocks: the last quarter of each participant.
+    single = replace(rays_splits, t=t + 5000 * rays_splits.person)
+    train, test = split_by_time(single, test_fraction=0.25, gap=10, clock="person")
     for p in range(5):
-        mine = own.person == p
-        assert own.t[test & mine].min() - own.t[train & mine].max() >= 10 and 0.24 < test[mine].mean() < 0.26
+        mine = single.person == p
+        assert single.t[test & mine].min() - single.t[train & mine].max() >= 10 and 0.24 < test[mine].mean() < 0.26
     for wrong, message in (({"gap": 1e6}, "smaller gap"), ({"of": "day"}, '"all" or "person"')):
         with pytest.raises(NergError, match=message):
             split_by_time(rays_splits, **wrong)
@@ -473,19 +478,19 @@ def test_no_combination_shares_a_ray(rays_splits, seed, kinds):
         a = place_probes(rays_splits.select(train), R, placement="blue", count=300, min_rays=4)
         b = place_probes(rays_splits.select(test), R, queries=by_position.test_centres, min_rays=1)
         assert not rows(train, a) & rows(test, b)
-        apart = np.linalg.norm(rays_splits.origin[train][:, None] - by_position.test_centres[None], axis=2)
-        assert apart.min() > 2 * R
+        distances = np.linalg.norm(rays_splits.origin[train][:, None] - by_position.test_centres[None], axis=2)
+        assert distances.min() > 2 * R
 
 
 @pytest.mark.parametrize("count, each", [(10, [4, 3, 3]), (11, [4, 4, 3]), (12, [4, 4, 4]), (2, [1, 1, 0])])
-def test_every_test_position_that_was_asked_for(rays_splits, count, each):
-    """What does not divide by the zones goes to the first of them."""
+def test_requested_number_of_test_positions(rays_splits, count, each):
+    """The remainder of the division by the number of zones is assigned to the first zones."""
     split = split_by_position(rays_splits, R, zones=3, zone_radius=0.4, test_probes=count, min_rays=8)
     assert len(split.test_centres) == count and np.bincount(split.zone, minlength=3).tolist() == each
 
 
-def test_the_metadata_tell_how_rays_were_split(rays_splits):
-    """What the layout draws; nothing where there was none."""
+def test_position_split_is_read_from_the_metadata(rays_splits):
+    """Data for the layout figure; empty without a split by position."""
     assert read_position_split(rays_splits) == {}
     by = {"position": {"radius": R, "test_centres": [[0.0, 0.0, 1.5]]}, "person": {"test": ["a"]}}
     split = rays_splits.with_step(step="filter", kept=9, of=9).with_step(step="split", side="test", kept=9, of=9, by=by)
@@ -494,21 +499,21 @@ def test_the_metadata_tell_how_rays_were_split(rays_splits):
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_of_two_people_one_is_on_each_side(rays_splits, share):
+def test_two_participants_are_split_one_to_each_side(rays_splits, share):
     train, test = split_by_person(rays_splits.select(rays_splits.person < 2), test_fraction=share)
     assert train.any() and test.any()
 
 
-def test_distances_and_times_on_the_bounds():
-    """Rays at R from a test centre are of the test, those at 2R of neither side."""
+def test_distances_and_times_at_the_limits():
+    """Rays at R from a test centre are test rays, those at 2R are on neither side."""
     near = [[0.5, 0, 0], [-0.5, 0, 0], [0, 0.5, 0], [0, -0.5, 0]]
     twice, far = [[1.0, 0, 0]], [[5.0 + 3 * k, 0, 0] for k in range(9)]
     origin = np.array([[0.0, 0, 0]] * 70 + near + twice + far)
     n = len(origin)
     rays = walk(origin, t=np.arange(n) * 1.0)
-    # Of all places the first alone has so many rays within R.
+    # Only the first position has that many rays within R.
     split = split_by_position(rays, 0.5, zones=1, test_probes=1, min_rays=73, min_train=9)
-    with pytest.raises(ValueError, match="9 rays are left to train on"):
+    with pytest.raises(ValueError, match="only 9 training rays are left"):
         split_by_position(rays, 0.5, zones=1, test_probes=1, min_rays=73, min_train=10)
     assert split.test.tolist() == [True] * 74 + [False] * 10 and split.train.tolist() == [False] * 75 + [True] * 9
     assert purge(rays, np.zeros((1, 3)), 1.0).tolist() == split.train.tolist()
@@ -518,8 +523,8 @@ def test_distances_and_times_on_the_bounds():
 
 
 @pytest.mark.parametrize("missing", [0, 1])
-def test_both_sides_of_several_splits_have_rays(missing):
+def test_combined_splits_need_rays_on_both_sides(missing):
     a, b = np.array([True, False, False]), np.array([False, True, False])
     sides = (a, b), ((b, b) if missing == 0 else (a, a))
-    with pytest.raises(ValueError, match="together the splits leave"):
+    with pytest.raises(ValueError, match="the splits together leave"):
         combine_splits(*sides)
