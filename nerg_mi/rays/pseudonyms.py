@@ -1,7 +1,7 @@
-"""Names of people replaced by pseudonyms: HMAC-SHA256 of the name under a salt.
+"""Pseudonyms of participants: HMAC-SHA256 of the name, with a salt as the key.
 
-Whoever has the salt can tell which pseudonym is that of a name that they know or guess; without it nobody can, by the
-pseudonyms. Where people stood and what they looked at is as it was, and can tell who they are by itself.
+With the salt, the pseudonym of a known or guessed name can be computed; without it, pseudonyms do not reveal names.
+Positions and gaze are not changed, and can still identify a person.
 """
 
 from __future__ import annotations
@@ -22,88 +22,91 @@ from nerg_mi.files.safe_read import read_bytes
 
 from .rays import Rays
 
-SALT_BYTES = 16  # A salt has at least so many bytes: fewer can be tried out one after the other
-_MOST_SALT = 1 << 20
-# Hexadecimal digits of a pseudonym: 64 bits, of which no two people share one.
+MIN_SALT_BYTES = 16  # Shorter salts can be found by trying all of them
+_MAX_SALT_BYTES = 1 << 20
+# Hexadecimal digits of a pseudonym: 64 bits, so that collisions are practically impossible.
 _DIGITS = 16
-# Names of fewer characters are parts of too many words to be looked for in them.
-_WORD = 3
+# Shorter names occur within too many words to be searched for.
+_MIN_NAME_LENGTH = 3
 
 
 def read_salt(path: str | os.PathLike) -> bytes:
-    """The bytes of the file ``path`` as a salt. Raises `NergError` for one that is missing, or too short to be one."""
-    salt = read_bytes(path, "salt", _MOST_SALT)
-    if len(salt) < SALT_BYTES:
+    """Read the file ``path`` as a salt. Raises `NergError` if it is missing or too short."""
+    salt = read_bytes(path, "salt", _MAX_SALT_BYTES)
+    if len(salt) < MIN_SALT_BYTES:
         raise NergError(
-            f'the salt "{path}" has {len(salt)} bytes, and fewer than {SALT_BYTES} can be guessed; '
+            f'the salt "{path}" has {len(salt)} bytes; fewer than {MIN_SALT_BYTES} bytes can be guessed; '
             f"make one with: head -c 32 /dev/urandom > {path}"
         )
     return salt
 
 
 def make_pseudonyms(names: Iterable[str], salt: bytes | None = None) -> dict[str, str]:
-    """A pseudonym for each of ``names`` of people: what `pseudonymise` gives them for the same salt."""
-    key = _key(salt)
-    return {name: "p" + _digest(key, "person", name)[:_DIGITS] for name in names}
+    """Pseudonyms by name, the same as `pseudonymise` gives with this ``salt``."""
+    key = _make_key(salt)
+    return {name: "p" + _compute_digest(key, "person", name)[:_DIGITS] for name in names}
 
 
-def _key(salt: bytes | None) -> bytes:
-    if salt is not None and len(salt) < SALT_BYTES:
-        raise NergError(f"a salt of {len(salt)} bytes can be guessed; give at least {SALT_BYTES}")
+def _make_key(salt: bytes | None) -> bytes:
+    if salt is not None and len(salt) < MIN_SALT_BYTES:
+        raise NergError(f"the salt has {len(salt)} bytes and can be guessed; use at least {MIN_SALT_BYTES}")
     return secrets.token_bytes(32) if salt is None else salt
 
 
-def _digest(key: bytes, kind: str, text: str) -> str:
+def _compute_digest(key: bytes, kind: str, text: str) -> str:
     return hmac.new(key, f"{kind}:{text}".encode("utf-8", "surrogatepass"), hashlib.sha256).hexdigest()
 
 
 def pseudonymise(rays: Rays, salt: bytes | None = None) -> Rays:
-    """``rays`` with a pseudonym (``p`` and 16 hexadecimal digits) for each person.
+    """Replace the name of each participant by a pseudonym (``p`` and 16 hexadecimal digits).
 
-    ``salt``: at least `SALT_BYTES` bytes; rays that were given the same have the same pseudonym for the same name.
-    Default: a random one, which nobody keeps. Rays are put into the order of the pseudonyms, since that of the names
-    can be guessed. In the metadata, files have names that are made alike (``f`` and digits, endings kept) and HMACs in
-    place of their checksums, and names of people are replaced wherever they stand, also as parts of other words.
-    Cohorts, times, origins, directions and hit points are left as they are.
+    Rays are sorted by pseudonym, since their former order would reveal that of the names. In the metadata, files get
+    aliases (``f`` and digits, suffixes kept) and HMACs instead of checksums, and names of participants are replaced
+    wherever they occur, also within words. Cohorts, times, origins, directions and hit points are not changed.
+
+    Parameters
+    ----------
+    salt
+        At least `MIN_SALT_BYTES` bytes; equal salts give equal pseudonyms. Default: a random salt, which is discarded.
     """
-    key = _key(salt)
-    digest = lambda kind, text: _digest(key, kind, text)
+    key = _make_key(salt)
+    digest = lambda kind, text: _compute_digest(key, kind, text)
     person = lambda name: "p" + digest("person", name)[:_DIGITS]
     names = [person(name) for name in rays.persons]
     order = sorted(range(len(names)), key=lambda i: names[i])
-    place = np.empty(len(names), np.int32)
-    place[order] = np.arange(len(names))
-    code = place[rays.person]
-    metadata = _without_names(rays.metadata, rays.persons, person, digest)
+    rank = np.empty(len(names), np.int32)
+    rank[order] = np.arange(len(names))
+    code = rank[rays.person]
+    metadata = _replace_names(rays.metadata, rays.persons, person, digest)
     metadata["pseudonyms"] = "HMAC-SHA256, " + ("random salt, not kept" if salt is None else "salt of a file")
     rows = np.argsort(code, kind="stable")
     return replace(rays, person=code, persons=tuple(names[i] for i in order), metadata=metadata).select(rows)
 
 
-def _without_names(metadata: dict, persons: tuple[str, ...], person: Callable, digest: Callable) -> dict:
-    files = {s["file"]: _alias(s["file"], digest) for s in metadata.get("sources", [])}
-    files |= {d["file"]: _alias(d["file"], digest) for d in metadata.get("dropped", []) if d.get("file")}
-    whole = {name: person(name) for name in persons} | files
-    # The longest first: "anna" is a part of "anna2".
-    parts = sorted((name for name in (*files, *persons) if len(name) >= _WORD), key=len, reverse=True)
+def _replace_names(metadata: dict, persons: tuple[str, ...], person: Callable, digest: Callable) -> dict:
+    files = {s["file"]: _make_alias(s["file"], digest) for s in metadata.get("sources", [])}
+    files |= {d["file"]: _make_alias(d["file"], digest) for d in metadata.get("dropped", []) if d.get("file")}
+    replacements = {name: person(name) for name in persons} | files
+    # Longest first: "anna" is a part of "anna2".
+    parts = sorted((name for name in (*files, *persons) if len(name) >= _MIN_NAME_LENGTH), key=len, reverse=True)
     pattern = re.compile("|".join(map(re.escape, parts)), re.IGNORECASE) if parts else None
-    folded = {name.lower(): whole[name] for name in parts}
+    folded = {name.lower(): replacements[name] for name in parts}
 
     def clean(value: object) -> object:
         if isinstance(value, dict):
-            return {whole.get(k, k): clean(v) for k, v in value.items()}
+            return {replacements.get(k, k): clean(v) for k, v in value.items()}
         if isinstance(value, (list, tuple)):
             return [clean(v) for v in value]
         if not isinstance(value, str):
             return value
-        if value in whole:
-            return whole[value]
-        # Some letters match without regard to case and are another letter in lower case.
-        hidden = lambda found: folded.get(found.group().lower()) or person(found.group())
-        return pattern.sub(hidden, value) if pattern else value
+        if value in replacements:
+            return replacements[value]
+        # Some letters match case-insensitively, but differ in lower case.
+        replace_match = lambda found: folded.get(found.group().lower()) or person(found.group())
+        return pattern.sub(replace_match, value) if pattern else value
 
-    kept = {k: metadata[k] for k in _PLAIN if k in metadata}
-    out = {k: clean(v) for k, v in metadata.items() if k not in (*_PLAIN, "sources", "dropped", "steps")}
+    unchanged = {k: metadata[k] for k in _PLAIN_KEYS if k in metadata}
+    out = {k: clean(v) for k, v in metadata.items() if k not in (*_PLAIN_KEYS, "sources", "dropped", "steps")}
     if "sources" in metadata:
         sources = [
             {"file": files[s["file"]], **({"hmac_sha256": digest("bytes", s["sha256"])} if "sha256" in s else {})}
@@ -114,18 +117,18 @@ def _without_names(metadata: dict, persons: tuple[str, ...], person: Callable, d
         dropped = [{**d, "file": files.get(d.get("file", ""), "")} for d in metadata["dropped"]]
         out["dropped"] = sorted(dropped, key=lambda d: (d["reason"], d["file"]))
     if "steps" in metadata:
-        # What a step is called, and which of its settings there are, are words of this package.
+        # The names of a step and of its settings are defined by this package.
         out["steps"] = [{k: v if k == "step" else clean(v) for k, v in step.items()} for step in metadata["steps"]]
-    return {**kept, **out}
+    return {**unchanged, **out}
 
 
-# What this package writes itself, whose words may hold somebody's name by chance.
-_PLAIN = ("frame", "source_frame", "transform", "rows_read", "preset", "tick", "degrees", "forward")
+# Keys whose values this package writes; they may contain a participant's name by chance.
+_PLAIN_KEYS = ("frame", "source_frame", "transform", "rows_read", "preset", "tick", "degrees", "forward")
 
 
-def _alias(file: str, digest: Callable) -> str:
-    suffixes = "".join(s for s in Path(file).suffixes[-2:] if s.lower() in _ENDINGS)
+def _make_alias(file: str, digest: Callable) -> str:
+    suffixes = "".join(s for s in Path(file).suffixes[-2:] if s.lower() in _FILE_SUFFIXES)
     return "f" + digest("file", file)[:_DIGITS] + suffixes
 
 
-_ENDINGS = (".csv", ".gz", ".parquet", ".txt", ".tsv", ".npz")
+_FILE_SUFFIXES = (".csv", ".gz", ".parquet", ".txt", ".tsv", ".npz")

@@ -1,4 +1,4 @@
-"""Names of people leave the rays, their files' names and their metadata; what the rays say stays."""
+"""Names of participants are removed from rays, file names and metadata; all other data remain."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ NAMES = ("Zoe Ames", "anna", "anna2", "bo")
 
 @pytest.fixture
 def rays(tmp_path):
-    """Four people, a file each that has their name, with a row that is dropped in each."""
+    """Four participants, with one file each that contains their name, and a dropped row in each."""
     for i, name in enumerate(NAMES):
         (tmp_path / f"{name}.csv").write_text(
             "t,x,y,z,a,b,c\n" + f"{i},0,0,{i},0,1,0\n{i + 0.5},0,0,{i},0,0,1\n9,,0,0,1,0,0\n"
         )
     files = [tmp_path / f"{n}.csv" for n in NAMES]
-    found = read("table", *files, columns=ColumnMap.parse("origin=x,y,z direction=a,b,c t=t"))
-    found.metadata["recorded_by"] = "ANNA, of /data/Zoe Ames/raw"
-    return found.with_step(step="filter", kept=8, of=8, persons=["anna", "bo"]).with_step(
+    rays_ = read("table", *files, columns=ColumnMap.parse("origin=x,y,z direction=a,b,c t=t"))
+    rays_.metadata["recorded_by"] = "ANNA, of /data/Zoe Ames/raw"
+    return rays_.with_step(step="filter", kept=8, of=8, persons=["anna", "bo"]).with_step(
         step="split", kept=8, of=8, by={"person": {"test": ["anna2"]}}
     )
 
 
-def test_no_name_is_left_anywhere(rays, tmp_path):
+def test_no_name_remains(rays, tmp_path):
     hidden = pseudonymise(rays)
     hidden.save(tmp_path / "out.npz")
     back = Rays.load(tmp_path / "out.npz")
@@ -42,7 +42,7 @@ def test_no_name_is_left_anywhere(rays, tmp_path):
         assert name not in text
     assert all(len(p) == 17 and p.startswith("p") for p in back.persons) and len(set(back.persons)) == 4
     assert "salt, not kept" in back.metadata["pseudonyms"]
-    # Endings tell what the files were, and each dropped row is still that of one of them.
+    # Suffixes identify the file types, and each dropped row still belongs to one of them.
     sources = [s["file"] for s in back.metadata["sources"]]
     assert all(s.endswith(".csv") for s in sources) and sources == sorted(sources)
     assert {d["file"] for d in back.metadata["dropped"]} == set(sources)
@@ -53,10 +53,10 @@ def test_no_name_is_left_anywhere(rays, tmp_path):
     assert split["by"]["person"]["test"][0] in back.persons
 
 
-def test_rays_stay_those_of_the_same_people(rays):
+def test_rays_keep_their_participants(rays):
     hidden = pseudonymise(rays, SALT)
     assert list(hidden.persons) == sorted(hidden.persons) and (np.diff(hidden.person) >= 0).all()
-    # Each person stands at a height of their own.
+    # Each participant is at a height of their own.
     by_name = {rays.origin[rays.person == p, 2][0]: np.sort(rays.t[rays.person == p]) for p in range(4)}
     for p in range(4):
         mine = hidden.person == p
@@ -66,12 +66,12 @@ def test_rays_stay_those_of_the_same_people(rays):
     assert hidden.metadata["transform"] == rays.metadata["transform"]
 
 
-def test_the_salt_decides(rays):
+def test_pseudonyms_depend_on_the_salt(rays):
     one, again, other = pseudonymise(rays, SALT), pseudonymise(rays, SALT), pseudonymise(rays, SALT[::-1])
     assert one.persons == again.persons and not set(one.persons) & set(other.persons)
     assert one.metadata["sources"] == again.metadata["sources"]
     assert not set(pseudonymise(rays).persons) & set(pseudonymise(rays).persons)
-    # The same person in another import, among others.
+    # The same participant in another import, among others.
     some = pseudonymise(rays.select(rays.person == 2), SALT)
     at = dict(zip(one.origin[:, 2], one.person))
     assert some.persons[some.person[0]] == one.persons[at[some.origin[0, 2]]]
@@ -82,7 +82,7 @@ def one_ray(name, note):
     return replace(rays, metadata={**rays.metadata, "note": note})
 
 
-def test_a_letter_or_two_are_no_word_to_look_for():
+def test_short_names_are_not_replaced_within_words():
     """A person called "a" does not change the words of the metadata."""
     rays = one_ray("a", "a draft")
     hidden = pseudonymise(rays, SALT)

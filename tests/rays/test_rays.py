@@ -29,31 +29,31 @@ from nerg_mi.rays.rays import (
 
 
 @pytest.mark.parametrize("block", [1 << 21, 64])
-def test_nearest_against_all_distances(block, monkeypatch):
+def test_query_equals_brute_force(block, monkeypatch):
     monkeypatch.setattr(module, "_INDEX_BLOCK", block)
     rng = np.random.default_rng(0)
     origin, places = rng.random((500, 3)), rng.random((40, 3)) * 1.2
     index = RayIndex(origin)
-    apart = np.linalg.norm(origin[None] - places[:, None], axis=2)
-    for most, radius in ((10, 0.2), (1000, 0.3), (7, np.inf)):
-        found = index.query(places, most, radius)
+    distances = np.linalg.norm(origin[None] - places[:, None], axis=2)
+    for limit, radius in ((10, 0.2), (1000, 0.3), (7, np.inf)):
+        result = index.query(places, limit, radius)
         for q in range(40):
-            run = slice(found.offsets[q], found.offsets[q + 1])
-            want = np.argsort(apart[q])[: min(most, (apart[q] <= radius).sum())]
-            assert np.array_equal(found.indices[run], want) and np.allclose(found.distances[run], apart[q][want])
+            run = slice(result.offsets[q], result.offsets[q + 1])
+            want = np.argsort(distances[q])[: min(limit, (distances[q] <= radius).sum())]
+            assert np.array_equal(result.indices[run], want) and np.allclose(result.distances[run], distances[q][want])
 
 
-def test_the_rim_counts_and_nonsense_is_refused():
+def test_radius_is_inclusive_and_invalid_queries_are_refused():
     index = RayIndex(np.array([[0.25, 0, 0], [0.3, 0, 0]]))
     assert index.query([[0, 0, 0]], 5, 0.25).indices.tolist() == [0]
-    with pytest.raises(ValueError, match="at least one ray"):
+    with pytest.raises(ValueError, match="max_count 0"):
         index.query([[0, 0, 0]], 0)
 
 
-def test_rays_that_are_equally_far_keep_their_order():
-    """It decides bits of every training: that of scipy's cKDTree as it is by default."""
+def test_equally_distant_rays_keep_their_order():
+    """The order determines the last bits of every training: it is that of SciPy's default cKDTree."""
     rng = np.random.default_rng(3)
-    origin = rng.integers(0, 30, (20_000, 3)).astype(float)  # on a lattice: many are equally far
+    origin = rng.integers(0, 30, (20_000, 3)).astype(float)  # on a lattice: many distances are equal
     near = RayIndex(origin).query(origin[:50], 300)
     _, indices = cKDTree(origin, balanced_tree=False).query(origin[:50], k=300)
     assert np.array_equal(near.indices, indices.ravel())
@@ -90,8 +90,8 @@ def some(hit):
     points = np.random.default_rng(1).random((9, 3))
     points[4] = np.nan
     heads = np.where(np.isnan(points), points, np.float32([0.6, 0.0, 0.8]))
-    about = {"frame": dict(FRAME), "dropped": [{"reason": "blink", "count": 2, "rows": [[3, 4]]}]}
-    return some_rays(9, metadata=about, **({"hit": points, "head": heads} if hit else {}))
+    metadata = {"frame": dict(FRAME), "dropped": [{"reason": "blink", "count": 2, "rows": [[3, 4]]}]}
+    return some_rays(9, metadata=metadata, **({"hit": points, "head": heads} if hit else {}))
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -132,7 +132,7 @@ def test_parquet_without_pyarrow(tmp_path, monkeypatch):
 
 
 def stored(path, **changes):
-    """A rays file in which some arrays, or keys of the metadata, are others; None: left out."""
+    """A rays file with some arrays or metadata keys replaced; None removes one."""
     rays = some(True)
     arrays = {k: getattr(rays, k) for k in ("t", "person", "origin", "direction", "confidence", "hit")}
     metadata = {"version": 1, **rays.metadata, "persons": list(rays.persons)}
@@ -150,9 +150,9 @@ def stored(path, **changes):
     [
         ({"person": np.full(9, -1)}, "unknown person"),
         ({"person": np.full(9, 1 << 32)}, "unknown person"),
-        ({"person": np.zeros(9)}, "person is not whole numbers"),
+        ({"person": np.zeros(9)}, "person is not integers"),
         ({"direction": np.full((9, 3), np.inf)}, "direction that is not finite"),
-        ({"origin": np.zeros((9, 2))}, r"origin has the shape \(9, 2\)"),
+        ({"origin": np.zeros((9, 2))}, r"origin has shape \(9, 2\)"),
         ({"t": np.zeros(8)}, "expected"),
         ({"t": np.zeros((3, 3))}, "expected"),
         ({"t": np.array(1.0)}, "expected"),
@@ -162,11 +162,11 @@ def stored(path, **changes):
         ({"hit": None, "cohort": np.zeros(9, int)}, "unknown cohort"),
         ({"t": None}, "lacks t"),
         ({"metadata": np.array("[" * 5000)}, "nested"),
-        ({"metadata": np.zeros(3)}, "no text"),
+        ({"metadata": np.zeros(3)}, "not text"),
         ({"version": None}, 'lack "version"'),
     ],
 )
-def test_what_is_no_rays_file_is_one_sentence(tmp_path, changes, why):
+def test_invalid_rays_files_are_refused(tmp_path, changes, why):
     path = stored(tmp_path / "changed.npz", **changes)
     with pytest.raises(NergError, match=why) as caught:
         Rays.load(path)
@@ -190,10 +190,10 @@ def test_narrow_numbers_and_other_columns_are_read(tmp_path):
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_every_cut_and_every_flipped_byte(tmp_path, ending):
-    """A file that lost its end, or of which one byte is another, is read or refused in a sentence; nothing else."""
-    whole, path = tmp_path / f"whole.{ending}", tmp_path / f"hurt.{ending}"
-    some(True).save(whole)
-    data, rng = whole.read_bytes(), np.random.default_rng(0)
+    """A truncated file, or one with a changed byte, is either read or refused with one sentence."""
+    complete, path = tmp_path / f"whole.{ending}", tmp_path / f"hurt.{ending}"
+    some(True).save(complete)
+    data, rng = complete.read_bytes(), np.random.default_rng(0)
     refused = 0
     for at in rng.integers(0, len(data), 120).tolist():
         for hurt in (data[:at], data[:at] + bytes([data[at] ^ 0x41]) + data[at + 1 :], data[:at] + data[at + 7 :]):
@@ -207,14 +207,14 @@ def test_every_cut_and_every_flipped_byte(tmp_path, ending):
 
 
 def test_a_small_file_does_not_become_a_large_array(tmp_path):
-    """Zeros take no room in the file: 8 million rays would be three quarters of a gigabyte."""
+    """Zeros compress to almost nothing: 8 million rays would take three quarters of a gigabyte."""
     n, path = 8_000_000, tmp_path / "zeros.npz"
     metadata = {"version": 1, "persons": ["a"], "frame": dict(FRAME)}
     small = {name: np.zeros(n, np.int8) for name in ("t", "person", "confidence")}
     small |= {name: np.zeros((n, 3), np.int8) for name in ("origin", "direction")}
     np.savez_compressed(path, metadata=np.array(json.dumps(metadata)), **small)
     assert path.stat().st_size < 1 << 20
-    with pytest.raises(NergError, match="8,000,000 rays, which its .* bytes do not warrant"):
+    with pytest.raises(NergError, match="8,000,000 rays, too many for its size"):
         Rays.load(path)
 
 
@@ -236,9 +236,9 @@ def test_parquet_of_other_types(tmp_path, column, value):
         Rays.load(path)
 
 
-def test_what_does_not_shrink_is_stored(tmp_path):
-    """Random digits are not worth the time of deflating them, and of inflating them each time."""
-    n = 50_000  # of a column more than the sample that is looked at
+def test_incompressible_columns_are_stored(tmp_path):
+    """Compressing random digits is not worth the time."""
+    n = 50_000  # more than the sample that is tested for compressibility
     rays = some_rays(n, t=np.arange(n) * 0.02, origin=np.zeros((n, 3)))
     rays.save(tmp_path / "r.npz")
     with zipfile.ZipFile(tmp_path / "r.npz") as archive:
@@ -249,15 +249,15 @@ def test_what_does_not_shrink_is_stored(tmp_path):
 
 
 @pytest.mark.parametrize("metadata", [{"tick": 0}, {"persons": 3}, {"note": [[]] * 9_000_000}])
-def test_nothing_is_written_that_could_not_be_read(tmp_path, metadata):
+def test_unreadable_metadata_are_not_written(tmp_path, metadata):
     rays = some(False)
     columns = {k: getattr(rays, k) for k in ("t", "person", "origin", "direction", "confidence")}
-    with pytest.raises(NergError, match="cannot be kept"):
+    with pytest.raises(NergError, match="cannot be saved"):
         write_rays_file(tmp_path / "r.npz", columns, {**rays.metadata, "persons": list(rays.persons), **metadata})
     assert not list(tmp_path.iterdir())
 
 
-# ---- The JSON document of a rays file: what is read, and what is refused ----
+# ---- Metadata of a rays file: accepted and refused documents ----
 
 GOOD = {
     "version": VERSION,
@@ -280,14 +280,14 @@ GOOD = {
 
 
 def read(**change):
-    about = {**GOOD, **change}
-    return read_metadata(json.dumps({k: v for k, v in about.items() if v is not ...}), "r.npz")
+    metadata = {**GOOD, **change}
+    return read_metadata(json.dumps({k: v for k, v in metadata.items() if v is not ...}), "r.npz")
 
 
-def test_what_is_known_and_what_is_not():
+def test_known_and_unknown_metadata():
     assert read() == {k: v for k, v in GOOD.items() if k != "version"}
-    least = json.dumps({k: GOOD[k] for k in ("version", "frame", "persons")})
-    assert set(read_metadata(least.encode(), "r.npz")) == {"frame", "persons"}
+    minimum = json.dumps({k: GOOD[k] for k in ("version", "frame", "persons")})
+    assert set(read_metadata(minimum.encode(), "r.npz")) == {"frame", "persons"}
 
 
 @pytest.mark.parametrize(
@@ -297,14 +297,14 @@ def test_what_is_known_and_what_is_not():
         ({"version": ...}, 'lack "version"'),
         ({"persons": ...}, 'lack "persons"'),
         ({"frame": ...}, 'lack "frame"'),
-        ({"frame": {"units": "m", "up": "z"}}, '"frame" .*frame of units'),
+        ({"frame": {"units": "m", "up": "z"}}, '"frame" .*frame with units'),
         ({"persons": ["ann", 2]}, '"persons" .*list of names'),
         ({"persons": "ann"}, '"persons" .*list of names'),
-        ({"transform": [[1e400]]}, "can be inverted"),
-        ({"transform": 3}, "can be inverted"),
-        ({"transform": np.zeros((4, 4)).tolist()}, "can be inverted"),
-        ({"transform": np.eye(3).tolist()}, "can be inverted"),
-        ({"transform": (np.arange(16).reshape(4, 4) + 1).tolist()}, "can be inverted"),
+        ({"transform": [[1e400]]}, "invertible"),
+        ({"transform": 3}, "invertible"),
+        ({"transform": np.zeros((4, 4)).tolist()}, "invertible"),
+        ({"transform": np.eye(3).tolist()}, "invertible"),
+        ({"transform": (np.arange(16).reshape(4, 4) + 1).tolist()}, "invertible"),
         ({"rows_read": -1}, "number of rows"),
         ({"rows_read": True}, "number of rows"),
         ({"sources": [{"sha256": "00"}]}, "list of files"),
@@ -315,7 +315,7 @@ def test_what_is_known_and_what_is_not():
         ({"steps": [{"step": "split", "kept": 1, "of": 2, "by": {"position": {"test_centres": [[1, 2]]}}}]}, "steps"),
         ({"eye_distance": {"ann": "wide"}}, "distances in metres"),
         ({"eye_distance": [0.06]}, "distances in metres"),
-        ({"floor": 0}, '"floor" .*word'),
+        ({"floor": 0}, '"floor" .*text'),
         ({"tick": 0}, "time in seconds"),
         ({"tick": "1"}, "time in seconds"),
     ],
@@ -326,7 +326,7 @@ def test_metadata_refusals(change, message):
 
 
 @pytest.mark.parametrize("text", ["[]", "1", "{", ""])
-def test_what_is_no_document(text):
+def test_invalid_documents_are_refused(text):
     with pytest.raises(NergError, match=r"r\.npz"):
         read_metadata(text, "r.npz")
 
@@ -354,21 +354,21 @@ def broken(name, row, value):
         (broken("confidence", 0, 1.5), r"confidence outside \[0, 1\]"),
         ({"head": np.tile([[0.0, 0, 2], [np.nan, 0, 0]], (3, 1))}, r"head that is not of unit length \(rays 0, 2, 4\)"),
         ({"origin": np.zeros((5, 3))}, r"origin has shape \(5, 3\)"),
-        ({"t": ["now"] * 6}, '"t" of rays holds what is no number'),
+        ({"t": ["now"] * 6}, '"t" of rays contains values that are not numbers'),
         ({"head": [["x"] * 3] * 6}, '"head"'),
-        ({"person": ["ann"] * 5 + ["cy"]}, r"'cy' is a person of the rays and none of persons"),
+        ({"person": ["ann"] * 5 + ["cy"]}, r"'cy' is a person of the rays but not in persons"),
         ({"cohort": ["old"] * 6}, "'old'"),
-        ({"persons": "ann"}, "persons are several names"),
+        ({"persons": "ann"}, "persons needs a sequence of names"),
         ({"metadata": {}}, "state units, up axis and handedness"),
     ],
 )
-def test_refuses_by_row(change, message):
+def test_invalid_rows_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         some_rays(**change)
 
 
 @pytest.mark.parametrize("kind", [list, tuple, np.array, lambda names: np.array(names, object)])
-def test_people_may_be_named(kind):
+def test_persons_may_be_given_by_name(kind):
     rays = some_rays(
         person=kind(["bo", "ann", "bo", "bo", "ann", "ann"]), cohort=kind(["old"] * 6), cohorts=("new", "old")
     )
@@ -376,7 +376,7 @@ def test_people_may_be_named(kind):
     assert rays.cohort is not None and rays.cohort.tolist() == [1] * 6
 
 
-def test_whole_numbers_are_taken_as_what_they_stand_for():
+def test_integer_codes_of_any_type():
     ones = np.ones((4, 3), int)
     rays = Rays(np.arange(4), np.zeros(4, np.int8), ("ann",), 0 * ones, ones * [0, 0, 1], ones[:, 0], ones)
     assert {a.dtype for a in (rays.t, rays.origin, rays.direction, rays.hit)} == {np.dtype(float)}
@@ -388,50 +388,50 @@ def test_select_keeps_codes_and_provenance():
     assert len(part) == 3 and part.persons == ("ann", "bo") and part.metadata == some_rays().metadata
 
 
-def test_kept_in_place():
-    """The same rays as selected, in the memory of all of them."""
+def test_filter_in_place():
+    """The same rays as from `select`, in the memory of the original."""
     rng = np.random.default_rng(0)
-    n = 700_000  # more than are moved at a time
+    n = 700_000  # more than one block
     rays = some_rays(n, t=rng.random(n), confidence=rng.random(n), hit=rng.random((n, 3)))
     mask = rng.random(n) < 0.6
     want = rays.select(mask)
-    kept = rays.filter_in_place(mask)
+    selected = rays.filter_in_place(mask)
     for name in ("t", "person", "origin", "direction", "confidence", "hit"):
-        assert np.array_equal(getattr(kept, name), getattr(want, name))
-        assert np.shares_memory(getattr(kept, name), getattr(rays, name))
-    assert kept.cohort is None and len(kept) == mask.sum()
+        assert np.array_equal(getattr(selected, name), getattr(want, name))
+        assert np.shares_memory(getattr(selected, name), getattr(rays, name))
+    assert selected.cohort is None and len(selected) == mask.sum()
 
 
-# ---- Rays of several blocks as one, and what is said of all of their sources ----
+# ---- Merging rays and their metadata ----
 
 AHEAD = np.array([[0.0, 1.0, 0.0]])
 
 
-def ray(t: float, name: str, others=(), **more) -> Rays:
-    persons = tuple(sorted({name, *others}))
-    return Rays([t], [persons.index(name)], persons, AHEAD, AHEAD, [1.0], **more)
+def ray(t: float, name: str, other_values=(), **extra) -> Rays:
+    persons = tuple(sorted({name, *other_values}))
+    return Rays([t], [persons.index(name)], persons, AHEAD, AHEAD, [1.0], **extra)
 
 
-def test_people_who_occur_and_what_some_lack():
+def test_merge_keeps_occurring_persons_and_fills_missing_columns():
     blocks = [ray(0, "b", ["a", "z"]), ray(1, "a", hit=2 * AHEAD, cohort=[1], cohorts=("x", "y")), ray(2, "b")]
-    found = merge_rays(blocks)
-    assert found.persons == ("a", "b") and [found.persons[k] for k in found.person] == ["b", "a", "b"]
-    assert found.t.tolist() == [0, 1, 2] and np.isnan(found.hit[[0, 2]]).all() and found.hit[1].tolist() == [0, 2, 0]
-    assert [found.cohorts[k] for k in found.cohort] == ["unknown", "y", "unknown"]
-    assert found.metadata == {"frame": FRAME}
+    result = merge_rays(blocks)
+    assert result.persons == ("a", "b") and [result.persons[k] for k in result.person] == ["b", "a", "b"]
+    assert result.t.tolist() == [0, 1, 2] and np.isnan(result.hit[[0, 2]]).all() and result.hit[1].tolist() == [0, 2, 0]
+    assert [result.cohorts[k] for k in result.cohort] == ["unknown", "y", "unknown"]
+    assert result.metadata == {"frame": FRAME}
     headed = merge_rays([ray(0, "b"), ray(1, "b", head=AHEAD)])
     assert headed.head.dtype == np.float32 and np.isnan(headed.head[0]).all() and headed.head[1].tolist() == [0, 1, 0]
     without = merge_rays([ray(0, "b"), ray(1, "b")])
     assert without.hit is None and without.cohort is None and without.cohorts == ()
 
 
-def test_metadata_are_what_holds_for_all():
-    about = {"frame": dict(FRAME), "preset": "table", "tick": 1.0, "rows_read": 4, "sources": [{"file": "a"}]}
-    about["dropped"] = [{"reason": "blink", "file": "a", "count": 1, "rows": [[1, 1]]}]
-    about["eye_distance"] = {"ann": 0.06}
-    about["complaints"] = ["the frame is mirrored", "the clock jumps"]
+def test_merge_metadata_keeps_common_values():
+    metadata = {"frame": dict(FRAME), "preset": "table", "tick": 1.0, "rows_read": 4, "sources": [{"file": "a"}]}
+    metadata["dropped"] = [{"reason": "blink", "file": "a", "count": 1, "rows": [[1, 1]]}]
+    metadata["eye_distance"] = {"ann": 0.06}
+    metadata["complaints"] = ["the frame is mirrored", "the clock jumps"]
     other = {
-        **about,
+        **metadata,
         "complaints": ["the clock jumps", "the gaze is frozen"],
         "eye_distance": {"bo": 0.07},
         "tick": 2.0,
@@ -440,19 +440,19 @@ def test_metadata_are_what_holds_for_all():
         "dropped": [],
         "missing": {"hit points": 2},
     }
-    found = merge_metadata([about, other])
-    assert found["rows_read"] == 9 and found["sources"] == [{"file": "a"}, {"file": "b"}]
-    assert found["eye_distance"] == {"ann": 0.06, "bo": 0.07}
-    assert found["complaints"] == ["the frame is mirrored", "the clock jumps", "the gaze is frozen"]
-    assert found["dropped"] == about["dropped"] and found["preset"] == "table" and "tick" not in found
-    assert found["missing"] == {"hit points": 2}
+    result = merge_metadata([metadata, other])
+    assert result["rows_read"] == 9 and result["sources"] == [{"file": "a"}, {"file": "b"}]
+    assert result["eye_distance"] == {"ann": 0.06, "bo": 0.07}
+    assert result["complaints"] == ["the frame is mirrored", "the clock jumps", "the gaze is frozen"]
+    assert result["dropped"] == metadata["dropped"] and result["preset"] == "table" and "tick" not in result
+    assert result["missing"] == {"hit points": 2}
 
 
-# ---- Samples: each row as likely as any other, without room for all ----
+# ---- Uniform sampling of rows ----
 
 
 @pytest.mark.parametrize("n, runs", [(7, None), (20, None), (33, None), (8, 4), (20, 3)])
-def test_every_row_is_as_likely(n, runs):
+def test_rows_are_sampled_uniformly(n, runs):
     counts, each = np.zeros(40), None
     for seed in range(1000):
         rows = sample_rows(40, n, seed, runs)
@@ -461,33 +461,33 @@ def test_every_row_is_as_likely(n, runs):
         each = len(rows)
         counts[rows] += 1
     assert each == (n if runs is None else n // runs * runs)
-    # Chi-square of 39 degrees of freedom: 72.1 at one in a thousand; samples without repeats spread less.
+    # Chi-square with 39 degrees of freedom: 72.1 at p = 0.001; samples without replacement vary less.
     expected = 1000 * each / 40
     assert ((counts - expected) ** 2 / expected).sum() < 72.1
 
 
-def test_pairs_are_as_likely_too():
+def test_pairs_of_rows_are_sampled_uniformly():
     together = np.zeros((6, 6))
     for seed in range(1500):
         rows = sample_rows(6, 2, seed)
         together[rows[0], rows[1]] += 1
-    found = together[np.triu_indices(6, 1)]
-    assert found.sum() == 1500 and ((found - 100) ** 2 / 100).sum() < 36.1
+    result = together[np.triu_indices(6, 1)]
+    assert result.sum() == 1500 and ((result - 100) ** 2 / 100).sum() < 36.1
 
 
-def test_runs_are_of_neighbours():
+def test_runs_consist_of_neighbours():
     rows = sample_rows(10_000, 600, 1, runs=6)
     jumps = np.count_nonzero(np.diff(rows) > 1)
     assert len(rows) == 600 and jumps <= 6
 
 
-def test_all_and_equal_seeds():
+def test_all_rows_and_equal_seeds():
     assert sample_rows(5, 5).tolist() == sample_rows(5, 9, 3, runs=2).tolist() == [0, 1, 2, 3, 4]
     assert np.array_equal(sample_rows(10**12, 50, 4), sample_rows(10**12, 50, 4))
     assert not np.array_equal(sample_rows(10**12, 50, 4), sample_rows(10**12, 50, 5))
 
 
-# ---- The example of docs/reference/python.md runs ----
+# ---- The example of docs/reference/python.md ----
 
 MANUAL = Path(__file__).resolve().parents[2] / "docs" / "reference" / "python.md"
 
