@@ -1,4 +1,4 @@
-"""Small sources for datasets, and what is imported of them."""
+"""Small sources for datasets, and the expected rays."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from nerg_mi.rays.dataset import RayDataset
 from nerg_mi.rays.dataset_write import ImportRecipe, update_dataset
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.columns import ColumnMap
-from nerg_mi.rays.readers.registry import make_options, read_rays, get_reader
+from nerg_mi.rays.readers.registry import get_reader, make_options, read_rays
 
 MAP = "origin=x,y,z direction=a,b,c t=t person=p confidence=q hit=h,i,j cohort=g"
 DAY = 20_000 * 86_400.0  # midnight of 2024-10-04, seconds since 1970
 
 
 def write_source(path: Path, seed: int = 0, count: int = 400, people: int = 3, start: float = 0.0) -> Path:
-    """A table of rays of some people, in the order of times; a confidence is missing in the third row."""
+    """Write a table of rays of some participants, sorted by time; the confidence of the third row is missing."""
     rng = np.random.default_rng(seed)
     origin = rng.uniform(0, 6, (count, 3)) * [1, 1, 0.1] + [0, 0, 1.5]
     direction = rng.normal(size=(count, 3))
@@ -49,12 +49,12 @@ def write_dataset(folder: Path, files: int = 3, **changes) -> tuple[RayDataset, 
 
 
 def in_order(rays: Rays) -> Rays:
-    """The same rays by person and time: an order that does not depend on where they were."""
+    """The same rays by participant and time, an order that does not depend on their storage."""
     return rays.select(np.lexsort((rays.t, np.array(rays.persons)[rays.person])))
 
 
 def assert_same(one: Rays, two: Rays) -> None:
-    """That they hold the same rays but for the rounding of places to float32."""
+    """Assert that both have the same rays, except for rounding of positions to float32."""
     assert len(one) == len(two)
     one, two = in_order(one), in_order(two)
     assert np.array_equal(one.t, two.t) and np.array_equal(one.confidence, two.confidence)
