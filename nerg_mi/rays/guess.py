@@ -1,4 +1,4 @@
-"""Proposes how an unknown table of tracking is imported: by names of columns, signatures of programs and rows."""
+"""Proposes how to import an unknown tracking table, from its column names, known file formats and its first rows."""
 
 from __future__ import annotations
 
@@ -15,112 +15,128 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import read_line_blocks, resolve_path
 
 from .readers import poses
-from .readers.base import BAD_LINES, UNITS, Reader
+from .readers.base import MAX_BAD_LINE_FRACTION, UNITS, Reader
 from .readers.columns import (
     ColumnFinder,
     ColumnMap,
     Roles,
+    are_degrees,
     find_roles,
-    in_degrees,
+    find_valid_values,
     is_counter,
-    is_validity,
-    time_unit,
-    valid_values,
+    is_validity_column,
+    parse_time_unit,
 )
-from .readers.registry import readers
-from .readers.tables import clock_seconds, iterate_table
+from .readers.registry import iterate_readers
+from .readers.tables import iterate_table, parse_clock_seconds
 
-# ---- Row evidence ----
+# ---- Evidence from rows ----
 #
-# What the rows of a table tell of its frame: the up axis and the unit by where heads are, the clock by its steps, the
-# way heads look by where they walk, and whether gaze is the head's or the world's by how far it is from the head.
+# The rows of a table suggest its frame: the up axis and the unit of length from the heights of heads, the unit of time
+# from the sampling interval, the forward axis of heads from walking, and the frame of gaze from its angle to the head.
 
-_LOW, _HIGH = 0.7, 2.3  # metres: so high are eyes, of people who sit or stand
-_STAYS = 1.2  # metres: they hardly vary more in height
-_RATES = 5.0, 2100.0  # rows a second of devices that there are
-_TICKS = (1.0, 1e-3, 1e-6, 1e-9, 1e-7)
-_STEP = 0.5  # seconds of walking that are looked at
-_WALK = 0.3, 3.0  # metres a second
-_AHEAD = 0.3  # mean cosine of a way to look and walking, from which on it is ahead
-_FEWEST = 50  # steps of walking
+_MIN_EYE_HEIGHT, _MAX_EYE_HEIGHT = 0.7, 2.3  # metres; range of eye heights of sitting and standing people
+_MAX_HEIGHT_RANGE = 1.2  # metres; maximum range of the height of one head
+_DEVICE_RATES = 5.0, 2100.0  # sampling rates of existing devices, Hz
+_TIME_UNITS = (1.0, 1e-3, 1e-6, 1e-9, 1e-7)
+_STEP_SECONDS = 0.5  # duration of a walking step for the comparison with gaze
+_WALKING_SPEEDS = 0.3, 3.0  # m/s
+_MIN_COSINE = 0.3  # minimum mean cosine between the forward axis and walking
+_MIN_WALKING_STEPS = 50
 
 
 @dataclass(frozen=True)
-class Standing:
-    """The axis that is up and the unit of length, by ``height``, the median along it in metres."""
+class UpAxis:
+    """Up axis and unit of length, with ``height``, the median coordinate along the axis in metres."""
 
     up: str
     units: str
     height: float
 
 
-def find_standing(places: np.ndarray) -> Standing | None:
-    """Of places of heads (n, 3), the one axis along which they stay where eyes are, in metres, centimetres or
-    millimetres; None where no axis does, or two do."""
-    places = places[np.isfinite(places).all(axis=1)]
-    if not len(places):
+def find_up_axis(positions: np.ndarray) -> UpAxis | None:
+    """Find the axis along which head positions (n, 3) stay at eye height in metres, centimetres or millimetres; None
+    if no axis does, or if several do."""
+    positions = positions[np.isfinite(positions).all(axis=1)]
+    if not len(positions):
         return None
-    low, middle, high = np.percentile(places, [5, 50, 95], axis=0)
-    moves = np.ptp(places, axis=0).max() > 0
-    found = []
+    low, median, high = np.percentile(positions, [5, 50, 95], axis=0)
+    has_movement = np.ptp(positions, axis=0).max() > 0
+    candidates = []
     for units, metre in UNITS.items():
         for axis in range(3):
-            height, varies = abs(middle[axis]) * metre, (high - low)[axis] * metre
-            # An axis along which nothing moves may be a constant of another kind, but for a head that is not tracked.
-            if _LOW <= height <= _HIGH and varies < _STAYS and moves:
-                found.append((Standing(("-" if middle[axis] < 0 else "") + "xyz"[axis], units, height), varies))
-    metres = [f for f in found if f[0].units == "m"] or found
-    if len(metres) > 1:
-        # Somebody who stays in a room may be at 1.6 m along each axis: up is where all of the time is spent.
-        metres.sort(key=lambda f: f[1])
-        if metres[0][1] > 0.5 * metres[1][1]:
+            height, height_range = abs(median[axis]) * metre, (high - low)[axis] * metre
+            # Constant coordinates along all axes are not heights but a constant of another kind.
+            if _MIN_EYE_HEIGHT <= height <= _MAX_EYE_HEIGHT and height_range < _MAX_HEIGHT_RANGE and has_movement:
+                candidates.append(
+                    (UpAxis(("-" if median[axis] < 0 else "") + "xyz"[axis], units, height), height_range)
+                )
+    preferred = [f for f in candidates if f[0].units == "m"] or candidates
+    if len(preferred) > 1:
+        # In a small room each coordinate may be near 1.6 m: height is the one that varies least.
+        preferred.sort(key=lambda f: f[1])
+        if preferred[0][1] > 0.5 * preferred[1][1]:
             return None
-    return metres[0][0] if metres else None
+    return preferred[0][0] if preferred else None
 
 
-def find_tick(times: np.ndarray) -> float | None:
-    """Seconds in a unit of ``times`` (n,), under which rows come as often as a device's; None where none fits."""
+def find_time_unit(times: np.ndarray) -> float | None:
+    """Find the unit of ``times`` (n,) in seconds that gives the sampling rate of a device; None if none does."""
     step = np.diff(times[np.isfinite(times)])
     step = step[step > 0]
     if not step.size:
         return None
-    middle = float(np.median(step))
-    return next((t for t in _TICKS if _RATES[0] <= 1 / (middle * t) <= _RATES[1]), None)
+    median_step = float(np.median(step))
+    return next((t for t in _TIME_UNITS if _DEVICE_RATES[0] <= 1 / (median_step * t) <= _DEVICE_RATES[1]), None)
 
 
 def is_unit(vectors: np.ndarray, tolerance: float = 0.02) -> bool:
-    """Whether nearly all of (n, C) that are finite have the length one; zeros count as missing."""
+    """Whether nearly all finite rows of (n, C) have length one; zero rows count as missing."""
     length = np.linalg.norm(vectors, axis=1)
     length = length[np.isfinite(length) & (length > 1e-9)]
     return bool(length.size and np.mean(np.abs(length - 1) < tolerance) > 0.95)
 
 
-def find_forward(turns: np.ndarray, places: np.ndarray, seconds: np.ndarray, up: str, metre: float) -> str | None:
-    """The axis of the head's frame that points where people walk; None where they do not walk, or no axis does.
+def find_forward_axis(
+    rotations: np.ndarray, positions: np.ndarray, seconds: np.ndarray, up: str, metre: float
+) -> str | None:
+    """Find the axis of the head's frame that points in the walking direction; None if there is too little walking, or
+    no such axis.
 
-    ``turns`` (n, 3, 3) head to table, ``places`` (n, 3), ``seconds`` (n,); ``metre``: of a unit of length.
+    Parameters
+    ----------
+    rotations
+        (n, 3, 3), head to table frame.
+    positions
+        (n, 3), in the unit of the table.
+    seconds
+        (n,) times.
+    up
+        Up axis of the table.
+    metre
+        Length of the unit of the table in metres.
     """
-    way = _walking(places, seconds, up, metre)
-    good = np.isfinite(way).all(axis=1) & np.isfinite(turns).all(axis=(1, 2))
-    if good.sum() < _FEWEST:
+    heading = _find_headings(positions, seconds, up, metre)
+    is_valid = np.isfinite(heading).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
+    if is_valid.sum() < _MIN_WALKING_STEPS:
         return None
-    level = _level(up)
-    agree = {
-        name: float(np.mean(np.sum((turns[good] @ axis) * level * way[good], axis=1)))
+    horizontal = _horizontal_mask(up)
+    mean_cosines = {
+        name: float(np.mean(np.sum((rotations[is_valid] @ axis) * horizontal * heading[is_valid], axis=1)))
         for name, axis in poses.AXES.items()
         if name[-1] != up[-1]
     }
-    best = max(agree, key=agree.__getitem__)
-    return best if agree[best] > _AHEAD else None
+    best = max(mean_cosines, key=mean_cosines.__getitem__)
+    return best if mean_cosines[best] > _MIN_COSINE else None
 
 
-def find_local(gaze: np.ndarray, turns: np.ndarray, forward: str) -> bool | None:
-    """Whether ``gaze`` (n, 3) is in the head's frame rather than the table's: as which it is nearer to where the head
-    points. None where both are alike, as of a head that does not turn."""
+def is_gaze_in_head_frame(gaze: np.ndarray, rotations: np.ndarray, forward: str) -> bool | None:
+    """Whether ``gaze`` (n, 3) is in the head's frame rather than in that of the table: the frame in which it is nearer
+    to the direction of the head. None if both are similar, as for a head that does not turn."""
     ahead = poses.AXES[forward]
     length = np.linalg.norm(gaze, axis=1)
-    good = np.isfinite(turns).all(axis=(1, 2)) & (length > 1e-9)
-    d, heads = gaze[good] / length[good, None], turns[good] @ ahead
+    is_valid = np.isfinite(rotations).all(axis=(1, 2)) & (length > 1e-9)
+    d, heads = gaze[is_valid] / length[is_valid, None], rotations[is_valid] @ ahead
     if not len(d):
         return None
     angle = lambda cosine: float(np.median(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
@@ -128,105 +144,110 @@ def find_local(gaze: np.ndarray, turns: np.ndarray, forward: str) -> bool | None
     return None if abs(local - world) < 5.0 else local < world
 
 
-def _walking(places: np.ndarray, seconds: np.ndarray, up: str, metre: float) -> np.ndarray:
-    """Unit directions (n, 3) of the level way of the next half second; NaN where nobody walks."""
-    out = np.full(places.shape, np.nan)
+def _find_headings(positions: np.ndarray, seconds: np.ndarray, up: str, metre: float) -> np.ndarray:
+    """Unit horizontal directions (n, 3) of motion over the next half second; NaN where nobody walks."""
+    out = np.full(positions.shape, np.nan)
     step = np.median(np.diff(seconds)) if len(seconds) > 1 else np.nan
     if not step > 0:
         return out
-    lag = max(1, min(round(_STEP / step), len(places) - 1))
-    moved = (places[lag:] - places[:-lag]) * _level(up)
-    taken = seconds[lag:] - seconds[:-lag]
+    lag = max(1, min(round(_STEP_SECONDS / step), len(positions) - 1))
+    moved = (positions[lag:] - positions[:-lag]) * _horizontal_mask(up)
+    duration = seconds[lag:] - seconds[:-lag]
     length = np.linalg.norm(moved, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        speed = metre * length / taken
-        walks = (speed > _WALK[0]) & (speed < _WALK[1]) & (taken < 4 * _STEP)
-    out[:-lag][walks] = moved[walks] / length[walks, None]
+        speed = metre * length / duration
+        is_walking = (speed > _WALKING_SPEEDS[0]) & (speed < _WALKING_SPEEDS[1]) & (duration < 4 * _STEP_SECONDS)
+    out[:-lag][is_walking] = moved[is_walking] / length[is_walking, None]
     return out
 
 
-def _level(up: str) -> np.ndarray:
-    """One for each axis but the up one."""
+def _horizontal_mask(up: str) -> np.ndarray:
+    """One for each horizontal axis, zero for the up axis, (3,)."""
     return (np.arange(3) != "xyz".index(up[-1])).astype(np.float64)
 
 
-# ---- Presets by what tells their files from others (`nerg_mi.rays.readers.base.Signature`) ----
+# ---- Presets found by their signature (`nerg_mi.rays.readers.base.Signature`) ----
 
 
-def preset_of_files(path: Path) -> tuple[Reader[Any], str] | None:
-    """The reader of a file or a folder ``path`` by the names of files, and why."""
+def find_preset_by_files(path: Path) -> tuple[Reader[Any], str] | None:
+    """Find the reader of a file or folder by file names; returns the reader and the reason."""
     folder = path if path.is_dir() else path.parent
-    for reader in readers():
-        for file, beside in reader.signature.files:
-            if (path.is_dir() or path.name == file) and (folder / file).is_file() and (folder / beside).is_file():
-                return reader, f"{file} with {beside} beside it"
+    for reader in iterate_readers():
+        for file, companion in reader.signature.files:
+            if (path.is_dir() or path.name == file) and (folder / file).is_file() and (folder / companion).is_file():
+                return reader, f"{file} with {companion} next to it"
         ending = reader.signature.ending
         if ending and path.name.lower().endswith(ending):
             return reader, f"its name ends in {ending}"
     return None
 
 
-def preset_of_text(path: Path) -> tuple[Reader[Any], str] | None:
-    """The reader of a file by its first line, where that is no header, and why."""
+def find_preset_by_first_line(path: Path) -> tuple[Reader[Any], str] | None:
+    """Find the reader of a file by its first line, if that is not a header; returns the reader and the reason."""
     for block in read_line_blocks(path, "tracking file", 1):
-        return next(((reader, why) for reader in readers() if (why := reader.signature.line(block[0]))), None)
+        return next(
+            ((reader, reason) for reader in iterate_readers() if (reason := reader.signature.line(block[0]))), None
+        )
     return None
 
 
-def preset_of_columns(table: ColumnFinder) -> tuple[Reader[Any], str] | None:
-    """The reader of a table by its columns, and which of them tell."""
-    there = set(table.columns)
-    sets = [
-        (columns, reader) for reader in readers() for columns in reader.signature.columns if there.issuperset(columns)
+def find_preset_by_columns(table: ColumnFinder) -> tuple[Reader[Any], str] | None:
+    """Find the reader of a table by its columns; returns the reader and the reason."""
+    available = set(table.columns)
+    matches = [
+        (columns, reader)
+        for reader in iterate_readers()
+        for columns in reader.signature.columns
+        if available.issuperset(columns)
     ]
-    if sets:
-        columns, reader = max(sets, key=lambda found: len(found[0]))
+    if matches:
+        columns, reader = max(matches, key=lambda found: len(found[0]))
         return reader, f"it has the columns {', '.join(columns)}"
-    return next(((reader, why) for reader in readers() if (why := reader.signature.table(table))), None)
+    return next(((reader, reason) for reader in iterate_readers() if (reason := reader.signature.table(table))), None)
 
 
-# ---- The first rows of a table: which of its columns hold numbers or times, and these ----
+# ---- First rows of a table, and which columns contain numbers or times ----
 
 
-_PEEKED = 40  # lines that tell which columns hold numbers
-_WORDS = {"", "nan", "na", "n/a", "null", "none", "-"}
-_WIDEST = 400  # columns of which numbers are looked at
+_SNIFFED_LINES = 40  # lines used to find the columns with numbers
+_MISSING_WORDS = {"", "nan", "na", "n/a", "null", "none", "-"}
+_MAX_COLUMNS = 400  # columns of numbers that are read
 
 
 class TableSample:
-    """At most 65,536 rows of those ``columns`` of a table that hold numbers; ``numbers[name]`` is (n,) float64.
+    """At most 65,536 rows of the ``columns`` of a table that contain numbers; ``numbers[name]`` is (n,) float64.
 
-    Times as text are seconds, and named in ``clocks``. A name that several columns have is none. Raises `NergError`
-    where more than 1 % of the rows have more or fewer cells than the header.
+    Times in text form are converted to seconds, and their columns are in ``clocks``. Columns with a repeated name are
+    excluded. Raises `NergError` if more than 1 % of the rows have more or fewer cells than the header.
     """
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self.path = path
         self.columns = [name for name in columns if list(columns).count(name) == 1]
         self.repeated = sorted(set(columns) - set(self.columns))
-        kinds = _numeric(path, list(columns))
-        wanted = [name for name in self.columns if name in kinds][:_WIDEST]
+        kinds = _find_numeric_columns(path, list(columns))
+        wanted = [name for name in self.columns if name in kinds][:_MAX_COLUMNS]
         for name in (wanted or self.columns)[:1]:
-            self.texts(name)
+            self.read_texts(name)
         self.clocks = {name for name in wanted if kinds[name]}
         self.numbers: dict[str, np.ndarray] = {}
-        # Cells that are no numbers are left to the import.
+        # The import reports cells that are not numbers.
         clocks = dict.fromkeys(self.clocks, 1.0)
-        for block in iterate_table(path, wanted, on_bad=lambda line, why: None, clocks=clocks):
+        for block in iterate_table(path, wanted, on_bad_line=lambda line, why: None, clocks=clocks):
             self.numbers = dict(zip(wanted, block.numbers.T))
             break
         self.rows = len(next(iter(self.numbers.values()), ()))
 
-    def vector(self, names: Sequence[str]) -> np.ndarray:
-        """Columns as (n, C); NaN for those that hold no numbers."""
+    def stack_columns(self, names: Sequence[str]) -> np.ndarray:
+        """Columns as (n, C); NaN for columns without numbers."""
         missing = np.full(self.rows, np.nan)
         return np.stack([self.numbers.get(name, missing) for name in names], axis=1)
 
-    def texts(self, name: str) -> np.ndarray:
-        """The cells of a column as they stand (n,)."""
+    def read_texts(self, name: str) -> np.ndarray:
+        """Cells (n,) of a column as text."""
         bad: list[tuple[int, str]] = []
-        for block in iterate_table(self.path, (), [name], on_bad=lambda line, why: bad.append((line, why))):
-            if len(bad) > max(1, BAD_LINES * len(block.lines)):
+        for block in iterate_table(self.path, (), [name], on_bad_line=lambda line, why: bad.append((line, why))):
+            if len(bad) > max(1, MAX_BAD_LINE_FRACTION * len(block.lines)):
                 break
             return block.texts[:, 0]
         if len(bad) > 1:
@@ -234,11 +255,12 @@ class TableSample:
         return np.empty(0, str)
 
 
-def _numeric(path: Path, columns: list[str]) -> dict[str, bool]:
-    """Names of the columns that hold numbers or times alone, or nothing, and whether they hold times as text."""
+def _find_numeric_columns(path: Path, columns: list[str]) -> dict[str, bool]:
+    """Columns that contain only numbers, or only times, or empty cells; the value is whether they are times in text
+    form."""
     if path.suffix.lower() == ".parquet":
-        return {name: kind for name in dict.fromkeys(columns) if (kind := _parquet_kind(path, name)) is not None}
-    head, *rows = next(iter(read_line_blocks(path, "table", _PEEKED + 1)), [""])
+        return {name: kind for name in dict.fromkeys(columns) if (kind := _is_parquet_clock(path, name)) is not None}
+    head, *rows = next(iter(read_line_blocks(path, "table", _SNIFFED_LINES + 1)), [""])
     separator = max(",;\t", key=head.count)
     kinds: list[set[bool | None]] = [set() for _ in columns]
     for line in rows:
@@ -247,22 +269,22 @@ def _numeric(path: Path, columns: list[str]) -> dict[str, bool]:
         except csv.Error:
             continue
         for k, cell in enumerate(cells[: len(columns)]):
-            if cell.strip().lower() not in _WORDS:
-                kinds[k].add(_kind(cell))
+            if cell.strip().lower() not in _MISSING_WORDS:
+                kinds[k].add(_is_clock_time(cell))
     return {name: True in kind for name, kind in zip(columns, kinds) if kind in ({True}, {False})}
 
 
-def _kind(cell: str) -> bool | None:
-    """False of a number, True of a time, None of another text."""
+def _is_clock_time(cell: str) -> bool | None:
+    """False for a number, True for a time, None for other text."""
     try:
-        # Whether a comma is the decimal sign is left to the reader of the table.
+        # The table reader decides whether a comma is the decimal sign.
         float(cell.replace(",", ".", 1))
     except ValueError:
-        return True if clock_seconds(cell) else None
+        return True if parse_clock_seconds(cell) else None
     return False
 
 
-def _parquet_kind(path: Path, name: str) -> bool | None:
+def _is_parquet_clock(path: Path, name: str) -> bool | None:
     for is_clock, clocks in ((False, None), (True, {name: 1.0})):
         try:
             next(iterate_table(path, [name], clocks=clocks), None)
@@ -272,22 +294,21 @@ def _parquet_kind(path: Path, name: str) -> bool | None:
     return None
 
 
-# ---- A proposal of how to import an unknown table: a preset, or a column map with the frame that it needs ----
+# ---- Proposals for the import of unknown tables: a preset, or a column map with its frame ----
 #
-# Nothing is applied: the proposal says what is sure, what is a guess and what no file says, and gives the command to
-# run.
+# Nothing is imported: a proposal lists what is certain, what is a guess and what only the user knows, and the command.
 
-_DIRECTION = {"dir", "direct", "direction", "forward", "vec", "vector", "ray", "normal", "look", "gazedir"}
-_HIT = {"hit", "point", "intersection", "target", "fixation", "poi", "collision"}
-_HEAD = {"head", "hmd", "camera", "cam", "device", "body", "headset"}
-_GAZE = {"gaze", "eye", "eyes"}
-_SIDES = {"left", "right", "l", "r", "0", "1"}
+_DIRECTION_WORDS = {"dir", "direct", "direction", "forward", "vec", "vector", "ray", "normal", "look", "gazedir"}
+_HIT_WORDS = {"hit", "point", "intersection", "target", "fixation", "poi", "collision"}
+_HEAD_WORDS = {"head", "hmd", "camera", "cam", "device", "body", "headset"}
+_GAZE_WORDS = {"gaze", "eye", "eyes"}
+_SIDE_WORDS = {"left", "right", "l", "r", "0", "1"}
 
 
 @dataclass
 class Proposal:
-    """How to import ``paths``; ``options`` of the command line beside the preset or the map, and sentences on what is
-    ``sure``, what is ``guessed`` and what is ``open``."""
+    """Proposed import of ``paths``: ``options`` of the command line in addition to the preset or the column map, and
+    sentences about what is certain, what is guessed and what is open."""
 
     paths: list[Path]
     preset: str | None = None
@@ -299,7 +320,7 @@ class Proposal:
 
     @property
     def command(self) -> str | None:
-        """The whole import command; None where nothing can be proposed."""
+        """The complete import command; None if nothing can be proposed."""
         if self.preset is None and self.columns is None:
             return None
         what = ["--preset", self.preset] if self.preset else ["--map", str(self.columns)]
@@ -310,59 +331,61 @@ class Proposal:
         return shlex.join(words)
 
 
-_TABLES = (".csv", ".csv.gz", ".tsv", ".txt", ".parquet")
+_TABLE_SUFFIXES = (".csv", ".csv.gz", ".tsv", ".txt", ".parquet")
 
 
 def propose_imports(paths: Sequence[str | Path]) -> list[Proposal]:
-    """What tracking files, or folders of recordings, are likely to be: a proposal for all that are imported alike.
+    """Propose imports of tracking files or folders of recordings; one proposal for all files that are imported alike.
 
-    A folder that is no recording stands for the tables in it. Raises `NergError` as `propose_import` does, and for a
-    folder without tables.
+    A folder that is not a recording is replaced by the tables in it. Raises `NergError` as `propose_import` does, and
+    for a folder without tables.
     """
     out: list[Proposal] = []
-    for path in (table for source in paths for table in _tables_in(Path(source))):
-        new = propose_import(path)
-        how = new.preset, new.columns, new.options
-        alike = next((p for p in out if new.command and (p.preset, p.columns, p.options) == how), None)
-        if alike is None:
-            out.append(new)
+    for path in (table for source in paths for table in _find_tables(Path(source))):
+        proposal = propose_import(path)
+        settings = proposal.preset, proposal.columns, proposal.options
+        existing = next((p for p in out if proposal.command and (p.preset, p.columns, p.options) == settings), None)
+        if existing is None:
+            out.append(proposal)
         else:
-            alike.paths += new.paths
+            existing.paths += proposal.paths
     return out
 
 
-def _tables_in(path: Path) -> list[Path]:
-    """The tables of a folder that is no recording, or the path itself."""
-    if not path.is_dir() or preset_of_files(path) is not None:
+def _find_tables(path: Path) -> list[Path]:
+    """The tables in a folder that is not a recording; otherwise the path itself."""
+    if not path.is_dir() or find_preset_by_files(path) is not None:
         return [path]
-    return sorted(p for p in path.iterdir() if p.is_file() and p.name.lower().endswith(_TABLES)) or [path]
+    return sorted(p for p in path.iterdir() if p.is_file() and p.name.lower().endswith(_TABLE_SUFFIXES)) or [path]
 
 
 def propose_import(path: str | Path) -> Proposal:
-    """What the tracking file, or folder of a recording, ``path`` is likely to be.
+    """Propose the import of a tracking file or of the folder of a recording.
 
-    Raises `NergError` for a file that is no table, or is damaged.
+    Raises `NergError` for a file that is damaged or not a table.
     """
     path = Path(path)
     out = Proposal([path])
-    found = preset_of_files(path)
-    if found is None:
+    match = find_preset_by_files(path)
+    if match is None:
         if path.is_dir():
-            names = ", ".join(f"{file} and {beside}" for reader in readers() for file, beside in reader.signature.files)
-            raise NergError(
-                f"the folder {path} is of no recording that is known by its files ({names}); name a file of it"
+            names = ", ".join(
+                f"{file} and {companion}" for reader in iterate_readers() for file, companion in reader.signature.files
             )
-        found = preset_of_text(path) if path.suffix.lower() != ".parquet" else None
-    table = ColumnFinder(path) if found is None else None
+            raise NergError(
+                f"the folder {path} is not a recording of a known format ({names}); name a file in it instead"
+            )
+        match = find_preset_by_first_line(path) if path.suffix.lower() != ".parquet" else None
+    table = ColumnFinder(path) if match is None else None
     if table is not None:
-        found = preset_of_columns(table)
-    if found is not None:
-        _use_preset(out, *found)
+        match = find_preset_by_columns(table)
+    if match is not None:
+        _propose_preset(out, *match)
         return out
     assert table is not None
     if not any(_is_name(c) for c in table.columns):
-        raise NergError(f"the first line of {path} holds no names of columns; a table needs a header: add one")
-    _use_columns(out, TableSample(path, table.columns), find_roles(table.columns))
+        raise NergError(f"the first line of {path} contains no column names; add a header to the table")
+    _propose_columns(out, TableSample(path, table.columns), find_roles(table.columns))
     return out
 
 
@@ -374,203 +397,230 @@ def _is_name(column: str) -> bool:
     return False
 
 
-def _use_preset(out: Proposal, reader: Reader[Any], why: str) -> None:
+def _propose_preset(out: Proposal, reader: Reader[Any], reason: str) -> None:
     out.preset = reader.name
-    out.certain.append(f"the preset {reader.name}: {why}")
+    out.certain.append(f"the preset {reader.name}: {reason}")
     out.options |= reader.signature.options
     if reader.signature.question:
         out.questions.append(reader.signature.question)
 
 
-def _use_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
-    """Fill ``out`` with a column map, as far as there is one."""
+def _propose_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
+    """Propose a column map in ``out``, as far as possible."""
     numbers = sample.numbers
     if sample.repeated:
-        out.questions.append(f"several columns are called {', '.join(map(repr, sample.repeated[:8]))}: rename all but one")
+        out.questions.append(
+            f"several columns are called {', '.join(map(repr, sample.repeated[:8]))}; rename all but one"
+        )
     vectors = {s: v for s, v in roles.vectors.items() if all(c in numbers for c in v)}
     quaternions = {
-        s: q for s, q in roles.quaternions.items() if all(c in numbers for c in q) and is_unit(sample.vector(q))
+        s: q for s, q in roles.quaternions.items() if all(c in numbers for c in q) and is_unit(sample.stack_columns(q))
     }
-    # A place named like a quaternion (x, y, z beside w) is none.
+    # A position named like a quaternion (x, y, z and w) is not one.
     vectors |= {s: q[:3] for s, q in roles.quaternions.items() if s not in quaternions and all(c in numbers for c in q)}
     parts = {stem: set(stem.replace("*", "").split("_")) for stem in (*vectors, *quaternions)}
-    direction = _best(
+    direction = _find_best(
         vectors,
-        lambda s: 4 * bool(parts[s] & _DIRECTION) + 2 * is_unit(sample.vector(vectors[s])) - _aside(parts[s]),
-        least=2,
-        more=lambda s: bool(parts[s] & _GAZE) - 2 * bool(parts[s] & _HEAD),
+        lambda s: (
+            4 * bool(parts[s] & _DIRECTION_WORDS)
+            + 2 * is_unit(sample.stack_columns(vectors[s]))
+            - _side_penalty(parts[s])
+        ),
+        min_score=2,
+        tie_break=lambda s: bool(parts[s] & _GAZE_WORDS) - 2 * bool(parts[s] & _HEAD_WORDS),
     )
-    hit = _best(vectors, lambda s: 3 * bool(parts[s] & _HIT) - _aside(parts[s]), least=3, but=(direction,))
-    place = lambda prefer, but: _best(
+    hit = _find_best(
+        vectors, lambda s: 3 * bool(parts[s] & _HIT_WORDS) - _side_penalty(parts[s]), min_score=3, excluded=(direction,)
+    )
+    find_position = lambda prefer, but: _find_best(
         vectors,
-        lambda s: 2 + 3 * bool(parts[s] & prefer) - 3 * bool(parts[s] & (_HIT | _DIRECTION)) - _aside(parts[s]),
-        least=1,
-        but=but,
+        lambda s: (
+            2
+            + 3 * bool(parts[s] & prefer)
+            - 3 * bool(parts[s] & (_HIT_WORDS | _DIRECTION_WORDS))
+            - _side_penalty(parts[s])
+        ),
+        min_score=1,
+        excluded=but,
     )
-    turn = _best(quaternions, lambda s: 2 + 2 * bool(parts[s] & _HEAD) - _aside(parts[s]), least=1)
+    quaternion = _find_best(
+        quaternions, lambda s: 2 + 2 * bool(parts[s] & _HEAD_WORDS) - _side_penalty(parts[s]), min_score=1
+    )
     matrix = next((m for m in roles.matrices.values() if all(c in numbers for c in m)), None)
-    head = place(_HEAD, (direction, hit))
-    eye = place(_GAZE, (direction, hit, head)) if head is not None and parts[head] & _HEAD else None
-    has_pose = turn is not None or matrix is not None
+    head = find_position(_HEAD_WORDS, (direction, hit))
+    eye = find_position(_GAZE_WORDS, (direction, hit, head)) if head is not None and parts[head] & _HEAD_WORDS else None
+    has_pose = quaternion is not None or matrix is not None
 
     origin = head if has_pose or eye is None else eye
-    standing = None
-    where = sample.vector(matrix)[:, 3:12:4] if matrix else sample.vector(vectors[origin]) if origin else None
-    if where is not None:
-        standing = find_standing(where)
+    upright = None
+    head_positions = (
+        sample.stack_columns(matrix)[:, 3:12:4] if matrix else sample.stack_columns(vectors[origin]) if origin else None
+    )
+    if head_positions is not None:
+        upright = find_up_axis(head_positions)
     time = _find_time(out, sample, roles)
-    settings = _frame(out, standing, _gravity_up(sample, roles))
-    turns = None
+    settings = _propose_frame(out, upright, _find_gravity_up(sample, roles))
+    rotations = None
     if matrix is not None:
-        turns, _ = poses.rotations_from_matrices(sample.vector(matrix))
-        mirrored = poses.is_mirrored(sample.vector(matrix))
-        if mirrored.any():
-            out.questions.append(f"{mirrored.sum():,} of {len(mirrored):,} rows: {poses.MIRRORED}; the import drops them")
-    elif turn is not None:
-        turns = poses.rotations_from_quaternions(sample.vector(quaternions[turn]))
-    gaze = sample.vector(vectors[direction]) if direction else None
-    local = _pose_evidence(out, settings, turns, gaze, where, time[1])
-    if turns is not None and gaze is not None and local is False:
-        turn = matrix = turns = None
-        if origin is None or (eye is not None and parts[eye] & _GAZE):
+        rotations, _ = poses.rotations_from_matrices(sample.stack_columns(matrix))
+        is_mirrored = poses.is_mirrored(sample.stack_columns(matrix))
+        if is_mirrored.any():
+            out.questions.append(
+                f"{is_mirrored.sum():,} of {len(is_mirrored):,} rows: {poses.MIRRORED_MATRIX}; the import drops them"
+            )
+    elif quaternion is not None:
+        rotations = poses.rotations_from_quaternions(sample.stack_columns(quaternions[quaternion]))
+    gaze = sample.stack_columns(vectors[direction]) if direction else None
+    is_local = _propose_pose(out, settings, rotations, gaze, head_positions, time[1])
+    if rotations is not None and gaze is not None and is_local is False:
+        quaternion = matrix = rotations = None
+        if origin is None or (eye is not None and parts[eye] & _GAZE_WORDS):
             origin = eye or origin
-    chosen: dict = {
+    mapping: dict = {
         "t": time[0],
-        "person": _person(out, sample, roles),
-        "confidence": _confidence(roles, sample),
+        "person": _find_person_column(out, sample, roles),
+        "confidence": _find_confidence(roles, sample),
         "hit": vectors[hit] if hit else None,
         "direction": vectors[direction] if direction else None,
-        "xyzw": quaternions[turn] if turn else None,
+        "xyzw": quaternions[quaternion] if quaternion else None,
         "matrix": matrix,
         "origin": vectors[origin] if origin and matrix is None else None,
-        "eye": vectors[eye] if turns is not None and local and eye and eye != origin else None,
+        "eye": vectors[eye] if rotations is not None and is_local and eye and eye != origin else None,
     }
-    _use_angles(out, sample, roles, chosen)
-    _use_validity(out, sample)
-    _finish(out, sample, roles, chosen)
+    _propose_angles(out, sample, roles, mapping)
+    _propose_validity(out, sample)
+    _finish_proposal(out, sample, roles, mapping)
 
 
-def _aside(parts: set[str]) -> int:
-    """How much less likely a vector is of one eye only, or none that a head or gaze has."""
-    return 2 * bool(parts & _SIDES)
+def _side_penalty(parts: set[str]) -> int:
+    """Penalty of vectors of a single eye in the choice of columns."""
+    return 2 * bool(parts & _SIDE_WORDS)
 
 
-def _best(stems, score, least: int, but: tuple = (), more=lambda stem: 0) -> str | None:
-    """The stem of the highest score, of those that have ``least``; ``more`` decides between equal ones, then the order
+def _find_best(stems, score, min_score: int, excluded: tuple = (), tie_break=lambda stem: 0) -> str | None:
+    """The stem with the highest score of at least ``min_score``; ties are decided by ``tie_break``, then by the order
     in the file."""
-    fits = [s for s in stems if s not in but and score(s) >= least]
-    return max(fits, key=lambda s: (score(s), more(s)), default=None)
+    candidates = [s for s in stems if s not in excluded and score(s) >= min_score]
+    return max(candidates, key=lambda s: (score(s), tie_break(s)), default=None)
 
 
 def _find_time(out: Proposal, sample: TableSample, roles: Roles) -> tuple[str | None, np.ndarray | None]:
-    """The column of the time, and its seconds."""
+    """Find the column of time, and its values in seconds."""
     name = next((c for c in (*roles.times, *sorted(sample.clocks)) if c in sample.numbers), None)
     if name is None:
-        why = "no column is called so"
-        if unread := next((c for c in roles.times if c in sample.columns), None):
-            cell = sanitize(next(iter(sample.texts(unread)), ""), 40)
-            why = f"{unread!r} holds {cell!r}, which is read neither as a number nor as 2024-05-01T12:00:00.25"
-        out.questions.append(f"the time: {why}; without t= rows are numbered, and --tick is the time of one")
+        reason = "no column has a usual name"
+        if unreadable := next((c for c in roles.times if c in sample.columns), None):
+            cell = sanitize(next(iter(sample.read_texts(unreadable)), ""), 40)
+            reason = f"{unreadable!r} contains {cell!r}, which is neither a number nor like 2024-05-01T12:00:00.25"
+        out.questions.append(f"the time: {reason}; without t= rows are numbered, and --tick is the sampling interval")
         return None, None
     if name in sample.clocks:
-        out.certain.append(f"{name!r} holds times of day, or dates with them (in UTC where no offset is written)")
+        out.certain.append(f"{name!r} contains times of day, or dates with times (in UTC without an offset)")
         return name, sample.numbers[name]
-    stated, fits = time_unit(name), find_tick(sample.numbers[name])
-    tick = stated or fits
-    if stated:
-        out.certain.append(f"{name!r} is the time, in units of {stated:g} s by its name")
-    elif fits:
-        out.assumptions.append(f"{name!r} is the time, in units of {fits:g} s by the steps between its rows")
+    named_unit, detected = parse_time_unit(name), find_time_unit(sample.numbers[name])
+    tick = named_unit or detected
+    if named_unit:
+        out.certain.append(f"{name!r} is the time, in units of {named_unit:g} s by its name")
+    elif detected:
+        out.assumptions.append(f"{name!r} is the time, in units of {detected:g} s by its sampling interval")
     else:
-        out.questions.append(f"the unit of the time {name!r}: its steps fit no device (--tick, seconds in one unit)")
-    if stated and fits and not np.isclose(stated, fits):
-        out.assumptions.append(f"the steps of {name!r} would be a device's in units of {fits:g} s: is its name right?")
+        out.questions.append(
+            f"the unit of the time {name!r}: no unit gives the sampling rate of a device (--tick, seconds)"
+        )
+    if named_unit and detected and not np.isclose(named_unit, detected):
+        out.assumptions.append(
+            f"by its sampling interval {name!r} would be in units of {detected:g} s: is its name right?"
+        )
     if tick and tick != 1.0:
         out.options["--tick"] = f"{tick:g}"
     return name, sample.numbers[name] * (tick or 1.0)
 
 
-def _gravity_up(sample: TableSample, roles: Roles) -> str | None:
-    """The axis against which gravity pulls, where the table has columns of it."""
+def _find_gravity_up(sample: TableSample, roles: Roles) -> str | None:
+    """The axis opposite to gravity, if the table has columns of gravity."""
     if roles.gravity is None or not sample.rows:
         return None
-    pull = np.nan_to_num(np.nanmedian(sample.vector(roles.gravity), axis=0))
+    pull = np.nan_to_num(np.nanmedian(sample.stack_columns(roles.gravity), axis=0))
     axis = int(np.argmax(np.abs(pull)))
     if np.abs(pull[axis]) < 0.95 * np.linalg.norm(pull) or not pull.any():
         return None
     return ("-" if pull[axis] > 0 else "") + "xyz"[axis]
 
 
-def _frame(out: Proposal, standing: Standing | None, against: str | None) -> dict[str, str]:
-    """Up and units, as far as the rows tell: by where heads are, or by the axis ``against`` which gravity pulls."""
-    if against is not None:
-        out.certain.append(f"{against} is up: the columns of gravity say so")
-    if standing is None or (against is not None and standing.up != against):
-        if against is None:
+def _propose_frame(out: Proposal, upright: UpAxis | None, gravity_up: str | None) -> dict[str, str]:
+    """Propose the up axis and the unit of length, from the heights of heads, or from gravity."""
+    if gravity_up is not None:
+        out.certain.append(f"{gravity_up} is up, opposite to the columns of gravity")
+    if upright is None or (gravity_up is not None and upright.up != gravity_up):
+        if gravity_up is None:
             out.questions.append(
-                "which axis is up (--up), the hand (--hand) and the unit (--units): along no one axis do the rows stay "
-                "at the height of eyes"
+                "the up axis (--up), the handedness (--hand) and the unit (--units): there is not exactly one axis "
+                "along which the rows stay at eye height"
             )
             out.options |= {"--up": "UP", "--hand": "HAND", "--units": "UNIT"}
             return {}
-        out.options["--up"] = against
-        out.assumptions.append("the unit is the metre; the rows are at no height that would tell, as where 0 is no floor")
-        return {"up": against, "metre": "m"}
-    out.options["--up"] = standing.up
-    if standing.units != "m":
-        out.options["--units"] = standing.units
-    which = f"the unit is {standing.units}" if against else f"{standing.up} is up and the unit {standing.units}"
-    out.assumptions.append(f"{which}: the rows stay at {standing.height:.2f} m along {standing.up}")
-    return {"up": standing.up, "metre": standing.units}
+        out.options["--up"] = gravity_up
+        out.assumptions.append("the unit is the metre; the rows are not at eye height, as if 0 were not the floor")
+        return {"up": gravity_up, "metre": "m"}
+    out.options["--up"] = upright.up
+    if upright.units != "m":
+        out.options["--units"] = upright.units
+    which = f"the unit is {upright.units}" if gravity_up else f"{upright.up} is up and the unit {upright.units}"
+    out.assumptions.append(f"{which}: the rows stay at {upright.height:.2f} m along {upright.up}")
+    return {"up": upright.up, "metre": upright.units}
 
 
-def _pose_evidence(
+def _propose_pose(
     out: Proposal,
     settings: dict[str, str],
-    turns: np.ndarray | None,
+    rotations: np.ndarray | None,
     gaze: np.ndarray | None,
-    where: np.ndarray | None,
+    positions: np.ndarray | None,
     seconds: np.ndarray | None,
 ) -> bool | None:
-    """Hand and forward axis into ``out``, and whether gaze is in the head's frame."""
+    """Propose the handedness and the forward axis in ``out``; returns whether gaze is in the head's frame."""
     up = settings.get("up")
     forward = None
-    if turns is not None and up and where is not None and seconds is not None:
-        forward = find_forward(turns, where, seconds, up, UNITS[settings["metre"]])
+    if rotations is not None and up and positions is not None and seconds is not None:
+        forward = find_forward_axis(rotations, positions, seconds, up, UNITS[settings["metre"]])
         if forward:
-            out.assumptions.append(f"heads look along their {forward}: that is where they walk to")
-    unity = up == "y" and forward != "-z"
-    unreal = up is not None and up.endswith("z") and settings["metre"] == "cm"
-    hand = "left" if unity or unreal else "right"
+            out.assumptions.append(f"the forward axis of heads is {forward}: it points in the walking direction")
+    is_unity = up == "y" and forward != "-z"
+    is_unreal = up is not None and up.endswith("z") and settings["metre"] == "cm"
+    hand = "left" if is_unity or is_unreal else "right"
     if up:
         out.options["--hand"] = hand
-        which = "as cameras' frames are" if up == "-y" else "as most worlds with that axis up are"
+        which = "like camera frames" if up == "-y" else "like most frames with this up axis"
         if hand == "left":
-            which = "as Unity's worlds with y up are" if unity else "as Unreal's worlds (z up, in centimetres) are"
+            which = "like Unity (y up)" if is_unity else "like Unreal (z up, in centimetres)"
         out.assumptions.append(
-            f"the world is {hand}-handed, {which}; no row tells: a mirrored place is the sign of the other"
+            f"the frame is {hand}-handed, {which}; the rows cannot confirm it: a mirrored scene means the other hand"
         )
-    if turns is None:
+    if rotations is None:
         return None
     default = poses.default_forward(up, hand) if up else None
     if forward is not None and forward != default:
         out.options["--forward"] = forward
     if forward is None:
-        usual_one = f"{default} is usual in such a world" if default else "it depends on the world"
-        out.questions.append(f"the axis along which heads look (--forward): {usual_one}, and nobody walks in the rows")
+        usual_one = f"{default} is usual in such a frame" if default else "it depends on the frame"
+        out.questions.append(
+            f"the forward axis of heads (--forward): {usual_one}, and there is no walking to confirm it"
+        )
     if gaze is None:
         return None
-    local = find_local(gaze, turns, forward or default or "z")
-    if local is None:
-        out.questions.append("whether the gaze is in the head's frame: its rows tell neither; it is taken for the head's")
+    is_local = is_gaze_in_head_frame(gaze, rotations, forward or default or "z")
+    if is_local is None:
+        out.questions.append(
+            "whether the gaze is in the head's frame: the rows do not tell; the head's frame is assumed"
+        )
         return True
-    where_to = "the head's frame" if local else "the world, so that the head's pose is left out"
-    out.assumptions.append(f"the gaze is in {where_to}: so it is nearer to where the head points")
-    return local
+    where_to = "the head's frame" if is_local else "the world frame, so that the head's pose is omitted"
+    out.assumptions.append(f"the gaze is in {where_to}: this is nearer to the direction of the head")
+    return is_local
 
 
-def _confidence(roles: Roles, sample: TableSample) -> str | None:
-    """The column of confidences, if they are from 0 to 1."""
+def _find_confidence(roles: Roles, sample: TableSample) -> str | None:
+    """The column of confidences, if they are in [0, 1]."""
     if roles.confidence is None or roles.confidence not in sample.numbers:
         return None
     values = sample.numbers[roles.confidence]
@@ -578,20 +628,22 @@ def _confidence(roles: Roles, sample: TableSample) -> str | None:
     return roles.confidence if values.size and values.min() >= 0 and values.max() <= 1 else None
 
 
-def _person(out: Proposal, sample: TableSample, roles: Roles) -> str | None:
-    """The column of participants, unless it counts rows."""
-    if roles.person not in sample.columns or not is_counter(sample.texts(roles.person)):
+def _find_person_column(out: Proposal, sample: TableSample, roles: Roles) -> str | None:
+    """The column of participants, unless it is a row counter."""
+    if roles.person not in sample.columns or not is_counter(sample.read_texts(roles.person)):
         return roles.person if roles.person in sample.columns else None
-    out.questions.append(f"{roles.person!r} has another value in nearly every row: it counts rows, not participants")
+    out.questions.append(
+        f"{roles.person!r} has another value in nearly every row: it is a row counter, not a participant"
+    )
     return None
 
 
-def _use_validity(out: Proposal, sample: TableSample) -> None:
-    """Columns of validity, and which of their values mark valid rows."""
+def _propose_validity(out: Proposal, sample: TableSample) -> None:
+    """Propose columns of validity and their values for valid rows."""
     words = []
-    for name in filter(is_validity, sample.columns):
-        values = sorted(set(sample.texts(name).tolist()))
-        valid = valid_values(name, values)
+    for name in filter(is_validity_column, sample.columns):
+        values = sorted(set(sample.read_texts(name).tolist()))
+        valid = find_valid_values(name, values)
         if valid is None or any(c in name + "".join(valid) for c in ",="):
             out.questions.append(
                 f"which values of {name!r} mark valid rows (--valid): {', '.join(map(repr, values[:8]))}"
@@ -604,41 +656,42 @@ def _use_validity(out: Proposal, sample: TableSample) -> None:
         out.options["--valid"] = " ".join(words)
 
 
-def _use_angles(out: Proposal, sample: TableSample, roles: Roles, chosen: dict) -> None:
-    """Angles, where there is no vector: as a direction, or as the head's pose."""
-    posed = chosen["xyzw"] or chosen["matrix"]
+def _propose_angles(out: Proposal, sample: TableSample, roles: Roles, mapping: dict) -> None:
+    """Propose angles as the direction or the head's pose, if there is no vector."""
+    has_pose = mapping["xyzw"] or mapping["matrix"]
     names: tuple[str, ...] | None = None
-    if chosen["direction"] is None and roles.azel and all(c in sample.numbers for c in roles.azel):
-        names = chosen["azel"] = roles.azel
-        out.assumptions.append("azimuths turn to the right and elevations up; put - before a name where they do not")
-    elif chosen["direction"] is None and roles.yaw_pitch_roll:
+    if mapping["direction"] is None and roles.azel and all(c in sample.numbers for c in roles.azel):
+        names = mapping["azel"] = roles.azel
+        out.assumptions.append("azimuths increase to the right and elevations upwards; put - before a name otherwise")
+    elif mapping["direction"] is None and roles.yaw_pitch_roll:
         if all(c in sample.numbers for c in roles.yaw_pitch_roll):
             names = roles.yaw_pitch_roll
-            gaze = any(set(n.lower().replace("_", " ").split()) & _GAZE for n in names)
-            chosen["yawpitch" if posed or (gaze and len(names) == 2) else "ypr"] = names[: 2 if posed else 3]
+            gaze = any(set(n.lower().replace("_", " ").split()) & _GAZE_WORDS for n in names)
+            mapping["yawpitch" if has_pose or (gaze and len(names) == 2) else "ypr"] = names[: 2 if has_pose else 3]
             out.assumptions.append(
-                "yaw and pitch turn as docs/reference/formats.md tells of this frame; put - before a name of yawpitch where not"
+                "yaw and pitch turn as described in docs/reference/formats.md for this frame; put - before a name of "
+                "yawpitch otherwise"
             )
     if names is None:
         return
-    stated = in_degrees(names)
-    most = float(np.nanmax(np.abs(sample.vector(names)), initial=0.0))
-    degrees = stated if stated is not None else most > 2 * np.pi
+    named_degrees = are_degrees(names)
+    max_angle = float(np.nanmax(np.abs(sample.stack_columns(names)), initial=0.0))
+    degrees = named_degrees if named_degrees is not None else max_angle > 2 * np.pi
     if not degrees:
         out.options["--radians"] = ""
-    how = "by their names" if stated is not None else f"the largest is {most:.3g}"
-    which = out.certain if stated is not None else out.assumptions
+    how = "by their names" if named_degrees is not None else f"the largest value is {max_angle:.3g}"
+    which = out.certain if named_degrees is not None else out.assumptions
     which.append(f"the angles are {'degrees' if degrees else 'radians'}: {how}")
 
 
-def _finish(out: Proposal, sample: TableSample, roles: Roles, chosen: dict) -> None:
-    named = {key: value for key, value in chosen.items() if value}
+def _finish_proposal(out: Proposal, sample: TableSample, roles: Roles, mapping: dict) -> None:
+    named = {key: value for key, value in mapping.items() if value}
     try:
         out.columns = ColumnMap(**named)
     except NergError as error:
         out.options = {}
         out.questions.append(
-            f"no map can be proposed ({error}); its columns that hold numbers are "
+            f"no column map can be proposed ({error}); the columns with numbers are "
             f"{', '.join(list(sample.numbers)[:24]) or 'none'}"
         )
         return
@@ -650,8 +703,8 @@ def _finish(out: Proposal, sample: TableSample, roles: Roles, chosen: dict) -> N
     if "person" in named:
         out.assumptions.append(f"person: {named['person']!r} by its name")
     else:
-        out.questions.append("the person: no column names participants, and the file is one")
+        out.questions.append("the person: no column names participants; the file is taken as one participant")
     used = {name for value in named.values() if not isinstance(value, str) for name in value}
-    left = [v[0] for v in (*roles.vectors.values(), *roles.quaternions.values()) if not used & set(v)]
-    if left:
-        out.questions.append(f"what is left out: {', '.join(left[:8])}{', ...' if len(left) > 8 else ''}")
+    unused = [v[0] for v in (*roles.vectors.values(), *roles.quaternions.values()) if not used & set(v)]
+    if unused:
+        out.questions.append(f"unused columns: {', '.join(unused[:8])}{', ...' if len(unused) > 8 else ''}")

@@ -14,26 +14,26 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays import guess as rows
 from nerg_mi.rays.guess import (
     TableSample,
-    preset_of_columns,
-    preset_of_files,
-    preset_of_text,
+    find_preset_by_columns,
+    find_preset_by_files,
+    find_preset_by_first_line,
     propose_import,
     propose_imports,
 )
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.columns import ColumnFinder, find_roles, in_degrees, time_unit
+from nerg_mi.rays.readers.columns import ColumnFinder, are_degrees, find_roles, parse_time_unit
 from tests.cli.rays.running import run
 from tests.rays.readers.examples import EXAMPLES
 
-# ---- A walk in the frame of rays, and tables of it as many programs would write them ----
+# ---- A walk in the frame of rays, and tables of it in the style of several programs ----
 
 N = 1500
-OTHERS = {
+OTHER_FORMATS = {
     "z right": np.eye(3),
     "y left": np.eye(3)[[0, 2, 1]],
     "y right": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
 }
-"""From the frame of rays to others, by rows."""
+"""Matrices from the frame of rays to other frames, by rows."""
 FORWARD = {"z right": [1.0, 0, 0], "y left": [0, 0, 1.0], "y right": [0, 0, -1.0]}
 
 
@@ -59,15 +59,15 @@ def walk(seed: int = 0) -> Walk:
 
 
 def frame(w: Walk, to: str, metre: float = 1.0) -> tuple[np.ndarray, np.ndarray, Rotation]:
-    """Eyes, gaze and heads of a walk in another frame: rotations of the head's frame there, which looks along
+    """Eyes, gaze and heads of a walk in another frame: rotations of the head's frame, whose forward axis is
     `FORWARD`."""
-    m = OTHERS[to]
+    m = OTHER_FORMATS[to]
     ahead, up = np.c_[np.cos(w.heading), np.sin(w.heading), np.zeros(N)] @ m.T, m @ [0, 0, 1]
     f = np.array(FORWARD[to])
-    # Columns of each rotation: where the head's own axes point.
-    own = np.stack([f, up, np.cross(f, up)])
-    there = np.stack([ahead, np.tile(up, (N, 1)), np.cross(ahead, up)], axis=2)
-    return w.eye @ m.T / metre, w.gaze @ m.T, Rotation.from_matrix(there @ own)
+    # Columns of each rotation: directions of the head's axes.
+    single = np.stack([f, up, np.cross(f, up)])
+    present = np.stack([ahead, np.tile(up, (N, 1)), np.cross(ahead, up)], axis=2)
+    return w.eye @ m.T / metre, w.gaze @ m.T, Rotation.from_matrix(present @ single)
 
 
 def csv(**columns) -> str:
@@ -80,7 +80,7 @@ def xyz(stem: str, values: np.ndarray, axes: str = "xyz") -> dict[str, np.ndarra
     return {f"{stem}{a}": v for a, v in zip(axes, values.T)}
 
 
-# ---- What names of columns tell ----
+# ---- Roles of column names ----
 
 
 @pytest.mark.parametrize(
@@ -104,18 +104,18 @@ def test_quaternions_and_matrices():
     assert roles.quaternions["q*"] == ("qx", "qy", "qz", "qw") and len(roles.quaternions) == 2
     m = [f"ctw_{r}{c}" for r in range(3) for c in range(4)]
     assert find_roles(m[::-1]).matrices == {"ctw": tuple(m)} and find_roles(m[1:]).matrices == {}
-    whole = [f"m{r}{c}" for r in range(4) for c in range(4)]
-    assert find_roles(whole).matrices == {"": tuple(whole)}
+    complete = [f"m{r}{c}" for r in range(4) for c in range(4)]
+    assert find_roles(complete).matrices == {"": tuple(complete)}
 
 
-def test_what_is_no_place_has_no_role():
+def test_other_columns_have_no_role():
     names = ["velocity", "angular_velocity", "gyro", "gaze_target_pos", "head_scale", "PupilPos"]
     assert find_roles([f"{n}_{a}" for n in names for a in "xyz"]).vectors == {}
     assert find_roles(["gaze_x_px", "gaze_y_px", "a,b", "c=d"]).vectors == {}
     assert find_roles([f"gravity_{a}_world" for a in "xyz"]).gravity == tuple(f"gravity_{a}_world" for a in "xyz")
 
 
-def test_angles_times_and_people():
+def test_roles_of_angles_times_and_participants():
     roles = find_roles(
         ["device_timestamp_ns", "timestamp [ns]", "relative time", "left_yaw_rads", "yaw_rads", "pitch_rads", "UserId"]
     )
@@ -137,21 +137,21 @@ def test_angles_times_and_people():
     ],
 )
 def test_units_of_time(name, unit):
-    assert time_unit(name) == unit
+    assert parse_time_unit(name) == unit
 
 
 def test_units_of_angles():
-    assert in_degrees(["yaw_deg", "pitch"]) is True and in_degrees(["yaw_rads"]) is False
-    assert in_degrees(["yaw"]) is None
+    assert are_degrees(["yaw_deg", "pitch"]) is True and are_degrees(["yaw_rads"]) is False
+    assert are_degrees(["yaw"]) is None
 
 
-# ---- Proposals: the command that is printed imports the rays that were meant ----
+# ---- Proposals: the printed command imports the intended rays ----
 
 WALK = walk()
 
 
 def imported(path, monkeypatch) -> Rays:
-    """The rays by the command that is proposed for ``path``."""
+    """The rays imported with the proposed command for ``path``."""
     monkeypatch.chdir(path.parent)
     proposal = propose_import(path)
     assert proposal.command is not None
@@ -198,7 +198,7 @@ def assert_walk(rays, gaze=WALK.gaze):
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_the_command_imports_what_was_meant(tmp_path, monkeypatch, name):
+def test_proposed_command_imports_the_rays(tmp_path, monkeypatch, name):
     (tmp_path / "log.csv").write_text(csv(**TABLES[name]))
     assert_walk(imported(tmp_path / "log.csv", monkeypatch))
 
@@ -214,8 +214,8 @@ def test_angles_are_a_direction(tmp_path, monkeypatch, radians):
     assert ("--radians" in propose_import(tmp_path / "log.csv").options) == radians
 
 
-def test_heads_alone_and_matrices(tmp_path, monkeypatch):
-    """Each head looks where it walks; the rows of its matrix in the names of the columns."""
+def test_heads_only_and_matrices(tmp_path, monkeypatch):
+    """Each head looks where it walks; the rows of its matrix are in the column names."""
     eye, _, head = frame(WALK, "y right")
     ahead = np.c_[np.cos(WALK.heading), np.sin(WALK.heading), np.zeros(N)]
     m = np.concatenate([head.as_matrix(), eye[:, :, None]], axis=2)
@@ -224,7 +224,7 @@ def test_heads_alone_and_matrices(tmp_path, monkeypatch):
     assert_walk(imported(tmp_path / "log.csv", monkeypatch), ahead)
 
 
-def test_people_confidence_and_hits(tmp_path, monkeypatch):
+def test_participants_confidence_and_hits(tmp_path, monkeypatch):
     table = gaze_in_world("z right", 1.0, 1.0)
     table |= {"participant_id": np.repeat(["ann", "bo"], N // 2), "confidence": np.full(N, 0.5)}
     table |= xyz("hit_point_", WALK.eye + 2 * WALK.gaze)
@@ -236,15 +236,15 @@ def test_people_confidence_and_hits(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", [n for n in EXAMPLES if n not in ("table", "unity", "unity_local", "unity_head")])
-def test_examples_of_presets_are_known(tmp_path, name):
+def test_examples_of_presets_are_recognised(tmp_path, name):
     """By their header, or by the files of their folder."""
     proposal = propose_import(EXAMPLES[name].make(tmp_path))
     assert proposal.preset == name and f"--preset {name}" in (proposal.command or "")
 
 
 @pytest.mark.parametrize("name", ["unity", "unity_local", "unity_head"])
-def test_a_map_does_for_presets_that_look_alike(tmp_path, name):
-    """What Unity projects call the gaze does not say of which frame it is."""
+def test_column_map_is_proposed_for_ambiguous_presets(tmp_path, name):
+    """Usual names of gaze in Unity projects do not tell its frame."""
     proposal = propose_import(EXAMPLES[name].make(tmp_path))
     assert proposal.preset is None and proposal.columns is not None and proposal.options["--hand"] == "left"
     assert (proposal.columns.xyzw is not None) == (name != "unity")
@@ -257,17 +257,17 @@ def test_folders(tmp_path):
     (tmp_path / "info.json").unlink()
     assert propose_import(tmp_path).preset == "neon"
     (tmp_path / "world_timestamps.csv").unlink()
-    with pytest.raises(NergError, match="of no recording that is known"):
+    with pytest.raises(NergError, match="is not a recording of a known format"):
         propose_import(tmp_path)
 
 
-def test_what_is_not_known_is_to_be_said(tmp_path):
-    """Nobody stands in these rows, and no name says what they are: the command does not run as it is."""
+def test_unknown_settings_are_open(tmp_path):
+    """These rows are at no eye height, and no name identifies them: the command needs values of the user."""
     path = tmp_path / "log.csv"
     rising = np.outer(np.arange(9.0), [1, 7, 5])
     path.write_text(csv(**xyz("a_", rising), **xyz("dir_", np.tile([1.0, 0, 0], (9, 1)))))
     proposal = propose_import(path)
-    assert proposal.options["--up"] == "UP" and any("which axis is up" in s for s in proposal.questions)
+    assert proposal.options["--up"] == "UP" and any("the up axis" in s for s in proposal.questions)
     assert any("the time" in s for s in proposal.questions) and not proposal.certain
     with pytest.raises(NergError, match='"UP up'):
         raise run(*shlex.split(proposal.command or "")[2:]).exception
@@ -276,7 +276,7 @@ def test_what_is_not_known_is_to_be_said(tmp_path):
     assert proposal.command is None and "origin is missing" in proposal.questions[-1]
 
 
-def test_gravity_says_what_is_up(tmp_path):
+def test_up_axis_from_gravity(tmp_path):
     table = {**gaze_in_world("y right", 1.0, 1.0), **xyz("gravity_", np.tile([0, -9.81, 0], (N, 1)))}
     table = {name: v + (50 if name == "gaze_origin_y" else 0) for name, v in table.items()}
     path = tmp_path / "log.csv"
@@ -285,16 +285,18 @@ def test_gravity_says_what_is_up(tmp_path):
     assert proposal.options["--up"] == "y" and any("gravity" in s for s in proposal.certain)
 
 
-@pytest.mark.parametrize("text, message", [("1,2,3\n4,5,6\n", "holds no names of columns"), ("", "holds no names")])
-def test_what_is_no_table(tmp_path, text, message):
+@pytest.mark.parametrize(
+    "text, message", [("1,2,3\n4,5,6\n", "contains no column names"), ("", "contains no column names")]
+)
+def test_other_files_are_refused(tmp_path, text, message):
     path = tmp_path / "log.csv"
     path.write_text(text)
     with pytest.raises(NergError, match=message):
         propose_import(path)
 
 
-def alike(eye, gaze, **more):
-    return csv(t=WALK.t, **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze), **more)
+def alike(eye, gaze, **extra):
+    return csv(t=WALK.t, **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze), **extra)
 
 
 @pytest.mark.parametrize(
@@ -306,25 +308,25 @@ def alike(eye, gaze, **more):
         (lambda v: v[:, [2, 0, 1]], "right"),  # x up
     ],
 )
-def test_hands_of_worlds(tmp_path, monkeypatch, to, hand):
+def test_handedness_of_frames(tmp_path, monkeypatch, to, hand):
     eye, gaze = to(WALK.eye), to(WALK.gaze)
     (tmp_path / "log.csv").write_text(alike(eye, gaze / np.linalg.norm(gaze, axis=1, keepdims=True)))
     proposal = propose_import(tmp_path / "log.csv")
     assert proposal.options["--hand"] == hand
     rays = imported(tmp_path / "log.csv", monkeypatch)
-    # A turn about the vertical is left open.
+    # A rotation about the vertical axis is not determined.
     assert np.allclose(rays.origin[:, 2], WALK.eye[:, 2], atol=1e-5) and np.allclose(
         rays.direction[:, 2], WALK.gaze[:, 2], atol=1e-5
     )
 
 
 @pytest.mark.parametrize("name, cell", [("time", "12:00"), ("timestamp", "5/1/2024 12:00:00"), ("utc", "noon")])
-def test_times_that_are_not_read_are_named(tmp_path, name, cell):
+def test_unreadable_times_are_reported(tmp_path, name, cell):
     eye, gaze, _ = frame(WALK, "y left")
     table = {name: [cell] * N, **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
     (tmp_path / "log.csv").write_text(csv(**table))
     (sentence,) = (s for s in propose_import(tmp_path / "log.csv").questions if "the time" in s)
-    assert f"{name!r} holds {cell!r}" in sentence
+    assert f"{name!r} contains {cell!r}" in sentence
 
 
 @pytest.mark.parametrize(
@@ -332,7 +334,7 @@ def test_times_that_are_not_read_are_named(tmp_path, name, cell):
     [np.arange(N), [f"u{k:05d}" for k in range(N)], [f"{k / 90:.3f}" for k in range(N)], np.arange(N)[::-1]],
     ids=["counter", "words", "times", "backwards"],
 )
-def test_what_differs_in_each_row_is_no_participant(tmp_path, ids):
+def test_row_counter_is_no_participant(tmp_path, ids):
     name = "user_id"
     (tmp_path / "log.csv").write_text(alike(*frame(WALK, "y left")[:2], **{name: ids}))
     proposal = propose_import(tmp_path / "log.csv")
@@ -345,7 +347,7 @@ def test_times_as_text(tmp_path, monkeypatch, form):
     table = {"when": [form.format(t - 100) for t in WALK.t], **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
     (tmp_path / "log.csv").write_text(csv(**table))
     assert np.allclose(np.diff(imported(tmp_path / "log.csv", monkeypatch).t), 0.02, atol=1e-5)
-    assert "'when' holds times of day" in propose_import(tmp_path / "log.csv").certain[0]
+    assert "'when' contains times of day" in propose_import(tmp_path / "log.csv").certain[0]
 
 
 def test_validity(tmp_path, monkeypatch):
@@ -372,9 +374,9 @@ def test_repeated_names_and_mirrored_matrices(tmp_path):
     rows = np.concatenate([head.as_matrix() @ np.diag([1, 1, -1.0]), eye[:, :, None]], axis=2).reshape(N, 12)
     names = {f"m{r}{c}": rows[:, 4 * r + c] for r in range(3) for c in range(4)}
     (tmp_path / "log.csv").write_text(csv(t=WALK.t, **names, x=eye[:, 0], X=eye[:, 0]).replace(",X", ",x"))
-    found = propose_import(tmp_path / "log.csv").questions
-    assert any("1,500 of 1,500 rows: the head's matrix is mirrored" in sentence for sentence in found)
-    assert any("several columns are called 'x'" in sentence for sentence in found)
+    result = propose_import(tmp_path / "log.csv").questions
+    assert any("1,500 of 1,500 rows: the head's matrix is mirrored" in sentence for sentence in result)
+    assert any("several columns are called 'x'" in sentence for sentence in result)
 
 
 def test_several_files_and_folders(tmp_path):
@@ -388,55 +390,55 @@ def test_several_files_and_folders(tmp_path):
     assert [p.name for p in metres.paths] == ["a.csv", "b.csv", "c.csv"] and "--units cm" in centimetres.command
     assert shlex.split(metres.command)[3:6] == [str(p) for p in metres.paths]
     (tmp_path / "empty").mkdir()
-    with pytest.raises(NergError, match="is of no recording"):
+    with pytest.raises(NergError, match="is not a recording"):
         propose_imports([tmp_path / "empty"])
 
 
-# ---- What rows tell of their frame ----
+# ---- Evidence from rows ----
 
 OTHER_WALK = walk(3)
 
 
 @pytest.mark.parametrize("to, up", [("z right", "z"), ("y left", "y"), ("y right", "y")])
 @pytest.mark.parametrize("units", ["m", "cm", "mm"])
-def test_heads_stand(to, up, units):
+def test_up_axis_from_head_heights(to, up, units):
     eye, _, _ = frame(OTHER_WALK, to, rows.UNITS[units])
-    found = rows.find_standing(eye)
-    assert found is not None and (found.up, found.units) == (up, units) and abs(found.height - 1.62) < 0.02
-    upside_down = rows.find_standing(-eye)
+    result = rows.find_up_axis(eye)
+    assert result is not None and (result.up, result.units) == (up, units) and abs(result.height - 1.62) < 0.02
+    upside_down = rows.find_up_axis(-eye)
     assert upside_down is not None and upside_down.up == "-" + up
 
 
-def test_rows_that_tell_nothing():
+def test_rows_without_evidence():
     eye = frame(OTHER_WALK, "z right")[0]
-    assert rows.find_standing(eye + [0, 0, 40]) is None and rows.find_standing(np.full((5, 3), np.nan)) is None
-    assert rows.find_standing(np.tile([0.0, 0.0, 1.6], (9, 1))) is None  # nothing moves
-    # Somebody who sits at 1.3 m along two axes.
+    assert rows.find_up_axis(eye + [0, 0, 40]) is None and rows.find_up_axis(np.full((5, 3), np.nan)) is None
+    assert rows.find_up_axis(np.tile([0.0, 0.0, 1.6], (9, 1))) is None  # nothing moves
+    # A sitting person at 1.3 m along two axes.
     still = np.array([1.3, 5.0, 1.3]) + np.random.default_rng(0).normal(0, 0.05, (500, 3))
-    assert rows.find_standing(still) is None
+    assert rows.find_up_axis(still) is None
 
 
 @pytest.mark.parametrize("rate", [11.0, 50.0, 200.0, 1000.0])
 @pytest.mark.parametrize("tick", [1e-3, 1e-6, 1e-9])
-def test_clocks(rate, tick):
-    found = rows.find_tick(np.arange(100) / rate / tick)
-    # At 11 to 2,100 a second units a thousand apart cannot both fit.
-    assert found == tick
-    assert rows.find_tick(np.zeros(9)) is None and rows.find_tick(np.array([1.0])) is None
-    assert rows.find_tick(np.arange(9) * 3.6e8) is None
+def test_unit_of_time(rate, tick):
+    result = rows.find_time_unit(np.arange(100) / rate / tick)
+    # At 11 to 2,100 Hz only one of two units a factor of thousand apart can match.
+    assert result == tick
+    assert rows.find_time_unit(np.zeros(9)) is None and rows.find_time_unit(np.array([1.0])) is None
+    assert rows.find_time_unit(np.arange(9) * 3.6e8) is None
 
 
 @pytest.mark.parametrize("to", FORWARD)
-def test_heads_look_where_they_walk(to):
+def test_forward_axis_from_walking(to):
     eye, gaze, head = frame(OTHER_WALK, to)
     turns, up = head.as_matrix(), "z" if to.startswith("z") else "y"
-    name = rows.find_forward(turns, eye, OTHER_WALK.t, up, 1.0)
+    name = rows.find_forward_axis(turns, eye, OTHER_WALK.t, up, 1.0)
     assert name is not None and np.allclose(rows.poses.AXES[name], FORWARD[to])
-    assert rows.find_forward(turns, eye * 0, OTHER_WALK.t, up, 1.0) is None
-    assert rows.find_forward(turns[:20], eye[:20], OTHER_WALK.t[:20], up, 1.0) is None
-    assert rows.find_local(head.inv().apply(gaze), turns, name) is True
-    assert rows.find_local(gaze, turns, name) is False
-    assert rows.find_local(gaze, np.tile(np.eye(3), (len(gaze), 1, 1)), name) is None
+    assert rows.find_forward_axis(turns, eye * 0, OTHER_WALK.t, up, 1.0) is None
+    assert rows.find_forward_axis(turns[:20], eye[:20], OTHER_WALK.t[:20], up, 1.0) is None
+    assert rows.is_gaze_in_head_frame(head.inv().apply(gaze), turns, name) is True
+    assert rows.is_gaze_in_head_frame(gaze, turns, name) is False
+    assert rows.is_gaze_in_head_frame(gaze, np.tile(np.eye(3), (len(gaze), 1, 1)), name) is None
 
 
 def test_unit_vectors():
@@ -450,15 +452,15 @@ def test_unit_vectors():
 @pytest.mark.parametrize(
     "head", ["gaze_dir_x,gaze_dir_y,gaze_dir_z,gaze_origin_x", "x,y,z", "timestamp [ns]", "ViewIndex"]
 )
-def test_gaze_alone_is_no_sign_of_a_preset(tmp_path, head):
-    """Of which world it is, rows tell, and no name."""
+def test_gaze_columns_alone_match_no_preset(tmp_path, head):
+    """Rows, not names, determine the frame."""
     (tmp_path / "a.csv").write_text(head + "\n")
-    assert preset_of_columns(ColumnFinder(tmp_path / "a.csv")) is None
+    assert find_preset_by_columns(ColumnFinder(tmp_path / "a.csv")) is None
 
 
 def test_files_and_first_lines(tmp_path):
     (tmp_path / "a.csv").write_text("a|b|c\n")
-    assert preset_of_text(tmp_path / "a.csv") is None and preset_of_files(tmp_path / "a.csv") is None
+    assert find_preset_by_first_line(tmp_path / "a.csv") is None and find_preset_by_files(tmp_path / "a.csv") is None
 
 
 # ---- The first rows of a table ----
@@ -473,10 +475,10 @@ def test_columns_of_numbers(tmp_path):
     rows = ROWS + [["1", "x", "1", "", "7"]] * 60 + [["1", "x", "1", "", "word"], ["1"]]
     path.write_text(";".join(NAMES) + "\n" + "\n".join(";".join(r) for r in rows) + "\n")
     sample = TableSample(path, NAMES)
-    # What comes late is left out by line, as is a line that is cut off.
+    # Bad cells after the sniffed lines are skipped by line, as is a truncated line.
     assert list(sample.numbers) == ["a", "b", "late"] and sample.rows == 63
     assert np.array_equal(
-        sample.vector(["b", "word"])[:3], [[np.nan, np.nan], [-300, np.nan], [1, np.nan]], equal_nan=True
+        sample.stack_columns(["b", "word"])[:3], [[np.nan, np.nan], [-300, np.nan], [1, np.nan]], equal_nan=True
     )
 
 
@@ -492,7 +494,7 @@ def test_no_numbers(tmp_path, text):
     path = tmp_path / "t.csv"
     path.write_text(text)
     sample = TableSample(path, ["a", "b"] if text else [])
-    assert sample.rows == 0 and sample.vector(["a", "b", "c"]).shape == (0, 3)
+    assert sample.rows == 0 and sample.stack_columns(["a", "b", "c"]).shape == (0, 3)
 
 
 # ---- The command ----
