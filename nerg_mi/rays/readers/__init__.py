@@ -1,1 +1,1 @@
-"""Readers of tracking: one module a device or kind of file, and what they share."""
+"""Readers of tracking data: one module per device or file format, and their common parts."""

@@ -1,4 +1,4 @@
-"""Which readers there are, and reading files with one of them."""
+"""Registry of readers, and reading files with one of them."""
 
 from __future__ import annotations
 
@@ -15,36 +15,35 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
 from . import skeleton, table
-from .base import Option, RaysBuilder, Reader, list_options, recorded_options
+from .base import Option, RaysBuilder, Reader, list_options, list_recorded_options
 
 TABLE = table.TABLE.name
-"""The reader of tables through a column map; the others know their columns, and are the presets."""
+"""Name of the reader of tables with a column map. All other readers know their columns, and are called presets."""
 
 _READERS: dict[str, Reader[Any]] = {}
 _FORMER_NAMES = {"skeleton22": skeleton.SkeletonFile.name}
 
 
 def register_reader(reader: Reader[Any]) -> None:
-    """Make ``reader`` known by its name, to `import_rays` and to the command line.
+    """Register a reader under its name, for `import_rays` and the command line.
 
-    Raises ``ValueError`` for a name that is taken or is no word, or for an option whose flag stands for another field
-    or type with another reader: on the command line it is one option for all.
-
+    Raises ``ValueError`` if the name is taken or invalid, or if the flag of an option denotes another field or type of
+    another reader: the command line has only one option per flag.
     >>> import nerg_mi as nerg
     >>> from nerg_mi.rays.readers.hololens import Arett
-    >>> from nerg_mi.rays.readers.registry import reader_names, unregister
+    >>> from nerg_mi.rays.readers.registry import list_reader_names, unregister_reader
     >>> class OfOurLab(Arett):
     ...     name = "our_lab"
     >>> nerg.register_reader(OfOurLab())
-    >>> "our_lab" in reader_names()
+    >>> "our_lab" in list_reader_names()
     True
-    >>> unregister("our_lab")
+    >>> unregister_reader("our_lab")
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", reader.name) or reader.name in _READERS:
-        raise ValueError(f'a reader cannot be called "{reader.name}": the name is taken, or no word in lower case')
-    known = {o.flag: o for r in _READERS.values() for o in list_options(r.Options)}
+        raise ValueError(f'a reader cannot be called "{reader.name}": the name is taken, or not a lower-case word')
+    options_by_flag = {o.flag: o for r in _READERS.values() for o in list_options(r.Options)}
     for option in list_options(reader.Options):
-        other = known.get(option.flag, option)
+        other = options_by_flag.get(option.flag, option)
         if (other.name, other.kind) != (option.name, option.kind):
             raise ValueError(
                 f"{option.flag} of {reader.name} is {option.name} ({option.kind.__name__}), and of other readers "
@@ -54,52 +53,54 @@ def register_reader(reader: Reader[Any]) -> None:
 
 
 def unregister_reader(name: str) -> None:
-    """Forget a reader. Raises ``KeyError`` where there is none of this name."""
+    """Remove a reader. Raises ``KeyError`` for an unknown name."""
     del _READERS[name]
 
 
 def list_reader_names() -> tuple[str, ...]:
-    """Names of all readers, in the order in which they were registered."""
+    """Names of all readers, in order of registration."""
     return tuple(_READERS)
 
 
-def readers() -> Iterable[Reader[Any]]:
-    """All readers, in the order in which they were registered."""
+def iterate_readers() -> Iterable[Reader[Any]]:
+    """All readers, in order of registration."""
     return _READERS.values()
 
 
 def list_preset_names() -> tuple[str, ...]:
-    """Names of the readers that know their columns."""
+    """Names of the presets: the readers that know their columns."""
     return tuple(name for name in _READERS if name != TABLE)
 
 
 def get_reader(name: str) -> Reader[Any]:
-    """The reader of this name, or of one that it had. Raises `NergError` naming those there are."""
+    """The reader with this name, or with this former name. Raises `NergError` listing the presets otherwise."""
     name = _FORMER_NAMES.get(name, name)
     if name not in _READERS:
-        raise NergError(f'there is no preset "{name}"; choose one of {", ".join(list_preset_names())}, or give a column map')
+        raise NergError(
+            f'there is no preset "{name}"; choose one of {", ".join(list_preset_names())}, or use a column map'
+        )
     return _READERS[name]
 
 
-def make_options(name: str, given: Mapping[str, Any]) -> Any:
-    """The options of the reader ``name`` with the values ``given`` by the fields' names; defaults for the others.
+def make_options(name: str, values: Mapping[str, Any]) -> Any:
+    """Make the options of the reader ``name`` from ``values`` by field name; other fields have their defaults.
 
-    Raises `NergError` for an option that the reader does not have, naming its flag, or a value that it refuses.
+    Raises `NergError` for options that the reader does not have, naming their flags, and for invalid values.
     """
     reader = get_reader(name)
-    known, flags = {o.name for o in list_options(reader.Options)}, {o.name: o.flag for o in collect_shared_options()}
-    foreign = ", ".join(flags.get(key, key) for key in given if key not in known)
+    names, flags = {o.name for o in list_options(reader.Options)}, {o.name: o.flag for o in collect_shared_options()}
+    foreign = ", ".join(flags.get(key, key) for key in values if key not in names)
     if foreign and name == TABLE:
-        raise NergError(f"{foreign} belongs to a preset; leave it out, or give --preset in place of --map")
+        raise NergError(f"{foreign} belongs to a preset; leave it out, or use --preset instead of --map")
     if foreign:
-        raise NergError(f"preset {name} knows its own conventions; leave out {foreign}")
-    return reader.Options(**given)
+        raise NergError(f"preset {name} has fixed conventions; leave out {foreign}")
+    return reader.Options(**values)
 
 
-def parse_options(name: str, given: Mapping[str, Any]) -> Any:
-    """As :func:`make_options`, of values as the command line has them: texts where an option makes its value of one."""
+def parse_options(name: str, values: Mapping[str, Any]) -> Any:
+    """As :func:`make_options`, but with ``values`` from the command line, which are text for options with a parser."""
     parse = {o.name: o.parse for o in list_options(get_reader(name).Options)}
-    return make_options(name, {key: f(value) if (f := parse.get(key)) else value for key, value in given.items()})
+    return make_options(name, {key: f(value) if (f := parse.get(key)) else value for key, value in values.items()})
 
 
 def read_rays(
@@ -111,16 +112,32 @@ def read_rays(
     on_source: Callable[[str], None] | None = None,
     on_rays: Callable[[Rays], None] | None = None,
 ) -> Rays:
-    """The rays of ``files``, right-handed, z up, in metres and seconds, with the account of what was dropped.
+    """Read tracking files as rays in the common frame: right-handed, z up, metres, seconds.
 
-    ``reader``: one, or its name. ``options``: an object of its ``Options`` (default: all as they are by default).
-    ``skip_bad_lines``: leave out lines that cannot be read, at most 1 % of a file's. ``on_source``: called with the
-    name of each file as it is begun. ``on_rays``: takes rays block by block as they are read, so that files of any size
-    are read in bounded memory; returned are the last of them, maybe none. The metadata are those of all: they say by
-    which reader, with which options, from which files and frame the rays were made.
+    The metadata record the reader, its options, the files, their frame, and the dropped rows.
 
-    Raises `NergError` for files that are not of the format, or give no ray; ``TypeError`` for options of another
-    reader.
+    Parameters
+    ----------
+    reader
+        A reader, or its name.
+    files
+        One or more files, or folders of recordings.
+    options
+        An object of the reader's ``Options``. Default: all defaults.
+    skip_bad_lines
+        Whether to skip unreadable lines, at most 1 % of a file.
+    on_source
+        Called with the name of each file when it begins.
+    on_rays
+        Receives rays block by block, so that memory is bounded for files of any size. The function then returns the
+        last rays, possibly none, with the metadata of all.
+
+    Raises
+    ------
+    NergError
+        For files that are not of the format, or give no rays.
+    TypeError
+        For options of another reader.
     """
     reader = get_reader(reader) if isinstance(reader, str) else reader
     options = reader.Options() if options is None else options
@@ -128,65 +145,74 @@ def read_rays(
         raise TypeError(f"{reader.name} takes {reader.Options.__qualname__}, not {type(options).__qualname__}")
     paths = [Path(p) for p in ([files] if isinstance(files, (str, os.PathLike)) else files)]
     if not paths:
-        raise NergError("there are no tracking files to read; name one or more")
+        raise NergError("there are no tracking files to read; list one or more")
     builder = RaysBuilder(
         reader.frame(paths, options), skip_bad_lines=skip_bad_lines, on_source=on_source, on_rays=on_rays
     )
-    builder.note(preset=reader.name, **recorded_options(options))
+    builder.add_metadata(preset=reader.name, **list_recorded_options(options))
     reader.read(paths, options, builder)
     return builder.build()
 
 
 @dataclass(frozen=True)
 class SharedOption:
-    """An option of the command line: that of one reader, or one that several have in common."""
+    """An option of the command line that belongs to one or more readers."""
 
     name: str  # of the field in the readers' options
     flag: str  # on the command line
     kind: type  # of the value on the command line
-    help: str  # with the readers it belongs to and their defaults
+    help: str  # with the readers that have it, and their defaults
 
 
 def collect_shared_options() -> tuple[SharedOption, ...]:
-    """The options of all readers, those of tables first, as the command line has them."""
+    """Collect the options of all readers for the command line, those of tables first."""
     order = sorted(_READERS, key=lambda name: name != TABLE)
-    found: dict[str, dict[str, Option]] = {}
+    options_by_name: dict[str, dict[str, Option]] = {}
     for name in order:
         for option in list_options(_READERS[name].Options):
-            found.setdefault(option.name, {})[name] = option
-    return tuple(SharedOption(name, *_shared(of)) for name, of in found.items())
+            options_by_name.setdefault(option.name, {})[name] = option
+    return tuple(
+        SharedOption(name, *_merge_options(options_by_reader)) for name, options_by_reader in options_by_name.items()
+    )
 
 
-def _shared(of: dict[str, Option]) -> tuple[str, type, str]:
-    """Flag, type and help of an option by the readers that have it."""
-    first = next(iter(of.values()))
-    texts, defaults = ({getattr(o, of_what): [] for o in of.values()} for of_what in ("help", "shown"))
-    for name, option in of.items():
+def _merge_options(options_by_reader: dict[str, Option]) -> tuple[str, type, str]:
+    """Merge an option of several readers: flag, type and help."""
+    first = next(iter(options_by_reader.values()))
+    texts, defaults = (
+        {getattr(o, field): [] for o in options_by_reader.values()} for field in ("help", "default_text")
+    )
+    for name, option in options_by_reader.items():
         texts[option.help].append(name)
-        defaults[option.shown].append(name)
-    # What tables know is there for files of any kind, and said without a name.
+        defaults[option.default_text].append(name)
+    # Options of tables apply to files of any kind, and are listed without the name of a reader.
     words = [text if names[0] == TABLE else f"{', '.join(names)}: {text}" for text, names in texts.items()]
-    shown = [
+    defaults_text = [
         text if i == 0 else f"{', '.join(names)}: {text}" for i, (text, names) in enumerate(defaults.items()) if text
     ]
-    return first.flag, first.kind, " ".join(words) + (f"  [default: {'; '.join(shown)}]" if shown else "")
+    return (
+        first.flag,
+        first.kind,
+        " ".join(words) + (f"  [default: {'; '.join(defaults_text)}]" if defaults_text else ""),
+    )
 
 
 def format_preset_table() -> str:
-    """The readers that know their columns as a table in Markdown, for the manual."""
-    rows = ["| preset | files | frame | checked on |", "|---|---|---|---|"]
+    """Format the presets as a table in Markdown, for the manual."""
+    rows = ["| preset | files | frame | validated on |", "|---|---|---|---|"]
     for reader in map(get_reader, list_preset_names()):
         options = "; ".join(
-            f"`{o.flag}`: {o.help[:1].lower()}{o.help[1:].rstrip('.')}" + (f" ({o.shown})" if o.shown else "")
+            f"`{o.flag}`: {o.help[:1].lower()}{o.help[1:].rstrip('.')}"
+            + (f" ({o.default_text})" if o.default_text else "")
             for o in list_options(reader.Options)
         )
         files = f"{reader.files}. {options}" if options else reader.files
-        cells = [f"`{reader.name}`", files, reader.world, reader.checked_on]
+        cells = [f"`{reader.name}`", files, reader.frame_description, reader.validated_on]
         rows.append(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |")
     return "\n".join(rows) + "\n"
 
 
-# Each module of this package that has ``READERS`` is one of readers.
+# Each module of this package with ``READERS`` contains readers.
 for _name in sorted(module.name for module in pkgutil.iter_modules([os.path.dirname(__file__)])):
     if f"{__package__}.{_name}" != __name__:
         for _reader in getattr(importlib.import_module(f"{__package__}.{_name}"), "READERS", ()):

@@ -1,4 +1,4 @@
-"""A small recording of each reader: what its contract and the fuzzer are tried on. A new reader needs one here."""
+"""A small recording for each reader, used by tests and the fuzzer. A new reader needs one here."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.files.movies import make_box_table, make_movie
 
 
 def read(name: str, *files, skip_bad_lines: bool = False, **options) -> Rays:
-    """The rays of ``files`` by the reader ``name`` with these of its options."""
+    """The rays of ``files`` from the reader ``name`` with these options."""
     return read_rays(name, files, make_options(name, options), skip_bad_lines=skip_bad_lines)
 
 
@@ -33,12 +33,12 @@ def dropped(rays: Rays) -> dict[str, list]:
 
 
 def csv_rows(path: Path) -> list[dict[str, str]]:
-    """The rows of a recorded table, as the standard library reads them."""
+    """Rows of a recorded table, read with the standard library."""
     with gzip.open(path, "rt") if path.name.endswith(".gz") else open(path) as file:
         return list(DictReader(file))
 
 
-# ---- C3D files, written after the format's manual (c3d.org) and without the package that reads them ----
+# ---- C3D files, written by the format's manual (c3d.org) without the package that reads them ----
 
 
 def _entry(name: str, number: int, body: bytes) -> bytes:
@@ -61,7 +61,7 @@ def write_c3d(
     up: str | None = "+Z",
     frames: int | None = None,
 ) -> None:
-    """Write ``positions`` (F, M, 3), NaN where a marker was not seen. ``frames``: how many the header claims."""
+    """Write ``positions`` (F, M, 3), NaN for missing markers. ``frames`` is the number of frames in the header."""
     count, markers = positions.shape[:2]
     claimed = count if frames is None else frames
     parameters = [
@@ -86,13 +86,13 @@ def write_c3d(
 
 
 def write_heads(path: Path) -> None:
-    """A head with the four markers of Plug-in Gait that walks along x and looks along it, and a marker of the trunk."""
+    """A head with the four markers of Plug-in Gait that walks and looks along x, and a marker of the trunk."""
     head = np.array([[70, 60, 1700], [70, -60, 1700], [-90, 60, 1700], [-90, -60, 1700], [0, 0, 1300]], float)
     walk = np.arange(20)[:, None, None] * [10.0, 0, 0]
     write_c3d(path, ["LFHD", "RFHD", "LBHD", "RBHD", "C7"], head + walk)
 
 
-# ---- Logs of headsets, as the programs that their readers name write them ----
+# ---- Logs of headsets in the style of each program ----
 
 ARETT_HEAD = (
     "eyeDataTimestamp,eyeDataRelativeTimestamp,frameTimestamp,isCalibrationValid,gazeHasValue,"
@@ -111,21 +111,21 @@ def csv(head: list[str] | str, rows) -> str:
 
 
 def arett(origin, direction, hit, seen, calibrated) -> str:
-    """``hit`` (n, 3), NaN where nothing was met."""
+    """``hit`` (n, 3) is NaN without a hit."""
     rows = []
     for k, (o, d, h) in enumerate(zip(origin, direction, hit)):
-        met = bool(np.isfinite(h).all())
-        there = [*o, *d] if seen[k] else [""] * 6
-        point = [*h, '"wall, left"'] if met else ["", "", "", ""]
-        rows.append([1_700_000_000_000 + 33 * k, 33 * k, 33 * k, calibrated[k], seen[k], *there, met, *point, ""])
+        has_hit = bool(np.isfinite(h).all())
+        present = [*o, *d] if seen[k] else [""] * 6
+        point = [*h, '"wall, left"'] if has_hit else ["", "", "", ""]
+        rows.append([1_700_000_000_000 + 33 * k, 33 * k, 33 * k, calibrated[k], seen[k], *present, has_hit, *point, ""])
     return csv(ARETT_HEAD, rows)
 
 
-def sranipal(t_ms, head, turn: Rotation, eyes: dict[str, tuple], style: str = "verbose_data.{}.{}.{}") -> str:
-    """``eyes``: by side (combined, left, right) origins in mm and directions (n, 3), and masks (n,), of the SDK."""
+def sranipal(t_ms, head, turn: Rotation, both_eyes: dict[str, tuple], style: str = "verbose_data.{}.{}.{}") -> str:
+    """``eyes``: origins in mm and directions (n, 3) by side (combined, left, right), and masks (n,) of the SDK."""
     columns, names = [t_ms, *np.transpose(head), *turn.as_quat().T], ["time_stamp(ms)", *xyz("head_pos_")]
     names += xyz("head_rot_", "xyzw")
-    for side, (origin, direction, mask) in eyes.items():
+    for side, (origin, direction, mask) in both_eyes.items():
         part = "combined.eye_data" if side == "combined" and "verbose" in style else side
         names += [style.format(part, "gaze_origin_mm", a) for a in "xyz"]
         names += [style.format(part, "gaze_direction_normalized", a) for a in "xyz"]
@@ -139,10 +139,10 @@ def openxr(t_ns, place, turn: Rotation, flags, active) -> str:
     return csv(head, zip(t_ns, *np.transpose(place), *turn.as_quat().T, flags, active))
 
 
-def quest(t, left, right, turns: tuple[Rotation, Rotation], sure: tuple, rig: tuple | None = None) -> str:
-    """Places and rotations of both eyes, their confidences, and place and rotation of the rig."""
+def quest(t, left, right, turns: tuple[Rotation, Rotation], confidences: tuple, rig: tuple | None = None) -> str:
+    """Positions and rotations of both eyes, their confidences, and the pose of the rig."""
     head, columns = ["Time"], [t]
-    for side, place, turn, confidence in zip(("Left", "Right"), (left, right), turns, sure):
+    for side, place, turn, confidence in zip(("Left", "Right"), (left, right), turns, confidences):
         head += [*xyz(f"{side}EyePosition", "XYZ"), *xyz(f"{side}EyeRotation", "XYZW"), f"{side}EyeConfidence"]
         columns += [*np.transpose(place), *turn.as_quat().T, confidence]
     if rig is not None:
@@ -152,44 +152,46 @@ def quest(t, left, right, turns: tuple[Rotation, Rotation], sure: tuple, rig: tu
 
 
 def motive(t, bodies: dict[str, tuple], units="Meters", rotation="Quaternion", space="Global") -> str:
-    """Bodies by name, each with its places (n, 3) and rotations; a marker and an error are beside each."""
+    """Bodies by name, each with positions (n, 3) and rotations, and with a marker and an error."""
     axes = [*(("Rotation", a) for a in "XYZW"), *(("Position", a) for a in "XYZ"), ("Mean Marker Error", "")]
     columns = [("Rigid Body", name, *axis) for name in bodies for axis in axes]
     columns += [("Rigid Body Marker", f"{name}:Marker1", "Position", a) for name in bodies for a in "XYZ"]
     kinds, names, whats, letters = zip(*columns)
     cells = [np.c_[turn.as_quat(), place, np.full(len(t), 1e-4)] for place, turn in bodies.values()]
     rows = np.hstack([*cells, *(place for place, _ in bodies.values())])
-    about = f"Format Version,1.23,Take Name,T,Rotation Type,{rotation},Length Units,{units},Coordinate Space,{space}"
+    header = f"Format Version,1.23,Take Name,T,Rotation Type,{rotation},Length Units,{units},Coordinate Space,{space}"
     above = [["", "Type", *kinds], ["", "Name", *names], ["", "ID", *["1"] * len(kinds)], ["", "", *whats]]
     samples = ([k, *row] for k, row in enumerate(np.c_[t, rows].tolist()))
-    head = [about, "", *map(",".join, above), ",".join(["Frame", "Time (Seconds)", *letters])]
+    head = [header, "", *map(",".join, above), ",".join(["Frame", "Time (Seconds)", *letters])]
     return csv("\n".join(head), (["" if v != v else v for v in row] for row in samples))
 
 
 _N = 6
 _K = np.arange(_N)
-_EYES = np.c_[0.1 * _K, np.full(_N, 1.6), np.zeros(_N)]
+_EYE_POSITIONS = np.c_[0.1 * _K, np.full(_N, 1.6), np.zeros(_N)]
 _STILL = Rotation.from_quat(np.tile([0.0, 0, 0, 1], (_N, 1)))
 _AHEAD = np.tile([0.0, 0, 1], (_N, 1))
 
-ARETT = {"ann.csv": arett(_EYES, _AHEAD, _EYES + 2 * _AHEAD, [True] * _N, [True] * _N)}
-SRANIPAL = {"ann.csv": sranipal(20 * _K, _EYES, _STILL, {"combined": (0 * _EYES, _AHEAD, np.full(_N, 3))})}
-OPENXR = {"ann.csv": openxr(10_000_000 * _K, _EYES, _STILL, np.full(_N, 15), np.ones(_N, int))}
-QUEST = {"ann.csv": quest(0.02 * _K, _EYES, _EYES, (_STILL, _STILL), (np.ones(_N), np.ones(_N)))}
-MOTIVE = motive(0.01 * _K, {"Head": (_EYES, _STILL)})
+ARETT = {"ann.csv": arett(_EYE_POSITIONS, _AHEAD, _EYE_POSITIONS + 2 * _AHEAD, [True] * _N, [True] * _N)}
+SRANIPAL = {
+    "ann.csv": sranipal(20 * _K, _EYE_POSITIONS, _STILL, {"combined": (0 * _EYE_POSITIONS, _AHEAD, np.full(_N, 3))})
+}
+OPENXR = {"ann.csv": openxr(10_000_000 * _K, _EYE_POSITIONS, _STILL, np.full(_N, 15), np.ones(_N, int))}
+QUEST = {"ann.csv": quest(0.02 * _K, _EYE_POSITIONS, _EYE_POSITIONS, (_STILL, _STILL), (np.ones(_N), np.ones(_N)))}
+MOTIVE = motive(0.01 * _K, {"Head": (_EYE_POSITIONS, _STILL)})
 
 
-# ---- Glasses with a scene camera, beside a model that holds the poses of frames of their video ----
+# ---- Glasses with a scene camera, and a model with the poses of frames of their video ----
 
-START = 1_700_000_000_000_000_000  # nanoseconds: what times of day look like
+START = 1_700_000_000_000_000_000  # nanoseconds since 1970
 LENS = {"k1": -0.13, "k2": 0.11, "p1": 0.0005, "p2": -0.0004, "k3": 0.01, "k4": 0.17, "k5": 0.05, "k6": 0.02}
-"""Of about a Neon, in OpenCV's order."""
+"""Approximate calibration of a Neon, in OpenCV's order."""
 MATRIX = [[891.0, 0.0, 810.0], [0.0, 890.0, 605.0], [0.0, 0.0, 1.0]]
 FRAMES = FrameNames("scene/frame_{frame1}")
 
 
 def model(count: int = 8, step: float = 0.1) -> str:
-    """A transforms file of ``count`` frames that go along x at 1.6 m and look along y (OpenGL), and of a photo."""
+    """A transforms file of ``count`` frames that move along x at 1.6 m and look along y (OpenGL), and of a photo."""
     look = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     frames = [
         {
@@ -235,13 +237,15 @@ CALIBRATION_G3 = {
 
 
 def video(times: np.ndarray, ticks: int = 24_950) -> Callable[[Path], None]:
-    """Writes a video without pictures, whose frames are shown at ``times`` (F,), seconds, rising: the first one by an
-    edit that shows nothing before it, the others by the durations of those before them."""
+    """Write a video without images, whose frames are shown at ``times`` (F,) seconds, increasing: the first one by an
+    edit with an empty start, the others by the durations of those before them."""
     shown = np.rint(np.asarray(times) * ticks).astype(int)
     durations = np.diff(shown, append=2 * shown[-1:] - shown[-2:-1])
     runs = struct.pack(f">{2 * len(durations)}I", *np.stack([np.ones_like(durations), durations], axis=1).ravel())
     edits = struct.pack(">IiiIii", shown[0], -1, 1 << 16, durations.sum(), 0, 1 << 16)
-    data = make_movie(ticks, ticks, make_box_table(b"stts", len(durations), runs), edits=make_box_table(b"elst", 2, edits))
+    data = make_movie(
+        ticks, ticks, make_box_table(b"stts", len(durations), runs), edits=make_box_table(b"elst", 2, edits)
+    )
 
     def write(path: Path) -> None:
         path.write_bytes(data)
@@ -264,7 +268,7 @@ TOBII = {
 
 
 def opencv_xml(**matrices: list) -> str:
-    """Matrices (rows) as OpenCV's FileStorage writes them."""
+    """Matrices (rows) as written by OpenCV's FileStorage."""
     out = '<?xml version="1.0"?>\n<opencv_storage>\n'
     for name, m in matrices.items():
         rows = np.atleast_2d(np.array(m, float).T if np.ndim(m) == 1 else np.array(m, float))
@@ -288,11 +292,11 @@ GLASSESTOOLS = {
 }
 
 
-# ---- A scene camera written another way than the package's: what tests of readers compare with ----
+# ---- Independent implementation of a scene camera, for comparison ----
 
 
 def project(d: np.ndarray, matrix, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0) -> np.ndarray:
-    """Pixels (n, 2) of directions (n, 3), x right, y down, z forward, as OpenCV documents them."""
+    """Pixels (n, 2) of directions (n, 3), x right, y down, z forward, by OpenCV's documentation."""
     x, y = d[:, 0] / d[:, 2], d[:, 1] / d[:, 2]
     r = np.hypot(x, y)
     f = (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) / (1 + k4 * r**2 + k5 * r**4 + k6 * r**6)
@@ -307,9 +311,9 @@ def camera_angles(d: np.ndarray) -> np.ndarray:
     return np.degrees(np.stack([np.arctan2(d[:, 0], d[:, 2]), -np.arcsin(d[:, 1])], axis=1))
 
 
-def gaze_in_camera(n: int, seed: int = 0, most: float = 0.55) -> np.ndarray:
-    """Unit directions (n, 3) within a scene camera's picture."""
-    xy = np.random.default_rng(seed).uniform(-most, most, (n, 2))
+def gaze_in_camera(n: int, seed: int = 0, max_angle: float = 0.55) -> np.ndarray:
+    """Unit directions (n, 3) within a scene camera's image."""
+    xy = np.random.default_rng(seed).uniform(-max_angle, max_angle, (n, 2))
     d = np.c_[xy, np.ones(n)]
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
@@ -338,13 +342,13 @@ def rays_at(t: np.ndarray, times: np.ndarray, poses: np.ndarray, gaze: np.ndarra
 
 @dataclass(frozen=True)
 class Example:
-    """Files by name, as text or as a function that writes one; the last of them is what is given to the reader."""
+    """Files by name, as text or as a function that writes one; the last one is passed to the reader."""
 
     files: dict[str, str | Callable[[Path], None]]
     options: dict[str, Any] = field(default_factory=dict)
 
     def make(self, folder: Path) -> Path:
-        """Write the files into ``folder``; the path to give to the reader."""
+        """Write the files to ``folder``; returns the path for the reader."""
         for name, content in self.files.items():
             if callable(content):
                 content(folder / name)
@@ -355,22 +359,22 @@ class Example:
         return self.given(folder)
 
     def given(self, folder: Path) -> Path:
-        """The path to give to the reader, of files that lie in ``folder``."""
+        """The path for the reader, of files in ``folder``."""
         return folder / list(self.files)[-1]
 
     def options_in(self, folder: Path) -> dict[str, Any]:
-        """The options, files among them as they lie in ``folder``."""
+        """The options, with paths of files in ``folder``."""
         return {name: folder / v if isinstance(v, Path) else v for name, v in self.options.items()}
 
 
 def lines(head: list[str] | None, row: Callable[[int], list], separator: str = ",", count: int = 8) -> str:
-    """A table of ``count`` rows, with a header or without."""
+    """A table of ``count`` rows, with or without a header."""
     rows = [separator.join(map(str, row(k))) for k in range(count)]
     return "\n".join([*([separator.join(head)] if head else []), *rows]) + "\n"
 
 
 def write_walk(path: Path) -> None:
-    """Two people's skeletons."""
+    """Skeletons of two people."""
     body = keypoints_from_head(np.array([[0.1 * k, 0, 1.65] for k in range(6)]), np.tile([0.0, 1.0, 0.0], (6, 1)))
     write_skeleton(path, ["ann", "bo"] * 3, np.arange(6), body, decimals=2)
 
@@ -401,7 +405,7 @@ _NAVGS = [
 
 
 def aria_pose(us: int, world: str = "w", place=(0, 0, 1.6), gravity=(0, 0, -9.81), turn=(0.5, 0.5, -0.5, 0.5)) -> list:
-    """A row of a trajectory of Aria's; by default the wearer stands upright."""
+    """A row of an Aria trajectory; by default the wearer is upright."""
     return [world, us, -1, *place, *turn, *gravity, 1.0]
 
 
@@ -417,7 +421,7 @@ _ARIA_VARIANTS = {
     ),
 }
 VARIANTS = {"aria": [Example(_ARIA_POSES | {name: text}) for name, text in _ARIA_VARIANTS.items()]}
-"""Recordings of other kinds that readers tell apart by what is in the files: for the fuzzer besides `EXAMPLES`."""
+"""Further recordings that readers distinguish by their content, for the fuzzer in addition to `EXAMPLES`."""
 
 _SCENE = {"poses": Path("transforms.json"), "frames": FRAMES}
 

@@ -1,4 +1,4 @@
-"""The list of readers; and a format added by one object, through the library, the job and the command."""
+"""Tests of the registry of readers, and of a format added by one object: in Python, as a job and as a command."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nerg_mi.rays.readers.tables import iterate_table
 from nerg_mi.workflows.rays import import_rays
 from nerg_mi.workflows.rays_commands import RaysImportOptions
 
-# ---- A format of tracking that nobody writes, as somebody would add it: a file of eyes beside a file of heads ----
+# ---- A fictitious format as an extension would add it: a file of gaze and a file of heads ----
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +34,8 @@ class MadeUp:
 
     name = "made_up"
     files = "directions, with the file of the heads in `--heads`"
-    world = "y up, right, m"
-    checked_on = "itself"
+    frame_description = "y up, right, m"
+    validated_on = "itself"
     signature = Signature(
         columns=(("t", "a", "b", "c", "open"),),
         options={"--heads": "HEADS"},
@@ -49,11 +49,11 @@ class MadeUp:
     def read(self, files: Sequence[Path], options: MadeUpOptions, builder: RaysBuilder) -> None:
         if options.heads is None:
             raise NergError("directions alone are no rays; name the file of the heads (--heads)")
-        builder.source(options.heads)
+        builder.begin_source(options.heads)
         heads = np.concatenate([b.numbers for b in iterate_table(options.heads, ["x", "y", "z"])])
         for path in files:
-            builder.source(path)
-            for values, _, lines in iterate_table(path, ["t", "a", "b", "c", "open"], on_bad=builder.on_bad):
+            builder.begin_source(path)
+            for values, _, lines in iterate_table(path, ["t", "a", "b", "c", "open"], on_bad_line=builder.on_bad_line):
                 builder.add(
                     values[:, 0] * options.tick,
                     path.stem,
@@ -65,7 +65,7 @@ class MadeUp:
 
 
 def write_recording(folder: Path) -> tuple[Path, Path]:
-    """Files of directions and of heads: two rows, of which the second is a blink."""
+    """Files of directions and of heads: two rows, the second of which is a blink."""
     (folder / "ann.csv").write_text("t,a,b,c,open\n0,0,0,-2,1\n500,1,0,0,0\n")
     (folder / "heads.csv").write_text("x,y,z\n100,160,-300\n200,160,0\n")
     return folder / "ann.csv", folder / "heads.csv"
@@ -81,10 +81,10 @@ def made_up():
     registry.unregister_reader("made_up")
 
 
-def test_a_format_is_added_by_one_object(tmp_path, made_up):
-    eyes, heads = write_recording(tmp_path)
+def test_format_is_added_by_one_object(tmp_path, made_up):
+    both_eyes, heads = write_recording(tmp_path)
     settings = MadeUpOptions(heads=heads, scale=0.01, tick=1e-3)
-    result = import_rays(eyes, RaysImportOptions(reader="made_up", settings=settings))
+    result = import_rays(both_eyes, RaysImportOptions(reader="made_up", settings=settings))
     rays = result.rays
     assert np.allclose(rays.origin, [[1, 3, 1.6]]) and np.allclose(rays.direction, [[0, 1, 0]])
     assert rays.persons == ("ann",) and result.summary.dropped == {"a blink": 1}
@@ -92,22 +92,22 @@ def test_a_format_is_added_by_one_object(tmp_path, made_up):
     assert "heads" not in rays.metadata and [s["file"] for s in rays.metadata["sources"]] == ["heads.csv", "ann.csv"]
 
     run = lambda *arguments: CliRunner().invoke(build_app(), ["rays", *(str(a) for a in arguments)])
-    command = ["import", eyes, "-o", tmp_path / "r.npz", "--preset", "made_up", "--heads", heads, "--scale", 0.01]
+    command = ["import", both_eyes, "-o", tmp_path / "r.npz", "--preset", "made_up", "--heads", heads, "--scale", 0.01]
     done = run(*command, "--tick", 1e-3)
     assert done.exit_code == 0, done.output
-    found = Rays.load(tmp_path / "r.npz")
-    assert np.array_equal(found.origin, rays.origin) and found.metadata == rays.metadata
+    options_found = Rays.load(tmp_path / "r.npz")
+    assert np.array_equal(options_found.origin, rays.origin) and options_found.metadata == rays.metadata
     done = run(*command, "--tick", 1e-3, "--blinks")
     assert done.exit_code == 0 and len(Rays.load(tmp_path / "r.npz")) == 2
     assert "name the file of the heads (--heads)" in str(run(*command[:6]).exception)
     assert "leave out --up" in str(run(*command, "--up", "y").exception)
     shown = " ".join(run("import", "--help").output.replace("│", " ").split())
     assert "made_up: What a unit of the heads' places is, in metres." in shown and "made_up" in shown
-    assert run("guess", eyes).output.rstrip().endswith("--preset made_up --heads HEADS")
+    assert run("guess", both_eyes).output.rstrip().endswith("--preset made_up --heads HEADS")
     assert "| `made_up` | directions, with the file of the heads in `--heads`" in registry.format_preset_table()
 
 
-def test_what_cannot_be_registered(made_up):
+def test_invalid_readers_are_refused(made_up):
     @dataclass(frozen=True, kw_only=True)
     class Other:
         tick: str = option("a", "Of another type.")
@@ -147,13 +147,13 @@ def test_options_of_another_reader():
     assert registry.parse_options("skeleton", {"keypoints": "1,2,3"}).keypoints == (1, 2, 3)
 
 
-def test_options_that_several_have(made_up):
+def test_options_of_several_readers(made_up):
     shared = {o.name: o for o in registry.collect_shared_options()}
     assert shared["up"].help == "Up axis: x, y, z, -x, -y or -z.  [default: z; c3d: the file's, or z; motive, pupil: y]"
-    sure = shared["min_confidence"].help
-    assert sure.startswith("Drop rows below this confidence.  [default: 0; ") and "pupil: 0.6" in sure
+    confidence = shared["min_confidence"].help
+    assert confidence.startswith("Drop rows below this confidence.  [default: 0; ") and "pupil: 0.6" in confidence
     assert shared["marker"].help == "pupil: Edge of a tracking marker in metres."
     assert shared["keypoints"].kind is str and shared["radians"].kind is bool and shared["heads"].kind is Path
     assert shared["handedness"].flag == "--hand" and shared["columns"].flag == "--map"
-    # Those of tables are first.
+    # Options of tables come first.
     assert list(shared).index("person_from") < list(shared).index("pitch")
