@@ -1,4 +1,4 @@
-"""Vectors of tracking: heads' rotations, tracks of poses that are interpolated, and fill values in their place."""
+"""Poses and vectors of tracking data: rotations, interpolated tracks of poses, and fill values."""
 
 from __future__ import annotations
 
@@ -9,113 +9,116 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import MAX_COORDINATE, TIMES
 
-# ---- Where something was and how it was turned, sample by sample, and in between ----
+# ---- Pose tracks ----
 
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack:
-    """Poses of a head or a camera in N >= 2 samples, to be interpolated."""
+    """N >= 2 poses of a head or a camera, for interpolation."""
 
-    times: np.ndarray  # (N,) seconds, strictly rising
-    vectors: np.ndarray  # (N, 3) rotations to the world as Rodrigues vectors, radians
-    places: np.ndarray  # (N, 3) origins in the world, in its unit of length
+    times: np.ndarray  # (N,) seconds, strictly increasing
+    rotation_vectors: np.ndarray  # (N, 3) rotations to the world as Rodrigues vectors, radians
+    positions: np.ndarray  # (N, 3) in the world, in its unit of length
 
     @classmethod
-    def of_samples(cls, times: np.ndarray, vectors: np.ndarray, places: np.ndarray) -> PoseTrack | None:
-        """A track of samples in any order; those with something missing, or beyond `FARTHEST`, are left out, and of
-        those at one time all but the first. None where fewer than two are left."""
+    def from_samples(cls, times: np.ndarray, rotation_vectors: np.ndarray, positions: np.ndarray) -> PoseTrack | None:
+        """Make a track from samples in any order. Drops samples with missing values or values beyond `FARTHEST`, and of
+        samples with equal times all but the first. Returns None if fewer than two remain."""
         within = lambda v: (np.abs(v) <= MAX_COORDINATE).all(axis=1)
-        good = (np.abs(times) <= TIMES.high) & within(vectors) & within(places)
-        kept = np.flatnonzero(good)
-        kept = kept[np.unique(times[kept], return_index=True)[1]]
-        return cls(times[kept], vectors[kept], places[kept]) if len(kept) >= 2 else None
+        is_valid = (np.abs(times) <= TIMES.high) & within(rotation_vectors) & within(positions)
+        rows = np.flatnonzero(is_valid)
+        rows = rows[np.unique(times[rows], return_index=True)[1]]
+        return cls(times[rows], rotation_vectors[rows], positions[rows]) if len(rows) >= 2 else None
 
-    def at(self, t: np.ndarray, gap: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rotations (n, 3, 3) and places (n, 3) at the times ``t`` (n,), seconds, turned along the shortest way and
-        moved along a straight line between the samples around them; and where nothing is known, (n,) bool: before the
-        first sample, after the last, or farther than ``gap`` seconds from the nearest."""
+    def interpolate(self, t: np.ndarray, max_gap: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Interpolate rotations (n, 3, 3, spherically) and positions (n, 3, linearly) at the times ``t`` (n,) seconds.
+
+        The third result is a mask (n,) bool of times without a pose: outside of the track, or farther than ``max_gap``
+        seconds from the nearest sample.
+        """
         from scipy.spatial.transform import Rotation, Slerp
 
         times = self.times
         inside = np.clip(np.nan_to_num(t), times[0], times[-1])
         after = np.clip(np.searchsorted(times, inside), 1, len(times) - 1)
-        apart = np.abs(t[:, None] - times[np.stack([after - 1, after], axis=1)])
-        lost = (apart.min(axis=1) > gap) | (inside != t)
-        turn = Slerp(times, Rotation.from_rotvec(self.vectors))(inside).as_matrix()
-        place = np.stack([np.interp(inside, times, self.places[:, i]) for i in range(3)], axis=1)
-        return turn, place, lost
+        intervals = np.abs(t[:, None] - times[np.stack([after - 1, after], axis=1)])
+        is_missing = (intervals.min(axis=1) > max_gap) | (inside != t)
+        rotation = Slerp(times, Rotation.from_rotvec(self.rotation_vectors))(inside).as_matrix()
+        position = np.stack([np.interp(inside, times, self.positions[:, i]) for i in range(3)], axis=1)
+        return rotation, position, is_missing
 
 
-# ---- Heads' poses: from quaternions, angles and matrices to rotations, and on to rays ----
+# ---- Head poses from quaternions, angles and matrices ----
 #
-# A rotation takes the head's frame to the table's. ``forward`` names the axis of the head's frame along which it looks:
-# ``z`` in Unity, ``-z`` of an OpenGL camera and in OpenXR, ``x`` in ROS and Unreal.
+# A rotation transforms from the head's frame to that of the table. ``forward`` is the forward axis of the head's frame:
+# ``z`` in Unity, ``-z`` for an OpenGL camera and in OpenXR, ``x`` in ROS and Unreal.
 
 AXES = {f"{sign}{axis}": s * np.eye(3)[i] for i, axis in enumerate("xyz") for sign, s in (("", 1.0), ("-", -1.0))}
 """Unit vectors by name: x, -x, y, -y, z, -z."""
 
-MIRRORED = "the head's matrix is mirrored (its determinant is negative)"  # Why a row is dropped
+MIRRORED_MATRIX = "the head's matrix is mirrored (its determinant is negative)"  # Reason for dropping a row
 
 
-def axis(name: str, what: str) -> np.ndarray:
-    """The unit vector of a name such as ``-z``. Raises `NergError` naming ``what`` for another word."""
+def parse_axis(name: str, what: str) -> np.ndarray:
+    """Unit vector of an axis such as ``-z``. Raises `NergError` naming ``what`` for an invalid name."""
     if name not in AXES:
         raise NergError(f'{what} is "{name}"; it is one of {", ".join(AXES)}')
     return AXES[name]
 
 
 def default_forward(up: str, handedness: str) -> str:
-    """Where heads look in the usual frame of this kind: Unity's z, OpenGL's -z, the x of ROS and Unreal."""
+    """Usual forward axis of heads in a frame of this kind: z for Unity, -z for OpenGL, x for ROS and Unreal."""
     if up.endswith("y"):
         return "z" if handedness == "left" else "-z"
     return "x"
 
 
 def rotations_from_quaternions(q: np.ndarray, order: str = "xyzw") -> np.ndarray:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4) in ``order`` xyzw or wxyz; they need not be unit. NaN where one
-    is not finite, zero or a fill value."""
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length, in ``order`` xyzw or wxyz. NaN for quaternions
+    that are not finite, zero or a fill value."""
     q = np.asarray(q, dtype=np.float64)
     if order not in ("xyzw", "wxyz") or q.ndim != 2 or q.shape[1] != 4:
         raise ValueError(f'quaternions {q.shape} in order "{order}": expected (N, 4), xyzw or wxyz')
     with np.errstate(over="ignore"):
         length = np.linalg.norm(q, axis=1)
-    good = np.isfinite(length) & (length > 1e-12) & np.isnan(fill_values(q))
+    is_valid = np.isfinite(length) & (length > 1e-12) & np.isnan(find_fill_values(q))
     if order == "wxyz":
         q = np.roll(q, -1, axis=1)
-    return _where(good, q, lambda rotation, q: rotation.from_quat(q))
+    return _make_rotations(is_valid, q, lambda rotation, q: rotation.from_quat(q))
 
 
 def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bool = True) -> np.ndarray:
-    """Rotation matrices (N, 3, 3) of yaw, pitch and, where there is a third column, roll (N, 2 or 3).
+    """Rotation matrices (N, 3, 3) of yaw, pitch and optionally roll, (N, 2 or 3).
 
-    First the head turns about the up axis (yaw), then about its own sideways axis (pitch), then about its forward axis
-    (roll), each by the usual rotation matrix about the coordinate axis of that name. So in Unity (y up, z forward)
-    positive angles turn right and look down, in ROS (z up, x forward) they turn left and look down, and in OpenXR (y
-    up, -z forward) they turn left and look up. Raises `NergError` where ``up`` and ``forward`` are the same axis.
+    The head is rotated about the up axis (yaw), then about its own sideways axis (pitch), then about its forward axis
+    (roll), with the usual rotation matrix about each coordinate axis. Positive angles therefore turn right and down in
+    Unity (y up, z forward), left and down in ROS (z up, x forward), and left and up in OpenXR (y up, -z forward).
+    Raises `NergError` if ``up`` and ``forward`` are the same axis.
     """
     angles = np.asarray(angles, dtype=np.float64)
     up, forward = up[-1], forward[-1]
     if up == forward:
-        raise NergError(f"the up axis and the forward axis are both {up}; say where heads look with forward")
+        raise NergError(f"the up axis and the forward axis are both {up}; set the forward axis of heads (--forward)")
     (side,) = set("xyz") - {up, forward}
     sequence = (up + side + forward).upper()[: angles.shape[1]]
-    good = np.isfinite(angles).all(axis=1) & ~is_filled_angles(angles)
-    return _where(good, angles, lambda rotation, a: rotation.from_euler(sequence, a, degrees=degrees))
+    is_valid = np.isfinite(angles).all(axis=1) & ~is_filled_angles(angles)
+    return _make_rotations(is_valid, angles, lambda rotation, a: rotation.from_euler(sequence, a, degrees=degrees))
 
 
 def directions_from_azimuths(
     angles: np.ndarray, up: str, forward: str, handedness: str, degrees: bool = True
 ) -> np.ndarray:
-    """Unit directions (N, 3) of azimuths, which turn from ``forward`` to the right, and elevations, which turn up from
-    there to the axis ``up``, (N, 2).
+    """Unit directions (N, 3) of azimuths, from ``forward`` to the right, and elevations, towards ``up``, (N, 2).
 
-    With a = azimuth and e = elevation: cos e cos a forward + cos e sin a right + sin e up. Right is forward x up in a
-    right-handed frame, and up x forward, by coordinates, in a left-handed one. Raises `NergError` where ``up`` and
+    With azimuth a and elevation e: cos e cos a forward + cos e sin a right + sin e up. In coordinates, right is
+    forward x up in a right-handed frame, and up x forward in a left-handed one. Raises `NergError` if ``up`` and
     ``forward`` are the same axis.
     """
     if up[-1] == forward[-1]:
-        raise NergError(f"the up axis and the forward axis are both {up[-1]}; say where heads look with forward")
-    ahead, top = axis(forward, "forward"), axis(up, "up")
+        raise NergError(
+            f"the up axis and the forward axis are both {up[-1]}; set the forward axis of heads (--forward)"
+        )
+    ahead, top = parse_axis(forward, "forward"), parse_axis(up, "up")
     right = np.cross(ahead, top) if handedness == "right" else np.cross(top, ahead)
     angles = np.where(is_filled_angles(angles)[:, None], np.nan, angles)
     a, e = (np.radians(angles) if degrees else angles).T
@@ -124,18 +127,18 @@ def directions_from_azimuths(
 
 
 def rotations_from_matrices(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation matrices (N, 3, 3) and origins (N, 3) of head-to-world matrices, given row by row as (N, 12) or (N, 16).
+    """Rotation matrices (N, 3, 3) and origins (N, 3) of head-to-world matrices, row by row as (N, 12) or (N, 16).
 
-    A uniform scale is taken out. NaN where the upper left part is no rotation times a scale, to 1 %, or is mirrored.
+    Removes a uniform scale. NaN if the upper left part is not a scaled rotation, to 1 %, or is mirrored.
     """
     values = np.asarray(values, dtype=np.float64)
     m = values[:, :12].reshape(-1, 3, 4)
     R, origin = m[:, :, :3].copy(), m[:, :, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # The cube root keeps the sign: a mirrored matrix becomes the rotation that it is times -1, and is left out.
+        # The cube root keeps the sign: a mirrored matrix becomes a rotation times -1, and is excluded below.
         R /= np.cbrt(_determinants(values))[:, None, None]
-        off = np.abs(np.einsum("nij,nik->njk", R, R) - np.eye(3)).max(axis=(1, 2))
-    R[~(off < 0.01) | is_mirrored(values)] = np.nan
+        errors = np.abs(np.einsum("nij,nik->njk", R, R) - np.eye(3)).max(axis=(1, 2))
+    R[~(errors < 0.01) | is_mirrored(values)] = np.nan
     return R, origin
 
 
@@ -150,102 +153,111 @@ def _determinants(values: np.ndarray) -> np.ndarray:
 
 
 def rotate(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Vectors (N, 3), each turned by its own of the ``rotations`` (N, 3, 3)."""
+    """Rotate vectors (N, 3), each by its own one of the ``rotations`` (N, 3, 3)."""
     return np.einsum("nij,nj->ni", rotations, vectors)
 
 
-def mean_of_two(v: np.ndarray) -> np.ndarray:
-    """Mean over the eyes of (n, 2, 3), of those that are there; NaN where neither is."""
-    there = np.isfinite(v).all(axis=2, keepdims=True)
+def average_eyes(v: np.ndarray) -> np.ndarray:
+    """Mean of the finite values of both eyes, (n, 2, 3); NaN if neither is finite."""
+    is_finite = np.isfinite(v).all(axis=2, keepdims=True)
     with np.errstate(invalid="ignore"):
-        return np.where(there, v, 0.0).sum(axis=1) / there.sum(axis=1)
+        return np.where(is_finite, v, 0.0).sum(axis=1) / is_finite.sum(axis=1)
 
 
-def _where(good: np.ndarray | np.bool_, values: np.ndarray, make) -> np.ndarray:
+def _make_rotations(is_valid: np.ndarray | np.bool_, values: np.ndarray, make) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     out = np.full((len(values), 3, 3), np.nan)
-    if good.any():
-        out[good] = make(Rotation, values[good]).as_matrix()
+    if is_valid.any():
+        out[is_valid] = make(Rotation, values[is_valid]).as_matrix()
     return out
 
 
 # ---- Fill values ----
 #
-# Vectors whose components are all one fill value, as 0, 0, 0 or -1, -1, -1 where a program had nothing to write.
+# Vectors whose components all have one value, such as 0, 0, 0 or -1, -1, -1, written by programs for missing data.
 
-_FILLS = np.array(
+_FILL_VALUES = np.array(
     [
         *(0.0, -1.0, *(sign * 10.0**k - sign for k in range(2, 7) for sign in (1, -1))),
         *(limit for bits in (16, 32) for limit in (-(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1, 2.0**bits - 1)),
     ]
 )
-_LIMIT = 1e30  # of floats that are lengths or directions; a fill beyond is the largest of its type, however rounded
-_APART = 0.1  # metres between a fill value and the nearest place of a person who was never there
-_AIMED = np.cos(np.radians(2.0))  # of a ray that points at its hit point
+_MAX_PLAUSIBLE = 1e30  # of lengths and directions; larger equal values are the maximum of a float type
+_MIN_DISTANCE = 0.1  # metres between a fill value and the nearest valid position of a participant
+_MIN_AIM_COSINE = np.cos(np.radians(2.0))  # of a ray that points at its hit point
 
 
-def fill_values(v: np.ndarray) -> np.ndarray:
-    """The fill value of vectors (..., C), (...); NaN of those that are none."""
+def find_fill_values(v: np.ndarray) -> np.ndarray:
+    """Fill values (...) of vectors (..., C); NaN for vectors that are not fill values."""
     first = v[..., 0]
-    is_fill = np.isin(first, _FILLS) | (np.isfinite(first) & (np.abs(first) > _LIMIT))
+    is_fill = np.isin(first, _FILL_VALUES) | (np.isfinite(first) & (np.abs(first) > _MAX_PLAUSIBLE))
     return np.where((v == v[..., :1]).all(axis=-1) & is_fill, first, np.nan)
 
 
 def is_filled_angles(angles: np.ndarray) -> np.ndarray:
-    """Whether angles (n, C) of a head or of gaze, in degrees or radians, are one fill value, (n,) bool; 0 and -1 may be
-    true."""
-    return np.abs(fill_values(angles)) > 90
+    """Whether angles (n, C) of a head or of gaze, in degrees or radians, are a fill value, (n,) bool; 0 and -1 count as
+    valid."""
+    return np.abs(find_fill_values(angles)) > 90
 
 
 def is_aimed(origin: np.ndarray, direction: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """Whether rays (n, 3) point at their hit points, to 2 degrees, (n,) bool."""
-    way = hit - origin
+    """Whether rays (n, 3) point at their hit points within 2 degrees, (n,) bool."""
+    to_hit = hit - origin
     with np.errstate(invalid="ignore", divide="ignore"):
-        cosine = np.einsum("ij,ij->i", way, direction) / np.linalg.norm(way, axis=1) / np.linalg.norm(direction, axis=1)
-    return cosine > _AIMED
+        cosine = (
+            np.einsum("ij,ij->i", to_hit, direction)
+            / np.linalg.norm(to_hit, axis=1)
+            / np.linalg.norm(direction, axis=1)
+        )
+    return cosine > _MIN_AIM_COSINE
 
 
-class FilledOrigins:
+class FilledOriginFinder:
     """Finds origins of one source that are fill values, block by block.
 
-    A place at exactly 0, 0, 0 may be true: somebody sits there, or a track begins there. It is a fill value where it is
-    repeated and the same person is otherwise never within 0.1 m of it. ``metre``: of a unit of length.
+    A position of exactly 0, 0, 0 may be valid: somebody may sit there, or a track may start there. It is a fill value
+    if it is repeated, and the same participant is otherwise never within 0.1 m of it. ``metre`` is the length of a unit
+    in metres.
     """
 
     def __init__(self, metre: float) -> None:
-        self._apart = _APART / metre
-        self._last: dict[int, np.ndarray] = {}  # the last place of each person that is none
+        self._min_distance = _MIN_DISTANCE / metre
+        self._last_origin: dict[int, np.ndarray] = {}  # last valid position of each participant
         self._count: dict[tuple[int, float], int] = {}
-        self.undecided: dict[int, int] = {}
-        """Rows of a person that were let through since no other place was known yet, and turned out to be filled."""
+        self.undecided_counts: dict[int, int] = {}
+        """Number of rows per participant that were accepted before a valid position was known, but are fill values."""
 
     def find(self, origin: np.ndarray, person: np.ndarray) -> np.ndarray:
-        """Which rows (n,) bool are filled, of origins (n, 3) and numbers of persons (n,)."""
-        fill = fill_values(origin)
-        filled, out = np.isfinite(fill), np.zeros(len(fill), bool)
-        good = np.flatnonzero(np.isfinite(origin).all(axis=1) & ~filled)
-        if filled.any():
+        """Mask (n,) bool of fill values among origins (n, 3) of participants with codes ``person`` (n,)."""
+        fill = find_fill_values(origin)
+        is_filled, out = np.isfinite(fill), np.zeros(len(fill), bool)
+        valid_rows = np.flatnonzero(np.isfinite(origin).all(axis=1) & ~is_filled)
+        if is_filled.any():
             order = np.argsort(person, kind="stable")
             codes, starts = np.unique(person[order], return_index=True)
             for code, rows in zip(codes.tolist(), np.split(order, starts[1:])):
-                if filled[rows].any():
-                    out[rows] = self._find_of(code, origin[rows], fill[rows])
-        if len(good):
-            codes, at = np.unique(person[good][::-1], return_index=True)
-            self._last.update(zip(codes.tolist(), origin[good[::-1][at]]))
+                if is_filled[rows].any():
+                    out[rows] = self._find_for_person(code, origin[rows], fill[rows])
+        if len(valid_rows):
+            codes, at = np.unique(person[valid_rows][::-1], return_index=True)
+            self._last_origin.update(zip(codes.tolist(), origin[valid_rows[::-1][at]]))
         return out
 
-    def _find_of(self, code: int, origin: np.ndarray, fill: np.ndarray) -> np.ndarray:
-        others = origin[np.isnan(fill) & np.isfinite(origin).all(axis=1)]
-        if code in self._last:
-            others = np.vstack([others, self._last[code]])
+    def _find_for_person(self, code: int, origin: np.ndarray, fill: np.ndarray) -> np.ndarray:
+        other_origins = origin[np.isnan(fill) & np.isfinite(origin).all(axis=1)]
+        if code in self._last_origin:
+            other_origins = np.vstack([other_origins, self._last_origin[code]])
         out = np.zeros(len(fill), bool)
         for value in np.unique(fill[np.isfinite(fill)]).tolist():
             before = self._count.get((code, value), 0)
             count = self._count[code, value] = before + int(np.count_nonzero(fill == value))
-            if len(others) and count > 1 and np.linalg.norm(others - value, axis=1).min() > self._apart:
+            if (
+                len(other_origins)
+                and count > 1
+                and np.linalg.norm(other_origins - value, axis=1).min() > self._min_distance
+            ):
                 out |= fill == value
-                if before and code not in self._last:
-                    self.undecided[code] = before
+                if before and code not in self._last_origin:
+                    self.undecided_counts[code] = before
         return out

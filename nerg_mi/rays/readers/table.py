@@ -1,4 +1,4 @@
-"""Tables through a column map: a direction of its own, or a head's pose, or both."""
+"""Tables with a column map: gaze directions, head poses, or both."""
 
 from __future__ import annotations
 
@@ -10,38 +10,43 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.ranges import ValidatedDataclass, Range
+from nerg_mi.ranges import Range, ValidatedDataclass
 
 from . import poses
 from .base import RECORDINGS, RaysBuilder, Signature, TrackingFrame, option, tick_option, valid_option
-from .columns import PERSONS, ColumnFinder, ColumnMap, is_counter, mark_valid, parse_valid, require_valid_values
+from .columns import PERSON_NAMES, ColumnFinder, ColumnMap, is_counter, mark_valid, parse_valid, require_valid_values
 from .tables import TableBlock, iterate_table
 
 
 @dataclass(frozen=True, kw_only=True)
 class TableOptions(ValidatedDataclass):
-    """What no table says of itself. Raises `NergError` for words that are not known."""
+    """Options for what tables do not contain. Raises `NergError` for invalid values."""
 
     columns: ColumnMap | None = option(  # needed
         None,
         'Column map: "origin=x,y,z direction=dx,dy,dz t=time person=id confidence=c hit=hx,hy,hz cohort=g"; for heads, '
-        "in place of direction: xyzw=..., wxyz=..., ypr=yaw,pitch,roll or matrix=... (12 or 16 columns, instead of "
-        "origin too); a direction as angles: azel=azimuth,elevation (right, up) or yawpitch=yaw,pitch, - before a name "
-        "turns its sign; for checks: head=x,y,z (or qx,qy,qz,qw), eyes=lx,ly,lz,rx,ry,rz.",
+        "instead of direction: xyzw=..., wxyz=..., ypr=yaw,pitch,roll or matrix=... (12 or 16 columns, also instead of "
+        "origin); for a direction as angles: azel=azimuth,elevation (right, up) or yawpitch=yaw,pitch, with - before a "
+        "name to negate it; for checks: head=x,y,z (or qx,qy,qz,qw), eyes=lx,ly,lz,rx,ry,rz.",
         flag="--map",
         parse=ColumnMap.parse,
-        recorded=False,
+        is_recorded=False,
     )
-    units: str = option("m", "Unit of length of a mapped table: m, cm or mm.", recorded=False)
-    up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", recorded=False)
+    units: str = option("m", "Unit of length of a mapped table: m, cm or mm.", is_recorded=False)
+    up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", is_recorded=False)
     handedness: str = option(
-        "right", "Handedness of a mapped table: right, or left (Unity).", flag="--hand", recorded=False
+        "right", "Handedness of a mapped table: right, or left (Unity).", flag="--hand", is_recorded=False
     )
     forward: str | None = option(
-        None, "Axis of a head's frame along which it looks.", shown="y up z (left-handed) or -z, else x", recorded=False
+        None,
+        "Forward axis of the head's frame.",
+        default_text="y up: z (left-handed) or -z, otherwise x",
+        is_recorded=False,
     )
-    radians: bool = option(False, "Angles of a mapped table are in radians.", recorded=False)
-    person_from: str = option("column", "Persons of a mapped table: column or filename.", recorded=False)
+    radians: bool = option(False, "Angles of a mapped table are in radians.", is_recorded=False)
+    person_from: str = option(
+        "column", "Source of the participants of a mapped table: column or filename.", is_recorded=False
+    )
     min_confidence: float = option(0.0, "Drop rows below this confidence.", within=Range(0, 1))
     valid: str | None = valid_option()
     tick: float = tick_option()
@@ -49,36 +54,36 @@ class TableOptions(ValidatedDataclass):
     def __post_init__(self) -> None:
         super().__post_init__()
         parse_valid(self.valid)
-        poses.axis(self.looks_along, "forward")
+        poses.parse_axis(self.forward_axis, "forward")
         if self.person_from not in ("column", "filename"):
             raise NergError(f'persons are named by "column" or "filename" (--person-from), not by "{self.person_from}"')
 
     @property
     def frame(self) -> TrackingFrame:
-        """The frame that was declared. Raises `NergError` for words that are not known."""
+        """The declared frame. Raises `NergError` for invalid values."""
         return TrackingFrame(self.up, self.handedness, self.units)
 
     @property
-    def looks_along(self) -> str:
-        """The axis of a head's frame along which it looks."""
+    def forward_axis(self) -> str:
+        """Forward axis of the head's frame."""
         return self.forward or poses.default_forward(self.up, self.handedness)
 
 
 class Table:
-    """CSV or Parquet tables through a column map.
+    """CSV or Parquet tables with a column map.
 
-    Directions need not be unit, and may be two angles from ``forward`` on: ``azel`` as told at
-    :func:`nerg_mi.rays.readers.poses.directions_from_azimuths`, or ``yawpitch``. Where the map has a head's
-    pose (``xyzw``, ``wxyz``, ``ypr``, ``matrix``), ``direction``, angles and ``eye`` are in the head's frame, and
-    without a direction the ray is where the head points: along ``forward``, an axis of its frame. How yaw, pitch and
-    roll turn is told at :func:`nerg_mi.rays.readers.poses.rotations_from_angles`. Rows with a confidence below
-    ``min_confidence`` are dropped. ``tick``: seconds in one unit of the time column; without one, in one row.
+    Directions may have any length, or be two angles from ``forward``: ``azel`` (see
+    :func:`nerg_mi.rays.readers.poses.directions_from_azimuths`) or ``yawpitch``. If the map has a head pose (``xyzw``,
+    ``wxyz``, ``ypr``, ``matrix``), ``direction``, angles and ``eye`` are in the head's frame, and without a direction
+    the ray is the direction of the head, the ``forward`` axis of its frame. See
+    :func:`nerg_mi.rays.readers.poses.rotations_from_angles` for yaw, pitch and roll. Rows below ``min_confidence`` are
+    dropped. ``tick`` is the unit of the time column in seconds; without such a column, the sampling interval.
     """
 
     name = "table"
     files = "CSV (comma, semicolon or tab; `.gz` too) or Parquet tables, whose columns are named by `--map`"
-    world = "declared: `--up`, `--hand`, `--units`"
-    checked_on = RECORDINGS
+    frame_description = "declared: `--up`, `--hand`, `--units`"
+    validated_on = RECORDINGS
     signature = Signature()
     Options = TableOptions
 
@@ -89,7 +94,7 @@ class Table:
         add_tables(files, options, builder)
 
 
-_VALUES = 1000  # of a column; one of more tells no validity
+_MAX_VALUES = 1000  # maximum number of different values of a column of validity
 
 TABLE = Table()
 READERS = (TABLE,)
@@ -98,59 +103,57 @@ READERS = (TABLE,)
 def add_tables(
     files: Sequence[Path], options: TableOptions, builder: RaysBuilder, validity: Sequence[str] = ()
 ) -> None:
-    """Add the rays of ``files`` to ``builder``, which was given ``options.frame``.
+    """Add the rays of ``files`` to ``builder``, whose frame is ``options.frame``.
 
-    ``validity``: columns of validity whose values speak for themselves; where ``options.valid`` names some, only those
-    are used. Raises `NergError` for missing columns, cells that are no numbers, and values of validity whose meaning is
-    not certain.
+    ``validity`` are columns of validity whose values are interpreted automatically, unless ``options.valid`` names
+    columns. Raises `NergError` for missing columns, cells that are not numbers, and uncertain values of validity.
     """
     if options.columns is None:
-        raise NergError("a table needs a column map; say what its columns are (--map)")
+        raise NergError("a table needs a column map; specify its columns (--map)")
     valid = parse_valid(options.valid)
     if valid is None:
         valid = {name: require_valid_values(files[0].name, name, _count_values(files, name)) for name in validity}
     rows = MappedRows(options.columns, options, valid)
-    builder.note(columns=str(rows.columns), min_confidence=options.min_confidence, tick=options.tick)
+    builder.add_metadata(columns=str(rows.columns), min_confidence=options.min_confidence, tick=options.tick)
     if rows.columns.pose or rows.columns.angles:
-        builder.note(forward=options.looks_along)
+        builder.add_metadata(forward=options.forward_axis)
     if rows.columns.ypr or rows.columns.angles:
-        builder.note(degrees=not options.radians)
+        builder.add_metadata(degrees=not options.radians)
     for path in files:
         rows.add(path, builder)
 
 
 def _count_values(files: Sequence[Path], column: str) -> Counter[str]:
-    """How often each value of a column of texts occurs in all ``files``."""
+    """Count the values of a column of text in all ``files``."""
     counts = Counter[str]()
     for path in files:
-        for block in iterate_table(path, (), [column], on_bad=lambda line, why: None):
+        for block in iterate_table(path, (), [column], on_bad_line=lambda line, why: None):
             for value, count in zip(*np.unique(block.texts[:, 0], return_counts=True)):
                 counts[str(value)] += int(count)
-            if len(counts) > _VALUES:
+            if len(counts) > _MAX_VALUES:
                 break
     return counts
 
 
 def find_person(table: ColumnFinder, builder: RaysBuilder) -> str | None:
-    """The column of participants by its usual names. One that differs in nearly every row is none, and ``builder``
-    reports it."""
-    name = table.find(*PERSONS)
+    """Find the column of participants by its usual names. A row counter is reported to ``builder`` and ignored."""
+    name = table.find(*PERSON_NAMES)
     if name is None or not is_counter(next((b.texts[:, 0] for b in iterate_table(table.path, (), [name])), ())):
         return name
-    builder.complain(
-        f"{name!r} has another value in nearly every row, as a counter of rows has, and is not taken for participants: "
-        f"each file is one (or name the column yourself: --map person={name})"
+    builder.add_warning(
+        f"{name!r} has another value in nearly every row, like a row counter, and is not used as the participant: "
+        f"each file is one participant (or specify the column: --map person={name})"
     )
     return None
 
 
 def person_from_filename(path: Path) -> str:
-    """The file's name without its endings (``anna.csv.gz`` is ``anna``)."""
+    """File name without suffixes (``anna`` for ``anna.csv.gz``)."""
     return path.name.split(".")[0]
 
 
 class MappedRows:
-    """Rows of tables that have the same columns, as rays."""
+    """Converts rows of tables with equal columns to rays."""
 
     def __init__(self, columns: ColumnMap, options: TableOptions, valid: Mapping[str, Sequence[str]]) -> None:
         self.columns, self.options, self.valid = columns, options, valid
@@ -166,29 +169,29 @@ class MappedRows:
 
     def add(self, path: Path, builder: RaysBuilder) -> None:
         """Add the rows of ``path``."""
-        builder.source(path)
-        before = 0
+        builder.begin_source(path)
+        first_row = 0
         clocks = {self.columns.t: self.options.tick} if self.columns.t else {}
         for block in builder.read_table(path, self.numbers, self.texts, clocks=clocks):
-            self._add_block(path, block, before, builder)
-            before += len(block.lines)
+            self._add_block(path, block, first_row, builder)
+            first_row += len(block.lines)
 
-    def _add_block(self, path: Path, block: TableBlock, before: int, builder: RaysBuilder) -> None:
-        """Add the rows of ``block``, ahead of which the file has ``before`` others."""
+    def _add_block(self, path: Path, block: TableBlock, first_row: int, builder: RaysBuilder) -> None:
+        """Add the rows of ``block``, the first of which is row ``first_row`` of the file."""
         columns, options = self.columns, self.options
         value = dict(zip(self.numbers, block.numbers.T))
         word = dict(zip(self.texts, block.texts.T))
         vector = lambda names: np.stack([value[c] for c in names], axis=1)
         n = len(block.lines)
-        t = value[columns.t] if columns.t else np.arange(before, before + n, dtype=np.float64)
+        t = value[columns.t] if columns.t else np.arange(first_row, first_row + n, dtype=np.float64)
         confidence = value[columns.confidence] if columns.confidence else np.ones(n)
-        origin, direction, head = self._geometry(vector)
+        origin, direction, head = self._compute_geometry(vector)
         pose = vector(self.pose_columns) if columns.pose == "matrix" else None
-        drop = {} if pose is None else {poses.MIRRORED: poses.is_mirrored(pose)}
+        drop = {} if pose is None else {poses.MIRRORED_MATRIX: poses.is_mirrored(pose)}
         drop |= {f"confidence below {options.min_confidence:g}": confidence < options.min_confidence}
         for name, words in self.valid.items():
-            shown = " or ".join(dict.fromkeys(w.lower() for w in words)) or "valid"
-            drop[f"{name} is not {shown}"] = ~mark_valid(word[name], words)
+            values_text = " or ".join(dict.fromkeys(w.lower() for w in words)) or "valid"
+            drop[f"{name} is not {values_text}"] = ~mark_valid(word[name], words)
         builder.add(
             t * options.tick,
             word[self.person] if self.person else person_from_filename(path),
@@ -207,44 +210,45 @@ class MappedRows:
             recorded_direction=vector(columns.direction) if columns.direction else None,
         )
 
-    def _geometry(
+    def _compute_geometry(
         self, vector: Callable[[Sequence[str]], np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Origins and directions (n, 3) of a block, whose columns ``vector`` stacks, and the heads', if they are not
-        the directions."""
-        columns, forward = self.columns, poses.axis(self.options.looks_along, "forward")
-        direction = self._direction(vector)
+        """Origins and directions (n, 3) of a block, and directions of heads, if different; ``vector`` stacks
+        columns."""
+        columns, forward = self.columns, poses.parse_axis(self.options.forward_axis, "forward")
+        direction = self._compute_directions(vector)
         if not columns.pose:
             head = vector(columns.head) if columns.head else None
             if head is not None and head.shape[1] == 4:
                 head = poses.rotations_from_quaternions(head) @ forward
             return vector(columns.origin or ()), np.asarray(direction), head
-        turn, place = _pose(columns.pose, vector(self.pose_columns), self.options)
-        origin = vector(columns.origin or ()) if place is None else place
+        rotation, position = _read_pose(columns.pose, vector(self.pose_columns), self.options)
+        origin = vector(columns.origin or ()) if position is None else position
         if columns.eye:
-            origin = origin + poses.rotate(turn, vector(columns.eye))
+            origin = origin + poses.rotate(rotation, vector(columns.eye))
         if direction is not None:
-            return origin, poses.rotate(turn, direction), turn @ forward
-        return origin, turn @ forward, None
+            return origin, poses.rotate(rotation, direction), rotation @ forward
+        return origin, rotation @ forward, None
 
-    def _direction(self, vector: Callable[[Sequence[str]], np.ndarray]) -> np.ndarray | None:
-        """The directions (n, 3) that the table gives beside a pose, or without one; None where the pose is all."""
+    def _compute_directions(self, vector: Callable[[Sequence[str]], np.ndarray]) -> np.ndarray | None:
+        """The directions (n, 3) in the table; None if the table only has a pose."""
         if self.columns.direction:
             return vector(self.columns.direction)
         if not self.columns.angles:
             return None
         options, angles = self.options, vector(self.angle_columns) * self.angle_signs
         if self.columns.azel:
-            forward = options.looks_along
+            forward = options.forward_axis
             return poses.directions_from_azimuths(angles, options.up, forward, options.handedness, not options.radians)
-        turn = poses.rotations_from_angles(angles, options.up, options.looks_along, not options.radians)
-        return turn @ poses.axis(options.looks_along, "forward")
+        rotation = poses.rotations_from_angles(angles, options.up, options.forward_axis, not options.radians)
+        return rotation @ poses.parse_axis(options.forward_axis, "forward")
 
 
-def _pose(kind: str, values: np.ndarray, options: TableOptions) -> tuple[np.ndarray, np.ndarray | None]:
-    """Rotations (N, 3, 3) from head to world of the pose columns (N, C), and where a head is, if they tell."""
+def _read_pose(kind: str, values: np.ndarray, options: TableOptions) -> tuple[np.ndarray, np.ndarray | None]:
+    """Rotations (N, 3, 3) from head to world of the pose columns (N, C), and positions (N, 3), if they contain
+    these."""
     if kind == "matrix":
         return poses.rotations_from_matrices(values)
     if kind == "ypr":
-        return poses.rotations_from_angles(values, options.up, options.looks_along, not options.radians), None
+        return poses.rotations_from_angles(values, options.up, options.forward_axis, not options.radians), None
     return poses.rotations_from_quaternions(values, kind), None

@@ -1,4 +1,4 @@
-"""Tables of tracking: CSV and Parquet files in blocks, with their header checked against their rows."""
+"""Tables of tracking data: CSV and Parquet files in blocks, with rows validated against the header."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, translate_read_errors
 from nerg_mi.rays.rays import open_parquet
 
-BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
-COLUMNS = 1 << 14  # A table may have so many columns
-TEXT_CHARACTERS = 1000  # So many characters may a cell have that is read as text
+BLOCK_ROWS = 1 << 16  # rows converted at a time, to bound memory
+MAX_COLUMNS = 1 << 14  # maximum number of columns of a table
+MAX_TEXT_CHARACTERS = 1000  # maximum length of a cell that is read as text
 
-# Cells of an array of text all take the space of the longest: rows times its characters, at four bytes each.
-_TEXT_BLOCK = 1 << 26
+# Maximum size of an array of text, in characters: all cells take the space of the longest, four bytes per character.
+_MAX_TEXT_BLOCK = 1 << 26
 
-# Memory of a row that is read, at least.
+# Minimum memory of a row, in bytes.
 _ROW_BYTES = 32
 
-_MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
+_MISSING_WORDS = {"", "nan", "na", "n/a", "null", "none", "-"}
 
 _DECIMAL = re.compile(r"\s*[+-]?\d*([.,])\d*([eE][+-]?\d+)?\s*")
 
-# Two cells that a decimal comma may have made of one number, or of a time.
-_WHOLE, _FRACTION = re.compile(r"(^|[+:-])\d+$"), re.compile(r"\d+([eE][+-]?\d+)?")
+# Two cells that may be one number or time that was split at a decimal comma.
+_INTEGER_CELL, _FRACTION_CELL = re.compile(r"(^|[+:-])\d+$"), re.compile(r"\d+([eE][+-]?\d+)?")
 
 
 class TableBlock(NamedTuple):
     """A run of n rows of a table."""
 
-    numbers: np.ndarray  # (n, C) float64 in the order asked, NaN where a cell is empty
+    numbers: np.ndarray  # (n, C) float64 in the requested order, NaN for empty cells
     texts: np.ndarray  # (n, T) str
-    lines: np.ndarray  # (n,) 1-based lines of the file; rows for Parquet
+    lines: np.ndarray  # (n,) line numbers in the file, from 1; row numbers for Parquet
 
 
 def read_table_columns(path: str | os.PathLike) -> list[str]:
-    """Names of a table's columns; of a CSV those of its first line. Raises `NergError` for a damaged file."""
+    """Names of a table's columns; in a CSV, the cells of the first line. Raises `NergError` for a damaged file."""
     if str(path).lower().endswith(".parquet"):
         with open_parquet(path, "table", _ROW_BYTES) as table:
             return list(table.schema_arrow.names)
     with closing(read_line_blocks(path, "table", 1)) as blocks:
-        return _header(path, next(blocks, [""])[0])[0]
+        return _parse_header(path, next(blocks, [""])[0])[0]
 
 
 def iterate_table(
@@ -56,48 +56,51 @@ def iterate_table(
     numbers: Sequence[str],
     texts: Sequence[str] = (),
     header: Sequence[str] | None = None,
-    on_bad: BadLineCallback | None = None,
+    on_bad_line: BadLineCallback | None = None,
     *,
     first_line: int = 1,
     clocks: Mapping[str, float] | None = None,
     on_note: Callable[..., None] | None = None,
 ) -> Iterator[TableBlock]:
-    """Yield named columns of a table in blocks of at most ``BLOCK`` rows.
+    """Iterate over columns of a table in blocks of at most `BLOCK_ROWS` rows.
 
-    The separator (comma, semicolon or tab) is taken from the header, and the decimal sign (point or comma) from the
-    first number that has one. Cells that are empty or say nan, na, null or none are NaN.
+    The separator (comma, semicolon or tab) is detected in the header, and the decimal sign (point or comma) in the
+    first number that has one. Empty cells and nan, na, null or none are NaN. Cells are converted with pyarrow if it is
+    installed, with the same results.
 
     Parameters
     ----------
+    numbers, texts
+        Columns to read as numbers and as text.
     header
-        The names of the columns of a CSV whose ``first_line`` is none.
-    on_bad
-        Called with each line that cannot be read, which is left out. Without it such a line raises.
+        Names of the columns of a CSV without a header, whose data start at ``first_line``.
+    on_bad_line
+        Called with each unreadable line, which is skipped. Without it such a line is an error.
     clocks
-        Those of ``numbers`` whose cells may be times such as ``2024-05-01T12:00:00`` or ``12:00:00.25``
-        (`clock_seconds`), with the seconds of the unit in which they are returned, and in which plain numbers count.
-        Times of day without a date go on past midnight (`DayCounter`).
+        Columns of ``numbers`` that may contain times such as ``2024-05-01T12:00:00`` or ``12:00:00.25``
+        (`parse_clock_seconds`), with the unit in seconds in which they are returned, and of plain numbers in them.
+        Times of day without a date continue past midnight (`DayCounter`).
     on_note
-        Called with ``decimal=","`` where commas are taken for decimal signs, and with ``passes_midnight=True`` where
-        times of day do.
+        Called with ``decimal=","`` for decimal commas, and with ``passes_midnight=True`` for times of day past
+        midnight.
 
     Raises
     ------
     NergError
-        For a damaged file, a missing or repeated column, a column that is requested twice, and, without ``on_bad``, a
-        row with more or fewer cells than the header (a single separator at its end aside) or a cell that is no number,
-        naming the line. Where pyarrow is installed it converts the cells, to the same numbers.
+        For a damaged file, a missing or repeated column, a column that is requested twice, and, without
+        ``on_bad_line``, for the line of a row with more or fewer cells than the header (except for one separator at its
+        end) or a cell that is not a number.
     """
     if str(path).lower().endswith(".parquet"):
         yield from _iterate_parquet(path, numbers, texts, clocks or {}, on_note)
         return
     count, layout, convert = 0, None, None
     days: dict[int, DayCounter] = {}
-    for raw in read_line_blocks(path, "table", BLOCK):
+    for raw in read_line_blocks(path, "table", BLOCK_ROWS):
         skip = max(0, first_line - 1 - count)
         raw, count = raw[skip:], count + min(skip, len(raw))
         if layout is None and raw:
-            columns, separator = (list(header), ",") if header is not None else _header(path, raw[0])
+            columns, separator = (list(header), ",") if header is not None else _parse_header(path, raw[0])
             if header is None:
                 raw, count = raw[1:], count + 1
             check_columns(path, [*numbers, *texts], columns)
@@ -105,17 +108,17 @@ def iterate_table(
             layout = _Layout(separator, columns, number_at, text_at, ".", {}, len(columns))
         blank = [line.isspace() for line in raw]
         lines = count + 1 + np.flatnonzero(~np.array(blank, dtype=bool))
-        rows = raw if len(lines) == len(raw) else [line for line, gone in zip(raw, blank) if not gone]
+        rows = raw if len(lines) == len(raw) else [line for line, is_blank in zip(raw, blank) if not is_blank]
         count += len(raw)
         if rows and layout is not None:
             if convert is None:
-                layout = _with_spelling(layout, rows, clocks or {})
-                convert = _fast_reader(layout) or (lambda rows: None)
+                layout = _detect_spelling(layout, rows, clocks or {})
+                convert = _make_arrow_converter(layout) or (lambda rows: None)
                 if on_note is not None and layout.decimal == ",":
                     on_note(decimal=",")
                 days = {k: DayCounter(tick, on_note) for k, (tick, dated) in layout.clocks.items() if not dated}
             values = convert(rows)
-            block = TableBlock(*values, lines) if values else _convert(path, rows, lines, layout, on_bad)
+            block = TableBlock(*values, lines) if values else _convert(path, rows, lines, layout, on_bad_line)
             for k, counter in days.items():
                 column = block.numbers[:, layout.number_at.index(k)]
                 column[:] = counter.unwrap(column)
@@ -126,75 +129,77 @@ def iterate_table(
 
 
 class _Layout(NamedTuple):
-    """Where in the lines of a CSV the wanted cells stand, and how they are written."""
+    """Positions and notation of the requested cells in the lines of a CSV."""
 
     separator: str
     columns: list[str]  # of the file
-    number_at: list[int]  # places among them of the columns of numbers
-    text_at: list[int]  # and of texts
+    number_at: list[int]  # indices of the columns of numbers
+    text_at: list[int]  # indices of the columns of text
     decimal: str  # sign: point or comma
-    clocks: dict[int, tuple[float, bool]]  # places of times as text: seconds of a unit, and whether with a date
-    row_cells: int  # of the first row that is whole
+    clocks: dict[int, tuple[float, bool]]  # indices of columns of times in text form: unit in seconds, has a date
+    row_cells: int  # number of cells of the first complete row
 
     @property
     def width(self) -> int:
-        """Cells of a row without the empty one after a separator at its end."""
+        """Number of cells of a row, without an empty one after a separator at its end."""
         return len(self.columns) - (len(self.columns) > 1 and not self.columns[-1])
 
     def accepts(self, cells: int, last: str) -> bool:
-        """Whether a row of so many cells, the last of which is ``last``, is one of the header's."""
+        """Whether a row with this number of cells, the last of which is ``last``, matches the header."""
         return cells in (self.width, len(self.columns)) or (cells == self.width + 1 and not last.strip())
 
 
-def _with_spelling(layout: _Layout, rows: list[str], clocks: Mapping[str, float]) -> _Layout:
-    """The layout with what the first ``rows`` tell of how numbers and times are written."""
+def _detect_spelling(layout: _Layout, rows: list[str], clocks: Mapping[str, float]) -> _Layout:
+    """Detect the decimal sign and the columns of times in the first ``rows``."""
     ticks = {layout.columns.index(name): tick for name, tick in clocks.items() if name in layout.columns}
     times: dict[int, tuple[float, bool]] = {}
-    waiting, decimal, row_cells = set(ticks), "", 0
+    pending, decimal, row_cells = set(ticks), "", 0
     for row in rows:
-        cells = _split(row, layout.separator) or []
+        cells = _split_cells(row, layout.separator) or []
         if not layout.accepts(len(cells), cells[-1] if cells else ""):
             continue
         row_cells = row_cells or len(cells)
-        for k in [k for k in waiting if cells[k].strip().lower() not in _MISSING]:
-            waiting.remove(k)
-            time = clock_seconds(cells[k])
+        for k in [k for k in pending if cells[k].strip().lower() not in _MISSING_WORDS]:
+            pending.remove(k)
+            time = parse_clock_seconds(cells[k])
             if time is not None:
                 times[k] = ticks[k], time[1]
         signs = (match[1] for k in layout.number_at if k not in times and (match := _DECIMAL.fullmatch(cells[k])))
         decimal = decimal or next(signs, "")
-        if decimal and not waiting:
+        if decimal and not pending:
             break
     return layout._replace(decimal=decimal or ".", clocks=times, row_cells=row_cells)
 
 
-def _split(row: str, separator: str) -> list[str] | None:
-    """The cells of a line; None where quotes or lengths forbid."""
+def _split_cells(row: str, separator: str) -> list[str] | None:
+    """Split a line into cells; None for invalid quotes or lengths."""
     try:
         return next(csv.reader([row], delimiter=separator), [])
     except csv.Error:
         return None
 
 
-def _header(path: str | os.PathLike, line: str) -> tuple[list[str], str]:
-    """Column names and the separator between them."""
+def _parse_header(path: str | os.PathLike, line: str) -> tuple[list[str], str]:
+    """Parse the header: column names, and the separator."""
     line = line.rstrip("\r\n").lstrip("\ufeff")
     if line.startswith("Format Version,"):
         raise NergError(f'"{path}" is an export of OptiTrack\'s Motive; import it with --preset motive')
     separator = max(",;\t", key=line.count)
-    if line.count(separator) >= COLUMNS:
-        raise NergError(f'the table "{path}" has more than the {COLUMNS:,} columns that are read; give one with fewer')
+    if line.count(separator) >= MAX_COLUMNS:
+        raise NergError(
+            f'the table "{path}" has more columns than the maximum of {MAX_COLUMNS:,}; provide one with fewer'
+        )
     try:
         return [c.strip() for c in next(csv.reader([line], delimiter=separator))] if line else [], separator
     except csv.Error as error:
-        raise NergError(f'the first line of the table "{path}" is no header ({error}); is it a table?') from error
+        raise NergError(f'the first line of the table "{path}" is not a header ({error}); is it a table?') from error
 
 
-def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.ndarray] | None] | None:
-    """A function of lines that converts them with pyarrow, on all cores; ``None`` without pyarrow.
+def _make_arrow_converter(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.ndarray] | None] | None:
+    """Make a function that converts lines with pyarrow on all cores; None without pyarrow.
 
-    It gives ``None`` for lines that are in any way unusual (missing cells, words among numbers), which the slower
-    reader converts, or refuses by line and column.
+    The function returns None for unusual lines (missing cells, words among numbers); the slow converter then converts
+    them, or reports line and column.
     """
     try:
         import pyarrow as pa
@@ -206,19 +211,22 @@ def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.
     names = [str(i) for i in range(layout.row_cells)]
     if not layout.width <= len(names) <= layout.width + 1:
         return None
-    # A row may end in a separator; nothing may stand after it unless the header names it.
-    spare = [names[-1]] if len(names) > len(layout.columns) else []
+    # A row may end with a separator, but not with a cell that has no column.
+    trailing = [names[-1]] if len(names) > len(layout.columns) else []
     options = dict(
         read_options=pc.ReadOptions(column_names=names),
         parse_options=pc.ParseOptions(delimiter=separator, ignore_empty_lines=False),
         convert_options=pc.ConvertOptions(
-            include_columns=[*(names[i] for i in (*number_at, *text_at)), *spare],
+            include_columns=[*(names[i] for i in (*number_at, *text_at)), *trailing],
             column_types={
                 **{names[i]: pa.float64() for i in number_at},
                 **{names[i]: pa.string() for i in words},
-                **{name: pa.string() for name in spare},
+                **{name: pa.string() for name in trailing},
             },
-            null_values=["", *(spelt for word in _MISSING if word for spelt in (word, word.upper(), word.title()))],
+            null_values=[
+                "",
+                *(spelt for word in _MISSING_WORDS if word for spelt in (word, word.upper(), word.title())),
+            ],
             strings_can_be_null=False,
             decimal_point=layout.decimal,
         ),
@@ -231,13 +239,13 @@ def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.
             return None
         if table.num_rows != len(rows):  # a quoted cell with a line break
             return None
-        if any(cell.strip() for name in spare for cell in table.column(name).to_pylist()):
+        if any(cell.strip() for name in trailing for cell in table.column(name).to_pylist()):
             return None
         numbers = []
         for i in number_at:
             column = table.column(names[i])
             if i in layout.clocks:
-                times = _clock_column(column.to_pylist(), *layout.clocks[i])
+                times = _parse_clock_column(column.to_pylist(), *layout.clocks[i])
                 if times is None:
                     return None
                 numbers.append(times)
@@ -245,7 +253,7 @@ def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.
                 numbers.append(column.to_numpy())
         values = np.stack(numbers, axis=1) if numbers else np.empty((len(rows), 0))
         cells = [table.column(names[i]).to_numpy() for i in text_at]
-        if any(len(rows) * max(map(len, column)) > _TEXT_BLOCK for column in cells):
+        if any(len(rows) * max(map(len, column)) > _MAX_TEXT_BLOCK for column in cells):
             return None
         texts = [np.char.strip(column.astype(str)) for column in cells]
         return values, np.stack(texts, axis=1) if texts else np.empty((len(rows), 0), dtype=str)
@@ -253,104 +261,102 @@ def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.
     return convert
 
 
-def _clock_column(cells: Sequence[str], tick: float, dated: bool) -> np.ndarray | None:
-    """Times (n,) in units of ``tick`` seconds; None where a cell is none, or differs in whether it has a date."""
-    times = [np.nan if cell.strip().lower() in _MISSING else _clock(cell, tick, dated) for cell in cells]
+def _parse_clock_column(cells: Sequence[str], tick: float, dated: bool) -> np.ndarray | None:
+    """Times (n,) in units of ``tick`` seconds; None if a cell is not a time, or differs in whether it has a date."""
+    times = [np.nan if cell.strip().lower() in _MISSING_WORDS else _parse_clock(cell, tick, dated) for cell in cells]
     return None if None in times else np.array(times, np.float64)
 
 
-def _clock(cell: str, tick: float, dated: bool) -> float | None:
-    time = clock_seconds(cell)
+def _parse_clock(cell: str, tick: float, dated: bool) -> float | None:
+    time = parse_clock_seconds(cell)
     return None if time is None or time[1] != dated else time[0] / tick
 
 
 def _convert(
-    path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad: BadLineCallback | None
+    path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad_line: BadLineCallback | None
 ) -> TableBlock:
-    too_long = layout.text_at and len(rows) * max(map(len, rows)) > _TEXT_BLOCK
+    too_long = layout.text_at and len(rows) * max(map(len, rows)) > _MAX_TEXT_BLOCK
     if too_long or layout.decimal != "." or layout.clocks or not all(_has_all_cells(row, layout) for row in rows):
-        return _convert_slowly(path, rows, lines, layout, on_bad)
-    # Empty cells are common (a gaze ray that hits nothing) and NumPy's fast reader refuses them, so they are spelt out
-    # first.
+        return _convert_slowly(path, rows, lines, layout, on_bad_line)
+    # Empty cells are common (gaze without a hit), but NumPy's fast parser rejects them: write nan into them first.
     gap = layout.separator * 2
-    filled = rows
+    completed_rows = rows
     if any(gap in row for row in rows):
         spelt = f"{layout.separator}nan{layout.separator}"
-        filled = [r.replace(gap, spelt).replace(gap, spelt) if gap in r else r for r in rows]
+        completed_rows = [r.replace(gap, spelt).replace(gap, spelt) if gap in r else r for r in rows]
     load = lambda lines, places, kind: np.loadtxt(
         lines, usecols=places, dtype=kind, delimiter=layout.separator, comments=None, quotechar='"', ndmin=2
     )
     try:
-        values = load(filled, layout.number_at, np.float64)
+        values = load(completed_rows, layout.number_at, np.float64)
         words = load(rows, layout.text_at, str) if layout.text_at else np.empty((len(rows), 0), dtype=str)
     except (ValueError, OverflowError):
-        return _convert_slowly(path, rows, lines, layout, on_bad)
-    if len(values) != len(rows) or len(words) != len(rows):  # a quote that is never closed joins lines
-        return _convert_slowly(path, rows, lines, layout, on_bad)
+        return _convert_slowly(path, rows, lines, layout, on_bad_line)
+    if len(values) != len(rows) or len(words) != len(rows):  # an unclosed quote joins lines
+        return _convert_slowly(path, rows, lines, layout, on_bad_line)
     return TableBlock(values, words, lines)
 
 
 def _has_all_cells(row: str, layout: _Layout) -> bool:
     if '"' in row:
-        cells = _split(row, layout.separator) or []
+        cells = _split_cells(row, layout.separator) or []
         return layout.accepts(len(cells), cells[-1] if cells else "")
     row = row.rstrip("\r\n")
     return layout.accepts(row.count(layout.separator) + 1, row[row.rfind(layout.separator) + 1 :])
 
 
 def _convert_slowly(
-    path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad: BadLineCallback | None
+    path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad_line: BadLineCallback | None
 ) -> TableBlock:
-    """Line by line, cell by cell: knows more spellings of "missing", and names the bad cell."""
-    values, words, kept = [], [], []
+    """Convert cell by cell: accepts more words for missing values, and reports the bad cell."""
+    values, words, good_lines = [], [], []
     for row, line in zip(rows, lines.tolist()):
-        found = _cells(row, layout)
-        if isinstance(found, str):
-            if on_bad is None:
-                raise NergError(f"{path}, line {line}{found}, or leave such lines out with --skip-bad-lines")
-            on_bad(line, found)
+        parsed = _parse_cells(row, layout)
+        if isinstance(parsed, str):
+            if on_bad_line is None:
+                raise NergError(f"{path}, line {line}{parsed}, or skip such lines with --skip-bad-lines")
+            on_bad_line(line, parsed)
             continue
-        cells, numbers = found
+        cells, numbers = parsed
         values.append(numbers)
         words.append([cells[k].strip() for k in layout.text_at])
-        kept.append(line)
+        good_lines.append(line)
     return TableBlock(
-        np.array(values, np.float64).reshape(len(kept), len(layout.number_at)),
-        np.array(words, dtype=str).reshape(len(kept), len(layout.text_at)),
-        np.array(kept, np.int64),
+        np.array(values, np.float64).reshape(len(good_lines), len(layout.number_at)),
+        np.array(words, dtype=str).reshape(len(good_lines), len(layout.text_at)),
+        np.array(good_lines, np.int64),
     )
 
 
-def _cells(row: str, layout: _Layout) -> tuple[list[str], list[float]] | str:
-    """The cells of a line and the numbers among them; or what is wrong with it, and the remedy."""
+def _parse_cells(row: str, layout: _Layout) -> tuple[list[str], list[float]] | str:
+    """Cells of a line and the numbers in them; or a description of the error, and the remedy."""
     try:
         cells = next(csv.reader([row], delimiter=layout.separator), [])
     except csv.Error as error:
         return f": it cannot be split into cells ({error}); correct or remove the line"
     if not layout.accepts(len(cells), cells[-1] if cells else ""):
-        return _why_other_width(cells, layout)
+        return _explain_cell_count(cells, layout)
     for k in layout.text_at:
-        if len(cells[k]) > TEXT_CHARACTERS:
-            what = (
-                f"column {sanitize(layout.columns[k], 40)!r}: more than the {TEXT_CHARACTERS:,} characters that are read"
-            )
+        if len(cells[k]) > MAX_TEXT_CHARACTERS:
+            name = sanitize(layout.columns[k], 40)
+            what = f"column {name!r}: more characters than the maximum of {MAX_TEXT_CHARACTERS:,}"
             return f", {what}; correct or remove the line"
     numbers = []
     for k in layout.number_at:
         word = cells[k].strip()
-        number = np.nan if word.lower() in _MISSING else _number(word, k, layout)
+        number = np.nan if word.lower() in _MISSING_WORDS else _parse_number(word, k, layout)
         if number is None:
             cell = f"column {sanitize(layout.columns[k], 40)!r}: {sanitize(word, 60)!r}"
-            return f", {cell} {_why_no_number(word, k, layout)}"
+            return f", {cell} {_explain_bad_number(word, k, layout)}"
         numbers.append(number)
     return cells, numbers
 
 
-def _number(word: str, k: int, layout: _Layout) -> float | None:
+def _parse_number(word: str, k: int, layout: _Layout) -> float | None:
     if k in layout.clocks:
-        return _clock(word, *layout.clocks[k])
+        return _parse_clock(word, *layout.clocks[k])
     if layout.decimal == ",":
-        # A point would be another decimal sign, or one between thousands.
+        # A point would be a second decimal sign, or a thousands separator.
         word = "" if "." in word else word.replace(",", ".", 1)
     try:
         return float(word)
@@ -358,27 +364,27 @@ def _number(word: str, k: int, layout: _Layout) -> float | None:
         return None
 
 
-def _why_no_number(word: str, k: int, layout: _Layout) -> str:
+def _explain_bad_number(word: str, k: int, layout: _Layout) -> str:
     if k in layout.clocks:
-        return "is no time such as those before it; write all times of the column alike"
+        return "is not a time like those before it; use one notation in the whole column"
     if any(sign in word for sign in ".," if sign != layout.decimal):
         sign = {".": "points", ",": "commas"}[layout.decimal]
-        return f"is not a number with the decimal {sign} that the table has; write all numbers alike"
+        return f"is not a number with the decimal {sign} of the table; use one notation for all numbers"
     return "is not a number; correct the cell or the column map"
 
 
-def _why_other_width(cells: list[str], layout: _Layout) -> str:
-    """What is wrong with a row of more or fewer cells than the header has, and the remedy."""
-    why, pairs, k = f": {len(cells)} cells, the header has {layout.width}", 0, 0
+def _explain_cell_count(cells: list[str], layout: _Layout) -> str:
+    """Describe a row with more or fewer cells than the header, with the remedy."""
+    reason, pairs, k = f": {len(cells)} cells, the header has {layout.width}", 0, 0
     while k + 1 < len(cells):
-        pair = bool(_WHOLE.search(cells[k]) and _FRACTION.fullmatch(cells[k + 1]))
+        pair = bool(_INTEGER_CELL.search(cells[k]) and _FRACTION_CELL.fullmatch(cells[k + 1]))
         pairs, k = pairs + pair, k + 1 + pair
     if layout.separator == "," and 0 < len(cells) - layout.width <= pairs:
         return (
-            f"{why}; are these decimal commas? They cannot be told from the commas between cells: export the table "
-            "with decimal points, or with semicolons between its cells"
+            f"{reason}; are these decimal commas? They cannot be distinguished from separators: export the table with "
+            "decimal points, or with semicolons as separators"
         )
-    return f"{why}; correct or remove the line"
+    return f"{reason}; correct or remove the line"
 
 
 def _iterate_parquet(
@@ -396,7 +402,7 @@ def _iterate_parquet(
         check_columns(path, [*numbers, *texts], names)
         first, wanted = 1, [*numbers, *texts]
         with translate_read_errors(path, "table", extra_errors=(pa.ArrowException,)):
-            batches = table.iter_batches(batch_size=BLOCK, columns=wanted)
+            batches = table.iter_batches(batch_size=BLOCK_ROWS, columns=wanted)
         while True:
             with translate_read_errors(path, "table", extra_errors=(pa.ArrowException,)):
                 batch = next(batches, None)
@@ -404,8 +410,8 @@ def _iterate_parquet(
                     return
                 n = batch.num_rows
                 column = {c: batch.column(batch.schema.get_field_index(c)) for c in wanted}
-                values = [_as_numbers(path, c, column[c], days.get(c)) for c in numbers]
-                words = [_as_texts(path, c, column[c]) for c in texts]
+                values = [_to_numbers(path, c, column[c], days.get(c)) for c in numbers]
+                words = [_to_texts(path, c, column[c]) for c in texts]
             yield TableBlock(
                 np.stack(values, axis=1) if values else np.empty((n, 0)),
                 np.stack(words, axis=1) if words else np.empty((n, 0), dtype=str),
@@ -414,24 +420,24 @@ def _iterate_parquet(
             first += n
 
 
-def _as_texts(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:
+def _to_texts(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:
     words = ["" if v is None else str(v) for v in column.to_pylist()]
-    if max(map(len, words), default=0) > TEXT_CHARACTERS:
+    if max(map(len, words), default=0) > MAX_TEXT_CHARACTERS:
         raise NergError(
-            f'the column {sanitize(name, 40)!r} of the table "{path}" has cells of more than the {TEXT_CHARACTERS:,} '
-            "characters that are read; name another one"
+            f'the column {sanitize(name, 40)!r} of the table "{path}" has cells with more characters than the maximum '
+            f"of {MAX_TEXT_CHARACTERS:,}; use another column"
         )
     return np.array(words, dtype=str)
 
 
-def _as_numbers(path: str | os.PathLike, name: str, column: Any, days: DayCounter | None) -> np.ndarray:
-    """A column as (n,) float64; one of times, for which there are ``days``, in their unit."""
+def _to_numbers(path: str | os.PathLike, name: str, column: Any, days: DayCounter | None) -> np.ndarray:
+    """Convert a column to (n,) float64; times, for which there are ``days``, to their unit."""
     try:
         values = column.to_numpy(zero_copy_only=False)
         if days is not None and values.dtype == object:
             cells = ["" if cell is None else str(cell) for cell in column.to_pylist()]
-            dated = next((time[1] for cell in cells if (time := clock_seconds(cell))), False)
-            values = _clock_column(cells, days.tick, dated)
+            dated = next((time[1] for cell in cells if (time := parse_clock_seconds(cell))), False)
+            values = _parse_clock_column(cells, days.tick, dated)
             values = values if dated or values is None else days.unwrap(values)
         elif days is not None and values.dtype.kind == "M":
             since = values.astype("datetime64[ns]").astype(np.int64) * (1e-9 / days.tick)
@@ -441,47 +447,48 @@ def _as_numbers(path: str | os.PathLike, name: str, column: Any, days: DayCounte
         return values.astype(np.float64)
     except (TypeError, ValueError):
         raise NergError(
-            f'the column {sanitize(name, 40)!r} of the table "{path}" holds no numbers; name another one'
+            f'the column {sanitize(name, 40)!r} of the table "{path}" does not contain numbers; use another column'
         ) from None
 
 
-def check_columns(path: str | os.PathLike, wanted: Sequence[str], there: Sequence[str]) -> None:
-    """Raise `NergError` for a ``wanted`` column that is not ``there``, is there several times, or is wanted twice."""
-    missing = [c for c in wanted if c not in there]
+def check_columns(path: str | os.PathLike, requested: Sequence[str], available: Sequence[str]) -> None:
+    """Raise `NergError` for a requested column that is missing, exists several times, or is requested twice."""
+    missing = [c for c in requested if c not in available]
     if missing:
-        brief = lambda names: ", ".join(sanitize(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
+        list_names = lambda names: ", ".join(sanitize(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
         raise NergError(
-            f"{path} has no column {brief(missing)}; its columns are {brief(there) or 'none'}; name those by --map"
+            f"{path} has no column {list_names(missing)}; its columns are {list_names(available) or 'none'}; name "
+            "columns with --map"
         )
-    repeated = next((c for c in wanted if there.count(c) > 1), None)
+    repeated = next((c for c in requested if available.count(c) > 1), None)
     if repeated is not None:
         raise NergError(f'the table "{path}" has several columns called {sanitize(repeated, 40)!r}; rename all but one')
-    twice = next((c for c in wanted if wanted.count(c) > 1), None)
+    twice = next((c for c in requested if requested.count(c) > 1), None)
     if twice is not None:
-        raise NergError(f"the column {sanitize(twice, 40)!r} of {path} is used in two roles; name another one in --map")
+        raise NergError(f"the column {sanitize(twice, 40)!r} of {path} has two roles; use another one in --map")
 
 
-# ---- Times of day, and dates with one, as text: ISO 8601 and what is close to it ----
+# ---- Times of day, and dates with times, as text: ISO 8601 and similar notations ----
 
-_CLOCK = re.compile(
+_CLOCK_FORMAT = re.compile(
     r"(?:(?:(?P<year>\d{4})[-/](?P<month>\d\d)[-/](?P<day>\d\d)|"
     r"(?P<day_>\d\d)\.(?P<month_>\d\d)\.(?P<year_>\d{4}))(?:T|,? +))?"
     r"(?P<hour>\d\d?):(?P<minute>\d\d):(?P<second>\d\d)(?:[.,](?P<fraction>\d+))?"
     r"(?: ?(?P<half>[AaPp])\.?[Mm]\.?)? ?(?P<zone>Z|(?P<sign>[+-])(?P<zone_hour>\d\d):?(?P<zone_minute>\d\d))?"
 )
-# ISO 8601's basic format; its time alone would be a number.
-_BASIC = re.compile(r"(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)(?=\D|$)")
+# ISO 8601's basic format, only with a date: the time alone would be a number.
+_BASIC_FORMAT = re.compile(r"(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)(?=\D|$)")
 _EPOCH = datetime.date(1970, 1, 1).toordinal()
 
 
-def clock_seconds(text: str) -> tuple[float, bool] | None:
+def parse_clock_seconds(text: str) -> tuple[float, bool] | None:
     """Seconds of a time such as ``2024-05-01T12:00:00.25+02:00`` or ``12:00:00.25``, and whether it has a date.
 
-    With a date they count from 1970 in UTC, as which a time without an offset is taken; else from midnight. None for
-    any other text. Dates are year-month-day or day.month.year, and hours count to 24 or have AM or PM, so that no order
-    has to be guessed.
+    With a date, seconds since 1970 in UTC, which is also assumed without an offset; otherwise since midnight. None for
+    other text. Dates are year-month-day or day.month.year, and hours are up to 24 or have AM or PM, so that the order
+    is never ambiguous.
     """
-    match = _CLOCK.fullmatch(_BASIC.sub(r"\1-\2-\3T\4:\5:\6", text.strip()[:64]))
+    match = _CLOCK_FORMAT.fullmatch(_BASIC_FORMAT.sub(r"\1-\2-\3T\4:\5:\6", text.strip()[:64]))
     if match is None:
         return None
     hour, minute, second = int(match["hour"]), int(match["minute"]), int(match["second"])
@@ -505,17 +512,17 @@ def clock_seconds(text: str) -> tuple[float, bool] | None:
     return 86400.0 * days + seconds, True
 
 
-_DAY = 86400.0
-_PAUSE = 3600.0  # seconds between two times of one recording, at most, of which one is before midnight
+_DAY_SECONDS = 86400.0
+_MAX_PAUSE = 3600.0  # maximum seconds between the last time before midnight and the next time of a recording
 
 
 class DayCounter:
-    """Lets times of day without a date go on past midnight, block by block of one column.
+    """Continues times of day without a date past midnight, block by block of one column.
 
-    Midnight lies between two times of which the second is earlier, and within an hour of the first on the next day.
-    Other steps back lead from one recording to another, as in a table of several participants, and steps forth of more
-    than half a day to the day before. ``tick``: seconds of a unit; ``on_note(passes_midnight=True)`` is called where a
-    block has times of another day.
+    Midnight is assumed between two times if the second is earlier, and within an hour of the first on the next day.
+    Other backward steps start another recording, as in a table of several participants, and forward steps of more than
+    half a day go to the previous day. ``tick`` is the unit in seconds; ``on_note(passes_midnight=True)`` is called for
+    blocks with times of another day.
     """
 
     def __init__(self, tick: float, on_note: Callable[..., None] | None = None) -> None:
@@ -523,16 +530,16 @@ class DayCounter:
         self._last, self._day = np.nan, 0
 
     def unwrap(self, times: np.ndarray) -> np.ndarray:
-        """Units since the first midnight, (n,), of units since the last one; NaN stays."""
+        """Convert times (n,) since the last midnight to times since the first midnight; keeps NaN."""
         valid = np.isfinite(times)
         if not valid.any():
             return times
         steps = self.tick * np.diff(times[valid], prepend=self._last)
-        days = self._day + np.cumsum((steps < _PAUSE - _DAY).astype(int) - (steps > _DAY / 2))
+        days = self._day + np.cumsum((steps < _MAX_PAUSE - _DAY_SECONDS).astype(int) - (steps > _DAY_SECONDS / 2))
         days -= np.minimum(np.minimum.accumulate(days), 0)
         self._last, self._day = times[valid][-1], int(days[-1])
         if days.any() and self._on_note is not None:
             self._on_note(passes_midnight=True)
         out = times.copy()
-        out[valid] += days * (_DAY / self.tick)
+        out[valid] += days * (_DAY_SECONDS / self.tick)
         return out

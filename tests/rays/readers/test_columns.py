@@ -7,13 +7,13 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.readers.columns import (
     ColumnFinder,
     ColumnMap,
-    column_words,
-    is_validity,
-    looks_like_validity,
+    find_valid_values,
+    is_validity_column,
     mark_valid,
+    may_be_validity_column,
     parse_valid,
     require_valid_values,
-    valid_values,
+    split_column_name,
 )
 
 # ---- Columns by their usual names ----
@@ -25,24 +25,30 @@ def table(tmp_path):
     return ColumnFinder(tmp_path / "t.csv")
 
 
-def test_spaces_dots_and_cases_are_one(table):
-    assert table.vector("look", "gaze_dir") == ("Gaze Dir.X", "gaze_dir_y", "GAZE_DIR_Z")
+def test_spaces_dots_and_case_are_ignored(table):
+    assert table.require_vector("look", "gaze_dir") == ("Gaze Dir.X", "gaze_dir_y", "GAZE_DIR_Z")
     assert table.find_vector("hit") is None and table.find_vector("hit", axes="xy") == ("hit_x", "hit_y")
-    # Of columns whose names differ in case alone, the first.
+    # Of columns whose names only differ in case, the first is used.
     assert table.find("clock", "time") == "Time" and table.find("person") is None
 
 
-def test_what_is_missing_is_named_with_what_is_there(table):
+def test_missing_columns_are_reported_with_available_ones(table):
     with pytest.raises(NergError, match="t.csv.*Dir.X.*--map"):
-        table.vector("head", "hmd", axes="xyzw")
+        table.require_vector("head", "hmd", axes="xyzw")
 
 
-def test_names_as_they_are_come_first(tmp_path):
-    """What was found before names were taken apart is found still, though a name in words stands ahead of it."""
+def test_literal_names_have_precedence(tmp_path):
+    """Literal matches have precedence over matches by words, also if those are listed first."""
     (tmp_path / "t.csv").write_text("gazeDir_x,gazeDir_y,gazeDir_z,look_x,look_y,look_z,userId,id\n")
     table = ColumnFinder(tmp_path / "t.csv")
-    assert table.vector("gaze_dir", "look") == ("look_x", "look_y", "look_z") and table.find("user_id", "id") == "id"
-    assert table.vector("gaze_dir") == ("gazeDir_x", "gazeDir_y", "gazeDir_z") and table.find("user_id") == "userId"
+    assert (
+        table.require_vector("gaze_dir", "look") == ("look_x", "look_y", "look_z")
+        and table.find("user_id", "id") == "id"
+    )
+    assert (
+        table.require_vector("gaze_dir") == ("gazeDir_x", "gazeDir_y", "gazeDir_z")
+        and table.find("user_id") == "userId"
+    )
 
 
 @pytest.mark.parametrize(
@@ -59,7 +65,7 @@ def test_names_as_they_are_come_first(tmp_path):
     ],
 )
 def test_words(name, words):
-    assert column_words(name) == words
+    assert split_column_name(name) == words
 
 
 # ---- Column map ----
@@ -107,12 +113,12 @@ def test_round_trip(text):
         ("origin=x,y,z azel=-x,el", "'x' has two roles"),
     ],
 )
-def test_refuses(text, message):
+def test_invalid_maps_are_refused(text, message):
     with pytest.raises(NergError, match=message):
         ColumnMap.parse(text)
 
 
-# ---- Names of columns of validity, and what their values mean ----
+# ---- Column names of validity, and the meaning of their values ----
 
 
 @pytest.mark.parametrize(
@@ -121,7 +127,7 @@ def test_refuses(text, message):
     "combinedGazeValid eye_tracked gazeRay.isValid validity_flag IsEyeTrackingEnabledAndValid HasValidGaze".split(),
 )
 def test_names_of_validity(name):
-    assert is_validity(name) and looks_like_validity(name)
+    assert is_validity_column(name) and may_be_validity_column(name)
 
 
 @pytest.mark.parametrize(
@@ -129,13 +135,13 @@ def test_names_of_validity(name):
     "left_valid RightEyeValidity left_eye_data_validata_bit_mask calibration_is_valid "
     "blink eye_detected GazeAvailable gaze.lost left_tracked".split(),
 )
-def test_names_of_another_validity(name):
-    assert not is_validity(name) and looks_like_validity(name)
+def test_names_of_other_validities(name):
+    assert not is_validity_column(name) and may_be_validity_column(name)
 
 
 @pytest.mark.parametrize("name", "state trial_status time statusbar gaze_dir_x blinks_per_minute".split())
-def test_names_of_none(name):
-    assert not is_validity(name) and not looks_like_validity(name)
+def test_names_without_validity(name):
+    assert not is_validity_column(name) and not may_be_validity_column(name)
 
 
 @pytest.mark.parametrize(
@@ -149,23 +155,23 @@ def test_names_of_none(name):
         ("gaze_status", ["0", "1", "2"], ["2"]),
         ("GazeStatus", ["2.0", "0.0"], ["2.0"]),
         ("gaze_status", ["0", "1"], None),  # calibrating, or true
-        ("status", ["0", "1", "2"], None),  # of no device that is named
+        ("status", ["0", "1", "2"], None),  # of an unknown device
         ("isValid", ["1", "-1"], None),
         ("isValid", ["+1", " 0"], ["+1"]),
-        ("valid", ["0", "1", "4"], None),  # of some trackers 0 is the best
+        ("valid", ["0", "1", "4"], None),  # for some trackers 0 is best
         ("status", ["good", "valid"], None),
     ],
 )
-def test_what_values_mean(name, values, valid):
-    assert valid_values(name, values) == valid
+def test_meaning_of_values(name, values, valid):
+    assert find_valid_values(name, values) == valid
 
 
-def test_values_without_a_certain_meaning_are_named():
+def test_uncertain_values_are_reported():
     with pytest.raises(NergError, match="'status'.*3.*90.*4.*--valid"):
         require_valid_values("a.csv", "status", {"": 4, "3": 90})
 
 
-def test_values_that_are_named():
+def test_values_given_by_the_user():
     assert parse_valid(None) is None and parse_valid("none") == {}
     assert parse_valid('"gaze status=2" isValid=true,1') == {"gaze status": ("2",), "isValid": ("true", "1")}
     for text in ("", "status", "status=", "=2", '"status=2'):

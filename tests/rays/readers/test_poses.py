@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.readers import poses
-from nerg_mi.rays.readers.poses import FilledOrigins, PoseTrack, fill_values, is_aimed
+from nerg_mi.rays.readers.poses import FilledOriginFinder, PoseTrack, find_fill_values, is_aimed
 from nerg_mi.rays.readers.qualisys import iterate_gaze_vectors
 
 # ---- Files of gaze vectors ----
@@ -14,7 +14,7 @@ from nerg_mi.rays.readers.qualisys import iterate_gaze_vectors
 HEAD = "FREQUENCY\t10\nSTART_OFFSET\t1\n"
 
 
-def test_blocks_are_one_file(tmp_path, monkeypatch):
+def test_blocks_are_joined(tmp_path, monkeypatch):
     path = tmp_path / "a_g.tsv"
     path.write_text("\ufeff" + HEAD + "".join(f"{k}\t0\t1600\t1\t0\tNaN\n" for k in range(7)) + "\n\n")
     monkeypatch.setattr("nerg_mi.rays.readers.qualisys._BLOCK", 3)
@@ -25,7 +25,7 @@ def test_blocks_are_one_file(tmp_path, monkeypatch):
     assert np.isnan(vectors[:, 5]).all()
 
 
-def test_columns_in_any_order_and_named_after_what_looks(tmp_path):
+def test_columns_in_any_order_with_prefixes(tmp_path):
     names = ["Sample", "Time", *(f"ann {a} Vec" for a in "XYZ"), *(f"ann {a} Pos" for a in "XYZ")]
     (tmp_path / "a_g.tsv").write_text("\t".join(names) + "\n1\t0.5\t1\t2\t3\t4\t5\t6\n")
     (block,) = iterate_gaze_vectors(tmp_path / "a_g.tsv")
@@ -33,9 +33,9 @@ def test_columns_in_any_order_and_named_after_what_looks(tmp_path):
 
 
 @pytest.mark.parametrize("rate", ["FREQUENCY\tEXT\n", "FREQUENCY\t0\n", ""])
-def test_times_that_nothing_tells(tmp_path, rate):
+def test_unknown_times_are_refused(tmp_path, rate):
     (tmp_path / "a_g.tsv").write_text(rate + "1\t2\t3\t4\t5\t6\n")
-    with pytest.raises(NergError, match="tells no time"):
+    with pytest.raises(NergError, match="has no times"):
         list(iterate_gaze_vectors(tmp_path / "a_g.tsv"))
 
 
@@ -43,9 +43,9 @@ def test_bad_lines_count_as_samples(tmp_path):
     (tmp_path / "a_g.tsv").write_text(
         HEAD + "1\t2\t3\t4\t5\t6\n1\t2\t3\t4\t5\t6\t7\n1\t2\t3\t4\t5\tx\n1\t2\t3\t4\t5\t6\n"
     )
-    told = []
-    (block,) = iterate_gaze_vectors(tmp_path / "a_g.tsv", lambda line, why: told.append(line))
-    assert told == [4, 5] and np.allclose(block.times, [-1, -0.7]) and block.samples.tolist() == [0, 3]
+    reported = []
+    (block,) = iterate_gaze_vectors(tmp_path / "a_g.tsv", lambda line, why: reported.append(line))
+    assert reported == [4, 5] and np.allclose(block.times, [-1, -0.7]) and block.samples.tolist() == [0, 3]
     with pytest.raises(ValueError, match="4.*1.2.*7.*6"):
         list(iterate_gaze_vectors(tmp_path / "a_g.tsv"))
 
@@ -58,9 +58,9 @@ def test_between_samples():
     times = np.linspace(5, 6, 11)
     vectors = np.outer(times - 5, [0, 0, np.pi / 2])
     places = np.outer(times - 5, [2.0, 0, 0])
-    track = PoseTrack.of_samples(times, vectors, places)
+    track = PoseTrack.from_samples(times, vectors, places)
     t = np.array([5.0, 5.123, 6.0, 4.99, 6.01, np.nan])
-    turn, place, lost = track.at(t, 0.2)
+    turn, place, lost = track.interpolate(t, 0.2)
     assert lost.tolist() == [False, False, False, True, True, True]
     assert np.allclose(turn[:3], Rotation.from_rotvec(np.outer(t[:3] - 5, [0, 0, np.pi / 2])).as_matrix())
     assert np.allclose(place[:3, 0], 2 * (t[:3] - 5)) and not place[:3, 1:].any()
@@ -68,31 +68,37 @@ def test_between_samples():
 
 
 def test_gaps():
-    track = PoseTrack.of_samples(np.array([0.0, 0.05, 1.0]), np.zeros((3, 3)), np.zeros((3, 3)))
-    assert track.at(np.array([0.02, 0.14, 0.16, 0.5, 0.91]), 0.1)[2].tolist() == [False, False, True, True, False]
+    track = PoseTrack.from_samples(np.array([0.0, 0.05, 1.0]), np.zeros((3, 3)), np.zeros((3, 3)))
+    assert track.interpolate(np.array([0.02, 0.14, 0.16, 0.5, 0.91]), 0.1)[2].tolist() == [
+        False,
+        False,
+        True,
+        True,
+        False,
+    ]
 
 
 @pytest.mark.parametrize("far", [1.1e7, -1e200, np.inf])
-@pytest.mark.parametrize("of", ["times", "vectors", "places"])
-def test_samples_beyond_all_places_are_left_out(far, of):
-    samples = {"times": np.arange(4.0), "vectors": np.zeros((4, 3)), "places": np.zeros((4, 3))}
+@pytest.mark.parametrize("of", ["times", "rotation_vectors", "positions"])
+def test_samples_beyond_the_limit_are_dropped(far, of):
+    samples = {"times": np.arange(4.0), "rotation_vectors": np.zeros((4, 3)), "positions": np.zeros((4, 3))}
     samples[of][2] = far * (1e14 if of == "times" and abs(far) < 1e100 else 1)
     with np.errstate(over="raise"):
-        turn, place, lost = PoseTrack.of_samples(**samples).at(np.array([0.1, 2.0, 2.9]), 0.2)
+        turn, place, lost = PoseTrack.from_samples(**samples).interpolate(np.array([0.1, 2.0, 2.9]), 0.2)
     assert np.isfinite(turn).all() and np.isfinite(place).all() and lost.tolist() == [False, True, False]
 
 
-def test_samples_in_any_order_with_something_missing():
+def test_samples_in_any_order_with_missing_values():
     times = np.array([3.0, 1.0, np.nan, 1.0, 2.0, 4.0])
     places = np.arange(18.0).reshape(6, 3)
     places[5, 1] = np.nan
-    track = PoseTrack.of_samples(times, np.zeros((6, 3)), places)
-    assert track.times.tolist() == [1, 2, 3] and track.places[:, 0].tolist() == [3, 12, 0]
-    assert PoseTrack.of_samples(times[:1], np.zeros((1, 3)), places[:1]) is None
-    assert PoseTrack.of_samples(times[1:4], np.zeros((3, 3)), places[1:4]) is None
+    track = PoseTrack.from_samples(times, np.zeros((6, 3)), places)
+    assert track.times.tolist() == [1, 2, 3] and track.positions[:, 0].tolist() == [3, 12, 0]
+    assert PoseTrack.from_samples(times[:1], np.zeros((1, 3)), places[:1]) is None
+    assert PoseTrack.from_samples(times[1:4], np.zeros((3, 3)), places[1:4]) is None
 
 
-# ---- Heads' poses as rotations; what their angles mean is tried in tests/rays/readers/test_table.py ----
+# ---- Head poses as rotations; see test_table.py for the meaning of angles ----
 
 
 def test_quaternions_need_not_be_unit():
@@ -107,7 +113,7 @@ def test_quaternions_need_not_be_unit():
             poses.rotations_from_quaternions(bad, order)
 
 
-def test_matrices_lose_their_scale_and_others_are_none():
+def test_matrices_lose_their_scale_and_invalid_ones_are_nan():
     turn = Rotation.from_quat(np.random.default_rng(1).normal(size=(4, 4))).as_matrix()
     rows = np.concatenate([turn * 2, np.arange(12.0).reshape(4, 3, 1)], axis=2)
     rows[3, 0, 0] += 1
@@ -126,25 +132,25 @@ def test_mirrored_matrices_are_no_rotations(mirror):
 def test_axes_and_forward():
     for up, hand, forward in (("y", "left", "z"), ("-y", "right", "-z"), ("z", "right", "x")):
         assert poses.default_forward(up, hand) == forward
-    assert poses.axis("-y", "up").tolist() == [0, -1, 0]
+    assert poses.parse_axis("-y", "up").tolist() == [0, -1, 0]
     with pytest.raises(NergError, match='"w"'):
-        poses.axis("w", "up")
+        poses.parse_axis("w", "up")
 
 
 def test_azimuths_turn_right_in_every_frame():
-    """Against a way that knows of no cross product: the frame of rays, in which right is x where forward is y."""
-    from nerg_mi.rays.readers.base import HANDS, TrackingFrame
+    """Compare with a computation without cross products: in the frame of rays, right is x if forward is y."""
+    from nerg_mi.rays.readers.base import HANDEDNESSES, TrackingFrame
 
     a, e = np.radians([35.0, -12.0])
     for up in poses.AXES:
-        for hand in HANDS:
+        for hand in HANDEDNESSES:
             to_rays = TrackingFrame(up, hand).to_rays()[:3, :3]
             for forward in (f for f in poses.AXES if f[-1] != up[-1]):
-                found = poses.directions_from_azimuths(np.array([[35.0, -12.0]]), up, forward, hand)[0] @ to_rays.T
+                result = poses.directions_from_azimuths(np.array([[35.0, -12.0]]), up, forward, hand)[0] @ to_rays.T
                 ahead = to_rays @ poses.AXES[forward]
                 heading = np.arctan2(ahead[0], ahead[1])  # clockwise from y, seen from above
                 want = [np.cos(e) * np.sin(heading + a), np.cos(e) * np.cos(heading + a), np.sin(e)]
-                assert np.allclose(found, want), (up, hand, forward)
+                assert np.allclose(result, want), (up, hand, forward)
 
 
 # ---- Fill values in place of vectors ----
@@ -156,9 +162,9 @@ def test_azimuths_turn_right_in_every_frame():
 def test_fill_values(fill):
     v = np.array([[fill] * 3, [fill, fill, 0.5], [0.5] * 3, [np.inf] * 3, [fill, fill, fill + 1e-9]], float)
     nan = np.nan
-    assert np.array_equal(fill_values(v)[:4], [fill, nan, nan, nan], equal_nan=True)
-    assert np.isnan(fill_values(v)[4]) == (fill + 1e-9 != fill)
-    assert np.array_equal(fill_values(v[:3, :2]), [fill, fill, nan], equal_nan=True)
+    assert np.array_equal(find_fill_values(v)[:4], [fill, nan, nan, nan], equal_nan=True)
+    assert np.isnan(find_fill_values(v)[4]) == (fill + 1e-9 != fill)
+    assert np.array_equal(find_fill_values(v[:3, :2]), [fill, fill, nan], equal_nan=True)
 
 
 def test_rays_that_point_at_their_hits():
@@ -170,32 +176,32 @@ def places_of(*rows):
     return np.array(rows, float)
 
 
-def test_origins_of_a_person_who_is_elsewhere():
-    find = FilledOrigins(1.0).find
+def test_filled_origins_far_from_a_person():
+    find = FilledOriginFinder(1.0).find
     walk = places_of([1, 1.6, 2], [0, 0, 0], [1, 1.6, 2.1], [0, 0, 0], [1, 1.6, 2.2])
     assert find(walk, np.zeros(5, int)).tolist() == [False, True, False, True, False]
-    # In a later block without another place.
+    # In a later block without another position.
     assert find(np.zeros((4, 3)), np.zeros(4, int)).all()
 
 
-def test_origins_that_are_places():
+def test_origins_that_are_valid_positions():
     zeros = np.zeros((3, 3))
-    assert not FilledOrigins(1.0).find(zeros, np.zeros(3, int)).any()  # somebody sits there
+    assert not FilledOriginFinder(1.0).find(zeros, np.zeros(3, int)).any()  # somebody sits there
     track = places_of([0, 0, 0], [0, 0, 0], [0, 0, 0.01], [0, 0, 0.05], [2, 0, 2])
-    assert not FilledOrigins(1.0).find(track, np.zeros(5, int)).any()  # a track begins there
+    assert not FilledOriginFinder(1.0).find(track, np.zeros(5, int)).any()  # a track begins there
     once = places_of([0, 0, 0], [1, 1.6, 1], [1, 1.6, 1.1])
-    assert not FilledOrigins(1.0).find(once, np.zeros(3, int)).any()
+    assert not FilledOriginFinder(1.0).find(once, np.zeros(3, int)).any()
     # In another unit of length.
     near = places_of([0, 0, 0], [0, 0, 0], [50, 0, 0])
-    assert not FilledOrigins(0.001).find(near, np.zeros(3, int)).any()
-    assert FilledOrigins(1.0).find(near, np.zeros(3, int)).tolist() == [True, True, False]
+    assert not FilledOriginFinder(0.001).find(near, np.zeros(3, int)).any()
+    assert FilledOriginFinder(1.0).find(near, np.zeros(3, int)).tolist() == [True, True, False]
 
 
-def test_people_are_apart():
-    """One sits at the origin, another walks, and a third is met there only before anywhere else."""
-    origins = FilledOrigins(1.0)
+def test_persons_are_tested_separately():
+    """One person sits at the origin, another walks, and a third is at the origin only before other positions."""
+    origins = FilledOriginFinder(1.0)
     origin = places_of([0, 0, 0], [1, 1, 1.6], [0, 0, 0], [0, 0, 0], [2, 1, 1.6], [0, 0, 0], [0, 0, 0])
     person = np.array([0, 1, 0, 1, 1, 1, 2])
     assert np.flatnonzero(origins.find(origin, person)).tolist() == [3, 5]
     assert origins.find(places_of([3, 3, 3], [0, 0, 0]), np.array([2, 2])).tolist() == [False, True]
-    assert origins.undecided == {2: 1}
+    assert origins.undecided_counts == {2: 1}

@@ -1,4 +1,4 @@
-"""Tables through a column map."""
+"""Tests of tables with a column map."""
 
 import gzip
 
@@ -93,7 +93,7 @@ def test_eyes_in_the_heads_frame(tmp_path, heads):
         (dict(up="y"), (0, 30, 0), (0, 3**0.5 / 2, 0.5)),  # OpenXR: up
     ],
 )
-def test_angles_turn_as_in_their_world(tmp_path, frame, angles, want):
+def test_angles_turn_by_the_convention_of_the_frame(tmp_path, frame, angles, want):
     path = write(tmp_path / "t.csv", "x,y,z,a,b,c", [(0, 0, 0, *angles), (0, 0, 0, *angles)])
     assert np.allclose(read_table(path, "origin=x,y,z ypr=a,b,c", **frame).direction, want)
     assert np.allclose(read_table(path, "origin=x,y,z ypr=a,b", **frame).direction, want)
@@ -101,7 +101,7 @@ def test_angles_turn_as_in_their_world(tmp_path, frame, angles, want):
     assert np.allclose(read_table(path, "origin=x,y,z ypr=a,b,c", radians=True, **frame).direction, want)
 
 
-def test_what_is_no_pose_is_dropped_by_row(tmp_path):
+def test_rows_with_invalid_poses_are_dropped(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("x,y,z,a,b,c,d\n0,0,0,0,0,0,1\n0,0,0,0,0,0,0\n0,0,0,nan,0,0,1\n")
     assert dropped(read_table(path, "origin=x,y,z xyzw=a,b,c,d")) == {"direction is missing": [[3, 4]]}
@@ -137,7 +137,7 @@ def test_cohorts_persons_and_validity(tmp_path):
     [
         ("direction=a,b,c", {"person_from": "shoe"}, '"column" or "filename"'),
         ("ypr=a,b,c", {"forward": "ahead"}, 'forward is "ahead"'),
-        ("direction=a,b,c", {"units": "inch"}, 'units "inch"'),
+        ("direction=a,b,c", {"units": "inch"}, 'unit "inch"'),
         ("ypr=a,b,c", {"forward": "z"}, "both z"),
         ("azel=a,b", {"forward": "z"}, "both z"),
     ],
@@ -150,7 +150,7 @@ def test_refusals(tmp_path, columns, options, message):
         read("table", path)
 
 
-def test_parquet_is_read_as_csv_is(tmp_path, heads):
+def test_parquet_and_csv_are_equal(tmp_path, heads):
     pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install pyarrow)")
     import pyarrow.parquet as pq
 
@@ -168,7 +168,7 @@ def test_parquet_is_read_as_csv_is(tmp_path, heads):
     ]
 
 
-# What is meant: 30 degrees to the right of forward and 20 up, in the frame of rays (z up, x right, y forward).
+# Expected: 30 degrees to the right of forward and 20 up, in the frame of rays (z up, x right, y forward).
 AZIMUTH, ELEVATION = 30.0, 20.0
 MEANT = np.array([0.46984631, 0.81379768, 0.34202014])  # cos 20 sin 30, cos 20 cos 30, sin 20
 
@@ -192,8 +192,8 @@ def test_angles_are_directions(tmp_path, frame, azel, yawpitch, radians):
         assert np.allclose(rays.direction, [MEANT]) and rays.metadata["degrees"] is not radians
 
 
-def test_angles_beside_a_pose_are_in_the_head(tmp_path):
-    """The head looks to the right (x); from there 30 degrees further to the right, and 20 up."""
+def test_angles_with_a_pose_are_in_the_head_frame(tmp_path):
+    """The head looks to the right (x); the gaze is 30 degrees further to the right, and 20 up."""
     head = Rotation.from_euler("Y", 90, degrees=True).as_quat()  # of Unity: to the right
     path = tmp_path / "a.csv"
     path.write_text("x,y,z,qx,qy,qz,qw,az [deg],el [deg]\n" + ",".join(map(str, [1, 2, 3, *head, 30, 20])) + "\n")
@@ -203,8 +203,8 @@ def test_angles_beside_a_pose_are_in_the_head(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["vector", "quaternion"])
-def test_heads_beside_gaze_in_the_world_and_both_eyes(tmp_path, heads, kind):
-    """A direction beside ``head`` stays as it is: the head is there for the checks."""
+def test_heads_and_eyes_with_gaze_in_the_world(tmp_path, heads, kind):
+    """A direction together with ``head`` is not changed: the head is only used for the checks."""
     origin, turn = heads
     gaze, aside = np.tile([0.0, 3, 4], (20, 1)), turn.apply([3.1, 0, 0])
     head = turn.apply([0, 0, 1]) if kind == "vector" else turn.as_quat()
@@ -223,7 +223,7 @@ def test_heads_beside_gaze_in_the_world_and_both_eyes(tmp_path, heads, kind):
 MATRIX = "matrix=" + ",".join("abcdefghijkl")
 
 
-def test_mirrored_matrices_are_dropped_and_named(tmp_path, heads):
+def test_mirrored_matrices_are_dropped(tmp_path, heads):
     origin, turn = heads
     m = np.concatenate([turn.as_matrix(), origin[:, :, None]], axis=2)
     m[4, :, 2] *= -1
@@ -233,7 +233,7 @@ def test_mirrored_matrices_are_dropped_and_named(tmp_path, heads):
 
 
 def test_fill_values_in_the_heads_frame(tmp_path, heads):
-    """They are no longer such once the head turns them."""
+    """Fill values are detected before the rotation of the head."""
     origin, turn = heads
     gaze = np.tile([0.0, 0, 1], (20, 1))
     gaze[3:5], gaze[7] = -1, 0
@@ -264,7 +264,7 @@ def test_columns_of_validity_of_a_map(tmp_path):
     path.write_text("x,y,z,a,b,c,isValid\n" + "".join(f"{k},0,1.6,1,0,0,{k % 2}\n" for k in range(10)))
     columns = "origin=x,y,z direction=a,b,c"
     rays = read_table(path, columns)
-    assert len(rays) == 10 and "'isValid' may say by name which rows are valid" in rays.metadata["complaints"][0]
+    assert len(rays) == 10 and "'isValid' may mark valid rows by their names" in rays.metadata["complaints"][0]
     rays = read_table(path, columns, valid="isValid=1")
     assert len(rays) == 5 and "complaints" not in rays.metadata and "unused_columns" not in rays.metadata
     with pytest.raises(NergError, match="has no column other"):

@@ -13,11 +13,11 @@ def read(path, numbers, texts=()):
 
 
 def choose_reader(monkeypatch, fast):
-    """pyarrow's, or that which does without it."""
+    """With pyarrow, or without it."""
     if fast:
         pytest.importorskip("pyarrow")
     else:
-        monkeypatch.setattr(ray_tables, "_fast_reader", lambda layout: None)
+        monkeypatch.setattr(ray_tables, "_make_arrow_converter", lambda layout: None)
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
@@ -36,7 +36,7 @@ def test_columns_gaps_and_lines(tmp_path, separator):
 
 
 def test_blocks_keep_line_numbers(tmp_path, monkeypatch):
-    monkeypatch.setattr(ray_tables, "BLOCK", 4)
+    monkeypatch.setattr(ray_tables, "BLOCK_ROWS", 4)
     path = tmp_path / "t.csv"
     path.write_text("a,b\n" + "".join(f"{i},{-i}\n" for i in range(10)))
     blocks = read(path, ["a"])
@@ -88,22 +88,22 @@ BAD = ["1,x\n", "1\n", "nonsense\n", '"1,2\n', "1,2e\n", "\x00\n", "1,1 2\n"]
 
 @pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize("fast", [True, False])
-def test_bad_lines_are_told_and_left_out(tmp_path, monkeypatch, bad, fast):
+def test_bad_lines_are_reported_and_skipped(tmp_path, monkeypatch, bad, fast):
     choose_reader(monkeypatch, fast)
     path, bad_lines = tmp_path / "t.csv", []
     path.write_text("a,b\n" + "".join(f"{i},{i}\n" for i in range(5)) + bad + "7,7\n")
-    (block,) = iterate_table(path, ["a", "b"], on_bad=lambda line, why: bad_lines.append((line, why)))
+    (block,) = iterate_table(path, ["a", "b"], on_bad_line=lambda line, why: bad_lines.append((line, why)))
     assert block.numbers[:, 0].tolist() == [0, 1, 2, 3, 4, 7] and block.lines.tolist() == [2, 3, 4, 5, 6, 8]
     assert [line for line, _ in bad_lines] == [7]
     with pytest.raises(NergError, match="t.csv, line 7[:,].*--skip-bad-lines"):
         read(path, ["a", "b"])
 
 
-def test_a_bad_line_among_texts(tmp_path):
-    """Texts and numbers of the other lines stay beside each other."""
+def test_bad_line_in_text_columns(tmp_path):
+    """Texts and numbers of the other lines remain aligned."""
     path, bad_lines = tmp_path / "t.csv", []
     path.write_text("who,a\nann,1\nbo\ncy,3\n")
-    (block,) = iterate_table(path, ["a"], ["who"], on_bad=lambda line, why: bad_lines.append(line))
+    (block,) = iterate_table(path, ["a"], ["who"], on_bad_line=lambda line, why: bad_lines.append(line))
     assert block.texts[:, 0].tolist() == ["ann", "cy"] and block.numbers[:, 0].tolist() == [1, 3] and bad_lines == [3]
     path.write_text("a,who\n1,ann\n2\n3,cy\n")
     with pytest.raises(NergError, match="line 3: 1 cells"):
@@ -114,15 +114,15 @@ def test_a_bad_line_among_texts(tmp_path):
     "text, message",
     [
         ("", "column b; its columns"),
-        ("," * (ray_tables.COLUMNS + 1) + "\n", "columns that are read"),
-        ("a" * 200_000 + ",b\n1,2\n", "no header"),
+        ("," * (ray_tables.MAX_COLUMNS + 1) + "\n", "more columns than"),
+        ("a" * 200_000 + ",b\n1,2\n", "not a header"),
         ("a,b\n1,2\n3,four\n", "3.*'b'.*'four'"),
         ("a,b\n1,2\n3\n", "line 3: 1 cells"),
         ("a,q\n1,2\n", "column b; its columns"),
         ("b,y,b\n1,2,3\n", "several columns called 'b'"),
     ],
 )
-def test_damaged_tables_are_one_sentence(tmp_path, text, message):
+def test_damaged_tables_are_refused(tmp_path, text, message):
     (tmp_path / "t.csv").write_text(text)
     with pytest.raises(NergError, match=message):
         read(tmp_path / "t.csv", ["b"])
@@ -142,10 +142,10 @@ def test_damaged_parquet_tables(tmp_path):
                 assert "t.parquet" in str(error)
     long = pa.table({"a": [1.0, 2.0], "who": ["ann", "w" * 1001]})
     for table, numbers, texts, message in (
-        (long, ["who"], [], "'who'.* holds no numbers"),
+        (long, ["who"], [], "'who'.* does not contain numbers"),
         (long, ["a"], ["who"], "'who'.*1,000"),
         (pa.Table.from_arrays([pa.array([1.0]), pa.array([2.0])], ["a", "a"]), ["a"], [], "several columns called 'a'"),
-        (pa.table({"a": np.zeros(20_000_000, np.int8)}), ["a"], [], "20,000,000 rows, which its .* do not warrant"),
+        (pa.table({"a": np.zeros(20_000_000, np.int8)}), ["a"], [], "20,000,000 rows, too many for its size"),
     ):
         pq.write_table(table, path)
         with pytest.raises(NergError, match=message):
@@ -153,18 +153,20 @@ def test_damaged_parquet_tables(tmp_path):
 
 
 @pytest.mark.parametrize("fast", [True, False])
-def test_one_long_cell_does_not_make_all_of_them_long(tmp_path, monkeypatch, fast):
-    """An array of text gives each cell the space of the longest."""
+def test_one_long_cell_does_not_exhaust_memory(tmp_path, monkeypatch, fast):
+    """In an array of text, each cell takes the space of the longest one."""
     choose_reader(monkeypatch, fast)
     path, rows = tmp_path / "t.csv", 2000
-    long = "w" * (ray_tables._TEXT_BLOCK // rows)
+    long = "w" * (ray_tables._MAX_TEXT_BLOCK // rows)
     path.write_text("a,who\n" + "1,ann\n" * rows + f"2,{long}\n" + "3,bo\n")
     with pytest.raises(NergError, match="2002.*'who'.*1,000"):
         read(path, ["a"], ["who"])
-    told = []
-    (block,) = iterate_table(path, ["a"], ["who"], on_bad=lambda line, why: told.append(line))
-    assert told == [2002] and len(block.lines) == 2001 and block.texts[-1, 0] == "bo" and block.texts.nbytes < 1 << 20
-    # Numbers of such lines are read as ever.
+    reported = []
+    (block,) = iterate_table(path, ["a"], ["who"], on_bad_line=lambda line, why: reported.append(line))
+    assert (
+        reported == [2002] and len(block.lines) == 2001 and block.texts[-1, 0] == "bo" and block.texts.nbytes < 1 << 20
+    )
+    # Numbers of such lines are read as usual.
     assert read(path, ["a"])[0].numbers[-2:, 0].tolist() == [2, 3]
 
 
@@ -213,7 +215,7 @@ def test_one_separator_may_end_a_row(tmp_path, monkeypatch, text, fast):
 
 
 @pytest.mark.parametrize("fast", [True, False])
-def test_decimal_commas_where_commas_do_not_separate(tmp_path, monkeypatch, fast):
+def test_decimal_commas_with_other_separators(tmp_path, monkeypatch, fast):
     choose_reader(monkeypatch, fast)
     path = tmp_path / "t.csv"
     for text in (
@@ -276,9 +278,9 @@ def test_times_as_text(tmp_path, monkeypatch, cells, seconds, fast):
         ["12:00:00:500"],
     ],
 )
-def test_times_that_nothing_orders_are_refused(tmp_path, cells):
+def test_mixed_notations_of_time_are_refused(tmp_path, cells):
     (tmp_path / "t.csv").write_text("a,t\n" + "".join(f"1,{cell}\n" for cell in cells))
-    with pytest.raises(NergError, match="column 't'.*is (no time|not a number)"):
+    with pytest.raises(NergError, match="column 't'.*is (not a time|not a number)"):
         list(iterate_table(tmp_path / "t.csv", ["t", "a"], clocks={"t": 1.0}))
 
 
@@ -298,9 +300,9 @@ def test_times_that_nothing_orders_are_refused(tmp_path, cells):
     ],
     ids=["two nights", "unsorted", "two recordings over midnight", "two recordings", "dated"],
 )
-def test_times_of_day_go_on_past_midnight(tmp_path, monkeypatch, cells, hours, block, fast):
+def test_times_of_day_continue_past_midnight(tmp_path, monkeypatch, cells, hours, block, fast):
     choose_reader(monkeypatch, fast)
-    monkeypatch.setattr(ray_tables, "BLOCK", block)
+    monkeypatch.setattr(ray_tables, "BLOCK_ROWS", block)
     (tmp_path / "t.csv").write_text("a,t\n" + "".join(f"1,{cell}\n" for cell in cells))
     notes = {}
     blocks = iterate_table(tmp_path / "t.csv", ["a", "t"], clocks={"t": 1e-3}, on_note=notes.update)
@@ -316,7 +318,7 @@ def test_times_of_parquet(tmp_path):
         pq.write_table(pa.table({"t": column}), tmp_path / "t.parquet")
         (block,) = iterate_table(tmp_path / "t.parquet", ["t"], clocks={"t": 0.5})
         assert np.allclose(block.numbers[:, 0], [2 * 1714564800, 2 * 1714564800 + 1])
-        with pytest.raises(NergError, match="'t' .* holds no numbers"):
+        with pytest.raises(NergError, match="'t' .* does not contain numbers"):
             read(tmp_path / "t.parquet", ["t"])
     pq.write_table(pa.table({"t": ["23:59:59", None, "00:00:01"]}), tmp_path / "t.parquet")
     (block,) = iterate_table(tmp_path / "t.parquet", ["t"], clocks={"t": 0.5})
