@@ -1,4 +1,4 @@
-"""Glasses with a scene camera: gaze in its frames, whose poses in the place are known from elsewhere."""
+"""Glasses with a scene camera: gaze in its frame, with camera poses from a reconstruction of the environment."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.photos.cameras import Intrinsics, undistort_with_mask
-from nerg_mi.photos.colmap import find_pose_source, estimate_up, read_named_poses
-from nerg_mi.ranges import LENGTHS, RATES, ValidatedDataclass, Range
+from nerg_mi.photos.colmap import estimate_up, find_pose_source, read_named_poses
+from nerg_mi.ranges import LENGTHS, RATES, Range, ValidatedDataclass
 
 from . import poses
 from .base import RaysBuilder, TrackingFrame, option
 from .poses import PoseTrack
 from .tables import iterate_table
 
-# ---- Which images of a model are frames of a recording's video, and when they were taken, by their names ----
+# ---- Frames of a recording's video among the images of a model, and their times, by file names ----
 
 _FIELDS = {
     "{frame0}": r"(?P<frame0>\d{1,12})",
@@ -31,22 +31,22 @@ _FIELDS = {
     "{s}": r"(?P<s>\d{1,12}(?:\.\d{1,12})?)",
     "{ns}": r"(?P<ns>\d{1,20})",
 }
-_HOW = (
-    "write the names of the video's frames with {frame0} or {frame1} (their number in the video, counted from 0 or 1), "
-    "{s} (seconds from its first frame on) or {ns} (the recording's time stamps), * for what varies besides and "
+_FRAMES_HELP = (
+    "write the names of the video's frames with {frame0} or {frame1} (frame number in the video, from 0 or 1), "
+    "{s} (seconds since its first frame) or {ns} (the recording's time stamps), * for other varying parts and "
     '{recording} for the recording\'s name: "frame_{frame1}"'
 )
 
 
 @dataclass(frozen=True)
 class FrameNames:
-    """``pattern``: the end of a frame's path without its suffix, with one of the fields that `_HOW` names."""
+    """``pattern``: the end of a frame's path without its suffix, with one of the fields in `_FRAMES_HELP`."""
 
     pattern: str
 
     def __post_init__(self) -> None:
         if sum(self.pattern.count(field) for field in _FIELDS) != 1:
-            raise NergError(f'--frames is "{sanitize(self.pattern, 80)}"; {_HOW}')
+            raise NergError(f'--frames is "{sanitize(self.pattern, 80)}"; {_FRAMES_HELP}')
 
     @classmethod
     def parse(cls, text: str) -> FrameNames:
@@ -56,43 +56,58 @@ class FrameNames:
         return self.pattern
 
     @property
-    def of_recording(self) -> bool:
-        """Whether names tell which recording a frame is of."""
+    def has_recording(self) -> bool:
+        """Whether names contain the recording of a frame."""
         return "{recording}" in self.pattern
 
     @property
-    def needs_frames(self) -> bool:
-        """Whether names are turned into times by those of the video's frames."""
+    def needs_frame_times(self) -> bool:
+        """Whether times follow from the times of the video's frames."""
         return "{ns}" not in self.pattern
 
-    def times(
+    def compute_times(
         self, names: Sequence[str], recording: str, frames: np.ndarray | None, fps: float | None, start: float
     ) -> np.ndarray:
-        """Seconds (N,) on the recording's clock at which images of these ``names`` were taken, NaN for those that are
-        no frames of the ``recording``.
+        """Times (N,) in seconds on the recording's clock of images, NaN for images that are not frames of its video.
 
-        ``frames``: seconds of the video's frames, (F,), or None where they are not there. ``fps``: numbers count frames
-        of this steady rate, into which FFmpeg's filter of that name has turned the video. ``start``: what {ns} is
-        counted from, in nanoseconds. Raises `NergError` where no name fits, or one counts a frame that there is not.
+        Parameters
+        ----------
+        names
+            Names of the images.
+        recording
+            Name of the recording.
+        frames
+            Times of the video's frames (F,) in seconds, or None if unknown.
+        fps
+            Constant rate to which the video was resampled with FFmpeg's filter ``fps``, and to which numbers refer.
+        start
+            Origin of {ns}, in nanoseconds.
+
+        Raises
+        ------
+        NergError
+            If no name matches, or a frame number does not exist.
         """
         parts = re.split(r"(\{frame0\}|\{frame1\}|\{s\}|\{ns\}|\{recording\}|\*)", self.pattern)
-        known = {**_FIELDS, "{recording}": re.escape(recording), "*": "[^/]*"}
-        pattern = re.compile(r"(?:.*/)?" + "".join(known.get(p, re.escape(p)) for p in parts) + r"(?:\.[A-Za-z0-9]+)?")
+        patterns = {**_FIELDS, "{recording}": re.escape(recording), "*": "[^/]*"}
+        pattern = re.compile(
+            r"(?:.*/)?" + "".join(patterns.get(p, re.escape(p)) for p in parts) + r"(?:\.[A-Za-z0-9]+)?"
+        )
         out = np.full(len(names), np.nan)
         for i, name in enumerate(names):
-            found = pattern.fullmatch(name[:4096])
-            if found is not None:
-                ((kind, text),) = found.groupdict().items()
-                out[i] = self._time(kind, text, name, frames, fps, start)
+            match = pattern.fullmatch(name[:4096])
+            if match is not None:
+                ((kind, text),) = match.groupdict().items()
+                out[i] = self._compute_time(kind, text, name, frames, fps, start)
         if not np.isfinite(out).any():
-            shown = ", ".join(sanitize(n, 60) for n in names[:3])
+            names_text = ", ".join(sanitize(n, 60) for n in names[:3])
             raise NergError(
                 f'no image of the model is called "{sanitize(self.pattern, 80)}" for the recording '
-                f'"{sanitize(recording, 60)}" (its first are {shown}); correct --frames: {_HOW}'
+                f'"{sanitize(recording, 60)}" (its first are {names_text}); correct --frames: {_FRAMES_HELP}'
             )
         return out
 
-    def _time(
+    def _compute_time(
         self, kind: str, text: str, name: str, frames: np.ndarray | None, fps: float | None, start: float
     ) -> float:
         if kind == "ns":
@@ -102,44 +117,48 @@ class FrameNames:
         index = int(text) - (kind == "frame1")
         if frames is None and fps is None:
             raise NergError(
-                "the recording has no times of its video's frames, which its numbers count; put the file that has them "
-                "beside the gaze (Tobii: the scene video, Neon: world_timestamps.csv), or give a steady rate with --fps"
+                "the times of the video's frames are unknown, but the names contain frame numbers; put the file with "
+                "them next to the gaze (Tobii: the scene video, Neon: world_timestamps.csv), or set a constant rate "
+                "with --fps"
             )
         if frames is None and fps is not None and index >= 0:
             return index / fps
-        position = index if fps is None or frames is None else _resampled(index, frames, fps)
+        position = index if fps is None or frames is None else _find_resampled_frame(index, frames, fps)
         if frames is None or not 0 <= position < len(frames):
-            of = "" if frames is None else f", which has {len(frames)}"
-            of += "" if fps is None else f" ({fps:g} a second were counted)"
+            detail = "" if frames is None else f", which has {len(frames)}"
+            detail += "" if fps is None else f" (at {fps:g} per second)"
             raise NergError(
-                f'"{sanitize(name, 80)}" is frame {index} of the video, counted from 0{of}; check --frames, and --fps '
-                "where not every frame was taken"
+                f'"{sanitize(name, 80)}" is frame {index} of the video, counted from 0{detail}; check --frames, and '
+                "--fps if not every frame was extracted"
             )
         return float(frames[position])
 
 
-def _resampled(index: int, frames: np.ndarray, fps: float) -> int:
-    """Which of the ``frames`` (F,) FFmpeg's filter fps shows as its frame ``index``; F where there is none.
+def _find_resampled_frame(index: int, frames: np.ndarray, fps: float) -> int:
+    """Index of the frame among ``frames`` (F,) that FFmpeg's filter fps shows as its frame ``index``; F if none.
 
-    Each frame goes to the nearest tick of the steady rate, and a tick shows the last frame that came to it or before:
-    at five a second of 25, the third, eighth, thirteenth frame, 0.08 s later than a fifth of a second times the index.
+    Each frame is assigned to the nearest tick of the constant rate, and a tick shows the last frame assigned to it or
+    to a previous tick: at 5 of 25 frames per second, the third, eighth, thirteenth frame, 0.08 s later than index / 5.
     """
     ticks = np.floor((frames - frames[0]) * fps + 0.5)
-    # The last frame lasts as long as the others do.
+    # The duration of the last frame is assumed to be the median.
     lasting = np.median(np.diff(frames)) if len(frames) > 1 else 0.0
     if index > np.floor((frames[-1] - frames[0] + lasting) * fps + 0.5):
         return len(frames)
     return int(np.searchsorted(ticks, index, side="right")) - 1
 
 
-# ---- From the coordinates of a model's file to those in which a place was trained from it ----
+# ---- From the coordinates of a model's file to those of a scene that was trained from it ----
 
 
 @dataclass(frozen=True, eq=False)
-class PlaceFrame:
-    """``scale``: length in the place of one unit of the file; ``rotation`` (3, 3), ``shift`` (3,) in the place's units:
-    place = scale rotation file + shift. ``up``: (3,) in the place, where its training knew it. ``sha256``: of the model
-    that it was trained on."""
+class SceneCoordinates:
+    """Coordinates of a trained scene: x_scene = scale * rotation @ x_file + shift.
+
+    ``scale`` is the length of a unit of the file in the scene, ``rotation`` is (3, 3), ``shift`` (3,) in units of the
+    scene. ``up`` is the up direction (3,) in the scene, if known from training; ``sha256`` is that of the model that
+    the scene was trained on.
+    """
 
     scale: float
     rotation: np.ndarray
@@ -148,59 +167,75 @@ class PlaceFrame:
     sha256: str | None = None
 
     @classmethod
-    def scaled(cls, scale: float) -> PlaceFrame:
-        """The file's own coordinates, in another unit. Raises `NergError` for what is no scale."""
+    def from_scale(cls, scale: float) -> SceneCoordinates:
+        """Coordinates of the file in another unit. Raises `NergError` for an invalid scale."""
         if not (np.isfinite(scale) and 1e-9 <= scale <= 1e9):
-            raise NergError(f"the length of the model's unit in metres is a positive number, got {scale} (--scale)")
+            raise NergError(f"the length of the model's unit in metres must be positive, got {scale} (--scale)")
         return cls(scale, np.eye(3), np.zeros(3))
 
     @classmethod
-    def of_checkpoint(cls, path: Path) -> PlaceFrame:
-        """As the provenance of a radiance checkpoint tells. Raises `NergError` for one that does not."""
-        about = read_checkpoint(path, "radiance")[1].get("provenance")
-        about = about if isinstance(about, dict) else {}
+    def from_checkpoint(cls, path: Path) -> SceneCoordinates:
+        """Read the coordinates from the provenance of a radiance checkpoint. Raises `NergError` if they are missing."""
+        provenance = read_checkpoint(path, "radiance")[1].get("provenance")
+        provenance = provenance if isinstance(provenance, dict) else {}
         try:
-            to_file = np.array(about["to_file"], np.float64).reshape(4, 4)
-            up = None if about.get("up") is None else np.array(about["up"], np.float64).reshape(3)
+            to_file = np.array(provenance["to_file"], np.float64).reshape(4, 4)
+            up = None if provenance.get("up") is None else np.array(provenance["up"], np.float64).reshape(3)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise NergError(
-                f'the place "{path}" does not say in which coordinates it was trained; give --scale in place of '
-                "--place if it was trained in those of its file, or train it anew"
+                f'the checkpoint "{path}" does not contain the coordinates of its training; use --scale instead of '
+                "--place if it was trained in those of its file, or train it again"
             ) from error
         scale = float(np.cbrt(np.linalg.det(to_file[:3, :3]))) if np.isfinite(to_file).all() else 0.0
         rotation = to_file[:3, :3].T / scale if scale > 1e-9 else np.zeros((3, 3))
         if not np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3:
-            raise NergError(f'the coordinates that the place "{path}" names are no similarity; train it anew')
-        sha256 = about.get("sha256")
+            raise NergError(f'the coordinates in the checkpoint "{path}" are not a similarity; train it again')
+        sha256 = provenance.get("sha256")
         up = up if up is not None and np.isfinite(up).all() and np.linalg.norm(up) > 0.5 else None
         return cls(
             1 / scale, rotation, -rotation @ to_file[:3, 3] / scale, up, sha256 if isinstance(sha256, str) else None
         )
 
-    def points(self, points: np.ndarray) -> np.ndarray:
-        """Points (N, 3) of the file in the place."""
+    def transform_points(self, points: np.ndarray) -> np.ndarray:
+        """Transform points (N, 3) of the file to the scene."""
         return self.scale * points @ self.rotation.T + self.shift
 
 
-# ---- Where a pixel, or a pair of angles, of a scene camera looks, in OpenCV's frame: x right, y down, z forward ----
+# ---- Directions of pixels and angles of a scene camera, in OpenCV's frame: x right, y down, z forward ----
 
-_COEFFICIENTS = 8  # k1 k2 p1 p2 k3 k4 k5 k6
-_LARGEST = 1e6  # of a calibration's numbers
+_NUM_COEFFICIENTS = 8  # k1 k2 p1 p2 k3 k4 k5 k6
+_MAX_CALIBRATION_VALUE = 1e6
 
 
 @dataclass(frozen=True)
 class SceneCamera:
-    """A calibrated camera: pixels are OpenCV's, the centre of the first one being (0, 0)."""
+    """A calibrated camera. Pixels are those of OpenCV: the centre of the first one is (0, 0)."""
 
     lens: Intrinsics
 
     @classmethod
-    def of_opencv(
+    def from_opencv(
         cls, matrix: object, coefficients: object, size: Sequence[float] | None = None, where: str = "the calibration"
     ) -> SceneCamera:
-        """Of a camera matrix (3, 3) and at most eight coefficients, k1 k2 p1 p2 k3 k4 k5 k6 (those of thin prisms and
-        tilted sensors, which follow, must be zero). ``size``: width and height in pixels; without it any pixel is
-        taken. Raises `NergError`, naming ``where`` they stand, for what is no calibration."""
+        """Make a camera from OpenCV's calibration.
+
+        Parameters
+        ----------
+        matrix
+            Camera matrix (3, 3).
+        coefficients
+            At most eight distortion coefficients, k1 k2 p1 p2 k3 k4 k5 k6. Further ones, those of thin prisms and
+            tilted sensors, must be zero.
+        size
+            Width and height in pixels. Default: any pixel is inside.
+        where
+            Source of the calibration, for messages.
+
+        Raises
+        ------
+        NergError
+            For an invalid calibration.
+        """
         try:
             k = np.asarray(matrix, np.float64).reshape(3, 3)
             d = np.zeros(0) if coefficients is None else np.asarray(coefficients, np.float64).ravel()
@@ -208,27 +243,31 @@ class SceneCamera:
         except (TypeError, ValueError, OverflowError) as error:
             raise NergError(f"{where} needs a camera matrix of 3 x 3 numbers and distortion coefficients") from error
         numbers = np.concatenate([k.ravel(), d, [w, h]])
-        if not (np.isfinite(numbers).all() and np.abs(numbers).max() <= _LARGEST and min(k[0, 0], k[1, 1]) > 1e-3):
-            raise NergError(f"{where} has no positive focal lengths, or numbers that no camera has; export it again")
-        if k[0, 1] != 0 or d[_COEFFICIENTS:].any():
+        if not (
+            np.isfinite(numbers).all()
+            and np.abs(numbers).max() <= _MAX_CALIBRATION_VALUE
+            and min(k[0, 0], k[1, 1]) > 1e-3
+        ):
+            raise NergError(f"{where} has no positive focal lengths, or implausible numbers; export it again")
+        if k[0, 1] != 0 or d[_NUM_COEFFICIENTS:].any():
             raise NergError(
                 f"{where} has a skew, or coefficients beyond OpenCV's rational model of eight, which are not supported"
             )
-        k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(d[:_COEFFICIENTS], (0, max(0, _COEFFICIENTS - len(d)))).tolist()
+        k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(d[:_NUM_COEFFICIENTS], (0, max(0, _NUM_COEFFICIENTS - len(d)))).tolist()
         fx, fy, cx, cy = (float(x) for x in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
         return cls(Intrinsics(int(w), int(h), fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6))
 
-    def directions(self, pixels: np.ndarray) -> np.ndarray:
-        """Unit directions (n, 3) of ``pixels`` (n, 2); NaN beyond the picture, and where the lens shows nothing."""
+    def compute_directions(self, pixels: np.ndarray) -> np.ndarray:
+        """Unit directions (n, 3) of ``pixels`` (n, 2); NaN outside the image or the field of view of the lens."""
         lens = self.lens
-        good = np.isfinite(pixels).all(axis=1)
+        is_inside = np.isfinite(pixels).all(axis=1)
         if lens.width and lens.height:
             with np.errstate(invalid="ignore"):
-                good &= ((pixels >= -0.5) & (pixels <= [lens.width - 0.5, lens.height - 0.5])).all(axis=1)
+                is_inside &= ((pixels >= -0.5) & (pixels <= [lens.width - 0.5, lens.height - 0.5])).all(axis=1)
         out = np.full((len(pixels), 3), np.nan)
-        xy, shown = undistort_with_mask((pixels[good] - [lens.cx, lens.cy]) / [lens.fx, lens.fy], lens)
+        xy, is_visible = undistort_with_mask((pixels[is_inside] - [lens.cx, lens.cy]) / [lens.fx, lens.fy], lens)
         d = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-        out[good] = np.where(shown[:, None], d / np.linalg.norm(d, axis=1, keepdims=True), np.nan)
+        out[is_inside] = np.where(is_visible[:, None], d / np.linalg.norm(d, axis=1, keepdims=True), np.nan)
         return out
 
 
@@ -241,67 +280,72 @@ def directions_from_angles(angles: np.ndarray) -> np.ndarray:
 
 
 def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Degrees (n,) between vectors (n, 3) of any length; exact for small angles too. NaN where one is not finite."""
+    """Angles (n,) in degrees between vectors (n, 3) of any length, also accurate for small angles. NaN for NaN."""
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1)))
 
 
 # ---- Timed poses ----
 #
-# Poses of a scene camera with their times, as tag-aligner and Pupil Cloud's Reference Image Mapper write them.
+# Poses of a scene camera with their times, from tag-aligner or Pupil Cloud's Reference Image Mapper.
 #
-# Both are of each interval of the recording the camera-to-world pose, in OpenCV's axes and in the unit of a tag, or of
-# no known unit. Seconds count from the recording's start. ``poses.p``, which the same tools keep, runs code when it is
-# opened, and is never read.
+# Both contain the camera-to-world pose of each interval of the recording, in OpenCV's axes, and in the unit of a tag or
+# in an unknown unit. Times are seconds from the recording's start. ``poses.p`` of the same tools is a pickle, which can
+# execute code, and is never read.
 
-_PLACE = tuple(f"translation_{a}" for a in "xyz")
-_QUATERNION = tuple(f"rotation_{a}" for a in "xyzw")
-_VECTOR = _QUATERNION[:3]
+_POSITION_KEYS = tuple(f"translation_{a}" for a in "xyz")
+_QUATERNION_KEYS = tuple(f"rotation_{a}" for a in "xyzw")
+_ROTATION_VECTOR_KEYS = _QUATERNION_KEYS[:3]
 
 
-def is_timed(path: Path) -> bool:
-    """Whether the name is that of poses with times, and not of a model's."""
+def is_timed_pose_file(path: Path) -> bool:
+    """Whether the name is that of a file of timed poses, instead of a model."""
     return path.suffix.lower() in (".csv", ".p") or path.name == "camera_pose.json"
 
 
-def read_timed_poses(path: Path, on_bad: BadLineCallback | None = None) -> tuple[PoseTrack, int]:
-    """The track in ``aligned_poses.csv`` or ``camera_pose.json``, and how many poses the file lists.
+def read_timed_poses(path: Path, on_bad_line: BadLineCallback | None = None) -> tuple[PoseTrack, int]:
+    """Read the track in ``aligned_poses.csv`` or ``camera_pose.json``, and the number of poses in the file.
 
-    A pose holds from ``start_timestamp``, when its frame was taken. Raises `NergError` for a file that is neither, or
-    holds fewer than two poses.
+    A pose is that of the frame at ``start_timestamp``. Raises `NergError` for another file, or fewer than two poses.
     """
     if path.suffix.lower() == ".p":
-        raise NergError(f"{path} is a pickle, which may run code, and is not read; give aligned_poses.csv beside it")
-    times, vectors, places = _of_csv(path, on_bad) if path.suffix.lower() == ".csv" else _of_json(path)
-    track = PoseTrack.of_samples(times, vectors, places)
+        raise NergError(f"{path} is a pickle, which can execute code; use aligned_poses.csv next to it instead")
+    times, vectors, positions = (
+        _read_csv_poses(path, on_bad_line) if path.suffix.lower() == ".csv" else _read_json_poses(path)
+    )
+    track = PoseTrack.from_samples(times, vectors, positions)
     if track is None:
-        raise NergError(f"{path} holds {len(times)} poses; two that are whole are needed to interpolate between")
+        raise NergError(f"{path} has {len(times)} poses; interpolation needs at least two complete ones")
     return track, len(times)
 
 
-def _of_csv(path: Path, on_bad: BadLineCallback | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _read_csv_poses(path: Path, on_bad: BadLineCallback | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     from scipy.spatial.transform import Rotation
 
-    blocks = iterate_table(path, ["start_timestamp", *_PLACE, *_QUATERNION], on_bad=on_bad)
+    blocks = iterate_table(path, ["start_timestamp", *_POSITION_KEYS, *_QUATERNION_KEYS], on_bad_line=on_bad)
     rows = np.concatenate([block.numbers for block in blocks] or [np.empty((0, 8))])
     length = np.linalg.norm(rows[:, 4:], axis=1)
-    good = np.isfinite(length) & (length > 1e-12)
+    is_valid = np.isfinite(length) & (length > 1e-12)
     vectors = np.full((len(rows), 3), np.nan)
-    if good.any():
-        vectors[good] = Rotation.from_quat(rows[good, 4:]).as_rotvec()
+    if is_valid.any():
+        vectors[is_valid] = Rotation.from_quat(rows[is_valid, 4:]).as_rotvec()
     return rows[:, 0], vectors, rows[:, 1:4]
 
 
-def _of_json(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    found: Any = read_json(path, "file of camera poses")
-    if isinstance(found, dict):
-        found = found.get("result")
+def _read_json_poses(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    content: Any = read_json(path, "file of camera poses")
+    if isinstance(content, dict):
+        content = content.get("result")
     try:
         rows = np.array(
-            [[float(pose[key]) for key in ("start_timestamp", *_VECTOR, *_PLACE)] for pose in found], np.float64
+            [
+                [float(pose[key]) for key in ("start_timestamp", *_ROTATION_VECTOR_KEYS, *_POSITION_KEYS)]
+                for pose in content
+            ],
+            np.float64,
         ).reshape(-1, 7)
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise NergError(
-            f'"{path}" is no list of camera poses with start_timestamp, translation_x, y, z and rotation_x, y, z; '
+            f'"{path}" is not a list of camera poses with start_timestamp, translation_x, y, z and rotation_x, y, z; '
             "download camera_pose.json again"
         ) from error
     return rows[:, 0], rows[:, 1:4], rows[:, 4:]
@@ -309,66 +353,63 @@ def _of_json(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 # ---- Scene gaze ----
 #
-# What readers of glasses with a scene camera have in common: where that camera was, and gaze in its frame as rays.
+# Common part of the readers of glasses with a scene camera: camera poses, and the conversion of gaze in its frame.
 #
-# The poses come from a model in which frames of the scene video were registered together with the photos of the place,
-# so that nothing has to be aligned: rays are in the coordinates that the place was trained in.
+# The poses are from a model in which frames of the scene video were registered together with the photos of the
+# environment, so that no alignment is needed: rays are in the coordinates of the trained scene.
 
 _OPENCV = np.diag([1.0, -1.0, -1.0])  # from an OpenCV camera's frame to an OpenGL one's
-_AT_A_FRAME = 1e-6  # seconds: so near to a posed frame nothing has to be interpolated
-_LEVEL = 25.0  # degrees between up as the place tells it and as it is declared
-_DIFFER = 1.0  # degrees between two accounts of one gaze
-_COMPARED = 1 << 20  # rows of a recording whose two accounts are compared
+_FRAME_TOLERANCE = 1e-6  # seconds; nearer to a frame with a pose, no interpolation is needed
+_MAX_TILT = 25.0  # degrees between the up direction of the scene and the declared one
+_MAX_DIFFERENCE = 1.0  # degrees between two representations of the same gaze
+_MAX_COMPARED_ROWS = 1 << 20  # rows of a recording for this comparison
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCameraOptions(ValidatedDataclass):
-    """Where the scene camera was. Raises `NergError` for a scale beside a place, or a rate or gap that is none."""
+    """Options for the poses of the scene camera. Raises `NergError` for invalid or contradictory values."""
 
     poses: Path | None = option(  # needed
         None,
-        "The model that holds frames of the scene video and the place's photos: its transforms.json, or the folder of "
+        "Model with frames of the scene video and the photos of the environment: its transforms.json, or the folder of "
         "a COLMAP model; or aligned_poses.csv of tag-aligner, camera_pose.json of the Reference Image Mapper.",
     )
     frames: FrameNames | None = option(
         None,
         'Names of the video\'s frames in the model: "frame_{frame1}" (number from 1; {frame0}: from 0), {s} '
-        "(seconds) or {ns} (time stamps); * for anything, {recording} for the recording's name.",
+        "(seconds) or {ns} (time stamps); * for other parts, {recording} for the recording's name.",
         parse=FrameNames.parse,
-        recorded=False,
+        is_recorded=False,
     )
     fps: float | None = option(
         None,
-        "Numbers count frames that ffmpeg's -vf fps=5 took, this many a second, not each frame of the video.",
+        "Rate of the frames that were extracted with ffmpeg's -vf fps=5, to which frame numbers refer. Default: "
+        "numbers refer to the video's frames.",
         within=RATES,
     )
     place: Path | None = option(
-        None, "Checkpoint of the place (nerg train radiance): rays are in the coordinates that it was trained in."
+        None, "Checkpoint of the scene (nerg train radiance); rays are converted to the coordinates of its training."
     )
-    scale: float = option(
-        1.0, "Without --place: length of a unit of the model in metres, as in training.", within=LENGTHS
-    )
-    gap: float = option(
-        0.2, "Seconds between posed frames; farther apart, nothing is interpolated.", within=Range(1e-06, 3600)
-    )
-    up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", recorded=False)
+    scale: float = option(1.0, "Without --place: length of the model's unit in metres, as in training.", within=LENGTHS)
+    gap: float = option(0.2, "Maximum seconds between frames with poses for interpolation.", within=Range(1e-06, 3600))
+    up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", is_recorded=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.place is not None and self.scale != 1.0:
-            raise NergError("the checkpoint of the place knows its scale; leave out --scale, or --place")
+            raise NergError("the checkpoint contains the scale; leave out --scale, or --place")
 
     @property
     def frame(self) -> TrackingFrame:
-        """The frame of the place, whose up is declared."""
+        """Frame of the scene, with the declared up axis."""
         return TrackingFrame(up=self.up)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """What a reader has found of a recording: its ``name`` (of its folder), the ``person`` who wore the glasses, the
-    seconds of the scene video's ``frames`` (F,) on the clock of the gaze, or None, and ``start``, the nanoseconds at
-    which that clock is 0: the recording's start, or, where that is not said (``starts_with_video``), the first frame.
+    """A recording: its ``name`` (that of its folder), the ``person`` who wore the glasses, the times of the scene
+    video's ``frames`` (F,) in seconds on the clock of the gaze, or None, and ``start``, the zero of this clock in
+    nanoseconds: the recording's start or, if that is unknown (``starts_with_video``), the first frame.
     """
 
     name: str
@@ -380,216 +421,221 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class GazeBlock:
-    """n rows of a recording: seconds ``t``, gaze ``direction`` (n, 3) in the scene camera's frame (OpenCV), NaN beyond
-    its picture, the 1-based ``rows`` of the file, and reasons of the format's own to ``drop`` some. ``other``: the
-    direction by another account of the file, to be compared."""
+    """n rows of a recording: times ``t`` in seconds, gaze ``direction`` (n, 3) in the scene camera's frame (OpenCV),
+    NaN outside its image, row numbers ``rows`` from 1, and reasons of the format to ``drop`` rows. ``other_direction``
+    is another representation of the gaze in the file, for comparison."""
 
     t: np.ndarray
     direction: np.ndarray
     rows: np.ndarray
     drop: Mapping[str, np.ndarray]
-    other: np.ndarray | None = None
+    other_direction: np.ndarray | None = None
 
 
 class SceneGaze:
-    """Gaze of one recording, to be added block by block, with the camera's poses in the place's coordinates."""
+    """Converts the gaze of one recording block by block, with camera poses in the coordinates of the scene."""
 
     def __init__(
-        self, options: SceneCameraOptions, recording: Recording, builder: RaysBuilder, about: list[dict[str, Any]]
+        self, options: SceneCameraOptions, recording: Recording, builder: RaysBuilder, summaries: list[dict[str, Any]]
     ) -> None:
-        """``about``: what is known of the recordings before, to which this one is added."""
-        self._builder, self._options, self._about = builder, options, about
+        """``summaries`` are those of the previous recordings; that of this one is appended."""
+        self._builder, self._options, self._summaries = builder, options, summaries
         self._person = recording.person
         self._angles: list[np.ndarray] = []
-        self._compared = 0
-        self._track = _camera_track(options, recording, builder)
+        self._num_compared = 0
+        self._track = _make_camera_track(options, recording, builder)
 
     def add(self, block: GazeBlock) -> None:
-        """Add rows as rays of the place, and compare the two accounts of them where there are two."""
-        turn, place, lost = self._at(block.t)
+        """Add rows as rays in the scene, and compare the two representations of their gaze, if there are two."""
+        rotation, position, has_no_pose = self._interpolate(block.t)
         direction = block.direction
-        beyond = np.asarray(~np.isfinite(direction).all(axis=1))
-        drop = {**block.drop, "gaze lies beyond the scene camera's picture": beyond}
-        if block.other is not None and self._compared < _COMPARED:
-            self._compared += len(block.t)
+        is_outside = np.asarray(~np.isfinite(direction).all(axis=1))
+        drop = {**block.drop, "gaze lies beyond the scene camera's picture": is_outside}
+        if block.other_direction is not None and self._num_compared < _MAX_COMPARED_ROWS:
+            self._num_compared += len(block.t)
             with np.errstate(invalid="ignore"):
-                angles = angles_between(direction, block.other)
+                angles = angles_between(direction, block.other_direction)
             self._angles.append(angles[np.isfinite(angles) & ~np.any(list(drop.values()), axis=0)])
-        drop["no frame of the scene camera near that time has a pose"] = lost
-        ray = poses.rotate(turn, direction)
-        self._builder.add(block.t, self._person, place, ray, rows=block.rows, head=turn[:, :, 2], drop=drop)
+        drop["no frame of the scene camera near that time has a pose"] = has_no_pose
+        ray = poses.rotate(rotation, direction)
+        self._builder.add(block.t, self._person, position, ray, rows=block.rows, head=rotation[:, :, 2], drop=drop)
 
-    def finish(self, accounts: str) -> None:
-        """Keep in the metadata how many frames were posed and how far the two ``accounts`` of the gaze differ ("pixels
-        and angles"), if there were two; beyond a degree, at the median, it is a complaint."""
-        about: dict[str, Any] = {"posed_frames": len(self._track.times)}
-        found = np.concatenate(self._angles or [np.empty(0)])
-        middle = 0.0
-        if found.size:
-            middle, most = (round(float(x), 4) for x in np.percentile(found, [50, 95]))
-            about |= {"compared": accounts, "median_degrees": middle, "p95_degrees": most}
-        self._about.append(about)
-        self._builder.note(scene_camera=self._about, frames=str(self._options.frames or ""), floor="unknown")
-        if middle > _DIFFER:
-            self._builder.complain(
-                f"{accounts} of the same gaze differ by {middle:.1f} degrees (median): is the calibration that of "
-                "these glasses, and of pictures of this size?"
+    def finish(self, compared: str) -> None:
+        """Add to the metadata the number of frames with a pose, and the difference between the two representations of
+        the gaze, named by ``compared``, if there are two; a median above `_MAX_DIFFERENCE` gives a warning."""
+        summary: dict[str, Any] = {"posed_frames": len(self._track.times)}
+        differences = np.concatenate(self._angles or [np.empty(0)])
+        median = 0.0
+        if differences.size:
+            median, p95 = (round(float(x), 4) for x in np.percentile(differences, [50, 95]))
+            summary |= {"compared": compared, "median_degrees": median, "p95_degrees": p95}
+        self._summaries.append(summary)
+        self._builder.add_metadata(
+            scene_camera=self._summaries, frames=str(self._options.frames or ""), floor="unknown"
+        )
+        if median > _MAX_DIFFERENCE:
+            self._builder.add_warning(
+                f"{compared} of the same gaze differ by {median:.1f} degrees (median): is the calibration that of "
+                "these glasses, and for images of this size?"
             )
 
-    def _at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `PoseTrack.at`; lost is, too, what lies between posed frames farther apart than the gap."""
-        turn, place, lost = self._track.at(t, self._options.gap)
+    def _interpolate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `PoseTrack.interpolate`, but without poses between frames that are farther apart than the maximum gap."""
+        rotation, position, is_missing = self._track.interpolate(t, self._options.gap)
         times = self._track.times
         after = np.clip(np.searchsorted(times, t), 1, len(times) - 1)
         nearest = np.minimum(np.abs(t - times[after]), np.abs(t - times[after - 1]))
-        apart = times[after] - times[after - 1] > self._options.gap
-        return turn, place, lost | (apart & (nearest > _AT_A_FRAME))
+        is_gap = times[after] - times[after - 1] > self._options.gap
+        return rotation, position, is_missing | (is_gap & (nearest > _FRAME_TOLERANCE))
 
 
-def _camera_track(options: SceneCameraOptions, recording: Recording, builder: RaysBuilder) -> PoseTrack:
-    """Where the camera was in the place, OpenCV's axes to the place's."""
+def _make_camera_track(options: SceneCameraOptions, recording: Recording, builder: RaysBuilder) -> PoseTrack:
+    """Make the track of camera poses in the scene, with OpenCV's camera axes."""
     from scipy.spatial.transform import Rotation
 
     if options.poses is None:
         raise NergError(
-            "the scene camera's poses are needed: name the model in which frames of its video were registered with the "
-            "place's photos (--poses transforms.json)"
+            "the poses of the scene camera are required: specify the model in which frames of its video were "
+            "registered with the photos of the environment (--poses transforms.json)"
         )
-    to_place = PlaceFrame.scaled(options.scale)
+    to_scene = SceneCoordinates.from_scale(options.scale)
     if options.place is not None:
-        to_place = PlaceFrame.of_checkpoint(options.place)
-        builder.source(options.place)
-    if is_timed(options.poses):
+        to_scene = SceneCoordinates.from_checkpoint(options.place)
+        builder.begin_source(options.place)
+    if is_timed_pose_file(options.poses):
         if recording.starts_with_video:
             raise NergError(
-                f'the poses of "{options.poses}" count from the start of the recording "{sanitize(recording.name, 60)}", '
-                "which no file of it says; put its info.json beside the gaze"
+                f'the poses of "{options.poses}" are relative to the start of the recording '
+                f'"{sanitize(recording.name, 60)}", which is unknown; put its info.json next to the gaze'
             )
-        builder.source(options.poses)
-        track, count = read_timed_poses(options.poses, builder.on_bad)
+        builder.begin_source(options.poses)
+        track, count = read_timed_poses(options.poses, builder.on_bad_line)
         builder.count_lines(count)
-        up = to_place.up
+        up = to_scene.up
     else:
-        track, up = _of_model(options, recording, to_place, builder)
-    _check_up(up, options, builder)
-    turned = Rotation.from_matrix(to_place.rotation) * Rotation.from_rotvec(track.vectors)
-    return PoseTrack(track.times, turned.as_rotvec(), to_place.points(track.places))
+        track, up = _read_model_track(options, recording, to_scene, builder)
+    _check_up_axis(up, options, builder)
+    rotation = Rotation.from_matrix(to_scene.rotation) * Rotation.from_rotvec(track.rotation_vectors)
+    return PoseTrack(track.times, rotation.as_rotvec(), to_scene.transform_points(track.positions))
 
 
-def _of_model(
-    options: SceneCameraOptions, recording: Recording, to_place: PlaceFrame, builder: RaysBuilder
+def _read_model_track(
+    options: SceneCameraOptions, recording: Recording, to_scene: SceneCoordinates, builder: RaysBuilder
 ) -> tuple[PoseTrack, np.ndarray | None]:
-    """The track of the model's frames in its own coordinates, and up in the place."""
+    """Read the track of the model's frames in its own coordinates, and the up direction in the scene."""
     from scipy.spatial.transform import Rotation
 
     assert options.poses is not None
     model = read_named_poses(find_pose_source(options.poses))
-    builder.source(model.path)
+    builder.begin_source(model.path)
     for note in model.notes:
-        builder.complain(note)
+        builder.add_warning(note)
     if options.frames is None:
         raise NergError(
-            f'which images of "{model.path}" are frames of the video, and when they were taken, has to be said, such '
-            f'as --frames "frame_{{frame1}}"; its first are {", ".join(sanitize(n, 60) for n in model.names[:3])}'
+            f'the images of "{model.path}" that are frames of the video, and their times, must be specified, '
+            f'as with --frames "frame_{{frame1}}"; first images: {", ".join(sanitize(n, 60) for n in model.names[:3])}'
         )
-    times = options.frames.times(model.names, recording.name, recording.frames, options.fps, recording.start)
-    if recording.frames is None and options.frames.needs_frames:
-        rate = "" if options.fps is None else f", {options.fps:g} a second exactly"
-        builder.complain(
-            f"the recording has no times of its video's frames: they are counted from the start of its clock{rate}; "
-            "put the file that has them beside the gaze (Tobii: the scene video, Neon: world_timestamps.csv)"
+    times = options.frames.compute_times(model.names, recording.name, recording.frames, options.fps, recording.start)
+    if recording.frames is None and options.frames.needs_frame_times:
+        rate = "" if options.fps is None else f", at exactly {options.fps:g} per second"
+        builder.add_warning(
+            f"the times of the video's frames are unknown; they are counted from the start of the gaze's clock{rate}; "
+            "put the file with them next to the gaze (Tobii: the scene video, Neon: world_timestamps.csv)"
         )
-    turns = Rotation.from_matrix(model.to_world[:, :3, :3] @ _OPENCV)
-    track = PoseTrack.of_samples(times, turns.as_rotvec(), model.to_world[:, :3, 3])
+    rotations = Rotation.from_matrix(model.to_world[:, :3, :3] @ _OPENCV)
+    track = PoseTrack.from_samples(times, rotations.as_rotvec(), model.to_world[:, :3, 3])
     if track is None:
         raise NergError(
-            f'one image of "{model.path}" alone is a frame of the recording "{sanitize(recording.name, 60)}"; two are '
-            "needed to interpolate between: register more of them"
+            f'only one image of "{model.path}" is a frame of the recording "{sanitize(recording.name, 60)}"; '
+            "interpolation needs at least two: register more of them"
         )
-    if to_place.sha256 is not None and to_place.sha256 != model.sha256:
-        builder.complain(
-            f'the place was trained on another file than "{model.path.name}": are its coordinates the same? If it was '
-            "registered anew, train the place on it"
+    if to_scene.sha256 is not None and to_scene.sha256 != model.sha256:
+        builder.add_warning(
+            f'the scene was trained on another file than "{model.path.name}": are its coordinates the same? If it was '
+            "registered again, train the scene on the new file"
         )
-    if to_place.up is None:
-        found = estimate_up(model.to_world, np.zeros((0, 3)))
-        up = to_place.rotation @ found.direction if found.is_reliable else None
+    if to_scene.up is None:
+        estimate = estimate_up(model.to_world, np.zeros((0, 3)))
+        up = to_scene.rotation @ estimate.direction if estimate.is_reliable else None
     else:
-        up = to_place.up
+        up = to_scene.up
     return track, up
 
 
-def _check_up(up: np.ndarray | None, options: SceneCameraOptions, builder: RaysBuilder) -> None:
+def _check_up_axis(up: np.ndarray | None, options: SceneCameraOptions, builder: RaysBuilder) -> None:
     if up is None:
         return
     up = up / np.linalg.norm(up)
-    off = float(np.degrees(np.arccos(np.clip(up @ poses.axis(options.up, "up"), -1, 1))))
-    if off > _LEVEL:
+    tilt = float(np.degrees(np.arccos(np.clip(up @ poses.parse_axis(options.up, "up"), -1, 1))))
+    if tilt > _MAX_TILT:
         axis = max(poses.AXES, key=lambda name: poses.AXES[name] @ up)
-        builder.complain(
-            f"up in the place is ({', '.join(f'{x:.2f}' for x in up)}), {off:.0f} degrees from {options.up}: train it "
-            f"with --coordinates upright, or import with --up {axis} and give training the matrix of --write-align"
+        builder.add_warning(
+            f"the up direction of the scene is ({', '.join(f'{x:.2f}' for x in up)}), {tilt:.0f} degrees from "
+            f"{options.up}: train it with --coordinates upright, or import with --up {axis} and pass the matrix of "
+            "--write-align to the training"
         )
 
 
 # ---- Scene reader ----
 #
-# What readers of glasses with a scene camera share: a folder a recording, read against the poses of its camera.
+# Base of readers of glasses with a scene camera: one folder per recording, converted with the poses of its camera.
 
-R = TypeVar("R", bound=Recording)  # What a reader knows of a recording
+R = TypeVar("R", bound=Recording)  # Data of a recording that a reader provides
 
 
-POSES = {"--poses": "MODEL", "--frames": "frame_{frame1}"}
-"""Options of its readers that no file says, with a word in place of the value."""
+POSE_OPTIONS = {"--poses": "MODEL", "--frames": "frame_{frame1}"}
+"""Options of these readers that only the user can set, with placeholders as values."""
 
-WHERE_CAMERA = (
-    "where the scene camera was: --poses names the model that holds its frames and the place's photos, --frames how "
-    "they are called; --place the place that was trained on it"
+POSE_QUESTION = (
+    "the poses of the scene camera: --poses is the model with its frames and the photos of the environment, --frames "
+    "the pattern of their names, --place the scene that was trained on it"
 )
-"""What these are."""
+"""Description of these options."""
 
 
 class SceneReader(ABC, Generic[R]):
-    """A reader of folders, each a recording of glasses whose scene camera's poses are known in the place.
+    """Base of readers of folders, one per recording of glasses with a scene camera, whose poses are known.
 
-    A format says what its file of the gaze is called, opens a recording, and gives its gaze block by block in the scene
-    camera's frame; whose rays that are in the place is worked out here (`nerg_mi.rays.readers.base.Reader`).
+    A format defines the name of its gaze file, opens a recording, and iterates over its gaze in the scene camera's
+    frame; this class converts it to rays (see `nerg_mi.rays.readers.base.Reader`).
     """
 
     gaze_file: str
-    """Name of the file of the gaze in the folder."""
+    """Name of the gaze file in the folder."""
 
-    accounts: str = ""
-    """The two accounts of one gaze that are compared, as "pixels and angles"; empty where there is one."""
+    compared: str = ""
+    """The two representations of the gaze that are compared, as "pixels and angles"; empty if there is only one."""
 
-    world = "the place's, whose axis `--up` points up"
+    frame_description = "that of the scene; `--up` points up"
     Options = SceneCameraOptions
 
     @abstractmethod
-    def open(self, folder: Path, builder: RaysBuilder) -> R:
-        """What is known of the recording in ``folder``; each file that is read is named to ``builder.source``."""
+    def open_recording(self, folder: Path, builder: RaysBuilder) -> R:
+        """Open the recording in ``folder``; each file that is read is passed to ``builder.begin_source``."""
 
     @abstractmethod
-    def blocks(self, gaze: Path, recording: R, builder: RaysBuilder) -> Iterable[GazeBlock]:
-        """The rows of the file ``gaze`` of an open recording."""
+    def iterate_gaze(self, gaze: Path, recording: R, builder: RaysBuilder) -> Iterable[GazeBlock]:
+        """Iterate over the rows of the file ``gaze`` of an open recording."""
 
     def frame(self, files: Sequence[Path], options: SceneCameraOptions) -> TrackingFrame:
         return options.frame
 
     def read(self, files: Sequence[Path], options: SceneCameraOptions, builder: RaysBuilder) -> None:
-        if len(files) > 1 and (options.frames is None or not options.frames.of_recording):
+        if len(files) > 1 and (options.frames is None or not options.frames.has_recording):
             raise NergError(
-                "frames of several recordings are told apart by {recording} in their names (--frames); import them one "
-                'by one, or name them as in --frames "{recording}/frame_{frame1}"'
+                "frames of several recordings are distinguished by {recording} in their names (--frames); import the "
+                'recordings one by one, or use a pattern such as --frames "{recording}/frame_{frame1}"'
             )
-        about: list[dict[str, Any]] = []
-        for given in files:
-            gaze = given / self.gaze_file if given.is_dir() else given
+        summaries: list[dict[str, Any]] = []
+        for path in files:
+            gaze = path / self.gaze_file if path.is_dir() else path
             if not gaze.is_file():
-                raise NergError(f"there is no {gaze}; give the folder of a recording, or the {self.gaze_file} in it")
-            recording = self.open(gaze.parent, builder)
-            scene = SceneGaze(options, recording, builder, about)
-            builder.source(gaze, f"{recording.person}/{gaze.name}")
-            for block in self.blocks(gaze, recording, builder):
+                raise NergError(
+                    f"{gaze} does not exist; specify the folder of a recording, or the {self.gaze_file} in it"
+                )
+            recording = self.open_recording(gaze.parent, builder)
+            scene = SceneGaze(options, recording, builder, summaries)
+            builder.begin_source(gaze, f"{recording.person}/{gaze.name}")
+            for block in self.iterate_gaze(gaze, recording, builder):
                 scene.add(block)
-            scene.finish(self.accounts)
+            scene.finish(self.compared)

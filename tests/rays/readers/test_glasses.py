@@ -30,7 +30,7 @@ from tests.rays.readers.examples import (
     video,
 )
 
-# ---- Pupil Labs Neon, on the poses of real photos and on small models ----
+# ---- Pupil Labs Neon, with the poses of real photos and of small models ----
 
 NEON_HEAD = (
     "section id,recording id,timestamp [ns],gaze x [px],gaze y [px],worn,fixation id,blink id,"
@@ -39,7 +39,7 @@ NEON_HEAD = (
 
 
 def opened(tmp_path, name):
-    """The folder of a reader's example, as that of a person, and its options."""
+    """The folder of a reader's example, named like a person, and its options."""
     folder = tmp_path / "2026-ann"
     folder.mkdir()
     EXAMPLES[name].make(folder)
@@ -67,7 +67,7 @@ def frame_poses(options):
 
 
 def write_neon(folder, ns, gaze, worn=None, blink=None, turned=0.0):
-    """``gaze`` (n, 3) in the camera; ``turned``: degrees by which the azimuths are off."""
+    """Write ``gaze`` (n, 3) in the camera; ``turned``: error of the azimuths in degrees."""
     pixels, angles = project(gaze, MATRIX, **LENS), camera_angles(gaze) + [turned, 0]
     rows = [
         ["s", "r", t, *p, 1.0 if worn is None else worn[k], "", "" if blink is None else blink[k], *a]
@@ -79,10 +79,10 @@ def write_neon(folder, ns, gaze, worn=None, blink=None, turned=0.0):
 @pytest.mark.parametrize("kind", ["transforms", "colmap"])
 @pytest.mark.parametrize("what", ["angles", "pixels"])
 def test_on_the_poses_of_real_photos(tmp_path, recorded, kind, what):
-    """The fox's photos as frames of a scene video, 30 a second: each ray to 1e-5, at frames and in between."""
+    """The fox's photos as frames of a scene video at 30 Hz: each ray to 1e-5, at frames and in between."""
     listed = json.loads((recorded("fox") / "transforms.json").read_text())["frames"]
     poses = {f["file_path"]: np.array(f["transform_matrix"]) for f in listed}
-    for pose in poses.values():  # as near to rotations as a file has them
+    for pose in poses.values():  # accurate to the digits in the file
         u, _, v = np.linalg.svd(pose[:3, :3])
         pose[:3, :3] = u @ v
     numbers = np.array([int(name[7:11]) for name in poses])
@@ -116,12 +116,12 @@ def test_on_the_poses_of_real_photos(tmp_path, recorded, kind, what):
         assert rays.metadata["scene_camera"][0]["p95_degrees"] < 1e-3
 
 
-def test_what_is_dropped(neon):
+def test_dropped_rows(neon):
     folder, options = neon
     ns = np.array(frame_ns(7)) + 1_000_000
     gaze = gaze_in_camera(7)
     late = ns.copy()
-    late[6] += 10**9  # after the last posed frame
+    late[6] += 10**9  # after the last frame with a pose
     write_neon(folder, late, gaze, worn=[1, 0.0, "False", 1, 1, 1, 1], blink=["", "", "", 4, "", "", ""])
     rays = read("neon", folder, **options)
     assert dropped(rays) == {
@@ -134,64 +134,64 @@ def test_what_is_dropped(neon):
     assert rays.metadata["unused_columns"] == ["section id", "recording id", "fixation id"]
 
 
-def test_frames_far_apart_are_not_bridged(neon):
+def test_gaps_between_frames_are_not_interpolated(neon):
     folder, options = neon
     model = json.loads(options["poses"].read_text())
     model["frames"] = [f for f in model["frames"] if not f["file_path"].endswith(("3.jpg", "4.jpg", "5.jpg"))]
     options["poses"].write_text(json.dumps(model))
-    # Frames 2 and 6 of 30 a second are 0.133 s apart.
+    # Frames 2 and 6 at 30 Hz are 0.133 s apart.
     assert len(read("neon", folder, **options)) == 7
     rays = read("neon", folder, **options, gap=0.1)
     assert dropped(rays) == {"no frame of the scene camera near that time has a pose": [[3, 6]]}
 
 
-def test_accounts_that_differ_are_told(neon):
+def test_differing_gaze_representations_give_a_warning(neon):
     folder, options = neon
     write_neon(folder, np.array(frame_ns(7)) + 1_000_000, gaze_in_camera(7), turned=4.0)
     rays = read("neon", folder, **options)
-    (about,) = rays.metadata["scene_camera"]
-    assert 3 < about["median_degrees"] < 4.01 and any("pixels and angles" in c for c in rays.metadata["complaints"])
+    (content,) = rays.metadata["scene_camera"]
+    assert 3 < content["median_degrees"] < 4.01 and any("pixels and angles" in c for c in rays.metadata["complaints"])
 
 
 def test_without_calibration_or_angles(neon):
-    """Pixels go through a nominal lens, which is said; Neon Player calls the calibration otherwise."""
+    """Pixels are converted with a nominal lens, with a warning; Neon Player has another name for the calibration."""
     folder, options = neon
     ns, gaze = np.array(frame_ns(7)) + 1_000_000, gaze_in_camera(7)
     write_neon(folder, ns, gaze)
-    whole = read("neon", folder, **options)
+    complete = read("neon", folder, **options)
     (folder / "scene_camera.json").unlink()
     rays = read("neon", folder, **options)
-    assert np.allclose(rays.direction, whole.direction) and "complaints" not in rays.metadata
+    assert np.allclose(rays.direction, complete.direction) and "complaints" not in rays.metadata
     text = (folder / "gaze.csv").read_text().replace("azimuth [deg]", "a")
     (folder / "gaze.csv").write_text(text)
     rays = read("neon", folder, **options)
     assert "nominal lens" in rays.metadata["complaints"][0]
-    off = np.degrees(np.arccos(np.sum(rays.direction * whole.direction, axis=1)))
+    off = np.degrees(np.arccos(np.sum(rays.direction * complete.direction, axis=1)))
     assert 0.3 < off.max() < 2
     (folder / "calibration.json").write_text(
         json.dumps({"scene_camera_matrix": MATRIX, "scene_distortion_coefficients": list(LENS.values())})
     )
     rays = read("neon", folder, **options)
-    assert np.abs(rays.direction - whole.direction).max() < 1e-6 and "complaints" not in rays.metadata
+    assert np.abs(rays.direction - complete.direction).max() < 1e-6 and "complaints" not in rays.metadata
 
 
 def test_exports_of_neon_player(neon):
-    """Without info.json the clock is the scene video's, and the person the folder, which is said."""
+    """Without info.json the clock is that of the scene video, and the participant the folder, with a warning."""
     folder, options = neon
     ns = np.array(frame_ns(7)) + 1_000_000
     gaze = gaze_in_camera(7)
-    # Shares of a sensor's 255 steps.
+    # Fractions of a sensor's 255 steps.
     write_neon(folder, ns, gaze, worn=[1.0, 0.996, 0.502, 0.498, 0.004, 0.0, 1.0])
-    whole = read("neon", folder, **options)
-    assert dropped(whole) == {"the glasses were not worn": [[5, 7]]}
+    complete = read("neon", folder, **options)
+    assert dropped(complete) == {"the glasses were not worn": [[5, 7]]}
     (folder / "info.json").unlink()
     rays = read("neon", folder, **options)
-    assert np.allclose(rays.origin, whole.origin) and np.allclose(rays.direction, whole.direction)
+    assert np.allclose(rays.origin, complete.origin) and np.allclose(rays.direction, complete.direction)
     assert np.allclose(rays.t, (ns[[0, 1, 2, 6]] - frame_ns(1)[0]) * 1e-9, atol=1e-6) and rays.persons == ("2026-ann",)
     (complaint,) = rays.metadata["complaints"]
-    assert 'no info.json beside the gaze of "2026-ann"' in complaint
+    assert 'no info.json next to the gaze of "2026-ann"' in complaint
     (folder / "aligned_poses.csv").write_text("start_timestamp\n")
-    with pytest.raises(NergError, match="put its info.json beside"):
+    with pytest.raises(NergError, match="put its info.json next to"):
         read("neon", folder, poses=folder / "aligned_poses.csv")
     (folder / "world_timestamps.csv").unlink()
     with pytest.raises(NergError, match="neither info.json nor world_timestamps.csv"):
@@ -200,7 +200,7 @@ def test_exports_of_neon_player(neon):
 
 @pytest.mark.parametrize("how", ["csv", "json"])
 def test_timed_poses(neon, how):
-    """What tag-aligner and the Reference Image Mapper write: intervals on the recording's clock, OpenCV's axes."""
+    """Files of tag-aligner and the Reference Image Mapper: intervals on the recording's clock, OpenCV's axes."""
     folder, options = neon
     times = (np.array(frame_ns(8)) - START) * 1e-9
     turn = Rotation.from_euler("xyz", np.c_[np.linspace(1.3, 1.6, 8), np.zeros(8), np.linspace(0, 0.5, 8)])
@@ -225,7 +225,7 @@ def test_timed_poses(neon, how):
     assert np.abs(rays.origin - origin).max() < 1e-5 and np.abs(rays.direction - direction).max() < 1e-5
 
 
-def test_several_recordings_need_names_that_tell_them_apart(neon):
+def test_several_recordings_need_distinct_frame_names(neon):
     folder, options = neon
     other = folder.with_name("bo")
     shutil.copytree(folder, other)
@@ -238,13 +238,13 @@ def test_several_recordings_need_names_that_tell_them_apart(neon):
     assert len(rays) == 14 and len(rays.metadata["scene_camera"]) == 2
 
 
-def test_what_has_to_be_said(neon):
+def test_required_options(neon):
     folder, options = neon
     with pytest.raises(NergError, match="--poses"):
         read("neon", folder)
-    with pytest.raises(NergError, match="its first are images/IMG_0001.jpg"):
+    with pytest.raises(NergError, match="first images: images/IMG_0001.jpg"):
         read("neon", folder, poses=options["poses"])
-    with pytest.raises(NergError, match="there is no .*gaze.csv"):
+    with pytest.raises(NergError, match="does not exist; .*gaze.csv"):
         read("neon", folder / "gone", **options)
     for text in ("{}", '{"start_time": true}'):
         (folder / "info.json").write_text(text)
@@ -267,8 +267,8 @@ def write_tobii(folder, t, gaze, points=None):
 
 
 @pytest.mark.parametrize("of_the_camera", [False, True])
-def test_tobii_rays_are_those_of_the_pixels(tobii, of_the_camera):
-    """gaze3d agrees whichever of the two the position is."""
+def test_tobii_rays_follow_the_pixels(tobii, of_the_camera):
+    """gaze3d agrees for both interpretations of the position."""
     folder, options = tobii
     t, gaze = np.linspace(0.01, 0.27, 40), gaze_in_camera(40, 2)
     points = gaze * 1500 @ TOBII_ROTATION + TOBII_POSITION if of_the_camera else None
@@ -276,8 +276,8 @@ def test_tobii_rays_are_those_of_the_pixels(tobii, of_the_camera):
     rays = read("tobii3", folder, **options)
     origin, direction = rays_at(t, np.arange(8) / 24.95, frame_poses(options), gaze)
     assert np.abs(rays.origin - origin).max() < 1e-5 and np.abs(rays.direction - direction).max() < 1e-5
-    (about,) = rays.metadata["scene_camera"]
-    assert about["p95_degrees"] < 1e-3 and "complaints" not in rays.metadata and rays.persons == ("2026-ann",)
+    (content,) = rays.metadata["scene_camera"]
+    assert content["p95_degrees"] < 1e-3 and "complaints" not in rays.metadata and rays.persons == ("2026-ann",)
 
 
 @pytest.mark.parametrize(
@@ -289,12 +289,12 @@ def test_tobii_rays_are_those_of_the_pixels(tobii, of_the_camera):
     ],
 )
 def test_frames_have_the_times_of_the_video(tobii, times):
-    """One that starts late, one whose rate varies, one that lost a frame."""
+    """Videos that start late, have a varying rate, or lost a frame."""
     folder, options = tobii
     folder.joinpath("scenevideo.mp4").rename(folder / "film.mp4")
     video(times)(folder / "film.mp4")
-    about = {"scenecamera": {"file": "film.mp4", "camera-calibration": CALIBRATION_G3}}
-    (folder / "recording.g3").write_text(json.dumps(about))
+    content = {"scenecamera": {"file": "film.mp4", "camera-calibration": CALIBRATION_G3}}
+    (folder / "recording.g3").write_text(json.dumps(content))
     t, gaze = np.linspace(times[0] + 1e-4, times[-1] - 1e-4, 30), gaze_in_camera(30, 2)
     write_tobii(folder, t, gaze)
     rays = read("tobii3", folder, **options)
@@ -304,19 +304,19 @@ def test_frames_have_the_times_of_the_video(tobii, times):
     assert "film.mp4" in [s["file"] for s in rays.metadata["sources"]]
 
 
-def test_without_the_video_no_rate_is_guessed(tobii):
+def test_without_the_video_no_rate_is_assumed(tobii):
     folder, options = tobii
     (folder / "scenevideo.mp4").unlink()
-    with pytest.raises(NergError, match="times of its video's"):
+    with pytest.raises(NergError, match="times of the video's"):
         read("tobii3", folder, **options)
     t, gaze = np.linspace(0.01, 0.27, 40), gaze_in_camera(40, 2)
     write_tobii(folder, t, gaze)
     rays = read("tobii3", folder, **options, fps=10.0)
     assert np.allclose(rays.origin[:, 0], t, atol=1e-6)
-    assert "10 a second exactly" in rays.metadata["complaints"][0]
+    assert "exactly 10 per second" in rays.metadata["complaints"][0]
 
 
-def test_samples_without_gaze_and_lines_that_are_none(tobii):
+def test_samples_without_gaze_and_invalid_lines(tobii):
     folder, options = tobii
     lines = [
         sample_g3(0.0, [0.5, 0.5], None),
@@ -334,18 +334,18 @@ def test_samples_without_gaze_and_lines_that_are_none(tobii):
     assert len(rays) == 1 and dropped(rays) == {
         "there is no gaze": [[2, 2]],
         "gaze lies beyond the scene camera's picture": [[4, 4]],
-        "the line is cut off, has cells too many, or holds one that is no number": [[6, 6]],
+        "the line is incomplete, has too many cells, or a cell that is not a number": [[6, 6]],
     }
 
 
-def test_tobii_calibrations_that_are_none(tobii):
+def test_invalid_tobii_calibrations_are_refused(tobii):
     folder, options = tobii
     for change, message in (
-        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}, "by no rotation"),
-        ({"radial-distortion": [1]}, "no whole camera calibration"),
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}, "rotation in the calibration"),
+        ({"radial-distortion": [1]}, "no complete calibration"),
     ):
-        about = {"scenecamera": {"camera-calibration": {**CALIBRATION_G3, **change}}}
-        (folder / "recording.g3").write_text(json.dumps(about))
+        content = {"scenecamera": {"camera-calibration": {**CALIBRATION_G3, **change}}}
+        (folder / "recording.g3").write_text(json.dumps(content))
         with pytest.raises(NergError, match=message):
             read("tobii3", folder, **options)
 
@@ -355,7 +355,7 @@ def test_tobii_calibrations_that_are_none(tobii):
 TOOLS_HEAD = "timestamp\tframe_idx\tgaze_pos_vid_x\tgaze_pos_vid_y"
 
 
-def test_rays_are_those_of_the_pixels(glasses):
+def test_rays_follow_the_pixels(glasses):
     folder, options = glasses
     t, gaze = np.linspace(0.0, 0.28, 30), gaze_in_camera(30, 8)
     pixels = project(gaze, MATRIX, **LENS)
@@ -371,7 +371,7 @@ def test_rays_are_those_of_the_pixels(glasses):
     assert rays.metadata["frames"] == "scene/frame_{frame1}"
 
 
-def test_numbers_from_0_are_a_frame_later(glasses):
+def test_frame_numbers_from_0_and_1(glasses):
     folder, options = glasses
     rays = read("glassestools", folder, **options)
     with pytest.raises(NergError, match="8.*0.*8.*--frames"):
@@ -381,21 +381,21 @@ def test_numbers_from_0_are_a_frame_later(glasses):
     assert np.allclose(later.origin[:, 0], rays.origin[1:, 0] - 0.1, atol=1e-9)
 
 
-def test_calibrations_that_are_none(glasses):
+def test_invalid_calibrations_are_refused(glasses):
     folder, options = glasses
     for text, message in (
         ("<opencv_storage></opencv_storage>", "lacks the cameraMatrix or the distCoeff"),
-        (opencv_xml(cameraMatrix=MATRIX, distCoeff=[0.0]).replace("891.0", "x"), "no number"),
+        (opencv_xml(cameraMatrix=MATRIX, distCoeff=[0.0]).replace("891.0", "x"), "not a number"),
     ):
         (folder / "calibration.xml").write_text(text)
         with pytest.raises(NergError, match=message):
             read("glassestools", folder, **options)
 
 
-def test_frames_that_are_not_counted(glasses):
+def test_unnumbered_frames_are_refused(glasses):
     folder, options = glasses
     (folder / "frameTimestamps.tsv").write_text(table("frame_idx\ttimestamp", [[1, 0], [2, 40]], "\t"))
-    with pytest.raises(NergError, match="does not count its frames"):
+    with pytest.raises(NergError, match="are not numbered"):
         read("glassestools", folder, **options)
     (folder / "frameTimestamps.tsv").unlink()
     with pytest.raises(NergError, match="--fps"):
@@ -439,7 +439,7 @@ def test_pupil(tmp_path):
         read("pupil", folder / "gaze_positions.csv", marker=0.05)
 
 
-def test_between_head_poses_far_apart_gaze_is_dropped(tmp_path):
+def test_gaze_in_gaps_of_head_poses_is_dropped(tmp_path):
     folder = tmp_path / "anna"
     folder.mkdir()
     head = "timestamp,rotation_x,rotation_y,rotation_z,translation_x,translation_y,translation_z\n"
@@ -450,6 +450,6 @@ def test_between_head_poses_far_apart_gaze_is_dropped(tmp_path):
     rays = read("pupil", folder, marker=1.0, up="z")
     assert np.allclose(rays.t, [10.01, 10.06, 10.92, 11.04]) and np.allclose(rays.origin[:, 0], rays.t)
     assert dropped(rays) == {"there is no head pose at that time": [[4, 4]]}
-    # What was read is written down: both files, by person, since their names are alike in every recording.
+    # Both files are recorded with the participant, since file names are equal in all recordings.
     names = ["anna/head_pose_tracker_poses.csv", "anna/gaze_positions.csv"]
     assert [s["file"] for s in rays.metadata["sources"]] == names

@@ -15,14 +15,14 @@ from nerg_mi.rays.readers.registry import read_rays
 from nerg_mi.rays.readers.scene_glasses import (
     FrameNames,
     GazeBlock,
-    PlaceFrame,
     Recording,
     SceneCamera,
     SceneCameraOptions,
+    SceneCoordinates,
     SceneReader,
     angles_between,
     directions_from_angles,
-    is_timed,
+    is_timed_pose_file,
     read_timed_poses,
 )
 from tests.photos.test_colmap import write_transforms
@@ -51,29 +51,29 @@ FRAMES = np.array([0.5, 0.54, 0.57, 0.61])
 )
 def test_times(pattern, name, seconds):
     names = FrameNames.parse(pattern)
-    assert str(names) == pattern and names.of_recording == ("recording" in pattern)
+    assert str(names) == pattern and names.has_recording == ("recording" in pattern)
     if seconds is None:
         with pytest.raises(NergError, match="image of the model"):
-            names.times([name], "ann (2)", FRAMES, None, 1.7e18)
+            names.compute_times([name], "ann (2)", FRAMES, None, 1.7e18)
         return
-    found = names.times([name, "IMG_77x.JPG"], "ann (2)", FRAMES, None, 1.7e18)
-    assert np.allclose(found, [seconds, np.nan], equal_nan=True)
+    result = names.compute_times([name, "IMG_77x.JPG"], "ann (2)", FRAMES, None, 1.7e18)
+    assert np.allclose(result, [seconds, np.nan], equal_nan=True)
 
 
 @pytest.mark.parametrize(
     "fps, shown",
     [
-        # What FFmpeg's filter fps gives of frames numbered from 0 at 24.95 a second.
+        # Result of FFmpeg's filter fps for frames numbered from 0 at 24.95 Hz.
         (5.0, [2, 7, 12, 17, 22, 27, 32, 37, 42, 47, 52, 57]),
         (10.0, [1, 3, 6, 8, 11, 13, 16, 18, 21, 23, 26, 28]),
         (40.0, [0, 0, 1, 2, 2, 3, 4, 4, 5, 5, 6, 7]),
     ],
 )
-def test_a_steady_rate(fps, shown):
+def test_constant_rate(fps, shown):
     frames = 0.5 + np.arange(60) / 24.95
-    found = FrameNames("{frame0}").times([str(k) for k in range(12)], "", frames, fps, 0)
-    assert np.allclose(found, frames[shown])
-    assert np.allclose(FrameNames("{frame0}").times(["1", "6"], "", None, 2.0, 0), [0.5, 3.0])
+    result = FrameNames("{frame0}").compute_times([str(k) for k in range(12)], "", frames, fps, 0)
+    assert np.allclose(result, frames[shown])
+    assert np.allclose(FrameNames("{frame0}").compute_times(["1", "6"], "", None, 2.0, 0), [0.5, 3.0])
 
 
 @pytest.mark.parametrize(
@@ -83,13 +83,13 @@ def test_a_steady_rate(fps, shown):
         ("{frame1}", "0", FRAMES, 5.0, "frame -1 of the video"),
         ("{frame1}", "0", None, 5.0, "frame -1 of the video"),
         ("{frame1}", "5", FRAMES, None, "frame 4 of the video, counted from 0, which has 4"),
-        ("{frame0}", "2", FRAMES, 5.0, r"frame 2 .* which has 4 \(5 a second were counted\)"),
+        ("{frame0}", "2", FRAMES, 5.0, r"frame 2 .* which has 4 \(at 5 per second\)"),
         ("{frame0}", "5", None, None, "scene video.*--fps"),
     ],
 )
-def test_frames_that_there_are_not(pattern, name, frames, fps, message):
+def test_missing_frames_are_refused(pattern, name, frames, fps, message):
     with pytest.raises(NergError, match=message):
-        FrameNames(pattern).times([name], "", frames, fps, 0)
+        FrameNames(pattern).compute_times([name], "", frames, fps, 0)
 
 
 @pytest.mark.parametrize("pattern", ["", "frame_*", "{frame0}_{s}", "{frame1}{frame1}", "{number}"])
@@ -98,7 +98,7 @@ def test_patterns_without_a_time(pattern):
         FrameNames.parse(pattern)
 
 
-# ---- The coordinates of a place that was trained ----
+# ---- Coordinates of a trained scene ----
 
 
 def write_place(path, **provenance):
@@ -106,37 +106,37 @@ def write_place(path, **provenance):
     return path
 
 
-def test_the_place_is_what_the_file_was_turned_into(tmp_path):
+def test_scene_coordinates_follow_the_training(tmp_path):
     to_place = np.eye(4)
     to_place[:3, :3] = 0.3 * Rotation.from_euler("xyz", [1, 2, 3]).as_matrix()
     to_place[:3, 3] = 1, 2, 3
     path = write_place(tmp_path / "p.safetensors", to_file=np.linalg.inv(to_place).tolist(), up=[0, 1, 0], sha256="ab")
-    found, points = PlaceFrame.of_checkpoint(path), np.random.default_rng(0).normal(size=(9, 3))
-    assert np.allclose(found.points(points), points @ to_place[:3, :3].T + to_place[:3, 3])
-    assert np.isclose(found.scale, 0.3) and np.allclose(found.rotation, to_place[:3, :3] / 0.3)
-    assert found.up is not None and found.up.tolist() == [0, 1, 0] and found.sha256 == "ab"
-    assert np.allclose(PlaceFrame.scaled(2.0).points(points), 2 * points)
+    result, points = SceneCoordinates.from_checkpoint(path), np.random.default_rng(0).normal(size=(9, 3))
+    assert np.allclose(result.transform_points(points), points @ to_place[:3, :3].T + to_place[:3, 3])
+    assert np.isclose(result.scale, 0.3) and np.allclose(result.rotation, to_place[:3, :3] / 0.3)
+    assert result.up is not None and result.up.tolist() == [0, 1, 0] and result.sha256 == "ab"
+    assert np.allclose(SceneCoordinates.from_scale(2.0).transform_points(points), 2 * points)
 
 
 @pytest.mark.parametrize(
     "provenance, message",
     [
-        ({}, "does not say in which coordinates"),
-        ({"to_file": [1, 2]}, "does not say in which coordinates"),
-        ({"to_file": np.diag([1.0, 2, 1, 1]).tolist()}, "no similarity"),
-        ({"to_file": np.diag([1.0, -1, 1, 1]).tolist()}, "no similarity"),
-        ({"to_file": np.zeros((4, 4)).tolist()}, "no similarity"),
+        ({}, "does not contain the coordinates"),
+        ({"to_file": [1, 2]}, "does not contain the coordinates"),
+        ({"to_file": np.diag([1.0, 2, 1, 1]).tolist()}, "not a similarity"),
+        ({"to_file": np.diag([1.0, -1, 1, 1]).tolist()}, "not a similarity"),
+        ({"to_file": np.zeros((4, 4)).tolist()}, "not a similarity"),
     ],
 )
-def test_places_that_do_not_tell(tmp_path, provenance, message):
+def test_checkpoints_without_coordinates_are_refused(tmp_path, provenance, message):
     with pytest.raises(NergError, match=message):
-        PlaceFrame.of_checkpoint(write_place(tmp_path / "p.safetensors", **provenance))
+        SceneCoordinates.from_checkpoint(write_place(tmp_path / "p.safetensors", **provenance))
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, 1e12])
-def test_scales_that_are_none(scale):
+def test_invalid_scales_are_refused(scale):
     with pytest.raises(NergError, match="--scale"):
-        PlaceFrame.scaled(scale)
+        SceneCoordinates.from_scale(scale)
 
 
 # ---- Pixels and angles of a scene camera ----
@@ -144,23 +144,23 @@ def test_scales_that_are_none(scale):
 SIZE = (1600, 1200)
 
 
-def test_pixels_lead_back_to_where_they_came_from():
+def test_pixels_and_directions_are_inverse():
     gaze = gaze_in_camera(500)
-    camera = SceneCamera.of_opencv(MATRIX, list(LENS.values()), SIZE)
-    assert np.abs(camera.directions(project(gaze, MATRIX, **LENS)) - gaze).max() < 1e-10
-    plain = SceneCamera.of_opencv(MATRIX, None)
-    assert np.allclose(plain.directions(np.array([[810.0, 605.0]])), [[0, 0, 1]])
-    # Four zeros of thin prisms follow in some files.
-    padded = SceneCamera.of_opencv(np.ravel(MATRIX), [list(LENS.values()) + [0] * 4], SIZE)
+    camera = SceneCamera.from_opencv(MATRIX, list(LENS.values()), SIZE)
+    assert np.abs(camera.compute_directions(project(gaze, MATRIX, **LENS)) - gaze).max() < 1e-10
+    plain = SceneCamera.from_opencv(MATRIX, None)
+    assert np.allclose(plain.compute_directions(np.array([[810.0, 605.0]])), [[0, 0, 1]])
+    # Some files have four zeros for thin prisms.
+    padded = SceneCamera.from_opencv(np.ravel(MATRIX), [list(LENS.values()) + [0] * 4], SIZE)
     assert padded == camera
 
 
-def test_beyond_the_picture_there_is_no_direction():
-    camera = SceneCamera.of_opencv(MATRIX, list(LENS.values()), SIZE)
+def test_pixels_outside_of_the_image_have_no_direction():
+    camera = SceneCamera.from_opencv(MATRIX, list(LENS.values()), SIZE)
     pixels = np.array([[-1.0, 600], [800, 1200.2], [np.nan, 3], [-0.4, 0], [1599.4, 1199]])
-    assert np.isnan(camera.directions(pixels)).any(axis=1).tolist() == [True, True, True, False, False]
-    folding = SceneCamera.of_opencv(MATRIX, [-0.4], None)
-    far = folding.directions(np.array([[811.0, 605.0], [3000.0, 605.0]]))
+    assert np.isnan(camera.compute_directions(pixels)).any(axis=1).tolist() == [True, True, True, False, False]
+    folding = SceneCamera.from_opencv(MATRIX, [-0.4], None)
+    far = folding.compute_directions(np.array([[811.0, 605.0], [3000.0, 605.0]]))
     assert np.isfinite(far[0]).all() and np.isnan(far[1]).all()
 
 
@@ -182,12 +182,12 @@ def test_angles():
         (MATRIX, [0.0] * 11 + [1.0], "rational model"),
     ],
 )
-def test_what_is_no_camera(matrix, coefficients, message):
+def test_invalid_cameras_are_refused(matrix, coefficients, message):
     with pytest.raises(NergError, match=f"the calibration .*{message}"):
-        SceneCamera.of_opencv(matrix, coefficients)
+        SceneCamera.from_opencv(matrix, coefficients)
 
 
-# ---- Gaze of a scene camera in the coordinates in which its place was trained ----
+# ---- Gaze of a scene camera in the coordinates of the trained scene ----
 
 
 @pytest.fixture
@@ -207,8 +207,8 @@ def turn_model(path, rotation, scale=1.0):
     write_transforms(path, poses)
 
 
-def test_an_upright_place_has_the_rays_of_its_training(neon):
-    """The model lies on its side and is twice as large; training turned it upright and gave its scale."""
+def test_rays_are_in_the_coordinates_of_an_upright_training(neon):
+    """The model is tilted and twice as large; training rotated it upright and set its scale."""
     folder, options = neon
     straight = read("neon", folder, **options)
     turn_model(options["poses"], Rotation.from_euler("x", 70, degrees=True), 2.0)
@@ -222,7 +222,7 @@ def test_an_upright_place_has_the_rays_of_its_training(neon):
     rays = read("neon", folder, **options, place=place)
     assert np.allclose(rays.origin, straight.origin, atol=1e-9) and "complaints" not in rays.metadata
     assert np.allclose(rays.direction, straight.direction, atol=1e-9)
-    # The poses of the training itself, as capture reads them.
+    # The poses used by the training itself.
     frames = [f for f in split.posed.frames if f.name.startswith("scene")]
     assert np.allclose(rays.origin[0], frames[0].to_world[:3, 3], atol=0.01)
     assert read_named_poses(options["poses"]).sha256 == split.posed.sha256
@@ -230,7 +230,7 @@ def test_an_upright_place_has_the_rays_of_its_training(neon):
         read("neon", folder, **options, place=place, scale=2.0)
 
 
-def test_a_place_of_another_file_is_told(neon):
+def test_scene_of_another_file_gives_a_warning(neon):
     folder, options = neon
     place = write_place(folder / "place.safetensors", to_file=np.eye(4).tolist(), sha256="00")
     rays = read("neon", folder, **options, place=place)
@@ -239,8 +239,8 @@ def test_a_place_of_another_file_is_told(neon):
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_a_place_that_lies_on_its_side_is_told(neon, known):
-    """By how its cameras are held, or by what its training knew; declared, the rays are z up."""
+def test_tilted_scene_gives_a_warning(neon, known):
+    """By the orientation of its cameras, or by the training; as declared, the rays are z up."""
     folder, options = neon
     straight = read("neon", folder, **options)
     turn_model(options["poses"], Rotation.from_euler("x", 90, degrees=True))
@@ -254,27 +254,27 @@ def test_a_place_that_lies_on_its_side_is_told(neon, known):
     assert np.allclose(rays.origin, straight.origin) and np.allclose(rays.direction, straight.direction)
 
 
-def test_one_frame_is_no_track(neon):
+def test_single_frame_is_refused(neon):
     folder, options = neon
     model = json.loads(options["poses"].read_text())
     options["poses"].write_text(json.dumps({"frames": model["frames"][:2]}))
-    with pytest.raises(NergError, match="two are needed"):
+    with pytest.raises(NergError, match="at least two"):
         read("neon", folder, **options)
 
 
-# ---- A reader of glasses that is two methods: its gaze becomes rays where the model's frames stand ----
+# ---- A minimal reader of glasses with two methods ----
 
 
 class Centre(SceneReader[Recording]):
-    """Seconds, a line each, at which the wearer looked along the scene camera's axis."""
+    """Times in seconds, one per line, at which the wearer looked along the scene camera's axis."""
 
-    name, files, checked_on = "centre", "folders with gaze.txt", "nothing"
+    name, files, validated_on = "centre", "folders with gaze.txt", "nothing"
     gaze_file = "gaze.txt"
 
-    def open(self, folder, builder):
+    def open_recording(self, folder, builder):
         return Recording(name=folder.name, person=f"wearer of {folder.name}", frames=np.arange(8) / 10)
 
-    def blocks(self, gaze, recording, builder):
+    def iterate_gaze(self, gaze, recording, builder):
         t = np.loadtxt(gaze, ndmin=1)
         builder.count_lines(len(t))
         ahead = np.tile([0.0, 0.0, 1.0], (len(t), 1))
@@ -289,13 +289,13 @@ def recording(tmp_path):
     return tmp_path
 
 
-def test_gaze_starts_where_the_camera_was(recording):
-    """The folder and its file are the same; a row that is dropped, and one after the last frame, are counted."""
+def test_gaze_starts_at_the_camera(recording):
+    """The folder and its file give the same rays; a dropped row and one after the last frame are counted."""
     frames = json.loads((recording / "transforms.json").read_text())["frames"][1:]  # the first is a photo
     poses = np.array([f["transform_matrix"] for f in frames])
     options = SceneCameraOptions(poses=recording / "transforms.json", frames=FrameNames("scene/frame_{frame1}.jpg"))
-    for given in (recording / "ann", recording / "ann" / "gaze.txt"):
-        rays = read_rays(Centre(), given, options)
+    for cases in (recording / "ann", recording / "ann" / "gaze.txt"):
+        rays = read_rays(Centre(), cases, options)
         assert rays.persons == ("wearer of ann",) and np.allclose(rays.t, [0, 0.1, 0.55])
         assert np.allclose(rays.origin[:2], poses[:2, :3, 3])
         assert np.allclose(rays.origin[2], (poses[5, :3, 3] + poses[6, :3, 3]) / 2, atol=1e-3)
@@ -304,19 +304,19 @@ def test_gaze_starts_where_the_camera_was(recording):
         read_rays(Centre(), recording / "cem", options)
 
 
-# ---- Poses with times of their own ----
+# ---- Timed poses ----
 
 NAMES = "translation_x translation_y translation_z rotation_x rotation_y rotation_z rotation_w"
 
 CSV = ",".join(["start_timestamp", "end_timestamp", *NAMES.split()]) + "\n"
 
 
-def test_which_files_have_times(tmp_path):
+def test_timed_pose_files(tmp_path):
     names = ("aligned_poses.csv", "camera_pose.json", "poses.p", "transforms.json", "sparse")
-    assert [is_timed(tmp_path / n) for n in names] == [True, True, True, False, False]
+    assert [is_timed_pose_file(tmp_path / n) for n in names] == [True, True, True, False, False]
 
 
-def test_quaternions_and_vectors_are_the_same(tmp_path):
+def test_quaternions_and_rotation_vectors_are_equal(tmp_path):
     half = np.sqrt(0.5)
     a, b = tmp_path / "aligned_poses.csv", tmp_path / "camera_pose.json"
     a.write_text(
@@ -333,14 +333,14 @@ def test_quaternions_and_vectors_are_the_same(tmp_path):
 @pytest.mark.parametrize(
     "name, text, message",
     [
-        ("aligned_poses.csv", CSV + "0,1,1,1,1,0,0,0,1\n", "holds 1 poses"),
+        ("aligned_poses.csv", CSV + "0,1,1,1,1,0,0,0,1\n", "has 1 poses"),
         ("aligned_poses.csv", "a,b\n1,2\n", "no column start_timestamp"),
-        ("camera_pose.json", "{}", "no list of camera poses"),
-        ("camera_pose.json", '[{"start_timestamp": 0}]', "no list of camera poses"),
-        ("poses.p", "x", "pickle, which may run"),
+        ("camera_pose.json", "{}", "not a list of camera poses"),
+        ("camera_pose.json", '[{"start_timestamp": 0}]', "not a list of camera poses"),
+        ("poses.p", "x", "pickle, which can execute"),
     ],
 )
-def test_what_holds_no_poses(tmp_path, name, text, message):
+def test_files_without_poses_are_refused(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with pytest.raises(NergError, match=message):
         read_timed_poses(tmp_path / name)
