@@ -1,4 +1,4 @@
-"""Logs of Unity projects, by the names that their columns usually have: gaze in the world, in the head, or heads."""
+"""Logs of Unity projects with usual column names: gaze in the world or in the head's frame, or heads only."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 from nerg_mi.errors import NergError, sanitize
 
 from . import columns as names
-from .base import DESCRIPTION, UNITY, InFrame, RaysBuilder, Signature, TickOption, valid_option
-from .columns import ColumnFinder, ColumnMap, is_validity, parse_valid
+from .base import GENERATED_FILES, UNITY, FixedFrameReader, RaysBuilder, Signature, TickOption, valid_option
+from .columns import ColumnFinder, ColumnMap, is_validity_column, parse_valid
 from .table import TableOptions, add_tables, find_person
 
 
 @dataclass(frozen=True, kw_only=True)
 class UnityOptions(TickOption):
-    """What names do not say. Raises `NergError` for a text that names no column with values."""
+    """Options of Unity logs. Raises `NergError` for an invalid ``valid``."""
 
     valid: str | None = valid_option()
 
@@ -25,33 +25,34 @@ class UnityOptions(TickOption):
         parse_valid(self.valid)
 
 
-class UnityReader(InFrame):
-    """Tables of Unity's world (y up, left-handed, metres), whose columns are found by name.
+class UnityReader(FixedFrameReader):
+    """Tables in Unity's world (y up, left-handed, metres), with columns found by name.
 
-    Where there are, ``hit_*`` (or ``gaze_hit_*``, ``hit_point_*``), a time, a person, ``confidence`` and columns of
-    validity (``status``, ``isValid``, ``GazeValidity``: rows that are not valid are dropped) are read too. Without a
-    person the file is the person. ``columns_of``: the columns that say where from and whereto.
+    Optional columns are ``hit_*`` (or ``gaze_hit_*``, ``hit_point_*``), a time, a person, ``confidence`` and columns of
+    validity (``status``, ``isValid``, ``GazeValidity``), whose invalid rows are dropped. Without a person, each file is
+    one participant. ``find_columns`` finds the columns of origin and direction in a table.
     """
 
-    world = "Unity: y up, left, m"
-    checked_on = DESCRIPTION
-    fixed = UNITY
-    # What projects call the gaze does not say of which frame it is: a column map is proposed.
+    frame_description = "Unity: y up, left, m"
+    validated_on = GENERATED_FILES
+    fixed_frame = UNITY
+    # Usual column names do not tell the frame of the gaze: `nerg rays guess` proposes a column map instead.
     signature = Signature()
     Options = UnityOptions
 
-    def __init__(self, name: str, files: str, columns_of: Callable[[ColumnFinder], dict]) -> None:
-        self.name, self.files, self._columns_of = name, files, columns_of
+    def __init__(self, name: str, files: str, find_columns: Callable[[ColumnFinder], dict]) -> None:
+        self.name, self.files, self._find_columns = name, files, find_columns
 
     def read(self, files: Sequence[Path], options: UnityOptions, builder: RaysBuilder) -> None:
-        first, *others = (ColumnFinder(path) for path in files)
-        columns = self._map(first, find_person(first, builder))
-        for other in others:
-            # Tables of one recording have the same columns.
-            if (found := str(self._map(other, find_person(other, builder)))) != str(columns):
+        first, *other_tables = (ColumnFinder(path) for path in files)
+        columns = self._make_map(first, find_person(first, builder))
+        for other in other_tables:
+            # All tables must have the same columns.
+            if (other_columns := str(self._make_map(other, find_person(other, builder)))) != str(columns):
                 raise NergError(
-                    f"{other.path} has other columns ({sanitize(found)}) than {first.path} ({sanitize(columns)}); "
-                    "import them apart, or with one column map (--map)"
+                    f"{other.path} has other columns ({sanitize(other_columns)}) than {first.path} "
+                    f"({sanitize(columns)}); "
+                    "import them separately, or with one column map (--map)"
                 )
         settings = TableOptions(
             columns=columns,
@@ -62,58 +63,58 @@ class UnityReader(InFrame):
             valid=options.valid,
             tick=options.tick,
         )
-        add_tables(files, settings, builder, [name for name in first.columns if is_validity(name)])
+        add_tables(files, settings, builder, [name for name in first.columns if is_validity_column(name)])
 
-    def _map(self, table: ColumnFinder, person: str | None) -> ColumnMap:
+    def _make_map(self, table: ColumnFinder, person: str | None) -> ColumnMap:
         return ColumnMap(
-            **self._columns_of(table),
-            hit=table.find_vector(*names.HITS),
-            t=table.find(*names.TIMES),
+            **self._find_columns(table),
+            hit=table.find_vector(*names.HIT_NAMES),
+            t=table.find(*names.TIME_NAMES),
             person=person,
             confidence=table.find("confidence"),
         )
 
 
-def _gaze_in_world(table: ColumnFinder) -> dict:
+def _find_gaze_in_world(table: ColumnFinder) -> dict:
     return {
-        "direction": table.vector(*names.DIRECTIONS, *names.BARE_DIRECTIONS),
-        "origin": table.vector(*names.EYES, *names.BARE_PLACES),
-        "head": table.find_vector(*names.ROTATIONS, axes="xyzw"),  # for the checks
+        "direction": table.require_vector(*names.DIRECTION_NAMES, *names.BARE_DIRECTION_NAMES),
+        "origin": table.require_vector(*names.EYE_NAMES, *names.BARE_POSITION_NAMES),
+        "head": table.find_vector(*names.ROTATION_NAMES, axes="xyzw"),  # for the checks
     }
 
 
-def _gaze_in_head(table: ColumnFinder) -> dict:
+def _find_gaze_in_head(table: ColumnFinder) -> dict:
     return {
-        "direction": table.vector(*names.DIRECTIONS, *names.BARE_DIRECTIONS),
-        "eye": table.find_vector(*names.EYES),
-        "origin": table.vector(*names.HEADS, *names.BARE_PLACES),
-        "xyzw": table.vector(*names.ROTATIONS, *names.BARE_ROTATIONS, axes="xyzw"),
+        "direction": table.require_vector(*names.DIRECTION_NAMES, *names.BARE_DIRECTION_NAMES),
+        "eye": table.find_vector(*names.EYE_NAMES),
+        "origin": table.require_vector(*names.HEAD_NAMES, *names.BARE_POSITION_NAMES),
+        "xyzw": table.require_vector(*names.ROTATION_NAMES, *names.BARE_ROTATION_NAMES, axes="xyzw"),
     }
 
 
-def _heads(table: ColumnFinder) -> dict:
-    rotation = table.find_vector(*names.ROTATIONS, *names.BARE_ROTATIONS, axes="xyzw")
+def _find_heads(table: ColumnFinder) -> dict:
+    rotation = table.find_vector(*names.ROTATION_NAMES, *names.BARE_ROTATION_NAMES, axes="xyzw")
     if rotation is not None:
-        return {"origin": table.vector(*names.HEADS, *names.BARE_PLACES), "xyzw": rotation}
+        return {"origin": table.require_vector(*names.HEAD_NAMES, *names.BARE_POSITION_NAMES), "xyzw": rotation}
     # Unity's Euler angles in degrees are pitch, yaw and roll.
-    x, y, z = table.vector(*names.ROTATIONS, "rot", "rotation")
-    return {"origin": table.vector(*names.HEADS, *names.BARE_PLACES), "ypr": (y, x, z)}
+    x, y, z = table.require_vector(*names.ROTATION_NAMES, "rot", "rotation")
+    return {"origin": table.require_vector(*names.HEAD_NAMES, *names.BARE_POSITION_NAMES), "ypr": (y, x, z)}
 
 
 READERS = (
     UnityReader(
         "unity",
-        "logs of gaze in the world: `gaze_origin_*`, `gaze_dir_*` (or `gaze_direction_*`, `gaze_forward_*`), if there "
-        "are: `hit_*`, a time, a person, a validity (`status`, `isValid`)",
-        _gaze_in_world,
+        "logs of gaze in the world: `gaze_origin_*`, `gaze_dir_*` (or `gaze_direction_*`, `gaze_forward_*`), "
+        "optionally `hit_*`, a time, a person, a validity (`status`, `isValid`)",
+        _find_gaze_in_world,
     ),
     UnityReader(
         "unity_local",
-        "the same in the head's frame (z forward), beside `head_pos_*` and `head_rot_*` (x, y, z, w); without "
-        "`gaze_origin_*` the eye is the head",
-        _gaze_in_head,
+        "the same in the head's frame (z forward), with `head_pos_*` and `head_rot_*` (x, y, z, w); without "
+        "`gaze_origin_*` the eye is at the head",
+        _find_gaze_in_head,
     ),
     UnityReader(
-        "unity_head", "heads alone: `head_pos_*`, `head_rot_*` (a quaternion, or Unity's Euler angles)", _heads
+        "unity_head", "heads only: `head_pos_*`, `head_rot_*` (a quaternion, or Unity's Euler angles)", _find_heads
     ),
 )

@@ -10,7 +10,7 @@ from nerg_mi.rays.readers import tables
 from nerg_mi.rays.readers.eyenavgs import read_scene_settings
 from tests.rays.readers.examples import csv_rows, dropped, read
 
-# ---- EyeNavGS's recordings of both sites ----
+# ---- EyeNavGS recordings of both sites ----
 
 COMMON = [f"FOV{k}" for k in range(1, 5)] + [f"Position{a}" for a in "XYZ"] + [f"Quaternion{a}" for a in "XYZW"]
 PLACE, TURN = [f"GazePos{a}" for a in "XYZ"], [f"GazeQ{a}" for a in "XYZW"]
@@ -18,7 +18,7 @@ RUTGERS = ["ViewIndex", *COMMON, *PLACE, *TURN, "Timestamp"]
 NTHU = ["ViewIndex", *COMMON, *TURN, *PLACE, "timestep"]
 
 
-# Of Rutgers: units a metre, the angle about x that stands the place upright (degrees), and the play area's start.
+# Of Rutgers: units per metre, the angle about x that makes the scene upright (degrees), and the play area's position.
 PLACES = {
     "room": (2, -26.99, (0, 1.15, 0)),
     "playroom": (2.7, -22.62, (0, 0.88, 0)),
@@ -36,23 +36,23 @@ def about_x(degrees: float) -> np.ndarray:
 
 
 def ahead(q) -> np.ndarray:
-    """Where (0, 0, -1) goes by unit quaternions (n, 4), x, y, z, w: minus the third column of their matrices."""
+    """The direction of (0, 0, -1) rotated by unit quaternions (n, 4), x, y, z, w: minus the third matrix column."""
     x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     return -np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=1)
 
 
 def upwards(v) -> np.ndarray:
-    """From y up to z up."""
+    """Convert from y up to z up."""
     return np.stack([v[:, 0], -v[:, 2], v[:, 1]], axis=1)
 
 
 @pytest.mark.parametrize(("place", "user"), [("room", "user101"), ("truck", "user102"), ("playroom", "user103")])
-def test_recordings_against_a_computation_by_hand(recorded, place, user):
+def test_recordings_equal_a_reference_computation(recorded, place, user):
     path = recorded("eyenavgs") / place / f"{user}_{place}.csv.gz"
     rays = read("eyenavgs", path)
     scale, degrees, start = PLACES[place]
     left, right = numbers_of(path)[0::2], numbers_of(path)[1::2]
-    assert not left[:, 0].any() and (right[:, 0] == 1).all()  # nothing is missing in these
+    assert not left[:, 0].any() and (right[:, 0] == 1).all()  # these files are complete
     upright = about_x(degrees)
     middle = 0.5 * (left[:, 5:8] + right[:, 5:8])
     area = np.array([upright @ ((x - start) / scale + start) + start for x in middle])
@@ -60,16 +60,16 @@ def test_recordings_against_a_computation_by_hand(recorded, place, user):
     sight = (ahead(left[:, 15:19]) + ahead(right[:, 15:19])) @ upright.T
     sight = upwards(sight / np.linalg.norm(sight, axis=1, keepdims=True))
     assert np.abs(rays.head - upwards(ahead(left[:, 8:12]) @ upright.T)).max() < 1e-3
-    apart = np.median(np.linalg.norm(right[:, 5:8] - left[:, 5:8], axis=1)) / scale
-    assert abs(rays.metadata["eye_distance"][user] - apart) < 1e-4 and 0.058 < apart < 0.07
+    distances = np.median(np.linalg.norm(right[:, 5:8] - left[:, 5:8], axis=1)) / scale
+    assert abs(rays.metadata["eye_distance"][user] - distances) < 1e-4 and 0.058 < distances < 0.07
     assert np.abs(rays.direction - sight).max() < 1e-3
     assert np.allclose(rays.t, 1e-3 * left[:, 19]) and rays.persons == (user,)
-    about = rays.metadata
-    assert about["place"] == place and about["units_per_metre"] == scale and about["dropped"] == []
-    # In the splats' axes y is down and z ahead, in which the recorder has them the other way round.
-    to_splat = np.array(about["place_from_rays"])
+    content = rays.metadata
+    assert content["place"] == place and content["units_per_metre"] == scale and content["dropped"] == []
+    # In the splats' axes y is down and z forward, which the recorder has inverted.
+    to_splat = np.array(content["place_from_rays"])
     assert np.allclose(rays.origin @ to_splat[:3, :3].T + to_splat[:3, 3], middle * (1, -1, -1), atol=1e-9)
-    # Each eye's line of sight is a degree and a half off the gaze, inwards: to the side where the other eye is.
+    # Each eye's line of sight is 1.5 degrees off the gaze, towards the other eye.
     for eye in ("left", "right"):
         one = read("eyenavgs", path, eye=eye)
         across = np.cross(rays.direction, one.direction)
@@ -80,7 +80,7 @@ def test_recordings_against_a_computation_by_hand(recorded, place, user):
 
 @pytest.mark.parametrize("place", PLACES)
 def test_all_recordings(recorded, place):
-    """Which are frozen, where eyes are above the floor, how far apart, and that heads are upright."""
+    """Frozen recordings, eye heights, eye distances, and upright heads."""
     folder = recorded("eyenavgs") / place
     rays = read("eyenavgs", folder)
     frozen, locked = {"room": (6, 5), "playroom": (8, 5), "truck": (4, 4)}[place]
@@ -94,28 +94,28 @@ def test_all_recordings(recorded, place):
     for path in sorted(folder.glob("*.gz"))[::5]:
         v = numbers_of(path)
         pairs = np.flatnonzero((v[:-1, 0] == 0) & (v[1:, 0] == 1))
-        apart = np.linalg.norm(v[pairs, 5:8] - v[pairs + 1, 5:8], axis=1) / scale
-        assert 0.055 < np.percentile(apart, 1) and np.percentile(apart, 99) < 0.075
+        distances = np.linalg.norm(v[pairs, 5:8] - v[pairs + 1, 5:8], axis=1) / scale
+        assert 0.055 < np.percentile(distances, 1) and np.percentile(distances, 99) < 0.075
         x, y, z, w = v[pairs, 8:12].T
         up += np.mean([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)], axis=1)
     upright = about_x(degrees) @ up
     assert np.degrees(np.arccos(upright[1] / np.linalg.norm(upright))) < 8  # before: 10 to 27
 
 
-# --- generated recordings -------------------------------------------------------------------------------------------
+# --- Generated recordings -------------------------------------------------------------------------------------------
 
 
 def quaternion(degrees: float) -> list[float]:
-    """About y, to the left."""
+    """Rotation about y, to the left."""
     return [0, math.sin(math.radians(degrees) / 2), 0, math.cos(math.radians(degrees) / 2)]
 
 
 def write(
-    folder, name="user7_room.csv", site=RUTGERS, gaze=lambda k: 2.0 * k, eyes=((0, 1) * 6), head=lambda k: 3.0 * k
+    folder, name="user7_room.csv", site=RUTGERS, gaze=lambda k: 2.0 * k, both_eyes=((0, 1) * 6), head=lambda k: 3.0 * k
 ):
-    """Eyes 6.4 cm apart along x; both turn to the left, each by a degree and a half inwards of the gaze."""
+    """Eyes 6.4 cm apart along x; both turn to the left, each 1.5 degrees towards the other."""
     rows = []
-    for k, eye in enumerate(eyes):
+    for k, eye in enumerate(both_eyes):
         cells = {"ViewIndex": eye, "PositionX": 0.2 + 0.128 * (eye - 0.5), "PositionY": 0.4, "PositionZ": -0.6}
         cells |= dict(zip((f"Quaternion{a}" for a in "XYZW"), quaternion(head(k // 2))))
         cells |= dict(zip((f"GazeQ{a}" for a in "XYZW"), quaternion(gaze(k // 2) + (1.5 if eye else -1.5))))
@@ -136,7 +136,7 @@ def test_the_columns_of_both_sites(tmp_path, site):
     settings(tmp_path)
     (tmp_path / "scene_setting.csv").write_text("\ufeff" + (tmp_path / "scene_setting.csv").read_text() + "\n")
     rays = read("eyenavgs", write(tmp_path / "dataset/room", site=site))
-    # No start: the origin is the splats'.
+    # Without a start, the origin is that of the splats.
     assert rays.persons == ("user7",) and np.allclose(rays.origin, [0.1, 0.3, 0.2])
     assert np.allclose(rays.t, 0.014 * np.arange(6))
     turned = np.radians(2.0 * np.arange(6))
@@ -148,9 +148,9 @@ def test_the_columns_of_both_sites(tmp_path, site):
 
 @pytest.mark.parametrize("block", [1 << 16, 3, 1])
 def test_rows_without_the_other_eye(tmp_path, monkeypatch, block):
-    monkeypatch.setattr(tables, "BLOCK", block)
+    monkeypatch.setattr(tables, "BLOCK_ROWS", block)
     settings(tmp_path)
-    rays = read("eyenavgs", write(tmp_path, eyes=(1, 0, 1, 0, 0, 1, 1, 0, 1, 0)))
+    rays = read("eyenavgs", write(tmp_path, both_eyes=(1, 0, 1, 0, 0, 1, 1, 0, 1, 0)))
     assert len(rays) == 3 and rays.metadata["rows_read"] == 7
     assert dropped(rays) == {"the other eye's row is missing": [[2, 2], [5, 5], [8, 8], [11, 11]]}
 
@@ -160,71 +160,71 @@ def test_frozen_gaze(tmp_path):
     still = write(tmp_path, "user1_train.csv", gaze=lambda k: 5.0)
     with pytest.raises(NergError, match="user1_train.csv"):
         read("eyenavgs", still)
-    # Spelt as one of the sites has it. Who keeps their head still as well may have looked at one thing.
+    # Spelling of one of the sites. A still head with still gaze may be one fixation.
     moving, resting = (
         write(tmp_path, "user2_trian.csv"),
         write(tmp_path, "user3_train.csv", gaze=abs, head=lambda k: 0.1 * k),
     )
     rays = read("eyenavgs", still, moving, resting)
     assert rays.persons == ("user2", "user3") and rays.metadata["place"] == "train"
-    frozen = "the gaze of the recording is frozen: it never changes while the head turns"
+    frozen = "the gaze of the recording is frozen: it is constant although the head turns"
     assert dropped(rays) == {frozen: [[k, k] for k in range(2, 13, 2)]}
 
 
-def test_gaze_that_is_locked_to_the_head(tmp_path):
-    """It follows the head five rows later, which no eye does; a head that hardly turns tells nothing."""
+def test_gaze_locked_to_the_head_is_dropped(tmp_path):
+    """Gaze follows the head five rows later, unlike real eyes; a head that hardly turns is not informative."""
     settings(tmp_path)
     turn = lambda k: 40 * math.sin(0.02 * k)
-    looks = lambda k: turn(k) + 12 * math.sin(0.4 * k)
-    behind = write(tmp_path, "user1_room.csv", eyes=(0, 1) * 400, head=turn, gaze=lambda k: 8 + turn(k - 5))
-    living = write(tmp_path, "user2_room.csv", eyes=(0, 1) * 400, head=turn, gaze=looks)
+    directions = lambda k: turn(k) + 12 * math.sin(0.4 * k)
+    behind = write(tmp_path, "user1_room.csv", both_eyes=(0, 1) * 400, head=turn, gaze=lambda k: 8 + turn(k - 5))
+    living = write(tmp_path, "user2_room.csv", both_eyes=(0, 1) * 400, head=turn, gaze=directions)
     resting = write(
-        tmp_path, "user3_room.csv", eyes=(0, 1) * 400, head=lambda k: turn(k) / 4, gaze=lambda k: turn(k) / 4
+        tmp_path, "user3_room.csv", both_eyes=(0, 1) * 400, head=lambda k: turn(k) / 4, gaze=lambda k: turn(k) / 4
     )
     rays = read("eyenavgs", behind, living, resting)
     assert rays.persons == ("user2", "user3") and len(rays) == 800
     (lost,) = rays.metadata["dropped"]
     assert "locked to the head" in lost["reason"] and lost["file"] == behind.name and lost["count"] == 400
-    with pytest.raises(NergError, match="nobody's eyes were tracked"):
+    with pytest.raises(NergError, match="no recording has tracked eyes"):
         read("eyenavgs", behind)
 
 
-def test_what_is_refused(tmp_path):
+def test_invalid_input_is_refused(tmp_path):
     path = write(tmp_path / "a/b")
     with pytest.raises(NergError, match="scene_setting.csv.*user7_room.csv"):
         read("eyenavgs", path)
     settings(tmp_path, 'room,"0, 0, 0, 1",2', 'nyc,"0, 0, 0, 1",1')
     with pytest.raises(NergError, match="user9_nyc.csv.*user7_room.csv"):
         read("eyenavgs", path, write(tmp_path, "user9_nyc.csv"))
-    for given, message in (
+    for cases, message in (
         (write(tmp_path, "user9_moon.csv"), '"moon"'),
         (tmp_path / "a", "there is no recording"),
-        (tmp_path / "gone_room.csv", "there is no .*gone_room.csv"),
+        (tmp_path / "gone_room.csv", "gone_room.csv does not exist"),
     ):
         with pytest.raises(NergError, match=message):
-            read("eyenavgs", given)
+            read("eyenavgs", cases)
     with pytest.raises(NergError, match='--eye is "third"'):
         read("eyenavgs", path, eye="third")
 
 
-# ---- Settings of EyeNavGS's places ----
+# ---- Scene settings of EyeNavGS ----
 
 
-def test_there_and_back(tmp_path):
-    """A quarter turn about z, two units a metre, the play area a metre along x."""
+def test_conversion_to_splats_is_inverse(tmp_path):
+    """A quarter turn about z, two units per metre, the play area one metre along x."""
     (tmp_path / "s.csv").write_text(
         'Scene_Name,Quaternion,Scale,Initial_Position\nhall,"0, 0, 0.70710678, 0.70710678",2,"1, 0, 3"\n'
     )
     setting = read_scene_settings(tmp_path / "s.csv")["hall"]
-    assert setting.start == (1, 0, 3) and np.allclose(setting.upright, [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert setting.start == (1, 0, 3) and np.allclose(setting.upright_rotation, [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
     x = np.array([[1.0, 0, 3], [3, 4, 5]])
-    assert np.allclose(setting.to_area(x), [[1, 1, 6], [-1, 2, 7]])
-    there = np.c_[setting.to_area(x), [1, 1]] @ setting.splat_from_area().T
-    assert np.allclose(there, np.c_[x * (1, -1, -1), [1, 1]])
+    assert np.allclose(setting.to_play_area(x), [[1, 1, 6], [-1, 2, 7]])
+    present = np.c_[setting.to_play_area(x), [1, 1]] @ setting.compute_splats_from_area().T
+    assert np.allclose(present, np.c_[x * (1, -1, -1), [1, 1]])
 
 
 @pytest.mark.parametrize("row", ['"0, 0, 0",2', '"0, 0, 0, 1",0', '"0, 0, 0, 0",1', "x,1", '"0, 0, 0, 1",2,"1, 0"'])
-def test_scene_settings_that_are_none(tmp_path, row):
+def test_invalid_scene_settings_are_refused(tmp_path, row):
     settings(tmp_path, f"room,{row}", head=",Initial_Position" * (row.count('"') > 2))
     with pytest.raises(NergError, match="2.*'room'.*0"):
         read_scene_settings(tmp_path / "scene_setting.csv")

@@ -14,7 +14,7 @@ N = 12
 RNG = np.random.default_rng(7)
 PLACE, TURN = RNG.normal(size=(N, 3)) + [0, 1.6, 0], Rotation.from_quat(RNG.normal(size=(N, 4)))
 LEFT, RIGHT = RNG.normal(size=(2, N, 3))
-RIGHT_DOWN = Rotation.from_euler("YX", [90, 30], degrees=True)  # of Unity: to the right, then down
+RIGHT_DOWN = Rotation.from_euler("YX", [90, 30], degrees=True)  # in Unity: to the right, then down
 
 # ---- ARETT on HoloLens 2 ----
 
@@ -27,17 +27,17 @@ def test_arett(tmp_path):
     path = tmp_path / "p03.csv"
     path.write_text(arett(origin, direction, hit, [1 == 1, False, True, True, True], [True] * 4 + [False]))
     rays = read("arett", path)
-    kept, unity = [0, 2, 3], [0, 2, 1]  # z of Unity is y of rays
+    selected, unity = [0, 2, 3], [0, 2, 1]  # z of Unity is y of rays
     d = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    assert np.allclose(rays.origin, origin[kept][:, unity]) and np.allclose(rays.direction, d[kept][:, unity])
-    assert np.allclose(rays.hit, hit[kept][:, unity], equal_nan=True) and rays.persons == ("p03",)
-    assert np.allclose(rays.t, 1.7e9 + 0.033 * np.array(kept), atol=1e-6)
+    assert np.allclose(rays.origin, origin[selected][:, unity]) and np.allclose(rays.direction, d[selected][:, unity])
+    assert np.allclose(rays.hit, hit[selected][:, unity], equal_nan=True) and rays.persons == ("p03",)
+    assert np.allclose(rays.t, 1.7e9 + 0.033 * np.array(selected), atol=1e-6)
     assert dropped(rays) == {"gazeHasValue is not true": [[3, 3]], "isCalibrationValid is not true": [[6, 6]]}
 
 
 # ---- HoloLens 2's StreamRecorder ----
 
-# A head that was turned by 90 degrees to its left, at a place of its own: row by row, as the recorder writes it.
+# A head that is rotated by 90 degrees to the left, at some position: row by row, as the recorder writes it.
 HOLOLENS_HEAD = np.array([[0.0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7], [0, 0, 0, 1]])
 
 
@@ -70,19 +70,19 @@ def test_hololens(tmp_path):
 TIMES = 7_000_000_000 + 11_111_111 * np.arange(N)
 
 
-def test_openxr_looks_along_minus_z(tmp_path):
+def test_openxr_forward_is_minus_z(tmp_path):
     path = tmp_path / "ann.csv"
     flags, active = np.full(N, 15), np.array(["1"] * N)
     flags[2], flags[3], flags[4], active[5] = 1, 2, 3, "0"
     path.write_text(openxr(TIMES, PLACE, TURN, flags, active))
     rays = read("openxr", path)
-    kept = [0, 1, 4, *range(6, N)]
+    selected = [0, 1, 4, *range(6, N)]
     # y up to z up: x, -z, y; the third column of a rotation by its quaternion's formula.
-    x, y, z, w = TURN.as_quat()[kept].T
+    x, y, z, w = TURN.as_quat()[selected].T
     back = np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=1)
     assert np.allclose(rays.direction, np.stack([-back[:, 0], back[:, 2], -back[:, 1]], axis=1))
-    assert np.allclose(rays.origin, np.stack([PLACE[kept, 0], -PLACE[kept, 2], PLACE[kept, 1]], axis=1))
-    assert np.allclose(rays.t, 0.011111111 * np.array(kept)) and rays.persons == ("ann",)
+    assert np.allclose(rays.origin, np.stack([PLACE[selected, 0], -PLACE[selected, 2], PLACE[selected, 1]], axis=1))
+    assert np.allclose(rays.t, 0.011111111 * np.array(selected)) and rays.persons == ("ann",)
     assert dropped(rays) == {"the pose is not valid": [[4, 5]], "the gaze is not active": [[7, 7]]}
 
 
@@ -92,13 +92,13 @@ def test_openxr_bare_names(tmp_path):
     rays = read("openxr", path)
     assert np.allclose(rays.origin, [[1, 2, 1.6]]) and np.allclose(rays.direction, [[0, 1, 0]]) and rays.t[0] == 0
     path.write_text("x,y,z,qx,qy,qz,qw\n1,1.6,-2,0,0,0,2\n")
-    with pytest.raises(NergError, match="has no time"):
+    with pytest.raises(NergError, match="has no column of time"):
         read("openxr", path)
 
 
 # ---- OVREyeGaze and Unity's eye gaze device ----
 
-# Eyes that look nearly the same way.
+# Eyes with almost equal directions.
 EYE_TURNS = (TURN * Rotation.from_euler("y", 2, degrees=True), TURN * Rotation.from_euler("y", -2, degrees=True))
 UNITY = [0, 2, 1]
 
@@ -106,16 +106,18 @@ UNITY = [0, 2, 1]
 @pytest.mark.parametrize("rig", [False, True])
 def test_quest_both_eyes_in_the_world(tmp_path, rig):
     at = (RNG.normal(size=(N, 3)), Rotation.from_quat(RNG.normal(size=(N, 4)))) if rig else None
-    sure = np.full(N, 0.9), np.array([0.9, 0.2, *[0.8] * (N - 2)])
+    confidences = np.full(N, 0.9), np.array([0.9, 0.2, *[0.8] * (N - 2)])
     path = tmp_path / "ann.csv"
-    path.write_text(quest(0.02 * np.arange(N), LEFT, RIGHT, EYE_TURNS, sure, at))
+    path.write_text(quest(0.02 * np.arange(N), LEFT, RIGHT, EYE_TURNS, confidences, at))
     rays = read("quest", path)
-    # Between eyes that are turned to either side lies the direction of the head.
+    # The direction of the head is midway between eyes that are rotated to either side.
     origin, direction = 0.5 * (LEFT + RIGHT), TURN.apply([0, 0, 1])
     if at is not None:
         origin, direction = at[0] + at[1].apply(origin), at[1].apply(direction)
-    kept = np.arange(N) != 1
-    assert np.allclose(rays.origin, origin[kept][:, UNITY]) and np.allclose(rays.direction, direction[kept][:, UNITY])
+    selected = np.arange(N) != 1
+    assert np.allclose(rays.origin, origin[selected][:, UNITY]) and np.allclose(
+        rays.direction, direction[selected][:, UNITY]
+    )
     assert np.allclose(rays.confidence, [0.9, *[0.8] * (N - 2)]) and dropped(rays) == {"confidence below 0.5": [[3, 3]]}
     assert len(read("quest", path, min_confidence=0.1)) == N
 
@@ -137,7 +139,7 @@ def test_quest_one_pose_of_the_gaze(tmp_path):
 
 @pytest.mark.parametrize("rig", [False, True])
 def test_quest_eyes_at_a_fill_value(tmp_path, rig):
-    """Of one eye the row is dropped at once; of both where the person is otherwise elsewhere."""
+    """A fill value of one eye drops the row at once; of both eyes, if the participant is otherwise elsewhere."""
     left, right = LEFT + [0, 3, 0], RIGHT + [0, 3, 0]
     left[2] = left[4] = right[4] = left[6] = right[6] = 0
     at = (RNG.normal(size=(N, 3)), Rotation.from_quat(RNG.normal(size=(N, 4)))) if rig else None
@@ -148,13 +150,13 @@ def test_quest_eyes_at_a_fill_value(tmp_path, rig):
     }
 
 
-# ---- SRanipal's own values beside Unity's heads ----
+# ---- SRanipal's values with heads in Unity's world ----
 
 ORIGIN, LOOK = 30 * RNG.normal(size=(N, 3)), RNG.normal(size=(N, 3)) * 0.2 + [0, 0, 1]
 
 
 def sranipal_world(origin, look):
-    """What Unity makes of GetGazeRay's values, point by point, in the frame of rays: x, z, y."""
+    """Points of GetGazeRay in Unity, in the frame of rays: x, z, y."""
     o, d = np.empty((2, N, 3))
     for k in range(N):
         m = TURN[k].as_matrix()
@@ -178,7 +180,7 @@ def test_sranipal_x_is_negated(tmp_path, style):
 
 
 def test_sranipal_two_eyes_are_one_ray(tmp_path):
-    """Where one is lost, the other alone; masks of 31 are all that there is to be valid."""
+    """If one eye is lost, the other is used alone; a mask of 31 is fully valid."""
     left, right = (
         (ORIGIN + [31, 0, 0], LOOK, np.full(N, 31)),
         (ORIGIN - [31, 0, 0], LOOK + [0, 0.1, 0], np.full(N, 31)),
@@ -205,14 +207,14 @@ def test_sranipal_names_of_the_sdks_example(tmp_path):
     assert np.allclose(rays.origin, [[1, 2, 1.6]]) and np.allclose(rays.direction, [[-0.6, 0.8, 0]])
 
 
-def test_sranipal_names_what_is_missing(tmp_path):
+def test_sranipal_missing_columns_are_reported(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time,gaze_origin_mm_x\n")
     with pytest.raises(NergError, match="no gaze_origin_mm_{x,y,z} or no gaze_direction_normalized"):
         read("sranipal", path)
-    eyes = {"combined": (ORIGIN, LOOK, np.full(N, 3))}
-    path.write_text(sranipal(np.arange(N), PLACE, TURN, eyes).replace("time_stamp", "clock"))
-    with pytest.raises(NergError, match="has no time"):
+    both_eyes = {"combined": (ORIGIN, LOOK, np.full(N, 3))}
+    path.write_text(sranipal(np.arange(N), PLACE, TURN, both_eyes).replace("time_stamp", "clock"))
+    with pytest.raises(NergError, match="has no column of time"):
         read("sranipal", path)
 
 
@@ -241,12 +243,12 @@ def test_unity_local_and_head(tmp_path):
     assert np.allclose(local.origin, head.origin + 0.1 * head.direction) and head.persons == ("4",)
     d = RIGHT_DOWN.apply([0, 0.5, 1]) / 1.25**0.5
     assert np.allclose(local.direction, d[[0, 2, 1]])
-    # The head is kept beside gaze in the head, beside gaze in the world, and not beside itself.
+    # The head is kept for gaze in the head's frame and in the world, but not for heads as gaze.
     world = read("unity", path)
     assert np.allclose(local.head, head.direction) and np.allclose(world.head, head.direction) and head.head is None
 
 
-def test_unity_names_what_is_missing(tmp_path):
+def test_unity_missing_columns_are_reported(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time,gaze_origin_x,gaze_origin_y,gaze_origin_z\n0,0,0,0\n")
     with pytest.raises(NergError, match="no columns gaze_dir_{x,y,z} or .*name them with --map"):
@@ -269,7 +271,7 @@ def test_unity_names_what_is_missing(tmp_path):
         "time [s],gaze origin x [m],gaze origin y [m],gaze origin z [m],gaze dir x,gaze dir y,gaze dir z",
     ],
 )
-def test_names_that_are_usual_elsewhere(tmp_path, head):
+def test_other_usual_names(tmp_path, head):
     path = tmp_path / "ann.csv"
     path.write_text(head + "\n0.5,1,1.6,3,0,0,2\n")
     rays = read("unity", path)
@@ -311,7 +313,7 @@ def test_validity(tmp_path, column, values, kept):
     assert np.allclose(rays.t, 0.02 * np.array(kept)) and sum(map(len, dropped(rays).values())) > 0
 
 
-def test_values_of_validity_are_of_all_files(tmp_path):
+def test_values_of_validity_are_collected_from_all_files(tmp_path):
     files = log(tmp_path / "a.csv", "gaze_status", [1, 1]), log(tmp_path / "b.csv", "gaze_status", [1, 2])
     assert len(read("unity", *files)) == 1
     with pytest.raises(NergError, match="'gaze_status'.*1.*2"):
@@ -319,7 +321,7 @@ def test_values_of_validity_are_of_all_files(tmp_path):
     assert len(read("unity", files[0], valid="gaze_status=1")) == 2 and len(read("unity", files[0], valid="none")) == 2
 
 
-def test_a_counter_is_no_participant(tmp_path):
+def test_row_counter_is_no_participant(tmp_path):
     rays = read("unity", log(tmp_path / "ann.csv", "id", range(40)))
     assert rays.persons == ("ann",) and rays.metadata["unused_columns"] == ["id"]
     assert "'id' has another value in nearly every row" in rays.metadata["complaints"][0]
@@ -356,8 +358,8 @@ VARJO_HEAD = "CaptureTime;HMDPosition;HMDRotation;CombinedGazePosition;CombinedG
 VARJO_ROW = "{};(0, 1.6, 0);(0, 0, 0, 1);(0, 0, 0);(0, 0, 1);{}\n"
 
 
-def test_varjo_vector_that_is_cut_off(tmp_path):
-    """Of Varjo's cells: told by line and column, or left out and counted."""
+def test_varjo_truncated_vector(tmp_path):
+    """Errors in Varjo's cells are reported with line and column, or skipped and counted."""
     path, rows = tmp_path / "ann.csv", "".join(VARJO_ROW.format(i * 10**7, "VALID") for i in range(5))
     path.write_text(VARJO_HEAD + "1;(0, 1.6;(0, 0, 0, 1);(0, 0;(0, oops);VALID\n" + rows)
     with pytest.raises(NergError, match="2.*'HMDPosition'.*--skip-bad-lines"):
@@ -375,7 +377,7 @@ def test_varjo_codes_of_the_status(tmp_path, status, kept):
     path = tmp_path / "v.csv"
     path.write_text(VARJO_HEAD + VARJO_ROW.format(0, "VALID") + VARJO_ROW.format(10**7, status))
     if kept is None:
-        with pytest.raises(NergError, match=f"GazeStatus '{status.upper()}', whose meaning is not certain"):
+        with pytest.raises(NergError, match=f"GazeStatus '{status.upper()}', whose meaning is uncertain"):
             read("varjo", path)
     else:
         assert len(read("varjo", path)) == 1 + kept
@@ -388,14 +390,14 @@ def test_real_supermarket(recorded):
     files = sorted(recorded("vr_supermarket").glob("*.csv.gz"))[:2]
     rays = read("vr_supermarket", *files)
     assert rays.persons == ("user10", "user11") and 0.85 < len(rays) / rays.metadata["rows_read"] < 0.97
-    # The gaze ray points at the recorded hit: the frame was decoded right.
+    # The gaze ray points at the recorded hit: the frame is correct.
     hit = np.isfinite(rays.hit).all(axis=1)
     to_hit = rays.hit[hit] - rays.origin[hit]
     to_hit /= np.linalg.norm(to_hit, axis=1, keepdims=True)
     angle = np.degrees(2 * np.arcsin(0.5 * np.linalg.norm(to_hit - rays.direction[hit], axis=1)))
     assert np.median(angle) < 1e-3 and np.percentile(angle, 99) < 0.05
     assert 0.97 < hit.mean() < 1
-    # Gaze is about where heads point.
+    # Gaze is near the direction of the head.
     assert np.median(np.einsum("ij,ij->i", rays.head, rays.direction)) > np.cos(np.radians(20))
     assert 1.2 < np.median(rays.origin[:, 2]) < 1.8  # z is up: eye heights
     probes = place_probes(rays, 0.25, count=64, min_rays=8, max_rays=100_000)
@@ -403,7 +405,7 @@ def test_real_supermarket(recorded):
 
 
 def test_supermarket_frame_eyes_and_openness(tmp_path):
-    """A camera that is turned by 90 degrees about Unity's y, against the formula by hand."""
+    """A camera rotated by 90 degrees about Unity's y, compared with the formula by hand."""
     turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     pose = np.hstack([turn, [[1.0], [1.6], [2.0]]]).ravel()
     rows = [
